@@ -1,0 +1,14 @@
+"""Viewpoints, cameras, view spheres, boxes and meshes.
+
+Conventions of the whole library (pinned by ``tests/geometry``):
+
+- OpenCV camera: x right, y down, z forward; ``T_cam_from_model`` maps model points into the camera.
+- Pixel (0, 0) is the centre of the top-left pixel; the image covers [-0.5, W - 0.5] x [-0.5, H - 0.5].
+- Boxes are ``x0, y0, x1, y1`` in pixels; depth is z along the optical axis in model units, background 0.
+- Angles are degrees at the API, radians inside. Images are RGB, floating, in [0, 1].
+- Poses are reported in the mesh file's own frame and unit.
+"""
+
+from .viewpoint import rotation_error, rotation_from_viewpoint, viewpoint_from_rotation
+
+__all__ = ["rotation_error", "rotation_from_viewpoint", "viewpoint_from_rotation"]

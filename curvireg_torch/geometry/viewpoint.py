@@ -1,0 +1,105 @@
+"""PASCAL3D+ viewpoint angles, rotations and the angle between two rotations.
+
+The PASCAL3D+ camera looks from ``C = d (cos e sin a, -cos e cos a, sin e)`` at the model's origin, +z of the model up
+in the image, turned by ``theta`` about the optical axis. With the image's y flipped to OpenCV's that is
+
+    R = diag(1, -1, -1) Rz(theta) Rx(e - 90 deg) Rz(-a),    x_cam = R x_model + t,    t = (0, 0, d).
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from .._checks import check_tensor
+from ..errors import InvalidInputError
+
+__all__ = ["rotation_error", "rotation_from_viewpoint", "viewpoint_from_rotation"]
+
+
+def _as_floating(*values: Tensor | float) -> list[Tensor]:
+    tensors = [v if isinstance(v, Tensor) else torch.tensor(float(v), dtype=torch.get_default_dtype()) for v in values]
+    tensors = [t if t.is_floating_point() else t.to(torch.get_default_dtype()) for t in tensors]
+    dtype = tensors[0].dtype
+    for t in tensors[1:]:
+        dtype = torch.promote_types(dtype, t.dtype)
+    return list(torch.broadcast_tensors(*(t.to(dtype) for t in tensors)))
+
+
+def rotation_from_viewpoint(azimuth: Tensor | float, elevation: Tensor | float, theta: Tensor | float = 0.0) -> Tensor:
+    """Rotation model -> OpenCV camera of a PASCAL3D+ viewpoint (METHOD of the PASCAL3D+ camera, see module).
+
+    Args:
+        azimuth, elevation, theta: degrees, numbers or tensors of broadcastable shapes (...).
+
+    Returns:
+        (..., 3, 3) rotations ``x_cam = R x_model``; x right, y down, z forward.
+
+    Example:
+        >>> R = rotation_from_viewpoint(0.0, 0.0, 0.0)      # camera on the -y axis, model's z up
+        >>> [round(v) for v in (R @ torch.tensor([0.0, 0.0, 1.0])).tolist()]
+        [0, -1, 0]
+    """
+    a, e, t = (torch.deg2rad(v) for v in _as_floating(azimuth, elevation, theta))
+    ca, sa, ce, se, ct, st = a.cos(), a.sin(), e.cos(), e.sin(), t.cos(), t.sin()
+    # Rows of Rz(theta) Rx(e - 90) Rz(-a), rows two and three negated.
+    return torch.stack(
+        [
+            torch.stack([ct * ca - st * se * -sa, ct * sa - st * se * ca, -st * ce], -1),
+            torch.stack([-(st * ca + ct * se * -sa), -(st * sa + ct * se * ca), -ct * ce], -1),
+            torch.stack([-ce * sa, ce * ca, -se], -1),
+        ],
+        -2,
+    )
+
+
+def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Inverse of :func:`rotation_from_viewpoint`.
+
+    Args:
+        R: (..., 3, 3) rotations into the OpenCV camera.
+
+    Returns:
+        azimuth in [0, 360), elevation in [-90, 90], theta in [-180, 180), degrees, each of shape (...). Looking straight
+        down or up (elevation +-90) azimuth and theta are not separable: theta is 0 there and azimuth carries the turn.
+
+    Example:
+        >>> a, e, t = viewpoint_from_rotation(rotation_from_viewpoint(30.0, 20.0, -10.0))
+        >>> round(float(a)), round(float(e)), round(float(t))
+        (30, 20, -10)
+    """
+    if R.shape[-2:] != (3, 3) or not R.is_floating_point():
+        raise InvalidInputError(f"R: expected a floating (..., 3, 3) tensor, got {R.dtype} of shape {tuple(R.shape)}")
+    # Camera centre direction is -R[2]; the image of the model's z axis gives theta.
+    cx, cy, cz = -R[..., 2, 0], -R[..., 2, 1], -R[..., 2, 2]
+    planar = torch.hypot(cx, cy)
+    elevation = torch.atan2(cz, planar)
+    pole = planar < 4 * torch.finfo(R.dtype).eps
+    # At the pole R[0] = (cos(a -+ theta), sin(a -+ theta), 0).
+    azimuth = torch.where(pole, torch.atan2(R[..., 0, 1], R[..., 0, 0]), torch.atan2(cx, -cy))
+    theta = torch.where(pole, torch.zeros_like(planar), torch.atan2(-R[..., 0, 2], -R[..., 1, 2]))
+    azimuth = torch.rad2deg(azimuth) % 360.0
+    theta = (torch.rad2deg(theta) + 180.0) % 360.0 - 180.0
+    # x % 360 may round up to 360 itself for a tiny negative x.
+    return torch.where(azimuth >= 360.0, torch.zeros_like(azimuth), azimuth), torch.rad2deg(elevation), theta
+
+
+def rotation_error(R1: Tensor, R2: Tensor) -> Tensor:
+    """Geodesic distance of rotations, ``acos((tr(R1^T R2) - 1) / 2)`` in degrees.
+
+    Computed as ``2 asin(|R1 - R2|_F / (2 sqrt 2))``, the same angle without the loss of digits of ``acos`` near 0.
+
+    Args:
+        R1, R2: (..., 3, 3), broadcast against each other.
+
+    Returns:
+        (...) degrees in [0, 180].
+
+    Example:
+        >>> round(float(rotation_error(rotation_from_viewpoint(0.0, 0.0), rotation_from_viewpoint(30.0, 0.0))), 3)
+        30.0
+    """
+    for name, R in (("R1", R1), ("R2", R2)):
+        check_tensor(R, name, (None,) * (R.ndim - 2) + (3, 3))
+    chord = torch.linalg.matrix_norm(R1 - R2) / (2.0 * math.sqrt(2.0))
+    return torch.rad2deg(2.0 * torch.asin(chord.clamp(max=1.0)))
