@@ -9,6 +9,30 @@ Conventions of the whole library (pinned by ``tests/geometry``):
 - Poses are reported in the mesh file's own frame and unit.
 """
 
+from .cameras import camera_matrix, project_points, projected_boxes, rotation_towards, transform
+from .crops import crop_images, crop_transforms, square_boxes, whole_image_box
+from .mesh import load_mesh, mesh_centre, mesh_radius, normalization_transform
 from .viewpoint import rotation_error, rotation_from_viewpoint, viewpoint_from_rotation
+from .views import ViewSphere, sample_views, uniform_views
 
-__all__ = ["rotation_error", "rotation_from_viewpoint", "viewpoint_from_rotation"]
+__all__ = [
+    "ViewSphere",
+    "camera_matrix",
+    "crop_images",
+    "crop_transforms",
+    "load_mesh",
+    "mesh_centre",
+    "mesh_radius",
+    "normalization_transform",
+    "project_points",
+    "projected_boxes",
+    "rotation_error",
+    "rotation_from_viewpoint",
+    "rotation_towards",
+    "sample_views",
+    "square_boxes",
+    "transform",
+    "uniform_views",
+    "viewpoint_from_rotation",
+    "whole_image_box",
+]

@@ -1,0 +1,5 @@
+"""Vector fields (B, 2, H, W) to descriptors (B, D) and point masks (B, 1, H, W)."""
+
+from .hog import HOG, hog, hog_length
+
+__all__ = ["HOG", "hog", "hog_length"]

@@ -1,0 +1,139 @@
+"""Histogram of oriented gradients on a vector field."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from .._checks import check_field, check_option, check_positive
+from ..errors import InvalidInputError
+from ..filters.derivatives import at_least_float32, safe_sqrt
+
+__all__ = ["HOG", "hog", "hog_length"]
+
+VOTINGS = ("linear", "hard")
+_EPSILON = 1e-5
+
+
+def hog_length(*, grid: int = 8, bins: int = 9, block: int = 2) -> int:
+    """Number of entries of a descriptor: (grid - block + 1)^2 block^2 bins.
+
+    Example:
+        >>> hog_length()
+        1764
+    """
+    return (grid - block + 1) ** 2 * block**2 * bins
+
+
+def hog(
+    field: Tensor,
+    *,
+    grid: int = 8,
+    bins: int = 9,
+    block: int = 2,
+    clip: float = 0.2,
+    voting: str = "linear",
+) -> Tensor:
+    """HOG (Dalal and Triggs 2005) of a vector field; the whole image is one grid of cells.
+
+    A pixel votes with the vector's length for the vector's orientation modulo 180 degrees. ``"linear"`` shares a vote
+    between the two nearest bins and the four nearest cells; ``"hard"`` gives it to one bin and one cell, as
+    ``skimage.feature.hog`` does. Cell histograms are means over the cell's area; blocks of ``block`` x ``block`` cells
+    are normalised by L2-Hys: to unit length, clipped, to unit length again.
+
+    Args:
+        field: (B, 2, H, W), channel 0 = x, 1 = y, H and W >= grid.
+        grid: cells along each side.
+        bins: orientations over 180 degrees.
+        block: cells along a block's side, <= grid.
+        clip: upper limit of L2-Hys in (0, 1]; 1 switches it off.
+        voting: ``"linear"`` or ``"hard"``.
+
+    Returns:
+        (B, D), D = (grid - block + 1)^2 block^2 bins = 1764 by default, ordered block row, block column, cell row, cell
+        column, bin; entries in [0, 1]. A field of zeros gives zeros. dtype kept (half types compute in float32).
+
+    Raises:
+        InvalidInputError: wrong shape, dtype or option, or fewer pixels than cells.
+
+    Example:
+        >>> hog(torch.randn(4, 2, 64, 64)).shape
+        torch.Size([4, 1764])
+    """
+    check_field(field)
+    check_option(voting, VOTINGS, "voting")
+    check_positive(clip, "clip")
+    _check_layout(grid, bins, block)
+    H, W = field.shape[-2:]
+    if min(H, W) < grid:
+        raise InvalidInputError(f"field: expected at least {grid} x {grid} px for grid={grid}, got {H} x {W}")
+    votes = _orientation_votes(at_least_float32(field), bins, voting)
+    rows = _cell_weights(H, grid, voting, votes)
+    columns = _cell_weights(W, grid, voting, votes)
+    cells = rows @ (votes @ columns.T)  # (B, bins, grid, grid)
+    return _normalised_blocks(cells, block, clip).to(field.dtype)
+
+
+def _check_layout(grid: int, bins: int, block: int) -> None:
+    if bins < 1 or block < 1 or grid < block:
+        raise InvalidInputError(f"expected bins >= 1 and 1 <= block <= grid, got {grid=}, {bins=}, {block=}")
+
+
+def _orientation_votes(field: Tensor, bins: int, voting: str) -> Tensor:
+    """(B, bins, H, W): each pixel's length, shared among the bins of its orientation."""
+    x, y = field[:, :1], field[:, 1:]
+    length = safe_sqrt(x * x + y * y)
+    nonzero = length > 0
+    # atan2 has no derivative at the origin: give it (1, 0) there.
+    angle = torch.atan2(torch.where(nonzero, y, torch.zeros_like(y)), torch.where(nonzero, x, torch.ones_like(x)))
+    position = torch.remainder(angle * (bins / math.pi), bins)  # bin i covers [i, i + 1)
+    index = torch.arange(bins, device=field.device, dtype=field.dtype).view(1, -1, 1, 1)
+    if voting == "hard":
+        # remainder may round up to ``bins`` itself.
+        return length * (torch.floor(position).clamp(max=bins - 1) == index)
+    distance = torch.remainder(position - (index + 0.5), bins)
+    distance = torch.minimum(distance, bins - distance)
+    return length * (1.0 - distance).clamp(min=0.0) if bins > 1 else length
+
+
+def _cell_weights(length: int, grid: int, voting: str, like: Tensor) -> Tensor:
+    """(grid, length) share of each pixel in each cell along one axis, times the pixels-per-cell normalisation."""
+    position = (torch.arange(length, device=like.device, dtype=like.dtype) + 0.5) * (grid / length)
+    cell = torch.arange(grid, device=like.device, dtype=like.dtype)[:, None]
+    if voting == "hard":
+        weights = (torch.floor(position) == cell).to(like.dtype)
+    else:
+        weights = (1.0 - (position - (cell + 0.5)).abs()).clamp(min=0.0)
+    return weights * (grid / length)
+
+
+def _normalised_blocks(cells: Tensor, block: int, clip: float) -> Tensor:
+    blocks = cells.unfold(2, block, 1).unfold(3, block, 1)  # (B, bins, n, n, block, block)
+    blocks = blocks.permute(0, 2, 3, 4, 5, 1).flatten(3)  # (B, n, n, block * block * bins)
+    blocks = blocks / (blocks.square().sum(-1, keepdim=True) + _EPSILON**2).sqrt()
+    blocks = blocks.clamp(max=clip)
+    blocks = blocks / (blocks.square().sum(-1, keepdim=True) + _EPSILON**2).sqrt()
+    return blocks.flatten(1)
+
+
+class HOG(nn.Module):
+    """Module twin of :func:`hog`; ``nn.Sequential(MultiScaleFocusCurves(), HOG())`` describes a photograph."""
+
+    def __init__(
+        self, *, grid: int = 8, bins: int = 9, block: int = 2, clip: float = 0.2, voting: str = "linear"
+    ) -> None:
+        super().__init__()
+        check_option(voting, VOTINGS, "voting")
+        _check_layout(grid, bins, block)
+        self.grid, self.bins, self.block, self.clip, self.voting = grid, bins, block, clip, voting
+
+    @property
+    def length(self) -> int:
+        """Number of entries of a descriptor."""
+        return hog_length(grid=self.grid, bins=self.bins, block=self.block)
+
+    def forward(self, field: Tensor) -> Tensor:
+        return hog(field, grid=self.grid, bins=self.bins, block=self.block, clip=self.clip, voting=self.voting)
+
+    def extra_repr(self) -> str:
+        return f"grid={self.grid}, bins={self.bins}, block={self.block}, clip={self.clip}, voting={self.voting!r}"

@@ -1,0 +1,97 @@
+"""OpenCV pinhole cameras, projection, and translations from boxes."""
+
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInputError
+
+__all__ = ["camera_matrix", "check_camera_matrix", "project_points", "projected_boxes", "rotation_towards", "transform"]
+
+
+def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dtype = torch.float32) -> Tensor:
+    """(3, 3) OpenCV camera matrix; all arguments in px.
+
+    Example:
+        >>> camera_matrix(500.0, 500.0, 319.5, 239.5).shape
+        torch.Size([3, 3])
+    """
+    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=dtype)
+    check_camera_matrix(K)
+    return K
+
+
+def check_camera_matrix(K: Tensor) -> None:
+    """Raise :class:`InvalidInputError` unless K is (..., 3, 3), finite, upper triangular, with focal lengths > 0."""
+    if K.shape[-2:] != (3, 3) or not K.is_floating_point():
+        raise InvalidInputError(f"camera matrix: expected floating (..., 3, 3), got {K.dtype} of shape {tuple(K.shape)}")
+    if not bool(torch.isfinite(K).all()):
+        raise InvalidInputError("camera matrix: expected finite entries, got NaN or inf")
+    if not bool((K[..., 0, 0] > 0).all() and (K[..., 1, 1] > 0).all()):
+        raise InvalidInputError("camera matrix: expected focal lengths FX, FY > 0 (in pixels); check their order FX FY CX CY")
+    last = torch.tensor([0.0, 0.0, 1.0], dtype=K.dtype, device=K.device)
+    if not bool((K[..., 2, :] == last).all() and (K[..., 1, 0] == 0).all()):
+        raise InvalidInputError("camera matrix: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]]")
+
+
+def transform(R: Tensor, t: Tensor) -> Tensor:
+    """(..., 4, 4) rigid transform from (..., 3, 3) and (..., 3)."""
+    top = torch.cat([R, t[..., None]], dim=-1)
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=R.dtype, device=R.device).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], dim=-2)
+
+
+def project_points(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False) -> Tensor:
+    """Pixel coordinates of model points, as ``cv2.projectPoints`` without distortion.
+
+    Args:
+        points: (P, 3) or (N, P, 3) in model units.
+        T_cam_from_model: (N, 4, 4) or (4, 4).
+        K: (N, 3, 3) or (3, 3). An orthographic camera uses ``u = fx x + cx``, with fx in px per model unit.
+        orthographic: drop the division by z.
+
+    Returns:
+        (..., P, 2) pixel coordinates; pixel (0, 0) is the centre of the top-left pixel.
+
+    Example:
+        >>> K = camera_matrix(100.0, 100.0, 50.0, 50.0)
+        >>> T = transform(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
+        >>> project_points(torch.tensor([[1.0, 0.0, 0.0]]), T, K).tolist()
+        [[100.0, 50.0]]
+    """
+    cam = points @ T_cam_from_model[..., :3, :3].mT + T_cam_from_model[..., None, :3, 3]
+    xy = cam[..., :2] if orthographic else cam[..., :2] / cam[..., 2:]
+    return xy @ K[..., :2, :2].mT + K[..., None, :2, 2]
+
+
+def projected_boxes(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False) -> Tensor:
+    """(..., 4) boxes x0, y0, x1, y1 around the projections of model points; the exact silhouette box for vertices.
+
+    Points must lie in front of a perspective camera.
+    """
+    uv = project_points(points, T_cam_from_model, K, orthographic=orthographic)
+    return torch.cat([uv.amin(dim=-2), uv.amax(dim=-2)], dim=-1)
+
+
+def rotation_towards(rays: Tensor) -> Tensor:
+    """Smallest rotations that take the optical axis (0, 0, 1) onto rays.
+
+    A box away from the principal point is seen along a ray, not along the axis: a view rendered on the axis has to be
+    turned by this rotation to be the pose in the whole camera.
+
+    Args:
+        rays: (..., 3), z > 0, any length.
+
+    Returns:
+        (..., 3, 3) rotations, R (0, 0, 1) = ray / |ray|.
+    """
+    x, y, z = (rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)).unbind(-1)
+    # Rodrigues with axis (0, 0, 1) x ray = (-y, x, 0): R = I + [v] + [v]^2 / (1 + z).
+    f = 1.0 / (1.0 + z)
+    return torch.stack(
+        [
+            torch.stack([1.0 - f * x * x, -f * x * y, x], -1),
+            torch.stack([-f * x * y, 1.0 - f * y * y, y], -1),
+            torch.stack([-x, -y, z], -1),
+        ],
+        -2,
+    )

@@ -1,0 +1,119 @@
+"""Boxes of photographs to square crops of fixed size, with the matching change of the camera matrix."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from .._checks import check_positive, check_tensor
+from ..errors import InvalidInputError
+
+__all__ = ["check_boxes", "crop_images", "crop_transforms", "square_boxes", "whole_image_box"]
+
+
+def whole_image_box(image: Tensor) -> Tensor:
+    """(4,) box that covers all of a (..., H, W) image."""
+    H, W = image.shape[-2:]
+    return torch.tensor([-0.5, -0.5, W - 0.5, H - 0.5], dtype=torch.float32, device=image.device)
+
+
+def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
+    """Raise :class:`InvalidInputError` for boxes that are not (B, 4), empty, not finite or wholly outside their image.
+
+    Args:
+        boxes: (B, 4) x0, y0, x1, y1 in px.
+        sizes: (H, W) of each image.
+    """
+    check_tensor(boxes, "boxes", (len(sizes), 4))
+    for i, (box, (H, W)) in enumerate(zip(boxes.tolist(), sizes, strict=True)):
+        x0, y0, x1, y1 = box
+        shown = f"box {i} ({x0:g}, {y0:g}, {x1:g}, {y1:g})"
+        if not all(abs(v) < 1e9 for v in box):
+            raise InvalidInputError(f"{shown}: expected finite coordinates in px")
+        if x1 <= x0 or y1 <= y0:
+            raise InvalidInputError(f"{shown}: expected X0 < X1 and Y0 < Y1; give corners, not width and height")
+        if x1 <= -0.5 or y1 <= -0.5 or x0 >= W - 0.5 or y0 >= H - 0.5:
+            raise InvalidInputError(f"{shown}: wholly outside the {W} x {H} image; give pixel coordinates of this image")
+
+
+def square_boxes(boxes: Tensor, margin: float) -> Tensor:
+    """(..., 4) squares around the boxes' centres, side = longer side x (1 + 2 margin).
+
+    Example:
+        >>> square_boxes(torch.tensor([0.0, 0.0, 10.0, 20.0]), 0.1).tolist()
+        [-7.0, -2.0, 17.0, 22.0]
+    """
+    check_positive(margin, "margin", zero_ok=True)
+    centre = 0.5 * (boxes[..., :2] + boxes[..., 2:])
+    half = (0.5 + margin) * (boxes[..., 2:] - boxes[..., :2]).amax(dim=-1, keepdim=True)
+    return torch.cat([centre - half, centre + half], dim=-1)
+
+
+def crop_transforms(squares: Tensor, size: int) -> Tensor:
+    """(..., 3, 3) maps from image pixels to pixels of the crop; ``A @ K`` is the crop's camera matrix.
+
+    The crop's outer border [-0.5, size - 0.5] falls on the square's.
+    """
+    scale = size / (squares[..., 2] - squares[..., 0])
+    zero, one = torch.zeros_like(scale), torch.ones_like(scale)
+    rows = [
+        torch.stack([scale, zero, -squares[..., 0] * scale - 0.5], -1),
+        torch.stack([zero, scale, -squares[..., 1] * scale - 0.5], -1),
+        torch.stack([zero, zero, one], -1),
+    ]
+    return torch.stack(rows, -2)
+
+
+def crop_images(
+    images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int = 256, margin: float = 0.1
+) -> tuple[Tensor, Tensor]:
+    """Square crops around boxes, resampled bilinearly, with a widened triangle (no aliasing) when shrinking.
+
+    Args:
+        images: (B, C, H, W), or a list of (C, H, W) of different sizes. Pixels outside an image repeat its border.
+        boxes: (B, 4) x0, y0, x1, y1 in px; may stick out of the image.
+        size: side of the crops in px.
+        margin: room around the box on each side, as a share of its longer side.
+
+    Returns:
+        crops (B, C, size, size) and (B, 3, 3) transforms A, ``A @ K`` being the crops' camera matrices.
+
+    Raises:
+        InvalidInputError: wrong shapes, or a box that is empty or wholly outside its image.
+
+    Example:
+        >>> crops, A = crop_images(torch.rand(2, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30], [10, 5, 60, 47]]), size=32)
+        >>> crops.shape, A.shape
+        (torch.Size([2, 3, 32, 32]), torch.Size([2, 3, 3]))
+    """
+    if isinstance(images, Tensor):
+        check_tensor(images, "images", (None, None, None, None))
+    else:
+        for image in images:
+            check_tensor(image, "images", (None, None, None))
+    check_boxes(boxes, [(int(image.shape[-2]), int(image.shape[-1])) for image in images])
+    squares = square_boxes(boxes, margin)
+    A = crop_transforms(squares, size)
+    if isinstance(images, Tensor):
+        return _resample(images, squares.to(images), size), A
+    crops = [_resample(image[None], squares[i : i + 1].to(image), size) for i, image in enumerate(images)]
+    if not crops:
+        raise InvalidInputError("images: expected at least one image in the list")
+    return torch.cat(crops), A
+
+
+def _resample(images: Tensor, squares: Tensor, size: int) -> Tensor:
+    H, W = images.shape[-2:]
+    rows = _triangle_weights(squares[:, 1], squares[:, 3], size, H)[:, None]
+    columns = _triangle_weights(squares[:, 0], squares[:, 2], size, W)[:, None]
+    return rows @ (images @ columns.mT)
+
+
+def _triangle_weights(low: Tensor, high: Tensor, size: int, length: int) -> Tensor:
+    """(B, size, length) weights of input samples in each output sample; rows sum to 1."""
+    scale = ((high - low) / size)[:, None]
+    index = torch.arange(size, device=low.device, dtype=low.dtype) + 0.5
+    centres = (low[:, None] + index * scale).clamp(0, length - 1)[..., None]
+    samples = torch.arange(length, device=low.device, dtype=low.dtype)
+    weights = (1.0 - (samples - centres).abs() / scale.clamp(min=1.0)[..., None]).clamp(min=0.0)
+    return weights / weights.sum(dim=-1, keepdim=True)

@@ -1,0 +1,135 @@
+"""Mesh files to one cleaned ``trimesh.Trimesh``, and a normalised model frame."""
+
+import logging
+import warnings
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from .._checks import check_option
+from ..errors import MeshError, MissingFileError
+
+__all__ = ["UNITS", "as_mesh", "load_mesh", "mesh_centre", "mesh_radius", "normalization_transform"]
+
+UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+"""Metres per unit."""
+
+SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+
+
+def load_mesh(path: str | PathLike[str], *, unit: str = "m") -> trimesh.Trimesh:
+    """Read a mesh file; scenes become one mesh, textures and normals are ignored.
+
+    Nothing is rescaled: vertices, and every pose computed from them, stay in the file's own frame and unit.
+
+    Args:
+        path: .obj, .ply, .stl, .off, .glb or .gltf.
+        unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. An object that would be
+            smaller than 5 mm or larger than 100 m gets a warning: the unit is probably another.
+
+    Returns:
+        ``trimesh.Trimesh`` with (V, 3) float64 vertices and (F, 3) faces, degenerate faces removed.
+
+    Raises:
+        MissingFileError: no such file.
+        MeshError: unreadable, empty, without faces, or with NaN or infinite vertices.
+    """
+    check_option(unit, UNITS, "unit")
+    path = Path(path)
+    if not path.is_file():
+        raise MissingFileError(f"{path}: no such mesh file")
+    if path.suffix.lower() not in SUFFIXES:
+        raise MeshError(f"{path}: expected a mesh file ({', '.join(SUFFIXES)}); convert it first")
+    logger = logging.getLogger("trimesh")
+    level = logger.level
+    try:
+        logger.setLevel(logging.CRITICAL)  # its tracebacks of files that it cannot read
+        loaded = trimesh.load(path, process=False, skip_materials=True)
+    except Exception as error:
+        raise MeshError(f"{path}: cannot be read as a mesh ({type(error).__name__}: {error}); re-export the file") from error
+    finally:
+        logger.setLevel(level)
+    mesh = as_mesh(loaded, name=str(path))
+    mesh.units = unit
+    mesh.metadata["file_name"] = path.name
+    size = float(np.linalg.norm(mesh.extents)) * UNITS[unit]
+    if not 0.005 <= size <= 100.0:
+        warnings.warn(
+            f"{path}: in unit {unit!r} the object measures {size:g} m across; if that is wrong, give the file's unit (mm?)",
+            stacklevel=2,
+        )
+    return mesh
+
+
+def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
+    """One clean mesh from a path, a ``trimesh.Trimesh`` or a ``trimesh.Scene``; see :func:`load_mesh` for the errors."""
+    if isinstance(source, str | PathLike):
+        return load_mesh(source)
+    if isinstance(source, trimesh.Scene):
+        parts = [part for part in source.dump() if isinstance(part, trimesh.Trimesh)]
+        source = trimesh.util.concatenate(parts) if parts else None
+    if not isinstance(source, trimesh.Trimesh) or len(source.faces) == 0:
+        raise MeshError(f"{name}: expected a mesh with faces, got none; point clouds and curves cannot be rendered")
+    vertices, faces = np.asarray(source.vertices, dtype=np.float64), np.asarray(source.faces, dtype=np.int64)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshError(f"{name}: faces name vertices that do not exist; the file is damaged, re-export it")
+    used = vertices[faces]
+    if not np.isfinite(used).all():
+        raise MeshError(f"{name}: {int((~np.isfinite(used).all(axis=(1, 2))).sum())} faces have NaN or infinite vertices; repair the mesh")
+    area = np.linalg.norm(np.cross(used[:, 1] - used[:, 0], used[:, 2] - used[:, 0]), axis=1)
+    if not (area > 0).any():
+        raise MeshError(f"{name}: every face is degenerate (area 0); repair the mesh")
+    mesh = trimesh.Trimesh(vertices=vertices, faces=faces[area > 0], process=False)
+    mesh.remove_unreferenced_vertices()
+    mesh.units = source.units
+    return mesh
+
+
+def mesh_centre(mesh: trimesh.Trimesh) -> Tensor:
+    """(3,) float64 centre of the axis-aligned box, in model units."""
+    return torch.from_numpy(np.asarray(mesh.bounds, dtype=np.float64).mean(axis=0))
+
+
+def mesh_radius(mesh: trimesh.Trimesh) -> float:
+    """Half the diagonal of the axis-aligned box, in model units."""
+    return 0.5 * float(np.linalg.norm(mesh.extents))
+
+
+def normalization_transform(mesh: trimesh.Trimesh, *, align_axes: bool = False) -> Tensor:
+    """Similarity that brings a mesh into a normalised frame; its inverse brings poses back.
+
+    The area-weighted centroid goes to the origin and the farthest vertex to distance 1. With ``align_axes`` (the paper's
+    normalisation) the principal axes of the surface go to x, y, z in decreasing order of variance. An axis's sign is
+    such that the surface's third moment along it is positive for x and y; z completes a right-handed frame.
+
+    Returns:
+        (4, 4) float64 ``T_normalized_from_model``; ``torch.linalg.inv`` of it is the way back.
+
+    Example:
+        >>> T = normalization_transform(trimesh.creation.box((2.0, 4.0, 4.0)))
+        >>> round(1 / float(T[0, 0]), 6)                                        # half the diagonal
+        3.0
+    """
+    corners = np.asarray(mesh.triangles, dtype=np.float64)
+    area = np.asarray(mesh.area_faces, dtype=np.float64)
+    centroid = np.average(corners.mean(axis=1), axis=0, weights=area)
+    R = np.eye(3)
+    if align_axes:
+        # Midpoints of the edges integrate second moments of a triangle exactly.
+        points = (0.5 * (corners + np.roll(corners, 1, axis=1)) - centroid).reshape(-1, 3)
+        weights = np.repeat(area / area.sum() / 3.0, 3)
+        _, axes = np.linalg.eigh((points * weights[:, None]).T @ points)
+        R = axes.T[::-1].copy()
+        third = ((points @ R.T) ** 3 * weights[:, None]).sum(axis=0)
+        R[:2] *= np.where(third[:2] < 0, -1.0, 1.0)[:, None]
+        R[2] = np.cross(R[0], R[1])
+    scale = 1.0 / np.linalg.norm(mesh.vertices - centroid, axis=1).max()
+    T = np.eye(4)
+    T[:3, :3] = scale * R
+    T[:3, 3] = -scale * (R @ centroid)
+    return torch.from_numpy(T)

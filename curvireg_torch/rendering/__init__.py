@@ -1,0 +1,5 @@
+"""Depth images of meshes behind one protocol; every backend samples the pixel's centre."""
+
+from .base import BACKENDS, DepthRenderer, make_renderer, render_depth
+
+__all__ = ["BACKENDS", "DepthRenderer", "make_renderer", "render_depth"]

@@ -1,0 +1,123 @@
+"""The renderer protocol, backend selection, and :func:`render_depth`."""
+
+import importlib.util
+from os import PathLike
+from typing import Any, Protocol
+
+import torch
+import trimesh
+from torch import Tensor
+
+from .._checks import check_option
+from ..errors import InvalidInputError, MissingDependencyError, RenderingError
+from ..geometry.cameras import check_camera_matrix
+from ..geometry.mesh import as_mesh
+
+__all__ = ["BACKENDS", "DepthRenderer", "make_renderer", "render_depth"]
+
+BACKENDS = ("auto", "embree", "pyrender")
+
+
+class DepthRenderer(Protocol):
+    """Depth images of one mesh. Both sides of every face are seen; textures play no part."""
+
+    name: str
+
+    def render(
+        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+    ) -> Tensor:
+        """Render N views.
+
+        Args:
+            T_cam_from_model: (N, 4, 4) rigid transforms into the OpenCV camera.
+            camera_matrix: (N, 3, 3) or (3, 3); see :func:`curvireg_torch.geometry.project_points`.
+            size: (H, W) in px.
+            orthographic: parallel projection along z; fx, fy are then px per model unit.
+
+        Returns:
+            (N, 1, H, W) float32 z-depth at the pixels' centres, in model units; 0 = background. On the CPU.
+        """
+        ...
+
+
+def make_renderer(mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto") -> DepthRenderer:
+    """A renderer of ``mesh``.
+
+    ``"embree"`` casts rays on the CPU and needs nothing but its wheel; ``"pyrender"`` draws through OpenGL and needs a
+    system with EGL. ``"auto"`` takes embree where it is installed (on a CPU it is the faster of the two), else pyrender.
+
+    Raises:
+        RenderingError, MissingDependencyError: the backend does not work here.
+    """
+    if not isinstance(backend, str):
+        return backend
+    check_option(backend, BACKENDS, "renderer")
+    if backend == "auto":
+        backend = "embree" if importlib.util.find_spec("embreex") else "pyrender"
+    if backend == "embree":
+        try:
+            from .embree import EmbreeRenderer
+        except ImportError as error:
+            raise MissingDependencyError(f"renderer 'embree' needs the package embreex ({error}): pip install embreex") from error
+        return EmbreeRenderer(mesh)
+    from .opengl import PyrenderRenderer
+
+    return PyrenderRenderer(mesh)
+
+
+def check_render_arguments(T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """float64 CPU (N, 4, 4) and (N, 3, 3), or a clear error."""
+    if T.ndim != 3 or T.shape[1:] != (4, 4):
+        raise InvalidInputError(f"T_cam_from_model: expected shape (N, 4, 4), got {tuple(T.shape)}")
+    if len(size) != 2 or min(size) < 1:
+        raise InvalidInputError(f"size: expected (H, W) >= 1, got {size}")
+    check_camera_matrix(K)
+    if K.ndim == 3 and K.shape[0] not in (1, T.shape[0]):
+        raise InvalidInputError(f"camera_matrix: expected one or {T.shape[0]} matrices, got {K.shape[0]}")
+    if not bool(torch.isfinite(T).all()):
+        raise InvalidInputError("T_cam_from_model: expected finite entries, got NaN or inf")
+    T = T.detach().to("cpu", torch.float64)
+    return T, K.detach().to("cpu", torch.float64).expand(T.shape[0], 3, 3)
+
+
+def render_depth(
+    mesh: "trimesh.Trimesh | trimesh.Scene | str | PathLike[str]",
+    T_cam_from_model: Tensor,
+    camera_matrix: Tensor,
+    size: tuple[int, int],
+    *,
+    renderer: Any = "auto",
+    orthographic: bool = False,
+) -> Tensor:
+    """Depth images of a mesh.
+
+    Args:
+        mesh: a mesh or the path of one.
+        T_cam_from_model: (N, 4, 4) or (4, 4), model to OpenCV camera.
+        camera_matrix: (N, 3, 3) or (3, 3) in px; pixel (0, 0) is the centre of the top-left pixel.
+        size: (H, W).
+        renderer: "auto", "embree" or "pyrender", or a :class:`DepthRenderer`.
+        orthographic: parallel projection; fx, fy are then px per model unit.
+
+    Returns:
+        (N, 1, H, W) float32 z-depth in model units, 0 = background.
+
+    Raises:
+        InvalidInputError, MeshError, MissingFileError, RenderingError.
+
+    Example:
+        >>> K = torch.tensor([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]])
+        >>> T = torch.eye(4); T[2, 3] = 4.0
+        >>> depth = render_depth(trimesh.creation.box((1.0, 1.0, 1.0)), T, K, (64, 64))
+        >>> depth.shape, round(float(depth[0, 0, 32, 32]), 4)
+        (torch.Size([1, 1, 64, 64]), 3.5)
+    """
+    if T_cam_from_model.ndim == 2:
+        T_cam_from_model = T_cam_from_model[None]
+    backend = make_renderer(as_mesh(mesh), renderer)
+    try:
+        return backend.render(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
+    except (InvalidInputError, RenderingError):
+        raise
+    except Exception as error:  # drivers raise anything
+        raise RenderingError(f"renderer {backend.name!r} failed: {type(error).__name__}: {error}; try another renderer") from error
