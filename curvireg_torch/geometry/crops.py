@@ -91,6 +91,7 @@ def crop_images(
     else:
         for image in images:
             check_tensor(image, "images", (None, None, None))
+    boxes = boxes.float() if isinstance(boxes, Tensor) and not boxes.is_floating_point() else boxes
     check_boxes(boxes, [(int(image.shape[-2]), int(image.shape[-1])) for image in images])
     squares = square_boxes(boxes, margin)
     A = crop_transforms(squares, size)
