@@ -1,0 +1,62 @@
+"""Scores of poses, rankings, feature points and detections, as functions and as classes that accumulate.
+
+Functions take a whole set at once. The classes take it batch by batch and merge across processes. An average over
+nothing is NaN; a missing estimate has the error ``inf`` and counts as a miss. Every threshold is strict: equal is not
+good enough, except for a radius in pixels and for the IoU, which are inclusive.
+"""
+
+from .classes import Metric, PoseRecall, RankPrecision, ViewpointAccuracy
+from .detection import (
+    Detections,
+    Objects,
+    average_precision,
+    average_rotation_precision,
+    average_viewpoint_precision,
+)
+from .points import hausdorff_distance, intersection_percentage, repeatability
+from .pose import add_error, add_recall, adds_error, mspd_error, mspd_recall, mssd_error, mssd_recall
+from .ranking import closest_view, pose_parameter_errors, rank_precision, viewpoint_differences
+from .symmetry import symmetry_transforms
+from .viewpoint import (
+    AVP_BINS,
+    accuracy,
+    axis_rotation_error,
+    azimuth_bin,
+    binned_accuracy,
+    median_error,
+    symmetric_rotation_error,
+)
+
+__all__ = [
+    "AVP_BINS",
+    "Detections",
+    "Metric",
+    "Objects",
+    "PoseRecall",
+    "RankPrecision",
+    "ViewpointAccuracy",
+    "accuracy",
+    "add_error",
+    "add_recall",
+    "adds_error",
+    "average_precision",
+    "average_rotation_precision",
+    "average_viewpoint_precision",
+    "axis_rotation_error",
+    "azimuth_bin",
+    "binned_accuracy",
+    "closest_view",
+    "hausdorff_distance",
+    "intersection_percentage",
+    "median_error",
+    "mspd_error",
+    "mspd_recall",
+    "mssd_error",
+    "mssd_recall",
+    "pose_parameter_errors",
+    "rank_precision",
+    "repeatability",
+    "symmetric_rotation_error",
+    "symmetry_transforms",
+    "viewpoint_differences",
+]

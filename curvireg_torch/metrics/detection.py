@@ -1,0 +1,188 @@
+"""Detection and viewpoint scored together: AP, AVP and ARP.
+
+All three read one curve. Detections of a class, best score first, claim the ground-truth box of their image with which
+they overlap most, if the IoU is at least 0.5 and nobody claimed it before. Recall is the share of boxes claimed;
+the height of the curve is the share of the detections so far that are claims *with the right viewpoint*. That is what
+PASCAL3D+'s own evaluation does, recall counting every claim, and why AVP on ground-truth boxes is the binned accuracy.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from curvireg_torch._checks import check_positive, check_same_device, check_tensor
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import rotation_error, viewpoint_from_rotation
+
+from .viewpoint import azimuth_bin
+
+__all__ = [
+    "Detections",
+    "Objects",
+    "average_precision",
+    "average_rotation_precision",
+    "average_viewpoint_precision",
+]
+
+_MIN_IOU = 0.5
+
+
+@dataclass(frozen=True)
+class Objects:
+    """True objects of one class, those to be found (PASCAL3D+ leaves the ones marked difficult out).
+
+    Args:
+        image: (M,) int64, which image each object is in.
+        boxes: (M, 4) x0, y0, x1, y1 in pixels.
+        rotations: (M, 3, 3) model -> camera.
+
+    Raises:
+        InvalidInputError: wrong shape, dtype or device.
+    """
+
+    image: Tensor
+    boxes: Tensor
+    rotations: Tensor
+
+    def __post_init__(self) -> None:
+        if self.image.ndim != 1 or self.image.is_floating_point():
+            raise InvalidInputError(
+                f"image: expected an integer tensor of shape (*), got {self.image.dtype} of {tuple(self.image.shape)}"
+            )
+        n = len(self.image)
+        check_tensor(self.boxes, "boxes", (n, 4))
+        check_tensor(self.rotations, "rotations", (n, 3, 3))
+        check_same_device(self.boxes, self.image, "boxes")
+        check_same_device(self.rotations, self.image, "rotations")
+
+
+@dataclass(frozen=True)
+class Detections(Objects):
+    """Detected objects of one class: :class:`Objects` with ``scores`` (M,), higher = more certain."""
+
+    scores: Tensor
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_tensor(self.scores, "scores", (len(self.image),))
+        if not bool(self.scores.isfinite().all()):
+            raise InvalidInputError("scores: expected finite numbers, got NaN or inf")
+
+
+def average_precision(detections: Detections, objects: Objects) -> float:
+    """Detection average precision at IoU 0.5, viewpoints ignored (VOC, area under the whole curve).
+
+    Returns:
+        [0, 1]; 0 without detections, NaN without objects.
+
+    Example:
+        >>> found = Objects(torch.tensor([0]), torch.tensor([[0.0, 0.0, 9.0, 9.0]]), torch.eye(3)[None])
+        >>> average_precision(Detections(found.image, found.boxes, found.rotations, torch.ones(1)), found)
+        1.0
+    """
+    claimed = _claims(detections, objects)
+    return _area(detections.scores, claimed >= 0, claimed >= 0, len(objects.image))
+
+
+def average_viewpoint_precision(detections: Detections, objects: Objects, bins: int) -> float:
+    """AVP of PASCAL3D+: a detection also needs the azimuth bin of the object it claims.
+
+    Args:
+        detections, objects: of one class, any number of images.
+        bins: 4, 8, 16 or 24.
+
+    Returns:
+        [0, 1]; 0 without detections, NaN without objects. Detections with equal scores enter the curve together, so
+        that the result does not depend on their order.
+
+    Raises:
+        InvalidInputError: another number of bins.
+
+    Example:
+        >>> found = Objects(torch.tensor([0]), torch.tensor([[0.0, 0.0, 9.0, 9.0]]), torch.eye(3)[None])
+        >>> average_viewpoint_precision(Detections(found.image, found.boxes, found.rotations, torch.ones(1)), found, 24)
+        1.0
+    """
+    claimed = _claims(detections, objects)
+    est = azimuth_bin(viewpoint_from_rotation(detections.rotations)[0], bins)
+    gt = azimuth_bin(viewpoint_from_rotation(objects.rotations)[0], bins)
+    return _area(detections.scores, claimed >= 0, _right(claimed, lambda d, o: est[d] == gt[o]), len(objects.image))
+
+
+def average_rotation_precision(detections: Detections, objects: Objects, *, threshold_deg: float = 30.0) -> float:
+    """ARP: a detection also needs a rotation error below a threshold (Tulsiani and Malik 2015).
+
+    Args:
+        detections, objects: of one class, any number of images.
+        threshold_deg: degrees > 0; an error equal to it is wrong.
+
+    Returns:
+        [0, 1]; 0 without detections, NaN without objects; ties as in :func:`average_viewpoint_precision`.
+
+    Raises:
+        InvalidInputError: a threshold that is not > 0.
+
+    Example:
+        >>> found = Objects(torch.tensor([0]), torch.tensor([[0.0, 0.0, 9.0, 9.0]]), torch.eye(3)[None])
+        >>> flipped = torch.diag(torch.tensor([1.0, -1.0, -1.0]))[None]
+        >>> average_rotation_precision(Detections(found.image, found.boxes, flipped, torch.ones(1)), found)
+        0.0
+    """
+    check_positive(threshold_deg, "threshold_deg")
+    claimed = _claims(detections, objects)
+    right = _right(
+        claimed, lambda d, o: rotation_error(detections.rotations[d], objects.rotations[o]) < threshold_deg
+    )
+    return _area(detections.scores, claimed >= 0, right, len(objects.image))
+
+
+def _iou(a: Tensor, b: Tensor) -> Tensor:
+    """(N, 4) x (M, 4) -> (N, M), 0 where the union is empty."""
+    overlap = (torch.minimum(a[:, None, 2:], b[:, 2:]) - torch.maximum(a[:, None, :2], b[:, :2])).clamp(min=0).prod(-1)
+    area_a, area_b = ((box[:, 2:] - box[:, :2]).clamp(min=0).prod(-1) for box in (a, b))
+    union = area_a[:, None] + area_b - overlap
+    return overlap / torch.where(union > 0, union, torch.ones_like(union))
+
+
+def _claims(detections: Detections, objects: Objects) -> Tensor:
+    """(N,) index of the object that each detection claims, -1 for none."""
+    claimed = torch.full_like(detections.image, -1, dtype=torch.int64)
+    by_score = torch.argsort(detections.scores, descending=True, stable=True)
+    for image in set(detections.image.tolist()):
+        mine = by_score[detections.image[by_score] == image]
+        there = torch.nonzero(objects.image == image).flatten()
+        if len(there) == 0:
+            continue
+        iou, best = _iou(detections.boxes[mine], objects.boxes[there]).max(1)
+        free = set(range(len(there)))
+        for d, overlap, o in zip(mine.tolist(), iou.tolist(), best.tolist(), strict=True):
+            if overlap >= _MIN_IOU and o in free:
+                free.remove(o)
+                claimed[d] = there[o]
+    return claimed
+
+
+def _right(claimed: Tensor, agrees: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """(N,) bool: the detection claims an object, and ``agrees(detections, objects)`` holds for the pair."""
+    right = claimed >= 0
+    index = torch.nonzero(right).flatten()
+    right[index] = agrees(index, claimed[index])
+    return right
+
+
+def _area(scores: Tensor, hits: Tensor, right: Tensor, n_objects: int) -> float:
+    """Area under (recall of the hits, share of the right ones), the curve made monotone from the right as VOC does."""
+    if n_objects == 0:
+        return math.nan
+    if len(scores) == 0:
+        return 0.0
+    ordered, by_score = torch.sort(scores, descending=True, stable=True)
+    last_of_ties = torch.cat([ordered[1:] != ordered[:-1], ordered.new_ones(1, dtype=torch.bool)])
+    rank = torch.arange(1, len(scores) + 1, device=scores.device, dtype=torch.float64)
+    recall = (hits[by_score].double().cumsum(0) / n_objects)[last_of_ties]
+    height = (right[by_score].double().cumsum(0) / rank)[last_of_ties]
+    envelope = height.flip(0).cummax(0).values.flip(0)
+    return float((torch.diff(recall, prepend=recall.new_zeros(1)) * envelope).sum())

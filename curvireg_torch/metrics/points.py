@@ -1,0 +1,121 @@
+"""How well two sets of feature points, given as boolean masks, fall on each other."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from curvireg_torch._checks import check_mask, check_positive
+from curvireg_torch.errors import InvalidInputError
+
+__all__ = ["hausdorff_distance", "intersection_percentage", "repeatability"]
+
+
+def intersection_percentage(photo: Tensor, view: Tensor, *, eps_px: float = 2.0) -> Tensor:
+    """IP of the paper: share of the photograph's feature points with a point of the rendered view within ``eps_px``.
+
+    Args:
+        photo, view: (..., H, W) bool, one mask of feature points per image.
+        eps_px: radius >= 0 in pixels, Euclidean, inclusive.
+
+    Returns:
+        (...) shares in [0, 1] (times 100 for the printed percentage); NaN where the photograph has no point, 0 where
+        only the view has none.
+
+    Raises:
+        InvalidInputError: masks that are not boolean or differ in shape or device; a bad radius.
+
+    Example:
+        >>> photo = torch.tensor([[True, False, False, True]])
+        >>> view = torch.tensor([[False, True, False, False]])
+        >>> float(intersection_percentage(photo, view, eps_px=1.0))
+        0.5
+    """
+    check_positive(eps_px, "eps_px", zero_ok=True)
+    return _per_image(
+        lambda a, b: float((_distances(a, b) <= eps_px).mean()) if a.any() else np.nan, photo, view, ("photo", "view")
+    )
+
+
+def repeatability(view: Tensor, photo: Tensor, *, eps_px: float = 2.0) -> Tensor:
+    """Share of the rendered view's feature points that are found again within ``eps_px`` in the photograph.
+
+    The other direction of :func:`intersection_percentage`: a photograph full of texture repeats any view: print both.
+
+    Args:
+        view, photo: (..., H, W) bool, one mask of feature points per image.
+        eps_px: radius >= 0 in pixels, Euclidean, inclusive.
+
+    Returns:
+        (...) shares in [0, 1]; NaN where the view has no point, 0 where only the photograph has none.
+
+    Raises:
+        InvalidInputError: masks that are not boolean or differ in shape or device; a bad radius.
+
+    Example:
+        >>> photo = torch.tensor([[True, False, False, True]])
+        >>> view = torch.tensor([[False, True, False, False]])
+        >>> float(repeatability(view, photo, eps_px=1.0))
+        1.0
+    """
+    return intersection_percentage(view, photo, eps_px=eps_px)
+
+
+def hausdorff_distance(a: Tensor, b: Tensor, *, percentile: float = 100.0, directed: bool = False) -> Tensor:
+    """Hausdorff distance of two point sets in pixels, or a percentile of it.
+
+    ``h(A, B)`` is the percentile over a in A of the distance of a to its nearest point of B; the result is
+    ``max(h(A, B), h(B, A))``. The classical distance (percentile 100) hangs on a single point; 95 is the robust one.
+
+    Args:
+        a, b: (..., H, W) bool.
+        percentile: in (0, 100], linear between order statistics.
+        directed: only ``h(A, B)``.
+
+    Returns:
+        (...) pixels >= 0; ``inf`` where one of the masks is empty, NaN where both are.
+
+    Raises:
+        InvalidInputError: masks that are not boolean or differ in shape or device; a bad percentile.
+
+    Example:
+        >>> a = torch.tensor([[True, False, False, False]])
+        >>> b = torch.tensor([[True, False, False, True]])
+        >>> float(hausdorff_distance(a, b)), float(hausdorff_distance(a, b, directed=True))
+        (3.0, 0.0)
+    """
+    if not 0.0 < percentile <= 100.0:
+        raise InvalidInputError(f"percentile: expected a number in (0, 100], got {percentile}")
+
+    def of_pair(x: NDArray[np.bool_], y: NDArray[np.bool_]) -> float:
+        if not (x.any() and y.any()):
+            return np.inf if x.any() or y.any() else np.nan
+        there = float(np.percentile(_distances(x, y), percentile))
+        return there if directed else max(there, float(np.percentile(_distances(y, x), percentile)))
+
+    return _per_image(of_pair, a, b, ("a", "b"))
+
+
+def _distances(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Distance of each point of ``a`` to its nearest point of ``b``, ``inf`` if ``b`` is empty."""
+    if not b.any():
+        return np.full(int(a.sum()), np.inf)
+    to_b: NDArray[np.float64] = distance_transform_edt(~b)
+    return to_b[a]
+
+
+def _per_image(
+    score: Callable[[NDArray[np.bool_], NDArray[np.bool_]], float], a: Tensor, b: Tensor, names: tuple[str, str]
+) -> Tensor:
+    """``score`` of each pair of (..., H, W) masks, as a (...) tensor of the default dtype on their device."""
+    if a.ndim < 2 or a.dtype != torch.bool:
+        raise InvalidInputError(f"{names[0]}: expected bool (..., H, W), got {a.dtype} of shape {tuple(a.shape)}")
+    check_mask(b, a, names[1])
+    height, width = a.shape[-2:]
+    n = a.shape[:-2].numel()
+    pairs = zip(*(m.reshape(n, height, width).cpu().numpy() for m in (a, b)), strict=True)
+    scores = [score(x, y) for x, y in pairs]
+    return torch.tensor(scores, dtype=torch.get_default_dtype(), device=a.device).reshape(a.shape[:-2])

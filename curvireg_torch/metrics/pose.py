@@ -1,0 +1,269 @@
+"""Errors of 6D poses: ADD, ADD-S, MSSD and MSPD, and the shares of good poses that BOP prints.
+
+All take the estimated and the true pose ``T_cam_from_model`` and points of the model's surface in one unit. An estimate
+that is missing is a pose full of NaN; its error is ``inf``, so that it counts as a miss in every share.
+
+- ADD (Hinterstoisser et al. 2012): mean over the points x of ``|T_est x - T_gt x|``;
+- ADD-S: mean over x of the distance of ``T_gt x`` to the nearest ``T_est y``;
+- MSSD, MSPD (Hodan et al. 2020): minimum over the symmetries S of the maximum over x of ``|T_est x - T_gt S x|``, in
+  space or after projection into the image.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from curvireg_torch._checks import check_positive, check_same_device, check_tensor
+from curvireg_torch.errors import InvalidInputError
+
+from ._samples import check_errors, per_item, share
+
+__all__ = ["add_error", "add_recall", "adds_error", "mspd_error", "mspd_recall", "mssd_error", "mssd_recall"]
+
+_CHUNK = 1 << 22
+"""Points transformed at a time: 50 MB of float32 for their coordinates."""
+
+_MSSD_THRESHOLDS = tuple(step / 20.0 for step in range(1, 11))
+_MSPD_THRESHOLDS = tuple(5.0 * step for step in range(1, 11))
+
+
+def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
+    """ADD: mean distance of the model's points under the two poses.
+
+    Args:
+        T_est, T_gt: (B, 4, 4) rigid model -> camera; NaN in ``T_est`` for a missing estimate.
+        points: (P, 3) on the model's surface, P >= 1.
+
+    Returns:
+        (B,) in the unit of the points.
+
+    Raises:
+        InvalidInputError: wrong shape, dtype or device, or no points.
+
+    Example:
+        >>> T = torch.eye(4)[None]
+        >>> moved = T.clone(); moved[0, 2, 3] = 0.5
+        >>> add_error(moved, T, torch.rand(10, 3)).tolist()
+        [0.5]
+    """
+    T_est, T_gt, points, found = _checked(T_est, T_gt, points)
+    means = [_transform(d, points).norm(dim=1).mean(1) for d in _chunks(T_est - T_gt, points)]
+    return _or_inf(torch.cat(means), found)
+
+
+def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
+    """ADD-S: mean distance of each point under the true pose to the nearest point under the estimate.
+
+    Computed in float64 on the CPU, with one k-d tree in the model frame: rigid poses keep distances.
+
+    Args:
+        T_est, T_gt: (B, 4, 4) rigid model -> camera; NaN in ``T_est`` for a missing estimate.
+        points: (P, 3) on the model's surface, P >= 1.
+
+    Returns:
+        (B,) in the unit of the points, on the device and in the dtype of ``T_est``.
+
+    Raises:
+        InvalidInputError: wrong shape, dtype or device, or no points.
+
+    Example:
+        >>> T = torch.eye(4)[None]
+        >>> half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))[None]
+        >>> adds_error(half_turn, T, torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])).tolist()
+        [0.0]
+    """
+    T_est, T_gt, points, found = _checked(T_est, T_gt, points)
+    model = points.detach().cpu().double()
+    tree = cKDTree(model.numpy())
+    back = torch.linalg.solve(T_est.detach().cpu().double(), T_gt.detach().cpu().double())
+    means = [float(tree.query((model @ T[:3, :3].T + T[:3, 3]).numpy())[0].mean()) for T in back]
+    return _or_inf(torch.tensor(means, dtype=T_est.dtype, device=T_est.device), found)
+
+
+def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
+    """MSSD: maximum distance of the model's points in space, the true pose taken up to the object's symmetries.
+
+    Args:
+        T_est, T_gt: (B, 4, 4) rigid model -> camera; NaN in ``T_est`` for a missing estimate.
+        points: (P, 3) on the model's surface, P >= 1.
+        symmetries: (S, 4, 4) of the model, S >= 1, the identity among them, as from :func:`symmetry_transforms`; None
+            for the identity alone.
+
+    Returns:
+        (B,) in the unit of the points.
+
+    Raises:
+        InvalidInputError: wrong shape, dtype or device, no points or no symmetry.
+
+    Example:
+        >>> T = torch.eye(4)[None]
+        >>> half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))[None]
+        >>> points = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 5.0]])
+        >>> mssd_error(half_turn, T, points).tolist()
+        [2.0]
+        >>> mssd_error(half_turn, T, points, symmetries=torch.cat([T, half_turn])).tolist()
+        [0.0]
+    """
+    T_est, T_gt, points, found = _checked(T_est, T_gt, points)
+    difference = T_est.unsqueeze(1) - T_gt.unsqueeze(1) @ _checked_symmetries(symmetries, T_gt)
+    largest = [_transform(d, points).norm(dim=1).amax(1) for d in _chunks(difference.flatten(0, 1), points)]
+    return _or_inf(torch.cat(largest).view(difference.shape[:2]).amin(1), found)
+
+
+def mspd_error(
+    T_est: Tensor, T_gt: Tensor, points: Tensor, camera_matrix: Tensor, *, symmetries: Tensor | None = None
+) -> Tensor:
+    """MSPD: maximum distance of the model's points in the image, the true pose taken up to the object's symmetries.
+
+    Args:
+        T_est, T_gt: (B, 4, 4) rigid model -> camera; NaN in ``T_est`` for a missing estimate.
+        points: (P, 3) on the model's surface, P >= 1.
+        camera_matrix: (B, 3, 3) or (3, 3), pixels.
+        symmetries: (S, 4, 4) of the model, S >= 1, the identity among them, as from :func:`symmetry_transforms`; None
+            for the identity alone.
+
+    Returns:
+        (B,) pixels; ``inf`` where a point lies in or behind the camera's plane.
+
+    Raises:
+        InvalidInputError: wrong shape, dtype or device, no points or no symmetry.
+
+    Example:
+        >>> T = torch.eye(4)[None]; T[0, 2, 3] = 2.0
+        >>> moved = T.clone(); moved[0, 0, 3] = 0.1
+        >>> K = torch.tensor([[100.0, 0.0, 32.0], [0.0, 100.0, 32.0], [0.0, 0.0, 1.0]])
+        >>> round(float(mspd_error(moved, T, torch.zeros(1, 3), K)), 3)       # 100 px * 0.1 / 2
+        5.0
+    """
+    T_est, T_gt, points, found = _checked(T_est, T_gt, points)
+    check_tensor(camera_matrix, "camera_matrix", (3, 3) if camera_matrix.ndim == 2 else (len(T_est), 3, 3))
+    check_same_device(camera_matrix, T_est, "camera_matrix")
+    K = camera_matrix.to(T_est.dtype)
+    if K.ndim == 3:
+        K = K.unsqueeze(1)
+    true = K @ (T_gt.unsqueeze(1) @ _checked_symmetries(symmetries, T_gt))[:, :, :3]
+    ours = (K @ T_est.unsqueeze(1)[:, :, :3]).expand_as(true)
+    largest = []
+    for a, b in zip(*(_chunks(projections.flatten(0, 1), points) for projections in (ours, true)), strict=True):
+        (xy_a, front_a), (xy_b, front_b) = _project(a, points), _project(b, points)
+        largest.append(_or_inf((xy_a - xy_b).norm(dim=1), front_a & front_b).amax(1))
+    return _or_inf(torch.cat(largest).view(true.shape[:2]).amin(1), found)
+
+
+def add_recall(errors: Tensor, diameter: Tensor | float, *, fraction: float = 0.1) -> float:
+    """Share of the poses with ADD (or ADD-S) below a fraction of the object's diameter.
+
+    Args:
+        errors: (N,) from :func:`add_error` or :func:`adds_error`.
+        diameter: of the objects, a number or (N,), in the unit of the errors.
+        fraction: of the diameter, > 0.
+
+    Returns:
+        Share in [0, 1], NaN for N = 0.
+
+    Raises:
+        InvalidInputError: errors that are negative or NaN, wrong shapes, a diameter or fraction that is not > 0.
+
+    Example:
+        >>> add_recall(torch.tensor([1.0, 9.0, 11.0, torch.inf]), 100.0)
+        0.5
+    """
+    check_positive(fraction, "fraction")
+    check_errors(errors)
+    return _average_recall(errors / per_item(diameter, errors, "diameter"), (fraction,))
+
+
+def mssd_recall(errors: Tensor, diameter: Tensor | float) -> float:
+    """BOP's AR_MSSD: mean share of the poses with MSSD below 0.05, 0.10, ..., 0.50 diameters.
+
+    Args:
+        errors: (N,) from :func:`mssd_error`.
+        diameter: of the objects, a number or (N,), in the unit of the errors.
+
+    Returns:
+        [0, 1], NaN for N = 0.
+
+    Raises:
+        InvalidInputError: errors that are negative or NaN, wrong shapes, a diameter that is not > 0.
+
+    Example:
+        >>> mssd_recall(torch.tensor([26.0]), 100.0)      # below 0.30, 0.35, 0.40, 0.45 and 0.50
+        0.5
+    """
+    check_errors(errors)
+    return _average_recall(errors / per_item(diameter, errors, "diameter"), _MSSD_THRESHOLDS)
+
+
+def mspd_recall(errors: Tensor, image_width: Tensor | float) -> float:
+    """BOP's AR_MSPD: mean share of the poses with MSPD below 5, 10, ..., 50 px, these scaled by image width / 640.
+
+    Args:
+        errors: (N,) px from :func:`mspd_error`.
+        image_width: px, a number or (N,).
+
+    Returns:
+        [0, 1], NaN for N = 0.
+
+    Raises:
+        InvalidInputError: errors that are negative or NaN, wrong shapes, a width that is not > 0.
+
+    Example:
+        >>> mspd_recall(torch.tensor([26.0]), 640), mspd_recall(torch.tensor([26.0]), 1280)
+        (0.5, 0.8)
+    """
+    check_errors(errors)
+    return _average_recall(errors * 640.0 / per_item(image_width, errors, "image_width"), _MSPD_THRESHOLDS)
+
+
+def _average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
+    return sum(share(errors < threshold) for threshold in thresholds) / len(thresholds)
+
+
+def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Everything in the dtype of ``T_est``, missing estimates replaced by the truth, and a mask of the others."""
+    check_tensor(T_est, "T_est", (None, 4, 4))
+    check_tensor(T_gt, "T_gt", (len(T_est), 4, 4))
+    check_tensor(points, "points", (None, 3))
+    check_same_device(T_gt, T_est, "T_gt")
+    check_same_device(points, T_est, "points")
+    if len(points) == 0:
+        raise InvalidInputError("points: expected at least one point, got none")
+    for name, x in (("T_gt", T_gt), ("points", points)):
+        if not bool(x.isfinite().all()):
+            raise InvalidInputError(f"{name}: expected finite numbers, got NaN or inf")
+    T_gt = T_gt.to(T_est.dtype)
+    found = T_est.isfinite().flatten(1).all(1)
+    return torch.where(found.view(-1, 1, 1), T_est, T_gt), T_gt, points.to(T_est.dtype), found
+
+
+def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:
+    if symmetries is None:
+        return torch.eye(4, dtype=like.dtype, device=like.device).unsqueeze(0)
+    check_tensor(symmetries, "symmetries", (None, 4, 4))
+    if len(symmetries) == 0:
+        raise InvalidInputError("symmetries: expected at least the identity, got none")
+    return symmetries.to(like)
+
+
+def _chunks(transforms: Tensor, points: Tensor) -> list[Tensor]:
+    """(N, ...) cut into runs, at least one, of as many transforms as may meet all the points at a time."""
+    step = max(1, _CHUNK // len(points))
+    return [transforms[start : start + step] for start in range(0, max(1, len(transforms)), step)]
+
+
+def _transform(T: Tensor, points: Tensor) -> Tensor:
+    """(N, 3 or 4, 4) and (P, 3) -> (N, 3, P)."""
+    return T[:, :3, :3] @ points.T + T[:, :3, 3:]
+
+
+def _project(projections: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """(N, 3, 4) projections -> pixels (N, 2, P) and which points (N, P) lie in front of the camera."""
+    image = _transform(projections, points)
+    front = image[:, 2] > 0
+    return image[:, :2] / torch.where(front, image[:, 2], torch.ones_like(image[:, 2])).unsqueeze(1), front
+
+
+def _or_inf(errors: Tensor, valid: Tensor) -> Tensor:
+    return torch.where(valid, errors, torch.full_like(errors, torch.inf))

@@ -1,0 +1,75 @@
+"""The symmetries of a BOP object as a list of rigid transforms."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from curvireg_torch._checks import check_positive
+from curvireg_torch.errors import InvalidInputError
+
+__all__ = ["symmetry_transforms"]
+
+
+def symmetry_transforms(info: Mapping[str, Any], *, max_step_fraction: float = 0.01) -> Tensor:
+    """All symmetries of an object as 4x4 transforms, from its entry in BOP's ``models_info.json``.
+
+    Each discrete symmetry is followed by each turn about each continuous axis. A vertex is at most half a diameter
+    away from an axis, so ``ceil(pi / max_step_fraction)`` turns move it by at most ``max_step_fraction`` diameters
+    between one and the next; BOP prescribes 0.01 (315 turns).
+
+    Args:
+        info: with ``symmetries_discrete`` (list of 16 numbers, a row-major 4x4 matrix) and ``symmetries_continuous``
+            (list of ``{"axis": [x, y, z], "offset": [x, y, z]}``, the offset a point of the axis); both may be absent,
+            other keys are ignored.
+        max_step_fraction: in (0, 1], the largest step of a vertex as a share of the object's diameter.
+
+    Returns:
+        (S, 4, 4) float64 on the CPU, S >= 1, in the unit of ``info`` (BOP: mm); the identity comes first.
+
+    Raises:
+        InvalidInputError: a matrix without 16 numbers, an axis or offset without 3, an axis of length 0, a bad step.
+
+    Example:
+        >>> symmetry_transforms({"diameter": 100.0}).shape
+        torch.Size([1, 4, 4])
+        >>> symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]}).shape
+        torch.Size([315, 4, 4])
+    """
+    check_positive(max_step_fraction, "max_step_fraction")
+    if max_step_fraction > 1.0:
+        raise InvalidInputError(f"max_step_fraction: expected a number in (0, 1], got {max_step_fraction}")
+    identity = torch.eye(4, dtype=torch.float64)
+    discrete = [identity]
+    for matrix in info.get("symmetries_discrete", ()):
+        discrete.append(_numbers(matrix, 16, "symmetries_discrete").view(4, 4))
+    turns = [identity[None]]
+    for symmetry in info.get("symmetries_continuous", ()):
+        axis = _numbers(symmetry["axis"], 3, "axis")
+        offset = _numbers(symmetry.get("offset", (0.0, 0.0, 0.0)), 3, "offset")
+        turns.append(_turns(axis, offset, math.ceil(math.pi / max_step_fraction)))
+    # (C, 1, 4, 4) @ (D, 4, 4): the discrete symmetry acts first.
+    return (torch.cat(turns).unsqueeze(1) @ torch.stack(discrete)).flatten(0, 1)
+
+
+def _numbers(values: Any, count: int, name: str) -> Tensor:
+    numbers = torch.as_tensor(values, dtype=torch.float64).flatten()
+    if len(numbers) != count or not bool(numbers.isfinite().all()):
+        raise InvalidInputError(f"{name}: expected {count} finite numbers, got {values}")
+    return numbers
+
+
+def _turns(axis: Tensor, offset: Tensor, count: int) -> Tensor:
+    """(count - 1, 4, 4) turns by multiples of 360 / count degrees about the axis through ``offset``."""
+    length = torch.linalg.vector_norm(axis)
+    if not bool(length > 0):
+        raise InvalidInputError(f"axis: expected a direction of length > 0, got {axis.tolist()}")
+    x, y, z = (axis / length).tolist()
+    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+    angles = (torch.arange(1, count, dtype=torch.float64) * (2.0 * math.pi / count)).view(-1, 1, 1)
+    transforms = torch.eye(4, dtype=torch.float64).repeat(count - 1, 1, 1)
+    transforms[:, :3, :3] += angles.sin() * cross + (1.0 - angles.cos()) * (cross @ cross)
+    transforms[:, :3, 3] = offset - transforms[:, :3, :3] @ offset
+    return transforms

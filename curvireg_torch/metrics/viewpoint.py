@@ -1,0 +1,188 @@
+"""How far estimated rotations are from the true ones, and the two numbers PASCAL3D+ tables print about it.
+
+The angle itself is :func:`curvireg_torch.geometry.rotation_error`; here are its variants for symmetric objects and the
+averages over a set. Rotations map model points into the camera, so a symmetry ``S`` of the model acts from the right:
+``R`` and ``R S`` show the same image.
+
+RenderForCNN's evaluation takes ``norm(logm(R1' R2)) / sqrt(2)`` with the spectral norm, where only the Frobenius norm
+gives the angle, so its errors are sqrt(2) too small; later papers inherited them. ``legacy_sqrt2=True`` reproduces
+those numbers, to be printed beside the right ones and never instead of them.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from curvireg_torch._checks import check_option, check_positive, check_same_device, check_tensor
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import rotation_error
+
+from ._samples import check_errors, share
+
+__all__ = [
+    "AVP_BINS",
+    "accuracy",
+    "axis_rotation_error",
+    "azimuth_bin",
+    "binned_accuracy",
+    "median_error",
+    "symmetric_rotation_error",
+]
+
+AVP_BINS = (4, 8, 16, 24)
+"""Numbers of azimuth bins that PASCAL3D+ tables print."""
+
+
+def accuracy(errors: Tensor, threshold_deg: float, *, legacy_sqrt2: bool = False) -> float:
+    """Share of the errors below a threshold: Acc(pi/6) with 30, Acc(pi/18) with 10.
+
+    Args:
+        errors: (N,) degrees >= 0; ``inf`` for an object without an estimate (a miss).
+        threshold_deg: degrees > 0; an error equal to it is a miss.
+        legacy_sqrt2: divide the errors by sqrt(2) first: the literature's flawed number (see module).
+
+    Returns:
+        Share in [0, 1], NaN for N = 0.
+
+    Raises:
+        InvalidInputError: errors that are not (N,), floating, >= 0; a threshold that is not > 0.
+
+    Example:
+        >>> errors = torch.tensor([5.0, 12.0, 40.0, 170.0])
+        >>> accuracy(errors, 30.0), accuracy(errors, 30.0, legacy_sqrt2=True)
+        (0.5, 0.75)
+    """
+    check_errors(errors)
+    check_positive(threshold_deg, "threshold_deg")
+    return share((errors / math.sqrt(2.0) if legacy_sqrt2 else errors) < threshold_deg)
+
+
+def median_error(errors: Tensor, *, legacy_sqrt2: bool = False) -> float:
+    """Median of the errors (MedErr), the mean of the middle two for an even number.
+
+    Args:
+        errors: (N,) degrees >= 0; ``inf`` for an object without an estimate.
+        legacy_sqrt2: divide by sqrt(2): the literature's flawed number (see module).
+
+    Returns:
+        Degrees >= 0, ``inf`` where half of the estimates are missing, NaN for N = 0.
+
+    Raises:
+        InvalidInputError: errors that are not (N,), floating, >= 0.
+
+    Example:
+        >>> median_error(torch.tensor([40.0, 5.0, 12.0, 170.0]))
+        26.0
+    """
+    check_errors(errors)
+    if errors.numel() == 0:
+        return math.nan
+    ordered = errors.double().sort().values
+    median = float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2.0
+    return median / math.sqrt(2.0) if legacy_sqrt2 else median
+
+
+def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) -> Tensor:
+    """Rotation error of an object with discrete symmetries: ``min_S angle(R_est, R_gt S)``.
+
+    Args:
+        R_est, R_gt: (..., 3, 3), broadcast against each other.
+        symmetries: (S, 3, 3) rotations of the model onto itself, S >= 0. The identity is always one of them, listed
+            or not; list the rest of the group in full, since products are not formed.
+
+    Returns:
+        (...) degrees in [0, 180].
+
+    Raises:
+        InvalidInputError: wrong shape, dtype or device.
+
+    Example:
+        >>> half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+        >>> float(symmetric_rotation_error(half_turn, torch.eye(3), half_turn[None]))
+        0.0
+    """
+    check_tensor(symmetries, "symmetries", (None, 3, 3))
+    check_same_device(symmetries, R_gt, "symmetries")
+    plain = rotation_error(R_est, R_gt)
+    turned = rotation_error(R_est.unsqueeze(-3), R_gt.unsqueeze(-3) @ symmetries.to(R_gt.dtype))
+    return torch.cat([plain.unsqueeze(-1), turned], -1).amin(-1)
+
+
+def axis_rotation_error(R_est: Tensor, R_gt: Tensor, axis: Tensor) -> Tensor:
+    """Rotation error of a solid of revolution: ``min_phi angle(R_est, R_gt Rot(axis, phi))``.
+
+    Free turns about the axis leave the angle between the two images of the axis, ``angle(R_est axis, R_gt axis)``,
+    which is the minimum in closed form. It is computed from the chord, without the loss of digits of ``acos`` near 0.
+
+    Args:
+        R_est, R_gt: (..., 3, 3), broadcast against each other.
+        axis: (3,) direction of the axis in the model frame, of any length > 0. The two ends of the axis differ; for a
+            solid that looks the same upside down take the minimum with the flipped rotation as well.
+
+    Returns:
+        (...) degrees in [0, 180].
+
+    Raises:
+        InvalidInputError: wrong shape, dtype or device, or an axis of length 0.
+
+    Example:
+        >>> from curvireg_torch.geometry import rotation_from_viewpoint
+        >>> a, b = rotation_from_viewpoint(0.0, 10.0), rotation_from_viewpoint(120.0, 30.0)
+        >>> round(float(axis_rotation_error(a, b, torch.tensor([0.0, 0.0, 1.0]))), 3)   # the azimuth of a vase is free
+        20.0
+    """
+    for name, R in (("R_est", R_est), ("R_gt", R_gt)):
+        check_tensor(R, name, (None,) * (R.ndim - 2) + (3, 3))
+    check_tensor(axis, "axis", (3,))
+    check_same_device(axis, R_gt, "axis")
+    length = torch.linalg.vector_norm(axis)
+    if not bool(length > 0):
+        raise InvalidInputError(f"axis: expected a direction of length > 0, got {axis.tolist()}")
+    axis = (axis / length).to(R_gt.dtype)
+    half_chord = torch.linalg.vector_norm(R_est @ axis - R_gt @ axis, dim=-1) / 2.0
+    return torch.rad2deg(2.0 * torch.asin(half_chord.clamp(max=1.0)))
+
+
+def azimuth_bin(azimuth: Tensor, bins: int) -> Tensor:
+    """Bin of an azimuth as PASCAL3D+ cuts the circle: bin 0 is centred on azimuth 0.
+
+    Args:
+        azimuth: (...) degrees, any turn.
+        bins: 4, 8, 16 or 24.
+
+    Returns:
+        (...) int64 in [0, bins); bin i holds [(i - 1/2) 360/bins, (i + 1/2) 360/bins).
+
+    Raises:
+        InvalidInputError: another number of bins, or an azimuth that is not a floating tensor.
+
+    Example:
+        >>> azimuth_bin(torch.tensor([0.0, 44.0, 45.0, 350.0]), 4).tolist()
+        [0, 0, 1, 0]
+    """
+    check_option(str(bins), tuple(map(str, AVP_BINS)), "bins")
+    check_tensor(azimuth, "azimuth", (None,) * azimuth.ndim)
+    return torch.floor(azimuth * (bins / 360.0) + 0.5).long() % bins
+
+
+def binned_accuracy(azimuth_est: Tensor, azimuth_gt: Tensor, bins: int) -> float:
+    """Share of the objects whose azimuth falls into the right bin: AVP with ground-truth boxes.
+
+    Args:
+        azimuth_est, azimuth_gt: (N,) degrees.
+        bins: 4, 8, 16 or 24.
+
+    Returns:
+        Share in [0, 1], NaN for N = 0.
+
+    Raises:
+        InvalidInputError: different shapes, not (N,), or another number of bins.
+
+    Example:
+        >>> binned_accuracy(torch.tensor([3.0, 100.0]), torch.tensor([350.0, 130.0]), 8)
+        0.5
+    """
+    check_tensor(azimuth_gt, "azimuth_gt", (None,))
+    check_tensor(azimuth_est, "azimuth_est", tuple(azimuth_gt.shape))
+    return share(azimuth_bin(azimuth_est, bins) == azimuth_bin(azimuth_gt, bins))
