@@ -17,7 +17,9 @@ def check_tensor(x: Tensor, name: str, shape: tuple[int | None, ...]) -> None:
         wanted = "(" + ", ".join("*" if n is None else str(n) for n in shape) + ")"
         raise InvalidInputError(f"{name}: expected shape {wanted}, got {tuple(x.shape)}")
     if not x.is_floating_point():
-        raise InvalidInputError(f"{name}: expected a floating dtype, got {x.dtype}; convert with x.float() (images: divide by 255)")
+        raise InvalidInputError(
+            f"{name}: expected a floating dtype, got {x.dtype}; convert with x.float() (images: divide by 255)"
+        )
 
 
 def check_image(x: Tensor, name: str = "image") -> None:

@@ -146,9 +146,7 @@ def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) ->
 class DepthCurvilinearSaliency(nn.Module):
     """Module twin of :func:`depth_curvilinear_saliency`."""
 
-    def __init__(
-        self, *, sigma: float = 1.0, formula: str = "geometric", depth_scale: float | None = None
-    ) -> None:
+    def __init__(self, *, sigma: float = 1.0, formula: str = "geometric", depth_scale: float | None = None) -> None:
         super().__init__()
         check_option(formula, FORMULAS, "formula")
         self.sigma, self.formula, self.depth_scale = sigma, formula, depth_scale

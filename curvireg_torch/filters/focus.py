@@ -144,9 +144,7 @@ def multiscale_focus_curves(
 class EdgeBlur(nn.Module):
     """Module twin of :func:`edge_blur`."""
 
-    def __init__(
-        self, *, reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0), mode: str = "reblur-image"
-    ) -> None:
+    def __init__(self, *, reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0), mode: str = "reblur-image") -> None:
         super().__init__()
         check_option(mode, MODES, "mode")
         self.reblur_sigmas, self.mode = tuple(reblur_sigmas), mode

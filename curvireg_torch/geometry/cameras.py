@@ -23,11 +23,15 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dt
 def check_camera_matrix(K: Tensor) -> None:
     """Raise :class:`InvalidInputError` unless K is (..., 3, 3), finite, upper triangular, with focal lengths > 0."""
     if K.shape[-2:] != (3, 3) or not K.is_floating_point():
-        raise InvalidInputError(f"camera matrix: expected floating (..., 3, 3), got {K.dtype} of shape {tuple(K.shape)}")
+        raise InvalidInputError(
+            f"camera matrix: expected floating (..., 3, 3), got {K.dtype} of shape {tuple(K.shape)}"
+        )
     if not bool(torch.isfinite(K).all()):
         raise InvalidInputError("camera matrix: expected finite entries, got NaN or inf")
     if not bool((K[..., 0, 0] > 0).all() and (K[..., 1, 1] > 0).all()):
-        raise InvalidInputError("camera matrix: expected focal lengths FX, FY > 0 (in pixels); check their order FX FY CX CY")
+        raise InvalidInputError(
+            "camera matrix: expected focal lengths FX, FY > 0 (in pixels); check their order FX FY CX CY"
+        )
     last = torch.tensor([0.0, 0.0, 1.0], dtype=K.dtype, device=K.device)
     if not bool((K[..., 2, :] == last).all() and (K[..., 1, 0] == 0).all()):
         raise InvalidInputError("camera matrix: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]]")

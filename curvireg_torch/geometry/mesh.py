@@ -51,7 +51,9 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m") -> trimesh.Trimesh:
         logger.setLevel(logging.CRITICAL)  # its tracebacks of files that it cannot read
         loaded = trimesh.load(path, process=False, skip_materials=True)
     except Exception as error:
-        raise MeshError(f"{path}: cannot be read as a mesh ({type(error).__name__}: {error}); re-export the file") from error
+        raise MeshError(
+            f"{path}: cannot be read as a mesh ({type(error).__name__}: {error}); re-export the file"
+        ) from error
     finally:
         logger.setLevel(level)
     mesh = as_mesh(loaded, name=str(path))
@@ -80,7 +82,9 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
         raise MeshError(f"{name}: faces name vertices that do not exist; the file is damaged, re-export it")
     used = vertices[faces]
     if not np.isfinite(used).all():
-        raise MeshError(f"{name}: {int((~np.isfinite(used).all(axis=(1, 2))).sum())} faces have NaN or infinite vertices; repair the mesh")
+        raise MeshError(
+            f"{name}: {int((~np.isfinite(used).all(axis=(1, 2))).sum())} faces have NaN or infinite vertices; repair the mesh"
+        )
     area = np.linalg.norm(np.cross(used[:, 1] - used[:, 0], used[:, 2] - used[:, 0]), axis=1)
     if not (area > 0).any():
         raise MeshError(f"{name}: every face is degenerate (area 0); repair the mesh")

@@ -81,7 +81,12 @@ def sample_views(
     if azimuths is None:
         count = max(1, round(360.0 / azimuth_step))
         azimuths = [360.0 * i / count for i in range(count)]
-    for name, values in (("azimuths", azimuths), ("elevations", elevations), ("thetas", thetas), ("distances", distances)):
+    for name, values in (
+        ("azimuths", azimuths),
+        ("elevations", elevations),
+        ("thetas", thetas),
+        ("distances", distances),
+    ):
         if len(values) == 0:
             raise InvalidInputError(f"{name}: expected at least one value, got none")
     axes = [torch.tensor([float(v) for v in values]) for values in (elevations, azimuths, thetas, distances)]

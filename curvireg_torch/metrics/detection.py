@@ -133,9 +133,7 @@ def average_rotation_precision(detections: Detections, objects: Objects, *, thre
     """
     check_positive(threshold_deg, "threshold_deg")
     claimed = _claims(detections, objects)
-    right = _right(
-        claimed, lambda d, o: rotation_error(detections.rotations[d], objects.rotations[o]) < threshold_deg
-    )
+    right = _right(claimed, lambda d, o: rotation_error(detections.rotations[d], objects.rotations[o]) < threshold_deg)
     return _area(detections.scores, claimed >= 0, right, len(objects.image))
 
 

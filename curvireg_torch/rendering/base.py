@@ -58,7 +58,9 @@ def make_renderer(mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto") 
         try:
             from .embree import EmbreeRenderer
         except ImportError as error:
-            raise MissingDependencyError(f"renderer 'embree' needs the package embreex ({error}): pip install embreex") from error
+            raise MissingDependencyError(
+                f"renderer 'embree' needs the package embreex ({error}): pip install embreex"
+            ) from error
         return EmbreeRenderer(mesh)
     from .opengl import PyrenderRenderer
 
@@ -120,4 +122,6 @@ def render_depth(
     except (InvalidInputError, RenderingError):
         raise
     except Exception as error:  # drivers raise anything
-        raise RenderingError(f"renderer {backend.name!r} failed: {type(error).__name__}: {error}; try another renderer") from error
+        raise RenderingError(
+            f"renderer {backend.name!r} failed: {type(error).__name__}: {error}; try another renderer"
+        ) from error
