@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import scipy.io
 
-__all__ = ["write_bop", "write_image", "write_mesh", "write_pascal3d", "write_web", "pascal_object"]
+__all__ = ["pascal_object", "write_bop", "write_image", "write_mesh", "write_pascal3d", "write_web"]
 
 HALF = 0.25  # half the edge of the cube that all meshes are
 
@@ -28,8 +28,9 @@ def write_mesh(path: Path, half: float = HALF) -> None:
     lines = [" ".join(map(str, c)) for c in corners] + ["3 " + " ".join(map(str, f)) for f in faces]
     if path.suffix == ".ply":
         axes = "".join(f"property float {axis}\n" for axis in "xyz")
-        header = f"ply\nformat ascii 1.0\nelement vertex 8\n{axes}element face 12\nproperty list uchar int vertex_indices\n"
-        path.write_text(header + "end_header\n" + "\n".join(lines) + "\n")
+        header = f"ply\nformat ascii 1.0\nelement vertex 8\n{axes}element face 12\n"
+        header += "property list uchar int vertex_indices\nend_header\n"
+        path.write_text(header + "\n".join(lines) + "\n")
     else:
         path.write_text("OFF\n8 12 0\n" + "\n".join(lines) + "\n")
 
@@ -173,7 +174,7 @@ def write_bop(root: Path) -> dict[str, int]:
     }
     outside = {**info, "bbox_obj": [-1, -1, -1, -1]}
     infos = {"0": [info, hidden, {**info, "visib_fract": 0.9}], "3": [info] * 5 + [outside, info], "4": [info]}
-    cameras = {key: K for key in ("0", "3", "4")}  # 5: without camera
+    cameras = dict.fromkeys(("0", "3", "4"), K)  # 5: without camera
     for name, content in (("gt", ground_truth), ("camera", cameras), ("gt_info", infos)):
         _write_json(one / f"scene_{name}.json", content)
     for key in ("0", "3", "5"):  # 4: without image

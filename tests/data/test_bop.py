@@ -97,7 +97,7 @@ def test_transforms(tree):
 
 def test_missing_things_say_what_to_do(tree, tmp_path):
     for root, split in ((tmp_path / "nothing", "test"), (tree[0], "train"), (tree[0], "../test")):
-        with pytest.raises(MissingFileError, match="datasets/bop/README.md"):
+        with pytest.raises(MissingFileError, match=r"datasets/bop/README\.md"):
             BOPDataset(root, split)
     (tree[0] / "models" / "models_info.json").unlink()
     with pytest.raises(MissingFileError, match="models_info"):

@@ -8,7 +8,11 @@ from curvireg_torch.geometry import rotation_from_viewpoint
 
 def row(**changes):
     values = {
-        **{"scene_id": 1, "im_id": 2, "obj_id": 3, "score": 0.25, "time": 1.5},
+        "scene_id": 1,
+        "im_id": 2,
+        "obj_id": 3,
+        "score": 0.25,
+        "time": 1.5,
         "R": rotation_from_viewpoint(*torch.tensor([30.0, 20.0, 10.0], dtype=torch.float64)),
         "t": torch.tensor([1.0, -2.5, 1e3 / 3], dtype=torch.float64),
     }
@@ -18,8 +22,7 @@ def row(**changes):
 def test_text(tmp_path):
     write_bop_csv(tmp_path / "a.csv", [row(R=torch.arange(9.0).reshape(3, 3), t=torch.tensor([0.5, 1, 2]))])
     assert (tmp_path / "a.csv").read_bytes() == (
-        b"scene_id,im_id,obj_id,score,R,t,time\n"
-        b"1,2,3,0.25,0.0 1.0 2.0 3.0 4.0 5.0 6.0 7.0 8.0,0.5 1.0 2.0,1.5\n"
+        b"scene_id,im_id,obj_id,score,R,t,time\n1,2,3,0.25,0.0 1.0 2.0 3.0 4.0 5.0 6.0 7.0 8.0,0.5 1.0 2.0,1.5\n"
     )
 
 

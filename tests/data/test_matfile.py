@@ -1,5 +1,6 @@
 """The reader of annotation files: equal to scipy's on sound files, an error and nothing worse on others."""
 
+import contextlib
 import struct
 
 import numpy as np
@@ -27,11 +28,13 @@ def file(content: bytes) -> bytes:
     return b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x0100) + b"IM" + content
 
 
+FIELD_A = element(5, struct.pack("<i", 8)) + element(1, b"a".ljust(8, b"\0"))  # one field, named a
+
+
 def nested_struct(depth: int) -> bytes:
     value = array(6, (1, 1), element(9, struct.pack("<d", 1.0)))
     for i in range(depth):
-        fields = element(5, struct.pack("<i", 8)) + element(1, b"a".ljust(8, b"\0"))
-        value = array(2, (1, 1), fields + value, b"record" if i == depth - 1 else b"")
+        value = array(2, (1, 1), FIELD_A + value, b"record" if i == depth - 1 else b"")
     return value
 
 
@@ -86,10 +89,7 @@ def test_deep_nesting_is_an_error(tmp_path):
     ("content", "message"),
     [
         (array(6, (1 << 15, 1 << 15), element(9, b"\0" * 8), b"record"), "claims 1073741824 numbers"),
-        (
-            array(2, (1 << 15, 1 << 15), element(5, struct.pack("<i", 8)) + element(1, b"a".ljust(8, b"\0")), b"record"),
-            "struct array claims",
-        ),
+        (array(2, (1 << 15, 1 << 15), FIELD_A, b"record"), "struct array claims"),
         (array(2, (1, 1), element(5, struct.pack("<i", 0)) + element(1, b""), b"record"), "field names"),
         (array(6, (-1, 1), element(9, b""), b"record"), "negative"),
         (array(6, (1, 1), element(99, b"\0" * 8), b"record"), "unknown type"),
@@ -142,7 +142,5 @@ def test_no_damage_does_worse_than_an_error(tmp_path, changes, cut):
     for position, value in changes:
         data[position % len(data)] = value
     path.write_bytes(data[: max(cut, 200)] if cut % 3 == 0 else data)
-    try:
+    with contextlib.suppress(InvalidInputError):
         read_mat(path, "record")
-    except InvalidInputError:
-        pass

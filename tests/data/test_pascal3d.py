@@ -130,7 +130,7 @@ def test_damaged_photograph_is_an_error_when_read(tree):
 
 
 def test_missing_things_say_what_to_do(tree, tmp_path):
-    with pytest.raises(MissingFileError, match="datasets/pascal3d/README.md"):
+    with pytest.raises(MissingFileError, match=r"datasets/pascal3d/README\.md"):
         Pascal3DPlus(tmp_path / "nothing")
     with pytest.raises(MissingFileError, match=r"train.*README"):
         Pascal3DPlus(tree[0], "train")

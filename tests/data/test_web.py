@@ -48,7 +48,7 @@ def test_samples_without_pose_or_theta(tree):
 def test_errors(tree, tmp_path):
     (tmp_path / "empty").mkdir()
     for root in (tmp_path / "nothing", tmp_path / "empty"):
-        with pytest.raises(MissingFileError, match="datasets/web/README.md"):
+        with pytest.raises(MissingFileError, match=r"datasets/web/README\.md"):
             WebCollection(root)
     write_mesh(tree[0] / "cup" / "mesh.ply")
     with pytest.raises(InvalidInputError, match=r"one mesh.*mesh\.off, mesh\.ply"):
