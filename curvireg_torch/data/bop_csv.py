@@ -2,7 +2,6 @@
 
 import csv
 import os
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypedDict
@@ -46,6 +45,7 @@ def write_bop_csv(path: str | os.PathLike[str], rows: Iterable[BOPRow]) -> None:
         MissingFileError: the folder does not exist.
 
     Example:
+        >>> import tempfile
         >>> row = BOPRow(scene_id=1, im_id=2, obj_id=3, score=0.5, R=torch.eye(3), t=torch.zeros(3), time=-1.0)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     write_bop_csv(Path(folder, "results.csv"), [row])
@@ -55,18 +55,17 @@ def write_bop_csv(path: str | os.PathLike[str], rows: Iterable[BOPRow]) -> None:
     path = Path(path)
     if not path.parent.is_dir():
         raise MissingFileError(f"{path.parent}: no such folder; create it before writing results")
-    handle, temporary = tempfile.mkstemp(prefix=path.name + ".", suffix=".tmp", dir=path.parent)
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
-        with os.fdopen(handle, "w", newline="", encoding="ascii") as file:
+        with open(temporary, "w", newline="", encoding="ascii") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(_HEADER)
             times: dict[tuple[int, int], float] = {}
             for number, row in enumerate(rows):
                 writer.writerow(_cells(row, f"row {number}", times))
-        os.chmod(temporary, 0o644)  # mkstemp gives 0600
         os.replace(temporary, path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 

@@ -34,6 +34,7 @@ def test_errors():
         collate([{"a": 1}, {"b": 1}])
 
 
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 warns of fork beside threads
 @pytest.mark.parametrize("context", ["spawn", None])
 def test_loader_with_workers(tmp_path, context):
     write_pascal3d(tmp_path / "pascal")

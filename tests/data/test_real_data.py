@@ -85,6 +85,7 @@ def test_bop_visibility():
     assert len(BOPDataset(dataset.root, min_visib=0.5)) == 65
 
 
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 warns of fork beside threads
 def test_loader_with_workers():
     for dataset in (Pascal3DPlus(real_data("pascal3d_mini"), pixel_origin=0), BOPDataset(real_data("bop/lm"))):
         loader = DataLoader(dataset, batch_size=16, num_workers=2, collate_fn=collate)
