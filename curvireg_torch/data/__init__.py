@@ -1,0 +1,23 @@
+"""Photographs with annotated objects: PASCAL3D+, BOP and collections of your own, as torch datasets.
+
+A sample is a dict, one per object. Every dataset reports what it left out and why (``skipped``, ``skipped_items``), and
+gives a sample without its photograph through ``annotation(index)``. Nothing is ever downloaded from here.
+"""
+
+from .bop import BOPDataset
+from .bop_csv import BOPRow, read_bop_csv, write_bop_csv
+from .collate import collate
+from .images import read_image
+from .pascal3d import Pascal3DPlus
+from .web import WebCollection
+
+__all__ = [
+    "BOPDataset",
+    "BOPRow",
+    "Pascal3DPlus",
+    "WebCollection",
+    "collate",
+    "read_bop_csv",
+    "read_image",
+    "write_bop_csv",
+]

@@ -1,0 +1,70 @@
+"""What the datasets share: dict samples, lazy images, and a count of everything that was left out."""
+
+import os
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.data import Dataset
+
+from ..errors import MissingFileError
+from .images import read_image
+
+__all__ = ["IMAGE_SUFFIXES", "ObjectDataset", "Sample", "Transform", "existing_root", "is_plain_name"]
+
+Sample = dict[str, Any]
+Transform = Callable[[Sample], Sample]
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".JPEG", ".JPG", ".PNG", ".tif", ".tiff")
+
+
+class ObjectDataset(Dataset[Sample]):
+    """One dict per annotated object; the index is built once, photographs are read when a sample is asked for.
+
+    Attributes:
+        skipped_items: reason -> what was left out for it, in the order met.
+        transforms: applied last to every sample, ``sample -> sample``; None for no change.
+    """
+
+    def __init__(self, transforms: Transform | None) -> None:
+        self.transforms = transforms
+        self.skipped_items: dict[str, list[str]] = {}
+        # Plain numbers, no tensors: thousands of small tensors exhaust file handles when a worker is spawned.
+        self._items: list[Sample] = []
+
+    @property
+    def skipped(self) -> Counter[str]:
+        """How many items were left out, by reason; ``missing_``, ``corrupt_`` and ``bad_`` tell of a defective tree."""
+        return Counter({reason: len(items) for reason, items in self.skipped_items.items()})
+
+    def _skip(self, reason: str, item: str) -> None:
+        self.skipped_items.setdefault(reason, []).append(item)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def annotation(self, index: int) -> Sample:
+        """All of sample ``index`` but its ``image``: reads no photograph and calls no ``transforms``."""
+        return {
+            key: torch.tensor(value, dtype=torch.float32) if isinstance(value, tuple) else value
+            for key, value in self._items[index].items()
+        }
+
+    def __getitem__(self, index: int) -> Sample:
+        sample = self.annotation(index)
+        sample["image"] = read_image(sample["image_path"])
+        return sample if self.transforms is None else self.transforms(sample)
+
+
+def existing_root(root: str | os.PathLike[str], readme: str) -> Path:
+    """``root`` as a path; it must be a folder."""
+    path = Path(root)
+    if not path.is_dir():
+        raise MissingFileError(f"{path}: no such folder; {readme} says where to get the data and how to lay it out")
+    return path
+
+
+def is_plain_name(name: str) -> bool:
+    """Whether ``name`` stays inside the folder that it is appended to."""
+    return name not in ("", ".", "..") and len(name) <= 200 and not any(c in name for c in "/\\:\0")

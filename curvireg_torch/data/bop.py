@@ -1,0 +1,218 @@
+"""Datasets in the layout of the BOP challenge (scenewise)."""
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._checks import check_positive
+from ..errors import InvalidInputError, MissingFileError
+from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name
+from ._json import finite_numbers, read_json
+
+__all__ = ["BOPDataset"]
+
+_README = "datasets/bop/README.md"
+_UNKNOWN_BOX = (math.nan,) * 4
+
+
+class BOPDataset(ObjectDataset):
+    """The annotated object instances of a BOP dataset, one sample each.
+
+    Args:
+        root: the folder that holds ``models`` and the split's folder.
+        split: folder of the scenes, such as ``"test"`` or ``"train_pbr"``.
+        targets: True keeps the instances that ``test_targets_bop19.json`` asks for, of each image and object the
+            ``inst_count`` most visible ones; False keeps all; None is True for ``split="test"`` where the file exists.
+        min_visib: least visible fraction, in [0, 1]; above 0, instances of unknown visibility are left out too.
+        transforms: applied to every sample, ``sample -> sample``.
+
+    Attributes:
+        camera: content of ``camera.json``, empty where it is missing.
+        models_info: obj_id -> entry of ``models/models_info.json`` as it stands, symmetries included.
+
+    Samples are dicts (tensors are float32):
+        - ``image`` (3, H, W) RGB in [0, 1], from ``rgb`` or ``gray``; ``image_path`` str
+        - ``box`` (4,) x0, y0, x1, y1 of the whole silhouette, which may leave the image; ``box_visible`` (4,) of its
+          visible part, NaN if nothing is visible. BOP's width is x1 - x0. NaN where ``scene_gt_info.json`` is missing
+        - ``camera_matrix`` (3, 3); ``rotation`` (3, 3), ``translation`` (3,): model to OpenCV camera, in the models'
+          unit (mm)
+        - ``scene_id``, ``image_id``, ``obj_id`` int; ``instance_index`` int: place in the image's list of ``scene_gt``
+        - ``visib_fract`` float in [0, 1], NaN where unknown
+        - ``model_path`` str; ``model_info`` dict
+
+    ``dataset.skipped`` counts what was left out by reason, ``dataset.skipped_items`` names it: ``no_target``,
+    ``not_visible``, ``bad_box`` (no area: the object is outside the image), ``missing_annotation``,
+    ``corrupt_annotation``, ``missing_image``, ``missing_mesh``, ``missing_model_info``.
+
+    Raises:
+        MissingFileError: the root, the split's folder, ``models_info.json`` or a required target list is not there.
+        InvalidInputError: ``min_visib`` out of range, or one of those files is damaged.
+
+    Example:
+        >>> lm = BOPDataset("data/bop/lm", min_visib=0.1)         # doctest: +SKIP
+        >>> lm[0]["translation"], lm[0]["model_info"]["diameter"]  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        split: str = "test",
+        *,
+        targets: bool | None = None,
+        min_visib: float = 0.0,
+        transforms: Transform | None = None,
+    ) -> None:
+        super().__init__(transforms)
+        check_positive(min_visib, "min_visib", zero_ok=True)
+        if min_visib > 1:
+            raise InvalidInputError(f"min_visib: expected a fraction in [0, 1], got {min_visib}")
+        self.root, self.split = existing_root(root, _README), split
+        scenes = self.root / split
+        if not is_plain_name(split) or not scenes.is_dir():
+            raise MissingFileError(f"{scenes}: no such folder; {_README} shows the layout")
+        camera = self.root / "camera.json"
+        self.camera: dict[str, Any] = read_json(camera, dict, _README) if camera.is_file() else {}
+        info = read_json(self.root / "models" / "models_info.json", dict, _README)
+        self.models_info: dict[int, dict[str, Any]] = {
+            int(key): value for key, value in info.items() if key.isdecimal() and isinstance(value, dict)
+        }
+        self._models = {path.name for path in (self.root / "models").glob("obj_*.ply")}
+        target_file = self.root / "test_targets_bop19.json"
+        if targets is None:
+            targets = split == "test" and target_file.is_file()
+        wanted = _targets(target_file) if targets else None
+        for folder in sorted(p for p in scenes.iterdir() if p.is_dir() and p.name.isdecimal()):
+            self._index(folder, wanted, min_visib)
+        if wanted:  # what is left of it was asked for and never met
+            for scene_id, image_id, obj_id in sorted(wanted):
+                self._skip("missing_annotation", f"{split}/{scene_id:06d}/{image_id:06d} object {obj_id}")
+
+    def _index(self, folder: Path, wanted: dict[tuple[int, int, int], int] | None, min_visib: float) -> None:
+        scene = f"{self.split}/{folder.name}"
+        contents: list[dict[str, Any]] = []
+        for name in ("scene_gt.json", "scene_camera.json", "scene_gt_info.json"):
+            try:
+                contents.append(read_json(folder / name, dict, _README))
+            except MissingFileError:
+                if name != "scene_gt_info.json":
+                    return self._skip("missing_annotation", f"{scene}/{name}")
+                contents.append({})
+            except InvalidInputError:
+                return self._skip("corrupt_annotation", f"{scene}/{name}")
+        ground_truth, cameras, infos = contents
+        images = {
+            path.stem: path
+            for kind in ("gray", "rgb")  # rgb wins
+            for path in sorted((folder / kind).glob("*"))
+            if path.suffix in IMAGE_SUFFIXES
+        }
+        for key in sorted(ground_truth, key=lambda k: int(k) if k.isdecimal() else -1):
+            item, instances = f"{scene}/{key}", ground_truth[key]
+            if not key.isdecimal() or not isinstance(instances, list):
+                self._skip("corrupt_annotation", item)
+                continue
+            image = images.get(f"{int(key):06d}")
+            found: list[Sample] = []
+            for index, entry in enumerate(instances):
+                info = _at(infos.get(key), index)
+                parsed = self._parse(entry, info, cameras.get(key))
+                if isinstance(parsed, str):
+                    self._skip(parsed, f"{item} #{index}")
+                else:
+                    place = {"scene_id": int(folder.name), "image_id": int(key), "instance_index": index}
+                    found.append({**parsed, **place, "image_path": str(image)})
+            for sample in _chosen(found, wanted):
+                item_name = f"{item} #{sample['instance_index']}"
+                if sample.pop("no_target"):
+                    self._skip("no_target", item_name)
+                elif image is None:
+                    self._skip("missing_image", item_name)
+                elif min_visib > 0 and not sample["visib_fract"] >= min_visib:
+                    self._skip("not_visible", item_name)
+                else:
+                    self._items.append(sample)
+        return None
+
+    def _parse(self, entry: object, info: dict[str, Any], camera: object) -> Sample | str:
+        """The sample of one instance, or the reason to leave it out."""
+        if not isinstance(entry, dict) or not isinstance(entry.get("obj_id"), int):
+            return "corrupt_annotation"
+        if not isinstance(camera, dict):
+            return "missing_annotation"
+        rotation, translation = finite_numbers(entry.get("cam_R_m2c"), 9), finite_numbers(entry.get("cam_t_m2c"), 3)
+        matrix = finite_numbers(camera.get("cam_K"), 9)
+        if rotation is None or translation is None or matrix is None or not _is_rotation(rotation):
+            return "corrupt_annotation"
+        box = _xyxy(info["bbox_obj"]) if "bbox_obj" in info else _UNKNOWN_BOX
+        if box is None or box[0] == box[2] or box[1] == box[3]:
+            return "bad_box"
+        visible = finite_numbers([info.get("visib_fract")], 1)
+        obj_id: int = entry["obj_id"]
+        model = f"obj_{obj_id:06d}.ply"
+        if model not in self._models:
+            return "missing_mesh"
+        if obj_id not in self.models_info:
+            return "missing_model_info"
+        return {
+            "box": box,
+            "box_visible": _xyxy(info.get("bbox_visib")) or _UNKNOWN_BOX,
+            "camera_matrix": _rows(matrix),
+            "rotation": _rows(rotation),
+            "translation": translation,
+            "obj_id": obj_id,
+            "visib_fract": math.nan if visible is None else visible[0],
+            "model_path": str(self.root / "models" / model),
+            "model_info": self.models_info[obj_id],
+        }
+
+
+def _xyxy(values: object) -> tuple[float, ...] | None:
+    """BOP's x, y, width, height as x0, y0, x1, y1; None for no box (BOP writes -1 four times)."""
+    numbers = finite_numbers(values, 4)
+    if numbers is None or numbers[2] < 0 or numbers[3] < 0:
+        return None
+    return numbers[0], numbers[1], numbers[0] + numbers[2], numbers[1] + numbers[3]
+
+
+def _targets(path: Path) -> dict[tuple[int, int, int], int]:
+    """(scene_id, im_id, obj_id) -> number of instances asked for."""
+    wanted = {}
+    for entry in read_json(path, list, _README):
+        keys = ("scene_id", "im_id", "obj_id", "inst_count")
+        if not isinstance(entry, dict) or not all(isinstance(entry.get(k), int) for k in keys):
+            raise InvalidInputError(f"{path}: expected entries with the numbers {', '.join(keys)}, got {entry!r}")
+        wanted[entry["scene_id"], entry["im_id"], entry["obj_id"]] = entry["inst_count"]
+    return wanted
+
+
+def _chosen(samples: list[Sample], wanted: dict[tuple[int, int, int], int] | None) -> list[Sample]:
+    """Mark with ``no_target`` what the targets do not ask for; take what was met out of ``wanted``."""
+    keys = [(s["scene_id"], s["image_id"], s["obj_id"]) for s in samples]
+    counts = {key: math.inf if wanted is None else wanted.pop(key, 0) for key in set(keys)}
+
+    def visibility(i: int) -> float:
+        value: float = samples[i]["visib_fract"]
+        return -1.0 if math.isnan(value) else value
+
+    for i in sorted(range(len(samples)), key=lambda i: (-visibility(i), i)):
+        samples[i]["no_target"] = counts[keys[i]] <= 0
+        counts[keys[i]] -= 1
+    return samples
+
+
+def _at(infos: object, index: int) -> dict[str, Any]:
+    """Entry ``index`` of an image's list in ``scene_gt_info.json``, empty where there is none."""
+    entry = infos[index] if isinstance(infos, list) and index < len(infos) else None
+    return entry if isinstance(entry, dict) else {}
+
+
+def _rows(values: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
+    return values[:3], values[3:6], values[6:]
+
+
+def _is_rotation(values: tuple[float, ...]) -> bool:
+    R = np.array(values).reshape(3, 3)
+    return bool(np.abs(R @ R.T - np.eye(3)).max() < 1e-2 and np.linalg.det(R) > 0)

@@ -1,0 +1,143 @@
+"""The results file of the BOP challenge: one line per pose estimate."""
+
+import csv
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TypedDict
+
+import torch
+from torch import Tensor
+
+from .._checks import check_tensor
+from ..errors import InvalidInputError, MissingFileError
+from ._json import finite_numbers
+
+__all__ = ["BOPRow", "read_bop_csv", "write_bop_csv"]
+
+_HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
+
+
+class BOPRow(TypedDict):
+    """A pose estimate: R (3, 3) and t (3,), mm, take model points into the OpenCV camera; time in seconds or -1."""
+
+    scene_id: int
+    im_id: int
+    obj_id: int
+    score: float
+    R: Tensor
+    t: Tensor
+    time: float
+
+
+def write_bop_csv(path: str | os.PathLike[str], rows: Iterable[BOPRow]) -> None:
+    """Write pose estimates in the format of the BOP challenge; ``path`` appears only when it is complete.
+
+    Columns: scene_id, im_id, obj_id, score, R (9 numbers, row by row, separated by spaces), t (3 numbers, mm), time
+    (seconds for the whole image, hence equal for all rows of an image; -1 if unknown). Numbers keep all their digits.
+
+    Args:
+        path: file to write; its folder must exist.
+        rows: dicts with those keys; R (3, 3) and t (3,) finite floating tensors.
+
+    Raises:
+        InvalidInputError: a row lacks a key, is not finite, or disagrees on an image's time.
+        MissingFileError: the folder does not exist.
+
+    Example:
+        >>> import tempfile
+        >>> row = BOPRow(scene_id=1, im_id=2, obj_id=3, score=0.5, R=torch.eye(3), t=torch.zeros(3), time=-1.0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_bop_csv(Path(folder, "results.csv"), [row])
+        ...     read_bop_csv(Path(folder, "results.csv"))[0]["score"]
+        0.5
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise MissingFileError(f"{path.parent}: no such folder; create it before writing results")
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "w", newline="", encoding="ascii") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(_HEADER)
+            times: dict[tuple[int, int], float] = {}
+            for number, row in enumerate(rows):
+                writer.writerow(_cells(row, f"row {number}", times))
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def _cells(row: BOPRow, name: str, times: dict[tuple[int, int], float]) -> list[str]:
+    if set(row) != set(_HEADER):
+        raise InvalidInputError(f"{name}: expected the keys {', '.join(_HEADER)}, got {', '.join(row)}")
+    check_tensor(row["R"], f"{name} R", (3, 3))
+    check_tensor(row["t"], f"{name} t", (3,))
+    ids = [row["scene_id"], row["im_id"], row["obj_id"]]
+    R, t = row["R"].flatten().tolist(), row["t"].tolist()
+    if any(isinstance(i, bool) or not isinstance(i, int) or i < 0 for i in ids):
+        raise InvalidInputError(f"{name}: expected whole ids >= 0, got {ids}")
+    numbers = finite_numbers([row["score"], *R, *t, row["time"]], 14)
+    if numbers is None:
+        raise InvalidInputError(f"{name}: score, R, t and time must be finite numbers")
+    _check_time(row, times, name)
+    texts = [repr(v) for v in numbers]
+    return [*map(str, ids), texts[0], " ".join(texts[1:10]), " ".join(texts[10:13]), texts[13]]
+
+
+def _check_time(row: BOPRow, times: dict[tuple[int, int], float], name: str) -> None:
+    first = times.setdefault((row["scene_id"], row["im_id"]), row["time"])
+    if first != row["time"]:
+        raise InvalidInputError(f"{name}: time {row['time']}, an earlier row of that image has {first}; BOP wants one")
+
+
+def read_bop_csv(path: str | os.PathLike[str]) -> list[BOPRow]:
+    """Read a results file of the BOP challenge.
+
+    Returns:
+        One :class:`BOPRow` per line, in order; R (3, 3) and t (3,) float64, t in mm.
+
+    Raises:
+        MissingFileError: no such file.
+        InvalidInputError: another header, or a line (named) with a wrong number of values or one that is not finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MissingFileError(f"{path}: no such file; write_bop_csv makes one")
+    rows: list[BOPRow] = []
+    times: dict[tuple[int, int], float] = {}
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            lines: Any = csv.reader(file)
+            if next(lines, None) != _HEADER:
+                raise InvalidInputError(f"{path}: expected the header {','.join(_HEADER)}")
+            for cells in lines:
+                if cells:
+                    rows.append(_row(cells, f"{path}, line {lines.line_num}"))
+                    _check_time(rows[-1], times, f"{path}, line {lines.line_num}")
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InvalidInputError(f"{path}: not a csv file ({error})") from error
+    return rows
+
+
+def _row(cells: list[str], name: str) -> BOPRow:
+    if len(cells) != len(_HEADER):
+        raise InvalidInputError(f"{name}: expected {len(_HEADER)} columns, got {len(cells)}")
+    try:
+        scene_id, im_id, obj_id = (int(c) for c in cells[:3])
+        score, time = float(cells[3]), float(cells[6])
+        R, t = [float(v) for v in cells[4].split()], [float(v) for v in cells[5].split()]
+    except ValueError as error:
+        raise InvalidInputError(f"{name}: {error}") from error
+    if len(R) != 9 or len(t) != 3 or finite_numbers([score, time, *R, *t], 14) is None:
+        raise InvalidInputError(f"{name}: expected 9 finite numbers in R and 3 in t, got {len(R)} and {len(t)}")
+    return BOPRow(
+        scene_id=scene_id,
+        im_id=im_id,
+        obj_id=obj_id,
+        score=score,
+        R=torch.tensor(R, dtype=torch.float64).reshape(3, 3),
+        t=torch.tensor(t, dtype=torch.float64),
+        time=time,
+    )

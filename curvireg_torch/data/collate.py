@@ -1,0 +1,46 @@
+"""Samples to batches."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInputError
+from ._base import Sample
+
+__all__ = ["collate"]
+
+
+def collate(samples: Sequence[Sample]) -> Sample:
+    """Join samples into one batch, for ``DataLoader(..., collate_fn=collate)``.
+
+    Tensors of equal shape and dtype are stacked along a new first axis. All other values become lists: photographs of
+    different sizes, texts, numbers, dicts.
+
+    Args:
+        samples: B >= 1 dicts with the same keys.
+
+    Returns:
+        One dict with those keys; each value is a (B, ...) tensor or a list of length B.
+
+    Raises:
+        InvalidInputError: no sample, or keys that differ.
+
+    Example:
+        >>> batch = collate([{"box": torch.zeros(4), "category": "car"}, {"box": torch.ones(4), "category": "sofa"}])
+        >>> batch["box"].shape, batch["category"]
+        (torch.Size([2, 4]), ['car', 'sofa'])
+    """
+    if not samples:
+        raise InvalidInputError("samples: expected at least one")
+    for sample in samples:
+        if sample.keys() != samples[0].keys():
+            raise InvalidInputError(f"samples: expected the keys {sorted(samples[0])}, got {sorted(sample)}")
+    return {key: _join([sample[key] for sample in samples]) for key in samples[0]}
+
+
+def _join(values: list[object]) -> object:
+    tensors = [v for v in values if isinstance(v, Tensor)]
+    if len(tensors) == len(values) and len({(t.shape, t.dtype, t.device) for t in tensors}) == 1:
+        return torch.stack(tensors)
+    return values

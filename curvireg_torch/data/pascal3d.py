@@ -1,0 +1,214 @@
+"""PASCAL3D+ 1.1: category-level CAD models aligned with photographs of PASCAL VOC 2012 and ImageNet."""
+
+import math
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from .._checks import check_option, check_positive
+from ..errors import InvalidInputError, MissingFileError
+from ..geometry import rotation_from_viewpoint
+from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name
+from ._matfile import MatStruct, MatValue, read_mat
+
+__all__ = ["Pascal3DPlus"]
+
+_README = "datasets/pascal3d/README.md"
+_VOC_LISTS = Path("PASCAL", "VOCdevkit", "VOC2012", "ImageSets", "Main")
+
+
+class Pascal3DPlus(ObjectDataset):
+    """The annotated objects of PASCAL3D+, one sample each.
+
+    The tree is that of the release: ``Annotations/<class>_<part>/<id>.mat``, ``Images/<class>_<part>/<id>.*``,
+    ``CAD/<class>/<NN>.off``. The ids of a class are those not marked -1 in
+    ``PASCAL/VOCdevkit/VOC2012/ImageSets/Main/<class>_<split>.txt`` for the VOC part, and where that list is absent,
+    as for the ImageNet part, those of ``Image_sets/<class>_<part>_<split>.txt``.
+
+    Args:
+        root: the folder that holds ``Annotations``, ``Images`` and ``CAD``.
+        split: name of the image lists, ``"train"`` or ``"val"``.
+        categories: class names; None for all that have a list for ``split``, in alphabetical order.
+        part: ``"pascal"`` (photographs of VOC 2012) or ``"imagenet"``.
+        occluded, truncated, difficult: False leaves objects with that flag out.
+        min_size: least width and least height of the labelled box, pixels.
+        pixel_origin: the number that ``bbox``, ``px`` and ``py`` give to the first pixel: 1 in the release (MATLAB),
+            0 in sets written from Python. It is subtracted.
+        transforms: applied to every sample, ``sample -> sample``.
+
+    Samples are dicts (tensors are float32):
+        - ``image`` (3, H, W) RGB in [0, 1]; ``image_path``, ``image_id`` str
+        - ``box`` (4,) x0, y0, x1, y1: centres of the outermost labelled pixels, first pixel 0; may leave the image
+        - ``viewpoint`` (3,) azimuth, elevation, theta in degrees; ``rotation`` (3, 3) model to OpenCV camera
+        - ``distance`` float, ``translation`` (3,) = (0, 0, distance), in units of the CAD (about its diagonal)
+        - ``camera_matrix`` (3, 3): the virtual camera of the annotation, its principal point at the object's centre
+        - ``category`` str, ``cad_index`` int from 1, ``cad_path`` str
+        - ``object_index`` int: place in the annotation file; ``truncated``, ``occluded``, ``difficult`` bool
+
+    ``dataset.skipped`` counts what was left out by reason, ``dataset.skipped_items`` names it: ``other_class`` (each
+    file lists every object of the photograph), ``occluded``, ``truncated``, ``difficult``, ``small``, ``no_viewpoint``,
+    ``coarse_viewpoint`` (only the 8 coarse bins were labelled: distance 0 or no fine angles), ``bad_box`` (no area),
+    ``missing_annotation``, ``corrupt_annotation``, ``missing_image``, ``missing_mesh``.
+
+    Raises:
+        MissingFileError: the root or an image list is not there.
+        InvalidInputError: an option is out of range.
+
+    Example:
+        >>> cars = Pascal3DPlus("data/PASCAL3D+_release1.1", categories=["car"], truncated=False)  # doctest: +SKIP
+        >>> cars[0]["rotation"].shape, dict(cars.skipped)                                          # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        split: str = "val",
+        *,
+        categories: Iterable[str] | None = None,
+        part: str = "pascal",
+        occluded: bool = True,
+        truncated: bool = True,
+        difficult: bool = True,
+        min_size: float = 0,
+        pixel_origin: int = 1,
+        transforms: Transform | None = None,
+    ) -> None:
+        super().__init__(transforms)
+        check_option(part, ("pascal", "imagenet"), "part")
+        check_positive(min_size, "min_size", zero_ok=True)
+        if pixel_origin not in (0, 1):
+            raise InvalidInputError(f"pixel_origin: expected 0 or 1, got {pixel_origin}")
+        if isinstance(categories, str):
+            raise InvalidInputError(f"categories: expected a list of names, got the text {categories!r}")
+        self.root, self.split, self.part = existing_root(root, _README), split, part
+        self.categories = sorted(self._listed() if categories is None else set(categories))
+        self._pixel_origin, self._min_size = pixel_origin, min_size
+        self._unwanted = {"occluded": not occluded, "truncated": not truncated, "difficult": not difficult}
+        for name in (split, *self.categories):
+            if not is_plain_name(name):
+                raise InvalidInputError(f"split, categories: expected plain names, got {name!r}")
+        for category in self.categories:
+            self._index(category)
+
+    def _list_files(self, category: str) -> list[Path]:
+        voc = [self.root / _VOC_LISTS / f"{category}_{self.split}.txt"] if self.part == "pascal" else []
+        return [*voc, self.root / "Image_sets" / f"{category}_{self.part}_{self.split}.txt"]
+
+    def _listed(self) -> list[str]:
+        ending = f"_{self.part}"
+        folders = [p.name.removesuffix(ending) for p in (self.root / "Annotations").glob("*" + ending) if p.is_dir()]
+        found = [name for name in folders if any(p.is_file() for p in self._list_files(name))]
+        if not found:
+            raise MissingFileError(
+                f"{self.root}: no {self.part} image list for split {self.split!r}; {_README} shows the layout"
+            )
+        return found
+
+    def _ids(self, category: str) -> list[str]:
+        for path in self._list_files(category):
+            if path.is_file():
+                lines = [line.split() for line in path.read_text(encoding="utf-8", errors="replace").splitlines()]
+                return [fields[0] for fields in lines if fields and fields[1:2] != ["-1"]]
+        wanted = " or ".join(str(p.relative_to(self.root)) for p in self._list_files(category))
+        raise MissingFileError(f"{self.root}: no image list {wanted}; {_README} shows the layout")
+
+    def _index(self, category: str) -> None:
+        folder = f"{category}_{self.part}"
+        for image_id in self._ids(category):
+            item = f"{folder}/{image_id}"
+            annotation = self.root / "Annotations" / folder / f"{image_id}.mat"
+            if not is_plain_name(image_id) or not annotation.is_file():
+                self._skip("missing_annotation", item)
+                continue
+            candidates = (self.root / "Images" / folder / (image_id + suffix) for suffix in IMAGE_SUFFIXES)
+            image = next((path for path in candidates if path.is_file()), None)
+            if image is None:
+                self._skip("missing_image", item)
+                continue
+            try:
+                objects = _objects(read_mat(annotation, "record"))
+            except InvalidInputError:
+                self._skip("corrupt_annotation", item)
+                continue
+            for index, entry in enumerate(objects):
+                parsed = self._parse(entry, category)
+                if isinstance(parsed, str):
+                    self._skip(parsed, f"{item} #{index}")
+                else:
+                    self._items.append(
+                        {"image_path": str(image), "image_id": image_id, "object_index": index, **parsed}
+                    )
+
+    def _parse(self, entry: MatStruct, category: str) -> Sample | str:
+        """The sample of one object, or the reason to leave it out."""
+        if entry.get("class") != category:
+            return "other_class"
+        flags = {name: bool(_number(entry.get(name)) or 0) for name in self._unwanted}
+        for name, unwanted in self._unwanted.items():
+            if unwanted and flags[name]:
+                return name
+        box = _box(entry.get("bbox"), self._pixel_origin)
+        if box is None:
+            return "bad_box"
+        if min(box[2] - box[0], box[3] - box[1]) < self._min_size:
+            return "small"
+        views = entry.get("viewpoint")
+        if not isinstance(views, list) or not views:
+            return "no_viewpoint"
+        azimuth, elevation, distance = (_number(views[0].get(key)) for key in ("azimuth", "elevation", "distance"))
+        if azimuth is None or elevation is None or not distance:
+            return "coarse_viewpoint"
+        cad_index = _number(entry.get("cad_index")) or 0.0
+        cad = self.root / "CAD" / category / f"{int(cad_index):02d}.off"
+        if not 1 <= cad_index < 1000 or not cad.is_file():
+            return "missing_mesh"
+        viewpoint = (azimuth, elevation, _number(views[0].get("theta")) or 0.0)
+        angles = torch.tensor(viewpoint, dtype=torch.float64)
+        rotation = rotation_from_viewpoint(*angles.unbind())
+        return {
+            "box": box,
+            "viewpoint": viewpoint,
+            "rotation": tuple(map(tuple, rotation.tolist())),
+            "distance": distance,
+            "translation": (0.0, 0.0, distance),
+            "camera_matrix": _camera(views[0], box, self._pixel_origin),
+            "category": category,
+            "cad_index": int(cad_index),
+            "cad_path": str(cad),
+            **flags,
+        }
+
+
+def _objects(record: MatValue) -> list[MatStruct]:
+    objects = record[0].get("objects") if isinstance(record, list) and record else None
+    if isinstance(objects, np.ndarray) and objects.size == 0:
+        return []
+    if not isinstance(objects, list):
+        raise InvalidInputError("record: holds no struct array 'objects'")
+    return objects
+
+
+def _number(value: MatValue) -> float | None:
+    """The first number of ``value`` if there is one and it is finite."""
+    if not isinstance(value, np.ndarray) or value.size == 0 or not math.isfinite(value[0]):
+        return None
+    return float(value[0])
+
+
+def _box(value: MatValue, origin: int) -> tuple[float, float, float, float] | None:
+    if not isinstance(value, np.ndarray) or value.size != 4 or not np.isfinite(value).all():
+        return None
+    x0, y0, x1, y1 = (float(v) - origin for v in value)
+    return (x0, y0, x1, y1) if x1 > x0 and y1 > y0 else None
+
+
+def _camera(view: MatStruct, box: tuple[float, float, float, float], origin: int) -> tuple[tuple[float, ...], ...]:
+    """K of the annotation's camera. Absent fields: focal 1, viewport 3000, principal point at the middle of the box."""
+    focal = (_number(view.get("focal")) or 1.0) * (_number(view.get("viewport")) or 3000.0)
+    px, py = _number(view.get("px")), _number(view.get("py"))
+    cx = (box[0] + box[2]) / 2 if px is None else px - origin
+    cy = (box[1] + box[3]) / 2 if py is None else py - origin
+    return (focal, 0.0, cx), (0.0, focal, cy), (0.0, 0.0, 1.0)

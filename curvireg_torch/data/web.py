@@ -1,0 +1,118 @@
+"""A collection of your own: some objects, each with a mesh and photographs from anywhere."""
+
+import csv
+import math
+import os
+from pathlib import Path
+
+import torch
+
+from ..errors import InvalidInputError, MissingFileError
+from ..geometry import rotation_from_viewpoint
+from ._base import ObjectDataset, Sample, Transform, existing_root, is_plain_name
+
+__all__ = ["WebCollection"]
+
+_README = "datasets/web/README.md"
+_COLUMNS = ["image", "x0", "y0", "x1", "y1", "azimuth", "elevation", "theta", "distance"]
+_MESH_SUFFIXES = (".glb", ".obj", ".off", ".ply", ".stl")
+
+
+class WebCollection(ObjectDataset):
+    """One folder per object with ``mesh.*``, photographs, and ``views.csv`` that says where the object is.
+
+    ``views.csv`` is UTF-8 with the header ``image,x0,y0,x1,y1,azimuth,elevation,theta,distance``: a file of the
+    folder, the box in pixels (centre of the first pixel = 0), PASCAL3D+ viewpoint angles in degrees, distance in units
+    of the mesh. Pose fields may be empty: without azimuth and elevation there is no pose, an empty theta is 0. A
+    photograph may have several lines. The mesh is one of ``mesh.glb``, ``.obj``, ``.off``, ``.ply``, ``.stl``.
+
+    Args:
+        root: the folder of the objects' folders.
+        transforms: applied to every sample, ``sample -> sample``.
+
+    Samples are dicts (tensors are float32):
+        - ``image`` (3, H, W) RGB in [0, 1]; ``image_path``, ``image_id`` str
+        - ``box`` (4,) x0, y0, x1, y1
+        - ``viewpoint`` (3,) azimuth, elevation, theta in degrees; ``rotation`` (3, 3) model to OpenCV camera; NaN where
+          the pose is unknown
+        - ``distance`` float, NaN where unknown
+        - ``category`` str, the object's folder; ``mesh_path`` str; ``object_index`` int: line of ``views.csv`` from 0
+
+    ``dataset.skipped`` counts what was left out by reason, ``dataset.skipped_items`` names it: ``missing_annotation``
+    (no ``views.csv``), ``corrupt_annotation``, ``missing_image``, ``missing_mesh``, ``bad_box`` (no area).
+
+    Raises:
+        MissingFileError: the root is not there or holds no folder.
+        InvalidInputError: a folder has two meshes.
+
+    Example:
+        >>> mine = WebCollection("data/web")           # doctest: +SKIP
+        >>> mine[0]["category"], mine[0]["viewpoint"]  # doctest: +SKIP
+    """
+
+    def __init__(self, root: str | os.PathLike[str], *, transforms: Transform | None = None) -> None:
+        super().__init__(transforms)
+        self.root = existing_root(root, _README)
+        folders = sorted(p for p in self.root.iterdir() if p.is_dir() and not p.name.startswith("."))
+        if not folders:
+            raise MissingFileError(f"{self.root}: holds no folder of an object; {_README} shows the layout")
+        self.categories = [folder.name for folder in folders]
+        for folder in folders:
+            self._index(folder)
+
+    def _index(self, folder: Path) -> None:
+        meshes = [folder / f"mesh{suffix}" for suffix in _MESH_SUFFIXES if (folder / f"mesh{suffix}").is_file()]
+        if len(meshes) > 1:
+            raise InvalidInputError(f"{folder}: expected one mesh, got {', '.join(p.name for p in meshes)}")
+        if not meshes:
+            return self._skip("missing_mesh", folder.name)
+        table = folder / "views.csv"
+        if not table.is_file():
+            return self._skip("missing_annotation", f"{folder.name}/views.csv")
+        try:
+            with open(table, newline="", encoding="utf-8-sig") as file:
+                lines = [[cell.strip() for cell in line] for line in csv.reader(file) if line]
+        except (UnicodeDecodeError, csv.Error):
+            lines = []
+        if not lines or lines[0] != _COLUMNS:
+            return self._skip("corrupt_annotation", f"{folder.name}/views.csv")
+        for index, line in enumerate(lines[1:]):
+            parsed = _parse(line, folder)
+            if isinstance(parsed, str):
+                self._skip(parsed, f"{folder.name}/views.csv #{index}")
+            else:
+                self._items.append(
+                    {**parsed, "category": folder.name, "mesh_path": str(meshes[0]), "object_index": index}
+                )
+        return None
+
+
+def _parse(line: list[str], folder: Path) -> Sample | str:
+    """The sample of one line, or the reason to leave it out."""
+    try:
+        numbers = [float(cell) if cell else math.nan for cell in line[1:]]
+    except ValueError:
+        return "corrupt_annotation"
+    if len(line) != len(_COLUMNS) or not is_plain_name(line[0]) or any(map(math.isinf, numbers)):
+        return "corrupt_annotation"
+    x0, y0, x1, y1, azimuth, elevation, theta, distance = numbers
+    if math.isnan(azimuth) != math.isnan(elevation):
+        return "corrupt_annotation"
+    if not (x1 > x0 and y1 > y0):
+        return "bad_box"
+    image = folder / line[0]
+    if not image.is_file():
+        return "missing_image"
+    if math.isnan(azimuth):
+        theta = math.nan
+    elif math.isnan(theta):
+        theta = 0.0
+    rotation = rotation_from_viewpoint(*torch.tensor([azimuth, elevation, theta], dtype=torch.float64).unbind())
+    return {
+        "image_path": str(image),
+        "image_id": image.stem,
+        "box": (x0, y0, x1, y1),
+        "viewpoint": (azimuth, elevation, theta),
+        "rotation": tuple(map(tuple, rotation.tolist())),
+        "distance": distance,
+    }

@@ -1,0 +1,95 @@
+"""Lay ObjectNet3D out as PASCAL3D+, so that Pascal3DPlus(..., part="imagenet") reads it.
+
+    python datasets/convert_objectnet3d.py OBJECTNET3D OUT [--splits train val]
+
+ObjectNet3D keeps all annotations and photographs in one folder each; PASCAL3D+ has one per class. Files are hard-linked
+where the file system allows it and copied otherwise; the source is not changed. An image that shows several classes
+appears under each of them.
+
+Read from OBJECTNET3D: Annotations/<id>.mat, Images/<id>.JPEG, Image_sets/<split>.txt, CAD/off/<class>/<NN>.off or
+CAD/<class>/<NN>.off.
+Exit code 0: all ids of the lists were found. 1: some were not (they are counted). 2: not an ObjectNet3D tree.
+"""
+
+import argparse
+import os
+import shutil
+import sys
+from collections import Counter
+from pathlib import Path
+
+from curvireg_torch.data._base import is_plain_name
+from curvireg_torch.data._matfile import read_mat
+from curvireg_torch.errors import InvalidInputError
+
+
+def place(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if target.exists():
+        return
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+
+
+def classes_of(annotation: Path) -> set[str]:
+    record = read_mat(annotation, "record")
+    objects = record[0].get("objects") if isinstance(record, list) and record else None
+    names = {entry.get("class") for entry in objects} if isinstance(objects, list) else set()
+    return {name for name in names if isinstance(name, str) and is_plain_name(name)}
+
+
+def convert_split(root: Path, out: Path, split: str) -> Counter[str]:
+    """Counts ``placed`` images and what was missing."""
+    counts: Counter[str] = Counter()
+    lists: dict[str, list[str]] = {}
+    for image_id in (root / "Image_sets" / f"{split}.txt").read_text(encoding="utf-8").split():
+        annotation, image = root / "Annotations" / f"{image_id}.mat", root / "Images" / f"{image_id}.JPEG"
+        if not is_plain_name(image_id) or not annotation.is_file():
+            counts["missing_annotation"] += 1
+            continue
+        if not image.is_file():
+            counts["missing_image"] += 1
+            continue
+        try:
+            names = classes_of(annotation)
+        except InvalidInputError:
+            counts["corrupt_annotation"] += 1
+            continue
+        for name in sorted(names):
+            place(annotation, out / "Annotations" / f"{name}_imagenet" / annotation.name)
+            place(image, out / "Images" / f"{name}_imagenet" / image.name)
+            lists.setdefault(name, []).append(image_id)
+        counts["placed"] += 1
+    (out / "Image_sets").mkdir(parents=True, exist_ok=True)
+    for name, ids in lists.items():
+        (out / "Image_sets" / f"{name}_imagenet_{split}.txt").write_text("\n".join(ids) + "\n")
+    return counts
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("root", type=Path, metavar="OBJECTNET3D")
+    parser.add_argument("out", type=Path, metavar="OUT")
+    parser.add_argument("--splits", nargs="+", default=["train", "val"])
+    options = parser.parse_args(arguments)
+    cads = options.root / "CAD" / "off"
+    if not cads.is_dir():
+        cads = options.root / "CAD"
+    needed = [cads, *(options.root / "Image_sets" / f"{split}.txt" for split in options.splits)]
+    if absent := [str(path) for path in needed if not path.exists()]:
+        print(f"not an ObjectNet3D tree: no {', '.join(absent)}; see datasets/objectnet3d/README.md", file=sys.stderr)
+        return 2
+    total: Counter[str] = Counter()
+    for split in options.splits:
+        counts = convert_split(options.root, options.out, split)
+        print(f"{split}: " + ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items())))
+        total += counts
+    for cad in sorted(cads.glob("*/*.off")):
+        place(cad, options.out / "CAD" / cad.parent.name / cad.name)
+    return 1 if set(total) - {"placed"} else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

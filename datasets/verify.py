@@ -1,0 +1,82 @@
+"""Check a dataset tree against its layout; print what is usable and what is not.
+
+    python datasets/verify.py pascal3d ROOT [--split val] [--part pascal] [--categories car sofa]
+    python datasets/verify.py bop ROOT [--split test]
+    python datasets/verify.py web ROOT
+
+Exit code 0: sound. 1: usable with defects (missing, corrupt or bad items, which the library skips). 2: unusable.
+"""
+
+import argparse
+import sys
+from collections import Counter
+from pathlib import Path
+
+from curvireg_torch.data import BOPDataset, Pascal3DPlus, WebCollection, read_image
+from curvireg_torch.errors import CurviregError
+
+DEFECTS = ("missing_", "corrupt_", "bad_")
+
+
+def open_dataset(options: argparse.Namespace) -> Pascal3DPlus | BOPDataset | WebCollection:
+    if options.kind == "pascal3d":
+        return Pascal3DPlus(options.root, options.split, part=options.part, categories=options.categories)
+    if options.kind == "bop":
+        return BOPDataset(options.root, options.split)
+    return WebCollection(options.root)
+
+
+def unreadable(dataset: Pascal3DPlus | BOPDataset | WebCollection) -> list[str]:
+    """Reads every photograph once."""
+    problems = []
+    for path in sorted({dataset.annotation(i)["image_path"] for i in range(len(dataset))}):
+        try:
+            read_image(path)
+        except CurviregError as error:
+            problems.append(str(error))
+    return problems
+
+
+def report(dataset: Pascal3DPlus | BOPDataset | WebCollection, images: bool, show: int) -> int:
+    samples = [dataset.annotation(i) for i in range(len(dataset))]
+    counts = Counter(str(s.get("category", s.get("obj_id"))) for s in samples)
+    print(f"{len(samples)} objects in {len({s['image_path'] for s in samples})} photographs")
+    for name, count in sorted(counts.items()):
+        print(f"  {name}: {count}")
+    skipped = dict(dataset.skipped_items)
+    if images:
+        skipped |= {"corrupt_image": found} if (found := unreadable(dataset)) else {}
+    for reason, items in sorted(skipped.items()):
+        defect = reason.startswith(DEFECTS)
+        print(f"{'defect' if defect else 'left out'}, {reason}: {len(items)}")
+        for item in items[: show if defect else 0]:
+            print(f"  {item}")
+    if not samples:
+        return 2
+    return 1 if any(reason.startswith(DEFECTS) for reason in skipped) else 0
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="{pascal3d,bop,web}")
+    for kind in ("pascal3d", "bop", "web"):
+        command = kinds.add_parser(kind)
+        command.add_argument("root", type=Path)
+        command.add_argument("--images", action="store_true", help="also decode every photograph (slow)")
+        command.add_argument("--show", type=int, default=5, help="how many items to name for each defect")
+        if kind == "pascal3d":
+            command.add_argument("--split", default="val")
+            command.add_argument("--part", choices=("pascal", "imagenet"), default="pascal")
+            command.add_argument("--categories", nargs="+")
+        if kind == "bop":
+            command.add_argument("--split", default="test")
+    options = parser.parse_args(arguments)
+    try:
+        return report(open_dataset(options), options.images, options.show)
+    except CurviregError as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,127 @@
+import json
+
+import pytest
+import torch
+
+from curvireg_torch.data import BOPDataset
+from curvireg_torch.errors import InvalidInputError, MissingFileError
+from tests._support.miniature import write_bop
+
+
+@pytest.fixture
+def tree(tmp_path):
+    return tmp_path, write_bop(tmp_path)
+
+
+def places(dataset):
+    samples = [dataset.annotation(i) for i in range(len(dataset))]
+    return [(s["scene_id"], s["image_id"], s["obj_id"], s["instance_index"]) for s in samples]
+
+
+def test_counts_everything(tree):
+    root, reasons = tree
+    dataset = BOPDataset(root, targets=False)
+    assert places(dataset) == [(1, 0, 1, 0), (1, 0, 2, 1), (1, 0, 1, 2), (2, 7, 1, 0)]
+    assert dict(dataset.skipped) == reasons
+    assert dataset.skipped_items["missing_image"] == ["test/000001/4 #0"]
+
+
+def test_sample(tree):
+    dataset = BOPDataset(tree[0], targets=False)
+    sample = dataset[0]
+    assert set(sample) == {
+        *("image", "image_path", "box", "box_visible", "camera_matrix", "rotation", "translation", "obj_id"),
+        *("scene_id", "image_id", "instance_index", "visib_fract", "model_path", "model_info"),
+    }
+    assert sample["image"].shape == (3, 60, 80)
+    assert sample["box"].tolist() == [-5, 4, 25, 24], "x, y, width, height become corners, and may leave the image"
+    assert sample["box_visible"].tolist() == [0, 4, 25, 24]
+    assert sample["camera_matrix"].tolist() == [[300, 0, 40], [0, 310, 30], [0, 0, 1]]
+    assert sample["rotation"].tolist() == [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "row by row"
+    assert sample["translation"].tolist() == [1, 2, 400]
+    assert sample["visib_fract"] == 0.8
+    assert sample["model_path"].endswith("models/obj_000001.ply")
+    assert sample["model_info"] == dataset.models_info[1]
+    assert "symmetries_discrete" in sample["model_info"]
+    assert dataset.camera["width"] == 80
+
+
+def test_hidden_instance_has_no_visible_box(tree):
+    hidden = BOPDataset(tree[0], targets=False).annotation(1)
+    assert hidden["visib_fract"] == 0
+    assert hidden["box"].isfinite().all()
+    assert hidden["box_visible"].isnan().all()
+
+
+def test_grey_folder_and_missing_scene_gt_info(tree):
+    sample = BOPDataset(tree[0], targets=False)[3]
+    torch.testing.assert_close(sample["image"], torch.full((3, 60, 80), 0.2))
+    assert sample["box"].isnan().all()
+    assert sample["box_visible"].isnan().all()
+    assert sample["visib_fract"] != sample["visib_fract"]
+
+
+def test_targets_take_the_most_visible_instances(tree):
+    for targets in (None, True):
+        dataset = BOPDataset(tree[0], targets=targets)
+        assert places(dataset) == [(1, 0, 1, 2), (2, 7, 1, 0)]
+        assert dataset.skipped["no_target"] == 3
+        assert "test/000001/000006 object 1" in dataset.skipped_items["missing_annotation"]
+
+
+def test_without_target_file(tree):
+    (tree[0] / "test_targets_bop19.json").unlink()
+    assert len(BOPDataset(tree[0])) == 4
+    with pytest.raises(MissingFileError, match="test_targets_bop19"):
+        BOPDataset(tree[0], targets=True)
+
+
+def test_min_visib(tree):
+    dataset = BOPDataset(tree[0], targets=False, min_visib=0.85)
+    assert places(dataset) == [(1, 0, 1, 2)]
+    assert dataset.skipped["not_visible"] == 3
+    for bad in (-0.1, 1.1, float("nan")):
+        with pytest.raises(InvalidInputError, match="min_visib"):
+            BOPDataset(tree[0], min_visib=bad)
+
+
+def test_other_split_has_no_targets_by_default(tree):
+    (tree[0] / "test").rename(tree[0] / "train_pbr")
+    assert len(BOPDataset(tree[0], "train_pbr")) == 4
+
+
+def test_transforms(tree):
+    dataset = BOPDataset(tree[0], transforms=lambda s: {"box": s["box"], "size": s["image"].shape[-2:]})
+    assert dataset[0]["size"] == (60, 80)
+
+
+def test_missing_things_say_what_to_do(tree, tmp_path):
+    for root, split in ((tmp_path / "nothing", "test"), (tree[0], "train"), (tree[0], "../test")):
+        with pytest.raises(MissingFileError, match=r"datasets/bop/README\.md"):
+            BOPDataset(root, split)
+    (tree[0] / "models" / "models_info.json").unlink()
+    with pytest.raises(MissingFileError, match="models_info"):
+        BOPDataset(tree[0])
+
+
+@pytest.mark.parametrize("content", ["[", "[" * 100000, "[1]", '[{"scene_id": 1}]', "{}"])
+def test_damaged_target_list(tree, content):
+    (tree[0] / "test_targets_bop19.json").write_text(content)
+    with pytest.raises(InvalidInputError, match="test_targets_bop19"):
+        BOPDataset(tree[0])
+
+
+@pytest.mark.parametrize("value", [None, "x", {"a": 1}, [1, 2], ["1"] * 9, [True] * 9, [1e400] * 9, [10**400] * 9])
+def test_odd_values_are_counted(tree, value):
+    path = tree[0] / "test" / "000001" / "scene_gt.json"
+    content = json.loads(path.read_text())
+    content["0"][0]["cam_R_m2c"] = value
+    path.write_text(json.dumps(content))
+    dataset = BOPDataset(tree[0], targets=False)
+    assert dataset.skipped["corrupt_annotation"] == tree[1]["corrupt_annotation"] + 1
+
+
+def test_mirrored_rotation_is_corrupt(tree):
+    path = tree[0] / "test" / "000002" / "scene_gt.json"
+    path.write_text(path.read_text().replace("[1.0, 0.0", "[-1.0, 0.0"))
+    assert len(BOPDataset(tree[0], targets=False)) == 3

@@ -1,0 +1,154 @@
+import math
+
+import pytest
+import torch
+
+from curvireg_torch.data import Pascal3DPlus
+from curvireg_torch.errors import ImageError, InvalidInputError, MissingFileError
+from curvireg_torch.geometry import rotation_from_viewpoint
+from tests._support.miniature import HALF, pascal_object, write_pascal3d, write_record
+
+
+@pytest.fixture
+def tree(tmp_path):
+    return tmp_path, write_pascal3d(tmp_path)
+
+
+def test_counts_everything(tree):
+    root, reasons = tree
+    dataset = Pascal3DPlus(root)
+    assert dataset.categories == ["car", "sofa"]
+    assert len(dataset) == 5
+    assert dict(dataset.skipped) == reasons
+    assert {k: len(v) for k, v in dataset.skipped_items.items()} == reasons
+    assert dataset.skipped_items["missing_image"] == ["car_pascal/2008_000009"]
+    assert dataset.skipped_items["coarse_viewpoint"] == ["car_pascal/2008_000003 #0", "car_pascal/2008_000003 #1"]
+
+
+def test_imagenet_part(tmp_path):
+    reasons = write_pascal3d(tmp_path, part="imagenet")
+    dataset = Pascal3DPlus(tmp_path, part="imagenet")
+    assert len(dataset) == 5
+    assert dict(dataset.skipped) == reasons
+    assert dataset[0]["image_path"].endswith("car_imagenet/2008_000001.JPEG")
+    with pytest.raises(MissingFileError, match="no pascal image list"):
+        Pascal3DPlus(tmp_path)
+
+
+def test_sample(tree):
+    dataset = Pascal3DPlus(tree[0], categories=["car"])
+    sample = dataset[0]
+    assert set(sample) == {
+        *("image", "image_path", "image_id", "object_index", "box", "viewpoint", "rotation", "distance", "translation"),
+        *("camera_matrix", "category", "cad_index", "cad_path", "truncated", "occluded", "difficult"),
+    }
+    assert sample["image"].shape == (3, 60, 80)
+    assert sample["box"].tolist() == [10, 5, 70, 55], "boxes of the release count from 1"
+    assert sample["camera_matrix"].tolist() == [[3000, 0, 40], [0, 3000, 30], [0, 0, 1]]
+    assert sample["viewpoint"].tolist() == [30, 10, -5]
+    torch.testing.assert_close(sample["rotation"], rotation_from_viewpoint(30.0, 10.0, -5.0))
+    assert sample["translation"].tolist() == [0, 0, 40]
+    assert (sample["category"], sample["cad_index"], sample["image_id"]) == ("car", 1, "2008_000001")
+    assert sample["cad_path"].endswith("01.off")
+    assert all(v.dtype == torch.float32 for v in sample.values() if isinstance(v, torch.Tensor))
+    assert (sample["truncated"], sample["occluded"], sample["difficult"]) == (False, False, False)
+
+
+def test_pixel_origin_moves_box_and_principal_point(tree):
+    sample = Pascal3DPlus(tree[0], pixel_origin=0)[0]
+    assert sample["box"].tolist() == [11, 6, 71, 56]
+    assert sample["camera_matrix"][:2, 2].tolist() == [41, 31]
+
+
+def test_projection_of_the_model_lies_in_the_image(tree):
+    """The cube's top is above its bottom in the photograph, and its centre is at the principal point."""
+    s = Pascal3DPlus(tree[0])[0]
+    points = torch.tensor([[0.0, 0, 0], [0, 0, HALF], [0, 0, -HALF]])
+    p = (points @ s["rotation"].T + s["translation"]) @ s["camera_matrix"].T
+    u, v = (p[:, :2] / p[:, 2:]).T
+    assert (u[0], v[0]) == (40, 30)
+    assert v[1] < v[0] < v[2]
+
+
+@pytest.mark.parametrize(("option", "left"), [("truncated", 3), ("occluded", 3), ("difficult", 3)])
+def test_flags_filter_and_are_counted(tree, option, left):
+    dataset = Pascal3DPlus(tree[0], categories=["car"], **{option: False})
+    assert len(dataset) == left
+    assert dataset.skipped[option] == 1
+    assert not any(dataset.annotation(i)[option] for i in range(left))
+
+
+def test_min_size(tree):
+    dataset = Pascal3DPlus(tree[0], categories=["car"], min_size=5)
+    assert len(dataset) == 3
+    assert dataset.skipped["small"] == 1
+
+
+def test_list_beside_the_voc_list_and_odd_entries(tree):
+    root = tree[0]
+    lists = root / "Image_sets"
+    lists.mkdir()
+    lists.joinpath("car_pascal_tiny.txt").write_text("2008_000001\n\n../car_pascal/2008_000001\n" + "x" * 5000 + "\n")
+    dataset = Pascal3DPlus(root, "tiny")
+    assert len(dataset) == 1
+    assert dict(dataset.skipped) == {"missing_annotation": 2}
+
+
+def test_absent_camera_fields_have_documented_values(tree):
+    entry = pascal_object("car")
+    entry["viewpoint"] = {"azimuth": 10.0, "elevation": 20.0, "distance": 3.0}
+    write_record(tree[0] / "Annotations" / "car_pascal" / "2008_000001.mat", [entry])
+    sample = Pascal3DPlus(tree[0], categories=["car"])[0]
+    assert sample["camera_matrix"].tolist() == [[3000, 0, 40], [0, 3000, 30], [0, 0, 1]]
+    assert sample["viewpoint"].tolist() == [10, 20, 0]
+
+
+@pytest.mark.parametrize("cad_index", [-1.0, 0.0, 1e300, math.nan, math.inf, "one"])
+def test_odd_cad_index(tree, cad_index):
+    entry = pascal_object("car", cad_index=cad_index)
+    write_record(tree[0] / "Annotations" / "car_pascal" / "2008_000001.mat", [entry])
+    dataset = Pascal3DPlus(tree[0], categories=["car"])
+    assert dataset.skipped["missing_mesh"] == 3
+
+
+def test_transforms_come_last_and_annotation_is_bare(tree):
+    dataset = Pascal3DPlus(tree[0], transforms=lambda sample: {**sample, "mean": sample["image"].mean()})
+    assert 0 < dataset[0]["mean"] < 1
+    assert not {"image", "mean"} & set(dataset.annotation(0))
+    dataset.annotation(0)["box"].zero_()
+    assert dataset.annotation(0)["box"].sum() > 0, "a sample is the caller's own"
+    with pytest.raises(IndexError):
+        dataset[len(dataset)]
+
+
+def test_damaged_photograph_is_an_error_when_read(tree):
+    path = tree[0] / "Images" / "car_pascal" / "2008_000001.jpg"
+    path.write_bytes(path.read_bytes()[:500])
+    dataset = Pascal3DPlus(tree[0])
+    with pytest.raises(ImageError, match="2008_000001"):
+        dataset[0]
+
+
+def test_missing_things_say_what_to_do(tree, tmp_path):
+    with pytest.raises(MissingFileError, match=r"datasets/pascal3d/README\.md"):
+        Pascal3DPlus(tmp_path / "nothing")
+    with pytest.raises(MissingFileError, match=r"train.*README"):
+        Pascal3DPlus(tree[0], "train")
+    with pytest.raises(MissingFileError, match=r"boat_val\.txt"):
+        Pascal3DPlus(tree[0], categories=["boat"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"part": "voc"}, "part"),
+        ({"min_size": -1}, "min_size"),
+        ({"pixel_origin": 2}, "pixel_origin"),
+        ({"categories": "car"}, "list of names"),
+        ({"categories": ["../car"]}, "plain names"),
+        ({"split": "../val", "categories": []}, "plain names"),
+    ],
+)
+def test_bad_options(tree, options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        Pascal3DPlus(tree[0], **options)

@@ -1,0 +1,99 @@
+"""The readers on the real photographs, against the counts and conventions that their README states."""
+
+from collections import Counter
+from functools import cache
+
+import pytest
+import torch
+import trimesh
+from torch.utils.data import DataLoader
+
+from curvireg_torch.data import BOPDataset, Pascal3DPlus, collate
+from tests._support.real_data import real_data
+
+pytestmark = pytest.mark.data
+
+
+@cache
+def vertices(path):
+    return torch.tensor(trimesh.load(path, process=False, force="mesh").vertices, dtype=torch.float32)
+
+
+def projected_box(path, sample):
+    p = (vertices(path) @ sample["rotation"].T + sample["translation"]) @ sample["camera_matrix"].T
+    pixels = p[:, :2] / p[:, 2:]
+    return torch.cat([pixels.min(0).values, pixels.max(0).values])
+
+
+def test_pascal3d_counts():
+    dataset = Pascal3DPlus(real_data("pascal3d_mini"), pixel_origin=0)
+    samples = [dataset.annotation(i) for i in range(len(dataset))]
+    assert not dataset.skipped
+    assert Counter(s["category"] for s in samples) == {
+        "aeroplane": 12,
+        "bicycle": 7,
+        "boat": 10,
+        "bottle": 11,
+        "bus": 5,
+        "car": 12,
+        "chair": 2,
+        "diningtable": 1,
+        "motorbike": 7,
+        "sofa": 5,
+        "train": 15,
+        "tvmonitor": 6,
+    }
+    assert len(samples) == 93
+    assert sum(s["truncated"] for s in samples) == 21
+    assert sum(s["difficult"] for s in samples) == 19
+    assert sum(not s["truncated"] and not s["difficult"] for s in samples) == 64
+    assert len(list(dataset.root.glob("CAD/*/*.off"))) == 63
+    assert len(Pascal3DPlus(dataset.root, pixel_origin=0, truncated=False, difficult=False)) == 64
+
+
+def test_pascal3d_projection_fills_the_labelled_box():
+    """Offset and distance were fitted to the box; the shape of a CAD of the category may still differ."""
+    dataset = Pascal3DPlus(real_data("pascal3d_mini"), pixel_origin=0, truncated=False, difficult=False)
+    centre, edges = [], []
+    for i in range(len(dataset)):
+        sample = dataset.annotation(i)
+        box, labelled = projected_box(sample["cad_path"], sample), sample["box"]
+        size = (labelled[2:] - labelled[:2]).max()
+        centre.append((box[:2] + box[2:] - labelled[:2] - labelled[2:]).abs().max() / 2)
+        edges.append((box - labelled).abs().max() / size)
+    assert max(centre) < 0.1
+    assert torch.stack(edges).median() < 0.02
+    assert max(edges) < 0.06
+
+
+@pytest.mark.parametrize(("name", "count"), [("dino", 105), ("hope", 80), ("lm", 8)])
+def test_bop_counts_and_projection(name, count):
+    dataset = BOPDataset(real_data(f"bop/{name}"))
+    assert len(dataset) == count
+    assert not dataset.skipped
+    errors = []
+    for i in range(count):
+        sample = dataset.annotation(i)
+        errors.append((projected_box(sample["model_path"], sample) - sample["box"]).abs().max())
+    assert max(errors) < 2, "pixels"
+
+
+def test_bop_visibility():
+    dataset = BOPDataset(real_data("bop/hope"))
+    fractions = Counter(dataset.annotation(i)["visib_fract"] for i in range(len(dataset)))
+    assert fractions == {1.0: 45, 0.7: 20, 0.4: 15}
+    assert len(BOPDataset(dataset.root, min_visib=0.5)) == 65
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 warns of fork beside threads
+def test_loader_with_workers():
+    for dataset in (Pascal3DPlus(real_data("pascal3d_mini"), pixel_origin=0), BOPDataset(real_data("bop/lm"))):
+        loader = DataLoader(dataset, batch_size=16, num_workers=2, collate_fn=collate)
+        seen = 0
+        for batch in loader:
+            seen += len(batch["image"])
+            assert batch["rotation"].shape[1:] == (3, 3)
+            for image in batch["image"]:
+                assert image.shape[0] == 3
+                assert 0 <= image.min() < image.max() <= 1
+        assert seen == len(dataset)

@@ -1,0 +1,201 @@
+"""The scripts of ``datasets/``: against the generated trees, and against a server of our own on this machine."""
+
+import hashlib
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+
+from curvireg_torch.data import Pascal3DPlus
+from tests._support.miniature import pascal_object, write_bop, write_image, write_mesh, write_pascal3d, write_record
+from tests._support.miniature import write_web as write_web_tree
+
+SCRIPTS = Path(__file__).parents[2] / "datasets"
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(f"datasets_{name}", SCRIPTS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("name", ["download", "verify", "convert_objectnet3d"])
+def test_help(name):
+    command = [sys.executable, SCRIPTS / f"{name}.py", "--help"]
+    environment = {**os.environ, "PYTHONPATH": str(SCRIPTS.parent)}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert "Exit code" in done.stdout or "manifest" in done.stdout
+    assert not done.stderr
+
+
+# --- verify
+
+
+def test_verify_defective_trees(tmp_path, capsys):
+    verify = load("verify")
+    for kind, write in (("pascal3d", write_pascal3d), ("bop", write_bop), ("web", write_web_tree)):
+        write(tmp_path / kind)
+        assert verify.main([kind, str(tmp_path / kind)]) == 1
+    out = capsys.readouterr().out
+    assert "5 objects in 4 photographs" in out
+    assert "left out, other_class: 3" in out
+    assert "defect, missing_image: 1\n  car_pascal/2008_000009" in out
+
+
+def test_verify_sound_tree_and_its_photographs(tmp_path, capsys):
+    verify = load("verify")
+    write_pascal3d(tmp_path)
+    arguments = ["pascal3d", str(tmp_path), "--categories", "sofa", "--images"]
+    assert verify.main(arguments) == 0
+    path = tmp_path / "Images" / "sofa_pascal" / "2008_000002.jpg"
+    path.write_bytes(path.read_bytes()[:300])
+    assert verify.main(arguments) == 1
+    assert "defect, corrupt_image: 1" in capsys.readouterr().out
+
+
+def test_verify_unusable_tree(tmp_path, capsys):
+    assert load("verify").main(["bop", str(tmp_path)]) == 2
+    assert "datasets/bop/README.md" in capsys.readouterr().err
+
+
+# --- convert_objectnet3d
+
+
+@pytest.mark.parametrize("cad", ["CAD/off", "CAD"])
+def test_convert_objectnet3d(tmp_path, cad, capsys):
+    convert = load("convert_objectnet3d")
+    root, out = tmp_path / "ObjectNet3D", tmp_path / "out"
+    both = [pascal_object("car", viewpoint={"viewport": 2000.0}), pascal_object("ashtray")]
+    write_record(root / "Annotations" / "n1_1.mat", both)
+    write_record(root / "Annotations" / "n1_2.mat", [pascal_object("ashtray")])
+    write_record(root / "Annotations" / "n1_3.mat", [])
+    for i in (1, 2, 3):
+        write_image(root / "Images" / f"n1_{i}.jpg")
+        (root / "Images" / f"n1_{i}.jpg").rename(root / "Images" / f"n1_{i}.JPEG")
+    write_mesh(root / cad / "car" / "01.off")
+    write_mesh(root / cad / "ashtray" / "01.off")
+    (root / "Image_sets").mkdir()
+    (root / "Image_sets" / "val.txt").write_text("n1_1\nn1_2\nn1_3\n")
+    assert convert.main([str(root), str(out), "--splits", "val"]) == 0
+    assert convert.main([str(root), str(out), "--splits", "val"]) == 0, "running it again changes nothing"
+    dataset = Pascal3DPlus(out, part="imagenet")
+    found = [(s["category"], s["image_id"]) for s in map(dataset.annotation, range(len(dataset)))]
+    assert found == [("ashtray", "n1_1"), ("ashtray", "n1_2"), ("car", "n1_1")]
+    assert dataset[2]["camera_matrix"][0, 0] == 2000
+    (root / "Image_sets" / "val.txt").write_text("n1_1\nn1_9\n../n1_1\n")
+    assert convert.main([str(root), str(out), "--splits", "val"]) == 1
+    assert "2 missing_annotation, 1 placed" in capsys.readouterr().out
+    assert convert.main([str(tmp_path / "nothing"), str(out)]) == 2
+
+
+# --- download
+
+CONTENT = bytes(range(256)) * 40
+
+
+class Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.0"
+    content, cut, tag = CONTENT, None, '"v1"'
+    ranges: ClassVar[list[str | None]] = []
+
+    def do_GET(self):
+        cls = type(self)
+        begin, asked = 0, self.headers.get("Range")
+        cls.ranges.append(asked)
+        if asked and self.headers.get("If-Range") == cls.tag:
+            begin = int(asked.removeprefix("bytes=").removesuffix("-"))
+            if begin >= len(cls.content):
+                self.send_error(416)
+                return
+            self.send_response(206)
+            self.send_header("Content-Range", f"bytes {begin}-{len(cls.content) - 1}/{len(cls.content)}")
+        else:
+            self.send_response(200)
+        self.send_header("Content-Length", str(len(cls.content) - begin))
+        self.send_header("ETag", cls.tag)
+        self.end_headers()
+        self.wfile.write(cls.content[begin : cls.cut])
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def server():
+    handler = type("OwnHandler", (Handler,), {"ranges": []})
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as http:
+        thread = threading.Thread(target=http.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield handler, f"http://127.0.0.1:{http.server_address[1]}/set%20a.zip"
+        http.shutdown()
+        thread.join()
+
+
+def test_download_records_then_verifies(tmp_path, server, capsys):
+    handler, url = server
+    main = load("download").main
+    assert main([url, "--out", str(tmp_path / "new")]) == 0
+    assert (tmp_path / "new" / "set a.zip").read_bytes() == CONTENT
+    assert json.loads((tmp_path / "new" / "manifest.json").read_text()) == {
+        "set a.zip": {"url": url, "size": len(CONTENT), "sha256": hashlib.sha256(CONTENT).hexdigest()}
+    }
+    assert main([url, "--out", str(tmp_path / "new")]) == 0
+    assert len(handler.ranges) == 1, "the second run fetches nothing"
+    assert capsys.readouterr().out.splitlines() == ["set a.zip: downloaded", "set a.zip: verified"]
+    (tmp_path / "new" / "set a.zip").write_bytes(b"changed")
+    assert main([url, "--out", str(tmp_path / "new")]) == 1
+    assert "delete the file" in capsys.readouterr().err
+    assert sorted(p.name for p in (tmp_path / "new").iterdir()) == ["manifest.json", "set a.zip"]
+
+
+def test_download_resumes(tmp_path, server, capsys):
+    handler, url = server
+    main = load("download").main
+    handler.cut = 5000
+    assert main([url, "--out", str(tmp_path)]) == 1
+    assert "run again" in capsys.readouterr().err
+    handler.cut = None
+    assert main([url, "--out", str(tmp_path)]) == 0
+    assert handler.ranges == [None, "bytes=5000-"]
+    assert (tmp_path / "set a.zip").read_bytes() == CONTENT
+
+
+def test_download_starts_again_when_the_file_changed(tmp_path, server):
+    handler, url = server
+    main = load("download").main
+    handler.cut = 5000
+    assert main([url, "--out", str(tmp_path)]) == 1
+    handler.cut, handler.tag, handler.content = None, '"v2"', CONTENT[::-1]
+    assert main([url, "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "set a.zip").read_bytes() == CONTENT[::-1]
+
+
+def test_download_with_everything_but_the_name_done(tmp_path, server):
+    handler, url = server
+    (tmp_path / "set a.zip.part").write_bytes(CONTENT)
+    (tmp_path / "set a.zip.part.validator").write_text(handler.tag)
+    assert load("download").main([url, "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "set a.zip").read_bytes() == CONTENT
+
+
+def test_download_with_checksum(tmp_path, server, capsys):
+    _, url = server
+    main = load("download").main
+    assert main([url, "--out", str(tmp_path), "--sha256", "0" * 64]) == 1
+    assert "discarded" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    assert main([url, "--out", str(tmp_path), "--sha256", hashlib.sha256(CONTENT).hexdigest().upper()]) == 0
+
+
+@pytest.mark.parametrize("url", ["file:///etc/hostname", "https://host/", "plain"])
+def test_download_refuses_other_addresses(tmp_path, url, capsys):
+    assert load("download").main([url, "--out", str(tmp_path)]) == 1
+    assert "expected an http" in capsys.readouterr().err

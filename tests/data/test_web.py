@@ -1,0 +1,55 @@
+import pytest
+import torch
+
+from curvireg_torch.data import WebCollection
+from curvireg_torch.errors import InvalidInputError, MissingFileError
+from curvireg_torch.geometry import rotation_from_viewpoint
+from tests._support.miniature import write_mesh, write_web
+
+
+@pytest.fixture
+def tree(tmp_path):
+    return tmp_path, write_web(tmp_path)
+
+
+def test_counts_everything(tree):
+    root, reasons = tree
+    dataset = WebCollection(root)
+    assert len(dataset) == 4
+    assert dict(dataset.skipped) == reasons
+    assert dataset.skipped_items["missing_image"] == ["cup/views.csv #3"]
+
+
+def test_sample_with_pose(tree):
+    sample = WebCollection(tree[0])[0]
+    assert set(sample) == {
+        *("image", "image_path", "image_id", "box", "viewpoint", "rotation", "distance", "category", "mesh_path"),
+        "object_index",
+    }
+    assert sample["image"].shape == (3, 60, 80)
+    assert sample["box"].tolist() == [10, 5, 70, 55]
+    assert sample["viewpoint"].tolist() == [30, 10, -5]
+    torch.testing.assert_close(sample["rotation"], rotation_from_viewpoint(30.0, 10.0, -5.0))
+    assert sample["distance"] == 3
+    assert sample["category"] == "cup"
+    assert sample["mesh_path"].endswith("mesh.off")
+
+
+def test_samples_without_pose_or_theta(tree):
+    dataset = WebCollection(tree[0])
+    unknown, level = dataset.annotation(1), dataset.annotation(2)
+    assert unknown["viewpoint"].isnan().all()
+    assert unknown["rotation"].isnan().all()
+    assert level["viewpoint"].tolist() == [90, 0, 0]
+    assert level["rotation"].isfinite().all()
+    assert level["distance"] != level["distance"]
+
+
+def test_errors(tree, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for root in (tmp_path / "nothing", tmp_path / "empty"):
+        with pytest.raises(MissingFileError, match=r"datasets/web/README\.md"):
+            WebCollection(root)
+    write_mesh(tree[0] / "cup" / "mesh.ply")
+    with pytest.raises(InvalidInputError, match=r"one mesh.*mesh\.off, mesh\.ply"):
+        WebCollection(tree[0])
