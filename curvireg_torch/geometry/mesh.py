@@ -30,7 +30,7 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m") -> trimesh.Trimesh:
     Args:
         path: .obj, .ply, .stl, .off, .glb or .gltf.
         unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. An object that would be
-            smaller than 5 mm or larger than 100 m gets a warning: the unit is probably another.
+            smaller than 5 mm or larger than 100 m gets a warning.
 
     Returns:
         ``trimesh.Trimesh`` with (V, 3) float64 vertices and (F, 3) faces, degenerate faces removed.
@@ -69,7 +69,7 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m") -> trimesh.Trimesh:
 
 
 def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
-    """One clean mesh from a path, a ``trimesh.Trimesh`` or a ``trimesh.Scene``; see :func:`load_mesh` for the errors."""
+    """One clean mesh from a path, a ``trimesh.Trimesh`` or a ``trimesh.Scene``; errors as :func:`load_mesh`."""
     if isinstance(source, str | PathLike):
         return load_mesh(source)
     if isinstance(source, trimesh.Scene):
@@ -82,9 +82,8 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
         raise MeshError(f"{name}: faces name vertices that do not exist; the file is damaged, re-export it")
     used = vertices[faces]
     if not np.isfinite(used).all():
-        raise MeshError(
-            f"{name}: {int((~np.isfinite(used).all(axis=(1, 2))).sum())} faces have NaN or infinite vertices; repair the mesh"
-        )
+        broken = int((~np.isfinite(used).all(axis=(1, 2))).sum())
+        raise MeshError(f"{name}: {broken} faces have NaN or infinite vertices; repair the mesh")
     area = np.linalg.norm(np.cross(used[:, 1] - used[:, 0], used[:, 2] - used[:, 0]), axis=1)
     if not (area > 0).any():
         raise MeshError(f"{name}: every face is degenerate (area 0); repair the mesh")
@@ -107,9 +106,9 @@ def mesh_radius(mesh: trimesh.Trimesh) -> float:
 def normalization_transform(mesh: trimesh.Trimesh, *, align_axes: bool = False) -> Tensor:
     """Similarity that brings a mesh into a normalised frame; its inverse brings poses back.
 
-    The area-weighted centroid goes to the origin and the farthest vertex to distance 1. With ``align_axes`` (the paper's
-    normalisation) the principal axes of the surface go to x, y, z in decreasing order of variance. An axis's sign is
-    such that the surface's third moment along it is positive for x and y; z completes a right-handed frame.
+    The area-weighted centroid goes to the origin and the farthest vertex to distance 1. With ``align_axes`` (the
+    paper's normalisation) the principal axes of the surface go to x, y, z in decreasing order of variance. An axis's
+    sign is such that the surface's third moment along it is positive for x and y; z completes a right-handed frame.
 
     Returns:
         (4, 4) float64 ``T_normalized_from_model``; ``torch.linalg.inv`` of it is the way back.

@@ -44,7 +44,7 @@ def make_renderer(mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto") 
     """A renderer of ``mesh``.
 
     ``"embree"`` casts rays on the CPU and needs nothing but its wheel; ``"pyrender"`` draws through OpenGL and needs a
-    system with EGL. ``"auto"`` takes embree where it is installed (on a CPU it is the faster of the two), else pyrender.
+    system with EGL. ``"auto"`` takes embree where it is installed (the faster of the two on a CPU), else pyrender.
 
     Raises:
         RenderingError, MissingDependencyError: the backend does not work here.

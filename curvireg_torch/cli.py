@@ -1,0 +1,261 @@
+"""``curvireg``: register a photograph, build a bank, run the demo."""
+
+import argparse
+import json
+import platform
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from . import __version__
+from .data import read_image
+from .errors import CurviregError, InvalidInputError
+from .geometry import camera_matrix, load_mesh, rotation_error, sample_views, uniform_views, whole_image_box
+from .geometry.mesh import UNITS
+from .geometry.views import ViewSphere
+from .matching import BankSettings, ViewBank, cached_bank
+from .registration import Registrar, Registration
+from .rendering import BACKENDS
+
+__all__ = ["main"]
+
+CONVENTIONS = {
+    "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
+    "translation": "in the mesh file's unit; null without --camera",
+    "viewpoint": "PASCAL3D+ azimuth, elevation, theta in degrees",
+    "pixels": "(0, 0) is the centre of the top-left pixel; boxes are x0, y0, x1, y1",
+    "score": "normalised correlation of photograph and view, 0 to 1",
+    "confidence": "share of the ranking's mass within 30 degrees of the best view, 0 to 1",
+}
+
+
+def pose_views(name: str) -> ViewSphere:
+    """The view sets behind ``--pose``."""
+    if name == "upright":
+        return sample_views()
+    return uniform_views(300, thetas=range(0, 360, 15))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code: 0, or 2 for input that cannot be used."""
+    arguments = _parser().parse_args(argv)
+    with warnings.catch_warnings():
+        if not arguments.debug:
+            warnings.showwarning = _show_warning
+        try:
+            arguments.run(arguments)
+        except CurviregError as error:
+            if arguments.debug:
+                raise
+            print(f"curvireg: error: {error}", file=sys.stderr)
+            return 2
+        except KeyboardInterrupt:
+            print("curvireg: interrupted", file=sys.stderr)
+            return 130
+    return 0
+
+
+def _show_warning(message: Any, *_: Any, **__: Any) -> None:
+    print(f"curvireg: warning: {message}", file=sys.stderr)
+
+
+def _parser() -> argparse.ArgumentParser:
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--debug", action="store_true", help="show tracebacks")
+    common.add_argument("--quiet", action="store_true", help="no progress bars")
+    common.add_argument("--renderer", choices=BACKENDS, default="auto", help="default: auto")
+    parser = argparse.ArgumentParser(prog="curvireg", description="Pose of a known 3D object from one photograph.")
+    parser.add_argument("--version", action="version", version=f"curvireg_torch {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    mesh_options = argparse.ArgumentParser(add_help=False)
+    mesh_options.add_argument("--unit", choices=sorted(UNITS), default="m", help="the mesh file's unit (default: m)")
+    mesh_options.add_argument(
+        "--pose",
+        choices=("any", "upright"),
+        default="any",
+        help="any: no assumption. upright: the mesh's z axis points up in the photograph and the object is not seen "
+        "from below; faster, and right more often where it is true (default: any)",
+    )
+    mesh_options.add_argument("--image-size", type=int, default=128, metavar="PX", help="side of crops (default: 128)")
+
+    register = commands.add_parser(
+        "register", parents=[common, mesh_options], help="find the pose of MESH in PHOTO",
+        description="Writes DIR/result.json and DIR/overlay.png.",
+    )  # fmt: skip
+    register.add_argument("photo", type=Path, metavar="PHOTO")
+    register.add_argument("mesh", type=Path, metavar="MESH", help="a mesh (.obj .ply .stl .off .glb) or a bank")
+    register.add_argument(
+        "--box", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help="px; default: the whole image"
+    )
+    register.add_argument(
+        "--camera", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="px; gives the translation"
+    )
+    register.add_argument("--top", type=int, default=5, metavar="K", help="hypotheses to report (default: 5)")
+    register.add_argument("--no-refine", action="store_true", help="stop at the best view of the bank")
+    register.add_argument("--out", type=Path, required=True, metavar="DIR")
+    register.set_defaults(run=_register)
+
+    bank = commands.add_parser("bank", parents=[common, mesh_options], help="render and describe the views of MESH")
+    bank.add_argument("mesh", type=Path, metavar="MESH")
+    bank.add_argument("--out", type=Path, required=True, metavar="FILE")
+    bank.set_defaults(run=_bank)
+
+    demo = commands.add_parser("demo", parents=[common], help="register a scene made in code, where the truth is known")
+    demo.add_argument("--seed", type=int, default=0)
+    demo.add_argument("--out", type=Path, required=True, metavar="DIR")
+    demo.set_defaults(run=_demo)
+    return parser
+
+
+def _bank(arguments: argparse.Namespace) -> None:
+    start = time.perf_counter()
+    mesh = load_mesh(arguments.mesh, unit=arguments.unit)
+    bank = ViewBank.build(
+        mesh,
+        pose_views(arguments.pose),
+        settings=BankSettings(image_size=arguments.image_size),
+        renderer=arguments.renderer,
+        progress=not arguments.quiet,
+    )
+    bank.save(arguments.out)
+    size = arguments.out.stat().st_size / 1e6
+    print(f"{arguments.out}: {len(bank)} views, {size:.1f} MB, {time.perf_counter() - start:.1f} s")
+
+
+def _open_bank(arguments: argparse.Namespace) -> ViewBank:
+    if arguments.mesh.suffix == ".safetensors":
+        return ViewBank.load(arguments.mesh)
+    return cached_bank(
+        load_mesh(arguments.mesh, unit=arguments.unit),
+        pose_views(arguments.pose),
+        BankSettings(image_size=arguments.image_size),
+        renderer=arguments.renderer,
+        progress=not arguments.quiet,
+    )
+
+
+def _register(arguments: argparse.Namespace) -> None:
+    times = {"start": time.perf_counter()}
+    image = read_image(arguments.photo)
+    box = whole_image_box(image) if arguments.box is None else torch.tensor(arguments.box)
+    K = None if arguments.camera is None else camera_matrix(*arguments.camera, dtype=torch.float64)
+    if arguments.top < 1:
+        raise InvalidInputError(f"--top: expected >= 1, got {arguments.top}")
+    bank = _open_bank(arguments)
+    times["bank"] = time.perf_counter()
+    registrar = Registrar(bank, refine=not arguments.no_refine, renderer=arguments.renderer, top=arguments.top)
+    try:
+        result = registrar([image], box[None], K)[0]
+    except CurviregError as error:
+        raise type(error)(f"{arguments.photo}: {error}") from error
+    times["register"] = time.perf_counter()
+    document = _document(result, registrar, times)
+    document["inputs"] = {"photo": str(arguments.photo), "mesh": str(arguments.mesh), "box": box.tolist()}
+    _write(arguments.out, document, registrar, result, image, box, K)
+    _print_result(document, arguments.out)
+
+
+def _demo(arguments: argparse.Namespace) -> None:
+    from .synthetic import example_mesh, random_pose, synthesize_photograph
+
+    times = {"start": time.perf_counter()}
+    generator = torch.Generator().manual_seed(arguments.seed)
+    mesh, size = example_mesh(), (360, 480)
+    K = camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
+    truth = random_pose(mesh, K, size, generator)
+    image, box = synthesize_photograph(mesh, truth, K, size, generator)
+    bank = cached_bank(mesh, sample_views(), BankSettings(), renderer=arguments.renderer, progress=not arguments.quiet)
+    times["bank"] = time.perf_counter()
+    registrar = Registrar(bank, renderer=arguments.renderer)
+    result = registrar([image], box[None], K)[0]
+    times["register"] = time.perf_counter()
+    document = _document(result, registrar, times)
+    assert result.translation is not None
+    document["rotation_error_deg"] = float(rotation_error(result.rotation, truth[:3, :3]))
+    document["translation_error"] = float((result.translation - truth[:3, 3]).norm() / truth[:3, 3].norm())
+    document["truth"] = {"rotation": truth[:3, :3].tolist(), "translation": truth[:3, 3].tolist()}
+    document["inputs"] = {"seed": arguments.seed, "box": box.tolist()}
+    _write(arguments.out, document, registrar, result, image, box, K)
+    mesh.export(arguments.out / "mesh.ply")
+    _write_picture(arguments.out / "photo.png", (image.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
+    _print_result(document, arguments.out)
+    print(
+        f"error against the truth: rotation {document['rotation_error_deg']:.1f} degrees, "
+        f"translation {100 * document['translation_error']:.1f} % of the distance"
+    )
+
+
+def _document(result: Registration, registrar: Registrar, times: dict[str, float]) -> dict[str, Any]:
+    bank = registrar.bank
+    top = [
+        {
+            "view": int(v),
+            "score": float(result.ranking.scores[0, v]),
+            "hog": float(result.ranking.hog[0, v]),
+            "repeatability": float(result.ranking.repeatability[0, v]),
+            "viewpoint": [float(getattr(bank.views, name)[v]) for name in ("azimuth", "elevation", "theta")],
+        }
+        for v in result.candidates.tolist()
+    ]
+    import kornia
+    import trimesh
+
+    return {
+        "rotation": result.rotation.tolist(),
+        "translation": None if result.translation is None else result.translation.tolist(),
+        "unit": bank.mesh.units,
+        "viewpoint": dict(zip(("azimuth", "elevation", "theta"), result.viewpoint, strict=True)),
+        "score": result.score,
+        "confidence": result.confidence,
+        "top": top,
+        "refinement_rounds": result.iterations,
+        "views": len(bank),
+        "seconds": {"bank": times["bank"] - times["start"], "register": times["register"] - times["bank"]},
+        "versions": {
+            "curvireg_torch": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "kornia": kornia.__version__,
+            "trimesh": trimesh.__version__,
+        },
+        "conventions": CONVENTIONS,
+    }
+
+
+def _write(out: Path, document: dict[str, Any], registrar: Registrar, result: Registration, *scene: Any) -> None:
+    from .visualization import registration_sheet
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "result.json").write_text(json.dumps(document, indent=2) + "\n")
+    except OSError as error:
+        raise InvalidInputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from error
+    _write_picture(out / "overlay.png", registration_sheet(registrar, result, *scene))
+
+
+def _write_picture(path: Path, picture: np.ndarray) -> None:
+    if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
+        raise InvalidInputError(f"{path}: cannot be written; choose another --out")
+
+
+def _print_result(document: dict[str, Any], out: Path) -> None:
+    angles = ", ".join(f"{name} {value:.1f}" for name, value in document["viewpoint"].items())
+    seconds = document["seconds"]
+    print(f"viewpoint: {angles} degrees   score {document['score']:.3f}   confidence {document['confidence']:.2f}")
+    if document["translation"] is not None:
+        print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")
+    print(
+        f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; written: {out}/result.json, overlay.png"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

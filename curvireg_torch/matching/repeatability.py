@@ -1,0 +1,82 @@
+"""Repeatability of feature points between a photograph and every view, as one matrix product."""
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from .._checks import check_option, check_positive
+from ..errors import InvalidInputError
+
+__all__ = ["dilate_points", "repeatability", "repeatability_score"]
+
+MODES = ("monotone", "paper")
+
+
+def dilate_points(points: Tensor, eps: float) -> Tensor:
+    """Pixels within ``eps`` px (Euclidean) of a point.
+
+    Args:
+        points: (N, H, W) bool.
+        eps: px, >= 0.
+
+    Returns:
+        (N, H, W) bool.
+    """
+    check_positive(eps, "eps", zero_ok=True)
+    radius = int(eps)
+    if radius == 0:
+        return points
+    offsets = np.arange(-radius, radius + 1)
+    disc = (offsets[:, None] ** 2 + offsets**2 <= eps**2).astype(np.uint8)
+    planes = points.cpu().numpy().view(np.uint8)
+    dilated = np.stack([cv2.dilate(plane, disc) for plane in planes]) if len(planes) else planes
+    return torch.from_numpy(dilated.view(bool)).to(points.device)
+
+
+def repeatability(query_points: Tensor, dilated_view_points: Tensor) -> Tensor:
+    """Share of each query's points that have a view's point within eps (the paper's Rep, view -> query).
+
+    Args:
+        query_points: (B, H, W) bool, or the number of points in cells of px.
+        dilated_view_points: (N, H, W) bool, from :func:`dilate_points`, or the share of cells within eps of a point.
+
+    Returns:
+        (B, N) float32 in [0, 1]; 0 for a query without points.
+
+    Example:
+        >>> query = torch.zeros(1, 8, 8, dtype=torch.bool); query[0, 2, 2] = query[0, 6, 6] = True
+        >>> view = torch.zeros(1, 8, 8, dtype=torch.bool); view[0, 2, 3] = True
+        >>> repeatability(query, dilate_points(view, 1)).tolist()
+        [[0.5]]
+    """
+    if query_points.shape[1:] != dilated_view_points.shape[1:]:
+        raise InvalidInputError(
+            f"query_points: expected shape (B, {', '.join(map(str, dilated_view_points.shape[1:]))}), "
+            f"got {tuple(query_points.shape)}"
+        )
+    queries = query_points.flatten(1).float()
+    found = queries @ dilated_view_points.flatten(1).float().T
+    return found / queries.sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+
+
+def repeatability_score(rep: Tensor, *, mode: str = "monotone", sigma: float = 0.1) -> Tensor:
+    r"""S_rep in (0, 1] from repeatabilities, per query, with :math:`R = 1 - Rep`.
+
+    - ``"monotone"``: :math:`\exp(-(R - \min R)^2 / (2\sigma^2))`: the most repeatable view scores 1;
+    - ``"paper"``: :math:`\exp(-(R - \mathrm{mean} R)^2 / (2\sigma^2))`, which favours average views.
+
+    Args:
+        rep: (B, N) in [0, 1].
+        mode: "monotone" or "paper".
+        sigma: the paper's :math:`\sigma_r`.
+
+    Example:
+        >>> repeatability_score(torch.tensor([[0.5, 0.4]]))[0].tolist()[0]
+        1.0
+    """
+    check_option(mode, MODES, "mode")
+    check_positive(sigma, "sigma")
+    R = 1.0 - rep
+    centre = R.amin(dim=1, keepdim=True) if mode == "monotone" else R.mean(dim=1, keepdim=True)
+    return torch.exp(-(R - centre).square() / (2.0 * sigma**2))

@@ -1,0 +1,165 @@
+"""The facade that joins it all: photographs, boxes and a mesh to poses."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..errors import ImageError, InvalidInputError
+from ..geometry.cameras import check_camera_matrix
+from ..geometry.mesh import mesh_radius
+from ..geometry.poses import pose_from_box
+from ..geometry.views import ViewSphere, sample_views
+from ..matching import BankSettings, QueryFeatures, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
+from .confidence import confidence, distinct_views
+from .pose import Registration
+from .refine import RefinedPose, coherent_views, refine_pose
+
+__all__ = ["Registrar"]
+
+_FLAT = 1.0 / 255.0
+
+
+class Registrar:
+    """Registers photographs to one mesh.
+
+    Each box is cropped, turned into a field and ranked against the bank; coherent views around the best are searched in
+    small steps. With a camera matrix the box then gives the translation.
+
+    Args:
+        bank_or_mesh: a :class:`ViewBank`, a mesh, or the path of a mesh; for a mesh the bank comes from the disk cache
+            or is built.
+        views, settings: of the bank built for a mesh.
+        field: photograph filter, see :class:`ViewMatcher`.
+        refine: run the coarse-to-fine search.
+        renderer: of the views rendered in it.
+        top: distinct hypotheses to report.
+        progress: show bars.
+
+    Example:
+        >>> import trimesh
+        >>> bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), sample_views(azimuth_step=45, elevations=[20]),
+        ...                       image_size=64, progress=False)
+        >>> result = Registrar(bank, refine=False)(torch.rand(1, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30]]))[0]
+        >>> result.rotation.shape, result.translation
+        (torch.Size([3, 3]), None)
+    """
+
+    def __init__(
+        self,
+        bank_or_mesh: Any,
+        *,
+        views: ViewSphere | None = None,
+        settings: BankSettings | None = None,
+        field: nn.Module | None = None,
+        refine: bool = True,
+        renderer: str = "auto",
+        top: int = 5,
+        progress: bool = False,
+    ) -> None:
+        if isinstance(bank_or_mesh, ViewBank):
+            if views is not None or settings is not None:
+                raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
+            self.bank = bank_or_mesh
+        else:
+            self.bank = cached_bank(
+                bank_or_mesh, views or sample_views(), settings or BankSettings(), progress=progress, renderer=renderer
+            )
+        self.matcher = ViewMatcher(self.bank, field=field)
+        self.refine, self.top = refine, top
+        self._renderer = renderer
+        self._describer: ViewDescriber | None = None
+        self._radius = mesh_radius(self.bank.mesh)
+
+    @property
+    def describe(self) -> ViewDescriber:
+        """Renders further views of the bank's mesh, made on first use."""
+        if self._describer is None:
+            self._describer = ViewDescriber(
+                self.bank.mesh, self.bank.settings, renderer=self._renderer, device=self.bank.device
+            )
+        return self._describer
+
+    @torch.no_grad()
+    def __call__(
+        self, images: Tensor | Sequence[Tensor], boxes: Tensor, camera_matrices: Tensor | None = None
+    ) -> list[Registration]:
+        """Register a batch.
+
+        Args:
+            images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, in [0, 1].
+            boxes: (B, 4) x0, y0, x1, y1 in px.
+            camera_matrices: (B, 3, 3) or (3, 3) in px; without them translations are None and rotations are relative to
+                a camera that looks straight at the box.
+
+        Raises:
+            InvalidInputError: wrong shapes, an unusable box or camera matrix.
+            ImageError: a box that shows one colour.
+        """
+        if camera_matrices is not None:
+            check_camera_matrix(camera_matrices)
+            if camera_matrices.ndim == 3 and len(camera_matrices) not in (1, len(images)):
+                raise InvalidInputError(
+                    f"camera_matrices: expected one or {len(images)} matrices, got {len(camera_matrices)}"
+                )
+            camera_matrices = camera_matrices.expand(len(images), 3, 3)
+        results: list[Registration] = []
+        for i in range(0, len(images), self.matcher.chunk_size):
+            chunk = slice(i, i + self.matcher.chunk_size)
+            crops = self.matcher.crop(images[chunk], boxes[chunk])[0]
+            contrast = crops.amax(dim=(1, 2, 3)) - crops.amin(dim=(1, 2, 3))
+            if bool((contrast < _FLAT).any()):
+                flat = i + int((contrast < _FLAT).nonzero()[0])
+                raise ImageError(f"image {flat}: the box shows one colour, nothing to register; check image and box")
+            query = self.matcher.features(crops)
+            ranking = self.matcher.rank(query)
+            trust = confidence(ranking.scores, self.bank.rotations)
+            for k in range(len(crops)):
+                K = None if camera_matrices is None else camera_matrices[i + k]
+                results.append(self._register(query[k : k + 1], ranking[k : k + 1], float(trust[k]), boxes[i + k], K))
+        return results
+
+    def _register(
+        self, query: QueryFeatures, ranking: Ranking, trust: float, box: Tensor, K: Tensor | None
+    ) -> Registration:
+        bank, order = self.bank, ranking.order[0]
+        best = int(order[0])
+        distance = float(bank.views.distance[best]) * self._radius
+        if self.refine:
+            start = coherent_views(bank.rotations, order)
+            pose = refine_pose(
+                self.describe,
+                query,
+                bank.rotations[start].cpu(),
+                distance=distance,
+                radius=self._radius,
+                box=box,
+                camera_matrix=K,
+            )
+        else:
+            pose = RefinedPose(bank.rotations[best].double().cpu(), distance, float(ranking.hog[0, best]), 0)
+        rotation, translation = pose.rotation, None
+        if K is not None:
+            rotation, translation = self._place(pose, box, K)
+        return Registration(
+            rotation=rotation,
+            translation=translation,
+            score=pose.score,
+            confidence=trust,
+            ranking=ranking,
+            candidates=distinct_views(order, bank.rotations, count=self.top),
+            view_rotation=pose.rotation,
+            view_distance=pose.distance,
+            iterations=pose.iterations,
+        )
+
+    def _place(self, pose: RefinedPose, box: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+        """Rotation and translation in the photograph's camera."""
+        distance = torch.tensor(pose.distance, dtype=torch.float64)
+        _, _, view_box = self.describe.cameras(pose.rotation[None], distance[None])
+        if self.bank.settings.camera == "orthographic":
+            view_box = view_box / distance
+        return pose_from_box(
+            pose.rotation, self.describe.centre, view_box[0], distance, box.double().cpu(), K.double().cpu()
+        )
