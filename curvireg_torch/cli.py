@@ -252,9 +252,7 @@ def _print_result(document: dict[str, Any], out: Path) -> None:
     print(f"viewpoint: {angles} degrees   score {document['score']:.3f}   confidence {document['confidence']:.2f}")
     if document["translation"] is not None:
         print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")
-    print(
-        f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; written: {out}/result.json, overlay.png"
-    )
+    print(f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see {out}/overlay.png")
 
 
 if __name__ == "__main__":

@@ -29,8 +29,8 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m") -> trimesh.Trimesh:
 
     Args:
         path: .obj, .ply, .stl, .off, .glb or .gltf.
-        unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. An object that would be
-            smaller than 5 mm or larger than 100 m gets a warning.
+        unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. An object that would
+            be smaller than 5 mm or larger than 100 m gets a warning.
 
     Returns:
         ``trimesh.Trimesh`` with (V, 3) float64 vertices and (F, 3) faces, degenerate faces removed.
@@ -62,7 +62,7 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m") -> trimesh.Trimesh:
     size = float(np.linalg.norm(mesh.extents)) * UNITS[unit]
     if not 0.005 <= size <= 100.0:
         warnings.warn(
-            f"{path}: in unit {unit!r} the object measures {size:g} m across; if that is wrong, give the file's unit (mm?)",
+            f"{path}: in unit {unit!r} the object is {size:g} m across; if that is wrong, give the unit (mm?)",
             stacklevel=2,
         )
     return mesh

@@ -61,7 +61,7 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
     Returns:
         azimuth in [0, 360), elevation in [-90, 90], theta in [-180, 180), degrees, each of shape (...). Looking
-        straight down or up (elevation +-90) azimuth and theta are not separable: theta is 0 and azimuth carries the turn.
+        straight down or up (elevation +-90) azimuth and theta are not separable: theta is 0, azimuth carries the turn.
 
     Example:
         >>> a, e, t = viewpoint_from_rotation(rotation_from_viewpoint(30.0, 20.0, -10.0))

@@ -11,9 +11,9 @@ __all__ = ["confidence", "distinct_views"]
 def confidence(scores: Tensor, rotations: Tensor, *, angle: float = 30.0, sharpness: float = 4.0) -> Tensor:
     """Share of the score's mass that lies around the best view.
 
-    ``sum of scores^sharpness over views within angle of the best / sum over all views``. A ranking with one sharp
-    peak tends to 1; one that cannot tell views apart tends to the share of views near any view. It says how clearly the views
-    differ, not that the object is in the box.
+    The sum of scores^sharpness over the views within ``angle`` of the best, divided by that over all views. A ranking
+    with one sharp peak tends to 1; one that cannot tell views apart tends to the share of views near any view. It says
+    how clearly the views differ, not that the object is in the box.
 
     Args:
         scores: (B, N) in [0, 1].
