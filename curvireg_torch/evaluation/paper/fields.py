@@ -54,8 +54,8 @@ def photo_detectors(point_share: float) -> dict[str, Callable[[Tensor], Tensor]]
         field = make()
         return lambda image: field_points(field(image), share=point_share)[:, 0]
 
-    def of_detector(detect: Callable[[Tensor], Any]) -> Callable[[Tensor], Tensor]:
-        return lambda image: detect(image).points[:, 0]
+    def of_detector(detect: Callable[..., Any]) -> Callable[[Tensor], Tensor]:
+        return lambda image: detect(image, share=point_share).points[:, 0]
 
     found = {name: of_field(make) for name, make in PHOTO_FIELDS.items()}
     known = {name.lower() for name in found}
