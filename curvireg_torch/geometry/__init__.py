@@ -12,7 +12,7 @@ Conventions of the whole library (pinned by ``tests/geometry``):
 from .cameras import camera_matrix, project_points, projected_boxes, rotation_towards, transform
 from .crops import crop_images, crop_transforms, square_boxes, whole_image_box
 from .mesh import load_mesh, mesh_centre, mesh_radius, normalization_transform
-from .poses import pose_from_box
+from .translation import place_view, translation_from_box
 from .viewpoint import rotation_error, rotation_from_viewpoint, viewpoint_from_rotation
 from .views import ViewSphere, sample_views, uniform_views
 
@@ -25,7 +25,7 @@ __all__ = [
     "mesh_centre",
     "mesh_radius",
     "normalization_transform",
-    "pose_from_box",
+    "place_view",
     "project_points",
     "projected_boxes",
     "rotation_error",
@@ -34,6 +34,7 @@ __all__ = [
     "sample_views",
     "square_boxes",
     "transform",
+    "translation_from_box",
     "uniform_views",
     "viewpoint_from_rotation",
     "whole_image_box",
