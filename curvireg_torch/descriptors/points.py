@@ -38,19 +38,23 @@ def field_points(field: Tensor, *, share: float = 0.04, threshold: float = 0.0, 
         [0, 0, 0, 0, 9, 0, 0, 0, 0]
     """
     check_field(field)
-    if not 0 < share <= 1:
-        raise InvalidInputError(f"share: expected 0 < share <= 1, got {share}")
     if not threshold >= 0:
         raise InvalidInputError(f"threshold: expected >= 0, got {threshold}")
-    B, _, H, W = field.shape
     x, y = at_least_float32(field).split(1, dim=1)
     length = safe_sqrt(x * x + y * y)
     candidates = length > threshold
     if suppress:
         candidates = candidates & is_ridge(length, x, y)
-    kept = torch.where(candidates, length, torch.zeros_like(length)).flatten(1)
+    return strongest_points(length, candidates, share)
+
+
+def strongest_points(response: Tensor, candidates: Tensor, share: float) -> Tensor:
+    """Of the candidates (B, 1, H, W) those of largest response > 0, up to ``share`` of each image's pixels."""
+    if not 0 < share <= 1:
+        raise InvalidInputError(f"share: expected 0 < share <= 1, got {share}")
+    B, _, H, W = response.shape
     if B == 0:
         return candidates
-    k = max(1, int(share * H * W))
-    limit = kept.topk(k, dim=1).values[:, -1]
-    return candidates & (length >= limit.view(B, 1, 1, 1))
+    kept = torch.where(candidates, response, 0.0).flatten(1)
+    limit = kept.topk(max(1, int(share * H * W)), dim=1).values[:, -1]
+    return candidates & (response > 0) & (response >= limit.view(B, 1, 1, 1))
