@@ -1,7 +1,7 @@
 """Times the path from mesh to pose: build a bank, open it from disk, register one photograph.
 
-Prints a table and writes scripts/results/bench_pipeline.json. The mesh is a sphere with dents, made in code, so that the
-number of faces can be chosen.
+Prints a table and writes scripts/results/bench_pipeline.json. The mesh is a sphere with dents, made in code, so that
+the number of faces can be chosen.
 """
 
 import argparse

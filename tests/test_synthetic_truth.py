@@ -1,4 +1,4 @@
-"""Scenes with known truth: real meshes before real backgrounds, random texture and light (the main job's acceptance)."""
+"""Scenes with known truth: real meshes before real backgrounds, with random texture and light."""
 
 import pytest
 import torch

@@ -101,7 +101,7 @@ def multiscale_focus_curves(
     scales: int = 5,
     sigma: float | Tensor = 1.0,
     mode: str = "reblur-image",
-    saliency_weight: bool = True,
+    saliency_weight: float = 1.0,
     threshold: float | None = None,
 ) -> Tensor:
     r"""MFC: edges in focus (the paper's section "Multi Focus Curves"), with the sharpest edges longest.
@@ -116,11 +116,12 @@ def multiscale_focus_curves(
         scales: n >= 2.
         sigma: smoothing in px before everything else.
         mode: of :func:`edge_blur`.
-        saliency_weight: multiply the focus by :math:`\sqrt{CS} = |\nabla I|`; ranks views better than the focus alone.
+        saliency_weight: p >= 0: the focus is multiplied by :math:`CS^p`. 0 is the focus alone, 0.5 multiplies by
+            :math:`|\nabla I|`; 1 ranks the views of real photographs best.
         threshold: T >= 0 in 1/px; None is the paper's :math:`e^{-n}`.
 
     Returns:
-        (B, 2, H, W) focus in 1/px (times grey levels per px with ``saliency_weight``) along the gradient. dtype kept.
+        (B, 2, H, W) focus in 1/px, times CS^p in (grey levels per px)^2p, along the gradient. dtype kept.
 
     Raises:
         InvalidInputError: wrong shape, dtype or option.
@@ -133,6 +134,7 @@ def multiscale_focus_curves(
     check_option(mode, MODES, "mode")
     if scales < 2:
         raise InvalidInputError(f"scales: expected >= 2, got {scales}")
+    check_positive(saliency_weight, "saliency_weight", zero_ok=True)
     limit = math.exp(-scales) if threshold is None else threshold
 
     def layer(image: Tensor) -> Tensor:
@@ -143,10 +145,8 @@ def multiscale_focus_curves(
         # Sub-pixel blur is not measurable: it counts as the derivative kernel's own.
         focus = 1.0 / blur.clamp(min=_DIFFERENCE_VARIANCE**0.5)
         kept = (focus > limit) & (saliency > _EDGE_FLOOR * image_maximum(saliency))
-        value = torch.where(kept, focus, 0.0)
-        if saliency_weight:
-            value = value * safe_sqrt(saliency)
-        return value * unit_vector(gx, gy)
+        weight = torch.where(kept, saliency, 1.0) ** saliency_weight
+        return torch.where(kept, focus * weight, 0.0) * unit_vector(gx, gy)
 
     return in_blocks(layer, at_least_float32(image)).to(image.dtype)
 
@@ -175,7 +175,7 @@ class MultiScaleFocusCurves(nn.Module):
         scales: int = 5,
         sigma: float = 1.0,
         mode: str = "reblur-image",
-        saliency_weight: bool = True,
+        saliency_weight: float = 1.0,
         threshold: float | None = None,
         learnable: bool = False,
     ) -> None:
