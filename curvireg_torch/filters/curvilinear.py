@@ -117,6 +117,8 @@ def _graph_saliency(z: Tensor, formula: str) -> Tensor:
     cut.
     """
     B, _, H, W = z.shape
+    if B == 0:
+        return z.expand(0, 2, H, W)
     padded = replicate_pad(z, 1).reshape(-1)
     width = W + 2
     inner = padded.numel() - 2 * (width + 1)

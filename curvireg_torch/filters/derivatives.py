@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 import torch.nn.functional as F
@@ -40,8 +41,9 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
     # One group per plane: on a CPU some 25 times faster than a batch of one-channel convolutions.
     planes = replicate_pad(x, radius).reshape(1, B * C, H + 2 * radius, W + 2 * radius)
     rows = kernel.view(1, 1, 1, -1).expand(B * C, 1, -1, -1)
-    planes = F.conv2d(planes, rows, groups=B * C)
-    return F.conv2d(planes, rows.mT, groups=B * C).view(B, C, H, W)
+    with full_precision(x):
+        planes = F.conv2d(planes, rows, groups=B * C)
+        return F.conv2d(planes, rows.mT, groups=B * C).view(B, C, H, W)
 
 
 def _shifted_sum(x: Tensor, kernel: Tensor, dim: int) -> Tensor:
@@ -107,6 +109,12 @@ def safe_sqrt(x: Tensor) -> Tensor:
     """sqrt of max(x, 0) whose gradient is 0, not inf, where x <= 0."""
     tiny: float = torch.finfo(x.dtype).tiny
     return x.clamp(min=tiny).sqrt() - math.sqrt(tiny)
+
+
+def full_precision(x: Tensor) -> AbstractContextManager[object]:
+    """Switches autocast off: convolutions in bfloat16 would leave nothing of a second derivative."""
+    kind = x.device.type
+    return torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext()
 
 
 def at_least_float32(x: Tensor) -> Tensor:
