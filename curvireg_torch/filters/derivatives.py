@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .._checks import check_image, check_positive
-from .learnable import parameter_if
+from .learnable import as_number, parameter_if
 
 __all__ = ["ImageGradient", "gaussian_smooth", "image_gradient"]
 
@@ -26,7 +26,7 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
         >>> gaussian_smooth(torch.ones(1, 1, 5, 5), 1.0).shape
         torch.Size([1, 1, 5, 5])
     """
-    value = float(sigma)
+    value = float(sigma.detach()) if isinstance(sigma, Tensor) else sigma
     check_positive(value, "sigma", zero_ok=True)
     radius = math.ceil(4.0 * value)
     if radius == 0:
@@ -161,4 +161,4 @@ class ImageGradient(nn.Module):
         return image_gradient(image, sigma=self.sigma)
 
     def extra_repr(self) -> str:
-        return f"sigma={float(self.sigma)}"
+        return f"sigma={as_number(self.sigma)}"

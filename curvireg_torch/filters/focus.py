@@ -10,7 +10,7 @@ from .._checks import check_image, check_option, check_positive
 from ..errors import InvalidInputError
 from .curvilinear import unit_vector
 from .derivatives import at_least_float32, central_gradient, gaussian_smooth, image_maximum, in_blocks, safe_sqrt
-from .learnable import parameter_if
+from .learnable import as_number, parameter_if
 
 __all__ = ["EdgeBlur", "MultiScaleFocusCurves", "edge_blur", "multiscale_focus_curves"]
 
@@ -197,6 +197,6 @@ class MultiScaleFocusCurves(nn.Module):
 
     def extra_repr(self) -> str:
         return (
-            f"scales={self.scales}, sigma={float(self.sigma)}, mode={self.mode!r}, "
+            f"scales={self.scales}, sigma={as_number(self.sigma)}, mode={self.mode!r}, "
             f"saliency_weight={self.saliency_weight}, threshold={self.threshold}"
         )
