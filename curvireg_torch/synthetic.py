@@ -2,13 +2,16 @@
 
 import math
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 import trimesh
 from torch import Tensor
 
-from .geometry.cameras import transform
+from .errors import InvalidInputError
+from .filters import gaussian_smooth
+from .geometry.cameras import rotation_towards, transform
+from .geometry.mesh import mesh_centre, mesh_radius
+from .geometry.viewpoint import rotation_from_viewpoint
 from .rendering import render_depth
 
 __all__ = ["example_mesh", "procedural_background", "random_pose", "synthesize_photograph"]
@@ -42,7 +45,9 @@ def procedural_background(size: tuple[int, int], generator: torch.Generator) -> 
     for octave in range(1, 7):
         cells = 2**octave
         noise = torch.rand(1, 3, cells + 1, cells + 1, generator=generator) - 0.5
-        picture += F.interpolate(noise, (H, W), mode="bicubic", align_corners=True) / octave**1.5
+        grey = noise.mean(dim=1, keepdim=True)
+        noise = 1.5 * grey + 0.4 * (noise - grey)
+        picture += F.interpolate(noise, (H, W), mode="bicubic", align_corners=True) / octave**1.2
     y, x = torch.meshgrid(torch.linspace(-1, 1, H), torch.linspace(-1, 1, W), indexing="ij")
     for _ in range(6):
         angle, offset, width, *colour = torch.rand(6, generator=generator).tolist()
@@ -62,10 +67,6 @@ def random_pose(
     fill: tuple[float, float] = (0.4, 0.7),
 ) -> Tensor:
     """(4, 4) float64 pose of an upright object that fills ``fill`` of the image's shorter side, near its middle."""
-    from .geometry.cameras import rotation_towards
-    from .geometry.mesh import mesh_centre, mesh_radius
-    from .geometry.viewpoint import rotation_from_viewpoint
-
     u = torch.rand(6, generator=generator, dtype=torch.float64)
     elevation = elevations[0] + (elevations[1] - elevations[0]) * u[1]
     R = rotation_from_viewpoint(360.0 * u[0], elevation, 10.0 * u[2] - 5.0)
@@ -87,6 +88,7 @@ def synthesize_photograph(
     *,
     background: Tensor | None = None,
     texture: float = 0.35,
+    defocus: float = 1.5,
 ) -> tuple[Tensor, Tensor]:
     """A photograph-like picture of the mesh: random light, a random solid texture, defocused background, sensor noise.
 
@@ -94,6 +96,7 @@ def synthesize_photograph(
         mesh, T_cam_from_model (4, 4), camera_matrix (3, 3), size (H, W): the scene.
         background: (3, H, W) in [0, 1]; default :func:`procedural_background`.
         texture: contrast of the texture, 0 = plain.
+        defocus: blur of the background in px, as behind an object in focus.
 
     Returns:
         image (3, H, W) in [0, 1] and the object's box (4,) in px.
@@ -113,7 +116,7 @@ def synthesize_photograph(
     jump = torch.maximum(du[..., 2].abs(), dv[..., 2].abs()) > 0.2 * mesh.scale
     normal[jump] = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
     light = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
-    light = F.normalize(light + torch.tensor([0.0, -0.8, -1.2], dtype=torch.float64), dim=0)
+    light = F.normalize(light + torch.tensor([0.0, -0.8, -1.2], dtype=torch.float64), dim=0)  # from above, in front
     shade = 0.35 + 0.65 * (normal @ light).clamp(min=0)
     model = (points - T_cam_from_model[:3, 3]) @ T_cam_from_model[:3, :3] / (0.5 * mesh.scale)
     waves = torch.randn(3, 4, generator=generator, dtype=torch.float64) * 6
@@ -123,10 +126,12 @@ def synthesize_photograph(
     coverage = F.avg_pool2d(mask[None, None].float(), 2)[0]
     front = F.avg_pool2d((surface * mask[..., None]).permute(2, 0, 1)[None].float(), 2)[0]
     back = procedural_background(size, generator) if background is None else background
+    back = gaussian_smooth(back[None], defocus)[0]
     image = front + (1.0 - coverage) * back
     image = image + 0.01 * torch.randn(3, H, W, generator=generator)
     rows, columns = mask.any(dim=1).nonzero(), mask.any(dim=0).nonzero()
     if len(rows) == 0:
-        raise ValueError("the object is not in the picture")
-    edges = np.array([int(columns[0]), int(rows[0]), int(columns[-1]), int(rows[-1])])
-    return image.clamp(0, 1), torch.from_numpy((edges - 0.5) / 2.0).float()
+        raise InvalidInputError("T_cam_from_model: the object is not in the picture")
+    # Outer borders of the outermost pixels, from the fine grid to the picture's.
+    fine = torch.tensor([int(columns[0]) - 0.5, int(rows[0]) - 0.5, int(columns[-1]) + 0.5, int(rows[-1]) + 0.5])
+    return image.clamp(0, 1), (fine - 0.5) / 2.0

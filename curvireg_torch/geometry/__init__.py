@@ -24,8 +24,8 @@ from .conversions import (
 from .crops import crop_images, crop_transforms, square_boxes, whole_image_box
 from .mesh import load_mesh, mesh_centre, mesh_radius, normalization_transform
 from .neighbours import nearest_views
-from .poses import pose_from_box
 from .symmetry import symmetry_transforms, views_without_symmetric
+from .translation import place_view, translation_from_box
 from .viewpoint import rotation_error, rotation_from_viewpoint, viewpoint_from_rotation
 from .views import ViewSphere, paper_views, sample_views, uniform_views
 
@@ -45,7 +45,7 @@ __all__ = [
     "opengl_from_opencv",
     "opengl_projection",
     "paper_views",
-    "pose_from_box",
+    "place_view",
     "project_points",
     "projected_boxes",
     "pytorch3d_from_opencv",
@@ -59,6 +59,7 @@ __all__ = [
     "square_boxes",
     "symmetry_transforms",
     "transform",
+    "translation_from_box",
     "uniform_views",
     "viewpoint_from_rotation",
     "views_without_symmetric",

@@ -95,7 +95,7 @@ class ViewDescriber:
         self.settings = settings
         self.centre = mesh_centre(mesh)
         self._renderer = make_renderer(mesh, renderer, device=device)
-        self._hull = extreme_points(mesh)
+        self.hull = extreme_points(mesh)
         self._orthographic = settings.camera == "orthographic"
         self._filter, self._descriptor = settings.depth_filter(), settings.descriptor()
         self._device = device
@@ -114,7 +114,7 @@ class ViewDescriber:
         t = -(R @ self.centre)
         t[:, 2] += distances.double().cpu()
         T = transform(R, t)
-        boxes = projected_boxes(self._hull, T, torch.eye(3, dtype=torch.float64), orthographic=self._orthographic)
+        boxes = projected_boxes(self.hull, T, torch.eye(3, dtype=torch.float64), orthographic=self._orthographic)
         return T, crop_transforms(square_boxes(boxes, self.settings.margin), self.settings.image_size), boxes
 
     def depth(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..geometry.poses import pose_from_box
+from ..geometry.translation import place_view
 from ..geometry.viewpoint import rotation_error
 from ..matching import DescribedViews, QueryFeatures, ViewDescriber, normalized_correlation
 
@@ -89,7 +89,8 @@ def refine_pose(
         if improved:
             best, score = candidates[winner], float(scores[winner])
             if camera_matrix is not None and box is not None:
-                z = _distance(describe, best, described.boxes[winner], z, box, camera_matrix)
+                R, t = place_view(describe.hull, best, box, camera_matrix)
+                z = float(torch.linalg.vector_norm(R @ describe.centre + t))
         if rounds > 1 and step <= FINEST_STEP and _moved(previous, best, previous_z, z, radius) <= TOLERANCE:
             break
         if rounds > 1 and not improved:
@@ -108,13 +109,6 @@ def _describe(describe: ViewDescriber, rotations: Tensor, z: float, chunk_size: 
     return DescribedViews(
         *(torch.cat([getattr(p, n) for p in parts]) for n in ("descriptors", "points", "silhouettes", "boxes"))
     )
-
-
-def _distance(describe: ViewDescriber, R: Tensor, view_box: Tensor, z: float, box: Tensor, K: Tensor) -> float:
-    rotation, translation = pose_from_box(
-        R, describe.centre, view_box.cpu(), torch.tensor(z, dtype=torch.float64), box.double().cpu(), K.double().cpu()
-    )
-    return float(torch.linalg.vector_norm(rotation @ describe.centre + translation))
 
 
 def _moved(R1: Tensor, R2: Tensor, z1: float, z2: float, radius: float) -> float:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from ..errors import ImageError, InvalidInputError
 from ..geometry.cameras import check_camera_matrix
 from ..geometry.mesh import mesh_radius
-from ..geometry.poses import pose_from_box
+from ..geometry.translation import place_view
 from ..geometry.views import ViewSphere, sample_views
 from ..matching import BankSettings, QueryFeatures, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
 from .confidence import confidence, distinct_views
@@ -141,7 +141,7 @@ class Registrar:
             pose = RefinedPose(bank.rotations[best].double().cpu(), distance, float(ranking.hog[0, best]), 0)
         rotation, translation = pose.rotation, None
         if K is not None:
-            rotation, translation = self._place(pose, box, K)
+            rotation, translation = place_view(self.describe.hull, pose.rotation, box, K)
         return Registration(
             rotation=rotation,
             translation=translation,
@@ -152,14 +152,4 @@ class Registrar:
             view_rotation=pose.rotation,
             view_distance=pose.distance,
             iterations=pose.iterations,
-        )
-
-    def _place(self, pose: RefinedPose, box: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-        """Rotation and translation in the photograph's camera."""
-        distance = torch.tensor(pose.distance, dtype=torch.float64)
-        _, _, view_box = self.describe.cameras(pose.rotation[None], distance[None])
-        if self.bank.settings.camera == "orthographic":
-            view_box = view_box / distance
-        return pose_from_box(
-            pose.rotation, self.describe.centre, view_box[0], distance, box.double().cpu(), K.double().cpu()
         )

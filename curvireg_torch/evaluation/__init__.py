@@ -1,0 +1,26 @@
+"""Datasets registered and scored: one loop puts predictions on disk, another scores what is there.
+
+``curvireg evaluate pascal3d ROOT --out DIR`` and ``curvireg evaluate bop ROOT --out DIR``; with ``torchrun``,
+``-m curvireg_torch.evaluation pascal3d ROOT --out DIR`` shares the objects among processes.
+"""
+
+from .benchmark import Benchmark
+from .bop import BOPBenchmark
+from .command import add_parser, run
+from .loops import evaluate, score
+from .pascal3d import Pascal3DBenchmark
+from .presets import PRESETS, Preset
+from .protocol import Protocol
+
+__all__ = [
+    "PRESETS",
+    "BOPBenchmark",
+    "Benchmark",
+    "Pascal3DBenchmark",
+    "Preset",
+    "Protocol",
+    "add_parser",
+    "evaluate",
+    "run",
+    "score",
+]

@@ -1,0 +1,74 @@
+"""What the two loops ask of a dataset."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from torch import Tensor
+
+from ..data import BOPDataset, Pascal3DPlus
+from .protocol import Protocol
+
+__all__ = ["Benchmark", "Item", "Row"]
+
+Row = dict[str, Any]
+"""A prediction: ``rotation``, ``translation``, ``score``, ...; or ``failed``, or ``skipped`` with the reason."""
+
+
+@dataclass(frozen=True)
+class Item:
+    """One object to register.
+
+    Attributes:
+        key: its name, which no other object of the benchmark has.
+        index: in the dataset.
+        meshes: one, or all that may be tried.
+        box: (4,) x0, y0, x1, y1 in px, as annotated; NaN where unknown.
+        camera_matrix: (3, 3) in px, None where the method is not told.
+    """
+
+    key: str
+    index: int
+    meshes: tuple[Path, ...]
+    box: Tensor
+    camera_matrix: Tensor | None
+
+
+class Benchmark(ABC):
+    """A dataset, the protocol that objects are registered under, and its scores.
+
+    Attributes:
+        name: of the kind of dataset.
+        unit: of its meshes.
+        dataset, protocol: as given.
+        items: all objects, in the order of the dataset.
+    """
+
+    name: ClassVar[str]
+    unit: ClassVar[str]
+
+    def __init__(self, dataset: Pascal3DPlus | BOPDataset, protocol: Protocol) -> None:
+        self.dataset, self.protocol = dataset, protocol
+        self.items = [self.item(i) for i in range(len(dataset))]
+
+    def selection(self, limit: int | None) -> list[Item]:
+        """``limit`` items spread evenly over the dataset, or all."""
+        n = len(self.items)
+        return self.items if limit is None or limit >= n else [self.items[i * n // limit] for i in range(limit)]
+
+    def settings(self) -> Row:
+        """What predictions depend on besides preset and protocol."""
+        return {"dataset": self.name, "root": str(self.dataset.root.resolve()), "split": self.dataset.split}
+
+    @abstractmethod
+    def item(self, index: int) -> Item:
+        """Object ``index`` of the dataset."""
+
+    @abstractmethod
+    def summary(self, items: list[Item], rows: list[Row]) -> Row:
+        """Scores of the predictions ``rows`` of ``items``, none of them skipped."""
+
+    @abstractmethod
+    def write_predictions(self, path: Path, items: list[Item], rows: list[Row]) -> None:
+        """The predictions as one table; ``path`` appears when it is complete."""

@@ -1,0 +1,106 @@
+"""``curvireg evaluate pascal3d|bop ROOT --out DIR``."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..data import BOPDataset, Pascal3DPlus
+from .benchmark import Benchmark
+from .bop import BOPBenchmark
+from .loops import evaluate
+from .pascal3d import Pascal3DBenchmark
+from .presets import PRESETS
+from .protocol import Protocol
+
+__all__ = ["add_datasets", "add_parser", "run"]
+
+PROTOCOL = (
+    "cad=annotated|any|fused: the annotated CAD, the best of the class, or one vote of all of the class; "
+    "pose=upright|any: whether objects are known to stand upright; "
+    "box=annotated|SHARE: each edge moved by up to SHARE of the side (seed=N)"
+)
+
+
+def add_parser(commands: Any, parents: Sequence[argparse.ArgumentParser]) -> None:
+    """Add ``evaluate`` to the subparsers ``commands``; parsed arguments get ``run``, to be called with them.
+
+    Args:
+        commands: what ``ArgumentParser.add_subparsers`` returned.
+        parents: parsers with at least ``--quiet`` and ``--renderer``.
+    """
+    parser = commands.add_parser("evaluate", help="register and score a dataset")
+    add_datasets(parser.add_subparsers(required=True, metavar="DATASET"), parents)
+
+
+def add_datasets(datasets: Any, parents: Sequence[argparse.ArgumentParser]) -> None:
+    """Add ``pascal3d`` and ``bop`` to the subparsers ``datasets``; ``parents`` as for :func:`add_parser`."""
+    description = "Writes DIR/summary.json, DIR/predictions.csv and, as it goes, DIR/predictions; run again to go on."
+    pascal = datasets.add_parser("pascal3d", parents=parents, description=description, help="viewpoints on PASCAL3D+")
+    pascal.add_argument("root", type=Path, metavar="ROOT", help="folder with Annotations, Images and CAD")
+    pascal.add_argument("--split", default="val", help="name of the image lists (default: val)")
+    pascal.add_argument("--categories", nargs="+", metavar="CLASS", help="default: all")
+    pascal.add_argument("--part", choices=("pascal", "imagenet"), default="pascal", help="default: pascal")
+    pascal.add_argument(
+        "--pixel-origin",
+        type=int,
+        choices=(0, 1),
+        default=1,
+        help="number of the first pixel (default: 1, the release)",
+    )
+    pascal.set_defaults(benchmark=_pascal3d)
+    bop = datasets.add_parser("bop", parents=parents, description=description, help="6D poses on a BOP set")
+    bop.add_argument("root", type=Path, metavar="ROOT", help="folder with models and the split's folder")
+    bop.add_argument("--split", default="test", help="folder of the scenes (default: test)")
+    bop.set_defaults(benchmark=_bop)
+    for parser, default in ((pascal, "upright"), (bop, "any")):
+        parser.add_argument(
+            "--protocol",
+            nargs="+",
+            default=[],
+            metavar="KEY=VALUE",
+            help=f"{PROTOCOL} (default: {Protocol(pose=default)})",
+        )
+        parser.add_argument("--preset", choices=sorted(PRESETS), default="default", help="default: default")
+        parser.add_argument("--limit", type=int, metavar="N", help="only N objects, spread evenly over the set")
+        parser.add_argument("--overwrite", action="store_true", help="start anew in a folder with other predictions")
+        parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+        parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Evaluate what ``curvireg evaluate`` was asked to, and print the headline.
+
+    Raises:
+        CurviregError: the dataset is not there, an option is out of range, or the folder holds other results.
+    """
+    summary = evaluate(
+        arguments.benchmark(arguments),
+        arguments.out,
+        preset=arguments.preset,
+        limit=arguments.limit,
+        renderer=arguments.renderer,
+        overwrite=arguments.overwrite,
+        progress=not arguments.quiet,
+    )
+    if summary is None:
+        return
+    shares = [name for name in summary if name.startswith(("acc_", "add_", "mssd_", "mspd_"))]
+    print(f"{summary['n']} objects, {summary['failed']} failed, {sum(summary['skipped'].values())} skipped")
+    print("   ".join([*(f"{n} {summary[n]:.3f}" for n in shares), f"med_err_deg {summary['med_err_deg']:.1f}"]))
+    print(f"protocol: {summary['protocol']}; see {arguments.out}/summary.json")
+
+
+def _pascal3d(arguments: argparse.Namespace) -> Benchmark:
+    dataset = Pascal3DPlus(
+        arguments.root,
+        arguments.split,
+        categories=arguments.categories,
+        part=arguments.part,
+        pixel_origin=arguments.pixel_origin,
+    )
+    return Pascal3DBenchmark(dataset, Protocol.parse(arguments.protocol))
+
+
+def _bop(arguments: argparse.Namespace) -> Benchmark:
+    return BOPBenchmark(BOPDataset(arguments.root, arguments.split), Protocol.parse(arguments.protocol, pose="any"))

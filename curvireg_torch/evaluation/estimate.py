@@ -1,0 +1,69 @@
+"""The pose of one object, from the CADs that the protocol allows."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..geometry import mesh_radius
+from ..registration import Registrar, coherent_views, confidence, refine_pose
+from .benchmark import Row
+
+__all__ = ["estimate_pose"]
+
+
+def estimate_pose(
+    registrars: Sequence[Registrar], image: Tensor, box: Tensor, camera_matrix: Tensor | None, *, fused: bool
+) -> Row:
+    """Register one photograph to the best of several meshes.
+
+    Args:
+        registrars: one per mesh, of banks with the same views.
+        image: (3, H, W) in [0, 1].
+        box: (4,) in px.
+        camera_matrix: (3, 3) in px or None.
+        fused: average the scores of each view over the meshes before the best is searched (no translation then).
+
+    Returns:
+        ``rotation`` (3 x 3 numbers), ``translation`` (3 numbers, unit of the mesh, or None), ``score``, ``confidence``,
+        ``mesh``: the place of the chosen mesh among the registrars.
+
+    Raises:
+        InvalidInputError, ImageError: see :class:`Registrar`.
+    """
+    results = [registrar([image], box[None], camera_matrix)[0] for registrar in registrars]
+    if fused:
+        return _fused(registrars, image, box, torch.cat([r.ranking.scores for r in results]))
+    best = max(range(len(results)), key=lambda i: results[i].score)
+    result = results[best]
+    return {
+        "rotation": result.rotation.tolist(),
+        "translation": None if result.translation is None else result.translation.tolist(),
+        "score": result.score,
+        "confidence": result.confidence,
+        "mesh": best,
+    }
+
+
+@torch.no_grad()
+def _fused(registrars: Sequence[Registrar], image: Tensor, box: Tensor, scores: Tensor) -> Row:
+    """``scores`` (M, N) of the meshes' views; the registrars are made with ``refine=False``."""
+    mean = scores.mean(dim=0)
+    order = mean.argsort(descending=True, stable=True)
+    chosen = int(scores[:, order[0]].argmax())
+    matcher, bank = registrars[chosen].matcher, registrars[chosen].bank
+    radius = mesh_radius(bank.mesh)
+    pose = refine_pose(
+        registrars[chosen].describe,
+        matcher.features(matcher.crop([image], box[None])[0]),
+        bank.rotations[coherent_views(bank.rotations, order)].cpu(),
+        distance=float(bank.views.distance[order[0]]) * radius,
+        radius=radius,
+    )
+    return {
+        "rotation": pose.rotation.tolist(),
+        "translation": None,
+        "score": pose.score,
+        "confidence": float(confidence(mean[None], bank.rotations)),
+        "mesh": chosen,
+    }

@@ -1,0 +1,110 @@
+"""Photographs whose true view is known, from any of the datasets."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import trimesh
+from torch import Tensor
+from tqdm import tqdm
+
+from ...data import BOPDataset, Pascal3DPlus, WebCollection, read_image
+from ...errors import InvalidInputError
+from ...geometry import crop_images, load_mesh, mesh_centre, mesh_radius, rotation_towards
+from ...geometry.views import DEFAULT_DISTANCE
+from ...matching import BankSettings
+
+__all__ = ["KINDS", "Case", "find_cases", "grouped"]
+
+KINDS = ("pascal3d", "bop", "web")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One object in one photograph.
+
+    Attributes:
+        category: class or object.
+        image_path, mesh_path, unit: files, and the mesh's unit.
+        box: (4,) x0, y0, x1, y1 in px.
+        pose: (3, 4) float64 model to camera; without a translation (NaN), of a camera that looks straight at the box.
+    """
+
+    category: str
+    image_path: str
+    mesh_path: str
+    unit: str
+    box: Tensor
+    pose: Tensor
+
+    def crop(self, settings: BankSettings) -> Tensor:
+        """(1, 3, S, S) of the photograph, framed as the bank's views are."""
+        image = read_image(self.image_path)
+        return crop_images([image], self.box[None], size=settings.image_size, margin=settings.margin)[0]
+
+    def view(self, mesh: trimesh.Trimesh) -> tuple[Tensor, float]:
+        """The view that a camera looking at the object's centre has: rotation (3, 3), distance in model units.
+
+        Without a translation the distance is that of banks: a photograph of unknown focal length does not tell it.
+        """
+        R, t = self.pose[:, :3], self.pose[:, 3]
+        if not bool(t.isfinite().all()):
+            return R, DEFAULT_DISTANCE * mesh_radius(mesh)
+        centre = R @ mesh_centre(mesh) + t
+        return rotation_towards(centre).T @ R, float(torch.linalg.vector_norm(centre))
+
+
+def find_cases(kind: str, root: Path, *, pixel_origin: int = 1, limit: int | None = None) -> list[Case]:
+    """The objects of a dataset that the paper would take: neither occluded nor truncated, with a known pose.
+
+    Args:
+        kind: "pascal3d", "bop" or "web".
+        root: of the dataset.
+        pixel_origin: of PASCAL3D+, see :class:`Pascal3DPlus`.
+        limit: only so many, spread evenly.
+
+    Returns:
+        Cases, those of one mesh together.
+
+    Raises:
+        InvalidInputError: nothing is left, or an unknown kind.
+        MissingFileError: the dataset is not there.
+    """
+    if kind not in KINDS:
+        raise InvalidInputError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
+    dataset: Any
+    if kind == "pascal3d":
+        dataset = Pascal3DPlus(root, occluded=False, truncated=False, pixel_origin=pixel_origin)
+    else:
+        dataset = BOPDataset(root) if kind == "bop" else WebCollection(root)
+    cases = [case for i in range(len(dataset)) if (case := _case(kind, dataset.annotation(i))) is not None]
+    if not cases:
+        raise InvalidInputError(f"{root}: holds no whole object with a known pose")
+    if limit is not None and limit < len(cases):
+        cases = [cases[i * len(cases) // limit] for i in range(limit)]
+    return sorted(cases, key=lambda case: case.mesh_path)
+
+
+def _case(kind: str, s: dict[str, Any]) -> Case | None:
+    unknown = torch.full((3,), math.nan)
+    category, mesh, unit, t = s.get("category"), s.get("cad_path") or s.get("mesh_path"), "m", unknown
+    if kind == "bop":
+        category, mesh, unit, t = f"object {s['obj_id']}", s["model_path"], "mm", s["translation"]
+        if s["visib_fract"] <= 0.95:
+            return None
+    pose = torch.cat([s["rotation"], t[:, None]], dim=1).double()
+    if not bool(pose[:, :3].isfinite().all() and s["box"].isfinite().all()):
+        return None
+    return Case(str(category), s["image_path"], str(mesh), unit, s["box"], pose)
+
+
+def grouped(cases: list[Case], label: str, progress: bool) -> Iterator[tuple[trimesh.Trimesh, list[Case]]]:
+    """Meshes with their cases, one mesh in memory at a time."""
+    with tqdm(total=len(cases), desc=label, unit="photo", disable=not progress) as bar:
+        for path in dict.fromkeys(case.mesh_path for case in cases):
+            group = [case for case in cases if case.mesh_path == path]
+            yield load_mesh(path, unit=group[0].unit), group
+            bar.update(len(group))

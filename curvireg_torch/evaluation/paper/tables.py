@@ -1,0 +1,94 @@
+"""Tables as CSV, Markdown and pictures."""
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..store import write_text
+
+__all__ = ["Table", "write_table"]
+
+Cell = str | float
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of numbers with their definition.
+
+    Attributes:
+        name: of the files.
+        title, definition: what was measured, on what.
+        columns: the first names the rows.
+        rows: as long as ``columns``.
+        curve: the first column is a number, the others are curves over it.
+    """
+
+    name: str
+    title: str
+    definition: str
+    columns: list[str]
+    rows: list[list[Cell]]
+    curve: bool = False
+
+    def csv(self) -> str:
+        """Comma-separated values with a header; all digits."""
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([self.columns, *self.rows])
+        return text.getvalue()
+
+    def markdown(self) -> str:
+        """Title, definition and table, three digits.
+
+        Example:
+            >>> print(Table("a", "A", "Shares.", ["class", "x"], [["car", 0.5]]).markdown())
+            ## A
+            <BLANKLINE>
+            Shares.
+            <BLANKLINE>
+            | class | x |
+            |---|---|
+            | car | 0.5 |
+            <BLANKLINE>
+        """
+        lines = [self.columns, ["---"] * len(self.columns), *([_short(v) for v in row] for row in self.rows)]
+        body = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        return f"## {self.title}\n\n{self.definition}\n\n{body.replace('| --- |', '|---|').replace(' --- |', '---|')}\n"
+
+
+def write_table(table: Table, folder: Path) -> list[Path]:
+    """Write ``NAME.csv``, ``NAME.md`` and, where matplotlib is installed, ``NAME.png``; returns their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{table.name}.{suffix}" for suffix in ("csv", "md")]
+    write_text(paths[0], table.csv())
+    write_text(paths[1], table.markdown())
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        return paths
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    axes = figure.add_subplot()
+    numbers = [[float(v) for v in row[1:]] for row in table.rows]
+    for k, name in enumerate(table.columns[1:]):
+        values = [row[k] for row in numbers]
+        if table.curve:
+            axes.plot([float(row[0]) for row in table.rows], values, label=name)
+        else:
+            width = 0.8 / len(table.columns[1:])
+            axes.bar([i + (k + 0.5) * width - 0.4 for i in range(len(values))], values, width, label=name)
+    if table.curve:
+        axes.set_xlabel(table.columns[0])
+    else:
+        axes.set_xticks(range(len(table.rows)), [str(row[0]) for row in table.rows], rotation=30, ha="right")
+    axes.set_title(table.title)
+    axes.legend(fontsize="small", ncols=2)
+    axes.grid(alpha=0.3)
+    figure.savefig(folder / f"{table.name}.png", dpi=120)
+    return [*paths, folder / f"{table.name}.png"]
+
+
+def _short(value: Cell) -> str:
+    if isinstance(value, str):
+        return value
+    return "-" if math.isnan(value) else f"{value:.3g}"

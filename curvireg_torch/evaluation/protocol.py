@@ -1,0 +1,100 @@
+"""Under which conditions objects are registered: which CAD, which poses, which box."""
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from .._checks import check_option
+from ..errors import InvalidInputError
+
+__all__ = ["Protocol", "perturbed_box"]
+
+CHOICES = {"cad": ("annotated", "any", "fused"), "pose": ("upright", "any")}
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What the method is told about an object, besides the photograph.
+
+    Attributes:
+        cad: "annotated": the CAD that the annotation names. "any": every CAD of the class is registered, the best score
+            wins. "fused": the scores of a view are averaged over the CADs of the class, and the best view wins.
+        pose: "upright": the object stands upright and is not seen from below. "any": nothing is known.
+        box: 0 for the annotated box; x > 0 moves each edge by a random share, up to x, of the box's side.
+        seed: of those moves. The move of an object depends on its name and on nothing else.
+
+    Raises:
+        InvalidInputError: an unknown choice, or a box outside [0, 0.45].
+
+    Example:
+        >>> protocol = Protocol.parse(["cad=any", "box=0.1"])
+        >>> str(protocol)
+        'cad=any pose=upright box=0.1 seed=0'
+        >>> str(Protocol(pose="any"))
+        'cad=annotated pose=any box=annotated'
+    """
+
+    cad: str = "annotated"
+    pose: str = "upright"
+    box: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, options in CHOICES.items():
+            check_option(getattr(self, name), options, name)
+        if not 0.0 <= self.box <= 0.45:
+            raise InvalidInputError(f"box: expected a share in [0, 0.45], got {self.box}")
+
+    @classmethod
+    def parse(cls, words: Iterable[str], *, pose: str = "upright") -> "Protocol":
+        """From words such as ``cad=any``, ``pose=any``, ``box=0.1``, ``seed=1``; what is not named keeps its default.
+
+        Args:
+            words: KEY=VALUE each; ``box=annotated`` is 0.
+            pose: the default of ``pose``.
+
+        Raises:
+            InvalidInputError: an unknown key or value.
+        """
+        values: dict[str, str | float | int] = {"pose": pose}
+        for word in words:
+            key, _, value = word.partition("=")
+            check_option(key, [f.name for f in fields(cls)], "protocol")
+            try:
+                if key == "box":
+                    values[key] = 0.0 if value == "annotated" else float(value)
+                else:
+                    values[key] = int(value) if key == "seed" else value
+            except ValueError as error:
+                raise InvalidInputError(f"protocol: expected {key}=NUMBER, got {word!r}") from error
+        return cls(**values)  # type: ignore[arg-type]
+
+    def __str__(self) -> str:
+        box = f"box={self.box:g} seed={self.seed}" if self.box else "box=annotated"
+        return f"cad={self.cad} pose={self.pose} {box}"
+
+
+def perturbed_box(box: Tensor, protocol: Protocol, key: str) -> Tensor:
+    """The box that the method is given for the object named ``key``.
+
+    Args:
+        box: (4,) x0, y0, x1, y1 in px.
+
+    Returns:
+        (4,) px, the edges moved as ``protocol.box`` says.
+
+    Example:
+        >>> box = torch.tensor([0.0, 0.0, 100.0, 50.0])
+        >>> moved = perturbed_box(box, Protocol(box=0.1), "car 1")
+        >>> bool(((moved - box).abs() <= torch.tensor([10.0, 5.0, 10.0, 5.0])).all() and (moved != box).all())
+        True
+    """
+    if protocol.box == 0:
+        return box
+    seed = int.from_bytes(hashlib.sha256(f"{protocol.seed} {key}".encode()).digest()[:7])
+    shift = 2.0 * torch.rand(4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1.0
+    sides = (box[2:] - box[:2]).repeat(2)
+    return (box + protocol.box * shift * sides).to(box.dtype)

@@ -1,0 +1,80 @@
+"""Full poses of views, from the box that the object fills."""
+
+import torch
+from torch import Tensor
+
+from .cameras import project_points, rotation_towards, transform
+
+__all__ = ["place_view", "translation_from_box"]
+
+_ITERATIONS = 20
+_RAYS = 4  # each is tens of times nearer to the ray of the object's centre than the one before
+
+
+def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor) -> Tensor:
+    """Translation that makes the projected points fill a box.
+
+    Fixed point of two closed-form steps: the sizes of projected and given box give the distance, their centres the
+    offset. With the true rotation and box it converges to the true translation; with others, to the best scale (in the
+    least-squares sense over width and height) with the centres equal.
+
+    Args:
+        points: (P, 3) of the model, for instance the vertices of its convex hull.
+        rotation: (3, 3) model -> camera.
+        box: (4,) x0, y0, x1, y1 in px.
+        K: (3, 3).
+
+    Returns:
+        (3,) float64 translation in model units, the object in front of the camera.
+
+    Example:
+        >>> cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
+        >>> K = torch.tensor([[100.0, 0, 50], [0, 100.0, 50], [0, 0, 1]])
+        >>> t = translation_from_box(cube, torch.eye(3), torch.tensor([25.0, 25, 75, 75]), K)
+        >>> [round(v, 3) for v in t.tolist()]
+        [0.0, 0.0, 5.0]
+    """
+    points, R, box, K = (v.detach().cpu().double() for v in (points, rotation, box, K))
+    centre = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
+    extent = torch.linalg.vector_norm(points - centre, dim=1).max()
+    size, middle = box[2:] - box[:2], 0.5 * (box[:2] + box[2:])
+    ray = torch.linalg.inv(K) @ torch.cat([middle, torch.ones(1, dtype=torch.float64)])
+    # Start far enough away for every point to be in front of the camera.
+    z = torch.maximum(2.0 * extent * K[0, 0] / size.max(), 2.0 * extent)
+    position = ray * z
+    for _ in range(_ITERATIONS):
+        uv = project_points(points - centre, transform(R, position), K)
+        low, high = uv.amin(dim=0), uv.amax(dim=0)
+        seen = high - low
+        zoom = (seen * size).sum() / (size * size).sum()
+        shift = torch.stack([*(middle - 0.5 * (low + high)), torch.zeros((), dtype=torch.float64)])
+        # Move sideways at the object's depth, then along its ray; never closer than its own extent.
+        position = position + torch.linalg.inv(K) @ shift * position[2]
+        position = position * torch.maximum(zoom, 1.05 * extent / position[2])
+    translation: Tensor = position - R @ centre
+    return translation
+
+
+def place_view(points: Tensor, view_rotation: Tensor, box: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    """Pose of an object that a camera looking straight at its centre would see with ``view_rotation``.
+
+    An object away from the principal point is seen along a ray, not along the optical axis: the view is turned towards
+    that ray, and the box gives the translation. The ray is first that of the box's centre, then that of the object's,
+    which the translation tells. With the true view and box the pose is the true one.
+
+    Args:
+        points, box, K: of :func:`translation_from_box`.
+        view_rotation: (3, 3).
+
+    Returns:
+        rotation (3, 3) and translation (3,) in the photograph's camera, float64.
+    """
+    points, R_view, K = (v.detach().cpu().double() for v in (points, view_rotation, K))
+    centre = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
+    middle = torch.tensor([0.5 * float(box[0] + box[2]), 0.5 * float(box[1] + box[3]), 1.0], dtype=torch.float64)
+    ray = torch.linalg.inv(K) @ middle
+    for _ in range(_RAYS):
+        rotation = rotation_towards(ray) @ R_view
+        translation = translation_from_box(points, rotation, box, K)
+        ray = rotation @ centre + translation
+    return rotation, translation

@@ -1,0 +1,81 @@
+"""The paper's tables and figures on a dataset of your own choice, as CSV, Markdown and pictures.
+
+    python scripts/reproduce_paper.py TABLE pascal3d|bop|web ROOT --out DIR
+
+TABLE is one of
+
+- detectors: intersection percentage and Hausdorff distances of every detector (the paper's IP and HD tables)
+- repeatability: {CS, ASG, HFN} x {MFC, MCS, IG}
+- curve: repeatability in 40 views around the right one
+- precision: {CS, ASG, AR} x {MFC, MCS, IG}, per category
+- angles: errors of elevation, azimuth and in-plane angle, of the estimate and of the closest view
+- ranks: precision at rank 1, 3, 5, 10, 20, in both readings
+- all
+
+Every table says what was measured and on how many photographs. Only objects that are neither occluded nor truncated
+take part, as in the paper.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from curvireg_torch.errors import CurviregError
+from curvireg_torch.evaluation import Preset, paper
+
+RANKINGS = ("precision", "angles", "ranks")
+TABLES = ("detectors", "repeatability", "curve", *RANKINGS)
+
+
+def main() -> int:
+    arguments = parser().parse_args()
+    try:
+        run(arguments)
+    except CurviregError as error:
+        print(f"reproduce_paper: error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    result = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    result.add_argument("table", choices=(*TABLES, "all"), metavar="TABLE")
+    result.add_argument("kind", choices=paper.KINDS)
+    result.add_argument("root", type=Path, metavar="ROOT")
+    result.add_argument("--out", type=Path, required=True, metavar="DIR")
+    result.add_argument("--limit", type=int, metavar="N", help="only N photographs, spread evenly over the set")
+    result.add_argument("--image-size", type=int, default=128, metavar="PX", help="side of crops (default: 128)")
+    result.add_argument("--eps", type=float, default=2.0, metavar="PX", help="radius of a hit in the crop (default: 2)")
+    result.add_argument("--pose", choices=("upright", "any"), help="views of the banks (default: any for bop)")
+    result.add_argument("--pixel-origin", type=int, choices=(0, 1), default=1, help="of PASCAL3D+ (default: 1)")
+    result.add_argument("--quiet", action="store_true", help="no progress bars")
+    return result
+
+
+def run(arguments: argparse.Namespace) -> None:
+    cases = paper.find_cases(arguments.kind, arguments.root, pixel_origin=arguments.pixel_origin, limit=arguments.limit)
+    settings, progress = paper.FieldSettings(image_size=arguments.image_size), not arguments.quiet
+    wanted = TABLES if arguments.table == "all" else (arguments.table,)
+    tables: list[paper.Table] = []
+    if "detectors" in wanted:
+        tables += paper.detector_tables(cases, settings, arguments.eps, progress)
+    if "repeatability" in wanted:
+        tables.append(paper.repeatability_table(cases, settings, arguments.eps, progress))
+    if "curve" in wanted:
+        tables.append(paper.curve_table(cases, settings, arguments.eps, progress))
+    if any(name in wanted for name in RANKINGS):
+        views = Preset().views(arguments.pose or ("any" if arguments.kind == "bop" else "upright"))
+        rankings = paper.rank_views(cases, views, settings, progress)
+        made = {
+            "precision": lambda: [paper.precision_table(rankings)],
+            "angles": lambda: [paper.angle_table(rankings)],
+            "ranks": lambda: paper.rank_tables(rankings),
+        }
+        tables += [table for name in RANKINGS if name in wanted for table in made[name]()]
+    for table in tables:
+        paper.write_table(table, arguments.out)
+        print(table.markdown())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,29 @@
+"""Small scenes shared by tests."""
+
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from curvireg_torch import BankSettings, ViewBank, camera_matrix, sample_views
+from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
+
+__all__ = ["CAMERA", "SIZE", "scene", "truck_bank"]
+
+SIZE = (180, 240)
+CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
+
+
+@cache
+def truck_bank() -> ViewBank:
+    views = sample_views(azimuth_step=15, elevations=[0, 15, 30, 45, 60])
+    return ViewBank.build(example_mesh(), views, settings=BankSettings(image_size=96), progress=False)
+
+
+@cache
+def scene(seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """image (3, H, W), box (4,), true T_cam_from_model (4, 4)."""
+    generator = torch.Generator().manual_seed(seed)
+    T = random_pose(example_mesh(), CAMERA, SIZE, generator, elevations=(5.0, 50.0))
+    image, box = synthesize_photograph(example_mesh(), T, CAMERA, SIZE, generator)
+    return image, box, T

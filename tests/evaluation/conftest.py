@@ -1,0 +1,31 @@
+import pytest
+
+from curvireg_torch.data import BOPDataset, Pascal3DPlus
+from curvireg_torch.evaluation import PRESETS
+from tests._support.miniature import write_bop, write_pascal3d
+
+from .small import SMALL
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch, tmp_path):
+    monkeypatch.setitem(PRESETS, "default", SMALL)
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def pascal(tmp_path):
+    """Five objects, of which one has a damaged photograph and one a damaged CAD."""
+    root = tmp_path / "pascal"
+    write_pascal3d(root)
+    photograph = root / "Images" / "car_pascal" / "2008_000003.jpg"
+    photograph.write_bytes(photograph.read_bytes()[:300])
+    root.joinpath("CAD", "sofa", "01.off").write_text("OFF\n8 12 0\n1 2\n")
+    return Pascal3DPlus(root)
+
+
+@pytest.fixture
+def bop(tmp_path):
+    """Four instances, one of them without a box."""
+    write_bop(tmp_path / "bop")
+    return BOPDataset(tmp_path / "bop", targets=False)

@@ -1,0 +1,37 @@
+import csv
+import io
+import sys
+
+import pytest
+
+from curvireg_torch.evaluation.paper import Table, write_table
+
+TABLE = Table(
+    "t", "A title", "Shares, N = 2.", ["category", "a", "b"], [["car", 0.123456, 1.0], ["all", float("nan"), 2.0]]
+)
+
+
+def test_csv_keeps_all_digits():
+    rows = list(csv.reader(io.StringIO(TABLE.csv())))
+    assert rows[0] == TABLE.columns
+    assert float(rows[1][1]) == 0.123456
+
+
+def test_markdown_says_what_it_shows():
+    lines = TABLE.markdown().splitlines()
+    assert lines[:3] == ["## A title", "", "Shares, N = 2."]
+    assert lines[4:] == ["| category | a | b |", "|---|---|---|", "| car | 0.123 | 1 |", "| all | - | 2 |"]
+
+
+@pytest.mark.parametrize("curve", [False, True])
+def test_files(tmp_path, curve):
+    pytest.importorskip("matplotlib")
+    table = Table("t", "T", "D", ["k", "a"], [[1.0, 0.5], [2.0, 0.7]], curve=curve)
+    paths = write_table(table, tmp_path / "new")
+    assert [p.name for p in paths] == ["t.csv", "t.md", "t.png"]
+    assert paths[2].read_bytes().startswith(b"\x89PNG")
+
+
+def test_without_matplotlib(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    assert [p.suffix for p in write_table(TABLE, tmp_path)] == [".csv", ".md"]

@@ -1,0 +1,142 @@
+import json
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from curvireg_torch.cli import main
+from curvireg_torch.synthetic import example_mesh
+from tests._support.scenes import scene, truck_bank
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A photograph, a mesh and a bank of it on disk."""
+    folder = tmp_path_factory.mktemp("cli")
+    image, box, T = scene(0)
+    picture = (image.permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
+    cv2.imwrite(str(folder / "photo.png"), picture)
+    cv2.imwrite(str(folder / "flat.png"), np.full((60, 80, 3), 90, np.uint8))
+    (folder / "text.jpg").write_text("not a picture")
+    example_mesh().export(folder / "truck.ply")
+    (folder / "empty.obj").write_text("")
+    (folder / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
+    (folder / "nan.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 nan\n0 1 0\n3 0 1 2\n")
+    truck_bank().save(folder / "truck.safetensors")
+    (folder / "broken.safetensors").write_bytes((folder / "truck.safetensors").read_bytes()[:1000])
+    return folder, [f"{v:.1f}" for v in box], T
+
+
+def run(folder, photo="photo.png", mesh="truck.safetensors", *more, box=None):
+    boxes = ["--box", *box] if box else []
+    return main(
+        ["register", str(folder / photo), str(folder / mesh), *boxes, "--out", str(folder / "out"), "--quiet", *more]
+    )
+
+
+def test_register_writes_result_and_overlay(files, capsys):
+    folder, box, truth = files
+    camera = ["--camera", "260", "260", "119.5", "89.5", "--top", "3"]
+    assert run(folder, "photo.png", "truck.safetensors", *camera, box=box) == 0
+    result = json.loads((folder / "out" / "result.json").read_text())
+    for key in (
+        "rotation",
+        "translation",
+        "viewpoint",
+        "score",
+        "confidence",
+        "top",
+        "seconds",
+        "versions",
+        "conventions",
+    ):
+        assert key in result
+    R = torch.tensor(result["rotation"], dtype=torch.float64)
+    from curvireg_torch import rotation_error
+
+    assert float(rotation_error(R, truth[:3, :3])) < 15
+    assert len(result["top"]) == 3
+    overlay = cv2.imread(str(folder / "out" / "overlay.png"))
+    assert overlay is not None
+    assert overlay.std() > 20
+    assert "viewpoint" in capsys.readouterr().out
+
+
+def test_without_box_and_camera(files):
+    folder, _, _ = files
+    assert run(folder, "photo.png", "truck.safetensors", "--no-refine") == 0
+    assert json.loads((folder / "out" / "result.json").read_text())["translation"] is None
+
+
+def test_bank_then_register(files, capsys):
+    folder, box, _ = files
+    out = folder / "new.safetensors"
+    options = ["--pose", "upright", "--image-size", "32", "--quiet"]
+    assert main(["bank", str(folder / "truck.ply"), "--out", str(out), *options]) == 0
+    assert "396 views" in capsys.readouterr().out
+    assert run(folder, "photo.png", "new.safetensors", "--no-refine", box=box) == 0
+
+
+@pytest.mark.parametrize(
+    ("photo", "mesh", "more", "box", "words"),
+    [
+        ("photo.png", "none.obj", [], None, ["none.obj", "no such"]),
+        ("none.png", "truck.safetensors", [], None, ["none.png", "no such"]),
+        ("photo.png", "empty.obj", [], None, ["empty.obj"]),
+        ("photo.png", "points.obj", [], None, ["points.obj", "faces"]),
+        ("photo.png", "nan.off", [], None, ["nan.off", "NaN"]),
+        ("photo.png", "text.jpg", [], None, ["text.jpg", "mesh"]),
+        ("text.jpg", "truck.safetensors", [], None, ["text.jpg"]),
+        ("flat.png", "truck.safetensors", [], None, ["flat.png", "one colour"]),
+        ("photo.png", "broken.safetensors", [], None, ["broken.safetensors", "build"]),
+        ("photo.png", "truck.safetensors", [], ["5", "5", "5", "9"], ["X0 < X1"]),
+        ("photo.png", "truck.safetensors", [], ["900", "5", "950", "9"], ["wholly outside"]),
+        ("photo.png", "truck.safetensors", ["--camera", "0", "260", "119", "89"], None, ["focal"]),
+        ("photo.png", "truck.safetensors", ["--top", "0"], None, ["--top"]),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(files, capsys, photo, mesh, more, box, words):
+    folder, _, _ = files
+    assert run(folder, photo, mesh, *more, box=box) == 2
+    error = capsys.readouterr().err.strip()
+    assert len(error.splitlines()) == 1
+    assert "Traceback" not in error
+    for word in words:
+        assert word in error
+
+
+def test_debug_shows_the_traceback(files):
+    folder, _, _ = files
+    with pytest.raises(FileNotFoundError):
+        run(folder, "none.png", "truck.safetensors", "--debug")
+
+
+def test_a_file_where_the_folder_should_be(files, capsys):
+    folder, box, _ = files
+    arguments = ["register", str(folder / "photo.png"), str(folder / "truck.safetensors"), "--box", *box, "--no-refine"]
+    assert main([*arguments, "--out", str(folder / "photo.png")]) == 2
+    assert "--out" in capsys.readouterr().err
+
+
+def test_help_names_the_commands(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    for command in ("register", "bank", "demo"):
+        assert command in text
+
+
+def test_demo_runs_as_a_module_and_is_right(tmp_path, monkeypatch):
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+    command = [sys.executable, "-m", "curvireg_torch", "demo", "--out", str(tmp_path / "demo"), "--quiet"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    result = json.loads((tmp_path / "demo" / "result.json").read_text())
+    assert result["rotation_error_deg"] < 15
+    assert "error against the truth" in done.stdout
+    assert trimesh.load(tmp_path / "demo" / "mesh.ply").is_empty is False
+    assert (tmp_path / "demo" / "overlay.png").stat().st_size > 10_000
