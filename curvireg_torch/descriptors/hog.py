@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_field, check_option, check_positive
+from .._checks import check_field, check_option, check_positive, check_tensor
 from ..errors import InvalidInputError
 from ..filters.derivatives import at_least_float32, safe_sqrt
 
@@ -33,6 +33,7 @@ def hog(
     block: int = 2,
     clip: float = 0.2,
     voting: str = "linear",
+    bin_weights: Tensor | None = None,
 ) -> Tensor:
     """HOG (Dalal and Triggs 2005) of a vector field; the whole image is one grid of cells.
 
@@ -48,6 +49,7 @@ def hog(
         block: cells along a block's side, <= grid.
         clip: upper limit of L2-Hys in (0, 1]; 1 switches it off.
         voting: ``"linear"`` or ``"hard"``.
+        bin_weights: (bins,) factor on every vote for a bin, >= 0; differentiated through.
 
     Returns:
         (B, D), D = (grid - block + 1)^2 block^2 bins = 1764 by default, ordered block row, block column, cell row, cell
@@ -68,6 +70,9 @@ def hog(
     if min(H, W) < grid:
         raise InvalidInputError(f"field: expected at least {grid} x {grid} px for grid={grid}, got {H} x {W}")
     votes = _orientation_votes(at_least_float32(field), bins, voting)
+    if bin_weights is not None:
+        check_tensor(bin_weights, "bin_weights", (bins,))
+        votes = votes * bin_weights.to(votes.dtype).view(1, -1, 1, 1)
     rows = _cell_weights(H, grid, voting, votes)
     columns = _cell_weights(W, grid, voting, votes)
     cells = rows @ (votes @ columns.T)  # (B, bins, grid, grid)
@@ -117,15 +122,28 @@ def _normalised_blocks(cells: Tensor, block: int, clip: float) -> Tensor:
 
 
 class HOG(nn.Module):
-    """Module twin of :func:`hog`; ``nn.Sequential(MultiScaleFocusCurves(), HOG())`` describes a photograph."""
+    """Module twin of :func:`hog`; ``nn.Sequential(MultiScaleFocusCurves(), HOG())`` describes a photograph.
+
+    ``learnable=True`` makes the weights of the bins, 1 at first, a parameter.
+    """
+
+    bin_weights: nn.Parameter | None
 
     def __init__(
-        self, *, grid: int = 8, bins: int = 9, block: int = 2, clip: float = 0.2, voting: str = "linear"
+        self,
+        *,
+        grid: int = 8,
+        bins: int = 9,
+        block: int = 2,
+        clip: float = 0.2,
+        voting: str = "linear",
+        learnable: bool = False,
     ) -> None:
         super().__init__()
         check_option(voting, VOTINGS, "voting")
         _check_layout(grid, bins, block)
         self.grid, self.bins, self.block, self.clip, self.voting = grid, bins, block, clip, voting
+        self.bin_weights = nn.Parameter(torch.ones(bins)) if learnable else None
 
     @property
     def length(self) -> int:
@@ -133,7 +151,15 @@ class HOG(nn.Module):
         return hog_length(grid=self.grid, bins=self.bins, block=self.block)
 
     def forward(self, field: Tensor) -> Tensor:
-        return hog(field, grid=self.grid, bins=self.bins, block=self.block, clip=self.clip, voting=self.voting)
+        return hog(
+            field,
+            grid=self.grid,
+            bins=self.bins,
+            block=self.block,
+            clip=self.clip,
+            voting=self.voting,
+            bin_weights=self.bin_weights,
+        )
 
     def extra_repr(self) -> str:
         return f"grid={self.grid}, bins={self.bins}, block={self.block}, clip={self.clip}, voting={self.voting!r}"

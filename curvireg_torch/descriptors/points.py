@@ -1,12 +1,12 @@
 """Feature points of a vector field."""
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from .._checks import check_field
 from ..errors import InvalidInputError
 from ..filters.derivatives import at_least_float32, safe_sqrt
+from ..filters.suppression import is_ridge
 
 __all__ = ["field_points"]
 
@@ -15,8 +15,9 @@ def field_points(field: Tensor, *, share: float = 0.04, threshold: float = 0.0, 
     """Pixels that are maxima of the field's length across the field's direction, the longest ones first.
 
     The length is compared with both neighbours along the direction, rounded to 45 degrees (as Canny does). Of the
-    maxima longer than ``threshold`` the longest are kept, up to ``share`` of all pixels; equal lengths at the limit are
-    all kept.
+    maxima
+    longer than ``threshold`` the longest are kept, up to ``share`` of all pixels; equal lengths at the limit are all
+    kept.
 
     Args:
         field: (B, 2, H, W).
@@ -37,37 +38,23 @@ def field_points(field: Tensor, *, share: float = 0.04, threshold: float = 0.0, 
         [0, 0, 0, 0, 9, 0, 0, 0, 0]
     """
     check_field(field)
-    if not 0 < share <= 1:
-        raise InvalidInputError(f"share: expected 0 < share <= 1, got {share}")
     if not threshold >= 0:
         raise InvalidInputError(f"threshold: expected >= 0, got {threshold}")
-    B, _, H, W = field.shape
     x, y = at_least_float32(field).split(1, dim=1)
     length = safe_sqrt(x * x + y * y)
     candidates = length > threshold
     if suppress:
-        candidates = candidates & _is_maximum(length, x, y)
-    kept = torch.where(candidates, length, torch.zeros_like(length)).flatten(1)
+        candidates = candidates & is_ridge(length, x, y)
+    return strongest_points(length, candidates, share)
+
+
+def strongest_points(response: Tensor, candidates: Tensor, share: float) -> Tensor:
+    """Of the candidates (B, 1, H, W) those of largest response > 0, up to ``share`` of each image's pixels."""
+    if not 0 < share <= 1:
+        raise InvalidInputError(f"share: expected 0 < share <= 1, got {share}")
+    B, _, H, W = response.shape
     if B == 0:
         return candidates
-    k = max(1, int(share * H * W))
-    limit = kept.topk(k, dim=1).values[:, -1]
-    return candidates & (length >= limit.view(B, 1, 1, 1))
-
-
-def _is_maximum(length: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    H, W = length.shape[-2:]
-    p = F.pad(length, (1, 1, 1, 1))
-
-    def shifted(dx: int, dy: int) -> Tensor:
-        return p[..., 1 + dy : 1 + dy + H, 1 + dx : 1 + dx + W]
-
-    tan = 0.41421356  # tan 22.5 degrees
-    horizontal, vertical = y.abs() <= tan * x.abs(), x.abs() <= tan * y.abs()
-    diagonal = ~(horizontal | vertical)
-    falling = diagonal & (x * y > 0)  # y points down: equal signs run from top left to bottom right
-    result = torch.zeros_like(horizontal)
-    for where, dx, dy in ((horizontal, 1, 0), (vertical, 0, 1), (falling, 1, 1), (diagonal & ~falling, 1, -1)):
-        # Strict on one side, so that a plateau two pixels wide gives one point, not two or none.
-        result = result | (where & (length > shifted(dx, dy)) & (length >= shifted(-dx, -dy)))
-    return result
+    kept = torch.where(candidates, response, 0.0).flatten(1)
+    limit = kept.topk(max(1, int(share * H * W)), dim=1).values[:, -1]
+    return candidates & (response > 0) & (response >= limit.view(B, 1, 1, 1))

@@ -11,23 +11,37 @@ from .curvilinear import (
 )
 from .derivatives import ImageGradient, gaussian_smooth, image_gradient
 from .diffusion import AnisotropicDiffusion, anisotropic_diffusion
+from .edge_preserving import bilateral_smooth, guided_smooth
 from .focus import EdgeBlur, MultiScaleFocusCurves, edge_blur, multiscale_focus_curves
 from .multiscale import MultiScaleCurvilinearSaliency, multiscale_curvilinear_saliency
+from .principal import PrincipalCurvatureImage, principal_curvature_image
+from .ridges import ApparentRidges, apparent_ridges
+from .shading import AverageShadingGradient, HessianFrobeniusNorm, average_shading_gradient, hessian_frobenius_norm
 
 __all__ = [
     "AnisotropicDiffusion",
+    "ApparentRidges",
+    "AverageShadingGradient",
     "DepthCurvilinearSaliency",
     "EdgeBlur",
+    "HessianFrobeniusNorm",
     "ImageCurvilinearSaliency",
     "ImageGradient",
     "MultiScaleCurvilinearSaliency",
     "MultiScaleFocusCurves",
+    "PrincipalCurvatureImage",
     "anisotropic_diffusion",
+    "apparent_ridges",
+    "average_shading_gradient",
+    "bilateral_smooth",
     "depth_curvilinear_saliency",
     "edge_blur",
     "gaussian_smooth",
+    "guided_smooth",
+    "hessian_frobenius_norm",
     "image_curvilinear_saliency",
     "image_gradient",
     "multiscale_curvilinear_saliency",
     "multiscale_focus_curves",
+    "principal_curvature_image",
 ]

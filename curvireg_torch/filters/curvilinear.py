@@ -1,10 +1,14 @@
 """Curvilinear saliency of depth images (the paper's contribution 1) and of photographs."""
 
+import math
+
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .._checks import check_image, check_mask, check_option, check_positive
-from .derivatives import at_least_float32, central_gradient, central_hessian, gaussian_smooth, image_gradient, safe_sqrt
+from .derivatives import at_least_float32, gaussian_smooth, image_gradient, in_blocks, replicate_pad, safe_sqrt
+from .learnable import parameter_if
 
 __all__ = [
     "DepthCurvilinearSaliency",
@@ -19,21 +23,31 @@ BACKGROUND = 1.25
 FORMULAS = ("geometric", "paper")
 
 
+def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Visible pixels (bool), depth with 0 elsewhere, and each image's nearest depth and range, (B, 1, 1, 1).
+
+    Missing is 0 or negative, inf, NaN, or outside ``mask``. A range of zero counts as 1.
+    """
+    visible = (depth > 0) & (depth < math.inf)  # false for NaN
+    if mask is not None:
+        visible = visible & mask
+    clean = torch.where(visible, depth, 0.0)
+    near = torch.where(visible, depth, torch.finfo(depth.dtype).max).amin(dim=(1, 2, 3), keepdim=True)
+    far = clean.amax(dim=(1, 2, 3), keepdim=True)
+    # An empty image has no depth at all, a fronto-parallel plane no range.
+    near = torch.where(far > 0, near, 1.0)
+    span = far - near
+    return visible, clean, near, torch.where(span > 0, span, 1.0)
+
+
 def fill_depth(depth: Tensor, mask: Tensor | None, depth_scale: float | None) -> Tensor:
     """Depth as a graph surface over the image: nearest visible point at 0, missing pixels at ``BACKGROUND`` ranges.
 
-    Missing is 0 or negative, inf, NaN, or outside ``mask``. With ``depth_scale=None`` the visible range becomes 1;
-    a number multiplies the depth instead. An image with no visible pixel becomes a constant.
+    With ``depth_scale=None`` the visible range becomes 1; a number multiplies the depth instead. An image with no
+    visible
+    pixel becomes a constant.
     """
-    visible = torch.isfinite(depth) & (depth > 0)
-    if mask is not None:
-        visible = visible & mask
-    clean = torch.where(visible, depth, torch.zeros_like(depth))
-    largest = torch.finfo(depth.dtype).max
-    near = torch.where(visible, clean, torch.full_like(depth, largest)).amin(dim=(1, 2, 3), keepdim=True)
-    span = clean.amax(dim=(1, 2, 3), keepdim=True) - near
-    # A fronto-parallel plane has no range of its own, an empty image not even a depth.
-    span = torch.where(span > 0, span, torch.ones_like(span))
+    visible, clean, near, span = visible_range(depth, mask)
     scale = 1.0 / span if depth_scale is None else torch.full_like(span, depth_scale)
     return torch.where(visible, (clean - near) * scale, BACKGROUND * span * scale)
 
@@ -77,36 +91,78 @@ def depth_curvilinear_saliency(
         >>> round(float(field[0, :, 32, 32].norm()) * 40, 2)                          # 1 / radius
         1.0
     """
-    check_image(depth, "depth")
+    check_depth(depth, mask, depth_scale)
     check_option(formula, FORMULAS, "formula")
+
+    def layer(depth: Tensor, mask: Tensor | None) -> Tensor:
+        return _graph_saliency(gaussian_smooth(fill_depth(depth, mask, depth_scale), sigma), formula)
+
+    return in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
+
+
+def check_depth(depth: Tensor, mask: Tensor | None, depth_scale: float | None = None) -> None:
+    check_image(depth, "depth")
     if mask is not None:
         check_mask(mask, depth)
     if depth_scale is not None:
         check_positive(depth_scale, "depth_scale")
-    z = gaussian_smooth(fill_depth(at_least_float32(depth), mask, depth_scale), sigma)
-    zx, zy = central_gradient(z)
-    zxx, zyy, zxy = central_hessian(z)
-    squared_gradient = zx * zx + zy * zy
-    m11 = (zy * zy + 1.0) * zxx - zx * zy * zxy
-    m12 = (zy * zy + 1.0) * zxy - zx * zy * zyy
-    m21 = (zx * zx + 1.0) * zxy - zx * zy * zxx
-    m22 = (zx * zx + 1.0) * zyy - zx * zy * zxy
+
+
+def _graph_saliency(z: Tensor, formula: str) -> Tensor:
+    """CS of the graph surface z.
+
+    Computed on the padded images laid end to end, where a neighbour is a shift: every intermediate is then one
+        contiguous
+    run, and the compiler makes one loop of all of them. What the shifts mix across borders lies in the padding and is
+    cut.
+    """
+    B, _, H, W = z.shape
+    padded = replicate_pad(z, 1).reshape(-1)
+    width = W + 2
+    inner = padded.numel() - 2 * (width + 1)
+
+    def at(dy: int, dx: int) -> Tensor:
+        return padded.narrow(0, width + 1 + dy * width + dx, inner)
+
+    def cut(flat: Tensor) -> Tensor:
+        return F.pad(flat, (0, 2 * (width + 1))).view(B, 1, H + 2, width)[..., :H, :W]
+
+    left, right, up, down = at(0, -1), at(0, 1), at(-1, 0), at(1, 0)
+    zx, zy = 0.5 * (right - left), 0.5 * (down - up)
+    zxx, zyy = torch.sub(right + left, at(0, 0), alpha=2), torch.sub(down + up, at(0, 0), alpha=2)
+    zxy = 0.25 * ((at(1, 1) - at(1, -1)) - (at(-1, 1) - at(-1, -1)))
+    # I_P = [[E, F], [F, G]] and M = adj(I_P) H_Z.
+    metric_e, metric_f, metric_g = zx * zx + 1.0, zx * zy, zy * zy + 1.0
+    m11 = torch.addcmul(metric_g * zxx, metric_f, zxy, value=-1)
+    m12 = torch.addcmul(metric_g * zxy, metric_f, zyy, value=-1)
+    m21 = torch.addcmul(metric_e * zxy, metric_f, zxx, value=-1)
+    m22 = torch.addcmul(metric_e * zyy, metric_f, zxy, value=-1)
+    vx, vy, root = dominant_eigenvector(m11, m12, m21, m22)
+    if formula == "geometric":
+        alpha = torch.addcmul(metric_e, zy, zy).rsqrt()
+        length = alpha * alpha * alpha * root
+    else:
+        length = safe_sqrt(zx * zx + zy * zy) * root
+    return torch.cat([cut(vx * length), cut(vy * length)], dim=1)
+
+
+def dominant_eigenvector(m11: Tensor, m12: Tensor, m21: Tensor, m22: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of [[m11, m12], [m21, m22]] with real eigenvalues: (vx, vy, difference of the eigenvalues >= 0).
+
+    (vx, vy) is the unit eigenvector to the eigenvalue largest in absolute value, and 0 where both are equal.
+    """
+    gap, trace = m11 - m22, m11 + m22
     # tr^2 - 4 det, in the form that does not cancel.
-    root = safe_sqrt((m11 - m22) ** 2 + 4.0 * m12 * m21)
-    factor = (1.0 + squared_gradient) ** -1.5 if formula == "geometric" else safe_sqrt(squared_gradient)
-    return (factor * root * _dominant_eigenvector(m11, m12, m21, m22, root)).to(depth.dtype)
-
-
-def _dominant_eigenvector(m11: Tensor, m12: Tensor, m21: Tensor, m22: Tensor, root: Tensor) -> Tensor:
-    """Unit eigenvector of [[m11, m12], [m21, m22]] to the eigenvalue largest in absolute value; 0 where there is none."""
-    trace = m11 + m22
+    root = safe_sqrt(torch.addcmul(gap * gap, m12, m21, value=4.0))
     # (lambda - m22, m21) and (m12, lambda - m11) are both eigenvectors: take the one that does not cancel.
-    half_gap = 0.5 * (m11 - m22)
-    signed = torch.where(trace >= 0, 0.5 * root, -0.5 * root)
-    first = (half_gap * signed) >= 0
-    vx = torch.where(first, half_gap + signed, m12)
-    vy = torch.where(first, m21, signed - half_gap)
-    return unit_vector(vx, vy)
+    first = (gap >= 0) == (trace >= 0)
+    main = torch.where(trace >= 0, gap.abs() + root, -(gap.abs() + root))
+    side = 2.0 * torch.where(first, m21, m12)
+    squared = torch.addcmul(main * main, side, side)
+    # The floor keeps the cube in rsqrt's derivative finite.
+    scale = squared.clamp(min=torch.finfo(squared.dtype).tiny ** 0.6).rsqrt()
+    main, side = main * scale, side * scale
+    return torch.where(first, main, side), torch.where(first, side, main), root
 
 
 def unit_vector(vx: Tensor, vy: Tensor) -> Tensor:
@@ -144,12 +200,19 @@ def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) ->
 
 
 class DepthCurvilinearSaliency(nn.Module):
-    """Module twin of :func:`depth_curvilinear_saliency`."""
+    """Module twin of :func:`depth_curvilinear_saliency`; ``learnable=True`` makes sigma a parameter."""
 
-    def __init__(self, *, sigma: float = 1.0, formula: str = "geometric", depth_scale: float | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        sigma: float = 1.0,
+        formula: str = "geometric",
+        depth_scale: float | None = None,
+        learnable: bool = False,
+    ) -> None:
         super().__init__()
         check_option(formula, FORMULAS, "formula")
-        self.sigma, self.formula, self.depth_scale = sigma, formula, depth_scale
+        self.sigma, self.formula, self.depth_scale = parameter_if(learnable, sigma), formula, depth_scale
 
     def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
         return depth_curvilinear_saliency(
@@ -157,18 +220,18 @@ class DepthCurvilinearSaliency(nn.Module):
         )
 
     def extra_repr(self) -> str:
-        return f"sigma={self.sigma}, formula={self.formula!r}, depth_scale={self.depth_scale}"
+        return f"sigma={float(self.sigma)}, formula={self.formula!r}, depth_scale={self.depth_scale}"
 
 
 class ImageCurvilinearSaliency(nn.Module):
-    """Module twin of :func:`image_curvilinear_saliency`."""
+    """Module twin of :func:`image_curvilinear_saliency`; ``learnable=True`` makes sigma a parameter."""
 
-    def __init__(self, *, sigma: float = 1.0) -> None:
+    def __init__(self, *, sigma: float = 1.0, learnable: bool = False) -> None:
         super().__init__()
-        self.sigma = sigma
+        self.sigma = parameter_if(learnable, sigma)
 
     def forward(self, image: Tensor) -> Tensor:
         return image_curvilinear_saliency(image, sigma=self.sigma)
 
     def extra_repr(self) -> str:
-        return f"sigma={self.sigma}"
+        return f"sigma={float(self.sigma)}"

@@ -1,12 +1,14 @@
 """Gaussian smoothing and finite differences on (B, C, H, W) tensors, with replicated borders."""
 
 import math
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .._checks import check_image, check_positive
+from .learnable import parameter_if
 
 __all__ = ["ImageGradient", "gaussian_smooth", "image_gradient"]
 
@@ -31,37 +33,70 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
     offsets = torch.arange(-radius, radius + 1, device=x.device, dtype=x.dtype)
     kernel = torch.exp(-0.5 * (offsets / sigma) ** 2).to(x.dtype)
     kernel = kernel / kernel.sum()
-    return _convolve(_convolve(x, kernel, -1), kernel, -2)
-
-
-def _convolve(x: Tensor, kernel: Tensor, dim: int) -> Tensor:
-    """Convolution with a symmetric odd kernel along ``dim`` (-1 or -2)."""
     B, C, H, W = x.shape
-    radius = kernel.numel() // 2
-    padded = F.pad(x, (radius, radius, 0, 0) if dim == -1 else (0, 0, radius, radius), mode="replicate")
     if torch.compiler.is_compiling() or B * C == 0:
         # Shifted sums: no group count that would tie a traced graph to one batch size.
-        length = x.shape[dim]
-        out = padded.narrow(dim, radius, length) * kernel[radius]
-        for i in range(1, radius + 1):
-            pair = padded.narrow(dim, radius - i, length) + padded.narrow(dim, radius + i, length)
-            out = out + pair * kernel[radius + i]
-        return out
+        return _shifted_sum(_shifted_sum(x, kernel, -1), kernel, -2)
     # One group per plane: on a CPU some 25 times faster than a batch of one-channel convolutions.
-    shape = (1, 1, 1, -1) if dim == -1 else (1, 1, -1, 1)
-    weight = kernel.view(shape).expand(B * C, 1, -1, -1)
-    return F.conv2d(padded.reshape(1, B * C, *padded.shape[-2:]), weight, groups=B * C).view(B, C, H, W)
+    planes = replicate_pad(x, radius).reshape(1, B * C, H + 2 * radius, W + 2 * radius)
+    rows = kernel.view(1, 1, 1, -1).expand(B * C, 1, -1, -1)
+    planes = F.conv2d(planes, rows, groups=B * C)
+    return F.conv2d(planes, rows.mT, groups=B * C).view(B, C, H, W)
+
+
+def _shifted_sum(x: Tensor, kernel: Tensor, dim: int) -> Tensor:
+    """Convolution with a symmetric odd kernel along ``dim`` (-1 or -2)."""
+    radius, length = kernel.numel() // 2, x.shape[dim]
+    padded = _replicate_along(x, radius, dim)
+    out = padded.narrow(dim, radius, length) * kernel[radius]
+    for i in range(1, radius + 1):
+        pair = padded.narrow(dim, radius - i, length) + padded.narrow(dim, radius + i, length)
+        out = out + pair * kernel[radius + i]
+    return out
+
+
+def replicate_pad(x: Tensor, radius: int) -> Tensor:
+    """(B, C, H, W) with its borders repeated ``radius`` times on all four sides."""
+    if torch.compiler.is_compiling():
+        return _replicate_along(_replicate_along(x, radius, -1), radius, -2)
+    return F.pad(x, (radius, radius, radius, radius), mode="replicate")
+
+
+def _replicate_along(x: Tensor, radius: int, dim: int) -> Tensor:
+    # Compiled, a concatenation is copied in vectors; F.pad becomes a gather inside every loop that reads it.
+    shape = list(x.shape)
+    shape[dim] = radius
+    first, last = x.narrow(dim, 0, 1), x.narrow(dim, x.shape[dim] - 1, 1)
+    return torch.cat([first.expand(shape), x, last.expand(shape)], dim=dim)
+
+
+BLOCK = 2**20
+"""Pixels that :func:`in_blocks` hands to a layer at once."""
+
+
+def in_blocks(layer: Callable[..., Tensor], *tensors: Tensor | None) -> Tensor:
+    """``layer(*tensors)``, on a CPU a few images at a time so that what it computes on the way stays in the cache.
+
+    Only for layers that treat each image by itself. ``tensors`` share their first dimension; None stays None.
+    """
+    x = tensors[0]
+    assert x is not None
+    if torch.compiler.is_compiling() or x.device.type != "cpu" or x.numel() <= BLOCK:
+        return layer(*tensors)
+    size = max(1, BLOCK // x.shape[1:].numel())
+    parts = [[None] * math.ceil(len(x) / size) if t is None else t.split(size) for t in tensors]
+    return torch.cat([layer(*part) for part in zip(*parts, strict=True)])
 
 
 def central_gradient(x: Tensor) -> tuple[Tensor, Tensor]:
     """(x_x, x_y) by central differences per px; one-sided halves at the border."""
-    p = F.pad(x, (1, 1, 1, 1), mode="replicate")
+    p = replicate_pad(x, 1)
     return 0.5 * (p[..., 1:-1, 2:] - p[..., 1:-1, :-2]), 0.5 * (p[..., 2:, 1:-1] - p[..., :-2, 1:-1])
 
 
 def central_hessian(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """(x_xx, x_yy, x_xy) by central differences per px^2."""
-    p = F.pad(x, (1, 1, 1, 1), mode="replicate")
+    p = replicate_pad(x, 1)
     xx = p[..., 1:-1, 2:] - 2.0 * x + p[..., 1:-1, :-2]
     yy = p[..., 2:, 1:-1] - 2.0 * x + p[..., :-2, 1:-1]
     xy = 0.25 * (p[..., 2:, 2:] - p[..., 2:, :-2] - p[..., :-2, 2:] + p[..., :-2, :-2])
@@ -70,8 +105,8 @@ def central_hessian(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def safe_sqrt(x: Tensor) -> Tensor:
     """sqrt of max(x, 0) whose gradient is 0, not inf, where x <= 0."""
-    positive = x > 0
-    return torch.where(positive, torch.where(positive, x, torch.ones_like(x)).sqrt(), torch.zeros_like(x))
+    tiny: float = torch.finfo(x.dtype).tiny
+    return x.clamp(min=tiny).sqrt() - math.sqrt(tiny)
 
 
 def at_least_float32(x: Tensor) -> Tensor:
@@ -108,14 +143,14 @@ def image_gradient(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
 
 
 class ImageGradient(nn.Module):
-    """Module twin of :func:`image_gradient`."""
+    """Module twin of :func:`image_gradient`; ``learnable=True`` makes sigma a parameter."""
 
-    def __init__(self, *, sigma: float = 1.0) -> None:
+    def __init__(self, *, sigma: float = 1.0, learnable: bool = False) -> None:
         super().__init__()
-        self.sigma = sigma
+        self.sigma = parameter_if(learnable, sigma)
 
     def forward(self, image: Tensor) -> Tensor:
         return image_gradient(image, sigma=self.sigma)
 
     def extra_repr(self) -> str:
-        return f"sigma={self.sigma}"
+        return f"sigma={float(self.sigma)}"

@@ -6,6 +6,7 @@ from torch import Tensor, nn
 from .._checks import check_option, check_positive, check_tensor
 from ..errors import InvalidInputError
 from .derivatives import at_least_float32
+from .learnable import parameter_if
 
 __all__ = ["AnisotropicDiffusion", "anisotropic_diffusion"]
 
@@ -71,14 +72,21 @@ def _flow(difference: Tensor, kappa: float | Tensor, conductance: str) -> Tensor
 
 
 class AnisotropicDiffusion(nn.Module):
-    """Module twin of :func:`anisotropic_diffusion`."""
+    """Module twin of :func:`anisotropic_diffusion`; ``learnable=True`` makes kappa a parameter."""
 
     def __init__(
-        self, *, iterations: int, kappa: float = 0.03, step: float = 0.2, conductance: str = "rational"
+        self,
+        *,
+        iterations: int,
+        kappa: float = 0.03,
+        step: float = 0.2,
+        conductance: str = "rational",
+        learnable: bool = False,
     ) -> None:
         super().__init__()
         check_option(conductance, CONDUCTANCES, "conductance")
-        self.iterations, self.kappa, self.step, self.conductance = iterations, kappa, step, conductance
+        self.kappa = parameter_if(learnable, kappa)
+        self.iterations, self.step, self.conductance = iterations, step, conductance
 
     def forward(self, image: Tensor) -> Tensor:
         return anisotropic_diffusion(
@@ -86,4 +94,7 @@ class AnisotropicDiffusion(nn.Module):
         )
 
     def extra_repr(self) -> str:
-        return f"iterations={self.iterations}, kappa={self.kappa}, step={self.step}, conductance={self.conductance!r}"
+        return (
+            f"iterations={self.iterations}, kappa={float(self.kappa)}, step={self.step}, "
+            f"conductance={self.conductance!r}"
+        )

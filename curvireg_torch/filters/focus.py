@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from .._checks import check_image, check_option, check_positive
 from ..errors import InvalidInputError
 from .curvilinear import unit_vector
-from .derivatives import at_least_float32, central_gradient, gaussian_smooth, image_maximum, safe_sqrt
+from .derivatives import at_least_float32, central_gradient, gaussian_smooth, image_maximum, in_blocks, safe_sqrt
+from .learnable import parameter_if
 
 __all__ = ["EdgeBlur", "MultiScaleFocusCurves", "edge_blur", "multiscale_focus_curves"]
 
@@ -21,7 +22,8 @@ _DIFFERENCE_VARIANCE = 1.0 / 3.0
 """Variance in px^2 that the 3-tap central difference itself adds to an edge."""
 
 _EDGE_FLOOR = 1e-3
-"""CS below this share of the image's largest CS is not an edge (noise is infinitely sharp); about 3 % of the contrast."""
+"""CS below this share of the image's largest CS is not an edge (noise is infinitely sharp); about 3 % of the
+contrast."""
 
 
 def edge_blur(
@@ -48,7 +50,8 @@ def edge_blur(
         mode: ``"reblur-image"`` or ``"reblur-saliency"``.
 
     Returns:
-        (B, S, H, W) blur in px, in [0, 1000]; 1000 where re-blurring does not lower the saliency. dtype kept (half types
+        (B, S, H, W) blur in px, in [0, 1000]; 1000 where re-blurring does not lower the saliency. dtype kept (half
+        types
         compute in float32).
 
     Raises:
@@ -62,9 +65,12 @@ def edge_blur(
     """
     check_image(image)
     check_option(mode, MODES, "mode")
-    x = at_least_float32(image)
-    gx, gy = central_gradient(x)
-    return _edge_blur(x, gx * gx + gy * gy, reblur_sigmas, mode).to(image.dtype)
+
+    def layer(x: Tensor) -> Tensor:
+        gx, gy = central_gradient(x)
+        return _edge_blur(x, gx * gx + gy * gy, reblur_sigmas, mode)
+
+    return in_blocks(layer, at_least_float32(image)).to(image.dtype)
 
 
 def _edge_blur(x: Tensor, saliency: Tensor, reblur_sigmas: Sequence[float], mode: str) -> Tensor:
@@ -95,7 +101,7 @@ def multiscale_focus_curves(
     scales: int = 5,
     sigma: float | Tensor = 1.0,
     mode: str = "reblur-image",
-    saliency_weight: bool = True,
+    saliency_weight: float = 1.0,
     threshold: float | None = None,
 ) -> Tensor:
     r"""MFC: edges in focus (the paper's section "Multi Focus Curves"), with the sharpest edges longest.
@@ -110,11 +116,12 @@ def multiscale_focus_curves(
         scales: n >= 2.
         sigma: smoothing in px before everything else.
         mode: of :func:`edge_blur`.
-        saliency_weight: multiply the focus by :math:`\sqrt{CS} = |\nabla I|`; ranks views better than the focus alone.
+        saliency_weight: p >= 0: the focus is multiplied by :math:`CS^p`. 0 is the focus alone, 0.5 multiplies by
+            :math:`|\nabla I|`; 1 ranks the views of real photographs best.
         threshold: T >= 0 in 1/px; None is the paper's :math:`e^{-n}`.
 
     Returns:
-        (B, 2, H, W) focus in 1/px (times grey levels per px with ``saliency_weight``) along the gradient. dtype kept.
+        (B, 2, H, W) focus in 1/px, times CS^p in (grey levels per px)^2p, along the gradient. dtype kept.
 
     Raises:
         InvalidInputError: wrong shape, dtype or option.
@@ -127,18 +134,21 @@ def multiscale_focus_curves(
     check_option(mode, MODES, "mode")
     if scales < 2:
         raise InvalidInputError(f"scales: expected >= 2, got {scales}")
+    check_positive(saliency_weight, "saliency_weight", zero_ok=True)
     limit = math.exp(-scales) if threshold is None else threshold
-    x = gaussian_smooth(at_least_float32(image), sigma)
-    gx, gy = central_gradient(x)
-    saliency = gx * gx + gy * gy
-    blur = _edge_blur(x, saliency, [float(i) for i in range(1, scales)], mode).amax(dim=1, keepdim=True)
-    # Sub-pixel blur is not measurable: it counts as the derivative kernel's own.
-    focus = 1.0 / blur.clamp(min=_DIFFERENCE_VARIANCE**0.5)
-    kept = (focus > limit) & (saliency > _EDGE_FLOOR * image_maximum(saliency))
-    value = torch.where(kept, focus, torch.zeros_like(focus))
-    if saliency_weight:
-        value = value * safe_sqrt(saliency)
-    return (value * unit_vector(gx, gy)).to(image.dtype)
+
+    def layer(image: Tensor) -> Tensor:
+        x = gaussian_smooth(image, sigma)
+        gx, gy = central_gradient(x)
+        saliency = gx * gx + gy * gy
+        blur = _edge_blur(x, saliency, [float(i) for i in range(1, scales)], mode).amax(dim=1, keepdim=True)
+        # Sub-pixel blur is not measurable: it counts as the derivative kernel's own.
+        focus = 1.0 / blur.clamp(min=_DIFFERENCE_VARIANCE**0.5)
+        kept = (focus > limit) & (saliency > _EDGE_FLOOR * image_maximum(saliency))
+        weight = torch.where(kept, saliency, 1.0) ** saliency_weight
+        return torch.where(kept, focus * weight, 0.0) * unit_vector(gx, gy)
+
+    return in_blocks(layer, at_least_float32(image)).to(image.dtype)
 
 
 class EdgeBlur(nn.Module):
@@ -157,7 +167,7 @@ class EdgeBlur(nn.Module):
 
 
 class MultiScaleFocusCurves(nn.Module):
-    """Module twin of :func:`multiscale_focus_curves`."""
+    """Module twin of :func:`multiscale_focus_curves`; ``learnable=True`` makes sigma a parameter."""
 
     def __init__(
         self,
@@ -165,12 +175,13 @@ class MultiScaleFocusCurves(nn.Module):
         scales: int = 5,
         sigma: float = 1.0,
         mode: str = "reblur-image",
-        saliency_weight: bool = True,
+        saliency_weight: float = 1.0,
         threshold: float | None = None,
+        learnable: bool = False,
     ) -> None:
         super().__init__()
         check_option(mode, MODES, "mode")
-        self.scales, self.sigma, self.mode = scales, sigma, mode
+        self.scales, self.sigma, self.mode = scales, parameter_if(learnable, sigma), mode
         self.saliency_weight, self.threshold = saliency_weight, threshold
 
     def forward(self, image: Tensor) -> Tensor:
@@ -185,6 +196,6 @@ class MultiScaleFocusCurves(nn.Module):
 
     def extra_repr(self) -> str:
         return (
-            f"scales={self.scales}, sigma={self.sigma}, mode={self.mode!r}, "
+            f"scales={self.scales}, sigma={float(self.sigma)}, mode={self.mode!r}, "
             f"saliency_weight={self.saliency_weight}, threshold={self.threshold}"
         )

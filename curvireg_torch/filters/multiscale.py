@@ -5,16 +5,20 @@ import math
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_image
+from .._checks import check_image, check_option, check_positive
 from ..errors import InvalidInputError
 from .curvilinear import image_curvilinear_saliency
-from .derivatives import at_least_float32, image_maximum, safe_sqrt
-from .diffusion import anisotropic_diffusion
+from .derivatives import at_least_float32, image_maximum, in_blocks, safe_sqrt
+from .diffusion import CONDUCTANCES, anisotropic_diffusion
+from .edge_preserving import bilateral_smooth, guided_smooth
+from .learnable import parameter_if
 
 __all__ = ["MultiScaleCurvilinearSaliency", "multiscale_curvilinear_saliency"]
 
-FIRST_ITERATIONS = 5
-"""Diffusion steps of the first smoothed level; each further level doubles the total (0, 5, 10, 20, 40, ...)."""
+SMOOTHINGS = ("perona-malik", "bilateral", "guided")
+
+STEP = 0.2
+"""Time step of the diffusion."""
 
 
 def multiscale_curvilinear_saliency(
@@ -22,20 +26,27 @@ def multiscale_curvilinear_saliency(
     *,
     scales: int = 5,
     sigma: float | Tensor = 1.0,
+    smoothing: str = "perona-malik",
     kappa: float | Tensor = 0.03,
     conductance: str = "rational",
+    diffusion_time: float | None = None,
     threshold: float | None = None,
 ) -> Tensor:
-    r"""MCS (the paper's section "Multi-Curvilinear Saliency"): edges that survive edge-preserving diffusion.
+    r"""MCS (the paper's section "Multi-Curvilinear Saliency"): edges that survive edge-preserving smoothing.
 
     The image curvilinear saliency :math:`|\nabla I|^2` of every level, divided by its own maximum over the image, is
     compared with T. Where *every* level exceeds T the largest level is kept, elsewhere the field is 0.
 
     Args:
         image: (B, 1, H, W) grey levels in [0, 1].
-        scales: number n of levels, the image itself included; diffused 0, 5, 10, 20, ... steps.
+        scales: number n of levels, the image itself included. Each smoothed level has twice the time t of the one
+            before.
         sigma: smoothing in px before differentiation.
-        kappa, conductance: of :func:`anisotropic_diffusion`.
+        smoothing: ``"perona-malik"`` (:func:`anisotropic_diffusion` to time t), or ``"bilateral"`` or ``"guided"``
+            with the width of linear diffusion to time t, sqrt(2 t) px.
+        kappa: contrast in grey levels above which an edge is kept, for all smoothings.
+        conductance: of :func:`anisotropic_diffusion`.
+        diffusion_time: t of the last level, in px^2; None is 2^(n-2), that is 0, 5, 10, 20, ... steps of 0.2.
         threshold: T in [0, 1); None is the paper's :math:`e^{-n}`.
 
     Returns:
@@ -51,54 +62,83 @@ def multiscale_curvilinear_saliency(
         1.0
     """
     check_image(image)
+    check_option(smoothing, SMOOTHINGS, "smoothing")
+    check_option(conductance, CONDUCTANCES, "conductance")
     if scales < 1:
         raise InvalidInputError(f"scales: expected >= 1, got {scales}")
     limit = math.exp(-scales) if threshold is None else threshold
     if not 0 <= limit < 1:
         raise InvalidInputError(f"threshold: expected 0 <= threshold < 1, got {threshold}")
-    level, done = at_least_float32(image), 0
-    fields: list[Tensor] = []
-    for k in range(scales):
-        total = FIRST_ITERATIONS * 2 ** (k - 1) if k else 0
-        level, done = anisotropic_diffusion(level, iterations=total - done, kappa=kappa, conductance=conductance), total
-        field = image_curvilinear_saliency(level, sigma=sigma)
-        peak = image_maximum(safe_sqrt(field.square().sum(dim=1, keepdim=True)))
-        fields.append(field / torch.where(peak > 0, peak, torch.ones_like(peak)))
-    stack = torch.stack(fields, dim=1)
-    saliency = safe_sqrt(stack.square().sum(dim=2))
-    best = saliency.argmax(dim=1)[:, None, None].expand(-1, -1, 2, -1, -1)
-    kept = (saliency > limit).all(dim=1, keepdim=True)
-    return (stack.gather(1, best).squeeze(1) * kept).to(image.dtype)
+    last = 2.0 ** (scales - 2) if diffusion_time is None else diffusion_time
+    check_positive(last, "diffusion_time")
+    times = [last * 2.0 ** (k - scales) for k in range(2, scales + 1)]
+
+    def layer(image: Tensor) -> Tensor:
+        level, done = image, 0
+        fields = [_normalised_saliency(level, sigma)]
+        for time in times:
+            if smoothing == "perona-malik":
+                steps = max(round(time / STEP), 1)
+                level = anisotropic_diffusion(
+                    level, iterations=max(steps - done, 0), kappa=kappa, step=STEP, conductance=conductance
+                )
+                done = max(steps, done)
+            else:
+                smooth = bilateral_smooth if smoothing == "bilateral" else guided_smooth
+                level = smooth(image, sigma=math.sqrt(2.0 * time), kappa=kappa)
+            fields.append(_normalised_saliency(level, sigma))
+        stack = torch.stack(fields, dim=1)
+        saliency = safe_sqrt(stack.square().sum(dim=2))
+        best = saliency.argmax(dim=1)[:, None, None].expand(-1, -1, 2, -1, -1)
+        kept = (saliency > limit).all(dim=1, keepdim=True)
+        return stack.gather(1, best).squeeze(1) * kept
+
+    return in_blocks(layer, at_least_float32(image)).to(image.dtype)
+
+
+def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> Tensor:
+    field = image_curvilinear_saliency(level, sigma=sigma)
+    peak = image_maximum(safe_sqrt(field.square().sum(dim=1, keepdim=True)))
+    return field / torch.where(peak > 0, peak, 1.0)
 
 
 class MultiScaleCurvilinearSaliency(nn.Module):
-    """Module twin of :func:`multiscale_curvilinear_saliency`."""
+    """Module twin of :func:`multiscale_curvilinear_saliency`; ``learnable=True`` makes sigma and kappa parameters."""
 
     def __init__(
         self,
         *,
         scales: int = 5,
         sigma: float = 1.0,
+        smoothing: str = "perona-malik",
         kappa: float = 0.03,
         conductance: str = "rational",
+        diffusion_time: float | None = None,
         threshold: float | None = None,
+        learnable: bool = False,
     ) -> None:
         super().__init__()
-        self.scales, self.sigma, self.kappa = scales, sigma, kappa
-        self.conductance, self.threshold = conductance, threshold
+        check_option(smoothing, SMOOTHINGS, "smoothing")
+        check_option(conductance, CONDUCTANCES, "conductance")
+        self.sigma, self.kappa = parameter_if(learnable, sigma), parameter_if(learnable, kappa)
+        self.scales, self.smoothing, self.conductance = scales, smoothing, conductance
+        self.diffusion_time, self.threshold = diffusion_time, threshold
 
     def forward(self, image: Tensor) -> Tensor:
         return multiscale_curvilinear_saliency(
             image,
             scales=self.scales,
             sigma=self.sigma,
+            smoothing=self.smoothing,
             kappa=self.kappa,
             conductance=self.conductance,
+            diffusion_time=self.diffusion_time,
             threshold=self.threshold,
         )
 
     def extra_repr(self) -> str:
         return (
-            f"scales={self.scales}, sigma={self.sigma}, kappa={self.kappa}, "
-            f"conductance={self.conductance!r}, threshold={self.threshold}"
+            f"scales={self.scales}, sigma={float(self.sigma)}, smoothing={self.smoothing!r}, "
+            f"kappa={float(self.kappa)}, conductance={self.conductance!r}, diffusion_time={self.diffusion_time}, "
+            f"threshold={self.threshold}"
         )

@@ -29,8 +29,8 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m") -> trimesh.Trimesh:
 
     Args:
         path: .obj, .ply, .stl, .off, .glb or .gltf.
-        unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. An object that would
-            be smaller than 5 mm or larger than 100 m gets a warning.
+        unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. An object that
+            would be smaller than 5 mm or larger than 100 m gets a warning.
 
     Returns:
         ``trimesh.Trimesh`` with (V, 3) float64 vertices and (F, 3) faces, degenerate faces removed.

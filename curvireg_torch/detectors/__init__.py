@@ -1,0 +1,47 @@
+"""The 2D detectors that the paper compares, behind one call: photograph in, response map and feature points out.
+
+``DETECTORS[name](image, share=0.04)`` takes (B, 1, H, W) grey levels in [0, 1] and returns a :class:`Detection`.
+"""
+
+from collections.abc import Callable
+
+from .base import Detection
+from .corners import harris, minimum_eigenvalue
+from .edges import canny, laplacian_of_gaussian, sobel
+from .fast_hessian import fast_hessian
+from .fields import focus_curves, gradient, multiscale_saliency, principal_curvature
+from .fuzzy import fuzzy_edges
+from .keypoints import sift
+
+__all__ = [
+    "DETECTORS",
+    "Detection",
+    "canny",
+    "fast_hessian",
+    "focus_curves",
+    "fuzzy_edges",
+    "gradient",
+    "harris",
+    "laplacian_of_gaussian",
+    "minimum_eigenvalue",
+    "multiscale_saliency",
+    "principal_curvature",
+    "sift",
+    "sobel",
+]
+
+DETECTORS: dict[str, Callable[..., Detection]] = {
+    "mfc": focus_curves,
+    "mcs": multiscale_saliency,
+    "ig": gradient,
+    "pci": principal_curvature,
+    "sobel": sobel,
+    "log": laplacian_of_gaussian,
+    "canny": canny,
+    "fuzzy": fuzzy_edges,
+    "harris": harris,
+    "mineig": minimum_eigenvalue,
+    "sift": sift,
+    "surf": fast_hessian,
+}
+"""Every detector of the comparison by its short name, the paper's own first."""

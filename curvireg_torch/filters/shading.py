@@ -1,0 +1,190 @@
+"""Average shading gradient (ASG) and Hessian Frobenius norm (HFN) of depth images, which the paper compares with CS."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from .._checks import check_same_device, check_tensor
+from ..errors import InvalidInputError
+from .curvilinear import BACKGROUND, check_depth, dominant_eigenvector, fill_depth, visible_range
+from .derivatives import at_least_float32, central_gradient, central_hessian, gaussian_smooth, in_blocks, safe_sqrt
+
+__all__ = ["AverageShadingGradient", "HessianFrobeniusNorm", "average_shading_gradient", "hessian_frobenius_norm"]
+
+
+def average_shading_gradient(
+    depth: Tensor,
+    mask: Tensor | None = None,
+    *,
+    camera_matrix: Tensor | None = None,
+    sigma: float | Tensor = 1.0,
+    depth_scale: float | None = None,
+) -> Tensor:
+    r"""Average shading gradient (Plötz and Roth 2017; the paper's ``equ:PG:103``).
+
+    :math:`\gamma\sqrt{|N_x|^2 + |N_y|^2}`, :math:`\gamma = \sqrt{\pi/3}`, N the unit normal of the observed surface: a
+    bound
+    on the gradient of a Lambertian image, averaged over all directions of the light.
+
+    Args:
+        depth: (B, 1, H, W) z-depth. 0, negative, inf and NaN are background.
+        mask: (B, 1, H, W) bool, False = background; optional.
+        camera_matrix: (3, 3) or (B, 3, 3), px, without skew: N is the normal of the surface that this perspective
+            camera sees (``equ:PG:300``), whatever the depth's unit. None (orthographic): N is the normal of the graph
+            of Z.
+        sigma: smoothing in px before differentiation, >= 0.
+        depth_scale: of :func:`depth_curvilinear_saliency`; orthographic only.
+
+    Returns:
+        (B, 2, H, W): length ASG in 1/px, direction in which the normal turns fastest, sign free. dtype kept (half
+        types compute in float32).
+
+    Raises:
+        InvalidInputError: wrong shape, dtype, mask or option, or ``depth_scale`` together with ``camera_matrix``.
+
+    Example:
+        >>> y, x = torch.meshgrid(torch.arange(65.0) - 32, torch.arange(65.0) - 32, indexing="ij")
+        >>> sphere = (100 - (60.0**2 - x**2 - y**2).sqrt())[None, None]
+        >>> field = average_shading_gradient(sphere, sigma=0.0, depth_scale=1.0)
+        >>> round(float(field[0, :, 32, 32].norm()) * 60 / (2 * torch.pi / 3) ** 0.5, 2)     # gamma sqrt(2) / radius
+        1.0
+    """
+    check_depth(depth, mask, depth_scale)
+    if camera_matrix is not None and depth_scale is not None:
+        raise InvalidInputError("depth_scale: has no meaning with a camera_matrix; leave one of them out")
+
+    def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Tensor:
+        a, b, c = normal_variation(depth, mask, camera, sigma, depth_scale)
+        vx, vy, _ = dominant_eigenvector(a, b, b, c)
+        # Where both eigenvalues agree every direction does: x.
+        vx = torch.where((vx == 0) & (vy == 0), 1.0, vx)
+        return math.sqrt(math.pi / 3.0) * safe_sqrt(a + c) * torch.cat([vx, vy], dim=1)
+
+    return in_blocks(layer, at_least_float32(depth), mask, batched_camera(camera_matrix, depth)).to(depth.dtype)
+
+
+def batched_camera(camera_matrix: Tensor | None, depth: Tensor) -> Tensor | None:
+    """(B, 3, 3) in the dtype that ``depth`` is computed in; None stays None."""
+    if camera_matrix is None:
+        return None
+    if camera_matrix.ndim == 2:
+        camera_matrix = camera_matrix.expand(depth.shape[0], -1, -1)
+    check_tensor(camera_matrix, "camera_matrix", (depth.shape[0], 3, 3))
+    check_same_device(camera_matrix, depth, "camera_matrix")
+    return camera_matrix.to(at_least_float32(depth).dtype)
+
+
+def normal_variation(
+    depth: Tensor, mask: Tensor | None, camera: Tensor | None, sigma: float | Tensor, depth_scale: float | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """N_x . N_x, N_x . N_y, N_y . N_y per px^2, each (B, 1, H, W), from the Hessian in closed form."""
+    if camera is None:
+        z = gaussian_smooth(fill_depth(depth, mask, depth_scale), sigma)
+        zx, zy = central_gradient(z)
+        zxx, zyy, zxy = central_hessian(z)
+        one, zero = torch.ones_like(z), torch.zeros_like(z)
+        normal = (-zx, -zy, one)
+        along_x, along_y = (-zxx, -zxy, zero), (-zxy, -zyy, zero)
+        return _gram(normal, along_x, along_y)
+    visible, clean, near, span = visible_range(depth, mask)
+    z = gaussian_smooth(torch.where(visible, clean, near + BACKGROUND * span) / span, sigma)
+    zx, zy = central_gradient(z)
+    zxx, zyy, zxy = central_hessian(z)
+    H, W = z.shape[-2:]
+    fx, fy, cx, cy = (camera[:, i, j].view(-1, 1, 1, 1) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    x = torch.arange(W, device=z.device, dtype=z.dtype).view(1, 1, 1, W) - cx
+    y = torch.arange(H, device=z.device, dtype=z.dtype).view(1, 1, H, 1) - cy
+    # equ:PG:300 without its factor Z, per px: with (x, y) in px from the principal point, x Z_x needs no focal length.
+    normal = (-fx * zx, -fy * zy, x * zx + y * zy + z)
+    along_x = (-fx * zxx, -fy * zxy, x * zxx + y * zxy + 2.0 * zx)
+    along_y = (-fx * zxy, -fy * zyy, x * zxy + y * zyy + 2.0 * zy)
+    return _gram(normal, along_x, along_y)
+
+
+Vector = tuple[Tensor, Tensor, Tensor]
+
+
+def _gram(normal: Vector, along_x: Vector, along_y: Vector) -> Vector:
+    """Inner products of the derivatives of normal / |normal|, from those of ``normal``."""
+
+    def dot(a: Vector, b: Vector) -> Tensor:
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+    def cross(a: Vector, b: Vector) -> Vector:
+        return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+    # The part of a derivative across N is |N|^-2 N x (derivative x N): cross products do not cancel as projections do.
+    inverse = 1.0 / dot(normal, normal)
+    tx, ty = cross(normal, along_x), cross(normal, along_y)
+    factor = inverse * inverse
+    return dot(tx, tx) * factor, dot(tx, ty) * factor, dot(ty, ty) * factor
+
+
+def hessian_frobenius_norm(
+    depth: Tensor, mask: Tensor | None = None, *, sigma: float | Tensor = 1.0, depth_scale: float | None = None
+) -> Tensor:
+    r"""Hessian Frobenius norm (HFN): :math:`\sqrt{Z_{xx}^2 + 2 Z_{xy}^2 + Z_{yy}^2}` of depth images.
+
+    Args:
+        depth, mask, sigma, depth_scale: as in :func:`depth_curvilinear_saliency`.
+
+    Returns:
+        (B, 2, H, W): length HFN; direction of the strongest second derivative, sign free. dtype kept (half types
+        compute
+        in float32).
+
+    Raises:
+        InvalidInputError: wrong shape, dtype, mask or option.
+
+    Example:
+        >>> y, x = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
+        >>> bowl = (1 + 0.5 * x**2)[None, None]
+        >>> hessian_frobenius_norm(bowl, sigma=0.0, depth_scale=1.0)[0, :, 16, 16].tolist()
+        [1.0, 0.0]
+    """
+    check_depth(depth, mask, depth_scale)
+
+    def layer(depth: Tensor, mask: Tensor | None) -> Tensor:
+        zxx, zyy, zxy = central_hessian(gaussian_smooth(fill_depth(depth, mask, depth_scale), sigma))
+        vx, vy, _ = dominant_eigenvector(zxx, zxy, zxy, zyy)
+        vx = torch.where((vx == 0) & (vy == 0), 1.0, vx)
+        return safe_sqrt(zxx * zxx + 2.0 * zxy * zxy + zyy * zyy) * torch.cat([vx, vy], dim=1)
+
+    return in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
+
+
+class AverageShadingGradient(nn.Module):
+    """Module twin of :func:`average_shading_gradient`; ``camera_matrix`` moves with the module's device."""
+
+    camera_matrix: Tensor | None
+
+    def __init__(
+        self, *, camera_matrix: Tensor | None = None, sigma: float = 1.0, depth_scale: float | None = None
+    ) -> None:
+        super().__init__()
+        self.register_buffer("camera_matrix", camera_matrix, persistent=False)
+        self.sigma, self.depth_scale = sigma, depth_scale
+
+    def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
+        return average_shading_gradient(
+            depth, mask, camera_matrix=self.camera_matrix, sigma=self.sigma, depth_scale=self.depth_scale
+        )
+
+    def extra_repr(self) -> str:
+        camera = "orthographic" if self.camera_matrix is None else "perspective"
+        return f"{camera}, sigma={self.sigma}, depth_scale={self.depth_scale}"
+
+
+class HessianFrobeniusNorm(nn.Module):
+    """Module twin of :func:`hessian_frobenius_norm`."""
+
+    def __init__(self, *, sigma: float = 1.0, depth_scale: float | None = None) -> None:
+        super().__init__()
+        self.sigma, self.depth_scale = sigma, depth_scale
+
+    def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
+        return hessian_frobenius_norm(depth, mask, sigma=self.sigma, depth_scale=self.depth_scale)
+
+    def extra_repr(self) -> str:
+        return f"sigma={self.sigma}, depth_scale={self.depth_scale}"

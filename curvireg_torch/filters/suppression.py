@@ -1,0 +1,26 @@
+"""Non-maximum suppression across the direction of a vector field."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+__all__ = ["is_ridge"]
+
+
+def is_ridge(length: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Pixels whose length is a maximum along (x, y), rounded to 45 degrees as Canny does; all (B, 1, H, W)."""
+    H, W = length.shape[-2:]
+    p = F.pad(length, (1, 1, 1, 1))
+
+    def shifted(dx: int, dy: int) -> Tensor:
+        return p[..., 1 + dy : 1 + dy + H, 1 + dx : 1 + dx + W]
+
+    tan = 0.41421356  # tan 22.5 degrees
+    horizontal, vertical = y.abs() <= tan * x.abs(), x.abs() <= tan * y.abs()
+    diagonal = ~(horizontal | vertical)
+    falling = diagonal & (x * y > 0)  # y points down: equal signs run from top left to bottom right
+    result = torch.zeros_like(horizontal)
+    for where, dx, dy in ((horizontal, 1, 0), (vertical, 0, 1), (falling, 1, 1), (diagonal & ~falling, 1, -1)):
+        # Strict on one side, so that a plateau two pixels wide gives one point, not two or none.
+        result = result | (where & (length > shifted(dx, dy)) & (length >= shifted(-dx, -dy)))
+    return result

@@ -1,0 +1,88 @@
+"""Times the path from mesh to pose: build a bank, open it from disk, register one photograph.
+
+Prints a table and writes scripts/results/bench_pipeline.json. The mesh is a sphere with dents, made in code, so that
+the number of faces can be chosen.
+"""
+
+import argparse
+import json
+import platform
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+
+from curvireg_torch import BankSettings, Registrar, ViewBank, camera_matrix, uniform_views
+from curvireg_torch.synthetic import random_pose, synthesize_photograph
+
+
+def dented_sphere(faces: int) -> trimesh.Trimesh:
+    rings = max(4, round((faces / 4) ** 0.5))
+    mesh = trimesh.creation.uv_sphere(count=(rings, 2 * rings))
+    waves = np.random.default_rng(0).normal(size=(3, 6)) * 3
+    bumps = np.sin(mesh.vertices @ waves).mean(axis=1)
+    mesh.vertices = mesh.vertices * (1 + 0.35 * bumps[:, None]) * [1.0, 0.7, 0.5]
+    return mesh
+
+
+def seconds(call, repeats: int = 3) -> float:
+    """Median of a few runs."""
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return sorted(times)[len(times) // 2]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--views", type=int, default=700)
+    parser.add_argument("--faces", type=int, default=20_000)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "bench_pipeline.json")
+    arguments = parser.parse_args()
+
+    mesh, K, size = dented_sphere(arguments.faces), camera_matrix(900.0, 900.0, 319.5, 239.5), (480, 640)
+    generator = torch.Generator().manual_seed(0)
+    T = random_pose(mesh, K, size, generator)
+    image, box = synthesize_photograph(mesh, T, K, size, generator)
+    rows = []
+    for image_size in (128, 256):
+        settings = BankSettings(image_size=image_size)
+        views = uniform_views(arguments.views)
+        bank = ViewBank.build(mesh, views, settings=settings, progress=False)
+        build = seconds(lambda: ViewBank.build(mesh, views, settings=settings, progress=False))  # noqa: B023
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "bank.safetensors"
+            bank.save(path)
+            megabytes = path.stat().st_size / 1e6
+            opened = seconds(lambda: Registrar(ViewBank.load(path)))  # noqa: B023
+        coarse, fine = Registrar(bank, refine=False), Registrar(bank)
+        rows.append(
+            {
+                "image_size": image_size,
+                "build_s": build,
+                "open_s": opened,
+                "rank_s": seconds(lambda: coarse([image], box[None], K)),  # noqa: B023
+                "rank_and_refine_s": seconds(lambda: fine([image], box[None], K)),  # noqa: B023
+                "bank_mb": megabytes,
+            }
+        )
+        print("  ".join(f"{k} {v:.3g}" for k, v in rows[-1].items()))
+    result = {
+        "views": arguments.views,
+        "faces": len(mesh.faces),
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+        "machine": platform.machine(),
+        "rows": rows,
+    }
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(json.dumps(result, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
