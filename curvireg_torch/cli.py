@@ -1,4 +1,4 @@
-"""``curvireg``: register a photograph, build a bank, run the demo."""
+"""``curvireg``: register a photograph, build a bank, evaluate a dataset, run the demo."""
 
 import argparse
 import json
@@ -17,6 +17,7 @@ import torch
 from . import __version__
 from .data import read_image
 from .errors import CurviregError, InvalidInputError
+from .evaluation import add_parser as add_evaluate
 from .geometry import camera_matrix, load_mesh, rotation_error, sample_views, uniform_views, whole_image_box
 from .geometry.mesh import UNITS
 from .geometry.views import ViewSphere
@@ -107,6 +108,8 @@ def _parser() -> argparse.ArgumentParser:
     bank.add_argument("mesh", type=Path, metavar="MESH")
     bank.add_argument("--out", type=Path, required=True, metavar="FILE")
     bank.set_defaults(run=_bank)
+
+    add_evaluate(commands, [common])
 
     demo = commands.add_parser("demo", parents=[common], help="register a scene made in code, where the truth is known")
     demo.add_argument("--seed", type=int, default=0)

@@ -127,7 +127,7 @@ def test_help_names_the_commands(capsys):
         main(["--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
-    for command in ("register", "bank", "demo"):
+    for command in ("register", "bank", "evaluate", "demo"):
         assert command in text
 
 
