@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import trimesh
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 from tqdm import tqdm
 
@@ -186,7 +186,7 @@ class ViewBank:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
         try:
-            save_file({k: v.cpu().contiguous() for k, v in tensors.items()}, temporary, metadata)
+            temporary.write_bytes(save({k: v.cpu().contiguous() for k, v in tensors.items()}, metadata))
             os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)

@@ -1,0 +1,190 @@
+"""Banks in memory, on disk, in parts and in collections."""
+
+import json
+import os
+import stat
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from safetensors.torch import load_file, save_file
+
+from curvireg_torch.errors import BankError, InvalidInputError, MissingFileError
+from curvireg_torch.geometry import sample_views, uniform_views
+from curvireg_torch.matching import BankCollection, BankSettings, ViewBank, ViewMatcher, normalized_correlation
+from curvireg_torch.synthetic import example_mesh
+
+SETTINGS = BankSettings(image_size=64)
+VIEWS = sample_views(azimuth_step=30, elevations=[0, 40])
+
+
+@pytest.fixture(scope="module")
+def bank() -> ViewBank:
+    return ViewBank.build(example_mesh(), VIEWS, settings=SETTINGS, progress=False)
+
+
+def same(a: ViewBank, b: ViewBank, *, atol: float = 0.0) -> None:
+    torch.testing.assert_close(a.descriptors, b.descriptors, rtol=0, atol=atol)
+    for name in ("points", "silhouettes", "boxes", "rotations"):
+        assert torch.equal(getattr(a, name), getattr(b, name))
+    assert a.settings == b.settings
+
+
+def test_bank_comes_back_from_disk(bank: ViewBank, tmp_path: Path) -> None:
+    bank.save(tmp_path / "new" / "bank.safetensors")
+    loaded = ViewBank.load(tmp_path / "new" / "bank.safetensors")
+    same(loaded, bank, atol=5e-4)
+    np.testing.assert_array_equal(loaded.mesh.vertices, bank.mesh.vertices)
+    np.testing.assert_array_equal(loaded.mesh.faces, bank.mesh.faces)
+    assert loaded.mesh.units == "m"
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["bank.safetensors"]
+    if os.name == "posix":
+        mask = os.umask(0)
+        os.umask(mask)
+        assert stat.S_IMODE((tmp_path / "new" / "bank.safetensors").stat().st_mode) == 0o666 & ~mask
+
+
+def test_float16_storage_leaves_the_ranking_as_it_is(bank: ViewBank, tmp_path: Path) -> None:
+    # Queries as unlike the views as photographs are: noise of half the descriptors' length.
+    bank.save(tmp_path / "bank.safetensors")
+    loaded = ViewBank.load(tmp_path / "bank.safetensors")
+    noise = torch.rand(200, bank.descriptors.shape[1], generator=torch.Generator().manual_seed(0))
+    noise *= 0.5 * bank.descriptors.norm(dim=1).mean() / noise.norm(dim=1, keepdim=True)
+    queries = bank.descriptors[torch.arange(200) % len(bank)] + noise
+    exact, stored = (normalized_correlation(queries, b.descriptors) for b in (bank, loaded))
+    assert float((exact - stored).abs().max()) < 1e-4
+    assert float((exact.argmax(dim=1) == stored.argmax(dim=1)).float().mean()) == 1.0
+
+
+def test_chunks_and_threads_change_nothing(bank: ViewBank) -> None:
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        other = ViewBank.build(example_mesh(), VIEWS, settings=SETTINGS, progress=False, chunk_size=5)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+    same(other, bank, atol=1e-5)
+
+
+def test_parts_are_unpacked_alone(bank: ViewBank) -> None:
+    index = torch.tensor([3, 0])
+    assert torch.equal(bank.points_at(index), bank.points[index])
+    assert torch.equal(bank.silhouettes_at(slice(2, 5)), bank.silhouettes[2:5])
+    assert bank.silhouettes.dtype == torch.bool
+    assert 0.1 < float(bank.silhouettes.float().mean()) < 0.6
+
+
+def test_interrupted_build_and_save_leave_nothing(
+    bank: ViewBank, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(path: Path, content: bytes) -> None:
+        with path.open("wb") as file:
+            file.write(content[: len(content) // 2])
+        raise KeyboardInterrupt
+
+    bank.save(tmp_path / "bank.safetensors")
+    whole = (tmp_path / "bank.safetensors").read_bytes()
+    monkeypatch.setattr(Path, "write_bytes", interrupted)
+    for name in ("bank.safetensors", "other.safetensors"):
+        with pytest.raises(KeyboardInterrupt):
+            bank.save(tmp_path / name)
+    assert [p.name for p in tmp_path.iterdir()] == ["bank.safetensors"]
+    assert (tmp_path / "bank.safetensors").read_bytes() == whole
+
+
+def test_an_error_in_one_view_ends_the_build() -> None:
+    class Broken:
+        name = "broken"
+
+        def render(self, T: torch.Tensor, *_: object, **__: object) -> torch.Tensor:
+            raise KeyboardInterrupt
+
+    before = torch.get_num_threads()
+    with pytest.raises(KeyboardInterrupt):
+        ViewBank.build(example_mesh(), VIEWS, settings=SETTINGS, progress=False, renderer=Broken(), chunk_size=1)
+    assert torch.get_num_threads() == before
+
+
+def edited(path: Path, out: Path, tensors: dict[str, torch.Tensor] | None = None, **metadata: str) -> Path:
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as file:
+        kept = dict(file.metadata())
+    content = {**load_file(path), **(tensors or {})}
+    save_file({k: v for k, v in content.items() if v.numel()}, out, {**kept, **metadata})
+    return out
+
+
+def test_files_that_do_not_fit_are_refused(bank: ViewBank, tmp_path: Path) -> None:
+    good = tmp_path / "bank.safetensors"
+    bank.save(good)
+    cut = tmp_path / "cut.safetensors"
+    cut.write_bytes(good.read_bytes()[:-100])
+    other = {"settings": json.dumps({**json.loads(json.dumps(SETTINGS.__dict__)), "image_size": 128})}
+    cases = [
+        (cut, "truncated"),
+        (edited(good, tmp_path / "a", format="x"), "not a view bank"),
+        (edited(good, tmp_path / "b", version="0"), "version 0"),
+        (edited(good, tmp_path / "c", settings="{"), "incomplete"),
+        (edited(good, tmp_path / "d", settings='{"image_size": 64, "colour": 1}'), "incomplete"),
+        (edited(good, tmp_path / "e", **other), "do not match the settings"),
+        (edited(good, tmp_path / "f", {"descriptors": torch.zeros(len(bank), 7)}), "do not match the settings"),
+        (edited(good, tmp_path / "g", {"boxes": torch.zeros(len(bank) - 1, 4)}), "do not match the settings"),
+        (edited(good, tmp_path / "h", {"points": torch.zeros(0)}), "incomplete"),
+    ]
+    for path, match in cases:
+        with pytest.raises(BankError, match=match):
+            ViewBank.load(path)
+    with pytest.raises(MissingFileError, match="no such bank"):
+        ViewBank.load(tmp_path / "none")
+
+
+def test_collection_is_its_banks_one_after_the_other(bank: ViewBank) -> None:
+    second = ViewBank.build(trimesh.creation.box((0.1, 0.2, 0.1)), uniform_views(7), settings=SETTINGS, progress=False)
+    both = BankCollection([bank, second])
+    assert len(both) == len(bank) + 7
+    for name in ("descriptors", "points", "silhouettes", "boxes", "rotations"):
+        assert torch.equal(getattr(both, name), torch.cat([getattr(bank, name), getattr(second, name)]))
+    assert torch.equal(
+        both.points_at(torch.tensor([len(bank) + 2, 1])), torch.stack([second.points[2], bank.points[1]])
+    )
+    assert [both.locate(i) for i in (0, len(bank) - 1, len(bank), len(both) - 1)] == [
+        (0, 0),
+        (0, len(bank) - 1),
+        (1, 0),
+        (1, 6),
+    ]
+    with pytest.raises(InvalidInputError, match="index"):
+        both.locate(len(both))
+
+
+def test_matcher_finds_the_right_model_in_a_collection(bank: ViewBank) -> None:
+    box = ViewBank.build(trimesh.creation.box((0.1, 0.2, 0.1)), VIEWS, settings=SETTINGS, progress=False)
+    both = BankCollection([box, bank])
+    matcher = ViewMatcher(both)  # type: ignore[arg-type]
+    index = len(box) + 5
+    picture = bank.silhouettes[5].float()[None, None].repeat(1, 3, 1, 1)
+    edges = torch.tensor([[-0.5, -0.5, 63.5, 63.5]])
+    ranking = matcher(picture, edges / 1.2 + 63.0 * (1 - 1 / 1.2) / 2)  # the crop's margin gives the whole view
+    best = [both.locate(int(i)) for i in ranking.top(3)[0]]
+    assert (1, 5) in best, (index, best)
+
+
+def test_collections_that_cannot_be_compared_are_refused(bank: ViewBank) -> None:
+    coarse = ViewBank.build(example_mesh(), uniform_views(3), settings=replace(SETTINGS, sigma=2.0), progress=False)
+    with pytest.raises(InvalidInputError, match="one set of settings"):
+        BankCollection([bank, coarse])
+    with pytest.raises(InvalidInputError, match="at least one bank"):
+        BankCollection([])
+
+
+def test_any_device(bank: ViewBank) -> None:
+    devices = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
+    for device in devices:
+        moved = bank.to(device)
+        assert moved.device.type == moved.rotations.device.type == moved.points.device.type == device
+        assert torch.equal(moved.silhouettes.cpu(), bank.silhouettes)

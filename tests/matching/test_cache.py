@@ -1,0 +1,138 @@
+"""The cache of banks: found again, trimmed, cleared, shared among processes."""
+
+import multiprocessing
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import trimesh
+
+from curvireg_torch.geometry import sample_views
+from curvireg_torch.matching import (
+    BankSettings,
+    ViewBank,
+    bank_key,
+    cache_folder,
+    cached_bank,
+    clear_cache,
+    list_cache,
+    trim_cache,
+)
+
+SETTINGS = BankSettings(image_size=64)
+VIEWS = sample_views(azimuth_step=90, elevations=[20])
+
+
+def build(folder: Path, edge: float = 1.0, **options: object) -> ViewBank:
+    mesh = trimesh.creation.box((edge, 1.0, 1.0))
+    return cached_bank(mesh, VIEWS, SETTINGS, folder=folder, progress=False, **options)
+
+
+def test_second_time_from_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = build(tmp_path)
+    monkeypatch.setattr(ViewBank, "build", None)  # would fail
+    again = build(tmp_path)
+    torch.testing.assert_close(again.descriptors, first.descriptors, rtol=0, atol=5e-4)
+
+
+def test_key_depends_on_everything(monkeypatch: pytest.MonkeyPatch) -> None:
+    from curvireg_torch.matching import cache
+
+    mesh = trimesh.creation.box()
+    millimetres, moved, flipped = mesh.copy(), mesh.copy(), mesh.copy()
+    millimetres.units = "mm"
+    moved.vertices[0] += 1e-9
+    flipped.faces = flipped.faces[::-1]
+    keys = [bank_key(m, VIEWS, SETTINGS) for m in (mesh, millimetres, moved, flipped)]
+    keys += [bank_key(mesh, VIEWS[:3], SETTINGS), bank_key(mesh, VIEWS, replace(SETTINGS, sigma=1.5))]
+    monkeypatch.setattr(cache, "_code_digest", lambda: b"another version")
+    keys.append(bank_key(mesh, VIEWS, SETTINGS))
+    assert len(set(keys)) == 7
+
+
+def test_damaged_and_mislabelled_files_are_built_again(tmp_path: Path) -> None:
+    bank = build(tmp_path)
+    (path,) = tmp_path.iterdir()
+    path.write_bytes(path.read_bytes()[:1000])
+    assert torch.equal(build(tmp_path).descriptors, bank.descriptors)
+    ViewBank.build(trimesh.creation.box((9, 1, 1)), VIEWS, settings=SETTINGS, progress=False).save(path)
+    assert torch.equal(build(tmp_path).descriptors, bank.descriptors)
+
+
+def test_least_recently_used_go_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for i, edge in enumerate((1.0, 2.0, 3.0)):
+        build(tmp_path, edge)
+        for file in list_cache(tmp_path):
+            if file.used > time.time() - 50:  # the new one
+                os.utime(file.path, (1000.0 + i, 1000.0 + i))
+    first, second, third = sorted(list_cache(tmp_path), key=lambda file: file.used)
+    build(tmp_path, 1.0)  # used again: now the youngest
+    assert list_cache(tmp_path)[0].path == first.path
+    assert trim_cache(tmp_path, limit=2 * first.size + 100) == 1
+    assert {file.path for file in list_cache(tmp_path)} == {first.path, third.path}
+    monkeypatch.setenv("CURVIREG_CACHE_LIMIT", "10")  # less than one bank: the newest stays all the same
+    build(tmp_path, 5.0)
+    assert len(list_cache(tmp_path)) == 1
+    assert second.path not in {file.path for file in list_cache(tmp_path)}
+
+
+def test_list_and_clear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+    assert cache_folder() == tmp_path / "cache"
+    assert (list_cache(), clear_cache(), trim_cache()) == ([], 0, 0)  # not even a folder
+    cached_bank(trimesh.creation.box(), VIEWS, SETTINGS, progress=False)
+    left = cache_folder() / "x.safetensors.0.tmp"
+    left.write_bytes(b"of a killed process")
+    (cache_folder() / "notes.txt").write_text("not ours")
+    (file,) = list_cache()
+    assert file.size == file.path.stat().st_size > 1000
+    trim_cache()
+    assert left.exists()  # it may belong to a builder at work
+    os.utime(left, (1000.0, 1000.0))
+    trim_cache()
+    assert not left.exists()
+    assert clear_cache() == 1
+    assert [p.name for p in cache_folder().iterdir()] == ["notes.txt"]
+
+
+def test_unwritable_cache_is_no_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("a file where the folder should be")
+    assert len(build(tmp_path / "file")) == len(VIEWS)
+
+
+def _builder(folder: str, edges: tuple[float, ...]) -> float:
+    torch.set_num_threads(1)
+    return sum(float(build(Path(folder), edge).descriptors.sum()) for edge in edges)
+
+
+def test_concurrent_builders(tmp_path: Path) -> None:
+    edges = (1.0, 2.0, 3.0)
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        sums = pool.starmap(_builder, [(str(tmp_path), edges)] * 4, chunksize=1)
+    assert max(sums) - min(sums) < 1e-3 * sums[0]
+    assert len(list(tmp_path.iterdir())) == len(edges)  # nothing half-written is left
+    for file in list_cache(tmp_path):
+        assert len(ViewBank.load(file.path)) == len(VIEWS)
+
+
+def _die_while_saving(folder: str) -> None:
+    def half(path: Path, content: bytes) -> None:
+        with path.open("wb") as file:
+            file.write(content[: len(content) // 2])
+        os._exit(9)
+
+    Path.write_bytes = half  # type: ignore[method-assign, assignment]
+    build(Path(folder))
+
+
+def test_killed_builder_leaves_no_bank(tmp_path: Path) -> None:
+    process = multiprocessing.get_context("spawn").Process(target=_die_while_saving, args=(str(tmp_path),))
+    process.start()
+    process.join(60)
+    assert process.exitcode == 9
+    assert list_cache(tmp_path) == []
+    assert len(build(tmp_path)) == len(VIEWS)
+    assert len(list_cache(tmp_path)) == 1
