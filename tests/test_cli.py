@@ -75,7 +75,7 @@ def test_without_box_and_camera(files):
 def test_bank_then_register(files, capsys):
     folder, box, _ = files
     out = folder / "new.safetensors"
-    options = ["--pose", "upright", "--image-size", "32", "--quiet"]
+    options = ["--pose", "upright", "--quiet"]
     assert main(["bank", str(folder / "truck.ply"), "--out", str(out), *options]) == 0
     assert "396 views" in capsys.readouterr().out
     assert run(folder, "photo.png", "new.safetensors", "--no-refine", box=box) == 0
