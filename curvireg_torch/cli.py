@@ -21,7 +21,7 @@ from .evaluation import add_parser as add_evaluate
 from .evaluation.presets import preset_named
 from .geometry import camera_matrix, load_mesh, rotation_error, whole_image_box
 from .geometry.mesh import UNITS
-from .matching import ViewBank, cached_bank
+from .matching import ViewBank, cache_folder, cached_bank, clear_cache, list_cache
 from .registration import Registrar, Registration
 from .rendering import BACKENDS
 
@@ -103,6 +103,10 @@ def _parser() -> argparse.ArgumentParser:
     bank.add_argument("--out", type=Path, required=True, metavar="FILE")
     bank.set_defaults(run=_bank)
 
+    cache = commands.add_parser("cache", parents=[common], help="list or clear the banks that were kept on disk")
+    cache.add_argument("--clear", action="store_true", help="remove them all")
+    cache.set_defaults(run=_cache)
+
     add_evaluate(commands, [common])
 
     demo = commands.add_parser("demo", parents=[common], help="register a scene made in code, where the truth is known")
@@ -125,6 +129,17 @@ def _bank(arguments: argparse.Namespace) -> None:
     bank.save(arguments.out)
     size = arguments.out.stat().st_size / 1e6
     print(f"{arguments.out}: {len(bank)} views, {size:.1f} MB, {time.perf_counter() - start:.1f} s")
+
+
+def _cache(arguments: argparse.Namespace) -> None:
+    if arguments.clear:
+        print(f"{cache_folder()}: {clear_cache()} banks removed")
+        return
+    banks = list_cache()
+    for bank in banks:
+        used = time.strftime("%Y-%m-%d %H:%M", time.localtime(bank.used))
+        print(f"{bank.size / 1e6:8.1f} MB   last used {used}   {bank.path.name}")
+    print(f"{cache_folder()}: {len(banks)} banks, {sum(bank.size for bank in banks) / 1e6:.1f} MB")
 
 
 def _open_bank(arguments: argparse.Namespace) -> ViewBank:

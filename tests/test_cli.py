@@ -122,6 +122,15 @@ def test_a_file_where_the_folder_should_be(files, capsys):
     assert "--out" in capsys.readouterr().err
 
 
+def test_cache_is_listed_and_cleared(files, capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path))
+    (tmp_path / "a.safetensors").write_bytes((files[0] / "truck.safetensors").read_bytes())
+    assert main(["cache"]) == 0
+    assert "1 banks" in capsys.readouterr().out
+    assert main(["cache", "--clear"]) == 0
+    assert not list(tmp_path.iterdir())
+
+
 def test_help_names_the_commands(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["--help"])
