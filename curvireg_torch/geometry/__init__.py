@@ -10,32 +10,58 @@ Conventions of the whole library (pinned by ``tests/geometry``):
 """
 
 from .cameras import camera_matrix, project_points, projected_boxes, rotation_towards, transform
+from .conversions import (
+    axis_angle_from_rotation,
+    opencv_from_opengl,
+    opencv_from_pytorch3d,
+    opengl_from_opencv,
+    opengl_projection,
+    pytorch3d_from_opencv,
+    quaternion_from_rotation,
+    rotation_from_axis_angle,
+    rotation_from_quaternion,
+)
 from .crops import crop_images, crop_transforms, square_boxes, whole_image_box
 from .mesh import load_mesh, mesh_centre, mesh_radius, normalization_transform
+from .neighbours import nearest_views
+from .symmetry import symmetry_transforms, views_without_symmetric
 from .translation import place_view, translation_from_box
 from .viewpoint import rotation_error, rotation_from_viewpoint, viewpoint_from_rotation
-from .views import ViewSphere, sample_views, uniform_views
+from .views import ViewSphere, paper_views, sample_views, uniform_views
 
 __all__ = [
     "ViewSphere",
+    "axis_angle_from_rotation",
     "camera_matrix",
     "crop_images",
     "crop_transforms",
     "load_mesh",
     "mesh_centre",
     "mesh_radius",
+    "nearest_views",
     "normalization_transform",
+    "opencv_from_opengl",
+    "opencv_from_pytorch3d",
+    "opengl_from_opencv",
+    "opengl_projection",
+    "paper_views",
     "place_view",
     "project_points",
     "projected_boxes",
+    "pytorch3d_from_opencv",
+    "quaternion_from_rotation",
     "rotation_error",
+    "rotation_from_axis_angle",
+    "rotation_from_quaternion",
     "rotation_from_viewpoint",
     "rotation_towards",
     "sample_views",
     "square_boxes",
+    "symmetry_transforms",
     "transform",
     "translation_from_box",
     "uniform_views",
     "viewpoint_from_rotation",
+    "views_without_symmetric",
     "whole_image_box",
 ]

@@ -14,7 +14,16 @@ from torch import Tensor
 from .._checks import check_option
 from ..errors import MeshError, MissingFileError
 
-__all__ = ["UNITS", "as_mesh", "load_mesh", "mesh_centre", "mesh_radius", "normalization_transform"]
+__all__ = [
+    "UNITS",
+    "as_mesh",
+    "box_corners",
+    "extreme_points",
+    "load_mesh",
+    "mesh_centre",
+    "mesh_radius",
+    "normalization_transform",
+]
 
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 """Metres per unit."""
@@ -91,6 +100,20 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
     mesh.remove_unreferenced_vertices()
     mesh.units = source.units
     return mesh
+
+
+def extreme_points(mesh: trimesh.Trimesh) -> Tensor:
+    """(P, 3) float64 vertices of the convex hull, which alone decide projected boxes and outlines."""
+    try:
+        points = mesh.convex_hull.vertices
+    except Exception:  # qhull refuses flat objects
+        points = mesh.vertices
+    return torch.from_numpy(np.array(points, dtype=np.float64))
+
+
+def box_corners(mesh: trimesh.Trimesh) -> Tensor:
+    """(8, 3) float64 corners of the axis-aligned box, in model units."""
+    return torch.cartesian_prod(*torch.from_numpy(np.array(mesh.bounds, dtype=np.float64)).T)
 
 
 def mesh_centre(mesh: trimesh.Trimesh) -> Tensor:

@@ -8,6 +8,7 @@ from .cameras import project_points, rotation_towards, transform
 __all__ = ["place_view", "translation_from_box"]
 
 _ITERATIONS = 20
+_RAYS = 4  # each is tens of times nearer to the ray of the object's centre than the one before
 
 
 def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor) -> Tensor:
@@ -55,10 +56,11 @@ def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tenso
 
 
 def place_view(points: Tensor, view_rotation: Tensor, box: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    """Pose of an object that a camera looking straight at its box would see with ``view_rotation``.
+    """Pose of an object that a camera looking straight at its centre would see with ``view_rotation``.
 
-    A box away from the principal point is seen along a ray, not along the optical axis: the view is turned towards the
-    ray, and the box then gives the translation.
+    An object away from the principal point is seen along a ray, not along the optical axis: the view is turned towards
+    that ray, and the box gives the translation. The ray is first that of the box's centre, then that of the object's,
+    which the translation tells. With the true view and box the pose is the true one.
 
     Args:
         points, box, K: of :func:`translation_from_box`.
@@ -67,7 +69,12 @@ def place_view(points: Tensor, view_rotation: Tensor, box: Tensor, K: Tensor) ->
     Returns:
         rotation (3, 3) and translation (3,) in the photograph's camera, float64.
     """
+    points, R_view, K = (v.detach().cpu().double() for v in (points, view_rotation, K))
+    centre = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
     middle = torch.tensor([0.5 * float(box[0] + box[2]), 0.5 * float(box[1] + box[3]), 1.0], dtype=torch.float64)
-    ray = torch.linalg.inv(K.detach().cpu().double()) @ middle
-    rotation = rotation_towards(ray) @ view_rotation.detach().cpu().double()
-    return rotation, translation_from_box(points, rotation, box, K)
+    ray = torch.linalg.inv(K) @ middle
+    for _ in range(_RAYS):
+        rotation = rotation_towards(ray) @ R_view
+        translation = translation_from_box(points, rotation, box, K)
+        ray = rotation @ centre + translation
+    return rotation, translation

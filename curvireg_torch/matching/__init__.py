@@ -1,14 +1,27 @@
 """Banks of described views, and the matcher that ranks them for photographs."""
 
 from .bank import ViewBank
-from .cache import bank_key, cache_folder, cached_bank
+from .cache import (
+    CACHE_LIMIT,
+    CachedBank,
+    bank_key,
+    cache_folder,
+    cached_bank,
+    clear_cache,
+    list_cache,
+    trim_cache,
+)
+from .collection import BankCollection
 from .describe import BankSettings, DescribedViews, ViewDescriber
 from .matcher import QueryFeatures, Ranking, ViewMatcher
 from .repeatability import dilate_points, repeatability, repeatability_score
 from .similarity import normalized_correlation, unit_score
 
 __all__ = [
+    "CACHE_LIMIT",
+    "BankCollection",
     "BankSettings",
+    "CachedBank",
     "DescribedViews",
     "QueryFeatures",
     "Ranking",
@@ -18,9 +31,12 @@ __all__ = [
     "bank_key",
     "cache_folder",
     "cached_bank",
+    "clear_cache",
     "dilate_points",
+    "list_cache",
     "normalized_correlation",
     "repeatability",
     "repeatability_score",
+    "trim_cache",
     "unit_score",
 ]

@@ -1,9 +1,11 @@
 """Banks cached on disk by the content of what made them."""
 
+import functools
 import hashlib
 import json
 import os
-from dataclasses import asdict, fields
+import time
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,30 @@ from ..geometry.views import ViewSphere
 from .bank import FORMAT_VERSION, ViewBank
 from .describe import BankSettings
 
-__all__ = ["bank_key", "cache_folder", "cached_bank"]
+__all__ = [
+    "CACHE_LIMIT",
+    "CachedBank",
+    "bank_key",
+    "cache_folder",
+    "cached_bank",
+    "clear_cache",
+    "list_cache",
+    "trim_cache",
+]
+
+CACHE_LIMIT = 2_000_000_000
+"""Bytes that the cache may take; the banks used longest ago go first. ``$CURVIREG_CACHE_LIMIT`` overrides it."""
+
+_ABANDONED = 3600.0  # seconds after which a half-written file belongs to no builder any more
+
+
+@dataclass(frozen=True)
+class CachedBank:
+    """A file of the cache: ``path``, ``size`` in bytes, ``used``: seconds since the epoch of its last use."""
+
+    path: Path
+    size: int
+    used: float
 
 
 def cache_folder() -> Path:
@@ -27,9 +52,22 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "curvireg_torch"
 
 
+@functools.cache
+def _code_digest() -> bytes:
+    """Digest of the sources that turn a mesh into descriptors: banks of another version of them are not found."""
+    package = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for folder in ("descriptors", "filters", "geometry", "rendering"):
+        for source in sorted((package / folder).glob("*.py")):
+            digest.update(source.read_bytes())
+    digest.update((package / "matching" / "describe.py").read_bytes())
+    return digest.digest()
+
+
 def bank_key(mesh: trimesh.Trimesh, views: ViewSphere, settings: BankSettings) -> str:
-    """Hexadecimal digest of vertices, faces, unit, views, settings and format version."""
-    digest = hashlib.sha256(json.dumps([FORMAT_VERSION, asdict(settings), mesh.units], sort_keys=True).encode())
+    """Hexadecimal digest of mesh (vertices, faces, unit), views, settings and the code that describes views."""
+    digest = hashlib.sha256(json.dumps([FORMAT_VERSION, asdict(settings), mesh.units or "m"], sort_keys=True).encode())
+    digest.update(_code_digest())
     digest.update(np.ascontiguousarray(mesh.vertices, np.float64).tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, np.int64).tobytes())
     for field in fields(ViewSphere):
@@ -47,17 +85,99 @@ def cached_bank(
     progress: bool = True,
     **build_options: Any,
 ) -> ViewBank:
-    """The bank from the cache, or built and put there; a damaged file is built again, an unwritable folder no error."""
+    """The bank from the cache, or built and put there; a damaged file is built again, an unwritable folder no error.
+
+    Afterwards the cache is trimmed to its limit. Any number of processes may do this at the same time.
+
+    Args:
+        mesh: a mesh or the path of one.
+        views, settings: of the bank.
+        folder: default :func:`cache_folder`.
+        device, progress, build_options: of :meth:`ViewBank.build`.
+
+    Example:
+        >>> import tempfile
+        >>> from curvireg_torch.geometry import sample_views
+        >>> folder, views = Path(tempfile.mkdtemp()), sample_views(azimuth_step=90, elevations=[20])
+        >>> settings = BankSettings(image_size=64)
+        >>> bank = cached_bank(trimesh.creation.box(), views, settings, folder=folder, progress=False)
+        >>> len(list_cache(folder)), clear_cache(folder)
+        (1, 1)
+    """
     mesh = as_mesh(mesh)
-    path = (folder or cache_folder()) / f"{bank_key(mesh, views, settings)}.safetensors"
+    folder = folder or cache_folder()
+    key = bank_key(mesh, views, settings)
+    path = folder / f"{key}.safetensors"
     if path.is_file():
         try:
-            return ViewBank.load(path, device=device)
+            bank = ViewBank.load(path, device=device)
+            if bank_key(bank.mesh, bank.views, bank.settings) != key:
+                raise BankError(f"{path}: holds another bank than its name says")
         except BankError:
             path.unlink(missing_ok=True)
+        else:
+            _touch(path)
+            return bank
     bank = ViewBank.build(mesh, views, settings=settings, progress=progress, device=device, **build_options)
     try:
         bank.save(path)
+        trim_cache(folder, keep=path)
     except OSError:
         return bank
     return bank
+
+
+def list_cache(folder: Path | None = None) -> list[CachedBank]:
+    """The banks of the cache, last used first."""
+    banks = []
+    for path in (folder or cache_folder()).glob("*.safetensors"):
+        try:
+            status = path.stat()
+        except FileNotFoundError:  # another process removed it
+            continue
+        banks.append(CachedBank(path, status.st_size, status.st_mtime))
+    return sorted(banks, key=lambda bank: bank.used, reverse=True)
+
+
+def clear_cache(folder: Path | None = None) -> int:
+    """Remove every bank of the cache, and what killed builders left; returns how many banks there were."""
+    folder = folder or cache_folder()
+    banks = list_cache(folder)
+    for path in [bank.path for bank in banks] + list(folder.glob("*.safetensors.*.tmp")):
+        path.unlink(missing_ok=True)
+    return len(banks)
+
+
+def trim_cache(folder: Path | None = None, *, limit: int | None = None, keep: Path | None = None) -> int:
+    """Remove the banks used longest ago until the cache fits its limit; returns how many went.
+
+    Args:
+        folder: default :func:`cache_folder`.
+        limit: bytes; default ``$CURVIREG_CACHE_LIMIT``, else :data:`CACHE_LIMIT`.
+        keep: a bank that stays, whatever its size.
+    """
+    folder = folder or cache_folder()
+    if limit is None:
+        given = os.environ.get("CURVIREG_CACHE_LIMIT", "")
+        limit = int(given) if given.isdecimal() else CACHE_LIMIT
+    for path in folder.glob("*.safetensors.*.tmp"):
+        try:
+            if time.time() - path.stat().st_mtime > _ABANDONED:
+                path.unlink(missing_ok=True)
+        except FileNotFoundError:
+            continue
+    removed, total = 0, 0
+    for bank in list_cache(folder):
+        total += bank.size
+        if total > limit and bank.path != keep:
+            bank.path.unlink(missing_ok=True)
+            total -= bank.size
+            removed += 1
+    return removed
+
+
+def _touch(path: Path) -> None:
+    try:
+        os.utime(path)
+    except OSError:  # a cache that may only be read
+        return

@@ -1,9 +1,7 @@
 """Views of one mesh, framed as a photograph's crop is, rendered, filtered and described."""
 
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
 import torch
 import trimesh
 from torch import Tensor
@@ -14,7 +12,7 @@ from ..errors import InvalidInputError
 from ..filters import DepthCurvilinearSaliency
 from ..geometry.cameras import projected_boxes, transform
 from ..geometry.crops import crop_transforms, square_boxes
-from ..geometry.mesh import mesh_centre
+from ..geometry.mesh import extreme_points, mesh_centre
 from ..rendering import DepthRenderer, make_renderer
 
 __all__ = ["BankSettings", "DescribedViews", "ViewDescriber"]
@@ -96,8 +94,8 @@ class ViewDescriber:
     ) -> None:
         self.settings = settings
         self.centre = mesh_centre(mesh)
-        self._renderer = make_renderer(mesh, renderer)
-        self.hull = _extreme_points(mesh)
+        self._renderer = make_renderer(mesh, renderer, device=device)
+        self.hull = extreme_points(mesh)
         self._orthographic = settings.camera == "orthographic"
         self._filter, self._descriptor = settings.depth_filter(), settings.descriptor()
         self._device = device
@@ -133,12 +131,3 @@ class ViewDescriber:
         field = self._filter(depth)
         points = field_points(field, share=self.settings.point_share)[:, 0]
         return DescribedViews(self._descriptor(field), points, depth[:, 0] > 0, boxes)
-
-
-def _extreme_points(mesh: Any) -> Tensor:
-    """(P, 3) vertices of the convex hull, which alone decide projected boxes."""
-    try:
-        points = mesh.convex_hull.vertices
-    except Exception:  # qhull refuses flat objects
-        points = mesh.vertices
-    return torch.from_numpy(np.array(points, dtype=np.float64))

@@ -5,6 +5,7 @@ nothing is NaN; a missing estimate has the error ``inf`` and counts as a miss. E
 good enough, except for a radius in pixels and for the IoU, which are inclusive.
 """
 
+from ..geometry.symmetry import symmetry_transforms
 from .classes import Metric, PoseRecall, RankPrecision, ViewpointAccuracy
 from .detection import (
     Detections,
@@ -16,7 +17,6 @@ from .detection import (
 from .points import hausdorff_distance, intersection_percentage, repeatability
 from .pose import add_error, add_recall, adds_error, mspd_error, mspd_recall, mssd_error, mssd_recall
 from .ranking import closest_view, pose_parameter_errors, rank_precision, viewpoint_differences
-from .symmetry import symmetry_transforms
 from .viewpoint import (
     AVP_BINS,
     accuracy,

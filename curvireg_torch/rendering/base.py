@@ -13,9 +13,12 @@ from ..errors import InvalidInputError, MissingDependencyError, RenderingError
 from ..geometry.cameras import check_camera_matrix
 from ..geometry.mesh import as_mesh
 
-__all__ = ["BACKENDS", "DepthRenderer", "make_renderer", "render_depth"]
+__all__ = ["BACKENDS", "NEAREST", "DepthRenderer", "make_renderer", "render_depth"]
 
-BACKENDS = ("auto", "embree", "pyrender")
+BACKENDS = ("auto", "embree", "pyrender", "torch")
+
+NEAREST = 1e-3
+"""Surface nearer to the camera's plane than this many object radii, or behind it, is not seen."""
 
 
 class DepthRenderer(Protocol):
@@ -35,25 +38,47 @@ class DepthRenderer(Protocol):
             orthographic: parallel projection along z; fx, fy are then px per model unit.
 
         Returns:
-            (N, 1, H, W) float32 z-depth at the pixels' centres, in model units; 0 = background. On the CPU.
+            (N, 1, H, W) float32 z-depth at the pixels' centres, in model units; 0 = background. On the renderer's
+            device: the CPU, but for "torch".
         """
         ...
 
 
-def make_renderer(mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto") -> DepthRenderer:
-    """A renderer of ``mesh``.
+def make_renderer(
+    mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto", *, device: torch.device | str = "cpu"
+) -> DepthRenderer:
+    """A renderer of ``mesh``; all agree, see ``docs/conventions.md``.
 
-    ``"embree"`` casts rays on the CPU and needs nothing but its wheel; ``"pyrender"`` draws through OpenGL and needs a
-    system with EGL. ``"auto"`` takes embree where it is installed (the faster of the two on a CPU), else pyrender.
+    - ``"embree"`` casts rays on the CPU and needs nothing but its wheel. Threads may share it, forked processes too.
+    - ``"pyrender"`` draws through OpenGL and needs a system with EGL. Threads may share it and take turns; a process
+      forked after its first use cannot (start processes by "spawn").
+    - ``"torch"`` needs nothing and runs on any torch device. Threads may share it; forked processes must call
+      ``torch.set_num_threads(1)`` first.
+    - ``"auto"``: embree where it is installed (the fastest on a CPU), else pyrender where EGL works, else torch.
+
+    Args:
+        mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
+        backend: a name, or a renderer, which is returned as it is.
+        device: where "torch" renders.
 
     Raises:
+        InvalidInputError: unknown name.
         RenderingError, MissingDependencyError: the backend does not work here.
     """
     if not isinstance(backend, str):
         return backend
     check_option(backend, BACKENDS, "renderer")
     if backend == "auto":
-        backend = "embree" if importlib.util.find_spec("embreex") else "pyrender"
+        if importlib.util.find_spec("embreex"):
+            return make_renderer(mesh, "embree")
+        try:
+            return make_renderer(mesh, "pyrender")
+        except RenderingError:
+            return make_renderer(mesh, "torch", device=device)
+    if backend == "torch":
+        from .zbuffer import TorchRenderer
+
+        return TorchRenderer(mesh, device=device)
     if backend == "embree":
         try:
             from .embree import EmbreeRenderer
@@ -94,11 +119,11 @@ def render_depth(
     """Depth images of a mesh.
 
     Args:
-        mesh: a mesh or the path of one.
+        mesh: a mesh, a scene (all its parts, placed by their transforms) or the path of one.
         T_cam_from_model: (N, 4, 4) or (4, 4), model to OpenCV camera.
         camera_matrix: (N, 3, 3) or (3, 3) in px; pixel (0, 0) is the centre of the top-left pixel.
         size: (H, W).
-        renderer: "auto", "embree" or "pyrender", or a :class:`DepthRenderer`.
+        renderer: "auto", "embree", "pyrender" or "torch", see :func:`make_renderer`, or a :class:`DepthRenderer`.
         orthographic: parallel projection; fx, fy are then px per model unit.
 
     Returns:

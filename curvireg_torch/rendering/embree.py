@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import numpy as np
 import torch
 import trimesh
@@ -9,19 +10,21 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from torch import Tensor
 
-from ..geometry.mesh import mesh_centre, mesh_radius
-from .base import check_render_arguments
+from ..geometry.mesh import box_corners, extreme_points, mesh_centre, mesh_radius
+from .base import NEAREST, check_render_arguments
 
 __all__ = ["EmbreeRenderer"]
 
 _MISS = 1e30  # embreex returns 1e37 where a ray hits nothing
-_NEAREST = 1e-3  # rays start no closer than this many object radii before the camera
+_HULL = 200_000  # vertices up to which a convex hull takes less time than it saves
+_OUTLINE = 4096  # points of a convex hull that are worth projecting in every view
+_DRAWABLE = 16000  # px, as far as OpenCV draws polygons
 
 
 class EmbreeRenderer:
     """One ray through each pixel's centre; views are shared among threads.
 
-    Thread-safe (rays only read the scene). A fork or another process needs its own renderer.
+    Thread-safe, since rays only read the scene, and fork-safe. Cannot be pickled: a spawned process makes its own.
     """
 
     name = "embree"
@@ -31,7 +34,9 @@ class EmbreeRenderer:
         self._centre = mesh_centre(mesh).numpy()
         self._radius = mesh_radius(mesh)
         vertices = (np.asarray(mesh.vertices) - self._centre) / self._radius
-        self._corners = np.array(np.meshgrid(*zip(vertices.min(0), vertices.max(0), strict=True))).reshape(3, -1).T
+        outline = extreme_points(mesh) if len(vertices) <= _HULL else box_corners(mesh)
+        outline = outline if len(outline) <= _OUTLINE else box_corners(mesh)
+        self._outline = (outline.numpy() - self._centre) / self._radius
         self._scene = EmbreeScene()
         TriangleMesh(scene=self._scene, vertices=vertices.astype(np.float32), indices=np.asarray(mesh.faces, np.int32))
 
@@ -51,44 +56,39 @@ class EmbreeRenderer:
     def _render_view(self, T: np.ndarray, K: np.ndarray, out: np.ndarray, orthographic: bool) -> None:
         R = T[:3, :3]
         t = (T[:3, 3] + R @ self._centre) / self._radius  # centre of the object in the camera, in radii
-        corners = self._corners @ R.T + t
-        near = corners[:, 2].min()
-        if corners[:, 2].max() <= _NEAREST and not orthographic:
+        outline = self._outline @ R.T + t
+        if outline[:, 2].max() <= NEAREST:
             return  # wholly behind the camera
-        rows, columns = self._window(corners, K, out.shape, orthographic)
-        if rows.stop <= rows.start or columns.stop <= columns.start:
-            return
-        u, v = np.meshgrid(np.arange(columns.start, columns.stop), np.arange(rows.start, rows.stop))
+        # Rays start at the plane z = near: no digits are spent on the way to a distant object.
+        near = max(outline[:, 2].min() - 1e-3, NEAREST)
+        v, u = self._pixels(outline, K, out.shape, orthographic)
         y = (v - K[1, 2]) / K[1, 1]
         x = (u - K[0, 2] - K[0, 1] * y) / K[0, 0]
-        pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
-        # Rays start at the plane z = near: no digits are spent on the way to a distant object.
         if orthographic:
-            near -= 1.0
-            starts = pixels @ R[:2] / self._radius + (near * R[2] - R.T @ t)
+            starts = np.stack([x, y], 1) @ R[:2] / self._radius + (near * R[2] - R.T @ t)
             directions = np.broadcast_to(R[2], starts.shape)
         else:
-            near = max(near - 1e-3, _NEAREST)
-            directions = pixels @ R[:2] + R[2]
+            directions = np.stack([x, y], 1) @ R[:2] + R[2]
             starts = near * directions - R.T @ t
         along = self._scene.run(
             np.ascontiguousarray(starts, np.float32), np.ascontiguousarray(directions, np.float32), query="DISTANCE"
-        ).reshape(u.shape)
-        depth = np.where(along < _MISS, (along + near) * self._radius, 0.0)
-        out[rows, columns] = np.maximum(depth, 0.0)
+        )
+        out[v, u] = np.where(along < _MISS, (along + near) * self._radius, 0.0)
 
-    def _window(
-        self, corners: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool
-    ) -> tuple[slice, slice]:
-        """Rows and columns that the object's box, projected, can touch."""
-        H, W = size
+    def _pixels(
+        self, outline: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool
+    ) -> tuple[np.ndarray, ...]:
+        """Rows and columns of the pixels inside the outline's projection, with a rim of a pixel."""
+        mask = np.ones(size, dtype=np.uint8)
         if orthographic:
-            xy = corners[:, :2] * self._radius
-        elif corners[:, 2].min() <= _NEAREST:
-            return slice(0, H), slice(0, W)  # the box passes the camera's plane: no finite projection
+            xy = outline[:, :2] * self._radius
+        elif outline[:, 2].min() > NEAREST:
+            xy = outline[:, :2] / outline[:, 2:]
         else:
-            xy = corners[:, :2] / corners[:, 2:]
+            return np.nonzero(mask)  # it passes the camera's plane: no finite projection
         uv = xy @ K[:2, :2].T + K[:2, 2]
-        low = np.clip(np.floor(uv.min(axis=0)), 0, (W, H)).astype(int)
-        high = np.clip(np.ceil(uv.max(axis=0)) + 1, 0, (W, H)).astype(int)
-        return slice(low[1], high[1]), slice(low[0], high[0])
+        if np.abs(uv).max() < _DRAWABLE:
+            mask[:] = 0
+            cv2.fillConvexPoly(mask, cv2.convexHull(np.round(uv).astype(np.int32)), 1)
+            mask = cv2.dilate(mask, np.ones((3, 3), np.uint8))
+        return np.nonzero(mask)

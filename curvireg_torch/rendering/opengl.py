@@ -1,5 +1,6 @@
 """Depth through OpenGL with pyrender, off screen by EGL."""
 
+import atexit
 import os
 import threading
 from typing import Any
@@ -10,8 +11,9 @@ import trimesh
 from torch import Tensor
 
 from ..errors import RenderingError
-from ..geometry.mesh import mesh_centre, mesh_radius
-from .base import check_render_arguments
+from ..geometry.conversions import opencv_from_opengl, opengl_projection
+from ..geometry.mesh import box_corners, mesh_centre, mesh_radius
+from .base import NEAREST, check_render_arguments
 
 __all__ = ["PyrenderRenderer"]
 
@@ -22,18 +24,41 @@ _context: tuple[int, Any] | None = None
 def _offscreen() -> Any:
     """The process's one OffscreenRenderer: a second one fails under EGL, and none survives a fork."""
     global _context
-    if _context is None or _context[0] != os.getpid():
+    if _context is not None and _context[0] != os.getpid():
+        raise RenderingError(
+            "renderer 'pyrender' was used before this process was forked, which OpenGL does not survive; start "
+            "processes by 'spawn', or use renderer='embree'"
+        )
+    if _context is None:
         os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
         try:
             import pyrender
 
             _context = (os.getpid(), pyrender.OffscreenRenderer(64, 64))
+            atexit.register(_release)
         except Exception as error:  # PyOpenGL raises whatever its loader met
             raise RenderingError(
                 f"renderer 'pyrender' needs OpenGL through EGL ({type(error).__name__}: {error}); "
                 "install the system's libegl1, or use renderer='embree'"
             ) from error
     return _context[1]
+
+
+def _let_go(offscreen: Any) -> None:
+    """Unbind the context from this thread, so that another may take it; pyrender's own make_uncurrent does nothing."""
+    from OpenGL import EGL
+
+    display = getattr(offscreen._platform, "_egl_display", None)
+    if display is not None:
+        EGL.eglMakeCurrent(display, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
+
+
+def _release() -> None:
+    """Give the context back at the end of the process that made it."""
+    global _context
+    if _context is not None and _context[0] == os.getpid():
+        _context[1].delete()
+    _context = None
 
 
 def _camera(P: np.ndarray, near: float, far: float) -> Any:
@@ -51,27 +76,32 @@ def _camera(P: np.ndarray, near: float, far: float) -> Any:
 class PyrenderRenderer:
     """Draws into the process's one EGL context, one view at a time, behind a lock: thread-safe.
 
-    Two defects of pyrender 0.1.45 are worked around. Its framebuffer takes four samples a pixel and resolves depth to
-    one of them, off the centre: segmentation mode switches that off. Orthographic depth comes back through the
-    perspective formula: it is inverted here.
+    Defects of pyrender 0.1.45 are worked around. Its framebuffer takes four samples a pixel and resolves depth to one
+    of them, off the centre: segmentation mode switches that off. That mode culls faces seen from behind, whatever its
+    flags say: faces are drawn both ways round. Orthographic depth comes back through the perspective formula: it is
+    inverted here. Its EGL context stays bound to the thread that used it last: it is unbound here.
+
+    Depth has 24 bits, spread over the object as perspective does: a camera inside the object's box sees its far end
+    less exactly than the other backends do.
     """
 
     name = "pyrender"
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
-        self._centre = mesh_centre(mesh).numpy()
+        self._centre = mesh_centre(mesh)
         self._radius = mesh_radius(mesh)
+        self._corners = (box_corners(mesh) - self._centre) / self._radius
         with _lock:
-            _offscreen()
+            _let_go(_offscreen())
             import pyrender
 
-            positions = ((np.asarray(mesh.vertices) - self._centre) / self._radius).astype(np.float32)
-            primitive = pyrender.Primitive(positions=positions, indices=np.asarray(mesh.faces, np.uint32), mode=4)
+            positions = ((np.asarray(mesh.vertices) - self._centre.numpy()) / self._radius).astype(np.float32)
+            faces = np.asarray(mesh.faces, np.uint32)
+            both_sides = np.concatenate([faces, faces[:, ::-1]])
+            primitive = pyrender.Primitive(positions=positions, indices=both_sides, mode=4)
             self._scene = pyrender.Scene(bg_color=np.zeros(4))
             self._node = self._scene.add(pyrender.Mesh([primitive]))
-            self._flags = (
-                pyrender.RenderFlags.DEPTH_ONLY | pyrender.RenderFlags.SEG | pyrender.RenderFlags.SKIP_CULL_FACES
-            )
+            self._flags = pyrender.RenderFlags.DEPTH_ONLY | pyrender.RenderFlags.SEG
 
     def render(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
@@ -81,45 +111,39 @@ class PyrenderRenderer:
         with _lock:
             offscreen = _offscreen()
             offscreen.viewport_height, offscreen.viewport_width = size
-            for i in range(len(T)):
-                self._render_view(offscreen, T[i].numpy(), K[i].numpy(), out[i, 0], orthographic)
+            try:
+                for i in range(len(T)):
+                    self._render_view(offscreen, T[i], K[i], out[i, 0], orthographic)
+            finally:
+                _let_go(offscreen)
         return torch.from_numpy(out)
 
-    def _render_view(self, offscreen: Any, T: np.ndarray, K: np.ndarray, out: np.ndarray, orthographic: bool) -> None:
-        H, W = out.shape
-        t = (T[:3, 3] + T[:3, :3] @ self._centre) / self._radius
+    def _render_view(self, offscreen: Any, T: Tensor, K: Tensor, out: np.ndarray, orthographic: bool) -> None:
+        cam_from_model = T.clone()  # in radii, the object's centre at its origin
+        cam_from_model[:3, 3] = (T[:3, 3] + T[:3, :3] @ self._centre) / self._radius
         # The clip range hugs the object: 24 bits of depth are spent on it alone.
-        near, far = t[2] - 1.001, t[2] + 1.001
-        if not orthographic:
-            near = max(near, 1e-3)
-            if far <= near:
-                return
-        fx, fy, skew = K[0, 0], K[1, 1], K[0, 1]
-        cx, cy = K[0, 2] + 0.5, K[1, 2] + 0.5  # OpenGL counts from the corner of the pixel
-        # Rows: clip x, clip y, clip z, clip w of an OpenCV camera point (x, y, z, 1); OpenGL's image runs upwards.
-        P = np.zeros((4, 4))
+        z = self._corners @ cam_from_model[2, :3] + cam_from_model[2, 3]
+        near, far = max(float(z.min()) - 1e-3, NEAREST), float(z.max()) + 1e-3
+        if far - 1e-3 <= near:
+            return  # wholly behind the camera
+        K = K.clone()
+        shift = 0.0
         if orthographic:
-            s = self._radius
-            P[0] = 2 * fx * s / W, 2 * skew * s / W, 0, 2 * cx / W - 1
-            P[1] = 0, -2 * fy * s / H, 0, 1 - 2 * cy / H
-            P[2] = 0, 0, 2 / (far - near), -(far + near) / (far - near)
-            P[3, 3] = 1
-        else:
-            P[0] = 2 * fx / W, 2 * skew / W, 2 * cx / W - 1, 0
-            P[1] = 0, -2 * fy / H, 1 - 2 * cy / H, 0
-            P[2] = 0, 0, (far + near) / (far - near), -2 * far * near / (far - near)
-            P[3, 2] = 1
-        camera = self._scene.add(_camera(P, near, far))
+            # Pyrender takes depth for perspective's, 2 f n / (f + n - ndc (f - n)): bring the object to where the
+            # inverse of that loses no digits.
+            shift = 2.0 - near
+            cam_from_model[2, 3] += shift
+            near, far = near + shift, far + shift
+            K[:2, :2] *= self._radius
+        P = opengl_projection(K, (out.shape[0], out.shape[1]), near=near, far=far, orthographic=orthographic)
+        camera = self._scene.add(_camera(P.numpy(), near, far))
         try:
-            model_from_cam = np.eye(4)
-            model_from_cam[:3, :3] = T[:3, :3].T
-            model_from_cam[:3, 3] = -T[:3, :3].T @ t
-            self._scene.set_pose(camera, model_from_cam)
+            self._scene.set_pose(camera, torch.linalg.inv(opencv_from_opengl(cam_from_model)).numpy())
             depth = offscreen.render(self._scene, flags=self._flags, seg_node_map={self._node: (255, 255, 255)})
         finally:
             self._scene.remove_node(camera)
+        seen = depth > 0
         if orthographic:
-            seen = depth > 0
             ndc = (far + near - 2 * near * far / np.where(seen, depth, 1.0)) / (far - near)
-            depth = np.where(seen, 0.5 * (ndc * (far - near) + far + near), 0.0)
-        out[:] = np.maximum(depth * self._radius, 0.0)
+            depth = np.asarray(0.5 * (ndc * (far - near) + far + near) - shift)
+        out[:] = np.where(seen, depth * self._radius, 0.0)

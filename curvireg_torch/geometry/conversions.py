@@ -1,0 +1,182 @@
+"""From the OpenCV camera to the conventions of others, and back.
+
+| convention | camera axes | transform | principal point of pixel (i, j)'s centre |
+|---|---|---|---|
+| here, OpenCV | x right, y down, z forward | ``x_cam = R x + t`` | (i, j) |
+| OpenGL | x right, y up, z backward | ``x_cam = R x + t`` | (i + 0.5, j + 0.5) |
+| PyTorch3D | x left, y up, z forward | ``x_cam = x R + T`` (rows) | (i + 0.5, j + 0.5) |
+
+Quaternions are (w, x, y, z), of length 1; axis-angle vectors have the angle, in radians, as their length.
+"""
+
+import torch
+from kornia.geometry import conversions as kornia_conversions
+from torch import Tensor
+
+from .._checks import check_tensor
+from ..errors import InvalidInputError
+from .cameras import check_camera_matrix, transform
+
+__all__ = [
+    "axis_angle_from_rotation",
+    "opencv_from_opengl",
+    "opencv_from_pytorch3d",
+    "opengl_from_opencv",
+    "opengl_projection",
+    "pytorch3d_from_opencv",
+    "quaternion_from_rotation",
+    "rotation_from_axis_angle",
+    "rotation_from_quaternion",
+]
+
+
+def _flip(matrix: Tensor, signs: tuple[float, ...]) -> Tensor:
+    return matrix * torch.tensor(signs, dtype=matrix.dtype, device=matrix.device)[:, None]
+
+
+def opengl_from_opencv(T_cam_from_model: Tensor) -> Tensor:
+    """Transform into the OpenGL camera (a view matrix, as ``gluLookAt`` makes it).
+
+    Args:
+        T_cam_from_model: (..., 4, 4) into the OpenCV camera.
+
+    Returns:
+        (..., 4, 4) into the camera with x right, y up, z backward. Its inverse is the camera's pose in the model frame,
+        which trimesh, pyrender and Blender ask for.
+
+    Raises:
+        InvalidInputError: not floating (..., 4, 4).
+
+    Example:
+        >>> opengl_from_opencv(torch.eye(4)).diagonal().tolist()
+        [1.0, -1.0, -1.0, 1.0]
+    """
+    check_tensor(T_cam_from_model, "T_cam_from_model", (None,) * (T_cam_from_model.ndim - 2) + (4, 4))
+    return _flip(T_cam_from_model, (1.0, -1.0, -1.0, 1.0))
+
+
+def opencv_from_opengl(T_cam_from_model: Tensor) -> Tensor:
+    """Inverse of :func:`opengl_from_opencv`; the flip of two axes is its own inverse."""
+    return opengl_from_opencv(T_cam_from_model)
+
+
+def opengl_projection(
+    K: Tensor, size: tuple[int, int], *, near: float, far: float, orthographic: bool = False
+) -> Tensor:
+    """OpenGL projection matrix of an OpenCV camera matrix.
+
+    Args:
+        K: (..., 3, 3) in px; orthographic: fx, fy in px per model unit.
+        size: (H, W) of the image in px.
+        near, far: clip distances along the optical axis in model units; 0 < near < far (orthographic: near < far).
+        orthographic: parallel projection.
+
+    Returns:
+        (..., 4, 4) from the OpenGL camera to clip coordinates; OpenGL's row 0 is the image's last.
+
+    Raises:
+        InvalidInputError: bad K, size or clip distances.
+
+    Example:
+        >>> K = torch.tensor([[64.0, 0, 31.5], [0, 64.0, 31.5], [0, 0, 1]])
+        >>> opengl_projection(K, (64, 64), near=1.0, far=3.0).diagonal().tolist()
+        [2.0, 2.0, -2.0, 0.0]
+    """
+    check_camera_matrix(K)
+    H, W = size
+    if H < 1 or W < 1:
+        raise InvalidInputError(f"size: expected (H, W) >= 1, got {size}")
+    if not near < far or (near <= 0 and not orthographic):
+        raise InvalidInputError(f"near, far: expected 0 < near < far, got {near}, {far}")
+    fx, fy, skew = K[..., 0, 0], K[..., 1, 1], K[..., 0, 1]
+    # The pixel's centre lies half a pixel from the corner that OpenGL counts from.
+    x0, y0 = 2.0 * (K[..., 0, 2] + 0.5) / W - 1.0, 1.0 - 2.0 * (K[..., 1, 2] + 0.5) / H
+    P = torch.zeros(*K.shape[:-2], 4, 4, dtype=K.dtype, device=K.device)
+    P[..., 0, 0], P[..., 0, 1], P[..., 1, 1] = 2.0 * fx / W, -2.0 * skew / W, 2.0 * fy / H
+    if orthographic:
+        P[..., 0, 3], P[..., 1, 3] = x0, y0
+        P[..., 2, 2], P[..., 2, 3] = -2.0 / (far - near), -(far + near) / (far - near)
+        P[..., 3, 3] = 1.0
+    else:
+        P[..., 0, 2], P[..., 1, 2] = -x0, -y0
+        P[..., 2, 2], P[..., 2, 3] = -(far + near) / (far - near), -2.0 * far * near / (far - near)
+        P[..., 3, 2] = -1.0
+    return P
+
+
+def pytorch3d_from_opencv(T_cam_from_model: Tensor) -> tuple[Tensor, Tensor]:
+    """``R`` and ``T`` of a PyTorch3D camera.
+
+    With ``in_ndc=False``, ``focal_length=(fx, fy)`` and ``principal_point=(cx + 0.5, cy + 0.5)`` complete the camera.
+
+    Args:
+        T_cam_from_model: (..., 4, 4) into the OpenCV camera.
+
+    Returns:
+        R (..., 3, 3), T (..., 3) with ``x_cam = x R + T`` for row vectors x; x left, y up, z forward.
+
+    Raises:
+        InvalidInputError: not floating (..., 4, 4).
+
+    Example:
+        >>> R, T = pytorch3d_from_opencv(transform(torch.eye(3), torch.tensor([1.0, 2.0, 3.0])))
+        >>> R.diagonal().tolist(), T.tolist()
+        ([-1.0, -1.0, 1.0], [-1.0, -2.0, 3.0])
+    """
+    check_tensor(T_cam_from_model, "T_cam_from_model", (None,) * (T_cam_from_model.ndim - 2) + (4, 4))
+    flipped = _flip(T_cam_from_model, (-1.0, -1.0, 1.0, 1.0))
+    return flipped[..., :3, :3].mT.contiguous(), flipped[..., :3, 3].contiguous()
+
+
+def opencv_from_pytorch3d(R: Tensor, T: Tensor) -> Tensor:
+    """Inverse of :func:`pytorch3d_from_opencv`: (..., 3, 3) and (..., 3) to (..., 4, 4)."""
+    check_tensor(R, "R", (None,) * (R.ndim - 2) + (3, 3))
+    check_tensor(T, "T", (*R.shape[:-2], 3))
+    return _flip(transform(R.mT, T), (-1.0, -1.0, 1.0, 1.0))
+
+
+def quaternion_from_rotation(R: Tensor) -> Tensor:
+    """(..., 3, 3) rotations to (..., 4) unit quaternions (w, x, y, z); q and -q are the same rotation.
+
+    Example:
+        >>> quaternion_from_rotation(torch.eye(3)).tolist()
+        [1.0, 0.0, 0.0, 0.0]
+    """
+    check_tensor(R, "R", (None,) * (R.ndim - 2) + (3, 3))
+    quaternion: Tensor = kornia_conversions.rotation_matrix_to_quaternion(R.contiguous())
+    return quaternion
+
+
+def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
+    """(..., 4) quaternions (w, x, y, z) of any length > 0 to (..., 3, 3) rotations.
+
+    Example:
+        >>> rotation_from_quaternion(torch.tensor([0.0, 0.0, 0.0, 2.0])).diagonal().tolist()
+        [-1.0, -1.0, 1.0]
+    """
+    check_tensor(quaternion, "quaternion", (None,) * (quaternion.ndim - 1) + (4,))
+    R: Tensor = kornia_conversions.quaternion_to_rotation_matrix(quaternion)
+    return R
+
+
+def axis_angle_from_rotation(R: Tensor) -> Tensor:
+    """(..., 3, 3) rotations to (..., 3) axis x angle, the angle in radians, at most pi.
+
+    Example:
+        >>> axis_angle_from_rotation(torch.diag(torch.tensor([1.0, -1.0, -1.0]))).abs().tolist()[0]
+        3.1415927410125732
+    """
+    check_tensor(R, "R", (None,) * (R.ndim - 2) + (3, 3))
+    axis_angle: Tensor = kornia_conversions.quaternion_to_axis_angle(quaternion_from_rotation(R))
+    return axis_angle
+
+
+def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
+    """(..., 3) axis x angle in radians to (..., 3, 3) rotations.
+
+    Example:
+        >>> rotation_from_axis_angle(torch.zeros(3)).diagonal().tolist()
+        [1.0, 1.0, 1.0]
+    """
+    check_tensor(axis_angle, "axis_angle", (None,) * (axis_angle.ndim - 1) + (3,))
+    return rotation_from_quaternion(kornia_conversions.axis_angle_to_quaternion(axis_angle))

@@ -1,0 +1,161 @@
+"""Depth by a z-buffer written in torch: any device, no compiled extension; the reference for the other backends."""
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from ..geometry.mesh import mesh_centre, mesh_radius
+from .base import NEAREST, check_render_arguments
+
+__all__ = ["TorchRenderer"]
+
+_PAIRS = 2**20  # (triangle, pixel) pairs in memory at a time, about 60 bytes each
+_TRIANGLES = 2**18  # triangles x views set up at a time, about 400 bytes each
+_SLACK = 1e-5  # barycentric share outside a triangle that still counts: closes the seams that rounding opens
+
+
+class TorchRenderer:
+    """Every pixel's centre is tested against every triangle whose box holds it, in chunks; the nearest wins.
+
+    Edge functions are formed from homogeneous points, so that no triangle needs clipping. They are set up in float64
+    (float32 where a device has none) at a pixel beside the triangle, and evaluated in float32.
+
+    Thread-safe. In a forked process torch itself hangs on more than one thread: call ``torch.set_num_threads(1)`` there
+    first, as the workers of a ``DataLoader`` do.
+
+    Args:
+        mesh: a clean mesh.
+        device: where views are rendered and depth stays.
+    """
+
+    name = "torch"
+
+    def __init__(self, mesh: trimesh.Trimesh, *, device: torch.device | str = "cpu") -> None:
+        self.device = torch.device(device)
+        self._setup_dtype = torch.float32 if self.device.type == "mps" else torch.float64
+        self._centre, self._radius = mesh_centre(mesh), mesh_radius(mesh)
+        vertices = (np.asarray(mesh.vertices) - self._centre.numpy()) / self._radius
+        self._vertices = torch.from_numpy(vertices).to(self.device, self._setup_dtype)
+        self._faces = torch.from_numpy(np.array(mesh.faces, dtype=np.int64)).to(self.device)
+
+    @torch.no_grad()
+    def render(
+        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+    ) -> Tensor:
+        T, K = check_render_arguments(T_cam_from_model, camera_matrix, size)
+        R = T[:, :3, :3]
+        t = (T[:, :3, 3] + R @ self._centre) / self._radius
+        K = K.clone()
+        if orthographic:
+            K[:, :2, :2] *= self._radius
+        R, t, K = (x.to(self.device, self._setup_dtype) for x in (R, t, K))
+        H, W = size
+        depth = torch.full((len(T), H * W), torch.inf, device=self.device)
+        views = max(1, _TRIANGLES // len(self._faces))
+        for i in range(0, len(T), views):
+            for j in range(0, len(self._faces), _TRIANGLES):
+                faces = self._faces[j : j + _TRIANGLES]
+                block = depth[i : i + views].view(-1)
+                self._draw(block, faces, R[i : i + views], t[i : i + views], K[i : i + views], size, orthographic)
+        depth = torch.where(depth.isfinite(), (depth + t[:, 2:].float()) * self._radius, 0.0)
+        return depth.view(-1, 1, H, W)
+
+    def _draw(
+        self,
+        depth: Tensor,
+        faces: Tensor,
+        R: Tensor,
+        t: Tensor,
+        K: Tensor,
+        size: tuple[int, int],
+        orthographic: bool,
+    ) -> None:
+        """Lower (n * H * W,) depths, relative to t's z, by the faces as n views see them."""
+        H, W = size
+        turned = self._vertices @ R.mT  # (n, V, 3) relative to the object's centre
+        camera = turned + t[:, None]
+        # Homogeneous pixels: K (x, y, z) or, orthographic, K (x, y, 1).
+        ray = torch.cat([camera[..., :2], torch.ones_like(camera[..., :1])], -1) if orthographic else camera
+        q = (ray @ K.mT)[:, faces]  # (n, F, 3 corners, 3)
+        low, high = self._windows(q, camera[..., 2][:, faces], size)
+        extent = (high - low).clamp(min=0)
+        count = (extent[..., 0] * extent[..., 1]).flatten()
+        used = count.nonzero()[:, 0]
+        if len(used) == 0:
+            return
+        count, low, extent = count[used], low.view(-1, 2)[used], extent.view(-1, 2)[used]
+        first = (used // len(faces)) * (H * W) + low[:, 1] * W + low[:, 0]
+        z = turned[..., 2][:, faces].view(-1, 3)[used]
+        edges = self._edges(q.view(-1, 3, 3)[used], low)
+        # The triangle's values side by side: three edge functions as (value at the window's corner, per column, per
+        # row), three relative depths.
+        table = torch.cat([edges.flatten(1), z], 1).float()
+        near = NEAREST - t[:, 2].float()
+        view = used // len(faces)
+        ends = count.cumsum(0)
+        for start in range(0, int(ends[-1]), _PAIRS):
+            self._draw_pairs(depth, table, ends, count, extent[:, 0], first, near[view], W, start)
+
+    def _windows(self, q: Tensor, z: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        """First and one past the last pixel (n, F, 2) x, y that each triangle can cover."""
+        H, W = size
+        border = torch.tensor([W, H], dtype=q.dtype, device=q.device)
+        uv = q[..., :2] / q[..., 2:]
+        low, high = uv.amin(dim=2), uv.amax(dim=2)
+        # Rounding must not lose a pixel whose centre lies on the triangle's rim.
+        low = torch.minimum((low - 1e-3).ceil().clamp(min=0), border).long()
+        high = torch.minimum(((high + 1e-3).floor() + 1).clamp(min=0), border).long()
+        crossing = (q[..., 2] <= 0).any(dim=2, keepdim=True)  # no finite projection: anywhere
+        low = torch.where(crossing, 0, low)
+        high = torch.where(crossing, border.long(), high)
+        behind = (z < NEAREST).all(dim=2, keepdim=True)
+        return low, torch.where(behind, low, high)
+
+    def _edges(self, q: Tensor, corner: Tensor) -> Tensor:
+        """(T, 3 edges, 3) value at the window's corner pixel, step per column, step per row; inside all are >= 0."""
+        pixel = torch.cat([corner.to(q), torch.ones_like(q[:, 0, :1])], 1)
+        # Corners relative to that pixel: small numbers, no cancellation.
+        local = q - pixel[:, None] * q[..., 2:]
+        local[..., 2] = q[..., 2]
+        normal = torch.linalg.cross(local[:, [1, 2, 0]], local[:, [2, 0, 1]])  # (T, 3, 3): columns are x, y, 1
+        scale = normal.flatten(1).abs().amax(dim=1).clamp(min=torch.finfo(q.dtype).tiny)
+        # Either side may face the camera: the sign is that of the volume between triangle and camera.
+        facing = (local[:, 0] * normal[:, 0]).sum(dim=1).sign()
+        normal = normal * (facing / scale)[:, None, None]
+        edges: Tensor = normal[..., [2, 0, 1]]
+        return edges
+
+    @staticmethod
+    def _draw_pairs(
+        depth: Tensor,
+        table: Tensor,
+        ends: Tensor,
+        count: Tensor,
+        width: Tensor,
+        first: Tensor,
+        near: Tensor,
+        W: int,
+        start: int,
+    ) -> None:
+        """The pairs number ``start`` to ``start + _PAIRS``, counted through all triangles."""
+        stop = min(start + _PAIRS, int(ends[-1]))
+        a = int(torch.searchsorted(ends, start, right=True))
+        b = int(torch.searchsorted(ends, stop, right=False)) + 1
+        begins = (ends[a:b] - count[a:b]).clamp(min=start)
+        repeats = ends[a:b].clamp(max=stop) - begins
+        triangle = torch.repeat_interleave(torch.arange(a, b, device=depth.device), repeats, output_size=stop - start)
+        offset = torch.arange(start, stop, device=depth.device) - (ends - count)[triangle]
+        column, row = offset % width[triangle], torch.div(offset, width[triangle], rounding_mode="floor")
+        values = table[triangle]
+        x, y = column.float(), row.float()
+        e = [values[:, 3 * i] + values[:, 3 * i + 1] * x + values[:, 3 * i + 2] * y for i in range(3)]
+        total = e[0] + e[1] + e[2]
+        inside = (torch.minimum(torch.minimum(e[0], e[1]), e[2]) >= -_SLACK * total) & (total > 0)
+        kept = inside.nonzero()[:, 0]
+        triangle = triangle[kept]
+        z = sum((e[i][kept] * values[kept, 9 + i] for i in range(3)), start=torch.zeros_like(total[kept]))
+        z = z / total[kept]
+        seen = z >= near[triangle]
+        pixel = first[triangle] + row[kept] * W + column[kept]
+        depth.scatter_reduce_(0, pixel[seen], z[seen], "amin")

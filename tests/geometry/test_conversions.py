@@ -1,0 +1,127 @@
+"""Every converter projects points as the convention it converts to, and back."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from curvireg_torch import geometry as g
+from curvireg_torch.errors import InvalidInputError
+
+SIZE = (108, 154)
+K = torch.tensor([[240.0, 4.0, 70.3], [0, 260.0, 51.8], [0, 0, 1]], dtype=torch.float64)
+
+
+def poses(count: int = 7) -> torch.Tensor:
+    R = torch.from_numpy(Rotation.random(count, random_state=0).as_matrix())
+    return g.transform(R, torch.tensor([0.2, -0.1, 5.0], dtype=torch.float64).expand(count, 3))
+
+
+def points() -> torch.Tensor:
+    return torch.rand(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2 - 1
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_opengl_window_coordinates_are_the_pixels(orthographic: bool) -> None:
+    T, X = poses(), points()
+    K_used = K.clone()
+    if orthographic:
+        K_used[:2, :2] /= 5.0
+    P = g.opengl_projection(K_used, SIZE, near=2.0, far=9.0, orthographic=orthographic)
+    homogeneous = torch.cat([X, torch.ones(50, 1, dtype=torch.float64)], 1)
+    clip = homogeneous @ (P @ g.opengl_from_opencv(T)).mT
+    ndc = clip[..., :3] / clip[..., 3:]
+    assert float(ndc[..., 2].abs().max()) < 1.0
+    # OpenGL's viewport transform; its window counts from the lower left corner of the corner pixel
+    window = 0.5 * (ndc[..., :2] + 1.0) * torch.tensor([SIZE[1], SIZE[0]])
+    pixels = torch.stack([window[..., 0], SIZE[0] - window[..., 1]], -1) - 0.5
+    torch.testing.assert_close(pixels, g.project_points(X, T, K_used, orthographic=orthographic), rtol=0, atol=1e-9)
+    back = g.opencv_from_opengl(g.opengl_from_opencv(T))
+    torch.testing.assert_close(back, T, rtol=0, atol=0)
+
+
+def test_opengl_near_and_far_planes() -> None:
+    for orthographic in (False, True):
+        P = g.opengl_projection(K, SIZE, near=2.0, far=9.0, orthographic=orthographic)
+        for z, expected in ((-2.0, -1.0), (-9.0, 1.0)):
+            clip = P @ torch.tensor([0.0, 0.0, z, 1.0], dtype=torch.float64)
+            assert float(clip[2] / clip[3]) == pytest.approx(expected)
+
+
+def test_pytorch3d_screen_coordinates_are_the_pixels() -> None:
+    # The formulas of PyTorch3D's documentation: x_view = x R + T; screen = principal point - focal x / z, where +x is
+    # left, +y is up and the first pixel covers [0, 1].
+    T, X = poses(), points()
+    K_used = K.clone()
+    K_used[0, 1] = 0.0
+    R, t = g.pytorch3d_from_opencv(T)
+    view = X @ R + t[:, None]
+    focal, principal = K_used.diagonal()[:2], K_used[:2, 2] + 0.5
+    pixels = principal - focal * view[..., :2] / view[..., 2:] - 0.5
+    torch.testing.assert_close(pixels, g.project_points(X, T, K_used), rtol=0, atol=1e-9)
+    torch.testing.assert_close(g.opencv_from_pytorch3d(R, t), T, rtol=0, atol=1e-15)
+
+
+def test_pascal3d_angles_project_as_the_data_set_says() -> None:
+    # p = diag(f, f, -1) Rx(e - 90) Rz(-a) (X - C); turned by theta; v = py - y, written out in numpy.
+    X, f, (px, py) = points().numpy(), 3000.0, (70.3, 51.8)
+    for a, e, t, d in ((30.0, 20.0, -10.0, 5.0), (200.0, -35.0, 100.0, 4.0), (0.0, 0.0, 0.0, 9.0)):
+        ar, er, tr = (math.radians(v) for v in (a, e, t))
+        C = d * np.array([math.cos(er) * math.sin(ar), -math.cos(er) * math.cos(ar), math.sin(er)])
+        turn = Rotation.from_euler("x", er - math.pi / 2).as_matrix() @ Rotation.from_euler("z", -ar).as_matrix()
+        p = (X - C) @ turn.T @ np.diag([f, f, -1.0])
+        xy = p[:, :2] / p[:, 2:]
+        xy = xy @ np.array([[math.cos(tr), math.sin(tr)], [-math.sin(tr), math.cos(tr)]])
+        expected = np.stack([px + xy[:, 0], py - xy[:, 1]], 1)
+        R = g.rotation_from_viewpoint(*(torch.tensor(v, dtype=torch.float64) for v in (a, e, t)))
+        T = g.transform(R, torch.tensor([0.0, 0.0, d], dtype=torch.float64))
+        ours = g.project_points(torch.from_numpy(X), T, g.camera_matrix(f, f, px, py, dtype=torch.float64))
+        np.testing.assert_allclose(ours, expected, atol=1e-8)
+        back = [float(v) for v in g.viewpoint_from_rotation(R)]
+        np.testing.assert_allclose(back, (a, e, t), atol=1e-9)
+
+
+ANGLES = [0.0, 1e-8, 1e-4, 1.0, math.pi - 1e-4, math.pi - 1e-8, math.pi]
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_axis_angle_and_quaternion_are_scipys(angle: float) -> None:
+    axes = np.random.default_rng(0).normal(size=(40, 3))
+    vectors = axes / np.linalg.norm(axes, axis=1, keepdims=True) * angle
+    R = Rotation.from_rotvec(vectors).as_matrix()
+    ours = g.rotation_from_axis_angle(torch.from_numpy(vectors))
+    np.testing.assert_allclose(ours, R, atol=1e-14)
+    q = g.quaternion_from_rotation(torch.from_numpy(R)).numpy()
+    theirs = Rotation.from_matrix(R).as_quat(scalar_first=True)
+    np.testing.assert_allclose(np.abs((q * theirs).sum(1)), 1.0, atol=1e-14)  # q or -q
+    np.testing.assert_allclose(g.rotation_from_quaternion(torch.from_numpy(3.0 * q)), R, atol=1e-14)
+    back = g.axis_angle_from_rotation(torch.from_numpy(R))
+    np.testing.assert_allclose(g.rotation_from_axis_angle(back), R, atol=1e-14)
+    assert float(back.norm(dim=1).max()) <= math.pi + 1e-12
+    X, T = points(), poses(40)
+    T[:, :3, :3] = g.rotation_from_axis_angle(back)
+    expected = np.einsum("nij,pj->npi", R, X.numpy()) + T[:, None, :3, 3].numpy()
+    uv = np.einsum("ij,npj->npi", K.numpy(), expected / expected[..., 2:])[..., :2]
+    np.testing.assert_allclose(g.project_points(X, T, K), uv, atol=1e-10)
+
+
+def test_shapes_and_errors() -> None:
+    R = torch.eye(3).expand(2, 5, 3, 3)
+    assert g.quaternion_from_rotation(R).shape == (2, 5, 4)
+    assert g.axis_angle_from_rotation(R[:0]).shape == (0, 5, 3)
+    assert g.opengl_projection(K.expand(2, 5, 3, 3), SIZE, near=1.0, far=2.0).shape == (2, 5, 4, 4)
+    for call in (
+        lambda: g.opengl_from_opencv(torch.eye(3)),
+        lambda: g.pytorch3d_from_opencv(torch.eye(4, dtype=torch.long)),
+        lambda: g.opencv_from_pytorch3d(R, torch.zeros(2, 3)),
+        lambda: g.quaternion_from_rotation(torch.zeros(4)),
+        lambda: g.rotation_from_quaternion(torch.zeros(3)),
+        lambda: g.rotation_from_axis_angle(torch.zeros(4)),
+        lambda: g.opengl_projection(K, SIZE, near=0.0, far=2.0),
+        lambda: g.opengl_projection(K, SIZE, near=3.0, far=2.0, orthographic=True),
+        lambda: g.opengl_projection(K, (0, 4), near=1.0, far=2.0),
+    ):
+        with pytest.raises(InvalidInputError, match="expected"):
+            call()

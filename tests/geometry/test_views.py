@@ -1,0 +1,128 @@
+"""View sets: how many, how dense, in which range, which duplicates."""
+
+import math
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import (
+    ViewSphere,
+    nearest_views,
+    paper_views,
+    rotation_error,
+    sample_views,
+    symmetry_transforms,
+    uniform_views,
+    views_without_symmetric,
+)
+
+AXIS = {"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]}
+HALF_TURN = {"symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}
+
+
+def directions(views: ViewSphere) -> torch.Tensor:
+    return -views.rotations[:, 2].double()
+
+
+@pytest.mark.parametrize("count", [2, 5, 20, 100, 300, 700])
+def test_stated_covering_radius(count: int) -> None:
+    probes = torch.randn(100_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    probes = torch.nn.functional.normalize(torch.cat([probes, torch.eye(3).double(), -torch.eye(3).double()]), dim=1)
+    nearest = torch.cat([(p @ directions(uniform_views(count)).T).amax(1) for p in probes.split(20_000)])
+    radius = math.degrees(math.acos(max(-1.0, float(nearest.min()))))
+    assert 0.9 * 157 / math.sqrt(count) < radius <= 157 / math.sqrt(count)
+
+
+def test_covering_radius_of_rotations_with_in_plane_turns() -> None:
+    views = uniform_views(200, thetas=range(0, 360, 20))
+    R = torch.from_numpy(Rotation.random(2000, random_state=0).as_matrix())
+    nearest = (R.flatten(1) @ views.rotations.double().flatten(1).T).argmax(dim=1)
+    error = rotation_error(R, views.rotations[nearest].double())
+    assert float(error.max()) <= 157 / math.sqrt(200) + 10.0
+
+
+def test_paper_grid() -> None:
+    views = paper_views()
+    assert len(views) == 756
+    assert sorted({round(float(d), 4) for d in views.distance}) == pytest.approx([1.5, 3.0, 4.5, 6.0, 7.5, 9.0])
+    one_shell = views[views.distance == views.distance[0]]
+    assert len(one_shell) == 126
+    _, nearest = nearest_views(one_shell.rotations, 1)
+    assert float(nearest.min()) > 3.0  # no view twice
+    # Elevation runs around: neighbours in the grid are turns of 50 degrees about the camera's x axis.
+    grid = one_shell.rotations.view(7, 18, 3, 3)
+    assert torch.allclose(rotation_error(grid[1:], grid[:-1]), torch.tensor(50.0), atol=1e-3)
+    turn = grid[1:] @ grid[:-1].mT
+    assert torch.allclose(turn[..., 0, 0], torch.tensor(1.0), atol=1e-5)
+    with pytest.raises(InvalidInputError, match="object_radius"):
+        paper_views(object_radius=0.3)
+
+
+def test_pose_range() -> None:
+    views = sample_views(azimuth_step=10, elevations=[-20, 0, 20], thetas=[-10, 0, 10])
+    car = views.within(azimuth=(350, 10), elevation=(0, 20), theta=(0, 10))
+    assert len(car) == 3 * 2 * 2
+    assert sorted(set(car.azimuth.tolist())) == [0.0, 10.0, 350.0]
+    assert len(views.within()) == len(views)
+    assert len(views.within(azimuth=(-10, 10))) == 3 * 3 * 3
+    assert len(uniform_views(40, thetas=[350]).within(theta=(-20, 0))) == 40  # 350 is -10
+    with pytest.raises(InvalidInputError, match="none of 324 views"):
+        views.within(elevation=(30, 40))
+
+
+@pytest.mark.parametrize(("info", "expected"), [({}, 72 * 3), (HALF_TURN, 36 * 3), (AXIS, 1 * 3)])
+def test_symmetric_duplicates_of_a_grid_go(info: dict[str, object], expected: int) -> None:
+    views = sample_views(azimuth_step=5, elevations=[-30, 0, 30])
+    assert len(views_without_symmetric(views, symmetry_transforms(info))) == expected
+
+
+def test_every_dropped_view_is_still_seen_from_a_kept_one() -> None:
+    views = uniform_views(150, thetas=range(0, 360, 30), distances=[3, 5])
+    symmetries = symmetry_transforms(HALF_TURN)
+    kept = views_without_symmetric(views, symmetries, tolerance=12.0)
+    assert 0.2 * len(views) < len(kept) < 0.6 * len(views)
+    for distance in (3, 5):
+        R = kept[kept.distance == distance].rotations.double()
+        seen = (R[:, None] @ symmetries[:, :3, :3]).flatten(0, 1)
+        all_views = views[views.distance == distance].rotations.double()
+        nearest = (all_views.flatten(1) @ seen.flatten(1).T).argmax(dim=1)
+        assert float(rotation_error(all_views, seen[nearest]).max()) <= 12.01
+    # and no two kept views are duplicates
+    R = kept[kept.distance == 3].rotations.double()
+    turned = R[:, None] @ symmetries[1:, :3, :3]
+    off = rotation_error(R[None], turned)
+    off[torch.arange(len(R)), torch.arange(len(R))] = 180.0
+    assert float(off.min()) > 12.0
+
+
+def test_neighbours_are_the_nearest() -> None:
+    views = uniform_views(60, thetas=[0, 90])
+    indices, degrees = nearest_views(views.rotations, 5)
+    everything = rotation_error(views.rotations[:, None].double(), views.rotations[None].double())
+    everything.fill_diagonal_(torch.inf)
+    torch.testing.assert_close(degrees.double(), everything.sort(dim=1).values[:, :5], rtol=0, atol=1e-4)
+    torch.testing.assert_close(everything.gather(1, indices), degrees.double(), rtol=0, atol=1e-4)
+    for count in (0, 120):
+        with pytest.raises(InvalidInputError, match="count"):
+            nearest_views(views.rotations, count)
+
+
+def test_bad_view_sets() -> None:
+    one = torch.zeros(1)
+    for call, match in (
+        (lambda: ViewSphere(one, one, one, one + 1), "distances > 1"),
+        (lambda: ViewSphere(one, one, torch.zeros(2), one + 2), "one shape"),
+        (lambda: sample_views(azimuth_step=0), "azimuth_step"),
+        (lambda: sample_views(elevations=[]), "elevations"),
+        (lambda: sample_views(elevations=[91]), "elevations"),
+        (lambda: uniform_views(0), "count"),
+        (lambda: uniform_views(5, elevation_range=(10, -10)), "elevation_range"),
+        (lambda: uniform_views(5, thetas=[]), "thetas"),
+        (lambda: views_without_symmetric(uniform_views(5), torch.eye(4)), "symmetries"),
+        (lambda: uniform_views(5).in_model_frame(torch.eye(3)), "T_views_from_model"),
+        (lambda: uniform_views(5).in_model_frame(torch.diag(torch.tensor([1.0, 2, 1, 1]))), "rotation"),
+    ):
+        with pytest.raises(InvalidInputError, match=match):
+            call()
