@@ -126,7 +126,7 @@ LAYERS = [
     Layer("blur-saliency", filters.edge_blur, filters.EdgeBlur, photos, {"mode": "reblur-saliency"}),
     Layer("mfc", filters.multiscale_focus_curves, filters.MultiScaleFocusCurves, photos),
     Layer(
-        "mfc-alone", filters.multiscale_focus_curves, filters.MultiScaleFocusCurves, photos, {"saliency_weight": False}
+        "mfc-alone", filters.multiscale_focus_curves, filters.MultiScaleFocusCurves, photos, {"saliency_weight": 0.0}
     ),
     Layer("pci", filters.principal_curvature_image, filters.PrincipalCurvatureImage, photos, {"sigmas": (1.0, 2.0)}),
     Layer("hog", descriptors.hog, descriptors.HOG, fields),

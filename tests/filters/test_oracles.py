@@ -74,8 +74,8 @@ def test_multiscale_curvilinear_saliency(time: float | None, steps: tuple[int, .
 
 
 @pytest.mark.parametrize("mode", ["reblur-image", "reblur-saliency"])
-@pytest.mark.parametrize("saliency_weight", [False, True])
-def test_multiscale_focus_curves(mode: str, saliency_weight: bool) -> None:
+@pytest.mark.parametrize("saliency_weight", [0.0, 0.5, 1.0])
+def test_multiscale_focus_curves(mode: str, saliency_weight: float) -> None:
     image = photos(1, 21, dtype=torch.float64)
     options = {"scales": 4, "mode": mode, "saliency_weight": saliency_weight, "threshold": 0.2}
     got = filters.multiscale_focus_curves(image, **options)[0]
@@ -92,7 +92,7 @@ def test_multiscale_focus_curves(mode: str, saliency_weight: bool) -> None:
         worst = np.maximum(worst, np.sqrt(np.clip(squared - 0.36, 0, 1000.0**2)))
     focus = 1 / np.maximum(worst, 0.6)
     value = np.where((focus > 0.2) & (cs > 1e-3 * cs.max()), focus, 0)
-    value = value * np.sqrt(cs) if saliency_weight else value
+    value = value * cs**saliency_weight
     want = value * np.stack([gx, gy]) / np.maximum(np.sqrt(cs), 1e-300)
     assert 0.02 < (value > 0).mean() < 0.98
     np.testing.assert_allclose(got, want, atol=1e-9)
