@@ -1,28 +1,48 @@
 """Pose of a known 3D object from one ordinary photograph."""
 
-from .descriptors import HOG, field_points, hog
-from .errors import CurviregError
+from .data import (
+    BOPDataset,
+    Pascal3DPlus,
+    WebCollection,
+)
+from .descriptors import (
+    HOG,
+    field_points,
+    hog,
+)
+from .errors import (
+    CurviregError,
+)
 from .filters import (
     AnisotropicDiffusion,
+    ApparentRidges,
+    AverageShadingGradient,
     DepthCurvilinearSaliency,
     EdgeBlur,
+    HessianFrobeniusNorm,
     ImageCurvilinearSaliency,
     ImageGradient,
     MultiScaleCurvilinearSaliency,
     MultiScaleFocusCurves,
+    PrincipalCurvatureImage,
     anisotropic_diffusion,
+    apparent_ridges,
+    average_shading_gradient,
     depth_curvilinear_saliency,
     edge_blur,
+    hessian_frobenius_norm,
     image_curvilinear_saliency,
     image_gradient,
     multiscale_curvilinear_saliency,
     multiscale_focus_curves,
+    principal_curvature_image,
 )
 from .geometry import (
     ViewSphere,
     camera_matrix,
     crop_images,
     load_mesh,
+    paper_views,
     project_points,
     rotation_error,
     rotation_from_viewpoint,
@@ -30,41 +50,63 @@ from .geometry import (
     uniform_views,
     viewpoint_from_rotation,
 )
-from .matching import BankSettings, Ranking, ViewBank, ViewMatcher
-from .registration import Registrar, Registration
-from .rendering import render_depth
+from .matching import (
+    BankSettings,
+    Ranking,
+    ViewBank,
+    ViewMatcher,
+)
+from .registration import (
+    Registrar,
+    Registration,
+)
+from .rendering import (
+    render_depth,
+)
 
 __version__ = "0.1.0"
 
 __all__ = [
     "HOG",
     "AnisotropicDiffusion",
+    "ApparentRidges",
+    "AverageShadingGradient",
+    "BOPDataset",
     "BankSettings",
     "CurviregError",
     "DepthCurvilinearSaliency",
     "EdgeBlur",
+    "HessianFrobeniusNorm",
     "ImageCurvilinearSaliency",
     "ImageGradient",
     "MultiScaleCurvilinearSaliency",
     "MultiScaleFocusCurves",
+    "Pascal3DPlus",
+    "PrincipalCurvatureImage",
     "Ranking",
     "Registrar",
     "Registration",
     "ViewBank",
     "ViewMatcher",
     "ViewSphere",
+    "WebCollection",
     "anisotropic_diffusion",
+    "apparent_ridges",
+    "average_shading_gradient",
     "camera_matrix",
     "crop_images",
     "depth_curvilinear_saliency",
     "edge_blur",
     "field_points",
+    "hessian_frobenius_norm",
     "hog",
     "image_curvilinear_saliency",
     "image_gradient",
     "load_mesh",
     "multiscale_curvilinear_saliency",
     "multiscale_focus_curves",
+    "paper_views",
+    "principal_curvature_image",
     "project_points",
     "render_depth",
     "rotation_error",

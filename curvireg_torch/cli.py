@@ -1,4 +1,4 @@
-"""``curvireg``: register a photograph, build a bank, run the demo."""
+"""``curvireg``: register a photograph, build a bank, evaluate a dataset, run the demo."""
 
 import argparse
 import json
@@ -17,14 +17,17 @@ import torch
 from . import __version__
 from .data import read_image
 from .errors import CurviregError, InvalidInputError
-from .geometry import camera_matrix, load_mesh, rotation_error, sample_views, uniform_views, whole_image_box
+from .evaluation import add_parser as add_evaluate
+from .evaluation.presets import preset_named
+from .geometry import camera_matrix, load_mesh, rotation_error, whole_image_box
 from .geometry.mesh import UNITS
-from .geometry.views import ViewSphere
-from .matching import BankSettings, ViewBank, cached_bank
+from .matching import ViewBank, cached_bank
 from .registration import Registrar, Registration
 from .rendering import BACKENDS
 
 __all__ = ["main"]
+
+PRESET = preset_named("default")
 
 CONVENTIONS = {
     "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
@@ -34,13 +37,6 @@ CONVENTIONS = {
     "score": "normalised correlation of photograph and view, 0 to 1",
     "confidence": "share of the ranking's mass within 30 degrees of the best view, 0 to 1",
 }
-
-
-def pose_views(name: str) -> ViewSphere:
-    """The view sets behind ``--pose``."""
-    if name == "upright":
-        return sample_views()
-    return uniform_views(300, thetas=range(0, 360, 15))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -84,7 +80,6 @@ def _parser() -> argparse.ArgumentParser:
         help="any: no assumption. upright: the mesh's z axis points up in the photograph and the object is not seen "
         "from below; faster, and right more often where it is true (default: any)",
     )
-    mesh_options.add_argument("--image-size", type=int, default=128, metavar="PX", help="side of crops (default: 128)")
 
     register = commands.add_parser(
         "register", parents=[common, mesh_options], help="find the pose of MESH in PHOTO",
@@ -108,6 +103,8 @@ def _parser() -> argparse.ArgumentParser:
     bank.add_argument("--out", type=Path, required=True, metavar="FILE")
     bank.set_defaults(run=_bank)
 
+    add_evaluate(commands, [common])
+
     demo = commands.add_parser("demo", parents=[common], help="register a scene made in code, where the truth is known")
     demo.add_argument("--seed", type=int, default=0)
     demo.add_argument("--out", type=Path, required=True, metavar="DIR")
@@ -120,8 +117,8 @@ def _bank(arguments: argparse.Namespace) -> None:
     mesh = load_mesh(arguments.mesh, unit=arguments.unit)
     bank = ViewBank.build(
         mesh,
-        pose_views(arguments.pose),
-        settings=BankSettings(image_size=arguments.image_size),
+        PRESET.views(arguments.pose),
+        settings=PRESET.bank,
         renderer=arguments.renderer,
         progress=not arguments.quiet,
     )
@@ -135,8 +132,8 @@ def _open_bank(arguments: argparse.Namespace) -> ViewBank:
         return ViewBank.load(arguments.mesh)
     return cached_bank(
         load_mesh(arguments.mesh, unit=arguments.unit),
-        pose_views(arguments.pose),
-        BankSettings(image_size=arguments.image_size),
+        PRESET.views(arguments.pose),
+        PRESET.bank,
         renderer=arguments.renderer,
         progress=not arguments.quiet,
     )
@@ -172,7 +169,9 @@ def _demo(arguments: argparse.Namespace) -> None:
     K = camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
     truth = random_pose(mesh, K, size, generator)
     image, box = synthesize_photograph(mesh, truth, K, size, generator)
-    bank = cached_bank(mesh, sample_views(), BankSettings(), renderer=arguments.renderer, progress=not arguments.quiet)
+    bank = cached_bank(
+        mesh, PRESET.views("upright"), PRESET.bank, renderer=arguments.renderer, progress=not arguments.quiet
+    )
     times["bank"] = time.perf_counter()
     registrar = Registrar(bank, renderer=arguments.renderer)
     result = registrar([image], box[None], K)[0]

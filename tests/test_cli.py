@@ -75,7 +75,7 @@ def test_without_box_and_camera(files):
 def test_bank_then_register(files, capsys):
     folder, box, _ = files
     out = folder / "new.safetensors"
-    options = ["--pose", "upright", "--image-size", "32", "--quiet"]
+    options = ["--pose", "upright", "--quiet"]
     assert main(["bank", str(folder / "truck.ply"), "--out", str(out), *options]) == 0
     assert "396 views" in capsys.readouterr().out
     assert run(folder, "photo.png", "new.safetensors", "--no-refine", box=box) == 0
@@ -127,7 +127,7 @@ def test_help_names_the_commands(capsys):
         main(["--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
-    for command in ("register", "bank", "demo"):
+    for command in ("register", "bank", "evaluate", "demo"):
         assert command in text
 
 

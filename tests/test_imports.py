@@ -18,6 +18,7 @@ ALLOWED = {
     "filters": BASE,
     "descriptors": BASE | {"filters"},
     "rendering": BASE | {"geometry"},
+    "detectors": BASE | {"filters", "descriptors"},
     "data": BASE | {"geometry"},
     "metrics": BASE | {"geometry"},
     "synthetic": BASE | {"geometry", "filters", "rendering"},
@@ -82,7 +83,7 @@ def test_imports_only_what_lies_below(part):
 
 
 def test_trimesh_and_pyrender_stay_where_they_belong():
-    for part in ("filters", "descriptors", "data", "metrics"):
+    for part in ("filters", "descriptors", "detectors", "data", "metrics"):
         for path in sources(part):
             assert not imported(path)[1] & {"trimesh", "pyrender", "embreex"}, path
     for path in PACKAGE.rglob("*.py"):

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from .._checks import check_field, check_option, check_positive, check_tensor
 from ..errors import InvalidInputError
-from ..filters.derivatives import at_least_float32, safe_sqrt
+from ..filters.derivatives import at_least_float32, full_precision, safe_sqrt
 
 __all__ = ["HOG", "hog", "hog_length"]
 
@@ -75,7 +75,8 @@ def hog(
         votes = votes * bin_weights.to(votes.dtype).view(1, -1, 1, 1)
     rows = _cell_weights(H, grid, voting, votes)
     columns = _cell_weights(W, grid, voting, votes)
-    cells = rows @ (votes @ columns.T)  # (B, bins, grid, grid)
+    with full_precision(votes):
+        cells = rows @ (votes @ columns.T)  # (B, bins, grid, grid)
     return _normalised_blocks(cells, block, clip).to(field.dtype)
 
 

@@ -18,6 +18,9 @@ from .workers import workers
 
 __all__ = ["evaluate", "score"]
 
+NOT_ASKED_FOR = ("other_class", "no_target")
+"""What datasets leave out because it is none of the objects to be evaluated, not because something is wrong with it."""
+
 
 def evaluate(
     benchmark: Benchmark,
@@ -86,7 +89,7 @@ def score(benchmark: Benchmark, out: Path, *, limit: int | None = None) -> Row:
     """
     store = PredictionStore(out / "predictions")
     everything = [(item, store.read(item.key)) for item in benchmark.selection(limit)]
-    skipped = Counter(benchmark.dataset.skipped)
+    skipped = Counter({k: n for k, n in benchmark.dataset.skipped.items() if k not in NOT_ASKED_FOR})
     skipped.update(row["skipped"] for _, row in everything if "skipped" in row)
     scored = [(item, row) for item, row in everything if "skipped" not in row]
     items, rows = [item for item, _ in scored], [row for _, row in scored]

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from .._checks import check_image, check_mask, check_option, check_positive
 from .derivatives import at_least_float32, gaussian_smooth, image_gradient, in_blocks, replicate_pad, safe_sqrt
-from .learnable import parameter_if
+from .learnable import as_number, parameter_if
 
 __all__ = [
     "DepthCurvilinearSaliency",
@@ -117,6 +117,8 @@ def _graph_saliency(z: Tensor, formula: str) -> Tensor:
     cut.
     """
     B, _, H, W = z.shape
+    if B == 0:
+        return z.expand(0, 2, H, W)
     padded = replicate_pad(z, 1).reshape(-1)
     width = W + 2
     inner = padded.numel() - 2 * (width + 1)
@@ -220,7 +222,7 @@ class DepthCurvilinearSaliency(nn.Module):
         )
 
     def extra_repr(self) -> str:
-        return f"sigma={float(self.sigma)}, formula={self.formula!r}, depth_scale={self.depth_scale}"
+        return f"sigma={as_number(self.sigma)}, formula={self.formula!r}, depth_scale={self.depth_scale}"
 
 
 class ImageCurvilinearSaliency(nn.Module):
@@ -234,4 +236,4 @@ class ImageCurvilinearSaliency(nn.Module):
         return image_curvilinear_saliency(image, sigma=self.sigma)
 
     def extra_repr(self) -> str:
-        return f"sigma={float(self.sigma)}"
+        return f"sigma={as_number(self.sigma)}"

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .._checks import check_image, check_positive
-from .learnable import parameter_if
+from .learnable import as_number, parameter_if
 
 __all__ = ["ImageGradient", "gaussian_smooth", "image_gradient"]
 
@@ -25,7 +26,7 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
         >>> gaussian_smooth(torch.ones(1, 1, 5, 5), 1.0).shape
         torch.Size([1, 1, 5, 5])
     """
-    value = float(sigma)
+    value = float(sigma.detach()) if isinstance(sigma, Tensor) else sigma
     check_positive(value, "sigma", zero_ok=True)
     radius = math.ceil(4.0 * value)
     if radius == 0:
@@ -40,8 +41,9 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
     # One group per plane: on a CPU some 25 times faster than a batch of one-channel convolutions.
     planes = replicate_pad(x, radius).reshape(1, B * C, H + 2 * radius, W + 2 * radius)
     rows = kernel.view(1, 1, 1, -1).expand(B * C, 1, -1, -1)
-    planes = F.conv2d(planes, rows, groups=B * C)
-    return F.conv2d(planes, rows.mT, groups=B * C).view(B, C, H, W)
+    with full_precision(x):
+        planes = F.conv2d(planes, rows, groups=B * C)
+        return F.conv2d(planes, rows.mT, groups=B * C).view(B, C, H, W)
 
 
 def _shifted_sum(x: Tensor, kernel: Tensor, dim: int) -> Tensor:
@@ -109,6 +111,12 @@ def safe_sqrt(x: Tensor) -> Tensor:
     return x.clamp(min=tiny).sqrt() - math.sqrt(tiny)
 
 
+def full_precision(x: Tensor) -> AbstractContextManager[object]:
+    """Switches autocast off: convolutions in bfloat16 would leave nothing of a second derivative."""
+    kind = x.device.type
+    return torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext()
+
+
 def at_least_float32(x: Tensor) -> Tensor:
     """float16 and bfloat16 become float32: squared derivatives leave their range."""
     return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
@@ -153,4 +161,4 @@ class ImageGradient(nn.Module):
         return image_gradient(image, sigma=self.sigma)
 
     def extra_repr(self) -> str:
-        return f"sigma={float(self.sigma)}"
+        return f"sigma={as_number(self.sigma)}"

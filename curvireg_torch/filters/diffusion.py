@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from .._checks import check_option, check_positive, check_tensor
 from ..errors import InvalidInputError
 from .derivatives import at_least_float32
-from .learnable import parameter_if
+from .learnable import as_number, parameter_if
 
 __all__ = ["AnisotropicDiffusion", "anisotropic_diffusion"]
 
@@ -95,6 +95,6 @@ class AnisotropicDiffusion(nn.Module):
 
     def extra_repr(self) -> str:
         return (
-            f"iterations={self.iterations}, kappa={float(self.kappa)}, step={self.step}, "
+            f"iterations={self.iterations}, kappa={as_number(self.kappa)}, step={self.step}, "
             f"conductance={self.conductance!r}"
         )

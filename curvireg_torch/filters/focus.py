@@ -10,7 +10,7 @@ from .._checks import check_image, check_option, check_positive
 from ..errors import InvalidInputError
 from .curvilinear import unit_vector
 from .derivatives import at_least_float32, central_gradient, gaussian_smooth, image_maximum, in_blocks, safe_sqrt
-from .learnable import parameter_if
+from .learnable import as_number, parameter_if
 
 __all__ = ["EdgeBlur", "MultiScaleFocusCurves", "edge_blur", "multiscale_focus_curves"]
 
@@ -18,8 +18,9 @@ MODES = ("reblur-image", "reblur-saliency")
 MAX_BLUR = 1000.0
 """Blur in px reported where re-blurring changes nothing (no edge, or infinitely smooth)."""
 
-_DIFFERENCE_VARIANCE = 1.0 / 3.0
-"""Variance in px^2 that the 3-tap central difference itself adds to an edge."""
+_DIFFERENCE_VARIANCE = 0.36
+"""Variance in px^2 that the 3-tap central difference itself adds to an edge: its second moment is 1/3, but it is not a
+Gaussian, and 0.36 lowers the largest error at blurs of 1 to 4 px from 3.1 to 1.8 %."""
 
 _EDGE_FLOOR = 1e-3
 """CS below this share of the image's largest CS is not an edge (noise is infinitely sharp); about 3 % of the
@@ -196,6 +197,6 @@ class MultiScaleFocusCurves(nn.Module):
 
     def extra_repr(self) -> str:
         return (
-            f"scales={self.scales}, sigma={float(self.sigma)}, mode={self.mode!r}, "
+            f"scales={self.scales}, sigma={as_number(self.sigma)}, mode={self.mode!r}, "
             f"saliency_weight={self.saliency_weight}, threshold={self.threshold}"
         )

@@ -11,7 +11,7 @@ from .curvilinear import image_curvilinear_saliency
 from .derivatives import at_least_float32, image_maximum, in_blocks, safe_sqrt
 from .diffusion import CONDUCTANCES, anisotropic_diffusion
 from .edge_preserving import bilateral_smooth, guided_smooth
-from .learnable import parameter_if
+from .learnable import as_number, parameter_if
 
 __all__ = ["MultiScaleCurvilinearSaliency", "multiscale_curvilinear_saliency"]
 
@@ -138,7 +138,7 @@ class MultiScaleCurvilinearSaliency(nn.Module):
 
     def extra_repr(self) -> str:
         return (
-            f"scales={self.scales}, sigma={float(self.sigma)}, smoothing={self.smoothing!r}, "
-            f"kappa={float(self.kappa)}, conductance={self.conductance!r}, diffusion_time={self.diffusion_time}, "
+            f"scales={self.scales}, sigma={as_number(self.sigma)}, smoothing={self.smoothing!r}, "
+            f"kappa={as_number(self.kappa)}, conductance={self.conductance!r}, diffusion_time={self.diffusion_time}, "
             f"threshold={self.threshold}"
         )

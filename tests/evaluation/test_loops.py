@@ -34,6 +34,7 @@ def test_pascal3d(pascal, tmp_path):
         "unreadable_image": 1, "unreadable_mesh": 1,
     }  # fmt: skip
     assert summary["skipped"]["missing_image"] == 1, "what the dataset left out is counted, too"
+    assert "other_class" not in summary["skipped"], "those are no cars and sofas"
     assert summary["failed"] == 0
     rows = rows_of(benchmark, tmp_path / "out")
     assert {k: r.get("skipped") for k, r in rows.items()} == {

@@ -6,7 +6,7 @@ import json
 import pytest
 import torch
 
-from curvireg_torch.data import BOPDataset, Pascal3DPlus, read_bop_csv
+from curvireg_torch.data import Pascal3DPlus, read_bop_csv
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, score
 from curvireg_torch.evaluation.store import PredictionStore
@@ -162,11 +162,12 @@ def test_bop_knows_the_object(bop):
         BOPBenchmark(bop, Protocol(cad="any"))
 
 
-def test_nothing_to_score(tmp_path, bop):
-    benchmark = BOPBenchmark(BOPDataset(bop.root, targets=False), Protocol(pose="any"))
-    write_predictions(benchmark, tmp_path / "out", [{"skipped": "x"}] * 4)
+@pytest.mark.parametrize("kind", ["pascal3d", "bop"])
+def test_nothing_to_score(tmp_path, bop, furniture, kind):
+    benchmark = BOPBenchmark(bop, Protocol(pose="any")) if kind == "bop" else furniture
+    write_predictions(benchmark, tmp_path / "out", [{"skipped": "x"}] * len(benchmark.items))
     summary = score(benchmark, tmp_path / "out")
-    assert summary["n"] == 0
+    assert (summary["n"], summary["skipped"]["x"]) == (0, len(benchmark.items))
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["med_err_deg"] is None
 
 

@@ -26,19 +26,22 @@ def detector_tables(cases: list[Case], settings: FieldSettings, eps_px: float, p
     """IP and Hausdorff distances of every detector against the curvilinear saliency of the right view, per category."""
     detectors = photo_detectors(settings.point_share)
     scores: dict[str, dict[str, dict[str, list[float]]]] = {
-        name: defaultdict(lambda: defaultdict(list)) for name in ("ip", "hausdorff", "hausdorff_95")
+        name: defaultdict(lambda: defaultdict(list)) for name in ("ip", "hausdorff", "hausdorff_95", "points")
     }
     for mesh, group in grouped(cases, "detectors", progress):
         describe = ViewDescriber(mesh, settings)
         for case in group:
             view = _view_points(describe, settings, *case.view(mesh))
             crop = _crop(case, settings)
+            anywhere = intersection_percentage(torch.ones_like(view), view, eps_px=eps_px)
+            scores["ip"][case.category]["chance"].append(float(anywhere))
             for name, detect in detectors.items():
                 photo = detect(crop)
                 values = (
                     intersection_percentage(photo, view, eps_px=eps_px),
                     hausdorff_distance(photo, view),
                     hausdorff_distance(photo, view, percentile=95.0),
+                    photo.sum().float(),
                 )
                 for table, value in zip(scores, values, strict=True):
                     if bool(value.isfinite().all()):
@@ -47,21 +50,18 @@ def detector_tables(cases: list[Case], settings: FieldSettings, eps_px: float, p
     told = {
         "ip": (
             "Intersection percentage",
-            f"share of the photograph's points within {eps_px:g} px of a point of the view",
+            f"share of the photograph's points within {eps_px:g} px of a point of the view; chance: of all pixels",
         ),
         "hausdorff": ("Hausdorff distance", "in px of the crop"),
         "hausdorff_95": ("Hausdorff distance, 95th percentile", "in px of the crop"),
+        "points": ("Number of points", "in the photograph's crop"),
     }
-    return [
-        Table(
-            name,
-            f"{title} of detectors",
-            f"{title}: {text}. {where}.",
-            ["category", *detectors],
-            _rows(scores[name], list(detectors)),
-        )
-        for name, (title, text) in told.items()
-    ]
+    tables = []
+    for name, (title, text) in told.items():
+        columns = [*detectors, "chance"] if name == "ip" else [*detectors]
+        rows = _rows(scores[name], columns)
+        tables.append(Table(name, f"{title}, by detector", f"{title}: {text}. {where}.", ["category", *columns], rows))
+    return tables
 
 
 def repeatability_table(cases: list[Case], settings: FieldSettings, eps_px: float, progress: bool = True) -> Table:

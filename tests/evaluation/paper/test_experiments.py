@@ -90,10 +90,12 @@ def test_rankings_find_the_right_view(cases):
 
 
 def test_points_of_the_photograph_lie_on_the_view(cases):
-    ip, hausdorff, robust = paper.detector_tables(cases, SETTINGS, 2.0, progress=False)
+    ip, hausdorff, robust, points = paper.detector_tables(cases, SETTINGS, 2.0, progress=False)
     column = ip.columns.index("MFC")
     assert [row[0] for row in ip.rows] == ["thing", "all"]
     assert 0.5 < ip.rows[1][column] <= 1
+    assert ip.rows[1][column] > 2 * ip.rows[1][ip.columns.index("chance")]
+    assert 10 < points.rows[1][column] <= 0.04 * 64 * 64 + 1
     assert 0 < robust.rows[1][column] <= hausdorff.rows[1][column] < 64
     table = paper.repeatability_table(cases, SETTINGS, 2.0, progress=False)
     assert 0.5 < table.rows[1][table.columns.index("CS/MFC")] <= 1

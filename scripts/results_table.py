@@ -1,0 +1,159 @@
+"""The README's table of results, made from ``scripts/results/evaluation_*.json`` and from nothing else.
+
+    python scripts/results_table.py --record DIR/summary.json NAME    keep a summary of ``curvireg evaluate`` as NAME
+    python scripts/results_table.py                                   write the table into the README
+    python scripts/results_table.py --check                           exit 1 if the README says something else
+
+A kept summary has the day and the commit it was kept at ("+": with changes that are not committed): record right after
+measuring. The table stands between ``<!-- results:begin -->`` and ``<!-- results:end -->``.
+"""
+
+import argparse
+import datetime
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
+
+PASCAL3D = (
+    ["set", "N", "Acc 30°", "Acc 10°", "median", "Acc 30°, symmetric", "easy: Acc 30°", "median", "s/object"],
+    "Acc 30°, Acc 10°: share of the objects whose rotation error acos((tr(R1ᵀR2) - 1) / 2) is below; median: of that "
+    "error; symmetric: a bottle's turns about its axis and a table's half turn do not count; easy: neither truncated, "
+    "occluded nor difficult. No camera is given.",
+)
+BOP = (
+    [
+        "set",
+        "N",
+        "Acc 15°",
+        "Acc 30°",
+        "median",
+        "ADD(-S) 0.1d",
+        "AR MSSD",
+        "AR MSPD",
+        "unoccluded: N",
+        "Acc 30°",
+        "s/object",
+    ],
+    "Rotation errors up to the object's symmetries; ADD(-S) 0.1d: share of the objects whose mean distance of model "
+    "points is below a tenth of the diameter; AR MSSD, AR MSPD: BOP's average recalls; unoccluded: at least 95 % "
+    "visible. Box and camera matrix are given.",
+)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--record", nargs=2, metavar=("SUMMARY", "NAME"), help="keep a summary.json under a name")
+    parser.add_argument("--check", action="store_true", help="change nothing; exit 1 if the README is out of date")
+    parser.add_argument("--root", type=Path, default=REPOSITORY, metavar="DIR", help="of the repository")
+    arguments = parser.parse_args()
+    results, readme = arguments.root / "scripts" / "results", arguments.root / "README.md"
+    if arguments.record:
+        print(record(Path(arguments.record[0]), arguments.record[1], results, arguments.root))
+        return 0
+    text = readme.read_text(encoding="utf-8")
+    if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
+        print(f"results_table: error: {readme}: expected {BEGIN} and then {END}, once each", file=sys.stderr)
+        return 2
+    before, after = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
+    wanted = f"{before}\n{table(results)}{after}"
+    if arguments.check:
+        if wanted != text:
+            print(f"results_table: {readme} is not what {results} says; run scripts/results_table.py", file=sys.stderr)
+        return int(wanted != text)
+    readme.write_text(wanted, encoding="utf-8")
+    return 0
+
+
+def record(summary: Path, name: str, results: Path, root: Path) -> Path:
+    """Keep ``summary`` with the day and the commit; returns the path."""
+    path = results / f"evaluation_{name}.json"
+    content = {
+        "name": name,
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "commit": commit(root),
+        "summary": json.loads(summary.read_text(encoding="utf-8")),
+    }
+    results.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    return path
+
+
+def commit(root: Path) -> str:
+    """Short hash of the checkout, "+" where it was changed, "unknown" outside of one."""
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", "-C", str(root), *words], capture_output=True, text=True, check=True
+        ).stdout.strip()
+
+    try:
+        return git("rev-parse", "--short", "HEAD") + (
+            "+" if git("status", "--porcelain", "--untracked-files=no") else ""
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def table(results: Path) -> str:
+    """Markdown of everything that was kept."""
+    kept = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(results.glob("evaluation_*.json"))]
+    parts = []
+    for title, kind, (columns, definition), cells in (
+        ("Viewpoints on PASCAL3D+", "pascal3d", PASCAL3D, pascal3d_cells),
+        ("Poses on BOP sets", "bop", BOP, bop_cells),
+    ):
+        chosen = [k for k in kept if k["summary"]["settings"]["dataset"] == kind]
+        if chosen:
+            lines = [columns, ["---"] * len(columns), *(cells(k["name"], k["summary"]) for k in chosen)]
+            body = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+            notes = "\n".join(f"- {note(k)}" for k in chosen)
+            parts.append(f"**{title}.** {definition}\n\n{body}\n\n{notes}\n")
+    return "\n".join(parts)
+
+
+def note(kept: dict[str, Any]) -> str:
+    """Under what conditions one line was measured."""
+    summary = kept["summary"]
+    settings = summary["settings"]
+    limit = "" if summary["limit"] is None else f", limited to {summary['limit']} objects"
+    skipped = sum(summary["skipped"].values())
+    return (
+        f"{kept['name']}: split {settings['split']}{limit}; {summary['protocol']}; "
+        f"preset {settings['preset']['name']}; {summary['failed']} failed, {skipped} skipped; "
+        f"{kept['date']}, commit {kept['commit']}"
+    )
+
+
+def pascal3d_cells(name: str, s: dict[str, Any]) -> list[str]:
+    easy, aware = s["subsets"]["easy"], s["symmetry_aware"]
+    shares = [percent(s["acc_pi_6"]), percent(s["acc_pi_18"]), degrees(s["med_err_deg"]), percent(aware["acc_pi_6"])]
+    return [name, str(s["n"]), *shares, percent(easy["acc_pi_6"]), degrees(easy["med_err_deg"]), each(s)]
+
+
+def bop_cells(name: str, s: dict[str, Any]) -> list[str]:
+    whole = s["subsets"]["unoccluded"]
+    shares = [percent(s["acc_15_deg"]), percent(s["acc_30_deg"]), degrees(s["med_err_deg"])]
+    recalls = [percent(s[key]) for key in ("add_recall_0.1d", "mssd_ar", "mspd_ar")]
+    return [name, str(s["n"]), *shares, *recalls, str(whole["n"]), percent(whole["acc_30_deg"]), each(s)]
+
+
+def percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f} %"
+
+
+def degrees(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}°"
+
+
+def each(summary: dict[str, Any]) -> str:
+    seconds = summary["seconds"]["register_each"]
+    return "-" if seconds is None else f"{seconds:.1f}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""HOG against scikit-image and against its own definition."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from skimage.feature import hog as skimage_hog
+
+from curvireg_torch import descriptors, filters
+from curvireg_torch.descriptors import hog
+from curvireg_torch.errors import InvalidInputError
+
+
+def _image(seed: int, size: int) -> np.ndarray:
+    x = torch.rand(1, 1, size, size, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return filters.gaussian_smooth(x, 1.0)[0, 0].numpy()
+
+
+@pytest.mark.parametrize(
+    ("size", "grid", "bins", "block"), [(64, 8, 9, 2), (48, 4, 6, 2), (96, 16, 9, 3), (32, 8, 9, 1)]
+)
+def test_hard_voting_is_scikit_image_on_the_same_gradients(size: int, grid: int, bins: int, block: int) -> None:
+    image = _image(size, size)
+    # scikit-image takes x[i + 1] - x[i - 1], 0 at the border.
+    gradient = np.zeros((2, size, size))
+    gradient[0, :, 1:-1] = image[:, 2:] - image[:, :-2]
+    gradient[1, 1:-1] = image[2:] - image[:-2]
+    want = skimage_hog(
+        image,
+        orientations=bins,
+        pixels_per_cell=(size // grid, size // grid),
+        cells_per_block=(block, block),
+        block_norm="L2-Hys",
+    )
+    got = hog(torch.from_numpy(gradient)[None], grid=grid, bins=bins, block=block, voting="hard")[0]
+    np.testing.assert_allclose(got, want, atol=1e-5)
+
+
+def _slow_hog(field: np.ndarray, grid: int, bins: int, block: int, clip: float) -> np.ndarray:
+    """Linear voting pixel by pixel."""
+    _, H, W = field.shape
+    cells = np.zeros((grid, grid, bins))
+    for i in range(H):
+        for j in range(W):
+            length = math.hypot(*field[:, i, j])
+            position = (math.atan2(field[1, i, j], field[0, i, j]) % math.pi) * bins / math.pi - 0.5
+            row, column = (i + 0.5) * grid / H - 0.5, (j + 0.5) * grid / W - 0.5
+            for r in (math.floor(row), math.floor(row) + 1):
+                for c in (math.floor(column), math.floor(column) + 1):
+                    for b in (math.floor(position), math.floor(position) + 1):
+                        if 0 <= r < grid and 0 <= c < grid:
+                            weight = (1 - abs(row - r)) * (1 - abs(column - c)) * (1 - abs(position - b))
+                            cells[r, c, b % bins] += length * weight * grid**2 / (H * W)
+    out = []
+    for r in range(grid - block + 1):
+        for c in range(grid - block + 1):
+            v = cells[r : r + block, c : c + block].ravel()
+            v = np.minimum(v / math.sqrt((v**2).sum() + 1e-10), clip)
+            out.append(v / math.sqrt((v**2).sum() + 1e-10))
+    return np.concatenate(out)
+
+
+@pytest.mark.parametrize(("shape", "grid"), [((24, 24), 4), ((21, 30), 4)])
+def test_linear_voting_against_loops(shape: tuple[int, int], grid: int) -> None:
+    field = torch.randn(1, 2, *shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    want = _slow_hog(field[0].numpy(), grid, 9, 2, 0.2)
+    np.testing.assert_allclose(hog(field, grid=grid)[0], want, atol=1e-10)
+
+
+def test_length_and_layout() -> None:
+    field = torch.zeros(1, 2, 64, 64)
+    field[0, 0, 24:32, 40:48] = 1.0  # cell (3, 5), pointing along x: bins 0 and 8 in equal parts
+    out = hog(field, voting="linear").view(7, 7, 2, 2, 9)
+    assert out.numel() == descriptors.hog_length() == descriptors.HOG().length == 1764
+    assert set(map(tuple, out.sum(-1).nonzero()[:, :2].tolist())) <= {(r, c) for r in range(1, 5) for c in range(3, 7)}
+    best = out[3, 5, 0, 0]  # the block whose first cell it is
+    assert best.nonzero().flatten().tolist() == [0, 8]
+    torch.testing.assert_close(best[0], best[8])
+
+
+def test_bin_weights_act_on_votes_and_learn() -> None:
+    field = torch.randn(2, 2, 32, 32, generator=torch.Generator().manual_seed(1))
+    without = hog(field, bin_weights=torch.tensor([0.0, *[1.0] * 8]))
+    assert float(without.view(2, -1, 9)[..., 0].abs().max()) == 0.0
+    module = descriptors.HOG(learnable=True)
+    torch.testing.assert_close(module(field), hog(field))
+    module(field)[:, ::9].sum().backward()
+    assert module.bin_weights is not None
+    assert module.bin_weights.grad is not None
+    assert float(module.bin_weights.grad[0]) > 0.0
+    assert descriptors.HOG().state_dict() == {}
+
+
+def test_bad_input_is_refused() -> None:
+    field = torch.zeros(1, 2, 16, 16)
+    with pytest.raises(InvalidInputError, match="at least 32 x 32 px"):
+        hog(field, grid=32)
+    with pytest.raises(InvalidInputError, match="voting"):
+        hog(field, voting="soft")
+    with pytest.raises(InvalidInputError, match="block <= grid"):
+        descriptors.HOG(grid=2, block=3)
+    with pytest.raises(InvalidInputError, match=r"bin_weights: expected shape \(9\)"):
+        hog(field, bin_weights=torch.ones(8))

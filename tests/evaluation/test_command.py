@@ -1,0 +1,55 @@
+"""``curvireg evaluate`` as the command line holds it."""
+
+import argparse
+import json
+
+import pytest
+
+from curvireg_torch.errors import InvalidInputError, MissingFileError
+from curvireg_torch.evaluation import add_parser
+
+
+def evaluate(*words):
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--quiet", action="store_true")
+    common.add_argument("--renderer", default="auto")
+    parser = argparse.ArgumentParser()
+    add_parser(parser.add_subparsers(), [common])
+    arguments = parser.parse_args(["evaluate", *map(str, words), "--quiet"])
+    arguments.run(arguments)
+
+
+def test_pascal3d(pascal, tmp_path, capsys):
+    words = ("pascal3d", pascal.root, "--categories", "car", "--out", tmp_path / "out")
+    evaluate(*words, "--limit", "2")
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["limit"] == 2
+    evaluate(*words)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert list(summary["per_class"]) == ["car"]
+    assert (summary["n"], summary["protocol"]) == (3, "cad=annotated pose=upright box=annotated")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-3].startswith("3 objects, 0 failed, ")
+    assert lines[-2].split()[:4] == [
+        "acc_pi_6", f"{summary['acc_pi_6']:.3f}", "acc_pi_18", f"{summary['acc_pi_18']:.3f}",
+    ]  # fmt: skip
+
+
+def test_bop_supposes_any_orientation(bop, tmp_path):
+    evaluate("bop", bop.root, "--out", tmp_path / "out", "--protocol", "box=0.1", "seed=3")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["protocol"] == "cad=annotated pose=any box=0.1 seed=3"
+    assert summary["settings"]["dataset"] == "bop"
+    assert summary["settings"]["preset"]["views"] == 18, "6 azimuths, 3 elevations"
+
+
+def test_errors_come_before_any_work(pascal, bop, tmp_path):
+    out = tmp_path / "out"
+    with pytest.raises(MissingFileError, match="no such folder"):
+        evaluate("pascal3d", tmp_path / "nowhere", "--out", out)
+    with pytest.raises(InvalidInputError, match="cad: expected one of"):
+        evaluate("pascal3d", pascal.root, "--out", out, "--protocol", "cad=all")
+    with pytest.raises(InvalidInputError, match="BOP names the object"):
+        evaluate("bop", bop.root, "--out", out, "--protocol", "cad=any")
+    with pytest.raises(SystemExit):
+        evaluate("bop", bop.root, "--out", out, "--preset", "best")
+    assert not out.exists()

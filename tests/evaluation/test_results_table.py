@@ -1,0 +1,77 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, evaluate
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "results_table.py"
+
+
+def run(root, *words):
+    return subprocess.run(
+        [sys.executable, str(SCRIPT), "--root", str(root), *map(str, words)], capture_output=True, text=True, timeout=60
+    )
+
+
+@pytest.fixture
+def repository(tmp_path):
+    root = tmp_path / "repository"
+    root.mkdir()
+    root.joinpath("README.md").write_text("# Title\n\n<!-- results:begin -->\nold\n<!-- results:end -->\n\nend\n")
+    return root
+
+
+def test_table_from_summaries(repository, pascal, bop, tmp_path):
+    for name, benchmark in (
+        ("mini", Pascal3DBenchmark(pascal, Protocol())),
+        ("cubes", BOPBenchmark(bop, Protocol(pose="any", box=0.1))),
+    ):
+        evaluate(benchmark, tmp_path / name, progress=False)
+        assert run(repository, "--record", tmp_path / name / "summary.json", name).returncode == 0
+    assert run(repository, "--check").returncode == 1, "the README still has the old table"
+    assert run(repository).returncode == 0
+    assert run(repository, "--check").returncode == 0
+    text = (repository / "README.md").read_text()
+    assert text.startswith("# Title\n\n<!-- results:begin -->\n**Viewpoints")
+    assert text.endswith("<!-- results:end -->\n\nend\n")
+    assert "old" not in text
+    summary = json.loads((tmp_path / "mini" / "summary.json").read_text())
+    assert f"| mini | {summary['n']} | {100 * summary['acc_pi_6']:.1f} % |" in text
+    assert "- cubes: split test; cad=annotated pose=any box=0.1 seed=0; preset default; 0 failed, " in text
+    widths = [line.count("|") for line in text.splitlines() if line.startswith("|")]
+    assert set(widths[:3]) == {widths[0]}
+    assert set(widths[3:]) == {widths[3]}
+    again = run(repository)
+    assert again.returncode == 0
+    assert (repository / "README.md").read_text() == text
+
+
+def test_readme_without_markers(repository):
+    repository.joinpath("README.md").write_text("# Title\n")
+    result = run(repository)
+    assert result.returncode == 2
+    assert "results:begin" in result.stderr
+
+
+def test_no_results_no_table(repository):
+    assert run(repository).returncode == 0
+    assert "<!-- results:begin -->\n<!-- results:end -->" in (repository / "README.md").read_text()
+
+
+def test_commit_is_kept(repository, tmp_path):
+    tmp_path.joinpath("summary.json").write_text("{}")
+    run(repository, "--record", tmp_path / "summary.json", "x")
+    path = repository / "scripts" / "results" / "evaluation_x.json"
+    assert json.loads(path.read_text())["commit"] == "unknown"
+    git = ["git", "-C", str(repository), "-c", "user.name=a", "-c", "user.email=a@b"]
+    for words in (["init", "-q"], ["add", "README.md"], ["commit", "-qm", "x"]):
+        subprocess.run([*git, *words], check=True)
+    run(repository, "--record", tmp_path / "summary.json", "x")
+    clean = json.loads(path.read_text())["commit"]
+    assert clean.isalnum()
+    repository.joinpath("README.md").write_text("changed")
+    run(repository, "--record", tmp_path / "summary.json", "x")
+    assert json.loads(path.read_text())["commit"] == clean + "+"

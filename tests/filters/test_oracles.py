@@ -1,0 +1,159 @@
+"""The same numbers from scikit-image, OpenCV, kornia, or slow loops in numpy float64."""
+
+import math
+
+import cv2
+import kornia
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+from skimage.feature import hessian_matrix_eigvals
+
+from curvireg_torch import filters
+from curvireg_torch.filters.derivatives import central_hessian
+
+from .support import photos
+
+
+def _smooth(x: np.ndarray, sigma: float) -> np.ndarray:
+    return gaussian_filter(x, sigma, mode="nearest", radius=math.ceil(4 * sigma))
+
+
+def _gradient(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Central differences with replicated borders, pixel by pixel."""
+    H, W = x.shape
+    gx, gy = np.zeros_like(x), np.zeros_like(x)
+    for i in range(H):
+        for j in range(W):
+            gx[i, j] = (x[i, min(j + 1, W - 1)] - x[i, max(j - 1, 0)]) / 2
+            gy[i, j] = (x[min(i + 1, H - 1), j] - x[max(i - 1, 0), j]) / 2
+    return gx, gy
+
+
+def _perona_malik(x: np.ndarray, iterations: int, kappa: float, step: float, conductance: str) -> np.ndarray:
+    H, W = x.shape
+    for _ in range(iterations):
+        new = x.copy()
+        for i in range(H):
+            for j in range(W):
+                for di, dj in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+                    if 0 <= i + di < H and 0 <= j + dj < W:
+                        d = x[i + di, j + dj] - x[i, j]
+                        g = 1 / (1 + (d / kappa) ** 2) if conductance == "rational" else math.exp(-((d / kappa) ** 2))
+                        new[i, j] += step * g * d
+        x = new
+    return x
+
+
+@pytest.mark.parametrize("conductance", ["rational", "exponential"])
+def test_perona_malik(conductance: str) -> None:
+    image = photos(1, 15, dtype=torch.float64)
+    got = filters.anisotropic_diffusion(image, iterations=6, kappa=0.07, step=0.25, conductance=conductance)
+    want = _perona_malik(image[0, 0].numpy(), 6, 0.07, 0.25, conductance)
+    np.testing.assert_allclose(got[0, 0], want, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("time", "steps"), [(None, (0, 5, 10)), (4.0, (0, 10, 20))])
+def test_multiscale_curvilinear_saliency(time: float | None, steps: tuple[int, ...]) -> None:
+    image = photos(1, 17, dtype=torch.float64)
+    got = filters.multiscale_curvilinear_saliency(image, scales=3, sigma=0.8, kappa=0.05, diffusion_time=time)[0]
+    fields = []
+    for n in steps:
+        gx, gy = _gradient(_smooth(_perona_malik(image[0, 0].numpy(), n, 0.05, 0.2, "rational"), 0.8))
+        length = np.hypot(gx, gy)
+        fields.append(np.stack([length * gx, length * gy]) / (length**2).max())
+    lengths = np.stack([np.hypot(*f) for f in fields])
+    kept, best = (lengths > math.exp(-3)).all(0), lengths.argmax(0)
+    want = np.where(kept, np.take_along_axis(np.stack(fields), best[None, None], 0)[0], 0.0)
+    assert 0.05 < kept.mean() < 0.95
+    # At the strongest pixel all levels are 1; which of their directions wins is left to rounding.
+    ties = np.isclose(np.sort(lengths, axis=0)[-1], np.sort(lengths, axis=0)[-2], rtol=1e-9)
+    np.testing.assert_allclose(np.where(ties, 0, got), np.where(ties, 0, want), atol=1e-10)
+    assert ties.mean() < 0.1
+
+
+@pytest.mark.parametrize("mode", ["reblur-image", "reblur-saliency"])
+@pytest.mark.parametrize("saliency_weight", [False, True])
+def test_multiscale_focus_curves(mode: str, saliency_weight: bool) -> None:
+    image = photos(1, 21, dtype=torch.float64)
+    options = {"scales": 4, "mode": mode, "saliency_weight": saliency_weight, "threshold": 0.2}
+    got = filters.multiscale_focus_curves(image, **options)[0]
+    x = _smooth(image[0, 0].numpy(), 1.0)
+    gx, gy = _gradient(x)
+    cs = gx**2 + gy**2
+    worst = np.zeros_like(cs)
+    for s in (1.0, 2.0, 3.0):
+        cs_s = sum(g**2 for g in _gradient(_smooth(x, s))) if mode == "reblur-image" else _smooth(cs, s)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = cs / cs_s
+            squared = s**2 / (ratio - 1) if mode == "reblur-image" else 2 * s**2 / (ratio**2 - 1)
+        squared = np.where(ratio > 1, squared, np.inf)
+        worst = np.maximum(worst, np.sqrt(np.clip(squared - 0.36, 0, 1000.0**2)))
+    focus = 1 / np.maximum(worst, 0.6)
+    value = np.where((focus > 0.2) & (cs > 1e-3 * cs.max()), focus, 0)
+    value = value * np.sqrt(cs) if saliency_weight else value
+    want = value * np.stack([gx, gy]) / np.maximum(np.sqrt(cs), 1e-300)
+    assert 0.02 < (value > 0).mean() < 0.98
+    np.testing.assert_allclose(got, want, atol=1e-9)
+
+
+def test_principal_curvature_image_against_skimage_eigenvalues() -> None:
+    image = photos(1, 33, dtype=torch.float64)
+    for eigenvalue, sign in (("largest", 1.0), ("smallest", -1.0)):
+        got = filters.principal_curvature_image(image, sigmas=(1.0, 2.0), eigenvalue=eigenvalue)[0]
+        responses = []
+        for sigma in (1.0, 2.0):
+            xx, yy, xy = (h[0, 0].numpy() for h in central_hessian(filters.gaussian_smooth(image, sigma)))
+            large, small = hessian_matrix_eigvals(np.stack([yy, xy, xx]))
+            responses.append(sigma**2 * np.maximum(sign * (large if sign > 0 else small), 0))
+        want = np.max(responses, axis=0)
+        np.testing.assert_allclose(np.hypot(*got.numpy()), want, atol=1e-12)
+
+
+def test_central_hessian_and_gaussian_against_scipy() -> None:
+    image = photos(1, 33, dtype=torch.float64)
+    smooth = filters.gaussian_smooth(image, 1.7)
+    # scipy rounds the radius 4 sigma to the nearest pixel, we round it up.
+    np.testing.assert_allclose(
+        smooth[0, 0], gaussian_filter(image[0, 0].numpy(), 1.7, mode="nearest", radius=7), rtol=1e-12
+    )
+    xx, yy, xy = (h[0, 0].numpy() for h in central_hessian(smooth))
+    gx, _ = _gradient(smooth[0, 0].numpy())
+    np.testing.assert_allclose(xy[1:-1, 1:-1], np.gradient(gx, axis=0)[1:-1, 1:-1], atol=1e-14)
+    x = smooth[0, 0].numpy()
+    np.testing.assert_allclose(xx[:, 1:-1], np.diff(x, 2, axis=1), atol=1e-14)
+    np.testing.assert_allclose(yy[1:-1], np.diff(x, 2, axis=0), atol=1e-14)
+
+
+def test_bilateral_against_kornia_and_opencv() -> None:
+    image = photos(1, 25)
+    inner = (..., slice(4, -4), slice(4, -4))  # borders differ
+    got = filters.bilateral_smooth(image, sigma=2.0, kappa=0.1)
+    # kornia squares the sum of absolute differences over channels: one channel is the same.
+    want = kornia.filters.bilateral_blur(image, (9, 9), 0.1, (2.0, 2.0))
+    torch.testing.assert_close(got[inner], want[inner], rtol=1e-5, atol=1e-6)
+    # OpenCV sums over the disc of that radius, not the square.
+    opencv = cv2.bilateralFilter(image[0, 0].numpy(), 9, 0.1, 2.0)
+    np.testing.assert_allclose(got[inner][0, 0], opencv[4:-4, 4:-4], atol=1e-2)
+
+
+def test_guided_filter_against_loops() -> None:
+    image = photos(1, 15, dtype=torch.float64)
+    got = filters.guided_smooth(image, sigma=2.0, kappa=0.1)[0, 0]
+    r = round((math.sqrt(6 * 4 + 1) - 1) / 2)
+    x = image[0, 0].numpy()
+    H, W = x.shape
+
+    def box(y: np.ndarray, i: int, j: int) -> np.ndarray:
+        rows, columns = np.clip(np.arange(i - r, i + r + 1), 0, H - 1), np.clip(np.arange(j - r, j + r + 1), 0, W - 1)
+        return y[np.ix_(rows, columns)]
+
+    a, b = np.zeros_like(x), np.zeros_like(x)
+    for i in range(H):
+        for j in range(W):
+            window = box(x, i, j)
+            a[i, j] = window.var() / (window.var() + 0.1**2)
+            b[i, j] = window.mean() * (1 - a[i, j])
+    want = [[box(a, i, j).mean() * x[i, j] + box(b, i, j).mean() for j in range(W)] for i in range(H)]
+    np.testing.assert_allclose(got, want, atol=1e-12)
