@@ -2,8 +2,8 @@
 
     python scripts/measure_view_distance.py BOP_FOLDER [--out scripts/results/view_distance.json]
 
-BOP_FOLDER holds BOP sets. For each instance the view of the true orientation is rendered at each
-assumed distance (in object radii; "true" is the annotated one, "orthographic" is infinity) and compared with the
+BOP_FOLDER holds BOP sets (see datasets/README.md). For each instance the view of the true orientation is rendered at
+each assumed distance (in object radii; "true" is the annotated one, "orthographic" is infinity) and compared with the
 photograph's crop (cosine of HOG descriptors), beside 150 views of other orientations rendered the same way.
 """
 
@@ -62,7 +62,7 @@ def main() -> None:
     others = random_rotations(DISTRACTORS)
     for root in sorted(p for p in arguments.root.iterdir() if (p / "test").is_dir()):
         rows = []
-        for photo, model, T, _, box in list(instances(root))[:: arguments.every]:
+        for photo, model, T, _K, box in list(instances(root))[:: arguments.every]:
             if model not in models:
                 radius, views = describers(model)
                 crowd = {

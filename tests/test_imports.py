@@ -9,10 +9,11 @@ import curvireg_torch
 
 PACKAGE = Path(curvireg_torch.__file__).parent
 
-BASE = {"errors", "_checks"}
+BASE = {"errors", "_checks", "_threads"}
 ALLOWED = {
     "errors": set(),
     "_checks": {"errors"},
+    "_threads": set(),
     "geometry": BASE,
     "filters": BASE,
     "descriptors": BASE | {"filters"},

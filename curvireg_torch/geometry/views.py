@@ -14,7 +14,11 @@ from .viewpoint import rotation_from_viewpoint, viewpoint_from_rotation
 __all__ = ["DEFAULT_DISTANCE", "ViewSphere", "paper_views", "sample_views", "uniform_views"]
 
 DEFAULT_DISTANCE = 5.0
-"""Distance of a view in units of the object's radius; a 35 mm photograph of an object that fills half of it."""
+"""Distance of a view in units of the object's radius.
+
+Measured on photographs at 5 to 14 radii: descriptors of views at 5 radii come within 0.005 of the cosine of views at
+the true distance (``docs/conventions.md``); nearer views lose more.
+"""
 
 
 @dataclass(frozen=True)

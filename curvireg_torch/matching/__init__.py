@@ -14,6 +14,7 @@ from .cache import (
 from .collection import BankCollection
 from .describe import BankSettings, DescribedViews, ViewDescriber
 from .matcher import QueryFeatures, Ranking, ViewMatcher
+from .near_symmetry import NearSymmetry, near_symmetries
 from .repeatability import dilate_points, repeatability, repeatability_score
 from .similarity import normalized_correlation, unit_score
 
@@ -23,6 +24,7 @@ __all__ = [
     "BankSettings",
     "CachedBank",
     "DescribedViews",
+    "NearSymmetry",
     "QueryFeatures",
     "Ranking",
     "ViewBank",
@@ -34,6 +36,7 @@ __all__ = [
     "clear_cache",
     "dilate_points",
     "list_cache",
+    "near_symmetries",
     "normalized_correlation",
     "repeatability",
     "repeatability_score",

@@ -3,7 +3,6 @@
 import json
 import os
 import uuid
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, fields
 from os import PathLike
 from pathlib import Path
@@ -17,6 +16,7 @@ from safetensors.torch import save
 from torch import Tensor
 from tqdm import tqdm
 
+from .._threads import one_thread_each
 from ..errors import BankError, InvalidInputError, MissingFileError
 from ..geometry.mesh import as_mesh, mesh_radius
 from ..geometry.views import ViewSphere, sample_views
@@ -135,21 +135,10 @@ class ViewBank:
             }
 
         parts = []
-        threads = torch.get_num_threads()
-        # One torch thread for each chunk: chunks are too small to be shared among threads inside.
-        with (
-            tqdm(total=len(views), desc="views", unit="view", disable=not progress) as bar,
-            ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool,
-        ):
-            try:
-                for part in pool.map(chunk, range(0, len(views), chunk_size)):
-                    parts.append(part)
-                    bar.update(len(part["boxes"]))
-            except BaseException:
-                pool.shutdown(cancel_futures=True)  # an error or Ctrl-C does not wait for the other views
-                raise
-            finally:
-                torch.set_num_threads(threads)  # some libraries underneath count for the whole process
+        with tqdm(total=len(views), desc="views", unit="view", disable=not progress) as bar, one_thread_each() as pool:
+            for part in pool.map(chunk, range(0, len(views), chunk_size)):
+                parts.append(part)
+                bar.update(len(part["boxes"]))
         return cls(mesh, views, settings, {name: torch.cat([part[name] for part in parts]) for name in parts[0]})
 
     def to(self, device: torch.device | str) -> "ViewBank":

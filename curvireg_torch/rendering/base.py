@@ -54,7 +54,8 @@ def make_renderer(
       forked after its first use cannot (start processes by "spawn").
     - ``"torch"`` needs nothing and runs on any torch device. Threads may share it; forked processes must call
       ``torch.set_num_threads(1)`` first.
-    - ``"auto"``: embree where it is installed (the fastest on a CPU), else pyrender where EGL works, else torch.
+    - ``"auto"``: embree where it is installed (it asks for no driver, and minds neither threads nor forks), else
+      pyrender where EGL works, else torch.
 
     Args:
         mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.

@@ -5,6 +5,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from .._threads import one_thread_each
 from ..geometry.mesh import mesh_centre, mesh_radius
 from .base import NEAREST, check_render_arguments
 
@@ -52,12 +53,22 @@ class TorchRenderer:
         R, t, K = (x.to(self.device, self._setup_dtype) for x in (R, t, K))
         H, W = size
         depth = torch.full((len(T), H * W), torch.inf, device=self.device)
-        views = max(1, _TRIANGLES // len(self._faces))
-        for i in range(0, len(T), views):
+        on_cpu = self.device.type == "cpu"
+        views = 1 if on_cpu else max(1, _TRIANGLES // len(self._faces))
+
+        @torch.no_grad()  # a thread does not inherit it
+        def draw(i: int) -> None:
             for j in range(0, len(self._faces), _TRIANGLES):
                 faces = self._faces[j : j + _TRIANGLES]
                 block = depth[i : i + views].view(-1)
                 self._draw(block, faces, R[i : i + views], t[i : i + views], K[i : i + views], size, orthographic)
+
+        if on_cpu and torch.get_num_threads() > 1:
+            with one_thread_each() as pool:
+                list(pool.map(draw, range(len(T))))
+        else:
+            for i in range(0, len(T), views):
+                draw(i)
         depth = torch.where(depth.isfinite(), (depth + t[:, 2:].float()) * self._radius, 0.0)
         return depth.view(-1, 1, H, W)
 
