@@ -23,7 +23,7 @@ class Preset:
         396
     """
 
-    bank: BankSettings = field(default_factory=lambda: BankSettings(image_size=128))
+    bank: BankSettings = field(default_factory=lambda: BankSettings(image_size=128, sigma=0.8))
     refine: bool = True
 
     def views(self, pose: str) -> ViewSphere:

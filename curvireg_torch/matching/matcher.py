@@ -110,9 +110,12 @@ class ViewMatcher(nn.Module):
         self.descriptor = bank.settings.descriptor()
         # Points are counted in cells of eps px or less, so that the product stays small.
         self._cell = max(1, min(int(self.eps), bank.settings.image_size // 64))
-        dilated = [dilate_points(chunk, self.eps)[:, None].float() for chunk in bank.points.split(64)]
+        cells = [
+            self._in_cells(dilate_points(bank.points_at(slice(i, i + 64)), self.eps)[:, None].float())
+            for i in range(0, len(bank), 64)
+        ]
         self._view_points: Tensor
-        self.register_buffer("_view_points", torch.cat([self._in_cells(d) for d in dilated]), persistent=False)
+        self.register_buffer("_view_points", torch.cat(cells), persistent=False)
 
     def _in_cells(self, points: Tensor) -> Tensor:
         """(N, C, C) share of each cell's pixels that are set, from (N, 1, S, S)."""
