@@ -77,7 +77,7 @@ def test_bank_then_register(files, capsys):
     out = folder / "new.safetensors"
     options = ["--pose", "upright", "--quiet"]
     assert main(["bank", str(folder / "truck.ply"), "--out", str(out), *options]) == 0
-    assert "396 views" in capsys.readouterr().out
+    assert "288 views" in capsys.readouterr().out
     assert run(folder, "photo.png", "new.safetensors", "--no-refine", box=box) == 0
 
 

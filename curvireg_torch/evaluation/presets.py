@@ -20,7 +20,7 @@ class Preset:
 
     Example:
         >>> len(Preset().views("upright"))
-        396
+        288
     """
 
     bank: BankSettings = field(default_factory=lambda: BankSettings(image_size=128, sigma=0.8))

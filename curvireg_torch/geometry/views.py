@@ -124,12 +124,12 @@ def _in_turn(angle: Tensor, start: float, stop: float) -> Tensor:
 def sample_views(
     *,
     azimuth_step: float = 10.0,
-    elevations: Sequence[float] = (-20, -10, 0, 10, 20, 30, 40, 50, 60, 70, 80),
+    elevations: Sequence[float] = (-10, 0, 10, 20, 30, 40, 50, 60),
     thetas: Sequence[float] = (0.0,),
     distances: Sequence[float] = (DEFAULT_DISTANCE,),
     azimuths: Sequence[float] | None = None,
 ) -> ViewSphere:
-    """Grid of viewpoints; the default suits an object that stands upright and is not seen from below.
+    """Grid of viewpoints; the default suits an object that stands upright, seen from the side or from above.
 
     Args:
         azimuth_step: degrees; the circle is divided into round(360 / step) equal parts.

@@ -14,6 +14,9 @@ __all__ = ["RefinedPose", "coherent_views", "refine_pose"]
 TOLERANCE = 0.05
 """|T_i^-1 T_(i+1) - Id|_F at which the search stops, translation in object radii (METHOD 6)."""
 
+REACH = 15.0
+"""Degrees: half as far again as the neighbours in a bank of 10 degrees, which were found worse."""
+
 FINEST_STEP = 1.0
 """Degrees: finer steps move the contours of a crop by less than a pixel."""
 
@@ -28,7 +31,7 @@ class RefinedPose:
     iterations: int
 
 
-def coherent_views(rotations: Tensor, order: Tensor, *, count: int = 5, angle: float = 30.0) -> Tensor:
+def coherent_views(rotations: Tensor, order: Tensor, *, count: int = 5, angle: float = REACH) -> Tensor:
     """The best ``count`` views, less those farther than ``angle`` degrees from the first.
 
     Args:
@@ -59,12 +62,13 @@ def refine_pose(
 
     The first round compares the views themselves. Every further round takes the 26 turns by +-step about the camera's
     axes around the best pose; the step halves whenever nothing is better. With a camera matrix, the distance follows in
-    closed form from the box after every round, so that perspective is that of the photograph.
+    closed form from the box after every round, so that perspective is that of the photograph. The search keeps within
+    ``REACH`` degrees of the first view.
 
     Args:
         describe: renders the mesh.
         query: features of the photograph's crop, B = 1.
-        rotations: (K, 3, 3) coherent views, best first.
+        rotations: (K, 3, 3) coherent views (:func:`coherent_views`), best first.
         distance: of the object's centre in the bank's views, model units.
         radius: of the object, model units.
         box, camera_matrix: (4,) px and (3, 3) of the photograph; both or none.
@@ -97,6 +101,7 @@ def refine_pose(
             step = max(step / 2.0, FINEST_STEP)
         turns = torch.linalg.matrix_exp(_skew(torch.deg2rad(offsets * step)))
         candidates = turns @ best
+        candidates = candidates[rotation_error(candidates, rotations[:1].double()) <= REACH]
     return RefinedPose(best, z, score, rounds)
 
 
