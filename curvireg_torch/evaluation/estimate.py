@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..geometry import mesh_radius
-from ..registration import Registrar, coherent_views, confidence, refine_pose
+from ..registration import Registrar, confidence
 from .benchmark import Row
 
 __all__ = ["estimate_pose"]
@@ -52,14 +51,7 @@ def _fused(registrars: Sequence[Registrar], image: Tensor, box: Tensor, scores: 
     order = mean.argsort(descending=True, stable=True)
     chosen = int(scores[:, order[0]].argmax())
     matcher, bank = registrars[chosen].matcher, registrars[chosen].bank
-    radius = mesh_radius(bank.mesh)
-    pose = refine_pose(
-        registrars[chosen].describe,
-        matcher.features(matcher.crop([image], box[None])[0]),
-        bank.rotations[coherent_views(bank.rotations, order)].cpu(),
-        distance=float(bank.views.distance[order[0]]) * radius,
-        radius=radius,
-    )
+    pose = registrars[chosen].search(matcher.features(matcher.crop([image], box[None])[0]).field, order)
     return {
         "rotation": pose.rotation.tolist(),
         "translation": None,

@@ -18,8 +18,8 @@ class Registration:
     Attributes:
         rotation: (3, 3) float64, ``x_cam = R x_model + t``, OpenCV camera.
         translation: (3,) float64 in model units, None without a camera matrix.
-        score: normalised correlation of the pose's view with the photograph, in [0, 1]; comparable between poses of one
-            photograph, not between photographs.
+        score: normalised correlation of the pose's view with the photograph, in [0, 1], on the grid of the search
+            (twice as fine as the bank's) or, without refinement, of the bank.
         confidence: in [0, 1], see :func:`curvireg_torch.registration.confidence`.
         ranking: of the bank's views for this photograph (B = 1).
         candidates: (K,) view indices of the best distinct hypotheses, best first.

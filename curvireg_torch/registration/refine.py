@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..geometry.translation import place_view
 from ..geometry.viewpoint import rotation_error
-from ..matching import DescribedViews, QueryFeatures, ViewDescriber, normalized_correlation
+from ..matching import DescribedViews, ViewDescriber, normalized_correlation
 
 __all__ = ["RefinedPose", "coherent_views", "refine_pose"]
 
@@ -47,7 +47,7 @@ def coherent_views(rotations: Tensor, order: Tensor, *, count: int = 5, angle: f
 
 def refine_pose(
     describe: ViewDescriber,
-    query: QueryFeatures,
+    query: Tensor,
     rotations: Tensor,
     *,
     distance: float,
@@ -67,7 +67,7 @@ def refine_pose(
 
     Args:
         describe: renders the mesh.
-        query: features of the photograph's crop, B = 1.
+        query: (1, D) descriptor of the photograph's crop, as ``describe`` makes them.
         rotations: (K, 3, 3) coherent views (:func:`coherent_views`), best first.
         distance: of the object's centre in the bank's views, model units.
         radius: of the object, model units.
@@ -86,7 +86,7 @@ def refine_pose(
     while rounds < max_iterations:
         rounds += 1
         described = _describe(describe, candidates, z, chunk_size)
-        scores = normalized_correlation(query.descriptors, described.descriptors)[0]
+        scores = normalized_correlation(query, described.descriptors)[0]
         winner = int(scores.argmax())
         previous, previous_z = best, z
         improved = float(scores[winner]) > score

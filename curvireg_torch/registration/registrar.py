@@ -1,6 +1,7 @@
 """The facade that joins it all: photographs, boxes and a mesh to poses."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -70,16 +71,40 @@ class Registrar:
         self.refine, self.top = refine, top
         self._renderer = renderer
         self._describer: ViewDescriber | None = None
-        self._radius = mesh_radius(self.bank.mesh)
+        self.radius = mesh_radius(self.bank.mesh)
+        settings = self.bank.settings
+        self._fine = replace(settings, grid=min(2 * settings.grid, settings.image_size))
+        self._fine_descriptor = self._fine.descriptor()
 
     @property
     def describe(self) -> ViewDescriber:
-        """Renders further views of the bank's mesh, made on first use."""
+        """Renders and describes further views of the bank's mesh, on a grid twice as fine; made on first use."""
         if self._describer is None:
             self._describer = ViewDescriber(
-                self.bank.mesh, self.bank.settings, renderer=self._renderer, device=self.bank.device
+                self.bank.mesh, self._fine, renderer=self._renderer, device=self.bank.device
             )
         return self._describer
+
+    def search(
+        self, field: Tensor, order: Tensor, *, box: Tensor | None = None, camera_matrix: Tensor | None = None
+    ) -> RefinedPose:
+        """Refine the best coherent views of a ranking, see :func:`refine_pose`.
+
+        Args:
+            field: (1, 2, S, S) of the photograph's crop.
+            order: (N,) view indices of the bank, best first.
+            box, camera_matrix: (4,) and (3, 3) of the photograph; both or none.
+        """
+        start = coherent_views(self.bank.rotations, order)
+        return refine_pose(
+            self.describe,
+            self._fine_descriptor(field),
+            self.bank.rotations[start].cpu(),
+            distance=float(self.bank.views.distance[start[0]]) * self.radius,
+            radius=self.radius,
+            box=box,
+            camera_matrix=camera_matrix,
+        )
 
     @torch.no_grad()
     def __call__(
@@ -125,19 +150,10 @@ class Registrar:
     ) -> Registration:
         bank, order = self.bank, ranking.order[0]
         best = int(order[0])
-        distance = float(bank.views.distance[best]) * self._radius
         if self.refine:
-            start = coherent_views(bank.rotations, order)
-            pose = refine_pose(
-                self.describe,
-                query,
-                bank.rotations[start].cpu(),
-                distance=distance,
-                radius=self._radius,
-                box=box,
-                camera_matrix=K,
-            )
+            pose = self.search(query.field, order, box=box, camera_matrix=K)
         else:
+            distance = float(bank.views.distance[best]) * self.radius
             pose = RefinedPose(bank.rotations[best].double().cpu(), distance, float(ranking.hog[0, best]), 0)
         rotation, translation = pose.rotation, None
         if K is not None:
