@@ -53,16 +53,19 @@ def contour_overlay(
 
 
 def _depth_edges(depth: np.ndarray) -> np.ndarray:
-    """Jumps of depth inside the silhouette: more than 3 % of the object's depth range from one pixel to the next."""
+    """Jumps of depth inside the silhouette: 3 % of the object's depth range more than a step of the slope beside them."""
     seen = depth > 0
     if not seen.any():
         return seen
     limit = 0.03 * float(np.ptp(depth[seen]))
     edges = np.zeros_like(seen)
     for axis in (0, 1):
-        jump = np.abs(np.diff(depth, axis=axis)) > limit
+        step = np.abs(np.diff(depth, axis=axis))
+        around = np.pad(step, [(1, 1), (0, 0)] if axis == 0 else [(0, 0), (1, 1)], mode="edge")
+        before, after = (np.take(around, range(k, k + step.shape[axis]), axis=axis) for k in (0, 2))
+        jump = step - np.minimum(before, after) > limit
         edges |= np.pad(jump, [(0, 1), (0, 0)] if axis == 0 else [(0, 0), (0, 1)])
-    return edges & seen
+    return np.asarray(edges & seen)
 
 
 def _thick(mask: np.ndarray, width: int) -> np.ndarray:

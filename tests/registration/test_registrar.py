@@ -26,7 +26,7 @@ def test_poses_of_synthetic_scenes(registered):
     coarse, fine = registered
     assert int((rotation_errors(coarse) < 20).sum()) >= 5
     right = rotation_errors(coarse) < 20
-    assert float(rotation_errors(fine)[right].median()) < 6
+    assert float(rotation_errors(fine)[right].median()) < 4
     assert float(rotation_errors(fine)[right].median()) <= float(rotation_errors(coarse)[right].median())
     for result, seed, is_right in zip(fine, SEEDS, right, strict=True):
         truth = scene(seed)[2][:3, 3]
