@@ -53,7 +53,7 @@ def contour_overlay(
 
 
 def _depth_edges(depth: np.ndarray) -> np.ndarray:
-    """Jumps of depth inside the silhouette: 3 % of the object's depth range more than a step of the slope beside them."""
+    """Jumps of depth inside the silhouette: steps that exceed those beside them by 3 % of the object's depth range."""
     seen = depth > 0
     if not seen.any():
         return seen
