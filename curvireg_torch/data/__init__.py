@@ -9,11 +9,13 @@ from .bop_csv import BOPRow, read_bop_csv, write_bop_csv
 from .collate import collate
 from .images import read_image
 from .pascal3d import Pascal3DPlus
+from .transforms import CropBox
 from .web import WebCollection
 
 __all__ = [
     "BOPDataset",
     "BOPRow",
+    "CropBox",
     "Pascal3DPlus",
     "WebCollection",
     "collate",

@@ -1,0 +1,41 @@
+"""Sample transforms, ``transforms(sample) -> sample``, for the datasets of this package."""
+
+from typing import Any
+
+from ..geometry import crop_images
+
+__all__ = ["CropBox"]
+
+
+class CropBox:
+    """Replaces a sample's image by the square crop around its box, so that samples stack and feed the layers directly.
+
+    The box stays in pixels of the original image; ``crop_transform`` (3, 3) maps those to pixels of the crop, and a
+    camera matrix becomes that of the crop.
+
+    Args:
+        size: side of the crops in px.
+        margin: room around the box on each side, as a share of its longer side.
+
+    Raises:
+        InvalidInputError: when called, for a box that is empty or wholly outside its image.
+
+    Example:
+        >>> import torch
+        >>> sample = {"image": torch.rand(3, 60, 80), "box": torch.tensor([10.0, 10.0, 50.0, 40.0])}
+        >>> CropBox(size=32)(sample)["image"].shape
+        torch.Size([3, 32, 32])
+    """
+
+    def __init__(self, *, size: int = 256, margin: float = 0.1) -> None:
+        self.size, self.margin = size, margin
+
+    def __call__(self, sample: dict[str, Any]) -> dict[str, Any]:
+        crops, A = crop_images(sample["image"][None], sample["box"][None], size=self.size, margin=self.margin)
+        changed = {"image": crops[0], "crop_transform": A[0]}
+        if "camera_matrix" in sample:
+            changed["camera_matrix"] = A[0].to(sample["camera_matrix"]) @ sample["camera_matrix"]
+        return {**sample, **changed}
+
+    def __repr__(self) -> str:
+        return f"CropBox(size={self.size}, margin={self.margin})"
