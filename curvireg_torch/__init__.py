@@ -51,6 +51,7 @@ from .geometry import (
     viewpoint_from_rotation,
 )
 from .matching import (
+    BankCollection,
     BankSettings,
     Ranking,
     ViewBank,
@@ -72,6 +73,7 @@ __all__ = [
     "ApparentRidges",
     "AverageShadingGradient",
     "BOPDataset",
+    "BankCollection",
     "BankSettings",
     "CurviregError",
     "DepthCurvilinearSaliency",

@@ -14,6 +14,7 @@ from ..errors import InvalidInputError
 from ..filters import MultiScaleFocusCurves
 from ..geometry.crops import crop_images
 from .bank import ViewBank
+from .collection import BankCollection
 from .repeatability import MODES, dilate_points, repeatability, repeatability_score
 from .similarity import normalized_correlation, unit_score
 
@@ -73,7 +74,7 @@ class ViewMatcher(nn.Module):
     (:func:`repeatability_score`).
 
     Args:
-        bank: the views.
+        bank: the views of one model, or of several (which one is it?).
         field: photograph filter (B, 1, S, S) -> (B, 2, S, S); default :class:`MultiScaleFocusCurves`.
         eps: distance in px of the crop within which points repeat; default 2 % of its side.
         repeatability_mode: "monotone" or "paper".
@@ -85,12 +86,12 @@ class ViewMatcher(nn.Module):
         >>> bank = ViewBank.build(trimesh.creation.box(), sample_views(azimuth_step=90), image_size=64, progress=False)
         >>> ranking = ViewMatcher(bank)(torch.rand(2, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30], [10, 5, 60, 47]]))
         >>> ranking.scores.shape, ranking.top(3).shape
-        (torch.Size([2, 44]), torch.Size([2, 3]))
+        (torch.Size([2, 32]), torch.Size([2, 3]))
     """
 
     def __init__(
         self,
-        bank: ViewBank,
+        bank: ViewBank | BankCollection,
         *,
         field: nn.Module | None = None,
         eps: float | None = None,
