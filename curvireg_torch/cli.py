@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import kornia
 import numpy as np
 import torch
+import trimesh
 
 from . import __version__
 from .data import read_image
@@ -52,6 +54,11 @@ def main(argv: Sequence[str] | None = None) -> int:
                 raise
             print(f"curvireg: error: {error}", file=sys.stderr)
             return 2
+        except OSError as error:
+            if arguments.debug:
+                raise
+            print(f"curvireg: error: {error.filename}: {error.strerror}; choose another --out", file=sys.stderr)
+            return 2
         except KeyboardInterrupt:
             print("curvireg: interrupted", file=sys.stderr)
             return 130
@@ -77,8 +84,8 @@ def _parser() -> argparse.ArgumentParser:
         "--pose",
         choices=("any", "upright"),
         default="any",
-        help="any: no assumption. upright: the mesh's z axis points up in the photograph and the object is not seen "
-        "from below; faster, and right more often where it is true (default: any)",
+        help="any: no assumption. upright: the mesh's z axis points up in the photograph and the object is seen "
+        "from 10 degrees below to 60 above; faster, and right more often where it is true (default: any)",
     )
 
     register = commands.add_parser(
@@ -219,9 +226,6 @@ def _document(result: Registration, registrar: Registrar, times: dict[str, float
         }
         for v in result.candidates.tolist()
     ]
-    import kornia
-    import trimesh
-
     return {
         "rotation": result.rotation.tolist(),
         "translation": None if result.translation is None else result.translation.tolist(),
@@ -247,11 +251,8 @@ def _document(result: Registration, registrar: Registrar, times: dict[str, float
 def _write(out: Path, document: dict[str, Any], registrar: Registrar, result: Registration, *scene: Any) -> None:
     from .visualization import registration_sheet
 
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "result.json").write_text(json.dumps(document, indent=2) + "\n")
-    except OSError as error:
-        raise InvalidInputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from error
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "result.json").write_text(json.dumps(document, indent=2) + "\n")
     _write_picture(out / "overlay.png", registration_sheet(registrar, result, *scene))
 
 

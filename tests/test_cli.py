@@ -131,6 +131,16 @@ def test_cache_is_listed_and_cleared(files, capsys, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_bank_that_cannot_be_written(files, capsys):
+    folder, _, _ = files
+    arguments = ["bank", str(folder / "truck.ply"), "--pose", "upright", "--quiet"]
+    assert main([*arguments, "--out", str(folder / "photo.png" / "bank.safetensors")]) == 2
+    error = capsys.readouterr().err.strip()
+    assert len(error.splitlines()) == 1
+    assert "photo.png" in error
+    assert "--out" in error
+
+
 def test_help_names_the_commands(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["--help"])

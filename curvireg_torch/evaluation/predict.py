@@ -97,6 +97,4 @@ class _Workshop:
     def _registrar(self, path: Path, protocol: Protocol) -> Registrar:
         mesh, views = load_mesh(path, unit=self.benchmark.unit), self.preset.views(protocol.pose)
         bank = cached_bank(mesh, views, self.preset.bank, renderer=self.renderer, progress=False)
-        # A bank from the cache was rounded when it was saved; a new one must give the same numbers.
-        bank.descriptors = bank.descriptors.half().float()
         return Registrar(bank, refine=self.preset.refine and protocol.cad != "fused", renderer=self.renderer)

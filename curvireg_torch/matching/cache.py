@@ -119,6 +119,7 @@ def cached_bank(
             _touch(path)
             return bank
     bank = ViewBank.build(mesh, views, settings=settings, progress=progress, device=device, **build_options)
+    bank.descriptors = bank.descriptors.half().float()  # as the file will hold them: now and later rank alike
     try:
         bank.save(path)
         trim_cache(folder, keep=path)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..geometry.translation import place_view
 from ..geometry.viewpoint import rotation_error
-from ..matching import DescribedViews, ViewDescriber, normalized_correlation
+from ..matching import ViewDescriber, normalized_correlation
 
 __all__ = ["RefinedPose", "coherent_views", "refine_pose"]
 
@@ -56,7 +56,6 @@ def refine_pose(
     camera_matrix: Tensor | None = None,
     step: float = 10.0,
     max_iterations: int = 12,
-    chunk_size: int = 32,
 ) -> RefinedPose:
     """Search between coherent views in ever smaller steps until the pose stops moving.
 
@@ -74,7 +73,6 @@ def refine_pose(
         box, camera_matrix: (4,) px and (3, 3) of the photograph; both or none.
         step: first step in degrees, about the spacing of the bank.
         max_iterations: rounds at most.
-        chunk_size: views in memory at a time.
     """
     axes = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
     offsets = torch.cartesian_prod(axes, axes, axes)
@@ -85,8 +83,8 @@ def refine_pose(
     rounds = 0
     while rounds < max_iterations:
         rounds += 1
-        described = _describe(describe, candidates, z, chunk_size)
-        scores = normalized_correlation(query, described.descriptors)[0]
+        views = describe(candidates, torch.full((len(candidates),), z, dtype=torch.float64))
+        scores = normalized_correlation(query, views.descriptors)[0]
         winner = int(scores.argmax())
         previous, previous_z = best, z
         improved = float(scores[winner]) > score
@@ -103,17 +101,6 @@ def refine_pose(
         candidates = turns @ best
         candidates = candidates[rotation_error(candidates, rotations[:1].double()) <= REACH]
     return RefinedPose(best, z, score, rounds)
-
-
-def _describe(describe: ViewDescriber, rotations: Tensor, z: float, chunk_size: int) -> DescribedViews:
-    distances = torch.full((len(rotations),), z, dtype=torch.float64)
-    parts = [
-        describe(rotations[i : i + chunk_size], distances[i : i + chunk_size])
-        for i in range(0, len(rotations), chunk_size)
-    ]
-    return DescribedViews(
-        *(torch.cat([getattr(p, n) for p in parts]) for n in ("descriptors", "points", "silhouettes", "boxes"))
-    )
 
 
 def _moved(R1: Tensor, R2: Tensor, z1: float, z2: float, radius: float) -> float:
