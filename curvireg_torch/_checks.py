@@ -29,6 +29,14 @@ def check_image(x: Tensor, name: str = "image") -> None:
         raise InvalidInputError(f"{name}: expected at least one pixel, got {tuple(x.shape)}")
 
 
+def check_colour_image(x: Tensor, name: str = "image") -> None:
+    """``x`` is a floating (B, 1, H, W) or (B, 3, H, W) tensor with H, W >= 1."""
+    check_tensor(x, name, (None, None, None, None))
+    if x.shape[1] not in (1, 3):
+        raise InvalidInputError(f"{name}: expected 1 (grey) or 3 (RGB) channels, got {x.shape[1]}")
+    check_image(x[:, :1], name)
+
+
 def check_field(x: Tensor, name: str = "field") -> None:
     """``x`` is a floating (B, 2, H, W) tensor: channel 0 = x, channel 1 = y."""
     check_tensor(x, name, (None, 2, None, None))

@@ -20,10 +20,10 @@ from . import __version__
 from .data import read_image
 from .errors import CurviregError, InvalidInputError
 from .evaluation import add_parser as add_evaluate
-from .evaluation.presets import preset_named
 from .geometry import camera_matrix, load_mesh, rotation_error, whole_image_box
 from .geometry.mesh import UNITS
 from .matching import ViewBank, cache_folder, cached_bank, clear_cache, list_cache
+from .presets import preset_named
 from .registration import Registrar, Registration
 from .rendering import BACKENDS
 

@@ -4,12 +4,12 @@
 ``-m curvireg_torch.evaluation pascal3d ROOT --out DIR`` shares the objects among processes.
 """
 
+from ..presets import PRESETS, Preset
 from .benchmark import Benchmark
 from .bop import BOPBenchmark
 from .command import add_parser, run
 from .loops import evaluate, score
 from .pascal3d import Pascal3DBenchmark
-from .presets import PRESETS, Preset
 from .protocol import Protocol
 
 __all__ = [

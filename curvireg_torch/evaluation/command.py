@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from ..data import BOPDataset, Pascal3DPlus
+from ..presets import PRESETS
 from .benchmark import Benchmark
 from .bop import BOPBenchmark
 from .loops import evaluate
 from .pascal3d import Pascal3DBenchmark
-from .presets import PRESETS
 from .protocol import Protocol
 
 __all__ = ["add_datasets", "add_parser", "run"]

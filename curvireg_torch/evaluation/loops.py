@@ -10,9 +10,9 @@ import torch
 
 from .. import __version__
 from .._checks import check_positive
+from ..presets import Preset, preset_named
 from .benchmark import Benchmark, Row
 from .predict import predict
-from .presets import Preset, preset_named
 from .store import PredictionStore, to_json, write_text
 from .workers import workers
 

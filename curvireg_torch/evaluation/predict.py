@@ -3,19 +3,21 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import torch
+from torch import nn
 from tqdm import tqdm
 
 from ..data import read_image
 from ..errors import ImageError, InvalidInputError, MeshError, MissingFileError
 from ..geometry import load_mesh
 from ..matching import cached_bank
+from ..presets import Preset
 from ..registration import Registrar
 from .benchmark import Benchmark, Item, Row
 from .estimate import estimate_pose
-from .presets import Preset
 from .protocol import Protocol, perturbed_box
 from .store import PredictionStore
 
@@ -65,6 +67,10 @@ class _Workshop:
     meshes: tuple[Path, ...] = ()
     registrars: tuple[Registrar, ...] = ()
 
+    @cached_property
+    def field(self) -> nn.Module:
+        return self.preset.photograph_filter()
+
     def row(self, item: Item) -> Row:
         protocol = self.benchmark.protocol
         if not bool(item.box.isfinite().all()):
@@ -97,4 +103,6 @@ class _Workshop:
     def _registrar(self, path: Path, protocol: Protocol) -> Registrar:
         mesh, views = load_mesh(path, unit=self.benchmark.unit), self.preset.views(protocol.pose)
         bank = cached_bank(mesh, views, self.preset.bank, renderer=self.renderer, progress=False)
-        return Registrar(bank, refine=self.preset.refine and protocol.cad != "fused", renderer=self.renderer)
+        return Registrar(
+            bank, field=self.field, refine=self.preset.refine and protocol.cad != "fused", renderer=self.renderer
+        )

@@ -75,7 +75,8 @@ class ViewMatcher(nn.Module):
 
     Args:
         bank: the views of one model, or of several (which one is it?).
-        field: photograph filter (B, 1, S, S) -> (B, 2, S, S); default :class:`MultiScaleFocusCurves`.
+        field: photograph filter (B, 1, S, S) -> (B, 2, S, S); default :class:`MultiScaleFocusCurves`. One with an
+            attribute ``colour = True`` gets colour photographs as (B, 3, S, S).
         eps: distance in px of the crop within which points repeat; default 2 % of its side.
         repeatability_mode: "monotone" or "paper".
         chunk_size: photographs in memory at a time.
@@ -149,7 +150,8 @@ class ViewMatcher(nn.Module):
         """Describe (B, 1 or 3, S, S) crops that :meth:`crop` cut."""
         if crops.shape[1] not in (1, 3):
             raise InvalidInputError(f"images: expected 1 (grey) or 3 (RGB) channels, got {crops.shape[1]}")
-        field: Tensor = self.field(rgb_to_grayscale(crops) if crops.shape[1] == 3 else crops)
+        grey = crops.shape[1] == 3 and not getattr(self.field, "colour", False)
+        field: Tensor = self.field(rgb_to_grayscale(crops) if grey else crops)
         points = field_points(field, share=self.bank.settings.point_share)[:, 0]
         return QueryFeatures(field, self.descriptor(field), points)
 

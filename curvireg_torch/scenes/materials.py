@@ -1,0 +1,97 @@
+"""Random looks: what colour a surface has at each of its points."""
+
+import cv2
+import numpy as np
+
+from .surfaces import Array
+
+__all__ = ["Material", "random_colour", "random_picture"]
+
+
+def random_colour(rng: np.random.Generator) -> Array:
+    """(3,) colour in [0, 1]; half of them nearly grey, as most things are."""
+    grey = rng.uniform(0.03, 0.97)
+    tint = rng.normal(0, rng.choice([0.03, 0.25]), 3)
+    colour: Array = np.clip(grey + tint, 0.01, 1.0)
+    return colour
+
+
+class Material:
+    """A colour pattern in space with a gloss, drawn at random.
+
+    Args:
+        rng: decides everything.
+        plain: probability of one flat colour.
+    """
+
+    def __init__(self, rng: np.random.Generator, *, plain: float = 0.5) -> None:
+        self._first, self._second = random_colour(rng), random_colour(rng)
+        kinds = ("waves", "stripes", "checks", "cells", "print", "grain")
+        self._kind = "plain" if rng.random() < plain else str(rng.choice(kinds))
+        self._axes = rng.normal(size=(3, 6)) * np.exp(rng.uniform(0.3, 2.5))
+        self._phases = rng.uniform(0, 2 * np.pi, 6)
+        self._seeds = rng.uniform(-1, 1, (int(rng.integers(4, 25)), 3))
+        self._palette = np.stack([random_colour(rng) for _ in self._seeds])
+        self._strength = rng.uniform(0.1, 1.0)
+        self.gloss = 0.0 if rng.random() < 0.5 else rng.uniform(0.1, 0.9)
+        self.shininess = np.exp(rng.uniform(1.5, 5.0))
+
+    def colours(self, points: Array) -> Array:
+        """(N, 3) colours in [0, 1] of (N, 3) points in units of the object's radius."""
+        if self._kind == "plain":
+            return np.broadcast_to(self._first, points.shape)
+        along = points @ self._axes + self._phases
+        if self._kind == "cells":
+            nearest = ((points[:, None] - self._seeds) ** 2).sum(axis=-1).argmin(axis=1)
+            mixed: Array = np.clip(self._first + self._strength * (self._palette[nearest] - self._first), 0, 1)
+            return mixed
+        if self._kind == "waves":
+            share = 0.5 + 0.5 * np.sin(along).mean(axis=1)
+        elif self._kind == "stripes":
+            share = (np.sin(along[:, 0]) > np.sin(self._phases[0])).astype(float)
+        elif self._kind == "checks":
+            share = (np.sin(along[:, 0]) * np.sin(along[:, 1]) * np.sin(along[:, 2]) > 0).astype(float)
+        elif self._kind == "print":  # lines of letter-like dashes
+            row, place = np.floor(along[:, 0]), np.floor(3 * along[:, 1])
+            letters = np.sin(12.9898 * row + 78.233 * place) * 43758.5453
+            share = (letters - np.floor(letters) > 0.5) & (along[:, 0] - row > 0.4) & (np.sin(7.1 * row) > -0.3)
+        else:
+            share = np.sin(17.0 * along).mean(axis=1) * np.sin(31.0 * along[:, ::-1]).mean(axis=1) + 0.5
+        blend: Array = self._strength * np.asarray(share, dtype=float)[:, None] * (self._second - self._first)
+        return self._first + blend
+
+
+def random_picture(rng: np.random.Generator, size: int) -> Array:
+    """(size, size, 3) float32 flat background in [0, 1]: gradients, clouds, foliage, or a clutter of shapes."""
+    top, bottom = random_colour(rng), random_colour(rng)
+    if rng.random() < 0.4:
+        bottom = np.clip(top + rng.normal(0, 0.1, 3), 0, 1)
+    ramp = np.linspace(0, 1, size)[:, None, None]
+    picture: Array = np.broadcast_to(top + ramp * (bottom - top), (size, size, 3)).astype(np.float32)
+    kind = rng.integers(5)
+    if kind in (1, 2):  # clouds or foliage
+        noise = np.zeros((size, size, 3), np.float32)
+        slope = rng.uniform(0.2, 1.0)
+        for octave in range(1, 8):
+            cells = rng.normal(size=(2**octave, 2**octave, 1)) + rng.normal(0, 0.3, (2**octave, 2**octave, 3))
+            layer = cv2.resize(cells.astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC)
+            noise += layer * 2 ** (-slope * octave)
+        noise /= noise.std() + 1e-6
+        picture = picture + rng.uniform(0.05, 0.35) * (noise if kind == 1 else np.tanh(4 * noise))
+    elif kind in (3, 4):  # shapes and lines
+        picture = np.ascontiguousarray(picture)
+        for _ in range(int(rng.integers(3, 40 if kind == 3 else 120))):
+            colour = tuple(float(c) for c in random_colour(rng))
+            x, y = rng.integers(0, size, 2).tolist()
+            reach = rng.uniform(0.02, 0.4) * size
+            if rng.random() < 0.3:
+                end = (rng.integers(0, size, 2)).tolist()
+                cv2.line(picture, (x, y), end, colour, int(rng.integers(1, 5)), cv2.LINE_AA)
+            elif rng.random() < 0.5:
+                corners = np.asarray([x, y]) + rng.normal(0, reach, (int(rng.integers(3, 6)), 2))
+                cv2.fillConvexPoly(picture, cv2.convexHull(corners.astype(np.int32)), colour, cv2.LINE_AA)
+            else:
+                a, b = rng.uniform(0.2, 1, 2) * reach
+                axes, angle = (int(a) + 1, int(b) + 1), float(rng.uniform(0, 180))
+                cv2.ellipse(picture, (x, y), axes, angle, 0, 360, colour, -1, cv2.LINE_AA)
+    return np.clip(picture, 0, 1).astype(np.float32)

@@ -1,0 +1,218 @@
+"""Train the learned field on generated scenes: no photograph, no annotation, no foreign weights.
+
+    python scripts/train_learned_field.py --out runs/field --minutes 90
+
+Every step draws a batch, partly fresh scenes, partly scenes seen before, recoloured and mirrored. Losses: see
+curvireg_torch.learned.losses; one goes straight through HOG, since our layers are differentiable. A second start
+with the same --out goes on where the first one stopped.
+"""
+
+import argparse
+import json
+import math
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from torch.utils.data import DataLoader
+from tqdm import tqdm
+
+from curvireg_torch.filters import MultiScaleFocusCurves
+from curvireg_torch.geometry import rotation_error, sample_views
+from curvireg_torch.learned import FieldNetwork, Lessons, Replay, altered, halved_angle, losses
+from curvireg_torch.learned.lessons import SETTINGS
+from curvireg_torch.learned.network import save_weights
+from curvireg_torch.matching import ViewDescriber, normalized_correlation
+from curvireg_torch.scenes import GeneratedScenes
+
+VALIDATION_SEED = 1_000_003
+
+
+class Validation:
+    """Held-out scenes of upright objects, each ranked against the views of its own mesh."""
+
+    def __init__(self, count: int) -> None:
+        scenes = GeneratedScenes(count, seed=VALIDATION_SEED, upright=1.0)
+        views = sample_views()
+        self.images, self.depths, self.errors, self.banks = [], [], [], []
+        for i in tqdm(range(count), desc="validation banks", mininterval=10):
+            sample = scenes[i]
+            describe = ViewDescriber(scenes.shape(i).mesh(), SETTINGS)
+            bank = describe(views.rotations, torch.full((len(views),), 5.0))
+            self.images.append(sample["image"])
+            self.depths.append(sample["depth"])
+            self.errors.append(rotation_error(views.rotations.float(), sample["rotation"].expand(len(views), 3, 3)))
+            self.banks.append(bank.descriptors.half())
+
+    @torch.no_grad()
+    def __call__(self, field: torch.nn.Module) -> dict[str, float]:
+        descriptor = SETTINGS.descriptor()
+        errors, cosines = [], []
+        for image, depth, error, bank in zip(self.images, self.depths, self.errors, self.banks, strict=True):
+            query = descriptor(field(image[None]))
+            errors.append(float(error[normalized_correlation(query, bank.float())[0].argmax()]))
+            right = descriptor(SETTINGS.depth_filter()(depth[None]))
+            cosines.append(float(normalized_correlation(query, right)))
+        e = np.array(errors)
+        return {
+            "accuracy_30": float((e < 30).mean()),
+            "accuracy_15": float((e < 15).mean()),
+            "median": float(np.median(e)),
+            "cosine": float(np.mean(cosines)),
+        }
+
+    def picture(self, network: torch.nn.Module, path: Path, count: int = 8) -> None:
+        """Photograph, predicted field, mask and wanted field."""
+        images, depths = torch.stack(self.images[:count]), torch.stack(self.depths[:count])
+        with torch.no_grad():
+            output = F.interpolate(network(images), scale_factor=2.0, mode="bilinear")
+        rows = [images.permute(0, 2, 3, 1).flip(3)]
+        for field in (halved_angle(output[:, :2]), SETTINGS.depth_filter()(depths)):
+            length = field.norm(dim=1).sqrt()
+            rows.append(
+                (length / length.amax(dim=(1, 2), keepdim=True).clamp(min=1e-6))[..., None].expand(-1, -1, -1, 3)
+            )
+        rows.insert(2, output[:, 2].sigmoid()[..., None].expand(-1, -1, -1, 3))
+        sheet = torch.cat([torch.cat(list(row), dim=1) for row in rows])
+        cv2.imwrite(str(path), (255 * sheet.clamp(0, 1)).byte().numpy())
+
+
+class _Field(torch.nn.Module):
+    def __init__(self, network: FieldNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Tensor) -> Tensor:
+        return F.interpolate(halved_angle(self.network(image)[:, :2]), scale_factor=2.0, mode="bilinear")
+
+
+class _Grey(torch.nn.Module):
+    def forward(self, image: Tensor) -> Tensor:
+        field: Tensor = MultiScaleFocusCurves()(image.mean(dim=1, keepdim=True))
+        return field
+
+
+def save_state(
+    path: Path, network: FieldNetwork, average: FieldNetwork, optimizer: torch.optim.Optimizer, **counts: float
+) -> None:
+    state = {f"network.{k}": v for k, v in network.state_dict().items()}
+    state |= {f"average.{k}": v for k, v in average.state_dict().items()}
+    for k, moments in optimizer.state_dict()["state"].items():
+        state |= {f"optimizer.{k}.{name}": value for name, value in moments.items()}
+    partial = path.with_suffix(".partial")
+    save_file(
+        {k: v.detach().clone().contiguous() for k, v in state.items()}, partial, {k: str(v) for k, v in counts.items()}
+    )
+    partial.replace(path)
+
+
+def load_state(path: Path, network: FieldNetwork, average: FieldNetwork, optimizer: torch.optim.Optimizer) -> None:
+    state = load_file(path)
+    for prefix, module in (("network.", network), ("average.", average)):
+        module.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+    moments: dict[int, dict[str, Tensor]] = {}
+    for k, v in state.items():
+        if k.startswith("optimizer."):
+            _, index, name = k.split(".")
+            moments.setdefault(int(index), {})[name] = v
+    optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder of checkpoints, log and pictures")
+    parser.add_argument("--minutes", type=float, default=90.0, help="training time, over all starts (default 90)")
+    parser.add_argument("--batch", type=int, default=32, help="scenes in a step (default 32)")
+    parser.add_argument("--fresh", type=int, default=8, help="of them new ones (default 8)")
+    parser.add_argument("--replay", type=int, default=30_000, help="scenes kept in memory, 80 kB each (default 30000)")
+    parser.add_argument("--workers", type=int, default=1, help="processes that generate scenes (default 1)")
+    parser.add_argument("--rate", type=float, default=3e-3, help="highest learning rate (default 3e-3)")
+    parser.add_argument("--descriptor-weight", type=float, default=1.0, help="of the descriptor's loss (default 1)")
+    parser.add_argument("--ranking-weight", type=float, default=0.1, help="of the ranking loss (default 0.1)")
+    parser.add_argument("--validate", type=int, default=60, help="held-out scenes (default 60)")
+    parser.add_argument("--every", type=float, default=10.0, help="minutes between validations (default 10)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+
+    torch.manual_seed(options.seed)
+    network, average = FieldNetwork(), FieldNetwork()
+    average.load_state_dict(network.state_dict())
+    average.eval().requires_grad_(False)
+    network.to(options.device, memory_format=torch.channels_last)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=options.rate, weight_decay=0.02)
+    spent, step, scenes = 0.0, 0, 0
+    checkpoint, log = options.out / "state.safetensors", options.out / "log.jsonl"
+    if checkpoint.exists():
+        load_state(checkpoint, network, average, optimizer)
+        last = json.loads(log.read_text().splitlines()[-1])
+        spent, step, scenes = last["minutes"], last["step"], last["scenes"]
+    weights = {"descriptor_weight": options.descriptor_weight, "ranking_weight": options.ranking_weight}
+    validation = Validation(options.validate)
+    if step == 0:
+        print("MFC, for comparison:", validation(_Grey()))
+
+    generated = GeneratedScenes(10**9, seed=options.seed)
+    fresh = range(scenes, len(generated))
+    lessons = Lessons(generated)
+    loader = iter(
+        DataLoader(lessons, options.fresh, sampler=fresh, num_workers=options.workers, multiprocessing_context="spawn")
+    )
+    replay = Replay(options.replay)
+    generator = torch.Generator().manual_seed(options.seed + step)
+    totals: dict[str, float] = {}
+    start = marked = time.monotonic()
+    before, seen_at_mark, step_at_mark = spent, scenes, step
+    bar = tqdm(total=round(options.minutes), initial=int(spent), unit="min", mininterval=10)
+    while spent < options.minutes:
+        replay.add(next(loader))
+        scenes += options.fresh
+        batch = altered(replay.draw(options.fresh, options.batch, generator), generator)
+        batch = {name: values.to(options.device) for name, values in batch.items()}
+        share = spent / options.minutes
+        for group in optimizer.param_groups:
+            group["lr"] = options.rate * min(1.0, (step + 1) / 200) * 0.5 * (1 + math.cos(math.pi * share))
+        network.train()
+        with torch.autocast(torch.device(options.device).type, torch.bfloat16):
+            output = network(batch["image"].contiguous(memory_format=torch.channels_last))
+        parts = losses(output.float(), batch, **weights)
+        loss = torch.stack(list(parts.values())).sum()
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
+        optimizer.step()
+        step += 1
+        keep = min(0.998, step / (step + 10))
+        for mean, now in zip(average.state_dict().values(), network.state_dict().values(), strict=True):
+            if mean.is_floating_point():
+                mean.lerp_(now.float().to(mean.device), 1 - keep)
+        for name, value in parts.items():
+            totals[name] = totals.get(name, 0.0) + float(value)
+        spent = before + (time.monotonic() - start) / 60
+        if int(spent) > bar.n:
+            bar.update(int(spent) - bar.n)
+        if time.monotonic() - marked > 60 * options.every or spent >= options.minutes:
+            seconds, steps = time.monotonic() - marked, step - step_at_mark
+            entry = {"step": step, "minutes": round(spent, 2), "scenes": scenes}
+            entry |= {name: round(value / steps, 4) for name, value in totals.items()}
+            entry["scenes_per_second"] = round((scenes - seen_at_mark) / seconds, 1)
+            entry["samples_per_second"] = round(steps * options.batch / seconds, 1)
+            entry |= {name: round(value, 4) for name, value in validation(_Field(average)).items()}
+            save_state(checkpoint, network, average, optimizer, **entry)
+            with log.open("a") as lines:
+                lines.write(json.dumps(entry) + "\n")
+            validation.picture(average, options.out / f"step{step:06d}.png")
+            tqdm.write(json.dumps(entry))
+            totals, marked, seen_at_mark, step_at_mark = {}, time.monotonic(), scenes, step
+    save_weights(average, options.out / "field.safetensors")
+    print(f"weights: {options.out / 'field.safetensors'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,47 @@
+"""Procedural shapes."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from curvireg_torch.scenes import FAMILIES, random_shape, shape_from_mesh
+from curvireg_torch.scenes.surfaces import bar, box, lathe, superquadric, torus
+
+
+@pytest.mark.parametrize("family", sorted(FAMILIES))
+def test_every_family_makes_finite_shapes_of_radius_one(family):
+    for seed in range(5):
+        shape = random_shape(np.random.default_rng(seed), family)
+        assert np.isfinite(shape.vertices).all()
+        assert np.linalg.norm(shape.vertices, axis=1).max() == pytest.approx(1.0)
+        assert shape.faces.min() >= 0 and shape.faces.max() < len(shape.vertices)
+        assert len(shape.materials) == len(shape.faces)
+        assert shape.mesh().area > 0.05
+
+
+def test_the_seed_decides():
+    one, same, other = (random_shape(np.random.default_rng(s)) for s in (3, 3, 4))
+    assert np.array_equal(one.vertices, same.vertices)
+    assert one.vertices.shape != other.vertices.shape or not np.array_equal(one.vertices, other.vertices)
+
+
+def volume(surface):
+    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    return abs(float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6))
+
+
+def test_surfaces_enclose_the_volumes_of_the_textbook():
+    assert volume(box((1, 2, 3))) == pytest.approx(6.0)
+    assert volume(box((2, 2, 3), top=0.5)) == pytest.approx(3 / 3 * (4 + 1 + 2))  # frustum
+    assert volume(lathe([0.5, 0.5], [0, 2])) == pytest.approx(np.pi * 0.25 * 2, rel=0.01)
+    assert volume(superquadric((1, 1, 1), (1, 1))) == pytest.approx(4 / 3 * np.pi, rel=0.03)
+    assert volume(torus(1.0, 0.2)) == pytest.approx(2 * np.pi**2 * 0.04, rel=0.08)  # ten-sided section
+    assert volume(bar((0, 0, 0), (0, 3, 4), np.sqrt(0.5), sides=4)) == pytest.approx(5.0)
+
+
+def test_a_users_mesh_is_centred_scaled_and_split_into_its_parts():
+    parts = [trimesh.creation.box(), trimesh.creation.icosphere(subdivisions=1)]
+    parts[1].apply_translation((5, 0, 0))
+    shape = shape_from_mesh(trimesh.util.concatenate(parts))
+    assert np.linalg.norm(shape.vertices, axis=1).max() == pytest.approx(1.0)
+    assert len(set(shape.materials)) == 2
