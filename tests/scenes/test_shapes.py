@@ -14,7 +14,8 @@ def test_every_family_makes_finite_shapes_of_radius_one(family):
         shape = random_shape(np.random.default_rng(seed), family)
         assert np.isfinite(shape.vertices).all()
         assert np.linalg.norm(shape.vertices, axis=1).max() == pytest.approx(1.0)
-        assert shape.faces.min() >= 0 and shape.faces.max() < len(shape.vertices)
+        assert shape.faces.min() >= 0
+        assert shape.faces.max() < len(shape.vertices)
         assert len(shape.materials) == len(shape.faces)
         assert shape.mesh().area > 0.05
 

@@ -1,0 +1,106 @@
+"""Lessons, losses and fine-tuning."""
+
+import pytest
+import torch
+import trimesh
+
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.learned import (
+    FieldNetwork,
+    LearnedCurvilinearSaliency,
+    Lessons,
+    Replay,
+    adapt,
+    altered,
+    doubled_angle,
+    losses,
+)
+from curvireg_torch.learned.lessons import SETTINGS
+from curvireg_torch.scenes import GeneratedScenes
+
+
+@pytest.fixture(scope="module")
+def batch():
+    lessons = Lessons(GeneratedScenes(4, seed=1))
+    items = [lessons[i] for i in range(4)]
+    stacked = {k: torch.stack([item[k] for item in items]).float() for k in items[0]}
+    return {**stacked, "image": stacked["image"] / 255}
+
+
+def test_the_answers_are_those_of_the_banks_filters(batch):
+    scenes = GeneratedScenes(4, seed=1)
+    field = SETTINGS.depth_filter()(scenes[2]["depth"][None])
+    assert torch.allclose(batch["descriptors"][2, 0], SETTINGS.descriptor()(field)[0], atol=1e-3)
+    direction = torch.nn.functional.avg_pool2d(doubled_angle(field), 2)[0]
+    same = torch.nn.functional.cosine_similarity(direction.flatten(), batch["code"][2].flatten(), dim=0)
+    assert same == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_right_answer_has_no_loss(batch):
+    mask = torch.logit(batch["mask"].clamp(1e-6, 1 - 1e-6))
+    right = losses(torch.cat([batch["code"], mask], dim=1), batch)
+    nothing = losses(torch.zeros(4, 3, 64, 64), batch)
+    assert right["field"] == 0
+    assert nothing["field"] == pytest.approx(1.0)
+    assert right["mask"] < nothing["mask"]
+    assert right["descriptor"] < 0.1 < nothing["descriptor"]
+    assert right["ranking"] < 0.01 < nothing["ranking"]
+
+
+def test_mirroring_keeps_answers_right(batch):
+    """All lessons are mirrored, or none: the code's loss of a mirrored right answer stays 0."""
+    found = set()
+    for seed in range(6):
+        one = {k: v[:1] for k, v in batch.items()}
+        other = altered(one, torch.Generator().manual_seed(seed))
+        mirrored = not torch.equal(other["mask"], one["mask"])
+        found.add(mirrored)
+        expected = one["code"].flip(3) * torch.tensor([1.0, -1.0])[:, None, None] if mirrored else one["code"]
+        assert torch.equal(other["code"], expected)
+        answer = torch.cat([other["code"], torch.zeros_like(other["mask"])], dim=1)
+        assert losses(answer, other)["descriptor"] < 0.1
+    assert found == {False, True}
+
+
+def test_replay_keeps_the_latest(batch):
+    replay = Replay(6)
+    for k in range(4):
+        replay.add({name: values[:2] * 0 + k for name, values in batch.items()})
+    drawn = replay.draw(2, 40, torch.Generator().manual_seed(0))
+    assert set(drawn["mask"].flatten(1)[:, 0].tolist()) == {1.0, 2.0, 3.0}
+    assert (drawn["mask"][:2] == 3).all()
+
+
+def test_a_few_steps_lower_the_loss(batch):
+    torch.manual_seed(0)
+    network = FieldNetwork((8, 8, 16, 16))
+    optimizer = torch.optim.AdamW(network.parameters(), lr=3e-3)
+    history = []
+    for _ in range(25):
+        parts = losses(network(batch["image"]), batch)
+        loss = torch.stack(list(parts.values())).sum()
+        history.append(float(loss))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert history[-1] < 0.7 * history[0]
+
+
+def test_adapting_changes_the_network_and_leaves_its_statistics():
+    mesh = trimesh.creation.box((1, 2, 3))
+    before = FieldNetwork().state_dict().keys()
+    field = adapt(mesh, scenes=16, workers=0, progress=False)
+    again = adapt(mesh, scenes=16, workers=0, progress=False)
+    packaged = LearnedCurvilinearSaliency().network.state_dict()
+    adapted = field.network.state_dict()
+    assert adapted.keys() == before
+    assert not torch.equal(adapted["head.weight"], packaged["head.weight"])
+    means = [k for k in before if k.endswith("running_mean")]
+    assert all(torch.equal(adapted[k], packaged[k]) for k in means)
+    assert torch.equal(adapted["head.weight"], again.network.state_dict()["head.weight"])
+    assert not any(p.requires_grad for p in field.network.parameters())
+
+
+def test_errors():
+    with pytest.raises(InvalidInputError, match="scenes"):
+        adapt(trimesh.creation.box(), scenes=0)
