@@ -74,13 +74,17 @@ def record(summary: Path, name: str, results: Path, root: Path) -> Path:
     path = results / f"evaluation_{name}.json"
     content = {
         "name": name,
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "date": today(),
         "commit": commit(root),
         "summary": json.loads(summary.read_text(encoding="utf-8")),
     }
     results.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     return path
+
+
+def today() -> str:
+    return datetime.datetime.now(datetime.UTC).date().isoformat()
 
 
 def commit(root: Path) -> str:

@@ -66,6 +66,14 @@ class Benchmark(ABC):
         """Object ``index`` of the dataset."""
 
     @abstractmethod
+    def rotation_errors(self, items: list[Item], rows: list[Row]) -> Tensor:
+        """(N,) float64 errors in degrees up to the objects' symmetries, ``inf`` for a miss."""
+
+    @abstractmethod
+    def easy(self, item: Item) -> bool:
+        """Whether the object is seen whole."""
+
+    @abstractmethod
     def summary(self, items: list[Item], rows: list[Row]) -> Row:
         """Scores of the predictions ``rows`` of ``items``, none of them skipped."""
 

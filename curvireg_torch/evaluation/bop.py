@@ -60,18 +60,19 @@ class BOPBenchmark(Benchmark):
             camera_matrix=s["camera_matrix"],
         )
 
+    def rotation_errors(self, items: list[Item], rows: list[Row]) -> Tensor:
+        return self._judged(items, rows)[0][0]
+
+    def easy(self, item: Item) -> bool:
+        return float(self.dataset.annotation(item.index)["visib_fract"]) > UNOCCLUDED
+
     def summary(self, items: list[Item], rows: list[Row]) -> Row:
         """Rotation errors up to the objects' symmetries, ADD(-S) recall, AR of MSSD and MSPD."""
-        samples = [self.dataset.annotation(item.index) for item in items]
-        objects = torch.tensor([s["obj_id"] for s in samples], dtype=torch.long)
-        errors = torch.full((4, len(rows)), torch.inf, dtype=torch.float64)  # degrees, diameters, diameters, widths
-        for obj_id in objects.unique().tolist():
-            chosen = (objects == obj_id).nonzero()[:, 0]
-            errors[:, chosen] = self._errors([samples[i] for i in chosen], [rows[i] for i in chosen])
-        visible = torch.tensor([s["visib_fract"] for s in samples], dtype=torch.float64)
+        errors, objects = self._judged(items, rows)
+        easy = torch.tensor([self.easy(item) for item in items], dtype=torch.bool)
         return {
             **_scores(errors),
-            "subsets": {"unoccluded": _scores(errors[:, visible > UNOCCLUDED])},
+            "subsets": {"unoccluded": _scores(errors[:, easy])},
             "per_object": {str(o): _scores(errors[:, objects == o]) for o in objects.unique().tolist()},
         }
 
@@ -98,6 +99,16 @@ class BOPBenchmark(Benchmark):
                 if "rotation" in row
             ],
         )
+
+    def _judged(self, items: list[Item], rows: list[Row]) -> tuple[Tensor, Tensor]:
+        """(4, N) errors in degrees, diameters, diameters and image widths, see :meth:`_errors`; (N,) object ids."""
+        samples = [self.dataset.annotation(item.index) for item in items]
+        objects = torch.tensor([s["obj_id"] for s in samples], dtype=torch.long)
+        errors = torch.full((4, len(rows)), torch.inf, dtype=torch.float64)
+        for obj_id in objects.unique().tolist():
+            chosen = (objects == obj_id).nonzero()[:, 0]
+            errors[:, chosen] = self._errors([samples[i] for i in chosen], [rows[i] for i in chosen])
+        return errors, objects
 
     def _errors(self, samples: list[Row], rows: list[Row]) -> Tensor:
         """(4, N) errors of N instances of one object: rotation in degrees, ADD(-S) and MSSD in diameters, MSPD in image

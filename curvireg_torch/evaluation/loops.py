@@ -26,7 +26,7 @@ def evaluate(
     benchmark: Benchmark,
     out: Path,
     *,
-    preset: str = "default",
+    preset: str | Preset = "default",
     limit: int | None = None,
     renderer: str = "auto",
     overwrite: bool = False,
@@ -40,7 +40,7 @@ def evaluate(
     Args:
         benchmark: the objects.
         out: folder for the results, made if it is not there.
-        preset: name of the settings.
+        preset: name of the settings, or settings of one's own.
         limit: register only so many objects, spread evenly over the dataset.
         renderer: of the views.
         overwrite: start anew in a folder that holds other predictions.
@@ -58,14 +58,15 @@ def evaluate(
         >>> cars = Pascal3DPlus("data/PASCAL3D+_release1.1", categories=["car"])            # doctest: +SKIP
         >>> evaluate(Pascal3DBenchmark(cars, Protocol()), Path("out"))["acc_pi_6"]          # doctest: +SKIP
     """
-    chosen = preset_named(preset)
+    chosen = preset_named(preset) if isinstance(preset, str) else preset
+    name = preset if isinstance(preset, str) else "own"
     if limit is not None:
         check_positive(limit, "limit")
     store = PredictionStore(out / "predictions")
     selection = benchmark.selection(limit)
     with workers() as group:
         if group.rank == 0:
-            store.open(_settings(benchmark, preset, chosen, renderer), overwrite=overwrite)
+            store.open(_settings(benchmark, name, chosen, renderer), overwrite=overwrite)
         group.wait()
         ordered = sorted(selection, key=lambda item: (item.meshes, item.index))
         n = len(ordered)

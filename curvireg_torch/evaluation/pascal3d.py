@@ -19,6 +19,7 @@ from .store import write_text
 
 __all__ = ["Pascal3DBenchmark"]
 
+FLAGS = ("truncated", "occluded", "difficult")
 THRESHOLDS = {"acc_pi_6": 30.0, "acc_pi_18": 10.0}
 COLUMNS = [
     *("image_id", "object_index", "category", "cad_index", "mesh", "azimuth", "elevation", "theta"),
@@ -71,6 +72,12 @@ class Pascal3DBenchmark(Benchmark):
     def settings(self) -> Row:
         return {**super().settings(), "part": self.dataset.part, "pixel_origin": self.dataset._pixel_origin}
 
+    def rotation_errors(self, items: list[Item], rows: list[Row]) -> Tensor:
+        return self._judged(items, rows)[4]
+
+    def easy(self, item: Item) -> bool:
+        return not any(self.dataset.annotation(item.index)[flag] for flag in FLAGS)
+
     def summary(self, items: list[Item], rows: list[Row]) -> Row:
         """Acc(pi/6), Acc(pi/18), MedErr: of all, of subsets, of each class, and up to the symmetries of the classes."""
         samples, R, truth, plain, symmetric = self._judged(items, rows)
@@ -81,7 +88,6 @@ class Pascal3DBenchmark(Benchmark):
             del aware["n"]
             return {**viewpoint_scores(plain[mask], THRESHOLDS), "symmetry_aware": aware}
 
-        flags = ("truncated", "occluded", "difficult")
         azimuth = viewpoint_from_rotation(R.nan_to_num())[0]
         found = R[:, 0, 0].isfinite()
         true_azimuth = viewpoint_from_rotation(truth)[0]
@@ -91,8 +97,8 @@ class Pascal3DBenchmark(Benchmark):
         return {
             **scores_of([True] * len(samples)),
             "subsets": {
-                "easy": scores_of([not any(s[f] for f in flags) for s in samples]),
-                **{flag: scores_of([s[flag] for s in samples]) for flag in flags},
+                "easy": scores_of([self.easy(item) for item in items]),
+                **{flag: scores_of([s[flag] for s in samples]) for flag in FLAGS},
             },
             "per_class": {c: scores_of([s["category"] == c for s in samples]) for c in classes},
             "symmetries": {c: text for c, (text, _) in SYMMETRIES.items()},

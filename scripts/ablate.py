@@ -1,0 +1,147 @@
+"""The ablation table of docs/accuracy.md: one change to a preset each row, all sets.
+
+    python scripts/ablate.py DATA --out results/ablation [--rows NAME ...]     measure what is not measured yet
+    python scripts/ablate.py --table                                           write the table again, measure nothing
+
+DATA holds pascal3d_mini (PASCAL3D+ layout, pixels counted from 0) and bop/dino, bop/hope, bop/lm. Predictions go to
+--out, one folder per row and set; stop it and run it again. Numbers are kept in scripts/results/ablation.json: for each
+row and set N, the shares of objects within 30 and 15 degrees (symmetries of the objects taken into account), the median
+error, 95 % intervals by bootstrap over objects, the same of the objects that are seen whole, and against the first row
+the difference within 30 degrees with its interval over paired resamples.
+"""
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from results_table import REPOSITORY, commit, today
+from torch import Tensor
+
+from curvireg_torch.data import BOPDataset, Pascal3DPlus
+from curvireg_torch.evaluation import Benchmark, BOPBenchmark, Pascal3DBenchmark, Protocol, evaluate
+from curvireg_torch.evaluation.store import PredictionStore
+from curvireg_torch.presets import PRESETS, Preset
+
+KEPT = REPOSITORY / "scripts" / "results" / "ablation.json"
+PAGE = REPOSITORY / "docs" / "accuracy.md"
+BEGIN, END = "<!-- ablation:begin -->", "<!-- ablation:end -->"
+SETS = {"pascal3d_mini": "upright", "hope": "any", "lm": "any", "dino": "any"}
+RESAMPLES = 2000
+
+_classical = replace(PRESETS["classical"], refine=False)
+_learned = replace(PRESETS["learned"], refine=False)
+
+ROWS: dict[str, Preset] = {
+    "classical": _classical,
+    "without S_rep": replace(_classical, matcher={"repeatability_sigma": None}),
+    "without S_box": replace(_classical, matcher={"box_sigma": None}),
+    "without slack": replace(_classical, matcher={"slack": 0.0}),
+    "crops of 256 px": replace(_classical, bank=replace(_classical.bank, image_size=256, sigma=1.0)),
+    "depth smoothed by 1.2 px": replace(_classical, bank=replace(_classical.bank, sigma=1.2)),
+    "gradient instead of MFC": replace(_classical, field="gradient"),
+    "MCS instead of MFC": replace(_classical, field="saliency"),
+    "paper": replace(PRESETS["paper"], refine=False),
+    "classical, refined": replace(_classical, refine=True),
+    "learned": _learned,
+    "learned x MFC": replace(_learned, field="both"),
+    "learned, refined": replace(_learned, refine=True),
+}
+"""Name -> settings; differences are taken against the first."""
+
+
+def benchmark(name: str, data: Path) -> Benchmark:
+    protocol = Protocol(pose=SETS[name])
+    if name == "pascal3d_mini":
+        return Pascal3DBenchmark(Pascal3DPlus(data / name, "val", pixel_origin=0), protocol)
+    return BOPBenchmark(BOPDataset(data / "bop" / name, "test"), protocol)
+
+
+def measure(row: str, name: str, data: Path, out: Path) -> dict[str, Any]:
+    """Errors of all objects, in the order of the dataset."""
+    folder = out / row.replace(" ", "_").replace(",", "") / name
+    objects = benchmark(name, data)
+    summary = evaluate(objects, folder, preset=ROWS[row])
+    assert summary is not None
+    store = PredictionStore(folder / "predictions")
+    rows = [(item, store.read(item.key)) for item in objects.items]
+    kept = [(item, prediction) for item, prediction in rows if "skipped" not in prediction]
+    items, predictions = [item for item, _ in kept], [prediction for _, prediction in kept]
+    return {
+        "errors": [round(float(e), 3) for e in objects.rotation_errors(items, predictions)],
+        "whole": [objects.easy(item) for item in items],
+        "seconds": summary["seconds"]["register_each"],
+        "add_recall_0.1d": summary.get("add_recall_0.1d"),
+        "plain_acc_30": summary.get("acc_pi_6"),
+        "date": today(),
+        "commit": commit(REPOSITORY),
+    }
+
+
+def interval(values: Tensor) -> tuple[float, float, float]:
+    """Mean of (N,) values and its 95 % interval by bootstrap."""
+    generator = torch.Generator().manual_seed(0)
+    picks = torch.randint(len(values), (RESAMPLES, len(values)), generator=generator)
+    low, high = values.double()[picks].mean(dim=1).quantile(torch.tensor([0.025, 0.975], dtype=torch.float64))
+    return float(values.double().mean()), float(low), float(high)
+
+
+def cells(name: str, kept: dict[str, Any], base: dict[str, Any]) -> list[str]:
+    errors, whole = torch.tensor(kept["errors"]), torch.tensor(kept["whole"])
+    mean, low, high = interval((errors < 30).float())
+    difference, worst, best = interval((errors < 30).float() - (torch.tensor(base["errors"]) < 30).float())
+    return [
+        name,
+        str(len(errors)),
+        f"{mean:.3f} ({low:.2f} to {high:.2f})",
+        "" if kept is base else f"{difference:+.3f} ({worst:+.2f} to {best:+.2f})",
+        f"{float((errors < 15).float().mean()):.3f}",
+        f"{float(errors.median()):.1f}°",
+        f"{float((errors[whole] < 30).float().mean()):.3f} ({int(whole.sum())})",
+        f"{kept['seconds']:.2f}",
+    ]
+
+
+def table(results: dict[str, Any]) -> str:
+    head = ["row", "N", "within 30°", "against the first", "15°", "median", "seen whole: 30° (N)", "s/object"]
+    parts = []
+    for name in SETS:
+        rows = {row: results[row][name] for row in ROWS if name in results.get(row, {})}
+        if not rows:
+            continue
+        base = next(iter(rows.values()))
+        lines = [head, ["---"] * len(head), *(cells(row, kept, base) for row, kept in rows.items())]
+        parts.append(f"**{name}**\n\n" + "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n")
+    return "\n".join(parts)
+
+
+def write_table() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    before, after = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
+    PAGE.write_text(f"{before}\n{table(json.loads(KEPT.read_text()))}{after}", encoding="utf-8")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path, nargs="?", metavar="DATA")
+    parser.add_argument("--out", type=Path, default=Path("results/ablation"), metavar="DIR")
+    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS), metavar="NAME")
+    parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS), metavar="NAME")
+    parser.add_argument("--table", action="store_true", help="only write the table again")
+    arguments = parser.parse_args()
+    if not arguments.table:
+        if arguments.data is None:
+            parser.error("DATA is needed to measure")
+        for row in arguments.rows:
+            for name in arguments.sets:
+                kept = measure(row, name, arguments.data, arguments.out)
+                results = json.loads(KEPT.read_text()) if KEPT.exists() else {}
+                results.setdefault(row, {})[name] = kept
+                KEPT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    write_table()
+
+
+if __name__ == "__main__":
+    main()
