@@ -132,12 +132,12 @@ class Registrar:
         results: list[Registration] = []
         for i in range(0, len(images), self.matcher.chunk_size):
             chunk = slice(i, i + self.matcher.chunk_size)
-            crops = self.matcher.crop(images[chunk], boxes[chunk])[0]
+            query = self.matcher.query(images[chunk], boxes[chunk])
+            crops = query.crops
             contrast = crops.amax(dim=(1, 2, 3)) - crops.amin(dim=(1, 2, 3))
             if bool((contrast < _FLAT).any()):
                 flat = i + int((contrast < _FLAT).nonzero()[0])
                 raise ImageError(f"image {flat}: the box shows one colour, nothing to register; check image and box")
-            query = self.matcher.features(crops)
             ranking = self.matcher.rank(query)
             trust = confidence(ranking.scores, self.bank.rotations)
             for k in range(len(crops)):
