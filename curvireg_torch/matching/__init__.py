@@ -14,6 +14,7 @@ from .cache import (
 )
 from .collection import BankCollection
 from .describe import BankSettings, DescribedViews, ViewDescriber
+from .index import ViewIndex
 from .matcher import Ranking, ViewMatcher
 from .near_symmetry import NearSymmetry, near_symmetries
 from .query import QueryFeatures, slack_boxes
@@ -33,6 +34,7 @@ __all__ = [
     "Ranking",
     "ViewBank",
     "ViewDescriber",
+    "ViewIndex",
     "ViewMatcher",
     "Whitening",
     "bank_key",
