@@ -163,7 +163,8 @@ def whitenings(data: Path) -> dict[str, Callable[[ViewBank], Whitening]]:
         if population == "bank":
             made[label] = lambda b, a=shrinkage: DescriptorStatistics.from_bank(b).whitening(shrinkage=a)
         else:
-            made[label] = lambda _, w=given[population].whitening(shrinkage=shrinkage): w
+            whitening = given[population].whitening(shrinkage=shrinkage)
+            made[label] = lambda _, w=whitening: w
     return made
 
 

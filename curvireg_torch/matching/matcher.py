@@ -171,7 +171,7 @@ class ViewMatcher(nn.Module):
             crops=crops[:, 0],
             field=field.unflatten(0, (B, K))[:, 0],
             descriptors=self.descriptor(field).unflatten(0, (B, K)),
-            points=points.unflatten(0, (B, K)),
+            points=self._in_cells(points[:, None].float()).unflatten(0, (B, K)),
             shapes=shapes,
         )
 
@@ -180,8 +180,11 @@ class ViewMatcher(nn.Module):
         K = query.descriptors.shape[1]
         queries = self._comparable(query.descriptors.flatten(0, 1)).to(self._views.dtype)
         hog = (queries @ self._views.T).float().view(-1, K, len(self._views)).amax(dim=1)
-        cells = self._in_cells(query.points.flatten(0, 1)[:, None].float())
-        rep = repeatability(cells.flatten(1), self._view_points).view(-1, K, len(self._views)).amax(dim=1)
+        rep = (
+            repeatability(query.points.flatten(0, 1).flatten(1), self._view_points)
+            .view(-1, K, len(self._views))
+            .amax(dim=1)
+        )
         box = box_shape_score(query.shapes.float(), self._view_shapes)
         scores = unit_score(hog) * repeatability_score(rep, mode=self.repeatability_mode) * box
         return Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), hog, rep, box)

@@ -24,7 +24,7 @@ class QueryFeatures:
         crops: (B, C, S, S) of the boxes themselves.
         field: (B, 2, S, S) of those crops.
         descriptors: (B, K, D).
-        points: (B, K, S, S) bool.
+        points: (B, K, C, C) share of each cell's pixels that are feature points.
         shapes: (B,) log of width / height of the boxes, NaN where unknown.
     """
 
