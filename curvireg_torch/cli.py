@@ -37,7 +37,8 @@ CONVENTIONS = {
     "viewpoint": "PASCAL3D+ azimuth, elevation, theta in degrees",
     "pixels": "(0, 0) is the centre of the top-left pixel; boxes are x0, y0, x1, y1",
     "score": "normalised correlation of photograph and view, 0 to 1",
-    "confidence": "share of the ranking's mass within 30 degrees of the best view, 0 to 1",
+    "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
+    "reliable": "confidence of at least 0.5; false = no reliable match, the pose is a guess",
 }
 
 
@@ -222,6 +223,7 @@ def _document(result: Registration, registrar: Registrar, times: dict[str, float
             "score": float(result.ranking.scores[0, v]),
             "hog": float(result.ranking.hog[0, v]),
             "repeatability": float(result.ranking.repeatability[0, v]),
+            "box": float(result.ranking.box[0, v]),
             "viewpoint": [float(getattr(bank.views, name)[v]) for name in ("azimuth", "elevation", "theta")],
         }
         for v in result.candidates.tolist()
@@ -233,6 +235,7 @@ def _document(result: Registration, registrar: Registrar, times: dict[str, float
         "viewpoint": dict(zip(("azimuth", "elevation", "theta"), result.viewpoint, strict=True)),
         "score": result.score,
         "confidence": result.confidence,
+        "reliable": result.reliable,
         "top": top,
         "refinement_rounds": result.iterations,
         "views": len(bank),
@@ -265,6 +268,8 @@ def _print_result(document: dict[str, Any], out: Path) -> None:
     angles = ", ".join(f"{name} {value:.1f}" for name, value in document["viewpoint"].items())
     seconds = document["seconds"]
     print(f"viewpoint: {angles} degrees   score {document['score']:.3f}   confidence {document['confidence']:.2f}")
+    if not document["reliable"]:
+        print("no reliable match: take the pose as a guess; check that the box is tight and the mesh is the object's")
     if document["translation"] is not None:
         print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")
     print(f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see {out}/overlay.png")

@@ -49,6 +49,7 @@ def test_register_writes_result_and_overlay(files, capsys):
         "viewpoint",
         "score",
         "confidence",
+        "reliable",
         "top",
         "seconds",
         "versions",

@@ -1,10 +1,12 @@
 """The pose of one object, from the CADs that the protocol allows."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from ..matching import Ranking
 from ..registration import Registrar, confidence
 from .benchmark import Row
 
@@ -32,7 +34,7 @@ def estimate_pose(
     """
     results = [registrar([image], box[None], camera_matrix)[0] for registrar in registrars]
     if fused:
-        return _fused(registrars, image, box, torch.cat([r.ranking.scores for r in results]))
+        return _fused(registrars, image, box, [r.ranking for r in results])
     best = max(range(len(results)), key=lambda i: results[i].score)
     result = results[best]
     return {
@@ -45,17 +47,19 @@ def estimate_pose(
 
 
 @torch.no_grad()
-def _fused(registrars: Sequence[Registrar], image: Tensor, box: Tensor, scores: Tensor) -> Row:
-    """``scores`` (M, N) of the meshes' views; the registrars are made with ``refine=False``."""
+def _fused(registrars: Sequence[Registrar], image: Tensor, box: Tensor, rankings: list[Ranking]) -> Row:
+    """``rankings`` of the meshes' views, one photograph each; the registrars are made with ``refine=False``."""
+    scores = torch.cat([ranking.scores for ranking in rankings])
     mean = scores.mean(dim=0)
     order = mean.argsort(descending=True, stable=True)
     chosen = int(scores[:, order[0]].argmax())
+    voted = replace(rankings[chosen], scores=mean[None], order=order[None])
     matcher, bank = registrars[chosen].matcher, registrars[chosen].bank
     pose = registrars[chosen].search(matcher.features(matcher.crop([image], box[None])[0]).field, order)
     return {
         "rotation": pose.rotation.tolist(),
         "translation": None,
         "score": pose.score,
-        "confidence": float(confidence(mean[None], bank.rotations)),
+        "confidence": float(confidence(voted, bank.rotations)),
         "mesh": chosen,
     }

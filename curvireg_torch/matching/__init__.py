@@ -1,6 +1,7 @@
 """Banks of described views, and the matcher that ranks them for photographs."""
 
 from .bank import ViewBank
+from .box_shape import box_shape_score, box_shapes, whole_box_shapes
 from .cache import (
     CACHE_LIMIT,
     CachedBank,
@@ -13,10 +14,13 @@ from .cache import (
 )
 from .collection import BankCollection
 from .describe import BankSettings, DescribedViews, ViewDescriber
-from .matcher import QueryFeatures, Ranking, ViewMatcher
+from .index import ViewIndex
+from .matcher import Ranking, ViewMatcher
 from .near_symmetry import NearSymmetry, near_symmetries
+from .query import QueryFeatures, slack_boxes
 from .repeatability import dilate_points, repeatability, repeatability_score
 from .similarity import normalized_correlation, unit_score
+from .whitening import DescriptorStatistics, Whitening
 
 __all__ = [
     "CACHE_LIMIT",
@@ -24,13 +28,18 @@ __all__ = [
     "BankSettings",
     "CachedBank",
     "DescribedViews",
+    "DescriptorStatistics",
     "NearSymmetry",
     "QueryFeatures",
     "Ranking",
     "ViewBank",
     "ViewDescriber",
+    "ViewIndex",
     "ViewMatcher",
+    "Whitening",
     "bank_key",
+    "box_shape_score",
+    "box_shapes",
     "cache_folder",
     "cached_bank",
     "clear_cache",
@@ -40,6 +49,8 @@ __all__ = [
     "normalized_correlation",
     "repeatability",
     "repeatability_score",
+    "slack_boxes",
     "trim_cache",
     "unit_score",
+    "whole_box_shapes",
 ]

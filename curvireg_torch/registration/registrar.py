@@ -36,6 +36,8 @@ class Registrar:
         refine: run the coarse-to-fine search.
         renderer: of the views rendered in it.
         top: distinct hypotheses to report.
+        symmetries: (S, 4, 4) of the mesh, from :func:`curvireg_torch.geometry.symmetry_transforms`; hypotheses that
+            differ by one of them are reported once.
         progress: show bars.
 
     Example:
@@ -57,6 +59,7 @@ class Registrar:
         refine: bool = True,
         renderer: str = "auto",
         top: int = 5,
+        symmetries: Tensor | None = None,
         progress: bool = False,
     ) -> None:
         if isinstance(bank_or_mesh, ViewBank):
@@ -68,7 +71,7 @@ class Registrar:
                 bank_or_mesh, views or sample_views(), settings or BankSettings(), progress=progress, renderer=renderer
             )
         self.matcher = ViewMatcher(self.bank, field=field)
-        self.refine, self.top = refine, top
+        self.refine, self.top, self.symmetries = refine, top, symmetries
         self._renderer = renderer
         self._describer: ViewDescriber | None = None
         self.radius = mesh_radius(self.bank.mesh)
@@ -132,14 +135,14 @@ class Registrar:
         results: list[Registration] = []
         for i in range(0, len(images), self.matcher.chunk_size):
             chunk = slice(i, i + self.matcher.chunk_size)
-            crops = self.matcher.crop(images[chunk], boxes[chunk])[0]
+            query = self.matcher.query(images[chunk], boxes[chunk])
+            crops = query.crops
             contrast = crops.amax(dim=(1, 2, 3)) - crops.amin(dim=(1, 2, 3))
             if bool((contrast < _FLAT).any()):
                 flat = i + int((contrast < _FLAT).nonzero()[0])
                 raise ImageError(f"image {flat}: the box shows one colour, nothing to register; check image and box")
-            query = self.matcher.features(crops)
             ranking = self.matcher.rank(query)
-            trust = confidence(ranking.scores, self.bank.rotations)
+            trust = confidence(ranking, self.bank.rotations)
             for k in range(len(crops)):
                 K = None if camera_matrices is None else camera_matrices[i + k]
                 results.append(self._register(query[k : k + 1], ranking[k : k + 1], float(trust[k]), boxes[i + k], K))
@@ -164,7 +167,7 @@ class Registrar:
             score=pose.score,
             confidence=trust,
             ranking=ranking,
-            candidates=distinct_views(order, bank.rotations, count=self.top),
+            candidates=distinct_views(order, bank.rotations, count=self.top, symmetries=self.symmetries),
             view_rotation=pose.rotation,
             view_distance=pose.distance,
             iterations=pose.iterations,

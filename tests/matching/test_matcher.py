@@ -39,10 +39,11 @@ def test_ranking_is_ordered_bounded_and_a_product(matcher):
     assert ranking.scores.shape == ranking.order.shape == (2, len(truck_bank()))
     sorted_scores = ranking.scores.gather(1, ranking.order)
     assert bool((sorted_scores[:, :-1] >= sorted_scores[:, 1:]).all())
-    for part in (ranking.scores, ranking.hog, ranking.repeatability):
+    for part in (ranking.scores, ranking.hog, ranking.repeatability, ranking.box):
         assert float(part.min()) >= 0
         assert float(part.max()) <= 1 + 1e-6
-    torch.testing.assert_close(ranking.scores, unit_score(ranking.hog) * repeatability_score(ranking.repeatability))
+    product = unit_score(ranking.hog) * repeatability_score(ranking.repeatability) * ranking.box
+    torch.testing.assert_close(ranking.scores, product)
     assert ranking.top(3).equal(ranking.order[:, :3])
 
 
@@ -68,7 +69,7 @@ def test_images_of_different_sizes_and_grey_images(matcher):
 
 
 def test_ties_keep_the_order_of_the_bank(matcher):
-    ranking = matcher(torch.full((1, 1, 64, 64), 0.5), torch.tensor([[5.0, 5, 50, 50]]))
+    ranking = matcher(torch.full((1, 1, 64, 64), 0.5), torch.tensor([[0.0, 0, 50, 50]]))
     assert ranking.order[0].tolist() == list(range(len(truck_bank())))
 
 

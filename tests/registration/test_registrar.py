@@ -3,7 +3,7 @@ import torch
 
 from curvireg_torch import Registrar, ViewBank, rotation_error, sample_views
 from curvireg_torch.errors import ImageError, InvalidInputError
-from curvireg_torch.registration import confidence, distinct_views
+from curvireg_torch.registration import distinct_views
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import CAMERA, scene, truck_bank
 
@@ -41,6 +41,7 @@ def test_results_are_proper_poses(registered):
         assert float(torch.linalg.det(result.rotation)) == pytest.approx(1.0)
         assert 0 <= result.score <= 1
         assert 0 <= result.confidence <= 1
+        assert result.reliable == (result.confidence >= 0.5)
         assert result.iterations > 0
         azimuth, elevation, theta = result.viewpoint
         assert 0 <= azimuth < 360
@@ -93,14 +94,6 @@ def test_bad_input_is_named():
         registrar([image], box[None], CAMERA.expand(2, 3, 3))
     with pytest.raises(InvalidInputError, match="belong to the bank"):
         Registrar(truck_bank(), views=sample_views())
-
-
-def test_confidence_of_a_peak_and_of_a_plateau():
-    R = sample_views(azimuth_step=10, elevations=[0]).rotations
-    peak, plateau = torch.zeros(1, 36), torch.ones(1, 36)
-    peak[0, 3] = 1
-    assert float(confidence(peak, R)) == 1.0
-    assert float(confidence(plateau, R, angle=35)) == pytest.approx(7 / 36)
 
 
 def test_distinct_views_stop_when_the_sphere_is_used_up():

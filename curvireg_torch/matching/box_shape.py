@@ -1,0 +1,66 @@
+"""Does the photograph's box have the proportions of the view's?"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from .._checks import check_positive, check_tensor
+
+__all__ = ["box_shape_score", "box_shapes", "whole_box_shapes"]
+
+_BORDER = 0.01
+"""Share of the box's longer side within which an edge counts as cut off by the image's border, besides 1 px."""
+
+
+def box_shapes(boxes: Tensor) -> Tensor:
+    """(...,) log of width / height of (..., 4) boxes x0, y0, x1, y1.
+
+    Example:
+        >>> box_shapes(torch.tensor([0.0, 0.0, 10.0, 10.0])).item()
+        0.0
+    """
+    sides = boxes[..., 2:] - boxes[..., :2]
+    return torch.log(sides[..., 0] / sides[..., 1])
+
+
+def whole_box_shapes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
+    """(B,) shapes of boxes that show a whole object; NaN for those that reach their image's border.
+
+    A box that ends at the border may be that of an object cut off there, or of nothing but the image.
+
+    Args:
+        boxes: (B, 4) x0, y0, x1, y1 in px.
+        sizes: (H, W) of each image.
+
+    Example:
+        >>> whole_box_shapes(torch.tensor([[9.0, 9, 19, 19], [-0.5, 9, 19, 19]]), [(48, 64)] * 2).tolist()
+        [0.0, nan]
+    """
+    far = torch.tensor([[W, H] for H, W in sizes], dtype=boxes.dtype, device=boxes.device).view(-1, 2) - 0.5
+    slack = 1.0 + _BORDER * (boxes[:, 2:] - boxes[:, :2]).amax(dim=1, keepdim=True)
+    inside = (boxes[:, :2] > -0.5 + slack).all(dim=1) & (boxes[:, 2:] < far - slack).all(dim=1)
+    return torch.where(inside, box_shapes(boxes), torch.nan)
+
+
+def box_shape_score(queries: Tensor, views: Tensor, *, sigma: float = 0.2) -> Tensor:
+    r"""S_box in (0, 1]: :math:`\exp(-d^2 / (2\sigma^2))`, d the difference of the logs of width / height.
+
+    Args:
+        queries: (B,) shapes of the photographs' boxes; NaN = unknown, every view then scores 1.
+        views: (N,) shapes of the views' boxes.
+        sigma: 0.2 = a box a fifth too wide.
+
+    Returns:
+        (B, N).
+
+    Example:
+        >>> box_shape_score(torch.tensor([0.0, float("nan")]), torch.tensor([0.0, 0.2])).round(decimals=2)
+        tensor([[1.0000, 0.6100],
+                [1.0000, 1.0000]])
+    """
+    check_tensor(queries, "queries", (None,))
+    check_tensor(views, "views", (None,))
+    check_positive(sigma, "sigma")
+    difference = (queries[:, None] - views.to(queries)[None]).nan_to_num(0.0)
+    return torch.exp(-difference.square() / (2.0 * sigma**2))

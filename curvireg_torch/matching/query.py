@@ -1,0 +1,99 @@
+"""What is compared of a photograph: crops around a box that need not be exact, and their features."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .._checks import check_tensor
+from ..errors import InvalidInputError
+from ..geometry.crops import check_boxes, crop_images, square_boxes
+
+__all__ = ["QueryFeatures", "crop_regions", "slack_boxes"]
+
+_MOVES = ((0, 0, 0), (-0.75, 0, 0), (0.75, 0, 0), (0, -0.75, 0), (0, 0.75, 0), (0, 0, -1), (0, 0, 1))
+"""Shifts in x and y and the exponent of the scale, in units of the slack."""
+
+
+@dataclass(frozen=True)
+class QueryFeatures:
+    """B photographs, each described in K crops: of its box first, then of the box moved and scaled a little.
+
+    Attributes:
+        crops: (B, C, S, S) of the boxes themselves.
+        field: (B, 2, S, S) of those crops.
+        descriptors: (B, K, D).
+        points: (B, K, C, C) share of each cell's pixels that are feature points.
+        shapes: (B,) log of width / height of the boxes, NaN where unknown.
+    """
+
+    crops: Tensor
+    field: Tensor
+    descriptors: Tensor
+    points: Tensor
+    shapes: Tensor
+
+    def __len__(self) -> int:
+        return self.crops.shape[0]
+
+    def __getitem__(self, index: slice) -> "QueryFeatures":
+        return QueryFeatures(
+            self.crops[index], self.field[index], self.descriptors[index], self.points[index], self.shapes[index]
+        )
+
+
+def slack_boxes(boxes: Tensor, slack: float) -> Tensor:
+    """(B, K, 4): each box, then it moved four ways by 3/4 ``slack`` of its longer side, shrunk and grown by ``slack``.
+
+    Args:
+        boxes: (B, 4) x0, y0, x1, y1 in px.
+        slack: share in [0, 0.45]; K = 7, or 1 for ``slack`` = 0.
+
+    Example:
+        >>> slack_boxes(torch.tensor([[0.0, 0.0, 100.0, 50.0]]), 0.1)[0, 1].tolist()
+        [-7.5, 0.0, 92.5, 50.0]
+    """
+    check_tensor(boxes, "boxes", (None, 4))
+    if not 0.0 <= slack <= 0.45:
+        raise InvalidInputError(f"slack: expected a share in [0, 0.45], got {slack}")
+    moves = torch.tensor(_MOVES if slack else _MOVES[:1], dtype=boxes.dtype, device=boxes.device)
+    sides = boxes[:, 2:] - boxes[:, :2]
+    shift = slack * moves[None, :, :2] * sides.amax(dim=1)[:, None, None]
+    centre = 0.5 * (boxes[:, None, :2] + boxes[:, None, 2:]) + shift
+    half = 0.5 * sides[:, None] * (1.0 + slack) ** moves[None, :, 2:]
+    return torch.cat([centre - half, centre + half], dim=2)
+
+
+def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int, margin: float) -> Tensor:
+    """(B, K, C, S, S) crops, K boxes on each image, cut as :func:`crop_images` does; reads no more than it needs.
+
+    Args:
+        images: (B, C, H, W), or a list of (C, H, W).
+        boxes: (B, K, 4) x0, y0, x1, y1 in px, from :func:`slack_boxes`; a moved box wholly outside its image gives way
+            to the first.
+        size, margin: see :func:`crop_images`.
+
+    Raises:
+        InvalidInputError: wrong shapes, or a first box that is empty or wholly outside its image.
+    """
+    for image in images:
+        check_tensor(image, "images", (None, None, None))
+    sizes = [(int(image.shape[-2]), int(image.shape[-1])) for image in images]
+    check_boxes(boxes[:, 0], sizes)
+    if not sizes:
+        raise InvalidInputError("images: expected at least one image")
+    squares = square_boxes(boxes, margin)
+    reach = 2.0 + (squares[..., 2] - squares[..., 0]).amax(dim=1) / size  # of the resampling, px
+    low = (squares[..., :2].amin(dim=1) - reach[:, None]).floor().long().clamp(min=0).tolist()
+    high = (squares[..., 2:].amax(dim=1) + reach[:, None]).ceil().long().tolist()
+    crops = []
+    for image, some, (x0, y0), (x1, y1), (H, W) in zip(images, boxes, low, high, sizes, strict=True):
+        end = torch.tensor([W - 0.5, H - 0.5], dtype=some.dtype, device=some.device)
+        seen = (some[:, 2:] > -0.5).all(dim=1) & (some[:, :2] < end).all(dim=1)
+        some = torch.where(seen[:, None], some, some[:1])
+        x0, y0 = min(x0, W - 1), min(y0, H - 1)
+        part = image[:, y0 : max(min(y1, H), y0 + 1), x0 : max(min(x1, W), x0 + 1)]
+        origin = torch.tensor([x0, y0, x0, y0], dtype=some.dtype, device=some.device)
+        crops.append(crop_images(part.expand(len(some), *part.shape), some - origin, size=size, margin=margin)[0])
+    return torch.stack(crops)

@@ -1,0 +1,213 @@
+"""Statistics of descriptors, and the linear map after which their entries are uncorrelated (LDA, Aubry et al. 2014)."""
+
+import math
+import os
+import uuid
+from collections.abc import Iterable
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import torch
+from kornia.color import rgb_to_grayscale
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from .._checks import check_option, check_tensor
+from ..errors import BankError, InvalidInputError, MissingFileError
+from ..filters import MultiScaleFocusCurves
+from ..geometry.crops import crop_images
+from .bank import ViewBank
+from .describe import BankSettings
+
+__all__ = ["DescriptorStatistics", "Whitening"]
+
+SHRINKAGES = ("oas", "ledoit-wolf")
+_FORMAT = "curvireg_torch.DescriptorStatistics"
+
+
+class Whitening(nn.Module):
+    r"""x -> L^-1 (x - mean), where Sigma = L L^T: inner products become :math:`(x - \mu)^T \Sigma^{-1} (y - \mu)`.
+
+    Args:
+        mean: (D,).
+        covariance: (D, D), symmetric, positive definite.
+
+    Raises:
+        InvalidInputError: wrong shapes or a covariance that is not positive definite.
+
+    Example:
+        >>> whiten = Whitening(torch.zeros(2), torch.diag(torch.tensor([4.0, 1.0])))
+        >>> whiten(torch.tensor([[2.0, 3.0]])).tolist()
+        [[1.0, 3.0]]
+    """
+
+    def __init__(self, mean: Tensor, covariance: Tensor) -> None:
+        super().__init__()
+        check_tensor(mean, "mean", (None,))
+        check_tensor(covariance, "covariance", (len(mean), len(mean)))
+        factor, failed = torch.linalg.cholesky_ex(covariance.double())
+        if int(failed):
+            raise InvalidInputError("covariance: expected a positive definite matrix; raise the shrinkage")
+        identity = torch.eye(len(mean), dtype=torch.float64, device=mean.device)
+        self.mean: Tensor
+        self.matrix: Tensor
+        self.register_buffer("mean", mean.float())
+        self.register_buffer("matrix", torch.linalg.solve_triangular(factor, identity, upper=False).float())
+
+    def forward(self, descriptors: Tensor) -> Tensor:
+        """(N, D) to (N, D), one matrix product."""
+        check_tensor(descriptors, "descriptors", (None, len(self.mean)))
+        return (descriptors.to(self.mean) - self.mean) @ self.matrix.T
+
+
+@dataclass(frozen=True)
+class DescriptorStatistics:
+    """Mean and covariance of a population of descriptors.
+
+    Attributes:
+        mean: (D,) float32.
+        covariance: (D, D) float32, of the sample, not shrunk.
+        count: descriptors that were counted.
+        fourth: mean of |x - mean|^4, which Ledoit and Wolf's shrinkage asks for.
+
+    Example:
+        >>> statistics = DescriptorStatistics.from_descriptors(torch.rand(50, 8))
+        >>> statistics.whitening(shrinkage="oas")(torch.rand(3, 8)).shape
+        torch.Size([3, 8])
+    """
+
+    mean: Tensor
+    covariance: Tensor
+    count: int
+    fourth: float
+
+    @classmethod
+    def from_descriptors(cls, descriptors: Tensor) -> "DescriptorStatistics":
+        """Of (N, D) descriptors, N >= 2."""
+        check_tensor(descriptors, "descriptors", (None, None))
+        if len(descriptors) < 2:
+            raise InvalidInputError(f"descriptors: expected at least 2, got {len(descriptors)}")
+        x = descriptors.float()
+        mean = x.mean(dim=0)
+        x = x - mean
+        fourth = float(x.square().sum(dim=1).double().square().mean())
+        return cls(mean, x.T @ x / len(x), len(x), fourth)
+
+    @classmethod
+    def from_bank(cls, bank: ViewBank) -> "DescriptorStatistics":
+        """Of the views of a bank: whitening by them brings out what tells views from each other (the paper)."""
+        return cls.from_descriptors(bank.descriptors)
+
+    @classmethod
+    def from_images(
+        cls,
+        images: Iterable[Tensor],
+        settings: BankSettings,
+        *,
+        crops: int = 200,
+        field: nn.Module | None = None,
+        generator: torch.Generator | None = None,
+    ) -> "DescriptorStatistics":
+        """Of random squares of images: whitening by them brings out what is unusual in images (Hariharan et al. 2012).
+
+        Squares have sides of 0.3 to 0.9 times the image's shorter side.
+
+        Args:
+            images: (C, H, W) each, C = 1 or 3, in [0, 1]; natural ones, without the objects to be found.
+            settings: of the banks that will be compared.
+            crops: squares of each image.
+            field: photograph filter, as given to :class:`ViewMatcher`.
+            generator: of the squares; default seed 0.
+        """
+        if crops < 1:
+            raise InvalidInputError(f"crops: expected >= 1, got {crops}")
+        field = MultiScaleFocusCurves() if field is None else field
+        generator = torch.Generator().manual_seed(0) if generator is None else generator
+        describe, found = settings.descriptor(), []
+        for image in images:
+            check_tensor(image, "images", (None, None, None))
+            H, W = image.shape[-2:]
+            u = torch.rand(crops, 3, generator=generator)
+            side = (0.3 + 0.6 * u[:, :1]) * min(H, W)
+            corner = u[:, 1:] * (torch.tensor([W, H]) - side) - 0.5
+            for boxes in torch.cat([corner, corner + side], dim=1).split(16):
+                cut = crop_images([image] * len(boxes), boxes, size=settings.image_size, margin=0.0)[0]
+                with torch.no_grad():
+                    found.append(describe(field(rgb_to_grayscale(cut) if cut.shape[1] == 3 else cut)))
+        if not found:
+            raise InvalidInputError("images: expected at least one image")
+        return cls.from_descriptors(torch.cat(found))
+
+    def shrinkage(self, rule: str | float) -> float:
+        """The share a in [0, 1] of the identity in (1 - a) Sigma + a tr(Sigma)/D Id.
+
+        Args:
+            rule: a number, or ``"oas"`` (Chen et al. 2010) or ``"ledoit-wolf"`` (2004), the closed forms that estimate
+                the population's covariance best.
+        """
+        if not isinstance(rule, str):
+            if not (math.isfinite(rule) and 0.0 <= rule <= 1.0):
+                raise InvalidInputError(f"shrinkage: expected a number in [0, 1], got {rule}")
+            return float(rule)
+        check_option(rule, SHRINKAGES, "shrinkage")
+        S = self.covariance.double()
+        D, n = len(S), self.count
+        trace, square = float(S.trace()), float(S.square().sum())
+        spread = square - trace**2 / D  # squared distance of S from its multiple of the identity
+        if spread <= 0:
+            return 1.0
+        if rule == "oas":
+            return min(1.0, (square / D**2 + (trace / D) ** 2) / ((n + 1) * spread / D**2))
+        return min(1.0, max(0.0, (self.fourth - square) / n / spread))
+
+    def whitening(self, *, shrinkage: str | float = 0.5) -> Whitening:
+        """The map that a :class:`ViewMatcher` takes.
+
+        Args:
+            shrinkage: see :meth:`shrinkage`. Descriptors of photographs and of renderings are not of one population,
+                and more than the closed forms give (nearly 0) matches better: ``docs/method.md``.
+        """
+        a = self.shrinkage(shrinkage)
+        S = self.covariance
+        ridge = a * float(S.diagonal().mean()) * torch.eye(len(S), dtype=S.dtype, device=S.device)
+        return Whitening(self.mean, (1.0 - a) * S + ridge)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write a safetensors file, in float16; it appears whole or not at all."""
+        path = Path(path)
+        scale = float(self.covariance.abs().amax().clamp(min=torch.finfo(torch.float32).tiny))
+        tensors = {
+            "mean": self.mean.half(),
+            "covariance": (self.covariance / scale).half(),
+            "numbers": torch.tensor([float(self.count), self.fourth, scale], dtype=torch.float64),
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
+        try:
+            temporary.write_bytes(save({k: v.cpu().contiguous() for k, v in tensors.items()}, {"format": _FORMAT}))
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> "DescriptorStatistics":
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            MissingFileError: no such file.
+            BankError: truncated, or another kind of file.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise MissingFileError(f"{path}: no such statistics; make them with DescriptorStatistics.from_images")
+        try:
+            with safe_open(path, framework="pt") as file:
+                if (file.metadata() or {}).get("format") != _FORMAT:
+                    raise BankError(f"{path}: not descriptor statistics; make them again")
+                mean, covariance, numbers = (file.get_tensor(n) for n in ("mean", "covariance", "numbers"))
+        except (SafetensorError, OSError) as error:
+            raise BankError(f"{path}: truncated or not a safetensors file ({error}); make it again") from error
+        count, fourth, scale = numbers.tolist()
+        return cls(mean.float(), covariance.float() * scale, int(count), fourth)

@@ -1,0 +1,102 @@
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from curvireg_torch import Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
+from curvireg_torch.geometry import symmetry_transforms
+from curvireg_torch.matching import Ranking
+from curvireg_torch.registration import confidence, distinct_views, ranking_evidence
+from curvireg_torch.registration.confidence import _BIAS, _WEIGHTS, EVIDENCE
+from curvireg_torch.synthetic import procedural_background
+from tests._support.scenes import CAMERA, SIZE, scene, truck_bank
+
+CONSTANTS = Path(__file__).parents[2] / "scripts" / "results" / "confidence_calibration.json"
+
+
+def ranking(scores: torch.Tensor, hog: float = 0.8, rep: float = 0.6) -> Ranking:
+    order = scores.argsort(dim=1, descending=True, stable=True)
+    same = torch.ones_like(scores)
+    return Ranking(scores, order, hog * same, rep * same, same)
+
+
+def test_evidence_in_closed_form():
+    R = sample_views(azimuth_step=10, elevations=[0]).rotations
+    scores = torch.full((1, 36), 0.1)
+    scores[0, 3], scores[0, 4], scores[0, 20] = 1.0, 0.9, 0.5
+    got = dict(zip(EVIDENCE, ranking_evidence(ranking(scores), R)[0].tolist(), strict=True))
+    near = 1 + 0.9**4 + 5 * 0.1**4  # views 0 to 6 lie within 30 degrees
+    assert got["similarity"] == pytest.approx(0.8)
+    assert got["repeatability"] == pytest.approx(0.6)
+    assert got["margin"] == pytest.approx(0.6931, abs=1e-3)  # log(1 / 0.5)
+    assert got["concentration"] == pytest.approx(near / (near + 0.5**4 + 28 * 0.1**4), rel=1e-4)
+
+
+def test_evidence_of_a_plateau_and_of_nothing():
+    R = sample_views(azimuth_step=10, elevations=[0]).rotations
+    plateau = ranking_evidence(ranking(torch.ones(1, 36)), R)[0]
+    assert plateau[2:].tolist() == pytest.approx([0.0, 7 / 36])
+    assert bool(ranking_evidence(ranking(torch.zeros(2, 36)), R).isfinite().all())
+    alone = torch.zeros(1, 36)
+    alone[0, 5] = 1.0
+    assert ranking_evidence(ranking(alone), R)[0, 2:].tolist() == [5.0, 1.0]
+
+
+def test_confidence_is_a_probability_that_grows_with_the_evidence():
+    R = sample_views(azimuth_step=10, elevations=[0]).rotations
+    sharp = torch.full((1, 36), 0.01)
+    sharp[0, 3] = 1.0
+    low, high = (float(confidence(r, R)) for r in (ranking(torch.ones(1, 36), 0.5, 0.3), ranking(sharp)))
+    assert 0 < low < 0.5 < high < 1
+
+
+def test_constants_are_those_that_the_script_found():
+    kept = json.loads(CONSTANTS.read_text())
+    assert kept["evidence"] == list(EVIDENCE)
+    assert kept["weights"] == pytest.approx(_WEIGHTS)
+    assert kept["bias"] == pytest.approx(_BIAS)
+
+
+def test_the_right_object_is_trusted_more_than_clutter():
+    """Six photographs of the truck, and the same boxes on pictures without it."""
+    matcher, R = ViewMatcher(truck_bank()), truck_bank().rotations
+    boxes = torch.stack([scene(s)[1] for s in range(6)])
+    own = confidence(matcher([scene(s)[0] for s in range(6)], boxes), R)
+    empty = [procedural_background(SIZE, torch.Generator().manual_seed(s)) for s in range(6)]
+    none = confidence(matcher(empty, boxes), R)
+    assert float((own[:, None] > none[None]).float().mean()) > 0.9
+    assert float(none.mean()) < 0.5
+
+
+def test_no_reliable_match_is_an_answer():
+    empty = procedural_background(SIZE, torch.Generator().manual_seed(0))
+    result = Registrar(truck_bank(), refine=False)([empty], torch.tensor([[60.0, 40, 180, 140]]), CAMERA)[0]
+    assert not result.reliable
+
+
+def test_symmetric_duplicates_are_reported_once():
+    info = {"symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}
+    symmetries = symmetry_transforms(info)
+    R = sample_views(azimuth_step=30, elevations=[10]).rotations
+    plain = distinct_views(torch.arange(12), R, count=12, angle=25)
+    merged = distinct_views(torch.arange(12), R, count=12, angle=25, symmetries=symmetries)
+    assert plain.tolist() == list(range(12))
+    assert merged.tolist() == list(range(6))
+    image, box, _ = scene(0)
+    result = Registrar(truck_bank(), refine=False, symmetries=symmetries)([image], box[None])[0]
+    found = truck_bank().rotations[result.candidates].double()
+    turned = found @ symmetries[1, :3, :3]
+    apart = rotation_error(found[:, None], turned[None]) + 1000 * torch.eye(len(found))
+    assert float(apart.min()) > 29.9
+
+
+def test_evidence_depends_on_each_photograph_alone():
+    bank = ViewBank.build(
+        truck_bank().mesh, sample_views(azimuth_step=45, elevations=[20]), image_size=64, progress=False
+    )
+    matcher = ViewMatcher(bank)
+    images, boxes = [scene(s)[0] for s in range(2)], torch.stack([scene(s)[1] for s in range(2)])
+    together = ranking_evidence(matcher(images, boxes), bank.rotations)
+    alone = ranking_evidence(matcher(images[1:], boxes[1:]), bank.rotations)
+    torch.testing.assert_close(together[1:], alone, atol=1e-4, rtol=1e-4)
