@@ -6,197 +6,257 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..descriptors import field_points
-from ..filters import depth_curvilinear_saliency, gaussian_smooth
-from ..filters.curvilinear import fill_depth
-from ..filters.derivatives import central_gradient
-from ..geometry import rotation_from_axis_angle, transform
+from .._checks import check_positive, check_tensor
+from ..errors import InvalidInputError
+from ..geometry import crop_images, rotation_from_axis_angle
+from ..geometry.cameras import check_camera_matrix, transform
 from ..rendering import DepthRenderer
+from .contour_points import ContourPoints, EdgeField, contour_points
 
-import os
-REACHES = eval(os.environ.get("REACHES", "(12.0, 8.0, 6.0, 4.0, 3.0, 2.0, 2.0)"))
-OUTER, INNER = int(os.environ.get("NOUT", 256)), int(os.environ.get("NIN", 128))
-JUMP = float(os.environ.get("JUMP", 0.05))
-SHARE = float(os.environ.get("SHARE", 0.02))
-SIGMA = float(os.environ.get("SIGMA", 1.0))
-GATE = float(os.environ.get("GATE", 4))
-LEVEL = float(os.environ.get("LEVEL", 1.0))
-STEPS = int(os.environ.get("STEPS", 2))
-WPOW = float(os.environ.get("WPOW", 1.0))
+__all__ = ["ContourFit", "fit_contours"]
+
+SIZE = 256
+"""Side of the crop in px; the first rounds use half of it."""
+
+COARSE, FINE = (6.0, 4.0, 3.0, 2.0), (6.0, 4.0, 3.0, 2.0, 2.0)
+"""How far edges are looked for in px, round by round; the mesh is rendered anew in each."""
+
+TURN = 8.0
+"""Degrees to the left, right, up and down of the given pose from which the fit starts too: half the width of what it
+draws in, and about the error of a coarse view."""
+
+FINALISTS = 2
+"""Fits that go on at full size."""
+
+STEPS, SELECTIONS = 2, 3
+"""Least-squares steps per rendering, and choices of edges per step."""
+
+DAMPING = 1e-2
+"""Levenberg-Marquardt: share of its own diagonal that is added to J^T W J."""
+
+CORRELATED = 8.0
+"""Neighbouring points err together: so many count as one in the covariance (found on synthetic scenes)."""
+
+MAX_TURN, MAX_SHIFT = 0.2, 0.1
+"""Longest step: radians, and share of the object's distance."""
 
 
 @dataclass(frozen=True)
-class ContourPoints:
-    model: Tensor
-    normals: Tensor
-    valid: Tensor
+class ContourFit:
+    """N poses fitted to one photograph.
+
+    Attributes:
+        transform: (N, 4, 4) float64 ``T_cam_from_model``.
+        covariance: (N, 6, 6) float64, see :func:`fit_contours`; NaN where the contours do not fix the pose.
+        support: (N,) float64 in [0, 1): mean strength of the edges within about 1 px of the contour points, weighted by
+            distance; 0 where the mesh shows no contour in the crop.
+    """
+
+    transform: Tensor
+    covariance: Tensor
+    support: Tensor
 
 
-def contour_points(depth: Tensor, T: Tensor, K: Tensor, radius: float) -> ContourPoints:
-    N, _, H, W = depth.shape
-    seen = depth > 0
-    z = torch.where(seen, depth, depth.amax(dim=(1, 2, 3), keepdim=True) + 4.0 * radius)
-    gx, gy = central_gradient(gaussian_smooth(fill_depth(depth, None, None), 1.0))
-    jumps, places, depths, normals = [], [], [], []
-    v, u = torch.meshgrid(torch.arange(H, dtype=torch.float64), torch.arange(W, dtype=torch.float64), indexing="ij")
-    at_jump = torch.zeros_like(seen)
-    for dim, shift in ((-1, (0.5, 0.0)), (-2, (0.0, 0.5))):
-        n = z.shape[dim]
-        a, b = z.narrow(dim, 0, n - 1), z.narrow(dim, 1, n - 1)
-        step = (b - a).abs()
-        m = step.shape[dim]
-        around = torch.cat([step.narrow(dim, 0, 1), step, step.narrow(dim, m - 1, 1)], dim=dim)
-        usual = torch.minimum(around.narrow(dim, 0, m), around.narrow(dim, 2, m))
-        jump = step - usual > JUMP * radius
-        pad = (0, 1) if dim == -1 else (0, 0, 0, 1)
-        at_jump |= F.pad(jump, pad) | F.pad(jump, (1, 0) if dim == -1 else (0, 0, 1, 0))
-        jumps.append(jump.flatten(1))
-        places.append(torch.stack([u + shift[0], v + shift[1]], -1).narrow(dim - 1, 0, n - 1).reshape(-1, 2))
-        depths.append(torch.minimum(a, b).flatten(1))
-        g = torch.cat([gx, gy], dim=1)
-        g = 0.5 * (g.narrow(dim, 0, n - 1) + g.narrow(dim, 1, n - 1))
-        normals.append(g.flatten(2).mT)
-    parts = [(torch.cat(jumps, 1), torch.cat(places), torch.cat(depths, 1), torch.cat(normals, 1), OUTER)]
-    if INNER:
-        field = depth_curvilinear_saliency(depth, sigma=1.0)
-        near = F.max_pool2d(at_jump.float(), 7, 1, 3) > 0
-        field = torch.where(near, 0.0, field)
-        crease = field_points(field, share=SHARE, threshold=float(os.environ.get("CTH", 0.0))) & seen
-        parts.append((crease.flatten(1), torch.stack([u, v], -1).view(-1, 2), depth.flatten(1), field.flatten(2).mT, INNER))
-    generator = torch.Generator().manual_seed(0)
-    chosen = []
-    for candidates, place, zs, ns, count in parts:
-        keys = torch.rand(len(place), generator=generator)
-        found, index = torch.where(candidates, keys, -1.0).topk(min(count, len(place)), dim=1)
-        chosen.append((place[index], zs.gather(1, index), ns.gather(1, index[..., None].expand(-1, -1, 2)), found >= 0))
-    uv, zs, ns, valid = (torch.cat(c, dim=1) for c in zip(*chosen, strict=True))
-    ray = torch.cat([uv, torch.ones_like(uv[..., :1])], -1) @ torch.linalg.inv(K).T
-    cam = ray * zs.double()[..., None]
-    model = (cam - T[:, None, :3, 3]) @ T[:, :3, :3]
-    length = torch.linalg.vector_norm(ns, dim=-1, keepdim=True)
-    return ContourPoints(model, (ns / length.clamp(min=1e-12)).double(), valid & (length[..., 0] > 0))
+@torch.no_grad()
+def fit_contours(
+    renderer: DepthRenderer,
+    image: Tensor,
+    box: Tensor,
+    camera_matrix: Tensor,
+    starts: Tensor,
+    *,
+    centre: Tensor,
+    radius: float,
+    margin: float = 0.1,
+) -> ContourFit:
+    """Poses whose contours lie on a photograph's edges, by robust least squares over SE(3).
+
+    Around each start the mesh is rendered, its occluding contours and creases become 3D points X_i with normals n_i in
+    the image (:func:`contour_points`), and the photograph is searched along n_i for edges that run as the contour
+    does. With d_i the distance to the chosen edge and J_i = n_i^T du_i/dxi, every step solves
+
+        (J^T W J + lambda diag(J^T W J)) xi = J^T W d,
+
+    W being the edge's strength times Tukey's weight of what remains. Strong edges near where the step leads are chosen
+    again within a step; the search narrows from round to round. From each start and from four poses turned away from
+    it the fit runs at half size; the best (by support) go on at full size. The start itself is returned where
+    nothing has more support than it has.
+
+    The covariance is 8 s^2 (J^T W J)^-1 with the residuals' robust scale s, as if every eighth point were independent.
+    Its order is turn (rad) about the camera's
+    x, y, z, then translation (model units) along them: with the true pose R, t,
+
+        R = exp([w]x) R_fit,   t = t_fit + e,   (w, e) ~ N(0, covariance).
+
+    It holds for a fit that has found the right edges, and knows nothing of others. Computed on the CPU.
+
+    Args:
+        renderer: of the mesh.
+        image: (C, H, W), C = 1 or 3, in [0, 1].
+        box: (4,) x0, y0, x1, y1 in px: where to look; need not be exact.
+        camera_matrix: (3, 3) in px.
+        starts: (N, 4, 4) poses, within about 15 degrees.
+        centre, radius: of the object, (3,) and model units.
+        margin: room around the box, as a share of its longer side.
+
+    Raises:
+        InvalidInputError: wrong shapes, a pose that is not finite, an unusable box or camera matrix.
+
+    Example:
+        >>> import trimesh
+        >>> from curvireg_torch.rendering import make_renderer
+        >>> K = torch.tensor([[200.0, 0, 63.5], [0, 200.0, 63.5], [0, 0, 1]], dtype=torch.float64)
+        >>> T = torch.eye(4, dtype=torch.float64); T[2, 3] = 5.0
+        >>> T[:3, :3] = rotation_from_axis_angle(torch.tensor([1.0, 0.6, 0.2], dtype=torch.float64))
+        >>> renderer = make_renderer(trimesh.creation.box((1, 1.5, 2)))
+        >>> image = (renderer.render(T[None], K, (128, 128))[0] > 0).float()
+        >>> start = T.clone(); start[0, 3] = 0.1                                              # 2 % to the right
+        >>> box = torch.tensor([24.0, 18, 102, 110])
+        >>> fit = fit_contours(renderer, image, box, K, start[None], centre=torch.zeros(3), radius=1.4)
+        >>> abs(float(fit.transform[0, 0, 3])) < 0.01
+        True
+    """
+    _check(image, box, camera_matrix, starts, radius)
+    T0, K, centre = starts.detach().cpu().double(), camera_matrix.detach().cpu().double(), centre.cpu().double()
+    crop, A = crop_images([image.detach().cpu().float()], box.detach().cpu().float()[None], size=SIZE, margin=margin)
+    full = _Scene(renderer, EdgeField(crop), A[0].double() @ K, SIZE, centre, radius)
+    half_K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ full.K
+    half = _Scene(renderer, EdgeField(F.avg_pool2d(crop, 2)), half_K, SIZE // 2, centre, radius)
+    N = len(T0)
+    if N == 0:
+        return ContourFit(T0, T0.new_zeros(0, 6, 6), T0.new_zeros(0))
+    turns = torch.zeros(5, 6, dtype=torch.float64)
+    turns[1:, :2] = torch.deg2rad(TURN * torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]))
+    around = _moved(T0.repeat_interleave(len(turns), dim=0), turns.repeat(N, 1), centre)
+    T = half.descend(around, COARSE)
+    best = half.look(T)[1].view(N, -1).topk(FINALISTS, dim=1).indices
+    T = T.view(N, -1, 4, 4).gather(1, best[..., None, None].expand(-1, -1, 4, 4)).flatten(0, 1)
+    T = torch.cat([full.descend(T, FINE).view(N, -1, 4, 4), T0[:, None]], dim=1)
+    covariance, support = full.look(T.flatten(0, 1))
+    winner = support.view(N, -1).argmax(dim=1) + torch.arange(N) * T.shape[1]
+    return ContourFit(T.flatten(0, 1)[winner], covariance[winner], support[winner])
 
 
-class EdgeField:
-    def __init__(self, crop: Tensor):
-        smooth = gaussian_smooth(crop, SIGMA)
-        gx, gy = central_gradient(smooth)
-        self.gradient = torch.stack([gx, gy], dim=2).flatten(1, 2)  # (1, 2C, S, S)
-        self.level = LEVEL * self.gradient.square().sum(dim=1).mean().sqrt()
-
-    def profiles(self, uv: Tensor, normals: Tensor, offsets: Tensor) -> Tensor:
-        """(N, P, L) strength in [0, 1) of edges along each normal."""
-        S = self.gradient.shape[-1]
-        N, P, _ = uv.shape
-        at = uv[:, :, None] + offsets[:, None] * normals[:, :, None]
-        grid = (2.0 * at + 1.0) / S - 1.0
-        g = F.grid_sample(self.gradient.expand(N, -1, -1, -1), grid.float(), align_corners=False)
-        g = g.unflatten(1, (-1, 2))
-        n = normals.float().permute(2, 0, 1)[None, ..., None]  # 1 2 N P 1
-        n = n.permute(2, 0, 1, 3, 4)  # N 1 2 P 1
-        along = (g * n).sum(dim=2).abs()
-        length = torch.linalg.vector_norm(g, dim=2)
-        r = along * (along / length.clamp(min=1e-9)) ** GATE
-        r = r.amax(dim=1)
-        return r / (r + self.level)
+def _check(image: Tensor, box: Tensor, camera_matrix: Tensor, starts: Tensor, radius: float) -> None:
+    check_tensor(image, "image", (None, None, None))
+    check_tensor(box, "box", (4,))
+    check_tensor(starts, "starts", (None, 4, 4))
+    check_camera_matrix(camera_matrix)
+    check_positive(radius, "radius")
+    if not bool(torch.isfinite(starts).all()):
+        raise InvalidInputError("starts: expected finite poses, got NaN or inf")
 
 
-def project(points: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
-    """uv (N, P, 2) and its derivative (N, P, 2, 6) by a turn about the centre and a shift of it, camera axes."""
-    turned = (points - centre) @ T[:, :3, :3].mT
-    cam = turned + (T[:, :3, :3] @ centre + T[:, :3, 3])[:, None]
-    x, y, z = cam.unbind(-1)
-    uvw = cam @ K.T
-    z = z.clamp(min=1e-6)
-    uv = uvw[..., :2] / z[..., None]
-    o = torch.zeros_like(z)
-    by_cam = torch.stack(
-        [
-            torch.stack([K[0, 0] / z, K[0, 1] / z, -(K[0, 0] * x + K[0, 1] * y) / z**2], -1),
-            torch.stack([o, K[1, 1] / z, -K[1, 1] * y / z**2], -1),
-        ],
-        -2,
-    )
-    qx, qy, qz = turned.unbind(-1)
-    by_turn = torch.stack(
-        [torch.stack([o, qz, -qy], -1), torch.stack([-qz, o, qx], -1), torch.stack([qy, -qx, o], -1)], -2
-    )
-    return uv, by_cam @ torch.cat([by_turn, torch.eye(3, dtype=z.dtype).expand_as(by_turn)], dim=-1)
+@dataclass(frozen=True)
+class _Scene:
+    """A mesh before one crop of the photograph: ``K`` (3, 3) and ``size`` of the crop."""
+
+    renderer: DepthRenderer
+    edges: EdgeField
+    K: Tensor
+    size: int
+    centre: Tensor
+    radius: float
+
+    def points(self, T: Tensor) -> ContourPoints:
+        depth = self.renderer.render(T, self.K, (self.size, self.size)).cpu()
+        return contour_points(depth, T, self.K, radius=self.radius)
+
+    def descend(self, T: Tensor, reaches: tuple[float, ...]) -> Tensor:
+        for reach in reaches:
+            points = self.points(T)
+            for _ in range(STEPS):
+                T = _moved(T, self._bounded(self._step(points, T, reach), T), self.centre)
+        return T
+
+    def _step(self, points: ContourPoints, T: Tensor, reach: float) -> Tensor:
+        """(N, 6) turn about the centre and shift of it."""
+        uv, du = _project(points.model, T, self.K, self.centre)
+        J = (points.normals[..., None, :] @ du)[..., 0, :]
+        distance, strength = self._candidates(uv, points, reach)
+        step = torch.zeros(len(T), 6, dtype=torch.float64)
+        for _ in range(SELECTIONS):
+            left = distance - (J @ step[..., None])
+            index = (strength * torch.exp(-2.0 * (left / reach) ** 2)).argmax(dim=-1, keepdim=True)
+            tukey = (1.0 - (left.gather(-1, index) / reach) ** 2).clamp(min=0.0) ** 2
+            W = strength.gather(-1, index) * tukey
+            A = J.mT @ (W * J)
+            b = J.mT @ (W * distance.gather(-1, index))
+            damping = DAMPING * A.diagonal(dim1=-2, dim2=-1)
+            floor = 1e-12 * damping.amax(dim=-1, keepdim=True) + 1e-12  # nothing found: no step
+            step = torch.linalg.solve(A + torch.diag_embed(damping + floor), b)[..., 0]
+        return step
+
+    def _candidates(self, uv: Tensor, points: ContourPoints, reach: float) -> tuple[Tensor, Tensor]:
+        """Distance in px along the normals and strength, both (N, P, L); the strength is 0 where there is no edge."""
+        far = round(1.5 * reach) + 1
+        offsets = torch.arange(-far, far + 1, dtype=torch.float64)
+        profile = self.edges.strength(uv, points.normals, offsets)
+        before, here, behind = profile[..., :-2], profile[..., 1:-1], profile[..., 2:]
+        is_peak = (here > before) & (here >= behind) & points.valid[..., None]
+        bend = (before - 2.0 * here + behind).clamp(max=-1e-9)
+        vertex = (0.5 * (before - behind) / bend).clamp(-0.5, 0.5)  # of the parabola through the three
+        return offsets[1:-1] + vertex, torch.where(is_peak, here, 0.0)
+
+    def _bounded(self, step: Tensor, T: Tensor) -> Tensor:
+        z = (T[:, :3, :3] @ self.centre + T[:, :3, 3])[:, 2]
+        turn, shift = torch.linalg.vector_norm(step[:, :3], dim=1), torch.linalg.vector_norm(step[:, 3:], dim=1)
+        share = torch.minimum(MAX_TURN / turn, MAX_SHIFT * z / shift).clamp(max=1.0)
+        return step * share[:, None]
+
+    def look(self, T: Tensor) -> tuple[Tensor, Tensor]:
+        """Covariance (N, 6, 6) and support (N,) of poses as they are."""
+        points = self.points(T)
+        uv, du = _project(points.model, T, self.K, self.centre)
+        J = (points.normals[..., None, :] @ du)[..., 0, :]
+        offsets = torch.arange(-3, 4, dtype=torch.float64)
+        near = self.edges.strength(uv, points.normals, offsets) * torch.exp(-0.5 * offsets**2)
+        valid = points.valid
+        support = (near.amax(dim=-1) * valid).sum(dim=1) / valid.sum(dim=1).clamp(min=1)
+        distance, strength = self._candidates(uv, points, FINE[-1])
+        index = (strength * torch.exp(-0.5 * distance**2)).argmax(dim=-1, keepdim=True)
+        d = distance.gather(-1, index)
+        W = strength.gather(-1, index) * (1.0 - (d / FINE[-1]) ** 2).clamp(min=0.0) ** 2
+        return _covariance(J, W, d, T[:, :3, :3] @ self.centre), support
 
 
-def moved(T: Tensor, step: Tensor, centre: Tensor) -> Tensor:
-    turn = rotation_from_axis_angle(step[:, :3])
-    R = turn @ T[:, :3, :3]
+def _covariance(J: Tensor, W: Tensor, d: Tensor, arm: Tensor) -> Tensor:
+    """(N, 6, 6) of (turn, translation of the model's origin); ``arm`` (N, 3) leads from the origin to the centre."""
+    freedom = W.sum(dim=(1, 2)) - 6.0
+    variance = CORRELATED * (W * d * d).sum(dim=(1, 2)) / freedom.clamp(min=1e-9)
+    A = J.mT @ (W * J)
+    scale = A.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
+    unit = scale[:, :, None] * A * scale[:, None]  # a correlation matrix: its smallest eigenvalue has no unit
+    known = (torch.linalg.eigvalsh(unit)[:, 0] > 1e-9) & (freedom > 0)
+    unit = torch.where(known[:, None, None], unit, torch.eye(6, dtype=unit.dtype))
+    C = variance[:, None, None] * scale[:, :, None] * torch.linalg.inv(unit) * scale[:, None]
+    # The origin moves by e - w x arm where the centre moves by e.
+    lever = torch.eye(6, dtype=C.dtype).repeat(len(C), 1, 1)
+    lever[:, 3:, :3] = _cross(arm)
+    C = lever @ C @ lever.mT
+    return torch.where(known[:, None, None], 0.5 * (C + C.mT), torch.nan)
+
+
+def _project(points: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (N, P, 2) of model points and their derivative (N, P, 2, 6) by a turn about the centre and its shift."""
+    arms = (points - centre) @ T[:, :3, :3].mT
+    cam = arms + (T[:, :3, :3] @ centre + T[:, :3, 3])[:, None]
+    z = cam[..., 2:].clamp(min=1e-9)
+    uv = cam @ K[:2].T / z
+    by_cam = (K[:2] - uv[..., None] * K[2]) / z[..., None]
+    by_step = torch.cat([-_cross(arms), torch.eye(3, dtype=z.dtype).expand(*arms.shape, 3)], dim=-1)
+    return uv, by_cam @ by_step
+
+
+def _moved(T: Tensor, step: Tensor, centre: Tensor) -> Tensor:
+    """Turned by (N, 3) rad about the centre, which is then shifted by (N, 3)."""
+    R = rotation_from_axis_angle(step[:, :3]) @ T[:, :3, :3]
     position = T[:, :3, :3] @ centre + T[:, :3, 3] + step[:, 3:]
     return transform(R, position - R @ centre)
 
 
-def fit(field: EdgeField, renderer: DepthRenderer, T: Tensor, K: Tensor, centre: Tensor, radius: float, size: int) -> Tensor:
-    for reach in REACHES:
-        depth = renderer.render(T, K, (size, size))
-        points = contour_points(depth, T, K, radius)
-        for _ in range(STEPS):
-            uv, J = project(points.model, T, K, centre)
-            n = points.normals
-            Jn = (n[..., None, :] @ J)[..., 0, :]  # N P 6
-            L = int(round(1.5 * reach)) + 1
-            offsets = torch.arange(-L, L + 1, dtype=torch.float64)
-            strength = field.profiles(uv, n, offsets).double()
-            mid, before, after = strength[..., 1:-1], strength[..., :-2], strength[..., 2:]
-            peak = (mid > before) & (mid >= after)
-            bend = (before - 2 * mid + after).clamp(max=-1e-9)
-            d = offsets[1:-1] + (0.5 * (before - after) / bend).clamp(-0.5, 0.5)
-            value = torch.where(peak, mid, 0.0) * points.valid[..., None]
-            step = torch.zeros(len(T), 6, dtype=torch.float64)
-            s = 0.5 * reach
-            for _ in range(3):
-                e = (Jn @ step[..., None])[..., 0]
-                gap = d - e[..., None]
-                score = value * torch.exp(-0.5 * (gap / s) ** 2)
-                best, index = score.max(dim=-1, keepdim=True)
-                r = gap.gather(-1, index)[..., 0]
-                target = d.gather(-1, index)[..., 0]
-                w = value.gather(-1, index)[..., 0] ** WPOW * (1 - (r / (2 * s)) ** 2).clamp(min=0) ** 2
-                A = Jn.mT @ (w[..., None] * Jn)
-                b = (Jn.mT @ (w * target)[..., None])[..., 0]
-                D = torch.diag_embed(A.diagonal(dim1=-2, dim2=-1)) * 1e-2 + 1e-9 * torch.eye(6, dtype=torch.float64)
-                step = torch.linalg.solve(A + D, b)
-            z = (T[:, :3, :3] @ centre + T[:, :3, 3])[:, 2]
-            limit = torch.minimum(0.2 / step[:, :3].norm(dim=1), 0.1 * z / step[:, 3:].norm(dim=1)).clamp(max=1.0)
-            T = moved(T, step * limit[:, None], centre)
-    return T
-
-
-def support(field: EdgeField, renderer: DepthRenderer, T: Tensor, K: Tensor, radius: float, size: int, reach: float = 2.0) -> Tensor:
-    depth = renderer.render(T, K, (size, size))
-    points = contour_points(depth, T, K, radius)
-    uv, _ = project(points.model, T, K, torch.zeros(3, dtype=torch.float64))
-    offsets = torch.arange(-3, 4, dtype=torch.float64)
-    strength = field.profiles(uv, points.normals, offsets).double() * torch.exp(-0.5 * (offsets / (0.5*reach)) ** 2)
-    best = strength.amax(dim=-1) * points.valid
-    return best.sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
-
-
-def halve(K):
-    A = torch.tensor([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]], dtype=K.dtype)
-    return A @ K
-
-
-REACH_A = eval(os.environ.get("REACH_A", "(6.0, 4.0, 3.0, 2.0)"))
-REACH_B = eval(os.environ.get("REACH_B", "(6.0, 4.0, 3.0, 2.0, 2.0)"))
-KEEP = int(os.environ.get("KEEP", 2))
-SUPA = float(os.environ.get("SUPA", 2.0))
-
-
-def multi(crop, renderer, starts, K, centre, radius, size):
-    global REACHES
-    small, Ks, s2 = F.avg_pool2d(crop, 2), halve(K), size // 2
-    f2, f1 = EdgeField(small), EdgeField(crop)
-    REACHES = REACH_A
-    T = fit(f2, renderer, starts, Ks, centre, radius, s2)
-    sup = support(f2, renderer, T, Ks, radius, s2, SUPA)
-    T = T[sup.topk(min(KEEP, len(T))).indices]
-    REACHES = REACH_B
-    T = fit(f1, renderer, T, K, centre, radius, size)
-    sup = support(f1, renderer, T, K, radius, size)
-    return T[sup.argmax()][None]
+def _cross(a: Tensor) -> Tensor:
+    """(..., 3, 3) matrices of b -> a x b."""
+    x, y, z = a.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
