@@ -259,4 +259,5 @@ def _cross(a: Tensor) -> Tensor:
     """(..., 3, 3) matrices of b -> a x b."""
     x, y, z = a.unbind(-1)
     o = torch.zeros_like(x)
-    return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
+    matrix: Tensor = torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
+    return matrix
