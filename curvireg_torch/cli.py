@@ -22,14 +22,13 @@ from .errors import CurviregError, InvalidInputError
 from .evaluation import add_parser as add_evaluate
 from .geometry import camera_matrix, load_mesh, rotation_error, whole_image_box
 from .geometry.mesh import UNITS
+from .learned import LearnedCurvilinearSaliency, adapt
 from .matching import ViewBank, cache_folder, cached_bank, clear_cache, list_cache
-from .presets import preset_named
+from .presets import DEFAULT, PRESETS, Preset, preset_named
 from .registration import Registrar, Registration
 from .rendering import BACKENDS
 
 __all__ = ["main"]
-
-PRESET = preset_named("default")
 
 CONVENTIONS = {
     "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
@@ -79,6 +78,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"curvireg_torch {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
+    preset = argparse.ArgumentParser(add_help=False)
+    preset.add_argument("--preset", choices=sorted(PRESETS), default=DEFAULT, help=f"default: {DEFAULT}")
+
     mesh_options = argparse.ArgumentParser(add_help=False)
     mesh_options.add_argument("--unit", choices=sorted(UNITS), default="m", help="the mesh file's unit (default: m)")
     mesh_options.add_argument(
@@ -90,7 +92,7 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     register = commands.add_parser(
-        "register", parents=[common, mesh_options], help="find the pose of MESH in PHOTO",
+        "register", parents=[common, preset, mesh_options], help="find the pose of MESH in PHOTO",
         description="Writes DIR/result.json and DIR/overlay.png.",
     )  # fmt: skip
     register.add_argument("photo", type=Path, metavar="PHOTO")
@@ -101,14 +103,24 @@ def _parser() -> argparse.ArgumentParser:
     register.add_argument(
         "--camera", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="px; gives the translation"
     )
+    register.add_argument("--field", type=Path, metavar="FILE", help="weights from curvireg bank --adapt")
     register.add_argument("--top", type=int, default=5, metavar="K", help="hypotheses to report (default: 5)")
     register.add_argument("--no-refine", action="store_true", help="stop at the best view of the bank")
     register.add_argument("--out", type=Path, required=True, metavar="DIR")
     register.set_defaults(run=_register)
 
-    bank = commands.add_parser("bank", parents=[common, mesh_options], help="render and describe the views of MESH")
+    bank = commands.add_parser(
+        "bank", parents=[common, preset, mesh_options], help="render and describe the views of MESH"
+    )
     bank.add_argument("mesh", type=Path, metavar="MESH")
     bank.add_argument("--out", type=Path, required=True, metavar="FILE")
+    bank.add_argument(
+        "--adapt",
+        type=Path,
+        metavar="FILE",
+        help="also fine-tune the learned field on generated photographs of MESH (minutes) and write its weights to "
+        "FILE, for register --field",
+    )
     bank.set_defaults(run=_bank)
 
     cache = commands.add_parser("cache", parents=[common], help="list or clear the banks that were kept on disk")
@@ -117,7 +129,9 @@ def _parser() -> argparse.ArgumentParser:
 
     add_evaluate(commands, [common])
 
-    demo = commands.add_parser("demo", parents=[common], help="register a scene made in code, where the truth is known")
+    demo = commands.add_parser(
+        "demo", parents=[common, preset], help="register a scene made in code, where the truth is known"
+    )
     demo.add_argument("--seed", type=int, default=0)
     demo.add_argument("--out", type=Path, required=True, metavar="DIR")
     demo.set_defaults(run=_demo)
@@ -126,17 +140,23 @@ def _parser() -> argparse.ArgumentParser:
 
 def _bank(arguments: argparse.Namespace) -> None:
     start = time.perf_counter()
+    chosen = preset_named(arguments.preset)
     mesh = load_mesh(arguments.mesh, unit=arguments.unit)
     bank = ViewBank.build(
         mesh,
-        PRESET.views(arguments.pose),
-        settings=PRESET.bank,
+        chosen.views(arguments.pose),
+        settings=chosen.bank,
         renderer=arguments.renderer,
         progress=not arguments.quiet,
     )
     bank.save(arguments.out)
     size = arguments.out.stat().st_size / 1e6
     print(f"{arguments.out}: {len(bank)} views, {size:.1f} MB, {time.perf_counter() - start:.1f} s")
+    if arguments.adapt is not None:
+        start = time.perf_counter()
+        upright = 1.0 if arguments.pose == "upright" else 0.0
+        adapt(mesh, upright=upright, progress=not arguments.quiet).save(arguments.adapt)
+        print(f"{arguments.adapt}: adapted field, {time.perf_counter() - start:.1f} s")
 
 
 def _cache(arguments: argparse.Namespace) -> None:
@@ -150,13 +170,13 @@ def _cache(arguments: argparse.Namespace) -> None:
     print(f"{cache_folder()}: {len(banks)} banks, {sum(bank.size for bank in banks) / 1e6:.1f} MB")
 
 
-def _open_bank(arguments: argparse.Namespace) -> ViewBank:
+def _open_bank(arguments: argparse.Namespace, preset: Preset) -> ViewBank:
     if arguments.mesh.suffix == ".safetensors":
         return ViewBank.load(arguments.mesh)
     return cached_bank(
         load_mesh(arguments.mesh, unit=arguments.unit),
-        PRESET.views(arguments.pose),
-        PRESET.bank,
+        preset.views(arguments.pose),
+        preset.bank,
         renderer=arguments.renderer,
         progress=not arguments.quiet,
     )
@@ -169,9 +189,12 @@ def _register(arguments: argparse.Namespace) -> None:
     K = None if arguments.camera is None else camera_matrix(*arguments.camera, dtype=torch.float64)
     if arguments.top < 1:
         raise InvalidInputError(f"--top: expected >= 1, got {arguments.top}")
-    bank = _open_bank(arguments)
+    preset = preset_named(arguments.preset)
+    field = None if arguments.field is None else LearnedCurvilinearSaliency(weights=arguments.field)
+    bank = _open_bank(arguments, preset)
     times["bank"] = time.perf_counter()
-    registrar = Registrar(bank, refine=not arguments.no_refine, renderer=arguments.renderer, top=arguments.top)
+    refine = preset.refine and not arguments.no_refine
+    registrar = preset.registrar(bank, field=field, refine=refine, renderer=arguments.renderer, top=arguments.top)
     try:
         result = registrar([image], box[None], K)[0]
     except CurviregError as error:
@@ -192,11 +215,12 @@ def _demo(arguments: argparse.Namespace) -> None:
     K = camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
     truth = random_pose(mesh, K, size, generator)
     image, box = synthesize_photograph(mesh, truth, K, size, generator)
+    preset = preset_named(arguments.preset)
     bank = cached_bank(
-        mesh, PRESET.views("upright"), PRESET.bank, renderer=arguments.renderer, progress=not arguments.quiet
+        mesh, preset.views("upright"), preset.bank, renderer=arguments.renderer, progress=not arguments.quiet
     )
     times["bank"] = time.perf_counter()
-    registrar = Registrar(bank, renderer=arguments.renderer)
+    registrar = preset.registrar(bank, renderer=arguments.renderer)
     result = registrar([image], box[None], K)[0]
     times["register"] = time.perf_counter()
     document = _document(result, registrar, times)

@@ -1,6 +1,6 @@
 """What is computed for an object: one table, looked up by name."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from dataclasses import field as dataclass_field
 from typing import Any
@@ -8,28 +8,32 @@ from typing import Any
 from torch import nn
 
 from .errors import InvalidInputError
-from .filters import MultiScaleFocusCurves
+from .filters import ImageGradient, MultiScaleCurvilinearSaliency, MultiScaleFocusCurves
 from .geometry import ViewSphere, sample_views, uniform_views
 from .learned import LearnedCurvilinearSaliency
-from .matching import BankSettings
+from .matching import BankSettings, ViewBank, ViewMatcher
+from .registration import Registrar
 
-__all__ = ["FIELDS", "PRESETS", "Preset", "preset_named"]
+__all__ = ["DEFAULT", "FIELDS", "PRESETS", "Preset", "preset_named"]
 
 FIELDS: dict[str, Callable[[], nn.Module]] = {
-    "focus": MultiScaleFocusCurves,
     "learned": LearnedCurvilinearSaliency,
+    "focus": MultiScaleFocusCurves,
+    "saliency": MultiScaleCurvilinearSaliency,
+    "gradient": ImageGradient,
 }
 """Photograph filters by name."""
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Settings of banks and of the search.
+    """Settings of banks, of the ranking and of the search.
 
     Attributes:
         bank: of every view bank.
         field: name of the photograph filter, one of ``FIELDS``.
-        refine: search around the best views of the bank.
+        matcher: further options of :class:`ViewMatcher`.
+        refine: search around the best views of the bank, and follow the contours.
 
     Example:
         >>> len(Preset().views("upright"))
@@ -37,7 +41,8 @@ class Preset:
     """
 
     bank: BankSettings = dataclass_field(default_factory=lambda: BankSettings(image_size=128, sigma=0.8))
-    field: str = "focus"
+    field: str = "learned"
+    matcher: Mapping[str, Any] = dataclass_field(default_factory=dict)
     refine: bool = True
 
     def photograph_filter(self) -> nn.Module:
@@ -48,12 +53,36 @@ class Preset:
         """The bank's viewpoints: for objects that stand upright, or for any orientation."""
         return sample_views() if pose == "upright" else uniform_views(300, thetas=range(0, 360, 15))
 
+    def registrar(self, bank: ViewBank, *, field: nn.Module | None = None, **options: Any) -> Registrar:
+        """A registrar as this preset wants it.
+
+        Args:
+            bank: made with ``self.bank``.
+            field: default :meth:`photograph_filter`.
+            options: of :class:`Registrar`.
+        """
+        matcher = ViewMatcher(bank, field=field or self.photograph_filter(), **self.matcher)
+        return Registrar(matcher, **{"refine": self.refine, **options})
+
     def describe(self) -> dict[str, Any]:
         """Everything that decides a result, as plain numbers and texts."""
-        return {**asdict(self.bank), "field": self.field, "refine": self.refine}
+        return {**asdict(self.bank), "field": self.field, **self.matcher, "refine": self.refine}
 
 
-PRESETS = {"default": Preset(), "learned": Preset(field="learned")}
+_PAPER = BankSettings(image_size=256, sigma=1.0, formula="paper", camera="orthographic")
+
+PRESETS = {
+    "learned": Preset(matcher={"repeatability_sigma": 0.2}),
+    "classical": Preset(field="focus"),
+    "fast": Preset(matcher={"repeatability_sigma": 0.2, "slack": 0.0}, refine=False),
+    "paper": Preset(
+        bank=_PAPER, field="focus", matcher={"repeatability_mode": "paper", "box_sigma": None, "slack": 0.0}
+    ),
+}
+"""``learned``: the photograph's field by :class:`LearnedCurvilinearSaliency`; ``classical``: by focus curves, nothing
+learnt; ``fast``: ``learned`` without slack and refinement; ``paper``: the paper's own, as far as it is stated."""
+
+DEFAULT = "learned"
 
 
 def preset_named(name: str) -> Preset:

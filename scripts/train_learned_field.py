@@ -129,11 +129,12 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=90.0, help="training time, over all starts (default 90)")
     parser.add_argument("--batch", type=int, default=32, help="scenes in a step (default 32)")
     parser.add_argument("--fresh", type=int, default=8, help="of them new ones (default 8)")
-    parser.add_argument("--replay", type=int, default=30_000, help="scenes kept in memory, 80 kB each (default 30000)")
+    parser.add_argument("--replay", type=int, default=15_000, help="scenes kept in memory, 140 kB each (default 15000)")
     parser.add_argument("--workers", type=int, default=1, help="processes that generate scenes (default 1)")
     parser.add_argument("--rate", type=float, default=3e-3, help="highest learning rate (default 3e-3)")
     parser.add_argument("--descriptor-weight", type=float, default=1.0, help="of the descriptor's loss (default 1)")
     parser.add_argument("--ranking-weight", type=float, default=0.1, help="of the ranking loss (default 0.1)")
+    parser.add_argument("--rivals-weight", type=float, default=0.2, help="of the loss among views (default 0.2)")
     parser.add_argument("--validate", type=int, default=60, help="held-out scenes (default 60)")
     parser.add_argument("--every", type=float, default=10.0, help="minutes between validations (default 10)")
     parser.add_argument("--seed", type=int, default=0)
@@ -153,7 +154,7 @@ def main() -> None:
         load_state(checkpoint, network, average, optimizer)
         last = json.loads(log.read_text().splitlines()[-1])
         spent, step, scenes = last["minutes"], last["step"], last["scenes"]
-    weights = {"descriptor_weight": options.descriptor_weight, "ranking_weight": options.ranking_weight}
+    weights = {f"{name}_weight": getattr(options, f"{name}_weight") for name in ("descriptor", "ranking", "rivals")}
     validation = Validation(options.validate)
     if step == 0:
         print("MFC, for comparison:", validation(_Grey()))

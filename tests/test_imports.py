@@ -23,7 +23,7 @@ ALLOWED = {
     "metrics": BASE | {"geometry"},
     "synthetic": BASE | {"geometry", "filters", "rendering"},
     "matching": BASE | {"geometry", "filters", "descriptors", "rendering"},
-    "scenes": BASE | {"geometry"},
+    "scenes": BASE | {"geometry", "rendering"},
     "learned": BASE | {"geometry", "filters", "matching", "scenes"},
     "registration": BASE | {"geometry", "filters", "descriptors", "rendering", "matching"},
     "visualization": BASE | {"geometry", "filters", "descriptors", "rendering", "matching", "registration"},

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..data import BOPDataset, Pascal3DPlus
-from ..presets import PRESETS
+from ..presets import DEFAULT, PRESETS
 from .benchmark import Benchmark
 from .bop import BOPBenchmark
 from .loops import evaluate
@@ -61,7 +61,7 @@ def add_datasets(datasets: Any, parents: Sequence[argparse.ArgumentParser]) -> N
             metavar="KEY=VALUE",
             help=f"{PROTOCOL} (default: {Protocol(pose=default)})",
         )
-        parser.add_argument("--preset", choices=sorted(PRESETS), default="default", help="default: default")
+        parser.add_argument("--preset", choices=sorted(PRESETS), default=DEFAULT, help=f"default: {DEFAULT}")
         parser.add_argument("--limit", type=int, metavar="N", help="only N objects, spread evenly over the set")
         parser.add_argument("--overwrite", action="store_true", help="start anew in a folder with other predictions")
         parser.add_argument("--out", type=Path, required=True, metavar="DIR")

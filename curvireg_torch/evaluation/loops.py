@@ -10,7 +10,7 @@ import torch
 
 from .. import __version__
 from .._checks import check_positive
-from ..presets import Preset, preset_named
+from ..presets import DEFAULT, Preset, preset_named
 from .benchmark import Benchmark, Row
 from .predict import predict
 from .store import PredictionStore, to_json, write_text
@@ -26,7 +26,7 @@ def evaluate(
     benchmark: Benchmark,
     out: Path,
     *,
-    preset: str | Preset = "default",
+    preset: str | Preset = DEFAULT,
     limit: int | None = None,
     renderer: str = "auto",
     overwrite: bool = False,

@@ -5,7 +5,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from ..matching import BankSettings, normalized_correlation
+from ..geometry import rotation_from_axis_angle
+from ..matching import BankSettings, ViewDescriber, normalized_correlation
 from ..scenes import GeneratedScenes
 from .network import WORK_SIZE, doubled_angle, halved_angle
 
@@ -17,6 +18,9 @@ SETTINGS = BankSettings(image_size=WORK_SIZE, sigma=0.8)
 TEMPERATURE = 0.05
 """Of the ranking loss: correlations of right and wrong views lie about so far apart."""
 
+RIVALS = 7
+"""Other views of the same object in a lesson."""
+
 
 class Lessons(Dataset[dict[str, Tensor]]):
     """Generated scenes with the right answers.
@@ -26,7 +30,8 @@ class Lessons(Dataset[dict[str, Tensor]]):
 
     Items: ``image`` (3, S, S) uint8; in half precision ``code`` (2, S/2, S/2), the clean depth's field by
     :func:`doubled_angle`, of length about 1 on its edges; ``mask`` (1, S/2, S/2), hidden parts included;
-    ``descriptors`` (2, D) of the field and of its mirror image.
+    ``descriptors`` (2, D) of the field and of its mirror image; ``rivals`` (2, 1 + RIVALS, D) of views of the object as
+    a bank would hold them, the right one first, and of their mirror images.
     """
 
     def __init__(self, scenes: GeneratedScenes) -> None:
@@ -40,15 +45,32 @@ class Lessons(Dataset[dict[str, Tensor]]):
     def __getitem__(self, index: int) -> dict[str, Tensor]:
         sample = self.scenes[index]
         field = self._filter(sample["depth"][None])
-        mirrored = field.flip(3) * torch.tensor([-1.0, 1.0])[:, None, None]
         code = F.avg_pool2d(doubled_angle(field), 2)
         length = code.norm(dim=1)
+        describe = ViewDescriber(self.scenes.shape(index).mesh(), SETTINGS)
+        turns = _rival_turns(torch.Generator().manual_seed(index))
+        views = self._filter(describe.depth(sample["rotation"] @ turns, sample["distance"].expand(len(turns)))[0])
+        both = self._descriptor(torch.cat([field, _mirrored(field), views, _mirrored(views)])).half()
         return {
             "image": (255 * sample["image"]).round().to(torch.uint8),
             "code": (code * length.sum() / (length.square().sum() + 1e-6))[0].half(),
             "mask": F.avg_pool2d((sample["depth"] > 0).half(), 2),
-            "descriptors": self._descriptor(torch.cat([field, mirrored])).half(),
+            "descriptors": both[:2],
+            "rivals": both[2:].unflatten(0, (2, -1)),
         }
+
+
+def _mirrored(field: Tensor) -> Tensor:
+    return field.flip(3) * torch.tensor([-1.0, 1.0])[:, None, None]
+
+
+def _rival_turns(generator: torch.Generator) -> Tensor:
+    """(1 + RIVALS, 3, 3) turns of the model: none, half a turn and a quarter about z, others at random."""
+    z = torch.tensor([0.0, torch.pi, 0.5 * torch.pi, -0.5 * torch.pi])
+    about_z = torch.stack([torch.zeros(4), torch.zeros(4), z], dim=1)
+    angles = torch.deg2rad(20.0 + 60.0 * torch.rand(RIVALS - 3, 1, generator=generator))
+    others = angles * F.normalize(torch.randn(RIVALS - 3, 3, generator=generator), dim=1)
+    return rotation_from_axis_angle(torch.cat([about_z, others]))
 
 
 class Replay:
@@ -89,36 +111,45 @@ def altered(batch: dict[str, Tensor], generator: torch.Generator) -> dict[str, T
     code = torch.where(mirror, batch["code"].flip(3) * torch.tensor([1.0, -1.0])[:, None, None], batch["code"])
     mask = torch.where(mirror, batch["mask"].flip(3), batch["mask"])
     descriptors = torch.where(mirror[:, 0], batch["descriptors"].flip(1), batch["descriptors"])
+    rivals = torch.where(mirror, batch["rivals"].flip(1), batch["rivals"])
     grey = images.mean(dim=1, keepdim=True)
     images = grey + (images - grey) * (1.4 * draw(1, 1, 1))
     images = torch.where(draw(1, 1, 1) < 0.3, images.flip(1), images)
     images = torch.where(draw(1, 1, 1) < 0.1, 1.0 - images, images)
     images = (images - 0.5) * (0.6 + 0.7 * draw(1, 1, 1)) + 0.5 + 0.2 * (draw(3, 1, 1) - 0.5)
     images = images + 0.02 * draw(1, 1, 1) * torch.randn(images.shape, generator=generator)
-    return {"image": images.clamp(0, 1), "code": code, "mask": mask, "descriptors": descriptors}
+    return {"image": images.clamp(0, 1), "code": code, "mask": mask, "descriptors": descriptors, "rivals": rivals}
 
 
 def losses(
-    answer: Tensor, batch: dict[str, Tensor], *, descriptor_weight: float = 1.0, ranking_weight: float = 0.1
+    answer: Tensor,
+    batch: dict[str, Tensor],
+    *,
+    descriptor_weight: float = 1.0,
+    ranking_weight: float = 0.1,
+    rivals_weight: float = 0.2,
 ) -> dict[str, Tensor]:
     """What is to be small, to be added up.
 
     ``field``: squared error of the code, 1 for no field at all; ``mask``: cross entropy; ``descriptor``: one minus the
     correlation with the right view's; ``ranking``: cross entropy of picking the right view among those of the batch and
-    their mirror images.
+    their mirror images; ``rivals``: of picking it among other views of the same object.
 
     Args:
         answer: (B, 3, S/2, S/2) of :class:`FieldNetwork`.
         batch: of :class:`Lessons`, float32.
-        descriptor_weight, ranking_weight: factors of the last two.
+        descriptor_weight, ranking_weight, rivals_weight: factors of the last three.
     """
     code, wanted = answer[:, :2], batch["code"]
     ours = SETTINGS.descriptor()(halved_angle(code))
     similar = normalized_correlation(ours, batch["descriptors"].transpose(0, 1).flatten(0, 1))
     right = torch.arange(len(ours), device=ours.device)
+    views = F.normalize(batch["rivals"][:, 0], dim=2)
+    among_views = (views @ F.normalize(ours, dim=1)[..., None])[..., 0]
     return {
         "field": (code - wanted).square().sum(dim=1).mean() / wanted.square().sum(dim=1).mean(),
         "mask": F.binary_cross_entropy_with_logits(answer[:, 2:], batch["mask"]),
         "descriptor": descriptor_weight * (1.0 - similar.diagonal()).mean(),
         "ranking": ranking_weight * F.cross_entropy(similar / TEMPERATURE, right),
+        "rivals": rivals_weight * F.cross_entropy(among_views / TEMPERATURE, torch.zeros_like(right)),
     }

@@ -19,6 +19,9 @@ __all__ = ["BankSettings", "DescribedViews", "ViewDescriber"]
 
 CAMERAS = ("perspective", "orthographic")
 
+FAR = 20.0
+"""Distances farther away than usual: parallel projection but for a few per mille."""
+
 
 @dataclass(frozen=True)
 class BankSettings:
@@ -94,7 +97,7 @@ class ViewDescriber:
     ) -> None:
         self.settings = settings
         self.centre = mesh_centre(mesh)
-        self._renderer = make_renderer(mesh, renderer, device=device)
+        self.renderer = make_renderer(mesh, renderer, device=device)
         self.hull = extreme_points(mesh)
         self._orthographic = settings.camera == "orthographic"
         self._filter, self._descriptor = settings.depth_filter(), settings.descriptor()
@@ -117,11 +120,32 @@ class ViewDescriber:
         boxes = projected_boxes(self.hull, T, torch.eye(3, dtype=torch.float64), orthographic=self._orthographic)
         return T, crop_transforms(square_boxes(boxes, self.settings.margin), self.settings.image_size), boxes
 
+    def camera_of_box(self, rotation: Tensor, distance: float, box: Tensor) -> tuple[Tensor, Tensor]:
+        """A perspective camera that would see the object, straight ahead, where a photograph's box has it.
+
+        For photographs of unknown cameras. An orthographic describer's camera is one from far away.
+
+        Args:
+            rotation: (3, 3).
+            distance: of the object's centre, in model units.
+            box: (4,) x0, y0, x1, y1 in px of the photograph.
+
+        Returns:
+            T_cam_from_model (4, 4) and camera matrix (3, 3) in px of the photograph, float64.
+        """
+        T, K, _ = self.cameras(rotation[None], torch.tensor([distance], dtype=torch.float64))
+        T, K = T[0].clone(), K[0].clone()
+        if self._orthographic:
+            T[2, 3] += FAR * distance
+            K[:2, :2] *= distance + FAR * distance
+        to_crop = crop_transforms(square_boxes(box.double().cpu(), self.settings.margin), self.settings.image_size)
+        return T, torch.linalg.inv(to_crop) @ K
+
     def depth(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
         """Depth (N, 1, S, S) of the framed views, and their boxes (N, 4)."""
         S = self.settings.image_size
         T, K, boxes = self.cameras(rotations, distances)
-        depth = self._renderer.render(T, K, (S, S), orthographic=self._orthographic)
+        depth = self.renderer.render(T, K, (S, S), orthographic=self._orthographic)
         return depth.to(self._device), boxes.to(self._device)
 
     @torch.no_grad()

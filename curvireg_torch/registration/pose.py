@@ -29,6 +29,11 @@ class Registration:
             without a camera matrix.
         view_distance: of the object's centre in that view, in model units.
         iterations: refinement rounds that were run; 0 without refinement.
+        support: how strongly edges of the photograph lie under the mesh's contours, in [0, 1]; None without the contour
+            stage (:func:`curvireg_torch.registration.fit_contours`).
+        covariance: (6, 6) float64 of turn (rad) about the camera's x, y, z and translation (model units) along them,
+            ``R_true = exp([w]x) R``, ``t_true = t + e``; None without a camera matrix, without the contour stage, and
+            where the contours do not fix the pose.
     """
 
     rotation: Tensor
@@ -40,6 +45,8 @@ class Registration:
     view_rotation: Tensor
     view_distance: float
     iterations: int
+    support: float | None = None
+    covariance: Tensor | None = None
 
     @property
     def reliable(self) -> bool:
@@ -51,6 +58,14 @@ class Registration:
         """Azimuth, elevation, theta of ``rotation`` in degrees (PASCAL3D+)."""
         azimuth, elevation, theta = viewpoint_from_rotation(self.rotation)
         return float(azimuth), float(elevation), float(theta)
+
+    @property
+    def standard_deviations(self) -> tuple[Tensor, Tensor] | None:
+        """(3,) degrees about and (3,) model units along the camera's axes; None without a covariance."""
+        if self.covariance is None:
+            return None
+        deviations = self.covariance.diagonal().sqrt()
+        return torch.rad2deg(deviations[:3]), deviations[3:]
 
     @property
     def transform(self) -> Tensor | None:

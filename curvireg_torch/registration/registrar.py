@@ -8,12 +8,23 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import ImageError, InvalidInputError
-from ..geometry.cameras import check_camera_matrix
+from ..geometry.cameras import check_camera_matrix, rotation_towards
 from ..geometry.mesh import mesh_radius
 from ..geometry.translation import place_view
 from ..geometry.views import ViewSphere, sample_views
-from ..matching import BankSettings, QueryFeatures, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
+from ..matching import (
+    BankCollection,
+    BankSettings,
+    QueryFeatures,
+    Ranking,
+    ViewBank,
+    ViewDescriber,
+    ViewMatcher,
+    cached_bank,
+    normalized_correlation,
+)
 from .confidence import confidence, distinct_views
+from .contour import fit_contours
 from .pose import Registration
 from .refine import RefinedPose, coherent_views, refine_pose
 
@@ -26,14 +37,16 @@ class Registrar:
     """Registers photographs to one mesh.
 
     Each box is cropped, turned into a field and ranked against the bank; coherent views around the best are searched in
-    small steps. With a camera matrix the box then gives the translation.
+    small steps, and the contours of the best are pulled onto the photograph's edges (:func:`fit_contours`). With a
+    camera matrix that yields rotation and translation with their covariance; without, the rotation.
 
     Args:
-        bank_or_mesh: a :class:`ViewBank`, a mesh, or the path of a mesh; for a mesh the bank comes from the disk cache
-            or is built.
+        bank_or_mesh: a :class:`ViewBank`, a :class:`ViewMatcher` of one model's bank, a mesh, or the path of a mesh;
+            for a mesh the bank comes from the disk cache or is built.
         views, settings: of the bank built for a mesh.
-        field: photograph filter, see :class:`ViewMatcher`.
-        refine: run the coarse-to-fine search.
+        field: photograph filter, see :class:`ViewMatcher`; that of a given matcher stays.
+        refine: run the coarse-to-fine search and the contour stage.
+        contours: False leaves out the contour stage; the box then gives the translation.
         renderer: of the views rendered in it.
         top: distinct hypotheses to report.
         symmetries: (S, 4, 4) of the mesh, from :func:`curvireg_torch.geometry.symmetry_transforms`; hypotheses that
@@ -57,26 +70,30 @@ class Registrar:
         settings: BankSettings | None = None,
         field: nn.Module | None = None,
         refine: bool = True,
+        contours: bool = True,
         renderer: str = "auto",
         top: int = 5,
         symmetries: Tensor | None = None,
         progress: bool = False,
     ) -> None:
-        if isinstance(bank_or_mesh, ViewBank):
+        bank = bank_or_mesh.bank if isinstance(bank_or_mesh, ViewMatcher) else bank_or_mesh
+        if isinstance(bank, ViewBank):
             if views is not None or settings is not None:
                 raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
-            self.bank = bank_or_mesh
+        elif isinstance(bank, BankCollection):
+            raise InvalidInputError("Registrar: expected the bank of one model; choose one with BankCollection.locate")
         else:
-            self.bank = cached_bank(
-                bank_or_mesh, views or sample_views(), settings or BankSettings(), progress=progress, renderer=renderer
+            bank = cached_bank(
+                bank, views or sample_views(), settings or BankSettings(), progress=progress, renderer=renderer
             )
-        self.matcher = ViewMatcher(self.bank, field=field)
-        self.refine, self.top, self.symmetries = refine, top, symmetries
+        self.bank: ViewBank = bank
+        self.matcher = bank_or_mesh if isinstance(bank_or_mesh, ViewMatcher) else ViewMatcher(bank, field=field)
+        self.refine, self.contours, self.top = refine, refine and contours, top
+        self.symmetries = symmetries
         self._renderer = renderer
         self._describer: ViewDescriber | None = None
         self.radius = mesh_radius(self.bank.mesh)
-        settings = self.bank.settings
-        self._fine = replace(settings, grid=min(2 * settings.grid, settings.image_size))
+        self._fine = replace(bank.settings, grid=min(2 * bank.settings.grid, bank.settings.image_size))
         self._fine_descriptor = self._fine.descriptor()
 
     @property
@@ -145,11 +162,15 @@ class Registrar:
             trust = confidence(ranking, self.bank.rotations)
             for k in range(len(crops)):
                 K = None if camera_matrices is None else camera_matrices[i + k]
-                results.append(self._register(query[k : k + 1], ranking[k : k + 1], float(trust[k]), boxes[i + k], K))
+                results.append(
+                    self._register(
+                        images[i + k], query[k : k + 1], ranking[k : k + 1], float(trust[k]), boxes[i + k], K
+                    )
+                )
         return results
 
     def _register(
-        self, query: QueryFeatures, ranking: Ranking, trust: float, box: Tensor, K: Tensor | None
+        self, image: Tensor, query: QueryFeatures, ranking: Ranking, trust: float, box: Tensor, K: Tensor | None
     ) -> Registration:
         bank, order = self.bank, ranking.order[0]
         best = int(order[0])
@@ -161,7 +182,7 @@ class Registrar:
         rotation, translation = pose.rotation, None
         if K is not None:
             rotation, translation = place_view(self.describe.hull, pose.rotation, box, K)
-        return Registration(
+        result = Registration(
             rotation=rotation,
             translation=translation,
             score=pose.score,
@@ -171,4 +192,41 @@ class Registrar:
             view_rotation=pose.rotation,
             view_distance=pose.distance,
             iterations=pose.iterations,
+        )
+        return self._follow_contours(result, image, query, box, K) if self.contours else result
+
+    def _follow_contours(
+        self, result: Registration, image: Tensor, query: QueryFeatures, box: Tensor, K: Tensor | None
+    ) -> Registration:
+        """``result`` with the pose that :func:`fit_contours` finds from it."""
+        describe, margin = self.describe, self.bank.settings.margin
+        if K is not None and result.transform is not None:
+            start, camera = result.transform, K
+        else:
+            start, camera = describe.camera_of_box(result.view_rotation, result.view_distance, box)
+        fit = fit_contours(
+            describe.renderer,
+            image,
+            box,
+            camera,
+            start[None],
+            centre=describe.centre,
+            radius=self.radius,
+            margin=margin,
+        )
+        R, t = fit.transform[0, :3, :3], fit.transform[0, :3, 3]
+        position = R @ describe.centre + t
+        view_rotation, view_distance = rotation_towards(position).T @ R, float(torch.linalg.vector_norm(position))
+        covariance = fit.covariance[0] if K is not None and bool(fit.covariance[0].isfinite().all()) else None
+        views = describe(view_rotation[None], torch.tensor([view_distance], dtype=torch.float64))
+        similarity = normalized_correlation(self._fine_descriptor(query.field), views.descriptors)
+        return replace(
+            result,
+            rotation=R if K is not None else view_rotation,
+            translation=t if K is not None else None,
+            score=float(similarity),
+            view_rotation=view_rotation,
+            view_distance=view_distance,
+            support=float(fit.support[0]),
+            covariance=covariance,
         )

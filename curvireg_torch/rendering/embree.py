@@ -13,12 +13,43 @@ from torch import Tensor
 from ..geometry.mesh import box_corners, extreme_points, mesh_centre, mesh_radius
 from .base import NEAREST, check_render_arguments
 
-__all__ = ["EmbreeRenderer"]
+__all__ = ["EmbreeRenderer", "RayScene"]
 
 _MISS = 1e30  # embreex returns 1e37 where a ray hits nothing
 _HULL = 200_000  # vertices up to which a convex hull takes less time than it saves
 _OUTLINE = 4096  # points of a convex hull that are worth projecting in every view
 _DRAWABLE = 16000  # px, as far as OpenCV draws polygons
+
+
+class RayScene:
+    """Triangles that rays are cast at.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3).
+    """
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        self._scene = EmbreeScene()
+        TriangleMesh(scene=self._scene, vertices=vertices.astype(np.float32), indices=np.asarray(faces, np.int32))
+
+    def distance(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """(N,) lengths along (N, 3) rays to what they hit first, in units of the directions; inf for nothing."""
+        along = self._scene.run(_float32(origins), _float32(directions), query="DISTANCE")
+        return np.where(along < _MISS, along, np.inf)
+
+    def hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """:meth:`distance`, the triangle hit (N,), and its normal (N, 3), neither of unit length nor of known sign."""
+        found = self._scene.run(_float32(origins), _float32(directions), query="INTERSECT", output=True)
+        return np.where(found["tfar"] < _MISS, found["tfar"], np.inf), found["primID"], found["Ng"]
+
+    def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """(N,) bool: whether rays hit anything."""
+        return np.asarray(self._scene.run(_float32(origins), _float32(directions), query="OCCLUDED") >= 0)
+
+
+def _float32(x: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(x, np.float32)
 
 
 class EmbreeRenderer:
@@ -37,8 +68,7 @@ class EmbreeRenderer:
         outline = extreme_points(mesh) if len(vertices) <= _HULL else box_corners(mesh)
         outline = outline if len(outline) <= _OUTLINE else box_corners(mesh)
         self._outline = (outline.numpy() - self._centre) / self._radius
-        self._scene = EmbreeScene()
-        TriangleMesh(scene=self._scene, vertices=vertices.astype(np.float32), indices=np.asarray(mesh.faces, np.int32))
+        self._scene = RayScene(vertices, mesh.faces)
 
     def render(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
@@ -70,10 +100,8 @@ class EmbreeRenderer:
         else:
             directions = np.stack([x, y], 1) @ R[:2] + R[2]
             starts = near * directions - R.T @ t
-        along = self._scene.run(
-            np.ascontiguousarray(starts, np.float32), np.ascontiguousarray(directions, np.float32), query="DISTANCE"
-        )
-        out[v, u] = np.where(along < _MISS, (along + near) * self._radius, 0.0)
+        along = self._scene.distance(starts, directions)
+        out[v, u] = np.where(np.isfinite(along), (along + near) * self._radius, 0.0)
 
     def _pixels(
         self, outline: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool

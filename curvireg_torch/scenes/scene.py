@@ -5,19 +5,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 
 from ..geometry.crops import crop_transforms, square_boxes
 from ..geometry.viewpoint import rotation_from_viewpoint
+from ..rendering.embree import RayScene
 from .camera_noise import photographed
 from .materials import Material, random_colour, random_picture
 from .shapes import Shape
 from .surfaces import Array
 
 __all__ = ["Scene", "make_scene"]
-
-_MISS = 1e30
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,8 @@ def make_scene(
     centre = np.array([0.0, 0.0, distance])
     placed = shape.vertices @ R.T + centre
     K, cut = _crop_camera(placed, rng, size, margin)
-    depth = _cast(_trace(placed, shape.faces), *_rays(K, size))[0].reshape(size, size)
+    alone = RayScene(placed, shape.faces).distance(*_rays(K, size)).reshape(size, size)
+    depth = np.where(np.isfinite(alone), alone, 0.0).astype(np.float32)
 
     things = [(placed, shape.faces, shape.materials, 0)]
     floor = float((shape.vertices[:, 2]).min())
@@ -118,18 +116,6 @@ def _rays(K: Array, size: int) -> tuple[Array, Array]:
     v, u = np.mgrid[0:size, 0:size].reshape(2, -1)
     directions = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(len(u))], -1).astype(np.float32)
     return np.zeros_like(directions), directions
-
-
-def _trace(vertices: Array, faces: Array) -> EmbreeScene:
-    scene = EmbreeScene()
-    TriangleMesh(scene=scene, vertices=vertices.astype(np.float32), indices=faces.astype(np.int32))
-    return scene
-
-
-def _cast(scene: EmbreeScene, origins: Array, directions: Array) -> tuple[Array, Array, Array]:
-    """Distance along each ray (0 = none), triangle and its normal."""
-    hits = scene.run(origins, directions, query="INTERSECT", output=True)
-    return np.where(hits["tfar"] < _MISS, hits["tfar"], 0.0), hits["primID"], hits["Ng"]
 
 
 def _beside(
@@ -187,9 +173,9 @@ def _render(
     faces = np.concatenate([t[1] + k for t, k in zip(things, first, strict=True)])
     owner = np.concatenate([np.full(len(t[1]), k) for k, t in enumerate(things)])
     material = np.concatenate([t[2] for t in things])
-    scene = _trace(vertices, faces)
-    depth, triangle, normal = _cast(scene, *rays)
-    hit = np.flatnonzero(depth > 0)
+    scene = RayScene(vertices, faces)
+    depth, triangle, normal = scene.hits(*rays)
+    hit = np.flatnonzero(np.isfinite(depth))
     points = rays[1][hit] * depth[hit, None]
     normal = normal[hit] / (np.linalg.norm(normal[hit], axis=1, keepdims=True) + 1e-12)
     view = -points / np.linalg.norm(points, axis=1, keepdims=True)
@@ -212,7 +198,7 @@ def _render(
     seen.reshape(-1)[hit] = owner[triangle] == 0
     if rng.random() < 0.35:  # depth of field: what is farther off is blurred
         sigma = rng.uniform(0.7, 4.0)
-        near = ((depth > 0) & (depth < centre[2] + 1.0)).astype(np.float32).reshape(size, size)
+        near = (depth < centre[2] + 1.0).astype(np.float32).reshape(size, size)
         share = cv2.GaussianBlur(near, (0, 0), 0.6)[..., None]
         blurred = cv2.GaussianBlur(picture * (1.0 - near[..., None]), (0, 0), sigma)
         weight = cv2.GaussianBlur(1.0 - near, (0, 0), sigma)[..., None]
@@ -221,7 +207,7 @@ def _render(
 
 
 def _lighting(
-    scene: EmbreeScene,
+    scene: RayScene,
     points: Array,
     normal: Array,
     view: Array,
@@ -241,10 +227,9 @@ def _lighting(
         power = rng.uniform(0.2, 1.0) * (1 + rng.normal(0, 0.08, 3))
         facing = np.maximum(normal @ towards, 0)
         if rng.random() < 0.6:
-            start = (points + 2e-3 * points[:, 2:].mean() * normal).astype(np.float32)
-            directions = np.broadcast_to(towards.astype(np.float32), start.shape)
-            blocked = scene.run(start, np.ascontiguousarray(directions), query="OCCLUDED")
-            facing = facing * np.where(blocked >= 0, 0.1, 1.0)
+            start = points + 2e-3 * points[:, 2:].mean() * normal
+            blocked = scene.blocked(start, np.broadcast_to(towards, start.shape))
+            facing = facing * np.where(blocked, 0.1, 1.0)
         half = view + towards
         half /= np.linalg.norm(half, axis=1, keepdims=True) + 1e-9
         shine = gloss * np.maximum((normal * half).sum(axis=1), 0) ** shininess * (facing > 0)

@@ -1,0 +1,155 @@
+"""The two sides of the contour stage: contours of a rendered mesh as 3D points, and a photograph's edges."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..descriptors import field_points
+from ..filters import depth_curvilinear_saliency, gaussian_smooth
+from ..filters.curvilinear import fill_depth
+from ..filters.derivatives import central_gradient
+
+__all__ = ["ContourPoints", "EdgeField", "contour_points"]
+
+OCCLUDING, CREASES = 256, 128
+"""Points per view: about every second pixel of an object that fills a crop of 128 px, every fourth at 256 px."""
+
+JUMP = 0.05
+"""Object radii by which depth jumps at an occluding contour."""
+
+CREASE_SHARE = 0.02
+"""Share of the pixels that may be creases."""
+
+AGREEMENT = 4
+"""Power of the cosine between normal and gradient: halves an edge's strength at 33 degrees."""
+
+
+@dataclass(frozen=True)
+class ContourPoints:
+    """Points on the contours of N views.
+
+    Attributes:
+        model: (N, P, 3) float64 in model units, always on the nearer surface.
+        normals: (N, P, 2) float64 unit vectors across the contour in the image, sign free.
+        valid: (N, P) bool; the rest is padding.
+    """
+
+    model: Tensor
+    normals: Tensor
+    valid: Tensor
+
+
+def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tensor, *, radius: float) -> ContourPoints:
+    """Occluding contours and creases of depth views, back-projected onto the mesh.
+
+    An occluding contour lies between two neighbouring pixels whose depth jumps (curvilinear saliency peaks on both
+    sides of a jump, never on it): half way between them on average, at the depth of the nearer one. Creases are maxima
+    of :func:`depth_curvilinear_saliency` away from jumps. Of each kind a fixed random sample is kept.
+
+    Args:
+        depth: (N, 1, H, W) z-depth, 0 = background.
+        T_cam_from_model: (N, 4, 4) float64.
+        camera_matrix: (3, 3) float64.
+        radius: of the object, in model units.
+
+    Example:
+        >>> depth = torch.zeros(1, 1, 32, 32)
+        >>> depth[..., 8:24, 8:24] = 5.0                                            # a square, 16 px wide
+        >>> K = torch.tensor([[32.0, 0, 15.5], [0, 32.0, 15.5], [0, 0, 1]], dtype=torch.float64)
+        >>> points = contour_points(depth, torch.eye(4, dtype=torch.float64)[None], K, radius=1.0)
+        >>> int(points.valid.sum()), points.model[points.valid][:, :2].abs().amax(dim=1).unique().tolist()
+        (64, [1.25])
+    """
+    H, W = depth.shape[-2:]
+    seen = depth > 0
+    z = torch.where(seen, depth, depth.amax(dim=(1, 2, 3), keepdim=True) + 4.0 * radius)
+    slope = torch.cat(central_gradient(gaussian_smooth(fill_depth(depth, None, None), 1.0)), dim=1)
+    v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in (H, W)), indexing="ij")
+    pixels = torch.stack([u, v], dim=-1)
+    beside = torch.zeros_like(seen)
+    pairs: list[tuple[Tensor, ...]] = []
+    for dim in (-1, -2):
+        a, b = _ends(z, dim)
+        step = (b - a).abs()
+        # What exceeds the steps before and behind is no steep face.
+        first, last = step.narrow(dim, 0, 1), step.narrow(dim, step.shape[dim] - 1, 1)
+        around = torch.cat([first, step, last], dim=dim)
+        usual = torch.minimum(around.narrow(dim, 0, step.shape[dim]), around.narrow(dim, 2, step.shape[dim]))
+        jump = step - usual > JUMP * radius
+        pads = ((0, 1), (1, 0)) if dim == -1 else ((0, 0, 0, 1), (0, 0, 1, 0))
+        beside |= F.pad(jump, pads[0]) | F.pad(jump, pads[1])
+        pairs.append((jump, _middle(pixels, dim - 1).reshape(-1, 2), torch.minimum(a, b), _middle(slope, dim)))
+    places, counts = torch.cat([p[1] for p in pairs]), (OCCLUDING, CREASES)
+    jumps, depths, normals = (torch.cat([p[i].flatten(2) for p in pairs], dim=2) for i in (0, 2, 3))
+    field = depth_curvilinear_saliency(depth)
+    field = torch.where(F.max_pool2d(beside.float(), 7, 1, 3) > 0, 0.0, field)
+    creases = field_points(field, share=CREASE_SHARE) & seen
+    kinds = (
+        (jumps, places, depths, normals),
+        (creases.flatten(2), pixels.view(-1, 2), depth.flatten(2), field.flatten(2)),
+    )
+    samples = [_sample(*kind, count) for kind, count in zip(kinds, counts, strict=True)]
+    uv, z, n, valid = (torch.cat(parts, dim=1) for parts in zip(*samples, strict=True))
+    rays = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1) @ torch.linalg.inv(camera_matrix).T
+    model = (rays * z[..., None] - T_cam_from_model[:, None, :3, 3]) @ T_cam_from_model[:, :3, :3]
+    length = torch.linalg.vector_norm(n, dim=-1)
+    return ContourPoints(model, n / length.clamp(min=1e-12)[..., None], valid & (length > 0))
+
+
+def _ends(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    """All but the last, and all but the first along ``dim``."""
+    n = x.shape[dim] - 1
+    return x.narrow(dim, 0, n), x.narrow(dim, 1, n)
+
+
+def _middle(x: Tensor, dim: int) -> Tensor:
+    a, b = _ends(x, dim)
+    return 0.5 * (a + b)
+
+
+def _sample(found: Tensor, places: Tensor, depths: Tensor, normals: Tensor, count: int) -> tuple[Tensor, ...]:
+    """``count`` of the found ones of M places: uv (N, P, 2), depth (N, P), normal (N, P, 2), valid (N, P)."""
+    keys = torch.rand(len(places), generator=torch.Generator().manual_seed(0))
+    best, index = torch.where(found[:, 0], keys, -1.0).topk(min(count, len(places)), dim=1)
+    chosen = normals.gather(2, index[:, None].expand(-1, 2, -1)).mT
+    return places[index], depths[:, 0].gather(1, index).double(), chosen.double(), best >= 0
+
+
+class EdgeField:
+    """Edges of one photograph crop, to be looked for along normals.
+
+    Args:
+        crop: (1, C, S, S), C = 1 or 3, in [0, 1]. With colours the strongest channel counts.
+    """
+
+    def __init__(self, crop: Tensor) -> None:
+        gx, gy = central_gradient(gaussian_smooth(crop, 1.0))
+        self._gradient = torch.stack([gx, gy], dim=2).flatten(1, 2)
+        self._level = self._gradient.square().sum(dim=1).mean().sqrt().clamp(min=1e-6)
+
+    def strength(self, uv: Tensor, normals: Tensor, offsets: Tensor) -> Tensor:
+        """How strongly the picture changes across a contour at places beside it.
+
+        With g the gradient and c = |n . g| / |g|, r = |n . g| c^4 is compared with the crop's mean gradient m: the
+        strength is r / (r + m). Outside the crop it is 0.
+
+        Args:
+            uv, normals: (N, P, 2) pixels of the crop, and unit vectors.
+            offsets: (L,) px along the normals.
+
+        Returns:
+            (N, P, L) float64 in [0, 1).
+        """
+        S = self._gradient.shape[-1]
+        grid = (2.0 * (uv[:, :, None] + offsets[:, None] * normals[:, :, None]) + 1.0) / S - 1.0
+        gradient = F.grid_sample(
+            self._gradient.expand(len(uv), -1, -1, -1), grid.to(self._gradient.dtype), align_corners=False
+        )
+        gx, gy = gradient[:, 0::2], gradient[:, 1::2]
+        nx, ny = normals.to(gx.dtype)[:, None, :, None].unbind(-1)
+        across = (gx * nx + gy * ny).abs()
+        cosine = across * (gx * gx + gy * gy).clamp(min=1e-20).rsqrt()
+        r = (across * cosine**AGREEMENT).amax(dim=1)
+        return (r / (r + self._level)).double()
