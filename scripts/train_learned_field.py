@@ -129,7 +129,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=90.0, help="training time, over all starts (default 90)")
     parser.add_argument("--batch", type=int, default=32, help="scenes in a step (default 32)")
     parser.add_argument("--fresh", type=int, default=8, help="of them new ones (default 8)")
-    parser.add_argument("--replay", type=int, default=15_000, help="scenes kept in memory, 140 kB each (default 15000)")
+    parser.add_argument("--replay", type=int, default=15_000, help="scenes kept in memory, 100 kB each (default 15000)")
     parser.add_argument("--workers", type=int, default=1, help="processes that generate scenes (default 1)")
     parser.add_argument("--rate", type=float, default=3e-3, help="highest learning rate (default 3e-3)")
     parser.add_argument("--descriptor-weight", type=float, default=1.0, help="of the descriptor's loss (default 1)")

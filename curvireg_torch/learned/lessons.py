@@ -10,7 +10,7 @@ from ..matching import BankSettings, ViewDescriber, normalized_correlation
 from ..scenes import GeneratedScenes
 from .network import WORK_SIZE, doubled_angle, halved_angle
 
-__all__ = ["SETTINGS", "Lessons", "Replay", "altered", "losses"]
+__all__ = ["SETTINGS", "Lessons", "Replay", "altered", "losses", "mirrored_descriptors"]
 
 SETTINGS = BankSettings(image_size=WORK_SIZE, sigma=0.8)
 """Of the depth views that the network is to imitate."""
@@ -18,7 +18,7 @@ SETTINGS = BankSettings(image_size=WORK_SIZE, sigma=0.8)
 TEMPERATURE = 0.05
 """Of the ranking loss: correlations of right and wrong views lie about so far apart."""
 
-RIVALS = 7
+RIVALS = 5
 """Other views of the same object in a lesson."""
 
 
@@ -30,8 +30,8 @@ class Lessons(Dataset[dict[str, Tensor]]):
 
     Items: ``image`` (3, S, S) uint8; in half precision ``code`` (2, S/2, S/2), the clean depth's field by
     :func:`doubled_angle`, of length about 1 on its edges; ``mask`` (1, S/2, S/2), hidden parts included;
-    ``descriptors`` (2, D) of the field and of its mirror image; ``rivals`` (2, 1 + RIVALS, D) of views of the object as
-    a bank would hold them, the right one first, and of their mirror images.
+    ``descriptors`` (2 + RIVALS, D) of that field, and of views of the object as a bank would hold them, the right one
+    first.
     """
 
     def __init__(self, scenes: GeneratedScenes) -> None:
@@ -50,18 +50,28 @@ class Lessons(Dataset[dict[str, Tensor]]):
         describe = ViewDescriber(self.scenes.shape(index).mesh(), SETTINGS)
         turns = _rival_turns(torch.Generator().manual_seed(index))
         views = self._filter(describe.depth(sample["rotation"] @ turns, sample["distance"].expand(len(turns)))[0])
-        both = self._descriptor(torch.cat([field, _mirrored(field), views, _mirrored(views)])).half()
         return {
             "image": (255 * sample["image"]).round().to(torch.uint8),
             "code": (code * length.sum() / (length.square().sum() + 1e-6))[0].half(),
             "mask": F.avg_pool2d((sample["depth"] > 0).half(), 2),
-            "descriptors": both[:2],
-            "rivals": both[2:].unflatten(0, (2, -1)),
+            "descriptors": self._descriptor(torch.cat([field, views])).half(),
         }
 
 
-def _mirrored(field: Tensor) -> Tensor:
-    return field.flip(3) * torch.tensor([-1.0, 1.0])[:, None, None]
+def mirrored_descriptors(descriptors: Tensor) -> Tensor:
+    """(..., D) descriptors of the mirror images: blocks, cells and bins change sides.
+
+    Example:
+        >>> field = torch.randn(1, 2, 128, 128)
+        >>> mirror = field.flip(3) * torch.tensor([-1.0, 1.0])[:, None, None]
+        >>> hog = SETTINGS.descriptor()
+        >>> torch.allclose(hog(mirror), mirrored_descriptors(hog(field)), atol=1e-5)
+        True
+    """
+    blocks = SETTINGS.grid - SETTINGS.block + 1
+    layout = (blocks, blocks, SETTINGS.block, SETTINGS.block, SETTINGS.bins)
+    mirrored: Tensor = descriptors.unflatten(-1, layout).flip((-4, -2, -1)).flatten(-5)
+    return mirrored
 
 
 def _rival_turns(generator: torch.Generator) -> Tensor:
@@ -110,15 +120,14 @@ def altered(batch: dict[str, Tensor], generator: torch.Generator) -> dict[str, T
     images = torch.where(mirror, images.flip(3), images)
     code = torch.where(mirror, batch["code"].flip(3) * torch.tensor([1.0, -1.0])[:, None, None], batch["code"])
     mask = torch.where(mirror, batch["mask"].flip(3), batch["mask"])
-    descriptors = torch.where(mirror[:, 0], batch["descriptors"].flip(1), batch["descriptors"])
-    rivals = torch.where(mirror, batch["rivals"].flip(1), batch["rivals"])
+    descriptors = torch.where(mirror[:, 0], mirrored_descriptors(batch["descriptors"]), batch["descriptors"])
     grey = images.mean(dim=1, keepdim=True)
     images = grey + (images - grey) * (1.4 * draw(1, 1, 1))
     images = torch.where(draw(1, 1, 1) < 0.3, images.flip(1), images)
     images = torch.where(draw(1, 1, 1) < 0.1, 1.0 - images, images)
     images = (images - 0.5) * (0.6 + 0.7 * draw(1, 1, 1)) + 0.5 + 0.2 * (draw(3, 1, 1) - 0.5)
     images = images + 0.02 * draw(1, 1, 1) * torch.randn(images.shape, generator=generator)
-    return {"image": images.clamp(0, 1), "code": code, "mask": mask, "descriptors": descriptors, "rivals": rivals}
+    return {"image": images.clamp(0, 1), "code": code, "mask": mask, "descriptors": descriptors}
 
 
 def losses(
@@ -142,9 +151,10 @@ def losses(
     """
     code, wanted = answer[:, :2], batch["code"]
     ours = SETTINGS.descriptor()(halved_angle(code))
-    similar = normalized_correlation(ours, batch["descriptors"].transpose(0, 1).flatten(0, 1))
+    own = batch["descriptors"][:, 0]
+    similar = normalized_correlation(ours, torch.cat([own, mirrored_descriptors(own)]))
     right = torch.arange(len(ours), device=ours.device)
-    views = F.normalize(batch["rivals"][:, 0], dim=2)
+    views = F.normalize(batch["descriptors"][:, 1:], dim=2)
     among_views = (views @ F.normalize(ours, dim=1)[..., None])[..., 0]
     return {
         "field": (code - wanted).square().sum(dim=1).mean() / wanted.square().sum(dim=1).mean(),

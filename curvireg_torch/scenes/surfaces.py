@@ -38,8 +38,9 @@ def _grid(points: Array, *, close: bool = True, caps: bool = True) -> Surface:
     if caps and close:
         ring = np.arange(n)
         middles = points[[0, -1]].mean(axis=1)
-        for k, row in enumerate((0, (m - 1) * n)):
-            faces.append(np.stack([row + ring, row + (ring + 1) % n, np.full(n, m * n + k)], -1))
+        following, last = (ring + 1) % n, (m - 1) * n
+        faces.append(np.stack([following, ring, np.full(n, m * n)], -1))
+        faces.append(np.stack([last + ring, last + following, np.full(n, m * n + 1)], -1))
         vertices = np.concatenate([vertices, middles])
     return Surface(vertices, np.concatenate(faces))
 

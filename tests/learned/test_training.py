@@ -79,7 +79,7 @@ def test_a_few_steps_lower_the_loss(batch):
     for _ in range(25):
         parts = losses(network(batch["image"]), batch)
         loss = torch.stack(list(parts.values())).sum()
-        history.append(float(loss))
+        history.append(float(loss.detach()))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
