@@ -6,7 +6,7 @@ from torch import Tensor
 
 from .._checks import check_image, check_positive
 from ..descriptors.points import strongest_points
-from ..filters.derivatives import at_least_float32, central_hessian, gaussian_smooth, replicate_pad, safe_sqrt
+from ..filters.derivatives import at_least_float32, central_hessian, replicate_pad, safe_sqrt, smooth
 from .base import Detection, from_field, grey_bytes
 
 
@@ -33,7 +33,7 @@ def laplacian_of_gaussian(image: Tensor, *, sigma: float = 2.0, share: float = 0
     """
     check_image(image)
     check_positive(sigma, "sigma")
-    xx, yy, _ = central_hessian(gaussian_smooth(at_least_float32(image), sigma))
+    xx, yy, _ = central_hessian(smooth(at_least_float32(image), sigma))
     laplacian = xx + yy
     response = torch.zeros_like(laplacian)
     for dim in (-1, -2):
@@ -56,9 +56,9 @@ def canny(image: Tensor, *, sigma: float = 1.4, edges: float = 0.3, share: float
     responses, points = [], []
     for grey in grey_bytes(image):
         # Derivatives as whole numbers of 16 bit, as cv2.Canny wants them, 32 times finer than a grey level.
-        smooth = cv2.GaussianBlur(grey.numpy().astype("float32"), (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+        blurred = cv2.GaussianBlur(grey.numpy().astype("float32"), (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
         dx, dy = (
-            cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, borderType=cv2.BORDER_REPLICATE)
+            cv2.Sobel(blurred, cv2.CV_32F, *order, ksize=3, borderType=cv2.BORDER_REPLICATE)
             for order in ((1, 0), (0, 1))
         )
         length = safe_sqrt(torch.from_numpy(dx) ** 2 + torch.from_numpy(dy) ** 2)

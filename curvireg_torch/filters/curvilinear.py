@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .._checks import check_image, check_mask, check_option, check_positive
-from .derivatives import at_least_float32, gaussian_smooth, image_gradient, in_blocks, replicate_pad, safe_sqrt
+from .derivatives import at_least_float32, central_gradient, central_hessian, image_gradient, in_blocks, safe_sqrt, smooth, vector_field
 from .learnable import as_number, parameter_if
 
 __all__ = [
@@ -23,33 +23,32 @@ BACKGROUND = 1.25
 FORMULAS = ("geometric", "paper")
 
 
-def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Visible pixels (bool), depth with 0 elsewhere, and each image's nearest depth and range, (B, 1, 1, 1).
+def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Depth with missing pixels at the largest number, and each image's nearest depth and range, (B, 1, 1, 1).
 
     Missing is 0 or negative, inf, NaN, or outside ``mask``. A range of zero counts as 1.
     """
-    visible = (depth > 0) & (depth < math.inf)  # false for NaN
+    visible = depth < math.inf  # false for NaN
     if mask is not None:
         visible = visible & mask
     clean = torch.where(visible, depth, 0.0)
-    near = torch.where(visible, depth, torch.finfo(depth.dtype).max).amin(dim=(1, 2, 3), keepdim=True)
     far = clean.amax(dim=(1, 2, 3), keepdim=True)
+    surface = F.threshold(clean, 0.0, torch.finfo(depth.dtype).max)
     # An empty image has no depth at all, a fronto-parallel plane no range.
-    near = torch.where(far > 0, near, 1.0)
+    near = torch.where(far > 0, surface.amin(dim=(1, 2, 3), keepdim=True), 1.0)
     span = far - near
-    return visible, clean, near, torch.where(span > 0, span, 1.0)
+    return surface, near, torch.where(span > 0, span, 1.0)
 
 
 def fill_depth(depth: Tensor, mask: Tensor | None, depth_scale: float | None) -> Tensor:
     """Depth as a graph surface over the image: nearest visible point at 0, missing pixels at ``BACKGROUND`` ranges.
 
     With ``depth_scale=None`` the visible range becomes 1; a number multiplies the depth instead. An image with no
-    visible
-    pixel becomes a constant.
+    visible pixel becomes a constant.
     """
-    visible, clean, near, span = visible_range(depth, mask)
-    scale = 1.0 / span if depth_scale is None else torch.full_like(span, depth_scale)
-    return torch.where(visible, (clean - near) * scale, BACKGROUND * span * scale)
+    surface, near, span = visible_range(depth, mask)
+    scale = 1.0 / span if depth_scale is None else depth_scale
+    return torch.minimum(surface - near, BACKGROUND * span) * scale
 
 
 def depth_curvilinear_saliency(
@@ -95,7 +94,7 @@ def depth_curvilinear_saliency(
     check_option(formula, FORMULAS, "formula")
 
     def layer(depth: Tensor, mask: Tensor | None) -> Tensor:
-        return _graph_saliency(gaussian_smooth(fill_depth(depth, mask, depth_scale), sigma), formula)
+        return _graph_saliency(smooth(fill_depth(depth, mask, depth_scale), sigma), formula)
 
     return in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
 
@@ -109,43 +108,24 @@ def check_depth(depth: Tensor, mask: Tensor | None, depth_scale: float | None = 
 
 
 def _graph_saliency(z: Tensor, formula: str) -> Tensor:
-    """CS of the graph surface z.
-
-    Computed on the padded images laid end to end, where a neighbour is a shift: every intermediate is then one
-        contiguous
-    run, and the compiler makes one loop of all of them. What the shifts mix across borders lies in the padding and is
-    cut.
-    """
-    B, _, H, W = z.shape
-    if B == 0:
-        return z.expand(0, 2, H, W)
-    padded = replicate_pad(z, 1).reshape(-1)
-    width = W + 2
-    inner = padded.numel() - 2 * (width + 1)
-
-    def at(dy: int, dx: int) -> Tensor:
-        return padded.narrow(0, width + 1 + dy * width + dx, inner)
-
-    def cut(flat: Tensor) -> Tensor:
-        return F.pad(flat, (0, 2 * (width + 1))).view(B, 1, H + 2, width)[..., :H, :W]
-
-    left, right, up, down = at(0, -1), at(0, 1), at(-1, 0), at(1, 0)
-    zx, zy = 0.5 * (right - left), 0.5 * (down - up)
-    zxx, zyy = torch.sub(right + left, at(0, 0), alpha=2), torch.sub(down + up, at(0, 0), alpha=2)
-    zxy = 0.25 * ((at(1, 1) - at(1, -1)) - (at(-1, 1) - at(-1, -1)))
-    # I_P = [[E, F], [F, G]] and M = adj(I_P) H_Z.
-    metric_e, metric_f, metric_g = zx * zx + 1.0, zx * zy, zy * zy + 1.0
-    m11 = torch.addcmul(metric_g * zxx, metric_f, zxy, value=-1)
-    m12 = torch.addcmul(metric_g * zxy, metric_f, zyy, value=-1)
-    m21 = torch.addcmul(metric_e * zxy, metric_f, zxx, value=-1)
-    m22 = torch.addcmul(metric_e * zyy, metric_f, zxy, value=-1)
-    vx, vy, root = dominant_eigenvector(m11, m12, m21, m22)
+    """CS of the graph surface z, which has a margin of 1 px."""
+    zx, zy = central_gradient(z)
+    zxx, zyy, zxy = central_hessian(z)
+    # M = adj(I_P) H_Z = H_Z + (z_y, -z_x)^T (u, -v).
+    u, v = torch.addcmul(zy * zxx, zx, zxy, value=-1), torch.addcmul(zx * zyy, zy, zxy, value=-1)
+    vx, vy, root = dominant_eigenvector(
+        torch.addcmul(zxx, zy, u),
+        torch.addcmul(zxy, zy, v, value=-1),
+        torch.addcmul(zxy, zx, u, value=-1),
+        torch.addcmul(zyy, zx, v),
+    )
+    squared = torch.addcmul(zx * zx, zy, zy)
     if formula == "geometric":
-        alpha = torch.addcmul(metric_e, zy, zy).rsqrt()
+        alpha = (squared + 1.0).rsqrt()
         length = alpha * alpha * alpha * root
     else:
-        length = safe_sqrt(zx * zx + zy * zy) * root
-    return torch.cat([cut(vx * length), cut(vy * length)], dim=1)
+        length = safe_sqrt(squared) * root
+    return vector_field(vx * length, vy * length)
 
 
 def dominant_eigenvector(m11: Tensor, m12: Tensor, m21: Tensor, m22: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -156,15 +136,17 @@ def dominant_eigenvector(m11: Tensor, m12: Tensor, m21: Tensor, m22: Tensor) -> 
     gap, trace = m11 - m22, m11 + m22
     # tr^2 - 4 det, in the form that does not cancel.
     root = safe_sqrt(torch.addcmul(gap * gap, m12, m21, value=4.0))
-    # (lambda - m22, m21) and (m12, lambda - m11) are both eigenvectors: take the one that does not cancel.
-    first = (gap >= 0) == (trace >= 0)
-    main = torch.where(trace >= 0, gap.abs() + root, -(gap.abs() + root))
-    side = 2.0 * torch.where(first, m21, m12)
+    # Signs times (lambda - m22, m21) and (m12, lambda - m11) are both eigenvectors: take the one that does not cancel.
+    # Selections by arithmetic: torch.where on a CPU costs as much as some thirty additions.
+    half = torch.full((), 0.5, dtype=gap.dtype, device=gap.device)
+    first = torch.copysign(half, gap * trace) + 0.5
+    main = gap.abs() + root
+    side = torch.lerp(m12, m21, first) * torch.copysign(4.0 * half, trace)
     squared = torch.addcmul(main * main, side, side)
     # The floor keeps the cube in rsqrt's derivative finite.
     scale = squared.clamp(min=torch.finfo(squared.dtype).tiny ** 0.6).rsqrt()
     main, side = main * scale, side * scale
-    return torch.where(first, main, side), torch.where(first, side, main), root
+    return torch.lerp(side, main, first), torch.lerp(main, side, first), root
 
 
 def unit_vector(vx: Tensor, vy: Tensor) -> Tensor:

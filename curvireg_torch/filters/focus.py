@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from .._checks import check_image, check_option, check_positive
 from ..errors import InvalidInputError
 from .curvilinear import unit_vector
-from .derivatives import at_least_float32, central_gradient, gaussian_smooth, image_maximum, in_blocks, safe_sqrt
+from .derivatives import at_least_float32, central_gradient, gaussian_smooth, image_maximum, in_blocks, safe_sqrt, smooth
 from .learnable import as_number, parameter_if
 
 __all__ = ["EdgeBlur", "MultiScaleFocusCurves", "edge_blur", "multiscale_focus_curves"]
@@ -68,7 +68,7 @@ def edge_blur(
     check_option(mode, MODES, "mode")
 
     def layer(x: Tensor) -> Tensor:
-        gx, gy = central_gradient(x)
+        gx, gy = central_gradient(smooth(x, 0.0))
         return _edge_blur(x, gx * gx + gy * gy, reblur_sigmas, mode)
 
     return in_blocks(layer, at_least_float32(image)).to(image.dtype)
@@ -81,7 +81,7 @@ def _edge_blur(x: Tensor, saliency: Tensor, reblur_sigmas: Sequence[float], mode
     for sigma in reblur_sigmas:
         check_positive(float(sigma), "reblur_sigmas")
         if mode == "reblur-image":
-            rx, ry = central_gradient(gaussian_smooth(x, sigma))
+            rx, ry = central_gradient(smooth(x, sigma))
             reblurred = rx * rx + ry * ry
             # sigma_i^2 / (R - 1) with R = saliency / reblurred, without dividing by zero.
             numerator, denominator = sigma**2 * reblurred, saliency - reblurred
@@ -139,8 +139,9 @@ def multiscale_focus_curves(
     limit = math.exp(-scales) if threshold is None else threshold
 
     def layer(image: Tensor) -> Tensor:
-        x = gaussian_smooth(image, sigma)
+        x = smooth(image, sigma)
         gx, gy = central_gradient(x)
+        x = x[..., 1:-1, 1:-1]
         saliency = gx * gx + gy * gy
         blur = _edge_blur(x, saliency, [float(i) for i in range(1, scales)], mode).amax(dim=1, keepdim=True)
         # Sub-pixel blur is not measurable: it counts as the derivative kernel's own.

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from .._checks import check_image, check_option, check_positive
 from ..errors import InvalidInputError
 from .curvilinear import unit_vector
-from .derivatives import at_least_float32, central_hessian, gaussian_smooth, in_blocks, safe_sqrt
+from .derivatives import at_least_float32, central_hessian, in_blocks, safe_sqrt, smooth
 
 __all__ = ["PrincipalCurvatureImage", "principal_curvature_image"]
 
@@ -59,7 +59,7 @@ def principal_curvature_image(
         best = torch.zeros_like(image)
         vx, vy = torch.zeros_like(image), torch.zeros_like(image)
         for sigma in sigmas:
-            xx, yy, xy = (sign * sigma**2 * h for h in central_hessian(gaussian_smooth(image, sigma)))
+            xx, yy, xy = (sign * sigma**2 * h for h in central_hessian(smooth(image, sigma)))
             gap = xx - yy
             root = safe_sqrt(gap * gap + 4.0 * xy * xy)
             curvature = 0.5 * (xx + yy + root)

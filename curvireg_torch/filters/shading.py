@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from .._checks import check_same_device, check_tensor
 from ..errors import InvalidInputError
 from .curvilinear import BACKGROUND, check_depth, dominant_eigenvector, fill_depth, visible_range
-from .derivatives import at_least_float32, central_gradient, central_hessian, gaussian_smooth, in_blocks, safe_sqrt
+from .derivatives import at_least_float32, central_gradient, central_hessian, in_blocks, safe_sqrt, smooth
 
 __all__ = ["AverageShadingGradient", "HessianFrobeniusNorm", "average_shading_gradient", "hessian_frobenius_norm"]
 
@@ -80,17 +80,18 @@ def normal_variation(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """N_x . N_x, N_x . N_y, N_y . N_y per px^2, each (B, 1, H, W), from the Hessian in closed form."""
     if camera is None:
-        z = gaussian_smooth(fill_depth(depth, mask, depth_scale), sigma)
+        z = smooth(fill_depth(depth, mask, depth_scale), sigma)
         zx, zy = central_gradient(z)
         zxx, zyy, zxy = central_hessian(z)
-        one, zero = torch.ones_like(z), torch.zeros_like(z)
+        one, zero = torch.ones_like(zx), torch.zeros_like(zx)
         normal = (-zx, -zy, one)
         along_x, along_y = (-zxx, -zxy, zero), (-zxy, -zyy, zero)
         return _gram(normal, along_x, along_y)
-    visible, clean, near, span = visible_range(depth, mask)
-    z = gaussian_smooth(torch.where(visible, clean, near + BACKGROUND * span) / span, sigma)
+    surface, near, span = visible_range(depth, mask)
+    z = smooth(torch.minimum(surface, near + BACKGROUND * span) / span, sigma)
     zx, zy = central_gradient(z)
     zxx, zyy, zxy = central_hessian(z)
+    z = z[..., 1:-1, 1:-1]
     H, W = z.shape[-2:]
     fx, fy, cx, cy = (camera[:, i, j].view(-1, 1, 1, 1) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     x = torch.arange(W, device=z.device, dtype=z.dtype).view(1, 1, 1, W) - cx
@@ -146,7 +147,7 @@ def hessian_frobenius_norm(
     check_depth(depth, mask, depth_scale)
 
     def layer(depth: Tensor, mask: Tensor | None) -> Tensor:
-        zxx, zyy, zxy = central_hessian(gaussian_smooth(fill_depth(depth, mask, depth_scale), sigma))
+        zxx, zyy, zxy = central_hessian(smooth(fill_depth(depth, mask, depth_scale), sigma))
         vx, vy, _ = dominant_eigenvector(zxx, zxy, zxy, zyy)
         vx = torch.where((vx == 0) & (vy == 0), 1.0, vx)
         return safe_sqrt(zxx * zxx + 2.0 * zxy * zxy + zyy * zyy) * torch.cat([vx, vy], dim=1)

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from skimage.feature import hessian_matrix_eigvals
 
 from curvireg_torch import filters
-from curvireg_torch.filters.derivatives import central_hessian
+from curvireg_torch.filters.derivatives import central_hessian, smooth
 
 from .support import photos
 
@@ -20,14 +20,15 @@ def _smooth(x: np.ndarray, sigma: float) -> np.ndarray:
     return gaussian_filter(x, sigma, mode="nearest", radius=math.ceil(4 * sigma))
 
 
-def _gradient(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Central differences with replicated borders, pixel by pixel."""
+def _gradient(x: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
+    """Central differences, pixel by pixel, of the smoothed image that goes on beyond its borders."""
     H, W = x.shape
+    p = _smooth(np.pad(x, 1, mode="edge"), sigma)
     gx, gy = np.zeros_like(x), np.zeros_like(x)
     for i in range(H):
         for j in range(W):
-            gx[i, j] = (x[i, min(j + 1, W - 1)] - x[i, max(j - 1, 0)]) / 2
-            gy[i, j] = (x[min(i + 1, H - 1), j] - x[max(i - 1, 0), j]) / 2
+            gx[i, j] = (p[i + 1, j + 2] - p[i + 1, j]) / 2
+            gy[i, j] = (p[i + 2, j + 1] - p[i, j + 1]) / 2
     return gx, gy
 
 
@@ -60,7 +61,7 @@ def test_multiscale_curvilinear_saliency(time: float | None, steps: tuple[int, .
     got = filters.multiscale_curvilinear_saliency(image, scales=3, sigma=0.8, kappa=0.05, diffusion_time=time)[0]
     fields = []
     for n in steps:
-        gx, gy = _gradient(_smooth(_perona_malik(image[0, 0].numpy(), n, 0.05, 0.2, "rational"), 0.8))
+        gx, gy = _gradient(_perona_malik(image[0, 0].numpy(), n, 0.05, 0.2, "rational"), 0.8)
         length = np.hypot(gx, gy)
         fields.append(np.stack([length * gx, length * gy]) / (length**2).max())
     lengths = np.stack([np.hypot(*f) for f in fields])
@@ -80,11 +81,11 @@ def test_multiscale_focus_curves(mode: str, saliency_weight: float) -> None:
     options = {"scales": 4, "mode": mode, "saliency_weight": saliency_weight, "threshold": 0.2}
     got = filters.multiscale_focus_curves(image, **options)[0]
     x = _smooth(image[0, 0].numpy(), 1.0)
-    gx, gy = _gradient(x)
+    gx, gy = _gradient(image[0, 0].numpy(), 1.0)
     cs = gx**2 + gy**2
     worst = np.zeros_like(cs)
     for s in (1.0, 2.0, 3.0):
-        cs_s = sum(g**2 for g in _gradient(_smooth(x, s))) if mode == "reblur-image" else _smooth(cs, s)
+        cs_s = sum(g**2 for g in _gradient(x, s)) if mode == "reblur-image" else _smooth(cs, s)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = cs / cs_s
             squared = s**2 / (ratio - 1) if mode == "reblur-image" else 2 * s**2 / (ratio**2 - 1)
@@ -104,7 +105,7 @@ def test_principal_curvature_image_against_skimage_eigenvalues() -> None:
         got = filters.principal_curvature_image(image, sigmas=(1.0, 2.0), eigenvalue=eigenvalue)[0]
         responses = []
         for sigma in (1.0, 2.0):
-            xx, yy, xy = (h[0, 0].numpy() for h in central_hessian(filters.gaussian_smooth(image, sigma)))
+            xx, yy, xy = (h[0, 0].numpy() for h in central_hessian(smooth(image, sigma)))
             large, small = hessian_matrix_eigvals(np.stack([yy, xy, xx]))
             responses.append(sigma**2 * np.maximum(sign * (large if sign > 0 else small), 0))
         want = np.max(responses, axis=0)
@@ -113,15 +114,14 @@ def test_principal_curvature_image_against_skimage_eigenvalues() -> None:
 
 def test_central_hessian_and_gaussian_against_scipy() -> None:
     image = photos(1, 33, dtype=torch.float64)
-    smooth = filters.gaussian_smooth(image, 1.7)
+    x = filters.gaussian_smooth(image, 1.7)[0, 0].numpy()
     # scipy rounds the radius 4 sigma to the nearest pixel, we round it up.
     np.testing.assert_allclose(
-        smooth[0, 0], gaussian_filter(image[0, 0].numpy(), 1.7, mode="nearest", radius=7), rtol=1e-12
+        x, gaussian_filter(image[0, 0].numpy(), 1.7, mode="nearest", radius=7), rtol=1e-12
     )
-    xx, yy, xy = (h[0, 0].numpy() for h in central_hessian(smooth))
-    gx, _ = _gradient(smooth[0, 0].numpy())
-    np.testing.assert_allclose(xy[1:-1, 1:-1], np.gradient(gx, axis=0)[1:-1, 1:-1], atol=1e-14)
-    x = smooth[0, 0].numpy()
+    xx, yy, xy = (h[0, 0].numpy() for h in central_hessian(smooth(image, 1.7)))
+    gx, _ = _gradient(image[0, 0].numpy(), 1.7)
+    np.testing.assert_allclose(xy[1:-1], np.gradient(gx, axis=0)[1:-1], atol=1e-14)
     np.testing.assert_allclose(xx[:, 1:-1], np.diff(x, 2, axis=1), atol=1e-14)
     np.testing.assert_allclose(yy[1:-1], np.diff(x, 2, axis=0), atol=1e-14)
 
