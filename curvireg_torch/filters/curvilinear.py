@@ -7,7 +7,17 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .._checks import check_image, check_mask, check_option, check_positive
-from .derivatives import at_least_float32, central_gradient, central_hessian, image_gradient, in_blocks, safe_sqrt, smooth, vector_field
+from .derivatives import (
+    at_least_float32,
+    central_gradient,
+    central_hessian,
+    channels,
+    floor,
+    image_gradient,
+    in_blocks,
+    safe_sqrt,
+    smooth,
+)
 from .learnable import as_number, parameter_if
 
 __all__ = [
@@ -125,7 +135,7 @@ def _graph_saliency(z: Tensor, formula: str) -> Tensor:
         length = alpha * alpha * alpha * root
     else:
         length = safe_sqrt(squared) * root
-    return vector_field(vx * length, vy * length)
+    return channels(vx * length, vy * length)
 
 
 def dominant_eigenvector(m11: Tensor, m12: Tensor, m21: Tensor, m22: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -143,21 +153,15 @@ def dominant_eigenvector(m11: Tensor, m12: Tensor, m21: Tensor, m22: Tensor) -> 
     main = gap.abs() + root
     side = torch.lerp(m12, m21, first) * torch.copysign(4.0 * half, trace)
     squared = torch.addcmul(main * main, side, side)
-    # The floor keeps the cube in rsqrt's derivative finite.
-    scale = squared.clamp(min=torch.finfo(squared.dtype).tiny ** 0.6).rsqrt()
+    scale = squared.clamp(min=floor(squared)).rsqrt()
     main, side = main * scale, side * scale
     return torch.lerp(side, main, first), torch.lerp(main, side, first), root
 
 
 def unit_vector(vx: Tensor, vy: Tensor) -> Tensor:
-    """(B, 2, H, W) unit vectors along (vx, vy), each (B, 1, H, W); the zero vector stays zero, with zero gradient."""
-    # Scaling by the larger component first keeps squares of tiny vectors from underflowing.
-    largest = torch.maximum(vx.abs(), vy.abs())
-    nonzero = largest > 0
-    safe = torch.where(nonzero, largest, torch.ones_like(largest)).detach()
-    ux, uy = vx / safe, vy / safe
-    squared = torch.where(nonzero, ux * ux + uy * uy, torch.ones_like(ux))
-    return torch.cat([ux, uy], dim=1) * squared.rsqrt()
+    """(B, 2, H, W) unit vectors along (vx, vy), each (B, 1, H, W); the zero vector stays zero."""
+    squared = torch.addcmul(vx * vx, vy, vy)
+    return channels(vx, vy) * squared.clamp(min=floor(squared)).rsqrt()
 
 
 def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:

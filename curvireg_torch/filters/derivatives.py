@@ -113,10 +113,16 @@ def central_hessian(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return xx, yy, 0.5 * (slope[..., 2:, :] - slope[..., :-2, :])
 
 
-def vector_field(x: Tensor, y: Tensor) -> Tensor:
-    """(B, 2, H, W) of two (B, 1, H, W)."""
+def channels(*planes: Tensor) -> Tensor:
+    """(B, C, H, W) of C tensors (B, 1, H, W)."""
     # Compiled, a concatenation of single channels would be laid out channels last and transposed again.
-    return torch.stack([x.squeeze(1), y.squeeze(1)], dim=1)
+    return torch.stack([plane.squeeze(1) for plane in planes], dim=1)
+
+
+def floor(x: Tensor) -> float:
+    """A positive number next to nothing in x's dtype, whose powers -1.5 (of rsqrt's derivative) are finite."""
+    tiny: float = torch.finfo(x.dtype).tiny
+    return tiny**0.6
 
 
 def safe_sqrt(x: Tensor) -> Tensor:
@@ -161,7 +167,7 @@ def image_gradient(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
     """
     check_image(image)
     gx, gy = central_gradient(smooth(at_least_float32(image), sigma))
-    return vector_field(gx, gy).to(image.dtype)
+    return channels(gx, gy).to(image.dtype)
 
 
 class ImageGradient(nn.Module):

@@ -1,5 +1,6 @@
 """Edge blur from re-blurring ratios, and multi-scale focus curves (MFC) of photographs."""
 
+import functools
 import math
 from collections.abc import Sequence
 
@@ -9,7 +10,17 @@ from torch import Tensor, nn
 from .._checks import check_image, check_option, check_positive
 from ..errors import InvalidInputError
 from .curvilinear import unit_vector
-from .derivatives import at_least_float32, central_gradient, gaussian_smooth, image_maximum, in_blocks, safe_sqrt, smooth
+from .derivatives import (
+    at_least_float32,
+    central_gradient,
+    channels,
+    floor,
+    gaussian_smooth,
+    image_maximum,
+    in_blocks,
+    safe_sqrt,
+    smooth,
+)
 from .learnable import as_number, parameter_if
 
 __all__ = ["EdgeBlur", "MultiScaleFocusCurves", "edge_blur", "multiscale_focus_curves"]
@@ -69,12 +80,12 @@ def edge_blur(
 
     def layer(x: Tensor) -> Tensor:
         gx, gy = central_gradient(smooth(x, 0.0))
-        return _edge_blur(x, gx * gx + gy * gy, reblur_sigmas, mode)
+        return channels(*_edge_blur(x, torch.addcmul(gx * gx, gy, gy), reblur_sigmas, mode))
 
     return in_blocks(layer, at_least_float32(image)).to(image.dtype)
 
 
-def _edge_blur(x: Tensor, saliency: Tensor, reblur_sigmas: Sequence[float], mode: str) -> Tensor:
+def _edge_blur(x: Tensor, saliency: Tensor, reblur_sigmas: Sequence[float], mode: str) -> list[Tensor]:
     if len(reblur_sigmas) == 0:
         raise InvalidInputError("reblur_sigmas: expected at least one sigma, got none")
     blurs: list[Tensor] = []
@@ -82,18 +93,16 @@ def _edge_blur(x: Tensor, saliency: Tensor, reblur_sigmas: Sequence[float], mode
         check_positive(float(sigma), "reblur_sigmas")
         if mode == "reblur-image":
             rx, ry = central_gradient(smooth(x, sigma))
-            reblurred = rx * rx + ry * ry
+            reblurred = torch.addcmul(rx * rx, ry, ry)
             # sigma_i^2 / (R - 1) with R = saliency / reblurred, without dividing by zero.
             numerator, denominator = sigma**2 * reblurred, saliency - reblurred
         else:
             reblurred = gaussian_smooth(saliency, sigma)
             numerator, denominator = 2.0 * sigma**2 * reblurred.square(), saliency.square() - reblurred.square()
-        # Where the blur would exceed MAX_BLUR the quotient is not formed at all.
-        measurable = numerator < MAX_BLUR**2 * denominator
-        quotient = numerator / torch.where(measurable, denominator, torch.ones_like(denominator))
-        blur = safe_sqrt(quotient - _DIFFERENCE_VARIANCE)
-        blurs.append(torch.where(measurable, blur, torch.full_like(blur, MAX_BLUR)))
-    return torch.cat(blurs, dim=1)
+        numerator = numerator + floor(numerator)
+        quotient = numerator / torch.maximum(denominator, numerator / (MAX_BLUR**2 + _DIFFERENCE_VARIANCE))
+        blurs.append(safe_sqrt(quotient - _DIFFERENCE_VARIANCE))
+    return blurs
 
 
 def multiscale_focus_curves(
@@ -142,13 +151,13 @@ def multiscale_focus_curves(
         x = smooth(image, sigma)
         gx, gy = central_gradient(x)
         x = x[..., 1:-1, 1:-1]
-        saliency = gx * gx + gy * gy
-        blur = _edge_blur(x, saliency, [float(i) for i in range(1, scales)], mode).amax(dim=1, keepdim=True)
+        saliency = torch.addcmul(gx * gx, gy, gy)
+        blur = functools.reduce(torch.maximum, _edge_blur(x, saliency, [float(i) for i in range(1, scales)], mode))
         # Sub-pixel blur is not measurable: it counts as the derivative kernel's own.
-        focus = 1.0 / blur.clamp(min=_DIFFERENCE_VARIANCE**0.5)
+        focus = blur.clamp(min=_DIFFERENCE_VARIANCE**0.5).reciprocal()
         kept = (focus > limit) & (saliency > _EDGE_FLOOR * image_maximum(saliency))
-        weight = torch.where(kept, saliency, 1.0) ** saliency_weight
-        return torch.where(kept, focus * weight, 0.0) * unit_vector(gx, gy)
+        weight = saliency.clamp(min=floor(saliency)) ** saliency_weight
+        return focus * weight * kept.to(focus.dtype) * unit_vector(gx, gy)
 
     return in_blocks(layer, at_least_float32(image)).to(image.dtype)
 

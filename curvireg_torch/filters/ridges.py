@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from ..errors import InvalidInputError
 from .curvilinear import check_depth, dominant_eigenvector
-from .derivatives import at_least_float32, in_blocks, safe_sqrt
+from .derivatives import at_least_float32, channels, in_blocks, safe_sqrt
 from .shading import batched_camera, normal_variation
 from .suppression import is_ridge
 
@@ -65,7 +65,7 @@ def apparent_ridges(
         curvature = safe_sqrt(0.5 * (a + c + gap))
         if maxima:
             curvature = torch.where(is_ridge(curvature, vx, vy), curvature, 0.0)
-        return curvature * torch.cat([vx, vy], dim=1)
+        return curvature * channels(vx, vy)
 
     return in_blocks(layer, at_least_float32(depth), mask, batched_camera(camera_matrix, depth)).to(depth.dtype)
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from .._checks import check_same_device, check_tensor
 from ..errors import InvalidInputError
 from .curvilinear import BACKGROUND, check_depth, dominant_eigenvector, fill_depth, visible_range
-from .derivatives import at_least_float32, central_gradient, central_hessian, in_blocks, safe_sqrt, smooth
+from .derivatives import at_least_float32, central_gradient, central_hessian, channels, in_blocks, safe_sqrt, smooth
 
 __all__ = ["AverageShadingGradient", "HessianFrobeniusNorm", "average_shading_gradient", "hessian_frobenius_norm"]
 
@@ -59,7 +59,7 @@ def average_shading_gradient(
         vx, vy, _ = dominant_eigenvector(a, b, b, c)
         # Where both eigenvalues agree every direction does: x.
         vx = torch.where((vx == 0) & (vy == 0), 1.0, vx)
-        return math.sqrt(math.pi / 3.0) * safe_sqrt(a + c) * torch.cat([vx, vy], dim=1)
+        return math.sqrt(math.pi / 3.0) * safe_sqrt(a + c) * channels(vx, vy)
 
     return in_blocks(layer, at_least_float32(depth), mask, batched_camera(camera_matrix, depth)).to(depth.dtype)
 
@@ -150,7 +150,7 @@ def hessian_frobenius_norm(
         zxx, zyy, zxy = central_hessian(smooth(fill_depth(depth, mask, depth_scale), sigma))
         vx, vy, _ = dominant_eigenvector(zxx, zxy, zxy, zyy)
         vx = torch.where((vx == 0) & (vy == 0), 1.0, vx)
-        return safe_sqrt(zxx * zxx + 2.0 * zxy * zxy + zyy * zyy) * torch.cat([vx, vy], dim=1)
+        return safe_sqrt(zxx * zxx + 2.0 * zxy * zxy + zyy * zyy) * channels(vx, vy)
 
     return in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
 

@@ -116,9 +116,7 @@ def test_central_hessian_and_gaussian_against_scipy() -> None:
     image = photos(1, 33, dtype=torch.float64)
     x = filters.gaussian_smooth(image, 1.7)[0, 0].numpy()
     # scipy rounds the radius 4 sigma to the nearest pixel, we round it up.
-    np.testing.assert_allclose(
-        x, gaussian_filter(image[0, 0].numpy(), 1.7, mode="nearest", radius=7), rtol=1e-12
-    )
+    np.testing.assert_allclose(x, gaussian_filter(image[0, 0].numpy(), 1.7, mode="nearest", radius=7), rtol=1e-12)
     xx, yy, xy = (h[0, 0].numpy() for h in central_hessian(smooth(image, 1.7)))
     gx, _ = _gradient(image[0, 0].numpy(), 1.7)
     np.testing.assert_allclose(xy[1:-1], np.gradient(gx, axis=0)[1:-1], atol=1e-14)
