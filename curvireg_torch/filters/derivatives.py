@@ -21,7 +21,7 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
     Args:
         x: (B, C, H, W), any floating dtype (kept).
         sigma: standard deviation in px, >= 0; 0 returns ``x``. A scalar tensor is differentiated through; its
-            support, ceil(4 sigma) px, is fixed at the time of the call.
+            support, ceil(4 sigma) px, is fixed at the time of the call (compiled or exported: at most 16 px).
 
     Example:
         >>> gaussian_smooth(torch.ones(1, 1, 5, 5), 1.0).shape

@@ -1,11 +1,14 @@
 """torch.compile, torch.export and ONNX."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
-from .support import LAYERS, NAMES, Layer
+from curvireg_torch import filters
+
+from .support import LAYERS, NAMES, Layer, depths, photos
 
 pytestmark = pytest.mark.slow
 every_layer = pytest.mark.parametrize("layer", LAYERS, ids=NAMES)
@@ -25,6 +28,24 @@ def test_compile_fullgraph(layer: Layer) -> None:
     torch._dynamo.reset()
     x = layer.inputs(2, 24)
     assert _agrees(torch.compile(layer.twin(), fullgraph=True)(x), layer(x))
+
+
+@pytest.mark.parametrize(
+    ("module", "inputs"), [(filters.ImageGradient, photos), (filters.DepthCurvilinearSaliency, depths)]
+)
+def test_learnable_sigma_compiles_and_exports(
+    module: Callable[..., torch.nn.Module], inputs: Callable[..., torch.Tensor]
+) -> None:
+    torch._dynamo.reset()
+    layer, x = module(sigma=1.7, learnable=True), inputs(2, 24)
+    want = layer(x)
+    want.square().sum().backward()
+    gradient, layer.sigma.grad = layer.sigma.grad, None
+    got = torch.compile(layer, fullgraph=True)(x)
+    got.square().sum().backward()
+    assert _agrees(got, want)
+    torch.testing.assert_close(layer.sigma.grad, gradient, rtol=1e-3, atol=1e-6)
+    assert _agrees(torch.export.export(layer, (x,)).module()(x), want)
 
 
 @every_layer

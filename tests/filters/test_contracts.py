@@ -98,27 +98,20 @@ def test_gradcheck(layer: Layer) -> None:
     """At generic points, where no maximum, threshold or suppression switches within the step."""
     x = layer.inputs(1, 9, seed=3, dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
-    x = (x + 0.05 * torch.rand(x.shape, generator=generator, dtype=torch.float64) * (x > 0)).requires_grad_()
+    x = x + 0.05 * torch.rand(x.shape, generator=generator, dtype=torch.float64) * (x > 0)
     options = {"grid": 4} if "hog" in layer.name else {}
-    output = layer.function(x, **layer.options, **options)
-    weights = torch.rand(output.shape, generator=generator, dtype=torch.float64)
+    # Background pixels are constants: a step there would make them visible.
+    where = (x > 0).nonzero(as_tuple=True) if layer.inputs is depths else torch.ones_like(x).nonzero(as_tuple=True)
+    weights: float | torch.Tensor = 1.0
     if layer.name.startswith("mcs"):
         # Where the image is strongest every level is 1, and which of them wins is left to rounding.
-        weights = weights * (output.norm(dim=1, keepdim=True) < 1.0 - 1e-6)
+        weights = layer(x).norm(dim=1, keepdim=True) < 1.0 - 1e-6
 
-    def scalar(x: torch.Tensor) -> torch.Tensor:
-        return (layer.function(x, **layer.options, **options) * weights).sum()
+    def function(values: torch.Tensor) -> torch.Tensor:
+        return layer.function(x.index_put(where, values), **layer.options, **options) * weights
 
-    # Background pixels are constants: a step there would make them visible.
-    seen = (x.detach() > 0) if layer.inputs is depths else torch.ones_like(x, dtype=torch.bool)
-    (gradient,) = torch.autograd.grad(scalar(x), x)
-    h = 1e-6
-    for index in seen.nonzero()[::11]:
-        step = torch.zeros_like(x)
-        step[tuple(index)] = h
-        with torch.no_grad():
-            slope = (scalar(x + step) - scalar(x - step)) / (2 * h)
-        assert float(gradient[tuple(index)]) == pytest.approx(float(slope), rel=1e-3, abs=1e-4), tuple(index.tolist())
+    assert float(function(x[where]).abs().max()) > 0.0
+    assert torch.autograd.gradcheck(function, x[where].requires_grad_(), eps=1e-7, atol=1e-5, rtol=1e-4, fast_mode=True)
 
 
 def _strange_inputs() -> dict[str, torch.Tensor]:
