@@ -147,15 +147,19 @@ def dominant_eigenvector(m11: Tensor, m12: Tensor, m21: Tensor, m22: Tensor) -> 
     # tr^2 - 4 det, in the form that does not cancel.
     root = safe_sqrt(torch.addcmul(gap * gap, m12, m21, value=4.0))
     # Signs times (lambda - m22, m21) and (m12, lambda - m11) are both eigenvectors: take the one that does not cancel.
-    # Selections by arithmetic: torch.where on a CPU costs as much as some thirty additions.
-    half = torch.full((), 0.5, dtype=gap.dtype, device=gap.device)
-    first = torch.copysign(half, gap * trace) + 0.5
+    # Selections by arithmetic: torch.where by an unpredictable mask costs a CPU some 27 additions.
+    first, positive = _not_negative(gap * trace), _not_negative(trace)
     main = gap.abs() + root
-    side = torch.lerp(m12, m21, first) * torch.copysign(4.0 * half, trace)
+    side = torch.lerp(m12, m21, first) * (4.0 * positive - 2.0)
     squared = torch.addcmul(main * main, side, side)
     scale = squared.clamp(min=floor(squared)).rsqrt()
     main, side = main * scale, side * scale
     return torch.lerp(side, main, first), torch.lerp(main, side, first), root
+
+
+def _not_negative(x: Tensor) -> Tensor:
+    """1 where x >= 0, otherwise 0."""
+    return (x.sign() + 1.0).clamp(max=1.0)
 
 
 def unit_vector(vx: Tensor, vy: Tensor) -> Tensor:

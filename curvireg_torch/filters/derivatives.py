@@ -121,8 +121,7 @@ def channels(*planes: Tensor) -> Tensor:
 
 def floor(x: Tensor) -> float:
     """A positive number next to nothing in x's dtype, whose powers -1.5 (of rsqrt's derivative) are finite."""
-    tiny: float = torch.finfo(x.dtype).tiny
-    return tiny**0.6
+    return math.pow(torch.finfo(x.dtype).tiny, 0.6)
 
 
 def safe_sqrt(x: Tensor) -> Tensor:
