@@ -8,13 +8,13 @@ from ..matching import Ranking
 
 __all__ = ["EVIDENCE", "RELIABLE", "confidence", "distinct_views", "ranking_evidence"]
 
-EVIDENCE = ("similarity", "repeatability", "margin", "concentration")
+EVIDENCE = ("similarity", "margin", "concentration")
 """What :func:`ranking_evidence` measures, in its order."""
 
 RELIABLE = 0.5
 """Confidence below which a registration says "no reliable match"."""
 
-_WEIGHTS = (1.0, 1.0, 1.0, 1.0)
+_WEIGHTS = (1.0, 1.0, 1.0)
 _BIAS = 0.0
 """Logistic regression on scenes made in code, by scripts/calibrate_confidence.py."""
 
@@ -22,11 +22,11 @@ _APART = 30.0  # degrees beyond which two views are rival answers
 
 
 def ranking_evidence(ranking: Ranking, rotations: Tensor) -> Tensor:
-    """(B, 4) numbers that tell right answers from wrong ones, see :data:`EVIDENCE`.
+    """(B, 3) numbers that tell right answers from wrong ones, see :data:`EVIDENCE`.
 
-    similarity, repeatability: of the best view, in [0, 1]. margin: how far its score leads the best view more than 30
-    degrees away, log S - log S', at most 5. concentration: of the sum of S^4 over all views, the share within 30
-    degrees of the best.
+    similarity: normalised correlation of the best view, in [0, 1]. margin: how far its score leads the best view more
+    than 30 degrees away, log S - log S', at most 5. concentration: of the sum of S^4 over all views, the share within
+    30 degrees of the best.
 
     Args:
         ranking: of N views for B photographs.
@@ -39,7 +39,7 @@ def ranking_evidence(ranking: Ranking, rotations: Tensor) -> Tensor:
     margin = (leader / rival.clamp(min=1e-300)).log().clamp(max=5.0)
     weights = (scores / leader.clamp(min=1e-300)) ** 4
     concentration = (weights * near).sum(dim=1, keepdim=True) / weights.sum(dim=1, keepdim=True)
-    parts = [ranking.hog.gather(1, best), ranking.repeatability.gather(1, best), margin, concentration]
+    parts = [ranking.hog.gather(1, best), margin, concentration]
     return torch.cat([part.double() for part in parts], dim=1).float()
 
 
@@ -48,7 +48,8 @@ def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
 
     A logistic function whose constants were fitted on scenes made in code (scripts/calibrate_confidence.py) that wrong
     meshes were a part of. What it is worth on photographs is in ``docs/method.md``: it orders answers better than it
-    counts them. An object with symmetries has several right answers, which look like doubt here.
+    counts them. An object with symmetries has several right answers, which look like doubt here; whitened descriptors
+    have another similarity, which the constants do not know.
 
     Args:
         ranking: of N views for B photographs.
