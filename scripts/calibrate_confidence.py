@@ -3,9 +3,9 @@
     python scripts/calibrate_confidence.py [--out scripts/results/confidence_calibration.json]
 
 Assemblies of boxes, cylinders, cones and spheres are photographed at random poses, from easily to hardly. Each
-photograph is ranked against its own mesh and against the next one. A logistic regression on the evidence of a ranking
-then tells right answers (the best view within 30 degrees of the truth) from wrong ones, wrong meshes among them at a
-quarter of the weight. Every other mesh is held out to judge a first fit; the constants come from all.
+photograph is ranked against its own mesh, and a logistic regression on the evidence of the rankings tells right answers
+(the best view within 30 degrees of the truth) from wrong ones. Every other mesh is held out to judge a first fit; the
+constants come from all. Rankings against the next mesh, a wrong one, are judged and take no part in the fit.
 """
 
 import argparse
@@ -29,7 +29,6 @@ from curvireg_torch.synthetic import example_mesh, procedural_background, random
 
 SIZE = (240, 320)
 CAMERA = cr.camera_matrix(400.0, 400.0, 159.5, 119.5, dtype=torch.float64)
-WRONG_MESH_WEIGHT = 0.25
 
 
 def assembly(seed: int) -> trimesh.Trimesh:
@@ -115,21 +114,20 @@ def collect(pose: str, meshes: int, scenes: int) -> list[dict]:
     return rows
 
 
-def arrays(rows: list[dict]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    X = np.array([r["evidence"] for r in rows])
-    y = np.array([r["right_mesh"] and r["error"] < 30.0 for r in rows])
-    return X, y, np.where([r["right_mesh"] for r in rows], 1.0, WRONG_MESH_WEIGHT)
+def arrays(rows: list[dict]) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) evidence and (n,) whether the answer is right, of the right meshes."""
+    own = [r for r in rows if r["right_mesh"]]
+    return np.array([r["evidence"] for r in own]), np.array([r["error"] < 30.0 for r in own])
 
 
 def fit(rows: list[dict]) -> tuple[list[float], float]:
-    X, y, w = arrays(rows)
-    model = LogisticRegression(C=10.0, max_iter=1000).fit(X, y, sample_weight=w)
+    model = LogisticRegression(C=10.0, max_iter=1000).fit(*arrays(rows))
     return [round(float(v), 3) for v in model.coef_[0]], round(float(model.intercept_[0]), 3)
 
 
 def judge(rows: list[dict], weights: list[float], bias: float) -> dict:
     """Calibration on the right meshes: mean confidence, accuracy, expected calibration error in 10 bins."""
-    X, y, _ = arrays([r for r in rows if r["right_mesh"]])
+    X, y = arrays(rows)
     p = 1.0 / (1.0 + np.exp(-(X @ weights + bias)))
     bins = np.minimum((p * 10).astype(int), 9)
     error = sum(abs(p[bins == b].mean() - y[bins == b].mean()) * (bins == b).mean() for b in np.unique(bins))

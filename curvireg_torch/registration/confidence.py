@@ -11,11 +11,11 @@ __all__ = ["EVIDENCE", "RELIABLE", "confidence", "distinct_views", "ranking_evid
 EVIDENCE = ("similarity", "margin", "concentration")
 """What :func:`ranking_evidence` measures, in its order."""
 
-RELIABLE = 0.5
+RELIABLE = 0.6
 """Confidence below which a registration says "no reliable match"."""
 
-_WEIGHTS = (1.0, 1.0, 1.0)
-_BIAS = 0.0
+_WEIGHTS = (6.658, 1.42, 0.181)
+_BIAS = -5.02
 """Logistic regression on scenes made in code, by scripts/calibrate_confidence.py."""
 
 _APART = 30.0  # degrees beyond which two views are rival answers
@@ -43,13 +43,18 @@ def ranking_evidence(ranking: Ranking, rotations: Tensor) -> Tensor:
     return torch.cat([part.double() for part in parts], dim=1).float()
 
 
+def probability(evidence: Tensor) -> Tensor:
+    """(B,) in (0, 1) from (B, 3) evidence, the logistic function of :func:`confidence`."""
+    return torch.sigmoid(evidence @ evidence.new_tensor(_WEIGHTS) + _BIAS)
+
+
 def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
     """Probability that the best view is within 30 degrees of the truth, from :func:`ranking_evidence`.
 
-    A logistic function whose constants were fitted on scenes made in code (scripts/calibrate_confidence.py) that wrong
-    meshes were a part of. What it is worth on photographs is in ``docs/method.md``: it orders answers better than it
-    counts them. An object with symmetries has several right answers, which look like doubt here; whitened descriptors
-    have another similarity, which the constants do not know.
+    A logistic function whose constants were fitted on scenes made in code (scripts/calibrate_confidence.py), each with
+    its own mesh. What it is worth on photographs, and against wrong meshes, is in ``docs/method.md``. An object with
+    symmetries has several right answers, which look like doubt here; whitened descriptors have another similarity,
+    which the constants do not know.
 
     Args:
         ranking: of N views for B photographs.
@@ -65,8 +70,7 @@ def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
         >>> bool(confidence(clear, R) > 0.9)
         True
     """
-    evidence = ranking_evidence(ranking, rotations)
-    return torch.sigmoid(evidence @ evidence.new_tensor(_WEIGHTS) + _BIAS)
+    return probability(ranking_evidence(ranking, rotations))
 
 
 def distinct_views(
