@@ -34,11 +34,12 @@ def ranking_evidence(ranking: Ranking, rotations: Tensor) -> Tensor:
     """
     scores, best = ranking.scores.double(), ranking.order[:, :1]
     near = rotation_error(rotations[best], rotations[None]) <= _APART
-    leader = scores.gather(1, best)
+    tiny = 1e-300  # of scores that are all 0
+    leader = scores.gather(1, best).clamp(min=tiny)
     rival = scores.masked_fill(near, 0.0).amax(dim=1, keepdim=True)
-    margin = (leader / rival.clamp(min=1e-300)).log().clamp(max=5.0)
-    weights = (scores / leader.clamp(min=1e-300)) ** 4
-    concentration = (weights * near).sum(dim=1, keepdim=True) / weights.sum(dim=1, keepdim=True)
+    margin = (leader / rival.clamp(min=tiny)).log().clamp(max=5.0)
+    weights = (scores / leader) ** 4
+    concentration = (weights * near).sum(dim=1, keepdim=True) / weights.sum(dim=1, keepdim=True).clamp(min=tiny)
     parts = [ranking.hog.gather(1, best), margin, concentration]
     return torch.cat([part.double() for part in parts], dim=1).float()
 
