@@ -37,7 +37,7 @@ CONVENTIONS = {
     "pixels": "(0, 0) is the centre of the top-left pixel; boxes are x0, y0, x1, y1",
     "score": "normalised correlation of photograph and view, 0 to 1",
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
-    "reliable": "confidence of at least 0.5; false = no reliable match, the pose is a guess",
+    "reliable": "confidence of at least 0.6; false = no reliable match, the pose is a guess",
 }
 
 

@@ -36,7 +36,7 @@ def photographs(count: int) -> torch.Tensor:
         return matcher.query([s[0] for s in shots], torch.stack([s[1] for s in shots])).descriptors[:, 0]
 
 
-def fastest(call, repeats: int = 5) -> float:
+def fastest(call, repeats: int = 7) -> float:
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -85,9 +85,9 @@ def main() -> None:
             }
         rows.append(row)
         print(json.dumps(row), flush=True)
-    result = {"threads": torch.get_num_threads(), "torch": torch.__version__, "rows": rows}
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(result, indent=2) + "\n")
+        result = {"threads": torch.get_num_threads(), "torch": torch.__version__, "rows": rows}
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)
+        arguments.out.write_text(json.dumps(result, indent=2) + "\n")
 
 
 def recall(found: torch.Tensor, truth: torch.Tensor) -> float:

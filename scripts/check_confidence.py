@@ -15,7 +15,8 @@ import torch
 from compare_similarities import SETS, shots
 
 import curvireg_torch as cr
-from curvireg_torch.registration import RELIABLE, confidence, ranking_evidence
+from curvireg_torch.registration import RELIABLE, ranking_evidence
+from curvireg_torch.registration.confidence import probability
 
 COVERAGES = (1.0, 0.75, 0.5, 0.25, 0.1)
 WRONG_CLASSES = 3
@@ -54,7 +55,6 @@ def collect(data: Path) -> list[dict]:
                             "mesh": f"{path.parent.name}/{path.stem}",
                             "error": error,
                             "evidence": ranking_evidence(ranking, bank.rotations)[0].tolist(),
-                            "confidence": float(confidence(ranking, bank.rotations)[0]),
                         }
                     )
             print(kind, path.stem, len(rows), flush=True)
@@ -69,11 +69,14 @@ def auc(higher: torch.Tensor, lower: torch.Tensor) -> float | None:
     return float(((difference > 0).double() + 0.5 * (difference == 0).double()).mean())
 
 
+def confidences(rows: list[dict]) -> torch.Tensor:
+    return probability(torch.tensor([r["evidence"] for r in rows], dtype=torch.float64))
+
+
 def judge(rows: list[dict]) -> dict:
-    own = [r for r in rows if r["error"] is not None]
-    p = torch.tensor([r["confidence"] for r in own], dtype=torch.float64)
+    own, others = ([r for r in rows if (r["error"] is None) == wrong] for wrong in (False, True))
+    p, wrong_mesh = confidences(own), confidences(others)
     right = torch.tensor([r["error"] < 30 for r in own])
-    wrong_mesh = torch.tensor([r["confidence"] for r in rows if r["error"] is None], dtype=torch.float64)
     bins = (p * 5).long().clamp(max=4)
     diagram = [
         {
@@ -109,13 +112,16 @@ def judge(rows: list[dict]) -> dict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, metavar="DATA")
-    parser.add_argument("--rows", type=Path, help="keep the collected rows in this file")
+    parser.add_argument("--rows", type=Path, help="keep the collected rows in this file, or read them from it")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "confidence.json")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    rows = collect(arguments.data)
-    if arguments.rows:
-        arguments.rows.write_text(json.dumps(rows))
+    if arguments.rows and arguments.rows.exists():
+        rows = json.loads(arguments.rows.read_text())
+    else:
+        rows = collect(arguments.data)
+        if arguments.rows:
+            arguments.rows.write_text(json.dumps(rows))
     result = {name: judge([r for r in rows if r["set"] == name]) for name in SETS} | {"all": judge(rows)}
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     arguments.out.write_text(json.dumps(result, indent=1) + "\n")

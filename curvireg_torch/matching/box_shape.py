@@ -44,7 +44,9 @@ def whole_box_shapes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
 
 
 def box_shape_score(queries: Tensor, views: Tensor, *, sigma: float = 0.2) -> Tensor:
-    r"""S_box in (0, 1]: :math:`\exp(-d^2 / (2\sigma^2))`, d the difference of the logs of width / height.
+    r"""S_box in (0, 1] per query, best view 1: :math:`\exp(-(d^2 - \min d^2) / (2\sigma^2))`.
+
+    d is the difference of the logs of width / height.
 
     Args:
         queries: (B,) shapes of the photographs' boxes; NaN = unknown, every view then scores 1.
@@ -63,4 +65,5 @@ def box_shape_score(queries: Tensor, views: Tensor, *, sigma: float = 0.2) -> Te
     check_tensor(views, "views", (None,))
     check_positive(sigma, "sigma")
     difference = (queries[:, None] - views.to(queries)[None]).nan_to_num(0.0)
-    return torch.exp(-difference.square() / (2.0 * sigma**2))
+    square = difference.square()
+    return torch.exp((square.amin(dim=1, keepdim=True) - square) / (2.0 * sigma**2))

@@ -33,7 +33,7 @@ class Ranking:
         order: (B, N) view indices, best first; ties in the order of the bank.
         hog: (B, N) normalised correlation of descriptors: in [0, 1], or in [-1, 1] if they are whitened.
         repeatability: (B, N) share of the photograph's points found in the view.
-        box: (B, N) S_box in (0, 1], likeness of the boxes' proportions.
+        box: (B, N) S_box in [0, 1], likeness of the boxes' proportions, best view 1.
     """
 
     scores: Tensor

@@ -8,25 +8,25 @@ from ..matching import Ranking
 
 __all__ = ["EVIDENCE", "RELIABLE", "confidence", "distinct_views", "ranking_evidence"]
 
-EVIDENCE = ("similarity", "repeatability", "margin", "concentration")
+EVIDENCE = ("similarity", "margin", "concentration")
 """What :func:`ranking_evidence` measures, in its order."""
 
-RELIABLE = 0.5
+RELIABLE = 0.6
 """Confidence below which a registration says "no reliable match"."""
 
-_WEIGHTS = (1.0, 1.0, 1.0, 1.0)
-_BIAS = 0.0
+_WEIGHTS = (6.658, 1.42, 0.181)
+_BIAS = -5.02
 """Logistic regression on scenes made in code, by scripts/calibrate_confidence.py."""
 
 _APART = 30.0  # degrees beyond which two views are rival answers
 
 
 def ranking_evidence(ranking: Ranking, rotations: Tensor) -> Tensor:
-    """(B, 4) numbers that tell right answers from wrong ones, see :data:`EVIDENCE`.
+    """(B, 3) numbers that tell right answers from wrong ones, see :data:`EVIDENCE`.
 
-    similarity, repeatability: of the best view, in [0, 1]. margin: how far its score leads the best view more than 30
-    degrees away, log S - log S', at most 5. concentration: of the sum of S^4 over all views, the share within 30
-    degrees of the best.
+    similarity: normalised correlation of the best view, in [0, 1]. margin: how far its score leads the best view more
+    than 30 degrees away, log S - log S', at most 5. concentration: of the sum of S^4 over all views, the share within
+    30 degrees of the best.
 
     Args:
         ranking: of N views for B photographs.
@@ -34,21 +34,28 @@ def ranking_evidence(ranking: Ranking, rotations: Tensor) -> Tensor:
     """
     scores, best = ranking.scores.double(), ranking.order[:, :1]
     near = rotation_error(rotations[best], rotations[None]) <= _APART
-    leader = scores.gather(1, best)
+    tiny = 1e-300  # of scores that are all 0
+    leader = scores.gather(1, best).clamp(min=tiny)
     rival = scores.masked_fill(near, 0.0).amax(dim=1, keepdim=True)
-    margin = (leader / rival.clamp(min=1e-300)).log().clamp(max=5.0)
-    weights = (scores / leader.clamp(min=1e-300)) ** 4
-    concentration = (weights * near).sum(dim=1, keepdim=True) / weights.sum(dim=1, keepdim=True)
-    parts = [ranking.hog.gather(1, best), ranking.repeatability.gather(1, best), margin, concentration]
+    margin = (leader / rival.clamp(min=tiny)).log().clamp(max=5.0)
+    weights = (scores / leader) ** 4
+    concentration = (weights * near).sum(dim=1, keepdim=True) / weights.sum(dim=1, keepdim=True).clamp(min=tiny)
+    parts = [ranking.hog.gather(1, best), margin, concentration]
     return torch.cat([part.double() for part in parts], dim=1).float()
+
+
+def probability(evidence: Tensor) -> Tensor:
+    """(B,) in (0, 1) from (B, 3) evidence, the logistic function of :func:`confidence`."""
+    return torch.sigmoid(evidence @ evidence.new_tensor(_WEIGHTS) + _BIAS)
 
 
 def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
     """Probability that the best view is within 30 degrees of the truth, from :func:`ranking_evidence`.
 
-    A logistic function whose constants were fitted on scenes made in code (scripts/calibrate_confidence.py) that wrong
-    meshes were a part of. What it is worth on photographs is in ``docs/method.md``: it orders answers better than it
-    counts them. An object with symmetries has several right answers, which look like doubt here.
+    A logistic function whose constants were fitted on scenes made in code (scripts/calibrate_confidence.py), each with
+    its own mesh. What it is worth on photographs, and against wrong meshes, is in ``docs/method.md``. An object with
+    symmetries has several right answers, which look like doubt here; whitened descriptors have another similarity,
+    which the constants do not know.
 
     Args:
         ranking: of N views for B photographs.
@@ -64,8 +71,7 @@ def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
         >>> bool(confidence(clear, R) > 0.9)
         True
     """
-    evidence = ranking_evidence(ranking, rotations)
-    return torch.sigmoid(evidence @ evidence.new_tensor(_WEIGHTS) + _BIAS)
+    return probability(ranking_evidence(ranking, rotations))
 
 
 def distinct_views(

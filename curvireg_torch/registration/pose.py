@@ -50,7 +50,7 @@ class Registration:
 
     @property
     def reliable(self) -> bool:
-        """Whether the confidence is at least 0.5; False = no reliable match: take the pose as a guess."""
+        """Whether the confidence is at least 0.6; False = no reliable match: take the pose as a guess."""
         return self.confidence >= RELIABLE
 
     @property

@@ -16,6 +16,12 @@ def test_the_score_is_a_gaussian_of_the_log_ratio_of_proportions():
     assert score[0].tolist() == pytest.approx(expected, rel=1e-5)
 
 
+def test_the_best_view_scores_1_however_odd_the_box():
+    score = box_shape_score(torch.tensor([9.0]), torch.tensor([-1.0, 0.0, 1.0]))
+    assert score[0, 2] == 1.0
+    assert bool((score[0, :2] < 1.0).all())
+
+
 def test_size_and_place_do_not_matter():
     box = torch.tensor([3.0, 4, 33, 14])
     assert float(box_shapes(box)) == pytest.approx(float(box_shapes(5 * box + 100)), abs=1e-6)

@@ -22,32 +22,31 @@ def ranking(scores: torch.Tensor, hog: float = 0.8, rep: float = 0.6) -> Ranking
 
 
 def test_evidence_in_closed_form():
-    R = sample_views(azimuth_step=10, elevations=[0]).rotations
-    scores = torch.full((1, 36), 0.1)
+    R = sample_views(azimuth_step=12, elevations=[0]).rotations
+    scores = torch.full((1, 30), 0.1)
     scores[0, 3], scores[0, 4], scores[0, 20] = 1.0, 0.9, 0.5
     got = dict(zip(EVIDENCE, ranking_evidence(ranking(scores), R)[0].tolist(), strict=True))
-    near = 1 + 0.9**4 + 5 * 0.1**4  # views 0 to 6 lie within 30 degrees
+    near = 1 + 0.9**4 + 3 * 0.1**4  # views 1 to 5 lie within 30 degrees
     assert got["similarity"] == pytest.approx(0.8)
-    assert got["repeatability"] == pytest.approx(0.6)
     assert got["margin"] == pytest.approx(0.6931, abs=1e-3)  # log(1 / 0.5)
-    assert got["concentration"] == pytest.approx(near / (near + 0.5**4 + 28 * 0.1**4), rel=1e-4)
+    assert got["concentration"] == pytest.approx(near / (near + 0.5**4 + 24 * 0.1**4), rel=1e-4)
 
 
 def test_evidence_of_a_plateau_and_of_nothing():
-    R = sample_views(azimuth_step=10, elevations=[0]).rotations
-    plateau = ranking_evidence(ranking(torch.ones(1, 36)), R)[0]
-    assert plateau[2:].tolist() == pytest.approx([0.0, 7 / 36])
-    assert bool(ranking_evidence(ranking(torch.zeros(2, 36)), R).isfinite().all())
-    alone = torch.zeros(1, 36)
+    R = sample_views(azimuth_step=12, elevations=[0]).rotations
+    plateau = ranking_evidence(ranking(torch.ones(1, 30)), R)[0]
+    assert plateau[1:].tolist() == pytest.approx([0.0, 5 / 30])
+    assert bool(ranking_evidence(ranking(torch.zeros(2, 30)), R).isfinite().all())
+    alone = torch.zeros(1, 30)
     alone[0, 5] = 1.0
-    assert ranking_evidence(ranking(alone), R)[0, 2:].tolist() == [5.0, 1.0]
+    assert ranking_evidence(ranking(alone), R)[0, 1:].tolist() == [5.0, 1.0]
 
 
 def test_confidence_is_a_probability_that_grows_with_the_evidence():
-    R = sample_views(azimuth_step=10, elevations=[0]).rotations
-    sharp = torch.full((1, 36), 0.01)
+    R = sample_views(azimuth_step=12, elevations=[0]).rotations
+    sharp = torch.full((1, 30), 0.01)
     sharp[0, 3] = 1.0
-    low, high = (float(confidence(r, R)) for r in (ranking(torch.ones(1, 36), 0.5, 0.3), ranking(sharp)))
+    low, high = (float(confidence(r, R)) for r in (ranking(torch.ones(1, 30), 0.5, 0.3), ranking(sharp)))
     assert 0 < low < 0.5 < high < 1
 
 

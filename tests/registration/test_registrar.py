@@ -3,7 +3,7 @@ import torch
 
 from curvireg_torch import Registrar, ViewBank, rotation_error, sample_views
 from curvireg_torch.errors import ImageError, InvalidInputError
-from curvireg_torch.registration import distinct_views
+from curvireg_torch.registration import RELIABLE, distinct_views
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import CAMERA, scene, truck_bank
 
@@ -41,7 +41,7 @@ def test_results_are_proper_poses(registered):
         assert float(torch.linalg.det(result.rotation)) == pytest.approx(1.0)
         assert 0 <= result.score <= 1
         assert 0 <= result.confidence <= 1
-        assert result.reliable == (result.confidence >= 0.5)
+        assert result.reliable == (result.confidence >= RELIABLE)
         assert result.iterations > 0
         azimuth, elevation, theta = result.viewpoint
         assert 0 <= azimuth < 360
