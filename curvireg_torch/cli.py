@@ -226,6 +226,7 @@ def _document(result: Registration, registrar: Registrar, times: dict[str, float
         }
         for v in result.candidates.tolist()
     ]
+    deviations = result.standard_deviations
     return {
         "rotation": result.rotation.tolist(),
         "translation": None if result.translation is None else result.translation.tolist(),
@@ -233,6 +234,11 @@ def _document(result: Registration, registrar: Registrar, times: dict[str, float
         "viewpoint": dict(zip(("azimuth", "elevation", "theta"), result.viewpoint, strict=True)),
         "score": result.score,
         "confidence": result.confidence,
+        "support": result.support,
+        "standard_deviations": None
+        if deviations is None
+        else {"rotation_deg": deviations[0].tolist(), "translation": deviations[1].tolist()},
+        "covariance": None if result.covariance is None else result.covariance.tolist(),
         "top": top,
         "refinement_rounds": result.iterations,
         "views": len(bank),
@@ -267,6 +273,10 @@ def _print_result(document: dict[str, Any], out: Path) -> None:
     print(f"viewpoint: {angles} degrees   score {document['score']:.3f}   confidence {document['confidence']:.2f}")
     if document["translation"] is not None:
         print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")
+    deviations = document["standard_deviations"]
+    if deviations is not None:
+        turn, shift = (", ".join(f"{v:.2g}" for v in deviations[name]) for name in ("rotation_deg", "translation"))
+        print(f"standard deviations: {turn} degrees; {shift} {document['unit']}   (about and along the camera's axes)")
     print(f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see {out}/overlay.png")
 
 
