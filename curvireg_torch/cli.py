@@ -38,6 +38,9 @@ CONVENTIONS = {
     "pixels": "(0, 0) is the centre of the top-left pixel; boxes are x0, y0, x1, y1",
     "score": "normalised correlation of photograph and view, 0 to 1",
     "confidence": "share of the ranking's mass within 30 degrees of the best view, 0 to 1",
+    "support": "how strongly edges of the photograph lie under the mesh's contours, 0 to 1",
+    "covariance": "of turn (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
+    "t_true = t + e; null without --camera",
 }
 
 

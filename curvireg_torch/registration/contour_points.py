@@ -49,8 +49,8 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
 
     An occluding contour lies between two neighbouring pixels whose depth jumps (curvilinear saliency peaks on both
     sides of a jump, never on it): half way between them on average, at the depth of the nearer one. Creases are maxima
-    of :func:`depth_curvilinear_saliency` away from jumps; bent surfaces have none. Of each kind a fixed random sample is
-    kept.
+    of :func:`depth_curvilinear_saliency` away from jumps; bent surfaces have none. Of each kind a fixed random sample
+    is kept.
 
     Args:
         depth: (N, 1, H, W) z-depth, 0 = background.
