@@ -38,6 +38,9 @@ CONVENTIONS = {
     "score": "normalised correlation of photograph and view, 0 to 1",
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
     "reliable": "confidence of at least 0.6; false = no reliable match, the pose is a guess",
+    "support": "how strongly edges of the photograph lie under the mesh's contours, 0 to 1",
+    "covariance": "of turn (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
+    "t_true = t + e; null without --camera",
 }
 
 
@@ -252,6 +255,7 @@ def _document(result: Registration, registrar: Registrar, times: dict[str, float
         }
         for v in result.candidates.tolist()
     ]
+    deviations = result.standard_deviations
     return {
         "rotation": result.rotation.tolist(),
         "translation": None if result.translation is None else result.translation.tolist(),
@@ -260,6 +264,11 @@ def _document(result: Registration, registrar: Registrar, times: dict[str, float
         "score": result.score,
         "confidence": result.confidence,
         "reliable": result.reliable,
+        "support": result.support,
+        "standard_deviations": None
+        if deviations is None
+        else {"rotation_deg": deviations[0].tolist(), "translation": deviations[1].tolist()},
+        "covariance": None if result.covariance is None else result.covariance.tolist(),
         "top": top,
         "refinement_rounds": result.iterations,
         "views": len(bank),
@@ -296,6 +305,10 @@ def _print_result(document: dict[str, Any], out: Path) -> None:
         print("no reliable match: take the pose as a guess; check that the box is tight and the mesh is the object's")
     if document["translation"] is not None:
         print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")
+    deviations = document["standard_deviations"]
+    if deviations is not None:
+        turn, shift = (", ".join(f"{v:.2g}" for v in deviations[name]) for name in ("rotation_deg", "translation"))
+        print(f"standard deviations: {turn} degrees; {shift} {document['unit']}   (about and along the camera's axes)")
     print(f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see {out}/overlay.png")
 
 

@@ -50,6 +50,8 @@ def test_register_writes_result_and_overlay(files, capsys):
         "score",
         "confidence",
         "reliable",
+        "support",
+        "covariance",
         "top",
         "seconds",
         "versions",
@@ -64,13 +66,22 @@ def test_register_writes_result_and_overlay(files, capsys):
     overlay = cv2.imread(str(folder / "out" / "overlay.png"))
     assert overlay is not None
     assert overlay.std() > 20
-    assert "viewpoint" in capsys.readouterr().out
+    assert np.shape(result["covariance"]) == (6, 6)
+    deviations = result["standard_deviations"]
+    assert deviations["translation"] == pytest.approx([result["covariance"][i][i] ** 0.5 for i in (3, 4, 5)])
+    assert all(0 < v < 30 for v in deviations["rotation_deg"])
+    printed = capsys.readouterr().out
+    assert "viewpoint" in printed
+    assert "standard deviations: " in printed
 
 
 def test_without_box_and_camera(files):
     folder, _, _ = files
     assert run(folder, "photo.png", "truck.safetensors", "--no-refine") == 0
-    assert json.loads((folder / "out" / "result.json").read_text())["translation"] is None
+    result = json.loads((folder / "out" / "result.json").read_text())
+    assert result["translation"] is None
+    assert result["covariance"] is None
+    assert result["standard_deviations"] is None
 
 
 def test_bank_then_register(files, capsys):

@@ -27,6 +27,7 @@ def estimate_pose(
 
     Returns:
         ``rotation`` (3 x 3 numbers), ``translation`` (3 numbers, unit of the mesh, or None), ``score``, ``confidence``,
+        ``support`` and ``covariance`` (see :class:`Registration`; None where the contour stage did not run),
         ``mesh``: the place of the chosen mesh among the registrars.
 
     Raises:
@@ -42,6 +43,8 @@ def estimate_pose(
         "translation": None if result.translation is None else result.translation.tolist(),
         "score": result.score,
         "confidence": result.confidence,
+        "support": result.support,
+        "covariance": None if result.covariance is None else result.covariance.tolist(),
         "mesh": best,
     }
 

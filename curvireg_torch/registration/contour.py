@@ -88,7 +88,8 @@ def fit_contours(
 
         R = exp([w]x) R_fit,   t = t_fit + e,   (w, e) ~ N(0, covariance).
 
-    It holds for a fit that has found the right edges, and knows nothing of others. Computed on the CPU.
+    It holds for a fit that has found the right edges, and knows nothing of others; turns about an object's axis of
+    symmetry look better known than they are, since the normals of rendered contours are not exact. Computed on the CPU.
 
     Args:
         renderer: of the mesh.
@@ -131,7 +132,7 @@ def fit_contours(
     T = half.descend(around, COARSE)
     best = half.look(T)[1].view(N, -1).topk(FINALISTS, dim=1).indices
     T = T.view(N, -1, 4, 4).gather(1, best[..., None, None].expand(-1, -1, 4, 4)).flatten(0, 1)
-    T = torch.cat([full.descend(T, FINE).view(N, -1, 4, 4), T0[:, None]], dim=1)
+    T = torch.cat([T0[:, None], full.descend(T, FINE).view(N, -1, 4, 4)], dim=1)  # of equals the first wins
     covariance, support = full.look(T.flatten(0, 1))
     winner = support.view(N, -1).argmax(dim=1) + torch.arange(N) * T.shape[1]
     return ContourFit(T.flatten(0, 1)[winner], covariance[winner], support[winner])
@@ -199,8 +200,8 @@ class _Scene:
         return offsets[1:-1] + vertex, torch.where(is_peak, here, 0.0)
 
     def _bounded(self, step: Tensor, T: Tensor) -> Tensor:
-        z = (T[:, :3, :3] @ self.centre + T[:, :3, 3])[:, 2]
-        turn, shift = torch.linalg.vector_norm(step[:, :3], dim=1), torch.linalg.vector_norm(step[:, 3:], dim=1)
+        z = (T[:, :3, :3] @ self.centre + T[:, :3, 3])[:, 2].clamp(min=0.0)
+        turn, shift = (torch.linalg.vector_norm(part, dim=1).clamp(min=1e-12) for part in step.split(3, dim=1))
         share = torch.minimum(MAX_TURN / turn, MAX_SHIFT * z / shift).clamp(max=1.0)
         return step * share[:, None]
 

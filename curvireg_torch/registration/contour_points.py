@@ -22,6 +22,9 @@ JUMP = 0.05
 CREASE_SHARE = 0.02
 """Share of the pixels that may be creases."""
 
+CREASE = 0.1
+"""Curvature in 1/px, smoothed by 1 px, of a crease: edges between faces that differ by 15 degrees or more."""
+
 AGREEMENT = 4
 """Power of the cosine between normal and gradient: halves an edge's strength at 33 degrees."""
 
@@ -46,7 +49,8 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
 
     An occluding contour lies between two neighbouring pixels whose depth jumps (curvilinear saliency peaks on both
     sides of a jump, never on it): half way between them on average, at the depth of the nearer one. Creases are maxima
-    of :func:`depth_curvilinear_saliency` away from jumps. Of each kind a fixed random sample is kept.
+    of :func:`depth_curvilinear_saliency` away from jumps; bent surfaces have none. Of each kind a fixed random sample
+    is kept.
 
     Args:
         depth: (N, 1, H, W) z-depth, 0 = background.
@@ -83,9 +87,12 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
         pairs.append((jump, _middle(pixels, dim - 1).reshape(-1, 2), torch.minimum(a, b), _middle(slope, dim)))
     places, counts = torch.cat([p[1] for p in pairs]), (OCCLUDING, CREASES)
     jumps, depths, normals = (torch.cat([p[i].flatten(2) for p in pairs], dim=2) for i in (0, 2, 3))
-    field = depth_curvilinear_saliency(depth)
-    field = torch.where(F.max_pool2d(beside.float(), 7, 1, 3) > 0, 0.0, field)
-    creases = field_points(field, share=CREASE_SHARE) & seen
+    # Depth in px: saliency is then a curvature in 1 / px, and a threshold has a meaning.
+    field = depth_curvilinear_saliency(
+        depth * (camera_matrix[0, 0] / z.amax(dim=(1, 2, 3), keepdim=True)).float(), depth_scale=1.0
+    )
+    field = torch.where(F.max_pool2d(beside.float(), 9, 1, 4) > 0, 0.0, field)
+    creases = field_points(field, share=CREASE_SHARE, threshold=CREASE) & seen
     kinds = (
         (jumps, places, depths, normals),
         (creases.flatten(2), pixels.view(-1, 2), depth.flatten(2), field.flatten(2)),

@@ -1,0 +1,217 @@
+"""The contour stage against closed forms, automatic differentiation and scenes of known truth."""
+
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F
+import trimesh
+
+from curvireg_torch import Registrar, camera_matrix, rotation_error
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import rotation_from_axis_angle, rotation_towards
+from curvireg_torch.geometry.cameras import project_points, transform
+from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
+from curvireg_torch.registration import contour, fit_contours
+from curvireg_torch.registration.contour_points import EdgeField, contour_points
+from curvireg_torch.rendering import make_renderer
+from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
+from tests._support.scenes import CAMERA, scene, truck_bank
+
+K = camera_matrix(300.0, 310.0, 63.5, 60.0, dtype=torch.float64)
+
+
+def pose(turn: list[float], position: list[float]) -> torch.Tensor:
+    R = rotation_from_axis_angle(torch.tensor(turn, dtype=torch.float64))
+    return transform(R, torch.tensor(position, dtype=torch.float64))
+
+
+def seen_points(mesh: trimesh.Trimesh, T: torch.Tensor):
+    depth = make_renderer(mesh).render(T[None], K, (128, 128))
+    return contour_points(depth, T[None], K, radius=mesh_radius(mesh))
+
+
+def test_derivative_of_the_projection_is_that_of_autograd():
+    points = torch.rand(1, 7, 3, dtype=torch.float64)
+    T, centre = pose([0.3, -0.5, 0.2], [0.1, 0.2, 4.0])[None], torch.tensor([0.4, 0.5, 0.6], dtype=torch.float64)
+
+    def pixels(step: torch.Tensor) -> torch.Tensor:
+        return contour._project(points, contour._moved(T, step[None], centre), K, centre)[0][0]
+
+    # Off zero, where the angle of an axis-angle vector has a derivative.
+    expected = torch.autograd.functional.jacobian(pixels, torch.full((6,), 1e-7, dtype=torch.float64))
+    uv, derivative = contour._project(points, T, K, centre)
+    torch.testing.assert_close(uv[0], project_points(points[0], T[0], K))
+    torch.testing.assert_close(derivative[0], expected, rtol=1e-4, atol=1e-3)
+
+
+def test_contour_of_a_sphere():
+    """Seen from distance D, its rim is the circle in the plane at r^2 / D before its centre."""
+    mesh, D = trimesh.creation.icosphere(subdivisions=5, radius=1.0), 6.0
+    found = seen_points(mesh, pose([0.0, 0.0, 0.0], [0.0, 0.0, D]))
+    rim = found.model[found.valid]
+    assert len(rim) > 200
+    assert float((torch.linalg.vector_norm(rim, dim=1) - 1).abs().max()) < 0.03
+    assert float((rim[:, 2] + 1 / D).abs().median()) < 0.15  # depth changes fast at the rim
+    uv = project_points(rim, pose([0.0, 0.0, 0.0], [0.0, 0.0, D]), K)
+    outwards = F.normalize((uv - K[:2, 2]) / K.diagonal()[:2], dim=1)
+    cosine = (outwards * found.normals[found.valid]).sum(dim=1).abs()
+    assert float(cosine.median()) > 0.995
+    radius = torch.linalg.vector_norm((uv - K[:2, 2]) / K.diagonal()[:2], dim=1)
+    exact = math.tan(math.asin(1 / D))
+    assert abs(float(radius.mean()) - exact) * 300 < 0.1  # px: half way between pixels, without bias
+    assert float((radius - exact).abs().max()) * 300 < 1.0
+
+
+def test_points_lie_on_the_nearer_surface():
+    near, far = trimesh.creation.box((1, 1, 0.2)), trimesh.creation.box((2.2, 2.2, 0.2))
+    near.apply_translation((0, 0, -1))
+    both = trimesh.util.concatenate([near, far])
+    found = seen_points(both, pose([0.2, 0.3, 0.1], [0.0, 0.0, 8.0]))
+    points = found.model[found.valid]
+    to_near = distance_to_box(points, (1.0, 1.0, 0.2), (0.0, 0.0, -1.0))
+    to_far = distance_to_box(points, (2.2, 2.2, 0.2), (0.0, 0.0, 0.0))
+    assert float(torch.minimum(to_near, to_far).max()) < 0.03  # a pixel is 0.027 wide
+    assert int((to_near < 0.03).sum()) > 60
+    # Around the small box its own rim is found, not the place that it hides on the large one.
+    assert int(((points[:, :2].abs().amax(dim=1) < 0.8) & (to_far < 0.03)).sum()) == 0
+
+
+def distance_to_box(points: torch.Tensor, sides: tuple[float, ...], centre: tuple[float, ...]) -> torch.Tensor:
+    beyond = (points - torch.tensor(centre)).abs() - 0.5 * torch.tensor(sides)
+    return torch.linalg.vector_norm(beyond.clamp(min=0), dim=1) + beyond.amax(dim=1).clamp(max=0).abs()
+
+
+def test_edges_are_found_where_they_are():
+    """A step along a slanted line: the strength peaks on it, and only for contours that run along it."""
+    y, x = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
+    n = torch.tensor([0.8, 0.6], dtype=torch.float64)
+    image = torch.sigmoid(4 * (0.8 * x + 0.6 * y - 44.0))[None, None]
+    at = torch.tensor([[[32.0, 31.0]]], dtype=torch.float64)  # 0.2 px beside the line
+    edges, offsets = EdgeField(image), torch.arange(-5, 6, dtype=torch.float64)
+    along = edges.strength(at, n.view(1, 1, 2), offsets)[0, 0]
+    assert int(along.argmax()) == 5
+    assert float(along[0]) < 0.1 * float(along[5])
+    across = edges.strength(at, torch.tensor([[[-0.6, 0.8]]], dtype=torch.float64), offsets)
+    assert float(across.max()) < 0.01
+    assert float(edges.strength(at + 500, n.view(1, 1, 2), offsets).max()) == 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_pose_three_degrees_and_three_per_cent_off_is_recovered(seed):
+    mesh, generator = example_mesh(), torch.Generator().manual_seed(seed)
+    size, camera = (360, 480), camera_matrix(600.0, 600.0, 239.5, 179.5, dtype=torch.float64)
+    T = random_pose(mesh, camera, size, generator, elevations=(10.0, 50.0))
+    black = torch.zeros(3, *size)  # darker than any shade of the object: its outline shows all around
+    image, box = synthesize_photograph(mesh, T, camera, size, generator, background=black, texture=0.0)
+    axis = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+    centre = mesh_centre(mesh)
+    off = torch.cat([math.radians(3.0) * axis, 0.03 * T[2, 3] * torch.tensor([0.1, 0.1, 0.99])])
+    start = contour._moved(T[None], off[None], centre)
+
+    def fitted(starts: torch.Tensor):
+        return fit_contours(make_renderer(mesh), image, box, camera, starts, centre=centre, radius=mesh_radius(mesh))
+
+    fit = fitted(start)
+    # Below half a degree but for scene 0 (0.53 when this was written).
+    assert float(rotation_error(fit.transform[0, :3, :3], T[:3, :3])) < (0.6 if seed == 0 else 0.5)
+    assert float((fit.transform[0, :3, 3] - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.01
+    R = fit.transform[0, :3, :3]
+    torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=torch.float64))
+    C = fit.covariance[0]
+    assert float(torch.linalg.eigvalsh(C).min()) > 0
+    assert 0.001 < float(torch.rad2deg(C.diagonal()[:3].sqrt()).max()) < 3.0
+    both = fitted(torch.cat([start, T[None]]))
+    torch.testing.assert_close(both.transform[:1], fit.transform)
+    torch.testing.assert_close(both.support[:1], fit.support)
+
+
+def test_covariance_is_that_of_turn_and_translation_of_the_origin():
+    """Directly in (w, e), from the derivative of R = exp([w]x) R0, t = t0 + e."""
+    generator = torch.Generator().manual_seed(0)
+    T, centre = pose([0.3, -0.5, 0.2], [0.1, 0.2, 4.0])[None], torch.tensor([2.0, 0.5, 0.6], dtype=torch.float64)
+    points = centre + torch.rand(1, 40, 3, generator=generator, dtype=torch.float64)
+    normals = F.normalize(torch.randn(1, 40, 1, 2, generator=generator, dtype=torch.float64), dim=-1)
+    W, d = torch.ones(1, 40, 1, dtype=torch.float64), torch.randn(1, 40, 1, generator=generator, dtype=torch.float64)
+    J = (normals @ contour._project(points, T, K, centre)[1])[..., 0, :]
+    found = contour._covariance(J, W, d, T[:, :3, :3] @ centre)[0]
+
+    def pixels(step: torch.Tensor) -> torch.Tensor:
+        R = rotation_from_axis_angle(step[None, :3])[0] @ T[0, :3, :3]
+        return project_points(points[0], transform(R, T[0, :3, 3] + step[3:]), K)
+
+    derivative = torch.autograd.functional.jacobian(pixels, torch.full((6,), 1e-7, dtype=torch.float64))
+    rows = (normals[0] @ derivative)[:, 0]
+    expected = contour.CORRELATED * float((d * d).sum()) / (40 - 6) * torch.linalg.inv(rows.T @ rows)
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-9)
+
+
+def cube_fit(image: torch.Tensor, start: torch.Tensor, mesh: trimesh.Trimesh | None = None):
+    mesh = trimesh.creation.box((1.0, 1.4, 0.8)) if mesh is None else mesh
+    box = torch.tensor([40.0, 36, 88, 84])
+    return fit_contours(make_renderer(mesh), image, box, K, start, centre=mesh_centre(mesh), radius=mesh_radius(mesh))
+
+
+def test_nothing_to_hold_on_to_leaves_the_pose_as_it_is():
+    start = pose([0.4, 0.5, 0.1], [0.0, 0.0, 8.0])[None]
+    blank = cube_fit(torch.full((3, 128, 128), 0.4), start)
+    assert blank.transform.equal(start)
+    assert float(blank.support) == 0
+    assert bool(blank.covariance.isnan().all())
+    noise = torch.rand(3, 128, 128, generator=torch.Generator().manual_seed(0))
+    for away in ([9.0, 0.0, 8.0], [0.0, 0.0, -8.0]):  # beside the crop; behind the camera
+        start = pose([0.4, 0.5, 0.1], away)[None]
+        outside = cube_fit(noise, start)
+        assert outside.transform.equal(start)
+        assert float(outside.support) == 0
+        assert bool(outside.covariance.isnan().all())
+
+
+def test_the_place_of_a_sphere_is_found_and_unknown_turns_are_said_to_be_unknown():
+    mesh, T = trimesh.creation.icosphere(subdivisions=4, radius=0.7), pose([0.0, 0.0, 0.0], [0.1, 0.0, 8.0])
+    image = (make_renderer(mesh).render(T[None], K, (128, 128))[0] > 0).float()
+    fit = cube_fit(image, pose([0.0, 0.0, 0.0], [0.2, 0.1, 8.2])[None], mesh)
+    assert float((fit.transform[0, :3, 3] - T[:3, 3]).norm()) < 0.08
+    rim = F.normalize(torch.randn(1, 50, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)), dim=-1)
+    normals = F.normalize(rim[..., None, :2], dim=-1)  # of an orthographic view: turns slide the rim along itself
+    J = torch.cat([torch.zeros(1, 50, 3, dtype=torch.float64), normals[:, :, 0], rim[..., :1]], dim=-1)
+    ones = torch.ones(1, 50, 1, dtype=torch.float64)
+    assert bool(contour._covariance(J, ones, ones, torch.zeros(1, 3, dtype=torch.float64)).isnan().all())
+
+
+def test_bad_input_is_named():
+    image, start = torch.rand(3, 128, 128), pose([0.4, 0.5, 0.1], [0.0, 0.0, 8.0])[None]
+    with pytest.raises(InvalidInputError, match="starts: expected finite"):
+        cube_fit(image, start * math.nan)
+    with pytest.raises(InvalidInputError, match="starts: expected shape"):
+        cube_fit(image, start[0])
+    with pytest.raises(InvalidInputError, match="image: expected shape"):
+        cube_fit(image[None], start)
+    none = cube_fit(image, start[:0])
+    assert none.transform.shape == (0, 4, 4)
+    assert none.covariance.shape == (0, 6, 6)
+    assert none.support.shape == (0,)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, None])
+def test_the_registrar_ends_with_the_contours(camera):
+    errors: dict[bool, list[float]] = {True: [], False: []}
+    for seed in (0, 1, 2):
+        image, box, T = scene(seed)
+        results = {c: Registrar(truck_bank(), contours=c)(image[None], box[None], camera)[0] for c in (True, False)}
+        truth = T[:3, :3]
+        if camera is None:
+            ray = truth @ mesh_centre(truck_bank().mesh) + T[:3, 3]
+            truth = rotation_towards(ray).T @ truth  # the view of a camera that looks straight at it
+        for c, result in results.items():
+            errors[c].append(float(rotation_error(result.rotation, truth)))
+        assert results[False].support is None
+        assert results[False].covariance is None
+        with_contours = results[True]
+        assert with_contours.support is not None
+        assert 0 < with_contours.support < 1
+        assert (with_contours.covariance is None) == (with_contours.translation is None) == (camera is None)
+        assert (with_contours.standard_deviations is None) == (camera is None)
+        assert 0 <= with_contours.score <= 1
+    assert sorted(errors[True])[1] < 1.0
+    assert sorted(errors[True])[1] < sorted(errors[False])[1]
