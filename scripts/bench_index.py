@@ -16,8 +16,8 @@ from safetensors import safe_open
 from torch.nn.functional import normalize
 
 import curvireg_torch as cr
-from curvireg_torch.evaluation.presets import preset_named
 from curvireg_torch.matching import ViewBank, ViewIndex
+from curvireg_torch.presets import preset_named
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
 TOP = (1, 10, 100)
@@ -28,7 +28,7 @@ def photographs(count: int) -> torch.Tensor:
     mesh, size = example_mesh(), (240, 320)
     K = cr.camera_matrix(400.0, 400.0, 159.5, 119.5, dtype=torch.float64)
     views = cr.sample_views(azimuth_step=90, elevations=[20])
-    matcher = cr.ViewMatcher(ViewBank.build(mesh, views, settings=preset_named("default").bank, progress=False))
+    matcher = cr.ViewMatcher(ViewBank.build(mesh, views, settings=preset_named("classical").bank, progress=False))
     generator, shots = torch.Generator().manual_seed(0), []
     for _ in range(count):
         shots.append(synthesize_photograph(mesh, random_pose(mesh, K, size, generator), K, size, generator))

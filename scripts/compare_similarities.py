@@ -22,7 +22,6 @@ import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset, Pascal3DPlus, read_image
 from curvireg_torch.evaluation import Benchmark, BOPBenchmark, Pascal3DBenchmark, Protocol
 from curvireg_torch.evaluation.pascal3d import SYMMETRIES
-from curvireg_torch.evaluation.presets import preset_named
 from curvireg_torch.evaluation.protocol import perturbed_box
 from curvireg_torch.geometry import rotation_towards, whole_image_box
 from curvireg_torch.matching import (
@@ -38,6 +37,7 @@ from curvireg_torch.matching import (
     unit_score,
 )
 from curvireg_torch.metrics import symmetric_rotation_error, symmetry_transforms
+from curvireg_torch.presets import preset_named
 from curvireg_torch.synthetic import procedural_background
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -108,7 +108,7 @@ def benchmark(data: Path, name: str) -> Benchmark:
 
 def shots(data: Path, name: str, boxes: dict[str, float | None]) -> Iterator[tuple[ViewBank, Path, list[Shot]]]:
     """The objects of a set, those of one mesh together, with its bank."""
-    chosen, preset = benchmark(data, name), preset_named("default")
+    chosen, preset = benchmark(data, name), preset_named("classical")
     items = chosen.items[:: EVERY.get(name, 1)]
     for meshes in sorted({item.meshes for item in items}):
         bank = cached_bank(
@@ -140,7 +140,7 @@ def exact(query: QueryFeatures) -> QueryFeatures:
 
 
 def populations(data: Path) -> dict[str, DescriptorStatistics]:
-    settings, generator = preset_named("default").bank, torch.Generator().manual_seed(0)
+    settings, generator = preset_named("classical").bank, torch.Generator().manual_seed(0)
     clutter = [procedural_background((360, 480), generator) for _ in range(12)]
     photographs = []
     for path in sorted((data / "backgrounds").glob("*.jpg")):

@@ -15,7 +15,6 @@ import json
 import math
 import platform
 import time
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +22,9 @@ import torch
 import trimesh
 
 from curvireg_torch import Registrar, camera_matrix, rotation_error
-from curvireg_torch.evaluation.presets import PRESETS
 from curvireg_torch.geometry import axis_angle_from_rotation
 from curvireg_torch.matching import cached_bank
+from curvireg_torch.presets import DEFAULT, PRESETS
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
 SIZE = (360, 480)
@@ -126,17 +125,18 @@ def main() -> None:
     parser.add_argument("--meshes", nargs="+", choices=sorted(MESHES), default=list(MESHES))
     parser.add_argument("--jitter", type=float, nargs="+", default=[0.0, 0.05], help="of the box, shares of its sides")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "refinement.json")
+    parser.add_argument("--preset", choices=sorted(PRESETS), default=DEFAULT)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    preset, rows = PRESETS["default"], {f"{j:g}": {} for j in arguments.jitter}
+    preset, rows = PRESETS[arguments.preset], {f"{j:g}": {} for j in arguments.jitter}
     for name in arguments.meshes:
         mesh = MESHES[name]()
         mesh.units = "m"
         bank = cached_bank(mesh, preset.views("upright"), preset.bank, progress=False)
         registrars = {
-            "view": Registrar(bank, refine=False),
-            "search": Registrar(bank, contours=False),
-            "contours": Registrar(bank),
+            "view": preset.registrar(bank, refine=False),
+            "search": preset.registrar(bank, refine=True, contours=False),
+            "contours": preset.registrar(bank, refine=True),
         }
         for jitter in arguments.jitter:
             own = rows[f"{jitter:g}"][name] = [
@@ -152,7 +152,7 @@ def main() -> None:
             }
             for jitter, own in rows.items()
         },
-        "bank": asdict(preset.bank),
+        "preset": preset.describe(),
         "torch": torch.__version__,
         "machine": platform.machine(),
     }

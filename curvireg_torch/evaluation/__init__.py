@@ -4,7 +4,7 @@
 ``-m curvireg_torch.evaluation pascal3d ROOT --out DIR`` shares the objects among processes.
 """
 
-from ..presets import PRESETS, Preset
+from ..presets import DEFAULT, PRESETS, Preset
 from .benchmark import Benchmark
 from .bop import BOPBenchmark
 from .command import add_parser, run
@@ -13,6 +13,7 @@ from .pascal3d import Pascal3DBenchmark
 from .protocol import Protocol
 
 __all__ = [
+    "DEFAULT",
     "PRESETS",
     "BOPBenchmark",
     "Benchmark",

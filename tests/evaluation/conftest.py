@@ -1,7 +1,7 @@
 import pytest
 
 from curvireg_torch.data import BOPDataset, Pascal3DPlus
-from curvireg_torch.evaluation import PRESETS
+from curvireg_torch.evaluation import DEFAULT, PRESETS
 from tests._support.miniature import write_bop, write_pascal3d
 
 from .small import SMALL
@@ -9,7 +9,7 @@ from .small import SMALL
 
 @pytest.fixture(autouse=True)
 def _small(monkeypatch, tmp_path):
-    monkeypatch.setitem(PRESETS, "default", SMALL)
+    monkeypatch.setitem(PRESETS, DEFAULT, SMALL)
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
 
 

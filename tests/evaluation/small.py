@@ -8,7 +8,7 @@ import signal
 import sys
 from dataclasses import dataclass
 
-from curvireg_torch.evaluation import PRESETS, Preset
+from curvireg_torch.evaluation import DEFAULT, PRESETS, Preset
 from curvireg_torch.evaluation.__main__ import main
 from curvireg_torch.geometry import ViewSphere, sample_views
 from curvireg_torch.matching import BankSettings
@@ -41,7 +41,7 @@ def die_at(count: int) -> None:
 
 
 if __name__ == "__main__":
-    PRESETS["default"] = SMALL
+    PRESETS[DEFAULT] = SMALL
     if "CURVIREG_TEST_KILL" in os.environ:
         die_at(int(os.environ["CURVIREG_TEST_KILL"]))
     sys.exit(main())

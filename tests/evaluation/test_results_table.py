@@ -40,7 +40,7 @@ def test_table_from_summaries(repository, pascal, bop, tmp_path):
     assert "old" not in text
     summary = json.loads((tmp_path / "mini" / "summary.json").read_text())
     assert f"| mini | {summary['n']} | {100 * summary['acc_pi_6']:.1f} % |" in text
-    assert "- cubes: split test; cad=annotated pose=any box=0.1 seed=0; preset default; 0 failed, " in text
+    assert "- cubes: split test; cad=annotated pose=any box=0.1 seed=0; preset learned; 0 failed, " in text
     widths = [line.count("|") for line in text.splitlines() if line.startswith("|")]
     assert set(widths[:3]) == {widths[0]}
     assert set(widths[3:]) == {widths[3]}
