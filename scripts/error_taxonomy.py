@@ -3,9 +3,9 @@
     python scripts/error_taxonomy.py DIR [DIR ...]           --out of "curvireg evaluate pascal3d", one column each
     python scripts/error_taxonomy.py DIR --pictures OUT --root ROOT [--pixel-origin 0]      draws the errors
 
-Every object gets the first kind that holds: right (within 30 degrees, symmetries of the class taken into account); half
-a turn (azimuth off by 180 +- 30 degrees); mirrored (azimuth as in a mirror, left for right, +- 30 degrees); elevation or
-in-plane angle (azimuth within 30 degrees); other. Pictures show the photograph's crop beside the depth view of the pose
+Every object gets the first kind that holds: right (within 30 degrees, symmetries of the class taken into account);
+half a turn (azimuth off by 180 +- 30 degrees); mirrored (azimuth as in a mirror, left for right, +- 30 degrees);
+elevation or in-plane angle (azimuth within 30 degrees); other. Pictures show the photograph's crop beside the depth view of the pose
 that was found; they are for looking at, not for committing.
 """
 
@@ -102,7 +102,7 @@ def draw(rows: list[dict[str, str]], dataset: Pascal3DPlus, out: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "folders", type=Path, nargs="+", metavar="DIR", help="named by their own or their parent's name"
+        "folders", type=Path, nargs="+", metavar="DIR", help="results of an evaluation"
     )
     parser.add_argument("--names", nargs="+", metavar="NAME", help="of the columns; default: names of the folders")
     parser.add_argument("--pictures", type=Path, metavar="OUT", help="draw the first folder's errors; no table")

@@ -7,9 +7,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..descriptors import field_points
-from ..filters import depth_curvilinear_saliency, gaussian_smooth
+from ..filters import depth_curvilinear_saliency
 from ..filters.curvilinear import fill_depth
-from ..filters.derivatives import central_gradient
+from ..filters.derivatives import central_gradient, smooth
 
 __all__ = ["ContourPoints", "EdgeField", "contour_points"]
 
@@ -69,7 +69,7 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
     H, W = depth.shape[-2:]
     seen = depth > 0
     z = torch.where(seen, depth, depth.amax(dim=(1, 2, 3), keepdim=True) + 4.0 * radius)
-    slope = torch.cat(central_gradient(gaussian_smooth(fill_depth(depth, None, None), 1.0)), dim=1)
+    slope = torch.cat(central_gradient(smooth(fill_depth(depth, None, None), 1.0)), dim=1)
     v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in (H, W)), indexing="ij")
     pixels = torch.stack([u, v], dim=-1)
     beside = torch.zeros_like(seen)
@@ -132,7 +132,7 @@ class EdgeField:
     """
 
     def __init__(self, crop: Tensor) -> None:
-        gx, gy = central_gradient(gaussian_smooth(crop, 1.0))
+        gx, gy = central_gradient(smooth(crop, 1.0))
         self._gradient = torch.stack([gx, gy], dim=2).flatten(1, 2)
         self._level = self._gradient.square().sum(dim=1).mean().sqrt().clamp(min=1e-6)
 
