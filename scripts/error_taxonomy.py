@@ -5,8 +5,8 @@
 
 Every object gets the first kind that holds: right (within 30 degrees, symmetries of the class taken into account);
 half a turn (azimuth off by 180 +- 30 degrees); mirrored (azimuth as in a mirror, left for right, +- 30 degrees);
-elevation or in-plane angle (azimuth within 30 degrees); other. Pictures show the photograph's crop beside the depth view of the pose
-that was found; they are for looking at, not for committing.
+elevation or in-plane angle (azimuth within 30 degrees); other. Pictures show the photograph's crop beside the depth view
+of the pose that was found; they are for looking at, not for committing.
 """
 
 import argparse
@@ -101,9 +101,7 @@ def draw(rows: list[dict[str, str]], dataset: Pascal3DPlus, out: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "folders", type=Path, nargs="+", metavar="DIR", help="results of an evaluation"
-    )
+    parser.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="results of an evaluation")
     parser.add_argument("--names", nargs="+", metavar="NAME", help="of the columns; default: names of the folders")
     parser.add_argument("--pictures", type=Path, metavar="OUT", help="draw the first folder's errors; no table")
     parser.add_argument("--root", type=Path, help="of the dataset, for --pictures")

@@ -9,6 +9,10 @@ import torch
 import trimesh
 
 from curvireg_torch.cli import main
+from curvireg_torch.geometry import sample_views
+from curvireg_torch.learned import adapt
+from curvireg_torch.matching import BankSettings
+from curvireg_torch.presets import DEFAULT, PRESETS, Preset
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import scene, truck_bank
 
@@ -171,3 +175,30 @@ def test_demo_runs_as_a_module_and_is_right(tmp_path, monkeypatch):
     assert "error against the truth" in done.stdout
     assert trimesh.load(tmp_path / "demo" / "mesh.ply").is_empty is False
     assert (tmp_path / "demo" / "overlay.png").stat().st_size > 10_000
+
+
+def test_every_preset_that_shares_the_banks_settings_registers(files):
+    folder, box, _ = files
+    for preset in ("learned", "classical", "fast"):
+        assert run(folder, "photo.png", "truck.safetensors", "--preset", preset, "--no-refine", box=box) == 0
+
+
+def test_adapted_field_from_bank_to_register(files, monkeypatch, capsys):
+    folder, box, _ = files
+    called = {}
+
+    def quick(mesh, *, upright, progress):
+        called["upright"] = upright
+        return adapt(mesh, scenes=16, upright=upright, workers=0, progress=progress)
+
+    monkeypatch.setattr("curvireg_torch.cli.adapt", quick)
+    small = Preset(bank=BankSettings(image_size=64))
+    monkeypatch.setattr(Preset, "views", lambda *_: sample_views(azimuth_step=90, elevations=[20]))
+    monkeypatch.setitem(PRESETS, DEFAULT, small)
+    out, field = folder / "own.safetensors", folder / "own_field.safetensors"
+    arguments = ["bank", str(folder / "truck.ply"), "--pose", "upright", "--out", str(out), "--adapt", str(field)]
+    assert main([*arguments, "--quiet"]) == 0
+    assert called["upright"] == 1.0
+    assert "adapted field" in capsys.readouterr().out
+    assert run(folder, "photo.png", "own.safetensors", "--field", str(field), "--no-refine", box=box) == 0
+    assert run(folder, "photo.png", "own.safetensors", "--field", str(folder / "none"), box=box) == 2

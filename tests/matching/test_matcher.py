@@ -128,3 +128,27 @@ def test_repeatability_scores():
     assert float(repeatability_score(rep)[0, 1]) == pytest.approx(2.718281828 ** (-(0.3**2) / 0.02), rel=1e-4)
     with pytest.raises(InvalidInputError, match="mode"):
         repeatability_score(rep, mode="other")
+
+
+@pytest.mark.parametrize(("colour", "channels"), [(True, 3), (False, 1)])
+def test_colours_go_to_the_fields_that_want_them(colour, channels):
+    seen = []
+
+    class Field(torch.nn.Module):
+        def forward(self, image):
+            seen.append(image.shape[1])
+            return torch.cat([image[:, :1], image[:, :1]], dim=1)
+
+    field = Field()
+    field.colour = colour
+    ViewMatcher(truck_bank(), field=field)(*batch(0))
+    assert set(seen) == {channels}
+
+
+def test_factors_are_left_out_where_their_width_is_none():
+    images, boxes = batch(0, 1)
+    plain = ViewMatcher(truck_bank(), repeatability_sigma=None, box_sigma=None)(images, boxes)
+    assert torch.equal(plain.scores, unit_score(plain.hog))
+    assert bool((plain.box == 1).all())
+    wide = ViewMatcher(truck_bank(), repeatability_sigma=1e6, box_sigma=1e6)(images, boxes)
+    assert torch.allclose(wide.scores, plain.scores, atol=1e-5)
