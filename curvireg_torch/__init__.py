@@ -50,6 +50,9 @@ from .geometry import (
     uniform_views,
     viewpoint_from_rotation,
 )
+from .learned import (
+    LearnedCurvilinearSaliency,
+)
 from .matching import (
     BankCollection,
     BankSettings,
@@ -81,6 +84,7 @@ __all__ = [
     "HessianFrobeniusNorm",
     "ImageCurvilinearSaliency",
     "ImageGradient",
+    "LearnedCurvilinearSaliency",
     "MultiScaleCurvilinearSaliency",
     "MultiScaleFocusCurves",
     "Pascal3DPlus",

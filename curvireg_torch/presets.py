@@ -11,7 +11,7 @@ from .errors import InvalidInputError
 from .filters import ImageGradient, MultiScaleCurvilinearSaliency, MultiScaleFocusCurves
 from .geometry import ViewSphere, sample_views, uniform_views
 from .learned import LearnedCurvilinearSaliency
-from .matching import BankSettings, ViewBank, ViewMatcher
+from .matching import BankSettings, DescriptorStatistics, ViewBank, ViewMatcher
 from .registration import Registrar
 
 __all__ = ["DEFAULT", "FIELDS", "PRESETS", "Preset", "preset_named"]
@@ -33,6 +33,7 @@ class Preset:
         bank: of every view bank.
         field: name of the photograph filter, one of ``FIELDS``.
         matcher: further options of :class:`ViewMatcher`.
+        whitened: whiten descriptors by the statistics of the bank, shrunk by Ledoit-Wolf, as the paper does.
         refine: search around the best views of the bank, and follow the contours.
 
     Example:
@@ -43,6 +44,7 @@ class Preset:
     bank: BankSettings = dataclass_field(default_factory=lambda: BankSettings(image_size=128, sigma=0.8))
     field: str = "learned"
     matcher: Mapping[str, Any] = dataclass_field(default_factory=dict)
+    whitened: bool = False
     refine: bool = True
 
     def photograph_filter(self) -> nn.Module:
@@ -61,22 +63,28 @@ class Preset:
             field: default :meth:`photograph_filter`.
             options: of :class:`Registrar`.
         """
-        matcher = ViewMatcher(bank, field=field or self.photograph_filter(), **self.matcher)
+        statistics = DescriptorStatistics.from_bank(bank) if self.whitened else None
+        whitening = None if statistics is None else statistics.whitening(shrinkage="ledoit-wolf")
+        matcher = ViewMatcher(bank, field=field or self.photograph_filter(), whitening=whitening, **self.matcher)
         return Registrar(matcher, **{"refine": self.refine, **options})
 
     def describe(self) -> dict[str, Any]:
         """Everything that decides a result, as plain numbers and texts."""
-        return {**asdict(self.bank), "field": self.field, **self.matcher, "refine": self.refine}
+        own = {"field": self.field, **self.matcher, "whitened": self.whitened, "refine": self.refine}
+        return {**asdict(self.bank), **own}
 
 
 _PAPER = BankSettings(image_size=256, sigma=1.0, formula="paper", camera="orthographic")
 
 PRESETS = {
-    "learned": Preset(matcher={"repeatability_sigma": 0.2}),
+    "learned": Preset(),
     "classical": Preset(field="focus"),
-    "fast": Preset(matcher={"repeatability_sigma": 0.2, "slack": 0.0}, refine=False),
+    "fast": Preset(matcher={"slack": 0.0}, refine=False),
     "paper": Preset(
-        bank=_PAPER, field="focus", matcher={"repeatability_mode": "paper", "box_sigma": None, "slack": 0.0}
+        bank=_PAPER,
+        field="focus",
+        matcher={"repeatability_mode": "paper", "box_sigma": None, "slack": 0.0},
+        whitened=True,
     ),
 }
 """``learned``: the photograph's field by :class:`LearnedCurvilinearSaliency`; ``classical``: by focus curves, nothing

@@ -5,8 +5,8 @@
 
 Every object gets the first kind that holds: right (within 30 degrees, symmetries of the class taken into account);
 half a turn (azimuth off by 180 +- 30 degrees); mirrored (azimuth as in a mirror, left for right, +- 30 degrees);
-elevation or in-plane angle (azimuth within 30 degrees); other. Pictures show the photograph's crop beside the depth view
-of the pose that was found; they are for looking at, not for committing.
+elevation or in-plane angle (azimuth within 30 degrees); other. Pictures show the photograph's crop beside the depth
+view of the pose that was found; they are for looking at, not for committing.
 """
 
 import argparse
