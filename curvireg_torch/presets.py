@@ -11,6 +11,7 @@ from .errors import InvalidInputError
 from .filters import ImageGradient, MultiScaleCurvilinearSaliency, MultiScaleFocusCurves
 from .geometry import ViewSphere, sample_views, uniform_views
 from .learned import LearnedCurvilinearSaliency
+from .learned.network import SHA256
 from .matching import BankSettings, DescriptorStatistics, ViewBank, ViewMatcher
 from .registration import Registrar
 
@@ -71,7 +72,8 @@ class Preset:
     def describe(self) -> dict[str, Any]:
         """Everything that decides a result, as plain numbers and texts."""
         own = {"field": self.field, **self.matcher, "whitened": self.whitened, "refine": self.refine}
-        return {**asdict(self.bank), **own}
+        weights = {"weights_sha256": SHA256[:16]} if self.field == "learned" else {}
+        return {**asdict(self.bank), **own, **weights}
 
 
 _PAPER = BankSettings(image_size=256, sigma=1.0, formula="paper", camera="orthographic")

@@ -11,26 +11,66 @@ the difference within 30 degrees with its interval over paired resamples.
 """
 
 import argparse
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
+from kornia.color import rgb_to_grayscale
 from results_table import REPOSITORY, commit, today
 from torch import Tensor
 
 from curvireg_torch.data import BOPDataset, Pascal3DPlus
 from curvireg_torch.evaluation import Benchmark, BOPBenchmark, Pascal3DBenchmark, Protocol, evaluate
 from curvireg_torch.evaluation.store import PredictionStore
-from curvireg_torch.presets import PRESETS, Preset
+from curvireg_torch.filters import MultiScaleFocusCurves
+from curvireg_torch.learned import LearnedCurvilinearSaliency, adapt
+from curvireg_torch.matching import ViewBank
+from curvireg_torch.presets import FIELDS, PRESETS, Preset
+from curvireg_torch.registration import Registrar
 
 KEPT = REPOSITORY / "scripts" / "results" / "ablation.json"
 PAGE = REPOSITORY / "docs" / "accuracy.md"
 BEGIN, END = "<!-- ablation:begin -->", "<!-- ablation:end -->"
 SETS = {"pascal3d_mini": "upright", "hope": "any", "lm": "any", "dino": "any"}
 RESAMPLES = 2000
+ADAPTED = 1000
+"""Generated photographs of each mesh in the row "adapted"."""
 
+
+class _Both(torch.nn.Module):
+    """Where the learned field is, the photograph's own edges: MFC times the root of the learned length."""
+
+    colour = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.learned, self.focus = LearnedCurvilinearSaliency(), MultiScaleFocusCurves()
+
+    def forward(self, image: Tensor) -> Tensor:
+        grey = rgb_to_grayscale(image) if image.shape[1] == 3 else image
+        field: Tensor = self.focus(grey) * self.learned(image).norm(dim=1, keepdim=True).sqrt()
+        return field
+
+
+class _Adapted(Preset):
+    """The learned field, fine-tuned on generated photographs of each mesh."""
+
+    folder: ClassVar[Path]
+
+    def registrar(self, bank: ViewBank, *, field: torch.nn.Module | None = None, **options: Any) -> Registrar:
+        digest = hashlib.sha256(bank.mesh.vertices.tobytes()).hexdigest()[:16]
+        path = self.folder / f"{digest}.safetensors"
+        if not path.exists():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with torch.enable_grad():
+                adapt(bank.mesh, scenes=ADAPTED).save(path)
+        return super().registrar(bank, field=LearnedCurvilinearSaliency(weights=path), **options)
+
+
+FIELDS["both"] = _Both
 _classical = replace(PRESETS["classical"], refine=False)
 _learned = replace(PRESETS["learned"], refine=False)
 
@@ -39,14 +79,16 @@ ROWS: dict[str, Preset] = {
     "without S_rep": replace(_classical, matcher={"repeatability_sigma": None}),
     "without S_box": replace(_classical, matcher={"box_sigma": None}),
     "without slack": replace(_classical, matcher={"slack": 0.0}),
-    "crops of 256 px": replace(_classical, bank=replace(_classical.bank, image_size=256, sigma=1.0)),
-    "depth smoothed by 1.2 px": replace(_classical, bank=replace(_classical.bank, sigma=1.2)),
     "gradient instead of MFC": replace(_classical, field="gradient"),
     "MCS instead of MFC": replace(_classical, field="saliency"),
     "paper": replace(PRESETS["paper"], refine=False),
     "classical, refined": replace(_classical, refine=True),
     "learned": _learned,
-    "learned x MFC": replace(_learned, field="both"),
+    "learned, without S_rep": replace(_learned, matcher={"repeatability_sigma": None}),
+    "learned, without S_box": replace(_learned, matcher={"box_sigma": None}),
+    "learned, without slack": replace(_learned, matcher={"slack": 0.0}),
+    "learned + classical": replace(_learned, field="both"),
+    "adapted": _Adapted(refine=False),
     "learned, refined": replace(_learned, refine=True),
 }
 """Name -> settings; differences are taken against the first."""
@@ -134,6 +176,7 @@ def main() -> None:
     if not arguments.table:
         if arguments.data is None:
             parser.error("DATA is needed to measure")
+        _Adapted.folder = arguments.out / "fields"
         for row in arguments.rows:
             for name in arguments.sets:
                 kept = measure(row, name, arguments.data, arguments.out)
