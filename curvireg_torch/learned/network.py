@@ -16,7 +16,7 @@ from ..filters.derivatives import safe_sqrt
 __all__ = ["FieldNetwork", "LearnedCurvilinearSaliency", "doubled_angle", "halved_angle"]
 
 WEIGHTS = Path(__file__).with_name("field.safetensors")
-SHA256 = "0c2ba184987a70524adfe01fc0010f92a28d55f23dca8d45f34039a0e50d71f5"
+SHA256 = "9c262139e4dd6d1e86faffa40ce4fc5206c750bbf3482297d56e4903e2f8cce0"
 """Of ``WEIGHTS``: a file that is not the one of the model card is refused."""
 
 WORK_SIZE = 128
