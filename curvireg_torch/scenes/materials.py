@@ -94,4 +94,4 @@ def random_picture(rng: np.random.Generator, size: int) -> Array:
                 a, b = rng.uniform(0.2, 1, 2) * reach
                 axes, angle = (int(a) + 1, int(b) + 1), float(rng.uniform(0, 180))
                 cv2.ellipse(picture, (x, y), axes, angle, 0, 360, colour, -1, cv2.LINE_AA)
-    return np.clip(picture, 0, 1).astype(np.float32)
+    return np.ascontiguousarray(np.clip(picture, 0, 1), dtype=np.float32)

@@ -71,7 +71,8 @@ def make_scene(
 
     things = [(placed, shape.faces, shape.materials, 0)]
     floor = float((shape.vertices[:, 2]).min())
-    ground = standing and rng.random() < 0.6
+    above = float(-(R.T @ centre)[2]) > floor + 0.1  # seen from below, the ground would hide everything
+    ground = standing and rng.random() < 0.6 and above
     for k, other in enumerate(clutter):
         things.append((*_beside(other, R, centre, floor if ground else None, K, size, rng), k + 1))
     if ground:
@@ -82,7 +83,10 @@ def make_scene(
     fine = 3 * size // 2
     K_fine = np.diag([1.5, 1.5, 1.0]) @ K
     K_fine[:2, 2] += 0.25  # pixel centres are whole numbers
-    picture, seen = _render(things, R, centre, _rays(K_fine, fine), fine, rng)
+    rays = _rays(K_fine, fine)
+    picture, seen = _render(things, R, centre, rays, fine, rng)
+    if seen.mean() < 0.1 * (depth > 0).mean():  # hidden: nothing could be learnt
+        picture, seen = _render(things[:1], R, centre, rays, fine, rng)
     picture = cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA)
     visible = cv2.resize(seen.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA) > 0.5
     picture = picture[cut[1] : cut[3], cut[0] : cut[2]]
@@ -193,9 +197,10 @@ def _render(
         gloss[here], shininess[here] = look.gloss, look.shininess
     light = _lighting(scene, points, normal, view, colour, gloss, shininess, R, rng)
     picture = random_picture(rng, size)
-    picture.reshape(-1, 3)[hit] = light
+    row, column = np.divmod(hit, size)
+    picture[row, column] = light
     seen = np.zeros((size, size), bool)
-    seen.reshape(-1)[hit] = owner[triangle] == 0
+    seen[row, column] = owner[triangle] == 0
     if rng.random() < 0.35:  # depth of field: what is farther off is blurred
         sigma = rng.uniform(0.7, 4.0)
         near = (depth < centre[2] + 1.0).astype(np.float32).reshape(size, size)

@@ -10,6 +10,7 @@ from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching import BankSettings, ViewDescriber
 from curvireg_torch.scenes import GeneratedScenes
 from curvireg_torch.scenes.camera_noise import photographed
+from curvireg_torch.scenes.materials import random_picture
 
 
 @pytest.fixture(scope="module")
@@ -105,3 +106,19 @@ def test_a_camera_keeps_the_picture_recognisable():
         assert picture.dtype == np.uint8
         assert picture.shape == clean.shape
         assert picture[24:40, 24:40].mean() > picture[:8].mean() + 40
+
+
+def test_the_object_is_in_every_picture():
+    """Also where the ground or clutter would hide it; and its pixels are its own, not the background's."""
+    scenes = GeneratedScenes(400, seed=77_000_001, upright=1.0)
+    for i in range(24):
+        sample = scenes[i]
+        assert sample["visible"].float().mean() > 0.08 * (sample["depth"] > 0).float().mean(), i
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_backgrounds_can_be_drawn_into(seed):
+    """Of every kind: rays write their colours into the picture itself."""
+    picture = random_picture(np.random.default_rng(seed), 16)
+    picture.reshape(-1, 3)[:] = 0.5
+    assert (picture == 0.5).all()
