@@ -82,14 +82,14 @@ ROWS: dict[str, Preset] = {
     "gradient instead of MFC": replace(_classical, field="gradient"),
     "MCS instead of MFC": replace(_classical, field="saliency"),
     "paper": replace(PRESETS["paper"], refine=False),
-    "classical, refined": replace(_classical, refine=True),
+    "classical, refined": PRESETS["classical"],
     "learned": _learned,
     "learned, without S_rep": replace(_learned, matcher={"repeatability_sigma": None}),
     "learned, without S_box": replace(_learned, matcher={"box_sigma": None}),
     "learned, without slack": replace(_learned, matcher={"slack": 0.0}),
     "learned + classical": replace(_learned, field="both"),
     "adapted": _Adapted(refine=False),
-    "learned, refined": replace(_learned, refine=True),
+    "learned, refined": PRESETS["learned"],
 }
 """Name -> settings; differences are taken against the first."""
 

@@ -10,7 +10,7 @@ import torch
 
 from .. import __version__
 from .._checks import check_positive
-from ..presets import DEFAULT, Preset, preset_named
+from ..presets import DEFAULT, PRESETS, Preset, preset_named
 from .benchmark import Benchmark, Row
 from .predict import predict
 from .store import PredictionStore, to_json, write_text
@@ -59,7 +59,7 @@ def evaluate(
         >>> evaluate(Pascal3DBenchmark(cars, Protocol()), Path("out"))["acc_pi_6"]          # doctest: +SKIP
     """
     chosen = preset_named(preset) if isinstance(preset, str) else preset
-    name = preset if isinstance(preset, str) else "own"
+    name = next((known for known, settings in PRESETS.items() if settings is chosen), "own")
     if limit is not None:
         check_positive(limit, "limit")
     store = PredictionStore(out / "predictions")
