@@ -16,7 +16,7 @@ from ..filters.derivatives import safe_sqrt
 __all__ = ["FieldNetwork", "LearnedCurvilinearSaliency", "doubled_angle", "halved_angle"]
 
 WEIGHTS = Path(__file__).with_name("field.safetensors")
-SHA256 = "9c262139e4dd6d1e86faffa40ce4fc5206c750bbf3482297d56e4903e2f8cce0"
+SHA256 = "928f1dc5ccf2784d401f86a3388079a50a95e855705e3dc2086eeae3e02ab859"
 """Of ``WEIGHTS``: a file that is not the one of the model card is refused."""
 
 WORK_SIZE = 128
