@@ -14,8 +14,8 @@ EVIDENCE = ("similarity", "margin", "concentration")
 RELIABLE = 0.6
 """Confidence below which a registration says "no reliable match"."""
 
-_WEIGHTS = (6.658, 1.42, 0.181)
-_BIAS = -5.02
+_WEIGHTS = (9.513, 1.042, 2.375)
+_BIAS = -8.803
 """Logistic regression on scenes made in code, by scripts/calibrate_confidence.py."""
 
 _APART = 30.0  # degrees beyond which two views are rival answers
