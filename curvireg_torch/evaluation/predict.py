@@ -103,6 +103,5 @@ class _Workshop:
     def _registrar(self, path: Path, protocol: Protocol) -> Registrar:
         mesh, views = load_mesh(path, unit=self.benchmark.unit), self.preset.views(protocol.pose)
         bank = cached_bank(mesh, views, self.preset.bank, renderer=self.renderer, progress=False)
-        return Registrar(
-            bank, field=self.field, refine=self.preset.refine and protocol.cad != "fused", renderer=self.renderer
-        )
+        refine = self.preset.refine and protocol.cad != "fused"
+        return self.preset.registrar(bank, field=self.field, refine=refine, renderer=self.renderer)

@@ -10,7 +10,7 @@ from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol,
 from curvireg_torch.evaluation.store import PredictionStore
 from curvireg_torch.registration import Registrar
 
-from .small import SMALL
+from .small import SMALL, SmallPreset
 
 
 def run(benchmark, out, **options):
@@ -157,3 +157,16 @@ def test_fused_takes_the_view_that_is_best_on_average(monkeypatch):
     best = scores.mean(0).argmax()
     assert seen == [int(best)]
     assert row["mesh"] == int(scores[:, best].argmax())
+
+
+def test_the_presets_options_reach_the_matcher(pascal, tmp_path):
+    seen = []
+
+    class Watched(SmallPreset):
+        def registrar(self, bank, **options):
+            made = super().registrar(bank, **options)
+            seen.append(made.matcher)
+            return made
+
+    evaluate(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out", preset=Watched(matcher={"slack": 0.05}), limit=1)
+    assert seen[0].slack == 0.05
