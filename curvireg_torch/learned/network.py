@@ -16,7 +16,7 @@ from ..filters.derivatives import safe_sqrt
 __all__ = ["FieldNetwork", "LearnedCurvilinearSaliency", "doubled_angle", "halved_angle"]
 
 WEIGHTS = Path(__file__).with_name("field.safetensors")
-SHA256 = "928f1dc5ccf2784d401f86a3388079a50a95e855705e3dc2086eeae3e02ab859"
+SHA256 = "a32e00a1984fa8f54c49a9c0df33ae24538fac0193c3958a40b88a4eaf837892"
 """Of ``WEIGHTS``: a file that is not the one of the model card is refused."""
 
 WORK_SIZE = 128
