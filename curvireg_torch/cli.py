@@ -25,7 +25,7 @@ from .geometry.mesh import UNITS
 from .learned import LearnedCurvilinearSaliency, adapt
 from .matching import ViewBank, cache_folder, cached_bank, clear_cache, list_cache
 from .presets import DEFAULT, PRESETS, Preset, preset_named
-from .registration import Registrar, Registration
+from .registration import RELIABLE, Registrar, Registration
 from .rendering import BACKENDS
 
 __all__ = ["main"]
@@ -37,7 +37,7 @@ CONVENTIONS = {
     "pixels": "(0, 0) is the centre of the top-left pixel; boxes are x0, y0, x1, y1",
     "score": "normalised correlation of photograph and view, 0 to 1",
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
-    "reliable": "confidence of at least 0.6; false = no reliable match, the pose is a guess",
+    "reliable": f"confidence of at least {RELIABLE:g}; false = no reliable match, the pose is a guess",
     "support": "how strongly edges of the photograph lie under the mesh's contours, 0 to 1",
     "covariance": "of turn (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
     "t_true = t + e; null without --camera",
@@ -156,6 +156,7 @@ def _bank(arguments: argparse.Namespace) -> None:
     size = arguments.out.stat().st_size / 1e6
     print(f"{arguments.out}: {len(bank)} views, {size:.1f} MB, {time.perf_counter() - start:.1f} s")
     if arguments.adapt is not None:
+        arguments.adapt.parent.mkdir(parents=True, exist_ok=True)  # not after minutes of training
         start = time.perf_counter()
         upright = 1.0 if arguments.pose == "upright" else 0.0
         adapt(mesh, upright=upright, progress=not arguments.quiet).save(arguments.adapt)

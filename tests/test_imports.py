@@ -9,10 +9,11 @@ import curvireg_torch
 
 PACKAGE = Path(curvireg_torch.__file__).parent
 
-BASE = {"errors", "_checks", "_threads"}
+BASE = {"errors", "_checks", "_files", "_threads"}
 ALLOWED = {
     "errors": set(),
     "_checks": {"errors"},
+    "_files": set(),
     "_threads": set(),
     "geometry": BASE,
     "filters": BASE,

@@ -6,10 +6,11 @@ from pathlib import Path
 import torch
 import torch.nn.functional as F
 from safetensors import SafetensorError
-from safetensors.torch import load, save_file
+from safetensors.torch import load
 from torch import Tensor, nn
 
 from .._checks import check_colour_image
+from .._files import write_tensors
 from ..errors import InvalidInputError, MissingFileError
 from ..filters.derivatives import safe_sqrt
 
@@ -159,10 +160,8 @@ class LearnedCurvilinearSaliency(nn.Module):
 
 def save_weights(network: FieldNetwork, path: Path) -> None:
     """Half-precision safetensors; ``path`` appears when it is complete."""
-    state = {k: v.detach().cpu().contiguous() for k, v in network.state_dict().items()}
-    partial = path.with_name(path.name + ".partial")
-    save_file({k: v.half() if v.is_floating_point() else v for k, v in state.items()}, partial)
-    partial.replace(path)
+    state = network.state_dict()
+    write_tensors(path, {k: v.half() if v.is_floating_point() else v for k, v in state.items()})
 
 
 def _read_weights(path: Path, *, packaged: bool) -> dict[str, Tensor]:

@@ -1,8 +1,6 @@
 """A bank of rendered views of one mesh, described once and matched many times."""
 
 import json
-import os
-import uuid
 from dataclasses import asdict, fields
 from os import PathLike
 from pathlib import Path
@@ -12,10 +10,10 @@ import numpy as np
 import torch
 import trimesh
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 from tqdm import tqdm
 
+from .._files import write_tensors
 from .._threads import one_thread_each
 from ..errors import BankError, InvalidInputError, MissingFileError
 from ..geometry.mesh import as_mesh, mesh_radius
@@ -159,7 +157,6 @@ class ViewBank:
         Descriptors are stored in float16: they move by at most 5e-4 of themselves, cosines by less than 1e-4
         (``tests/matching/test_bank.py``).
         """
-        path = Path(path)
         views = {f"views.{f.name}": getattr(self.views, f.name) for f in fields(ViewSphere)}
         mesh = {
             "mesh.vertices": torch.from_numpy(np.array(self.mesh.vertices, dtype=np.float64)),
@@ -172,13 +169,7 @@ class ViewBank:
             "settings": json.dumps(asdict(self.settings)),
             "unit": self.mesh.units or "m",
         }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
-        try:
-            temporary.write_bytes(save({k: v.cpu().contiguous() for k, v in tensors.items()}, metadata))
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_tensors(Path(path), tensors, metadata)
 
     @classmethod
     def load(cls, path: str | PathLike[str], *, device: torch.device | str = "cpu") -> "ViewBank":

@@ -5,7 +5,6 @@ from dataclasses import dataclass, fields
 
 import torch
 import torch.nn.functional as F
-from kornia.color import rgb_to_grayscale
 from torch import Tensor, nn
 
 from .._checks import check_option, check_positive
@@ -16,7 +15,7 @@ from ..geometry.crops import crop_images
 from .bank import ViewBank
 from .box_shape import box_shape_score, box_shapes, whole_box_shapes
 from .collection import BankCollection
-from .query import QueryFeatures, crop_regions, slack_boxes
+from .query import QueryFeatures, crop_regions, photograph_field, slack_boxes
 from .repeatability import MODES, dilate_points, repeatability, repeatability_score
 from .similarity import unit_score
 from .whitening import Whitening
@@ -165,12 +164,8 @@ class ViewMatcher(nn.Module):
         return self._describe(crops[:, None], torch.full_like(crops[:, 0, 0, 0], torch.nan))
 
     def _describe(self, crops: Tensor, shapes: Tensor) -> QueryFeatures:
-        B, K, channels = crops.shape[:3]
-        if channels not in (1, 3):
-            raise InvalidInputError(f"images: expected 1 (grey) or 3 (RGB) channels, got {channels}")
-        flat = crops.flatten(0, 1)
-        grey = channels == 3 and not getattr(self.field, "colour", False)
-        field: Tensor = self.field(rgb_to_grayscale(flat) if grey else flat)
+        B, K = crops.shape[:2]
+        field = photograph_field(self.field, crops.flatten(0, 1))
         points = field_points(field, share=self.bank.settings.point_share)[:, 0]
         return QueryFeatures(
             crops=crops[:, 0],

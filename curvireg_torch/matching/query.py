@@ -4,13 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from kornia.color import rgb_to_grayscale
+from torch import Tensor, nn
 
 from .._checks import check_tensor
 from ..errors import InvalidInputError
 from ..geometry.crops import check_boxes, crop_images, square_boxes
 
-__all__ = ["QueryFeatures", "crop_regions", "slack_boxes"]
+__all__ = ["QueryFeatures", "crop_regions", "photograph_field", "slack_boxes"]
 
 _MOVES = ((0, 0, 0), (-0.75, 0, 0), (0.75, 0, 0), (0, -0.75, 0), (0, 0.75, 0), (0, 0, -1), (0, 0, 1))
 """Shifts in x and y and the exponent of the scale, in units of the slack."""
@@ -41,6 +42,15 @@ class QueryFeatures:
         return QueryFeatures(
             self.crops[index], self.field[index], self.descriptors[index], self.points[index], self.shapes[index]
         )
+
+
+def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
+    """(B, 2, S, S) of (B, 1 or 3, S, S) crops: in grey, unless the filter has an attribute ``colour = True``."""
+    if crops.shape[1] not in (1, 3):
+        raise InvalidInputError(f"images: expected 1 (grey) or 3 (RGB) channels, got {crops.shape[1]}")
+    grey = crops.shape[1] == 3 and not getattr(field, "colour", False)
+    out: Tensor = field(rgb_to_grayscale(crops) if grey else crops)
+    return out
 
 
 def slack_boxes(boxes: Tensor, slack: float) -> Tensor:

@@ -1,25 +1,23 @@
 """Statistics of descriptors, and the linear map after which their entries are uncorrelated (LDA, Aubry et al. 2014)."""
 
 import math
-import os
-import uuid
 from collections.abc import Iterable
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
 import torch
-from kornia.color import rgb_to_grayscale
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from .._checks import check_option, check_tensor
+from .._files import write_tensors
 from ..errors import BankError, InvalidInputError, MissingFileError
 from ..filters import MultiScaleFocusCurves
 from ..geometry.crops import crop_images
 from .bank import ViewBank
 from .describe import BankSettings
+from .query import photograph_field
 
 __all__ = ["DescriptorStatistics", "Whitening"]
 
@@ -135,7 +133,7 @@ class DescriptorStatistics:
             for boxes in torch.cat([corner, corner + side], dim=1).split(16):
                 cut = crop_images([image] * len(boxes), boxes, size=settings.image_size, margin=0.0)[0]
                 with torch.no_grad():
-                    found.append(describe(field(rgb_to_grayscale(cut) if cut.shape[1] == 3 else cut)))
+                    found.append(describe(photograph_field(field, cut)))
         if not found:
             raise InvalidInputError("images: expected at least one image")
         return cls.from_descriptors(torch.cat(found))
@@ -176,20 +174,13 @@ class DescriptorStatistics:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write a safetensors file, in float16; it appears whole or not at all."""
-        path = Path(path)
         scale = float(self.covariance.abs().amax().clamp(min=torch.finfo(torch.float32).tiny))
         tensors = {
             "mean": self.mean.half(),
             "covariance": (self.covariance / scale).half(),
             "numbers": torch.tensor([float(self.count), self.fourth, scale], dtype=torch.float64),
         }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
-        try:
-            temporary.write_bytes(save({k: v.cpu().contiguous() for k, v in tensors.items()}, {"format": _FORMAT}))
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_tensors(Path(path), tensors, {"format": _FORMAT})
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> "DescriptorStatistics":
