@@ -17,11 +17,12 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
+from curvireg_torch._files import write_tensors
 from curvireg_torch.filters import MultiScaleFocusCurves
 from curvireg_torch.geometry import rotation_error, sample_views
 from curvireg_torch.learned import FieldNetwork, Lessons, Replay, altered, halved_angle, losses
@@ -104,11 +105,7 @@ def save_state(
     state |= {f"average.{k}": v for k, v in average.state_dict().items()}
     for k, moments in optimizer.state_dict()["state"].items():
         state |= {f"optimizer.{k}.{name}": value for name, value in moments.items()}
-    partial = path.with_suffix(".partial")
-    save_file(
-        {k: v.detach().clone().contiguous() for k, v in state.items()}, partial, {k: str(v) for k, v in counts.items()}
-    )
-    partial.replace(path)
+    write_tensors(path, state, {k: str(v) for k, v in counts.items()})
 
 
 def load_state(path: Path, network: FieldNetwork, average: FieldNetwork, optimizer: torch.optim.Optimizer) -> None:
