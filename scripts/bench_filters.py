@@ -1,7 +1,9 @@
 """Time of every layer as a multiple of one ``x.clone()``, eager and compiled, and of a formulation by kornia alone.
 
 All times of a row come from one run with the same threads; the clone is timed again beside every layer, because other
-work on the machine moves both. The smallest of the repetitions counts.
+work on the machine moves both. The smallest of the repetitions counts. ``fresh`` is the floor of any layer: ones
+written to a new tensor of the output's shape, whose pages the operating system hands out one by one, where a clone gets
+the memory of the one before.
 
     python scripts/bench_filters.py [--threads 2] [--batch 64] [--size 256] [--skip-compile]
 
@@ -154,8 +156,10 @@ def main() -> None:
                 torch._dynamo.reset()
                 compiled = torch.compile(layer, fullgraph=True)
                 row["compiled_s"] = smallest(lambda f=compiled, d=data: f(d), options.repetitions)
+            shape = layer(data).shape
+            row["fresh_s"] = smallest(lambda s=shape: torch.ones(s), options.repetitions)
             row["clone_s"] = min(before, clone())
-            for kind in ("eager", "kornia", "compiled"):
+            for kind in ("eager", "kornia", "compiled", "fresh"):
                 if f"{kind}_s" in row:
                     row[f"{kind}_clones"] = round(row[f"{kind}_s"] / row["clone_s"], 1)
             if "kornia_s" in row:

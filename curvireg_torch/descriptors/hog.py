@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from .._checks import check_field, check_option, check_positive, check_tensor
 from ..errors import InvalidInputError
-from ..filters.derivatives import at_least_float32, full_precision, safe_sqrt
+from ..filters.derivatives import Planes, at_least_float32, full_precision, in_blocks, safe_sqrt
 
 __all__ = ["HOG", "hog", "hog_length"]
 
@@ -69,15 +69,19 @@ def hog(
     H, W = field.shape[-2:]
     if min(H, W) < grid:
         raise InvalidInputError(f"field: expected at least {grid} x {grid} px for grid={grid}, got {H} x {W}")
-    votes = _orientation_votes(at_least_float32(field), bins, voting)
     if bin_weights is not None:
         check_tensor(bin_weights, "bin_weights", (bins,))
-        votes = votes * bin_weights.to(votes.dtype).view(1, -1, 1, 1)
-    rows = _cell_weights(H, grid, voting, votes)
-    columns = _cell_weights(W, grid, voting, votes)
-    with full_precision(votes):
-        cells = rows @ (votes @ columns.T)  # (B, bins, grid, grid)
-    return _normalised_blocks(cells, block, clip).to(field.dtype)
+
+    def layer(field: Tensor) -> Planes:
+        votes = _orientation_votes(field, bins, voting)
+        rows, columns = _cell_weights(H, grid, voting, votes), _cell_weights(W, grid, voting, votes)
+        with full_precision(votes):
+            cells = rows @ (votes @ columns.T)  # (B, bins, grid, grid)
+        if bin_weights is not None:
+            cells = cells * bin_weights.to(cells.dtype).view(1, -1, 1, 1)
+        return (_normalised_blocks(cells, block, clip),)
+
+    return in_blocks(layer, at_least_float32(field)).to(field.dtype)
 
 
 def _check_layout(grid: int, bins: int, block: int) -> None:
@@ -97,9 +101,12 @@ def _orientation_votes(field: Tensor, bins: int, voting: str) -> Tensor:
     if voting == "hard":
         # remainder may round up to ``bins`` itself.
         return length * (torch.floor(position).clamp(max=bins - 1) == index)
-    distance = torch.remainder(position - (index + 0.5), bins)
-    distance = torch.minimum(distance, bins - distance)
-    return length * (1.0 - distance).clamp(min=0.0) if bins > 1 else length
+    if bins == 1:
+        return length
+    # 1 - min(d, bins - d), written so that every step but the first can happen in place.
+    half = 0.5 * bins
+    distance = (position - (index + 0.5)).abs_().sub_(half).abs_()
+    return distance.add_(1.0 - half).clamp_(min=0.0).mul_(length)
 
 
 def _cell_weights(length: int, grid: int, voting: str, like: Tensor) -> Tensor:

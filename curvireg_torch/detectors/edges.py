@@ -6,7 +6,7 @@ from torch import Tensor
 
 from .._checks import check_image, check_positive
 from ..descriptors.points import strongest_points
-from ..filters.derivatives import at_least_float32, central_hessian, replicate_pad, safe_sqrt, smooth
+from ..filters.derivatives import at_least_float32, central_derivatives, replicate_pad, safe_sqrt, smooth
 from .base import Detection, from_field, grey_bytes
 
 
@@ -33,7 +33,7 @@ def laplacian_of_gaussian(image: Tensor, *, sigma: float = 2.0, share: float = 0
     """
     check_image(image)
     check_positive(sigma, "sigma")
-    xx, yy, _ = central_hessian(smooth(at_least_float32(image), sigma))
+    _, _, xx, yy, _ = central_derivatives(smooth(at_least_float32(image), sigma))
     laplacian = xx + yy
     response = torch.zeros_like(laplacian)
     for dim in (-1, -2):

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
 import torch
@@ -36,19 +36,26 @@ def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1) -> Tensor:
     x = replicate_pad(x, radius + margin)
     if radius == 0:
         return x
-    offsets = torch.arange(-radius, radius + 1, device=x.device, dtype=x.dtype)
-    kernel = torch.exp(-0.5 * (offsets / sigma) ** 2).to(x.dtype)
-    if isinstance(sigma, Tensor):
-        kernel = kernel * (offsets.abs() <= torch.ceil(4.0 * sigma))
-    weights = (kernel / kernel.sum()).unbind()
+    weights = _gaussian(sigma, radius, x)
     # Sums of shifted images: on a CPU seldom slower than convolutions, on few images several times faster, and
     # compiled they are one loop.
     for dim in (-1, -2):
         padded, length = x, x.shape[dim] - 2 * radius
         x = padded.narrow(dim, 0, length) * weights[0]
         for i in range(1, 2 * radius + 1):
-            x.addcmul_(padded.narrow(dim, i, length), weights[i])
+            part = padded.narrow(dim, i, length)
+            x = x.addcmul_(part, weights[i]) if isinstance(weights, Tensor) else x.add_(part, alpha=weights[i])
     return x
+
+
+def _gaussian(sigma: float | Tensor, radius: int, like: Tensor) -> Sequence[float] | Tensor:
+    """2 radius + 1 weights: numbers for a number, a tensor for a tensor."""
+    if not isinstance(sigma, Tensor):
+        kernel = [math.exp(-0.5 * (i / sigma) ** 2) for i in range(-radius, radius + 1)]
+        return [weight / sum(kernel) for weight in kernel]
+    offsets = torch.arange(-radius, radius + 1, device=like.device, dtype=like.dtype)
+    weights = torch.exp(-0.5 * (offsets / sigma) ** 2).to(like.dtype) * (offsets.abs() <= torch.ceil(4.0 * sigma))
+    return weights / weights.sum()
 
 
 def _support(sigma: float | Tensor) -> int:
@@ -74,47 +81,57 @@ def replicate_pad(x: Tensor, radius: int) -> Tensor:
     return x
 
 
+Planes = tuple[Tensor, ...]
+"""The channels of a result, each (B, 1, H, W), or several of them together."""
+
 BLOCK = 2**18
 """Pixels that :func:`in_blocks` hands to a layer at once."""
 
 
-def in_blocks(layer: Callable[..., Tensor], *tensors: Tensor | None) -> Tensor:
-    """``layer(*tensors)``, on a CPU a few images at a time so that what it computes on the way stays in the cache.
+def in_blocks(layer: Callable[..., Planes], *tensors: Tensor | None) -> Tensor:
+    """``channels(*layer(*tensors))``, on a CPU a few images at a time so that what it computes stays in the cache.
 
     Only for layers that treat each image by itself. ``tensors`` share their first dimension; None stays None.
     """
     x = tensors[0]
     assert x is not None
     if torch.compiler.is_compiling() or x.device.type != "cpu" or x.numel() <= BLOCK:
-        return layer(*tensors)
+        return channels(*layer(*tensors))
     size = max(1, BLOCK // x.shape[1:].numel())
     parts = [[None] * math.ceil(len(x) / size) if t is None else t.split(size) for t in tensors]
     blocks = (layer(*part) for part in zip(*parts, strict=True))
     if torch.is_grad_enabled():
-        return torch.cat(list(blocks))
+        return torch.cat([channels(*planes) for planes in blocks])
     # One block in memory at a time.
     first = next(blocks)
-    out = first.new_empty(len(x), *first.shape[1:])
-    for place, block in zip(out.split(size), itertools.chain([first], blocks), strict=True):
-        place.copy_(block)
+    out = x.new_empty(len(x), sum(plane.shape[1] for plane in first), *first[0].shape[2:])
+    for place, planes in zip(out.split(size), itertools.chain([first], blocks), strict=True):
+        torch.cat(planes, dim=1, out=place)
     return out
 
 
 def central_gradient(p: Tensor) -> tuple[Tensor, Tensor]:
     """(x_x, x_y) by central differences per px of an image with a margin of 1 px."""
-    return 0.5 * (p[..., 1:-1, 2:] - p[..., 1:-1, :-2]), 0.5 * (p[..., 2:, 1:-1] - p[..., :-2, 1:-1])
+    return _half(p[..., 1:-1, 2:], p[..., 1:-1, :-2]), _half(p[..., 2:, 1:-1], p[..., :-2, 1:-1])
 
 
-def central_hessian(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(x_xx, x_yy, x_xy) by central differences per px^2 of an image with a margin of 1 px."""
-    x, slope = p[..., 1:-1, 1:-1], 0.5 * (p[..., 2:] - p[..., :-2])
-    xx = torch.sub(p[..., 1:-1, 2:] + p[..., 1:-1, :-2], x, alpha=2)
-    yy = torch.sub(p[..., 2:, 1:-1] + p[..., :-2, 1:-1], x, alpha=2)
-    return xx, yy, 0.5 * (slope[..., 2:, :] - slope[..., :-2, :])
+def central_derivatives(p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """(x_x, x_y, x_xx, x_yy, x_xy) by central differences per px and px^2 of an image with a margin of 1 px."""
+    x, slope = p[..., 1:-1, 1:-1], _half(p[..., 2:], p[..., :-2])
+    xx = (p[..., 1:-1, 2:] + p[..., 1:-1, :-2]).sub_(x, alpha=2)
+    yy = (p[..., 2:, 1:-1] + p[..., :-2, 1:-1]).sub_(x, alpha=2)
+    xy = _half(slope[..., 2:, :], slope[..., :-2, :])
+    return slope[..., 1:-1, :], _half(p[..., 2:, 1:-1], p[..., :-2, 1:-1]), xx, yy, xy
+
+
+def _half(after: Tensor, before: Tensor) -> Tensor:
+    return torch.sub(after, before).mul_(0.5)
 
 
 def channels(*planes: Tensor) -> Tensor:
     """(B, C, H, W) of C tensors (B, 1, H, W)."""
+    if len(planes) == 1:
+        return planes[0]
     # Compiled, a concatenation of single channels would be laid out channels last and transposed again.
     return torch.stack([plane.squeeze(1) for plane in planes], dim=1)
 
@@ -165,8 +182,7 @@ def image_gradient(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
         [1.0, 0.0]
     """
     check_image(image)
-    gx, gy = central_gradient(smooth(at_least_float32(image), sigma))
-    return channels(gx, gy).to(image.dtype)
+    return in_blocks(lambda x: central_gradient(smooth(x, sigma)), at_least_float32(image)).to(image.dtype)
 
 
 class ImageGradient(nn.Module):

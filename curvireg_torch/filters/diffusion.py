@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from .._checks import check_option, check_positive, check_tensor
 from ..errors import InvalidInputError
-from .derivatives import at_least_float32
+from .derivatives import Planes, at_least_float32, in_blocks, replicate_pad
 from .learnable import as_number, parameter_if
 
 __all__ = ["AnisotropicDiffusion", "anisotropic_diffusion"]
@@ -51,24 +51,25 @@ def anisotropic_diffusion(
         raise InvalidInputError(f"iterations: expected >= 0, got {iterations}")
     if not 0 < step <= 0.25:
         raise InvalidInputError(f"step: expected 0 < step <= 0.25 (stability), got {step}")
-    x = at_least_float32(image)
-    zero_column, zero_row = torch.zeros_like(x[..., :1]), torch.zeros_like(x[..., :1, :])
-    for _ in range(iterations):
-        # The flow between two neighbours is computed once and enters both with opposite signs.
-        flow_x = _flow(x[..., 1:] - x[..., :-1], kappa, conductance)
-        flow_y = _flow(x[..., 1:, :] - x[..., :-1, :], kappa, conductance)
-        x = x + step * (
-            torch.cat([flow_x, zero_column], -1)
-            - torch.cat([zero_column, flow_x], -1)
-            + torch.cat([flow_y, zero_row], -2)
-            - torch.cat([zero_row, flow_y], -2)
-        )
-    return x.to(image.dtype)
+
+    def layer(x: Tensor) -> Planes:
+        for _ in range(iterations):
+            p = replicate_pad(x, 1)  # no difference, hence no flow, across the border
+            # The flow between two neighbours is computed once and enters both with opposite signs.
+            flow_x = _flow(p[..., 1:-1, 1:] - p[..., 1:-1, :-1], kappa, conductance)
+            flow_y = _flow(p[..., 1:, 1:-1] - p[..., :-1, 1:-1], kappa, conductance)
+            x = torch.add(x, flow_x[..., 1:], alpha=step).sub_(flow_x[..., :-1], alpha=step)
+            x = x.add_(flow_y[..., 1:, :], alpha=step).sub_(flow_y[..., :-1, :], alpha=step)
+        return (x,)
+
+    return in_blocks(layer, at_least_float32(image)).to(image.dtype)
 
 
 def _flow(difference: Tensor, kappa: float | Tensor, conductance: str) -> Tensor:
-    ratio = (difference / kappa).square()
-    return difference / (1.0 + ratio) if conductance == "rational" else difference * torch.exp(-ratio)
+    scaled = difference * (1.0 / kappa)
+    if conductance == "rational":
+        return difference / torch.addcmul(scaled.new_ones(()), scaled, scaled)
+    return difference * torch.exp(-scaled.square())
 
 
 class AnisotropicDiffusion(nn.Module):

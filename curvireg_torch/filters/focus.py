@@ -9,11 +9,11 @@ from torch import Tensor, nn
 
 from .._checks import check_image, check_option, check_positive
 from ..errors import InvalidInputError
-from .curvilinear import unit_vector
+from .curvilinear import along
 from .derivatives import (
+    Planes,
     at_least_float32,
     central_gradient,
-    channels,
     floor,
     gaussian_smooth,
     image_maximum,
@@ -78,9 +78,9 @@ def edge_blur(
     check_image(image)
     check_option(mode, MODES, "mode")
 
-    def layer(x: Tensor) -> Tensor:
+    def layer(x: Tensor) -> Planes:
         gx, gy = central_gradient(smooth(x, 0.0))
-        return channels(*_edge_blur(x, torch.addcmul(gx * gx, gy, gy), reblur_sigmas, mode))
+        return tuple(_edge_blur(x, torch.addcmul(gx * gx, gy, gy), reblur_sigmas, mode))
 
     return in_blocks(layer, at_least_float32(image)).to(image.dtype)
 
@@ -147,7 +147,7 @@ def multiscale_focus_curves(
     check_positive(saliency_weight, "saliency_weight", zero_ok=True)
     limit = math.exp(-scales) if threshold is None else threshold
 
-    def layer(image: Tensor) -> Tensor:
+    def layer(image: Tensor) -> Planes:
         x = smooth(image, sigma)
         gx, gy = central_gradient(x)
         x = x[..., 1:-1, 1:-1]
@@ -157,7 +157,7 @@ def multiscale_focus_curves(
         focus = blur.clamp(min=_DIFFERENCE_VARIANCE**0.5).reciprocal()
         kept = (focus > limit) & (saliency > _EDGE_FLOOR * image_maximum(saliency))
         weight = saliency.clamp(min=floor(saliency)) ** saliency_weight
-        return focus * weight * kept.to(focus.dtype) * unit_vector(gx, gy)
+        return along(focus * weight * kept, gx, gy)
 
     return in_blocks(layer, at_least_float32(image)).to(image.dtype)
 

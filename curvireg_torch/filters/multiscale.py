@@ -7,8 +7,16 @@ from torch import Tensor, nn
 
 from .._checks import check_image, check_option, check_positive
 from ..errors import InvalidInputError
-from .curvilinear import image_curvilinear_saliency
-from .derivatives import at_least_float32, image_maximum, in_blocks, safe_sqrt
+from .curvilinear import along
+from .derivatives import (
+    Planes,
+    at_least_float32,
+    central_gradient,
+    channels,
+    image_maximum,
+    in_blocks,
+    smooth,
+)
 from .diffusion import CONDUCTANCES, anisotropic_diffusion
 from .edge_preserving import bilateral_smooth, guided_smooth
 from .learnable import as_number, parameter_if
@@ -73,9 +81,10 @@ def multiscale_curvilinear_saliency(
     check_positive(last, "diffusion_time")
     times = [last * 2.0 ** (k - scales) for k in range(2, scales + 1)]
 
-    def layer(image: Tensor) -> Tensor:
+    def layer(image: Tensor) -> Planes:
         level, done = image, 0
-        fields = [_normalised_saliency(level, sigma)]
+        field, saliency = _normalised_saliency(level, sigma)
+        lowest = saliency
         for time in times:
             if smoothing == "perona-malik":
                 steps = max(round(time / STEP), 1)
@@ -84,22 +93,24 @@ def multiscale_curvilinear_saliency(
                 )
                 done = max(steps, done)
             else:
-                smooth = bilateral_smooth if smoothing == "bilateral" else guided_smooth
-                level = smooth(image, sigma=math.sqrt(2.0 * time), kappa=kappa)
-            fields.append(_normalised_saliency(level, sigma))
-        stack = torch.stack(fields, dim=1)
-        saliency = safe_sqrt(stack.square().sum(dim=2))
-        best = saliency.argmax(dim=1)[:, None, None].expand(-1, -1, 2, -1, -1)
-        kept = (saliency > limit).all(dim=1, keepdim=True)
-        return stack.gather(1, best).squeeze(1) * kept
+                edge_preserving = bilateral_smooth if smoothing == "bilateral" else guided_smooth
+                level = edge_preserving(image, sigma=math.sqrt(2.0 * time), kappa=kappa)
+            level_field, level_saliency = _normalised_saliency(level, sigma)
+            # A selection by arithmetic: on a CPU far faster than argmax and gather.
+            field = torch.lerp(field, level_field, (level_saliency > saliency).to(field.dtype))
+            saliency, lowest = torch.maximum(saliency, level_saliency), torch.minimum(lowest, level_saliency)
+        return (field * (lowest > limit),)
 
     return in_blocks(layer, at_least_float32(image)).to(image.dtype)
 
 
-def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> Tensor:
-    field = image_curvilinear_saliency(level, sigma=sigma)
-    peak = image_maximum(safe_sqrt(field.square().sum(dim=1, keepdim=True)))
-    return field / torch.where(peak > 0, peak, 1.0)
+def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> tuple[Tensor, Tensor]:
+    """CS of a level as vectors and their lengths, 1 at the image's largest."""
+    gx, gy = central_gradient(smooth(level, sigma))
+    saliency = torch.addcmul(gx * gx, gy, gy)
+    peak = image_maximum(saliency)
+    saliency = saliency / torch.where(peak > 0, peak, 1.0)
+    return channels(*along(saliency, gx, gy)), saliency
 
 
 class MultiScaleCurvilinearSaliency(nn.Module):

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from .._checks import check_image, check_option, check_positive
 from ..errors import InvalidInputError
-from .curvilinear import unit_vector
-from .derivatives import at_least_float32, central_hessian, in_blocks, safe_sqrt, smooth
+from .curvilinear import along, dominant_eigenvector
+from .derivatives import Planes, at_least_float32, central_derivatives, in_blocks, smooth
 
 __all__ = ["PrincipalCurvatureImage", "principal_curvature_image"]
 
@@ -55,23 +55,17 @@ def principal_curvature_image(
         check_positive(sigma, "sigmas")
     sign = 1.0 if eigenvalue == "largest" else -1.0
 
-    def layer(image: Tensor) -> Tensor:
-        best = torch.zeros_like(image)
-        vx, vy = torch.zeros_like(image), torch.zeros_like(image)
+    def layer(image: Tensor) -> Planes:
+        best, vx, vy = torch.zeros_like(image), torch.zeros_like(image), torch.zeros_like(image)
         for sigma in sigmas:
-            xx, yy, xy = (sign * sigma**2 * h for h in central_hessian(smooth(image, sigma)))
-            gap = xx - yy
-            root = safe_sqrt(gap * gap + 4.0 * xy * xy)
-            curvature = 0.5 * (xx + yy + root)
-            better = curvature > best
-            best = torch.where(better, curvature, best)
-            # Of the two ways to write the eigenvector to the larger eigenvalue, the one that does not cancel.
-            first = gap >= 0
-            vx = torch.where(better, torch.where(first, gap + root, 2.0 * xy), vx)
-            vy = torch.where(better, torch.where(first, 2.0 * xy, root - gap), vy)
+            xx, yy, xy = (sign * sigma**2 * h for h in central_derivatives(smooth(image, sigma))[2:])
+            x, y, half_gap = dominant_eigenvector(xx, xy, xy, yy, sign=1.0)
+            curvature = 0.5 * (xx + yy) + half_gap
+            better = (curvature > best).to(best.dtype)
+            best, vx, vy = torch.maximum(best, curvature), torch.lerp(vx, x, better), torch.lerp(vy, y, better)
         # A blob has no direction of its own: x.
         vx = torch.where((vx == 0) & (vy == 0), 1.0, vx)
-        return best * unit_vector(vx, vy)
+        return along(best, vx, vy)
 
     return in_blocks(layer, at_least_float32(image)).to(image.dtype)
 

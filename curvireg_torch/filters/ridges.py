@@ -4,8 +4,8 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError
-from .curvilinear import check_depth, dominant_eigenvector
-from .derivatives import at_least_float32, channels, in_blocks, safe_sqrt
+from .curvilinear import along, check_depth, dominant_eigenvector
+from .derivatives import Planes, at_least_float32, in_blocks, safe_sqrt
 from .shading import batched_camera, normal_variation
 from .suppression import is_ridge
 
@@ -59,13 +59,13 @@ def apparent_ridges(
     if camera_matrix is not None and depth_scale is not None:
         raise InvalidInputError("depth_scale: has no meaning with a camera_matrix; leave one of them out")
 
-    def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Tensor:
+    def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Planes:
         a, b, c = normal_variation(depth, mask, camera, sigma, depth_scale)
-        vx, vy, gap = dominant_eigenvector(a, b, b, c)
-        curvature = safe_sqrt(0.5 * (a + c + gap))
+        vx, vy, half_gap = dominant_eigenvector(a, b, b, c)
+        curvature = safe_sqrt(0.5 * (a + c) + half_gap)
         if maxima:
             curvature = torch.where(is_ridge(curvature, vx, vy), curvature, 0.0)
-        return curvature * channels(vx, vy)
+        return along(curvature, vx, vy)
 
     return in_blocks(layer, at_least_float32(depth), mask, batched_camera(camera_matrix, depth)).to(depth.dtype)
 

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from .._checks import check_same_device, check_tensor
 from ..errors import InvalidInputError
-from .curvilinear import BACKGROUND, check_depth, dominant_eigenvector, fill_depth, visible_range
-from .derivatives import at_least_float32, central_gradient, central_hessian, channels, in_blocks, safe_sqrt, smooth
+from .curvilinear import BACKGROUND, along, check_depth, dominant_eigenvector, fill_depth, visible_range
+from .derivatives import Planes, at_least_float32, central_derivatives, in_blocks, safe_sqrt, smooth
 
 __all__ = ["AverageShadingGradient", "HessianFrobeniusNorm", "average_shading_gradient", "hessian_frobenius_norm"]
 
@@ -54,12 +54,12 @@ def average_shading_gradient(
     if camera_matrix is not None and depth_scale is not None:
         raise InvalidInputError("depth_scale: has no meaning with a camera_matrix; leave one of them out")
 
-    def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Tensor:
+    def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Planes:
         a, b, c = normal_variation(depth, mask, camera, sigma, depth_scale)
         vx, vy, _ = dominant_eigenvector(a, b, b, c)
         # Where both eigenvalues agree every direction does: x.
         vx = torch.where((vx == 0) & (vy == 0), 1.0, vx)
-        return math.sqrt(math.pi / 3.0) * safe_sqrt(a + c) * channels(vx, vy)
+        return along(math.sqrt(math.pi / 3.0) * safe_sqrt(a + c), vx, vy)
 
     return in_blocks(layer, at_least_float32(depth), mask, batched_camera(camera_matrix, depth)).to(depth.dtype)
 
@@ -81,16 +81,14 @@ def normal_variation(
     """N_x . N_x, N_x . N_y, N_y . N_y per px^2, each (B, 1, H, W), from the Hessian in closed form."""
     if camera is None:
         z = smooth(fill_depth(depth, mask, depth_scale), sigma)
-        zx, zy = central_gradient(z)
-        zxx, zyy, zxy = central_hessian(z)
+        zx, zy, zxx, zyy, zxy = central_derivatives(z)
         one, zero = torch.ones_like(zx), torch.zeros_like(zx)
         normal = (-zx, -zy, one)
         along_x, along_y = (-zxx, -zxy, zero), (-zxy, -zyy, zero)
         return _gram(normal, along_x, along_y)
     surface, near, span = visible_range(depth, mask)
     z = smooth(torch.minimum(surface, near + BACKGROUND * span) / span, sigma)
-    zx, zy = central_gradient(z)
-    zxx, zyy, zxy = central_hessian(z)
+    zx, zy, zxx, zyy, zxy = central_derivatives(z)
     z = z[..., 1:-1, 1:-1]
     H, W = z.shape[-2:]
     fx, fy, cx, cy = (camera[:, i, j].view(-1, 1, 1, 1) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
@@ -146,11 +144,11 @@ def hessian_frobenius_norm(
     """
     check_depth(depth, mask, depth_scale)
 
-    def layer(depth: Tensor, mask: Tensor | None) -> Tensor:
-        zxx, zyy, zxy = central_hessian(smooth(fill_depth(depth, mask, depth_scale), sigma))
+    def layer(depth: Tensor, mask: Tensor | None) -> Planes:
+        _, _, zxx, zyy, zxy = central_derivatives(smooth(fill_depth(depth, mask, depth_scale), sigma))
         vx, vy, _ = dominant_eigenvector(zxx, zxy, zxy, zyy)
         vx = torch.where((vx == 0) & (vy == 0), 1.0, vx)
-        return safe_sqrt(zxx * zxx + 2.0 * zxy * zxy + zyy * zyy) * channels(vx, vy)
+        return along(safe_sqrt(zxx * zxx + 2.0 * zxy * zxy + zyy * zyy), vx, vy)
 
     return in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
 

@@ -1,7 +1,6 @@
 """Non-maximum suppression across the direction of a vector field."""
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 __all__ = ["is_ridge"]
@@ -10,7 +9,10 @@ __all__ = ["is_ridge"]
 def is_ridge(length: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Pixels whose length is a maximum along (x, y), rounded to 45 degrees as Canny does; all (B, 1, H, W)."""
     H, W = length.shape[-2:]
-    p = F.pad(length, (1, 1, 1, 1))
+    p = length
+    for dim in (-1, -2):  # not F.pad: compiled, everything before it would be computed again for every neighbour
+        margin = torch.zeros_like(p.narrow(dim, 0, 1))
+        p = torch.cat([margin, p, margin], dim=dim)
 
     def shifted(dx: int, dy: int) -> Tensor:
         return p[..., 1 + dy : 1 + dy + H, 1 + dx : 1 + dx + W]
