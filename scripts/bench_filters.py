@@ -110,7 +110,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--size", type=int, default=256)
-    parser.add_argument("--repetitions", type=int, default=5)
+    parser.add_argument("--repetitions", type=int, default=15)
     parser.add_argument("--cpu-time", action="store_true", help="for a busy machine: processor time, with --threads 1")
     parser.add_argument("--skip-compile", action="store_true")
     parser.add_argument("--only", nargs="*")
@@ -175,9 +175,7 @@ def main() -> None:
         "torch": torch.__version__,
         "kornia": kornia.__version__,
         "machine": platform.machine(),
-        "environment": {
-            k: os.environ[k] for k in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_") if k in os.environ
-        },
+        "environment": {k: v for k, v in os.environ.items() if k.startswith(("GLIBC_TUNABLES", "MALLOC_"))},
         "load_average_at_end": os.getloadavg()[0],
         "layers": rows,
         "mcs_smoothing": smoothings(),
