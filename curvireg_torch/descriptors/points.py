@@ -15,9 +15,8 @@ def field_points(field: Tensor, *, share: float = 0.04, threshold: float = 0.0, 
     """Pixels that are maxima of the field's length across the field's direction, the longest ones first.
 
     The length is compared with both neighbours along the direction, rounded to 45 degrees (as Canny does). Of the
-    maxima
-    longer than ``threshold`` the longest are kept, up to ``share`` of all pixels; equal lengths at the limit are all
-    kept.
+    maxima longer than ``threshold`` the longest are kept, up to ``share`` of all pixels; equal lengths at the limit are
+    all kept.
 
     Args:
         field: (B, 2, H, W).

@@ -28,8 +28,7 @@ def laplacian_of_gaussian(image: Tensor, *, sigma: float = 2.0, share: float = 0
     """Zero crossings of the Laplacian of the image smoothed by ``sigma`` px (Marr and Hildreth 1980).
 
     A pixel is a crossing where the Laplacian's sign differs from the right or the lower neighbour's; its response is
-    the
-    larger of the two steps, in grey levels per px^2. Elsewhere the response is 0.
+    the larger of the two steps, in grey levels per px^2. Elsewhere the response is 0.
     """
     check_image(image)
     check_positive(sigma, "sigma")

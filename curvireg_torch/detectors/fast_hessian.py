@@ -17,10 +17,8 @@ def fast_hessian(image: Tensor, *, threshold: float = 1e-4, share: float = 0.04)
 
     Own code, since the wheels of OpenCV come without SURF: the second derivatives are sums over boxes, by an integral
     image, divided by the filter's area; :math:`D_{xx} D_{yy} - (0.9 D_{xy})^2`. Points are maxima over 3 x 3 px and
-    three
-    neighbouring sides of an octave. Every octave is sampled at every pixel, and positions are not refined below a
-    pixel.
-    Filters that do not fit into the image are left out; borders are replicated. Sums run in float64 on the CPU.
+    three neighbouring sides of an octave. Every octave is sampled at every pixel, and positions are not refined below a
+    pixel. Filters that do not fit into the image are left out; borders are replicated. Sums run in float64 on the CPU.
 
     Args:
         image: (B, 1, H, W) grey levels in [0, 1].

@@ -17,9 +17,8 @@ def fuzzy_edges(image: Tensor, *, width: float = 0.1, share: float = 0.04) -> De
     2. If I_x is not zero or I_y is not zero, the pixel is an edge (1).
 
     The answer is the mean of 0 and 1 weighted by how far each rule holds (Sugeno). Since rule 2 negates rule 1, the
-    weights
-    add up to 1 and the answer is :math:`1 - \min(\mu(I_x), \mu(I_y))`, in [0, 1]. Points are its maxima along the
-    gradient.
+    weights add up to 1 and the answer is :math:`1 - \min(\mu(I_x), \mu(I_y))`, in [0, 1]. Points are its maxima along
+    the gradient.
     """
     check_positive(width, "width")
     gradient = at_least_float32(image_gradient(image, sigma=1.0))

@@ -63,8 +63,7 @@ def edge_blur(
 
     Returns:
         (B, S, H, W) blur in px, in [0, 1000]; 1000 where re-blurring does not lower the saliency. dtype kept (half
-        types
-        compute in float32).
+        types compute in float32).
 
     Raises:
         InvalidInputError: wrong shape, dtype or option.

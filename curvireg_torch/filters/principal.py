@@ -21,11 +21,9 @@ def principal_curvature_image(
     r"""Principal curvature image (Deng et al. 2007): lines and the sides of edges, over scales.
 
     :math:`\max_\sigma \sigma^2 \max(\lambda, 0)` with :math:`\lambda` an eigenvalue of the Hessian of the image
-    smoothed by
-    :math:`\sigma`: the largest one (``"largest"``, dark lines and the dark side of edges) or the smallest one, negated
-    (``"smallest"``, bright lines and the bright side). Deng et al. take maxima over three neighbouring scales at a
-    time and
-    sum them up in a watershed; this is the maximum over all scales, which the paper compares with.
+    smoothed by :math:`\sigma`: the largest one (``"largest"``, dark lines and the dark side of edges) or the smallest
+    one, negated (``"smallest"``, bright lines and the bright side). Deng et al. take maxima over three neighbouring
+    scales at a time and sum them up in a watershed; this is the maximum over all scales, which the paper compares with.
 
     Args:
         image: (B, 1, H, W) grey levels, usually in [0, 1].
@@ -34,8 +32,7 @@ def principal_curvature_image(
 
     Returns:
         (B, 2, H, W): length the curvature >= 0 in grey levels, direction across the line at the scale that won, sign
-        free.
-        dtype kept (half types compute in float32).
+        free. dtype kept (half types compute in float32).
 
     Raises:
         InvalidInputError: wrong shape, dtype or option.

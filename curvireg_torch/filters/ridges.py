@@ -24,17 +24,13 @@ def apparent_ridges(
     r"""Apparent ridges (Judd, Durand and Adelson 2007): maxima of view-dependent curvature.
 
     View-dependent curvature :math:`q_1` is the largest rate at which the surface's normal turns per step *on the
-    screen*,
-    the largest singular value of :math:`[N_x\ N_y]`; :math:`t_1` is the screen direction of that step. Apparent ridges
-    are
-    the maxima of :math:`q_1` along :math:`t_1`.
+    screen*, the largest singular value of :math:`[N_x\ N_y]`; :math:`t_1` is the screen direction of that step.
+    Apparent ridges are the maxima of :math:`q_1` along :math:`t_1`.
 
     What a depth image approximates: Judd et al. take curvature from the mesh and follow the zero crossings of
     :math:`D_{t_1} q_1` over its faces. Here N comes from finite differences of the smoothed depth; the drop to the
-    background
-    at an occluding contour, where the true :math:`q_1` is infinite, is a steep slope with a finite one; maxima are
-    pixels,
-    along :math:`t_1` rounded to 45 degrees; and the surface behind a contour is not seen.
+    background at an occluding contour, where the true :math:`q_1` is infinite, is a steep slope with a finite one;
+    maxima are pixels, along :math:`t_1` rounded to 45 degrees; and the surface behind a contour is not seen.
 
     Args:
         depth, mask, camera_matrix, sigma, depth_scale: as in :func:`average_shading_gradient`.
@@ -42,8 +38,7 @@ def apparent_ridges(
 
     Returns:
         (B, 2, H, W): length :math:`q_1` in 1/px (0 off the ridges), direction :math:`t_1`, sign free. dtype kept (half
-        types
-        compute in float32).
+        types compute in float32).
 
     Raises:
         InvalidInputError: wrong shape, dtype, mask or option.

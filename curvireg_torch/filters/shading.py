@@ -24,8 +24,7 @@ def average_shading_gradient(
     r"""Average shading gradient (Plötz and Roth 2017; the paper's ``equ:PG:103``).
 
     :math:`\gamma\sqrt{|N_x|^2 + |N_y|^2}`, :math:`\gamma = \sqrt{\pi/3}`, N the unit normal of the observed surface: a
-    bound
-    on the gradient of a Lambertian image, averaged over all directions of the light.
+    bound on the gradient of a Lambertian image, averaged over all directions of the light.
 
     Args:
         depth: (B, 1, H, W) z-depth. 0, negative, inf and NaN are background.
@@ -130,8 +129,7 @@ def hessian_frobenius_norm(
 
     Returns:
         (B, 2, H, W): length HFN; direction of the strongest second derivative, sign free. dtype kept (half types
-        compute
-        in float32).
+        compute in float32).
 
     Raises:
         InvalidInputError: wrong shape, dtype, mask or option.
