@@ -14,6 +14,7 @@ from .derivatives import (
     central_gradient,
     floor,
     in_blocks,
+    owned,
     safe_sqrt,
     smooth,
 )
@@ -104,7 +105,9 @@ def depth_curvilinear_saliency(
     check_option(formula, FORMULAS, "formula")
 
     def layer(depth: Tensor, mask: Tensor | None) -> Planes:
-        return _graph_saliency(smooth(fill_depth(depth, mask, depth_scale), sigma), formula)
+        factor, *m = _shape_operator(smooth(fill_depth(depth, mask, depth_scale), sigma), formula)
+        vx, vy, half_gap = dominant_eigenvector(*m)
+        return along(factor.mul_(half_gap), vx, vy)
 
     return in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
 
@@ -117,24 +120,19 @@ def check_depth(depth: Tensor, mask: Tensor | None, depth_scale: float | None = 
         check_positive(depth_scale, "depth_scale")
 
 
-def _graph_saliency(z: Tensor, formula: str) -> Planes:
-    """CS of the graph surface z, which has a margin of 1 px."""
+def _shape_operator(z: Tensor, formula: str) -> Planes:
+    """What CS is of half the difference of M's eigenvalues, and M row by row; z has a margin of 1 px."""
     zx, zy, zxx, zyy, zxy = central_derivatives(z)
     # M = adj(I_P) H_Z = H_Z + (z_y, -z_x)^T (u, -v).
-    u, v = torch.addcmul(zy * zxx, zx, zxy, value=-1), torch.addcmul(zx * zyy, zy, zxy, value=-1)
-    vx, vy, half_gap = dominant_eigenvector(
-        torch.addcmul(zxx, zy, u),
-        torch.addcmul(zxy, zy, v, value=-1),
-        torch.addcmul(zxy, zx, u, value=-1),
-        torch.addcmul(zyy, zx, v),
-    )
-    if formula == "geometric":
-        # 2 alpha^3 = (c + c |grad Z|^2)^(-3/2)
-        c = 2.0 ** (-2.0 / 3.0)
-        factor = torch.addcmul(torch.addcmul(z.new_full((), c), zx, zx, value=c), zy, zy, value=c).rsqrt().pow(3)
-    else:
-        factor = 2.0 * safe_sqrt(torch.addcmul(zx * zx, zy, zy))
-    return along(factor * half_gap, vx, vy)
+    u, v = (zy * zxx).addcmul_(zx, zxy, value=-1), (zx * zyy).addcmul_(zy, zxy, value=-1)
+    m11, m12 = owned(zxx).addcmul_(zy, u), torch.addcmul(zxy, zy, v, value=-1)
+    m21, m22 = owned(zxy).addcmul_(zx, u, value=-1), owned(zyy).addcmul_(zx, v)
+    if formula == "paper":
+        return safe_sqrt((zx * zx).addcmul_(zy, zy)).mul_(2.0), m11, m12, m21, m22
+    # 2 alpha^3 = (c + c |grad Z|^2)^(-3/2)
+    c = 2.0 ** (-2.0 / 3.0)
+    stretch = torch.addcmul(z.new_full((), c), zx, zx, value=c).addcmul_(zy, zy, value=c)
+    return stretch.rsqrt_().pow(3), m11, m12, m21, m22
 
 
 def dominant_eigenvector(
@@ -147,19 +145,19 @@ def dominant_eigenvector(
     """
     gap = m11 - m22
     # tr^2 / 4 - det, in the form that does not cancel.
-    half_gap = safe_sqrt(torch.addcmul(m12 * m21, gap, gap, value=0.25))
+    half_gap = safe_sqrt((m12 * m21).addcmul_(gap, gap, value=0.25))
     # With s the sign, (s half_gap + gap / 2, m21) and (m12, s half_gap - gap / 2) are both eigenvectors. Take the one
     # that does not cancel; by arithmetic, as torch.where by an unpredictable mask costs a CPU 27 additions.
     sign = (m11 + m22).ge_(0.0).mul_(2.0).sub_(1.0) if sign is None else sign
-    diagonal = torch.add(half_gap, gap.abs(), alpha=0.5).mul_(sign)
+    diagonal = gap.abs().mul_(0.5).add_(half_gap).mul_(sign)
     first = (gap * sign).ge_(0.0)
     return torch.lerp(m12, diagonal, first), torch.lerp(diagonal, m21, first), half_gap
 
 
 def along(length: Tensor, vx: Tensor, vy: Tensor) -> Planes:
     """The vectors of the given length along (vx, vy), as planes; the zero vector stays zero."""
-    squared = torch.addcmul(vx * vx, vy, vy)
-    scale = squared.clamp_(min=floor(squared)).rsqrt() * length
+    squared = (vx * vx).addcmul_(vy, vy)
+    scale = squared.clamp_(min=floor(squared)).rsqrt_() * length
     return vx * scale, vy * scale
 
 

@@ -147,6 +147,11 @@ def safe_sqrt(x: Tensor) -> Tensor:
     return x.clamp(min=tiny).sqrt() - math.sqrt(tiny)
 
 
+def owned(x: Tensor) -> Tensor:
+    """x, of which this is the last use, to be changed in place; a copy where autograd still wants its value."""
+    return x.clone() if torch.is_grad_enabled() else x
+
+
 def full_precision(x: Tensor) -> AbstractContextManager[object]:
     """Switches autocast off: convolutions in bfloat16 would leave nothing of a second derivative."""
     kind = x.device.type
