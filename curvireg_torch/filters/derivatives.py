@@ -2,8 +2,9 @@
 
 import itertools
 import math
+import mmap
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 
 import torch
 import torch.nn.functional as F
@@ -100,14 +101,25 @@ def in_blocks(layer: Callable[..., Planes], *tensors: Tensor | None) -> Tensor:
     size = max(1, BLOCK // x.shape[1:].numel())
     parts = [[None] * math.ceil(len(x) / size) if t is None else t.split(size) for t in tensors]
     blocks = (layer(*part) for part in zip(*parts, strict=True))
-    if torch.is_grad_enabled():
-        return torch.cat([channels(*planes) for planes in blocks])
-    # One block in memory at a time.
     first = next(blocks)
-    out = x.new_empty(len(x), sum(plane.shape[1] for plane in first), *first[0].shape[2:])
+    if any(plane.requires_grad for plane in first):
+        return torch.cat([channels(*planes) for planes in itertools.chain([first], blocks)])
+    # One block in memory at a time.
+    out = _empty((len(x), sum(plane.shape[1] for plane in first), *first[0].shape[2:]), first[0].dtype)
     for place, planes in zip(out.split(size), itertools.chain([first], blocks), strict=True):
         torch.cat(planes, dim=1, out=place)
     return out
+
+
+def _empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """``torch.empty`` on the CPU. What glibc would map anew each time, in pages of 2 MB: sooner filled."""
+    size = math.prod(shape) * dtype.itemsize
+    if size < 2**25 or not hasattr(mmap, "MADV_HUGEPAGE"):
+        return torch.empty(shape, dtype=dtype, device="cpu")
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    with suppress(OSError):  # a kernel without them
+        memory.madvise(mmap.MADV_HUGEPAGE)
+    return torch.frombuffer(memory, dtype=dtype).view(shape)
 
 
 def central_gradient(p: Tensor) -> tuple[Tensor, Tensor]:
@@ -149,7 +161,7 @@ def safe_sqrt(x: Tensor) -> Tensor:
 
 def owned(x: Tensor) -> Tensor:
     """x, of which this is the last use, to be changed in place; a copy where autograd still wants its value."""
-    return x.clone() if torch.is_grad_enabled() else x
+    return x.clone() if x.requires_grad else x
 
 
 def full_precision(x: Tensor) -> AbstractContextManager[object]:

@@ -48,6 +48,22 @@ def test_blocks_are_invisible(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.testing.assert_close(
         filters.average_shading_gradient(x), torch.cat([filters.average_shading_gradient(i[None]) for i in x])
     )
+    x.requires_grad_()
+    trained = filters.depth_curvilinear_saliency(x, mask)
+    torch.testing.assert_close(trained, want)
+    (gradient,) = torch.autograd.grad(trained.square().sum(), x)
+    assert gradient[1:].abs().amax(dim=(1, 2, 3)).min() > 0  # every block's
+
+
+def test_a_large_result_is_an_ordinary_tensor() -> None:
+    x = torch.rand(65, 1, 256, 256)
+    y = filters.image_gradient(x, sigma=0.0)
+    assert y.element_size() * y.numel() > 2**25
+    torch.testing.assert_close(y[-1], filters.image_gradient(x[-1:], sigma=0.0)[0])
+    assert y.is_contiguous()
+    assert not y.requires_grad
+    y.zero_()
+    assert not y.any()
 
 
 @every_layer
