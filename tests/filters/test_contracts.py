@@ -205,3 +205,21 @@ def test_bad_input_is_refused_with_expected_and_actual() -> None:
         filters.principal_curvature_image(image, sigmas=())
     with pytest.raises(InvalidInputError, match=r"step: expected 0 < step <= 0.25"):
         filters.anisotropic_diffusion(image, iterations=1, step=0.3)
+
+
+@every_layer
+@pytest.mark.filterwarnings("ignore:There is a performance drop", "ignore:`torch.jit.script`:DeprecationWarning")
+def test_function_transforms(layer: Layer) -> None:
+    x = layer.inputs(2, dtype=torch.float64)
+    stack = torch.stack([x, 0.5 * x])
+    torch.testing.assert_close(torch.func.vmap(layer)(stack), torch.stack([layer(i) for i in stack]))
+
+    def loss(x: torch.Tensor) -> torch.Tensor:
+        return layer(x).square().sum()
+
+    want = torch.autograd.grad(loss(x.requires_grad_()), x)[0]
+    gradient = torch.func.grad(loss)(x.detach())
+    torch.testing.assert_close(gradient, want)
+    direction = torch.randn(x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(0))
+    _, slope = torch.func.jvp(loss, (x.detach(),), (direction,))
+    torch.testing.assert_close(slope, (want * direction).sum())
