@@ -17,6 +17,7 @@ from .derivatives import (
     owned,
     safe_sqrt,
     smooth,
+    squared_length,
 )
 from .learnable import as_number, parameter_if
 
@@ -128,7 +129,7 @@ def _shape_operator(z: Tensor, formula: str) -> Planes:
     m11, m12 = owned(zxx).addcmul_(zy, u), torch.addcmul(zxy, zy, v, value=-1)
     m21, m22 = owned(zxy).addcmul_(zx, u, value=-1), owned(zyy).addcmul_(zx, v)
     if formula == "paper":
-        return safe_sqrt((zx * zx).addcmul_(zy, zy)).mul_(2.0), m11, m12, m21, m22
+        return safe_sqrt(squared_length(zx, zy)).mul_(2.0), m11, m12, m21, m22
     # 2 alpha^3 = (c + c |grad Z|^2)^(-3/2)
     c = 2.0 ** (-2.0 / 3.0)
     stretch = torch.addcmul(z.new_full((), c), zx, zx, value=c).addcmul_(zy, zy, value=c)
@@ -156,7 +157,7 @@ def dominant_eigenvector(
 
 def along(length: Tensor, vx: Tensor, vy: Tensor) -> Planes:
     """The vectors of the given length along (vx, vy), as planes; the zero vector stays zero."""
-    squared = (vx * vx).addcmul_(vy, vy)
+    squared = squared_length(vx, vy)
     scale = squared.clamp_(min=floor(squared)).rsqrt_() * length
     return vx * scale, vy * scale
 
@@ -183,7 +184,7 @@ def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) ->
 
     def layer(x: Tensor) -> Planes:
         gx, gy = central_gradient(smooth(x, sigma))
-        length = safe_sqrt(torch.addcmul(gx * gx, gy, gy))
+        length = safe_sqrt(squared_length(gx, gy))
         return gx * length, gy * length
 
     return in_blocks(layer, at_least_float32(image)).to(image.dtype)

@@ -53,7 +53,8 @@ def _gaussian(sigma: float | Tensor, radius: int, like: Tensor) -> Sequence[floa
     """2 radius + 1 weights: numbers for a number, a tensor for a tensor."""
     if not isinstance(sigma, Tensor):
         kernel = [math.exp(-0.5 * (i / sigma) ** 2) for i in range(-radius, radius + 1)]
-        return [weight / sum(kernel) for weight in kernel]
+        total = sum(kernel)
+        return [weight / total for weight in kernel]
     offsets = torch.arange(-radius, radius + 1, device=like.device, dtype=like.dtype)
     weights = torch.exp(-0.5 * (offsets / sigma) ** 2).to(like.dtype) * (offsets.abs() <= torch.ceil(4.0 * sigma))
     return weights / weights.sum()
@@ -83,7 +84,7 @@ def replicate_pad(x: Tensor, radius: int) -> Tensor:
 
 
 Planes = tuple[Tensor, ...]
-"""The channels of a result, each (B, 1, H, W), or several of them together."""
+"""The channels of a result, each (B, 1, H, W), or several of them together; of a descriptor (B, D), all of it."""
 
 BLOCK = 2**18
 """Pixels that :func:`in_blocks` hands to a layer at once."""
@@ -157,6 +158,11 @@ def safe_sqrt(x: Tensor) -> Tensor:
     """sqrt of max(x, 0) whose gradient is 0, not inf, where x <= 0."""
     tiny: float = torch.finfo(x.dtype).tiny
     return x.clamp(min=tiny).sqrt() - math.sqrt(tiny)
+
+
+def squared_length(x: Tensor, y: Tensor) -> Tensor:
+    """x^2 + y^2, a new tensor."""
+    return (x * x).addcmul_(y, y)
 
 
 def owned(x: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ from .derivatives import (
     in_blocks,
     safe_sqrt,
     smooth,
+    squared_length,
 )
 from .learnable import as_number, parameter_if
 
@@ -79,7 +80,7 @@ def edge_blur(
 
     def layer(x: Tensor) -> Planes:
         gx, gy = central_gradient(smooth(x, 0.0))
-        return tuple(_edge_blur(x, torch.addcmul(gx * gx, gy, gy), reblur_sigmas, mode))
+        return tuple(_edge_blur(x, squared_length(gx, gy), reblur_sigmas, mode))
 
     return in_blocks(layer, at_least_float32(image)).to(image.dtype)
 
@@ -92,7 +93,7 @@ def _edge_blur(x: Tensor, saliency: Tensor, reblur_sigmas: Sequence[float], mode
         check_positive(float(sigma), "reblur_sigmas")
         if mode == "reblur-image":
             rx, ry = central_gradient(smooth(x, sigma))
-            reblurred = torch.addcmul(rx * rx, ry, ry)
+            reblurred = squared_length(rx, ry)
             # sigma_i^2 / (R - 1) with R = saliency / reblurred, without dividing by zero.
             numerator, denominator = sigma**2 * reblurred, saliency - reblurred
         else:
@@ -150,7 +151,7 @@ def multiscale_focus_curves(
         x = smooth(image, sigma)
         gx, gy = central_gradient(x)
         x = x[..., 1:-1, 1:-1]
-        saliency = torch.addcmul(gx * gx, gy, gy)
+        saliency = squared_length(gx, gy)
         blur = functools.reduce(torch.maximum, _edge_blur(x, saliency, [float(i) for i in range(1, scales)], mode))
         # Sub-pixel blur is not measurable: it counts as the derivative kernel's own.
         focus = blur.clamp(min=_DIFFERENCE_VARIANCE**0.5).reciprocal()

@@ -16,6 +16,7 @@ from .derivatives import (
     image_maximum,
     in_blocks,
     smooth,
+    squared_length,
 )
 from .diffusion import CONDUCTANCES, anisotropic_diffusion
 from .edge_preserving import bilateral_smooth, guided_smooth
@@ -107,7 +108,7 @@ def multiscale_curvilinear_saliency(
 def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> tuple[Tensor, Tensor]:
     """CS of a level as vectors and their lengths, 1 at the image's largest."""
     gx, gy = central_gradient(smooth(level, sigma))
-    saliency = torch.addcmul(gx * gx, gy, gy)
+    saliency = squared_length(gx, gy)
     peak = image_maximum(saliency)
     saliency = saliency / torch.where(peak > 0, peak, 1.0)
     return channels(*along(saliency, gx, gy)), saliency
