@@ -6,8 +6,10 @@ written to a new tensor of the output's shape, whose pages the operating system 
 the memory of the one before.
 
     python scripts/bench_filters.py [--threads 2] [--batch 64] [--size 256] [--skip-compile]
+    python scripts/bench_filters.py --table
 
-writes scripts/results/bench_filters.json.
+writes scripts/results/bench_filters.json, or with huge pages asked for in GLIBC_TUNABLES bench_filters_huge_pages.json,
+and then the table of docs/performance.md from both; ``--table`` measures nothing.
 """
 
 import argparse
@@ -21,6 +23,7 @@ from pathlib import Path
 import kornia
 import torch
 from make_detector_figure import scene, silhouette
+from results_table import REPOSITORY, commit, today
 from torch import Tensor
 
 from curvireg_torch import descriptors, filters
@@ -104,6 +107,40 @@ def smoothings() -> dict[str, dict[str, float]]:
     return rows
 
 
+RESULTS = REPOSITORY / "scripts" / "results"
+PLAIN, HUGE = RESULTS / "bench_filters.json", RESULTS / "bench_filters_huge_pages.json"
+PAGE = REPOSITORY / "docs" / "performance.md"
+BEGIN, END = "<!-- layers:begin -->", "<!-- layers:end -->"
+
+
+def write_table() -> None:
+    """The table of docs/performance.md, of the two files and of nothing else."""
+    plain, huge = (json.loads(path.read_text(encoding="utf-8")) for path in (PLAIN, HUGE))
+
+    def cell(row: dict[str, float], kind: str) -> str:
+        return f"{1e3 * row[f'{kind}_s']:.1f} ({row[f'{kind}_clones']:.0f})" if f"{kind}_s" in row else ""
+
+    lines = [
+        ["", "eager", "compiled", "kornia", "fresh", *(f"{k}, huge pages" for k in ("eager", "compiled", "fresh"))]
+    ]
+    lines.append(["---"] * len(lines[0]))
+    for name, row in plain["layers"].items():
+        other = huge["layers"][name]
+        cells = [cell(row, kind) for kind in ("eager", "compiled", "kornia", "fresh")]
+        lines.append([name, *cells, *(cell(other, kind) for kind in ("eager", "compiled", "fresh"))])
+    notes = []
+    for title, kept in (("Without", plain), ("With", huge)):
+        clones = [1e3 * row["clone_s"] for row in kept["layers"].values()]
+        notes.append(
+            f"{title} huge pages: {kept['date']}, commit {kept['commit']}, torch {kept['torch']}, {kept['threads']} "
+            f"threads; a clone took {min(clones):.2f} to {max(clones):.2f} ms."
+        )
+    body = "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n\n" + "\n".join(notes)
+    text = PAGE.read_text(encoding="utf-8")
+    before, after = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
+    PAGE.write_text(f"{before}\n{body}\n{after}", encoding="utf-8")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--threads", type=int, default=2)
@@ -113,8 +150,14 @@ def main() -> None:
     parser.add_argument("--cpu-time", action="store_true", help="for a busy machine: processor time, with --threads 1")
     parser.add_argument("--skip-compile", action="store_true")
     parser.add_argument("--only", nargs="*")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "bench_filters.json")
+    parser.add_argument(
+        "--out", type=Path, default=HUGE if "hugetlb" in os.environ.get("GLIBC_TUNABLES", "") else PLAIN
+    )
+    parser.add_argument("--table", action="store_true", help="only write the table again")
     options = parser.parse_args()
+    if options.table:
+        write_table()
+        return
     torch.set_num_threads(options.threads)
     if options.cpu_time:
         if options.threads != 1:
@@ -175,12 +218,16 @@ def main() -> None:
         "kornia": kornia.__version__,
         "machine": platform.machine(),
         "environment": {k: v for k, v in os.environ.items() if k.startswith(("GLIBC_TUNABLES", "MALLOC_"))},
+        "date": today(),
+        "commit": commit(REPOSITORY),
         "load_average_at_end": os.getloadavg()[0],
         "layers": rows,
         "mcs_smoothing": smoothings(),
     }
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(result, indent=1) + "\n")
+    if options.out in (PLAIN, HUGE) and not options.only:
+        write_table()
 
 
 if __name__ == "__main__":
