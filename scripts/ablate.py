@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 
 import torch
 from kornia.color import rgb_to_grayscale
-from results_table import REPOSITORY, commit, today
+from results_table import REPOSITORY, between, commit, today
 from torch import Tensor
 
 from curvireg_torch.data import BOPDataset, Pascal3DPlus
@@ -161,8 +161,7 @@ def table(results: dict[str, Any]) -> str:
 
 def write_table() -> None:
     text = PAGE.read_text(encoding="utf-8")
-    before, after = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
-    PAGE.write_text(f"{before}\n{table(json.loads(KEPT.read_text()))}{after}", encoding="utf-8")
+    PAGE.write_text(between(text, BEGIN, END, table(json.loads(KEPT.read_text()))), encoding="utf-8")
 
 
 def main() -> None:

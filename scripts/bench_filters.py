@@ -23,7 +23,7 @@ from pathlib import Path
 import kornia
 import torch
 from make_detector_figure import scene, silhouette
-from results_table import REPOSITORY, commit, today
+from results_table import REPOSITORY, between, commit, today
 from torch import Tensor
 
 from curvireg_torch import descriptors, filters
@@ -120,10 +120,8 @@ def write_table() -> None:
     def cell(row: dict[str, float], kind: str) -> str:
         return f"{1e3 * row[f'{kind}_s']:.1f} ({row[f'{kind}_clones']:.0f})" if f"{kind}_s" in row else ""
 
-    lines = [
-        ["", "eager", "compiled", "kornia", "fresh", *(f"{k}, huge pages" for k in ("eager", "compiled", "fresh"))]
-    ]
-    lines.append(["---"] * len(lines[0]))
+    head = ["", "eager", "compiled", "kornia", "fresh", "huge pages: eager", "compiled", "fresh"]
+    lines = [head, ["---"] * len(head)]
     for name, row in plain["layers"].items():
         other = huge["layers"][name]
         cells = [cell(row, kind) for kind in ("eager", "compiled", "kornia", "fresh")]
@@ -137,8 +135,7 @@ def write_table() -> None:
         )
     body = "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n\n" + "\n".join(notes)
     text = PAGE.read_text(encoding="utf-8")
-    before, after = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
-    PAGE.write_text(f"{before}\n{body}\n{after}", encoding="utf-8")
+    PAGE.write_text(between(text, BEGIN, END, body + "\n"), encoding="utf-8")
 
 
 def main() -> None:

@@ -59,14 +59,18 @@ def main() -> int:
     if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
         print(f"results_table: error: {readme}: expected {BEGIN} and then {END}, once each", file=sys.stderr)
         return 2
-    before, after = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
-    wanted = f"{before}\n{table(results)}{after}"
+    wanted = between(text, BEGIN, END, table(results))
     if arguments.check:
         if wanted != text:
             print(f"results_table: {readme} is not what {results} says; run scripts/results_table.py", file=sys.stderr)
         return int(wanted != text)
     readme.write_text(wanted, encoding="utf-8")
     return 0
+
+
+def between(text: str, begin: str, end: str, body: str) -> str:
+    """``text`` with ``body`` between the two markers."""
+    return f"{text[: text.index(begin) + len(begin)]}\n{body}{text[text.index(end) :]}"
 
 
 def record(summary: Path, name: str, results: Path, root: Path) -> Path:
