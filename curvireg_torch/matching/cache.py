@@ -4,7 +4,10 @@ import functools
 import hashlib
 import json
 import os
+import re
 import time
+import warnings
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -34,6 +37,9 @@ CACHE_LIMIT = 2_000_000_000
 """Bytes that the cache may take; the banks used longest ago go first. ``$CURVIREG_CACHE_LIMIT`` overrides it."""
 
 _ABANDONED = 3600.0  # seconds after which a half-written file belongs to no builder any more
+_HEADER_LIMIT = 1_000_000  # bytes; a bank's header takes about 2000
+_BANK = re.compile(r"bank-[0-9a-f]{32}\.safetensors")
+_HALF_WRITTEN = re.compile(_BANK.pattern + r"\.[0-9a-f]{32}\.tmp")
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,11 @@ class CachedBank:
 
 
 def cache_folder() -> Path:
-    """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else ``~/.cache/curvireg_torch``."""
+    """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else ``~/.cache/curvireg_torch``.
+
+    Banks lie in its folder ``banks``, as ``bank-<key>.safetensors``. Nothing else is ever listed, overwritten or removed:
+    a file must lie there, bear such a name, and say in its own header that it is a bank.
+    """
     if folder := os.environ.get("CURVIREG_CACHE"):
         return Path(folder)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "curvireg_torch"
@@ -107,19 +117,22 @@ def cached_bank(
     mesh = as_mesh(mesh)
     folder = folder or cache_folder()
     key = bank_key(mesh, views, settings)
-    path = folder / f"{key}.safetensors"
-    if path.is_file():
+    path = folder / "banks" / f"bank-{key}.safetensors"
+    if _is_ours(path):
         try:
             bank = ViewBank.load(path, device=device)
             if bank_key(bank.mesh, bank.views, bank.settings) != key:
                 raise BankError(f"{path}: holds another bank than its name says")
-        except BankError:
-            path.unlink(missing_ok=True)
+        except BankError:  # built again, and replaced
+            pass
         else:
             _touch(path)
             return bank
     bank = ViewBank.build(mesh, views, settings=settings, progress=progress, device=device, **build_options)
     bank.descriptors = bank.descriptors.half().float()  # as the file will hold them: now and later rank alike
+    if os.path.lexists(path) and not _is_ours(path):
+        warnings.warn(f"{path}: not a view bank, so it stays and the bank is not cached; move it away", stacklevel=2)
+        return bank
     try:
         bank.save(path)
         trim_cache(folder, keep=path)
@@ -131,7 +144,7 @@ def cached_bank(
 def list_cache(folder: Path | None = None) -> list[CachedBank]:
     """The banks of the cache, last used first."""
     banks = []
-    for path in (folder or cache_folder()).glob("*.safetensors"):
+    for path in _our_files(folder or cache_folder(), _BANK):
         try:
             status = path.stat()
         except FileNotFoundError:  # another process removed it
@@ -144,7 +157,7 @@ def clear_cache(folder: Path | None = None) -> int:
     """Remove every bank of the cache, and what killed builders left; returns how many banks there were."""
     folder = folder or cache_folder()
     banks = list_cache(folder)
-    for path in [bank.path for bank in banks] + list(folder.glob("*.safetensors.*.tmp")):
+    for path in [*(bank.path for bank in banks), *_our_files(folder, _HALF_WRITTEN)]:
         path.unlink(missing_ok=True)
     return len(banks)
 
@@ -161,7 +174,7 @@ def trim_cache(folder: Path | None = None, *, limit: int | None = None, keep: Pa
     if limit is None:
         given = os.environ.get("CURVIREG_CACHE_LIMIT", "")
         limit = int(given) if given.isdecimal() else CACHE_LIMIT
-    for path in folder.glob("*.safetensors.*.tmp"):
+    for path in _our_files(folder, _HALF_WRITTEN):
         try:
             if time.time() - path.stat().st_mtime > _ABANDONED:
                 path.unlink(missing_ok=True)
@@ -175,6 +188,21 @@ def trim_cache(folder: Path | None = None, *, limit: int | None = None, keep: Pa
             total -= bank.size
             removed += 1
     return removed
+
+
+def _our_files(folder: Path, name: re.Pattern[str]) -> Iterator[Path]:
+    return (path for path in (folder / "banks").glob("*") if name.fullmatch(path.name) and _is_ours(path))
+
+
+def _is_ours(path: Path) -> bool:
+    """The header of this safetensors file, whole or cut short behind it, names this library; or the file is empty."""
+    try:
+        with path.open("rb") as file:
+            size = file.read(8)
+            header = file.read(min(int.from_bytes(size, "little"), _HEADER_LIMIT))
+        return not size or str(json.loads(header)["__metadata__"]["format"]).startswith("curvireg_torch.")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return False
 
 
 def _touch(path: Path) -> None:

@@ -3,10 +3,12 @@
 import multiprocessing
 import os
 import time
+import uuid
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import safetensors.torch
 import torch
 import trimesh
 
@@ -55,9 +57,12 @@ def test_key_depends_on_everything(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_damaged_and_mislabelled_files_are_built_again(tmp_path: Path) -> None:
     bank = build(tmp_path)
-    (path,) = tmp_path.iterdir()
-    path.write_bytes(path.read_bytes()[:1000])
-    assert torch.equal(build(tmp_path).descriptors, bank.descriptors)
+    (path,) = (tmp_path / "banks").iterdir()
+    whole = path.stat().st_size
+    for damaged in (path.read_bytes()[:-10], b""):
+        path.write_bytes(damaged)
+        assert torch.equal(build(tmp_path).descriptors, bank.descriptors)
+        assert path.stat().st_size == whole
     ViewBank.build(trimesh.creation.box((9, 1, 1)), VIEWS, settings=SETTINGS, progress=False).save(path)
     assert torch.equal(build(tmp_path).descriptors, bank.descriptors)
 
@@ -84,18 +89,51 @@ def test_list_and_clear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert cache_folder() == tmp_path / "cache"
     assert (list_cache(), clear_cache(), trim_cache()) == ([], 0, 0)  # not even a folder
     cached_bank(trimesh.creation.box(), VIEWS, SETTINGS, progress=False)
-    left = cache_folder() / "x.safetensors.0.tmp"
-    left.write_bytes(b"of a killed process")
-    (cache_folder() / "notes.txt").write_text("not ours")
     (file,) = list_cache()
+    left = file.path.with_name(f"{file.path.name}.{uuid.uuid4().hex}.tmp")
+    left.write_bytes(file.path.read_bytes()[:2000])  # of a killed process
+    assert list_cache() == [file]
     assert file.size == file.path.stat().st_size > 1000
     trim_cache()
     assert left.exists()  # it may belong to a builder at work
     os.utime(left, (1000.0, 1000.0))
     trim_cache()
     assert not left.exists()
+    left.touch()
     assert clear_cache() == 1
-    assert [p.name for p in cache_folder().iterdir()] == ["notes.txt"]
+    assert [p.name for p in cache_folder().rglob("*")] == ["banks"]
+
+
+def test_foreign_files_are_never_touched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    build(tmp_path)
+    (bank,) = list_cache(tmp_path)
+    other = bank.path.with_name(bank.path.name.replace(bank.path.name[5], "f" if bank.path.name[5] == "0" else "0"))
+    foreign = {
+        tmp_path / "model.safetensors": safetensors.torch.save({"w": torch.zeros(9)}),
+        tmp_path / "model.safetensors.1234.tmp": b"",
+        tmp_path / bank.path.name: bank.path.read_bytes(),  # ours by name and content, but not in our folder
+        bank.path.with_name("my bank.safetensors"): bank.path.read_bytes(),  # not by name
+        bank.path.with_name(f"{bank.path.name}.orig"): bank.path.read_bytes(),
+        other: safetensors.torch.save({"w": torch.zeros(9)}, {"format": "pt"}),  # not by content
+        bank.path.with_name(f"{other.name}.{uuid.uuid4().hex}.tmp"): b"{" * 100,
+        bank.path.with_name("notes.txt"): b"notes",
+    }
+    for path, content in foreign.items():
+        path.write_bytes(content)
+        os.utime(path, (1000.0, 1000.0))
+    assert [file.path for file in list_cache(tmp_path)] == [bank.path]
+    assert trim_cache(tmp_path, limit=0) == 1
+    monkeypatch.setenv("CURVIREG_CACHE_LIMIT", "0")
+    build(tmp_path, 2.0)
+    assert clear_cache(tmp_path) == 1
+    bank.path.write_bytes(foreign[other])  # in the bank's own place
+    with pytest.warns(UserWarning, match=r"not a view bank, so it stays"):
+        build(tmp_path)
+    assert bank.path.read_bytes() == foreign[other]
+    for path, content in foreign.items():
+        assert path.read_bytes() == content
+    bank.path.unlink()
+    assert {path for path in tmp_path.rglob("*") if path.is_file()} == set(foreign)
 
 
 def test_unwritable_cache_is_no_error(tmp_path: Path) -> None:
@@ -113,7 +151,7 @@ def test_concurrent_builders(tmp_path: Path) -> None:
     with multiprocessing.get_context("spawn").Pool(2) as pool:
         sums = pool.starmap(_builder, [(str(tmp_path), edges)] * 4, chunksize=1)
     assert max(sums) - min(sums) < 1e-3 * sums[0]
-    assert len(list(tmp_path.iterdir())) == len(edges)  # nothing half-written is left
+    assert len(list((tmp_path / "banks").iterdir())) == len(edges)  # nothing half-written is left
     for file in list_cache(tmp_path):
         assert len(ViewBank.load(file.path)) == len(VIEWS)
 
