@@ -13,6 +13,7 @@ from .camera_noise import photographed
 from .materials import Material, random_colour, random_picture
 from .shapes import Shape
 from .surfaces import Array
+from .turns import any_turn
 
 __all__ = ["Scene", "make_scene"]
 
@@ -60,8 +61,7 @@ def make_scene(
         azimuth, elevation = rng.uniform(0, 360), rng.uniform(-12, 60) * rng.choice([0.35, 1.0])
         R = rotation_from_viewpoint(azimuth, elevation, rng.normal(0, 5)).numpy()
     else:
-        R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        R *= np.sign(np.linalg.det(R))
+        R = any_turn(rng)
     distance = float(np.exp(rng.uniform(np.log(2.2), np.log(14.0))))
     centre = np.array([0.0, 0.0, distance])
     placed = shape.vertices @ R.T + centre
@@ -127,12 +127,12 @@ def _beside(
 ) -> tuple[Array, Array, Array]:
     """Another shape somewhere in the picture: mostly behind the object, at times before it."""
     scale = np.exp(rng.uniform(-1.0, 0.8))
-    turn = R @ rotation_from_viewpoint(rng.uniform(0, 360), 90.0, 0.0).numpy()  # about the vertical
+    upright = R @ rotation_from_viewpoint(rng.uniform(0, 360), 90.0, 0.0).numpy()  # about the vertical
     if floor is not None:
         towards = rng.uniform(0, 2 * np.pi)
         reach = rng.uniform(0.8, 3.5)
         where = np.array([reach * np.cos(towards), reach * np.sin(towards), floor - scale * other.vertices[:, 2].min()])
-        points = scale * other.vertices @ turn.T + R @ where + centre
+        points = scale * other.vertices @ upright.T + R @ where + centre
         if points[:, 2].min() > 0.3:
             return points, other.faces, other.materials
     front = rng.random() < 0.25
@@ -142,8 +142,7 @@ def _beside(
     if front:  # at the rim, so that it covers a part only
         pixel[rng.integers(2)] = size * rng.choice([0.1, 0.9])
     ray = np.array([(pixel[0] - K[0, 2]) / K[0, 0], (pixel[1] - K[1, 2]) / K[1, 1], 1.0])
-    any_turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    points = scale * other.vertices @ (turn if rng.random() < 0.5 else any_turn).T + ray * max(z, 0.4 + scale)
+    points = scale * other.vertices @ (upright if rng.random() < 0.5 else any_turn(rng)).T + ray * max(z, 0.4 + scale)
     return points, other.faces, other.materials
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 
 from .surfaces import Array, Surface, bar, box, extrude, join, lathe, loft, superquadric, torus, tube
+from .turns import any_turn, turn
 
 __all__ = ["FAMILIES", "Shape", "random_shape", "shape_from_mesh"]
 
@@ -63,26 +64,6 @@ def _normalised(points: Array, faces: Array, materials: Array) -> Shape:
     return Shape(points / max(float(np.linalg.norm(points, axis=1).max()), 1e-9), faces, materials)
 
 
-def _turn(axis: int, angle: float) -> Array:
-    c, s = np.cos(angle), np.sin(angle)
-    i, j = [(1, 2), (2, 0), (0, 1)][axis]
-    R = np.eye(3)
-    R[i, i], R[i, j], R[j, i], R[j, j] = c, -s, s, c
-    return R
-
-
-def _any_turn(rng: Rng) -> Array:
-    q = rng.normal(size=4)
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def _rounded(rng: Rng, size: object) -> Surface:
     """A box, sharp or with soft edges, with the full side lengths ``size``."""
     if rng.random() < 0.5:
@@ -119,8 +100,8 @@ def _compound(rng: Rng) -> list[Part]:
     centre = np.zeros(3)
     mirrored = rng.random() < 0.5
     for k in range(int(rng.integers(2, 8))):
-        turn = _any_turn(rng) if rng.random() < 0.3 else _turn(int(rng.integers(3)), 0.5 * np.pi * rng.integers(4))
-        piece = _piece(rng).moved(centre, turn, rng.uniform(0.3, 1.0))
+        pose = any_turn(rng) if rng.random() < 0.3 else turn(int(rng.integers(3)), 0.5 * np.pi * rng.integers(4))
+        piece = _piece(rng).moved(centre, pose, rng.uniform(0.3, 1.0))
         parts.append((piece, k))
         if mirrored:
             parts.append((Surface(piece.vertices * (-1, 1, 1), piece.faces), k))
@@ -154,7 +135,7 @@ def _vessel(rng: Rng) -> list[Part]:
         low, high = 0.3 * heights[2], heights[2]
         parts.append((lathe(np.full(2, radii[:3].max() * 1.01), np.array([low, high])), 2))
     if rng.random() < 0.3:
-        ring = torus(0.15, 0.02).moved((radii.max(), 0, 0.5), _turn(0, np.pi / 2))
+        ring = torus(0.15, 0.02).moved((radii.max(), 0, 0.5), turn(0, np.pi / 2))
         parts.append((ring, 3))
     return parts
 
@@ -180,7 +161,7 @@ def _chair(rng: Rng) -> list[Part]:
     ]
     if rng.random() < 0.5:
         panel = _rounded(rng, (w, thick * 0.7, back)).moved(
-            (0, 0.5 * d + 0.5 * lean, h + 0.5 * back), _turn(0, -lean / back)
+            (0, 0.5 * d + 0.5 * lean, h + 0.5 * back), turn(0, -lean / back)
         )
         parts.append((panel, 0))
     else:
@@ -248,7 +229,7 @@ def _sofa(rng: Rng) -> list[Part]:
     parts.append(
         (
             _rounded(rng, (w, deep, h + back)).moved(
-                (0, 0.5 * d, 0.5 * (h + back) + 0.05), _turn(0, -rng.uniform(0, 0.2))
+                (0, 0.5 * d, 0.5 * (h + back) + 0.05), turn(0, -rng.uniform(0, 0.2))
             ),
             0,
         )
@@ -275,7 +256,7 @@ def _sofa(rng: Rng) -> list[Part]:
 
 
 def _wheels(rng: Rng, length: float, width: float, radius: float) -> list[Part]:
-    turn = _turn(1, np.pi / 2)
+    across = turn(1, np.pi / 2)
     tyre = lathe(
         radius * np.array([0.55, 0.6, 0.95, 1, 1, 0.95]), np.array([0.0, -0.35, -0.5, -0.3, 0.3, 0.5]) * radius * 0.5
     )
@@ -285,7 +266,7 @@ def _wheels(rng: Rng, length: float, width: float, radius: float) -> list[Part]:
         for s in (-1, 1)
         for y in (-rng.uniform(0.27, 0.36), rng.uniform(0.25, 0.35))
     ]
-    return [(part.moved(at, turn), number) for at in where for part, number in ((tyre, 7), (hub, 8))]
+    return [(part.moved(at, across), number) for at in where for part, number in ((tyre, 7), (hub, 8))]
 
 
 def _car(rng: Rng) -> list[Part]:
@@ -342,13 +323,13 @@ def _car(rng: Rng) -> list[Part]:
 def _bicycle(rng: Rng) -> list[Part]:
     radius, base = rng.uniform(0.28, 0.36), rng.uniform(0.9, 1.1)
     rod, tyre = rng.uniform(0.012, 0.03), rng.uniform(0.015, 0.04)
-    turn = _turn(1, np.pi / 2)
+    across = turn(1, np.pi / 2)
     back, front = np.array([0, base / 2, radius]), np.array([0, -base / 2, radius])
     crank, seat, head = np.array([0, 0.08, 0.28]), np.array([0, 0.2, 0.78]), np.array([0, -0.32, 0.78])
     low_head = 0.75 * head + 0.25 * front
     parts: list[Part] = []
     for hub in (back, front):
-        parts.append((torus(radius, tyre).moved(hub, turn), 1))
+        parts.append((torus(radius, tyre).moved(hub, across), 1))
         if rng.random() < 0.7:
             t = np.pi * np.arange(int(rng.integers(3, 9))) / 8
             rim = radius * np.stack([0 * t, np.cos(t), np.sin(t)], -1)
@@ -362,7 +343,7 @@ def _bicycle(rng: Rng) -> list[Part]:
     else:
         parts.append((superquadric((0.05, 0.13, 0.03), (0.6, 0.8)).moved(seat + np.array((0, 0, 0.08))), 4))
         parts.append((bar(seat, seat + np.array([0, 0, 0.08]), rod), 0))
-        parts.append((torus(0.08, 0.01).moved(crank, turn), 2))
+        parts.append((torus(0.08, 0.01).moved(crank, across), 2))
     grip, wide = head + np.array((0, -0.03, rng.uniform(0.1, 0.25))), rng.uniform(0.2, 0.35)
     parts.append((bar(head, grip, rod), 0))
     parts.append((tube(np.array([grip + np.array((-wide, 0.1, 0)), grip, grip + np.array((wide, 0.1, 0))]), rod), 2))
@@ -373,7 +354,7 @@ def _aircraft(rng: Rng) -> list[Part]:
     r, span = rng.uniform(0.07, 0.13), rng.uniform(0.6, 1.1)
     y = np.array([-1, -0.97, -0.85, -0.5, 0.4, 0.8, 1.0])
     parts: list[Part] = [
-        (lathe(r * np.array([0.05, 0.4, 0.85, 1, 1, 0.6, 0.15]), y).moved(rotation=_turn(0, np.pi / 2)), 0)
+        (lathe(r * np.array([0.05, 0.4, 0.85, 1, 1, 0.6, 0.15]), y).moved(rotation=turn(0, np.pi / 2)), 0)
     ]
     parts[0] = (parts[0][0].moved(scale=(1, -1, 1)), 0)
 
@@ -400,7 +381,7 @@ def _aircraft(rng: Rng) -> list[Part]:
         (s, 1) for s in wing(0.2, 0.1, 0.35 * span, 0.6 * sweep, (0, 0.85, rng.choice([0.3, 2.0]) * r), 0.15, 0.02)
     ]
     fin = wing(0.25, 0.12, rng.uniform(0.2, 0.35), 0.15, (0, 0.85, 0), 0.15, 0.0)[1]
-    parts.append((fin.moved((0, 0, 0.5 * r), _turn(1, -np.pi / 2)), 2))
+    parts.append((fin.moved((0, 0, 0.5 * r), turn(1, -np.pi / 2)), 2))
     n = int(rng.integers(0, 3))
     for k in range(n):
         for s in (-1, 1):
@@ -409,13 +390,13 @@ def _aircraft(rng: Rng) -> list[Part]:
                 (
                     pod.moved(
                         (s * span * (k + 1) / (n + 1.5), 0.5 * sweep * (k + 1) / n - 0.2, height - 0.5 * r),
-                        _turn(0, np.pi / 2),
+                        turn(0, np.pi / 2),
                     ),
                     3,
                 )
             )
     if n == 0 and rng.random() < 0.6:
-        parts.append((box((0.5, 0.02, 0.05)).moved((0, -1.0, 0), _turn(1, rng.uniform(0, np.pi))), 3))
+        parts.append((box((0.5, 0.02, 0.05)).moved((0, -1.0, 0), turn(1, rng.uniform(0, np.pi))), 3))
     return parts
 
 
@@ -457,7 +438,7 @@ def _boat(rng: Rng) -> list[Part]:
 def _screen(rng: Rng) -> list[Part]:
     w, h, deep, rim = rng.uniform((0.6, 0.4, 0.03, 0.02), (1.2, 0.8, 0.12, 0.06))
     up = rng.uniform(0.05, 0.3) + 0.5 * h
-    tilt = _turn(0, rng.uniform(-0.15, 0.15))
+    tilt = turn(0, rng.uniform(-0.15, 0.15))
     parts: list[Part] = [(_rounded(rng, (w, deep, h)).moved((0, 0, up), tilt), 0)]
     parts.append((box((w - 2 * rim, 0.01, h - 2 * rim)).moved((0, 0, up) + tilt @ (0, -0.5 * deep, 0), tilt), 1))
     if rng.random() < 0.35:
@@ -492,7 +473,7 @@ def _creature(rng: Rng) -> list[Part]:
     body = np.array([rng.uniform(0.15, 0.3), rng.uniform(0.3, 0.5), rng.uniform(0.15, 0.35)])
     high = rng.uniform(0.2, 0.6) + body[2]
     ball = (1.0, 1.0)
-    parts: list[Part] = [(superquadric(body, ball).moved((0, 0, high), _turn(0, rng.uniform(-0.6, 0.6))), 0)]
+    parts: list[Part] = [(superquadric(body, ball).moved((0, 0, high), turn(0, rng.uniform(-0.6, 0.6))), 0)]
     head = np.array([0, -body[1] - rng.uniform(0, 0.2), high + rng.uniform(0, 0.5)])
     parts.append((bar((0, -0.7 * body[1], high), head, rng.uniform(0.05, 0.12)), 0))
     size = rng.uniform((0.1, 0.1, 0.1), (0.2, 0.28, 0.2))
@@ -500,7 +481,7 @@ def _creature(rng: Rng) -> list[Part]:
     for s in (-1, 1):
         ear = superquadric((0.03, 0.05, rng.uniform(0.05, 0.2)), ball)
         parts.append(
-            (ear.moved(head + np.array((s * 0.7 * size[0], 0.03, size[2])), _turn(1, s * rng.uniform(0, 0.5))), 1)
+            (ear.moved(head + np.array((s * 0.7 * size[0], 0.03, size[2])), turn(1, s * rng.uniform(0, 0.5))), 1)
         )
         for y in (-0.6, 0.6):
             foot = (s * rng.uniform(0.8, 1.1) * body[0], y * body[1] + rng.normal(0, 0.05), 0)
