@@ -54,8 +54,8 @@ class CachedBank:
 def cache_folder() -> Path:
     """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else ``~/.cache/curvireg_torch``.
 
-    Banks lie in its folder ``banks``, as ``bank-<key>.safetensors``. Nothing else is ever listed, overwritten or removed:
-    a file must lie there, bear such a name, and say in its own header that it is a bank.
+    Banks lie in its folder ``banks``, as ``bank-<key>.safetensors``. Nothing else is ever listed, overwritten or
+    removed: a file must lie there, bear such a name, and say in its own header that it is a bank.
     """
     if folder := os.environ.get("CURVIREG_CACHE"):
         return Path(folder)

@@ -107,7 +107,7 @@ def test_list_and_clear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 def test_foreign_files_are_never_touched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     build(tmp_path)
     (bank,) = list_cache(tmp_path)
-    other = bank.path.with_name(bank.path.name.replace(bank.path.name[5], "f" if bank.path.name[5] == "0" else "0"))
+    other = bank.path.with_name(f"bank-{uuid.uuid4().hex}.safetensors")
     foreign = {
         tmp_path / "model.safetensors": safetensors.torch.save({"w": torch.zeros(9)}),
         tmp_path / "model.safetensors.1234.tmp": b"",
