@@ -1,0 +1,84 @@
+"""Depth views lit by a lamp beside the camera."""
+
+import math
+
+import pytest
+import torch
+import trimesh
+
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.rendering import render_depth
+from curvireg_torch.rendering.shading import AMBIENT, LIT, shade
+
+K = torch.tensor([[80.0, 0, 20.0], [0, 90.0, 40.0], [0, 0, 1]], dtype=torch.float64)
+
+
+def rays(size=64):
+    v, u = torch.meshgrid(torch.arange(size).double(), torch.arange(size).double(), indexing="ij")
+    return torch.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], torch.ones_like(u)])
+
+
+def test_planes_are_exact_in_perspective():
+    ray = rays()
+    for normal in ([0.3, -0.2, 1.0], [-0.4, 0.5, 1.0], [0.0, 0.0, 1.0]):
+        n = torch.tensor(normal, dtype=torch.float64)
+        along = torch.einsum("i,ihw->hw", n, ray)
+        depth = (5.0 / along)[None, None]
+        cosine = along / n.norm() / ray.norm(dim=0)
+        torch.testing.assert_close(shade(depth, K)[0, 0], AMBIENT + (LIT - AMBIENT) * cosine, atol=2e-4, rtol=0)
+
+
+def test_planes_are_exact_in_parallel_projection():
+    ray = rays()
+    depth = (7.0 + 0.3 * ray[0] - 0.6 * ray[1])[None, None]
+    expected = AMBIENT + (LIT - AMBIENT) / math.sqrt(1 + 0.3**2 + 0.6**2)
+    torch.testing.assert_close(shade(depth, K, orthographic=True), torch.full_like(depth, expected), atol=2e-4, rtol=0)
+
+
+def test_a_rendered_sphere_darkens_towards_its_rim():
+    size, focal, distance = 129, 400.0, 6.0
+    camera = torch.tensor([[focal, 0, 64.0], [0, focal, 64.0], [0, 0, 1]])
+    T = torch.eye(4)
+    T[2, 3] = distance
+    depth = render_depth(trimesh.creation.icosphere(5), T, camera, (size, size))
+    grey = shade(depth, camera)[0, 0]
+    for column in (64, 84, 104):
+        point = depth[0, 0, 64, column] * torch.tensor([(column - 64) / focal, 0.0, 1.0])
+        cosine = -(point - T[:3, 3]) @ point / point.norm()
+        assert abs(float(grey[64, column]) - float(AMBIENT + (LIT - AMBIENT) * cosine)) < 0.02
+    assert (grey[depth[0, 0] == 0] == 1.0).all()
+
+
+def test_contours_and_creases_stay_sharp():
+    depth = torch.zeros(1, 1, 12, 24)
+    depth[..., 3:9, 2:8] = 4.0
+    depth[..., 3:9, 8:14] = 9.0  # a step
+    depth[..., 1, 20] = 3.0  # one pixel alone
+    near = torch.tensor([[1000.0, 0, 11.5], [0, 1000.0, 5.5], [0, 0, 1]])
+    grey = shade(depth, near)
+    assert (grey[depth > 0] > LIT - 1e-3).all()
+    assert (grey[depth == 0] == 1.0).all()
+
+
+def test_batches_cameras_dtypes_and_nothing_at_all():
+    depth = 4.0 + torch.rand(3, 1, 16, 16)
+    cameras = torch.stack([K, 1.5 * K, 2.0 * K]).float()
+    cameras[:, 2, 2] = 1.0
+    together = shade(depth, cameras)
+    torch.testing.assert_close(together[1:2], shade(depth[1:2], cameras[1]))
+    assert shade(depth.double(), cameras).dtype == torch.float64
+    assert shade(depth[:0], cameras[:0]).shape == (0, 1, 16, 16)
+    assert (shade(torch.zeros(1, 1, 4, 4), K) == 1.0).all()
+
+
+@pytest.mark.parametrize(
+    ("depth", "camera"),
+    [
+        (torch.ones(4, 4), K),
+        (torch.ones(2, 1, 4, 4), torch.eye(3).expand(3, 3, 3)),
+        (torch.ones(1, 1, 4, 4, dtype=torch.int), K),
+    ],
+)
+def test_refuses_what_is_no_depth_or_camera(depth, camera):
+    with pytest.raises(InvalidInputError):
+        shade(depth, camera)
