@@ -17,7 +17,7 @@ import torch
 import trimesh
 
 from . import __version__
-from .data import read_image
+from .data import read_photo
 from .errors import CurviregError, InvalidInputError
 from .evaluation import add_parser as add_evaluate
 from .geometry import camera_matrix, load_mesh, rotation_error, whole_image_box
@@ -34,7 +34,8 @@ CONVENTIONS = {
     "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
     "translation": "in the mesh file's unit; null without --camera",
     "viewpoint": "PASCAL3D+ azimuth, elevation, theta in degrees",
-    "pixels": "(0, 0) is the centre of the top-left pixel; boxes are x0, y0, x1, y1",
+    "pixels": "(0, 0) is the centre of the top-left pixel of the picture as viewers show it (EXIF orientation applied)",
+    "boxes": "x0, y0, x1, y1 in those pixels",
     "score": "normalised correlation of photograph and view, 0 to 1",
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
     "reliable": f"confidence of at least {RELIABLE:g}; false = no reliable match, the pose is a guess",
@@ -188,7 +189,8 @@ def _open_bank(arguments: argparse.Namespace, preset: Preset) -> ViewBank:
 
 def _register(arguments: argparse.Namespace) -> None:
     times = {"start": time.perf_counter()}
-    image = read_image(arguments.photo)
+    photo = read_photo(arguments.photo, dtype=torch.float32)
+    image = photo.image
     box = whole_image_box(image) if arguments.box is None else torch.tensor(arguments.box)
     K = None if arguments.camera is None else camera_matrix(*arguments.camera, dtype=torch.float64)
     if arguments.top < 1:
@@ -206,7 +208,10 @@ def _register(arguments: argparse.Namespace) -> None:
     times["register"] = time.perf_counter()
     document = _document(result, registrar, times)
     document["inputs"] = {"photo": str(arguments.photo), "mesh": str(arguments.mesh), "box": box.tolist()}
+    document["inputs"]["picture"] = photo.facts()
     _write(arguments.out, document, registrar, result, image, box, K)
+    if photo.notes:
+        print(f"{arguments.photo}: {'; '.join(photo.notes)}")
     _print_result(document, arguments.out)
 
 

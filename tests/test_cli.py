@@ -14,6 +14,7 @@ from curvireg_torch.learned import adapt
 from curvireg_torch.matching import BankSettings
 from curvireg_torch.presets import DEFAULT, PRESETS, Preset
 from curvireg_torch.synthetic import example_mesh
+from tests._support.exif import exif, with_exif
 from tests._support.scenes import scene, truck_bank
 
 
@@ -86,6 +87,22 @@ def test_without_box_and_camera(files):
     assert result["translation"] is None
     assert result["covariance"] is None
     assert result["standard_deviations"] is None
+
+
+def test_a_sideways_photograph_is_registered_as_viewers_show_it(files, capsys):
+    folder, box, _ = files
+    options = ["--no-refine"]
+    assert run(folder, "photo.png", "truck.safetensors", *options, box=box) == 0
+    upright = json.loads((folder / "out" / "result.json").read_text())
+    # Stored a quarter turn anticlockwise; orientation 6 has viewers turn it back.
+    cv2.imwrite(str(folder / "sideways.png"), np.rot90(cv2.imread(str(folder / "photo.png"))))
+    with_exif(folder / "sideways.png", exif(6))
+    assert run(folder, "sideways.png", "truck.safetensors", *options, box=box) == 0
+    result = json.loads((folder / "out" / "result.json").read_text())
+    assert result["rotation"] == upright["rotation"]
+    assert result["inputs"]["picture"]["orientation"] == 6
+    assert upright["inputs"]["picture"]["orientation"] == 1
+    assert "sideways.png: EXIF orientation 6 applied" in capsys.readouterr().out
 
 
 def test_bank_then_register(files, capsys):

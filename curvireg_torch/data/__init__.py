@@ -7,7 +7,7 @@ gives a sample without its photograph through ``annotation(index)``. Nothing is 
 from .bop import BOPDataset
 from .bop_csv import BOPRow, read_bop_csv, write_bop_csv
 from .collate import collate
-from .images import read_image
+from .images import Photo, read_image, read_photo
 from .pascal3d import Pascal3DPlus
 from .transforms import CropBox
 from .web import WebCollection
@@ -17,9 +17,11 @@ __all__ = [
     "BOPRow",
     "CropBox",
     "Pascal3DPlus",
+    "Photo",
     "WebCollection",
     "collate",
     "read_bop_csv",
     "read_image",
+    "read_photo",
     "write_bop_csv",
 ]
