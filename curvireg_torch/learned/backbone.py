@@ -63,8 +63,9 @@ class _Block(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         y = x if self.expand is None else F.relu6(self.expand(x), inplace=True)
-        y = self.project(F.relu6(self.depthwise(y), inplace=True))
-        return x + y if self.residual else y
+        y = F.relu6(self.depthwise(y), inplace=True)
+        out: Tensor = self.project(y)
+        return x + out if self.residual else out
 
 
 class Backbone(nn.Module):

