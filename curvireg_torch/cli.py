@@ -20,8 +20,9 @@ from . import __version__
 from .data import read_photo
 from .errors import CurviregError, InvalidInputError
 from .evaluation import add_parser as add_evaluate
-from .geometry import camera_matrix, load_mesh, rotation_error, whole_image_box
+from .geometry import ViewSphere, camera_matrix, load_mesh, mesh_up, rotation_error, whole_image_box
 from .geometry.mesh import UNITS
+from .geometry.up import UP_AXES
 from .learned import LearnedCurvilinearSaliency, adapt
 from .matching import ViewBank, cache_folder, cached_bank, clear_cache, list_cache
 from .presets import DEFAULT, PRESETS, Preset, preset_named
@@ -91,8 +92,12 @@ def _parser() -> argparse.ArgumentParser:
         "--pose",
         choices=("any", "upright"),
         default="any",
-        help="any: no assumption. upright: the mesh's z axis points up in the photograph and the object is seen "
+        help="any: no assumption. upright: the mesh's up axis points up in the photograph and the object is seen "
         "from 10 degrees below to 60 above; faster, and right more often where it is true (default: any)",
+    )
+
+    mesh_options.add_argument(
+        "--up", choices=UP_AXES, help="the mesh file's axis that points up, as --up=-y; default: y for glTF, else z"
     )
 
     register = commands.add_parser(
@@ -145,10 +150,10 @@ def _parser() -> argparse.ArgumentParser:
 def _bank(arguments: argparse.Namespace) -> None:
     start = time.perf_counter()
     chosen = preset_named(arguments.preset)
-    mesh = load_mesh(arguments.mesh, unit=arguments.unit)
+    mesh = load_mesh(arguments.mesh, unit=arguments.unit, up=arguments.up)
     bank = ViewBank.build(
         mesh,
-        chosen.views(arguments.pose),
+        _views(arguments, chosen, mesh),
         settings=chosen.bank,
         renderer=arguments.renderer,
         progress=not arguments.quiet,
@@ -175,12 +180,18 @@ def _cache(arguments: argparse.Namespace) -> None:
     print(f"{cache_folder()}: {len(banks)} banks, {sum(bank.size for bank in banks) / 1e6:.1f} MB")
 
 
+def _views(arguments: argparse.Namespace, preset: Preset, mesh: trimesh.Trimesh) -> ViewSphere:
+    views = preset.views(arguments.pose)
+    return views.for_up(mesh_up(mesh)) if arguments.pose == "upright" else views
+
+
 def _open_bank(arguments: argparse.Namespace, preset: Preset) -> ViewBank:
     if arguments.mesh.suffix == ".safetensors":
         return ViewBank.load(arguments.mesh)
+    mesh = load_mesh(arguments.mesh, unit=arguments.unit, up=arguments.up)
     return cached_bank(
-        load_mesh(arguments.mesh, unit=arguments.unit),
-        preset.views(arguments.pose),
+        mesh,
+        _views(arguments, preset, mesh),
         preset.bank,
         renderer=arguments.renderer,
         progress=not arguments.quiet,

@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 from curvireg_torch.cli import main
-from curvireg_torch.geometry import sample_views
+from curvireg_torch.geometry import rotation_error, sample_views, up_rotation
 from curvireg_torch.learned import adapt
 from curvireg_torch.matching import BankSettings
 from curvireg_torch.presets import DEFAULT, PRESETS, Preset
@@ -64,8 +64,6 @@ def test_register_writes_result_and_overlay(files, capsys):
     ):
         assert key in result
     R = torch.tensor(result["rotation"], dtype=torch.float64)
-    from curvireg_torch import rotation_error
-
     assert float(rotation_error(R, truth[:3, :3])) < 15
     assert len(result["top"]) == 3
     overlay = cv2.imread(str(folder / "out" / "overlay.png"))
@@ -103,6 +101,19 @@ def test_a_sideways_photograph_is_registered_as_viewers_show_it(files, capsys):
     assert result["inputs"]["picture"]["orientation"] == 6
     assert upright["inputs"]["picture"]["orientation"] == 1
     assert "sideways.png: EXIF orientation 6 applied" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("name", "options", "up"), [("y.glb", [], "y"), ("x.ply", ["--up=-x"], "-x")])
+def test_upright_meshes_of_another_up_axis(files, monkeypatch, name, options, up):
+    folder, box, truth = files
+    monkeypatch.setenv("CURVIREG_CACHE", str(folder / "cache"))
+    turn = up_rotation(up)
+    T = np.eye(4)
+    T[:3, :3] = turn.numpy().T
+    example_mesh().apply_transform(T).export(folder / name)
+    assert run(folder, "photo.png", name, "--pose", "upright", "--no-refine", *options, box=box) == 0
+    R = torch.tensor(json.loads((folder / "out" / "result.json").read_text())["rotation"], dtype=torch.float64)
+    assert float(rotation_error(R, truth[:3, :3] @ turn)) < 15  # in the file's own frame
 
 
 def test_bank_then_register(files, capsys):

@@ -6,7 +6,7 @@ Conventions of the whole library (pinned by ``tests/geometry``):
 - Pixel (0, 0) is the centre of the top-left pixel; the image covers [-0.5, W - 0.5] x [-0.5, H - 0.5].
 - Boxes are ``x0, y0, x1, y1`` in pixels; depth is z along the optical axis in model units, background 0.
 - Angles are degrees at the API, radians inside. Images are RGB, floating, in [0, 1].
-- Poses are reported in the mesh file's own frame and unit.
+- Poses are reported in the mesh file's own frame and unit; ``up`` says which of its axes points up, and turns nothing.
 """
 
 from .cameras import camera_matrix, project_points, projected_boxes, rotation_towards, transform
@@ -26,6 +26,7 @@ from .mesh import load_mesh, mesh_centre, mesh_radius, normalization_transform
 from .neighbours import nearest_views
 from .symmetry import symmetry_transforms, views_without_symmetric
 from .translation import place_view, translation_from_box
+from .up import mesh_up, up_rotation, with_z_up
 from .viewpoint import rotation_error, rotation_from_viewpoint, viewpoint_from_rotation
 from .views import ViewSphere, paper_views, sample_views, uniform_views
 
@@ -38,6 +39,7 @@ __all__ = [
     "load_mesh",
     "mesh_centre",
     "mesh_radius",
+    "mesh_up",
     "nearest_views",
     "normalization_transform",
     "opencv_from_opengl",
@@ -61,7 +63,9 @@ __all__ = [
     "transform",
     "translation_from_box",
     "uniform_views",
+    "up_rotation",
     "viewpoint_from_rotation",
     "views_without_symmetric",
     "whole_image_box",
+    "with_z_up",
 ]

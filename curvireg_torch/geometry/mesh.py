@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .._checks import check_option
 from ..errors import MeshError, MissingFileError
+from .up import UP_AXES, format_up, mesh_up
 
 __all__ = [
     "UNITS",
@@ -31,7 +32,7 @@ UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.304
 SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 
 
-def load_mesh(path: str | PathLike[str], *, unit: str = "m") -> trimesh.Trimesh:
+def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = None) -> trimesh.Trimesh:
     """Read a mesh file; scenes become one mesh, textures and normals are ignored.
 
     Nothing is rescaled: vertices, and every pose computed from them, stay in the file's own frame and unit.
@@ -40,6 +41,8 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m") -> trimesh.Trimesh:
         path: .obj, .ply, .stl, .off, .glb or .gltf.
         unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. An object that
             would be smaller than 5 mm or larger than 100 m gets a warning.
+        up: the axis that points up when the object stands ("x", "y", "z", "-x", "-y", "-z"), kept in
+            ``mesh.metadata["up"]`` for views of standing objects, see :meth:`ViewSphere.for_up`; None: y for glTF, else z.
 
     Returns:
         ``trimesh.Trimesh`` with (V, 3) float64 vertices and (F, 3) faces, degenerate faces removed.
@@ -50,6 +53,8 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m") -> trimesh.Trimesh:
     """
     check_option(unit, UNITS, "unit")
     path = Path(path)
+    up = format_up(path.suffix) if up is None else up
+    check_option(up, UP_AXES, "up")
     if not path.is_file():
         raise MissingFileError(f"{path}: no such mesh file")
     if path.suffix.lower() not in SUFFIXES:
@@ -67,7 +72,7 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m") -> trimesh.Trimesh:
         logger.setLevel(level)
     mesh = as_mesh(loaded, name=str(path))
     mesh.units = unit
-    mesh.metadata["file_name"] = path.name
+    mesh.metadata.update(file_name=path.name, up=up)
     size = float(np.linalg.norm(mesh.extents)) * UNITS[unit]
     if not 0.005 <= size <= 100.0:
         warnings.warn(
@@ -99,6 +104,7 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
     mesh = trimesh.Trimesh(vertices=vertices, faces=faces[area > 0], process=False)
     mesh.remove_unreferenced_vertices()
     mesh.units = source.units
+    mesh.metadata["up"] = mesh_up(source)
     return mesh
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from .._checks import check_positive
 from ..errors import InvalidInputError
+from .up import up_rotation
 from .viewpoint import rotation_from_viewpoint, viewpoint_from_rotation
 
 __all__ = ["DEFAULT_DISTANCE", "ViewSphere", "paper_views", "sample_views", "uniform_views"]
@@ -81,6 +82,21 @@ class ViewSphere:
                 f"theta in {theta}; widen the range or sample more finely"
             )
         return self[inside]
+
+    def for_up(self, up: str) -> "ViewSphere":
+        """These views of an object that stands on z, as views of one whose axis ``up`` points up, in its own frame.
+
+        Args:
+            up: "x", "y", "z", "-x", "-y" or "-z"; :func:`curvireg_torch.geometry.mesh_up` says it of a mesh.
+
+        Example:
+            >>> y_up = sample_views(azimuths=[0.0], elevations=[90.0]).for_up("y")          # from above
+            >>> (y_up.rotations[0] @ torch.tensor([0.0, 1.0, 0.0])).round().tolist()        # y points at the camera
+            [0.0, 0.0, -1.0]
+        """
+        T = torch.eye(4, dtype=torch.float64)
+        T[:3, :3] = up_rotation(up)
+        return self if up == "z" else self.in_model_frame(T)
 
     def in_model_frame(self, T_views_from_model: Tensor) -> "ViewSphere":
         """Views that were chosen in another frame of the model, as views of the model's own frame.

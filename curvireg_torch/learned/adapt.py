@@ -8,6 +8,7 @@ from tqdm import tqdm
 
 from .._checks import check_positive
 from ..geometry.mesh import as_mesh
+from ..geometry.up import with_z_up
 from ..scenes import GeneratedScenes
 from .lessons import Lessons, altered, losses
 from .network import LearnedCurvilinearSaliency
@@ -36,7 +37,7 @@ def adapt(
     Args:
         mesh: a mesh or the path of one.
         scenes: how many photographs to generate; each is seen once.
-        upright: share of them where the mesh's z axis points up.
+        upright: share of them where the object stands; the mesh's ``up`` axis points up then.
         field: start from this one, which is changed; default the packaged one.
         seed: of the scenes.
         workers: processes that generate them; 0 is this one.
@@ -47,7 +48,7 @@ def adapt(
     """
     check_positive(scenes, "scenes")
     field = LearnedCurvilinearSaliency() if field is None else field
-    lessons = Lessons(GeneratedScenes(scenes, seed=seed, upright=upright, meshes=[as_mesh(mesh)]))
+    lessons = Lessons(GeneratedScenes(scenes, seed=seed, upright=upright, meshes=[with_z_up(as_mesh(mesh))]))
     loader = DataLoader(lessons, BATCH, num_workers=workers, multiprocessing_context="spawn" if workers else None)
     network = field.network
     network.eval().requires_grad_(True)

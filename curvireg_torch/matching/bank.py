@@ -17,6 +17,7 @@ from .._files import write_tensors
 from .._threads import one_thread_each
 from ..errors import BankError, InvalidInputError, MissingFileError
 from ..geometry.mesh import as_mesh, mesh_radius
+from ..geometry.up import mesh_up
 from ..geometry.views import ViewSphere, sample_views
 from ..rendering import DepthRenderer
 from .describe import BankSettings, ViewDescriber
@@ -116,7 +117,7 @@ class ViewBank:
             (4, torch.Size([4, 1764]))
         """
         mesh = as_mesh(mesh)
-        views = sample_views() if views is None else views
+        views = sample_views().for_up(mesh_up(mesh)) if views is None else views
         settings = settings or BankSettings(image_size=image_size, camera=camera)
         if chunk_size < 1:
             raise InvalidInputError(f"chunk_size: expected >= 1, got {chunk_size}")

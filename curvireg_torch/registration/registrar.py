@@ -9,8 +9,9 @@ from torch import Tensor, nn
 
 from ..errors import ImageError, InvalidInputError
 from ..geometry.cameras import check_camera_matrix, rotation_towards
-from ..geometry.mesh import mesh_radius
+from ..geometry.mesh import as_mesh, mesh_radius
 from ..geometry.translation import place_view
+from ..geometry.up import mesh_up
 from ..geometry.views import ViewSphere, sample_views
 from ..matching import (
     BankCollection,
@@ -83,9 +84,9 @@ class Registrar:
         elif isinstance(bank, BankCollection):
             raise InvalidInputError("Registrar: expected the bank of one model; choose one with BankCollection.locate")
         else:
-            bank = cached_bank(
-                bank, views or sample_views(), settings or BankSettings(), progress=progress, renderer=renderer
-            )
+            bank = as_mesh(bank)
+            views = views or sample_views().for_up(mesh_up(bank))
+            bank = cached_bank(bank, views, settings or BankSettings(), progress=progress, renderer=renderer)
         self.bank: ViewBank = bank
         self.matcher = bank_or_mesh if isinstance(bank_or_mesh, ViewMatcher) else ViewMatcher(bank, field=field)
         self.refine, self.contours, self.top = refine, refine and contours, top
