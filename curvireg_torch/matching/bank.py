@@ -92,7 +92,7 @@ class ViewBank:
         renderer: str | DepthRenderer = "auto",
         settings: BankSettings | None = None,
         progress: bool = True,
-        chunk_size: int = 8,
+        chunk_size: int = 24,
         device: torch.device | str = "cpu",
     ) -> "ViewBank":
         """Render, filter and describe every view, chunks of them in parallel on as many threads as torch may use.
@@ -104,7 +104,8 @@ class ViewBank:
             renderer: "auto", "embree", "pyrender", "torch" or a :class:`DepthRenderer` of this mesh.
             settings: everything else that may be chosen; overrides the shortcuts.
             progress: show a bar.
-            chunk_size: views that a thread has in memory at a time (about 60 bytes x image_size^2 each).
+            chunk_size: views that a thread has in memory at a time (about 60 bytes x image_size^2 each). Those of one
+                direction are rendered at once (:func:`render_views`) where they fall into one chunk.
             device: where views are filtered and described, and where the bank stays.
 
         Raises:

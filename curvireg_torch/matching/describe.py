@@ -13,7 +13,7 @@ from ..filters import DepthCurvilinearSaliency
 from ..geometry.cameras import projected_boxes, transform
 from ..geometry.crops import crop_transforms, square_boxes
 from ..geometry.mesh import extreme_points, mesh_centre
-from ..rendering import DepthRenderer, make_renderer
+from ..rendering import DepthRenderer, make_renderer, render_views
 
 __all__ = ["BankSettings", "DescribedViews", "ViewDescriber"]
 
@@ -145,7 +145,7 @@ class ViewDescriber:
         """Depth (N, 1, S, S) of the framed views, and their boxes (N, 4)."""
         S = self.settings.image_size
         T, K, boxes = self.cameras(rotations, distances)
-        depth = self.renderer.render(T, K, (S, S), orthographic=self._orthographic)
+        depth = render_views(self.renderer, T, K, (S, S), orthographic=self._orthographic)
         return depth.to(self._device), boxes.to(self._device)
 
     @torch.no_grad()

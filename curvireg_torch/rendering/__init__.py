@@ -1,5 +1,6 @@
 """Depth images of meshes behind one protocol; every backend samples the pixel's centre."""
 
 from .base import BACKENDS, DepthRenderer, make_renderer, render_depth
+from .turned import render_views
 
-__all__ = ["BACKENDS", "DepthRenderer", "make_renderer", "render_depth"]
+__all__ = ["BACKENDS", "DepthRenderer", "make_renderer", "render_depth", "render_views"]
