@@ -42,7 +42,8 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
         unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. An object that
             would be smaller than 5 mm or larger than 100 m gets a warning.
         up: the axis that points up when the object stands ("x", "y", "z", "-x", "-y", "-z"), kept in
-            ``mesh.metadata["up"]`` for views of standing objects, see :meth:`ViewSphere.for_up`; None: y for glTF, else z.
+            ``mesh.metadata["up"]`` for views of standing objects, see :meth:`ViewSphere.for_up`; None: y for glTF,
+            else z.
 
     Returns:
         ``trimesh.Trimesh`` with (V, 3) float64 vertices and (F, 3) faces, degenerate faces removed.
