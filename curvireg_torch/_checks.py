@@ -22,6 +22,11 @@ def check_tensor(x: Tensor, name: str, shape: tuple[int | None, ...]) -> None:
         )
 
 
+def check_last_axes(x: Tensor, name: str, shape: tuple[int | None, ...]) -> None:
+    """``x`` is a floating tensor of shape (..., *shape)."""
+    check_tensor(x, name, (None,) * (getattr(x, "ndim", 0) - len(shape)) + shape)
+
+
 def check_image(x: Tensor, name: str = "image") -> None:
     """``x`` is a floating (B, 1, H, W) tensor with H, W >= 1."""
     check_tensor(x, name, (None, 1, None, None))

@@ -88,11 +88,7 @@ class Pascal3DBenchmark(Benchmark):
             del aware["n"]
             return {**viewpoint_scores(plain[mask], THRESHOLDS), "symmetry_aware": aware}
 
-        azimuth = viewpoint_from_rotation(R.nan_to_num())[0]
-        found = R[:, 0, 0].isfinite()
-        true_azimuth = viewpoint_from_rotation(truth)[0]
-        # A miss is put into the bin opposite to the right one.
-        azimuth = torch.where(found, azimuth, true_azimuth + 180.0)
+        azimuth, true_azimuth = (viewpoint_from_rotation(rotations)[0] for rotations in (R, truth))
         classes = sorted({s["category"] for s in samples})
         return {
             **scores_of([True] * len(samples)),

@@ -1,5 +1,7 @@
 """The graph of neighbouring views: which views are coherent with which."""
 
+import warnings
+
 import torch
 from torch import Tensor
 
@@ -12,6 +14,8 @@ __all__ = ["nearest_views"]
 
 def nearest_views(rotations: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """The nearest neighbours of every view, by the angle between rotations: in-plane turns count.
+
+    Deprecated: nothing in the library needs it; :func:`rotation_error` gives the angles.
 
     Views within an angle are those of the first ``count`` whose returned angle is below it.
 
@@ -27,10 +31,13 @@ def nearest_views(rotations: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
     Example:
         >>> from curvireg_torch.geometry import sample_views
-        >>> indices, degrees = nearest_views(sample_views(azimuth_step=90, elevations=[0]).rotations, 2)
+        >>> R = sample_views(azimuth_step=90, elevations=[0]).rotations
+        >>> with warnings.catch_warnings(action="ignore"):
+        ...     indices, degrees = nearest_views(R, 2)
         >>> indices[0].sort().values.tolist(), [round(float(d)) for d in degrees[0]]
         ([1, 3], [90, 90])
     """
+    warnings.warn("nearest_views is deprecated; rotation_error gives the angles", DeprecationWarning, stacklevel=2)
     check_tensor(rotations, "rotations", (None, 3, 3))
     N = len(rotations)
     if not 1 <= count < N:

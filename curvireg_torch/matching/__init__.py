@@ -16,7 +16,6 @@ from .collection import BankCollection
 from .describe import BankSettings, DescribedViews, ViewDescriber
 from .index import ViewIndex
 from .matcher import Ranking, ViewMatcher
-from .near_symmetry import NearSymmetry, near_symmetries
 from .query import QueryFeatures, slack_boxes
 from .repeatability import dilate_points, repeatability, repeatability_score
 from .similarity import normalized_correlation, unit_score
@@ -29,7 +28,6 @@ __all__ = [
     "CachedBank",
     "DescribedViews",
     "DescriptorStatistics",
-    "NearSymmetry",
     "QueryFeatures",
     "Ranking",
     "ViewBank",
@@ -45,7 +43,6 @@ __all__ = [
     "clear_cache",
     "dilate_points",
     "list_cache",
-    "near_symmetries",
     "normalized_correlation",
     "repeatability",
     "repeatability_score",

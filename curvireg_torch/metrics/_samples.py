@@ -17,6 +17,22 @@ def check_errors(errors: Tensor, name: str = "errors") -> None:
         )
 
 
+def shown(x: object) -> str:
+    """What came in place of the tensor that was expected."""
+    return f"{x.dtype} of shape {tuple(x.shape)}" if isinstance(x, Tensor) else type(x).__name__
+
+
+def check_finite(x: Tensor, name: str) -> None:
+    """``x``, which is true or given and not estimated, has no NaN and no inf."""
+    if not bool(x.isfinite().all()):
+        raise InvalidInputError(f"{name}: expected finite numbers, got NaN or inf")
+
+
+def or_inf(errors: Tensor, valid: Tensor) -> Tensor:
+    """``errors``, ``inf`` where they are not valid."""
+    return torch.where(valid, errors, torch.full_like(errors, torch.inf))
+
+
 def share(hits: Tensor) -> float:
     """Share of True in a boolean tensor, NaN of an empty one."""
     return float(hits.double().mean())

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from curvireg_torch._checks import check_tensor
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import rotation_error
 
 from ._samples import per_item
 from .pose import add_error, add_recall, adds_error, mspd_error, mspd_recall, mssd_error, mssd_recall
@@ -100,18 +99,12 @@ class ViewpointAccuracy(Metric):
             symmetries: (S, 3, 3) of the objects of this batch, see :func:`symmetric_rotation_error`.
 
         Raises:
-            InvalidInputError: wrong shape, dtype or device, or NaN in ``R_gt``.
+            InvalidInputError: wrong shape, dtype or device, or ``R_gt`` with NaN or inf.
         """
         check_tensor(R_gt, "R_gt", (None, 3, 3))
         check_tensor(R_est, "R_est", tuple(R_gt.shape))
-        if not bool(R_gt.isfinite().all()):
-            raise InvalidInputError("R_gt: expected finite numbers, got NaN or inf")
-        if symmetries is None:
-            errors = rotation_error(R_est, R_gt)
-        else:
-            errors = symmetric_rotation_error(R_est, R_gt, symmetries)
-        found = R_est.isfinite().flatten(1).all(1)
-        self._append(torch.where(found, errors, torch.full_like(errors, torch.inf)).unsqueeze(1))
+        symmetries = R_gt.new_empty(0, 3, 3) if symmetries is None else symmetries
+        self._append(symmetric_rotation_error(R_est, R_gt, symmetries).unsqueeze(1))
 
     def compute(self) -> dict[str, float]:
         """``n``, ``acc_pi_6``, ``acc_pi_18`` (shares), ``med_err_deg``; NaN where n = 0."""

@@ -4,6 +4,9 @@ All three read one curve. Detections of a class, best score first, claim the gro
 they overlap most, if the IoU is at least 0.5 and nobody claimed it before. Recall is the share of boxes claimed;
 the height of the curve is the share of the detections so far that are claims *with the right viewpoint*. That is what
 PASCAL3D+'s own evaluation does, recall counting every claim, and why AVP on ground-truth boxes is the binned accuracy.
+
+A detection whose rotation has NaN in it has no viewpoint, and a wrong one therefore; one whose box has NaN claims
+nothing. True objects have finite boxes and rotations.
 """
 
 import math
@@ -15,9 +18,10 @@ from torch import Tensor
 
 from curvireg_torch._checks import check_positive, check_same_device, check_tensor
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import rotation_error, viewpoint_from_rotation
+from curvireg_torch.geometry import viewpoint_from_rotation
 
-from .viewpoint import azimuth_bin
+from ._samples import check_finite, shown
+from .viewpoint import same_bin, symmetric_rotation_error
 
 __all__ = [
     "Detections",
@@ -28,6 +32,7 @@ __all__ = [
 ]
 
 _MIN_IOU = 0.5
+_INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 
 
 @dataclass(frozen=True)
@@ -48,10 +53,8 @@ class Objects:
     rotations: Tensor
 
     def __post_init__(self) -> None:
-        if self.image.ndim != 1 or self.image.is_floating_point():
-            raise InvalidInputError(
-                f"image: expected an integer tensor of shape (*), got {self.image.dtype} of {tuple(self.image.shape)}"
-            )
+        if not isinstance(self.image, Tensor) or self.image.ndim != 1 or self.image.dtype not in _INTEGERS:
+            raise InvalidInputError(f"image: expected an integer tensor of shape (*), got {shown(self.image)}")
         n = len(self.image)
         check_tensor(self.boxes, "boxes", (n, 4))
         check_tensor(self.rotations, "rotations", (n, 3, 3))
@@ -78,6 +81,9 @@ def average_precision(detections: Detections, objects: Objects) -> float:
     Returns:
         [0, 1]; 0 without detections, NaN without objects.
 
+    Raises:
+        InvalidInputError: true boxes or rotations with NaN or inf, or a true box without area.
+
     Example:
         >>> found = Objects(torch.tensor([0]), torch.tensor([[0.0, 0.0, 9.0, 9.0]]), torch.eye(3)[None])
         >>> average_precision(Detections(found.image, found.boxes, found.rotations, torch.ones(1)), found)
@@ -99,7 +105,7 @@ def average_viewpoint_precision(detections: Detections, objects: Objects, bins: 
         that the result does not depend on their order.
 
     Raises:
-        InvalidInputError: another number of bins.
+        InvalidInputError: another number of bins; true boxes or rotations as for :func:`average_precision`.
 
     Example:
         >>> found = Objects(torch.tensor([0]), torch.tensor([[0.0, 0.0, 9.0, 9.0]]), torch.eye(3)[None])
@@ -107,9 +113,12 @@ def average_viewpoint_precision(detections: Detections, objects: Objects, bins: 
         1.0
     """
     claimed = _claims(detections, objects)
-    est = azimuth_bin(viewpoint_from_rotation(detections.rotations)[0], bins)
-    gt = azimuth_bin(viewpoint_from_rotation(objects.rotations)[0], bins)
-    return _area(detections.scores, claimed >= 0, _right(claimed, lambda d, o: est[d] == gt[o]), len(objects.image))
+    # One lost number makes all of a rotation missing, also where the azimuth does not need it.
+    lost = ~detections.rotations.isfinite().flatten(1).all(1)
+    est = viewpoint_from_rotation(detections.rotations)[0].masked_fill(lost, torch.nan)
+    gt = viewpoint_from_rotation(objects.rotations)[0]
+    right = _right(claimed, lambda d, o: same_bin(est[d], gt[o], bins))
+    return _area(detections.scores, claimed >= 0, right, len(objects.image))
 
 
 def average_rotation_precision(detections: Detections, objects: Objects, *, threshold_deg: float = 30.0) -> float:
@@ -123,7 +132,7 @@ def average_rotation_precision(detections: Detections, objects: Objects, *, thre
         [0, 1]; 0 without detections, NaN without objects; ties as in :func:`average_viewpoint_precision`.
 
     Raises:
-        InvalidInputError: a threshold that is not > 0.
+        InvalidInputError: a threshold that is not > 0; true boxes or rotations as for :func:`average_precision`.
 
     Example:
         >>> found = Objects(torch.tensor([0]), torch.tensor([[0.0, 0.0, 9.0, 9.0]]), torch.eye(3)[None])
@@ -133,7 +142,12 @@ def average_rotation_precision(detections: Detections, objects: Objects, *, thre
     """
     check_positive(threshold_deg, "threshold_deg")
     claimed = _claims(detections, objects)
-    right = _right(claimed, lambda d, o: rotation_error(detections.rotations[d], objects.rotations[o]) < threshold_deg)
+    none = objects.rotations[:0]
+
+    def agrees(d: Tensor, o: Tensor) -> Tensor:
+        return symmetric_rotation_error(detections.rotations[d], objects.rotations[o], none) < threshold_deg
+
+    right = _right(claimed, agrees)
     return _area(detections.scores, claimed >= 0, right, len(objects.image))
 
 
@@ -147,6 +161,10 @@ def _iou(a: Tensor, b: Tensor) -> Tensor:
 
 def _claims(detections: Detections, objects: Objects) -> Tensor:
     """(N,) index of the object that each detection claims, -1 for none."""
+    check_finite(objects.boxes, "objects.boxes")
+    check_finite(objects.rotations, "objects.rotations")
+    if not bool((objects.boxes[:, 2:] > objects.boxes[:, :2]).all()):
+        raise InvalidInputError("objects.boxes: expected X0 < X1 and Y0 < Y1; give corners, not width and height")
     claimed = torch.full_like(detections.image, -1, dtype=torch.int64)
     by_score = torch.argsort(detections.scores, descending=True, stable=True)
     for image in set(detections.image.tolist()):

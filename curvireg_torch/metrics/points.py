@@ -1,5 +1,6 @@
 """How well two sets of feature points, given as boolean masks, fall on each other."""
 
+import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -11,7 +12,9 @@ from torch import Tensor
 from curvireg_torch._checks import check_mask, check_positive
 from curvireg_torch.errors import InvalidInputError
 
-__all__ = ["hausdorff_distance", "intersection_percentage", "repeatability"]
+from ._samples import shown
+
+__all__ = ["hausdorff_distance", "intersection_percentage", "repeatability", "view_repeatability"]
 
 
 def intersection_percentage(photo: Tensor, view: Tensor, *, eps_px: float = 2.0) -> Tensor:
@@ -35,15 +38,15 @@ def intersection_percentage(photo: Tensor, view: Tensor, *, eps_px: float = 2.0)
         0.5
     """
     check_positive(eps_px, "eps_px", zero_ok=True)
-    return _per_image(
-        lambda a, b: float((_distances(a, b) <= eps_px).mean()) if a.any() else np.nan, photo, view, ("photo", "view")
-    )
+    return _per_image(_share_near(eps_px), photo, view, ("photo", "view"))
 
 
-def repeatability(view: Tensor, photo: Tensor, *, eps_px: float = 2.0) -> Tensor:
+def view_repeatability(view: Tensor, photo: Tensor, *, eps_px: float = 2.0) -> Tensor:
     """Share of the rendered view's feature points that are found again within ``eps_px`` in the photograph.
 
-    The other direction of :func:`intersection_percentage`: a photograph full of texture repeats any view: print both.
+    What the paper's introduction calls the repeatability of a detector. The other direction of
+    :func:`intersection_percentage` and of the paper's Rep, which ranks views
+    (:func:`curvireg_torch.matching.repeatability`): a photograph full of texture repeats any view: print both.
 
     Args:
         view, photo: (..., H, W) bool, one mask of feature points per image.
@@ -58,10 +61,18 @@ def repeatability(view: Tensor, photo: Tensor, *, eps_px: float = 2.0) -> Tensor
     Example:
         >>> photo = torch.tensor([[True, False, False, True]])
         >>> view = torch.tensor([[False, True, False, False]])
-        >>> float(repeatability(view, photo, eps_px=1.0))
+        >>> float(view_repeatability(view, photo, eps_px=1.0))
         1.0
     """
-    return intersection_percentage(view, photo, eps_px=eps_px)
+    check_positive(eps_px, "eps_px", zero_ok=True)
+    return _per_image(_share_near(eps_px), view, photo, ("view", "photo"))
+
+
+def repeatability(view: Tensor, photo: Tensor, *, eps_px: float = 2.0) -> Tensor:
+    """Former name of :func:`view_repeatability`."""
+    message = "metrics.repeatability is now called view_repeatability; matching.repeatability is the other direction"
+    warnings.warn(message, DeprecationWarning, stacklevel=2)
+    return view_repeatability(view, photo, eps_px=eps_px)
 
 
 def hausdorff_distance(a: Tensor, b: Tensor, *, percentile: float = 100.0, directed: bool = False) -> Tensor:
@@ -99,6 +110,10 @@ def hausdorff_distance(a: Tensor, b: Tensor, *, percentile: float = 100.0, direc
     return _per_image(of_pair, a, b, ("a", "b"))
 
 
+def _share_near(eps_px: float) -> Callable[[NDArray[np.bool_], NDArray[np.bool_]], float]:
+    return lambda a, b: float((_distances(a, b) <= eps_px).mean()) if a.any() else np.nan
+
+
 def _distances(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Distance of each point of ``a`` to its nearest point of ``b``, ``inf`` if ``b`` is empty."""
     if not b.any():
@@ -111,8 +126,9 @@ def _per_image(
     score: Callable[[NDArray[np.bool_], NDArray[np.bool_]], float], a: Tensor, b: Tensor, names: tuple[str, str]
 ) -> Tensor:
     """``score`` of each pair of (..., H, W) masks, as a (...) tensor of the default dtype on their device."""
-    if a.ndim < 2 or a.dtype != torch.bool:
-        raise InvalidInputError(f"{names[0]}: expected bool (..., H, W), got {a.dtype} of shape {tuple(a.shape)}")
+    for name, mask in zip(names, (a, b), strict=True):
+        if not isinstance(mask, Tensor) or mask.ndim < 2 or mask.dtype != torch.bool:
+            raise InvalidInputError(f"{name}: expected bool (..., H, W), got {shown(mask)}")
     check_mask(b, a, names[1])
     height, width = a.shape[-2:]
     n = a.shape[:-2].numel()

@@ -1,7 +1,8 @@
 """Errors of 6D poses: ADD, ADD-S, MSSD and MSPD, and the shares of good poses that BOP prints.
 
 All take the estimated and the true pose ``T_cam_from_model`` and points of the model's surface in one unit. An estimate
-that is missing is a pose full of NaN; its error is ``inf``, so that it counts as a miss in every share.
+that is missing is a pose full of NaN; its error is ``inf``, so that it counts as a miss in every share. Any other pose
+that is not rigid is refused.
 
 - ADD (Hinterstoisser et al. 2012): mean over the points x of ``|T_est x - T_gt x|``;
 - ADD-S: mean over x of the distance of ``T_gt x`` to the nearest ``T_est y``;
@@ -17,13 +18,17 @@ from torch import Tensor
 
 from curvireg_torch._checks import check_positive, check_same_device, check_tensor
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry.cameras import check_camera_matrix
 
-from ._samples import check_errors, per_item, share
+from ._samples import check_errors, check_finite, or_inf, per_item, share
 
 __all__ = ["add_error", "add_recall", "adds_error", "mspd_error", "mspd_recall", "mssd_error", "mssd_recall"]
 
 _CHUNK = 1 << 22
 """Points transformed at a time: 50 MB of float32 for their coordinates."""
+
+_RIGID = 1e-2
+"""Largest entry of R R' - I that passes: poses in files are rounded, and half precision rounds to 5e-4."""
 
 _MSSD_THRESHOLDS = tuple(step / 20.0 for step in range(1, 11))
 _MSPD_THRESHOLDS = tuple(5.0 * step for step in range(1, 11))
@@ -40,7 +45,7 @@ def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
         (B,) in the unit of the points.
 
     Raises:
-        InvalidInputError: wrong shape, dtype or device, or no points.
+        InvalidInputError: wrong shape, dtype or device, no points, a pose that is not rigid, NaN in ``T_gt``.
 
     Example:
         >>> T = torch.eye(4)[None]
@@ -50,7 +55,7 @@ def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     """
     T_est, T_gt, points, found = _checked(T_est, T_gt, points)
     means = [_transform(d, points).norm(dim=1).mean(1) for d in _chunks(T_est - T_gt, points)]
-    return _or_inf(torch.cat(means), found)
+    return or_inf(torch.cat(means), found)
 
 
 def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
@@ -66,7 +71,7 @@ def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
         (B,) in the unit of the points, on the device and in the dtype of ``T_est``.
 
     Raises:
-        InvalidInputError: wrong shape, dtype or device, or no points.
+        InvalidInputError: wrong shape, dtype or device, no points, a pose that is not rigid, NaN in ``T_gt``.
 
     Example:
         >>> T = torch.eye(4)[None]
@@ -79,7 +84,7 @@ def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     tree = cKDTree(model.numpy())
     back = torch.linalg.solve(T_est.detach().cpu().double(), T_gt.detach().cpu().double())
     means = [float(tree.query((model @ T[:3, :3].T + T[:3, 3]).numpy())[0].mean()) for T in back]
-    return _or_inf(torch.tensor(means, dtype=T_est.dtype, device=T_est.device), found)
+    return or_inf(torch.tensor(means, dtype=T_est.dtype, device=T_est.device), found)
 
 
 def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
@@ -95,7 +100,7 @@ def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tenso
         (B,) in the unit of the points.
 
     Raises:
-        InvalidInputError: wrong shape, dtype or device, no points or no symmetry.
+        InvalidInputError: as :func:`add_error`, or no symmetry.
 
     Example:
         >>> T = torch.eye(4)[None]
@@ -109,7 +114,7 @@ def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tenso
     T_est, T_gt, points, found = _checked(T_est, T_gt, points)
     difference = T_est.unsqueeze(1) - T_gt.unsqueeze(1) @ _checked_symmetries(symmetries, T_gt)
     largest = [_transform(d, points).norm(dim=1).amax(1) for d in _chunks(difference.flatten(0, 1), points)]
-    return _or_inf(torch.cat(largest).view(difference.shape[:2]).amin(1), found)
+    return or_inf(torch.cat(largest).view(difference.shape[:2]).amin(1), found)
 
 
 def mspd_error(
@@ -128,7 +133,7 @@ def mspd_error(
         (B,) pixels; ``inf`` where a point lies in or behind the camera's plane.
 
     Raises:
-        InvalidInputError: wrong shape, dtype or device, no points or no symmetry.
+        InvalidInputError: as :func:`mssd_error`, or no camera matrix.
 
     Example:
         >>> T = torch.eye(4)[None]; T[0, 2, 3] = 2.0
@@ -138,8 +143,11 @@ def mspd_error(
         5.0
     """
     T_est, T_gt, points, found = _checked(T_est, T_gt, points)
-    check_tensor(camera_matrix, "camera_matrix", (3, 3) if camera_matrix.ndim == 2 else (len(T_est), 3, 3))
+    check_tensor(
+        camera_matrix, "camera_matrix", (3, 3) if getattr(camera_matrix, "ndim", 0) == 2 else (len(T_est), 3, 3)
+    )
     check_same_device(camera_matrix, T_est, "camera_matrix")
+    check_camera_matrix(camera_matrix)
     K = camera_matrix.to(T_est.dtype)
     if K.ndim == 3:
         K = K.unsqueeze(1)
@@ -148,8 +156,8 @@ def mspd_error(
     largest = []
     for a, b in zip(*(_chunks(projections.flatten(0, 1), points) for projections in (ours, true)), strict=True):
         (xy_a, front_a), (xy_b, front_b) = _project(a, points), _project(b, points)
-        largest.append(_or_inf((xy_a - xy_b).norm(dim=1), front_a & front_b).amax(1))
-    return _or_inf(torch.cat(largest).view(true.shape[:2]).amin(1), found)
+        largest.append(or_inf((xy_a - xy_b).norm(dim=1), front_a & front_b).amax(1))
+    return or_inf(torch.cat(largest).view(true.shape[:2]).amin(1), found)
 
 
 def add_recall(errors: Tensor, diameter: Tensor | float, *, fraction: float = 0.1) -> float:
@@ -230,12 +238,26 @@ def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tenso
     check_same_device(points, T_est, "points")
     if len(points) == 0:
         raise InvalidInputError("points: expected at least one point, got none")
-    for name, x in (("T_gt", T_gt), ("points", points)):
-        if not bool(x.isfinite().all()):
-            raise InvalidInputError(f"{name}: expected finite numbers, got NaN or inf")
+    check_finite(T_gt, "T_gt")
+    check_finite(points, "points")
     T_gt = T_gt.to(T_est.dtype)
     found = T_est.isfinite().flatten(1).all(1)
-    return torch.where(found.view(-1, 1, 1), T_est, T_gt), T_gt, points.to(T_est.dtype), found
+    T_est = torch.where(found.view(-1, 1, 1), T_est, T_gt)
+    for name, T in (("T_est", T_est), ("T_gt", T_gt)):
+        _check_rigid(T, name)
+    return T_est, T_gt, points.to(T_est.dtype), found
+
+
+def _check_rigid(T: Tensor, name: str) -> None:
+    T = T.detach().double()
+    eye = torch.eye(4, dtype=T.dtype, device=T.device)
+    off = (T[:, :3, :3] @ T[:, :3, :3].mT - eye[:3, :3]).abs().amax((1, 2)) > _RIGID
+    bad = int((off | (torch.linalg.det(T[:, :3, :3]) <= 0) | (T[:, 3] != eye[3]).any(1)).sum())
+    if bad:
+        raise InvalidInputError(
+            f"{name}: expected rigid transforms [[R, t], [0, 0, 0, 1]], got {bad} that are not; "
+            "a missing estimate is NaN"
+        )
 
 
 def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:
@@ -244,6 +266,7 @@ def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:
     check_tensor(symmetries, "symmetries", (None, 4, 4))
     if len(symmetries) == 0:
         raise InvalidInputError("symmetries: expected at least the identity, got none")
+    check_finite(symmetries, "symmetries")
     return symmetries.to(like)
 
 
@@ -263,7 +286,3 @@ def _project(projections: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     image = _transform(projections, points)
     front = image[:, 2] > 0
     return image[:, :2] / torch.where(front, image[:, 2], torch.ones_like(image[:, 2])).unsqueeze(1), front
-
-
-def _or_inf(errors: Tensor, valid: Tensor) -> Tensor:
-    return torch.where(valid, errors, torch.full_like(errors, torch.inf))

@@ -12,11 +12,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from curvireg_torch._checks import check_positive, check_same_device, check_tensor
+from curvireg_torch._checks import check_last_axes, check_positive, check_same_device, check_tensor
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint
 
-from ._samples import share
+from ._samples import check_finite, or_inf, share, shown
 
 __all__ = ["closest_view", "pose_parameter_errors", "rank_precision", "viewpoint_differences"]
 
@@ -40,7 +40,7 @@ def rank_precision(
         ``{k: share in [0, 1]}``, NaN for B = 0.
 
     Raises:
-        InvalidInputError: wrong shapes or dtypes, indices outside of the bank, negative or NaN errors, bad ranks.
+        InvalidInputError: wrong shapes or dtypes, indices outside of the bank, negative, NaN or inf errors, bad ranks.
 
     Example:
         >>> order = torch.tensor([[2, 0, 1]])
@@ -64,16 +64,16 @@ def rank_rows(order: Tensor, errors: Tensor, ks: Sequence[int]) -> Tensor:
     check_tensor(errors, "errors", (None, None))
     n = errors.shape[1]
     needed = min(max(ks), n)
-    if order.is_floating_point() or order.ndim != 2 or len(order) != len(errors) or not needed <= order.shape[1] <= n:
+    integers = isinstance(order, Tensor) and not order.is_floating_point() and order.dtype != torch.bool
+    if not integers or order.ndim != 2 or len(order) != len(errors) or not needed <= order.shape[1] <= n:
         raise InvalidInputError(
-            f"order: expected integers of shape ({len(errors)}, {needed} to {n}), "
-            f"got {order.dtype} of shape {tuple(order.shape)}"
+            f"order: expected integers of shape ({len(errors)}, {needed} to {n}), got {shown(order)}"
         )
     check_same_device(order, errors, "order")
     if n == 0:
         raise InvalidInputError("errors: expected a bank of at least one view, got none")
-    if not bool((errors >= 0).all()):
-        raise InvalidInputError("errors: expected degrees >= 0, got negative ones or NaN")
+    if not bool(((errors >= 0) & errors.isfinite()).all()):  # all inf would be all nearest
+        raise InvalidInputError("errors: expected degrees >= 0, got negative ones, inf or NaN")
     if not bool(((order >= 0) & (order < n)).all()):
         raise InvalidInputError(f"order: expected indices in [0, {n}), got some outside")
     best = errors.gather(1, order.long()).cummin(1).values
@@ -104,7 +104,7 @@ def viewpoint_differences(a: Tensor, b: Tensor) -> Tensor:
         [30.0, 20.0, 15.0, 0.5]
     """
     for name, x in (("a", a), ("b", b)):
-        check_tensor(x, name, (None,) * (x.ndim - 1) + (4,))
+        check_last_axes(x, name, (4,))
     difference = (a - b).abs()
     turn = difference % 360.0
     circular = torch.tensor([True, False, True, False], device=difference.device)
@@ -122,7 +122,7 @@ def closest_view(views: Tensor, truth: Tensor) -> Tensor:
         (B,) int64 indices into ``views``.
 
     Raises:
-        InvalidInputError: wrong shapes or an empty bank.
+        InvalidInputError: wrong shapes, an empty bank, NaN or inf.
 
     Example:
         >>> views = torch.tensor([[0.0, 0.0, 0.0, 1.0], [90.0, 0.0, 0.0, 1.0], [90.0, 0.0, 0.0, 2.0]])
@@ -131,6 +131,8 @@ def closest_view(views: Tensor, truth: Tensor) -> Tensor:
     """
     check_tensor(views, "views", (None, 4))
     check_tensor(truth, "truth", (None, 4))
+    check_finite(views, "views")
+    check_finite(truth, "truth")
     if len(views) == 0:
         raise InvalidInputError("views: expected at least one view, got none")
     error = rotation_error(
@@ -145,7 +147,8 @@ def pose_parameter_errors(estimate: Tensor, truth: Tensor, views: Tensor) -> dic
     """Mean absolute errors of the estimate (Est.) beside those of the bank's closest view (Clo.), as the paper's table.
 
     Args:
-        estimate, truth: (B, 4) azimuth, elevation, theta in degrees and distance.
+        estimate, truth: (B, 4) azimuth, elevation, theta in degrees and distance; NaN in ``estimate`` for a missing
+            one, which makes the means of Est. infinite.
         views: (N, 4), the same of the bank's views.
 
     Returns:
@@ -153,7 +156,7 @@ def pose_parameter_errors(estimate: Tensor, truth: Tensor, views: Tensor) -> dic
         in the unit that came in; NaN for B = 0.
 
     Raises:
-        InvalidInputError: wrong shapes or an empty bank.
+        InvalidInputError: wrong shapes, an empty bank, NaN or inf in ``truth`` or ``views``.
 
     Example:
         >>> truth = torch.tensor([[10.0, 5.0, 0.0, 1.0]])
@@ -167,6 +170,7 @@ def pose_parameter_errors(estimate: Tensor, truth: Tensor, views: Tensor) -> dic
     names = ("azimuth", "elevation", "theta", "distance")
     table = {}
     for key, view in (("est", estimate), ("clo", views[closest_view(views, truth)])):
-        means = viewpoint_differences(view, truth).double().mean(0)
+        found = view.isfinite().all(1, keepdim=True)
+        means = or_inf(viewpoint_differences(view, truth), found).double().mean(0)
         table[key] = dict(zip(names, means.tolist(), strict=True))
     return table

@@ -2,7 +2,8 @@
 
 The angle itself is :func:`curvireg_torch.geometry.rotation_error`; here are its variants for symmetric objects and the
 averages over a set. Rotations map model points into the camera, so a symmetry ``S`` of the model acts from the right:
-``R`` and ``R S`` show the same image.
+``R`` and ``R S`` show the same image. An estimate with NaN or inf in it is missing: its error is ``inf``, its azimuth
+in no bin.
 
 RenderForCNN's evaluation takes ``norm(logm(R1' R2)) / sqrt(2)`` with the spectral norm, where only the Frobenius norm
 gives the angle, so its errors are sqrt(2) too small; later papers inherited them. ``legacy_sqrt2=True`` reproduces
@@ -14,11 +15,11 @@ import math
 import torch
 from torch import Tensor
 
-from curvireg_torch._checks import check_option, check_positive, check_same_device, check_tensor
+from curvireg_torch._checks import check_last_axes, check_option, check_positive, check_same_device, check_tensor
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_error
 
-from ._samples import check_errors, share
+from ._samples import check_errors, check_finite, or_inf, share
 
 __all__ = [
     "AVP_BINS",
@@ -87,26 +88,28 @@ def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) ->
     """Rotation error of an object with discrete symmetries: ``min_S angle(R_est, R_gt S)``.
 
     Args:
-        R_est, R_gt: (..., 3, 3), broadcast against each other.
+        R_est, R_gt: (..., 3, 3), broadcast against each other; NaN in ``R_est`` for a missing estimate.
         symmetries: (S, 3, 3) rotations of the model onto itself, S >= 0. The identity is always one of them, listed
             or not; list the rest of the group in full, since products are not formed.
 
     Returns:
-        (...) degrees in [0, 180].
+        (...) degrees in [0, 180]; ``inf`` for a missing estimate.
 
     Raises:
-        InvalidInputError: wrong shape, dtype or device.
+        InvalidInputError: wrong shape, dtype or device; NaN or inf in ``R_gt`` or ``symmetries``.
 
     Example:
         >>> half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
         >>> float(symmetric_rotation_error(half_turn, torch.eye(3), half_turn[None]))
         0.0
     """
+    found = _found(R_est, R_gt)
     check_tensor(symmetries, "symmetries", (None, 3, 3))
     check_same_device(symmetries, R_gt, "symmetries")
+    check_finite(symmetries, "symmetries")
     plain = rotation_error(R_est, R_gt)
     turned = rotation_error(R_est.unsqueeze(-3), R_gt.unsqueeze(-3) @ symmetries.to(R_gt.dtype))
-    return torch.cat([plain.unsqueeze(-1), turned], -1).amin(-1)
+    return or_inf(torch.cat([plain.unsqueeze(-1), turned], -1).amin(-1), found)
 
 
 def axis_rotation_error(R_est: Tensor, R_gt: Tensor, axis: Tensor) -> Tensor:
@@ -116,15 +119,15 @@ def axis_rotation_error(R_est: Tensor, R_gt: Tensor, axis: Tensor) -> Tensor:
     which is the minimum in closed form. It is computed from the chord, without the loss of digits of ``acos`` near 0.
 
     Args:
-        R_est, R_gt: (..., 3, 3), broadcast against each other.
+        R_est, R_gt: (..., 3, 3), broadcast against each other; NaN in ``R_est`` for a missing estimate.
         axis: (3,) direction of the axis in the model frame, of any length > 0. The two ends of the axis differ; for a
             solid that looks the same upside down take the minimum with the flipped rotation as well.
 
     Returns:
-        (...) degrees in [0, 180].
+        (...) degrees in [0, 180]; ``inf`` for a missing estimate.
 
     Raises:
-        InvalidInputError: wrong shape, dtype or device, or an axis of length 0.
+        InvalidInputError: wrong shape, dtype or device; NaN or inf in ``R_gt``; an axis of length 0 or not finite.
 
     Example:
         >>> from curvireg_torch.geometry import rotation_from_viewpoint
@@ -132,52 +135,67 @@ def axis_rotation_error(R_est: Tensor, R_gt: Tensor, axis: Tensor) -> Tensor:
         >>> round(float(axis_rotation_error(a, b, torch.tensor([0.0, 0.0, 1.0]))), 3)   # the azimuth of a vase is free
         20.0
     """
-    for name, R in (("R_est", R_est), ("R_gt", R_gt)):
-        check_tensor(R, name, (None,) * (R.ndim - 2) + (3, 3))
+    found = _found(R_est, R_gt)
     check_tensor(axis, "axis", (3,))
     check_same_device(axis, R_gt, "axis")
     length = torch.linalg.vector_norm(axis)
-    if not bool(length > 0):
-        raise InvalidInputError(f"axis: expected a direction of length > 0, got {axis.tolist()}")
+    if not bool(length > 0) or not bool(length.isfinite()):
+        raise InvalidInputError(f"axis: expected a direction of finite length > 0, got {axis.tolist()}")
     axis = (axis / length).to(R_gt.dtype)
     half_chord = torch.linalg.vector_norm(R_est @ axis - R_gt @ axis, dim=-1) / 2.0
-    return torch.rad2deg(2.0 * torch.asin(half_chord.clamp(max=1.0)))
+    return or_inf(torch.rad2deg(2.0 * torch.asin(half_chord.clamp(max=1.0))), found)
+
+
+def _found(R_est: Tensor, R_gt: Tensor) -> Tensor:
+    """(...) bool: which estimates are not missing; the rotations are checked."""
+    for name, R in (("R_est", R_est), ("R_gt", R_gt)):
+        check_last_axes(R, name, (3, 3))
+    check_same_device(R_est, R_gt, "R_est")
+    check_finite(R_gt, "R_gt")
+    return R_est.isfinite().flatten(-2).all(-1)
 
 
 def azimuth_bin(azimuth: Tensor, bins: int) -> Tensor:
     """Bin of an azimuth as PASCAL3D+ cuts the circle: bin 0 is centred on azimuth 0.
 
     Args:
-        azimuth: (...) degrees, any turn.
+        azimuth: (...) degrees, any turn, finite.
         bins: 4, 8, 16 or 24.
 
     Returns:
         (...) int64 in [0, bins); bin i holds [(i - 1/2) 360/bins, (i + 1/2) 360/bins).
 
     Raises:
-        InvalidInputError: another number of bins, or an azimuth that is not a floating tensor.
+        InvalidInputError: another number of bins, an azimuth that is not a floating tensor or is NaN or inf.
 
     Example:
         >>> azimuth_bin(torch.tensor([0.0, 44.0, 45.0, 350.0]), 4).tolist()
         [0, 0, 1, 0]
     """
     check_option(str(bins), tuple(map(str, AVP_BINS)), "bins")
-    check_tensor(azimuth, "azimuth", (None,) * azimuth.ndim)
-    return torch.floor(azimuth * (bins / 360.0) + 0.5).long() % bins
+    check_last_axes(azimuth, "azimuth", ())
+    check_finite(azimuth, "azimuth")
+    return torch.floor(azimuth % 360.0 * (bins / 360.0) + 0.5).long() % bins
+
+
+def same_bin(azimuth_est: Tensor, azimuth_gt: Tensor, bins: int) -> Tensor:
+    """Whether azimuths of one shape share a bin; an estimate with NaN or inf, which is missing, shares none."""
+    found = azimuth_est.isfinite()
+    return found & (azimuth_bin(azimuth_est.where(found, 0.0), bins) == azimuth_bin(azimuth_gt, bins))
 
 
 def binned_accuracy(azimuth_est: Tensor, azimuth_gt: Tensor, bins: int) -> float:
     """Share of the objects whose azimuth falls into the right bin: AVP with ground-truth boxes.
 
     Args:
-        azimuth_est, azimuth_gt: (N,) degrees.
+        azimuth_est, azimuth_gt: (N,) degrees; NaN in ``azimuth_est`` for a missing estimate, which is a miss.
         bins: 4, 8, 16 or 24.
 
     Returns:
         Share in [0, 1], NaN for N = 0.
 
     Raises:
-        InvalidInputError: different shapes, not (N,), or another number of bins.
+        InvalidInputError: different shapes, not (N,), NaN or inf in ``azimuth_gt``, or another number of bins.
 
     Example:
         >>> binned_accuracy(torch.tensor([3.0, 100.0]), torch.tensor([350.0, 130.0]), 8)
@@ -185,4 +203,4 @@ def binned_accuracy(azimuth_est: Tensor, azimuth_gt: Tensor, bins: int) -> float
     """
     check_tensor(azimuth_gt, "azimuth_gt", (None,))
     check_tensor(azimuth_est, "azimuth_est", tuple(azimuth_gt.shape))
-    return share(azimuth_bin(azimuth_est, bins) == azimuth_bin(azimuth_gt, bins))
+    return share(same_bin(azimuth_est, azimuth_gt, bins))

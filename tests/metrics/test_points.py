@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.distance import cdist
 from skimage.metrics import hausdorff_distance as skimage_hausdorff
 
-from curvireg_torch import metrics
+from curvireg_torch import matching, metrics
 from curvireg_torch.errors import InvalidInputError
 
 
@@ -25,8 +25,19 @@ def test_shares_against_a_distance_matrix(eps: float) -> None:
     ip = [np.mean(_slow_distances(p, v) <= eps) for p, v in zip(photo, view, strict=True)]
     rep = [np.mean(_slow_distances(v, p) <= eps) for p, v in zip(photo, view, strict=True)]
     np.testing.assert_allclose(metrics.intersection_percentage(photo, view, eps_px=eps), ip, rtol=1e-6)
-    np.testing.assert_allclose(metrics.repeatability(view, photo, eps_px=eps), rep, rtol=1e-6)
+    np.testing.assert_allclose(metrics.view_repeatability(view, photo, eps_px=eps), rep, rtol=1e-6)
     assert not np.allclose(ip, rep)
+
+
+def test_matching_ranks_by_the_papers_rep_which_is_ip_and_not_view_repeatability() -> None:
+    # Rep(view -> query): the photograph's points with a point of the view near them.
+    photo, view = _masks(0, density=0.1), _masks(1)
+    rep = matching.repeatability(photo, matching.dilate_points(view, 1.5)).diagonal()
+    torch.testing.assert_close(rep, metrics.intersection_percentage(photo, view, eps_px=1.5))
+    ours = metrics.view_repeatability(view, photo, eps_px=1.5)
+    assert not np.allclose(ours, rep)
+    with pytest.warns(DeprecationWarning, match="view_repeatability"):
+        torch.testing.assert_close(metrics.repeatability(view, photo, eps_px=1.5), ours)
 
 
 def test_hausdorff_against_scikit_image() -> None:
@@ -60,7 +71,7 @@ def test_empty_masks() -> None:
     some, none = _masks(6, n=1)[0], torch.zeros(24, 31, dtype=torch.bool)
     assert float(metrics.intersection_percentage(some, none)) == 0.0
     assert math.isnan(float(metrics.intersection_percentage(none, some)))
-    assert math.isnan(float(metrics.repeatability(none, some)))
+    assert math.isnan(float(metrics.view_repeatability(none, some)))
     assert float(metrics.hausdorff_distance(some, none)) == float(metrics.hausdorff_distance(none, some)) == math.inf
     assert math.isnan(float(metrics.hausdorff_distance(none, none)))
 
@@ -80,6 +91,6 @@ def test_bad_input_is_refused() -> None:
     with pytest.raises(InvalidInputError, match="view: expected bool"):
         metrics.intersection_percentage(a, a[:1])
     with pytest.raises(InvalidInputError, match="eps_px"):
-        metrics.repeatability(a, a, eps_px=-1.0)
+        metrics.view_repeatability(a, a, eps_px=-1.0)
     with pytest.raises(InvalidInputError, match="percentile"):
         metrics.hausdorff_distance(a, a, percentile=0.0)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ...descriptors import field_points
 from ...matching import ViewDescriber
-from ...metrics import hausdorff_distance, intersection_percentage, repeatability
+from ...metrics import hausdorff_distance, intersection_percentage, view_repeatability
 from .cases import Case, grouped
 from .fields import DEPTH_FIELDS, PHOTO_FIELDS, FieldSettings, photo_detectors
 from .tables import Table
@@ -79,7 +79,7 @@ def repeatability_table(cases: list[Case], settings: FieldSettings, eps_px: floa
             for name in depths:
                 view = _points(depth, settings, name)
                 for photo_name, photo in photos.items():
-                    value = float(repeatability(view, photo, eps_px=eps_px))
+                    value = float(view_repeatability(view, photo, eps_px=eps_px))
                     if value == value:
                         scores[case.category][f"{name}/{photo_name}"].append(value)
     text = (
@@ -111,7 +111,7 @@ def curve_table(cases: list[Case], settings: FieldSettings, eps_px: float, progr
             crop = _crop(case, settings)
             for k, detect in enumerate(detectors.values()):
                 photo = detect(crop).expand_as(views)
-                sums[k] += repeatability(views, photo, eps_px=eps_px).nan_to_num().double()
+                sums[k] += view_repeatability(views, photo, eps_px=eps_px).nan_to_num().double()
     rows = [[float(o), *means] for o, means in zip(CURVE_OFFSETS, (sums / len(cases)).T.tolist(), strict=True)]
     text = (
         f"Share of the points of the view with a point of the photograph within {eps_px:g} px, the object turned about "
