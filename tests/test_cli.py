@@ -168,11 +168,13 @@ def test_a_file_where_the_folder_should_be(files, capsys):
 
 def test_cache_is_listed_and_cleared(files, capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path))
-    (tmp_path / "a.safetensors").write_bytes((files[0] / "truck.safetensors").read_bytes())
+    (tmp_path / "banks").mkdir()
+    bank = tmp_path / "banks" / f"bank-{'0' * 32}.safetensors"
+    bank.write_bytes((files[0] / "truck.safetensors").read_bytes())
     assert main(["cache"]) == 0
     assert "1 banks" in capsys.readouterr().out
     assert main(["cache", "--clear"]) == 0
-    assert not list(tmp_path.iterdir())
+    assert not bank.exists()
 
 
 def test_a_bank_that_cannot_be_written(files, capsys):

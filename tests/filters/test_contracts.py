@@ -208,7 +208,7 @@ def test_bad_input_is_refused_with_expected_and_actual() -> None:
 
 
 @every_layer
-@pytest.mark.filterwarnings("ignore:There is a performance drop", "ignore:`torch.jit.script`:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:There is a performance drop")  # torch's, in the name of whoever calls it
 def test_function_transforms(layer: Layer) -> None:
     x = layer.inputs(2, dtype=torch.float64)
     stack = torch.stack([x, 0.5 * x])
