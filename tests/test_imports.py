@@ -9,9 +9,10 @@ import curvireg_torch
 
 PACKAGE = Path(curvireg_torch.__file__).parent
 
-BASE = {"errors", "_checks", "_files", "_threads"}
+BASE = {"errors", "limits", "_checks", "_files", "_threads"}
 ALLOWED = {
     "errors": set(),
+    "limits": set(),
     "_checks": {"errors"},
     "_files": set(),
     "_threads": set(),

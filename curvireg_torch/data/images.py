@@ -15,8 +15,8 @@ from torch import Tensor
 from .._checks import check_option
 from ..errors import ImageError, InvalidInputError, MissingFileError
 from ..geometry.cameras import camera_matrix
+from ..limits import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, MAX_IMAGE_SCANS
 from ._image_headers import ImageHeader, read_header
-from .limits import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, MAX_IMAGE_SCANS
 
 __all__ = ["Photo", "read_image", "read_photo"]
 
@@ -77,7 +77,7 @@ def read_photo(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.uint8
     Raises:
         MissingFileError: no such file.
         ImageError: not such an image, truncated, of another bit depth, or beyond
-            :mod:`curvireg_torch.data.limits`.
+            :mod:`curvireg_torch.limits`.
 
     Example:
         >>> import tempfile
@@ -113,7 +113,7 @@ def read_image(
     Raises:
         MissingFileError: no such file.
         ImageError: not such an image, truncated, of another bit depth, or beyond
-            :mod:`curvireg_torch.data.limits`.
+            :mod:`curvireg_torch.limits`.
 
     Example:
         >>> read_image("missing.jpg")

@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from io import BytesIO
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from .._checks import check_option
 from ..errors import MeshError, MissingFileError
+from .polygon_files import with_triangles
 from .up import UP_AXES, format_up, mesh_up
 
 __all__ = [
@@ -33,7 +35,7 @@ SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 
 
 def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = None) -> trimesh.Trimesh:
-    """Read a mesh file; scenes become one mesh, textures and normals are ignored.
+    """Read a mesh file; scenes become one mesh, polygons become triangles, textures and normals are ignored.
 
     Nothing is rescaled: vertices, and every pose computed from them, stay in the file's own frame and unit.
 
@@ -64,7 +66,16 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
     level = logger.level
     try:
         logger.setLevel(logging.CRITICAL)  # its tracebacks of files that it cannot read
-        loaded = trimesh.load(path, process=False, skip_materials=True)
+        data, suffix = path.read_bytes(), path.suffix.lower()
+        if suffix in (".obj", ".off", ".ply"):
+            data = with_triangles(data, suffix)
+        loaded = trimesh.load(
+            BytesIO(data),
+            file_type=suffix[1:],
+            resolver=trimesh.resolvers.FilePathResolver(path),
+            process=False,
+            skip_materials=True,
+        )
     except Exception as error:
         raise MeshError(
             f"{path}: cannot be read as a mesh ({type(error).__name__}: {error}); re-export the file"
