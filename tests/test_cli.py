@@ -65,6 +65,9 @@ def test_register_writes_result_and_overlay(files, capsys):
         assert key in result
     R = torch.tensor(result["rotation"], dtype=torch.float64)
     assert float(rotation_error(R, truth[:3, :3])) < 15
+    # CX and CY, swapped, would move the object by 30 px of 260: 0.16 of its distance.
+    t = torch.tensor(result["translation"], dtype=torch.float64)
+    assert float((t - truth[:3, 3]).norm() / truth[:3, 3].norm()) < 0.05
     assert len(result["top"]) == 3
     overlay = cv2.imread(str(folder / "out" / "overlay.png"))
     assert overlay is not None

@@ -138,6 +138,7 @@ def _process(rank_: int, folder: str) -> None:
     dist.destroy_process_group()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not dist.is_available(), reason="torch was built without torch.distributed")
 def test_two_processes_see_the_items_of_both(tmp_path: Path) -> None:
     mp.spawn(_process, args=(str(tmp_path),), nprocs=2)

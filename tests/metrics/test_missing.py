@@ -179,6 +179,27 @@ def test_wrong_types_and_shapes_are_named(name: str) -> None:
         WRONG[name]()
 
 
+ELSEWHERE: dict[str, Callable[[Callable[[Tensor], Tensor]], object]] = {
+    "R_est": lambda to: metrics.symmetric_rotation_error(to(R), R, SYMMETRIES),
+    "symmetries": lambda to: metrics.symmetric_rotation_error(R, R, to(SYMMETRIES)),
+    "axis": lambda to: metrics.axis_rotation_error(R, R, to(AXIS)),
+    "T_gt": lambda to: metrics.add_error(T, to(T), POINTS),
+    "points": lambda to: metrics.add_error(T, T, to(POINTS)),
+    "camera_matrix": lambda to: metrics.mspd_error(T, T, POINTS, to(K)),
+    "diameter": lambda to: metrics.add_recall(torch.ones(1), to(torch.ones(1))),
+    "order": lambda to: metrics.rank_precision(to(torch.tensor([[0]])), torch.ones(1, 1), ks=(1,)),
+    "view": lambda to: metrics.intersection_percentage(*(f(torch.ones(2, 2) > 0) for f in (torch.clone, to))),
+    "boxes": lambda to: metrics.Objects(OBJECTS.image, to(BOXES), R),
+    "rotations": lambda to: metrics.Objects(OBJECTS.image, BOXES, to(R)),
+}
+
+
+@pytest.mark.parametrize("name", ELSEWHERE)
+def test_tensors_of_two_devices_are_named(name: str) -> None:
+    with pytest.raises(InvalidInputError, match=rf"^{name}: expected device cpu, got meta"):
+        ELSEWHERE[name](lambda x: x.to("meta"))
+
+
 def test_of_nothing_there_is_nothing() -> None:
     nothing = torch.empty(0, dtype=torch.float64)
     assert metrics.symmetric_rotation_error(R[:0], R[:0], SYMMETRIES).shape == (0,)

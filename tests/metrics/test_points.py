@@ -88,7 +88,7 @@ def test_bad_input_is_refused() -> None:
     a = _masks(9)
     with pytest.raises(InvalidInputError, match="photo: expected bool"):
         metrics.intersection_percentage(a.float(), a)
-    with pytest.raises(InvalidInputError, match="view: expected bool"):
+    with pytest.raises(InvalidInputError, match=r"view: expected bool of shape \(4, 24, 31\)"):
         metrics.intersection_percentage(a, a[:1])
     with pytest.raises(InvalidInputError, match="eps_px"):
         metrics.view_repeatability(a, a, eps_px=-1.0)

@@ -141,5 +141,9 @@ def test_recall_of_nothing_is_nan_and_bad_input_is_refused() -> None:
         metrics.mssd_recall(torch.ones(2), 0.0)
     with pytest.raises(InvalidInputError, match="diameter: expected a number or shape"):
         metrics.add_recall(torch.ones(2), torch.ones(3))
-    with pytest.raises(InvalidInputError, match="errors: expected numbers >= 0"):
-        metrics.mspd_recall(torch.tensor([math.nan]), 640)
+    for recall in (metrics.mspd_recall, metrics.mssd_recall, metrics.add_recall):
+        for bad in (math.nan, -1.0):
+            with pytest.raises(InvalidInputError, match="errors: expected numbers >= 0"):
+                recall(torch.tensor([bad]), 640)
+    with pytest.raises(InvalidInputError, match="fraction"):
+        metrics.add_recall(torch.ones(2), 1.0, fraction=0.0)

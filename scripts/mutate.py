@@ -1,0 +1,191 @@
+"""Mutation test: change the package in one small place, run the tests of that place, see whether one of them notices.
+
+    python scripts/mutate.py metrics geometry --sample 30     # go on where the last run stopped
+    python scripts/mutate.py metrics --sample 30 --again      # survivors once more, after new tests
+    python scripts/mutate.py metrics --list                   # what would be changed
+
+One mutant (``mutants.py``) at a time, in a temporary copy; the first failing test kills it. Tests of a module: its own
+file in the folder of its package, the rest of that folder, other test files that import it by name, its doctests; not
+those marked slow or data. The sample is drawn by a hash of the mutant and the seed, so it stays where the code does.
+
+``scripts/results/mutation.json``: score per package (killed / sampled) and every survivor. A ``reason`` written there
+beside a survivor is kept: why no test can or need tell it from the original.
+"""
+
+import argparse
+import hashlib
+import importlib
+import json
+import os
+import re
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from mutants import Mutant, mutants_of
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULT = ROOT / "scripts" / "results" / "mutation.json"
+PACKAGE = "curvireg_torch"
+PRELOADED = ("torch", "numpy", "scipy.spatial", "kornia", "cv2", "trimesh", "sklearn.covariance", "skimage.feature")
+PRELOADED += ("pytest",)
+WALL_LIMIT_S = 400.0
+
+
+def sample(mutants: Iterable[Mutant], count: int, seed: int) -> list[Mutant]:
+    """``count`` of them (0: all), the choice of each depending on its own text alone; in the files' order."""
+
+    def rank(mutant: Mutant) -> bytes:
+        return hashlib.sha1(f"{seed} {mutant.key.rsplit(' in ', 1)[0]}".encode()).digest()
+
+    chosen = sorted(mutants, key=rank)[: count or None]
+    return sorted(chosen, key=lambda m: (m.path, m.start, m.text))
+
+
+def files_of(package: str) -> list[str]:
+    """Sources of a package or of a module, relative to the repository."""
+    folder = ROOT / PACKAGE / package
+    paths = sorted(folder.rglob("*.py")) if folder.is_dir() else [folder.with_suffix(".py")]
+    return [p.relative_to(ROOT).as_posix() for p in paths if p.name != "__init__.py"]
+
+
+def tests_of(path: str) -> list[str]:
+    """Test files of a source, the likeliest to notice first, and its doctests last."""
+    parts = Path(path).with_suffix("").parts[1:]
+    home, stem = ROOT.joinpath("tests", *parts[:-1]), parts[-1].strip("_")
+    everywhere = sorted((ROOT / "tests").rglob("test_*.py"))
+    module = re.compile(rf"{PACKAGE}\.{re.escape('.'.join(parts))}\b")
+    if len(parts) > 1:
+        near = [p for p in everywhere if home in p.parents]
+        module = re.compile(rf"{module.pattern}|{PACKAGE}\.{'.'.join(parts[:-1])} import [^\n]*\b{parts[-1]}\b")
+    else:
+        near = [p for p in everywhere if p.parent == home and stem in p.stem]
+    named = [p for p in everywhere if p not in near and module.search(p.read_text())]
+    ordered = sorted(near, key=lambda p: stem not in p.stem) + named
+    return [*(p.relative_to(ROOT).as_posix() for p in ordered), path]
+
+
+def run_tests(copy: Path, tests: list[str], *, cpu_s: int | None, write_bytecode: bool = False) -> tuple[str, float]:
+    """``survived``, ``killed`` or ``timeout``, and the seconds, of a forked process that runs tests in the copy."""
+    start = time.monotonic()
+    log = copy / "log.txt"
+    child = os.fork()
+    if child == 0:  # torch and the like are imported already; the package is not
+        os.setsid()
+        os.chdir(copy)
+        output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        if cpu_s is not None:
+            resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s))
+        sys.dont_write_bytecode = not write_bytecode
+        sys.path.insert(0, str(copy))
+        os.environ["PYTHONPATH"] = str(copy)
+        import pytest
+
+        code = 3
+        try:
+            code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow and not data", *tests])
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(int(code))
+    while (status := os.waitpid(child, os.WNOHANG))[0] == 0:
+        if time.monotonic() - start > WALL_LIMIT_S:
+            os.killpg(child, signal.SIGKILL)
+        time.sleep(0.02)
+    seconds = time.monotonic() - start
+    if os.WIFSIGNALED(status[1]):
+        return "timeout", seconds
+    code = os.WEXITSTATUS(status[1])
+    if code not in (0, 1, 2):
+        raise SystemExit(f"pytest ended with {code}:\n{log.read_text()[-2000:]}")
+    return ("survived" if code == 0 else "killed"), seconds
+
+
+def judged(mutants: list[Mutant], known: dict[str, str], *, again: bool) -> Iterator[tuple[Mutant, str, float]]:
+    """Outcome of each mutant whose outcome is not known."""
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+        copy = Path(folder)
+        for name in (PACKAGE, "tests", "scripts", "docs"):
+            shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+        for name in ("pyproject.toml", "README.md"):
+            shutil.copy(ROOT / name, copy / name)
+        cpu: dict[str, int] = {}
+        for mutant in mutants:
+            if mutant.key in known and not (again and known[mutant.key] == "survived"):
+                continue
+            tests, target = tests_of(mutant.path), copy / mutant.path
+            if mutant.path not in cpu:
+                before = resource.getrusage(resource.RUSAGE_CHILDREN)
+                if run_tests(copy, tests, cpu_s=None, write_bytecode=True)[0] != "survived":
+                    raise SystemExit(
+                        f"the tests of {mutant.path} fail by themselves:\n{(copy / 'log.txt').read_text()}"
+                    )
+                after = resource.getrusage(resource.RUSAGE_CHILDREN)
+                cpu[mutant.path] = int(3.0 * (after.ru_utime - before.ru_utime) + 15.0)
+                for stale in (target.parent / "__pycache__").glob(f"{target.stem}.*"):
+                    stale.unlink()
+            source = target.read_bytes()
+            target.write_bytes(mutant.apply(source))
+            try:
+                outcome, seconds = run_tests(copy, tests, cpu_s=cpu[mutant.path])
+            finally:
+                target.write_bytes(source)
+            yield mutant, outcome, seconds
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("packages", nargs="+", help="metrics, geometry, cli, ...")
+    parser.add_argument("--sample", type=int, default=30, help="mutants of each package; 0: all")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--again", action="store_true", help="run known survivors once more")
+    parser.add_argument("--list", action="store_true", help="print the sample and run nothing")
+    options = parser.parse_args()
+    result = json.loads(RESULT.read_text()) if RESULT.exists() else {}
+    if not options.list:
+        for name in PRELOADED:
+            importlib.import_module(name)
+    for package in options.packages:
+        sources = {path: (ROOT / path).read_bytes() for path in files_of(package)}
+        every = [m for path, source in sources.items() for m in mutants_of(path, source)]
+        chosen = sample(every, options.sample, options.seed)
+        if options.list:
+            for m in chosen:
+                print(f"{m.path}:{m.line} {m.kind}: {' -> '.join(m.diff(sources[m.path]))}")
+            continue
+        old = result.get(package, {})
+        reasons = {s["key"]: s["reason"] for s in old.get("survivors", [])}
+        outcomes = {m.key: old["outcomes"][m.key] for m in chosen if m.key in old.get("outcomes", {})}
+
+        def record(package: str = package, every: list[Mutant] = every, chosen: list[Mutant] = chosen) -> None:
+            alive = [m for m in chosen if outcomes.get(m.key) == "survived"]  # noqa: B023
+            survivors = [{"key": m.key, "line": m.line, "reason": reasons.get(m.key, "")} for m in alive]  # noqa: B023
+            n = len(outcomes)  # noqa: B023
+            result[package] = {"mutants": len(every), "sampled": n, "killed": n - len(alive)}
+            result[package] |= {"score": round(1.0 - len(alive) / n, 3) if n else None}
+            result[package] |= {"explained": sum(bool(s["reason"]) for s in survivors)}
+            result[package] |= {"survivors": survivors, "outcomes": outcomes}  # noqa: B023
+            RESULT.write_text(json.dumps(dict(sorted(result.items())), indent=1, ensure_ascii=False) + "\n")
+
+        for mutant, outcome, seconds in judged(chosen, outcomes, again=options.again):
+            outcomes[mutant.key] = outcome
+            change = " -> ".join(mutant.diff(sources[mutant.path]))
+            print(f"{outcome:8} {seconds:5.1f} s {mutant.path}:{mutant.line} {mutant.kind}: {change}", flush=True)
+            record()
+        record()
+        shown = {k: v for k, v in result[package].items() if k not in ("survivors", "outcomes")}
+        print(f"{package}: {shown}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

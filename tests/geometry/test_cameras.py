@@ -1,0 +1,73 @@
+"""Cameras and projections, by hand and against OpenCV."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from curvireg_torch import geometry as g
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry.cameras import check_camera_matrix
+
+K = torch.tensor([[240.0, 0.0, 70.3], [0, 260.0, 51.8], [0, 0, 1]], dtype=torch.float64)
+
+
+def test_the_four_numbers_have_their_places() -> None:
+    assert g.camera_matrix(1.0, 2.0, 3.0, 4.0).tolist() == [[1, 0, 3], [0, 2, 4], [0, 0, 1]]
+    assert g.camera_matrix(1.0, 2.0, 3.0, 4.0).dtype == torch.float32
+    assert g.camera_matrix(1.0, 2.0, 3.0, 4.0, dtype=torch.float64).dtype == torch.float64
+
+
+def test_transform_is_rotation_and_translation() -> None:
+    R = torch.arange(18.0).view(2, 3, 3)
+    t = torch.arange(6.0).view(2, 3) + 100.0
+    T = g.transform(R, t)
+    assert T.shape == (2, 4, 4)
+    assert torch.equal(T[:, :3, :3], R)
+    assert torch.equal(T[:, :3, 3], t)
+    assert T[:, 3].tolist() == [[0, 0, 0, 1]] * 2
+
+
+def test_projection_is_opencvs() -> None:
+    X = np.random.default_rng(0).uniform(-1, 1, (40, 3))
+    rotation, t = np.array([0.3, -0.8, 0.2]), np.array([0.2, -0.1, 5.0])
+    theirs = cv2.projectPoints(X, rotation, t, K.numpy(), None)[0][:, 0]
+    T = g.transform(torch.from_numpy(Rotation.from_rotvec(rotation).as_matrix()), torch.from_numpy(t))
+    ours = g.project_points(torch.from_numpy(X), T, K)
+    np.testing.assert_allclose(ours, theirs, atol=1e-9)
+    box = g.projected_boxes(torch.from_numpy(X), T, K)
+    np.testing.assert_allclose(box, [*theirs.min(0), *theirs.max(0)], atol=1e-9)
+
+
+def test_orthographic_projection_forgets_the_depth_and_skew_leans() -> None:
+    leaning = K.clone()
+    leaning[0, 1] = 10.0
+    X = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 30.0]], dtype=torch.float64)
+    uv = g.project_points(X, torch.eye(4, dtype=torch.float64), leaning, orthographic=True)
+    expected = torch.tensor([240.0 + 20.0 + 70.3, 520.0 + 51.8], dtype=torch.float64)
+    torch.testing.assert_close(uv, expected.expand(2, 2))
+    box = g.projected_boxes(X, torch.eye(4, dtype=torch.float64), leaning, orthographic=True)
+    torch.testing.assert_close(box, expected.repeat(2))
+
+
+@pytest.mark.parametrize(
+    ("bad", "match"),
+    [
+        (torch.eye(4), "expected floating"),
+        (torch.eye(3).long(), "expected floating"),
+        (K * float("nan"), "finite"),
+        (K * float("inf"), "finite"),
+        (torch.diag(torch.tensor([0.0, 1.0, 1.0])), "FX FY CX CY"),
+        (torch.diag(torch.tensor([1.0, 0.0, 1.0])), "FX FY CX CY"),
+        (torch.stack([torch.eye(3), torch.diag(torch.tensor([1.0, -1.0, 1.0]))]), "FX FY CX CY"),
+        (torch.diag(torch.tensor([1.0, 1.0, 2.0])), r"\[0, fy, cy\]"),
+        (torch.eye(3) + torch.tensor([[0.0] * 3, [0.5, 0, 0], [0.0] * 3]), r"\[0, fy, cy\]"),
+        (K.T.contiguous(), r"\[0, fy, cy\]"),
+    ],
+)
+def test_a_matrix_that_is_no_camera_is_refused(bad: torch.Tensor, match: str) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        check_camera_matrix(bad)
+    with pytest.raises(InvalidInputError, match="focal"):
+        g.camera_matrix(500.0, 0.0, 10.0, 10.0)

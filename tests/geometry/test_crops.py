@@ -1,0 +1,108 @@
+"""Boxes, squares and crops: where a pixel goes, and what its value becomes."""
+
+import pytest
+import torch
+
+from curvireg_torch import geometry as g
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry.crops import check_boxes
+
+
+def ramp(height: int, width: int) -> torch.Tensor:
+    """(1, 2, H, W): each pixel's x and y."""
+    y, x = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
+    return torch.stack([x, y])[None]
+
+
+def test_the_whole_image_reaches_from_border_to_border() -> None:
+    assert g.whole_image_box(torch.zeros(3, 40, 60)).tolist() == [-0.5, -0.5, 59.5, 39.5]
+
+
+def test_squares_by_hand() -> None:
+    boxes = torch.tensor([[10.0, 20.0, 30.0, 24.0], [0.0, 0.0, 2.0, 8.0]])
+    assert g.square_boxes(boxes, 0.0).tolist() == [[10.0, 12.0, 30.0, 32.0], [-3.0, 0.0, 5.0, 8.0]]
+    assert g.square_boxes(boxes, 0.25).tolist() == [[5.0, 7.0, 35.0, 37.0], [-5.0, -2.0, 7.0, 10.0]]
+    with pytest.raises(InvalidInputError, match="margin"):
+        g.square_boxes(boxes, -0.1)
+
+
+def test_borders_of_the_square_become_borders_of_the_crop() -> None:
+    square = torch.tensor([[10.0, 30.0, 26.0, 46.0]])
+    A = g.crop_transforms(square, 32)[0]
+    corners = torch.tensor([[10.0, 30.0, 1.0], [26.0, 46.0, 1.0]]) @ A.T
+    assert corners.tolist() == [[-0.5, -0.5, 1.0], [31.5, 31.5, 1.0]]
+
+
+@pytest.mark.parametrize(("side", "size", "off"), [(8.0, 8, 2e-4), (8.0, 16, 2e-4), (24.0, 8, 2e-4), (20.5, 12, 0.1)])
+def test_pixels_of_a_ramp_say_where_they_came_from(side: float, size: int, off: float) -> None:
+    # Bilinear weights keep a ramp, those widened by a whole number too, others nearly: crop pixel p shows A^-1 p.
+    image = ramp(60, 80)
+    box = torch.tensor([[30.2, 18.3, 30.2 + side, 18.3 + 0.5 * side]])
+    crops, A = g.crop_images(image, box, size=size, margin=0.0)
+    y, x = torch.meshgrid(torch.arange(float(size)), torch.arange(float(size)), indexing="ij")
+    source = torch.stack([x.flatten(), y.flatten(), torch.ones(size * size)]).double()
+    expected = (torch.linalg.inv(A[0].double()) @ source)[:2].view(2, size, size)
+    torch.testing.assert_close(crops[0].double(), expected, rtol=0, atol=off)
+
+
+def test_a_lone_pixel_keeps_its_place_and_its_mass() -> None:
+    image = torch.zeros(1, 1, 40, 40)
+    image[0, 0, 22, 13] = 1.0
+    same, _ = g.crop_images(image, torch.tensor([[3.5, 11.5, 23.5, 31.5]]), size=20, margin=0.0)
+    assert same[0, 0, 10, 9] == 1.0
+    assert same.sum() == 1.0
+    halved, _ = g.crop_images(image, torch.tensor([[3.5, 11.5, 23.5, 31.5]]), size=10, margin=0.0)
+    assert float(halved.sum()) == pytest.approx(0.25)  # a quarter of the pixels
+    assert float(halved[0, 0, 5, 4]) == float(halved.max())
+
+
+def test_outside_of_the_image_its_border_is_repeated() -> None:
+    crop, _ = g.crop_images(ramp(10, 10), torch.tensor([[-8.0, -8.0, 8.0, 8.0]]), size=16, margin=0.0)
+    assert torch.equal(crop[0, 0, :, :7], torch.zeros(16, 7))
+    assert torch.equal(crop[0, 1, :7], torch.zeros(7, 16))
+    far, _ = g.crop_images(ramp(10, 10), torch.tensor([[2.0, 2.0, 18.0, 18.0]]), size=16, margin=0.0)
+    assert torch.equal(far[0, 0, :, 8:], torch.full((16, 8), 9.0))
+
+
+def test_a_list_of_sizes_and_a_margin_agree_with_one_by_one() -> None:
+    images = [torch.rand(3, 30, 40), torch.rand(3, 50, 20)]
+    boxes = torch.tensor([[3.0, 4.0, 20.0, 22.0], [1.0, 10.0, 15.0, 40.0]])
+    crops, A = g.crop_images(images, boxes, size=24, margin=0.2)
+    assert torch.equal(A, g.crop_transforms(g.square_boxes(boxes, 0.2), 24))
+    for i, image in enumerate(images):
+        alone, own = g.crop_images(image[None], boxes[i : i + 1], size=24, margin=0.2)
+        torch.testing.assert_close(crops[i], alone[0])
+        assert torch.equal(A[i], own[0])
+    default, _ = g.crop_images(images, boxes)
+    torch.testing.assert_close(default, g.crop_images(images, boxes, size=256, margin=0.1)[0], rtol=0, atol=0)
+    whole = g.crop_images(images[:1], boxes[:1].long(), size=8)[0]  # boxes of integers are boxes too
+    torch.testing.assert_close(whole, g.crop_images(images[:1], boxes[:1], size=8)[0])
+
+
+@pytest.mark.parametrize(
+    ("box", "match"),
+    [
+        ([float("nan"), 0.0, 5.0, 5.0], "finite"),
+        ([0.0, 0.0, 1e9, 5.0], "finite"),
+        ([5.0, 0.0, 5.0, 5.0], "X0 < X1"),
+        ([0.0, 6.0, 5.0, 5.0], "X0 < X1"),
+        ([-9.0, 0.0, -0.5, 5.0], "wholly outside the 30 x 20 image"),
+        ([0.0, -9.0, 5.0, -0.5], "wholly outside"),
+        ([29.5, 0.0, 40.0, 5.0], "wholly outside"),
+        ([0.0, 19.5, 5.0, 40.0], "wholly outside"),
+    ],
+)
+def test_boxes_that_show_nothing_are_refused(box: list[float], match: str) -> None:
+    with pytest.raises(InvalidInputError, match=rf"box 1 .*{match}"):
+        check_boxes(torch.tensor([[0.0, 0.0, 5.0, 5.0], box]), [(20, 30), (20, 30)])
+
+
+def test_boxes_that_touch_the_last_pixel_pass() -> None:
+    for box in ([-9.0, 0.0, -0.4, 5.0], [0.0, -9.0, 5.0, -0.4], [29.4, 0.0, 40.0, 5.0], [0.0, 19.4, 5.0, 40.0]):
+        check_boxes(torch.tensor([box]), [(20, 30)])
+    with pytest.raises(InvalidInputError, match="boxes"):
+        check_boxes(torch.zeros(2, 4), [(20, 30)])
+    with pytest.raises(InvalidInputError, match="at least one image"):
+        g.crop_images([], torch.zeros(0, 4))
+    with pytest.raises(InvalidInputError, match="images"):
+        g.crop_images([torch.rand(4, 4)], torch.tensor([[0.0, 0.0, 2.0, 2.0]]))

@@ -1,0 +1,66 @@
+"""Viewpoints and rotations, there and back, at the poles and in every dtype."""
+
+import math
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from curvireg_torch import geometry as g
+from curvireg_torch.errors import InvalidInputError
+
+
+def test_angles_come_back_in_their_ranges() -> None:
+    R = torch.from_numpy(Rotation.random(500, random_state=0).as_matrix())
+    a, e, t = g.viewpoint_from_rotation(R)
+    assert bool(((a >= 0) & (a < 360) & (e.abs() <= 90) & (t >= -180) & (t < 180)).all())
+    torch.testing.assert_close(g.rotation_from_viewpoint(a, e, t), R, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("elevation", [90.0, -90.0])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_at_a_pole_theta_is_0_and_azimuth_carries_the_turn(elevation: float, dtype: torch.dtype) -> None:
+    azimuth = torch.tensor([0.0, 30.0, 200.0, 359.0], dtype=dtype)
+    R = g.rotation_from_viewpoint(azimuth, elevation, 20.0)
+    a, e, t = g.viewpoint_from_rotation(R)
+    assert t.tolist() == [0.0] * 4
+    torch.testing.assert_close(e, torch.full_like(e, elevation), rtol=0, atol=1e-3)
+    torch.testing.assert_close(g.rotation_from_viewpoint(a, e, t), R, rtol=0, atol=2e-6)
+
+
+def test_a_full_turn_is_0_and_half_a_turn_is_minus_180() -> None:
+    R = g.rotation_from_viewpoint(torch.tensor([-1e-9, 720.0]), 0.0, torch.tensor([180.0, -180.0]))
+    a, _, t = g.viewpoint_from_rotation(R)
+    assert bool((a < 360).all())
+    torch.testing.assert_close(t.abs(), torch.full_like(t, 180.0), rtol=0, atol=1e-4)
+    assert bool((t < 180).all())
+
+
+def test_numbers_integers_and_tensors_mix() -> None:
+    R = g.rotation_from_viewpoint(torch.tensor([10, 20]), 5, torch.tensor([[1.0], [2.0]], dtype=torch.float64))
+    assert R.shape == (2, 2, 3, 3)
+    assert R.dtype == torch.float64
+    torch.testing.assert_close(R[1, 0], g.rotation_from_viewpoint(*(torch.tensor(v).double() for v in (10, 5, 2))))
+    assert g.rotation_from_viewpoint(10, 5).dtype == torch.float32
+
+
+def test_rotation_error_is_scipys_magnitude_also_of_tiny_and_half_turns() -> None:
+    A = Rotation.random(60, random_state=1)
+    turns = Rotation.from_rotvec([[0, 0, v] for v in (0.0, 1e-9, 1e-4, 1.0, 3.0, math.pi)] * 10)
+    B = A * turns
+    ours = g.rotation_error(torch.from_numpy(A.as_matrix()), torch.from_numpy(B.as_matrix()))
+    theirs = torch.rad2deg(torch.from_numpy((A.inv() * B).magnitude()))
+    torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-5)
+    small = ours[theirs < 1e-6]
+    torch.testing.assert_close(small, theirs[theirs < 1e-6], rtol=0.02, atol=1e-12)
+    assert g.rotation_error(torch.eye(3).expand(4, 1, 3, 3), torch.eye(3).expand(5, 3, 3)).shape == (4, 5)
+
+
+@pytest.mark.parametrize("bad", [torch.eye(4), torch.eye(3).long(), torch.zeros(3)])
+def test_what_is_no_rotation_is_refused(bad: torch.Tensor) -> None:
+    with pytest.raises(InvalidInputError, match="R: expected"):
+        g.viewpoint_from_rotation(bad)
+    with pytest.raises(InvalidInputError, match="R1: expected"):
+        g.rotation_error(bad, torch.eye(3))
+    with pytest.raises(InvalidInputError, match="R2: expected"):
+        g.rotation_error(torch.eye(3), bad)
