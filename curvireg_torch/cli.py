@@ -17,6 +17,7 @@ import torch
 import trimesh
 
 from . import __version__
+from ._files import probe_folder, terminable, write_file
 from .data import read_photo
 from .errors import CurviregError, InvalidInputError
 from .evaluation import add_parser as add_evaluate
@@ -49,7 +50,7 @@ CONVENTIONS = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code: 0, or 2 for input that cannot be used."""
     arguments = _parser().parse_args(argv)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), terminable():
         if not arguments.debug:
             warnings.showwarning = _show_warning
         try:
@@ -62,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except OSError as error:
             if arguments.debug:
                 raise
-            print(f"curvireg: error: {error.filename}: {error.strerror}; choose another --out", file=sys.stderr)
+            print(f"curvireg: error: {error}; check that it is there and may be read", file=sys.stderr)
             return 2
         except KeyboardInterrupt:
             print("curvireg: interrupted", file=sys.stderr)
@@ -148,6 +149,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _bank(arguments: argparse.Namespace) -> None:
+    probe_folder(arguments.out.parent, "--out")
+    if arguments.adapt is not None:
+        probe_folder(arguments.adapt.parent, "--adapt")
     start = time.perf_counter()
     chosen = preset_named(arguments.preset)
     mesh = load_mesh(arguments.mesh, unit=arguments.unit, up=arguments.up)
@@ -162,7 +166,6 @@ def _bank(arguments: argparse.Namespace) -> None:
     size = arguments.out.stat().st_size / 1e6
     print(f"{arguments.out}: {len(bank)} views, {size:.1f} MB, {time.perf_counter() - start:.1f} s")
     if arguments.adapt is not None:
-        arguments.adapt.parent.mkdir(parents=True, exist_ok=True)  # not after minutes of training
         start = time.perf_counter()
         upright = 1.0 if arguments.pose == "upright" else 0.0
         adapt(mesh, upright=upright, progress=not arguments.quiet).save(arguments.adapt)
@@ -208,6 +211,7 @@ def _register(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(f"--top: expected >= 1, got {arguments.top}")
     preset = preset_named(arguments.preset)
     field = None if arguments.field is None else LearnedCurvilinearSaliency(weights=arguments.field)
+    probe_folder(arguments.out, "--out")
     bank = _open_bank(arguments, preset)
     times["bank"] = time.perf_counter()
     refine = preset.refine and not arguments.no_refine
@@ -229,6 +233,7 @@ def _register(arguments: argparse.Namespace) -> None:
 def _demo(arguments: argparse.Namespace) -> None:
     from .synthetic import example_mesh, random_pose, synthesize_photograph
 
+    probe_folder(arguments.out, "--out")
     times = {"start": time.perf_counter()}
     generator = torch.Generator().manual_seed(arguments.seed)
     mesh, size = example_mesh(), (360, 480)
@@ -250,7 +255,7 @@ def _demo(arguments: argparse.Namespace) -> None:
     document["truth"] = {"rotation": truth[:3, :3].tolist(), "translation": truth[:3, 3].tolist()}
     document["inputs"] = {"seed": arguments.seed, "box": box.tolist()}
     _write(arguments.out, document, registrar, result, image, box, K)
-    mesh.export(arguments.out / "mesh.ply")
+    write_file(arguments.out / "mesh.ply", mesh.export(file_type="ply"))
     _write_picture(arguments.out / "photo.png", (image.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
     _print_result(document, arguments.out)
     print(
@@ -304,14 +309,14 @@ def _document(result: Registration, registrar: Registrar, times: dict[str, float
 def _write(out: Path, document: dict[str, Any], registrar: Registrar, result: Registration, *scene: Any) -> None:
     from .visualization import registration_sheet
 
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "result.json").write_text(json.dumps(document, indent=2) + "\n")
-    _write_picture(out / "overlay.png", registration_sheet(registrar, result, *scene))
+    sheet = registration_sheet(registrar, result, *scene)
+    (out / "result.json").unlink(missing_ok=True)  # an older one never stands beside this picture
+    _write_picture(out / "overlay.png", sheet)
+    write_file(out / "result.json", (json.dumps(document, indent=2) + "\n").encode())
 
 
 def _write_picture(path: Path, picture: np.ndarray) -> None:
-    if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
-        raise InvalidInputError(f"{path}: cannot be written; choose another --out")
+    write_file(path, cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
 def _print_result(document: dict[str, Any], out: Path) -> None:

@@ -13,6 +13,7 @@ __all__ = [
     "MeshError",
     "MissingDependencyError",
     "MissingFileError",
+    "OutputError",
     "RenderingError",
 ]
 
@@ -42,6 +43,10 @@ class MissingFileError(CurviregError, FileNotFoundError):
 
     def __str__(self) -> str:  # FileNotFoundError would print its errno form
         return str(self.args[0]) if self.args else ""
+
+
+class OutputError(InvalidInputError, OSError):
+    """A file or folder cannot be written."""
 
 
 class MissingDependencyError(CurviregError, ImportError):

@@ -49,7 +49,7 @@ def main() -> int:
     return int(any(known[cell]["failed"] for cell in arguments.cells or CELLS))
 
 
-def test(cell: str, select: str, *, keep: bool = False) -> dict[str, Any]:
+def test(cell: str, select: str, *, keep: bool) -> dict[str, Any]:
     """Make the cell's environment and run the suite in it; the counts and versions, or why there are none."""
     number, end = cell.split("-")
     folder = REPOSITORY / "out" / "versions" / cell

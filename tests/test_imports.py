@@ -14,7 +14,7 @@ ALLOWED = {
     "errors": set(),
     "limits": set(),
     "_checks": {"errors"},
-    "_files": set(),
+    "_files": {"errors"},
     "_threads": set(),
     "geometry": BASE,
     "filters": BASE,

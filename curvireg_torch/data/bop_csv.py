@@ -1,6 +1,7 @@
 """The results file of the BOP challenge: one line per pose estimate."""
 
 import csv
+import io
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from .._checks import check_tensor
+from .._files import write_file
 from ..errors import InvalidInputError, MissingFileError
 from ._json import finite_numbers
 
@@ -43,6 +45,7 @@ def write_bop_csv(path: str | os.PathLike[str], rows: Iterable[BOPRow]) -> None:
     Raises:
         InvalidInputError: a row lacks a key, is not finite, or disagrees on an image's time.
         MissingFileError: the folder does not exist.
+        OutputError: the file cannot be written.
 
     Example:
         >>> import tempfile
@@ -55,18 +58,13 @@ def write_bop_csv(path: str | os.PathLike[str], rows: Iterable[BOPRow]) -> None:
     path = Path(path)
     if not path.parent.is_dir():
         raise MissingFileError(f"{path.parent}: no such folder; create it before writing results")
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "w", newline="", encoding="ascii") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(_HEADER)
-            times: dict[tuple[int, int], float] = {}
-            for number, row in enumerate(rows):
-                writer.writerow(_cells(row, f"row {number}", times))
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_HEADER)
+    times: dict[tuple[int, int], float] = {}
+    for number, row in enumerate(rows):
+        writer.writerow(_cells(row, f"row {number}", times))
+    write_file(path, text.getvalue().encode("ascii"))
 
 
 def _cells(row: BOPRow, name: str, times: dict[tuple[int, int], float]) -> list[str]:

@@ -2,12 +2,12 @@
 
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from ..errors import InvalidInputError
+from .._files import write_file
+from ..errors import InvalidInputError, OutputError
 
 __all__ = ["PredictionStore", "write_text"]
 
@@ -18,18 +18,9 @@ def write_text(path: Path, text: str) -> None:
     """Write a file that appears whole or not at all.
 
     Raises:
-        InvalidInputError: the folder cannot be written to.
+        OutputError: it cannot be written.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "w", encoding="utf-8", newline="") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())  # after a crash of the machine, too, the name never stands for an empty file
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InvalidInputError(f"{path}: cannot be written ({error.strerror}); choose another folder") from error
+    write_file(path, text.encode())
 
 
 def plain(value: Any) -> Any:
@@ -76,15 +67,14 @@ class PredictionStore:
             overwrite: remove what is there and start anew.
 
         Raises:
-            InvalidInputError: the folder holds predictions of other settings, or cannot be written to.
+            InvalidInputError: the folder holds predictions of other settings.
+            OutputError: it cannot be written to.
         """
         path = self.folder / "settings.json"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InvalidInputError(
-                f"{self.folder}: cannot be made ({error.strerror}); choose another --out"
-            ) from error
+            raise OutputError(f"{self.folder}: cannot be made ({error.strerror}); choose another --out") from error
         if overwrite:
             path.unlink(missing_ok=True)  # first: rows without settings are refused, should this be killed
             for row in self.folder.glob("*.json"):

@@ -5,6 +5,7 @@ import hashlib
 import json
 import os
 import re
+import tempfile
 import time
 import warnings
 from collections.abc import Iterator
@@ -39,7 +40,7 @@ CACHE_LIMIT = 2_000_000_000
 _ABANDONED = 3600.0  # seconds after which a half-written file belongs to no builder any more
 _HEADER_LIMIT = 1_000_000  # bytes; a bank's header takes about 2000
 _BANK = re.compile(r"bank-[0-9a-f]{32}\.safetensors")
-_HALF_WRITTEN = re.compile(_BANK.pattern + r"\.[0-9a-f]{32}\.tmp")
+_HALF_WRITTEN = re.compile(_BANK.pattern + r"\.[0-9a-f]{8}\.tmp")
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,12 @@ def cache_folder() -> Path:
     """
     if folder := os.environ.get("CURVIREG_CACHE"):
         return Path(folder)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "curvireg_torch"
+    if folder := os.environ.get("XDG_CACHE_HOME"):
+        return Path(folder) / "curvireg_torch"
+    try:
+        return Path.home() / ".cache" / "curvireg_torch"
+    except RuntimeError:  # a user without a home
+        return Path(tempfile.gettempdir()) / "curvireg_torch"
 
 
 @functools.cache
@@ -95,7 +101,7 @@ def cached_bank(
     progress: bool = True,
     **build_options: Any,
 ) -> ViewBank:
-    """The bank from the cache, or built and put there; a damaged file is built again, an unwritable folder no error.
+    """The bank from the cache, or built and put there; a damaged file is built again, an unwritable folder a warning.
 
     Afterwards the cache is trimmed to its limit. Any number of processes may do this at the same time.
 
@@ -135,9 +141,17 @@ def cached_bank(
         return bank
     try:
         bank.save(path)
-        trim_cache(folder, keep=path)
-    except OSError:
+    except OSError as error:
+        warnings.warn(
+            f"the bank is not cached, so it will be built again: {error}, by CURVIREG_CACHE=FOLDER", stacklevel=2
+        )
         return bank
+    try:
+        trim_cache(folder, keep=path)
+    except OSError as error:  # its files may be added to, but not removed
+        warnings.warn(
+            f"the cache exceeds its limit: {error.filename} cannot be removed ({error.strerror})", stacklevel=2
+        )
     return bank
 
 
@@ -191,7 +205,12 @@ def trim_cache(folder: Path | None = None, *, limit: int | None = None, keep: Pa
 
 
 def _our_files(folder: Path, name: re.Pattern[str]) -> Iterator[Path]:
-    return (path for path in (folder / "banks").glob("*") if name.fullmatch(path.name) and _is_ours(path))
+    banks = folder / "banks"
+    try:
+        names = os.listdir(banks)
+    except OSError:  # not there yet, or not for us
+        names = []
+    return (banks / found for found in names if name.fullmatch(found) and _is_ours(banks / found))
 
 
 def _is_ours(path: Path) -> bool:

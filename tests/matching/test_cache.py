@@ -1,7 +1,9 @@
 """The cache of banks: found again, trimmed, cleared, shared among processes."""
 
+import errno
 import multiprocessing
 import os
+import tempfile
 import time
 import uuid
 from dataclasses import replace
@@ -90,7 +92,7 @@ def test_list_and_clear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert (list_cache(), clear_cache(), trim_cache()) == ([], 0, 0)  # not even a folder
     cached_bank(trimesh.creation.box(), VIEWS, SETTINGS, progress=False)
     (file,) = list_cache()
-    left = file.path.with_name(f"{file.path.name}.{uuid.uuid4().hex}.tmp")
+    left = file.path.with_name(f"{file.path.name}.{uuid.uuid4().hex[:8]}.tmp")
     left.write_bytes(file.path.read_bytes()[:2000])  # of a killed process
     assert list_cache() == [file]
     assert file.size == file.path.stat().st_size > 1000
@@ -115,7 +117,7 @@ def test_foreign_files_are_never_touched(tmp_path: Path, monkeypatch: pytest.Mon
         bank.path.with_name("my bank.safetensors"): bank.path.read_bytes(),  # not by name
         bank.path.with_name(f"{bank.path.name}.orig"): bank.path.read_bytes(),
         other: safetensors.torch.save({"w": torch.zeros(9)}, {"format": "pt"}),  # not by content
-        bank.path.with_name(f"{other.name}.{uuid.uuid4().hex}.tmp"): b"{" * 100,
+        bank.path.with_name(f"{other.name}.{uuid.uuid4().hex[:8]}.tmp"): b"{" * 100,
         bank.path.with_name("notes.txt"): b"notes",
     }
     for path, content in foreign.items():
@@ -136,9 +138,44 @@ def test_foreign_files_are_never_touched(tmp_path: Path, monkeypatch: pytest.Mon
     assert {path for path in tmp_path.rglob("*") if path.is_file()} == set(foreign)
 
 
-def test_unwritable_cache_is_no_error(tmp_path: Path) -> None:
+def test_unwritable_cache_is_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("a file where the folder should be")
-    assert len(build(tmp_path / "file")) == len(VIEWS)
+    with pytest.warns(UserWarning, match=r"file/banks/bank-.*cannot be written \(.*by CURVIREG_CACHE=FOLDER"):
+        assert len(build(tmp_path / "file")) == len(VIEWS)
+    assert (list_cache(tmp_path / "file"), clear_cache(tmp_path / "file")) == ([], 0)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", "it")
+
+    for name in ("listdir", "utime"):
+        monkeypatch.setattr(os, name, refuse)
+    build(tmp_path / "new")
+    build(tmp_path / "new")
+    assert list_cache(tmp_path / "new") == []
+
+
+def test_a_cache_whose_files_may_not_be_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path, missing_ok: bool = False) -> None:
+        if path.suffix == ".safetensors":
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        real(path, missing_ok=missing_ok)
+
+    real = Path.unlink
+    build(tmp_path)
+    monkeypatch.setattr(Path, "unlink", refuse)
+    monkeypatch.setenv("CURVIREG_CACHE_LIMIT", "10")
+    with pytest.warns(UserWarning, match=r"exceeds its limit: .*bank-.* cannot be removed \(Permission denied"):
+        assert len(build(tmp_path, 2.0)) == len(VIEWS)
+
+
+def test_users_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("CURVIREG_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", homeless)
+    assert cache_folder() == Path(tempfile.gettempdir()) / "curvireg_torch"
 
 
 def _builder(folder: str, edges: tuple[float, ...]) -> float:
@@ -157,12 +194,11 @@ def test_concurrent_builders(tmp_path: Path) -> None:
 
 
 def _die_while_saving(folder: str) -> None:
-    def half(path: Path, content: bytes) -> None:
-        with path.open("wb") as file:
-            file.write(content[: len(content) // 2])
+    def die(file: int) -> None:
+        os.truncate(file, os.stat(file).st_size // 2)
         os._exit(9)
 
-    Path.write_bytes = half  # type: ignore[method-assign, assignment]
+    os.fsync = die  # type: ignore[assignment]
     build(Path(folder))
 
 
@@ -171,6 +207,7 @@ def test_killed_builder_leaves_no_bank(tmp_path: Path) -> None:
     process.start()
     process.join(60)
     assert process.exitcode == 9
+    assert [path.suffix for path in (tmp_path / "banks").iterdir()] == [".tmp"]
     assert list_cache(tmp_path) == []
     assert len(build(tmp_path)) == len(VIEWS)
     assert len(list_cache(tmp_path)) == 1

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..._files import write_file
 from ..store import write_text
 
 __all__ = ["Table", "write_table"]
@@ -59,7 +60,6 @@ class Table:
 
 def write_table(table: Table, folder: Path) -> list[Path]:
     """Write ``NAME.csv``, ``NAME.md`` and, where matplotlib is installed, ``NAME.png``; returns their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{table.name}.{suffix}" for suffix in ("csv", "md")]
     write_text(paths[0], table.csv())
     write_text(paths[1], table.markdown())
@@ -84,7 +84,9 @@ def write_table(table: Table, folder: Path) -> list[Path]:
     axes.set_title(table.title)
     axes.legend(fontsize="small", ncols=2)
     axes.grid(alpha=0.3)
-    figure.savefig(folder / f"{table.name}.png", dpi=120)
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=120, format="png")
+    write_file(folder / f"{table.name}.png", picture.getvalue())
     return [*paths, folder / f"{table.name}.png"]
 
 
