@@ -1,12 +1,58 @@
 """Many small jobs on the threads that torch may use, each job on one of them."""
 
-from collections.abc import Iterator
+import itertools
+import os
+import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import torch
 
-__all__ = ["one_thread_each"]
+__all__ = ["for_each", "one_thread_each"]
+
+_workers: tuple[int, ThreadPoolExecutor] | None = None
+_here = threading.local()
+
+
+def for_each(count: int, job: Callable[[int], object]) -> None:
+    """Call ``job(0)`` to ``job(count - 1)`` on as many threads as torch may use; they are started once for the process.
+
+    On a thread on which torch computes alone, as those of :func:`one_thread_each`, and in a job, nothing is shared.
+    For jobs that do not call torch. The first error ends all threads after their present job and is raised.
+    """
+    threads = min(torch.get_num_threads(), count)
+    numbers = itertools.count()
+    stopped = False
+
+    def work() -> None:
+        nonlocal stopped
+        _here.working = True
+        try:
+            while not stopped and (number := next(numbers)) < count:
+                job(number)
+        except BaseException:
+            stopped = True
+            raise
+
+    if threads <= 1 or getattr(_here, "working", False):
+        for number in range(count):
+            job(number)
+        return
+    shared = [_pool().submit(work) for _ in range(threads)]
+    try:
+        for part in shared:
+            part.result()
+    finally:
+        stopped = True  # also where this thread was interrupted while it waited
+
+
+def _pool() -> ThreadPoolExecutor:
+    """The process's threads for short jobs; a fork leaves them behind."""
+    global _workers
+    if _workers is None or _workers[0] != os.getpid():
+        _workers = os.getpid(), ThreadPoolExecutor(max(os.cpu_count() or 1, torch.get_num_threads()))
+    return _workers[1]
 
 
 @contextmanager

@@ -1,7 +1,5 @@
 """Depth by ray casting with embree: needs no GPU, no driver, no display."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import cv2
 import numpy as np
 import torch
@@ -10,6 +8,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from torch import Tensor
 
+from .._threads import for_each
 from ..geometry.mesh import box_corners, extreme_points, mesh_centre, mesh_radius
 from .base import NEAREST, check_render_arguments
 
@@ -32,11 +31,18 @@ class RayScene:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self._scene = EmbreeScene()
         TriangleMesh(scene=self._scene, vertices=vertices.astype(np.float32), indices=np.asarray(faces, np.int32))
+        self.distance(np.zeros((1, 3)), np.ones((1, 3)))  # builds embree's tree, which threads may not do at a time
 
     def distance(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(N,) lengths along (N, 3) rays to what they hit first, in units of the directions; inf for nothing."""
-        along = self._scene.run(_float32(origins), _float32(directions), query="DISTANCE")
-        return np.where(along < _MISS, along, np.inf)
+        """(N,) float32 lengths along rays to what they hit first, in units of the directions; inf for nothing.
+
+        Args:
+            origins: (N, 3).
+            directions: (N, 3), or (1, 3) for all of them.
+        """
+        along: np.ndarray = self._scene.run(_float32(origins), _float32(directions), query="DISTANCE")
+        along[along >= _MISS] = np.inf
+        return along
 
     def hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """:meth:`distance`, the triangle hit (N,), and its normal (N, 3), neither of unit length nor of known sign."""
@@ -53,7 +59,7 @@ def _float32(x: np.ndarray) -> np.ndarray:
 
 
 class EmbreeRenderer:
-    """One ray through each pixel's centre; views are shared among threads.
+    """One ray through each pixel's centre inside the outline of the object's hull; threads share a call's views.
 
     Thread-safe, since rays only read the scene, and fork-safe. Cannot be pickled: a spawned process makes its own.
     """
@@ -73,50 +79,55 @@ class EmbreeRenderer:
     def render(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
     ) -> Tensor:
-        T, K = check_render_arguments(T_cam_from_model, camera_matrix, size)
+        T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
         out = np.zeros((len(T), 1, *size), dtype=np.float32)
-
-        def one(i: int) -> None:
-            self._render_view(T[i].numpy(), K[i].numpy(), out[i, 0], orthographic)
-
-        with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
-            list(pool.map(one, range(len(T))))
+        for_each(len(T), lambda i: self._render_view(T[i], K[i], out[i, 0], orthographic))
         return torch.from_numpy(out)
 
     def _render_view(self, T: np.ndarray, K: np.ndarray, out: np.ndarray, orthographic: bool) -> None:
         R = T[:3, :3]
         t = (T[:3, 3] + R @ self._centre) / self._radius  # centre of the object in the camera, in radii
         outline = self._outline @ R.T + t
+        nearest = outline[:, 2].min()
         if outline[:, 2].max() <= NEAREST:
             return  # wholly behind the camera
-        # Rays start at the plane z = near: no digits are spent on the way to a distant object.
-        near = max(outline[:, 2].min() - 1e-3, NEAREST)
-        v, u = self._pixels(outline, K, out.shape, orthographic)
-        y = (v - K[1, 2]) / K[1, 1]
-        x = (u - K[0, 2] - K[0, 1] * y) / K[0, 0]
-        if orthographic:
-            starts = np.stack([x, y], 1) @ R[:2] / self._radius + (near * R[2] - R.T @ t)
-            directions = np.broadcast_to(R[2], starts.shape)
-        else:
-            directions = np.stack([x, y], 1) @ R[:2] + R[2]
-            starts = near * directions - R.T @ t
-        along = self._scene.distance(starts, directions)
-        out[v, u] = np.where(np.isfinite(along), (along + near) * self._radius, 0.0)
+        mask = self._mask(outline, K, out.shape, orthographic)
+        # Rays start at the plane z = near, relative to the object: no digits are spent on the way to a distant one.
+        # Rows and columns are computed in float64, pixels in float32.
+        near = max(nearest - 1e-3, NEAREST)
+        reach = 1.0 / self._radius if orthographic else near
+        y = (np.arange(out.shape[0]) - K[1, 2]) / K[1, 1]
+        x = (np.arange(out.shape[1]) - K[0, 2]) / K[0, 0]
+        skew = K[0, 1] / K[0, 0]
+        axes = np.stack([R[0], R[1] - skew * R[0], R[2]])  # what x, y and z of the camera are in the model
+        starts = _rays(mask, reach * x - t[0] - skew * t[1], reach * y - t[1], near - t[2], axes)
+        directions = _float32(R[2:]) if orthographic else _rays(mask, x, y, 1.0, axes)
+        z = (self._scene.distance(starts, directions) + np.float32(near)) * np.float32(self._radius)
+        z[np.isinf(z)] = 0.0
+        out[mask] = z
 
-    def _pixels(
-        self, outline: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool
-    ) -> tuple[np.ndarray, ...]:
-        """Rows and columns of the pixels inside the outline's projection, with a rim of a pixel."""
-        mask = np.ones(size, dtype=np.uint8)
+    def _mask(self, outline: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool) -> np.ndarray:
+        """(H, W) bool: the pixels inside the outline's projection, with a rim of a pixel."""
+        everywhere = np.ones(size, dtype=bool)
         if orthographic:
             xy = outline[:, :2] * self._radius
         elif outline[:, 2].min() > NEAREST:
             xy = outline[:, :2] / outline[:, 2:]
         else:
-            return np.nonzero(mask)  # it passes the camera's plane: no finite projection
+            return everywhere  # it passes the camera's plane: no finite projection
         uv = xy @ K[:2, :2].T + K[:2, 2]
-        if np.abs(uv).max() < _DRAWABLE:
-            mask[:] = 0
-            cv2.fillConvexPoly(mask, cv2.convexHull(np.round(uv).astype(np.int32)), 1)
-            mask = cv2.dilate(mask, np.ones((3, 3), np.uint8))
-        return np.nonzero(mask)
+        if np.abs(uv).max() >= _DRAWABLE:
+            return everywhere
+        mask = np.zeros(size, dtype=np.uint8)
+        cv2.fillConvexPoly(mask, cv2.convexHull(np.round(uv).astype(np.int32)), 1)
+        return np.asarray(cv2.dilate(mask, np.ones((3, 3), np.uint8))).view(bool)
+
+
+def _rays(mask: np.ndarray, x: np.ndarray, y: np.ndarray, z: float, axes: np.ndarray) -> np.ndarray:
+    """(N, 3) float32 x(column) axes[0] + y(row) axes[1] + z axes[2] for the N pixels of a mask."""
+    a = np.broadcast_to(x.astype(np.float32), mask.shape)[mask]
+    b = np.broadcast_to(y.astype(np.float32)[:, None], mask.shape)[mask]
+    rays = np.empty((len(a), 3), dtype=np.float32)
+    for i in range(3):
+        rays[:, i] = a * np.float32(axes[0, i]) + (b * np.float32(axes[1, i]) + np.float32(z * axes[2, i]))
+    return rays

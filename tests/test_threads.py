@@ -1,0 +1,94 @@
+"""Jobs shared among the process's threads."""
+
+import os
+import threading
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from curvireg_torch._threads import for_each, one_thread_each
+
+
+@pytest.fixture(autouse=True)
+def two_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_every_job_once_and_two_at_a_time() -> None:
+    both = threading.Barrier(2, timeout=20)  # broken, unless two jobs run at the same time
+    done: list[int] = []
+
+    def job(number: int) -> None:
+        both.wait()
+        done.append(number)
+
+    for _ in range(3):
+        done.clear()
+        for_each(6, job)
+        assert sorted(done) == list(range(6))
+
+
+def test_threads_are_started_once() -> None:
+    seen = set()
+    for _ in range(20):
+        for_each(4, lambda _: seen.add(threading.get_ident()))
+    assert 1 <= len(seen) <= max(2, os.cpu_count() or 1)
+    assert threading.get_ident() not in seen
+
+
+def test_where_torch_computes_alone_nothing_is_shared() -> None:
+    here = []
+    with one_thread_each() as pool:
+        pool.submit(for_each, 3, lambda _: here.append(threading.get_ident())).result()
+        mine = pool.submit(threading.get_ident)
+        mine.result()
+    assert len(set(here)) == 1
+    torch.set_num_threads(1)
+    for_each(2, lambda _: here.append(threading.get_ident()))
+    assert here[3:] == [threading.get_ident()] * 2
+
+
+def test_jobs_that_share_jobs_end() -> None:
+    # Every thread waiting for others that never get one: that must not be.
+    done = []
+    for_each(40, lambda i: for_each(3, lambda k: done.append((i, k))))
+    assert sorted(done) == [(i, k) for i in range(40) for k in range(3)]
+
+
+def test_an_error_stops_and_is_raised() -> None:
+    done = []
+
+    def job(number: int) -> None:
+        if number == 2:
+            raise ValueError("two")
+        done.append(number)
+
+    with pytest.raises(ValueError, match="two"):
+        for_each(100_000, job)
+    assert len(done) < 99_999
+    for_each(2, done.append)  # the threads live on
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_forked_process_starts_its_own() -> None:
+    for_each(4, lambda _: None)
+    child = os.fork()
+    if child == 0:
+        done: list[int] = []
+        for_each(4, done.append)
+        os._exit(0 if sorted(done) == [0, 1, 2, 3] else 1)
+    for _ in range(200):
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            break
+        threading.Event().wait(0.1)
+    else:
+        os.kill(child, 9)
+        os.waitpid(child, 0)
+        pytest.fail("the child hangs")
+    assert os.waitstatus_to_exitcode(status) == 0
