@@ -35,7 +35,8 @@ _BLOCKS = [
     for count, kernel, stride, expansion, width in _STAGES
     for i in range(count)
 ]
-_KEPT = (4, 10)  # last blocks at strides 8 and 16
+_KEPT = ((3, 4), (8, 9, 10))
+"""Blocks whose sum is the map at stride 8, and at stride 16."""
 
 
 class _Conv(nn.Conv2d):
@@ -88,15 +89,26 @@ class Backbone(nn.Module):
         (torch.Size([2, 40, 16, 16]), torch.Size([2, 112, 8, 8]))
     """
 
+    _spread0: Tensor
+    _spread1: Tensor
+
     def __init__(self) -> None:
         super().__init__()
         self.stem = _Conv(3, 32, 3, 2)
         widths = [32, *(block[-1] for block in _BLOCKS)]
         self.blocks = nn.ModuleList([_Block(inputs, *block) for inputs, block in zip(widths, _BLOCKS, strict=False)])
-        self.load_state_dict(_folded(_read_weights()))
+        weights = _read_weights()
+        self.load_state_dict(_folded(weights))
+        for i, blocks in enumerate(_KEPT):
+            scales = torch.stack([weights[f"_blocks.{k}._bn2.weight"] for k in blocks])
+            self.register_buffer(f"_spread{i}", torch.linalg.vector_norm(scales, dim=0), persistent=False)
         self.requires_grad_(False)
         self.eval()
         self.to(memory_format=torch.channels_last)
+
+    @property
+    def spreads(self) -> tuple[Tensor, Tensor]:
+        return self._spread0, self._spread1
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         check_colour_image(image)
@@ -105,7 +117,7 @@ class Backbone(nn.Module):
         kept = []
         for i, block in enumerate(self.blocks):
             x = block(x)
-            if i in _KEPT:
+            if i in (_KEPT[0][-1], _KEPT[1][-1]):
                 kept.append(x)
         return kept[0], kept[1]
 
