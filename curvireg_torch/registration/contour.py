@@ -1,5 +1,6 @@
 """Contours of the mesh pulled onto the photograph's edges: the continuous stage of the refinement."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -8,37 +9,29 @@ from torch import Tensor
 
 from .._checks import check_positive, check_tensor
 from ..errors import InvalidInputError
-from ..geometry import crop_images, rotation_from_axis_angle
-from ..geometry.cameras import check_camera_matrix, transform
+from ..geometry import crop_images
+from ..geometry.cameras import check_camera_matrix
 from ..rendering import DepthRenderer
-from .contour_points import ContourPoints, EdgeField, contour_points
+from .contour_descent import Views, cross, moved
+from .contour_points import ContourPoints, EdgeField
 
 __all__ = ["ContourFit", "fit_contours"]
 
 SIZE = 256
 """Side of the crop in px; the first rounds use half of it."""
 
-COARSE, FINE = (6.0, 4.0, 3.0, 2.0), (6.0, 4.0, 3.0, 2.0, 2.0)
-"""How far edges are looked for in px, round by round; the mesh is rendered anew in each."""
+FIRST, SECOND, FINE = (6.0, 4.0), (3.0, 2.0), (6.0, 4.0, 3.0, 2.0, 2.0)
+"""How far edges are looked for in px, round by round: from all turns and from the best, at half size, and at full."""
+
+SAME = 0.5
+"""Mean distance in px at half size within which two fits count as one."""
 
 TURN = 8.0
 """Degrees to the left, right, up and down of the given pose from which the fit starts too: half the width of what it
 draws in, and about the error of a coarse view."""
 
-FINALISTS = 2
-"""Fits that go on at full size."""
-
-STEPS, SELECTIONS = 2, 3
-"""Least-squares steps per rendering, and choices of edges per step."""
-
-DAMPING = 1e-2
-"""Levenberg-Marquardt: share of its own diagonal that is added to J^T W J."""
-
 CORRELATED = 8.0
 """Neighbouring points err together: so many count as one in the covariance (found on synthetic scenes)."""
-
-MAX_TURN, MAX_SHIFT = 0.2, 0.1
-"""Longest step: radians, and share of the object's distance."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +53,16 @@ class ContourFit:
 @torch.no_grad()
 def fit_contours(
     renderer: DepthRenderer,
-    image: Tensor,
-    box: Tensor,
-    camera_matrix: Tensor,
+    images: Tensor | Sequence[Tensor],
+    boxes: Tensor,
+    camera_matrices: Tensor,
     starts: Tensor,
     *,
+    photograph: Tensor | None = None,
     centre: Tensor,
     radius: float,
     margin: float = 0.1,
+    finish: int | None = None,
 ) -> ContourFit:
     """Poses whose contours lie on a photograph's edges, by robust least squares over SE(3).
 
@@ -78,9 +73,10 @@ def fit_contours(
         (J^T W J + lambda diag(J^T W J)) xi = J^T W d,
 
     W being the edge's strength times Tukey's weight of what remains. Strong edges near where the step leads are chosen
-    again within a step; the search narrows from round to round. From each start and from four poses turned away from
-    it the fit runs at half size; the best (by support) go on at full size. The start itself is returned where
-    nothing has more support than it has.
+    again within a step; the search narrows from round to round, and the mesh is rendered anew where contours have
+    moved. From each start and from four poses turned away from it the fit begins at half size; the best (by support)
+    and the next best that differs from it go on, and end at full size. The start itself is returned where nothing has
+    more support than it has. All starts of all photographs share a round's rendering.
 
     The covariance is 8 s^2 (J^T W J)^-1 with the residuals' robust scale s, as if every eighth point were independent.
     Its order is turn (rad) about the camera's
@@ -93,22 +89,25 @@ def fit_contours(
 
     Args:
         renderer: of the mesh.
-        image: (C, H, W), C = 1 or 3, in [0, 1].
-        box: (4,) x0, y0, x1, y1 in px: where to look; need not be exact.
-        camera_matrix: (3, 3) in px.
+        images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, in [0, 1] or uint8; or one photograph (C, H, W).
+        boxes: (B, 4) x0, y0, x1, y1 in px: where to look; need not be exact. (4,) for one photograph.
+        camera_matrices: (B, 3, 3) or (3, 3) in px.
         starts: (N, 4, 4) poses, within about 15 degrees.
+        photograph: (N,) index of the photograph that a start belongs to; may be left out for one photograph.
         centre, radius: of the object, (3,) and model units.
         margin: room around the box, as a share of its longer side.
+        finish: of each photograph's starts only so many are fitted, those with most support after the first rounds from
+            themselves alone; the others come back as those rounds left them. None fits all: each as if it were alone.
 
     Raises:
         InvalidInputError: wrong shapes, a pose that is not finite, an unusable box or camera matrix.
 
     Example:
-        >>> import trimesh
+        >>> import curvireg_torch as cr, trimesh
         >>> from curvireg_torch.rendering import make_renderer
         >>> K = torch.tensor([[200.0, 0, 63.5], [0, 200.0, 63.5], [0, 0, 1]], dtype=torch.float64)
         >>> T = torch.eye(4, dtype=torch.float64); T[2, 3] = 5.0
-        >>> T[:3, :3] = rotation_from_axis_angle(torch.tensor([1.0, 0.6, 0.2], dtype=torch.float64))
+        >>> T[:3, :3] = cr.rotation_from_viewpoint(30.0, 20.0, 5.0)
         >>> renderer = make_renderer(trimesh.creation.box((1, 1.5, 2)))
         >>> image = (renderer.render(T[None], K, (128, 128))[0] > 0).float()
         >>> start = T.clone(); start[0, 3] = 0.1                                              # 2 % to the right
@@ -117,108 +116,99 @@ def fit_contours(
         >>> abs(float(fit.transform[0, 0, 3])) < 0.01
         True
     """
-    _check(image, box, camera_matrix, starts, radius)
-    T0, K, centre = starts.detach().cpu().double(), camera_matrix.detach().cpu().double(), centre.cpu().double()
-    crop, A = crop_images([image.detach().cpu().float()], box.detach().cpu().float()[None], size=SIZE, margin=margin)
-    full = _Scene(renderer, EdgeField(crop), A[0].double() @ K, SIZE, centre, radius)
-    half_K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ full.K
-    half = _Scene(renderer, EdgeField(F.avg_pool2d(crop, 2)), half_K, SIZE // 2, centre, radius)
+    images, boxes, K, photograph = _batch(images, boxes, camera_matrices, starts, photograph)
+    check_positive(radius, "radius")
+    if finish is not None and not finish >= 1:
+        raise InvalidInputError(f"finish: expected a whole number >= 1 or None, got {finish}")
+    T0, centre = starts.detach().cpu().double(), centre.detach().cpu().double()
     N = len(T0)
     if N == 0:
         return ContourFit(T0, T0.new_zeros(0, 6, 6), T0.new_zeros(0))
+    crops, A = crop_images(images, boxes, size=SIZE, margin=margin)
+    K = (A.double() @ K)[photograph]
+    full = Views(renderer, EdgeField(crops), photograph, K, SIZE, centre, radius)
+    K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ K
+    half = Views(renderer, EdgeField(F.avg_pool2d(crops, 2)), photograph, K, SIZE // 2, centre, radius)
+    every = torch.arange(N)
+    screened = T0
+    tried = torch.ones(N, dtype=torch.bool)
+    if finish is not None:
+        screened, seen = half.descend(T0, FIRST)
+        tried = _among_best(half.support(screened, seen), photograph, finish)
+    of, T = _around(half, T0, every[tried])
+    T, _ = half.of(of).descend(T, SECOND)
+    T, seen = full.of(of).descend(T, FINE)
+    # The starts, and what was only screened, as they are. Of equals the first wins.
+    owner, still = torch.cat([every, every[~tried]]), torch.cat([T0, screened[~tried]])
+    seen = ContourPoints.cat([full.of(owner).points(still), seen])
+    T, owner = torch.cat([still, T]), torch.cat([owner, of])
+    support = full.of(owner).support(T, seen)
+    winner = torch.where(owner == every[:, None], support, -1.0).argmax(dim=1)
+    found = full.matches(T[winner], seen[winner], FINE[-1])
+    covariance = _covariance(found.J, found.weight, found.distance, T[winner, :3, :3] @ centre)
+    return ContourFit(T[winner], covariance, support[winner])
+
+
+def _around(half: Views, T0: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+    """After the first rounds from the starts and from four turns of each: the best of five, and the next best that is
+    another pose. Returns which start each belongs to, and the poses."""
     turns = torch.zeros(5, 6, dtype=torch.float64)
     turns[1:, :2] = torch.deg2rad(TURN * torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]))
-    around = _moved(T0.repeat_interleave(len(turns), dim=0), turns.repeat(N, 1), centre)
-    T = half.descend(around, COARSE)
-    best = half.look(T)[1].view(N, -1).topk(FINALISTS, dim=1).indices
-    T = T.view(N, -1, 4, 4).gather(1, best[..., None, None].expand(-1, -1, 4, 4)).flatten(0, 1)
-    T = torch.cat([T0[:, None], full.descend(T, FINE).view(N, -1, 4, 4)], dim=1)  # of equals the first wins
-    covariance, support = full.look(T.flatten(0, 1))
-    winner = support.view(N, -1).argmax(dim=1) + torch.arange(N) * T.shape[1]
-    return ContourFit(T.flatten(0, 1)[winner], covariance[winner], support[winner])
+    five = index.repeat_interleave(5)
+    views = half.of(five)
+    T, seen = views.descend(moved(T0[five], turns.repeat(len(index), 1), half.centre), FIRST)
+    support = views.support(T, seen).view(-1, 5)
+    first = 5 * torch.arange(len(index))
+    best = support.argmax(dim=1) + first
+    reference = best.repeat_interleave(5)
+    gap = views.way(seen[reference], T[reference], T).view(-1, 5)
+    rival, second = torch.where(gap > SAME, support, -1.0).max(dim=1)
+    chosen = torch.cat([best, (second + first)[rival >= 0]])
+    return five[chosen], T[chosen]
 
 
-def _check(image: Tensor, box: Tensor, camera_matrix: Tensor, starts: Tensor, radius: float) -> None:
-    check_tensor(image, "image", (None, None, None))
-    check_tensor(box, "box", (4,))
+def _among_best(support: Tensor, photograph: Tensor, count: int) -> Tensor:
+    """(N,) whether fewer than ``count`` other starts of the same photograph have more support."""
+    order = torch.arange(len(support))
+    ahead = (support > support[:, None]) | ((support == support[:, None]) & (order < order[:, None]))
+    return (ahead & (photograph == photograph[:, None])).sum(dim=1) < count
+
+
+def _batch(
+    images: Tensor | Sequence[Tensor],
+    boxes: Tensor,
+    camera_matrices: Tensor,
+    starts: Tensor,
+    photograph: Tensor | None,
+) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
+    """Float images, boxes (B, 4), camera matrices (B, 3, 3) and (N,) indices of them, all on the CPU."""
     check_tensor(starts, "starts", (None, 4, 4))
-    check_camera_matrix(camera_matrix)
-    check_positive(radius, "radius")
     if not bool(torch.isfinite(starts).all()):
         raise InvalidInputError("starts: expected finite poses, got NaN or inf")
-
-
-@dataclass(frozen=True)
-class _Scene:
-    """A mesh before one crop of the photograph: ``K`` (3, 3) and ``size`` of the crop."""
-
-    renderer: DepthRenderer
-    edges: EdgeField
-    K: Tensor
-    size: int
-    centre: Tensor
-    radius: float
-
-    def points(self, T: Tensor) -> ContourPoints:
-        depth = self.renderer.render(T, self.K, (self.size, self.size)).cpu()
-        return contour_points(depth, T, self.K, radius=self.radius)
-
-    def descend(self, T: Tensor, reaches: tuple[float, ...]) -> Tensor:
-        for reach in reaches:
-            points = self.points(T)
-            for _ in range(STEPS):
-                T = _moved(T, self._bounded(self._step(points, T, reach), T), self.centre)
-        return T
-
-    def _step(self, points: ContourPoints, T: Tensor, reach: float) -> Tensor:
-        """(N, 6) turn about the centre and shift of it."""
-        uv, du = _project(points.model, T, self.K, self.centre)
-        J = (points.normals[..., None, :] @ du)[..., 0, :]
-        distance, strength = self._candidates(uv, points, reach)
-        step = torch.zeros(len(T), 6, dtype=torch.float64)
-        for _ in range(SELECTIONS):
-            left = distance - (J @ step[..., None])
-            index = (strength * torch.exp(-2.0 * (left / reach) ** 2)).argmax(dim=-1, keepdim=True)
-            tukey = (1.0 - (left.gather(-1, index) / reach) ** 2).clamp(min=0.0) ** 2
-            W = strength.gather(-1, index) * tukey
-            A = J.mT @ (W * J)
-            b = J.mT @ (W * distance.gather(-1, index))
-            damping = DAMPING * A.diagonal(dim1=-2, dim2=-1)
-            floor = 1e-12 * damping.amax(dim=-1, keepdim=True) + 1e-12  # nothing found: no step
-            step = torch.linalg.solve(A + torch.diag_embed(damping + floor), b)[..., 0]
-        return step
-
-    def _candidates(self, uv: Tensor, points: ContourPoints, reach: float) -> tuple[Tensor, Tensor]:
-        """Distance in px along the normals and strength, both (N, P, L); the strength is 0 where there is no edge."""
-        far = round(1.5 * reach) + 1
-        offsets = torch.arange(-far, far + 1, dtype=torch.float64)
-        profile = self.edges.strength(uv, points.normals, offsets)
-        before, here, behind = profile[..., :-2], profile[..., 1:-1], profile[..., 2:]
-        is_peak = (here > before) & (here >= behind) & points.valid[..., None]
-        bend = (before - 2.0 * here + behind).clamp(max=-1e-9)
-        vertex = (0.5 * (before - behind) / bend).clamp(-0.5, 0.5)  # of the parabola through the three
-        return offsets[1:-1] + vertex, torch.where(is_peak, here, 0.0)
-
-    def _bounded(self, step: Tensor, T: Tensor) -> Tensor:
-        z = (T[:, :3, :3] @ self.centre + T[:, :3, 3])[:, 2].clamp(min=0.0)
-        turn, shift = (torch.linalg.vector_norm(part, dim=1).clamp(min=1e-12) for part in step.split(3, dim=1))
-        share = torch.minimum(MAX_TURN / turn, MAX_SHIFT * z / shift).clamp(max=1.0)
-        return step * share[:, None]
-
-    def look(self, T: Tensor) -> tuple[Tensor, Tensor]:
-        """Covariance (N, 6, 6) and support (N,) of poses as they are."""
-        points = self.points(T)
-        uv, du = _project(points.model, T, self.K, self.centre)
-        J = (points.normals[..., None, :] @ du)[..., 0, :]
-        offsets = torch.arange(-3, 4, dtype=torch.float64)
-        near = self.edges.strength(uv, points.normals, offsets) * torch.exp(-0.5 * offsets**2)
-        valid = points.valid
-        support = (near.amax(dim=-1) * valid).sum(dim=1) / valid.sum(dim=1).clamp(min=1)
-        distance, strength = self._candidates(uv, points, FINE[-1])
-        index = (strength * torch.exp(-0.5 * distance**2)).argmax(dim=-1, keepdim=True)
-        d = distance.gather(-1, index)
-        W = strength.gather(-1, index) * (1.0 - (d / FINE[-1]) ** 2).clamp(min=0.0) ** 2
-        return _covariance(J, W, d, T[:, :3, :3] @ self.centre), support
+    check_camera_matrix(camera_matrices)
+    if isinstance(images, Tensor) and images.ndim == 3:  # one photograph
+        check_tensor(boxes, "box", (4,))
+        images, boxes = images[None], boxes[None]
+    B = len(images)
+    if camera_matrices.ndim == 3 and len(camera_matrices) not in (1, B):
+        raise InvalidInputError(f"camera_matrices: expected one or {B} matrices, got {len(camera_matrices)}")
+    if photograph is None:
+        if B != 1:
+            raise InvalidInputError(f"photograph: {B} images; say which of them each start belongs to")
+        photograph = torch.zeros(len(starts), dtype=torch.long)
+    photograph = photograph.detach().cpu()
+    if photograph.shape != starts.shape[:1] or photograph.is_floating_point():
+        raise InvalidInputError(
+            f"photograph: expected {len(starts)} integers, got {photograph.dtype} of shape {tuple(photograph.shape)}"
+        )
+    if len(starts) and not 0 <= int(photograph.min()) <= int(photograph.max()) < B:
+        raise InvalidInputError(f"photograph: expected indices of {B} images, got {photograph.tolist()}")
+    return (
+        [image.detach().cpu().float() / (1 if image.is_floating_point() else 255) for image in images],
+        boxes.detach().cpu().float(),
+        camera_matrices.detach().cpu().double().expand(B, 3, 3),
+        photograph.long(),
+    )
 
 
 def _covariance(J: Tensor, W: Tensor, d: Tensor, arm: Tensor) -> Tensor:
@@ -233,32 +223,6 @@ def _covariance(J: Tensor, W: Tensor, d: Tensor, arm: Tensor) -> Tensor:
     C = variance[:, None, None] * scale[:, :, None] * torch.linalg.inv(unit) * scale[:, None]
     # The origin moves by e - w x arm where the centre moves by e.
     lever = torch.eye(6, dtype=C.dtype).repeat(len(C), 1, 1)
-    lever[:, 3:, :3] = _cross(arm)
+    lever[:, 3:, :3] = cross(arm)
     C = lever @ C @ lever.mT
     return torch.where(known[:, None, None], 0.5 * (C + C.mT), torch.nan)
-
-
-def _project(points: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels (N, P, 2) of model points and their derivative (N, P, 2, 6) by a turn about the centre and its shift."""
-    arms = (points - centre) @ T[:, :3, :3].mT
-    cam = arms + (T[:, :3, :3] @ centre + T[:, :3, 3])[:, None]
-    z = cam[..., 2:].clamp(min=1e-9)
-    uv = cam @ K[:2].T / z
-    by_cam = (K[:2] - uv[..., None] * K[2]) / z[..., None]
-    by_step = torch.cat([-_cross(arms), torch.eye(3, dtype=z.dtype).expand(*arms.shape, 3)], dim=-1)
-    return uv, by_cam @ by_step
-
-
-def _moved(T: Tensor, step: Tensor, centre: Tensor) -> Tensor:
-    """Turned by (N, 3) rad about the centre, which is then shifted by (N, 3)."""
-    R = rotation_from_axis_angle(step[:, :3]) @ T[:, :3, :3]
-    position = T[:, :3, :3] @ centre + T[:, :3, 3] + step[:, 3:]
-    return transform(R, position - R @ centre)
-
-
-def _cross(a: Tensor) -> Tensor:
-    """(..., 3, 3) matrices of b -> a x b."""
-    x, y, z = a.unbind(-1)
-    o = torch.zeros_like(x)
-    matrix: Tensor = torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
-    return matrix

@@ -1,5 +1,6 @@
 """The two sides of the contour stage: contours of a rendered mesh as 3D points, and a photograph's edges."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -25,9 +26,6 @@ CREASE_SHARE = 0.02
 CREASE = 0.1
 """Curvature in 1/px, smoothed by 1 px, of a crease: edges between faces that differ by 15 degrees or more."""
 
-AGREEMENT = 4
-"""Power of the cosine between normal and gradient: halves an edge's strength at 33 degrees."""
-
 
 @dataclass(frozen=True)
 class ContourPoints:
@@ -43,6 +41,17 @@ class ContourPoints:
     normals: Tensor
     valid: Tensor
 
+    def __getitem__(self, index: Tensor) -> "ContourPoints":
+        return ContourPoints(self.model[index], self.normals[index], self.valid[index])
+
+    @staticmethod
+    def cat(parts: Sequence["ContourPoints"]) -> "ContourPoints":
+        return ContourPoints(
+            torch.cat([p.model for p in parts]),
+            torch.cat([p.normals for p in parts]),
+            torch.cat([p.valid for p in parts]),
+        )
+
 
 def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tensor, *, radius: float) -> ContourPoints:
     """Occluding contours and creases of depth views, back-projected onto the mesh.
@@ -55,7 +64,7 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
     Args:
         depth: (N, 1, H, W) z-depth, 0 = background.
         T_cam_from_model: (N, 4, 4) float64.
-        camera_matrix: (3, 3) float64.
+        camera_matrix: (N, 3, 3) or (3, 3) float64.
         radius: of the object, in model units.
 
     Example:
@@ -67,6 +76,7 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
         (64, [1.25])
     """
     H, W = depth.shape[-2:]
+    K = camera_matrix.expand(len(depth), 3, 3)
     seen = depth > 0
     z = torch.where(seen, depth, depth.amax(dim=(1, 2, 3), keepdim=True) + 4.0 * radius)
     slope = torch.cat(central_gradient(smooth(fill_depth(depth, None, None), 1.0)), dim=1)
@@ -88,18 +98,16 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
     places, counts = torch.cat([p[1] for p in pairs]), (OCCLUDING, CREASES)
     jumps, depths, normals = (torch.cat([p[i].flatten(2) for p in pairs], dim=2) for i in (0, 2, 3))
     # Depth in px: saliency is then a curvature in 1 / px, and a threshold has a meaning.
-    field = depth_curvilinear_saliency(
-        depth * (camera_matrix[0, 0] / z.amax(dim=(1, 2, 3), keepdim=True)).float(), depth_scale=1.0
-    )
-    field = torch.where(F.max_pool2d(beside.float(), 9, 1, 4) > 0, 0.0, field)
-    creases = field_points(field, share=CREASE_SHARE, threshold=CREASE) & seen
+    scale = K[:, 0, 0].view(-1, 1, 1, 1) / z.amax(dim=(1, 2, 3), keepdim=True)
+    field = depth_curvilinear_saliency(depth * scale.float(), depth_scale=1.0)
+    creases = field_points(field * ~(_widened(beside) | ~seen), share=CREASE_SHARE, threshold=CREASE)
     kinds = (
         (jumps, places, depths, normals),
         (creases.flatten(2), pixels.view(-1, 2), depth.flatten(2), field.flatten(2)),
     )
     samples = [_sample(*kind, count) for kind, count in zip(kinds, counts, strict=True)]
     uv, z, n, valid = (torch.cat(parts, dim=1) for parts in zip(*samples, strict=True))
-    rays = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1) @ torch.linalg.inv(camera_matrix).T
+    rays = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1) @ torch.linalg.inv(K).mT
     model = (rays * z[..., None] - T_cam_from_model[:, None, :3, 3]) @ T_cam_from_model[:, :3, :3]
     length = torch.linalg.vector_norm(n, dim=-1)
     return ContourPoints(model, n / length.clamp(min=1e-12)[..., None], valid & (length > 0))
@@ -116,6 +124,17 @@ def _middle(x: Tensor, dim: int) -> Tensor:
     return 0.5 * (a + b)
 
 
+def _widened(mask: Tensor) -> Tensor:
+    """What is true within a square of 9 px."""
+    for dim in (-1, -2):
+        for shift in (1, 3):
+            n, wide = mask.shape[dim] - shift, mask.clone()
+            wide.narrow(dim, 0, n).logical_or_(mask.narrow(dim, shift, n))
+            wide.narrow(dim, shift, n).logical_or_(mask.narrow(dim, 0, n))
+            mask = wide
+    return mask
+
+
 def _sample(found: Tensor, places: Tensor, depths: Tensor, normals: Tensor, count: int) -> tuple[Tensor, ...]:
     """``count`` of the found ones of M places: uv (N, P, 2), depth (N, P), normal (N, P, 2), valid (N, P)."""
     keys = torch.rand(len(places), generator=torch.Generator().manual_seed(0))
@@ -125,38 +144,41 @@ def _sample(found: Tensor, places: Tensor, depths: Tensor, normals: Tensor, coun
 
 
 class EdgeField:
-    """Edges of one photograph crop, to be looked for along normals.
+    """Edges of crops of photographs, to be looked for along normals.
 
     Args:
-        crop: (1, C, S, S), C = 1 or 3, in [0, 1]. With colours the strongest channel counts.
+        crops: (B, C, S, S), C = 1 or 3, in [0, 1]. With colours the strongest channel counts.
     """
 
-    def __init__(self, crop: Tensor) -> None:
-        gx, gy = central_gradient(smooth(crop, 1.0))
+    def __init__(self, crops: Tensor) -> None:
+        gx, gy = central_gradient(smooth(crops, 1.0))
         self._gradient = torch.stack([gx, gy], dim=2).flatten(1, 2)
-        self._level = self._gradient.square().sum(dim=1).mean().sqrt().clamp(min=1e-6)
+        self._level = self._gradient.square().sum(dim=1).mean(dim=(1, 2)).sqrt().clamp(min=1e-6)
 
-    def strength(self, uv: Tensor, normals: Tensor, offsets: Tensor) -> Tensor:
+    def strength(self, uv: Tensor, normals: Tensor, offsets: Tensor, photograph: Tensor) -> Tensor:
         """How strongly the picture changes across a contour at places beside it.
 
         With g the gradient and c = |n . g| / |g|, r = |n . g| c^4 is compared with the crop's mean gradient m: the
-        strength is r / (r + m). Outside the crop it is 0.
+        strength is r / (r + m): halved where they differ by 33 degrees, 0 outside the crop.
 
         Args:
-            uv, normals: (N, P, 2) pixels of the crop, and unit vectors.
+            uv, normals: (N, P, 2) pixels of the crops, and unit vectors.
             offsets: (L,) px along the normals.
+            photograph: (N,) indices of the crops.
 
         Returns:
             (N, P, L) float64 in [0, 1).
         """
         S = self._gradient.shape[-1]
-        grid = (2.0 * (uv[:, :, None] + offsets[:, None] * normals[:, :, None]) + 1.0) / S - 1.0
-        gradient = F.grid_sample(
-            self._gradient.expand(len(uv), -1, -1, -1), grid.to(self._gradient.dtype), align_corners=False
-        )
+        grid = ((2.0 * (uv[:, :, None] + offsets[:, None] * normals[:, :, None]) + 1.0) / S - 1.0).float()
+        gradient = grid.new_empty(len(uv), self._gradient.shape[1], *grid.shape[1:3])
+        for b in photograph.unique().tolist():  # expanded, a crop need not be copied for every pose
+            own = (photograph == b).nonzero()[:, 0]
+            crop = self._gradient[b].expand(len(own), -1, -1, -1)
+            gradient[own] = F.grid_sample(crop, grid[own], align_corners=False)
         gx, gy = gradient[:, 0::2], gradient[:, 1::2]
         nx, ny = normals.to(gx.dtype)[:, None, :, None].unbind(-1)
         across = (gx * nx + gy * ny).abs()
         cosine = across * (gx * gx + gy * gy).clamp(min=1e-20).rsqrt()
-        r = (across * cosine**AGREEMENT).amax(dim=1)
-        return (r / (r + self._level)).double()
+        r = (across * cosine.square().square()).amax(dim=1)
+        return (r / (r + self._level[photograph, None, None])).double()

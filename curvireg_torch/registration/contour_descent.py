@@ -1,0 +1,178 @@
+"""Poses pulled onto edges by robust least squares: the inside of :func:`fit_contours`."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..geometry import rotation_from_axis_angle
+from ..geometry.cameras import transform
+from ..rendering import DepthRenderer
+from .contour_points import ContourPoints, EdgeField, contour_points
+
+__all__ = ["Matches", "Views", "cross", "moved", "project"]
+
+STEPS, SELECTIONS = 2, 3
+"""Least-squares steps per round, and choices of edges per step."""
+
+STALE = 0.3
+"""Mean way in px of contour points on the mesh, after which the mesh is rendered anew."""
+
+DAMPING = 1e-2
+"""Levenberg-Marquardt: share of its own diagonal that is added to J^T W J."""
+
+MAX_TURN, MAX_SHIFT = 0.2, 0.1
+"""Longest step: radians, and share of the object's distance."""
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Contour points of N poses and the edges that they lie by: derivatives ``J`` (N, P, 6) of the distance along the
+    normal, that distance in px and its weight, (N, P, 1)."""
+
+    J: Tensor
+    distance: Tensor
+    weight: Tensor
+
+
+@dataclass(frozen=True)
+class Views:
+    """N poses of a mesh, each before the crop of its photograph.
+
+    Attributes:
+        renderer: of the mesh.
+        edges: of B crops.
+        photograph: (N,) which of them a pose belongs to.
+        K: (N, 3, 3) of the crops.
+        size: of the crops in px.
+        centre, radius: of the object, (3,) and model units.
+    """
+
+    renderer: DepthRenderer
+    edges: EdgeField
+    photograph: Tensor
+    K: Tensor
+    size: int
+    centre: Tensor
+    radius: float
+
+    def of(self, index: Tensor) -> "Views":
+        return Views(
+            self.renderer, self.edges, self.photograph[index], self.K[index], self.size, self.centre, self.radius
+        )
+
+    def points(self, T: Tensor) -> ContourPoints:
+        depth = self.renderer.render(T, self.K, (self.size, self.size)).cpu()
+        return contour_points(depth, T, self.K, radius=self.radius)
+
+    def descend(self, T: Tensor, reaches: tuple[float, ...]) -> tuple[Tensor, ContourPoints]:
+        """Poses (N, 4, 4) after one round per reach, and contour points seen from about there."""
+        rendered, points = T, self.points(T)
+        for reach in reaches:
+            for _ in range(STEPS):
+                T = moved(T, self._bounded(self._step(points, T, reach), T), self.centre)
+            rendered, points = self._refreshed(rendered, points, T)
+        return T, points
+
+    def _refreshed(self, rendered: Tensor, points: ContourPoints, T: Tensor) -> tuple[Tensor, ContourPoints]:
+        """The same points, but new ones where contours have moved since."""
+        # Each pose by itself: a result does not depend on what shares its batch.
+        stale = (self.way(points, rendered, T) > STALE).nonzero()[:, 0]
+        if len(stale) == 0:
+            return rendered, points
+        new = self.of(stale).points(T[stale])
+        return rendered.index_copy(0, stale, T[stale]), ContourPoints(
+            points.model.index_copy(0, stale, new.model),
+            points.normals.index_copy(0, stale, new.normals),
+            points.valid.index_copy(0, stale, new.valid),
+        )
+
+    def way(self, points: ContourPoints, before: Tensor, after: Tensor) -> Tensor:
+        """(N,) mean way in px of the points from one pose to another."""
+        way = pixels(points.model, after, self.K, self.centre) - pixels(points.model, before, self.K, self.centre)
+        length = torch.linalg.vector_norm(way, dim=-1) * points.valid
+        return length.sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
+
+    def _step(self, points: ContourPoints, T: Tensor, reach: float) -> Tensor:
+        """(N, 6) turn about the centre and shift of it."""
+        uv, du = project(points.model, T, self.K, self.centre)
+        J = (points.normals[..., None, :] @ du)[..., 0, :]
+        distance, strength = self._candidates(uv, points, reach)
+        step = torch.zeros(len(T), 6, dtype=torch.float64)
+        for _ in range(SELECTIONS):
+            left = distance - (J @ step[..., None])
+            index = (strength * torch.exp(-2.0 * (left / reach) ** 2)).argmax(dim=-1, keepdim=True)
+            tukey = (1.0 - (left.gather(-1, index) / reach) ** 2).clamp(min=0.0) ** 2
+            W = strength.gather(-1, index) * tukey
+            A = J.mT @ (W * J)
+            b = J.mT @ (W * distance.gather(-1, index))
+            damping = DAMPING * A.diagonal(dim1=-2, dim2=-1)
+            floor = 1e-12 * damping.amax(dim=-1, keepdim=True) + 1e-12  # nothing found: no step
+            step = torch.linalg.solve(A + torch.diag_embed(damping + floor), b)[..., 0]
+        return step
+
+    def _candidates(self, uv: Tensor, points: ContourPoints, reach: float) -> tuple[Tensor, Tensor]:
+        """Distance in px along the normals and strength, both (N, P, L); the strength is 0 where there is no edge."""
+        far = round(1.5 * reach) + 1
+        offsets = torch.arange(-far, far + 1, dtype=torch.float64)
+        profile = self.edges.strength(uv, points.normals, offsets, self.photograph)
+        before, here, behind = profile[..., :-2], profile[..., 1:-1], profile[..., 2:]
+        is_peak = (here > before) & (here >= behind) & points.valid[..., None]
+        bend = (before - 2.0 * here + behind).clamp(max=-1e-9)
+        vertex = (0.5 * (before - behind) / bend).clamp(-0.5, 0.5)  # of the parabola through the three
+        return offsets[1:-1] + vertex, torch.where(is_peak, here, 0.0)
+
+    def _bounded(self, step: Tensor, T: Tensor) -> Tensor:
+        z = (T[:, :3, :3] @ self.centre + T[:, :3, 3])[:, 2].clamp(min=0.0)
+        turn, shift = (torch.linalg.vector_norm(part, dim=1).clamp(min=1e-12) for part in step.split(3, dim=1))
+        share = torch.minimum(MAX_TURN / turn, MAX_SHIFT * z / shift).clamp(max=1.0)
+        return step * share[:, None]
+
+    def support(self, T: Tensor, points: ContourPoints) -> Tensor:
+        """(N,) mean strength of the edges within about 1 px of the contour points."""
+        uv, _ = project(points.model, T, self.K, self.centre)
+        offsets = torch.arange(-3, 4, dtype=torch.float64)
+        near = self.edges.strength(uv, points.normals, offsets, self.photograph) * torch.exp(-0.5 * offsets**2)
+        return (near.amax(dim=-1) * points.valid).sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
+
+    def matches(self, T: Tensor, points: ContourPoints, reach: float) -> Matches:
+        """What the last round's least squares saw."""
+        uv, du = project(points.model, T, self.K, self.centre)
+        distance, strength = self._candidates(uv, points, reach)
+        index = (strength * torch.exp(-0.5 * distance**2)).argmax(dim=-1, keepdim=True)
+        d = distance.gather(-1, index)
+        W = strength.gather(-1, index) * (1.0 - (d / reach) ** 2).clamp(min=0.0) ** 2
+        return Matches((points.normals[..., None, :] @ du)[..., 0, :], d, W)
+
+
+def project(points: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (N, P, 2) of model points and their derivative (N, P, 2, 6) by a turn about the centre and its shift."""
+    K = K.expand(len(T), 3, 3)
+    arms = (points - centre) @ T[:, :3, :3].mT
+    cam = arms + (T[:, :3, :3] @ centre + T[:, :3, 3])[:, None]
+    z = cam[..., 2:].clamp(min=1e-9)
+    uv = cam @ K[:, :2].mT / z
+    by_cam = (K[:, None, :2] - uv[..., None] * K[:, None, 2:]) / z[..., None]
+    by_turn = torch.linalg.cross(arms[..., None, :].expand_as(by_cam), by_cam)  # b . (w x a) = w . (a x b)
+    return uv, torch.cat([by_turn, by_cam], dim=-1)
+
+
+def pixels(points: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> Tensor:
+    """Those of :func:`project` alone."""
+    cam = (points - centre) @ T[:, :3, :3].mT + (T[:, :3, :3] @ centre + T[:, :3, 3])[:, None]
+    return cam @ K[:, :2].mT / cam[..., 2:].clamp(min=1e-9)
+
+
+def moved(T: Tensor, step: Tensor, centre: Tensor) -> Tensor:
+    """Turned by (N, 3) rad about the centre, which is then shifted by (N, 3)."""
+    R = rotation_from_axis_angle(step[:, :3]) @ T[:, :3, :3]
+    position = T[:, :3, :3] @ centre + T[:, :3, 3] + step[:, 3:]
+    return transform(R, position - R @ centre)
+
+
+def cross(a: Tensor) -> Tensor:
+    """(..., 3, 3) matrices of b -> a x b."""
+    x, y, z = a.unbind(-1)
+    o = torch.zeros_like(x)
+    matrix: Tensor = torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
+    return matrix
