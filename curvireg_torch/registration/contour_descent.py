@@ -91,7 +91,8 @@ class Views:
         """(N,) mean way in px of the points from one pose to another."""
         way = pixels(points.model, after, self.K, self.centre) - pixels(points.model, before, self.K, self.centre)
         length = torch.linalg.vector_norm(way, dim=-1) * points.valid
-        return length.sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
+        mean: Tensor = length.sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
+        return mean
 
     def _step(self, points: ContourPoints, T: Tensor, reach: float) -> Tensor:
         """(N, 6) turn about the centre and shift of it."""
