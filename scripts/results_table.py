@@ -13,6 +13,7 @@ import datetime
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -91,8 +92,8 @@ def today() -> str:
     return datetime.datetime.now(datetime.UTC).date().isoformat()
 
 
-def commit(root: Path) -> str:
-    """Short hash of the checkout, "+" where it was changed, "unknown" outside of one."""
+def commit(root: Path, *, but: Sequence[str] = ()) -> str:
+    """Short hash of the checkout, "+" where anything ``but`` these paths was changed, "unknown" outside of one."""
 
     def git(*words: str) -> str:
         return subprocess.run(
@@ -101,7 +102,7 @@ def commit(root: Path) -> str:
 
     try:
         return git("rev-parse", "--short", "HEAD") + (
-            "+" if git("status", "--porcelain", "--untracked-files=no") else ""
+            "+" if git("status", "--porcelain", "--untracked-files=no", "--", ".", *(f":!{p}" for p in but)) else ""
         )
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
