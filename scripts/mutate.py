@@ -27,6 +27,7 @@ import time
 import traceback
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 from mutants import Mutant, mutants_of
 
@@ -36,6 +37,7 @@ PACKAGE = "curvireg_torch"
 PRELOADED = ("torch", "numpy", "scipy.spatial", "kornia", "cv2", "trimesh", "sklearn.covariance", "skimage.feature")
 PRELOADED += ("pytest",)
 WALL_LIMIT_S = 400.0
+LOG = "log.txt"
 
 
 def sample(mutants: Iterable[Mutant], count: int, seed: int) -> list[Mutant]:
@@ -48,33 +50,41 @@ def sample(mutants: Iterable[Mutant], count: int, seed: int) -> list[Mutant]:
     return sorted(chosen, key=lambda m: (m.path, m.start, m.text))
 
 
-def files_of(package: str) -> list[str]:
-    """Sources of a package or of a module, relative to the repository."""
-    folder = ROOT / PACKAGE / package
+def snapshot(folder: Path) -> None:
+    """What tests need of the repository as it is now."""
+    for name in (PACKAGE, "tests", "scripts", "docs"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md"):
+        shutil.copy(ROOT / name, folder / name)
+
+
+def files_of(copy: Path, package: str) -> list[str]:
+    """Sources of a package or of a module."""
+    folder = copy / PACKAGE / package
     paths = sorted(folder.rglob("*.py")) if folder.is_dir() else [folder.with_suffix(".py")]
-    return [p.relative_to(ROOT).as_posix() for p in paths if p.name != "__init__.py"]
+    return [p.relative_to(copy).as_posix() for p in paths if p.name != "__init__.py"]
 
 
-def tests_of(path: str) -> list[str]:
+def tests_of(copy: Path, path: str) -> list[str]:
     """Test files of a source, the likeliest to notice first, and its doctests last."""
     parts = Path(path).with_suffix("").parts[1:]
-    home, stem = ROOT.joinpath("tests", *parts[:-1]), parts[-1].strip("_")
-    everywhere = sorted((ROOT / "tests").rglob("test_*.py"))
-    module = re.compile(rf"{PACKAGE}\.{re.escape('.'.join(parts))}\b")
+    home, stem = copy.joinpath("tests", *parts[:-1]), parts[-1].strip("_")
+    everywhere = sorted((copy / "tests").rglob("test_*.py"))
+    module = rf"{PACKAGE}\.{re.escape('.'.join(parts))}\b"
     if len(parts) > 1:
         near = [p for p in everywhere if home in p.parents]
-        module = re.compile(rf"{module.pattern}|{PACKAGE}\.{'.'.join(parts[:-1])} import [^\n]*\b{parts[-1]}\b")
+        module += rf"|{PACKAGE}\.{re.escape('.'.join(parts[:-1]))} import [^\n]*\b{parts[-1]}\b"
     else:
         near = [p for p in everywhere if p.parent == home and stem in p.stem]
-    named = [p for p in everywhere if p not in near and module.search(p.read_text())]
+    named = [p for p in everywhere if p not in near and re.search(module, p.read_text())]
     ordered = sorted(near, key=lambda p: stem not in p.stem) + named
-    return [*(p.relative_to(ROOT).as_posix() for p in ordered), path]
+    return [*(p.relative_to(copy).as_posix() for p in ordered), path]
 
 
 def run_tests(copy: Path, tests: list[str], *, cpu_s: int | None, write_bytecode: bool = False) -> tuple[str, float]:
     """``survived``, ``killed`` or ``timeout``, and the seconds, of a forked process that runs tests in the copy."""
     start = time.monotonic()
-    log = copy / "log.txt"
+    log = copy / LOG
     child = os.fork()
     if child == 0:  # torch and the like are imported already; the package is not
         os.setsid()
@@ -111,36 +121,43 @@ def run_tests(copy: Path, tests: list[str], *, cpu_s: int | None, write_bytecode
     return ("survived" if code == 0 else "killed"), seconds
 
 
-def judged(mutants: list[Mutant], known: dict[str, str], *, again: bool) -> Iterator[tuple[Mutant, str, float]]:
-    """Outcome of each mutant whose outcome is not known."""
-    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
-        copy = Path(folder)
-        for name in (PACKAGE, "tests", "scripts", "docs"):
-            shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
-        for name in ("pyproject.toml", "README.md"):
-            shutil.copy(ROOT / name, copy / name)
-        cpu: dict[str, int] = {}
-        for mutant in mutants:
-            if mutant.key in known and not (again and known[mutant.key] == "survived"):
-                continue
-            tests, target = tests_of(mutant.path), copy / mutant.path
-            if mutant.path not in cpu:
-                before = resource.getrusage(resource.RUSAGE_CHILDREN)
-                if run_tests(copy, tests, cpu_s=None, write_bytecode=True)[0] != "survived":
-                    raise SystemExit(
-                        f"the tests of {mutant.path} fail by themselves:\n{(copy / 'log.txt').read_text()}"
-                    )
-                after = resource.getrusage(resource.RUSAGE_CHILDREN)
-                cpu[mutant.path] = int(3.0 * (after.ru_utime - before.ru_utime) + 15.0)
-                for stale in (target.parent / "__pycache__").glob(f"{target.stem}.*"):
-                    stale.unlink()
-            source = target.read_bytes()
-            target.write_bytes(mutant.apply(source))
-            try:
-                outcome, seconds = run_tests(copy, tests, cpu_s=cpu[mutant.path])
-            finally:
-                target.write_bytes(source)
-            yield mutant, outcome, seconds
+def judged(copy: Path, mutants: list[Mutant]) -> Iterator[tuple[Mutant, str, float]]:
+    """Each mutant with its outcome and the seconds."""
+    cpu: dict[str, int] = {}
+    for mutant in mutants:
+        tests, target = tests_of(copy, mutant.path), copy / mutant.path
+        if mutant.path not in cpu:
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            if run_tests(copy, tests, cpu_s=None, write_bytecode=True)[0] != "survived":
+                raise SystemExit(f"the tests of {mutant.path} fail by themselves:\n{(copy / LOG).read_text()}")
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            cpu[mutant.path] = int(3.0 * (after.ru_utime - before.ru_utime) + 15.0)
+            for stale in (target.parent / "__pycache__").glob(f"{target.stem}.*"):
+                stale.unlink()
+        source = target.read_bytes()
+        target.write_bytes(mutant.apply(source))
+        try:
+            outcome, seconds = run_tests(copy, tests, cpu_s=cpu[mutant.path])
+        finally:
+            target.write_bytes(source)
+        yield mutant, outcome, seconds
+
+
+def stored() -> dict[str, Any]:
+    return json.loads(RESULT.read_text()) if RESULT.exists() else {}
+
+
+def store(package: str, mutants: int, chosen: list[Mutant], outcomes: dict[str, str]) -> dict[str, Any]:
+    """Writes a package's row, keeping what others wrote meanwhile; returns it without its lists."""
+    result = stored()
+    reasons = {s["key"]: s["reason"] for s in result.get(package, {}).get("survivors", [])}
+    alive = [m for m in chosen if outcomes.get(m.key) == "survived"]
+    n = len(outcomes)
+    row = {"mutants": mutants, "sampled": n, "killed": n - len(alive), "score": round(1 - len(alive) / max(n, 1), 3)}
+    survivors = [{"key": m.key, "line": m.line, "reason": reasons.get(m.key, "")} for m in alive]
+    result[package] = {**row, "survivors": survivors, "outcomes": outcomes}
+    RESULT.write_text(json.dumps(dict(sorted(result.items())), indent=1, ensure_ascii=False) + "\n")
+    return row
 
 
 def main() -> None:
@@ -151,40 +168,28 @@ def main() -> None:
     parser.add_argument("--again", action="store_true", help="run known survivors once more")
     parser.add_argument("--list", action="store_true", help="print the sample and run nothing")
     options = parser.parse_args()
-    result = json.loads(RESULT.read_text()) if RESULT.exists() else {}
     if not options.list:
         for name in PRELOADED:
             importlib.import_module(name)
-    for package in options.packages:
-        sources = {path: (ROOT / path).read_bytes() for path in files_of(package)}
-        every = [m for path, source in sources.items() for m in mutants_of(path, source)]
-        chosen = sample(every, options.sample, options.seed)
-        if options.list:
-            for m in chosen:
-                print(f"{m.path}:{m.line} {m.kind}: {' -> '.join(m.diff(sources[m.path]))}")
-            continue
-        old = result.get(package, {})
-        reasons = {s["key"]: s["reason"] for s in old.get("survivors", [])}
-        outcomes = {m.key: old["outcomes"][m.key] for m in chosen if m.key in old.get("outcomes", {})}
-
-        def record(package: str = package, every: list[Mutant] = every, chosen: list[Mutant] = chosen) -> None:
-            alive = [m for m in chosen if outcomes.get(m.key) == "survived"]  # noqa: B023
-            survivors = [{"key": m.key, "line": m.line, "reason": reasons.get(m.key, "")} for m in alive]  # noqa: B023
-            n = len(outcomes)  # noqa: B023
-            result[package] = {"mutants": len(every), "sampled": n, "killed": n - len(alive)}
-            result[package] |= {"score": round(1.0 - len(alive) / n, 3) if n else None}
-            result[package] |= {"explained": sum(bool(s["reason"]) for s in survivors)}
-            result[package] |= {"survivors": survivors, "outcomes": outcomes}  # noqa: B023
-            RESULT.write_text(json.dumps(dict(sorted(result.items())), indent=1, ensure_ascii=False) + "\n")
-
-        for mutant, outcome, seconds in judged(chosen, outcomes, again=options.again):
-            outcomes[mutant.key] = outcome
-            change = " -> ".join(mutant.diff(sources[mutant.path]))
-            print(f"{outcome:8} {seconds:5.1f} s {mutant.path}:{mutant.line} {mutant.kind}: {change}", flush=True)
-            record()
-        record()
-        shown = {k: v for k, v in result[package].items() if k not in ("survivors", "outcomes")}
-        print(f"{package}: {shown}", flush=True)
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+        copy = Path(folder)
+        snapshot(copy)
+        for package in options.packages:
+            sources = {path: (copy / path).read_bytes() for path in files_of(copy, package)}
+            every = [m for path, source in sources.items() for m in mutants_of(path, source)]
+            chosen = sample(every, options.sample, options.seed)
+            changes = {m: f"{m.path}:{m.line} {m.kind}: {' -> '.join(m.diff(sources[m.path]))}" for m in chosen}
+            if options.list:
+                print(*changes.values(), sep="\n")
+                continue
+            old = stored().get(package, {}).get("outcomes", {})
+            outcomes = {m.key: old[m.key] for m in chosen if m.key in old}
+            open_ = [m for m in chosen if m.key not in old or (options.again and old[m.key] == "survived")]
+            for mutant, outcome, seconds in judged(copy, open_):
+                outcomes[mutant.key] = outcome
+                print(f"{outcome:8} {seconds:5.1f} s {changes[mutant]}", flush=True)
+                store(package, len(every), chosen, outcomes)
+            print(package, store(package, len(every), chosen, outcomes), flush=True)
 
 
 if __name__ == "__main__":
