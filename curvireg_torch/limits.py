@@ -1,6 +1,24 @@
-"""How much of a file is read, in one place: files are others' and may be made to harm."""
+"""How much of a file is read, in one place: files are others' and may be made to harm.
 
-__all__ = ["MAX_IMAGE_BYTES", "MAX_IMAGE_PIXELS", "MAX_IMAGE_SCANS", "MAX_POLYGON_CORNERS"]
+A file beyond a limit ends in an error that names it; nothing is cut in silence. Readers use no network and open no file
+but the one named and, for glTF, buffers in its folder.
+"""
+
+__all__ = [
+    "MAX_IMAGE_BYTES",
+    "MAX_IMAGE_PIXELS",
+    "MAX_IMAGE_SCANS",
+    "MAX_MAT_BYTES",
+    "MAX_MAT_DEPTH",
+    "MAX_MAT_UNPACKED_BYTES",
+    "MAX_MESH_BYTES",
+    "MAX_MESH_COORDINATE",
+    "MAX_MESH_DEPTH",
+    "MAX_MESH_FACES",
+    "MAX_MESH_PARTS",
+    "MAX_POLYGON_CORNERS",
+    "MAX_TABLE_BYTES",
+]
 
 MAX_IMAGE_BYTES = 1 << 28
 """Bytes of a photograph's file."""
@@ -11,5 +29,32 @@ MAX_IMAGE_PIXELS = 1 << 27
 MAX_IMAGE_SCANS = 64
 """Passes over the picture in a progressive JPEG; encoders make about ten, and each takes as long as the picture."""
 
+MAX_MESH_BYTES = 1 << 29
+"""Bytes of a mesh file, and of all the buffers of a glTF file together."""
+
+MAX_MESH_FACES = 10_000_000
+"""Triangles of a mesh, every placed copy of a part counted."""
+
+MAX_MESH_COORDINATE = 1e12
+"""Distance of a vertex from the origin along an axis, in the file's unit; squares and products stay finite."""
+
+MAX_MESH_PARTS = 10_000
+"""Placed parts of a glTF scene."""
+
+MAX_MESH_DEPTH = 200
+"""Nodes from the root of a glTF scene to a part."""
+
 MAX_POLYGON_CORNERS = 2000
 """Corners of one face that is not convex; dividing it into triangles takes time with their square."""
+
+MAX_TABLE_BYTES = 1 << 26
+"""Bytes of a JSON or CSV file."""
+
+MAX_MAT_BYTES = 1 << 24
+"""Bytes of a MATLAB annotation file."""
+
+MAX_MAT_UNPACKED_BYTES = 1 << 26
+"""Bytes that all of its compressed variables unpack to."""
+
+MAX_MAT_DEPTH = 16
+"""Structs within structs of a MATLAB annotation file."""

@@ -14,16 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidInputError
+from ..limits import MAX_MAT_BYTES, MAX_MAT_DEPTH, MAX_MAT_UNPACKED_BYTES
 
 __all__ = ["MatStruct", "MatValue", "read_mat"]
 
 MatStruct = dict[str, "MatValue"]
 MatValue = list[MatStruct] | str | NDArray[np.float64] | None
 """A struct array, a text, real numbers in MATLAB's column order, or None for what is not read."""
-
-MAX_FILE_BYTES = 1 << 24
-MAX_UNPACKED_BYTES = 1 << 26
-MAX_DEPTH = 16
 
 _MATRIX, _COMPRESSED, _INT32, _UINT32 = 14, 15, 5, 6
 _STRUCT, _CHAR, _NUMERIC = 2, 4, range(6, 16)
@@ -38,8 +35,8 @@ def read_mat(path: Path, variable: str) -> MatValue:
         InvalidInputError: the file is unreadable, too large, too deep, of another format, or lacks the variable.
     """
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise InvalidInputError(f"{path}: larger than {MAX_FILE_BYTES} bytes, no annotation")
+        if path.stat().st_size > MAX_MAT_BYTES:
+            raise InvalidInputError(f"{path}: larger than {MAX_MAT_BYTES} bytes, no annotation")
         data = path.read_bytes()
         order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
         if order is None or data[124:126] not in (b"\x00\x01", b"\x01\x00"):
@@ -52,17 +49,18 @@ def read_mat(path: Path, variable: str) -> MatValue:
 
 
 def _find(data: bytes, variable: str, order: str) -> MatValue:
-    position = 0
+    position, left = 0, MAX_MAT_UNPACKED_BYTES
     while position + 8 <= len(data):
         kind, body, position = _element(data, position, order, padded=False)
         if kind == _COMPRESSED:
             stream = zlib.decompressobj()
-            unpacked = stream.decompress(body, MAX_UNPACKED_BYTES)
-            if not stream.eof:
-                raise InvalidInputError(f"truncated, or unpacks to more than {MAX_UNPACKED_BYTES} bytes")
+            unpacked = stream.decompress(body, left)
+            left -= len(unpacked)
+            if not stream.eof or left <= 0:
+                raise InvalidInputError(f"truncated, or unpacks to more than {MAX_MAT_UNPACKED_BYTES} bytes")
             kind, body, _ = _element(unpacked, 0, order)
         if kind == _MATRIX:
-            name, value = _matrix(body, order, MAX_DEPTH, wanted=variable)
+            name, value = _matrix(body, order, MAX_MAT_DEPTH, wanted=variable)
             if name == variable:
                 return value
     raise InvalidInputError(f"holds no variable {variable!r}")
@@ -89,7 +87,7 @@ def _matrix(body: bytes, order: str, depth: int, wanted: str | None = None) -> t
     if not body:
         return "", np.empty(0)
     if depth == 0:
-        raise InvalidInputError(f"nested more than {MAX_DEPTH} deep")
+        raise InvalidInputError(f"nested more than {MAX_MAT_DEPTH} deep")
     kind, flags, position = _element(body, 0, order)
     if kind != _UINT32 or len(flags) < 4:
         raise InvalidInputError("array without flags")

@@ -13,7 +13,7 @@ from torch import Tensor
 from .._checks import check_tensor
 from .._files import write_file
 from ..errors import InvalidInputError, MissingFileError
-from ._json import finite_numbers
+from ._json import check_table_size, finite_numbers
 
 __all__ = ["BOPRow", "read_bop_csv", "write_bop_csv"]
 
@@ -103,6 +103,7 @@ def read_bop_csv(path: str | os.PathLike[str]) -> list[BOPRow]:
     path = Path(path)
     if not path.is_file():
         raise MissingFileError(f"{path}: no such file; write_bop_csv makes one")
+    check_table_size(path)
     rows: list[BOPRow] = []
     times: dict[tuple[int, int], float] = {}
     try:

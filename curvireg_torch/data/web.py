@@ -10,6 +10,7 @@ import torch
 from ..errors import InvalidInputError, MissingFileError
 from ..geometry import rotation_from_viewpoint
 from ._base import ObjectDataset, Sample, Transform, existing_root, is_plain_name
+from ._json import check_table_size
 
 __all__ = ["WebCollection"]
 
@@ -69,6 +70,7 @@ class WebCollection(ObjectDataset):
         table = folder / "views.csv"
         if not table.is_file():
             return self._skip("missing_annotation", f"{folder.name}/views.csv")
+        check_table_size(table)
         try:
             with open(table, newline="", encoding="utf-8-sig") as file:
                 lines = [[cell.strip() for cell in line] for line in csv.reader(file) if line]

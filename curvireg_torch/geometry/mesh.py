@@ -1,6 +1,7 @@
 """Mesh files to one cleaned ``trimesh.Trimesh``, and a normalised model frame."""
 
 import logging
+import urllib.parse
 import warnings
 from io import BytesIO
 from os import PathLike
@@ -14,6 +15,8 @@ from torch import Tensor
 
 from .._checks import check_option
 from ..errors import MeshError, MissingFileError
+from ..limits import MAX_MESH_BYTES, MAX_MESH_COORDINATE, MAX_MESH_FACES
+from .gltf import check_gltf
 from .polygon_files import with_triangles
 from .up import UP_AXES, format_up, mesh_up
 
@@ -52,7 +55,8 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
 
     Raises:
         MissingFileError: no such file.
-        MeshError: unreadable, empty, without faces, or with NaN or infinite vertices.
+        MeshError: unreadable, empty, without faces, with NaN or infinite vertices, or beyond
+            :mod:`curvireg_torch.limits`.
     """
     check_option(unit, UNITS, "unit")
     path = Path(path)
@@ -62,27 +66,7 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
         raise MissingFileError(f"{path}: no such mesh file")
     if path.suffix.lower() not in SUFFIXES:
         raise MeshError(f"{path}: expected a mesh file ({', '.join(SUFFIXES)}); convert it first")
-    logger = logging.getLogger("trimesh")
-    level = logger.level
-    try:
-        logger.setLevel(logging.CRITICAL)  # its tracebacks of files that it cannot read
-        data, suffix = path.read_bytes(), path.suffix.lower()
-        if suffix in (".obj", ".off", ".ply"):
-            data = with_triangles(data, suffix)
-        loaded = trimesh.load(
-            BytesIO(data),
-            file_type=suffix[1:],
-            resolver=trimesh.resolvers.FilePathResolver(path),
-            process=False,
-            skip_materials=True,
-        )
-    except Exception as error:
-        raise MeshError(
-            f"{path}: cannot be read as a mesh ({type(error).__name__}: {error}); re-export the file"
-        ) from error
-    finally:
-        logger.setLevel(level)
-    mesh = as_mesh(loaded, name=str(path))
+    mesh = as_mesh(_load(path), name=str(path))
     mesh.units = unit
     mesh.metadata.update(file_name=path.name, up=up)
     size = float(np.linalg.norm(mesh.extents)) * UNITS[unit]
@@ -94,22 +78,85 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
     return mesh
 
 
+def _load(path: Path) -> Any:
+    """What trimesh makes of a file that was found in order."""
+    suffix, folder = path.suffix.lower(), _Folder(path)
+    logger = logging.getLogger("trimesh")
+    level = logger.level
+    try:
+        logger.setLevel(logging.CRITICAL)  # its tracebacks of files that it cannot read
+        if path.stat().st_size > MAX_MESH_BYTES:
+            raise ValueError(f"larger than {MAX_MESH_BYTES:,} bytes")
+        data = path.read_bytes()
+        if suffix in (".obj", ".off", ".ply"):
+            data = with_triangles(data, suffix)
+        elif suffix in (".glb", ".gltf"):
+            check_gltf(data, suffix, folder.size)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # numpy's, of numbers that the checks in as_mesh find
+            return trimesh.load(
+                BytesIO(data), file_type=suffix[1:], resolver=folder, process=False, skip_materials=True
+            )
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".removeprefix("ValueError: ").split())[:300]
+        raise MeshError(f"{path}: cannot be read as a mesh ({reason}); re-export the file") from error
+    finally:
+        logger.setLevel(level)
+
+
+class _Folder(trimesh.resolvers.Resolver):  # type: ignore[misc]
+    """Files beside a mesh, which it may name; no others, and nothing from the network."""
+
+    def __init__(self, path: Path) -> None:
+        self.folder, self.file_name = path.parent.resolve(), path.name
+
+    def _path(self, name: str) -> Path:
+        path = (self.folder / urllib.parse.unquote(name)).resolve()
+        if "://" in name or not path.is_relative_to(self.folder) or not path.is_file():
+            raise ValueError(f"it names {name[:100]!r}, which is no file of its folder")
+        return path
+
+    def size(self, name: str) -> int:
+        return self._path(name).stat().st_size
+
+    def get(self, key: str) -> bytes:
+        return self._path(key).read_bytes()
+
+    def keys(self) -> list[str]:
+        return []
+
+    def write(self, name: str, data: Any) -> None:
+        raise NotImplementedError
+
+    def namespaced(self, namespace: str) -> "_Folder":
+        raise NotImplementedError
+
+
 def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
     """One clean mesh from a path, a ``trimesh.Trimesh`` or a ``trimesh.Scene``; errors as :func:`load_mesh`."""
     if isinstance(source, str | PathLike):
         return load_mesh(source)
     if isinstance(source, trimesh.Scene):
-        parts = [part for part in source.dump() if isinstance(part, trimesh.Trimesh)]
+        try:
+            parts = [part for part in source.dump() if isinstance(part, trimesh.Trimesh)]
+        except Exception as error:  # transforms that are none, parts that hang on nothing
+            raise MeshError(f"{name}: its parts cannot be placed ({error}); re-export the file") from error
         source = trimesh.util.concatenate(parts) if parts else None
     if not isinstance(source, trimesh.Trimesh) or len(source.faces) == 0:
         raise MeshError(f"{name}: expected a mesh with faces, got none; point clouds and curves cannot be rendered")
+    if len(source.faces) > MAX_MESH_FACES:
+        raise MeshError(f"{name}: {len(source.faces):,} faces, more than {MAX_MESH_FACES:,}; simplify it")
     vertices, faces = np.asarray(source.vertices, dtype=np.float64), np.asarray(source.faces, dtype=np.int64)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise MeshError(f"{name}: expected vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError(f"{name}: faces name vertices that do not exist; the file is damaged, re-export it")
     used = vertices[faces]
     if not np.isfinite(used).all():
         broken = int((~np.isfinite(used).all(axis=(1, 2))).sum())
         raise MeshError(f"{name}: {broken} faces have NaN or infinite vertices; repair the mesh")
+    if float(np.abs(used).max()) > MAX_MESH_COORDINATE:
+        raise MeshError(f"{name}: vertices farther than {MAX_MESH_COORDINATE:g} from the origin; repair the mesh")
     area = np.linalg.norm(np.cross(used[:, 1] - used[:, 0], used[:, 2] - used[:, 0]), axis=1)
     if not (area > 0).any():
         raise MeshError(f"{name}: every face is degenerate (area 0); repair the mesh")

@@ -143,7 +143,7 @@ class LearnedCurvilinearSaliency(nn.Module):
     def _answer(self, image: Tensor) -> Tensor:
         check_colour_image(image)
         H, W = image.shape[-2:]
-        zoom = WORK_SIZE / min(H, W)
+        zoom = min(WORK_SIZE / min(H, W), 8 * WORK_SIZE / max(H, W))  # slivers do not become wide pictures
         size = [max(1, round(side * zoom / _STRIDE)) * _STRIDE for side in (H, W)]
         x = image.to(self.network.head.weight.dtype).expand(-1, 3, -1, -1)
         if size != [H, W]:

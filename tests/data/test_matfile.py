@@ -110,10 +110,10 @@ def test_false_claims_are_errors(tmp_path, content, message):
 def test_unpacking_is_bounded(tmp_path, monkeypatch):
     scipy.io.savemat(tmp_path / "a.mat", {"record": np.zeros((1000, 100))}, do_compression=True)
     assert read_mat(tmp_path / "a.mat", "record").size == 100000
-    monkeypatch.setattr(_matfile, "MAX_UNPACKED_BYTES", 100000)
+    monkeypatch.setattr(_matfile, "MAX_MAT_UNPACKED_BYTES", 100000)
     with pytest.raises(InvalidInputError, match="unpacks to more"):
         read_mat(tmp_path / "a.mat", "record")
-    monkeypatch.setattr(_matfile, "MAX_FILE_BYTES", 100)
+    monkeypatch.setattr(_matfile, "MAX_MAT_BYTES", 100)
     with pytest.raises(InvalidInputError, match="larger"):
         read_mat(tmp_path / "a.mat", "record")
 

@@ -1,0 +1,380 @@
+"""What scripts/fuzz.py throws at the readers: valid files, broken in ways that know their structure."""
+
+import json
+import math
+import re
+import struct
+import tempfile
+import zlib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import scipy.io
+import torch
+import trimesh
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import strategies as st
+from safetensors.torch import save
+
+import curvireg_torch as cr
+from curvireg_torch.data import BOPDataset, WebCollection, read_bop_csv, read_photo
+from curvireg_torch.data._matfile import read_mat
+from curvireg_torch.errors import CurviregError
+from curvireg_torch.geometry import camera_matrix, crop_images, place_view, square_boxes, translation_from_box
+from curvireg_torch.geometry.crops import check_boxes
+from curvireg_torch.geometry.mesh import extreme_points
+from curvireg_torch.matching.query import crop_regions, slack_boxes
+from curvireg_torch.synthetic import example_mesh
+
+__all__ = ["KINDS", "attack"]
+
+NUMBERS = [0, 1, -1, 2, 255, 65535, 2**31 - 1, -(2**31), 2**32 - 1, 10**9, 10**18, 0.5, 1e308, math.nan, math.inf]
+WORDS = b" -1 0 1 nan inf 1e999 99999999999 4294967295 1000000000 x -0 3.5".split(b" ")
+
+
+def mutated(data: bytes, rng: np.random.Generator, other: bytes) -> bytes:
+    """``data`` with one to four faults, mostly one: bits, numbers, pieces missing, doubled or foreign, no end."""
+    out = bytearray(data)
+    for _ in range(min(4, int(rng.geometric(0.6)))):
+        n = len(out)
+        if n < 8:
+            break
+        # Headers are short and decide: half of the faults go there.
+        place = int(rng.integers(0, min(n, 400) if rng.random() < 0.5 else n))
+        stop = min(n, place + int(rng.geometric(0.05)))
+        match int(rng.integers(0, 8)):
+            case 0:
+                out[place] ^= 1 << int(rng.integers(0, 8))
+            case 1:
+                out[place] = int(rng.choice([0, 1, 127, 128, 255]))
+            case 2:
+                value = int(rng.choice([0, 1, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0x3B9ACA00]))
+                out[place : place + 4] = struct.pack("<>"[int(rng.integers(2))] + "I", value)
+            case 3:
+                del out[place:stop]
+            case 4:
+                out[place:place] = out[place:stop] * int(rng.integers(1, 4))
+            case 5:
+                start = int(rng.integers(0, max(1, len(other))))
+                out[place:stop] = other[start : start + stop - place]
+            case 6:
+                del out[place:]
+            case 7:
+                found = list(re.finditer(rb"-?\d+(?:\.\d+)?", bytes(out[place : place + 200])))
+                if found:
+                    chosen = found[int(rng.integers(len(found)))]
+                    out[place + chosen.start() : place + chosen.end()] = WORDS[int(rng.integers(len(WORDS)))]
+    return bytes(out)
+
+
+def mutated_json(tree: Any, rng: np.random.Generator) -> Any:
+    """``tree`` with one to three values replaced, missing, doubled or nested."""
+    tree = json.loads(json.dumps(tree))
+    for _ in range(min(3, int(rng.geometric(0.6)))):
+        places: list[tuple[Any, Any]] = []
+        ahead = [tree]
+        while ahead:
+            node = ahead.pop()
+            keys = list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else []
+            places += [(node, key) for key in keys]
+            ahead += [node[key] for key in keys]
+        if not places:
+            break
+        node, key = places[int(rng.integers(len(places)))]
+        match int(rng.integers(0, 6)):
+            case 0 | 1:
+                node[key] = NUMBERS[int(rng.integers(len(NUMBERS)))]
+            case 2:
+                node[key] = [None, "", "x" * 300, [], {}, True, "data:,", "../a", "http://a/b"][int(rng.integers(9))]
+            case 3:
+                node.pop(key)
+            case 4:
+                node[key] = [node[key]] * int(rng.integers(1, 50))
+            case 5:
+                inner: Any = node[key]
+                for _ in range(int(rng.choice([1, 50, 3000]))):
+                    inner = [inner]
+                node[key] = inner
+    return tree
+
+
+def dumped(tree: Any) -> bytes:
+    try:
+        return json.dumps(tree).encode()
+    except RecursionError:
+        return b"[" * 100_000
+
+
+@cache
+def images() -> dict[str, list[bytes]]:
+    rng = np.random.default_rng(0)
+    found: dict[str, list[bytes]] = {}
+    for suffix in (".jpg", ".png", ".webp", ".tiff", ".bmp", ".ppm"):
+        for shape in ((24, 31, 3), (17, 9), (8, 8, 4)):
+            if (suffix == ".ppm" and shape != (24, 31, 3)) or (suffix == ".jpg" and len(shape) > 2 and shape[2] == 4):
+                continue
+            for dtype in (np.uint8, np.uint16) if suffix in (".png", ".tiff") else (np.uint8,):
+                pixels = rng.integers(0, np.iinfo(dtype).max, shape).astype(dtype)
+                flags = [cv2.IMWRITE_JPEG_PROGRESSIVE, len(shape) - 2] if suffix == ".jpg" else []
+                found.setdefault(suffix, []).append(cv2.imencode(suffix, pixels, flags)[1].tobytes())
+    block = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    jpeg = found[".jpg"][0]
+    body = b"Exif\0\0" + block
+    found[".jpg"].append(jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:])
+    return found
+
+
+def image(rng: np.random.Generator, folder: Path) -> None:
+    seeds = images()
+    suffix = list(seeds)[int(rng.integers(len(seeds)))]
+    data, other = (seeds[suffix][int(rng.integers(len(seeds[suffix])))] for _ in range(2))
+    broken = mutated(data, rng, other)
+    if suffix == ".png" and rng.random() < 0.7:
+        broken = _with_checksums(broken)
+    path = folder / f"a{suffix}"
+    path.write_bytes(broken)
+    photo = read_photo(path, dtype=torch.float32 if rng.random() < 0.5 else torch.uint8)
+    assert photo.image.shape[0] == 3
+    assert bool((photo.image >= 0).all())
+    assert photo.image.dtype == torch.uint8 or bool((photo.image <= 1).all())
+    photo.guessed_camera_matrix()
+    json.dumps(photo.facts(), allow_nan=False)
+
+
+def _with_checksums(data: bytes) -> bytes:
+    out, position = bytearray(data[:8]), 8
+    while position + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, position)
+        body = data[position + 4 : position + 8 + length]
+        out += data[position : position + 4] + body + struct.pack(">I", zlib.crc32(body))
+        position += 12 + length
+    return bytes(out) + data[position:]
+
+
+@cache
+def meshes() -> dict[str, list[bytes]]:
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    textured = box.copy()
+    textured.visual = trimesh.visual.TextureVisuals(uv=np.random.default_rng(0).random((8, 2)))
+    scene = trimesh.Scene()
+    scene.add_geometry(box, node_name="a")
+    scene.add_geometry(trimesh.creation.icosphere(0, 0.1), node_name="b", parent_node_name="a")
+    pentagon = b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv .2 .2 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1 4/1 5/1\nf -1 -2 -3\n"
+    found = {".obj": [*(m.export(file_type="obj", include_texture=False) for m in (box, textured)), pentagon]}
+    pentagon = b"OFF\n5 1 0\n0 0 0\n1 0 0\n1 1 0\n.2 .2 0\n0 1 0\n5 0 1 2 3 4\n"
+    found[".off"] = [box.export(file_type="off"), pentagon]
+    head = b"element vertex 5\nproperty float x\nproperty float y\nproperty float z\nelement face 1\n"
+    head += b"property list uchar int vertex_indices\nend_header\n"
+    points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0.2, 0.2, 0), (0, 1, 0)]
+    packed = b"".join(struct.pack("<3f", *p) for p in points) + struct.pack("<B5i", 5, 0, 1, 2, 3, 4)
+    text = "".join(f"{x:g} {y:g} {z:g}\n" for x, y, z in points).encode() + b"5 0 1 2 3 4\n"
+    found[".ply"] = [
+        box.export(file_type="ply"),
+        box.export(file_type="ply", encoding="ascii"),
+        b"ply\nformat binary_little_endian 1.0\n" + head + packed,
+        b"ply\nformat ascii 1.0\n" + head + text,
+    ]
+    found[".stl"] = [box.export(file_type="stl"), box.export(file_type="stl_ascii").encode()]
+    found[".glb"] = [scene.export(file_type="glb")]
+    found[".gltf"] = [_one_file(scene)]
+    return {suffix: [d if isinstance(d, bytes) else d.encode() for d in some] for suffix, some in found.items()}
+
+
+def _one_file(scene: trimesh.Scene) -> bytes:
+    parts = trimesh.exchange.gltf.export_gltf(scene, embed_buffers=True)
+    return bytes(parts["model.gltf"])
+
+
+def mesh(rng: np.random.Generator, folder: Path) -> None:
+    seeds = meshes()
+    suffix = list(seeds)[int(rng.integers(len(seeds)))]
+    data, other = (seeds[suffix][int(rng.integers(len(seeds[suffix])))] for _ in range(2))
+    if suffix == ".gltf" and rng.random() < 0.8:
+        broken = dumped(mutated_json(json.loads(data), rng))
+    elif suffix == ".glb" and rng.random() < 0.8:
+        (length,) = struct.unpack_from("<I", data, 12)
+        text = dumped(mutated_json(json.loads(data[20 : 20 + length]), rng))
+        text += b" " * (-len(text) % 4)
+        rest = data[20 + length :]
+        broken = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
+    else:
+        broken = mutated(data, rng, other)
+    path = folder / f"a{suffix}"
+    path.write_bytes(broken)
+    loaded = cr.load_mesh(path)
+    assert np.isfinite(loaded.vertices).all()
+    assert loaded.faces.min() >= 0
+    assert loaded.faces.max() < len(loaded.vertices)
+
+
+@cache
+def mat_files() -> list[bytes]:
+    found = []
+    folder = Path(tempfile.mkdtemp())
+    for compressed in (False, True):
+        view = {"azimuth": 30.0, "elevation": 10.0, "distance": 4.0, "px": 41.0, "name": "ü"}
+        objects = np.array([("car", np.array([1.0, 2, 30, 40]), view)] * 2, [("class", "O"), ("bbox", "O"), ("v", "O")])
+        deep: Any = 1.0
+        for _ in range(12):
+            deep = {"a": deep}
+        scipy.io.savemat(folder / "a.mat", {"record": {"objects": objects, "d": deep}}, do_compression=compressed)
+        found.append((folder / "a.mat").read_bytes())
+    return found
+
+
+def mat(rng: np.random.Generator, folder: Path) -> None:
+    seeds = mat_files()
+    which = int(rng.random() < 0.2)
+    broken = mutated(seeds[which], rng, seeds[0])
+    if which == 0 and rng.random() < 0.3 and len(broken) > 136:  # a compressed variable of broken content
+        body = zlib.compress(broken[128:])
+        broken = broken[:128] + struct.pack("<II", 15, len(body)) + body
+    (folder / "a.mat").write_bytes(broken)
+    read_mat(folder / "a.mat", "record")
+
+
+def tables(rng: np.random.Generator, folder: Path) -> None:
+    """JSON of a BOP set, a results file and a web collection."""
+    K, R = [300.0, 0, 40, 0, 300, 30, 0, 0, 1], [1.0, 0, 0, 0, 1, 0, 0, 0, 1]
+    trees: dict[str, Any] = {
+        "test/000001/scene_gt.json": {"0": [{"cam_R_m2c": R, "cam_t_m2c": [1.0, 2, 400], "obj_id": 1}]},
+        "test/000001/scene_camera.json": {"0": {"cam_K": K, "depth_scale": 1.0}},
+        "test/000001/scene_gt_info.json": {
+            "0": [{"bbox_obj": [1, 2, 30, 20], "bbox_visib": [1, 2, 3, 4], "visib_fract": 0.5}]
+        },
+        "models/models_info.json": {"1": {"diameter": 86.6}},
+        "camera.json": {"fx": 300.0},
+        "test_targets_bop19.json": [{"scene_id": 1, "im_id": 0, "obj_id": 1, "inst_count": 1}],
+    }
+    broken = list(trees)[int(rng.integers(len(trees)))]
+    for name, tree in trees.items():
+        path = folder / "bop" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        data = dumped(mutated_json(tree, rng) if name == broken else tree)
+        path.write_bytes(mutated(data, rng, data) if name == broken and rng.random() < 0.3 else data)
+    for name in ("test/000001/rgb/000000.png", "models/obj_000001.ply"):
+        (folder / "bop" / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / "bop" / name).write_bytes(b"")
+    line = b"1,2,3,0.5,1 0 0 0 1 0 0 0 1,1 2 3,-1\n"
+    rows = b"scene_id,im_id,obj_id,score,R,t,time\n" + line * 3
+    (folder / "a.csv").write_bytes(mutated(rows, rng, rows))
+    (folder / "web" / "cup").mkdir(parents=True, exist_ok=True)
+    for name in ("mesh.off", "0.jpg"):
+        (folder / "web" / "cup" / name).write_bytes(b"")
+    views = b"image,x0,y0,x1,y1,azimuth,elevation,theta,distance\n" + b"0.jpg,10,5,70,55,30,10,-5,3\n" * 2
+    (folder / "web" / "cup" / "views.csv").write_bytes(mutated(views, rng, views))
+    for read in (
+        lambda: [BOPDataset(folder / "bop").annotation(0)],
+        lambda: read_bop_csv(folder / "a.csv"),
+        lambda: WebCollection(folder / "web").annotation(0),
+    ):
+        try:
+            read()
+        except (CurviregError, IndexError) as error:
+            if isinstance(error, IndexError) and "list index" not in str(error):
+                raise  # the set may be empty
+
+
+@cache
+def bank_bytes() -> bytes:
+    views = cr.sample_views(azimuth_step=180, elevations=[20])
+    bank = cr.ViewBank.build(example_mesh(), views, image_size=32, progress=False)
+    path = Path(tempfile.mkdtemp()) / "a.safetensors"
+    bank.save(path)
+    return path.read_bytes()
+
+
+def bank(rng: np.random.Generator, folder: Path) -> None:
+    data = bank_bytes()
+    (length,) = struct.unpack_from("<Q", data)
+    broken = mutated(data, rng, data)
+    if rng.random() < 0.6:
+        header = dumped(mutated_json(json.loads(data[8 : 8 + length]), rng))
+        broken = struct.pack("<Q", len(header)) + header + data[8 + length :]
+    elif rng.random() < 0.1:
+        broken = save({"descriptors": torch.zeros(2, 3)}, {"format": "curvireg_torch.ViewBank"})
+    (folder / "a.safetensors").write_bytes(broken)
+    loaded = cr.ViewBank.load(folder / "a.safetensors")
+    assert len(loaded) == len(loaded.descriptors) == len(loaded.points)
+
+
+_VALUES = st.floats(width=32) | st.sampled_from([-0.5, 0.0, 1e-30, 63.5, 47.5, 1e9, -1e9, 1e30, math.nan])
+_IMAGE = torch.linspace(0, 1, 3 * 48 * 64).view(3, 48, 64)
+
+
+def _box(values: list[float], sides: tuple[int, int], margin: float) -> None:
+    box, image = torch.tensor([values]), _IMAGE[:, : sides[0], : sides[1]]
+    crops, A = crop_images([image], box, size=16, margin=abs(margin) % 4)
+    assert bool(crops.isfinite().all())
+    assert bool(A.isfinite().all())
+    assert bool((crops >= -1e-3).all() and (crops <= 1.001).all())
+    regions = crop_regions([image], slack_boxes(box, 0.1), size=16, margin=0.1)
+    assert bool(regions.isfinite().all())
+    square_boxes(box, 0.1)
+
+
+def _camera(values: list[float], box: list[float]) -> None:
+    K = camera_matrix(*values, dtype=torch.float64)
+    corners = extreme_points(trimesh.creation.box((0.1, 0.2, 0.3)))
+    boxes = torch.tensor(box, dtype=torch.float64)
+    check_boxes(boxes[None], [(48, 64)])
+    R, t = place_view(corners, torch.eye(3, dtype=torch.float64), boxes, K)
+    assert bool(R.isfinite().all() and t.isfinite().all())
+    assert bool(translation_from_box(corners, torch.eye(3, dtype=torch.float64), boxes, K).isfinite().all())
+
+
+def _by_hypothesis(check: Callable[..., None], *strategies: Any) -> Callable[[int, int], int]:
+    """Runs ``count`` examples that hypothesis finds from ``number``; returns how many it had."""
+
+    def run(number: int, count: int) -> int:
+        tried = 0
+
+        @seed(number)
+        @settings(
+            max_examples=count, database=None, deadline=None, phases=[Phase.generate, Phase.shrink],
+            suppress_health_check=list(HealthCheck),
+        )  # fmt: skip
+        @given(st.tuples(*strategies))
+        def examples(values: tuple[Any, ...]) -> None:
+            nonlocal tried
+            tried += 1
+            try:
+                check(*values)
+            except CurviregError:
+                return
+
+        examples()
+        return tried
+
+    return run
+
+
+_four = st.lists(_VALUES, min_size=4, max_size=4)
+_plain = st.tuples(st.floats(-5, 60), st.floats(-5, 45), st.floats(0.01, 200), st.floats(0.01, 200))
+_boxes = _four | _plain.map(lambda b: [b[0], b[1], b[0] + b[2], b[1] + b[3]])
+KINDS: dict[str, Any] = {
+    "images": image,
+    "meshes": mesh,
+    "mat": mat,
+    "tables": tables,
+    "banks": bank,
+    "boxes": _by_hypothesis(_box, _boxes, st.tuples(st.integers(1, 48), st.integers(1, 64)), _VALUES),
+    "cameras": _by_hypothesis(_camera, _four, _boxes),
+}
+"""Name: what throws one input at a reader, ``(generator, folder)``; for boxes and cameras ``(seed, count)``."""
+
+
+def attack(kind: str, number: int, folder: Path) -> str:
+    """Input ``number`` of ``kind``: the name of what came of it; anything but a result or our error is raised."""
+    try:
+        KINDS[kind](np.random.default_rng([number, list(KINDS).index(kind)]), folder)
+    except CurviregError as error:
+        text = str(error)
+        assert text, "an error without a message"
+        assert len(text.splitlines()) == 1, f"a message of several lines: {text!r}"
+        return type(error).__name__
+    return "result"

@@ -1,0 +1,166 @@
+"""Mesh files made to harm end in one line of ours, soon and in little memory."""
+
+import base64
+import json
+import struct
+import time
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import curvireg_torch as cr
+from curvireg_torch import limits
+from curvireg_torch.errors import MeshError
+from curvireg_torch.geometry import gltf
+from curvireg_torch.geometry import mesh as mesh_module
+
+POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
+
+
+def tree(**changes: Any) -> dict[str, Any]:
+    """A triangle as glTF."""
+    whole = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "buffers": [{"byteLength": 36, "uri": "data:;base64," + base64.b64encode(POINTS).decode()}],
+    }
+    return {**whole, **changes}
+
+
+def glb(content: dict[str, Any]) -> bytes:
+    text = json.dumps({**content, "buffers": [{"byteLength": 36}]}).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", 36, b"BIN\0") + POINTS
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def refused(path: Path, content: bytes, match: str, *, seconds: float = 5.0, megabytes: float = 100.0) -> None:
+    path.write_bytes(content)
+    tracemalloc.start()
+    start = time.perf_counter()
+    with pytest.raises(MeshError, match=match) as caught:
+        cr.load_mesh(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert time.perf_counter() - start < seconds
+    assert peak < megabytes * 1e6
+    assert len(str(caught.value).splitlines()) == 1
+    assert path.name in str(caught.value)
+
+
+def test_the_triangle_itself_is_read(tmp_path: Path) -> None:
+    (tmp_path / "a.gltf").write_text(json.dumps(tree()))
+    (tmp_path / "a.glb").write_bytes(glb(tree()))
+    assert cr.load_mesh(tmp_path / "a.gltf").area == cr.load_mesh(tmp_path / "a.glb").area == 0.5
+
+
+CHAIN = [{"children": [i + 1]} for i in range(1000)] + [{"mesh": 0}]
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]}, "circle"),
+        ({"nodes": [{"children": [0], "mesh": 0}]}, "circle"),
+        ({"nodes": [{"children": [1, 1]}, {"mesh": 0}]}, "child of several"),
+        ({"nodes": [{"children": [7], "mesh": 0}]}, "missing"),
+        ({"nodes": CHAIN}, "200 deep"),
+        ({"nodes": [{"mesh": 0}] * 20_000}, "10,000 parts"),
+        ({"accessors": [{"componentType": 5126, "count": 10**9, "type": "VEC3"}]}, "1000000000 values"),
+        ({"accessors": [{"bufferView": 0, "componentType": 5126, "count": 10**6, "type": "VEC3"}]}, "view holds"),
+        ({"accessors": [{"bufferView": 0, "componentType": 5126, "count": -3, "type": "VEC3"}]}, "-3"),
+        ({"bufferViews": [{"buffer": 0, "byteLength": 10**12}]}, "beyond its buffer"),
+        ({"buffers": [{"byteLength": 10**12, "uri": "data:;base64,AAAA"}]}, "claims 1000000000000 bytes"),
+        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "KHR_draco_mesh_compression.*export without it"),
+        ({"extensionsRequired": ["EXT_meshopt_compression"]}, "EXT_meshopt_compression"),
+        ({"asset": {"version": "1.0"}}, "version 2"),
+        ({"meshes": 5}, "valid glTF"),
+    ],
+)
+def test_gltf_that_claims_or_asks_too_much(tmp_path: Path, changes: dict[str, Any], match: str) -> None:
+    refused(tmp_path / "a.gltf", json.dumps(tree(**changes)).encode(), match)
+    if "buffers" not in changes:
+        refused(tmp_path / "a.glb", glb(tree(**changes)), match)
+
+
+def test_copies_of_a_part_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gltf, "MAX_MESH_FACES", 100)
+    refused(tmp_path / "a.gltf", json.dumps(tree(nodes=[{"mesh": 0}] * 200)).encode(), "more than 100 faces")
+
+
+def test_deep_json(tmp_path: Path) -> None:
+    refused(tmp_path / "a.gltf", b'{"asset": ' + b"[" * 1_000_000, "JSON is damaged")
+
+
+FOREIGN = [
+    "../b.bin",
+    "/etc/passwd",
+    "file:///etc/passwd",
+    "http://127.0.0.1:9/b.bin",
+    "%2e%2e/b.bin",
+    "link.bin",
+    "no.bin",
+]
+
+
+@pytest.mark.parametrize("uri", FOREIGN)
+def test_files_outside_the_folder_are_not_opened(tmp_path: Path, uri: str) -> None:
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    (tmp_path / "b.bin").write_bytes(POINTS)
+    (folder / "link.bin").symlink_to(tmp_path / "b.bin")
+    content = tree(buffers=[{"byteLength": 36, "uri": uri}])
+    refused(folder / "a.gltf", json.dumps(content).encode(), "no file of its folder")
+
+
+def test_files_of_the_folder_are(tmp_path: Path) -> None:
+    (tmp_path / "b c.bin").write_bytes(POINTS)
+    (tmp_path / "a.gltf").write_text(json.dumps(tree(buffers=[{"byteLength": 36, "uri": "b%20c.bin"}])))
+    assert cr.load_mesh(tmp_path / "a.gltf").area == 0.5
+
+
+def test_an_obj_names_materials_that_are_not_opened(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("mtllib ../../secret.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl x\nf 1 2 3\n")
+    assert cr.load_mesh(tmp_path / "a.obj").area == 0.5
+
+
+AXES = b"".join(b"property float %c\n" % axis for axis in b"xyz")
+PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"element face 1000000000\n"
+PLY += b"property list uchar int vertex_indices\nend_header\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "match"),
+    [
+        ("a.off", b"OFF\n1000000000 1000000000 0\n0 0 0\n", "too early"),
+        ("a.off", b"OFF\n-1 1 0\n0 0 0\n", "too early"),
+        ("a.ply", PLY % (b"binary_little_endian", 10**9) + b"\0\0", "early"),
+        ("a.ply", PLY % (b"binary_big_endian", 0), "early"),
+        ("a.ply", PLY % (b"ascii", 0), "early"),
+        ("a.stl", b"\0" * 80 + struct.pack("<I", 10**9) + b"\0" * 50, "got none"),
+        ("a.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", r"\(3, 2\)"),
+        ("a.obj", b"v 0 0 0\nv 1e300 0 0\nv 0 1 0\nf 1 2 3\n", r"1e\+12"),
+        ("a.obj", b"v 0 0 0\n" * 9 + b"f " + b"1 2 3 " * 2_000 + b"\n", "degenerate"),
+    ],
+)
+def test_false_claims_of_other_formats(tmp_path: Path, name: str, content: bytes, match: str) -> None:
+    refused(tmp_path / name, content, match)
+
+
+def test_size_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trimesh.creation.icosphere(3).export(tmp_path / "a.stl")
+    content = (tmp_path / "a.stl").read_bytes()
+    monkeypatch.setattr(mesh_module, "MAX_MESH_FACES", 1000)
+    refused(tmp_path / "a.stl", content, "1,280 faces")
+    monkeypatch.setattr(mesh_module, "MAX_MESH_BYTES", 1000)
+    refused(tmp_path / "a.stl", content, "larger than 1,000 bytes")
+    assert limits.MAX_MESH_FACES > 1_000_000
