@@ -168,7 +168,7 @@ def _bank(arguments: argparse.Namespace) -> None:
     if arguments.adapt is not None:
         start = time.perf_counter()
         upright = 1.0 if arguments.pose == "upright" else 0.0
-        adapt(mesh, upright=upright, progress=not arguments.quiet).save(arguments.adapt)
+        adapt(mesh, upright=upright, workers=1, progress=not arguments.quiet).save(arguments.adapt)
         print(f"{arguments.adapt}: adapted field, {time.perf_counter() - start:.1f} s")
 
 

@@ -220,9 +220,10 @@ def test_adapted_field_from_bank_to_register(files, monkeypatch, capsys):
     folder, box, _ = files
     called = {}
 
-    def quick(mesh, *, upright, progress):
+    def quick(mesh, *, upright, workers, progress):
         called["upright"] = upright
-        return adapt(mesh, scenes=16, upright=upright, workers=0, progress=progress)
+        assert workers == 1
+        return adapt(mesh, scenes=16, upright=upright, progress=progress)
 
     monkeypatch.setattr("curvireg_torch.cli.adapt", quick)
     small = Preset(bank=BankSettings(image_size=64))

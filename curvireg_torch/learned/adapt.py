@@ -26,7 +26,7 @@ def adapt(
     upright: float = 0.0,
     field: LearnedCurvilinearSaliency | None = None,
     seed: int = 0,
-    workers: int = 1,
+    workers: int = 0,
     progress: bool = True,
 ) -> LearnedCurvilinearSaliency:
     """Fine-tune on generated photographs of one mesh, some minutes on a CPU.
@@ -40,7 +40,8 @@ def adapt(
         upright: share of them where the object stands; the mesh's ``up`` axis points up then.
         field: start from this one, which is changed; default the packaged one.
         seed: of the scenes.
-        workers: processes that generate them; 0 is this one.
+        workers: processes that generate them; 0 is this one. They are spawned, so that a script that asks for them
+            needs ``if __name__ == "__main__":``.
         progress: show a bar.
 
     Returns:

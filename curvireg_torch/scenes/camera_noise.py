@@ -9,16 +9,16 @@ __all__ = ["photographed"]
 
 
 def photographed(picture: Array, rng: np.random.Generator) -> Array:
-    """A clean (S, S, 3) picture as a camera would give it: exposure, white balance, blur, few pixels, noise, JPEG.
+    """A clean (H, W, 3) picture as a camera would give it: exposure, white balance, blur, few pixels, noise, JPEG.
 
     Args:
         picture: float32 in [0, 1], linear light.
         rng: decides everything.
 
     Returns:
-        (S, S, 3) uint8.
+        (H, W, 3) uint8.
     """
-    size = picture.shape[0]
+    height, width = picture.shape[:2]
     gain = rng.uniform(0.45, 0.75) / (np.percentile(picture, rng.uniform(60, 95)) + 1e-3)
     picture = picture * gain * (1 + rng.normal(0, 0.06, 3))
     picture = np.clip(picture, 0, 1) ** rng.uniform(0.5, 1.1)
@@ -34,8 +34,9 @@ def photographed(picture: Array, rng: np.random.Generator) -> Array:
         cv2.line(kernel, (length // 2, length // 2), end, 1.0)
         picture = cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
     if rng.random() < 0.35:  # an object of few pixels, enlarged
-        few = int(size * rng.uniform(0.35, 0.9))
-        picture = cv2.resize(cv2.resize(picture, (few, few), interpolation=cv2.INTER_AREA), (size, size))
+        share = rng.uniform(0.35, 0.9)
+        few = cv2.resize(picture, (int(width * share), int(height * share)), interpolation=cv2.INTER_AREA)
+        picture = cv2.resize(few, (width, height))
     picture = picture + rng.normal(0, np.exp(rng.uniform(-6.5, -3.0)), picture.shape)
     coded: Array = (255 * np.clip(picture, 0, 1) + 0.5).astype(np.uint8)
     if rng.random() < 0.6:

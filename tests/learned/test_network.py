@@ -133,3 +133,12 @@ def test_a_square_on_a_plain_ground_gives_its_outline(field):
     mask = field.mask(x)[0, 0]
     assert mask[40:88, 40:88].mean() > 0.8
     assert mask[:8].mean() < 0.2
+
+
+def test_black_and_white_lie_two_either_side_of_nought():
+    """As in training: the first layer is handed 4 (x - 1/2)."""
+    network, handed = FieldNetwork((8, 8, 8, 8)).eval(), []
+    network.down[0].register_forward_pre_hook(lambda _module, inputs: handed.append(inputs[0]))
+    picture = torch.linspace(0, 1, 3 * 32 * 32).view(1, 3, 32, 32)
+    network(picture)
+    assert torch.allclose(handed[0], torch.linspace(-2, 2, 3 * 32 * 32).view(1, 3, 32, 32), atol=1e-6)

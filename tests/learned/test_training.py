@@ -1,5 +1,10 @@
 """Lessons, losses and fine-tuning."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 import trimesh
@@ -99,6 +104,28 @@ def test_adapting_changes_the_network_and_leaves_its_statistics():
     assert all(torch.equal(adapted[k], packaged[k]) for k in means)
     assert torch.equal(adapted["head.weight"], again.network.state_dict()["head.weight"])
     assert not any(p.requires_grad for p in field.network.parameters())
+
+
+def test_adapting_works_from_a_plain_script(tmp_path):
+    """One without ``if __name__ == "__main__":``, which a spawned process would run again."""
+    script = tmp_path / "plain.py"
+    script.write_text(
+        "import trimesh\n"
+        "from curvireg_torch.learned import adapt\n"
+        "adapt(trimesh.creation.box(), scenes=1, progress=False).save('adapted.safetensors')\n"
+        "print('done')\n"
+    )
+    root = Path(__file__).parents[2]
+    found = subprocess.run(
+        [sys.executable, script],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+    )
+    assert found.returncode == 0, found.stderr
+    assert found.stdout == "done\n"
+    assert (tmp_path / "adapted.safetensors").is_file()
 
 
 def test_errors():

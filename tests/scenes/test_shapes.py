@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from curvireg_torch.rendering.embree import RayScene
 from curvireg_torch.scenes import FAMILIES, random_shape, shape_from_mesh
 from curvireg_torch.scenes.surfaces import bar, box, lathe, superquadric, torus
 
@@ -38,6 +39,23 @@ def test_surfaces_enclose_the_volumes_of_the_textbook():
     assert volume(superquadric((1, 1, 1), (1, 1))) == pytest.approx(4 / 3 * np.pi, rel=0.03)
     assert volume(torus(1.0, 0.2)) == pytest.approx(2 * np.pi**2 * 0.04, rel=0.08)  # ten-sided section
     assert volume(bar((0, 0, 0), (0, 3, 4), np.sqrt(0.5), sides=4)) == pytest.approx(5.0)
+
+
+def open_bed(seed):
+    """Whether the rear third of a car, seen from above, is a trough: lower inside than at both sides and at the end."""
+    shape = random_shape(np.random.default_rng(seed), "car")
+    low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
+    x, y = np.meshgrid(np.linspace(low[0], high[0], 61), np.linspace(low[1], high[1], 121))
+    starts = np.stack([x, y, np.full_like(x, 2.0)], -1).reshape(-1, 3)
+    height = 2.0 - RayScene(shape.vertices, shape.faces).distance(starts, np.tile((0, 0, -1.0), (len(starts), 1)))
+    height = height.reshape(x.shape)[85:]
+    inside = np.median(height[5:25, 20:41])
+    rims = [height[5:25, :20].max(axis=1), height[5:25, 41:].max(axis=1), height[-8:, 20:41].max(axis=0)]
+    return all(np.median(rim) > inside + 0.03 for rim in rims)
+
+
+def test_some_cars_have_an_open_bed():
+    assert 3 <= sum(open_bed(seed) for seed in range(40)) <= 16
 
 
 def test_a_users_mesh_is_centred_scaled_and_split_into_its_parts():

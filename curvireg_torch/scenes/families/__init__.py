@@ -1,0 +1,29 @@
+"""Families of procedural objects, by kind: a family is a function from a generator to parts."""
+
+from collections.abc import Callable
+
+from ..parts import Part, Rng
+from . import furniture, solids, things, vehicles
+
+__all__ = ["FAMILIES"]
+
+FAMILIES: dict[str, Callable[[Rng], list[Part]]] = {
+    "compound": solids.compound,
+    "stack": solids.stack,
+    "vessel": things.vessel,
+    "chair": furniture.chair,
+    "table": furniture.table,
+    "sofa": furniture.sofa,
+    "car": vehicles.car,
+    "bicycle": vehicles.bicycle,
+    "aircraft": vehicles.aircraft,
+    "boat": vehicles.boat,
+    "screen": furniture.screen,
+    "train": vehicles.train,
+    "creature": things.creature,
+    "bracket": solids.bracket,
+    "frame": furniture.frame,
+    "lump": solids.lump,
+    "package": things.package,
+}
+"""Families of shapes by name."""

@@ -1,0 +1,21 @@
+"""What shapes are put together from: surfaces with the number of their material."""
+
+from typing import TypeAlias
+
+import numpy as np
+
+from .surfaces import Surface, box, superquadric
+
+__all__ = ["Part", "Rng", "rounded_box"]
+
+Rng: TypeAlias = np.random.Generator
+Part: TypeAlias = tuple[Surface, int]
+"""A surface and the number of its material: parts of one number look alike."""
+
+
+def rounded_box(rng: Rng, size: object) -> Surface:
+    """A box, sharp or with soft edges, with the full side lengths ``size``."""
+    if rng.random() < 0.5:
+        return box(size, top=rng.choice([1.0, rng.uniform(0.7, 1.0)]))
+    e = rng.uniform(0.1, 0.5)
+    return superquadric(0.5 * np.asarray(size), (e, e))
