@@ -67,7 +67,11 @@ def check_option(value: str, options: Iterable[str], name: str) -> None:
         raise InvalidInputError(f"{name}: expected one of {', '.join(map(repr, options))}, got {value!r}")
 
 
-def check_positive(value: float, name: str, *, zero_ok: bool = False) -> None:
-    """``value`` is a finite number > 0 (or >= 0)."""
+def check_positive(value: float, name: str, *, zero_ok: bool = False) -> float:
+    """``value``, a finite number > 0 (or >= 0). In a compiled graph it is a constant: one graph per value."""
+    # torch.compile makes a float symbolic at its second value, and no kernel can be built of symbols. Taking the number
+    # apart makes it look.
+    value = math.ldexp(*math.frexp(value))
     if not math.isfinite(value) or value < 0 or (value == 0 and not zero_ok):
         raise InvalidInputError(f"{name}: expected a finite number {'>=' if zero_ok else '>'} 0, got {value}")
+    return value

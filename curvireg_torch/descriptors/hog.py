@@ -7,12 +7,16 @@ from torch import Tensor, nn
 
 from .._checks import check_field, check_option, check_positive, check_tensor
 from ..errors import InvalidInputError
-from ..filters.derivatives import Planes, at_least_float32, full_precision, in_blocks, safe_sqrt
+from ..filters.blocks import Planes, in_blocks
+from ..filters.inputs import finite_vectors
+from ..filters.numerics import at_least_float32, floor, full_precision, image_maximum, safe_sqrt
 
 __all__ = ["HOG", "hog", "hog_length"]
 
 VOTINGS = ("linear", "hard")
+
 _EPSILON = 1e-5
+"""Length of a block, in units of the image's longest one, below which it is nothing rather than a direction."""
 
 
 def hog_length(*, grid: int = 8, bins: int = 9, block: int = 2) -> int:
@@ -40,10 +44,12 @@ def hog(
     A pixel votes with the vector's length for the vector's orientation modulo 180 degrees. ``"linear"`` shares a vote
     between the two nearest bins and the four nearest cells; ``"hard"`` gives it to one bin and one cell, as
     ``skimage.feature.hog`` does. Cell histograms are means over the cell's area; blocks of ``block`` x ``block`` cells
-    are normalised by L2-Hys: to unit length, clipped, to unit length again.
+    are normalised by L2-Hys: to unit length, clipped, to unit length again. What counts as nothing is relative to the
+    image's strongest block, so the descriptor does not change with the field's unit or the photograph's contrast.
 
     Args:
-        field: (B, 2, H, W), channel 0 = x, 1 = y, H and W >= grid.
+        field: (B, 2, H, W), channel 0 = x, 1 = y, H and W >= grid. Vectors with a NaN or infinite component have no
+            vote.
         grid: cells along each side.
         bins: orientations over 180 degrees.
         block: cells along a block's side, <= grid.
@@ -63,9 +69,7 @@ def hog(
         torch.Size([4, 1764])
     """
     check_field(field)
-    check_option(voting, VOTINGS, "voting")
-    check_positive(clip, "clip")
-    _check_layout(grid, bins, block)
+    limit = _check_options(grid, bins, block, clip, voting)
     H, W = field.shape[-2:]
     if min(H, W) < grid:
         raise InvalidInputError(f"field: expected at least {grid} x {grid} px for grid={grid}, got {H} x {W}")
@@ -73,20 +77,25 @@ def hog(
         check_tensor(bin_weights, "bin_weights", (bins,))
 
     def layer(field: Tensor) -> Planes:
-        votes = _orientation_votes(field, bins, voting)
+        votes = _orientation_votes(finite_vectors(field), bins, voting)
         rows, columns = _cell_weights(H, grid, voting, votes), _cell_weights(W, grid, voting, votes)
         with full_precision(votes):
             cells = rows @ (votes @ columns.T)  # (B, bins, grid, grid)
         if bin_weights is not None:
             cells = cells * bin_weights.to(cells.dtype).view(1, -1, 1, 1)
-        return (_normalised_blocks(cells, block, clip),)
+        return (_normalised_blocks(cells, block, limit),)
 
     return in_blocks(layer, at_least_float32(field)).to(field.dtype)
 
 
-def _check_layout(grid: int, bins: int, block: int) -> None:
+def _check_options(grid: int, bins: int, block: int, clip: float, voting: str) -> float:
+    """clip."""
+    check_option(voting, VOTINGS, "voting")
+    if not 0 < clip <= 1:
+        raise InvalidInputError(f"clip: expected 0 < clip <= 1, got {clip}")
     if bins < 1 or block < 1 or grid < block:
         raise InvalidInputError(f"expected bins >= 1 and 1 <= block <= grid, got {grid=}, {bins=}, {block=}")
+    return check_positive(clip, "clip")
 
 
 def _orientation_votes(field: Tensor, bins: int, voting: str) -> Tensor:
@@ -123,7 +132,8 @@ def _cell_weights(length: int, grid: int, voting: str, like: Tensor) -> Tensor:
 def _normalised_blocks(cells: Tensor, block: int, clip: float) -> Tensor:
     blocks = cells.unfold(2, block, 1).unfold(3, block, 1)  # (B, bins, n, n, block, block)
     blocks = blocks.permute(0, 2, 3, 4, 5, 1).flatten(3)  # (B, n, n, block * block * bins)
-    blocks = blocks / (blocks.square().sum(-1, keepdim=True) + _EPSILON**2).sqrt()
+    squared = blocks.square().sum(-1, keepdim=True)
+    blocks = blocks / (squared + (_EPSILON**2 * image_maximum(squared) + floor(squared))).sqrt()
     blocks = blocks.clamp(max=clip)
     blocks = blocks / (blocks.square().sum(-1, keepdim=True) + _EPSILON**2).sqrt()
     return blocks.flatten(1)
@@ -148,8 +158,7 @@ class HOG(nn.Module):
         learnable: bool = False,
     ) -> None:
         super().__init__()
-        check_option(voting, VOTINGS, "voting")
-        _check_layout(grid, bins, block)
+        _check_options(grid, bins, block, clip, voting)
         self.grid, self.bins, self.block, self.clip, self.voting = grid, bins, block, clip, voting
         self.bin_weights = nn.Parameter(torch.ones(bins)) if learnable else None
 

@@ -5,7 +5,8 @@ from torch import Tensor
 
 from .._checks import check_field
 from ..errors import InvalidInputError
-from ..filters.derivatives import at_least_float32, safe_sqrt
+from ..filters.inputs import finite_vectors
+from ..filters.numerics import at_least_float32, safe_sqrt
 from ..filters.suppression import is_ridge
 
 __all__ = ["field_points"]
@@ -19,7 +20,7 @@ def field_points(field: Tensor, *, share: float = 0.04, threshold: float = 0.0, 
     all kept.
 
     Args:
-        field: (B, 2, H, W).
+        field: (B, 2, H, W). Vectors with a NaN or infinite component count as 0.
         share: of the image's pixels, in (0, 1].
         threshold: in the field's unit, >= 0; vectors of length 0 are never points.
         suppress: False skips the non-maximum suppression.
@@ -39,7 +40,7 @@ def field_points(field: Tensor, *, share: float = 0.04, threshold: float = 0.0, 
     check_field(field)
     if not threshold >= 0:
         raise InvalidInputError(f"threshold: expected >= 0, got {threshold}")
-    x, y = at_least_float32(field).split(1, dim=1)
+    x, y = finite_vectors(at_least_float32(field)).split(1, dim=1)
     length = safe_sqrt(x * x + y * y)
     candidates = length > threshold
     if suppress:

@@ -1,14 +1,19 @@
 """What every detector returns, and the steps that several of them share."""
 
-from typing import NamedTuple
+import functools
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .._checks import check_image
+from .._checks import check_colour_image
 from ..descriptors.points import field_points, strongest_points
-from ..filters.derivatives import at_least_float32, safe_sqrt
+from ..filters.inputs import fill_missing, grey, may_lack_pixels, missing
+from ..filters.numerics import at_least_float32, safe_sqrt
+
+Function = TypeVar("Function", bound=Callable[..., "Detection"])
 
 
 class Detection(NamedTuple):
@@ -36,9 +41,28 @@ class Detection(NamedTuple):
         return result
 
 
+def detector(function: Function) -> Function:
+    """A detector on photographs by the rule of :mod:`curvireg_torch.filters.inputs`: it sees grey levels, all finite.
+
+    (B, 3, H, W) is RGB and becomes grey; half types compute in float32; NaN and infinite pixels are filled from around
+    them, and nothing is detected there.
+    """
+
+    @functools.wraps(function)
+    def on_photograph(image: Tensor, **options: float) -> Detection:
+        check_colour_image(image)
+        x = grey(at_least_float32(image))
+        if not may_lack_pixels(x):
+            return function(x, **options)
+        holes = missing(x)
+        response, points = function(fill_missing(x, holes), **options)
+        return Detection(torch.where(holes, 0.0, response), points & ~holes)
+
+    return cast(Function, on_photograph)
+
+
 def from_field(field: Tensor, share: float) -> Detection:
     """Length of a vector field, and its maxima across the field's direction."""
-    field = at_least_float32(field)
     response = safe_sqrt(field.square().sum(dim=1, keepdim=True))
     return Detection(response, field_points(field, share=share))
 
@@ -52,5 +76,4 @@ def from_peaks(response: Tensor, share: float) -> Detection:
 
 def grey_bytes(image: Tensor) -> list[Tensor]:
     """Each image as (H, W) uint8 in memory that OpenCV can read."""
-    check_image(image)
     return list((image.detach().float().clamp(0.0, 1.0) * 255.0).round().byte().cpu()[:, 0])

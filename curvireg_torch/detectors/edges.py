@@ -4,19 +4,20 @@ import cv2
 import torch
 from torch import Tensor
 
-from .._checks import check_image, check_positive
+from .._checks import check_positive
 from ..descriptors.points import strongest_points
-from ..filters.derivatives import at_least_float32, central_derivatives, replicate_pad, safe_sqrt, smooth
-from .base import Detection, from_field, grey_bytes
+from ..filters.derivatives import central_derivatives, replicate_pad, smooth
+from ..filters.numerics import safe_sqrt
+from .base import Detection, detector, from_field, grey_bytes
 
 
+@detector
 def sobel(image: Tensor, *, share: float = 0.04) -> Detection:
     """Gradient by Sobel's 3 x 3 kernels, per px (their sums divided by 8), borders replicated.
 
     Written out: kornia's ``spatial_gradient`` is slower, and its ``sobel`` is not 0 on flat images.
     """
-    check_image(image)
-    p = replicate_pad(at_least_float32(image), 1)
+    p = replicate_pad(image, 1)
     along_x = p[..., 2:] - p[..., :-2]
     along_y = p[..., 2:, :] - p[..., :-2, :]
     gx = along_x[..., :-2, :] + 2.0 * along_x[..., 1:-1, :] + along_x[..., 2:, :]
@@ -24,33 +25,38 @@ def sobel(image: Tensor, *, share: float = 0.04) -> Detection:
     return from_field(torch.cat([gx, gy], dim=1) / 8.0, share)
 
 
+@detector
 def laplacian_of_gaussian(image: Tensor, *, sigma: float = 2.0, share: float = 0.04) -> Detection:
     """Zero crossings of the Laplacian of the image smoothed by ``sigma`` px (Marr and Hildreth 1980).
 
-    A pixel is a crossing where the Laplacian's sign differs from the right or the lower neighbour's; its response is
-    the larger of the two steps, in grey levels per px^2. Elsewhere the response is 0.
+    A pixel is a crossing where the Laplacian's sign differs from the right or the lower neighbour's, or where it is 0
+    between neighbours of opposite sign, left and right or above and below; its response is the largest of those steps,
+    in grey levels per px^2 and px. Elsewhere the response is 0.
     """
-    check_image(image)
     check_positive(sigma, "sigma")
-    _, _, xx, yy, _ = central_derivatives(smooth(at_least_float32(image), sigma))
+    _, _, xx, yy, _ = central_derivatives(smooth(image, sigma))
     laplacian = xx + yy
     response = torch.zeros_like(laplacian)
     for dim in (-1, -2):
         n = laplacian.shape[dim] - 1
         here, there = laplacian.narrow(dim, 0, n), laplacian.narrow(dim, 1, n)
         step = torch.where(here * there < 0, (here - there).abs(), 0.0)
-        padded = torch.cat([step, torch.zeros_like(laplacian.narrow(dim, 0, 1))], dim=dim)
-        response = torch.maximum(response, padded)
+        border = torch.zeros_like(laplacian.narrow(dim, 0, 1))
+        response = torch.maximum(response, torch.cat([step, border], dim=dim))
+        if n > 1:
+            before, at, after = (laplacian.narrow(dim, i, n - 1) for i in range(3))
+            through = torch.where((at == 0) & (before * after < 0), 0.5 * (after - before).abs(), 0.0)
+            response = torch.maximum(response, torch.cat([border, through, border], dim=dim))
     return Detection(response, strongest_points(response, response > 0, share))
 
 
+@detector
 def canny(image: Tensor, *, sigma: float = 1.4, edges: float = 0.3, share: float = 0.04) -> Detection:
     """Canny (1986) by OpenCV, its thresholds set per image as MATLAB's ``edge`` sets them.
 
     The response is the length of the Sobel gradient of the smoothed image per px; the upper threshold leaves the share
     ``edges`` of the pixels above it, the lower one is 0.4 times as high. Runs on the CPU.
     """
-    check_image(image)
     check_positive(sigma, "sigma")
     responses, points = [], []
     for grey in grey_bytes(image):

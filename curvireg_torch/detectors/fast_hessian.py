@@ -4,14 +4,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .._checks import check_image
+from .._checks import check_positive
 from ..descriptors.points import strongest_points
-from .base import Detection
+from .base import Detection, detector
 
 OCTAVES = ((9, 15, 21, 27), (15, 27, 39, 51), (27, 51, 75, 99))
 """Sides in px of the box filters, as in Bay et al.; a side of 9 stands for a Gaussian of sigma 1.2 px."""
 
 
+@detector
 def fast_hessian(image: Tensor, *, threshold: float = 1e-4, share: float = 0.04) -> Detection:
     r"""Fast-Hessian (Bay et al. 2008): determinant of a Hessian of box filters, the detector of SURF.
 
@@ -28,7 +29,7 @@ def fast_hessian(image: Tensor, *, threshold: float = 1e-4, share: float = 0.04)
     Returns:
         response: the largest determinant over all sides, where positive.
     """
-    check_image(image)
+    check_positive(threshold, "threshold")
     H, W = image.shape[-2:]
     x = image.detach().to("cpu", torch.float64)
     determinants = {side: _determinant(x, side) for side in sorted(set(sum(OCTAVES, ()))) if side <= max(min(H, W), 9)}

@@ -4,10 +4,12 @@ import torch
 from torch import Tensor
 
 from .._checks import check_positive
-from ..filters.derivatives import at_least_float32, image_gradient, image_maximum
-from .base import Detection, from_field
+from ..filters import image_gradient
+from ..filters.numerics import image_maximum
+from .base import Detection, detector, from_field
 
 
+@detector
 def fuzzy_edges(image: Tensor, *, width: float = 0.1, share: float = 0.04) -> Detection:
     r"""Edges by a rule base on the two derivatives of the image, each divided by the image's largest derivative.
 
@@ -21,7 +23,7 @@ def fuzzy_edges(image: Tensor, *, width: float = 0.1, share: float = 0.04) -> De
     the gradient.
     """
     check_positive(width, "width")
-    gradient = at_least_float32(image_gradient(image, sigma=1.0))
+    gradient = image_gradient(image, sigma=1.0)
     peak = image_maximum(gradient.abs())
     relative = gradient / torch.where(peak > 0, peak, 1.0)
     zero = torch.exp(-0.5 * (relative / width).square()).amin(dim=1, keepdim=True)

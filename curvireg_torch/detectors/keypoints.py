@@ -4,9 +4,10 @@ import cv2
 import torch
 from torch import Tensor
 
-from .base import Detection, grey_bytes
+from .base import Detection, detector, grey_bytes
 
 
+@detector
 def sift(image: Tensor, *, share: float = 0.04) -> Detection:
     """SIFT keypoints (Lowe 2004) by OpenCV with its defaults, each at the pixel nearest to it. Runs on the CPU.
 

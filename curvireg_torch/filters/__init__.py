@@ -9,10 +9,11 @@ from .curvilinear import (
     depth_curvilinear_saliency,
     image_curvilinear_saliency,
 )
-from .derivatives import ImageGradient, gaussian_smooth, image_gradient
+from .derivatives import gaussian_smooth
 from .diffusion import AnisotropicDiffusion, anisotropic_diffusion
 from .edge_preserving import bilateral_smooth, guided_smooth
 from .focus import EdgeBlur, MultiScaleFocusCurves, edge_blur, multiscale_focus_curves
+from .gradient import ImageGradient, image_gradient
 from .multiscale import MultiScaleCurvilinearSaliency, multiscale_curvilinear_saliency
 from .principal import PrincipalCurvatureImage, principal_curvature_image
 from .ridges import ApparentRidges, apparent_ridges

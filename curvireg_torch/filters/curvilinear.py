@@ -7,19 +7,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .._checks import check_image, check_mask, check_option, check_positive
-from .derivatives import (
-    Planes,
-    at_least_float32,
-    central_derivatives,
-    central_gradient,
-    floor,
-    in_blocks,
-    owned,
-    safe_sqrt,
-    smooth,
-    squared_length,
-)
-from .learnable import as_number, parameter_if
+from .blocks import Planes, in_blocks
+from .derivatives import central_derivatives, central_gradient, smooth
+from .inputs import on_photograph
+from .learnable import as_number, check_width, keep_positive, positive_option
+from .numerics import at_least_float32, floor, owned, safe_sqrt, squared_length
 
 __all__ = [
     "DepthCurvilinearSaliency",
@@ -83,7 +75,7 @@ def depth_curvilinear_saliency(
 
     Args:
         depth: (B, 1, H, W) z-depth in any unit. 0, negative, inf and NaN are background.
-        mask: (B, 1, H, W) bool, False = background; optional.
+        mask: bool, False = background; optional. (B, 1, H, W) or what broadcasts to it.
         sigma: smoothing in px before differentiation, >= 0.
         formula: ``"geometric"`` or ``"paper"``.
         depth_scale: None rescales each image's visible depth range to 1, so that the vector points across occluding
@@ -102,23 +94,32 @@ def depth_curvilinear_saliency(
         >>> round(float(field[0, :, 32, 32].norm()) * 40, 2)                          # 1 / radius
         1.0
     """
-    check_depth(depth, mask, depth_scale)
+    mask, scale = check_depth(depth, mask), check_scale(depth_scale)
+    width = check_width(sigma, "sigma", zero_ok=True)
     check_option(formula, FORMULAS, "formula")
 
     def layer(depth: Tensor, mask: Tensor | None) -> Planes:
-        factor, *m = _shape_operator(smooth(fill_depth(depth, mask, depth_scale), sigma), formula)
+        factor, *m = _shape_operator(smooth(fill_depth(depth, mask, scale), width, linear=True), formula)
         vx, vy, half_gap = dominant_eigenvector(*m)
         return along(factor.mul_(half_gap), vx, vy)
 
     return in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
 
 
-def check_depth(depth: Tensor, mask: Tensor | None, depth_scale: float | None = None) -> None:
+def check_depth(depth: Tensor, mask: Tensor | None) -> Tensor | None:
+    """The mask in the depth's shape."""
     check_image(depth, "depth")
-    if mask is not None:
-        check_mask(mask, depth)
-    if depth_scale is not None:
-        check_positive(depth_scale, "depth_scale")
+    if mask is None:
+        return None
+    fits = mask.ndim <= 4 and all(m in (1, n) for m, n in zip(mask.shape[::-1], depth.shape[::-1], strict=False))
+    if fits:
+        mask = mask.expand(depth.shape)
+    check_mask(mask, depth)
+    return mask
+
+
+def check_scale(depth_scale: float | None) -> float | None:
+    return None if depth_scale is None else check_positive(depth_scale, "depth_scale")
 
 
 def _shape_operator(z: Tensor, formula: str) -> Planes:
@@ -162,11 +163,18 @@ def along(length: Tensor, vx: Tensor, vy: Tensor) -> Planes:
     return vx * scale, vy * scale
 
 
+def x_if_none(vx: Tensor, vy: Tensor) -> Tensor:
+    """vx, and 1 where (vx, vy) is next to 0: where every direction is as good as any other, take x."""
+    squared = squared_length(vx, vy)
+    return torch.where(squared <= floor(squared), 1.0, vx)
+
+
 def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
     r"""Curvilinear saliency of a photograph, :math:`\mu_1-\mu_2 = |\nabla I|^2` (the paper's ``equ:PG:004``).
 
     Args:
-        image: (B, 1, H, W) grey levels, usually in [0, 1].
+        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB; NaN pixels are missing (0 in the
+            result).
         sigma: smoothing in px before differentiation, >= 0.
 
     Returns:
@@ -180,18 +188,20 @@ def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) ->
         >>> image_curvilinear_saliency(ramp, sigma=0.0)[0, :, 4, 4].tolist()
         [9.0, 0.0]
     """
-    check_image(image)
+    width = check_width(sigma, "sigma", zero_ok=True)
 
     def layer(x: Tensor) -> Planes:
-        gx, gy = central_gradient(smooth(x, sigma))
+        gx, gy = central_gradient(smooth(x, width))
         length = safe_sqrt(squared_length(gx, gy))
         return gx * length, gy * length
 
-    return in_blocks(layer, at_least_float32(image)).to(image.dtype)
+    return on_photograph(layer, image)
 
 
 class DepthCurvilinearSaliency(nn.Module):
-    """Module twin of :func:`depth_curvilinear_saliency`; ``learnable=True`` makes sigma a parameter."""
+    """Module twin of :func:`depth_curvilinear_saliency`; ``learnable=True`` makes log sigma a parameter."""
+
+    sigma = positive_option("sigma")
 
     def __init__(
         self,
@@ -203,7 +213,10 @@ class DepthCurvilinearSaliency(nn.Module):
     ) -> None:
         super().__init__()
         check_option(formula, FORMULAS, "formula")
-        self.sigma, self.formula, self.depth_scale = parameter_if(learnable, sigma), formula, depth_scale
+        check_width(sigma, "sigma", zero_ok=True)
+        check_scale(depth_scale)
+        keep_positive(self, learnable, sigma=sigma)
+        self.formula, self.depth_scale = formula, depth_scale
 
     def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
         return depth_curvilinear_saliency(
@@ -215,11 +228,14 @@ class DepthCurvilinearSaliency(nn.Module):
 
 
 class ImageCurvilinearSaliency(nn.Module):
-    """Module twin of :func:`image_curvilinear_saliency`; ``learnable=True`` makes sigma a parameter."""
+    """Module twin of :func:`image_curvilinear_saliency`; ``learnable=True`` makes log sigma a parameter."""
+
+    sigma = positive_option("sigma")
 
     def __init__(self, *, sigma: float = 1.0, learnable: bool = False) -> None:
         super().__init__()
-        self.sigma = parameter_if(learnable, sigma)
+        check_width(sigma, "sigma", zero_ok=True)
+        keep_positive(self, learnable, sigma=sigma)
 
     def forward(self, image: Tensor) -> Tensor:
         return image_curvilinear_saliency(image, sigma=self.sigma)

@@ -5,8 +5,11 @@ from torch import Tensor, nn
 
 from .._checks import check_option, check_positive, check_tensor
 from ..errors import InvalidInputError
-from .derivatives import Planes, at_least_float32, in_blocks, replicate_pad
-from .learnable import as_number, parameter_if
+from .blocks import Planes, in_blocks
+from .derivatives import replicate_pad
+from .inputs import filled
+from .learnable import as_number, check_width, inverse, keep_positive, positive_option
+from .numerics import at_least_float32
 
 __all__ = ["AnisotropicDiffusion", "anisotropic_diffusion"]
 
@@ -27,7 +30,7 @@ def anisotropic_diffusion(
     :math:`g = 1/(1 + (d/\kappa)^2)` (``"rational"``) or :math:`g = \exp(-(d/\kappa)^2)` (``"exponential"``).
 
     Args:
-        image: (B, C, H, W); channels diffuse independently.
+        image: (B, C, H, W); channels diffuse independently. NaN pixels are missing and come out filled.
         iterations: number of steps, >= 0.
         kappa: difference in grey levels above which an edge is kept, > 0; a scalar tensor is differentiated through.
         step: time step in (0, 0.25]; larger ones are unstable.
@@ -44,36 +47,49 @@ def anisotropic_diffusion(
         torch.Size([1, 3, 16, 16])
     """
     check_tensor(image, "image", (None, None, None, None))
-    check_option(conductance, CONDUCTANCES, "conductance")
-    if not isinstance(kappa, Tensor):
-        check_positive(kappa, "kappa")
-    if iterations < 0:
-        raise InvalidInputError(f"iterations: expected >= 0, got {iterations}")
-    if not 0 < step <= 0.25:
-        raise InvalidInputError(f"step: expected 0 < step <= 0.25 (stability), got {step}")
+    edge, dt = check_diffusion(iterations, kappa, step, conductance)
 
     def layer(x: Tensor) -> Planes:
-        for _ in range(iterations):
-            p = replicate_pad(x, 1)  # no difference, hence no flow, across the border
-            # The flow between two neighbours is computed once and enters both with opposite signs.
-            flow_x = _flow(p[..., 1:-1, 1:] - p[..., 1:-1, :-1], kappa, conductance)
-            flow_y = _flow(p[..., 1:, 1:-1] - p[..., :-1, 1:-1], kappa, conductance)
-            x = torch.add(x, flow_x[..., 1:], alpha=step).sub_(flow_x[..., :-1], alpha=step)
-            x = x.add_(flow_y[..., 1:, :], alpha=step).sub_(flow_y[..., :-1, :], alpha=step)
-        return (x,)
+        return (diffuse(filled(x), iterations, edge, dt, conductance),)
 
     return in_blocks(layer, at_least_float32(image)).to(image.dtype)
 
 
+def check_diffusion(
+    iterations: int, kappa: float | Tensor, step: float, conductance: str
+) -> tuple[float | Tensor, float]:
+    """kappa and step, once they and the other options are right."""
+    check_option(conductance, CONDUCTANCES, "conductance")
+    if iterations < 0:
+        raise InvalidInputError(f"iterations: expected >= 0, got {iterations}")
+    if not 0 < step <= 0.25:
+        raise InvalidInputError(f"step: expected 0 < step <= 0.25 (stability), got {step}")
+    return check_width(kappa, "kappa"), check_positive(step, "step")
+
+
+def diffuse(x: Tensor, iterations: int, kappa: float | Tensor, step: float, conductance: str) -> Tensor:
+    """:func:`anisotropic_diffusion` of what was checked."""
+    for _ in range(iterations):
+        p = replicate_pad(x, 1)  # no difference, hence no flow, across the border
+        # The flow between two neighbours is computed once and enters both with opposite signs.
+        flow_x = _flow(p[..., 1:-1, 1:] - p[..., 1:-1, :-1], kappa, conductance)
+        flow_y = _flow(p[..., 1:, 1:-1] - p[..., :-1, 1:-1], kappa, conductance)
+        x = torch.add(x, flow_x[..., 1:], alpha=step).sub_(flow_x[..., :-1], alpha=step)
+        x = x.add_(flow_y[..., 1:, :], alpha=step).sub_(flow_y[..., :-1, :], alpha=step)
+    return x
+
+
 def _flow(difference: Tensor, kappa: float | Tensor, conductance: str) -> Tensor:
-    scaled = difference * (1.0 / kappa)
+    scaled = difference * inverse(kappa)
     if conductance == "rational":
         return difference / torch.addcmul(scaled.new_ones(()), scaled, scaled)
     return difference * torch.exp(-scaled.square())
 
 
 class AnisotropicDiffusion(nn.Module):
-    """Module twin of :func:`anisotropic_diffusion`; ``learnable=True`` makes kappa a parameter."""
+    """Module twin of :func:`anisotropic_diffusion`; ``learnable=True`` makes log kappa a parameter."""
+
+    kappa = positive_option("kappa")
 
     def __init__(
         self,
@@ -85,8 +101,8 @@ class AnisotropicDiffusion(nn.Module):
         learnable: bool = False,
     ) -> None:
         super().__init__()
-        check_option(conductance, CONDUCTANCES, "conductance")
-        self.kappa = parameter_if(learnable, kappa)
+        check_diffusion(iterations, kappa, step, conductance)
+        keep_positive(self, learnable, kappa=kappa)
         self.iterations, self.step, self.conductance = iterations, step, conductance
 
     def forward(self, image: Tensor) -> Tensor:

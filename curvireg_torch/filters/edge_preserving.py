@@ -7,7 +7,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .._checks import check_positive, check_tensor
-from .derivatives import at_least_float32, replicate_pad
+from .derivatives import replicate_pad
+from .inputs import filled
+from .learnable import check_width, inverse
+from .numerics import at_least_float32
 
 __all__ = ["bilateral_smooth", "guided_smooth"]
 
@@ -19,7 +22,7 @@ def bilateral_smooth(image: Tensor, *, sigma: float, kappa: float | Tensor = 0.0
     ``bilateral_blur``) holds the whole window of every pixel.
 
     Args:
-        image: (B, C, H, W); channels are smoothed independently.
+        image: (B, C, H, W); channels are smoothed independently. NaN pixels are missing and come out filled.
         sigma: spatial standard deviation in px, > 0.
         kappa: standard deviation in grey levels, > 0; a scalar tensor is differentiated through.
 
@@ -35,12 +38,10 @@ def bilateral_smooth(image: Tensor, *, sigma: float, kappa: float | Tensor = 0.0
         True
     """
     check_tensor(image, "image", (None, None, None, None))
-    check_positive(sigma, "sigma")
-    if not isinstance(kappa, Tensor):
-        check_positive(kappa, "kappa")
-    x = at_least_float32(image)
+    width, sharpness = check_positive(sigma, "sigma"), inverse(check_width(kappa, "kappa"))
+    x = filled(at_least_float32(image))
     H, W = x.shape[-2:]
-    radius = math.ceil(2.0 * sigma)
+    radius = math.ceil(2.0 * width)
     padded = replicate_pad(x, radius)
     weights, total = torch.ones_like(x), x
     for dy in range(-radius, radius + 1):
@@ -48,8 +49,8 @@ def bilateral_smooth(image: Tensor, *, sigma: float, kappa: float | Tensor = 0.0
             if dy == dx == 0:
                 continue
             neighbour = padded[..., radius + dy : radius + dy + H, radius + dx : radius + dx + W]
-            nearness = -0.5 * (dx * dx + dy * dy) / sigma**2
-            weight = torch.exp(nearness - 0.5 * ((neighbour - x) / kappa).square())
+            nearness = -0.5 * (dx * dx + dy * dy) / width**2
+            weight = torch.exp(nearness - 0.5 * ((neighbour - x) * sharpness).square())
             weights, total = weights + weight, total + weight * neighbour
     return (total / weights).to(image.dtype)
 
@@ -60,7 +61,7 @@ def guided_smooth(image: Tensor, *, sigma: float, kappa: float | Tensor = 0.03) 
     Where the variance in a box is well below kappa squared the result is the mean, where it is well above, the image.
 
     Args:
-        image: (B, C, H, W); channels are smoothed independently.
+        image: (B, C, H, W); channels are smoothed independently. NaN pixels are missing and come out filled.
         sigma: standard deviation in px of the smoothing on flat ground, > 0. Two means over boxes of side 2 r + 1
             follow each other; r is the whole number nearest to that variance, at least 1.
         kappa: standard deviation in grey levels, > 0; a scalar tensor is differentiated through.
@@ -76,16 +77,14 @@ def guided_smooth(image: Tensor, *, sigma: float, kappa: float | Tensor = 0.03) 
         torch.Size([2, 3, 16, 16])
     """
     check_tensor(image, "image", (None, None, None, None))
-    check_positive(sigma, "sigma")
-    if not isinstance(kappa, Tensor):
-        check_positive(kappa, "kappa")
-    x = at_least_float32(image)
-    radius = max(1, round((math.sqrt(6.0 * sigma**2 + 1.0) - 1.0) / 2.0))
+    width, contrast = check_positive(sigma, "sigma"), 1.0 / inverse(check_width(kappa, "kappa"))
+    x = filled(at_least_float32(image))
+    radius = max(1, round((math.sqrt(6.0 * width**2 + 1.0) - 1.0) / 2.0))
 
     def mean(y: Tensor) -> Tensor:
         return F.avg_pool2d(replicate_pad(y, radius), 2 * radius + 1, stride=1)
 
     average = mean(x)
     variance = (mean(x * x) - average * average).clamp(min=0.0)
-    slope = variance / (variance + kappa**2)
+    slope = variance / (variance + contrast**2)
     return (mean(slope) * x + mean(average - slope * average)).to(image.dtype)

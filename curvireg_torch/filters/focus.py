@@ -7,22 +7,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_image, check_option, check_positive
+from .._checks import check_option, check_positive
 from ..errors import InvalidInputError
+from .blocks import Planes
 from .curvilinear import along
-from .derivatives import (
-    Planes,
-    at_least_float32,
-    central_gradient,
-    floor,
-    gaussian_smooth,
-    image_maximum,
-    in_blocks,
-    safe_sqrt,
-    smooth,
-    squared_length,
-)
-from .learnable import as_number, parameter_if
+from .derivatives import central_gradient, smooth
+from .inputs import on_photograph
+from .learnable import as_number, check_width, keep_positive, positive_option
+from .numerics import floor, image_maximum, safe_sqrt, squared_length
 
 __all__ = ["EdgeBlur", "MultiScaleFocusCurves", "edge_blur", "multiscale_focus_curves"]
 
@@ -58,7 +50,7 @@ def edge_blur(
     subtracted. The estimate is right on the edge's centre line; beside it :math:`R_i` falls and the blur grows.
 
     Args:
-        image: (B, 1, H, W) grey levels.
+        image: (B, 1, H, W) grey levels, or (B, 3, H, W) RGB; NaN pixels are missing (1000 in the result).
         reblur_sigmas: S re-blurring sigmas in px, > 0.
         mode: ``"reblur-image"`` or ``"reblur-saliency"``.
 
@@ -75,29 +67,32 @@ def edge_blur(
         >>> abs(float(edge_blur(edge)[0, 0, 32, 32]) - 2.0) < 0.06
         True
     """
-    check_image(image)
-    check_option(mode, MODES, "mode")
+    widths = _check_reblurring(reblur_sigmas, mode)
 
     def layer(x: Tensor) -> Planes:
         gx, gy = central_gradient(smooth(x, 0.0))
-        return tuple(_edge_blur(x, squared_length(gx, gy), reblur_sigmas, mode))
+        return tuple(_edge_blur(x, squared_length(gx, gy), widths, mode))
 
-    return in_blocks(layer, at_least_float32(image)).to(image.dtype)
+    return on_photograph(layer, image, where_missing=MAX_BLUR)
+
+
+def _check_reblurring(reblur_sigmas: Sequence[float], mode: str) -> list[float]:
+    check_option(mode, MODES, "mode")
+    if len(reblur_sigmas) == 0:
+        raise InvalidInputError("reblur_sigmas: expected at least one sigma, got none")
+    return [check_positive(float(sigma), "reblur_sigmas") for sigma in reblur_sigmas]
 
 
 def _edge_blur(x: Tensor, saliency: Tensor, reblur_sigmas: Sequence[float], mode: str) -> list[Tensor]:
-    if len(reblur_sigmas) == 0:
-        raise InvalidInputError("reblur_sigmas: expected at least one sigma, got none")
     blurs: list[Tensor] = []
     for sigma in reblur_sigmas:
-        check_positive(float(sigma), "reblur_sigmas")
         if mode == "reblur-image":
             rx, ry = central_gradient(smooth(x, sigma))
             reblurred = squared_length(rx, ry)
             # sigma_i^2 / (R - 1) with R = saliency / reblurred, without dividing by zero.
             numerator, denominator = sigma**2 * reblurred, saliency - reblurred
         else:
-            reblurred = gaussian_smooth(saliency, sigma)
+            reblurred = smooth(saliency, sigma, margin=0)
             numerator, denominator = 2.0 * sigma**2 * reblurred.square(), saliency.square() - reblurred.square()
         numerator = numerator + floor(numerator)
         quotient = numerator / torch.maximum(denominator, numerator / (MAX_BLUR**2 + _DIFFERENCE_VARIANCE))
@@ -122,7 +117,7 @@ def multiscale_focus_curves(
     pre-smoothing ``sigma``, so the value is at most 1/sigma.
 
     Args:
-        image: (B, 1, H, W) grey levels in [0, 1].
+        image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB; NaN pixels are missing (0 in the result).
         scales: n >= 2.
         sigma: smoothing in px before everything else.
         mode: of :func:`edge_blur`.
@@ -140,15 +135,11 @@ def multiscale_focus_curves(
         >>> multiscale_focus_curves(torch.rand(2, 1, 32, 32)).shape
         torch.Size([2, 2, 32, 32])
     """
-    check_image(image)
-    check_option(mode, MODES, "mode")
-    if scales < 2:
-        raise InvalidInputError(f"scales: expected >= 2, got {scales}")
-    check_positive(saliency_weight, "saliency_weight", zero_ok=True)
-    limit = math.exp(-scales) if threshold is None else threshold
+    power, limit = _check_focus(scales, mode, saliency_weight, threshold)
+    width = check_width(sigma, "sigma", zero_ok=True)
 
     def layer(image: Tensor) -> Planes:
-        x = smooth(image, sigma)
+        x = smooth(image, width)
         gx, gy = central_gradient(x)
         x = x[..., 1:-1, 1:-1]
         saliency = squared_length(gx, gy)
@@ -156,10 +147,19 @@ def multiscale_focus_curves(
         # Sub-pixel blur is not measurable: it counts as the derivative kernel's own.
         focus = blur.clamp(min=_DIFFERENCE_VARIANCE**0.5).reciprocal()
         kept = (focus > limit) & (saliency > _EDGE_FLOOR * image_maximum(saliency))
-        weight = saliency.clamp(min=floor(saliency)) ** saliency_weight
+        weight = saliency.clamp(min=floor(saliency)) ** power
         return along(focus * weight * kept, gx, gy)
 
-    return in_blocks(layer, at_least_float32(image)).to(image.dtype)
+    return on_photograph(layer, image)
+
+
+def _check_focus(scales: int, mode: str, saliency_weight: float, threshold: float | None) -> tuple[float, float]:
+    """p and T."""
+    check_option(mode, MODES, "mode")
+    if scales < 2:
+        raise InvalidInputError(f"scales: expected >= 2, got {scales}")
+    limit = math.exp(-scales) if threshold is None else check_positive(threshold, "threshold", zero_ok=True)
+    return check_positive(saliency_weight, "saliency_weight", zero_ok=True), limit
 
 
 class EdgeBlur(nn.Module):
@@ -167,7 +167,7 @@ class EdgeBlur(nn.Module):
 
     def __init__(self, *, reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0), mode: str = "reblur-image") -> None:
         super().__init__()
-        check_option(mode, MODES, "mode")
+        _check_reblurring(reblur_sigmas, mode)
         self.reblur_sigmas, self.mode = tuple(reblur_sigmas), mode
 
     def forward(self, image: Tensor) -> Tensor:
@@ -178,7 +178,9 @@ class EdgeBlur(nn.Module):
 
 
 class MultiScaleFocusCurves(nn.Module):
-    """Module twin of :func:`multiscale_focus_curves`; ``learnable=True`` makes sigma a parameter."""
+    """Module twin of :func:`multiscale_focus_curves`; ``learnable=True`` makes log sigma a parameter."""
+
+    sigma = positive_option("sigma")
 
     def __init__(
         self,
@@ -191,8 +193,10 @@ class MultiScaleFocusCurves(nn.Module):
         learnable: bool = False,
     ) -> None:
         super().__init__()
-        check_option(mode, MODES, "mode")
-        self.scales, self.sigma, self.mode = scales, parameter_if(learnable, sigma), mode
+        _check_focus(scales, mode, saliency_weight, threshold)
+        check_width(sigma, "sigma", zero_ok=True)
+        keep_positive(self, learnable, sigma=sigma)
+        self.scales, self.mode = scales, mode
         self.saliency_weight, self.threshold = saliency_weight, threshold
 
     def forward(self, image: Tensor) -> Tensor:

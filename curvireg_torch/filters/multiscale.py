@@ -5,22 +5,16 @@ import math
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_image, check_option, check_positive
+from .._checks import check_option, check_positive
 from ..errors import InvalidInputError
+from .blocks import Planes, channels
 from .curvilinear import along
-from .derivatives import (
-    Planes,
-    at_least_float32,
-    central_gradient,
-    channels,
-    image_maximum,
-    in_blocks,
-    smooth,
-    squared_length,
-)
-from .diffusion import CONDUCTANCES, anisotropic_diffusion
+from .derivatives import central_gradient, smooth
+from .diffusion import CONDUCTANCES, diffuse
 from .edge_preserving import bilateral_smooth, guided_smooth
-from .learnable import as_number, parameter_if
+from .inputs import on_photograph
+from .learnable import as_number, check_width, keep_positive, positive_option
+from .numerics import image_maximum, squared_length
 
 __all__ = ["MultiScaleCurvilinearSaliency", "multiscale_curvilinear_saliency"]
 
@@ -47,7 +41,7 @@ def multiscale_curvilinear_saliency(
     compared with T. Where *every* level exceeds T the largest level is kept, elsewhere the field is 0.
 
     Args:
-        image: (B, 1, H, W) grey levels in [0, 1].
+        image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB; NaN pixels are missing (0 in the result).
         scales: number n of levels, the image itself included. Each smoothed level has twice the time t of the one
             before.
         sigma: smoothing in px before differentiation.
@@ -70,7 +64,34 @@ def multiscale_curvilinear_saliency(
         >>> round(float(field[0, :, 16, 16].norm()), 3)
         1.0
     """
-    check_image(image)
+    times, limit = _check_scales(scales, smoothing, conductance, diffusion_time, threshold)
+    width, edge = check_width(sigma, "sigma", zero_ok=True), check_width(kappa, "kappa")
+
+    def layer(image: Tensor) -> Planes:
+        level, done = image, 0
+        field, saliency = _normalised_saliency(level, width)
+        lowest = saliency
+        for time in times:
+            if smoothing == "perona-malik":
+                steps = max(round(time / STEP), 1)
+                level = diffuse(level, max(steps - done, 0), edge, STEP, conductance)
+                done = max(steps, done)
+            else:
+                edge_preserving = bilateral_smooth if smoothing == "bilateral" else guided_smooth
+                level = edge_preserving(image, sigma=math.sqrt(2.0 * time), kappa=edge)
+            level_field, level_saliency = _normalised_saliency(level, width)
+            # A selection by arithmetic: on a CPU far faster than argmax and gather.
+            field = torch.lerp(field, level_field, (level_saliency > saliency).to(field.dtype))
+            saliency, lowest = torch.maximum(saliency, level_saliency), torch.minimum(lowest, level_saliency)
+        return (field * (lowest > limit),)
+
+    return on_photograph(layer, image)
+
+
+def _check_scales(
+    scales: int, smoothing: str, conductance: str, diffusion_time: float | None, threshold: float | None
+) -> tuple[list[float], float]:
+    """The smoothed levels' times, and T."""
     check_option(smoothing, SMOOTHINGS, "smoothing")
     check_option(conductance, CONDUCTANCES, "conductance")
     if scales < 1:
@@ -78,31 +99,8 @@ def multiscale_curvilinear_saliency(
     limit = math.exp(-scales) if threshold is None else threshold
     if not 0 <= limit < 1:
         raise InvalidInputError(f"threshold: expected 0 <= threshold < 1, got {threshold}")
-    last = 2.0 ** (scales - 2) if diffusion_time is None else diffusion_time
-    check_positive(last, "diffusion_time")
-    times = [last * 2.0 ** (k - scales) for k in range(2, scales + 1)]
-
-    def layer(image: Tensor) -> Planes:
-        level, done = image, 0
-        field, saliency = _normalised_saliency(level, sigma)
-        lowest = saliency
-        for time in times:
-            if smoothing == "perona-malik":
-                steps = max(round(time / STEP), 1)
-                level = anisotropic_diffusion(
-                    level, iterations=max(steps - done, 0), kappa=kappa, step=STEP, conductance=conductance
-                )
-                done = max(steps, done)
-            else:
-                edge_preserving = bilateral_smooth if smoothing == "bilateral" else guided_smooth
-                level = edge_preserving(image, sigma=math.sqrt(2.0 * time), kappa=kappa)
-            level_field, level_saliency = _normalised_saliency(level, sigma)
-            # A selection by arithmetic: on a CPU far faster than argmax and gather.
-            field = torch.lerp(field, level_field, (level_saliency > saliency).to(field.dtype))
-            saliency, lowest = torch.maximum(saliency, level_saliency), torch.minimum(lowest, level_saliency)
-        return (field * (lowest > limit),)
-
-    return in_blocks(layer, at_least_float32(image)).to(image.dtype)
+    last = check_positive(2.0 ** (scales - 2) if diffusion_time is None else diffusion_time, "diffusion_time")
+    return [last * 2.0 ** (k - scales) for k in range(2, scales + 1)], limit
 
 
 def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> tuple[Tensor, Tensor]:
@@ -115,7 +113,9 @@ def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> tuple[Tensor, 
 
 
 class MultiScaleCurvilinearSaliency(nn.Module):
-    """Module twin of :func:`multiscale_curvilinear_saliency`; ``learnable=True`` makes sigma and kappa parameters."""
+    """Module twin of :func:`multiscale_curvilinear_saliency`; ``learnable=True`` makes log sigma and kappa parameters."""
+
+    sigma, kappa = positive_option("sigma"), positive_option("kappa")
 
     def __init__(
         self,
@@ -130,9 +130,9 @@ class MultiScaleCurvilinearSaliency(nn.Module):
         learnable: bool = False,
     ) -> None:
         super().__init__()
-        check_option(smoothing, SMOOTHINGS, "smoothing")
-        check_option(conductance, CONDUCTANCES, "conductance")
-        self.sigma, self.kappa = parameter_if(learnable, sigma), parameter_if(learnable, kappa)
+        _check_scales(scales, smoothing, conductance, diffusion_time, threshold)
+        check_width(sigma, "sigma", zero_ok=True), check_width(kappa, "kappa")
+        keep_positive(self, learnable, sigma=sigma, kappa=kappa)
         self.scales, self.smoothing, self.conductance = scales, smoothing, conductance
         self.diffusion_time, self.threshold = diffusion_time, threshold
 

@@ -5,10 +5,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_image, check_option, check_positive
+from .._checks import check_option, check_positive
 from ..errors import InvalidInputError
-from .curvilinear import along, dominant_eigenvector
-from .derivatives import Planes, at_least_float32, central_derivatives, in_blocks, smooth
+from .blocks import Planes
+from .curvilinear import along, dominant_eigenvector, x_if_none
+from .derivatives import central_derivatives, smooth
+from .inputs import on_photograph
 
 __all__ = ["PrincipalCurvatureImage", "principal_curvature_image"]
 
@@ -26,7 +28,8 @@ def principal_curvature_image(
     scales at a time and sum them up in a watershed; this is the maximum over all scales, which the paper compares with.
 
     Args:
-        image: (B, 1, H, W) grey levels, usually in [0, 1].
+        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB; NaN pixels are missing (0 in the
+            result).
         sigmas: scales in px, > 0.
         eigenvalue: ``"largest"`` or ``"smallest"``.
 
@@ -44,27 +47,27 @@ def principal_curvature_image(
         >>> int(field[0, 0, 16].abs().argmax())
         16
     """
-    check_image(image)
-    check_option(eigenvalue, EIGENVALUES, "eigenvalue")
-    if len(sigmas) == 0:
-        raise InvalidInputError("sigmas: expected at least one sigma, got none")
-    for sigma in sigmas:
-        check_positive(sigma, "sigmas")
+    widths = _check_scales(sigmas, eigenvalue)
     sign = 1.0 if eigenvalue == "largest" else -1.0
 
     def layer(image: Tensor) -> Planes:
         best, vx, vy = torch.zeros_like(image), torch.zeros_like(image), torch.zeros_like(image)
-        for sigma in sigmas:
+        for sigma in widths:
             xx, yy, xy = (sign * sigma**2 * h for h in central_derivatives(smooth(image, sigma))[2:])
             x, y, half_gap = dominant_eigenvector(xx, xy, xy, yy, sign=1.0)
             curvature = 0.5 * (xx + yy) + half_gap
             better = (curvature > best).to(best.dtype)
             best, vx, vy = torch.maximum(best, curvature), torch.lerp(vx, x, better), torch.lerp(vy, y, better)
-        # A blob has no direction of its own: x.
-        vx = torch.where((vx == 0) & (vy == 0), 1.0, vx)
-        return along(best, vx, vy)
+        return along(best, x_if_none(vx, vy), vy)  # a blob has no direction of its own
 
-    return in_blocks(layer, at_least_float32(image)).to(image.dtype)
+    return on_photograph(layer, image)
+
+
+def _check_scales(sigmas: Sequence[float], eigenvalue: str) -> list[float]:
+    check_option(eigenvalue, EIGENVALUES, "eigenvalue")
+    if len(sigmas) == 0:
+        raise InvalidInputError("sigmas: expected at least one sigma, got none")
+    return [check_positive(sigma, "sigmas") for sigma in sigmas]
 
 
 class PrincipalCurvatureImage(nn.Module):
@@ -72,7 +75,7 @@ class PrincipalCurvatureImage(nn.Module):
 
     def __init__(self, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0), eigenvalue: str = "largest") -> None:
         super().__init__()
-        check_option(eigenvalue, EIGENVALUES, "eigenvalue")
+        _check_scales(sigmas, eigenvalue)
         self.sigmas, self.eigenvalue = tuple(sigmas), eigenvalue
 
     def forward(self, image: Tensor) -> Tensor:

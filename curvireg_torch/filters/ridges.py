@@ -1,12 +1,12 @@
 """Apparent ridges (AR) of depth images."""
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from ..errors import InvalidInputError
-from .curvilinear import along, check_depth, dominant_eigenvector
-from .derivatives import Planes, at_least_float32, in_blocks, safe_sqrt
-from .shading import batched_camera, normal_variation
+from .blocks import Planes, in_blocks
+from .curvilinear import along, check_depth, dominant_eigenvector, x_if_none
+from .numerics import at_least_float32, safe_sqrt
+from .shading import WithCamera, batched_camera, check_shading, normal_variation
 from .suppression import is_ridge
 
 __all__ = ["ApparentRidges", "apparent_ridges"]
@@ -50,25 +50,23 @@ def apparent_ridges(
         >>> int(field[0, :, 16].norm(dim=0).argmax())                              # its edge
         16
     """
-    check_depth(depth, mask, depth_scale)
-    if camera_matrix is not None and depth_scale is not None:
-        raise InvalidInputError("depth_scale: has no meaning with a camera_matrix; leave one of them out")
+    mask, camera = check_depth(depth, mask), batched_camera(camera_matrix, depth)
+    width, scale = check_shading(sigma, depth_scale, camera_matrix)
 
     def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Planes:
-        a, b, c = normal_variation(depth, mask, camera, sigma, depth_scale)
+        a, b, c = normal_variation(depth, mask, camera, width, scale)
         vx, vy, half_gap = dominant_eigenvector(a, b, b, c)
+        vx = x_if_none(vx, vy)
         curvature = safe_sqrt(0.5 * (a + c) + half_gap)
         if maxima:
             curvature = torch.where(is_ridge(curvature, vx, vy), curvature, 0.0)
         return along(curvature, vx, vy)
 
-    return in_blocks(layer, at_least_float32(depth), mask, batched_camera(camera_matrix, depth)).to(depth.dtype)
+    return in_blocks(layer, at_least_float32(depth), mask, camera).to(depth.dtype)
 
 
-class ApparentRidges(nn.Module):
-    """Module twin of :func:`apparent_ridges`; ``camera_matrix`` moves with the module's device."""
-
-    camera_matrix: Tensor | None
+class ApparentRidges(WithCamera):
+    """Module twin of :func:`apparent_ridges`; ``camera_matrix`` moves with the module, its dtype kept."""
 
     def __init__(
         self,
@@ -78,8 +76,8 @@ class ApparentRidges(nn.Module):
         depth_scale: float | None = None,
         maxima: bool = True,
     ) -> None:
-        super().__init__()
-        self.register_buffer("camera_matrix", camera_matrix, persistent=False)
+        super().__init__(camera_matrix)
+        check_shading(sigma, depth_scale, camera_matrix)
         self.sigma, self.depth_scale, self.maxima = sigma, depth_scale, maxima
 
     def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:

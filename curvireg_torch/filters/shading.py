@@ -1,14 +1,28 @@
 """Average shading gradient (ASG) and Hessian Frobenius norm (HFN) of depth images, which the paper compares with CS."""
 
 import math
+from collections.abc import Callable
+from typing import Self
 
 import torch
 from torch import Tensor, nn
 
 from .._checks import check_same_device, check_tensor
 from ..errors import InvalidInputError
-from .curvilinear import BACKGROUND, along, check_depth, dominant_eigenvector, fill_depth, visible_range
-from .derivatives import Planes, at_least_float32, central_derivatives, in_blocks, safe_sqrt, smooth
+from .blocks import Planes, in_blocks
+from .curvilinear import (
+    BACKGROUND,
+    along,
+    check_depth,
+    check_scale,
+    dominant_eigenvector,
+    fill_depth,
+    visible_range,
+    x_if_none,
+)
+from .derivatives import central_derivatives, smooth
+from .learnable import check_width
+from .numerics import at_least_float32, safe_sqrt
 
 __all__ = ["AverageShadingGradient", "HessianFrobeniusNorm", "average_shading_gradient", "hessian_frobenius_norm"]
 
@@ -28,10 +42,10 @@ def average_shading_gradient(
 
     Args:
         depth: (B, 1, H, W) z-depth. 0, negative, inf and NaN are background.
-        mask: (B, 1, H, W) bool, False = background; optional.
-        camera_matrix: (3, 3) or (B, 3, 3), px, without skew: N is the normal of the surface that this perspective
-            camera sees (``equ:PG:300``), whatever the depth's unit. None (orthographic): N is the normal of the graph
-            of Z.
+        mask: bool, False = background; optional. (B, 1, H, W) or what broadcasts to it.
+        camera_matrix: (3, 3), (1, 3, 3) or (B, 3, 3), px, without skew: N is the normal of the surface that this
+            perspective camera sees (``equ:PG:300``), whatever the depth's unit. None (orthographic): N is the normal of
+            the graph of Z.
         sigma: smoothing in px before differentiation, >= 0.
         depth_scale: of :func:`depth_curvilinear_saliency`; orthographic only.
 
@@ -49,25 +63,33 @@ def average_shading_gradient(
         >>> round(float(field[0, :, 32, 32].norm()) * 60 / (2 * torch.pi / 3) ** 0.5, 2)     # gamma sqrt(2) / radius
         1.0
     """
-    check_depth(depth, mask, depth_scale)
-    if camera_matrix is not None and depth_scale is not None:
-        raise InvalidInputError("depth_scale: has no meaning with a camera_matrix; leave one of them out")
+    mask, camera = check_depth(depth, mask), batched_camera(camera_matrix, depth)
+    width, scale = check_shading(sigma, depth_scale, camera_matrix)
 
     def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Planes:
-        a, b, c = normal_variation(depth, mask, camera, sigma, depth_scale)
+        a, b, c = normal_variation(depth, mask, camera, width, scale)
         vx, vy, _ = dominant_eigenvector(a, b, b, c)
-        # Where both eigenvalues agree every direction does: x.
-        vx = torch.where((vx == 0) & (vy == 0), 1.0, vx)
-        return along(math.sqrt(math.pi / 3.0) * safe_sqrt(a + c), vx, vy)
+        return along(math.sqrt(math.pi / 3.0) * safe_sqrt(a + c), x_if_none(vx, vy), vy)
 
-    return in_blocks(layer, at_least_float32(depth), mask, batched_camera(camera_matrix, depth)).to(depth.dtype)
+    return in_blocks(layer, at_least_float32(depth), mask, camera).to(depth.dtype)
+
+
+def check_shading(
+    sigma: float | Tensor, depth_scale: float | None, camera_matrix: Tensor | None
+) -> tuple[float | Tensor, float | None]:
+    """sigma and depth_scale."""
+    if camera_matrix is not None:
+        check_tensor(camera_matrix, "camera_matrix", (None,) * (camera_matrix.ndim == 3) + (3, 3))
+        if depth_scale is not None:
+            raise InvalidInputError("depth_scale: has no meaning with a camera_matrix; leave one of them out")
+    return check_width(sigma, "sigma", zero_ok=True), check_scale(depth_scale)
 
 
 def batched_camera(camera_matrix: Tensor | None, depth: Tensor) -> Tensor | None:
     """(B, 3, 3) in the dtype that ``depth`` is computed in; None stays None."""
     if camera_matrix is None:
         return None
-    if camera_matrix.ndim == 2:
+    if camera_matrix.ndim == 2 or (camera_matrix.ndim == 3 and camera_matrix.shape[0] == 1):
         camera_matrix = camera_matrix.expand(depth.shape[0], -1, -1)
     check_tensor(camera_matrix, "camera_matrix", (depth.shape[0], 3, 3))
     check_same_device(camera_matrix, depth, "camera_matrix")
@@ -79,14 +101,14 @@ def normal_variation(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """N_x . N_x, N_x . N_y, N_y . N_y per px^2, each (B, 1, H, W), from the Hessian in closed form."""
     if camera is None:
-        z = smooth(fill_depth(depth, mask, depth_scale), sigma)
+        z = smooth(fill_depth(depth, mask, depth_scale), sigma, linear=True)
         zx, zy, zxx, zyy, zxy = central_derivatives(z)
         one, zero = torch.ones_like(zx), torch.zeros_like(zx)
         normal = (-zx, -zy, one)
         along_x, along_y = (-zxx, -zxy, zero), (-zxy, -zyy, zero)
         return _gram(normal, along_x, along_y)
     surface, near, span = visible_range(depth, mask)
-    z = smooth(torch.minimum(surface, near + BACKGROUND * span) / span, sigma)
+    z = smooth(torch.minimum(surface, near + BACKGROUND * span) / span, sigma, linear=True)
     zx, zy, zxx, zyy, zxy = central_derivatives(z)
     z = z[..., 1:-1, 1:-1]
     H, W = z.shape[-2:]
@@ -140,27 +162,42 @@ def hessian_frobenius_norm(
         >>> hessian_frobenius_norm(bowl, sigma=0.0, depth_scale=1.0)[0, :, 16, 16].tolist()
         [1.0, 0.0]
     """
-    check_depth(depth, mask, depth_scale)
+    mask = check_depth(depth, mask)
+    width, scale = check_shading(sigma, depth_scale, None)
 
     def layer(depth: Tensor, mask: Tensor | None) -> Planes:
-        _, _, zxx, zyy, zxy = central_derivatives(smooth(fill_depth(depth, mask, depth_scale), sigma))
+        _, _, zxx, zyy, zxy = central_derivatives(smooth(fill_depth(depth, mask, scale), width, linear=True))
         vx, vy, _ = dominant_eigenvector(zxx, zxy, zxy, zyy)
-        vx = torch.where((vx == 0) & (vy == 0), 1.0, vx)
-        return along(safe_sqrt(zxx * zxx + 2.0 * zxy * zxy + zyy * zyy), vx, vy)
+        return along(safe_sqrt(zxx * zxx + 2.0 * zxy * zxy + zyy * zyy), x_if_none(vx, vy), vy)
 
     return in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
 
 
-class AverageShadingGradient(nn.Module):
-    """Module twin of :func:`average_shading_gradient`; ``camera_matrix`` moves with the module's device."""
+class WithCamera(nn.Module):
+    """A module whose camera matrix moves with its device and keeps its dtype: ``.half()`` would round focal lengths."""
 
     camera_matrix: Tensor | None
+
+    def __init__(self, camera_matrix: Tensor | None) -> None:
+        super().__init__()
+        self.register_buffer("camera_matrix", camera_matrix, persistent=False)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        camera = self.camera_matrix
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        if camera is not None and self.camera_matrix is not None:
+            self.camera_matrix = camera.to(self.camera_matrix.device)
+        return self
+
+
+class AverageShadingGradient(WithCamera):
+    """Module twin of :func:`average_shading_gradient`; ``camera_matrix`` moves with the module, its dtype kept."""
 
     def __init__(
         self, *, camera_matrix: Tensor | None = None, sigma: float = 1.0, depth_scale: float | None = None
     ) -> None:
-        super().__init__()
-        self.register_buffer("camera_matrix", camera_matrix, persistent=False)
+        super().__init__(camera_matrix)
+        check_shading(sigma, depth_scale, camera_matrix)
         self.sigma, self.depth_scale = sigma, depth_scale
 
     def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -178,6 +215,7 @@ class HessianFrobeniusNorm(nn.Module):
 
     def __init__(self, *, sigma: float = 1.0, depth_scale: float | None = None) -> None:
         super().__init__()
+        check_shading(sigma, depth_scale, None)
         self.sigma, self.depth_scale = sigma, depth_scale
 
     def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:

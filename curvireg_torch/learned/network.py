@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from .._checks import check_colour_image
 from .._files import write_tensors
 from ..errors import InvalidInputError, MissingFileError
-from ..filters.derivatives import safe_sqrt
+from ..filters.numerics import safe_sqrt
 
 __all__ = ["FieldNetwork", "LearnedCurvilinearSaliency", "doubled_angle", "halved_angle"]
 

@@ -43,7 +43,7 @@ def test_blocks_are_invisible(monkeypatch: pytest.MonkeyPatch) -> None:
     x = depths(5)
     mask = x > 2.4
     want = filters.depth_curvilinear_saliency(x, mask)
-    monkeypatch.setattr("curvireg_torch.filters.derivatives.BLOCK", 2 * 24 * 24)
+    monkeypatch.setattr("curvireg_torch.filters.blocks.BLOCK", 2 * 24 * 24)
     torch.testing.assert_close(filters.depth_curvilinear_saliency(x, mask), want)
     torch.testing.assert_close(
         filters.average_shading_gradient(x), torch.cat([filters.average_shading_gradient(i[None]) for i in x])
