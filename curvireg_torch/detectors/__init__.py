@@ -1,6 +1,7 @@
 """The 2D detectors that the paper compares, behind one call: photograph in, response map and feature points out.
 
-``DETECTORS[name](image, share=0.04)`` takes (B, 1, H, W) grey levels in [0, 1] and returns a :class:`Detection`.
+``DETECTORS[name](image, share=0.04)`` takes (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB, and returns a
+:class:`Detection`. Nothing is detected on NaN pixels, which are filled from around them.
 """
 
 from collections.abc import Callable
@@ -12,10 +13,12 @@ from .fast_hessian import fast_hessian
 from .fields import focus_curves, gradient, multiscale_saliency, principal_curvature
 from .fuzzy import fuzzy_edges
 from .keypoints import sift
+from .response import Response
 
 __all__ = [
     "DETECTORS",
     "Detection",
+    "Response",
     "canny",
     "fast_hessian",
     "focus_curves",

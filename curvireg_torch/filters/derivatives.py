@@ -92,20 +92,14 @@ def replicate_pad(x: Tensor, radius: int) -> Tensor:
 
 
 def extrapolate_pad(x: Tensor, radius: int) -> Tensor:
-    """(B, C, H, W) turned by 180 degrees about each border, ``radius`` px deep on all four sides: planes go on.
-
-    Beyond the depth of the image itself the last value found is repeated.
-    """
+    """(B, C, H, W) continued by ``radius`` px on all sides with the slope at its borders: planes stay planes."""
+    steps = torch.arange(1, radius + 1, device=x.device, dtype=x.dtype)
     for dim in (-1, -2):
-        n = x.shape[dim]
-        inside = min(radius, n - 1)
+        n, k = x.shape[dim], steps if dim == -1 else steps[:, None]
         first, last = x.narrow(dim, 0, 1), x.narrow(dim, n - 1, 1)
-        before = 2.0 * first - x.narrow(dim, 1, inside).flip(dim)
-        after = 2.0 * last - x.narrow(dim, n - 1 - inside, inside).flip(dim)
-        x = torch.cat([before, x, after], dim=dim)
-        if inside < radius:
-            missing = radius - inside
-            x = F.pad(x, (missing, missing, 0, 0) if dim == -1 else (0, 0, missing, missing), mode="replicate")
+        # An image one pixel wide has no slope.
+        fall, rise = first - x.narrow(dim, min(1, n - 1), 1), last - x.narrow(dim, max(n - 2, 0), 1)
+        x = torch.cat([first + fall * k.flip(0), x, last + rise * k], dim=dim)
     return x
 
 

@@ -43,7 +43,8 @@ def grey(image: Tensor) -> Tensor:
     if image.shape[1] == 1:
         return image
     r, g, b = image.split(1, dim=1)
-    return LUMA[0] * r + LUMA[1] * g + LUMA[2] * b
+    level: Tensor = LUMA[0] * r + LUMA[1] * g + LUMA[2] * b
+    return level
 
 
 def may_lack_pixels(x: Tensor) -> bool:

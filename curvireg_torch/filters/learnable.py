@@ -43,8 +43,8 @@ def check_width(value: float | Tensor, name: str, *, zero_ok: bool = False) -> f
 
 
 def inverse(value: float | Tensor) -> float | Tensor:
-    """1 / value; of a tensor at least 1e-6, so that a graph, which cannot check, makes no infinity."""
-    return 1.0 / (value.clamp(min=1e-6) if isinstance(value, Tensor) else value)
+    """1 / value; a tensor counts as between 1e-6 and 1e6, so that a graph, which cannot check, makes no infinity."""
+    return 1.0 / (value.clamp(min=1e-6, max=1e6) if isinstance(value, Tensor) else value)
 
 
 def as_number(value: float | Tensor) -> float:

@@ -113,7 +113,7 @@ def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> tuple[Tensor, 
 
 
 class MultiScaleCurvilinearSaliency(nn.Module):
-    """Module twin of :func:`multiscale_curvilinear_saliency`; ``learnable=True`` makes log sigma and kappa parameters."""
+    """Module twin of :func:`multiscale_curvilinear_saliency`; learnable: log sigma and log kappa."""
 
     sigma, kappa = positive_option("sigma"), positive_option("kappa")
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from .._checks import check_colour_image
 from .._files import write_tensors
 from ..errors import InvalidInputError, MissingFileError
-from ..filters.numerics import safe_sqrt
+from ..filters.numerics import at_least_float32, floor, safe_sqrt
 
 __all__ = ["FieldNetwork", "LearnedCurvilinearSaliency", "doubled_angle", "halved_angle"]
 
@@ -31,20 +31,22 @@ def doubled_angle(field: Tensor) -> Tensor:
 
     Vectors of one direction and of its reverse add up instead of cancelling, so that they may be averaged and learnt.
     """
-    x, y = field.unbind(1)
+    x, y = at_least_float32(field).unbind(1)
     length = safe_sqrt(x * x + y * y)
-    scale = (length + 1e-12) ** -1.5
-    return torch.stack([(x * x - y * y) * scale, 2.0 * x * y * scale], dim=1)
+    scale = length.clamp(min=1e-12) ** -1.5
+    return torch.stack([(x * x - y * y) * scale, 2.0 * x * y * scale], dim=1).to(field.dtype)
 
 
 def halved_angle(doubled: Tensor) -> Tensor:
     """The inverse of :func:`doubled_angle`, each vector in the half plane x >= 0."""
-    c, s = doubled.unbind(1)
+    c, s = at_least_float32(doubled).unbind(1)
     length = safe_sqrt(c * c + s * s)
-    # m cos t and m sin t with m = length^2 and cos 2t = c / length.
-    x = length * safe_sqrt((0.5 * length * (length + c)).clamp(min=0.0))
-    y = length * safe_sqrt((0.5 * length * (length - c)).clamp(min=0.0))
-    return torch.stack([x, torch.where(s < 0, -y, y)], dim=1)
+    # m cos t and m sin t with m = length^2 and cos 2t = c / length. Of the two the one that does not cancel; the other
+    # from sin 2t = 2 sin t cos t.
+    larger = safe_sqrt(0.5 * length * (length + c.abs()))
+    smaller = 0.5 * length * s.abs() / larger.clamp(min=floor(larger))
+    x, y = torch.where(c >= 0, larger, smaller), torch.where(c >= 0, smaller, larger)
+    return (length[:, None] * torch.stack([x, torch.where(s < 0, -y, y)], dim=1)).to(doubled.dtype)
 
 
 def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:

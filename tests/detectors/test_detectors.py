@@ -68,7 +68,9 @@ def test_a_flat_image_has_no_points(name: str, value: float) -> None:
 @every_detector
 def test_bad_input_is_refused(name: str) -> None:
     with pytest.raises(InvalidInputError, match="image: expected shape"):
-        DETECTORS[name](torch.zeros(1, 3, 32, 32))
+        DETECTORS[name](torch.zeros(3, 32, 32))
+    with pytest.raises(InvalidInputError, match="got 2"):
+        DETECTORS[name](torch.zeros(1, 2, 32, 32))
 
 
 def _near(points: np.ndarray, others: np.ndarray, radius: int) -> float:

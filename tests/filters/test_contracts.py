@@ -183,8 +183,10 @@ def test_holes_in_the_depth_leak_into_no_number(layer: Layer, hole: float) -> No
 
 def test_bad_input_is_refused_with_expected_and_actual() -> None:
     image, depth = photos(), depths()
-    with pytest.raises(InvalidInputError, match=r"image: expected shape \(\*, 1, \*, \*\), got \(2, 3, 24, 24\)"):
-        filters.image_gradient(image.expand(2, 3, 24, 24))
+    with pytest.raises(InvalidInputError, match=r"image: expected 1 \(grey\) or 3 \(RGB\) channels, got 2"):
+        filters.image_gradient(image.expand(2, 2, 24, 24))
+    with pytest.raises(InvalidInputError, match=r"depth: expected shape \(\*, 1, \*, \*\), got \(2, 3, 24, 24\)"):
+        filters.hessian_frobenius_norm(depth.expand(2, 3, 24, 24))
     with pytest.raises(InvalidInputError, match=r"expected a floating dtype, got torch\.uint8"):
         filters.multiscale_focus_curves(image.byte())
     with pytest.raises(InvalidInputError, match="formula: expected one of 'geometric', 'paper', got 'x'"):

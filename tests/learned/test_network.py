@@ -81,10 +81,30 @@ def test_it_stays_in_evaluation_mode_after_loading(field):
     assert not field.training
 
 
-def test_it_compiles_whole_and_exports(field):
+def test_it_exports(field):
     x = torch.rand(1, 3, 128, 128)
     exported = torch.export.export(field, (x,)).module()
     assert alike(exported(x), field(x))
+
+
+@pytest.mark.slow
+def test_it_compiles_whole(field):
+    torch._dynamo.reset()
+    x = torch.rand(1, 3, 128, 128)
+    assert alike(torch.compile(field, fullgraph=True)(x), field(x))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e3])
+def test_doubled_angles_are_undone_in_every_dtype(dtype, size):
+    t = torch.linspace(-3.1, 3.1, 63, dtype=torch.float64)
+    vectors = (size * torch.stack([t.cos(), t.sin()])[None, :, :, None]).to(dtype)
+    back = halved_angle(doubled_angle(vectors))
+    assert back.dtype == doubled_angle(vectors).dtype == dtype
+    off = torch.minimum((back - vectors).abs(), (back + vectors).abs()).amax(dim=1)
+    # float16 has no more than 4 bits of 1e-6 itself.
+    precision = 0.5 if (dtype, size) == (torch.float16, 1e-6) else 16 * torch.finfo(dtype).eps
+    assert off.max() < precision * size
 
 
 def test_saved_weights_come_back(field, tmp_path):
