@@ -17,7 +17,11 @@ class Response(nn.Module):
         layer: from photographs (B, 1 or 3, H, W) to a vector field (B, 2, H, W), whose length is the response, to a
             :class:`Detection`, whose response it is, or to a map (B, 1, H, W).
 
-    Input (B, 1 or 3, H, W), and the levels' sigmas, which kornia passes and no layer here needs; output (B, 1, H, W).
+        power: p of the factor sigma^p on the response of a level of scale sigma px, without which no level is a maximum
+            over scales: the number of derivatives that the response multiplies, 1 for a gradient, 2 for its square or a
+            curvature, 4 for the product of two curvatures.
+
+    Input (B, 1 or 3, H, W), and (B,) sigmas of the levels, as kornia passes them; output (B, 1, H, W).
 
     Example:
         >>> from curvireg_torch.filters import ImageCurvilinearSaliency
@@ -25,14 +29,14 @@ class Response(nn.Module):
         torch.Size([1, 1, 32, 32])
     """
 
-    def __init__(self, layer: Callable[[Tensor], Tensor | Detection]) -> None:
+    def __init__(self, layer: Callable[[Tensor], Tensor | Detection], *, power: float = 0.0) -> None:
         super().__init__()
-        self.layer = layer
+        self.layer, self.power = layer, power
 
     def forward(self, image: Tensor, sigmas: Tensor | None = None) -> Tensor:
         answer = self.layer(image)
         if isinstance(answer, Detection):
-            return answer.response
-        if answer.shape[1] == 1:
-            return answer
-        return safe_sqrt(answer.square().sum(dim=1, keepdim=True))
+            answer = answer.response
+        if answer.shape[1] > 1:
+            answer = safe_sqrt(answer.square().sum(dim=1, keepdim=True))
+        return answer if sigmas is None else answer * sigmas.to(answer).view(-1, 1, 1, 1) ** self.power

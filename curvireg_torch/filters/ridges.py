@@ -50,8 +50,8 @@ def apparent_ridges(
         >>> int(field[0, :, 16].norm(dim=0).argmax())                              # its edge
         16
     """
-    mask, camera = check_depth(depth, mask), batched_camera(camera_matrix, depth)
     width, scale = check_shading(sigma, depth_scale, camera_matrix)
+    mask, camera = check_depth(depth, mask), batched_camera(camera_matrix, depth)
 
     def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Planes:
         a, b, c = normal_variation(depth, mask, camera, width, scale)

@@ -63,8 +63,8 @@ def average_shading_gradient(
         >>> round(float(field[0, :, 32, 32].norm()) * 60 / (2 * torch.pi / 3) ** 0.5, 2)     # gamma sqrt(2) / radius
         1.0
     """
-    mask, camera = check_depth(depth, mask), batched_camera(camera_matrix, depth)
     width, scale = check_shading(sigma, depth_scale, camera_matrix)
+    mask, camera = check_depth(depth, mask), batched_camera(camera_matrix, depth)
 
     def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Planes:
         a, b, c = normal_variation(depth, mask, camera, width, scale)

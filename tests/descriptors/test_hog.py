@@ -68,6 +68,24 @@ def test_linear_voting_against_loops(shape: tuple[int, int], grid: int) -> None:
     np.testing.assert_allclose(hog(field, grid=grid)[0], want, atol=1e-10)
 
 
+@pytest.mark.parametrize("factor", [1e-6, 1e-3, 1e6])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_no_contrast_is_too_low(factor: float, dtype: torch.dtype) -> None:
+    field = torch.randn(2, 2, 32, 32, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    field[:, :, 16:] *= 0.01  # weak blocks as well as strong ones
+    torch.testing.assert_close(hog(factor * field), hog(field), rtol=1e-4, atol=1e-6)
+    assert not hog(torch.zeros_like(field)).any()
+
+
+def test_what_is_nothing_beside_the_strongest_block_stays_nothing() -> None:
+    field = torch.zeros(1, 2, 64, 64, dtype=torch.float64)
+    field[:, 0, :32] = 1.0
+    field[:, 1, 32:] = 1e-13  # rounding
+    lengths = hog(field).view(7, 7, 36).norm(dim=-1)
+    assert float(lengths[:3].min()) > 0.99
+    assert float(lengths[5:].max()) < 0.01
+
+
 def test_length_and_layout() -> None:
     field = torch.zeros(1, 2, 64, 64)
     field[0, 0, 24:32, 40:48] = 1.0  # cell (3, 5), pointing along x: bins 0 and 8 in equal parts

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from kornia.color import rgb_to_grayscale
 from scipy.ndimage import binary_dilation
 from skimage.feature import canny as skimage_canny
 from skimage.feature import corner_harris, corner_shi_tomasi
@@ -71,6 +72,21 @@ def test_bad_input_is_refused(name: str) -> None:
         DETECTORS[name](torch.zeros(3, 32, 32))
     with pytest.raises(InvalidInputError, match="got 2"):
         DETECTORS[name](torch.zeros(1, 2, 32, 32))
+
+
+@every_detector
+def test_colour_becomes_grey_and_missing_pixels_detect_nothing(name: str) -> None:
+    colour = torch.stack([photos(1, 48, seed=i)[:, 0] for i in range(3)], dim=1)
+    want, got = DETECTORS[name](rgb_to_grayscale(colour)), DETECTORS[name](colour)
+    torch.testing.assert_close(got.response, want.response, rtol=1e-3, atol=1e-5)
+    box = _box()
+    broken = box.clone()
+    broken[0, 0, 20, 30:33] = torch.nan  # on its outline
+    clean, answer = DETECTORS[name](box), DETECTORS[name](broken)
+    assert torch.isfinite(answer.response).all()
+    assert not answer.points[0, 0, 20, 30:33].any()
+    assert not answer.response[0, 0, 20, 30:33].any()
+    assert int((answer.points & clean.points).sum()) >= 0.5 * int(clean.points.sum())
 
 
 def _near(points: np.ndarray, others: np.ndarray, radius: int) -> float:
@@ -149,6 +165,32 @@ def test_zero_crossings_lie_on_a_disc_where_the_laplacian_changes_sign() -> None
     assert float((r[strong] - 20).abs().max()) < 1.5
 
 
+@pytest.mark.parametrize("contrast", [1.0, -0.4])
+@pytest.mark.parametrize("transposed", [False, True])
+def test_zero_crossings_find_a_step_whose_edge_is_a_pixel(contrast: float, transposed: bool) -> None:
+    """0, ..., 0, 1/2, 1, ..., 1: the Laplacian is 0 on the edge itself, and of opposite sign beside it."""
+    image = torch.zeros(1, 1, 24, 31)
+    image[..., 15] = 0.5
+    image[..., 16:] = 1.0
+    image = contrast * image
+    answer = detectors.laplacian_of_gaussian(image.mT if transposed else image, share=1.0)
+    response = (answer.response.mT if transposed else answer.response)[0, 0]
+    strong = response > 0.1 * response.max()
+    assert float(response.max()) > 1e-3
+    # Where rounding makes the 0 a little more or less, the crossing is on the one side or the other.
+    assert strong.any(dim=0).nonzero().flatten().tolist() in ([14], [15], [14, 15])
+    assert bool(strong.any(dim=1).all())
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 3.5])
+def test_the_step_of_the_laplacian_is_that_of_a_gaussian_edge(sigma: float) -> None:
+    """Beside a step of height 1 smoothed by s, L = -x exp(-x^2 / 2 s^2) / (sqrt(2 pi) s^3); the step is 2 L(1/2)."""
+    image = (torch.arange(64) >= 32).double().expand(1, 1, 16, 64)
+    response = detectors.laplacian_of_gaussian(image, sigma=sigma).response[0, 0, 8]
+    want = math.exp(-0.125 / sigma**2) / (math.sqrt(2 * math.pi) * sigma**3)
+    assert float(response.max()) == pytest.approx(want, rel=0.15 if sigma == 1.0 else 0.05)
+
+
 def test_fuzzy_rules() -> None:
     """The degree of "edge" is 1 - min(mu(Ix), mu(Iy)) of the derivatives over the largest one."""
     image = torch.zeros(1, 1, 9, 40)
@@ -174,12 +216,44 @@ def _slow_determinant(x: np.ndarray, side: int, i: int, j: int) -> float:
 
 
 def test_fast_hessian_against_the_filters_of_bay() -> None:
-    image = photos(1, 40, seed=8, dtype=torch.float64)
+    """The largest determinant over all sides that fit, constants included, to the last digit of float32."""
+    image = photos(1, 54, seed=8, dtype=torch.float64)
     response = detectors.fast_hessian(image).response[0, 0]
-    for i, j in ((20, 20), (14, 17), (22, 19)):
-        want = max(_slow_determinant(image[0, 0].numpy(), side, i, j) for side in (9, 15, 21, 27))
-        # Larger filters reach over the border; they can only add.
-        assert float(response[i, j]) >= max(want, 0.0) - 1e-7
+    pixels = ((26, 26), (27, 27), (26, 28), (28, 25))
+    for i, j in pixels:
+        want = max(_slow_determinant(image[0, 0].numpy(), side, i, j) for side in (9, 15, 21, 27, 39, 51))
+        assert float(response[i, j]) == pytest.approx(max(want, 0.0), rel=1e-5)
+    assert max(float(response[p]) for p in pixels) > 0.0
+
+
+def test_fast_hessian_weighs_the_mixed_derivative() -> None:
+    """On a saddle within a bowl D_xx, D_yy and D_xy all answer, and the weight 0.9 of the last one tells."""
+    axis = torch.arange(41.0, dtype=torch.float64) - 20
+    image = (0.5 + 0.001 * axis[:, None] * axis + 0.001 * (axis[:, None] ** 2 + axis**2))[None, None] / 4.0
+    want = max(_slow_determinant(image[0, 0].numpy(), side, 20, 20) for side in (9, 15, 21, 27, 39))
+    assert want > 0.0
+    assert float(detectors.fast_hessian(image).response[0, 0, 20, 20]) == pytest.approx(want, rel=1e-4)
+
+
+def test_fast_hessian_keeps_what_exceeds_its_threshold() -> None:
+    axis = torch.arange(65.0) - 32
+    blob = torch.exp(-0.5 * (axis[:, None] ** 2 + axis**2) / 3.0**2)[None, None]
+    strongest = float(detectors.fast_hessian(blob).response.max())
+    for contrast, found in ((0.95, False), (1.05, True)):  # the determinant goes with the square
+        faint = contrast * math.sqrt(1e-4 / strongest) * blob
+        assert bool(detectors.fast_hessian(faint).points.any()) is found
+    assert not detectors.fast_hessian(blob, threshold=1.01 * strongest).points.any()
+    assert detectors.fast_hessian(blob, threshold=0.99 * strongest).points.sum() == 1
+    with pytest.raises(InvalidInputError, match="threshold"):
+        detectors.fast_hessian(blob, threshold=0.0)
+
+
+@pytest.mark.parametrize("side", [15, 27, 51, 75])
+def test_fast_hessian_answers_at_the_side_that_a_blob_has(side: int) -> None:
+    """A side of 9 stands for a Gaussian of 1.2 px; blobs of the sides within the three octaves are found at once."""
+    axis = torch.arange(161.0) - 80
+    blob = torch.exp(-0.5 * (axis[:, None] ** 2 + axis**2) / (1.2 * side / 9) ** 2)[None, None]
+    assert detectors.fast_hessian(blob, threshold=1e-3).coordinates()[0][0].tolist() == [80, 80]
 
 
 @pytest.mark.parametrize("sigma", [2.5, 4.0])

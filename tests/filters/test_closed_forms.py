@@ -63,6 +63,20 @@ def test_a_plane_has_no_saliency(formula: str, slopes: tuple[float, float]) -> N
     assert float(field.abs().max()) < 1e-9
 
 
+@pytest.mark.parametrize("sigma", [0.0, 1.0, 2.0])
+@pytest.mark.parametrize("slopes", [(0.5, 0.0), (0.3, -2.0)])
+def test_a_plane_is_flat_up_to_the_border(sigma: float, slopes: tuple[float, float]) -> None:
+    depth = plane(33, *slopes, distance=200.0)
+    for layer in (
+        filters.depth_curvilinear_saliency,
+        filters.hessian_frobenius_norm,
+        filters.average_shading_gradient,
+    ):
+        for depth_scale in (1.0, None):
+            assert float(layer(depth, sigma=sigma, depth_scale=depth_scale).abs().max()) < 1e-9
+    assert float(filters.apparent_ridges(depth, sigma=sigma, maxima=False).abs().max()) < 1e-9
+
+
 def test_both_formulas_differ_by_the_metric_alone() -> None:
     depth = cylinder(65, 60.0, 100.0)
     geometric, paper = (_saliency(depth, formula=f).norm(dim=1)[0] for f in ("geometric", "paper"))
@@ -136,6 +150,43 @@ def test_perspective_normals_of_a_sphere_whatever_the_unit_of_depth() -> None:
     for unit in (1.0, 1000.0):
         field = filters.average_shading_gradient(unit * depth, sigma=0.0, camera_matrix=_camera(focal, size))
         assert float(field[0, :, 32, 32].norm()) == pytest.approx(want, rel=1e-3)
+
+
+def test_a_sphere_beside_the_axis_of_a_camera_of_two_focal_lengths() -> None:
+    """fx != fy and cx != cy: the normal is (point - centre) / radius, differentiated by differences of its own."""
+    H, W, d, r = 49, 61, 5.0, 2.0
+    camera = torch.tensor([[130.0, 0.0, 24.0], [0.0, 90.0, 31.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+    def surface(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """Depth and normals (3, ...) at pixels u, v, of a sphere around (0.2, -0.1, d)."""
+        ray = torch.stack([(u - 24.0) / 130.0, (v - 31.0) / 90.0, torch.ones_like(u)])
+        centre = torch.tensor([0.2, -0.1, d], dtype=torch.float64).view(3, 1, 1)
+        a, b = (ray * ray).sum(0), (ray * centre).sum(0)
+        z = (b - (b * b - a * ((centre * centre).sum() - r * r)).sqrt()) / a
+        return z, (z * ray - centre) / r
+
+    v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in (H, W)), indexing="ij")
+    step = 1e-4
+    nx = (surface(u + step, v)[1] - surface(u - step, v)[1]) / (2 * step)
+    ny = (surface(u, v + step)[1] - surface(u, v - step)[1]) / (2 * step)
+    depth = surface(u, v)[0][None, None]
+    want = math.sqrt(math.pi / 3.0) * ((nx * nx).sum(0) + (ny * ny).sum(0)).sqrt()
+    inner = (slice(2, -2), slice(2, -2))
+    got = filters.average_shading_gradient(depth, sigma=0.0, camera_matrix=camera)[0].norm(dim=0)
+    torch.testing.assert_close(got[inner], want[inner], rtol=5e-3, atol=0.0)
+    q1 = torch.linalg.svdvals(torch.stack([nx, ny], dim=-1).permute(1, 2, 0, 3))[..., 0]
+    ridges = filters.apparent_ridges(depth, sigma=0.0, camera_matrix=camera, maxima=False)[0].norm(dim=0)
+    torch.testing.assert_close(ridges[inner], q1[inner], rtol=5e-3, atol=0.0)
+
+
+@pytest.mark.parametrize("radius", [60.0, 6000.0])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_apparent_ridges_know_the_curvature_of_an_umbilic(radius: float, dtype: torch.dtype) -> None:
+    """At the vertex of a paraboloid the normal turns alike in all directions, by 1 / r per px."""
+    x, y = grid(33)
+    bowl = ((x**2 + y**2) / (2 * radius) + 1.0)[None, None].to(dtype)
+    field = filters.apparent_ridges(bowl, sigma=0.0, depth_scale=1.0, maxima=False)[0, :, 16, 16]
+    assert float(field.norm()) * radius == pytest.approx(1.0, rel=5e-3)
 
 
 def test_hessian_frobenius_norm_of_a_quadratic() -> None:
