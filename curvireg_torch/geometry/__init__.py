@@ -10,6 +10,7 @@ Conventions of the whole library (pinned by ``tests/geometry``):
 """
 
 from .cameras import camera_matrix, project_points, projected_boxes, rotation_towards, transform
+from .colours import SurfaceColours, has_colours, surface_colours
 from .conversions import (
     axis_angle_from_rotation,
     opencv_from_opengl,
@@ -31,11 +32,13 @@ from .viewpoint import rotation_error, rotation_from_viewpoint, viewpoint_from_r
 from .views import ViewSphere, paper_views, sample_views, uniform_views
 
 __all__ = [
+    "SurfaceColours",
     "ViewSphere",
     "axis_angle_from_rotation",
     "camera_matrix",
     "crop_images",
     "crop_transforms",
+    "has_colours",
     "load_mesh",
     "mesh_centre",
     "mesh_radius",
@@ -59,6 +62,7 @@ __all__ = [
     "rotation_towards",
     "sample_views",
     "square_boxes",
+    "surface_colours",
     "symmetry_transforms",
     "transform",
     "translation_from_box",

@@ -16,6 +16,7 @@ from torch import Tensor
 from .._checks import check_option
 from ..errors import MeshError, MissingFileError
 from ..limits import MAX_MESH_BYTES, MAX_MESH_COORDINATE, MAX_MESH_FACES
+from .colours import SurfaceColours, surface_colours
 from .gltf import check_gltf
 from .polygon_files import with_triangles
 from .up import UP_AXES, format_up, mesh_up
@@ -38,7 +39,7 @@ SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 
 
 def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = None) -> trimesh.Trimesh:
-    """Read a mesh file; scenes become one mesh, polygons become triangles, textures and normals are ignored.
+    """Read a mesh file; scenes become one mesh, polygons become triangles, normals are ignored.
 
     Nothing is rescaled: vertices, and every pose computed from them, stay in the file's own frame and unit.
 
@@ -51,7 +52,8 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
             else z.
 
     Returns:
-        ``trimesh.Trimesh`` with (V, 3) float64 vertices and (F, 3) faces, degenerate faces removed.
+        ``trimesh.Trimesh`` with (V, 3) float64 vertices and (F, 3) faces, degenerate faces removed. Textures and other
+        colours are kept as one :class:`SurfaceColours` in ``mesh.metadata["colours"]``.
 
     Raises:
         MissingFileError: no such file.
@@ -94,9 +96,7 @@ def _load(path: Path) -> Any:
             check_gltf(data, suffix, folder.size)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numpy's, of numbers that the checks in as_mesh find
-            return trimesh.load(
-                BytesIO(data), file_type=suffix[1:], resolver=folder, process=False, skip_materials=True
-            )
+            return trimesh.load(BytesIO(data), file_type=suffix[1:], resolver=folder, process=False)
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".removeprefix("ValueError: ").split())[:300]
         raise MeshError(f"{path}: cannot be read as a mesh ({reason}); re-export the file") from error
@@ -120,6 +120,8 @@ class _Folder(trimesh.resolvers.Resolver):  # type: ignore[misc]
         return self._path(name).stat().st_size
 
     def get(self, key: str) -> bytes:
+        if self.size(key) > MAX_MESH_BYTES:
+            raise ValueError(f"{key[:100]!r} is larger than {MAX_MESH_BYTES:,} bytes")
         return self._path(key).read_bytes()
 
     def keys(self) -> list[str]:
@@ -141,7 +143,7 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
             parts = [part for part in source.dump() if isinstance(part, trimesh.Trimesh)]
         except Exception as error:  # transforms that are none, parts that hang on nothing
             raise MeshError(f"{name}: its parts cannot be placed ({error}); re-export the file") from error
-        source = trimesh.util.concatenate(parts) if parts else None
+        source = _joined(parts) if parts else None
     if not isinstance(source, trimesh.Trimesh) or len(source.faces) == 0:
         raise MeshError(f"{name}: expected a mesh with faces, got none; point clouds and curves cannot be rendered")
     if len(source.faces) > MAX_MESH_FACES:
@@ -160,10 +162,36 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
     area = np.linalg.norm(np.cross(used[:, 1] - used[:, 0], used[:, 2] - used[:, 0]), axis=1)
     if not (area > 0).any():
         raise MeshError(f"{name}: every face is degenerate (area 0); repair the mesh")
+    colours = _colours(source)
     mesh = trimesh.Trimesh(vertices=vertices, faces=faces[area > 0], process=False)
     mesh.remove_unreferenced_vertices()
     mesh.units = source.units
     mesh.metadata["up"] = mesh_up(source)
+    if colours is not None:
+        mesh.metadata["colours"] = colours[area > 0]
+    return mesh
+
+
+def _colours(mesh: trimesh.Trimesh) -> SurfaceColours | None:
+    try:
+        colours = surface_colours(mesh)
+        if colours is not None and len(colours) != len(mesh.faces):
+            raise ValueError(f"{len(colours)} for {len(mesh.faces)} faces")
+        return colours
+    except Exception as error:  # of whatever a file says about them
+        warnings.warn(f"the mesh's colours cannot be used ({error}); it is seen in grey", stacklevel=2)
+        return None
+
+
+def _joined(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """One mesh of several; trimesh would pack their textures into one, which repeats no more."""
+    colours = [_colours(part) for part in parts]
+    for part in parts:
+        part.visual = trimesh.visual.ColorVisuals()
+    mesh = trimesh.util.concatenate(parts)
+    if any(c is not None for c in colours):
+        known = [c or SurfaceColours.plain(len(part.faces)) for c, part in zip(colours, parts, strict=True)]
+        mesh.metadata["colours"] = SurfaceColours.joined(known)
     return mesh
 
 

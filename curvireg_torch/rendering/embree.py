@@ -49,6 +49,11 @@ class RayScene:
         found = self._scene.run(_float32(origins), _float32(directions), query="INTERSECT", output=True)
         return np.where(found["tfar"] < _MISS, found["tfar"], np.inf), found["primID"], found["Ng"]
 
+    def places(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The triangle hit first (N,), -1 for none, and the shares u, v (N,) of its second and third corner there."""
+        found = self._scene.run(_float32(origins), _float32(directions), query="INTERSECT", output=True)
+        return np.where(found["tfar"] < _MISS, found["primID"], -1), found["u"], found["v"]
+
     def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """(N,) bool: whether rays hit anything."""
         return np.asarray(self._scene.run(_float32(origins), _float32(directions), query="OCCLUDED") >= 0)
@@ -84,27 +89,57 @@ class EmbreeRenderer:
         for_each(len(T), lambda i: self._render_view(T[i], K[i], out[i, 0], orthographic))
         return torch.from_numpy(out)
 
+    def faces_at(
+        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The face that each pixel of :meth:`render` sees, and where on it.
+
+        Returns:
+            (N, H, W) int32 numbers of faces, -1 for none, and (N, H, W) float32 u and v: the point is
+            (1 - u - v) a + u b + v c, with the face's corners a, b, c.
+        """
+        T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
+        face = np.full((len(T), *size), -1, dtype=np.int32)
+        u, v = np.zeros(face.shape, np.float32), np.zeros(face.shape, np.float32)
+
+        def one(i: int) -> None:
+            rays = self._rays(T[i], K[i], size, orthographic)
+            if rays is not None:
+                mask, starts, directions, _ = rays
+                face[i][mask], u[i][mask], v[i][mask] = self._scene.places(starts, directions)
+
+        for_each(len(T), one)
+        return face, u, v
+
     def _render_view(self, T: np.ndarray, K: np.ndarray, out: np.ndarray, orthographic: bool) -> None:
+        rays = self._rays(T, K, out.shape, orthographic)
+        if rays is not None:
+            mask, starts, directions, near = rays
+            z = (self._scene.distance(starts, directions) + np.float32(near)) * np.float32(self._radius)
+            z[np.isinf(z)] = 0.0
+            out[mask] = z
+
+    def _rays(
+        self, T: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
+        """Pixels (H, W) that may see the object, origins and directions of their rays, and the depth they start at."""
         R = T[:3, :3]
         t = (T[:3, 3] + R @ self._centre) / self._radius  # centre of the object in the camera, in radii
         outline = self._outline @ R.T + t
         nearest = outline[:, 2].min()
         if outline[:, 2].max() <= NEAREST:
-            return  # wholly behind the camera
-        mask = self._mask(outline, K, out.shape, orthographic)
+            return None  # wholly behind the camera
+        mask = self._mask(outline, K, size, orthographic)
         # Rays start at the plane z = near, relative to the object: no digits are spent on the way to a distant one.
         # Rows and columns are computed in float64, pixels in float32.
         near = max(nearest - 1e-3, NEAREST)
         reach = 1.0 / self._radius if orthographic else near
-        y = (np.arange(out.shape[0]) - K[1, 2]) / K[1, 1]
-        x = (np.arange(out.shape[1]) - K[0, 2]) / K[0, 0]
+        y = (np.arange(size[0]) - K[1, 2]) / K[1, 1]
+        x = (np.arange(size[1]) - K[0, 2]) / K[0, 0]
         skew = K[0, 1] / K[0, 0]
         axes = np.stack([R[0], R[1] - skew * R[0], R[2]])  # what x, y and z of the camera are in the model
-        starts = _rays(mask, reach * x - t[0] - skew * t[1], reach * y - t[1], near - t[2], axes)
-        directions = _float32(R[2:]) if orthographic else _rays(mask, x, y, 1.0, axes)
-        z = (self._scene.distance(starts, directions) + np.float32(near)) * np.float32(self._radius)
-        z[np.isinf(z)] = 0.0
-        out[mask] = z
+        starts = _combined(mask, reach * x - t[0] - skew * t[1], reach * y - t[1], near - t[2], axes)
+        return mask, starts, _float32(R[2:]) if orthographic else _combined(mask, x, y, 1.0, axes), near
 
     def _mask(self, outline: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool) -> np.ndarray:
         """(H, W) bool: the pixels inside the outline's projection, with a rim of a pixel."""
@@ -123,7 +158,7 @@ class EmbreeRenderer:
         return np.asarray(cv2.dilate(mask, np.ones((3, 3), np.uint8))).view(bool)
 
 
-def _rays(mask: np.ndarray, x: np.ndarray, y: np.ndarray, z: float, axes: np.ndarray) -> np.ndarray:
+def _combined(mask: np.ndarray, x: np.ndarray, y: np.ndarray, z: float, axes: np.ndarray) -> np.ndarray:
     """(N, 3) float32 x(column) axes[0] + y(row) axes[1] + z axes[2] for the N pixels of a mask."""
     a = np.broadcast_to(x.astype(np.float32), mask.shape)[mask]
     b = np.broadcast_to(y.astype(np.float32)[:, None], mask.shape)[mask]

@@ -71,7 +71,7 @@ def test_scene_parts_are_placed_by_their_transforms(backend: str) -> None:
     assert torch.equal(render(scene, backend), render(whole, backend))
 
 
-def test_textures_are_ignored() -> None:
+def test_textures_change_no_depth() -> None:
     plain = trimesh.creation.box()
     textured = plain.copy()
     textured.visual = trimesh.visual.TextureVisuals(uv=np.random.default_rng(0).random((len(plain.vertices), 2)))

@@ -1,0 +1,75 @@
+"""Views in the mesh's own colours, under the light that grey views are shaded with."""
+
+from os import PathLike
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+import trimesh
+from torch import Tensor
+
+from ..geometry.colours import surface_colours
+from ..geometry.mesh import as_mesh
+from .base import DepthRenderer, check_render_arguments, make_renderer
+from .shading import shade
+
+__all__ = ["render_colour"]
+
+FINENESS = 2
+"""Samples per pixel and axis: textures are finer than views."""
+
+
+@torch.no_grad()
+def render_colour(
+    mesh: "trimesh.Trimesh | trimesh.Scene | str | PathLike[str]",
+    T_cam_from_model: Tensor,
+    camera_matrix: Tensor,
+    size: tuple[int, int],
+    *,
+    renderer: str | DepthRenderer = "auto",
+    orthographic: bool = False,
+) -> Tensor:
+    """Pictures of a mesh in its own colours before white: the colour times :func:`shade`, four samples a pixel.
+
+    A mesh without colours (:func:`has_colours`) is white, which is what :func:`shade` shows. So is every mesh where
+    the renderer cannot tell which face a pixel sees: only "embree" can.
+
+    Args:
+        mesh: a mesh, a scene or the path of one.
+        T_cam_from_model: (N, 4, 4) or (4, 4), model to OpenCV camera.
+        camera_matrix: (N, 3, 3) or (3, 3) in px, without skew.
+        size: (H, W).
+        renderer: a name, or a renderer of this very mesh, which saves building one in every call.
+        orthographic: parallel projection; fx, fy are then px per model unit.
+
+    Returns:
+        (N, 3, H, W) float32 RGB in [0, 1] on the CPU.
+
+    Raises:
+        InvalidInputError, MeshError, MissingFileError, RenderingError.
+
+    Example:
+        >>> box = trimesh.creation.box()
+        >>> box.visual.face_colors = [200, 20, 20, 255]
+        >>> K = torch.tensor([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]])
+        >>> T = torch.eye(4); T[2, 3] = 4.0
+        >>> red, green, blue = render_colour(box, T, K, (64, 64))[0, :, 32, 32].tolist()
+        >>> red > 0.6 and green < 0.1 and blue < 0.1
+        True
+    """
+    mesh = as_mesh(mesh)
+    T, K = check_render_arguments(T_cam_from_model.view(-1, 4, 4), camera_matrix, size)
+    zoom = torch.tensor([[1.0, 0, 0.5 - 0.5 / FINENESS], [0, 1, 0.5 - 0.5 / FINENESS], [0, 0, 1 / FINENESS]])
+    K = FINENESS * zoom.double() @ K
+    fine = FINENESS * size[0], FINENESS * size[1]
+    backend = make_renderer(mesh, renderer)
+    depth = backend.render(T, K, fine, orthographic=orthographic).cpu()
+    picture = shade(depth, K, orthographic=orthographic).expand(-1, 3, -1, -1)
+    colours, faces_at = surface_colours(mesh), getattr(backend, "faces_at", None)
+    if colours is not None and faces_at is not None:
+        face, u, v = faces_at(T, K, fine, orthographic=orthographic)
+        albedo = np.ones((*face.shape, 3), np.float32)
+        seen = face >= 0
+        albedo[seen] = colours.at(face[seen], u[seen], v[seen])
+        picture = picture * torch.from_numpy(albedo).permute(0, 3, 1, 2)
+    return F.avg_pool2d(picture.contiguous(), FINENESS)

@@ -1,0 +1,180 @@
+"""A mesh's own colours: kept by the loader, and seen where they belong."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from torch import Tensor
+
+from curvireg_torch.geometry import has_colours, load_mesh, rotation_from_viewpoint, surface_colours, transform
+from curvireg_torch.rendering import make_renderer, render_colour
+from curvireg_torch.rendering.shading import shade
+
+COLOURS = [(230, 20, 20), (20, 220, 30), (30, 40, 240), (240, 230, 10), (10, 230, 230), (220, 20, 230)]
+SIZE = (72, 96)
+K = torch.tensor([[150.0, 0, 47.5], [0, 150.0, 35.5], [0, 0, 1]], dtype=torch.float64)
+
+
+def camera(azimuth: float, elevation: float, theta: float = 0.0, distance: float = 5.0) -> Tensor:
+    R = rotation_from_viewpoint(*(torch.tensor([a], dtype=torch.float64) for a in (azimuth, elevation, theta)))
+    return transform(R, torch.tensor([[0.0, 0.0, distance]], dtype=torch.float64))
+
+
+def textured_box() -> trimesh.Trimesh:
+    """A box whose six sides show six stripes of one texture, the left half of each darker."""
+    picture = np.zeros((16, 6 * 32, 3), np.uint8)
+    for i, colour in enumerate(COLOURS):
+        picture[:, 32 * i : 32 * (i + 1)] = colour
+        picture[:, 32 * i : 32 * i + 16] //= 2
+    vertices, faces, uv = [], [], []
+    for i in range(6):
+        axis, sign = i // 2, 1 if i % 2 else -1
+        for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+            vertices.append(np.roll([sign, a, b], axis) * 0.5)
+            uv.append(((i + 0.5 + 0.5 * a) / 6, 0.5 + 0.4 * b))
+        faces += [[4 * i, 4 * i + 1, 4 * i + 2], [4 * i, 4 * i + 2, 4 * i + 3]]
+    material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(picture), diffuse=[255] * 4)
+    visual = trimesh.visual.TextureVisuals(uv=np.array(uv), material=material)
+    return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
+
+
+def expected_albedo(points: np.ndarray) -> np.ndarray:
+    """Colour of points of the box by its definition: which side, which half."""
+    side = np.abs(points).argmax(axis=1)
+    sign = points[np.arange(len(points)), side] > 0
+    colour = np.array(COLOURS)[2 * side + sign] / 255
+    first = points[np.arange(len(points)), (side + 1) % 3]
+    return np.where(first[:, None] < 0, colour // (2 / 255) / 255, colour)
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+@pytest.mark.parametrize("view", [(20.0, 30.0, 0.0), (140.0, -40.0, 25.0), (260.0, 10.0, -70.0)])
+def test_every_side_shows_its_own_texture(view: tuple[float, float, float], orthographic: bool) -> None:
+    mesh, T = textured_box(), camera(*view)
+    intrinsics = K.clone()
+    if orthographic:
+        intrinsics[:2, :2] /= 5.0
+    picture = render_colour(mesh, T, intrinsics, SIZE, orthographic=orthographic)[0].permute(1, 2, 0).double().numpy()
+    depth = make_renderer(mesh).render(T, intrinsics, SIZE, orthographic=orthographic)
+    grey = shade(depth, intrinsics, orthographic=orthographic)[0, 0].double().numpy()
+    z = depth[0, 0].double().numpy()
+    v, u = np.nonzero(z)
+    rays = np.stack([u, v, np.ones_like(u)], 1) @ np.linalg.inv(intrinsics.numpy()).T
+    points = rays * z[v, u, None]
+    if orthographic:
+        points = np.concatenate([rays[:, :2], z[v, u, None]], axis=1)
+    points = (points - T[0, :3, 3].numpy()) @ T[0, :3, :3].numpy()
+    order = np.sort(np.abs(points), axis=1)
+    middle = np.abs(points[np.arange(len(points)), (np.abs(points).argmax(axis=1) + 1) % 3])
+    clear = (order[:, 1] < 0.38) & (middle > 0.12)  # off the edges, and off the line between the halves
+    sides = np.unique(np.abs(points).argmax(axis=1)[clear])
+    assert clear.sum() > 300
+    assert len(sides) >= 2
+    expected = expected_albedo(points) * grey[v, u, None]
+    right = np.abs(picture[v, u] - expected).max(axis=1) < 0.02
+    assert right[clear].mean() > 0.97  # the rest mix with what lies behind a contour
+    for side in sides:
+        assert right[clear & (np.abs(points).argmax(axis=1) == side)].mean() > 0.9
+    assert picture[0, 0].tolist() == [1.0, 1.0, 1.0]
+
+
+def can() -> trimesh.Trimesh:
+    """A cylinder with a printed band nearer to its top."""
+    print_ = np.full((64, 64, 3), 255, np.uint8)
+    print_[8:24] = (200, 0, 0)
+    angle = np.linspace(0, 2 * math.pi, 33)
+    ring = np.stack([np.cos(angle), np.sin(angle)], 1)
+    vertices = np.concatenate([np.c_[ring, np.full(33, z)] for z in (-1.2, 1.2)])
+    uv = np.concatenate([np.c_[angle / (2 * math.pi), np.full(33, v)] for v in (0.0, 1.0)])
+    i = np.arange(32)
+    faces = np.concatenate([np.stack([i, i + 1, i + 34], 1), np.stack([i, i + 34, i + 33], 1)])
+    material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(print_))
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
+
+
+def test_a_can_upside_down_differs_only_in_colour() -> None:
+    mesh = can()
+    up, down = camera(0.0, 0.0, distance=12.0), camera(0.0, 0.0, 180.0, distance=12.0)
+    a, b = (render_colour(mesh, T, K, SIZE) for T in (up, down))
+    plain = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    grey = [render_colour(plain, T, K, SIZE) for T in (up, down)]
+    assert float((grey[0] - grey[1]).abs().max()) < 0.05
+    assert float((a - b).abs().mean()) > 0.02
+    red = (a[0, 0] - a[0, 1] > 0.3).nonzero()[:, 0].float().mean()
+    assert float(red) < SIZE[0] / 2 - 3  # the band is near the top, which is up
+    assert float((b[0, 0] - b[0, 1] > 0.3).nonzero()[:, 0].float().mean()) > SIZE[0] / 2 + 3
+
+
+def test_without_colours_and_without_faces_it_is_grey() -> None:
+    mesh, T = textured_box(), camera(20.0, 30.0)
+    bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert has_colours(mesh)
+    assert not has_colours(bare)
+    one, other = render_colour(bare, T, K, SIZE), render_colour(mesh, T, K, SIZE, renderer="torch")
+    assert float((one - other).abs().mean()) < 1e-3
+    assert bool((one[:, 0] == one[:, 1]).all())
+    assert float((one - render_colour(mesh, T, K, SIZE)).abs().mean()) > 0.05
+    assert render_colour(mesh, T[:0], K, SIZE).shape == (0, 3, *SIZE)
+
+
+def test_vertex_and_face_colours_survive_cleaning() -> None:
+    box = trimesh.creation.box()
+    faces = np.concatenate([[[0, 0, 1]], box.faces])  # a degenerate one first: removed, and the others move up
+    by_face = np.concatenate([[[9, 9, 9, 255]], np.tile([[0, 0, 250, 255]], (12, 1))]).astype(np.uint8)
+    mesh = trimesh.Trimesh(box.vertices, faces, face_colors=by_face, process=False)
+    middle = render_colour(mesh, camera(0.0, 0.0), K, SIZE)[0, :, 36, 48]
+    assert middle.tolist() == pytest.approx([0.0, 0.0, 0.9 * 250 / 255], abs=0.02)
+    by_vertex = np.c_[np.where(box.vertices[:, 2:] > 0, [[255, 0, 0]], [[0, 255, 0]]), np.full(8, 255)]
+    mesh = trimesh.Trimesh(box.vertices, box.faces, vertex_colors=by_vertex.astype(np.uint8), process=False)
+    picture = render_colour(mesh, camera(0.0, 0.0), K, SIZE)[0]
+    assert picture[0, 24, 48] > 2 * picture[1, 24, 48]  # red above
+    assert picture[1, 47, 48] > 2 * picture[0, 47, 48]  # green below
+    assert picture[:2, 36, 48].tolist() == pytest.approx([0.45, 0.45], abs=0.05)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_files_keep_textures_and_materials(tmp_path: Path, suffix: str) -> None:
+    red = trimesh.creation.box((0.4, 0.4, 0.4))
+    material = trimesh.visual.material
+    look = material.PBRMaterial(baseColorFactor=[250, 10, 10, 255]) if suffix == ".glb" else material.SimpleMaterial()
+    if suffix == ".obj":
+        look.diffuse = np.array([250, 10, 10, 255], np.uint8)
+    red.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(red.vertices), 2)), material=look)
+    scene = trimesh.Scene()
+    scene.add_geometry(textured_box(), geom_name="printed")
+    shift = trimesh.transformations.translation_matrix([1.5, 0, 0])
+    scene.add_geometry(red, geom_name="red", transform=shift)
+    path = tmp_path / f"two{suffix}"
+    scene.export(path)
+    mesh = load_mesh(path, up="z")
+    assert has_colours(mesh)
+    colours = surface_colours(mesh)
+    assert colours is not None
+    assert len(colours) == len(mesh.faces) == 24
+    assert len(colours.textures) == 1
+    own = textured_box()
+    assert len(render_colour(mesh, camera(20.0, 30.0), K, SIZE)) == 1
+    place = mesh.triangles_center[:, 0] > 1.0
+    assert place.sum() == 12
+    centre = np.full(24, 1 / 3, np.float32)
+    found = colours.at(np.arange(24, dtype=np.int32), centre, centre)
+    np.testing.assert_allclose(found[place], np.tile([250 / 255, 10 / 255, 10 / 255], (12, 1)), atol=0.01)
+    expected = surface_colours(own)
+    assert expected is not None
+    by_place = {tuple(np.round(c, 4)): i for i, c in enumerate(own.triangles_center)}
+    match = np.array([by_place[tuple(np.round(c, 4))] for c in mesh.triangles_center[~place]], np.int32)
+    np.testing.assert_allclose(found[~place], expected.at(match, centre[:12], centre[:12]), atol=0.02)
+
+
+def test_a_damaged_texture_warns_and_leaves_the_shape(tmp_path: Path) -> None:
+    textured_box().export(tmp_path / "box.obj")
+    picture = next(p for p in tmp_path.iterdir() if p.suffix in (".png", ".jpg", ".jpeg"))
+    picture.write_bytes(picture.read_bytes()[: picture.stat().st_size // 2])
+    with pytest.warns(UserWarning, match="texture"):
+        mesh = load_mesh(tmp_path / "box.obj")
+    assert len(mesh.faces) == 12
