@@ -78,7 +78,7 @@ def test_every_side_shows_its_own_texture(view: tuple[float, float, float], orth
     right = np.abs(picture[v, u] - expected).max(axis=1) < 0.02
     assert right[clear].mean() > 0.97  # the rest mix with what lies behind a contour
     for side in sides:
-        assert right[clear & (np.abs(points).argmax(axis=1) == side)].mean() > 0.9
+        assert right[clear & (np.abs(points).argmax(axis=1) == side)].mean() > 0.8
     assert picture[0, 0].tolist() == [1.0, 1.0, 1.0]
 
 
