@@ -54,13 +54,13 @@ def test(cell: str, select: str, *, keep: bool) -> dict[str, Any]:
     """Make the cell's environment and run the suite in it; the counts and versions, or why there are none."""
     number, end = cell.split("-")
     folder = REPOSITORY / "out" / "versions" / cell
-    python, log, report = folder / "bin" / "python", folder.with_suffix(".log"), folder.with_suffix(".xml")
+    python, log, report = folder / "bin" / "python", Path(f"{folder}.log"), Path(f"{folder}.xml")
     folder.parent.mkdir(parents=True, exist_ok=True)
     nothing = {"passed": 0, "failed": 0, "skipped": 0, "versions": {}}
     found = shutil.which(f"python{number}")
     if found is None or subprocess.run([found, "--version"], capture_output=True).returncode:
         return {**nothing, "note": f"no python{number} on this machine"}
-    constraints = folder.with_suffix(".txt")
+    constraints = Path(f"{folder}.txt")
     constraints.write_text("\n".join(lowest() if end == "lowest" else []) + "\n")
     start = time.monotonic()
     report.unlink(missing_ok=True)

@@ -37,7 +37,7 @@ def contour_overlay(
         cameras, crops, _ = registrar.describe.cameras(result.view_rotation[None], distance)
         settings = registrar.bank.settings
         to_crop = crop_transforms(square_boxes(box.double().cpu(), settings.margin), settings.image_size)
-        T, K = cameras[0], torch.linalg.inv(to_crop) @ crops[0]
+        T, K = cameras[0], torch.linalg.inv(to_crop).triu() @ crops[0]
     orthographic = registrar.bank.settings.camera == "orthographic" and camera_matrix is None
     depth = make_renderer(registrar.bank.mesh).render(T[None], K, (H, W), orthographic=orthographic)[0, 0].numpy()
     picture = to_uint8(image)
