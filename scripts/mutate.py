@@ -5,8 +5,9 @@
     python scripts/mutate.py metrics --list                   # what would be changed
 
 One mutant (``mutants.py``) at a time, in a temporary copy; the first failing test kills it. Tests of a module: its own
-file in the folder of its package, the rest of that folder, other test files that import it by name, its doctests; not
-those marked slow or data. The sample is drawn by a hash of the mutant and the seed, so it stays where the code does.
+file in the folder of its package, the rest of that folder (where there is none, files that import it by name), and its
+doctests; not those marked slow or data. The sample is drawn by a hash of the mutant and the seed, so it stays where the
+code does.
 
 ``scripts/results/mutation.json``: score per package (killed / sampled) and every survivor. A ``reason`` written there
 beside a survivor is kept: why no test can or need tell it from the original.
@@ -76,8 +77,8 @@ def tests_of(copy: Path, path: str) -> list[str]:
         module += rf"|{PACKAGE}\.{re.escape('.'.join(parts[:-1]))} import [^\n]*\b{parts[-1]}\b"
     else:
         near = [p for p in everywhere if p.parent == home and stem in p.stem]
-    named = [p for p in everywhere if p not in near and re.search(module, p.read_text())]
-    ordered = sorted(near, key=lambda p: stem not in p.stem) + named
+    ordered = sorted(near, key=lambda p: stem not in p.stem)
+    ordered = ordered or [p for p in everywhere if re.search(module, p.read_text())]
     return [*(p.relative_to(copy).as_posix() for p in ordered), path]
 
 
@@ -165,6 +166,7 @@ def main() -> None:
     parser.add_argument("packages", nargs="+", help="metrics, geometry, cli, ...")
     parser.add_argument("--sample", type=int, default=30, help="mutants of each package; 0: all")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="", help="files whose path holds this; the rest of the sample stays as it is")
     parser.add_argument("--again", action="store_true", help="run known survivors once more")
     parser.add_argument("--list", action="store_true", help="print the sample and run nothing")
     options = parser.parse_args()
@@ -184,7 +186,8 @@ def main() -> None:
                 continue
             old = stored().get(package, {}).get("outcomes", {})
             outcomes = {m.key: old[m.key] for m in chosen if m.key in old}
-            open_ = [m for m in chosen if m.key not in old or (options.again and old[m.key] == "survived")]
+            wanted = (None, "survived") if options.again else (None,)
+            open_ = [m for m in chosen if options.only in m.path and old.get(m.key) in wanted]
             for mutant, outcome, seconds in judged(copy, open_):
                 outcomes[mutant.key] = outcome
                 print(f"{outcome:8} {seconds:5.1f} s {changes[mutant]}", flush=True)

@@ -61,3 +61,10 @@ def test_nothing_has_no_points_and_bad_input_is_refused() -> None:
         field_points(torch.zeros(1, 2, 8, 8), share=0.0)
     with pytest.raises(InvalidInputError, match="threshold"):
         field_points(torch.zeros(1, 2, 8, 8), threshold=-1.0)
+
+
+def test_a_share_of_less_than_a_pixel_keeps_the_strongest() -> None:
+    field = torch.zeros(1, 2, 1, 9)
+    field[0, 0, 0, [1, 4, 7]] = torch.tensor([1.0, 3.0, 2.0])
+    assert field_points(field, share=1e-3, suppress=False)[0, 0, 0].nonzero().flatten().tolist() == [4]
+    assert int(field_points(field, share=2 / 9, suppress=False).sum()) == 2

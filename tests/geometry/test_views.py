@@ -68,6 +68,10 @@ def test_pose_range() -> None:
     assert len(views.within()) == len(views)
     assert len(views.within(azimuth=(-10, 10))) == 3 * 3 * 3
     assert len(uniform_views(40, thetas=[350]).within(theta=(-20, 0))) == 40  # 350 is -10
+    assert len(views.within(azimuth=(20, 320))) == 31 * 9  # more than half a circle, and less than a whole
+    assert len(views.within(azimuth=(0, 359), theta=(-180, 170))) == len(views)
+    poles = sample_views(azimuth_step=180, elevations=[-90, 90], thetas=[-180, 170])
+    assert len(poles.within()) == len(poles)
     with pytest.raises(InvalidInputError, match="none of 324 views"):
         views.within(elevation=(30, 40))
 
@@ -124,6 +128,8 @@ def test_bad_view_sets() -> None:
         (lambda: uniform_views(5, elevation_range=(10, -10)), "elevation_range"),
         (lambda: uniform_views(5, thetas=[]), "thetas"),
         (lambda: views_without_symmetric(uniform_views(5), torch.eye(4)), "symmetries"),
+        (lambda: views_without_symmetric(uniform_views(5), torch.eye(4)[None], tolerance=-1.0), "tolerance"),
+        (lambda: sample_views(elevations=[-91]), "elevations"),
         (lambda: uniform_views(5).in_model_frame(torch.eye(3)), "T_views_from_model"),
         (lambda: uniform_views(5).in_model_frame(torch.diag(torch.tensor([1.0, 2, 1, 1]))), "rotation"),
     ):
