@@ -1,6 +1,8 @@
 """Layers and detectors inside kornia's own pipelines."""
 
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import kornia
 import pytest
@@ -99,6 +101,16 @@ def test_layers_in_kornias_sequences(layer: nn.Module) -> None:
     seen, turned = augment(colour, mask)
     torch.testing.assert_close(seen, layer(flipped))
     torch.testing.assert_close(turned, mask.flip(-1))
+
+
+def test_the_page_runs_as_it_stands() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "detectors.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    names: dict[str, object] = {}
+    with torch.random.fork_rng():
+        exec(compile(code, "docs/detectors.md", "exec"), names)
+    assert isinstance(names["descriptors"], Tensor)
+    assert names["descriptors"].shape == (1, 50, 324)
 
 
 def test_our_smoothing_and_derivatives_are_kornias() -> None:
