@@ -142,10 +142,10 @@ def _decode(path: Path) -> tuple[ImageHeader, NDArray[Any]]:
     if header.scans > MAX_IMAGE_SCANS:
         raise ImageError(f"{path}: a JPEG of {header.scans} scans, more than {MAX_IMAGE_SCANS}; save it again")
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    log = cv2.utils.logging
+    log = getattr(cv2.utils, "logging", cv2)  # OpenCV 5, and 4
     level = log.getLogLevel()
     try:
-        log.setLogLevel(log.LOG_LEVEL_SILENT)  # the error below says it, in one line
+        log.setLogLevel(0)  # silent: the error below says it, in one line
         pixels = cv2.imdecode(np.frombuffer(header.data, np.uint8), flags)
     except cv2.error:
         pixels = None

@@ -1,0 +1,42 @@
+"""``scripts/soak.py``: what it calls flat, and a short run of it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+
+
+def test_growth_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    import soak
+
+    def course(rss: float, files: float, threads: float) -> list[dict[str, float]]:
+        return [
+            {"rss_mb": 500 + rss * i + 300 * (i > 10), "files": 9 + int(files * i), "threads": 2 + int(threads * i)}
+            for i in range(100)
+        ]
+
+    assert soak.is_flat(soak.growth(course(0.0, 0.0, 0.0)), 20.0)  # warming up is no growth
+    assert soak.growth(course(1.0, 0.0, 0.0))["rss_mb"] == pytest.approx(50.0)
+    for leak in ((1.0, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.1)):
+        assert not soak.is_flat(soak.growth(course(*leak)), 20.0)
+    before = soak.resources()
+    with open(__file__, "rb"):
+        assert soak.resources()["files"] == before["files"] + 1
+
+
+@pytest.mark.slow
+def test_a_short_soak_of_two_processes_with_one_cache(tmp_path: Path) -> None:
+    out = tmp_path / "soak.json"
+    words = ["--count", "40", "--processes", "2", "--reopen", "5", "--out", str(out)]
+    done = subprocess.run(
+        [sys.executable, str(SCRIPTS / "soak.py"), *words], capture_output=True, text=True, timeout=900
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    result = json.loads(out.read_text())
+    assert result["flat"] is True
+    assert [len(process["course"]) for process in result["processes"]] == [40, 40]
