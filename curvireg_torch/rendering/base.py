@@ -1,6 +1,8 @@
 """The renderer protocol, backend selection, and :func:`render_depth`."""
 
 import importlib.util
+import threading
+import warnings
 from os import PathLike
 from typing import Any, Protocol
 
@@ -55,7 +57,7 @@ def make_renderer(
     - ``"torch"`` needs nothing and runs on any torch device. Threads may share it; forked processes must call
       ``torch.set_num_threads(1)`` first.
     - ``"auto"``: embree where it is installed (it asks for no driver, and minds neither threads nor forks), else
-      pyrender where EGL works, else torch.
+      pyrender where EGL works, else torch. Where one fails later on, the next takes over with a warning.
 
     Args:
         mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
@@ -70,12 +72,7 @@ def make_renderer(
         return backend
     check_option(backend, BACKENDS, "renderer")
     if backend == "auto":
-        if importlib.util.find_spec("embreex"):
-            return make_renderer(mesh, "embree")
-        try:
-            return make_renderer(mesh, "pyrender")
-        except RenderingError:
-            return make_renderer(mesh, "torch", device=device)
+        return _FirstThatWorks(mesh, device)
     if backend == "torch":
         from .zbuffer import TorchRenderer
 
@@ -91,6 +88,51 @@ def make_renderer(
     from .opengl import PyrenderRenderer
 
     return PyrenderRenderer(mesh)
+
+
+class _FirstThatWorks:
+    """The first backend that works, and the next from the moment it no longer does."""
+
+    def __init__(self, mesh: trimesh.Trimesh, device: torch.device | str) -> None:
+        self._mesh, self._device = mesh, device
+        self._left = [b for b in BACKENDS[1:] if b != "embree" or importlib.util.find_spec("embreex")]
+        self._lock = threading.Lock()
+        self._renderer = self._next()
+        self.name = self._renderer.name
+
+    def _next(self) -> DepthRenderer:
+        while True:
+            try:
+                return make_renderer(self._mesh, self._left.pop(0), device=self._device)
+            except (RenderingError, MissingDependencyError):
+                if not self._left:
+                    raise
+
+    @property
+    def faces_at(self) -> Any:
+        """That of the backend, where it has one, see :func:`render_colour`."""
+        return getattr(self._renderer, "faces_at", None)
+
+    def render(
+        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+    ) -> Tensor:
+        check_render_arguments(T_cam_from_model, camera_matrix, size)  # what fails below is the backend's fault
+        while True:
+            used = self._renderer
+            try:
+                return used.render(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
+            except Exception as error:  # drivers raise anything
+                with self._lock:  # of several threads that met the same failure one replaces the backend
+                    if used is self._renderer:
+                        if not self._left:
+                            raise
+                        self._renderer = self._next()
+                        self.name = self._renderer.name
+                        warnings.warn(
+                            f"renderer {used.name!r} failed ({type(error).__name__}: {error}); "
+                            f"going on with {self.name!r}",
+                            stacklevel=2,
+                        )
 
 
 def check_render_arguments(T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:

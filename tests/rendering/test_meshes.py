@@ -6,7 +6,7 @@ import torch
 import trimesh
 
 import curvireg_torch as cr
-from curvireg_torch.errors import InvalidInputError, MeshError
+from curvireg_torch.errors import InvalidInputError, MeshError, RenderingError
 from curvireg_torch.geometry.mesh import as_mesh
 from curvireg_torch.rendering import make_renderer
 
@@ -166,7 +166,6 @@ def test_arguments_are_checked() -> None:
 
 
 def test_auto_falls_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    from curvireg_torch.errors import RenderingError
     from curvireg_torch.rendering import base, opengl
 
     box = trimesh.creation.box()
@@ -178,3 +177,31 @@ def test_auto_falls_back(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(opengl, "PyrenderRenderer", no_driver)
     assert make_renderer(box).name == "torch"
+
+
+def test_another_takes_over_from_one_that_dies(monkeypatch: pytest.MonkeyPatch) -> None:
+    from curvireg_torch.rendering import opengl
+    from curvireg_torch.rendering.embree import EmbreeRenderer
+
+    def no_driver(_: object) -> None:
+        raise RenderingError("no EGL")
+
+    monkeypatch.setattr(opengl, "PyrenderRenderer", no_driver)
+    renderer = make_renderer(trimesh.creation.box())
+    T, K, size = camera(2)
+    expected = renderer.render(T, K, size)
+    with pytest.raises(InvalidInputError):  # the caller's own mistake is nobody's death
+        renderer.render(T[:, :3], K, size)
+    assert renderer.name == "embree"
+
+    def dies(*_: object) -> None:
+        raise MemoryError("out of memory")
+
+    monkeypatch.setattr(EmbreeRenderer, "_rays", dies)
+    with pytest.warns(UserWarning, match="'embree' failed.*out of memory.*'torch'"):
+        found = renderer.render(T, K, size)
+    assert renderer.name == "torch"
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
+    renderer.render(T, K, size)  # said once: a second warning would fail this test
+    with pytest.raises(RenderingError, match="embree"):  # who asked for one renderer gets no other
+        cr.render_depth(trimesh.creation.box(), T, K, size, renderer="embree")
