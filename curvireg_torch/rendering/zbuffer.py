@@ -11,8 +11,9 @@ from .base import NEAREST, check_render_arguments
 
 __all__ = ["TorchRenderer"]
 
-_PAIRS = 2**20  # (triangle, pixel) pairs in memory at a time, about 60 bytes each
-_TRIANGLES = 2**18  # triangles x views set up at a time, about 400 bytes each
+# Of a CPU, whose threads take a view each and whose caches are small, and of other devices:
+_PAIRS = 2**20, 2**24  # (triangle, pixel) pairs in memory at a time, about 60 bytes each
+_TRIANGLES = 2**18, 2**21  # triangles x views set up at a time, about 400 bytes each
 _SLACK = 1e-5  # barycentric share outside a triangle that still counts: closes the seams that rounding opens
 
 
@@ -39,6 +40,9 @@ class TorchRenderer:
         vertices = (np.asarray(mesh.vertices) - self._centre.numpy()) / self._radius
         self._vertices = torch.from_numpy(vertices).to(self.device, self._setup_dtype)
         self._faces = torch.from_numpy(np.array(mesh.faces, dtype=np.int64)).to(self.device)
+        away = self.device.type != "cpu"
+        self._pairs, self._triangles = _PAIRS[away], _TRIANGLES[away]
+        self._views = max(1, self._triangles // len(self._faces)) if away else 1
 
     @torch.no_grad()
     def render(
@@ -53,19 +57,18 @@ class TorchRenderer:
         R, t, K = (x.to(self.device, self._setup_dtype) for x in (R, t, K))
         H, W = size
         depth = torch.full((len(T), H * W), torch.inf, device=self.device)
-        on_cpu = self.device.type == "cpu"
-        views = 1 if on_cpu else max(1, _TRIANGLES // len(self._faces))
+        views = self._views
 
         @torch.no_grad()  # a thread does not inherit it
         def draw(i: int) -> None:
-            for j in range(0, len(self._faces), _TRIANGLES):
-                faces = self._faces[j : j + _TRIANGLES]
+            for j in range(0, len(self._faces), self._triangles):
+                faces = self._faces[j : j + self._triangles]
                 block = depth[i : i + views].view(-1)
                 self._draw(block, faces, R[i : i + views], t[i : i + views], K[i : i + views], size, orthographic)
 
-        if on_cpu and torch.get_num_threads() > 1:
+        if self.device.type == "cpu" and torch.get_num_threads() > 1:
             with one_thread_each() as pool:
-                list(pool.map(draw, range(len(T))))
+                list(pool.map(draw, range(0, len(T), views)))
         else:
             for i in range(0, len(T), views):
                 draw(i)
@@ -105,8 +108,10 @@ class TorchRenderer:
         near = NEAREST - t[:, 2].float()
         view = used // len(faces)
         ends = count.cumsum(0)
-        for start in range(0, int(ends[-1]), _PAIRS):
-            self._draw_pairs(depth, table, ends, count, extent[:, 0], first, near[view], W, start)
+        total = int(ends[-1])
+        for start in range(0, total, self._pairs):
+            stop = min(start + self._pairs, total)
+            self._draw_pairs(depth, table, ends, count, extent[:, 0], first, near[view], W, start, stop)
 
     def _windows(self, q: Tensor, z: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """First and one past the last pixel (n, F, 2) x, y that each triangle can cover."""
@@ -148,9 +153,9 @@ class TorchRenderer:
         near: Tensor,
         W: int,
         start: int,
+        stop: int,
     ) -> None:
-        """The pairs number ``start`` to ``start + _PAIRS``, counted through all triangles."""
-        stop = min(start + _PAIRS, int(ends[-1]))
+        """The pairs number ``start`` to ``stop``, counted through all triangles."""
         a = int(torch.searchsorted(ends, start, right=True))
         b = int(torch.searchsorted(ends, stop, right=False)) + 1
         begins = (ends[a:b] - count[a:b]).clamp(min=start)

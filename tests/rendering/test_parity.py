@@ -10,6 +10,7 @@ import trimesh
 
 from curvireg_torch.geometry import mesh_centre, mesh_radius, project_points
 from curvireg_torch.rendering import make_renderer
+from curvireg_torch.rendering.zbuffer import TorchRenderer
 from curvireg_torch.synthetic import example_mesh
 
 from .scenes import BACKENDS, camera, interior, require, smooth
@@ -119,3 +120,17 @@ def test_silhouette_lies_where_project_points_says(backend: str, orthographic: b
     assert bool(mask[inside > 0.005].all())
     assert not bool(mask[outside > 0.005].any())
     assert int(mask.sum()) > 1000
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_torch_renderer_gives_the_same_in_any_portions(orthographic: bool) -> None:
+    # Devices other than a CPU take many views and pairs at once; here, the other way, portions that end anywhere.
+    mesh = MESHES["knot"]()
+    T, K, size = camera(7, radius=mesh_radius(mesh), centre=mesh_centre(mesh), orthographic=orthographic)
+    renderer = TorchRenderer(mesh)
+    expected = renderer.render(T, K, size, orthographic=orthographic)
+    for views, triangles, pairs in ((3, 10**6, 10**7), (7, 501, 10**7), (2, 10**6, 4099)):
+        renderer._views, renderer._triangles, renderer._pairs = views, triangles, pairs
+        found = renderer.render(T, K, size, orthographic=orthographic)
+        assert int(((found > 0) != (expected > 0)).sum()) == 0
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
