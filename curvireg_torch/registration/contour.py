@@ -12,7 +12,8 @@ from ..errors import InvalidInputError
 from ..geometry import crop_images
 from ..geometry.cameras import check_camera_matrix
 from ..rendering import DepthRenderer
-from .contour_descent import Views, cross, moved
+from .contour_covariance import pose_covariance
+from .contour_descent import Views, moved
 from .contour_points import ContourPoints, EdgeField
 
 __all__ = ["ContourFit", "fit_contours"]
@@ -30,8 +31,9 @@ TURN = 8.0
 """Degrees to the left, right, up and down of the given pose from which the fit starts too: half the width of what it
 draws in, and about the error of a coarse view."""
 
-CORRELATED = 8.0
-"""Neighbouring points err together: so many count as one in the covariance (found on synthetic scenes)."""
+
+SUPPORTED, GAINED = 0.5, 0.2
+"""Support of a fit that is worth more than its start, and what it gains; chosen on generated scenes."""
 
 
 @dataclass(frozen=True)
@@ -40,14 +42,34 @@ class ContourFit:
 
     Attributes:
         transform: (N, 4, 4) float64 ``T_cam_from_model``.
-        covariance: (N, 6, 6) float64, see :func:`fit_contours`; NaN where the contours do not fix the pose.
+        covariance: (N, 6, 6) float64, see :func:`fit_contours`; NaN where too few edges were found.
         support: (N,) float64 in [0, 1): mean strength of the edges within about 1 px of the contour points, weighted by
             distance; 0 where the mesh shows no contour in the crop.
+        start_support: (N,) the same of the starts.
+        observable: (N,) int64, how many of a pose's six directions the contours fix; the covariance of the others is
+            that of not knowing them.
+        matched: (N,) share of the contour points that lie within 2 px of an edge.
+        residual: (N,) root mean square distance of those from their edges, in px of a crop of 256 px.
+        moved: (N,) mean way of the contour points from the start, in the same px.
     """
 
     transform: Tensor
     covariance: Tensor
     support: Tensor
+    start_support: Tensor
+    observable: Tensor
+    matched: Tensor
+    residual: Tensor
+    moved: Tensor
+
+    @property
+    def trustworthy(self) -> Tensor:
+        """(N,) bool: whether enough of what the photograph shows fits the mesh to believe its turn.
+
+        Support of at least 0.5, or at least 0.2 more than the start had. Contours of *another* object of the kind gain
+        less: there the start's rotation is as good as the fit's.
+        """
+        return (self.support >= SUPPORTED) | (self.support - self.start_support >= GAINED)
 
 
 @torch.no_grad()
@@ -78,14 +100,14 @@ def fit_contours(
     and the next best that differs from it go on, and end at full size. The start itself is returned where nothing has
     more support than it has. All starts of all photographs share a round's rendering.
 
-    The covariance is 8 s^2 (J^T W J)^-1 with the residuals' robust scale s, as if every eighth point were independent.
-    Its order is turn (rad) about the camera's
-    x, y, z, then translation (model units) along them: with the true pose R, t,
+    The order of the covariance is turn (rad) about the camera's x, y, z, then translation (model units) along them:
+    with the true pose R, t,
 
         R = exp([w]x) R_fit,   t = t_fit + e,   (w, e) ~ N(0, covariance).
 
-    It holds for a fit that has found the right edges, and knows nothing of others; turns about an object's axis of
-    symmetry look better known than they are, since the normals of rendered contours are not exact. Computed on the CPU.
+    It is :func:`pose_covariance`'s: what contours do not fix (turns of a sphere, a cylinder's about its axis) has a
+    standard deviation of pi or of the distance. It holds for a fit that has found the right edges, and knows nothing
+    of others. Computed on the CPU.
 
     Args:
         renderer: of the mesh.
@@ -123,7 +145,8 @@ def fit_contours(
     T0, centre = starts.detach().cpu().double(), centre.detach().cpu().double()
     N = len(T0)
     if N == 0:
-        return ContourFit(T0, T0.new_zeros(0, 6, 6), T0.new_zeros(0))
+        none = T0.new_zeros(0)
+        return ContourFit(T0, T0.new_zeros(0, 6, 6), none, none, none.long(), none, none, none)
     crops, A = crop_images(images, boxes, size=SIZE, margin=margin)
     K = (A.double() @ K)[photograph]
     full = Views(renderer, EdgeField(crops), photograph, K, SIZE, centre, radius)
@@ -144,9 +167,21 @@ def fit_contours(
     T, owner = torch.cat([still, T]), torch.cat([owner, of])
     support = full.of(owner).support(T, seen)
     winner = torch.where(owner == every[:, None], support, -1.0).argmax(dim=1)
-    found = full.matches(T[winner], seen[winner], FINE[-1])
-    covariance = _covariance(found.J, found.weight, found.distance, T[winner, :3, :3] @ centre)
-    return ContourFit(T[winner], covariance, support[winner])
+    T, seen = T[winner], seen[winner]
+    found = full.matches(T, seen, FINE[-1])
+    covariance, observable = pose_covariance(found, seen, T, full.K, centre, radius=radius)
+    weight = found.weight[..., 0]
+    mean_square = (weight * found.distance[..., 0].square()).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-12)
+    return ContourFit(
+        transform=T,
+        covariance=covariance,
+        support=support[winner],
+        start_support=support[:N],
+        observable=observable,
+        matched=(weight > 0).sum(dim=1) / seen.valid.sum(dim=1).clamp(min=1),
+        residual=mean_square.sqrt(),
+        moved=full.way(seen, T0, T),
+    )
 
 
 def _around(half: Views, T0: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
@@ -209,20 +244,3 @@ def _batch(
         camera_matrices.detach().cpu().double().expand(B, 3, 3),
         photograph.long(),
     )
-
-
-def _covariance(J: Tensor, W: Tensor, d: Tensor, arm: Tensor) -> Tensor:
-    """(N, 6, 6) of (turn, translation of the model's origin); ``arm`` (N, 3) leads from the origin to the centre."""
-    freedom = W.sum(dim=(1, 2)) - 6.0
-    variance = CORRELATED * (W * d * d).sum(dim=(1, 2)) / freedom.clamp(min=1e-9)
-    A = J.mT @ (W * J)
-    scale = A.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
-    unit = scale[:, :, None] * A * scale[:, None]  # a correlation matrix: its smallest eigenvalue has no unit
-    known = (torch.linalg.eigvalsh(unit)[:, 0] > 1e-9) & (freedom > 0)
-    unit = torch.where(known[:, None, None], unit, torch.eye(6, dtype=unit.dtype))
-    C = variance[:, None, None] * scale[:, :, None] * torch.linalg.inv(unit) * scale[:, None]
-    # The origin moves by e - w x arm where the centre moves by e.
-    lever = torch.eye(6, dtype=C.dtype).repeat(len(C), 1, 1)
-    lever[:, 3:, :3] = cross(arm)
-    C = lever @ C @ lever.mT
-    return torch.where(known[:, None, None], 0.5 * (C + C.mT), torch.nan)
