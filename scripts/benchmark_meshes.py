@@ -183,12 +183,12 @@ def symmetries(points: np.ndarray) -> list[int]:
     return [k for k, R in enumerate(turns()) if fits(R, points[::400]) and fits(R, points[::16])]
 
 
-def copy_of(cloud: np.ndarray, others: dict[str, np.ndarray]) -> str | None:
+def copy_of(cloud: np.ndarray, others: dict[str, tuple[np.ndarray, cKDTree]]) -> str | None:
     """Name of the first of the others that has the same shape, to 4 % of the radius for nine tenths of the points."""
-    span = np.ptp(cloud, axis=0)
-    for name, there in others.items():
-        near = np.abs(np.ptp(there, axis=0) - span).max() < 0.03
-        if near and np.quantile(cKDTree(there).query(cloud[::16])[0], 0.9) < 0.04:
+    span, some = np.ptp(cloud, axis=0), cloud[::16]
+    for name, (extents, tree) in others.items():
+        near = np.abs(extents - span).max() < 0.03
+        if near and np.isfinite(tree.query(some, distance_upper_bound=0.04)[0]).mean() >= 0.9:
             return name
     return None
 
@@ -231,19 +231,19 @@ def main() -> None:
     unpacked = fetch(arguments.out, arguments.deb)
     once = {row["id"]: row for row in reversed(catalogue(unpacked))}  # some are listed twice
     listing = {"package": PACKAGE, "sha256": SHA256, "turns": turns().tolist(), "meshes": [], "left_out": {}}
-    clouds: dict[str, np.ndarray] = {}
+    kept: dict[str, tuple[np.ndarray, cKDTree]] = {}
     for half in ("held-out", "train"):
         tasks = [(row, unpacked, arguments.out) for name, row in sorted(once.items()) if half_of(name) == half]
         with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
             answers = list(tqdm(pool.map(examine, tasks), desc=half, total=len(tasks)))
         for row, why, cloud in answers:
-            like = None if why else copy_of(cloud, clouds)
+            like = None if why else copy_of(cloud, kept)
             if why is None and half == "train" and like is not None and half_of(like) == "held-out":
                 why = "a copy of one held out"
             if why is not None:
                 listing["left_out"][row["id"]] = why
                 continue
-            clouds[row["id"]] = cloud
+            kept[row["id"]] = np.ptp(cloud, axis=0), cKDTree(cloud)
             listing["meshes"].append({**row, "half": half, "like": like or row["id"]})
         part = arguments.out / "meshes.json.part"
         part.write_text(json.dumps(listing, indent=1))
