@@ -34,6 +34,9 @@ from curvireg_torch.scenes.turns import any_turn
 FORMS = [(cad, pose) for cad in ("exact", "sibling") for pose in ("upright", "free")]
 SIZES = [(320, 320), (320, 400), (360, 480), (400, 320), (400, 400)]  # rows, columns
 LEAST_SEEN = 0.35
+PROPORTIONS = 1.6
+"""Siblings' boxes differ by no more than this factor where there is such a sibling; else the closest is taken."""
+
 ROUND = 12
 """Turns by 30 degrees about z that a body of revolution has: it has no azimuth to be found."""
 
@@ -96,6 +99,12 @@ class Meshes:
                 return (picture / 255.0).astype(np.float32) ** 2.2
 
 
+def proportions_apart(one: list[float], other: list[float]) -> float:
+    """Largest factor between the sides of two boxes whose diagonals are made equal."""
+    a, b = (np.array(side) / np.linalg.norm(side) for side in (one, other))
+    return float(np.exp(np.abs(np.log(a / b)).max()))
+
+
 def plan(meshes: Meshes, seed: int, index: int) -> dict:
     """Which object, which CAD, and how: a function of seed and index."""
     cad, pose = FORMS[index % 4]
@@ -109,6 +118,8 @@ def plan(meshes: Meshes, seed: int, index: int) -> dict:
         members = meshes.kinds[names[rng.choice(len(names), p=share / share.sum())]]
         shown = members[rng.integers(len(members))]
         others = [m for m in members if m["like"] != shown["like"]]
+        gaps = [proportions_apart(m["extents"], shown["extents"]) for m in others]
+        others = [m for m, gap in zip(others, gaps, strict=True) if gap <= max(PROPORTIONS, min(gaps))]
         wanted = others[rng.integers(len(others))]
     return {"cad": cad, "pose": pose, "shown": shown, "wanted": wanted, "rng": rng}
 

@@ -70,7 +70,15 @@ class OneMesh:
 
     def __init__(self, scripts, folder):
         self.turns = scripts["benchmark_meshes"].turns()
-        row = {"id": "die", "name": "die", "kind": None, "path": "model.obj", "like": "die", "faces": 12}
+        row = {
+            "id": "die",
+            "name": "die",
+            "kind": None,
+            "path": "model.obj",
+            "like": "die",
+            "faces": 12,
+            "extents": [2, 1, 1],
+        }
         self.good = self.clutter = [{**row, "shape_symmetries": [0, 3], "look_symmetries": [0]}]
         self.kinds = {"die": [self.good[0], {**self.good[0], "like": "other", "shape_symmetries": [0, 5]}]}
         self._model = scripts["_textured"].Textured.load(folder / "model.obj")
@@ -99,3 +107,16 @@ def test_truth_is_that_of_the_picture(scripts, folder, index):
     again, same = scripts["make_benchmark"].make(meshes, 3, index)
     assert np.array_equal(image, again)
     assert item == same
+
+
+def test_a_sibling_has_the_objects_proportions_where_there_is_one(scripts, folder):
+    make, meshes = scripts["make_benchmark"], OneMesh(scripts, folder)
+    assert make.proportions_apart([2, 1, 1], [4, 2, 2]) == pytest.approx(1.0)
+    assert make.proportions_apart([1, 1, 1], [1, 1, 2]) == pytest.approx(np.sqrt(2))
+    box = meshes.good[0]
+    near, far = ({**box, "like": name, "extents": e} for name, e in (("near", [2, 1, 1.2]), ("far", [1, 1, 9])))
+    meshes.kinds = {"box": [box, near, far]}
+    pairs = {(p["shown"]["like"], p["wanted"]["like"]) for i in range(2, 200, 4) for p in [make.plan(meshes, 1, i)]}
+    assert {("die", "near"), ("near", "die")} < pairs
+    assert not {("die", "far"), ("near", "far")} & pairs
+    assert {shown for shown, _ in pairs} == {"die", "near", "far"}
