@@ -45,6 +45,8 @@ def main() -> int:
         work = [(arguments.count, arguments.reopen, seed) for seed in range(arguments.processes)]
         with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
             courses = pool.starmap(soak, work, chunksize=1)
+            pool.close()
+            pool.join()
         left = sorted(path.suffix for path in Path(cache).rglob("*") if path.is_file())
     processes = [{"growth": growth(course), "course": course} for course in courses]
     flat = all(is_flat(process["growth"], arguments.allow) for process in processes) and set(left) <= {".safetensors"}
