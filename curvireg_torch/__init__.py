@@ -60,6 +60,9 @@ from .matching import (
     ViewBank,
     ViewMatcher,
 )
+from .pipeline import (
+    Pipeline,
+)
 from .registration import (
     Registrar,
     Registration,
@@ -88,6 +91,7 @@ __all__ = [
     "MultiScaleCurvilinearSaliency",
     "MultiScaleFocusCurves",
     "Pascal3DPlus",
+    "Pipeline",
     "PrincipalCurvatureImage",
     "Ranking",
     "Registrar",

@@ -19,15 +19,15 @@ import trimesh
 from . import __version__
 from ._files import probe_folder, terminable, write_file
 from .data import read_photo
-from .errors import CurviregError, InvalidInputError
+from .errors import BankError, CurviregError
 from .evaluation import add_parser as add_evaluate
-from .geometry import ViewSphere, camera_matrix, load_mesh, mesh_up, rotation_error, whole_image_box
+from .geometry import camera_matrix, load_mesh, rotation_error, whole_image_box
 from .geometry.mesh import UNITS
 from .geometry.up import UP_AXES
 from .learned import LearnedCurvilinearSaliency, adapt
 from .matching import ViewBank, cache_folder, cached_bank, clear_cache, list_cache
-from .presets import DEFAULT, PRESETS, Preset, preset_named
-from .registration import RELIABLE, Registrar, Registration
+from .pipeline import DEFAULT, PRESETS, Pipeline, preset_named
+from .registration import RELIABLE, FailedRegistration, Registrar, Registration
 from .rendering import BACKENDS
 
 __all__ = ["main"]
@@ -85,14 +85,17 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     preset = argparse.ArgumentParser(add_help=False)
-    preset.add_argument("--preset", choices=sorted(PRESETS), default=DEFAULT, help=f"default: {DEFAULT}")
+    preset.add_argument(
+        "--preset", choices=sorted(PRESETS), help=f"default: that of a bank that is given, else {DEFAULT}"
+    )
+    preset.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
+    preset.add_argument("--device", default="cpu", help="where modules, bank and search live (default: cpu)")
 
     mesh_options = argparse.ArgumentParser(add_help=False)
     mesh_options.add_argument("--unit", choices=sorted(UNITS), default="m", help="the mesh file's unit (default: m)")
     mesh_options.add_argument(
         "--pose",
         choices=("any", "upright"),
-        default="any",
         help="any: no assumption. upright: the mesh's up axis points up in the photograph and the object is seen "
         "from 10 degrees below to 60 above; faster, and right more often where it is true (default: any)",
     )
@@ -114,7 +117,7 @@ def _parser() -> argparse.ArgumentParser:
         "--camera", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="px; gives the translation"
     )
     register.add_argument("--field", type=Path, metavar="FILE", help="weights from curvireg bank --adapt")
-    register.add_argument("--top", type=int, default=5, metavar="K", help="hypotheses to report (default: 5)")
+    register.add_argument("--top", type=int, metavar="K", help="hypotheses to carry and report (default: 5)")
     register.add_argument("--no-refine", action="store_true", help="stop at the best view of the bank")
     register.add_argument("--out", type=Path, required=True, metavar="DIR")
     register.set_defaults(run=_register)
@@ -144,7 +147,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     demo.add_argument("--seed", type=int, default=0)
     demo.add_argument("--out", type=Path, required=True, metavar="DIR")
-    demo.set_defaults(run=_demo)
+    demo.set_defaults(run=_demo, pose="upright")
     return parser
 
 
@@ -153,14 +156,10 @@ def _bank(arguments: argparse.Namespace) -> None:
     if arguments.adapt is not None:
         probe_folder(arguments.adapt.parent, "--adapt")
     start = time.perf_counter()
-    chosen = preset_named(arguments.preset)
+    pipeline = _pipeline(arguments)
     mesh = load_mesh(arguments.mesh, unit=arguments.unit, up=arguments.up)
     bank = ViewBank.build(
-        mesh,
-        _views(arguments, chosen, mesh),
-        settings=chosen.bank,
-        renderer=arguments.renderer,
-        progress=not arguments.quiet,
+        mesh, pipeline=pipeline, renderer=arguments.renderer, progress=not arguments.quiet, device=arguments.device
     )
     bank.save(arguments.out)
     size = arguments.out.stat().st_size / 1e6
@@ -183,48 +182,55 @@ def _cache(arguments: argparse.Namespace) -> None:
     print(f"{cache_folder()}: {len(banks)} banks, {sum(bank.size for bank in banks) / 1e6:.1f} MB")
 
 
-def _views(arguments: argparse.Namespace, preset: Preset, mesh: trimesh.Trimesh) -> ViewSphere:
-    views = preset.views(arguments.pose)
-    return views.for_up(mesh_up(mesh)) if arguments.pose == "upright" else views
+def _pipeline(arguments: argparse.Namespace) -> Pipeline:
+    chosen = preset_named(arguments.preset or DEFAULT)
+    if arguments.pipeline is not None:
+        chosen = Pipeline.read(arguments.pipeline)
+    return chosen if arguments.pose is None else chosen.posed(arguments.pose)
 
 
-def _open_bank(arguments: argparse.Namespace, preset: Preset) -> ViewBank:
+def _open_bank(arguments: argparse.Namespace, pipeline: Pipeline) -> ViewBank:
     if arguments.mesh.suffix == ".safetensors":
-        return ViewBank.load(arguments.mesh)
+        bank = ViewBank.load(arguments.mesh)
+        if arguments.pose not in (None, bank.pipeline.views.pose):
+            raise BankError(
+                f"{arguments.mesh}: made for --pose {bank.pipeline.views.pose}, asked for --pose {arguments.pose}; "
+                "leave --pose out, or build it again with 'curvireg bank'"
+            )
+        return bank
     mesh = load_mesh(arguments.mesh, unit=arguments.unit, up=arguments.up)
-    return cached_bank(
-        mesh,
-        _views(arguments, preset, mesh),
-        preset.bank,
-        renderer=arguments.renderer,
-        progress=not arguments.quiet,
-    )
+    return cached_bank(mesh, pipeline=pipeline, renderer=arguments.renderer, progress=not arguments.quiet)
 
 
 def _register(arguments: argparse.Namespace) -> None:
     times = {"start": time.perf_counter()}
-    photo = read_photo(arguments.photo, dtype=torch.float32)
+    photo = read_photo(arguments.photo, dtype=torch.uint8)
     image = photo.image
     box = whole_image_box(image) if arguments.box is None else torch.tensor(arguments.box)
     K = None if arguments.camera is None else camera_matrix(*arguments.camera, dtype=torch.float64)
-    if arguments.top < 1:
-        raise InvalidInputError(f"--top: expected >= 1, got {arguments.top}")
-    preset = preset_named(arguments.preset)
+    pipeline = _pipeline(arguments)
     field = None if arguments.field is None else LearnedCurvilinearSaliency(weights=arguments.field)
     probe_folder(arguments.out, "--out")
-    bank = _open_bank(arguments, preset)
+    bank = _open_bank(arguments, pipeline).to(arguments.device)
+    if arguments.mesh.suffix == ".safetensors" and arguments.preset is None and arguments.pipeline is None:
+        pipeline = bank.pipeline
     times["bank"] = time.perf_counter()
-    refine = preset.refine and not arguments.no_refine
-    registrar = preset.registrar(bank, field=field, refine=refine, renderer=arguments.renderer, top=arguments.top)
-    try:
-        result = registrar([image], box[None], K)[0]
-    except CurviregError as error:
-        raise type(error)(f"{arguments.photo}: {error}") from error
+    registrar = Registrar(
+        bank,
+        pipeline=pipeline,
+        field=field,
+        refine=not arguments.no_refine,
+        hypotheses=arguments.top,
+        renderer=arguments.renderer,
+    )
+    result = registrar([image], box[None], K)[0]
+    if isinstance(result, FailedRegistration):
+        raise type(result.error)(str(result.error).replace("image 0", str(arguments.photo)))
     times["register"] = time.perf_counter()
     document = _document(result, registrar, times)
     document["inputs"] = {"photo": str(arguments.photo), "mesh": str(arguments.mesh), "box": box.tolist()}
     document["inputs"]["picture"] = photo.facts()
-    _write(arguments.out, document, registrar, result, image, box, K)
+    _write(arguments.out, document, registrar, result, image / 255.0, box, K)
     if photo.notes:
         print(f"{arguments.photo}: {'; '.join(photo.notes)}")
     _print_result(document, arguments.out)
@@ -240,13 +246,12 @@ def _demo(arguments: argparse.Namespace) -> None:
     K = camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
     truth = random_pose(mesh, K, size, generator)
     image, box = synthesize_photograph(mesh, truth, K, size, generator)
-    preset = preset_named(arguments.preset)
-    bank = cached_bank(
-        mesh, preset.views("upright"), preset.bank, renderer=arguments.renderer, progress=not arguments.quiet
-    )
+    pipeline = _pipeline(arguments)
+    bank = cached_bank(mesh, pipeline=pipeline, renderer=arguments.renderer, progress=not arguments.quiet)
     times["bank"] = time.perf_counter()
-    registrar = preset.registrar(bank, renderer=arguments.renderer)
+    registrar = Registrar(bank, pipeline=pipeline, renderer=arguments.renderer, device=arguments.device)
     result = registrar([image], box[None], K)[0]
+    assert isinstance(result, Registration)
     times["register"] = time.perf_counter()
     document = _document(result, registrar, times)
     assert result.translation is not None
@@ -268,14 +273,15 @@ def _document(result: Registration, registrar: Registrar, times: dict[str, float
     bank = registrar.bank
     top = [
         {
-            "view": int(v),
-            "score": float(result.ranking.scores[0, v]),
-            "hog": float(result.ranking.hog[0, v]),
-            "repeatability": float(result.ranking.repeatability[0, v]),
-            "box": float(result.ranking.box[0, v]),
-            "viewpoint": [float(getattr(bank.views, name)[v]) for name in ("azimuth", "elevation", "theta")],
+            "rotation": h.rotation.tolist(),
+            "translation": None if h.translation is None else h.translation.tolist(),
+            "viewpoint": dict(zip(("azimuth", "elevation", "theta"), h.viewpoint, strict=True)),
+            "score": h.score,
+            "evidence": dict(h.evidence),
+            "view": h.view,
+            "terms": {name: float(raw[0, h.view]) for name, raw in result.ranking.terms.items()},
         }
-        for v in result.candidates.tolist()
+        for h in result.hypotheses
     ]
     deviations = result.standard_deviations
     return {
@@ -292,8 +298,8 @@ def _document(result: Registration, registrar: Registrar, times: dict[str, float
         else {"rotation_deg": deviations[0].tolist(), "translation": deviations[1].tolist()},
         "covariance": None if result.covariance is None else result.covariance.tolist(),
         "top": top,
-        "refinement_rounds": result.iterations,
         "views": len(bank),
+        "pipeline": registrar.pipeline.describe(),
         "seconds": {"bank": times["bank"] - times["start"], "register": times["register"] - times["bank"]},
         "versions": {
             "curvireg_torch": __version__,

@@ -11,11 +11,11 @@ the difference within 30 degrees with its interval over paired resamples.
 """
 
 import argparse
-import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from kornia.color import rgb_to_grayscale
@@ -26,18 +26,14 @@ from curvireg_torch.data import BOPDataset, Pascal3DPlus
 from curvireg_torch.evaluation import Benchmark, BOPBenchmark, Pascal3DBenchmark, Protocol, evaluate
 from curvireg_torch.evaluation.store import PredictionStore
 from curvireg_torch.filters import MultiScaleFocusCurves
-from curvireg_torch.learned import LearnedCurvilinearSaliency, adapt
-from curvireg_torch.matching import ViewBank
-from curvireg_torch.presets import FIELDS, PRESETS, Preset
-from curvireg_torch.registration import Registrar
+from curvireg_torch.learned import LearnedCurvilinearSaliency
+from curvireg_torch.pipeline import PRESETS, Pipeline
 
 KEPT = REPOSITORY / "scripts" / "results" / "ablation.json"
 PAGE = REPOSITORY / "docs" / "accuracy.md"
 BEGIN, END = "<!-- ablation:begin -->", "<!-- ablation:end -->"
 SETS = {"pascal3d_mini": "upright", "hope": "any", "lm": "any", "dino": "any"}
 RESAMPLES = 2000
-ADAPTED = 1000
-"""Generated photographs of each mesh in the row "adapted"."""
 
 
 class _Both(torch.nn.Module):
@@ -55,43 +51,29 @@ class _Both(torch.nn.Module):
         return field
 
 
-class _Adapted(Preset):
-    """The learned field, fine-tuned on generated photographs of each mesh."""
+_classical = replace(PRESETS["classical"], search=False, contours=False)
+_learned = replace(PRESETS["learned"], search=False, contours=False)
 
-    folder: ClassVar[Path]
-
-    def registrar(self, bank: ViewBank, *, field: torch.nn.Module | None = None, **options: Any) -> Registrar:
-        digest = hashlib.sha256(bank.mesh.vertices.tobytes()).hexdigest()[:16]
-        path = self.folder / f"{digest}.safetensors"
-        if not path.exists():
-            self.folder.mkdir(parents=True, exist_ok=True)
-            with torch.enable_grad():
-                adapt(bank.mesh, scenes=ADAPTED).save(path)
-        return super().registrar(bank, field=LearnedCurvilinearSaliency(weights=path), **options)
-
-
-FIELDS["both"] = _Both
-_classical = replace(PRESETS["classical"], refine=False)
-_learned = replace(PRESETS["learned"], refine=False)
-
-ROWS: dict[str, Preset] = {
+ROWS: dict[str, Pipeline] = {
     "classical": _classical,
-    "without S_rep": replace(_classical, matcher={"repeatability_sigma": None}),
-    "without S_box": replace(_classical, matcher={"box_sigma": None}),
-    "without slack": replace(_classical, matcher={"slack": 0.0}),
+    "without S_rep": _classical.with_term("repeatability", weight=0.0),
+    "without S_box": _classical.with_term("box", weight=0.0),
+    "without slack": replace(_classical, slack=0.0),
     "gradient instead of MFC": replace(_classical, field="gradient"),
     "MCS instead of MFC": replace(_classical, field="saliency"),
-    "paper": replace(PRESETS["paper"], refine=False),
+    "paper": replace(PRESETS["paper"], search=False, contours=False),
     "classical, refined": PRESETS["classical"],
     "learned": _learned,
-    "learned, without S_rep": replace(_learned, matcher={"repeatability_sigma": None}),
-    "learned, without S_box": replace(_learned, matcher={"box_sigma": None}),
-    "learned, without slack": replace(_learned, matcher={"slack": 0.0}),
-    "learned + classical": replace(_learned, field="both"),
-    "adapted": _Adapted(refine=False),
+    "learned, without S_rep": _learned.with_term("repeatability", weight=0.0),
+    "learned, without S_box": _learned.with_term("box", weight=0.0),
+    "learned, without slack": replace(_learned, slack=0.0),
+    "learned + classical": _learned,
     "learned, refined": PRESETS["learned"],
 }
-"""Name -> settings; differences are taken against the first."""
+"""Name -> pipeline; differences are taken against the first."""
+
+FIELD_OF: dict[str, Callable[[], torch.nn.Module]] = {"learned + classical": _Both}
+"""Rows with a field of their own."""
 
 
 def benchmark(name: str, data: Path) -> Benchmark:
@@ -105,7 +87,7 @@ def measure(row: str, name: str, data: Path, out: Path) -> dict[str, Any]:
     """Errors of all objects, in the order of the dataset."""
     folder = out / row.replace(" ", "_").replace(",", "") / name
     objects = benchmark(name, data)
-    summary = evaluate(objects, folder, preset=ROWS[row])
+    summary = evaluate(objects, folder, preset=ROWS[row], field=FIELD_OF[row]() if row in FIELD_OF else None)
     assert summary is not None
     store = PredictionStore(folder / "predictions")
     rows = [(item, store.read(item.key)) for item in objects.items]
@@ -175,7 +157,6 @@ def main() -> None:
     if not arguments.table:
         if arguments.data is None:
             parser.error("DATA is needed to measure")
-        _Adapted.folder = arguments.out / "fields"
         for row in arguments.rows:
             for name in arguments.sets:
                 kept = measure(row, name, arguments.data, arguments.out)

@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 import curvireg_torch as cr
 from curvireg_torch.matching import ViewBank, ViewIndex
-from curvireg_torch.presets import preset_named
+from curvireg_torch.pipeline import preset_named
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
 TOP = (1, 10, 100)

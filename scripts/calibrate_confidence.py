@@ -23,7 +23,7 @@ from curvireg_torch.geometry import rotation_from_quaternion, rotation_towards
 from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
 from curvireg_torch.matching import cached_bank
-from curvireg_torch.presets import DEFAULT, preset_named
+from curvireg_torch.pipeline import DEFAULT, preset_named
 from curvireg_torch.registration.confidence import EVIDENCE, ranking_evidence
 from curvireg_torch.synthetic import example_mesh, procedural_background, random_pose, synthesize_photograph
 
@@ -95,13 +95,13 @@ def collect(pose: str, meshes: int, scenes: int) -> list[dict]:
     """One row per ranking: mesh, evidence, error in degrees, whether the mesh was the right one."""
     preset = preset_named(DEFAULT)
     objects = [assembly(seed) for seed in range(meshes)]
-    views, rows = preset.views(pose), []
+    rows = []
     shots = []
     for i, mesh in enumerate(objects):
         generator = torch.Generator().manual_seed(1000 * (pose == "any") + i)
         shots.append([photograph(mesh, pose, generator) for _ in range(scenes)])
     for i, mesh in enumerate(objects):
-        matcher = preset.registrar(cached_bank(mesh, views, preset.bank, progress=False)).matcher
+        matcher = cr.ViewMatcher(cached_bank(mesh, pipeline=preset.posed(pose), progress=False))
         for j in (i, (i - 1) % meshes):
             images, boxes = [s[0] for s in shots[j]], torch.stack([s[1] for s in shots[j]])
             ranking = matcher(images, boxes)

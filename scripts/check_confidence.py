@@ -14,7 +14,8 @@ from pathlib import Path
 import torch
 from compare_similarities import SETS, shots
 
-from curvireg_torch.presets import DEFAULT, preset_named
+import curvireg_torch as cr
+from curvireg_torch.pipeline import DEFAULT, preset_named
 from curvireg_torch.registration import RELIABLE, ranking_evidence
 from curvireg_torch.registration.confidence import probability
 
@@ -31,7 +32,7 @@ def collect(data: Path) -> list[dict]:
         folders = sorted({path.parent for _, _, path, _ in groups})
         queries = {}
         for _, bank, path, group in groups:
-            matcher = preset_named(DEFAULT).registrar(bank).matcher
+            matcher = cr.ViewMatcher(bank, pipeline=preset_named(DEFAULT))
             queries[path] = [matcher.query([s.image], s.boxes["annotated"][None]) for s in group]
             for name, _, other, members in groups:
                 if other not in queries and other != path:

@@ -37,7 +37,7 @@ from curvireg_torch.matching import (
     unit_score,
 )
 from curvireg_torch.metrics import symmetric_rotation_error, symmetry_transforms
-from curvireg_torch.presets import preset_named
+from curvireg_torch.pipeline import preset_named
 from curvireg_torch.synthetic import procedural_background
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -111,9 +111,7 @@ def shots(data: Path, name: str, boxes: dict[str, float | None]) -> Iterator[tup
     chosen, preset = benchmark(data, name), preset_named("classical")
     items = chosen.items[:: EVERY.get(name, 1)]
     for meshes in sorted({item.meshes for item in items}):
-        bank = cached_bank(
-            cr.load_mesh(meshes[0], unit=chosen.unit), preset.views(SETS[name]), preset.bank, progress=False
-        )
+        bank = cached_bank(cr.load_mesh(meshes[0], unit=chosen.unit), pipeline=preset.posed(SETS[name]), progress=False)
         found = []
         for item in (i for i in items if i.meshes == meshes):
             image = read_image(chosen.dataset.annotation(item.index)["image_path"])

@@ -24,7 +24,7 @@ import trimesh
 from curvireg_torch import Registrar, camera_matrix, rotation_error
 from curvireg_torch.geometry import axis_angle_from_rotation
 from curvireg_torch.matching import cached_bank
-from curvireg_torch.presets import DEFAULT, PRESETS
+from curvireg_torch.pipeline import DEFAULT, PRESETS
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
 SIZE = (360, 480)
@@ -132,11 +132,11 @@ def main() -> None:
     for name in arguments.meshes:
         mesh = MESHES[name]()
         mesh.units = "m"
-        bank = cached_bank(mesh, preset.views("upright"), preset.bank, progress=False)
+        bank = cached_bank(mesh, pipeline=preset.posed("upright"), progress=False)
         registrars = {
-            "view": preset.registrar(bank, refine=False),
-            "search": preset.registrar(bank, refine=True, contours=False),
-            "contours": preset.registrar(bank, refine=True),
+            "view": Registrar(bank, refine=False),
+            "search": Registrar(bank, contours=False),
+            "contours": Registrar(bank),
         }
         for jitter in arguments.jitter:
             own = rows[f"{jitter:g}"][name] = [

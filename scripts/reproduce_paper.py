@@ -22,6 +22,7 @@ from pathlib import Path
 
 from curvireg_torch.errors import CurviregError
 from curvireg_torch.evaluation import Preset, paper
+from curvireg_torch.pipeline import BankSettings
 
 RANKINGS = ("precision", "angles", "ranks")
 TABLES = ("detectors", "repeatability", "curve", *RANKINGS)
@@ -54,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> None:
     cases = paper.find_cases(arguments.kind, arguments.root, pixel_origin=arguments.pixel_origin, limit=arguments.limit)
-    settings, progress = paper.FieldSettings(image_size=arguments.image_size), not arguments.quiet
+    settings, progress = BankSettings(image_size=arguments.image_size), not arguments.quiet
     wanted = TABLES if arguments.table == "all" else (arguments.table,)
     tables: list[paper.Table] = []
     if "detectors" in wanted:

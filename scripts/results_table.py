@@ -133,7 +133,7 @@ def note(kept: dict[str, Any]) -> str:
     skipped = sum(summary["skipped"].values())
     return (
         f"{kept['name']}: split {settings['split']}{limit}; {summary['protocol']}; "
-        f"preset {settings['preset']['name']}; {summary['failed']} failed, {skipped} skipped; "
+        f"preset {settings['preset']}; {summary['failed']} failed, {skipped} skipped; "
         f"{kept['date']}, commit {kept['commit']}"
     )
 

@@ -1,6 +1,8 @@
+import inspect
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -8,11 +10,12 @@ import pytest
 import torch
 import trimesh
 
+from curvireg_torch import Registrar, camera_matrix
 from curvireg_torch.cli import main
-from curvireg_torch.geometry import rotation_error, sample_views, up_rotation
+from curvireg_torch.errors import BankError
+from curvireg_torch.geometry import rotation_error, up_rotation
 from curvireg_torch.learned import adapt
-from curvireg_torch.matching import BankSettings
-from curvireg_torch.presets import DEFAULT, PRESETS, Preset
+from curvireg_torch.pipeline import DEFAULT, PRESETS, BankSettings, Pipeline, ViewPolicy, preset_named
 from curvireg_torch.synthetic import example_mesh
 from tests._support.exif import exif, with_exif
 from tests._support.scenes import scene, truck_bank
@@ -143,7 +146,7 @@ def test_bank_then_register(files, capsys):
         ("photo.png", "truck.safetensors", [], ["5", "5", "5", "9"], ["X0 < X1"]),
         ("photo.png", "truck.safetensors", [], ["900", "5", "950", "9"], ["wholly outside"]),
         ("photo.png", "truck.safetensors", ["--camera", "0", "260", "119", "89"], None, ["focal"]),
-        ("photo.png", "truck.safetensors", ["--top", "0"], None, ["--top"]),
+        ("photo.png", "truck.safetensors", ["--top", "0"], None, ["hypotheses"]),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(files, capsys, photo, mesh, more, box, words):
@@ -212,8 +215,56 @@ def test_demo_runs_as_a_module_and_is_right(tmp_path, monkeypatch):
 
 def test_every_preset_that_shares_the_banks_settings_registers(files):
     folder, box, _ = files
+    settings = truck_bank().settings
     for preset in ("learned", "classical", "fast"):
-        assert run(folder, "photo.png", "truck.safetensors", "--preset", preset, "--no-refine", box=box) == 0
+        (folder / "own.json").write_text(replace(PRESETS[preset], bank=settings).to_json())
+        options = ["--pipeline", str(folder / "own.json"), "--no-refine"]
+        assert run(folder, "photo.png", "truck.safetensors", *options, box=box) == 0
+
+
+def test_a_bank_of_another_pipeline_is_refused(files, capsys):
+    folder, box, _ = files
+    assert run(folder, "photo.png", "truck.safetensors", "--preset", "paper", box=box) == 2
+    assert "made with other settings" in capsys.readouterr().err
+    assert run(folder, "photo.png", "truck.safetensors", "--pose", "upright", box=box) == 2
+    assert "--pose" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+def test_python_and_the_command_line_give_the_same_bits(files, monkeypatch, preset):
+    """One source of defaults: the facade on a mesh file, and the command, for every preset."""
+    folder, box, _ = files
+    monkeypatch.setenv("CURVIREG_CACHE", str(folder / "doors"))
+    # The views of every preset, thinned out: 12 instead of 7200.
+    views = ViewPolicy(directions=12, turn=360.0)
+    (folder / "own.json").write_text(replace(PRESETS[preset], views=views).to_json())
+    camera = ["--camera", "260", "260", "119.5", "89.5"]
+    assert run(folder, "photo.png", "truck.ply", "--pipeline", str(folder / "own.json"), *camera, box=box) == 0
+    written = json.loads((folder / "out" / "result.json").read_text())
+    registrar = Registrar(str(folder / "truck.ply"), pipeline=Pipeline.read(folder / "own.json"))
+    edges = torch.tensor([[float(v) for v in box]])
+    found = registrar([folder / "photo.png"], edges, camera_matrix(260, 260, 119.5, 89.5))[0]
+    assert written["rotation"] == found.rotation.tolist()
+    assert written["translation"] == found.translation.tolist()
+    assert (written["score"], written["confidence"]) == (found.score, found.confidence)
+    assert [top["rotation"] for top in written["top"]] == [h.rotation.tolist() for h in found.hypotheses]
+    assert written["pipeline"] == registrar.pipeline.describe()
+
+
+def test_no_option_is_the_default_pipeline_at_every_door(monkeypatch):
+    from curvireg_torch import cli
+    from curvireg_torch.evaluation import evaluate
+    from curvireg_torch.registration import registrar
+
+    assert preset_named(DEFAULT) == Pipeline()
+    parsed = cli._parser().parse_args(["register", "a.jpg", "b.stl", "--out", "c"])
+    assert cli._pipeline(parsed) == Pipeline()
+    assert inspect.signature(evaluate).parameters["preset"].default == DEFAULT
+    asked = []
+    monkeypatch.setattr(registrar, "cached_bank", lambda *_, pipeline, **__: asked.append(pipeline) or truck_bank())
+    with pytest.raises(BankError):  # the truck's bank is not what was asked for
+        Registrar(example_mesh())
+    assert asked == [Pipeline()]
 
 
 def test_adapted_field_from_bank_to_register(files, monkeypatch, capsys):
@@ -226,8 +277,7 @@ def test_adapted_field_from_bank_to_register(files, monkeypatch, capsys):
         return adapt(mesh, scenes=16, upright=upright, progress=progress)
 
     monkeypatch.setattr("curvireg_torch.cli.adapt", quick)
-    small = Preset(bank=BankSettings(image_size=64))
-    monkeypatch.setattr(Preset, "views", lambda *_: sample_views(azimuth_step=90, elevations=[20]))
+    small = Pipeline(views=ViewPolicy(azimuth_step=90, elevations=(20,)), bank=BankSettings(image_size=64))
     monkeypatch.setitem(PRESETS, DEFAULT, small)
     out, field = folder / "own.safetensors", folder / "own_field.safetensors"
     arguments = ["bank", str(folder / "truck.ply"), "--pose", "upright", "--out", str(out), "--adapt", str(field)]

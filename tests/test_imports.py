@@ -24,10 +24,12 @@ ALLOWED = {
     "data": BASE | {"geometry"},
     "metrics": BASE | {"geometry"},
     "synthetic": BASE | {"geometry", "filters", "rendering"},
-    "matching": BASE | {"geometry", "filters", "descriptors", "rendering"},
+    "terms": BASE | {"geometry", "filters", "descriptors", "pipeline"},  # pipeline: types alone
+    "pipeline": BASE | {"geometry", "filters", "descriptors", "terms", "learned"},
+    "matching": BASE | {"geometry", "filters", "descriptors", "rendering", "terms", "pipeline"},
     "scenes": BASE | {"geometry", "rendering"},
     "learned": BASE | {"geometry", "filters", "matching", "scenes"},
-    "registration": BASE | {"geometry", "filters", "descriptors", "rendering", "matching"},
+    "registration": BASE | {"geometry", "filters", "data", "descriptors", "rendering", "pipeline", "matching"},
     "visualization": BASE | {"geometry", "filters", "descriptors", "rendering", "matching", "registration"},
 }
 FORBIDDEN_LIBRARIES = {

@@ -4,7 +4,7 @@
 ``-m curvireg_torch.evaluation pascal3d ROOT --out DIR`` shares the objects among processes.
 """
 
-from ..presets import DEFAULT, PRESETS, Preset
+from ..pipeline import DEFAULT, PRESETS, Pipeline
 from .benchmark import Benchmark
 from .bop import BOPBenchmark
 from .command import add_parser, run
@@ -18,7 +18,7 @@ __all__ = [
     "BOPBenchmark",
     "Benchmark",
     "Pascal3DBenchmark",
-    "Preset",
+    "Pipeline",
     "Protocol",
     "add_parser",
     "evaluate",

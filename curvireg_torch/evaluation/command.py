@@ -1,12 +1,16 @@
 """``curvireg evaluate pascal3d|bop ROOT --out DIR``."""
 
 import argparse
+import os
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from ..data import BOPDataset, Pascal3DPlus
-from ..presets import DEFAULT, PRESETS
+from ..errors import InvalidInputError
+from ..pipeline import DEFAULT, PRESETS, Pipeline
 from .benchmark import Benchmark
 from .bop import BOPBenchmark
 from .loops import evaluate
@@ -62,6 +66,10 @@ def add_datasets(datasets: Any, parents: Sequence[argparse.ArgumentParser]) -> N
             help=f"{PROTOCOL} (default: {Protocol(pose=default)})",
         )
         parser.add_argument("--preset", choices=sorted(PRESETS), default=DEFAULT, help=f"default: {DEFAULT}")
+        parser.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
+        parser.add_argument(
+            "--jobs", type=int, default=1, metavar="N", help="processes that share the objects (default: 1)"
+        )
         parser.add_argument("--limit", type=int, metavar="N", help="only N objects, spread evenly over the set")
         parser.add_argument("--overwrite", action="store_true", help="start anew in a folder with other predictions")
         parser.add_argument("--out", type=Path, required=True, metavar="DIR")
@@ -74,10 +82,13 @@ def run(arguments: argparse.Namespace) -> None:
     Raises:
         CurviregError: the dataset is not there, an option is out of range, or the folder holds other results.
     """
+    if arguments.jobs > 1 and "TORCHELASTIC_RUN_ID" not in os.environ:
+        _run_jobs(arguments.jobs)
+        return
     summary = evaluate(
         arguments.benchmark(arguments),
         arguments.out,
-        preset=arguments.preset,
+        preset=arguments.preset if arguments.pipeline is None else Pipeline.read(arguments.pipeline),
         limit=arguments.limit,
         renderer=arguments.renderer,
         overwrite=arguments.overwrite,
@@ -85,10 +96,24 @@ def run(arguments: argparse.Namespace) -> None:
     )
     if summary is None:
         return
+    if summary["n"] == 0:
+        told = ", ".join(f"{count} {reason}" for reason, count in summary["skipped"].items()) or "it is empty"
+        raise InvalidInputError(f"{arguments.root}: nothing was scored ({told}); see {arguments.out}/summary.json")
     shares = [name for name in summary if name.startswith(("acc_", "add_", "mssd_", "mspd_"))]
     print(f"{summary['n']} objects, {summary['failed']} failed, {sum(summary['skipped'].values())} skipped")
     print("   ".join([*(f"{n} {summary[n]:.3f}" for n in shares), f"med_err_deg {summary['med_err_deg']:.1f}"]))
     print(f"protocol: {summary['protocol']}; see {arguments.out}/summary.json")
+
+
+def _run_jobs(count: int) -> None:
+    """This same command again, in processes that ``torchrun`` starts."""
+    words = sys.argv[1:]
+    words = words[words.index("evaluate") + 1 :] if "evaluate" in words else words
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
+    environment = {"OMP_NUM_THREADS": "1", **os.environ}
+    done = subprocess.run([*torchrun, "-m", "curvireg_torch.evaluation", *words], env=environment, check=False)
+    if done.returncode:
+        raise InvalidInputError(f"evaluate: a process ended with {done.returncode}; what it says stands above")
 
 
 def _pascal3d(arguments: argparse.Namespace) -> Benchmark:

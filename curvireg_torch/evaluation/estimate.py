@@ -1,68 +1,70 @@
-"""The pose of one object, from the CADs that the protocol allows."""
+"""Poses of objects, from the CADs that the protocol allows."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
-from torch import Tensor
 
-from ..matching import Ranking
-from ..registration import Registrar, confidence
+from ..matching import Photographs, Ranking, ViewMatcher
+from ..registration import FailedRegistration, Registrar, Registration
+from ..registration.inputs import Item
 from .benchmark import Row
 
-__all__ = ["estimate_pose"]
+__all__ = ["FusedMatcher", "estimate_poses"]
 
 
-def estimate_pose(
-    registrars: Sequence[Registrar], image: Tensor, box: Tensor, camera_matrix: Tensor | None, *, fused: bool
-) -> Row:
-    """Register one photograph to the best of several meshes.
+def estimate_poses(registrar: Registrar, items: Sequence[Item]) -> list[Row]:
+    """Register photographs to one mesh, or to the best of several.
 
     Args:
-        registrars: one per mesh, of banks with the same views.
-        image: (3, H, W) in [0, 1].
-        box: (4,) in px.
-        camera_matrix: (3, 3) in px or None.
-        fused: average the scores of each view over the meshes before the best is searched (no translation then).
+        registrar: of the bank of the meshes.
+        items: photographs with their boxes, all with a camera matrix or all without.
 
     Returns:
-        ``rotation`` (3 x 3 numbers), ``translation`` (3 numbers, unit of the mesh, or None), ``score``, ``confidence``,
-        ``support`` and ``covariance`` (see :class:`Registration`; None where the contour stage did not run),
-        ``mesh``: the place of the chosen mesh among the registrars.
-
-    Raises:
-        InvalidInputError, ImageError: see :class:`Registrar`.
+        For each ``rotation`` (3 x 3 numbers), ``translation`` (3 numbers, unit of the mesh, or None), ``score``,
+        ``confidence``, ``reliable``, ``support`` and ``covariance`` (see :class:`Hypothesis`), ``mesh``: the place of
+        the chosen mesh in the bank, and ``rivals``: rotation, score and evidence of the other hypotheses; or ``failed``
+        with the reason.
     """
-    results = [registrar([image], box[None], camera_matrix)[0] for registrar in registrars]
-    if fused:
-        return _fused(registrars, image, box, [r.ranking for r in results])
-    best = max(range(len(results)), key=lambda i: results[i].score)
-    result = results[best]
+    cameras = [item.camera_matrix for item in items if item.camera_matrix is not None]
+    results = registrar(
+        [item.image for item in items],
+        torch.stack([item.box for item in items]),
+        torch.stack(cameras) if cameras else None,
+    )
+    return [_row(result) for result in results]
+
+
+def _row(result: Registration | FailedRegistration) -> Row:
+    if isinstance(result, FailedRegistration):
+        return {"failed": str(result.error)}
+    best, *rivals = result.hypotheses
     return {
-        "rotation": result.rotation.tolist(),
-        "translation": None if result.translation is None else result.translation.tolist(),
-        "score": result.score,
+        "rotation": best.rotation.tolist(),
+        "translation": None if best.translation is None else best.translation.tolist(),
+        "score": best.score,
         "confidence": result.confidence,
-        "support": result.support,
-        "covariance": None if result.covariance is None else result.covariance.tolist(),
-        "mesh": best,
+        "reliable": result.reliable,
+        "support": best.support,
+        "evidence": dict(best.evidence),
+        "covariance": None if best.covariance is None else best.covariance.tolist(),
+        "mesh": best.model,
+        "rivals": [
+            {"rotation": r.rotation.tolist(), "score": r.score, "mesh": r.model, "evidence": dict(r.evidence)}
+            for r in rivals
+        ],
     }
 
 
-@torch.no_grad()
-def _fused(registrars: Sequence[Registrar], image: Tensor, box: Tensor, rankings: list[Ranking]) -> Row:
-    """``rankings`` of the meshes' views, one photograph each; the registrars are made with ``refine=False``."""
-    scores = torch.cat([ranking.scores for ranking in rankings])
-    mean = scores.mean(dim=0)
-    order = mean.argsort(descending=True, stable=True)
-    chosen = int(scores[:, order[0]].argmax())
-    voted = replace(rankings[chosen], scores=mean[None], order=order[None])
-    matcher, bank = registrars[chosen].matcher, registrars[chosen].bank
-    pose = registrars[chosen].search(matcher.features(matcher.crop([image], box[None])[0]).field, order)
-    return {
-        "rotation": pose.rotation.tolist(),
-        "translation": None,
-        "score": pose.score,
-        "confidence": float(confidence(voted, bank.rotations)),
-        "mesh": chosen,
-    }
+class FusedMatcher(ViewMatcher):
+    """Scores of each view averaged over the models of a bank, which are all seen from the same views.
+
+    The mean stands at the model that scores best from that view; at the others 0.
+    """
+
+    def rank(self, query: Photographs) -> Ranking:
+        ranking = super().rank(query)
+        scores = ranking.scores.unflatten(1, (len(self.bank.meshes), -1))
+        best = scores == scores.amax(dim=1, keepdim=True)
+        first = best & (best.cumsum(dim=1) == 1)
+        mean = (scores.mean(dim=1, keepdim=True) * first).flatten(1)
+        return Ranking(mean, mean.argsort(dim=1, descending=True, stable=True), ranking.terms)

@@ -3,20 +3,24 @@
 import hashlib
 import platform
 from collections import Counter
-from dataclasses import fields
+from functools import cache
 from pathlib import Path
 
 import torch
+from torch import nn
 
 from .. import __version__
 from .._checks import check_positive
-from ..presets import DEFAULT, PRESETS, Preset, preset_named
+from ..pipeline import DEFAULT, PRESETS, Pipeline, preset_named
 from .benchmark import Benchmark, Row
 from .predict import predict
 from .store import PredictionStore, to_json, write_text
 from .workers import workers
 
 __all__ = ["evaluate", "score"]
+
+BESIDE_THE_POINT = ("cli.py", "detectors", "evaluation", "metrics", "scenes", "synthetic.py", "visualization")
+"""Parts of the package that no pose depends on."""
 
 NOT_ASKED_FOR = ("other_class", "no_target")
 """What datasets leave out because it is none of the objects to be evaluated, not because something is wrong with it."""
@@ -26,9 +30,10 @@ def evaluate(
     benchmark: Benchmark,
     out: Path,
     *,
-    preset: str | Preset = DEFAULT,
+    preset: str | Pipeline = DEFAULT,
     limit: int | None = None,
     renderer: str = "auto",
+    field: nn.Module | None = None,
     overwrite: bool = False,
     progress: bool = True,
 ) -> Row | None:
@@ -40,9 +45,10 @@ def evaluate(
     Args:
         benchmark: the objects.
         out: folder for the results, made if it is not there.
-        preset: name of the settings, or settings of one's own.
+        preset: name of a pipeline, or a pipeline of one's own.
         limit: register only so many objects, spread evenly over the dataset.
         renderer: of the views.
+        field: photograph filter of one's own, instead of the pipeline's.
         overwrite: start anew in a folder that holds other predictions.
         progress: show a bar.
 
@@ -59,6 +65,7 @@ def evaluate(
         >>> evaluate(Pascal3DBenchmark(cars, Protocol()), Path("out"))["acc_pi_6"]          # doctest: +SKIP
     """
     chosen = preset_named(preset) if isinstance(preset, str) else preset
+    chosen = chosen if field is None else chosen.with_field(field)
     name = next((known for known, settings in PRESETS.items() if settings is chosen), "own")
     if limit is not None:
         check_positive(limit, "limit")
@@ -71,7 +78,7 @@ def evaluate(
         ordered = sorted(selection, key=lambda item: (item.meshes, item.index))
         n = len(ordered)
         share = ordered[group.rank * n // group.size : (group.rank + 1) * n // group.size]
-        predict(benchmark, share, store, chosen, renderer=renderer, progress=progress and group.rank == 0)
+        predict(benchmark, share, store, chosen, renderer=renderer, field=field, progress=progress and group.rank == 0)
         group.wait()
         return score(benchmark, out, limit=limit) if group.rank == 0 else None
 
@@ -101,7 +108,7 @@ def score(benchmark: Benchmark, out: Path, *, limit: int | None = None) -> Row:
         **benchmark.summary(items, rows),
         "failed": sum("failed" in row for row in rows),
         "skipped": dict(sorted(skipped.items())),
-        "protocol": str(benchmark.protocol),
+        "protocol": settings["protocol"],
         "limit": limit,
         "settings": settings,
         "versions": {"curvireg_torch": __version__, "python": platform.python_version(), "torch": torch.__version__},
@@ -112,14 +119,25 @@ def score(benchmark: Benchmark, out: Path, *, limit: int | None = None) -> Row:
     return summary
 
 
-def _settings(benchmark: Benchmark, name: str, preset: Preset, renderer: str) -> Row:
-    """All that a prediction depends on; --limit and --categories only say which ones are wanted."""
-    views = preset.views(benchmark.protocol.pose)
-    digest = hashlib.sha256(b"".join(getattr(views, f.name).double().numpy().tobytes() for f in fields(views)))
+def _settings(benchmark: Benchmark, name: str, pipeline: Pipeline, renderer: str) -> Row:
+    """All that a prediction depends on besides its own files; --limit and --categories say which ones are wanted."""
     return {
         **benchmark.settings(),
         "protocol": str(benchmark.protocol),
-        "preset": {"name": name, **preset.describe(), "views": len(views), "views_sha256": digest.hexdigest()[:16]},
+        "preset": name,
+        "pipeline": pipeline.posed(benchmark.protocol.pose).describe(),
         "renderer": renderer,
         "version": __version__,
+        "code": code_digest(),
     }
+
+
+@cache
+def code_digest() -> str:
+    """16 hexadecimal digits of the sources that poses come from."""
+    package = Path(__file__).parents[1]
+    digest = hashlib.blake2b(digest_size=8)
+    for source in sorted(package.rglob("*.py")):
+        if source.relative_to(package).parts[0] not in BESIDE_THE_POINT:
+            digest.update(source.read_bytes())
+    return digest.hexdigest()

@@ -1,107 +1,149 @@
 """The first loop: every object's pose, to disk."""
 
+import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache
+from itertools import groupby
 from pathlib import Path
 
-import torch
 from torch import nn
 from tqdm import tqdm
 
 from ..data import read_image
-from ..errors import ImageError, InvalidInputError, MeshError, MissingFileError
+from ..errors import ImageError, MeshError, MissingFileError
 from ..geometry import load_mesh
-from ..matching import cached_bank
-from ..presets import Preset
+from ..matching import ViewBank, ViewMatcher, cached_bank
+from ..pipeline import Pipeline
 from ..registration import Registrar
+from ..registration.inputs import Item as Photograph
 from .benchmark import Benchmark, Item, Row
-from .estimate import estimate_pose
+from .estimate import FusedMatcher, estimate_poses
 from .protocol import Protocol, perturbed_box
 from .store import PredictionStore
 
 __all__ = ["predict"]
+
+BATCH = 8
+"""Objects of one mesh that are registered together."""
 
 
 def predict(
     benchmark: Benchmark,
     items: Sequence[Item],
     store: PredictionStore,
-    preset: Preset,
+    pipeline: Pipeline,
     *,
     renderer: str = "auto",
+    field: nn.Module | None = None,
     progress: bool = True,
 ) -> None:
-    """Register those of ``items`` that ``store`` does not hold yet.
+    """Register those of ``items`` that ``store`` does not hold yet, holds as skipped, or holds of other files.
 
-    Objects of one mesh follow each other, so that a bank is made once and only those in use are in memory. Each
-    photograph is registered alone and on one thread: a prediction depends neither on its neighbours, nor on what was
-    done before a restart, nor on the number of cores. More cores: more processes (``torchrun``).
+    Objects of one mesh follow each other, so that a bank is made once and only those in use are in memory, and are
+    registered in batches. More cores: more processes (``--jobs``, ``torchrun``).
 
     A photograph or mesh that cannot be read, or an unknown box, gives a row ``skipped``; an object that the method
     refuses gives a row ``failed``, which scores count as a miss. Any other error is a defect and ends the loop.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    workshop = _Workshop(benchmark, pipeline, renderer, field)
+    digests = {item.key: input_digests(benchmark, item) for item in items}
+    todo = [item for item in items if not _is_done(store, item, digests[item.key])]
+    with tqdm(
+        total=len(items), initial=len(items) - len(todo), desc=benchmark.name, unit="object", disable=not progress
+    ) as bar:
+        for _, group in groupby(todo, key=lambda item: (item.meshes, item.camera_matrix is None)):
+            alike = list(group)
+            for start in range(0, len(alike), BATCH):
+                batch = alike[start : start + BATCH]
+                for item, row in zip(batch, workshop.rows(batch), strict=True):
+                    store.write(item.key, {**row, "inputs": digests[item.key]})
+                    bar.update()
+
+
+def input_digests(benchmark: Benchmark, item: Item) -> dict[str, str]:
+    """Digests of the files that a prediction rests on; "" of one that cannot be read."""
+    photograph = Path(benchmark.dataset.annotation(item.index)["image_path"])
+    return {
+        "photograph": _file_digest(photograph),
+        "meshes": " ".join(_file_digest(path) for path in item.meshes),
+        "box": " ".join(f"{v:g}" for v in item.box.tolist()),
+    }
+
+
+def _is_done(store: PredictionStore, item: Item, digests: dict[str, str]) -> bool:
+    if item.key not in store:
+        return False
+    row = store.read(item.key)
+    return "skipped" not in row and row.get("inputs") == digests
+
+
+@cache
+def _file_digest(path: Path) -> str:
     try:
-        workshop = _Workshop(benchmark, preset, renderer)
-        todo = [item for item in items if item.key not in store]
-        with tqdm(
-            total=len(items), initial=len(items) - len(todo), desc=benchmark.name, unit="object", disable=not progress
-        ) as bar:
-            for item in todo:
-                store.write(item.key, workshop.row(item))
-                bar.update()
-    finally:
-        torch.set_num_threads(threads)
+        return hashlib.blake2b(path.read_bytes(), digest_size=8).hexdigest()
+    except OSError:
+        return ""
 
 
 @dataclass
 class _Workshop:
-    """Turns items into rows; keeps the registrars of the meshes in use."""
+    """Turns items into rows; keeps the registrar of the meshes in use."""
 
     benchmark: Benchmark
-    preset: Preset
+    pipeline: Pipeline
     renderer: str
+    field: nn.Module | None
     meshes: tuple[Path, ...] = ()
-    registrars: tuple[Registrar, ...] = ()
+    registrar: Registrar | None = None
 
-    @cached_property
-    def field(self) -> nn.Module:
-        return self.preset.photograph_filter()
-
-    def row(self, item: Item) -> Row:
+    def rows(self, items: Sequence[Item]) -> list[Row]:
+        """Rows of items of the same meshes."""
         protocol = self.benchmark.protocol
-        if not bool(item.box.isfinite().all()):
-            return {"skipped": "unknown_box"}
-        try:
-            image = read_image(self.benchmark.dataset.annotation(item.index)["image_path"])
-        except (ImageError, MissingFileError) as error:
-            return {"skipped": "unreadable_image", "reason": str(error)}
+        rows: dict[str, Row] = {}
+        photographs: dict[str, Photograph] = {}
+        for item in items:
+            if not bool(item.box.isfinite().all()):
+                rows[item.key] = {"skipped": "unknown_box"}
+                continue
+            try:
+                image = read_image(self.benchmark.dataset.annotation(item.index)["image_path"])
+            except (ImageError, MissingFileError) as error:
+                rows[item.key] = {"skipped": "unreadable_image", "reason": str(error)}
+                continue
+            photographs[item.key] = Photograph(image, perturbed_box(item.box, protocol, item.key), item.camera_matrix)
         start = time.perf_counter()
         try:
-            self._fetch(item.meshes, protocol)
+            registrar = self._registrar(items[0].meshes, protocol) if photographs else None
         except (MeshError, MissingFileError) as error:
-            return {"skipped": "unreadable_mesh", "reason": str(error)}
+            skipped: Row = {"skipped": "unreadable_mesh", "reason": str(error)}
+            return [rows.get(item.key, skipped) for item in items]
         ready = time.perf_counter()
-        box = perturbed_box(item.box, protocol, item.key)
-        row: Row = {"image_size": list(image.shape[1:])}
-        try:
-            row |= estimate_pose(self.registrars, image, box, item.camera_matrix, fused=protocol.cad == "fused")
-            row["mesh"] = self.meshes[row["mesh"]].name
-        except (ImageError, InvalidInputError) as error:
-            row |= {"failed": str(error)}
-        return row | {"seconds": {"bank": ready - start, "register": time.perf_counter() - ready}}
+        if registrar is not None:
+            found = estimate_poses(registrar, list(photographs.values()))
+            each = {"bank": ready - start, "register": time.perf_counter() - ready}
+            seconds = {name: value / len(found) for name, value in each.items()}
+            for (key, photograph), row in zip(photographs.items(), found, strict=True):
+                if "mesh" in row:
+                    row["mesh"] = self.meshes[row["mesh"]].name
+                    for rival in row["rivals"]:
+                        rival["mesh"] = self.meshes[rival["mesh"]].name
+                rows[key] = {"image_size": list(photograph.image.shape[1:]), **row, "seconds": seconds}
+        return [rows[item.key] for item in items]
 
-    def _fetch(self, meshes: tuple[Path, ...], protocol: Protocol) -> None:
-        if meshes != self.meshes:
-            self.meshes, self.registrars = (), ()  # the memory goes before more is asked for
-            self.registrars = tuple(self._registrar(path, protocol) for path in meshes)
+    def _registrar(self, meshes: tuple[Path, ...], protocol: Protocol) -> Registrar:
+        if self.registrar is None or meshes != self.meshes:
+            self.meshes, self.registrar = (), None  # the memory goes before more is asked for
+            pipeline = self.pipeline.posed(protocol.pose)
+            banks = [
+                cached_bank(
+                    load_mesh(path, unit=self.benchmark.unit), pipeline=pipeline, renderer=self.renderer, progress=False
+                )
+                for path in meshes
+            ]
+            make = FusedMatcher if protocol.cad == "fused" else ViewMatcher
+            matcher = make(ViewBank.join(banks), pipeline=pipeline, field=self.field)
+            self.registrar = Registrar(matcher, renderer=self.renderer)
             self.meshes = meshes
-
-    def _registrar(self, path: Path, protocol: Protocol) -> Registrar:
-        mesh, views = load_mesh(path, unit=self.benchmark.unit), self.preset.views(protocol.pose)
-        bank = cached_bank(mesh, views, self.preset.bank, renderer=self.renderer, progress=False)
-        refine = self.preset.refine and protocol.cad != "fused"
-        return self.preset.registrar(bank, field=self.field, refine=refine, renderer=self.renderer)
+        return self.registrar

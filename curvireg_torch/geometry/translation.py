@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from .cameras import project_points, rotation_towards, transform
+from .cameras import projected_boxes, rotation_towards, transform
 
 __all__ = ["place_view", "translation_from_box"]
 
@@ -20,12 +20,12 @@ def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tenso
 
     Args:
         points: (P, 3) of the model, for instance the vertices of its convex hull.
-        rotation: (3, 3) model -> camera.
-        box: (4,) x0, y0, x1, y1 in px.
-        K: (3, 3).
+        rotation: (..., 3, 3) model -> camera.
+        box: (..., 4) x0, y0, x1, y1 in px.
+        K: (..., 3, 3).
 
     Returns:
-        (3,) float64 translation in model units, the object in front of the camera.
+        (..., 3) float64 translation in model units, the object in front of the camera.
 
     Example:
         >>> cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
@@ -37,22 +37,25 @@ def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tenso
     points, R, box, K = (v.detach().cpu().double() for v in (points, rotation, box, K))
     centre = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
     extent = torch.linalg.vector_norm(points - centre, dim=1).max()
-    size, middle = box[2:] - box[:2], 0.5 * (box[:2] + box[2:])
-    ray = torch.linalg.inv(K) @ torch.cat([middle, torch.ones(1, dtype=torch.float64)])
+    size, middle = box[..., 2:] - box[..., :2], 0.5 * (box[..., :2] + box[..., 2:])
+    inverse = torch.linalg.inv(K)
     # Start far enough away for every point to be in front of the camera.
-    z = torch.maximum(2.0 * extent * K[0, 0] / size.max(), 2.0 * extent)
-    position = ray * z
+    z = torch.maximum(2.0 * extent * K[..., 0, 0] / size.amax(dim=-1), 2.0 * extent)
+    position = _rays(inverse, middle) * z[..., None]
     for _ in range(_ITERATIONS):
-        uv = project_points(points - centre, transform(R, position), K)
-        low, high = uv.amin(dim=0), uv.amax(dim=0)
-        seen = high - low
-        zoom = (seen * size).sum() / (size * size).sum()
-        shift = torch.stack([*(middle - 0.5 * (low + high)), torch.zeros((), dtype=torch.float64)])
+        low, high = projected_boxes(points - centre, transform(R, position), K).split(2, dim=-1)
+        zoom = ((high - low) * size).sum(dim=-1, keepdim=True) / (size * size).sum(dim=-1, keepdim=True)
+        shift = torch.nn.functional.pad(middle - 0.5 * (low + high), (0, 1))
         # Move sideways at the object's depth, then along its ray; never closer than its own extent.
-        position = position + torch.linalg.inv(K) @ shift * position[2]
-        position = position * torch.maximum(zoom, 1.05 * extent / position[2])
+        position = position + (inverse @ shift[..., None])[..., 0] * position[..., 2:]
+        position = position * torch.maximum(zoom, 1.05 * extent / position[..., 2:])
     translation: Tensor = position - R @ centre
     return translation
+
+
+def _rays(inverse: Tensor, pixels: Tensor) -> Tensor:
+    """(..., 3) rays through (..., 2) pixels."""
+    return (inverse @ torch.nn.functional.pad(pixels, (0, 1), value=1.0)[..., None])[..., 0]
 
 
 def place_view(points: Tensor, view_rotation: Tensor, box: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
@@ -64,15 +67,14 @@ def place_view(points: Tensor, view_rotation: Tensor, box: Tensor, K: Tensor) ->
 
     Args:
         points, box, K: of :func:`translation_from_box`.
-        view_rotation: (3, 3).
+        view_rotation: (..., 3, 3).
 
     Returns:
-        rotation (3, 3) and translation (3,) in the photograph's camera, float64.
+        rotation (..., 3, 3) and translation (..., 3) in the photograph's camera, float64.
     """
-    points, R_view, K = (v.detach().cpu().double() for v in (points, view_rotation, K))
+    points, R_view, box, K = (v.detach().cpu().double() for v in (points, view_rotation, box, K))
     centre = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
-    middle = torch.tensor([0.5 * float(box[0] + box[2]), 0.5 * float(box[1] + box[3]), 1.0], dtype=torch.float64)
-    ray = torch.linalg.inv(K) @ middle
+    ray = _rays(torch.linalg.inv(K), 0.5 * (box[..., :2] + box[..., 2:]))
     for _ in range(_RAYS):
         rotation = rotation_towards(ray) @ R_view
         translation = translation_from_box(points, rotation, box, K)

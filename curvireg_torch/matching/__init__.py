@@ -1,7 +1,24 @@
 """Banks of described views, and the matcher that ranks them for photographs."""
 
+import warnings
+from collections.abc import Sequence
+
+from ..pipeline import BankSettings
+from ..terms import (
+    DescriptorStatistics,
+    Photographs,
+    Whitening,
+    box_shape_score,
+    box_shapes,
+    dilate_points,
+    normalized_correlation,
+    repeatability,
+    repeatability_score,
+    slack_boxes,
+    unit_score,
+    whole_box_shapes,
+)
 from .bank import ViewBank
-from .box_shape import box_shape_score, box_shapes, whole_box_shapes
 from .cache import (
     CACHE_LIMIT,
     CachedBank,
@@ -12,14 +29,9 @@ from .cache import (
     list_cache,
     trim_cache,
 )
-from .collection import BankCollection
-from .describe import BankSettings, DescribedViews, ViewDescriber
+from .describe import DescribedViews, ViewDescriber
 from .index import ViewIndex
 from .matcher import Ranking, ViewMatcher
-from .query import QueryFeatures, slack_boxes
-from .repeatability import dilate_points, repeatability, repeatability_score
-from .similarity import normalized_correlation, unit_score
-from .whitening import DescriptorStatistics, Whitening
 
 __all__ = [
     "CACHE_LIMIT",
@@ -28,7 +40,7 @@ __all__ = [
     "CachedBank",
     "DescribedViews",
     "DescriptorStatistics",
-    "QueryFeatures",
+    "Photographs",
     "Ranking",
     "ViewBank",
     "ViewDescriber",
@@ -51,3 +63,9 @@ __all__ = [
     "unit_score",
     "whole_box_shapes",
 ]
+
+
+def BankCollection(banks: Sequence[ViewBank]) -> ViewBank:  # noqa: N802 (the name of version 0.1)
+    """Deprecated name of :meth:`ViewBank.join`."""
+    warnings.warn("BankCollection is deprecated; use ViewBank.join", DeprecationWarning, stacklevel=2)
+    return ViewBank.join(banks)

@@ -1,7 +1,7 @@
-"""A bank of rendered views of one mesh, described once and matched many times."""
+"""A bank of rendered views of one or several meshes, described once and matched many times."""
 
-import json
-from dataclasses import asdict, fields
+from collections.abc import Sequence
+from dataclasses import fields, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -9,31 +9,29 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from tqdm import tqdm
 
-from .._files import write_tensors
 from .._threads import one_thread_each
-from ..errors import BankError, InvalidInputError, MissingFileError
+from ..errors import BankError, InvalidInputError
 from ..geometry.mesh import as_mesh, mesh_radius
 from ..geometry.up import mesh_up
-from ..geometry.views import ViewSphere, sample_views
+from ..geometry.views import ViewSphere
+from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
-from .describe import BankSettings, ViewDescriber
+from .describe import ViewDescriber
 
-__all__ = ["FORMAT_VERSION", "ViewBank"]
-
-FORMAT_VERSION = 1
+__all__ = ["ViewBank"]
 
 
 class ViewBank:
-    """N views of one mesh: descriptors, feature points, silhouettes and the cameras that saw them.
+    """N views of one mesh, or of several: descriptors, feature points, silhouettes and the cameras that saw them.
 
     Attributes:
-        mesh: the mesh, in its file's own frame and unit.
+        meshes: the meshes, in their files' own frames and units.
+        model: (N,) int64: which of the meshes each view shows.
         views: the N viewpoints.
-        settings: what the views were made with.
+        pipeline: what the views were made for.
         descriptors: (N, D) float32.
         points, silhouettes: (N, S, S) bool, unpacked on demand; :meth:`points_at` and :meth:`silhouettes_at` unpack a
             few views at a time, which a large bank asks for.
@@ -41,18 +39,35 @@ class ViewBank:
     """
 
     def __init__(
-        self, mesh: trimesh.Trimesh, views: ViewSphere, settings: BankSettings, tensors: dict[str, Tensor]
+        self, meshes: Sequence[trimesh.Trimesh], views: ViewSphere, pipeline: Pipeline, tensors: dict[str, Tensor]
     ) -> None:
-        self.mesh, self.views, self.settings = mesh, views, settings
+        self.meshes, self.views, self.pipeline = tuple(meshes), views, pipeline
         self.descriptors = tensors["descriptors"].float()
-        self.boxes = tensors["boxes"]
+        self.boxes, self.model = tensors["boxes"], tensors["model"]
         self._points, self._silhouettes = tensors["points"], tensors["silhouettes"]
 
     def __len__(self) -> int:
         return len(self.views)
 
     def __repr__(self) -> str:
-        return f"ViewBank({len(self)} views, {len(self.mesh.faces)} faces, {self.settings})"
+        faces = sum(len(mesh.faces) for mesh in self.meshes)
+        return f"ViewBank({len(self)} views of {len(self.meshes)} meshes, {faces} faces, {self.settings})"
+
+    @property
+    def mesh(self) -> trimesh.Trimesh:
+        """The one mesh.
+
+        Raises:
+            InvalidInputError: there are several; see ``meshes``.
+        """
+        if len(self.meshes) != 1:
+            raise InvalidInputError(f"bank: has {len(self.meshes)} meshes; choose one of bank.meshes")
+        return self.meshes[0]
+
+    @property
+    def settings(self) -> BankSettings:
+        """How the views are rendered and described."""
+        return self.pipeline.bank
 
     @property
     def device(self) -> torch.device:
@@ -60,8 +75,14 @@ class ViewBank:
 
     @property
     def rotations(self) -> Tensor:
-        """(N, 3, 3) rotations model -> camera."""
+        """(N, 3, 3) rotations model -> camera, each in its own model's frame."""
         return self.views.rotations.to(self.device)
+
+    @property
+    def distances(self) -> Tensor:
+        """(N,) float64 distances of the object's centre, in the unit of each view's mesh."""
+        radii = torch.tensor([mesh_radius(mesh) for mesh in self.meshes], dtype=torch.float64, device=self.device)
+        return self.views.distance.to(radii) * radii[self.model]
 
     @property
     def points(self) -> Tensor:
@@ -81,16 +102,25 @@ class ViewBank:
         """(K, S, S) bool silhouettes of some views."""
         return _unpack(self._silhouettes[index], self.settings.image_size)
 
+    def check_made_for(self, pipeline: Pipeline) -> None:
+        """Raise :class:`BankError` if the views were made in another way than ``pipeline`` asks for."""
+        if pipeline.bank != self.settings:
+            names = [f.name for f in fields(BankSettings)]
+            differ = [n for n in names if getattr(pipeline.bank, n) != getattr(self.settings, n)]
+            told = ", ".join(f"{n} {getattr(self.settings, n)}, asked for {getattr(pipeline.bank, n)}" for n in differ)
+            raise BankError(f"bank: made with other settings ({told}); build it again, or use bank.pipeline")
+
     @classmethod
     def build(
         cls,
         mesh: Any,
         views: ViewSphere | None = None,
         *,
-        image_size: int = 256,
-        camera: str = "perspective",
+        image_size: int | None = None,
+        camera: str | None = None,
         renderer: str | DepthRenderer = "auto",
         settings: BankSettings | None = None,
+        pipeline: Pipeline | None = None,
         progress: bool = True,
         chunk_size: int = 24,
         device: torch.device | str = "cpu",
@@ -99,10 +129,11 @@ class ViewBank:
 
         Args:
             mesh: a mesh or the path of one.
-            views: default :func:`sample_views`, for objects that stand upright.
-            image_size, camera: shortcuts into ``settings``.
+            views: viewpoints of one's own; default those of the pipeline.
+            image_size, camera: instead of the pipeline's.
             renderer: "auto", "embree", "pyrender", "torch" or a :class:`DepthRenderer` of this mesh.
-            settings: everything else that may be chosen; overrides the shortcuts.
+            settings: instead of the pipeline's ``bank``.
+            pipeline: what the bank is made for; default ``Pipeline()``.
             progress: show a bar.
             chunk_size: views that a thread has in memory at a time (about 60 bytes x image_size^2 each). Those of one
                 direction are rendered at once (:func:`render_views`) where they fall into one chunk.
@@ -112,14 +143,24 @@ class ViewBank:
             MeshError, MissingFileError, InvalidInputError, RenderingError.
 
         Example:
+            >>> from curvireg_torch.geometry import sample_views
             >>> bank = ViewBank.build(trimesh.creation.box(), sample_views(azimuth_step=90, elevations=[20]),
             ...                       image_size=64, progress=False)
             >>> len(bank), bank.descriptors.shape
             (4, torch.Size([4, 1764]))
         """
         mesh = as_mesh(mesh)
-        views = sample_views().for_up(mesh_up(mesh)) if views is None else views
-        settings = settings or BankSettings(image_size=image_size, camera=camera)
+        pipeline = Pipeline() if pipeline is None else pipeline
+        settings = pipeline.bank if settings is None else settings
+        settings = settings if image_size is None else replace(settings, image_size=image_size)
+        settings = settings if camera is None else replace(settings, camera=camera)
+        pipeline = replace(pipeline, bank=settings)
+        if views is None:
+            views = pipeline.views.sphere(mesh_up(mesh))
+        elif len(views) != 0:
+            pipeline = pipeline.posed("given")
+        if len(views) == 0:
+            raise InvalidInputError("views: expected at least one viewpoint")
         if chunk_size < 1:
             raise InvalidInputError(f"chunk_size: expected >= 1, got {chunk_size}")
         describe = ViewDescriber(mesh, settings, renderer=renderer, device=device)
@@ -139,39 +180,77 @@ class ViewBank:
             for part in pool.map(chunk, range(0, len(views), chunk_size)):
                 parts.append(part)
                 bar.update(len(part["boxes"]))
-        return cls(mesh, views, settings, {name: torch.cat([part[name] for part in parts]) for name in parts[0]})
+        tensors = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        tensors["model"] = torch.zeros(len(views), dtype=torch.long, device=tensors["boxes"].device)
+        return cls([mesh], views, pipeline, tensors)
+
+    @classmethod
+    def join(cls, banks: "Sequence[ViewBank]") -> "ViewBank":
+        """The views of several banks, one after the other: which model fits a photograph best?
+
+        Args:
+            banks: at least one, all made for the same pipeline and on one device.
+
+        Raises:
+            InvalidInputError: no bank, or banks that do not go together.
+
+        Example:
+            >>> from curvireg_torch.geometry import sample_views
+            >>> views = sample_views(azimuth_step=90, elevations=[20])
+            >>> meshes = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 1, 3))
+            >>> both = ViewBank.join([ViewBank.build(m, views, image_size=64, progress=False) for m in meshes])
+            >>> len(both), both.model.tolist()
+            (8, [0, 0, 0, 0, 1, 1, 1, 1])
+        """
+        if not banks:
+            raise InvalidInputError("banks: expected at least one bank, got none")
+        first = banks[0]
+        for i, bank in enumerate(banks):
+            if bank.settings != first.settings:
+                raise InvalidInputError(
+                    f"banks: expected one set of settings, but bank {i} has {bank.settings} and bank 0 {first.settings}"
+                )
+            if bank.device != first.device:
+                raise InvalidInputError(
+                    f"banks: expected one device, but bank {i} is on {bank.device}, not {first.device}"
+                )
+        tensors = {name: torch.cat([bank.tensors[name] for bank in banks]) for name in first.tensors}
+        shift = torch.tensor([0, *(len(bank.meshes) for bank in banks)]).cumsum(0)[:-1].tolist()
+        tensors["model"] = torch.cat([bank.model + n for bank, n in zip(banks, shift, strict=True)])
+        views = ViewSphere(*(torch.cat([getattr(b.views, f.name) for b in banks]) for f in fields(ViewSphere)))
+        return cls([mesh for bank in banks for mesh in bank.meshes], views, first.pipeline, tensors)
+
+    def locate(self, index: int) -> tuple[int, int]:
+        """Number of the model, and of the view among its views, of one of the N views."""
+        if not 0 <= index < len(self):
+            raise InvalidInputError(f"index: expected 0 <= index < {len(self)}, got {index}")
+        model = int(self.model[index])
+        return model, int((self.model[:index] == model).sum())
 
     def to(self, device: torch.device | str) -> "ViewBank":
         """The same bank on another device."""
-        return ViewBank(self.mesh, self.views, self.settings, {k: v.to(device) for k, v in self._tensors().items()})
+        return ViewBank(self.meshes, self.views, self.pipeline, {k: v.to(device) for k, v in self.tensors.items()})
 
-    def _tensors(self) -> dict[str, Tensor]:
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """All that was computed of the views; masks packed eight pixels to a byte."""
         return {
             "descriptors": self.descriptors,
             "boxes": self.boxes,
             "points": self._points,
             "silhouettes": self._silhouettes,
+            "model": self.model,
         }
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write a safetensors file; it appears whole or not at all, whoever else writes it at the same time.
 
         Descriptors are stored in float16: they move by at most 5e-4 of themselves, cosines by less than 1e-4
-        (``tests/matching/test_bank.py``).
+        (``tests/matching/test_bank_files.py``).
         """
-        views = {f"views.{f.name}": getattr(self.views, f.name) for f in fields(ViewSphere)}
-        mesh = {
-            "mesh.vertices": torch.from_numpy(np.array(self.mesh.vertices, dtype=np.float64)),
-            "mesh.faces": torch.from_numpy(np.array(self.mesh.faces, dtype=np.int32)),
-        }
-        tensors = {**self._tensors(), "descriptors": self.descriptors.half(), **views, **mesh}
-        metadata = {
-            "format": "curvireg_torch.ViewBank",
-            "version": str(FORMAT_VERSION),
-            "settings": json.dumps(asdict(self.settings)),
-            "unit": self.mesh.units or "m",
-        }
-        write_tensors(Path(path), tensors, metadata)
+        from .bank_file import write_bank
+
+        write_bank(self, Path(path))
 
     @classmethod
     def load(cls, path: str | PathLike[str], *, device: torch.device | str = "cpu") -> "ViewBank":
@@ -179,42 +258,11 @@ class ViewBank:
 
         Raises:
             MissingFileError: no such file.
-            BankError: truncated, not a bank, or written by another version of the format.
+            BankError: truncated, changed, not a bank, or written by another version of the format.
         """
-        path = Path(path)
-        if not path.is_file():
-            raise MissingFileError(f"{path}: no such bank; build one with 'curvireg bank MESH --out {path}'")
-        try:
-            with safe_open(path, framework="pt", device=str(device)) as file:
-                metadata = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-        except (SafetensorError, OSError) as error:
-            raise BankError(f"{path}: truncated or not a safetensors file ({error}); build the bank again") from error
-        if metadata.get("format") != "curvireg_torch.ViewBank":
-            raise BankError(f"{path}: not a view bank; build one with 'curvireg bank MESH --out FILE'")
-        if metadata.get("version") != str(FORMAT_VERSION):
-            raise BankError(
-                f"{path}: bank format version {metadata.get('version')}, this library reads {FORMAT_VERSION}; "
-                "build the bank again"
-            )
-        try:
-            settings = BankSettings(**json.loads(metadata["settings"]))
-            views = ViewSphere(**{f.name: tensors[f"views.{f.name}"].cpu() for f in fields(ViewSphere)})
-            mesh = trimesh.Trimesh(
-                vertices=tensors["mesh.vertices"].cpu().numpy(),
-                faces=tensors["mesh.faces"].cpu().numpy(),
-                process=False,
-            )
-            mesh.units = metadata["unit"]
-            bank = cls(mesh, views, settings, tensors)
-            length = settings.descriptor().length
-        except (KeyError, TypeError, ValueError) as error:
-            raise BankError(f"{path}: incomplete bank ({error!r}); build it again") from error
-        packed = (len(views), -(-(settings.image_size**2) // 8))
-        shapes = {bank.descriptors.shape: (len(views), length), bank.boxes.shape: (len(views), 4)}
-        if any(tuple(a) != b for a, b in shapes.items()) or {bank._points.shape, bank._silhouettes.shape} != {packed}:
-            raise BankError(f"{path}: tensors do not match the settings; build the bank again")
-        return bank
+        from .bank_file import read_bank
+
+        return read_bank(Path(path)).to(device)
 
 
 def _pack(mask: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,12 @@ import trimesh
 
 from ..errors import BankError
 from ..geometry.mesh import as_mesh
+from ..geometry.up import mesh_up
 from ..geometry.views import ViewSphere
-from .bank import FORMAT_VERSION, ViewBank
-from .describe import BankSettings
+from ..pipeline import BankSettings, Pipeline
+from ..rendering import DepthRenderer
+from .bank import ViewBank
+from .bank_file import FORMAT_VERSION
 
 __all__ = [
     "CACHE_LIMIT",
@@ -80,9 +83,10 @@ def _code_digest() -> bytes:
     return digest.digest()
 
 
-def bank_key(mesh: trimesh.Trimesh, views: ViewSphere, settings: BankSettings) -> str:
-    """Hexadecimal digest of mesh (vertices, faces, unit), views, settings and the code that describes views."""
-    digest = hashlib.sha256(json.dumps([FORMAT_VERSION, asdict(settings), mesh.units or "m"], sort_keys=True).encode())
+def bank_key(mesh: trimesh.Trimesh, views: ViewSphere, settings: BankSettings, renderer: str = "auto") -> str:
+    """Digest in hexadecimal: mesh (vertices, faces, unit), views, settings, renderer, the code that describes views."""
+    facts = [FORMAT_VERSION, asdict(settings), mesh.units or "m", renderer]
+    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     digest.update(_code_digest())
     digest.update(np.ascontiguousarray(mesh.vertices, np.float64).tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, np.int64).tobytes())
@@ -93,9 +97,11 @@ def bank_key(mesh: trimesh.Trimesh, views: ViewSphere, settings: BankSettings) -
 
 def cached_bank(
     mesh: Any,
-    views: ViewSphere,
-    settings: BankSettings,
+    views: ViewSphere | None = None,
+    settings: BankSettings | None = None,
     *,
+    pipeline: Pipeline | None = None,
+    renderer: str | DepthRenderer = "auto",
     folder: Path | None = None,
     device: torch.device | str = "cpu",
     progress: bool = True,
@@ -107,7 +113,9 @@ def cached_bank(
 
     Args:
         mesh: a mesh or the path of one.
-        views, settings: of the bank.
+        views, settings: of the bank; default those of the pipeline.
+        pipeline: what the bank is made for; default ``Pipeline()``.
+        renderer: of a bank that is built; its name is part of the key, and a bank of one's own renderer is not kept.
         folder: default :func:`cache_folder`.
         device, progress, build_options: of :meth:`ViewBank.build`.
 
@@ -122,19 +130,29 @@ def cached_bank(
     """
     mesh = as_mesh(mesh)
     folder = folder or cache_folder()
-    key = bank_key(mesh, views, settings)
+    pipeline = pipeline or Pipeline()
+    if views is not None:
+        pipeline = pipeline.posed("given")
+    views = pipeline.views.sphere(mesh_up(mesh)) if views is None else views
+    pipeline = replace(pipeline, bank=settings or pipeline.bank)
+    build_options |= {"views": views, "pipeline": pipeline, "renderer": renderer, "device": device}
+    if not isinstance(renderer, str):
+        return ViewBank.build(mesh, progress=progress, **build_options)
+    key = bank_key(mesh, views, pipeline.bank, renderer)
     path = folder / "banks" / f"bank-{key}.safetensors"
     if _is_ours(path):
         try:
             bank = ViewBank.load(path, device=device)
-            if bank_key(bank.mesh, bank.views, bank.settings) != key:
+            if bank_key(bank.mesh, bank.views, bank.settings, renderer) != key:
                 raise BankError(f"{path}: holds another bank than its name says")
         except BankError:  # built again, and replaced
             pass
         else:
             _touch(path)
+            bank.pipeline = pipeline  # of all that share these views
             return bank
-    bank = ViewBank.build(mesh, views, settings=settings, progress=progress, device=device, **build_options)
+    bank = ViewBank.build(mesh, progress=progress, **build_options)
+    bank.pipeline = pipeline
     bank.descriptors = bank.descriptors.half().float()  # as the file will hold them: now and later rank alike
     if os.path.lexists(path) and not _is_ours(path):
         warnings.warn(f"{path}: not a view bank, so it stays and the bank is not cached; move it away", stacklevel=2)

@@ -6,58 +6,20 @@ import torch
 import trimesh
 from torch import Tensor
 
-from .._checks import check_option, check_positive
-from ..descriptors import HOG, field_points
-from ..errors import InvalidInputError
-from ..filters import DepthCurvilinearSaliency
+from ..descriptors import field_points
 from ..geometry.cameras import projected_boxes, transform
 from ..geometry.crops import crop_transforms, square_boxes
-from ..geometry.mesh import extreme_points, mesh_centre
+from ..geometry.mesh import extreme_points, mesh_centre, mesh_radius
+from ..pipeline import BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_views
 
-__all__ = ["BankSettings", "DescribedViews", "ViewDescriber"]
+__all__ = ["DescribedViews", "ViewDescriber"]
 
-CAMERAS = ("perspective", "orthographic")
+CHUNK = 64
+"""Views in memory at a time."""
 
 FAR = 20.0
 """Distances farther away than usual: parallel projection but for a few per mille."""
-
-
-@dataclass(frozen=True)
-class BankSettings:
-    """Everything, besides mesh and views, that decides what a bank holds. Photographs are cropped the same way.
-
-    Attributes:
-        image_size: side of views and crops in px.
-        camera: "perspective" or "orthographic".
-        margin: room around the object's box, as a share of its longer side.
-        sigma, formula: of :func:`depth_curvilinear_saliency`.
-        grid, bins, block, clip: of :func:`hog`.
-        point_share: of :func:`field_points`.
-    """
-
-    image_size: int = 256
-    camera: str = "perspective"
-    margin: float = 0.1
-    sigma: float = 1.0
-    formula: str = "geometric"
-    grid: int = 8
-    bins: int = 9
-    block: int = 2
-    clip: float = 0.2
-    point_share: float = 0.04
-
-    def __post_init__(self) -> None:
-        check_option(self.camera, CAMERAS, "camera")
-        check_positive(self.margin, "margin", zero_ok=True)
-        if self.image_size < self.grid:
-            raise InvalidInputError(f"image_size: expected at least grid = {self.grid}, got {self.image_size}")
-
-    def descriptor(self) -> HOG:
-        return HOG(grid=self.grid, bins=self.bins, block=self.block, clip=self.clip)
-
-    def depth_filter(self) -> DepthCurvilinearSaliency:
-        return DepthCurvilinearSaliency(sigma=self.sigma, formula=self.formula)
 
 
 @dataclass(frozen=True)
@@ -65,16 +27,29 @@ class DescribedViews:
     """N described views.
 
     Attributes:
+        settings: what they were made with.
         descriptors: (N, D) float32.
         points, silhouettes: (N, S, S) bool.
         boxes: (N, 4) float64 boxes of the object in normalised image coordinates (focal length 1), the object's centre
             on the axis; model units for an orthographic camera.
     """
 
+    settings: BankSettings
     descriptors: Tensor
     points: Tensor
     silhouettes: Tensor
     boxes: Tensor
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def points_at(self, index: Tensor | slice) -> Tensor:
+        """(K, S, S) bool feature points of some views."""
+        return self.points[index]
+
+    def silhouettes_at(self, index: Tensor | slice) -> Tensor:
+        """(K, S, S) bool silhouettes of some views."""
+        return self.silhouettes[index]
 
 
 class ViewDescriber:
@@ -100,7 +75,8 @@ class ViewDescriber:
         self.renderer = make_renderer(mesh, renderer, device=device)
         self.hull = extreme_points(mesh)
         self._orthographic = settings.camera == "orthographic"
-        self._filter, self._descriptor = settings.depth_filter(), settings.descriptor()
+        self.radius = mesh_radius(mesh)
+        self._filter, self.descriptor = settings.depth_filter(), settings.descriptor()
         self._device = device
 
     def cameras(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -120,25 +96,26 @@ class ViewDescriber:
         boxes = projected_boxes(self.hull, T, torch.eye(3, dtype=torch.float64), orthographic=self._orthographic)
         return T, crop_transforms(square_boxes(boxes, self.settings.margin), self.settings.image_size), boxes
 
-    def camera_of_box(self, rotation: Tensor, distance: float, box: Tensor) -> tuple[Tensor, Tensor]:
-        """A perspective camera that would see the object, straight ahead, where a photograph's box has it.
+    def cameras_of_boxes(self, rotations: Tensor, distances: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
+        """Perspective cameras that would see the object, straight ahead, where photographs' boxes have it.
 
         For photographs of unknown cameras. An orthographic describer's camera is one from far away.
 
         Args:
-            rotation: (3, 3).
-            distance: of the object's centre, in model units.
-            box: (4,) x0, y0, x1, y1 in px of the photograph.
+            rotations: (N, 3, 3).
+            distances: (N,) of the object's centre, in model units.
+            boxes: (N, 4) x0, y0, x1, y1 in px of the photographs.
 
         Returns:
-            T_cam_from_model (4, 4) and camera matrix (3, 3) in px of the photograph, float64.
+            T_cam_from_model (N, 4, 4) and camera matrices (N, 3, 3) in px of the photographs, float64.
         """
-        T, K, _ = self.cameras(rotation[None], torch.tensor([distance], dtype=torch.float64))
-        T, K = T[0].clone(), K[0].clone()
+        T, K, _ = self.cameras(rotations, distances)
         if self._orthographic:
-            T[2, 3] += FAR * distance
-            K[:2, :2] *= distance + FAR * distance
-        to_crop = crop_transforms(square_boxes(box.double().cpu(), self.settings.margin), self.settings.image_size)
+            z = distances.double().cpu()
+            T, K = T.clone(), K.clone()
+            T[:, 2, 3] += FAR * z
+            K[:, :2, :2] *= (1.0 + FAR) * z[:, None, None]
+        to_crop = crop_transforms(square_boxes(boxes.double().cpu(), self.settings.margin), self.settings.image_size)
         return T, torch.linalg.inv(to_crop).triu() @ K  # exact zeros below; torch 2.5 leaves 1e-16
 
     def depth(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
@@ -149,9 +126,18 @@ class ViewDescriber:
         return depth.to(self._device), boxes.to(self._device)
 
     @torch.no_grad()
+    def descriptors(self, rotations: Tensor, distances: Tensor) -> Tensor:
+        """(N, D) of (N, 3, 3) rotations at (N,) distances of the object's centre, in model units."""
+        parts = [
+            self.descriptor(self._filter(self.depth(R, z)[0]))
+            for R, z in zip(rotations.split(CHUNK), distances.split(CHUNK), strict=True)
+        ]
+        return torch.cat(parts)
+
+    @torch.no_grad()
     def __call__(self, rotations: Tensor, distances: Tensor) -> DescribedViews:
         """Describe (N, 3, 3) rotations at (N,) distances of the object's centre, in model units."""
         depth, boxes = self.depth(rotations, distances)
         field = self._filter(depth)
         points = field_points(field, share=self.settings.point_share)[:, 0]
-        return DescribedViews(self._descriptor(field), points, depth[:, 0] > 0, boxes)
+        return DescribedViews(self.settings, self.descriptor(field), points, depth[:, 0] > 0, boxes)

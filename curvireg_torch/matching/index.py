@@ -17,7 +17,7 @@ class ViewIndex:
     """The views most like a query, found among very many without looking at all of them.
 
     Views are put into cells around ``sqrt(N)`` centres; a query looks into the ``probes`` nearest cells. What it finds
-    is a short list, of models for instance (:meth:`BankCollection.locate`), to be ranked by a :class:`ViewMatcher`.
+    is a short list, of models for instance (:meth:`ViewBank.locate`), to be ranked by a :class:`ViewMatcher`.
     How much it misses and when it pays is measured in ``docs/performance.md``.
 
     Args:

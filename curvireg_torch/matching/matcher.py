@@ -1,24 +1,20 @@
 """All views of a bank ranked for every photograph of a batch."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .._checks import check_option, check_positive
 from ..descriptors import field_points
 from ..errors import InvalidInputError
-from ..filters import MultiScaleFocusCurves
 from ..geometry.crops import crop_images
+from ..pipeline import Pipeline
+from ..terms import Photographs, Whitening, crop_regions, photograph_field, slack_boxes, whole_box_shapes
+from ..terms.correlation import Correlated
 from .bank import ViewBank
-from .box_shape import box_shape_score, box_shapes, whole_box_shapes
-from .collection import BankCollection
-from .query import QueryFeatures, crop_regions, photograph_field, slack_boxes
-from .repeatability import MODES, dilate_points, repeatability, repeatability_score
-from .similarity import unit_score
-from .whitening import Whitening
 
 __all__ = ["Ranking", "ViewMatcher"]
 
@@ -28,50 +24,71 @@ class Ranking:
     """Scores of N views for B photographs.
 
     Attributes:
-        scores: (B, N) in [0, 1], S = S_hog . S_rep . S_box.
+        scores: (B, N) in [0, 1], the product of the terms' scores, each to the power of its weight.
         order: (B, N) view indices, best first; ties in the order of the bank.
-        hog: (B, N) normalised correlation of descriptors: in [0, 1], or in [-1, 1] if they are whitened.
-        repeatability: (B, N) share of the photograph's points found in the view.
-        box: (B, N) S_box in [0, 1], likeness of the boxes' proportions, best view 1.
+        terms: name -> (B, N) raw scores of each term: "hog": normalised correlation of descriptors, in [0, 1], or in
+            [-1, 1] if they are whitened; "repeatability": share of the photograph's points found in the view; "box":
+            S_box in [0, 1], likeness of the boxes' proportions, best view 1.
     """
 
     scores: Tensor
     order: Tensor
-    hog: Tensor
-    repeatability: Tensor
-    box: Tensor
+    terms: Mapping[str, Tensor]
 
     def __len__(self) -> int:
         return self.scores.shape[0]
 
     def __getitem__(self, index: slice) -> "Ranking":
-        return Ranking(*(getattr(self, field.name)[index] for field in fields(self)))
+        """Some of the photographs, in memory of their own."""
+        terms = {name: raw[index].clone() for name, raw in self.terms.items()}
+        return Ranking(self.scores[index].clone(), self.order[index].clone(), terms)
+
+    @property
+    def hog(self) -> Tensor:
+        """``terms["hog"]``."""
+        return self.terms["hog"]
+
+    @property
+    def repeatability(self) -> Tensor:
+        """``terms["repeatability"]``."""
+        return self.terms["repeatability"]
+
+    @property
+    def box(self) -> Tensor:
+        """``terms["box"]``."""
+        return self.terms["box"]
 
     def top(self, k: int) -> Tensor:
         """(B, k) indices of the best views; fewer where the bank is smaller."""
         return self.order[:, :k]
 
+    @staticmethod
+    def cat(parts: Sequence["Ranking"]) -> "Ranking":
+        """Rankings of the same views for more photographs."""
+        terms = {name: torch.cat([part.terms[name] for part in parts]) for name in parts[0].terms}
+        return Ranking(torch.cat([p.scores for p in parts]), torch.cat([p.order for p in parts]), terms)
+
 
 class ViewMatcher(nn.Module):
-    """Ranks all views of a bank for every photograph.
+    r"""Ranks all views of a bank for every photograph.
 
-    The box of each photograph is cropped as the views are, turned into a field, described by the bank's HOG, and
-    compared with all views: S_hog (normalised correlation, mapped to (0, 1] by :func:`unit_score`) times S_rep
-    (:func:`repeatability_score`) times S_box (:func:`box_shape_score`; 1 for a box that reaches the image's border).
-    A box is never exact: correlation and repeatability are the best over a few crops that are moved and scaled a
-    little.
+    The box of each photograph is cropped as the views are, turned into a field and described; each ranking term
+    compares it with all views, and :math:`S = \prod_t S_t^{w_t}`. A box is never exact: terms take the best over a few
+    crops that are moved and scaled a little.
 
     Args:
         bank: the views of one model, or of several (which one is it?).
-        field: photograph filter (B, 1, S, S) -> (B, 2, S, S); default :class:`MultiScaleFocusCurves`. One with an
-            attribute ``colour = True`` gets colour photographs as (B, 3, S, S).
-        eps: distance in px of the crop within which points repeat; default 2 % of its side.
-        repeatability_mode: "monotone" or "paper".
-        repeatability_sigma, box_sigma: widths of S_rep and S_box; None leaves that factor out.
-        slack: how wrong boxes may be, as a share of their longer side (:func:`slack_boxes`); 0 takes them as they are
-            and costs a seventh of the work.
-        whitening: compare whitened descriptors (:class:`DescriptorStatistics`); default plain ones.
+        pipeline: field, terms and slack; default the one the bank was made with.
+        field: photograph filter (B, 1, S, S) -> (B, 2, S, S) of one's own. One with an attribute ``colour = True`` gets
+            colour photographs as (B, 3, S, S).
+        slack: instead of the pipeline's.
+        whitening: compare whitened descriptors (:class:`DescriptorStatistics`), whatever the term "hog" says.
         chunk_size: photographs in memory at a time.
+        deprecated: ``eps``, ``repeatability_mode``, ``repeatability_sigma`` and ``box_sigma`` of version 0.1; use
+            :meth:`Pipeline.with_term`.
+
+    Raises:
+        InvalidInputError: a bank made for another pipeline, or an option out of range.
 
     Example:
         >>> import trimesh
@@ -84,50 +101,37 @@ class ViewMatcher(nn.Module):
 
     def __init__(
         self,
-        bank: ViewBank | BankCollection,
+        bank: ViewBank,
         *,
+        pipeline: Pipeline | None = None,
         field: nn.Module | None = None,
-        eps: float | None = None,
-        repeatability_mode: str = "monotone",
-        repeatability_sigma: float | None = 0.1,
-        box_sigma: float | None = 0.2,
-        slack: float = 0.1,
+        slack: float | None = None,
         whitening: Whitening | None = None,
         chunk_size: int = 16,
+        **deprecated: Any,
     ) -> None:
         super().__init__()
-        check_option(repeatability_mode, MODES, "repeatability_mode")
+        pipeline = bank.pipeline if pipeline is None else pipeline
+        bank.check_made_for(pipeline)
+        pipeline = replace(pipeline, views=bank.pipeline.views)
+        if deprecated:
+            pipeline = _with_old_options(pipeline, deprecated)
+        if slack is not None:
+            pipeline = replace(pipeline, slack=slack)
         if chunk_size < 1:
             raise InvalidInputError(f"chunk_size: expected >= 1, got {chunk_size}")
-        self.bank = bank
-        self.field = MultiScaleFocusCurves() if field is None else field
-        self.eps = 0.02 * bank.settings.image_size if eps is None else eps
-        check_positive(self.eps, "eps", zero_ok=True)
-        slack_boxes(torch.ones(0, 4), slack)  # says what is wrong with it
-        self.repeatability_mode, self.slack, self.chunk_size = repeatability_mode, slack, chunk_size
-        self.repeatability_sigma, self.box_sigma, self.whitening = repeatability_sigma, box_sigma, whitening
+        self.bank, self.chunk_size = bank, chunk_size
+        self.pipeline = pipeline if field is None else pipeline.with_field(field)
+        self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
         self.descriptor = bank.settings.descriptor()
-        # Points are counted in cells of eps px or less, so that the product stays small.
-        self._cell = max(1, min(int(self.eps), bank.settings.image_size // 64))
-        cells = [
-            self._in_cells(dilate_points(bank.points_at(slice(i, i + 64)), self.eps)[:, None].float())
-            for i in range(0, len(bank), 64)
-        ]
-        self._views: Tensor
-        self._view_points: Tensor
-        self._view_shapes: Tensor
-        self.register_buffer("_views", self._comparable(bank.descriptors), persistent=False)
-        self.register_buffer("_view_points", torch.cat(cells).flatten(1), persistent=False)
-        self.register_buffer("_view_shapes", box_shapes(bank.boxes).float(), persistent=False)
+        self._comparisons = nn.ModuleDict({term.name: term.over(bank) for term in pipeline.terms})
+        if whitening is not None:
+            self._comparisons["hog"] = Correlated(bank.descriptors, whitening)
 
-    def _comparable(self, descriptors: Tensor) -> Tensor:
-        """(N, D) descriptors whose inner products are the similarity."""
-        whitened = descriptors if self.whitening is None else self.whitening(descriptors)
-        return F.normalize(whitened, dim=1)
-
-    def _in_cells(self, points: Tensor) -> Tensor:
-        """(N, C, C) share of each cell's pixels that are set, from (N, 1, S, S)."""
-        return F.avg_pool2d(points, self._cell, ceil_mode=True)[:, 0]
+    @property
+    def device(self) -> torch.device:
+        """Where photographs are described and compared: that of the bank."""
+        return self.bank.device
 
     def crop(self, images: Tensor | Sequence[Tensor], boxes: Tensor) -> tuple[Tensor, Tensor]:
         """(B, C, S, S) crops and (B, 3, 3) crop transforms, cut as the bank's views are."""
@@ -138,57 +142,70 @@ class ViewMatcher(nn.Module):
         """Rank all views.
 
         Args:
-            images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, in [0, 1].
+            images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, floating in [0, 1] or uint8, on any device.
             boxes: (B, 4) x0, y0, x1, y1 in px.
 
         Raises:
-            InvalidInputError: wrong shape, dtype, device, or an unusable box.
+            InvalidInputError: wrong shape, dtype, as many boxes as images not given, or an unusable box.
         """
+        if len(images) != len(boxes):
+            raise InvalidInputError(f"boxes: expected one for each of {len(images)} images, got {len(boxes)}")
         parts = [
             self.rank(self.query(images[i : i + self.chunk_size], boxes[i : i + self.chunk_size]))
             for i in range(0, max(1, len(images)), self.chunk_size)
         ]
-        return Ranking(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Ranking)))
+        return Ranking.cat(parts)
 
-    def query(self, images: Tensor | Sequence[Tensor], boxes: Tensor) -> QueryFeatures:
+    def query(self, images: Tensor | Sequence[Tensor], boxes: Tensor) -> Photographs:
         """Crop and describe photographs, see :meth:`forward`."""
         settings = self.bank.settings
-        boxes = boxes.float() if isinstance(boxes, Tensor) and not boxes.is_floating_point() else boxes
-        several = slack_boxes(boxes, self.slack)
-        crops = crop_regions(images, several, size=settings.image_size, margin=settings.margin)
-        shapes = whole_box_shapes(boxes, [(int(image.shape[-2]), int(image.shape[-1])) for image in images])
-        return self._describe(crops, shapes.to(crops))
+        boxes = boxes.to(self.device, torch.float32)
+        images = [image.to(self.device) for image in images]
+        several = slack_boxes(boxes, self.pipeline.slack)
+        regions = crop_regions(images, several, size=settings.image_size, margin=settings.margin)
+        return self.describe(regions, whole_box_shapes(boxes, [(int(i.shape[-2]), int(i.shape[-1])) for i in images]))
 
-    def features(self, crops: Tensor) -> QueryFeatures:
+    def features(self, crops: Tensor) -> Photographs:
         """Describe (B, 1 or 3, S, S) crops that :meth:`crop` cut: boxes taken as they are, their shapes unknown."""
-        return self._describe(crops[:, None], torch.full_like(crops[:, 0, 0, 0], torch.nan))
+        return self.describe(crops[:, None], torch.full_like(crops[:, 0, 0, 0], torch.nan))
 
-    def _describe(self, crops: Tensor, shapes: Tensor) -> QueryFeatures:
-        B, K = crops.shape[:2]
-        field = photograph_field(self.field, crops.flatten(0, 1))
+    def describe(self, regions: Tensor, shapes: Tensor) -> Photographs:
+        """Field, descriptors and points of (B, K, C, S, S) crops; ``shapes`` (B,) of the boxes."""
+        B, K = regions.shape[:2]
+        field = photograph_field(self.field, regions.flatten(0, 1))
         points = field_points(field, share=self.bank.settings.point_share)[:, 0]
-        return QueryFeatures(
-            crops=crops[:, 0],
+        return Photographs(
+            regions=regions,
             field=field.unflatten(0, (B, K))[:, 0],
             descriptors=self.descriptor(field).unflatten(0, (B, K)),
-            points=self._in_cells(points[:, None].float()).unflatten(0, (B, K)),
-            shapes=shapes,
+            points=points.unflatten(0, (B, K)),
+            shapes=shapes.to(regions),
         )
 
-    def rank(self, query: QueryFeatures) -> Ranking:
+    def rank(self, query: Photographs) -> Ranking:
         """Compare described photographs with all views."""
-        K = query.descriptors.shape[1]
-        queries = self._comparable(query.descriptors.flatten(0, 1)).to(self._views.dtype)
-        hog = (queries @ self._views.T).float().view(-1, K, len(self._views)).amax(dim=1)
-        rep = (
-            repeatability(query.points.flatten(0, 1).flatten(1), self._view_points)
-            .view(-1, K, len(self._views))
-            .amax(dim=1)
-        )
-        box = torch.ones_like(hog)
-        if self.box_sigma is not None:
-            box = box_shape_score(query.shapes.float(), self._view_shapes, sigma=self.box_sigma)
-        scores = unit_score(hog) * box
-        if self.repeatability_sigma is not None:
-            scores = scores * repeatability_score(rep, mode=self.repeatability_mode, sigma=self.repeatability_sigma)
-        return Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), hog, rep, box)
+        terms = {name: compare(query) for name, compare in self._comparisons.items()}
+        logs = [t.weight * t.log_score(terms[t.name]) for t in self.pipeline.terms]
+        scores = torch.stack(logs).sum(dim=0).exp()
+        return Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), terms)
+
+
+def _with_old_options(pipeline: Pipeline, options: dict[str, Any]) -> Pipeline:
+    """The options that :class:`ViewMatcher` had in version 0.1."""
+    known = {"eps", "repeatability_mode", "repeatability_sigma", "box_sigma"}
+    if not options.keys() <= known:
+        raise TypeError(f"ViewMatcher: unexpected options {sorted(options.keys() - known)}")
+    warnings.warn(
+        f"ViewMatcher: {', '.join(sorted(options))} are deprecated; use pipeline=Pipeline().with_term(...)",
+        DeprecationWarning,
+        stacklevel=3,
+    )
+    if options.get("eps") is not None:
+        pipeline = pipeline.with_term("repeatability", eps=options["eps"] / pipeline.bank.image_size)
+    if "repeatability_mode" in options:
+        pipeline = pipeline.with_term("repeatability", mode=options["repeatability_mode"])
+    for name in ("repeatability", "box"):
+        if f"{name}_sigma" in options:
+            sigma = options[f"{name}_sigma"]
+            pipeline = pipeline.with_term(name, **({"weight": 0.0} if sigma is None else {"sigma": sigma}))
+    return pipeline

@@ -1,21 +1,27 @@
-"""From a ranking of views to a pose."""
+"""From a ranking of views to poses: stages as functions over photographs x hypotheses, joined by the registrar."""
 
-from .confidence import RELIABLE, confidence, distinct_views, ranking_evidence
+from .confidence import RELIABLE, confidence, ranking_evidence
 from .contour import ContourFit, fit_contours
-from .pose import Registration
-from .refine import RefinedPose, coherent_views, refine_pose
+from .hypotheses import Hypotheses, distinct_views, hypotheses
+from .pose import FailedRegistration, Hypothesis, Registration
 from .registrar import Registrar
+from .search import coherent_views, search
+from .verify import verdict
 
 __all__ = [
     "RELIABLE",
     "ContourFit",
-    "RefinedPose",
+    "FailedRegistration",
+    "Hypotheses",
+    "Hypothesis",
     "Registrar",
     "Registration",
     "coherent_views",
     "confidence",
     "distinct_views",
     "fit_contours",
+    "hypotheses",
     "ranking_evidence",
-    "refine_pose",
+    "search",
+    "verdict",
 ]

@@ -6,7 +6,7 @@ from torch import Tensor
 from ..geometry.viewpoint import rotation_error
 from ..matching import Ranking
 
-__all__ = ["EVIDENCE", "RELIABLE", "confidence", "distinct_views", "ranking_evidence"]
+__all__ = ["EVIDENCE", "RELIABLE", "confidence", "ranking_evidence"]
 
 EVIDENCE = ("similarity", "margin", "concentration")
 """What :func:`ranking_evidence` measures, in its order."""
@@ -67,43 +67,8 @@ def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
     Example:
         >>> one = torch.tensor([[1.0, 0.0]])
         >>> R = torch.stack([torch.eye(3), torch.diag(torch.tensor([1.0, -1.0, -1.0]))])
-        >>> clear = Ranking(scores=one, order=torch.tensor([[0, 1]]), hog=0.9 * one, repeatability=0.8 * one, box=one)
+        >>> clear = Ranking(one, torch.tensor([[0, 1]]), {"hog": 0.9 * one})
         >>> bool(confidence(clear, R) > 0.9)
         True
     """
     return probability(ranking_evidence(ranking, rotations))
-
-
-def distinct_views(
-    order: Tensor, rotations: Tensor, *, count: int, angle: float = 30.0, symmetries: Tensor | None = None
-) -> Tensor:
-    """Best views that are more than ``angle`` degrees from every better one: peaks, not ten neighbours of one.
-
-    Args:
-        order: (N,) view indices, best first.
-        rotations: (N, 3, 3) of the views.
-        symmetries: (S, 3, 3) or (S, 4, 4) of the model, from :func:`curvireg_torch.geometry.symmetry_transforms`: views
-            that differ by one of them count as the same.
-
-    Returns:
-        (K,) view indices, best first, K <= count.
-
-    Example:
-        >>> R = torch.stack([torch.eye(3), torch.diag(torch.tensor([-1.0, -1.0, 1.0]))])     # half a turn about z
-        >>> distinct_views(torch.tensor([1, 0]), R, count=2, symmetries=R).tolist()
-        [1]
-    """
-    turns = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
-    turns = turns.to(rotations)
-    kept: list[int] = []
-    open_views = torch.ones(len(rotations), dtype=torch.bool, device=order.device)
-    while len(kept) < count:
-        candidates = order[open_views[order]]
-        if len(candidates) == 0:
-            break
-        kept.append(int(candidates[0]))
-        alike = rotations[candidates[0]] @ turns
-        traces = (alike.flatten(1) @ rotations.flatten(1).T).amax(dim=0)
-        open_views &= torch.rad2deg(torch.acos((0.5 * (traces - 1.0)).clamp(-1.0, 1.0))) > angle
-        open_views[candidates[0]] = False
-    return torch.tensor(kept, dtype=torch.long, device=order.device)

@@ -113,7 +113,7 @@ def fit_contours(
         renderer: of the mesh.
         images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, in [0, 1] or uint8; or one photograph (C, H, W).
         boxes: (B, 4) x0, y0, x1, y1 in px: where to look; need not be exact. (4,) for one photograph.
-        camera_matrices: (B, 3, 3) or (3, 3) in px.
+        camera_matrices: (B, 3, 3) or (3, 3) in px; or (N, 3, 3), one of each start.
         starts: (N, 4, 4) poses, within about 15 degrees.
         photograph: (N,) index of the photograph that a start belongs to; may be left out for one photograph.
         centre, radius: of the object, (3,) and model units.
@@ -148,7 +148,7 @@ def fit_contours(
         none = T0.new_zeros(0)
         return ContourFit(T0, T0.new_zeros(0, 6, 6), none, none, none.long(), none, none, none)
     crops, A = crop_images(images, boxes, size=SIZE, margin=margin)
-    K = (A.double() @ K)[photograph]
+    K = A.double()[photograph] @ K
     full = Views(renderer, EdgeField(crops), photograph, K, SIZE, centre, radius)
     K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ K
     half = Views(renderer, EdgeField(F.avg_pool2d(crops, 2)), photograph, K, SIZE // 2, centre, radius)
@@ -216,7 +216,7 @@ def _batch(
     starts: Tensor,
     photograph: Tensor | None,
 ) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
-    """Float images, boxes (B, 4), camera matrices (B, 3, 3) and (N,) indices of them, all on the CPU."""
+    """Float images, boxes (B, 4), camera matrices (N, 3, 3) of the starts and (N,) photographs, all on the CPU."""
     check_tensor(starts, "starts", (None, 4, 4))
     if not bool(torch.isfinite(starts).all()):
         raise InvalidInputError("starts: expected finite poses, got NaN or inf")
@@ -225,8 +225,9 @@ def _batch(
         check_tensor(boxes, "box", (4,))
         images, boxes = images[None], boxes[None]
     B = len(images)
-    if camera_matrices.ndim == 3 and len(camera_matrices) not in (1, B):
-        raise InvalidInputError(f"camera_matrices: expected one or {B} matrices, got {len(camera_matrices)}")
+    N, given = len(starts), len(camera_matrices) if camera_matrices.ndim == 3 else 1
+    if given not in (1, B, N):
+        raise InvalidInputError(f"camera_matrices: expected one or {B} matrices (or {N}), got {given}")
     if photograph is None:
         if B != 1:
             raise InvalidInputError(f"photograph: {B} images; say which of them each start belongs to")
@@ -238,9 +239,11 @@ def _batch(
         )
     if len(starts) and not 0 <= int(photograph.min()) <= int(photograph.max()) < B:
         raise InvalidInputError(f"photograph: expected indices of {B} images, got {photograph.tolist()}")
+    photograph = photograph.long()
+    K = camera_matrices.detach().cpu().double()
     return (
         [image.detach().cpu().float() / (1 if image.is_floating_point() else 255) for image in images],
         boxes.detach().cpu().float(),
-        camera_matrices.detach().cpu().double().expand(B, 3, 3),
-        photograph.long(),
+        K.expand(B, 3, 3)[photograph] if given in (1, B) else K,
+        photograph,
     )

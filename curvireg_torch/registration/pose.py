@@ -1,57 +1,54 @@
 """The result of a registration."""
 
+import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from ..errors import CurviregError
+from ..geometry.cameras import transform
 from ..geometry.viewpoint import viewpoint_from_rotation
 from ..matching import Ranking
 from .confidence import RELIABLE
 
-__all__ = ["Registration"]
+__all__ = ["FailedRegistration", "Hypothesis", "Registration"]
 
 
 @dataclass(frozen=True)
-class Registration:
-    """Pose of one object in one photograph, in the mesh file's own frame and unit.
+class Hypothesis:
+    """One pose of the object that the photograph may show, in the mesh file's own frame and unit.
 
     Attributes:
         rotation: (3, 3) float64, ``x_cam = R x_model + t``, OpenCV camera.
         translation: (3,) float64 in model units, None without a camera matrix.
         score: normalised correlation of the pose's view with the photograph, in [0, 1], on the grid of the search
-            (twice as fine as the bank's) or, without refinement, of the bank.
-        confidence: probability that the best view is within 30 degrees of the truth, see
-            :func:`curvireg_torch.registration.confidence`.
-        ranking: of the bank's views for this photograph (B = 1).
-        candidates: (K,) view indices of the best distinct hypotheses, best first.
-        view_rotation: (3, 3) float64 of the same view by a camera that looks straight at the box; equal to ``rotation``
-            without a camera matrix.
-        view_distance: of the object's centre in that view, in model units.
-        iterations: refinement rounds that were run; 0 without refinement.
+            (twice as fine as the bank's) or, without search, of the bank.
+        evidence: what the order of hypotheses rests on, by name, see :mod:`curvireg_torch.registration.verify`.
+        allocentric_rotation: (3, 3) float64 of the same view by a camera that looks straight at the object; equal to
+            ``rotation`` without a camera matrix.
+        distance: of the object's centre in that view, in model units.
+        view: of the bank, where the hypothesis comes from.
+        model: which of the bank's meshes.
         support: how strongly edges of the photograph lie under the mesh's contours, in [0, 1]; None without the contour
             stage (:func:`curvireg_torch.registration.fit_contours`).
         covariance: (6, 6) float64 of turn (rad) about the camera's x, y, z and translation (model units) along them,
-            ``R_true = exp([w]x) R``, ``t_true = t + e``; None without a camera matrix, without the contour stage, and
-            where the contours do not fix the pose.
+            ``R_true = exp([w]x) R``, ``t_true = t + e``; None without a camera matrix, without the contour stage, where
+            the contours do not fix the pose, and where the answer is not reliable.
     """
 
     rotation: Tensor
     translation: Tensor | None
     score: float
-    confidence: float
-    ranking: Ranking
-    candidates: Tensor
-    view_rotation: Tensor
-    view_distance: float
-    iterations: int
+    evidence: Mapping[str, float]
+    allocentric_rotation: Tensor
+    distance: float
+    view: int
+    model: int = 0
     support: float | None = None
     covariance: Tensor | None = None
-
-    @property
-    def reliable(self) -> bool:
-        """Whether the confidence is at least 0.6; False = no reliable match: take the pose as a guess."""
-        return self.confidence >= RELIABLE
 
     @property
     def viewpoint(self) -> tuple[float, float, float]:
@@ -70,8 +67,110 @@ class Registration:
     @property
     def transform(self) -> Tensor | None:
         """(4, 4) float64 ``T_cam_from_model``, None without a camera matrix."""
-        if self.translation is None:
-            return None
-        T = torch.eye(4, dtype=torch.float64)
-        T[:3, :3], T[:3, 3] = self.rotation, self.translation
-        return T
+        return None if self.translation is None else transform(self.rotation, self.translation)
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Poses of one object in one photograph, best first.
+
+    Everything that a :class:`Hypothesis` has is here too, of the best one: ``rotation``, ``translation``, ``score``,
+    ``viewpoint``, ``covariance`` and so on.
+
+    Attributes:
+        hypotheses: distinct poses, best first; the others are rivals, such as half a turn.
+        confidence: probability that the best is within 30 degrees of the truth, see
+            :func:`curvireg_torch.registration.confidence`.
+        ranking: of the bank's views for this photograph (B = 1).
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    confidence: float
+    ranking: Ranking
+
+    ok = True
+    """False of a :class:`FailedRegistration`."""
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the confidence is high enough; False = no reliable match: take the pose as a guess."""
+        return self.confidence >= RELIABLE
+
+    @property
+    def candidates(self) -> Tensor:
+        """(K,) view indices of the hypotheses."""
+        return torch.tensor([h.view for h in self.hypotheses])
+
+    @property
+    def view_rotation(self) -> Tensor:
+        """Deprecated name of ``allocentric_rotation``."""
+        warnings.warn("view_rotation is deprecated; use allocentric_rotation", DeprecationWarning, stacklevel=2)
+        return self.hypotheses[0].allocentric_rotation
+
+    @property
+    def view_distance(self) -> float:
+        """Deprecated name of ``distance``."""
+        warnings.warn("view_distance is deprecated; use distance", DeprecationWarning, stacklevel=2)
+        return self.hypotheses[0].distance
+
+    @property
+    def rotation(self) -> Tensor:
+        return self.hypotheses[0].rotation
+
+    @property
+    def translation(self) -> Tensor | None:
+        return self.hypotheses[0].translation
+
+    @property
+    def score(self) -> float:
+        return self.hypotheses[0].score
+
+    @property
+    def allocentric_rotation(self) -> Tensor:
+        return self.hypotheses[0].allocentric_rotation
+
+    @property
+    def distance(self) -> float:
+        return self.hypotheses[0].distance
+
+    @property
+    def model(self) -> int:
+        return self.hypotheses[0].model
+
+    @property
+    def support(self) -> float | None:
+        return self.hypotheses[0].support
+
+    @property
+    def covariance(self) -> Tensor | None:
+        return self.hypotheses[0].covariance
+
+    @property
+    def viewpoint(self) -> tuple[float, float, float]:
+        return self.hypotheses[0].viewpoint
+
+    @property
+    def standard_deviations(self) -> tuple[Tensor, Tensor] | None:
+        return self.hypotheses[0].standard_deviations
+
+    @property
+    def transform(self) -> Tensor | None:
+        return self.hypotheses[0].transform
+
+
+@dataclass(frozen=True)
+class FailedRegistration:
+    """A photograph of a batch that could not be registered. Asked for a pose, it raises its error.
+
+    Attributes:
+        error: what was wrong with this photograph, its box or its camera.
+    """
+
+    error: CurviregError
+
+    ok = False
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise self.error

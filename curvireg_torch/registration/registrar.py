@@ -1,61 +1,59 @@
-"""The facade that joins it all: photographs, boxes and a mesh to poses."""
+"""The facade that joins it all: photographs, boxes and meshes to poses."""
 
+import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from ..errors import ImageError, InvalidInputError
-from ..geometry.cameras import check_camera_matrix, rotation_towards
-from ..geometry.mesh import as_mesh, mesh_radius
+from ..errors import CurviregError, InvalidInputError
+from ..geometry.cameras import rotation_towards
 from ..geometry.translation import place_view
-from ..geometry.up import mesh_up
-from ..geometry.views import ViewSphere, sample_views
-from ..matching import (
-    BankCollection,
-    BankSettings,
-    QueryFeatures,
-    Ranking,
-    ViewBank,
-    ViewDescriber,
-    ViewMatcher,
-    cached_bank,
-    normalized_correlation,
-)
-from .confidence import confidence, distinct_views
-from .contour import fit_contours
-from .pose import Registration
-from .refine import RefinedPose, coherent_views, refine_pose
+from ..geometry.views import ViewSphere
+from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
+from ..pipeline import BankSettings, Pipeline
+from .confidence import RELIABLE, confidence
+from .contour import ContourFit, fit_contours
+from .hypotheses import Hypotheses, distinct_views, hypotheses
+from .inputs import Item, check_crop, items_of, named
+from .pose import FailedRegistration, Hypothesis, Registration
+from .search import FINALISTS, search
+from .verify import EVIDENCE, gathered_evidence, similarities, verdict
 
 __all__ = ["Registrar"]
 
-_FLAT = 1.0 / 255.0
+SAME = 15.0
+"""Degrees within which two hypotheses have become one."""
 
 
 class Registrar:
-    """Registers photographs to one mesh.
+    """Registers photographs to a mesh, or to the best of several.
 
-    Each box is cropped, turned into a field and ranked against the bank; coherent views around the best are searched in
-    small steps, and the contours of the best are pulled onto the photograph's edges (:func:`fit_contours`). With a
-    camera matrix that yields rotation and translation with their covariance; without, the rotation.
+    Each box is cropped, turned into a field and ranked against the bank; the best distinct views become hypotheses,
+    each is searched around in small steps, its contours are pulled onto the photograph's edges (:func:`fit_contours`),
+    and what was found decides their order. With a camera matrix that yields rotation and translation with their
+    covariance; without, the rotation. It does what ``curvireg register`` does, to the bit.
 
     Args:
-        bank_or_mesh: a :class:`ViewBank`, a :class:`ViewMatcher` of one model's bank, a mesh, or the path of a mesh;
-            for a mesh the bank comes from the disk cache or is built.
-        views, settings: of the bank built for a mesh.
-        field: photograph filter, see :class:`ViewMatcher`; that of a given matcher stays.
-        refine: run the coarse-to-fine search and the contour stage.
-        contours: False leaves out the contour stage; the box then gives the translation.
-        renderer: of the views rendered in it.
-        top: distinct hypotheses to report.
+        bank_or_mesh: a :class:`ViewBank`, a :class:`ViewMatcher`, a mesh, the path of a mesh, or a list of meshes or
+            paths (which of them is it?); for meshes the bank comes from the disk cache or is built.
+        pipeline: all settings; default that of a bank, else ``Pipeline()``.
+        views, settings: viewpoints and bank settings of one's own, for a mesh.
+        field: photograph filter of one's own, see :class:`ViewMatcher`.
+        refine, contours: False leaves out the search and all behind it, or the contour stage.
+        hypotheses: distinct hypotheses to carry and to report, instead of the pipeline's; ``top`` is its old name.
+        renderer: of the views rendered in search and contours, and of a bank that is built.
         symmetries: (S, 4, 4) of the mesh, from :func:`curvireg_torch.geometry.symmetry_transforms`; hypotheses that
             differ by one of them are reported once.
+        device: where modules, bank and search live.
         progress: show bars.
 
     Example:
         >>> import trimesh
+        >>> from curvireg_torch.geometry import sample_views
         >>> bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), sample_views(azimuth_step=45, elevations=[20]),
         ...                       image_size=64, progress=False)
         >>> result = Registrar(bank, refine=False)(torch.rand(1, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30]]))[0]
@@ -67,167 +65,260 @@ class Registrar:
         self,
         bank_or_mesh: Any,
         *,
+        pipeline: Pipeline | None = None,
         views: ViewSphere | None = None,
         settings: BankSettings | None = None,
         field: nn.Module | None = None,
         refine: bool = True,
         contours: bool = True,
+        hypotheses: int | None = None,
+        top: int | None = None,
         renderer: str = "auto",
-        top: int = 5,
         symmetries: Tensor | None = None,
+        device: torch.device | str | None = None,
         progress: bool = False,
     ) -> None:
-        bank = bank_or_mesh.bank if isinstance(bank_or_mesh, ViewMatcher) else bank_or_mesh
-        if isinstance(bank, ViewBank):
-            if views is not None or settings is not None:
-                raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
-        elif isinstance(bank, BankCollection):
-            raise InvalidInputError("Registrar: expected the bank of one model; choose one with BankCollection.locate")
+        if top is not None:
+            warnings.warn("Registrar: top is deprecated; use hypotheses", DeprecationWarning, stacklevel=2)
+            hypotheses = top
+        if isinstance(bank_or_mesh, ViewMatcher):
+            if pipeline is not None or field is not None:
+                raise InvalidInputError("Registrar: pipeline and field belong to the matcher; give them to ViewMatcher")
+            matcher, pipeline = bank_or_mesh, bank_or_mesh.pipeline
         else:
-            bank = as_mesh(bank)
-            views = views or sample_views().for_up(mesh_up(bank))
-            bank = cached_bank(bank, views, settings or BankSettings(), progress=progress, renderer=renderer)
-        self.bank: ViewBank = bank
-        self.matcher = bank_or_mesh if isinstance(bank_or_mesh, ViewMatcher) else ViewMatcher(bank, field=field)
-        self.refine, self.contours, self.top = refine, refine and contours, top
+            bank = bank_or_mesh
+            if not isinstance(bank, ViewBank):
+                pipeline = pipeline or Pipeline()
+                pipeline = pipeline if settings is None else replace(pipeline, bank=settings)
+                meshes = list(bank) if isinstance(bank, list | tuple) else [bank]
+                bank = ViewBank.join(
+                    [
+                        cached_bank(
+                            mesh, views, pipeline=pipeline, renderer=renderer, device=device or "cpu", progress=progress
+                        )
+                        for mesh in meshes
+                    ]
+                )
+            bank = bank if device is None else bank.to(device)
+            matcher = ViewMatcher(bank, pipeline=pipeline, field=field)
+            pipeline = matcher.pipeline
+        if isinstance(bank_or_mesh, ViewBank | ViewMatcher) and (views is not None or settings is not None):
+            raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
+        self.pipeline = replace(
+            pipeline,
+            search=pipeline.search and refine,
+            contours=pipeline.contours and refine and contours,
+            hypotheses=pipeline.hypotheses if hypotheses is None else hypotheses,
+        )
+        self.matcher, self.bank = matcher, matcher.bank
         self.symmetries = symmetries
         self._renderer = renderer
-        self._describer: ViewDescriber | None = None
-        self.radius = mesh_radius(self.bank.mesh)
-        self._fine = replace(bank.settings, grid=min(2 * bank.settings.grid, bank.settings.image_size))
-        self._fine_descriptor = self._fine.descriptor()
 
-    @property
-    def describe(self) -> ViewDescriber:
-        """Renders and describes further views of the bank's mesh, on a grid twice as fine; made on first use."""
-        if self._describer is None:
-            self._describer = ViewDescriber(
-                self.bank.mesh, self._fine, renderer=self._renderer, device=self.bank.device
-            )
-        return self._describer
-
-    def search(
-        self, field: Tensor, order: Tensor, *, box: Tensor | None = None, camera_matrix: Tensor | None = None
-    ) -> RefinedPose:
-        """Refine the best coherent views of a ranking, see :func:`refine_pose`.
-
-        Args:
-            field: (1, 2, S, S) of the photograph's crop.
-            order: (N,) view indices of the bank, best first.
-            box, camera_matrix: (4,) and (3, 3) of the photograph; both or none.
-        """
-        start = coherent_views(self.bank.rotations, order)
-        return refine_pose(
-            self.describe,
-            self._fine_descriptor(field),
-            self.bank.rotations[start].cpu(),
-            distance=float(self.bank.views.distance[start[0]]) * self.radius,
-            radius=self.radius,
-            box=box,
-            camera_matrix=camera_matrix,
+    @cached_property
+    def describers(self) -> tuple[ViewDescriber, ...]:
+        """Render and describe further views of each model, on a grid twice as fine as the bank's; made on first use."""
+        settings = self.bank.settings
+        fine = replace(settings, grid=min(2 * settings.grid, settings.image_size))
+        return tuple(
+            ViewDescriber(mesh, fine, renderer=self._renderer, device=self.bank.device) for mesh in self.bank.meshes
         )
 
     @torch.no_grad()
     def __call__(
-        self, images: Tensor | Sequence[Tensor], boxes: Tensor, camera_matrices: Tensor | None = None
-    ) -> list[Registration]:
+        self, images: Tensor | Sequence[Any], boxes: Any, camera_matrices: Any | None = None
+    ) -> list[Registration | FailedRegistration]:
         """Register a batch.
 
         Args:
-            images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, in [0, 1].
+            images: (B, C, H, W) or a list of (C, H, W) tensors, (H, W, C) arrays or paths, C = 1 or 3, floating in
+                [0, 1] or uint8.
             boxes: (B, 4) x0, y0, x1, y1 in px.
             camera_matrices: (B, 3, 3) or (3, 3) in px; without them translations are None and rotations are relative to
                 a camera that looks straight at the box.
 
+        Returns:
+            One :class:`Registration` for each photograph, in their order; a :class:`FailedRegistration` for one that
+            cannot be registered (unreadable, its box empty or outside, one colour, NaN), which raises its error when
+            asked for a pose.
+
         Raises:
-            InvalidInputError: wrong shapes, an unusable box or camera matrix.
-            ImageError: a box that shows one colour.
+            InvalidInputError: not as many boxes or cameras as images.
         """
-        if camera_matrices is not None:
-            check_camera_matrix(camera_matrices)
-            if camera_matrices.ndim == 3 and len(camera_matrices) not in (1, len(images)):
-                raise InvalidInputError(
-                    f"camera_matrices: expected one or {len(images)} matrices, got {len(camera_matrices)}"
-                )
-            camera_matrices = camera_matrices.expand(len(images), 3, 3)
-        results: list[Registration] = []
-        for i in range(0, len(images), self.matcher.chunk_size):
-            chunk = slice(i, i + self.matcher.chunk_size)
-            query = self.matcher.query(images[chunk], boxes[chunk])
-            crops = query.crops
-            contrast = crops.amax(dim=(1, 2, 3)) - crops.amin(dim=(1, 2, 3))
-            if bool((contrast < _FLAT).any()):
-                flat = i + int((contrast < _FLAT).nonzero()[0])
-                raise ImageError(f"image {flat}: the box shows one colour, nothing to register; check image and box")
-            ranking = self.matcher.rank(query)
-            trust = confidence(ranking, self.bank.rotations)
-            for k in range(len(crops)):
-                K = None if camera_matrices is None else camera_matrices[i + k]
-                results.append(
-                    self._register(
-                        images[i + k], query[k : k + 1], ranking[k : k + 1], float(trust[k]), boxes[i + k], K
-                    )
-                )
+        items = items_of(images, boxes, camera_matrices)
+        results: list[Registration | FailedRegistration] = []
+        for i in range(0, len(items), self.matcher.chunk_size):
+            results += self._chunk(items[i : i + self.matcher.chunk_size], i)
         return results
 
-    def _register(
-        self, image: Tensor, query: QueryFeatures, ranking: Ranking, trust: float, box: Tensor, K: Tensor | None
-    ) -> Registration:
-        bank, order = self.bank, ranking.order[0]
-        best = int(order[0])
-        if self.refine:
-            pose = self.search(query.field, order, box=box, camera_matrix=K)
-        else:
-            distance = float(bank.views.distance[best]) * self.radius
-            pose = RefinedPose(bank.rotations[best].double().cpu(), distance, float(ranking.hog[0, best]), 0)
-        rotation, translation = pose.rotation, None
-        if K is not None:
-            rotation, translation = place_view(self.describe.hull, pose.rotation, box, K)
-        result = Registration(
-            rotation=rotation,
-            translation=translation,
-            score=pose.score,
-            confidence=trust,
-            ranking=ranking,
-            candidates=distinct_views(order, bank.rotations, count=self.top, symmetries=self.symmetries),
-            view_rotation=pose.rotation,
-            view_distance=pose.distance,
-            iterations=pose.iterations,
+    def _chunk(self, items: Sequence[Item | CurviregError], first: int) -> list[Registration | FailedRegistration]:
+        out: list[Registration | FailedRegistration | None] = [
+            None if isinstance(item, Item) else FailedRegistration(item) for item in items
+        ]
+        usable = [(i, item) for i, item in enumerate(items) if isinstance(item, Item)]
+        if usable:
+            query = self.matcher.query(
+                [item.image for _, item in usable], torch.stack([item.box for _, item in usable])
+            )
+            kept = []
+            for k, (i, _) in enumerate(usable):
+                try:
+                    check_crop(query.crops[k])
+                    kept.append(k)
+                except CurviregError as error:
+                    out[i] = FailedRegistration(named(error, f"image {first + i}"))
+            if kept:
+                results = self.register([usable[k][1] for k in kept], query[torch.tensor(kept)])
+                for k, result in zip(kept, results, strict=True):
+                    out[usable[k][0]] = result
+        return [result for result in out if result is not None]
+
+    @torch.no_grad()
+    def register(self, items: Sequence[Item], query: Photographs, ranking: Ranking | None = None) -> list[Registration]:
+        """All stages behind the cropping.
+
+        Args:
+            items: B photographs, all with a camera matrix or all without.
+            query: the same, cropped and described by the matcher.
+            ranking: of the same; default :meth:`ViewMatcher.rank`.
+        """
+        ranking = self.matcher.rank(query) if ranking is None else ranking
+        boxes = torch.stack([item.box for item in items]).double()
+        matrices = [item.camera_matrix for item in items if item.camera_matrix is not None]
+        K = torch.stack(matrices) if matrices else None
+        starts = hypotheses(ranking, self.bank, count=self.pipeline.hypotheses, symmetries=self.symmetries)
+        descriptors = self.describers[0].descriptor(query.field)
+        found, fit = starts, None
+        if self.pipeline.search:
+            found = search(
+                self.describers, descriptors, found, bank=self.bank, ranking=ranking, boxes=boxes, camera_matrices=K
+            )
+        T, cameras = self._placed(found, boxes, K)
+        if self.pipeline.contours:
+            fit = self._follow_contours(items, found, boxes, T, cameras)
+            T, found = fit.transform, self._seen_straight(found, fit.transform)
+        found = replace(found, score=similarities(self.describers, descriptors, found))
+        evidence = gathered_evidence(starts, found, None if fit is None else fit.support)
+        own = self._own_peaks(found, verdict(evidence))
+        if not bool(own.all()):
+            found, T, fit = self._sent_back(own, starts, found, T, fit, boxes, K)
+            found = replace(found, score=similarities(self.describers, descriptors, found))
+            evidence = gathered_evidence(starts, found, None if fit is None else fit.support)
+        order = (verdict(evidence) + torch.where(own, 0.0, -1e6)).argsort(descending=True, stable=True)
+        trust = confidence(ranking, self.bank.rotations)
+        results = []
+        for b in range(len(items)):
+            reliable = float(trust[b]) >= RELIABLE
+            mine = order[found.photograph[order] == b].tolist()
+            poses = tuple(self._hypothesis(h, found, T, evidence, fit, reliable, K is not None) for h in mine)
+            results.append(Registration(poses, float(trust[b]), ranking[b : b + 1]))
+        return results
+
+    def _own_peaks(self, found: Hypotheses, score: Tensor) -> Tensor:
+        """(H,) bool: False where a hypothesis ended within ``SAME`` degrees of a better one of its photograph."""
+        own = torch.zeros(len(found), dtype=torch.bool)
+        order = score.argsort(descending=True, stable=True)
+        for b in found.photograph.unique():
+            mine = order[found.photograph[order] == b]
+            R, model, best_first = found.rotation[mine].float(), found.model[mine], torch.arange(len(mine))
+            apart = distinct_views(best_first, R, count=len(mine), angle=SAME, symmetries=self.symmetries, model=model)
+            own[mine[apart]] = True
+        return own
+
+    def _sent_back(
+        self,
+        own: Tensor,
+        starts: Hypotheses,
+        found: Hypotheses,
+        T: Tensor,
+        fit: ContourFit | None,
+        boxes: Tensor,
+        K: Tensor | None,
+    ) -> tuple[Hypotheses, Tensor, ContourFit | None]:
+        """Hypotheses that became another one stand where they started: a rival is a rival, if not a peak."""
+        placed = self._placed(starts, boxes, K)[0]
+        T = torch.where(own[:, None, None], T, placed)
+        found = replace(
+            found,
+            rotation=torch.where(own[:, None, None], found.rotation, starts.rotation),
+            distance=torch.where(own, found.distance, starts.distance),
         )
-        return self._follow_contours(result, image, query, box, K) if self.contours else result
+        if fit is not None:
+            covariance = torch.where(own[:, None, None], fit.covariance, torch.nan)
+            fit = replace(fit, transform=T, covariance=covariance, support=torch.where(own, fit.support, 0.0))
+        return found, T, fit
+
+    def _hypothesis(
+        self,
+        h: int,
+        found: Hypotheses,
+        T: Tensor,
+        evidence: Tensor,
+        fit: ContourFit | None,
+        reliable: bool,
+        with_camera: bool,
+    ) -> Hypothesis:
+        known = fit is not None and with_camera and reliable and bool(fit.covariance[h].isfinite().all())
+        return Hypothesis(
+            rotation=T[h, :3, :3].clone() if with_camera else found.rotation[h].clone(),
+            translation=T[h, :3, 3].clone() if with_camera else None,
+            score=float(found.score[h]),
+            evidence=dict(zip(EVIDENCE, evidence[h].tolist(), strict=True)),
+            allocentric_rotation=found.rotation[h].clone(),
+            distance=float(found.distance[h]),
+            view=int(found.view[h]),
+            model=int(found.model[h]),
+            support=None if fit is None else float(fit.support[h]),
+            covariance=fit.covariance[h].clone() if fit is not None and known else None,
+        )
+
+    def _placed(self, found: Hypotheses, boxes: Tensor, K: Tensor | None) -> tuple[Tensor, Tensor]:
+        """T_cam_from_model (H, 4, 4) and camera matrices (H, 3, 3) of hypotheses that fill their boxes."""
+        T = torch.eye(4, dtype=torch.float64).repeat(len(found), 1, 1)
+        cameras = torch.eye(3, dtype=torch.float64).repeat(len(found), 1, 1)
+        for model, mine in self._by_model(found):
+            describe, photograph = self.describers[model], found.photograph[mine]
+            if K is None:
+                T[mine], cameras[mine] = describe.cameras_of_boxes(
+                    found.rotation[mine], found.distance[mine], boxes[photograph]
+                )
+            else:
+                cameras[mine] = K[photograph]
+                T[mine, :3, :3], T[mine, :3, 3] = place_view(
+                    describe.hull, found.rotation[mine], boxes[photograph], K[photograph]
+                )
+        return T, cameras
 
     def _follow_contours(
-        self, result: Registration, image: Tensor, query: QueryFeatures, box: Tensor, K: Tensor | None
-    ) -> Registration:
-        """``result`` with the pose that :func:`fit_contours` finds from it."""
-        describe, margin = self.describe, self.bank.settings.margin
-        if K is not None and result.transform is not None:
-            start, camera = result.transform, K
-        else:
-            start, camera = describe.camera_of_box(result.view_rotation, result.view_distance, box)
-        fit = fit_contours(
-            describe.renderer,
-            image,
-            box,
-            camera,
-            start[None],
-            centre=describe.centre,
-            radius=self.radius,
-            margin=margin,
-        )
-        R, t = fit.transform[0, :3, :3], fit.transform[0, :3, 3]
-        position = R @ describe.centre + t
-        view_rotation, view_distance = rotation_towards(position).T @ R, float(torch.linalg.vector_norm(position))
-        covariance = fit.covariance[0] if K is not None and bool(fit.covariance[0].isfinite().all()) else None
-        views = describe(view_rotation[None], torch.tensor([view_distance], dtype=torch.float64))
-        similarity = normalized_correlation(self._fine_descriptor(query.field), views.descriptors)
-        return replace(
-            result,
-            rotation=R if K is not None else view_rotation,
-            translation=t if K is not None else None,
-            score=float(similarity),
-            view_rotation=view_rotation,
-            view_distance=view_distance,
-            support=float(fit.support[0]),
-            covariance=covariance,
-        )
+        self, items: Sequence[Item], found: Hypotheses, boxes: Tensor, T: Tensor, cameras: Tensor
+    ) -> ContourFit:
+        fit = ContourFit(T.clone(), T.new_zeros(len(T), 6, 6), T.new_zeros(len(T)))
+        for model, mine in self._by_model(found):
+            describe = self.describers[model]
+            part = fit_contours(
+                describe.renderer,
+                [item.image for item in items],
+                boxes,
+                cameras[mine],
+                T[mine],
+                photograph=found.photograph[mine],
+                centre=describe.centre,
+                radius=describe.radius,
+                margin=self.bank.settings.margin,
+                finish=FINALISTS,
+            )
+            for f in fields(ContourFit):
+                getattr(fit, f.name)[mine] = getattr(part, f.name)
+        return fit
+
+    def _seen_straight(self, found: Hypotheses, T: Tensor) -> Hypotheses:
+        """Allocentric rotations and distances of poses."""
+        rotation, distance = found.rotation.clone(), found.distance.clone()
+        for model, mine in self._by_model(found):
+            R, t = T[mine, :3, :3], T[mine, :3, 3]
+            position = R @ self.describers[model].centre + t
+            rotation[mine] = rotation_towards(position).mT @ R
+            distance[mine] = torch.linalg.vector_norm(position, dim=1)
+        return replace(found, rotation=rotation, distance=distance)
+
+    def _by_model(self, found: Hypotheses) -> list[tuple[int, Tensor]]:
+        return [(m, (found.model == m).nonzero()[:, 0]) for m in found.model.unique().tolist()]

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from ..geometry.crops import crop_transforms, square_boxes
 from ..registration import Registrar, Registration
-from ..rendering import make_renderer
 
 __all__ = ["contour_overlay", "registration_sheet"]
 
@@ -33,13 +32,14 @@ def contour_overlay(
     if camera_matrix is not None and result.transform is not None:
         T, K = result.transform, camera_matrix.double().cpu()
     else:
-        distance = torch.tensor([result.view_distance], dtype=torch.float64)
-        cameras, crops, _ = registrar.describe.cameras(result.view_rotation[None], distance)
+        distance = torch.tensor([result.distance], dtype=torch.float64)
+        cameras, crops, _ = registrar.describers[result.model].cameras(result.allocentric_rotation[None], distance)
         settings = registrar.bank.settings
         to_crop = crop_transforms(square_boxes(box.double().cpu(), settings.margin), settings.image_size)
         T, K = cameras[0], torch.linalg.inv(to_crop).triu() @ crops[0]
     orthographic = registrar.bank.settings.camera == "orthographic" and camera_matrix is None
-    depth = make_renderer(registrar.bank.mesh).render(T[None], K, (H, W), orthographic=orthographic)[0, 0].numpy()
+    renderer = registrar.describers[result.model].renderer
+    depth = renderer.render(T[None], K, (H, W), orthographic=orthographic)[0, 0].cpu().numpy()
     picture = to_uint8(image)
     width = max(1, round(max(H, W) / 500))
     mask = (depth > 0).astype(np.uint8)
@@ -84,9 +84,11 @@ def registration_sheet(
     """
     crop = registrar.matcher.crop(image[None], box[None])[0]
     field = registrar.matcher.features(crop).field[0]
-    rotations = [result.view_rotation, *registrar.bank.rotations[result.candidates].double().cpu()]
-    distances = [result.view_distance] + [result.view_distance] * len(result.candidates)
-    depth, _ = registrar.describe.depth(torch.stack(rotations), torch.tensor(distances, dtype=torch.float64))
+    rotations = [result.allocentric_rotation, *registrar.bank.rotations[result.candidates].double().cpu()]
+    distances = [result.distance] + [result.distance] * len(result.candidates)
+    depth, _ = registrar.describers[result.model].depth(
+        torch.stack(rotations), torch.tensor(distances, dtype=torch.float64)
+    )
     view_field = registrar.bank.settings.depth_filter()(depth[:1])[0]
     side = [
         _caption(_tile(to_uint8(crop[0])), "photograph"),

@@ -6,24 +6,17 @@
 import os
 import signal
 import sys
-from dataclasses import dataclass
 
-from curvireg_torch.evaluation import DEFAULT, PRESETS, Preset
+from curvireg_torch.evaluation import DEFAULT, PRESETS, Pipeline
 from curvireg_torch.evaluation.__main__ import main
-from curvireg_torch.geometry import ViewSphere, sample_views
-from curvireg_torch.matching import BankSettings
+from curvireg_torch.pipeline import BankSettings, ViewPolicy
 
-
-@dataclass(frozen=True)
-class SmallPreset(Preset):
-    bank: BankSettings = BankSettings(image_size=32)  # noqa: RUF009 (frozen)
-    refine: bool = False
-
-    def views(self, pose: str) -> ViewSphere:
-        return sample_views(azimuth_step=60, elevations=[10] if pose == "upright" else [-60, 10, 60])
-
-
-SMALL = SmallPreset()
+SMALL = Pipeline(
+    views=ViewPolicy(directions=18, turn=360.0, azimuth_step=60.0, elevations=(10.0,)),
+    bank=BankSettings(image_size=32),
+    search=False,
+    contours=False,
+)
 
 
 def die_at(count: int) -> None:

@@ -6,8 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from curvireg_torch.presets import FIELDS
-
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 
 
@@ -18,7 +16,6 @@ def scripts(monkeypatch):
     import error_taxonomy
 
     yield ablate, error_taxonomy
-    FIELDS.pop("both")
     for name in ("ablate", "error_taxonomy", "results_table"):
         sys.modules.pop(name, None)
 

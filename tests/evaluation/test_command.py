@@ -2,11 +2,14 @@
 
 import argparse
 import json
+from dataclasses import replace
 
 import pytest
 
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.evaluation import add_parser
+
+from .small import SMALL
 
 
 def evaluate(*words):
@@ -39,7 +42,8 @@ def test_bop_supposes_any_orientation(bop, tmp_path):
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["protocol"] == "cad=annotated pose=any box=0.1 seed=3"
     assert summary["settings"]["dataset"] == "bop"
-    assert summary["settings"]["preset"]["views"] == 18, "6 azimuths, 3 elevations"
+    views = summary["settings"]["pipeline"]["views"]
+    assert (views["pose"], views["directions"], views["turn"]) == ("any", 18, 360.0)
 
 
 def test_errors_come_before_any_work(pascal, bop, tmp_path):
@@ -53,3 +57,18 @@ def test_errors_come_before_any_work(pascal, bop, tmp_path):
     with pytest.raises(SystemExit):
         evaluate("bop", bop.root, "--out", out, "--preset", "best")
     assert not out.exists()
+
+
+def test_nothing_scored_is_an_error(pascal, tmp_path):
+    for photograph in (pascal.root / "Images").rglob("*.jpg"):
+        photograph.write_bytes(b"")
+    with pytest.raises(InvalidInputError, match=r"nothing was scored .*unreadable_image"):
+        evaluate("pascal3d", pascal.root, "--out", tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["n"] == 0
+
+
+def test_a_pipeline_of_ones_own(pascal, tmp_path):
+    (tmp_path / "own.json").write_text(replace(SMALL, slack=0.0).to_json())
+    evaluate("pascal3d", pascal.root, "--out", tmp_path / "out", "--pipeline", tmp_path / "own.json")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["settings"]["preset"], summary["settings"]["pipeline"]["slack"]) == ("own", 0.0)

@@ -4,6 +4,7 @@ import pytest
 
 from curvireg_torch.data import Pascal3DPlus
 from curvireg_torch.evaluation import Pascal3DBenchmark, Protocol, evaluate, paper
+from curvireg_torch.pipeline import BankSettings
 from tests._support.real_data import real_data
 
 pytestmark = pytest.mark.data
@@ -19,7 +20,7 @@ def test_pascal3d_runs_through(tmp_path):
 def test_right_view_of_the_dinosaur_repeats_best():
     """Its poses are exact to less than a pixel: this pins crop, box, camera and true view together."""
     cases = paper.find_cases("bop", real_data("bop/dino"), limit=4)
-    table = paper.curve_table(cases, paper.FieldSettings(image_size=128), 2.0, progress=False)
+    table = paper.curve_table(cases, BankSettings(image_size=128), 2.0, progress=False)
     for k, name in enumerate(table.columns[1:], start=1):
         if name in ("MFC", "MCS", "IG"):
             shares = {row[0]: row[k] for row in table.rows}

@@ -27,7 +27,7 @@ def turned(sample, axis, degrees):
 
 def write_predictions(benchmark, out, rows):
     store = PredictionStore(out / "predictions")
-    store.open({"root": "/some/where"})
+    store.open({"root": "/some/where", "protocol": str(benchmark.protocol)})
     for item, row in zip(benchmark.items, rows, strict=True):
         full = {"score": 0.5, "confidence": 0.5, "mesh": "01.off", "image_size": [60, 80], "seconds": SECONDS}
         store.write(item.key, row if "skipped" in row else full | row)

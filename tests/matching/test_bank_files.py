@@ -1,6 +1,5 @@
 """Banks in memory, on disk, in parts and in collections."""
 
-import json
 import os
 import stat
 from dataclasses import replace
@@ -15,6 +14,7 @@ from safetensors.torch import load_file, save_file
 from curvireg_torch.errors import BankError, InvalidInputError, MissingFileError
 from curvireg_torch.geometry import sample_views, uniform_views
 from curvireg_torch.matching import BankCollection, BankSettings, ViewBank, ViewMatcher, normalized_correlation
+from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.synthetic import example_mesh
 
 SETTINGS = BankSettings(image_size=64)
@@ -81,14 +81,12 @@ def test_parts_are_unpacked_alone(bank: ViewBank) -> None:
 def test_interrupted_build_and_save_leave_nothing(
     bank: ViewBank, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(path: Path, content: bytes) -> None:
-        with path.open("wb") as file:
-            file.write(content[: len(content) // 2])
+    def interrupted(_: int) -> None:
         raise KeyboardInterrupt
 
     bank.save(tmp_path / "bank.safetensors")
     whole = (tmp_path / "bank.safetensors").read_bytes()
-    monkeypatch.setattr(Path, "write_bytes", interrupted)
+    monkeypatch.setattr(os, "fsync", interrupted)  # the content is written, the name not yet given
     for name in ("bank.safetensors", "other.safetensors"):
         with pytest.raises(KeyboardInterrupt):
             bank.save(tmp_path / name)
@@ -119,22 +117,56 @@ def edited(path: Path, out: Path, tensors: dict[str, torch.Tensor] | None = None
     return out
 
 
+def written(bank: ViewBank, out: Path, **tensors: torch.Tensor) -> Path:
+    """A bank of nonsense, with a checksum that fits."""
+    ViewBank(bank.meshes, bank.views, bank.pipeline, {**bank.tensors, **tensors}).save(out)
+    return out
+
+
+def test_every_changed_bit_is_found(bank: ViewBank, tmp_path: Path) -> None:
+    path = tmp_path / "bank.safetensors"
+    bank.save(path)
+    content = bytearray(path.read_bytes())
+    for place in torch.linspace(len(content) // 3, len(content) - 1, 12).long().tolist():
+        content[place] ^= 1
+        path.write_bytes(content)
+        with pytest.raises(BankError, match="checksum"):
+            ViewBank.load(path)
+        content[place] ^= 1
+
+
+def test_a_bank_of_another_pipeline_is_refused(bank: ViewBank) -> None:
+    with pytest.raises(BankError, match=r"made with other settings \(image_size 64, asked for 128\)"):
+        ViewMatcher(bank, pipeline=Pipeline())
+
+
+def test_old_name_of_join(bank: ViewBank) -> None:
+    with pytest.warns(DeprecationWarning, match=r"ViewBank\.join"):
+        assert len(BankCollection([bank, bank])) == 2 * len(bank)
+
+
 def test_files_that_do_not_fit_are_refused(bank: ViewBank, tmp_path: Path) -> None:
     good = tmp_path / "bank.safetensors"
     bank.save(good)
     cut = tmp_path / "cut.safetensors"
     cut.write_bytes(good.read_bytes()[:-100])
-    other = {"settings": json.dumps({**json.loads(json.dumps(SETTINGS.__dict__)), "image_size": 128})}
+    wider = Pipeline(bank=replace(SETTINGS, image_size=128)).to_json()
+    infinite = bank.descriptors.half()
+    infinite[3, 5] = torch.nan
     cases = [
         (cut, "truncated"),
         (edited(good, tmp_path / "a", format="x"), "not a view bank"),
-        (edited(good, tmp_path / "b", version="0"), "version 0"),
-        (edited(good, tmp_path / "c", settings="{"), "incomplete"),
-        (edited(good, tmp_path / "d", settings='{"image_size": 64, "colour": 1}'), "incomplete"),
-        (edited(good, tmp_path / "e", **other), "do not match the settings"),
-        (edited(good, tmp_path / "f", {"descriptors": torch.zeros(len(bank), 7)}), "do not match the settings"),
-        (edited(good, tmp_path / "g", {"boxes": torch.zeros(len(bank) - 1, 4)}), "do not match the settings"),
-        (edited(good, tmp_path / "h", {"points": torch.zeros(0)}), "incomplete"),
+        (edited(good, tmp_path / "b", version="0"), "bank format 0"),
+        (edited(good, tmp_path / "c", pipeline="{"), "incomplete"),
+        (edited(good, tmp_path / "d", pipeline='{"bank": {"image_size": 64, "colour": 1}}'), "incomplete"),
+        (edited(good, tmp_path / "e", pipeline=wider), "points, silhouettes: not of the shape"),
+        (edited(good, tmp_path / "f", {"descriptors": torch.zeros(len(bank), 7)}), "checksum"),
+        (edited(good, tmp_path / "g", {"boxes": torch.zeros(len(bank) - 1, 4)}), "checksum"),
+        (edited(good, tmp_path / "h", {"points": torch.zeros(0)}), "checksum"),
+        (written(bank, tmp_path / "i", descriptors=infinite), "not finite"),
+        (written(bank, tmp_path / "j", descriptors=torch.zeros_like(bank.descriptors)), "all zero"),
+        (written(bank, tmp_path / "k", boxes=bank.boxes[:, [2, 1, 0, 3]]), "empty"),
+        (written(bank, tmp_path / "l", model=bank.model + 1), "meshes that are not there"),
     ]
     for path, match in cases:
         with pytest.raises(BankError, match=match):
@@ -145,7 +177,7 @@ def test_files_that_do_not_fit_are_refused(bank: ViewBank, tmp_path: Path) -> No
 
 def test_collection_is_its_banks_one_after_the_other(bank: ViewBank) -> None:
     second = ViewBank.build(trimesh.creation.box((0.1, 0.2, 0.1)), uniform_views(7), settings=SETTINGS, progress=False)
-    both = BankCollection([bank, second])
+    both = ViewBank.join([bank, second])
     assert len(both) == len(bank) + 7
     for name in ("descriptors", "points", "silhouettes", "boxes", "rotations"):
         assert torch.equal(getattr(both, name), torch.cat([getattr(bank, name), getattr(second, name)]))
@@ -164,8 +196,8 @@ def test_collection_is_its_banks_one_after_the_other(bank: ViewBank) -> None:
 
 def test_matcher_finds_the_right_model_in_a_collection(bank: ViewBank) -> None:
     box = ViewBank.build(trimesh.creation.box((0.1, 0.2, 0.1)), VIEWS, settings=SETTINGS, progress=False)
-    both = BankCollection([box, bank])
-    matcher = ViewMatcher(both)  # type: ignore[arg-type]
+    both = ViewBank.join([box, bank])
+    matcher = ViewMatcher(both)
     index = len(box) + 5
     picture = bank.silhouettes[5].float()[None, None].repeat(1, 3, 1, 1)
     edges = torch.tensor([[-0.5, -0.5, 63.5, 63.5]])
@@ -177,9 +209,9 @@ def test_matcher_finds_the_right_model_in_a_collection(bank: ViewBank) -> None:
 def test_collections_that_cannot_be_compared_are_refused(bank: ViewBank) -> None:
     coarse = ViewBank.build(example_mesh(), uniform_views(3), settings=replace(SETTINGS, sigma=2.0), progress=False)
     with pytest.raises(InvalidInputError, match="one set of settings"):
-        BankCollection([bank, coarse])
+        ViewBank.join([bank, coarse])
     with pytest.raises(InvalidInputError, match="at least one bank"):
-        BankCollection([])
+        ViewBank.join([])
 
 
 def test_any_device(bank: ViewBank) -> None:

@@ -4,7 +4,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from curvireg_torch import ViewBank, ViewMatcher, sample_views
-from curvireg_torch.matching import BankCollection, DescriptorStatistics
+from curvireg_torch.matching import DescriptorStatistics, Ranking
 from tests._support.scenes import scene, truck_bank
 
 
@@ -19,7 +19,7 @@ def test_a_data_loader_loop_gives_what_one_batch_gives():
         whole = matcher(torch.stack([p[0] for p in pairs]), torch.stack([p[1] for p in pairs]))
         parts = [matcher(images, boxes) for images, boxes in DataLoader(pairs, batch_size=2)]
         again = [matcher(images, boxes) for images, boxes in DataLoader(pairs, batch_size=2)]
-    torch.testing.assert_close(torch.cat([p.scores for p in parts]), whole.scores, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(Ranking.cat(parts).scores, whole.scores, rtol=1e-4, atol=1e-5)
     assert all(a.scores.equal(b.scores) and a.order.equal(b.order) for a, b in zip(parts, again, strict=True))
 
 
@@ -30,7 +30,7 @@ def test_one_photograph_among_several_models_scores_as_with_each_alone():
     views = sample_views(azimuth_step=45, elevations=[20])
     meshes = truck_bank().mesh, trimesh.creation.box((1, 2, 3))
     banks = [ViewBank.build(m, views, settings=truck_bank().settings, progress=False) for m in meshes]
-    together = ViewMatcher(BankCollection(banks))([image], box[None])
+    together = ViewMatcher(ViewBank.join(banks))([image], box[None])
     for name in ("hog", "repeatability"):
         alone = [getattr(ViewMatcher(bank)([image], box[None]), name) for bank in banks]
         torch.testing.assert_close(getattr(together, name), torch.cat(alone, dim=1), rtol=1e-4, atol=1e-5)

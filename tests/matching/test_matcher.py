@@ -1,6 +1,7 @@
+from dataclasses import replace
+
 import pytest
 import torch
-from torch import nn
 
 from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
@@ -11,6 +12,7 @@ from curvireg_torch.matching import (
     repeatability_score,
     unit_score,
 )
+from curvireg_torch.terms import Correlation
 from tests._support.scenes import scene, truck_bank
 
 
@@ -26,10 +28,9 @@ def batch(*seeds: int) -> tuple[torch.Tensor, torch.Tensor]:
 def test_a_view_of_the_bank_finds_itself():
     """The depth field itself as the photograph's field: the identity of the whole matching step."""
     bank = truck_bank()
-    matcher = ViewMatcher(bank, field=nn.Identity())
     for i in (0, 7, 60):
         similarity = normalized_correlation(bank.descriptors[i : i + 1], bank.descriptors)
-        rep = repeatability(bank.points[i : i + 1], dilate_points(bank.points, matcher.eps))
+        rep = repeatability(bank.points[i : i + 1], dilate_points(bank.points, 0.02 * bank.settings.image_size))
         assert int(similarity.argmax()) == i
         assert float(rep[0, i]) == 1.0
 
@@ -91,8 +92,33 @@ def test_wrong_channels_and_integer_images_are_named(matcher):
     box = torch.tensor([[5.0, 5, 50, 50]])
     with pytest.raises(InvalidInputError, match="channels"):
         matcher(torch.rand(1, 4, 64, 64), box)
-    with pytest.raises(InvalidInputError, match="floating"):
-        matcher(torch.zeros(1, 3, 64, 64, dtype=torch.uint8), box)
+    with pytest.raises(InvalidInputError, match="floating or uint8"):
+        matcher(torch.zeros(1, 3, 64, 64, dtype=torch.int16), box)
+
+
+def test_bytes_and_mixed_channels_rank_as_floats_do(matcher):
+    images, boxes = batch(0, 1)
+    exact = (images * 255).round() / 255
+    pixels = (images * 255).round().to(torch.uint8)
+    torch.testing.assert_close(matcher(pixels, boxes).scores, matcher(exact, boxes).scores)
+    grey = exact[1].mean(dim=0, keepdim=True)
+    mixed = matcher([pixels[0], grey], boxes)
+    torch.testing.assert_close(mixed.scores[0], matcher(exact[:1], boxes[:1]).scores[0], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(mixed.scores[1], matcher([grey], boxes[1:]).scores[0], rtol=1e-4, atol=1e-5)
+
+
+def test_counts_that_differ_are_refused_and_none_is_no_error(matcher):
+    images, boxes = batch(0, 1)
+    with pytest.raises(InvalidInputError, match="one for each of 2 images, got 3"):
+        matcher(images, boxes[[0, 1, 1]])
+    none = matcher([], torch.zeros(0, 4))
+    assert none.scores.shape == none.order.shape == none.hog.shape == (0, len(truck_bank()))
+
+
+def test_a_ranking_of_one_photograph_does_not_hold_on_to_the_batch(matcher):
+    ranking = matcher(*batch(0, 1, 2))[1:2]
+    for part in (ranking.scores, ranking.order, *ranking.terms.values()):
+        assert part.untyped_storage().nbytes() == part.numel() * part.element_size()
 
 
 @pytest.mark.parametrize("eps", [0.0, 1.0, 2.5, 4.0])
@@ -145,10 +171,31 @@ def test_colours_go_to_the_fields_that_want_them(colour, channels):
     assert set(seen) == {channels}
 
 
-def test_factors_are_left_out_where_their_width_is_none():
+def test_terms_are_weighted():
     images, boxes = batch(0, 1)
-    plain = ViewMatcher(truck_bank(), repeatability_sigma=None, box_sigma=None)(images, boxes)
-    assert torch.equal(plain.scores, unit_score(plain.hog))
-    assert bool((plain.box == 1).all())
-    wide = ViewMatcher(truck_bank(), repeatability_sigma=1e6, box_sigma=1e6)(images, boxes)
-    assert torch.allclose(wide.scores, plain.scores, atol=1e-5)
+    bank = truck_bank()
+    without = bank.pipeline.with_term("repeatability", weight=0).with_term("box", weight=0)
+    plain = ViewMatcher(bank, pipeline=without)(images, boxes)
+    torch.testing.assert_close(plain.scores, unit_score(plain.hog))
+    assert float(plain.box.min()) < 1, "computed and reported, and not counted"
+    twice = ViewMatcher(bank, pipeline=without.with_term("hog", weight=2))(images, boxes)
+    torch.testing.assert_close(twice.scores, plain.scores**2)
+    wide = bank.pipeline.with_term("repeatability", sigma=1e6).with_term("box", sigma=1e6)
+    torch.testing.assert_close(ViewMatcher(bank, pipeline=wide)(images, boxes).scores, plain.scores, atol=1e-5, rtol=0)
+
+
+def test_a_term_that_is_not_in_the_pipeline_is_not_computed():
+    bank = truck_bank()
+    ranking = ViewMatcher(bank, pipeline=replace(bank.pipeline, terms=(Correlation(),)))(*batch(0))
+    assert set(ranking.terms) == {"hog"}
+
+
+def test_old_options_are_terms_now():
+    images, boxes = batch(0, 1)
+    with pytest.warns(DeprecationWarning, match="with_term"):
+        old = ViewMatcher(truck_bank(), repeatability_sigma=None, box_sigma=0.3, repeatability_mode="paper", eps=3.0)
+    now = truck_bank().pipeline.with_term("repeatability", weight=0, mode="paper", eps=3 / 96)
+    new = ViewMatcher(truck_bank(), pipeline=now.with_term("box", sigma=0.3))
+    assert torch.equal(old(images, boxes).scores, new(images, boxes).scores)
+    with pytest.raises(TypeError, match="sigmas"):
+        ViewMatcher(truck_bank(), sigmas=3)

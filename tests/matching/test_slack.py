@@ -6,7 +6,7 @@ from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import crop_images
 from curvireg_torch.matching import slack_boxes
-from curvireg_torch.matching.query import crop_regions
+from curvireg_torch.terms import crop_regions
 from tests._support.scenes import scene, truck_bank
 
 
@@ -46,7 +46,7 @@ def test_a_moved_box_outside_the_image_gives_way():
 def test_parts_are_the_best_over_the_crops():
     image, box, _ = scene(0)
     exact, slack = ViewMatcher(truck_bank(), slack=0), ViewMatcher(truck_bank())
-    several = slack_boxes(box[None], slack.slack)[0]
+    several = slack_boxes(box[None], slack.pipeline.slack)[0]
     each = [exact([image], b[None]) for b in several]
     together = slack([image], box[None])
     for part in ("hog", "repeatability"):

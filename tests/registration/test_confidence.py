@@ -18,7 +18,7 @@ CONSTANTS = Path(__file__).parents[2] / "scripts" / "results" / "confidence_cali
 def ranking(scores: torch.Tensor, hog: float = 0.8, rep: float = 0.6) -> Ranking:
     order = scores.argsort(dim=1, descending=True, stable=True)
     same = torch.ones_like(scores)
-    return Ranking(scores, order, hog * same, rep * same, same)
+    return Ranking(scores, order, {"hog": hog * same, "repeatability": rep * same, "box": same})
 
 
 def test_evidence_in_closed_form():

@@ -1,9 +1,13 @@
+import pickle
+
+import cv2
 import pytest
 import torch
+import trimesh
 
-from curvireg_torch import Registrar, ViewBank, rotation_error, sample_views
-from curvireg_torch.errors import ImageError, InvalidInputError
-from curvireg_torch.registration import RELIABLE, distinct_views
+from curvireg_torch import ImageGradient, Registrar, ViewBank, ViewMatcher, project_points, rotation_error, sample_views
+from curvireg_torch.errors import CurviregError, InvalidInputError
+from curvireg_torch.registration import RELIABLE, FailedRegistration, distinct_views
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import CAMERA, scene, truck_bank
 
@@ -42,7 +46,6 @@ def test_results_are_proper_poses(registered):
         assert 0 <= result.score <= 1
         assert 0 <= result.confidence <= 1
         assert result.reliable == (result.confidence >= RELIABLE)
-        assert result.iterations > 0
         azimuth, elevation, theta = result.viewpoint
         assert 0 <= azimuth < 360
         assert -90 <= elevation <= 90
@@ -54,7 +57,7 @@ def test_without_a_camera_there_is_no_translation():
     result = Registrar(truck_bank(), refine=False)(image[None], box[None])[0]
     assert result.translation is None
     assert result.transform is None
-    assert result.rotation.equal(result.view_rotation)
+    assert result.rotation.equal(result.allocentric_rotation)
 
 
 def test_batched_equals_one_by_one(registered):
@@ -63,12 +66,27 @@ def test_batched_equals_one_by_one(registered):
     torch.testing.assert_close(alone.rotation, registered[1][1].rotation)
 
 
-def test_candidates_are_distinct(registered):
-    result = registered[0][0]
-    R = truck_bank().rotations[result.candidates]
-    errors = rotation_error(R[:, None], R[None]) + 1000 * torch.eye(len(R))
-    assert float(errors.min()) > 30
-    assert int(result.candidates[0]) == int(result.ranking.order[0, 0])
+def test_hypotheses_are_distinct(registered):
+    for results in registered:
+        for result in results:
+            R = torch.stack([h.rotation for h in result.hypotheses])
+            errors = rotation_error(R[:, None], R[None]) + 1000 * torch.eye(len(R))
+            assert float(errors.min()) > 15
+    first = registered[0][0]
+    assert int(first.candidates[0]) == int(first.ranking.order[0, 0])
+
+
+def test_a_rival_is_a_whole_pose(registered):
+    """The truck's half turn is its strongest rival, and comes with a translation that fills the box."""
+    box, points = scene(0)[1], torch.from_numpy(truck_bank().mesh.vertices.copy())
+    rivals = registered[1][0].hypotheses[1:]
+    assert any(abs(float(rotation_error(r.rotation, registered[1][0].rotation)) - 180) < 15 for r in rivals)
+    for rival in rivals:
+        uv = project_points(points, rival.transform[None], CAMERA)[0]
+        seen = torch.cat([uv.amin(dim=0), uv.amax(dim=0)])
+        side = float((box[2:] - box[:2]).max())
+        assert float((seen - box).abs().max()) < 0.35 * side
+        assert set(rival.evidence) == {"rank", "similarity", "support"}
 
 
 def test_a_mesh_instead_of_a_bank_uses_the_cache(tmp_path, monkeypatch):
@@ -81,19 +99,89 @@ def test_a_mesh_instead_of_a_bank_uses_the_cache(tmp_path, monkeypatch):
     torch.testing.assert_close(first.bank.descriptors, second.bank.descriptors, atol=1e-3, rtol=0)
 
 
-def test_bad_input_is_named():
+def test_what_is_wrong_with_one_photograph_is_its_own_failure(tmp_path):
     registrar = Registrar(truck_bank(), refine=False)
     image, box, _ = scene(0)
-    with pytest.raises(ImageError, match="image 1: the box shows one colour"):
-        registrar([image, torch.full((3, 50, 50), 0.3)], torch.stack([box, torch.tensor([5.0, 5, 40, 40])]))
+    nan = image.clone()
+    nan[1, int(box[1]) + 9, int(box[0]) + 9] = torch.nan
+    grey = torch.full((3, 50, 50), 0.3)
+    images = [image, grey, nan, image, tmp_path / "none.png", image * 255, torch.zeros(4, 9, 9), image]
+    boxes = torch.stack([box, torch.tensor([5.0, 5, 40, 40]), box, -box, box, box, box, box])
+    results = registrar(images, boxes, CAMERA)
+    assert [result.ok for result in results] == [True, False, False, False, False, False, False, True]
+    assert results[0].rotation.equal(results[7].rotation)
+    told = {1: "one colour", 2: "NaN", 3: "X0 < X1", 4: "no such file", 5: r"\[0, 1\]", 6: "channels"}
+    for i, message in told.items():
+        assert isinstance(results[i], FailedRegistration)
+        with pytest.raises(CurviregError, match=f"image {i}: .*{message}"):
+            _ = results[i].rotation
+
+
+def test_photographs_as_people_have_them(tmp_path):
+    image, box, _ = scene(0)
+    pixels = (image * 255).round().byte()
+    array = pixels.permute(1, 2, 0).numpy()
+    cv2.imwrite(str(tmp_path / "photo.png"), array[..., ::-1])
+    images = [pixels, array, array.astype("float32") / 255, tmp_path / "photo.png", str(tmp_path / "photo.png")]
+    results = Registrar(truck_bank(), refine=False)(images, [box.tolist()] * 5)
+    for result in results[1:]:
+        torch.testing.assert_close(result.ranking.scores, results[0].ranking.scores, atol=1e-5, rtol=1e-4)
+
+
+def test_bad_calls_are_named():
+    registrar = Registrar(truck_bank(), refine=False)
+    image, box, _ = scene(0)
     bad = CAMERA.clone()
     bad[0, 0] = 0
     with pytest.raises(InvalidInputError, match="focal"):
-        registrar([image], box[None], bad)
+        _ = registrar([image], box[None], bad)[0].rotation
     with pytest.raises(InvalidInputError, match="one or 1 matrices"):
         registrar([image], box[None], CAMERA.expand(2, 3, 3))
+    with pytest.raises(InvalidInputError, match=r"shape \(1, 4\), one for each image, got \(3, 4\)"):
+        registrar([image], box.expand(3, 4))
+    with pytest.raises(InvalidInputError, match="put a single one into a list"):
+        registrar(image, box[None])
     with pytest.raises(InvalidInputError, match="belong to the bank"):
         Registrar(truck_bank(), views=sample_views())
+    with pytest.raises(InvalidInputError, match="belong to the matcher"):
+        Registrar(ViewMatcher(truck_bank()), field=ImageGradient())
+    assert registrar([], []) == []
+
+
+def test_a_field_of_ones_own_is_used_and_noted():
+    registrar = Registrar(truck_bank(), field=ImageGradient(), refine=False)
+    assert registrar.pipeline.field == "own:ImageGradient"
+    image, box, _ = scene(0)
+    gradient = ViewMatcher(truck_bank(), field=ImageGradient())([image], box[None])
+    assert registrar([image], box[None])[0].ranking.scores.equal(gradient.scores)
+
+
+def test_a_pickle_of_one_result_is_small():
+    images, boxes = [scene(s)[0] for s in range(4)], torch.stack([scene(s)[1] for s in range(4)])
+    results = Registrar(truck_bank(), refine=False)(images, boxes)
+    one = len(pickle.dumps(results[:1]))
+    assert one < 1.2 * len(pickle.dumps(Registrar(truck_bank(), refine=False)(images[:1], boxes[:1])))
+
+
+def test_several_meshes_one_answer(tmp_path, monkeypatch):
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path))
+    meshes = [trimesh.creation.box((0.1, 0.2, 0.1)), example_mesh()]
+    views, (image, box, T) = sample_views(azimuth_step=15, elevations=[0, 20, 40]), scene(0)
+    result = Registrar(meshes, views=views)([image], box[None], CAMERA)[0]
+    assert result.model == 1
+    assert float(rotation_error(result.rotation, T[:3, :3])) < 5
+
+
+def test_old_names_still_work():
+    image, box, _ = scene(0)
+    with pytest.warns(DeprecationWarning, match="hypotheses"):
+        registrar = Registrar(truck_bank(), refine=False, top=2)
+    result = registrar([image], box[None])[0]
+    assert len(result.hypotheses) == 2
+    with pytest.warns(DeprecationWarning, match="allocentric_rotation"):
+        assert result.view_rotation.equal(result.allocentric_rotation)
+    with pytest.warns(DeprecationWarning, match="distance"):
+        assert result.view_distance == result.distance
 
 
 def test_distinct_views_stop_when_the_sphere_is_used_up():

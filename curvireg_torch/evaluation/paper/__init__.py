@@ -1,17 +1,15 @@
 """The measurements of the paper, on any of the datasets; ``scripts/reproduce_paper.py`` runs them."""
 
 from .cases import KINDS, Case, find_cases
-from .fields import DEPTH_FIELDS, PHOTO_FIELDS, FieldSettings, photo_detectors
+from .fields import PHOTO_FIELDS, photo_detectors
 from .points import curve_table, detector_tables, repeatability_table
 from .rankings import Rankings, angle_table, precision_table, rank_tables, rank_views
 from .tables import Table, write_table
 
 __all__ = [
-    "DEPTH_FIELDS",
     "KINDS",
     "PHOTO_FIELDS",
     "Case",
-    "FieldSettings",
     "Rankings",
     "Table",
     "angle_table",

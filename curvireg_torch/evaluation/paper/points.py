@@ -1,6 +1,7 @@
 """How well feature points of photographs and of the right view fall on each other: IP, HD, repeatability."""
 
 from collections import defaultdict
+from dataclasses import replace
 from statistics import fmean
 
 import torch
@@ -8,10 +9,10 @@ from kornia.color import rgb_to_grayscale
 from torch import Tensor
 
 from ...descriptors import field_points
-from ...matching import ViewDescriber
+from ...matching import BankSettings, ViewDescriber
 from ...metrics import hausdorff_distance, intersection_percentage, view_repeatability
 from .cases import Case, grouped
-from .fields import DEPTH_FIELDS, PHOTO_FIELDS, FieldSettings, photo_detectors
+from .fields import PHOTO_FIELDS, photo_detectors
 from .tables import Table
 
 __all__ = ["CURVE_OFFSETS", "curve_table", "detector_tables", "repeatability_table"]
@@ -22,7 +23,7 @@ CURVE_OFFSETS = tuple(range(-100, 100, 5))
 CURVE_DETECTORS = ("mfc", "mcs", "ig", "sift", "sobel")
 
 
-def detector_tables(cases: list[Case], settings: FieldSettings, eps_px: float, progress: bool = True) -> list[Table]:
+def detector_tables(cases: list[Case], settings: BankSettings, eps_px: float, progress: bool = True) -> list[Table]:
     """IP and Hausdorff distances of every detector against the curvilinear saliency of the right view, per category."""
     detectors = photo_detectors(settings.point_share)
     scores: dict[str, dict[str, dict[str, list[float]]]] = {
@@ -64,10 +65,10 @@ def detector_tables(cases: list[Case], settings: FieldSettings, eps_px: float, p
     return tables
 
 
-def repeatability_table(cases: list[Case], settings: FieldSettings, eps_px: float, progress: bool = True) -> Table:
+def repeatability_table(cases: list[Case], settings: BankSettings, eps_px: float, progress: bool = True) -> Table:
     """Repeatability of each depth filter's points in each photograph filter's points."""
     detectors = {n: d for n, d in photo_detectors(settings.point_share).items() if n in PHOTO_FIELDS}
-    depths = [n for n in ("CS", "ASG", "HFN") if n in DEPTH_FIELDS]
+    depths = ("CS", "ASG", "HFN")
     columns = [f"{d}/{p}" for d in depths for p in detectors]
     scores: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for mesh, group in grouped(cases, "repeatability", progress):
@@ -95,7 +96,7 @@ def repeatability_table(cases: list[Case], settings: FieldSettings, eps_px: floa
     )
 
 
-def curve_table(cases: list[Case], settings: FieldSettings, eps_px: float, progress: bool = True) -> Table:
+def curve_table(cases: list[Case], settings: BankSettings, eps_px: float, progress: bool = True) -> Table:
     """Repeatability in 40 views around the right one."""
     detectors = {n: d for n, d in photo_detectors(settings.point_share).items() if n.lower() in CURVE_DETECTORS}
     angles = torch.deg2rad(torch.tensor(CURVE_OFFSETS, dtype=torch.float64))
@@ -122,7 +123,7 @@ def curve_table(cases: list[Case], settings: FieldSettings, eps_px: float, progr
     )
 
 
-def _crop(case: Case, settings: FieldSettings) -> Tensor:
+def _crop(case: Case, settings: BankSettings) -> Tensor:
     """(1, 1, S, S) grey crop."""
     grey: Tensor = rgb_to_grayscale(case.crop(settings))
     return grey
@@ -135,13 +136,13 @@ def _depth(describe: ViewDescriber, R: Tensor, distance: float) -> Tensor:
     return describe.depth(R, distances)[0]
 
 
-def _points(depth: Tensor, settings: FieldSettings, name: str = "CS") -> Tensor:
+def _points(depth: Tensor, settings: BankSettings, name: str = "CS") -> Tensor:
     with torch.no_grad():
-        field = FieldSettings(**{**vars(settings), "depth_field": name}).depth_filter()(depth)
+        field = replace(settings, depth_field=name).depth_filter()(depth)
     return field_points(field, share=settings.point_share)[:, 0]
 
 
-def _view_points(describe: ViewDescriber, settings: FieldSettings, R: Tensor, distance: float) -> Tensor:
+def _view_points(describe: ViewDescriber, settings: BankSettings, R: Tensor, distance: float) -> Tensor:
     return _points(_depth(describe, R, distance), settings)
 
 

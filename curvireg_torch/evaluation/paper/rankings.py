@@ -1,15 +1,15 @@
 """Where the right view comes in the ranking: precision, errors of angles, precision at rank."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from ...geometry import ViewSphere, rotation_error, viewpoint_from_rotation
-from ...matching import ViewBank, ViewMatcher
+from ...matching import BankSettings, ViewBank, ViewMatcher
 from ...metrics import accuracy, pose_parameter_errors, rank_precision
 from .cases import Case, grouped
-from .fields import DEPTH_FIELDS, PHOTO_FIELDS, FieldSettings
+from .fields import PHOTO_FIELDS
 from .tables import Table
 
 __all__ = ["RANKS", "Rankings", "angle_table", "precision_table", "rank_tables", "rank_views"]
@@ -44,9 +44,9 @@ class Rankings:
 
 
 @torch.no_grad()
-def rank_views(cases: list[Case], views: ViewSphere, settings: FieldSettings, progress: bool = True) -> Rankings:
+def rank_views(cases: list[Case], views: ViewSphere, settings: BankSettings, progress: bool = True) -> Rankings:
     """Rank all views for every photograph with {CS, ASG, AR} x {MFC, MCS, IG}."""
-    depths = [n for n in ("CS", "ASG", "AR") if n in DEPTH_FIELDS]
+    depths = ("CS", "ASG", "AR")
     photos = {name: make() for name, make in PHOTO_FIELDS.items()}
     categories: list[str] = []
     truth, errors = [], []
@@ -59,7 +59,7 @@ def rank_views(cases: list[Case], views: ViewSphere, settings: FieldSettings, pr
             truth.append(torch.tensor([*map(float, viewpoint_from_rotation(R)), 0.0]))
             errors.append(rotation_error(R[None].float(), views.rotations))
         for depth in depths:
-            changed = FieldSettings(**{**vars(settings), "depth_field": depth})
+            changed = replace(settings, depth_field=depth)
             bank = ViewBank.build(mesh, views, settings=changed, progress=False)
             for photo, field in photos.items():
                 matcher = ViewMatcher(bank, field=field)

@@ -14,10 +14,11 @@ import trimesh
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import paper
 from curvireg_torch.geometry import camera_matrix, rotation_error, rotation_from_viewpoint, sample_views
+from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support.miniature import write_bop, write_pascal3d, write_web
 
-SETTINGS = paper.FieldSettings(image_size=64)
+SETTINGS = BankSettings(image_size=64)
 VIEWS = sample_views(azimuth_step=30, elevations=[0, 30])
 REPOSITORY = Path(__file__).parents[3]
 

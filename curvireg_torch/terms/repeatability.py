@@ -1,14 +1,20 @@
 """Repeatability of feature points between a photograph and every view, as one matrix product."""
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import cv2
 import numpy as np
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from torch import Tensor, nn
 
 from .._checks import check_option, check_positive
 from ..errors import InvalidInputError
+from .base import Term, Views
+from .photographs import Photographs
 
-__all__ = ["dilate_points", "repeatability", "repeatability_score"]
+__all__ = ["Repeatability", "dilate_points", "repeatability", "repeatability_score"]
 
 MODES = ("monotone", "paper")
 
@@ -75,8 +81,62 @@ def repeatability_score(rep: Tensor, *, mode: str = "monotone", sigma: float = 0
         >>> repeatability_score(torch.tensor([[0.5, 0.4]]))[0].tolist()[0]
         1.0
     """
+    return torch.exp(_log_score(rep, mode, sigma))
+
+
+def _log_score(rep: Tensor, mode: str, sigma: float) -> Tensor:
     check_option(mode, MODES, "mode")
     check_positive(sigma, "sigma")
     R = 1.0 - rep
     centre = R.amin(dim=1, keepdim=True) if mode == "monotone" else R.mean(dim=1, keepdim=True)
-    return torch.exp(-(R - centre).square() / (2.0 * sigma**2))
+    return -(R - centre).square() / (2.0 * sigma**2)
+
+
+@dataclass(frozen=True)
+class Repeatability(Term):
+    """S_rep: the photograph's feature points have points of the view nearby, the best over the slack crops.
+
+    Attributes:
+        sigma, mode: of :func:`repeatability_score`.
+        eps: how near, as a share of the crop's side.
+    """
+
+    name: ClassVar[str] = "repeatability"
+    sigma: float = 0.1
+    mode: str = "monotone"
+    eps: float = 0.02
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive(self.sigma, "sigma")
+        check_option(self.mode, MODES, "mode")
+        check_positive(self.eps, "eps", zero_ok=True)
+
+    def over(self, views: Views) -> nn.Module:
+        return _Points(views, self.eps)
+
+    def log_score(self, raw: Tensor) -> Tensor:
+        return _log_score(raw, self.mode, self.sigma)
+
+
+class _Points(nn.Module):
+    def __init__(self, views: Views, eps: float) -> None:
+        super().__init__()
+        S = views.settings.image_size
+        # Points are counted in cells of eps px or less, so that the product stays small.
+        self.cell = max(1, min(int(eps * S), S // 64))
+        near = [
+            self._in_cells(dilate_points(views.points_at(slice(i, i + 64)), eps * S)).flatten(1)
+            for i in range(0, len(views), 64)
+        ]
+        self.near: Tensor
+        self.register_buffer("near", torch.cat(near), persistent=False)
+
+    def _in_cells(self, points: Tensor) -> Tensor:
+        """(N, C, C) share of each cell's pixels that are set, from (N, S, S)."""
+        return F.avg_pool2d(points[:, None].float(), self.cell, ceil_mode=True)[:, 0]
+
+    def forward(self, photographs: Photographs) -> Tensor:
+        B, K = photographs.points.shape[:2]
+        points = self._in_cells(photographs.points.flatten(0, 1)).flatten(1)
+        return repeatability(points, self.near).view(B, K, len(self.near)).amax(dim=1)

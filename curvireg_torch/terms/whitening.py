@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -15,9 +16,11 @@ from .._files import write_tensors
 from ..errors import BankError, InvalidInputError, MissingFileError
 from ..filters import MultiScaleFocusCurves
 from ..geometry.crops import crop_images
-from .bank import ViewBank
-from .describe import BankSettings
-from .query import photograph_field
+from .base import Views
+from .photographs import photograph_field
+
+if TYPE_CHECKING:
+    from ..pipeline import BankSettings
 
 __all__ = ["DescriptorStatistics", "Whitening"]
 
@@ -94,7 +97,7 @@ class DescriptorStatistics:
         return cls(mean, x.T @ x / len(x), len(x), fourth)
 
     @classmethod
-    def from_bank(cls, bank: ViewBank) -> "DescriptorStatistics":
+    def from_bank(cls, bank: Views) -> "DescriptorStatistics":
         """Of the views of a bank: whitening by them brings out what tells views from each other (the paper)."""
         return cls.from_descriptors(bank.descriptors)
 
@@ -102,7 +105,7 @@ class DescriptorStatistics:
     def from_images(
         cls,
         images: Iterable[Tensor],
-        settings: BankSettings,
+        settings: "BankSettings",
         *,
         crops: int = 200,
         field: nn.Module | None = None,

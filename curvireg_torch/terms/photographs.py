@@ -1,7 +1,7 @@
 """What is compared of a photograph: crops around a box that need not be exact, and their features."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from kornia.color import rgb_to_grayscale
@@ -11,37 +11,40 @@ from .._checks import check_tensor
 from ..errors import InvalidInputError
 from ..geometry.crops import check_boxes, crop_images, square_boxes
 
-__all__ = ["QueryFeatures", "crop_regions", "photograph_field", "slack_boxes"]
+__all__ = ["Photographs", "crop_regions", "photograph_field", "slack_boxes"]
 
 _MOVES = ((0, 0, 0), (-0.75, 0, 0), (0.75, 0, 0), (0, -0.75, 0), (0, 0.75, 0), (0, 0, -1), (0, 0, 1))
 """Shifts in x and y and the exponent of the scale, in units of the slack."""
 
 
 @dataclass(frozen=True)
-class QueryFeatures:
+class Photographs:
     """B photographs, each described in K crops: of its box first, then of the box moved and scaled a little.
 
     Attributes:
-        crops: (B, C, S, S) of the boxes themselves.
-        field: (B, 2, S, S) of those crops.
+        regions: (B, K, C, S, S) the crops, in [0, 1].
+        field: (B, 2, S, S) of the first of them.
         descriptors: (B, K, D).
-        points: (B, K, C, C) share of each cell's pixels that are feature points.
+        points: (B, K, S, S) bool feature points.
         shapes: (B,) log of width / height of the boxes, NaN where unknown.
     """
 
-    crops: Tensor
+    regions: Tensor
     field: Tensor
     descriptors: Tensor
     points: Tensor
     shapes: Tensor
 
     def __len__(self) -> int:
-        return self.crops.shape[0]
+        return self.regions.shape[0]
 
-    def __getitem__(self, index: slice) -> "QueryFeatures":
-        return QueryFeatures(
-            self.crops[index], self.field[index], self.descriptors[index], self.points[index], self.shapes[index]
-        )
+    def __getitem__(self, index: slice | Tensor) -> "Photographs":
+        return Photographs(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    @property
+    def crops(self) -> Tensor:
+        """(B, C, S, S) crops of the boxes themselves."""
+        return self.regions[:, 0]
 
 
 def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
@@ -79,20 +82,27 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
     """(B, K, C, S, S) crops, K boxes on each image, cut as :func:`crop_images` does; reads no more than it needs.
 
     Args:
-        images: (B, C, H, W), or a list of (C, H, W).
+        images: (B, C, H, W), or a list of (C, H, W), floating in [0, 1] or uint8; of several channel counts, grey ones
+            get three channels.
         boxes: (B, K, 4) x0, y0, x1, y1 in px, from :func:`slack_boxes`; a moved box wholly outside its image gives way
             to the first.
         size, margin: see :func:`crop_images`.
+
+    Returns:
+        Floating crops; of no images (0, K, 3, S, S).
 
     Raises:
         InvalidInputError: wrong shapes, or a first box that is empty or wholly outside its image.
     """
     for image in images:
-        check_tensor(image, "images", (None, None, None))
+        if not isinstance(image, Tensor) or image.ndim != 3 or not (image.is_floating_point() or _is_bytes(image)):
+            raise InvalidInputError(f"images: expected floating or uint8 (C, H, W), got {_shown(image)}")
     sizes = [(int(image.shape[-2]), int(image.shape[-1])) for image in images]
+    check_tensor(boxes, "boxes", (len(sizes), None, 4))
     check_boxes(boxes[:, 0], sizes)
     if not sizes:
-        raise InvalidInputError("images: expected at least one image")
+        return boxes.new_zeros(0, boxes.shape[1], 3, size, size)
+    channels = max(image.shape[0] for image in images)
     squares = square_boxes(boxes, margin)
     reach = 2.0 + (squares[..., 2] - squares[..., 0]).amax(dim=1) / size  # of the resampling, px
     low = (squares[..., :2].amin(dim=1) - reach[:, None]).floor().long().clamp(min=0).tolist()
@@ -104,6 +114,16 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
         some = torch.where(seen[:, None], some, some[:1])
         x0, y0 = min(x0, W - 1), min(y0, H - 1)
         part = image[:, y0 : max(min(y1, H), y0 + 1), x0 : max(min(x1, W), x0 + 1)]
+        part = part.to(boxes.dtype) / 255.0 if _is_bytes(part) else part
+        part = part.expand(channels, -1, -1) if len(part) == 1 else part
         origin = torch.tensor([x0, y0, x0, y0], dtype=some.dtype, device=some.device)
         crops.append(crop_images(part.expand(len(some), *part.shape), some - origin, size=size, margin=margin)[0])
     return torch.stack(crops)
+
+
+def _is_bytes(image: Tensor) -> bool:
+    return image.dtype == torch.uint8
+
+
+def _shown(image: object) -> str:
+    return f"{image.dtype} {tuple(image.shape)}" if isinstance(image, Tensor) else type(image).__name__

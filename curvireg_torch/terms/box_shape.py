@@ -1,13 +1,17 @@
 """Does the photograph's box have the proportions of the view's?"""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from .._checks import check_positive, check_tensor
+from .base import Term, Views
+from .photographs import Photographs
 
-__all__ = ["box_shape_score", "box_shapes", "whole_box_shapes"]
+__all__ = ["BoxShape", "box_shape_score", "box_shapes", "whole_box_shapes"]
 
 _BORDER = 0.01
 """Share of the box's longer side within which an edge counts as cut off by the image's border, besides 1 px."""
@@ -67,3 +71,36 @@ def box_shape_score(queries: Tensor, views: Tensor, *, sigma: float = 0.2) -> Te
     difference = (queries[:, None] - views.to(queries)[None]).nan_to_num(0.0)
     square = difference.square()
     return torch.exp((square.amin(dim=1, keepdim=True) - square) / (2.0 * sigma**2))
+
+
+@dataclass(frozen=True)
+class BoxShape(Term):
+    """S_box: the photograph's box has the proportions of the view's; 1 for a box that reaches the image's border.
+
+    Attributes:
+        sigma: of :func:`box_shape_score`.
+    """
+
+    name: ClassVar[str] = "box"
+    sigma: float = 0.2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive(self.sigma, "sigma")
+
+    def over(self, views: Views) -> nn.Module:
+        return _Shapes(box_shapes(views.boxes).float(), self.sigma)
+
+    def log_score(self, raw: Tensor) -> Tensor:
+        return raw.clamp(min=torch.finfo(raw.dtype).tiny).log()
+
+
+class _Shapes(nn.Module):
+    def __init__(self, shapes: Tensor, sigma: float) -> None:
+        super().__init__()
+        self.sigma = sigma
+        self.shapes: Tensor
+        self.register_buffer("shapes", shapes, persistent=False)
+
+    def forward(self, photographs: Photographs) -> Tensor:
+        return box_shape_score(photographs.shapes.float(), self.shapes, sigma=self.sigma)

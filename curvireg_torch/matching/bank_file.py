@@ -1,0 +1,123 @@
+"""Banks on disk: safetensors with the pipeline and a checksum of the contents in the header."""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+import trimesh
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from .._files import write_tensors
+from ..errors import BankError, CurviregError, MissingFileError
+from ..geometry.up import mesh_up
+from ..geometry.views import ViewSphere
+from ..pipeline import Pipeline
+
+if TYPE_CHECKING:
+    from .bank import ViewBank
+
+__all__ = ["FORMAT", "FORMAT_VERSION", "read_bank", "write_bank"]
+
+FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 2
+
+
+def write_bank(bank: "ViewBank", path: Path) -> None:
+    """See :meth:`ViewBank.save`."""
+    views = {f"views.{f.name}": getattr(bank.views, f.name) for f in fields(ViewSphere)}
+    meshes = {}
+    for i, mesh in enumerate(bank.meshes):
+        meshes[f"mesh{i}.vertices"] = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
+        meshes[f"mesh{i}.faces"] = torch.from_numpy(np.array(mesh.faces, dtype=np.int32))
+    tensors = {**bank.tensors, "descriptors": bank.descriptors.half(), **views, **meshes}
+    metadata = {
+        "format": FORMAT,
+        "version": str(FORMAT_VERSION),
+        "pipeline": bank.pipeline.to_json(),
+        "units": " ".join(mesh.units or "m" for mesh in bank.meshes),
+        "up": " ".join(mesh_up(mesh) for mesh in bank.meshes),
+        "checksum": _checksum(tensors),
+    }
+    write_tensors(path, tensors, metadata)
+
+
+def read_bank(path: Path) -> "ViewBank":
+    """See :meth:`ViewBank.load`; on the CPU."""
+    from .bank import ViewBank
+
+    again = "build it again with 'curvireg bank MESH --out FILE'"
+    if not path.is_file():
+        raise MissingFileError(f"{path}: no such bank; build one with 'curvireg bank MESH --out {path}'")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise BankError(f"{path}: not a view bank; build one with 'curvireg bank MESH --out FILE'")
+            if metadata.get("version") != str(FORMAT_VERSION):
+                raise BankError(
+                    f"{path}: bank format {metadata.get('version')}, this library reads {FORMAT_VERSION}; {again}"
+                )
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError) as error:
+        raise BankError(f"{path}: truncated or not a safetensors file ({error}); {again}") from error
+    try:
+        if metadata["checksum"] != _checksum(tensors):
+            raise BankError(f"{path}: changed since it was written (its checksum differs); {again}")
+        pipeline = Pipeline.from_json(metadata["pipeline"])
+        views = ViewSphere(**{f.name: tensors[f"views.{f.name}"] for f in fields(ViewSphere)})
+        units, ups = metadata["units"].split(" "), metadata["up"].split(" ")
+        meshes = [_mesh(tensors, i, *facts) for i, facts in enumerate(zip(units, ups, strict=True))]
+        bank = ViewBank(meshes, views, pipeline, tensors)
+        _check_contents(bank)
+    except (KeyError, TypeError, ValueError, CurviregError) as error:
+        if isinstance(error, BankError):
+            raise
+        raise BankError(f"{path}: incomplete bank ({error!r}); {again}") from error
+    return bank
+
+
+def _mesh(tensors: Mapping[str, Tensor], index: int, unit: str, up: str) -> trimesh.Trimesh:
+    vertices, faces = tensors[f"mesh{index}.vertices"].numpy(), tensors[f"mesh{index}.faces"].numpy()
+    if faces.size == 0 or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
+        raise ValueError(f"mesh {index} is not a mesh")
+    mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+    mesh.units = unit
+    mesh.metadata["up"] = up
+    return mesh
+
+
+def _check_contents(bank: "ViewBank") -> None:
+    """A checksum says that a file is as it was written, not that sense was written."""
+    N, S = len(bank), bank.settings.image_size
+    packed = (N, -(-(S**2) // 8))
+    shapes = {
+        "descriptors": (N, bank.settings.descriptor().length),
+        "boxes": (N, 4),
+        "model": (N,),
+        "points": packed,
+        "silhouettes": packed,
+    }
+    wrong = [name for name, shape in shapes.items() if tuple(bank.tensors[name].shape) != shape]
+    if wrong:
+        raise ValueError(f"{', '.join(wrong)}: not of the shape that the settings say")
+    boxes, angles = bank.boxes, torch.stack([bank.views.azimuth, bank.views.elevation, bank.views.theta])
+    if not bool(angles.isfinite().all() and bank.views.distance.isfinite().all()):
+        raise ValueError("viewpoints that are not finite")
+    if not bool(bank.descriptors.isfinite().all()) or not bool(bank.descriptors.any()):
+        raise ValueError("descriptors that are not finite, or all zero")
+    if not bool(boxes.isfinite().all() and (boxes[:, 2:] > boxes[:, :2]).all()):
+        raise ValueError("boxes that are empty or not finite")
+    if int(bank.model.min()) < 0 or int(bank.model.max()) >= len(bank.meshes):
+        raise ValueError("views of meshes that are not there")
+
+
+def _checksum(tensors: Mapping[str, Tensor]) -> str:
+    digest = hashlib.blake2b(digest_size=16)
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,329 @@
+"""Everything that decides a result, in one frozen value: the only source of defaults."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import field as dataclass_field
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from ._checks import check_option, check_positive
+from .descriptors import HOG
+from .errors import InvalidInputError, MissingFileError
+from .filters import (
+    ApparentRidges,
+    AverageShadingGradient,
+    DepthCurvilinearSaliency,
+    HessianFrobeniusNorm,
+    ImageGradient,
+    MultiScaleCurvilinearSaliency,
+    MultiScaleFocusCurves,
+)
+from .geometry import ViewSphere, sample_views, uniform_views
+from .geometry.views import DEFAULT_DISTANCE
+from .terms import TERMS, BoxShape, Correlation, Repeatability, Term, slack_boxes
+
+__all__ = ["DEFAULT", "FIELDS", "PRESETS", "BankSettings", "Pipeline", "ViewPolicy", "field_digest", "preset_named"]
+
+VERSION = 1
+"""Of the JSON form."""
+
+CAMERAS = ("perspective", "orthographic")
+POSES = ("any", "upright", "given")
+FIELDS = ("learned", "focus", "saliency", "gradient")
+"""Photograph filters by name; "own:NAME" stands for a module that comes with the call."""
+
+
+DEPTH_FIELDS: dict[str, type[nn.Module]] = {
+    "CS": DepthCurvilinearSaliency,
+    "ASG": AverageShadingGradient,
+    "HFN": HessianFrobeniusNorm,
+    "AR": ApparentRidges,
+}
+"""Depth filters, by the paper's names."""
+
+
+@dataclass(frozen=True)
+class ViewPolicy:
+    """Which viewpoints a bank shows.
+
+    Attributes:
+        pose: "any": nothing is known. "upright": the object stands upright and is not seen from far below. "given": the
+            views came with the call.
+        directions, turn: of "any": directions spread over the sphere, and degrees between turns in the image plane.
+        azimuth_step, elevations: of "upright", degrees.
+        distance: of the camera from the object's centre, in units of the object's radius.
+
+    Example:
+        >>> len(ViewPolicy().sphere()), len(ViewPolicy(pose="upright").sphere())
+        (7200, 288)
+    """
+
+    pose: str = "any"
+    directions: int = 300
+    turn: float = 15.0
+    azimuth_step: float = 10.0
+    elevations: tuple[float, ...] = (-10.0, 0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
+    distance: float = DEFAULT_DISTANCE
+
+    def __post_init__(self) -> None:
+        check_option(self.pose, POSES, "pose")
+        check_positive(self.turn, "turn")
+        object.__setattr__(self, "elevations", tuple(float(e) for e in self.elevations))
+
+    def sphere(self, up: str = "z") -> ViewSphere:
+        """The viewpoints.
+
+        Args:
+            up: the mesh's axis that points up when it stands, for "upright" (:func:`curvireg_torch.geometry.mesh_up`).
+
+        Raises:
+            InvalidInputError: they were given with the call and cannot be made again.
+        """
+        if self.pose == "given":
+            raise InvalidInputError("views: this pipeline's views came with the call; give them again")
+        if self.pose == "upright":
+            grid = sample_views(azimuth_step=self.azimuth_step, elevations=self.elevations, distances=[self.distance])
+            return grid.for_up(up)
+        count = max(1, round(360.0 / self.turn))
+        turns = [360.0 * i / count for i in range(count)]
+        return uniform_views(self.directions, thetas=turns, distances=[self.distance])
+
+
+@dataclass(frozen=True)
+class BankSettings:
+    """How views are rendered and described. Photographs are cropped and described the same way.
+
+    Attributes:
+        image_size: side of views and crops in px.
+        camera: "perspective" or "orthographic".
+        margin: room around the object's box, as a share of its longer side.
+        depth_field: "CS": :func:`depth_curvilinear_saliency` with ``sigma`` and ``formula``; "ASG", "HFN", "AR": the
+            filters that the paper compares it with, as they are.
+        grid, bins, block, clip: of :func:`hog`.
+        point_share: of :func:`field_points`.
+    """
+
+    image_size: int = 128
+    camera: str = "perspective"
+    margin: float = 0.1
+    depth_field: str = "CS"
+    sigma: float = 0.8
+    formula: str = "geometric"
+    grid: int = 8
+    bins: int = 9
+    block: int = 2
+    clip: float = 0.2
+    point_share: float = 0.04
+
+    def __post_init__(self) -> None:
+        check_option(self.camera, CAMERAS, "camera")
+        check_option(self.depth_field, DEPTH_FIELDS, "depth_field")
+        check_positive(self.margin, "margin", zero_ok=True)
+        if self.image_size < self.grid:
+            raise InvalidInputError(f"image_size: expected at least grid = {self.grid}, got {self.image_size}")
+        self.descriptor()
+        self.depth_filter()
+
+    def descriptor(self) -> HOG:
+        return HOG(grid=self.grid, bins=self.bins, block=self.block, clip=self.clip)
+
+    def depth_filter(self) -> nn.Module:
+        if self.depth_field == "CS":
+            return DepthCurvilinearSaliency(sigma=self.sigma, formula=self.formula)
+        return DEPTH_FIELDS[self.depth_field]()
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """From a photograph, a box and a mesh to a pose: all settings, as plain numbers and texts.
+
+    Attributes:
+        views: which viewpoints are rendered.
+        bank: how views and photographs are described.
+        field: what makes the photograph's field: one of :data:`FIELDS`, or "own:NAME" for a module given with the call.
+        weights: digest of the field's weights; "" where there are none, and filled in for packaged ones.
+        terms: ranking terms, one of a kind.
+        slack: how wrong boxes may be, as a share of their longer side (:func:`slack_boxes`); 0 takes them as they are.
+        hypotheses: distinct views that are carried through search and contours.
+        search: search around them in small steps.
+        contours: pull the mesh's contours onto the photograph's edges.
+
+    Raises:
+        InvalidInputError: an unknown name or a number out of range.
+
+    Example:
+        >>> Pipeline() == Pipeline.from_json(Pipeline().to_json())
+        True
+        >>> replace(Pipeline(), slack=0.0).posed("upright").views.pose
+        'upright'
+    """
+
+    views: ViewPolicy = ViewPolicy()
+    bank: BankSettings = BankSettings()
+    field: str = "learned"
+    weights: str = ""
+    terms: tuple[Term, ...] = dataclass_field(default=(Correlation(), Repeatability(), BoxShape()))
+    slack: float = 0.1
+    hypotheses: int = 5
+    search: bool = True
+    contours: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.field.startswith("own:"):
+            check_option(self.field, FIELDS, "field")
+        if self.field == "learned" and not self.weights:
+            from .learned.network import SHA256
+
+            object.__setattr__(self, "weights", SHA256[:16])
+        names = [term.name for term in self.terms]
+        if not names or len(set(names)) < len(names):
+            raise InvalidInputError(f"terms: expected one or more, each once, got {names}")
+        if self.hypotheses < 1:
+            raise InvalidInputError(f"hypotheses: expected >= 1, got {self.hypotheses}")
+        slack_boxes(torch.ones(0, 4), self.slack)  # says what is wrong with it
+
+    def posed(self, pose: str) -> "Pipeline":
+        """The same for another ``pose`` of the view policy."""
+        return replace(self, views=replace(self.views, pose=pose))
+
+    def with_term(self, name: str, **options: Any) -> "Pipeline":
+        """The same with other options of one term; ``weight=0`` takes it out of the product.
+
+        Example:
+            >>> Pipeline().with_term("box", weight=0).terms[2].weight
+            0
+        """
+        check_option(name, [term.name for term in self.terms], "term")
+        return replace(self, terms=tuple(replace(t, **options) if t.name == name else t for t in self.terms))
+
+    def photograph_field(self) -> nn.Module:
+        """What makes fields of photographs.
+
+        Raises:
+            InvalidInputError: it came with the call, or the packaged weights are not those this pipeline was made with.
+        """
+        if self.field.startswith("own:"):
+            raise InvalidInputError(f"field: {self.field!r} came with the call; give the module again (field=...)")
+        if self.field == "learned":
+            from .learned.network import SHA256, LearnedCurvilinearSaliency
+
+            if self.weights != SHA256[:16]:
+                raise InvalidInputError(
+                    f"field: made with weights {self.weights}, packaged are {SHA256[:16]}; give the module (field=...)"
+                )
+            return LearnedCurvilinearSaliency()
+        plain = {"focus": MultiScaleFocusCurves, "saliency": MultiScaleCurvilinearSaliency, "gradient": ImageGradient}
+        made: nn.Module = plain[self.field]()
+        return made
+
+    def with_field(self, field: nn.Module) -> "Pipeline":
+        """The same with a module of one's own as the photograph's field: its name and digest are noted."""
+        return replace(self, field=f"own:{type(field).__name__}", weights=field_digest(field))
+
+    def made(self) -> dict[str, Any]:
+        """What decides the contents of a bank, besides mesh and viewpoints."""
+        return asdict(self.bank)
+
+    def describe(self) -> dict[str, Any]:
+        """Plain numbers and texts, as JSON holds them."""
+        terms = {term.name: {f.name: getattr(term, f.name) for f in fields(term)} for term in self.terms}
+        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("views", "bank", "terms")}
+        views = {**asdict(self.views), "elevations": list(self.views.elevations)}
+        return {"version": VERSION, "views": views, "bank": asdict(self.bank), "terms": terms, **own}
+
+    def to_json(self) -> str:
+        """The pipeline as a JSON text, which :meth:`from_json` reads."""
+        return json.dumps(self.describe(), indent=2) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> "Pipeline":
+        """Read what :meth:`to_json` wrote, or part of it: what is not named keeps its default.
+
+        Raises:
+            InvalidInputError: not JSON, another version, an unknown name or a number out of range.
+        """
+        try:
+            data = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise InvalidInputError(f"pipeline: not JSON ({error})") from error
+        if not isinstance(data, dict):
+            raise InvalidInputError(f"pipeline: expected a JSON object, got {type(data).__name__}")
+        if data.pop("version", VERSION) != VERSION:
+            raise InvalidInputError(f"pipeline: this library reads version {VERSION}; write the file again")
+        try:
+            if "views" in data:
+                data["views"] = ViewPolicy(**data["views"])
+            if "bank" in data:
+                data["bank"] = BankSettings(**data["bank"])
+            if "terms" in data:
+                data["terms"] = tuple(_term(name, options) for name, options in data["terms"].items())
+            return cls(**data)
+        except (TypeError, AttributeError) as error:
+            raise InvalidInputError(f"pipeline: {error}; compare with Pipeline().to_json()") from error
+
+    @classmethod
+    def read(cls, path: str | PathLike[str]) -> "Pipeline":
+        """From a JSON file.
+
+        Raises:
+            MissingFileError, InvalidInputError.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise MissingFileError(f"{path}: no such pipeline; write one with Pipeline().to_json()")
+        try:
+            return cls.from_json(path.read_text(encoding="utf-8"))
+        except (InvalidInputError, UnicodeDecodeError) as error:
+            raise InvalidInputError(f"{path}: {error}") from error
+
+
+def field_digest(field: nn.Module) -> str:
+    """16 hexadecimal digits of a module's parameters and buffers; "" of one that has none."""
+    state = field.state_dict()
+    if not state:
+        return ""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(state.items()):
+        digest.update(f"{name} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.detach().cpu().double().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _term(name: str, options: Mapping[str, Any]) -> Term:
+    check_option(name, list(TERMS), "term")
+    return TERMS[name](**options)
+
+
+_PAPER = BankSettings(image_size=256, sigma=1.0, formula="paper", camera="orthographic")
+
+PRESETS: dict[str, Pipeline] = {
+    "learned": Pipeline(),
+    "classical": Pipeline(field="focus"),
+    "fast": Pipeline(slack=0.0, search=False, contours=False),
+    "paper": Pipeline(
+        bank=_PAPER,
+        field="focus",
+        terms=(Correlation(whitening="bank"), Repeatability(mode="paper"), BoxShape(weight=0.0)),
+        slack=0.0,
+    ),
+}
+"""``learned``: the photograph's field by :class:`LearnedCurvilinearSaliency`; ``classical``: by focus curves, nothing
+learnt; ``fast``: ``learned`` without slack, search and contours; ``paper``: the paper's own, as far as it is stated."""
+
+DEFAULT = "learned"
+
+
+def preset_named(name: str) -> Pipeline:
+    """The preset of that name.
+
+    Raises:
+        InvalidInputError: there is none.
+    """
+    check_option(name, list(PRESETS), "preset")
+    return PRESETS[name]

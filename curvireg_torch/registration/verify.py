@@ -1,0 +1,54 @@
+"""Which of the hypotheses is it, now that each has been followed to its end?"""
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..matching import ViewDescriber
+from .hypotheses import Hypotheses
+
+__all__ = ["EVIDENCE", "WEIGHTS", "gathered_evidence", "similarities", "verdict"]
+
+EVIDENCE = ("rank", "similarity", "support")
+"""Of a hypothesis: log S of the view it comes from, less that of the best view; normalised correlation of the pose that
+was found; strength of the photograph's edges under its contours (0 without the contour stage)."""
+
+WEIGHTS = (1.0, 10.0, 10.0)
+
+
+def gathered_evidence(starts: Hypotheses, found: Hypotheses, support: Tensor | None) -> Tensor:
+    """(H, 3) float64, see :data:`EVIDENCE`.
+
+    Args:
+        starts: as they were ranked, their score being S.
+        found: as they were found, their score being the similarity.
+        support: (H,) of the contour stage.
+    """
+    log = starts.score.clamp(min=torch.finfo(torch.float64).tiny).log()
+    count = int(starts.photograph.max()) + 1 if len(starts) else 0
+    best = log.new_full((count,), -torch.inf).scatter_reduce(0, starts.photograph, log, "amax")
+    rank = log - best[starts.photograph]
+    return torch.stack([rank, found.score, torch.zeros_like(rank) if support is None else support], dim=1)
+
+
+def verdict(evidence: Tensor) -> Tensor:
+    """(H,) scores of hypotheses from (H, 3) evidence: the higher, the sooner believed."""
+    return evidence @ torch.tensor(WEIGHTS, dtype=evidence.dtype)
+
+
+def similarities(describers: Sequence[ViewDescriber], descriptors: Tensor, found: Hypotheses) -> Tensor:
+    """(H,) normalised correlations of hypotheses' views with their photographs.
+
+    Args:
+        describers: of the bank's models.
+        descriptors: (B, D) of the photographs' fields, as the describers make them.
+    """
+    queries = F.normalize(descriptors, dim=1)
+    out = torch.zeros(len(found), dtype=torch.float64)
+    for model in found.model.unique().tolist():
+        mine = (found.model == model).nonzero()[:, 0]
+        views = F.normalize(describers[model].descriptors(found.rotation[mine], found.distance[mine]), dim=1)
+        out[mine] = (views * queries[found.photograph[mine].to(queries.device)]).sum(dim=1).double().cpu()
+    return out

@@ -1,0 +1,34 @@
+"""Ranking terms: each compares photographs with views, one file each; the ranking multiplies them."""
+
+from .base import Term, Views
+from .box_shape import BoxShape, box_shape_score, box_shapes, whole_box_shapes
+from .correlation import Correlation, normalized_correlation, unit_score
+from .photographs import Photographs, crop_regions, photograph_field, slack_boxes
+from .repeatability import Repeatability, dilate_points, repeatability, repeatability_score
+from .whitening import DescriptorStatistics, Whitening
+
+__all__ = [
+    "TERMS",
+    "BoxShape",
+    "Correlation",
+    "DescriptorStatistics",
+    "Photographs",
+    "Repeatability",
+    "Term",
+    "Views",
+    "Whitening",
+    "box_shape_score",
+    "box_shapes",
+    "crop_regions",
+    "dilate_points",
+    "normalized_correlation",
+    "photograph_field",
+    "repeatability",
+    "repeatability_score",
+    "slack_boxes",
+    "unit_score",
+    "whole_box_shapes",
+]
+
+TERMS: dict[str, type[Term]] = {term.name: term for term in (Correlation, Repeatability, BoxShape)}
+"""Terms by name, as JSON files of pipelines name them."""

@@ -1,0 +1,69 @@
+"""What a ranking term is: views and photographs are compared, and what comes out becomes a score."""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Protocol
+
+from torch import Tensor, nn
+
+from ..errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from ..pipeline import BankSettings
+
+__all__ = ["Term", "Views"]
+
+
+class Views(Protocol):
+    """N views as terms see them: a bank, or views that were rendered a moment ago."""
+
+    @property
+    def settings(self) -> "BankSettings": ...
+
+    @property
+    def descriptors(self) -> Tensor:
+        """(N, D) float32."""
+        ...
+
+    @property
+    def boxes(self) -> Tensor:
+        """(N, 4) boxes of the object in normalised image coordinates."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def points_at(self, index: Tensor | slice) -> Tensor:
+        """(K, S, S) bool feature points of some of the views."""
+        ...
+
+    def silhouettes_at(self, index: Tensor | slice) -> Tensor:
+        """(K, S, S) bool: pixels that show the object."""
+        ...
+
+
+@dataclass(frozen=True)
+class Term(ABC):
+    """One factor of the score S = prod S_t^w_t of a view for a photograph.
+
+    A new term is a new file: a frozen dataclass of plain numbers with these three methods, and its name in
+    :data:`curvireg_torch.terms.TERMS`.
+
+    Attributes:
+        weight: w >= 0; with 0 the term is computed and reported, and does not count.
+    """
+
+    name: ClassVar[str]
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.weight) and self.weight >= 0):
+            raise InvalidInputError(f"{self.name}: weight: expected a number >= 0, got {self.weight}")
+
+    @abstractmethod
+    def over(self, views: Views) -> nn.Module:
+        """A module that compares photographs with these N views: :class:`Photographs` -> (B, N) raw scores."""
+
+    @abstractmethod
+    def log_score(self, raw: Tensor) -> Tensor:
+        """(B, N) log S_t <= 0 from raw scores, 0 for the best view of each photograph or near it."""

@@ -1,0 +1,99 @@
+"""Similarity of descriptors, and its map to (0, 1]."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from .._checks import check_option, check_tensor
+from .base import Term, Views
+from .photographs import Photographs
+from .whitening import DescriptorStatistics, Whitening
+
+__all__ = ["Correlation", "normalized_correlation", "unit_score"]
+
+WHITENINGS = ("none", "bank")
+
+
+def normalized_correlation(queries: Tensor, views: Tensor) -> Tensor:
+    """Cosine of every query with every view.
+
+    Args:
+        queries: (B, D).
+        views: (N, D), any length; a zero descriptor scores 0.
+
+    Returns:
+        (B, N) in [-1, 1]; [0, 1] for HOG, whose entries are not negative.
+
+    Example:
+        >>> normalized_correlation(torch.tensor([[1.0, 0.0]]), torch.tensor([[2.0, 0.0], [0.0, 3.0]])).tolist()
+        [[1.0, 0.0]]
+    """
+    check_tensor(queries, "queries", (None, None))
+    check_tensor(views, "views", (None, queries.shape[1]))
+    return torch.nn.functional.normalize(queries, dim=1) @ torch.nn.functional.normalize(views, dim=1).T
+
+
+def unit_score(similarity: Tensor) -> Tensor:
+    """Map similarities to (0, 1] per query, best view 1: ``exp((s - max s) / std s)``, a softmax of z-scores.
+
+    Args:
+        similarity: (B, N).
+
+    Example:
+        >>> unit_score(torch.tensor([[1.0, 1.0, 1.0]])).tolist()
+        [[1.0, 1.0, 1.0]]
+    """
+    return torch.exp(_log_score(similarity))
+
+
+def _log_score(similarity: Tensor) -> Tensor:
+    check_tensor(similarity, "similarity", (None, None))
+    spread = (similarity - similarity.mean(dim=1, keepdim=True)).square().mean(dim=1, keepdim=True).sqrt()
+    spread = torch.where(spread > 0, spread, torch.ones_like(spread))
+    return (similarity - similarity.amax(dim=1, keepdim=True)) / spread
+
+
+@dataclass(frozen=True)
+class Correlation(Term):
+    """S_hog: normalised correlation of descriptors, the best over the slack crops, mapped by :func:`unit_score`.
+
+    Attributes:
+        whitening: "none", or "bank": by the statistics of the bank, shrunk by Ledoit-Wolf, as the paper does.
+    """
+
+    name: ClassVar[str] = "hog"
+    whitening: str = "none"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_option(self.whitening, WHITENINGS, "whitening")
+
+    def over(self, views: Views) -> nn.Module:
+        if self.whitening == "none":
+            return Correlated(views.descriptors)
+        statistics = DescriptorStatistics.from_descriptors(views.descriptors)
+        return Correlated(views.descriptors, statistics.whitening(shrinkage="ledoit-wolf"))
+
+    def log_score(self, raw: Tensor) -> Tensor:
+        return _log_score(raw)
+
+
+class Correlated(nn.Module):
+    """Photographs against (N, D) descriptors of views, whitened or as they are."""
+
+    def __init__(self, descriptors: Tensor, whitening: Whitening | None = None) -> None:
+        super().__init__()
+        self.whitening = whitening
+        self.views: Tensor
+        self.register_buffer("views", self._comparable(descriptors), persistent=False)
+
+    def _comparable(self, descriptors: Tensor) -> Tensor:
+        return F.normalize(descriptors if self.whitening is None else self.whitening(descriptors), dim=1)
+
+    def forward(self, photographs: Photographs) -> Tensor:
+        B, K = photographs.descriptors.shape[:2]
+        queries = self._comparable(photographs.descriptors.flatten(0, 1)).to(self.views.dtype)
+        return (queries @ self.views.T).float().view(B, K, len(self.views)).amax(dim=1)
