@@ -195,7 +195,10 @@ class Registrar:
         T, cameras = self._placed(found, boxes, K)
         if self.pipeline.contours:
             fit = self._follow_contours(items, found, boxes, T, cameras)
-            T, found = fit.transform, self._seen_straight(found, fit.transform)
+            # Without a camera matrix the mesh is often another object of the kind, whose contours lie elsewhere.
+            believed = fit.trustworthy if K is None else torch.ones_like(fit.trustworthy)
+            T = torch.where(believed[:, None, None], fit.transform, T)
+            found = self._seen_straight(found, T)
         found = replace(found, score=similarities(self.describers, descriptors, found))
         evidence = gathered_evidence(starts, found, None if fit is None else fit.support)
         own = self._own_peaks(found, verdict(evidence))
@@ -291,24 +294,26 @@ class Registrar:
     def _follow_contours(
         self, items: Sequence[Item], found: Hypotheses, boxes: Tensor, T: Tensor, cameras: Tensor
     ) -> ContourFit:
-        fit = ContourFit(T.clone(), T.new_zeros(len(T), 6, 6), T.new_zeros(len(T)))
+        parts, index = [], []
         for model, mine in self._by_model(found):
             describe = self.describers[model]
-            part = fit_contours(
-                describe.renderer,
-                [item.image for item in items],
-                boxes,
-                cameras[mine],
-                T[mine],
-                photograph=found.photograph[mine],
-                centre=describe.centre,
-                radius=describe.radius,
-                margin=self.bank.settings.margin,
-                finish=FINALISTS,
+            parts.append(
+                fit_contours(
+                    describe.renderer,
+                    [item.image for item in items],
+                    boxes,
+                    cameras[mine],
+                    T[mine],
+                    photograph=found.photograph[mine],
+                    centre=describe.centre,
+                    radius=describe.radius,
+                    margin=self.bank.settings.margin,
+                    finish=FINALISTS,
+                )
             )
-            for f in fields(ContourFit):
-                getattr(fit, f.name)[mine] = getattr(part, f.name)
-        return fit
+            index.append(mine)
+        place = torch.cat(index).argsort()
+        return ContourFit(*(torch.cat([getattr(part, f.name) for part in parts])[place] for f in fields(ContourFit)))
 
     def _seen_straight(self, found: Hypotheses, T: Tensor) -> Hypotheses:
         """Allocentric rotations and distances of poses."""
