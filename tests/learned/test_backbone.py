@@ -9,6 +9,7 @@ import torch
 from curvireg_torch.errors import InvalidInputError, MissingDependencyError, MissingFileError
 from curvireg_torch.learned import backbone
 from curvireg_torch.learned.backbone import CHANNELS, STRIDES, Backbone
+from curvireg_torch.synthetic import procedural_background
 
 FINE = [-10.855, 9.144, 22.643, 29.955, 10.676]
 COARSE = [3.881, -7.187, 11.409, 4.5, 0.649, 3.231, 0.273, -0.637, -0.245, 12.171, -14.463, 7.883, -5.292]
@@ -90,3 +91,14 @@ def test_refuses_another_file(monkeypatch, tmp_path):
     monkeypatch.setattr(backbone, "find_spec", lambda _: SimpleNamespace(submodule_search_locations=[str(tmp_path)]))
     with pytest.raises(InvalidInputError, match="damaged"):
         Backbone()
+
+
+def test_spreads_are_those_of_pictures(network):
+    """Measured on clutter, which has a little less of everything than ImageNet; without one of the blocks: beyond."""
+    generator = torch.Generator().manual_seed(0)
+    pictures = torch.stack([procedural_background((128, 128), generator) for _ in range(8)])
+    for features, spread, (low, high) in zip(
+        network(pictures), network.spreads, ((0.8, 0.95), (0.7, 0.82)), strict=True
+    ):
+        measured = (features - features.mean(dim=(2, 3), keepdim=True)).square().mean(dim=(0, 2, 3)).sqrt()
+        assert low < float((measured / spread).median()) < high
