@@ -26,7 +26,7 @@ from .filters import (
 )
 from .geometry import ViewSphere, sample_views, uniform_views
 from .geometry.views import DEFAULT_DISTANCE
-from .terms import TERMS, BoxShape, Correlation, Repeatability, Term, slack_boxes
+from .terms import TERMS, Appearance, BoxShape, Correlation, LateTerm, Repeatability, Term, slack_boxes
 
 __all__ = ["DEFAULT", "FIELDS", "PRESETS", "BankSettings", "Pipeline", "ViewPolicy", "field_digest", "preset_named"]
 
@@ -168,7 +168,7 @@ class Pipeline:
     bank: BankSettings = BankSettings()
     field: str = "learned"
     weights: str = ""
-    terms: tuple[Term, ...] = dataclass_field(default=(Correlation(), Repeatability(), BoxShape()))
+    terms: tuple[Term, ...] = dataclass_field(default=(Correlation(), Repeatability(), BoxShape(), Appearance()))
     slack: float = 0.1
     hypotheses: int = 5
     search: bool = True
@@ -182,8 +182,8 @@ class Pipeline:
 
             object.__setattr__(self, "weights", SHA256[:16])
         names = [term.name for term in self.terms]
-        if not names or len(set(names)) < len(names):
-            raise InvalidInputError(f"terms: expected one or more, each once, got {names}")
+        if len(set(names)) < len(names) or all(isinstance(term, LateTerm) for term in self.terms):
+            raise InvalidInputError(f"terms: expected one or more that compare all views, each once, got {names}")
         if self.hypotheses < 1:
             raise InvalidInputError(f"hypotheses: expected >= 1, got {self.hypotheses}")
         slack_boxes(torch.ones(0, 4), self.slack)  # says what is wrong with it
@@ -226,9 +226,13 @@ class Pipeline:
         """The same with a module of one's own as the photograph's field: its name and digest are noted."""
         return replace(self, field=f"own:{type(field).__name__}", weights=field_digest(field))
 
-    def made(self) -> dict[str, Any]:
-        """What decides the contents of a bank, besides mesh and viewpoints."""
-        return asdict(self.bank)
+    def late_terms(self, count: int) -> list[LateTerm]:
+        """The late terms by which all views of a bank of ``count`` are described."""
+        return [term for term in self.terms if isinstance(term, LateTerm) and count <= term.coarse]
+
+    def made(self, count: int) -> dict[str, Any]:
+        """What decides the contents of a bank of ``count`` views, besides mesh and viewpoints."""
+        return {**asdict(self.bank), "late": [term.name for term in self.late_terms(count)]}
 
     def describe(self) -> dict[str, Any]:
         """Plain numbers and texts, as JSON holds them."""
@@ -300,12 +304,15 @@ def _term(name: str, options: Mapping[str, Any]) -> Term:
     return TERMS[name](**options)
 
 
+_OWN: tuple[Term, ...] = (Correlation(), Repeatability(), BoxShape())
+"""The paper's terms and the box: nothing that was learnt compares."""
+
 _PAPER = BankSettings(image_size=256, sigma=1.0, formula="paper", camera="orthographic")
 
 PRESETS: dict[str, Pipeline] = {
     "learned": Pipeline(),
-    "classical": Pipeline(field="focus"),
-    "fast": Pipeline(slack=0.0, search=False, contours=False),
+    "classical": Pipeline(field="focus", terms=_OWN),
+    "fast": Pipeline(terms=_OWN, slack=0.0, search=False, contours=False),
     "paper": Pipeline(
         bank=_PAPER,
         field="focus",
@@ -313,8 +320,9 @@ PRESETS: dict[str, Pipeline] = {
         slack=0.0,
     ),
 }
-"""``learned``: the photograph's field by :class:`LearnedCurvilinearSaliency`; ``classical``: by focus curves, nothing
-learnt; ``fast``: ``learned`` without slack, search and contours; ``paper``: the paper's own, as far as it is stated."""
+"""``learned``: the photograph's field by :class:`LearnedCurvilinearSaliency`, and the appearance term; ``classical``: by
+focus curves, nothing learnt; ``fast``: the learnt field alone, without slack, search and contours; ``paper``: the paper's
+own, as far as it is stated."""
 
 DEFAULT = "learned"
 

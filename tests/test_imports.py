@@ -24,7 +24,7 @@ ALLOWED = {
     "data": BASE | {"geometry"},
     "metrics": BASE | {"geometry"},
     "synthetic": BASE | {"geometry", "filters", "rendering"},
-    "terms": BASE | {"geometry", "filters", "descriptors", "pipeline"},  # pipeline: types alone
+    "terms": BASE | {"geometry", "filters", "descriptors", "learned", "pipeline"},  # pipeline: types alone
     "pipeline": BASE | {"geometry", "filters", "descriptors", "terms", "learned"},
     "matching": BASE | {"geometry", "filters", "descriptors", "rendering", "terms", "pipeline"},
     "scenes": BASE | {"geometry", "rendering"},

@@ -81,8 +81,9 @@ def test_a_description_says_all_that_decides():
     changed += [replace(base, bank=replace(base.bank, **{n: 40})) for n in ("image_size", "sigma", "margin", "bins")]
     for term in base.terms:
         for f in fields(term):
-            value = {"none": "bank", "monotone": "paper"}.get(getattr(term, f.name), 0.3)
-            changed.append(base.with_term(term.name, **{f.name: value}))
+            value = {"none": "bank", "monotone": "paper", 1000: 7, 32: 7}.get(getattr(term, f.name), 0.3)
+            if f.name != "weights":
+                changed.append(base.with_term(term.name, **{f.name: value}))
     texts = {pipeline.to_json() for pipeline in changed}
     assert len(texts) == len(changed)
     assert base.to_json() not in texts
@@ -117,6 +118,9 @@ def test_part_of_a_json_text_keeps_the_other_defaults(tmp_path):
         ('{"terms": {"box": {"sigma": 0}}}', "sigma"),
         ('{"slack": 0.6}', "slack"),
         ('{"hypotheses": 0}', "hypotheses"),
+        ('{"terms": {"appearance": {}}}', "compare all views"),
+        ('{"terms": {"hog": {}, "appearance": {"top": 0}}}', "top"),
+        ('{"terms": {"hog": {}, "appearance": {"weights": "0"}}}', "made with weights 0"),
     ],
 )
 def test_what_is_wrong_with_a_pipeline_is_said_when_it_is_made(tmp_path, text, message):

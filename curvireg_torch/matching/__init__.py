@@ -30,6 +30,7 @@ from .cache import (
     trim_cache,
 )
 from .describe import DescribedViews, ViewDescriber
+from .distinct import distinct_views
 from .index import ViewIndex
 from .matcher import Ranking, ViewMatcher
 
@@ -54,6 +55,7 @@ __all__ = [
     "cached_bank",
     "clear_cache",
     "dilate_points",
+    "distinct_views",
     "list_cache",
     "normalized_correlation",
     "repeatability",

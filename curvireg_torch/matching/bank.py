@@ -23,6 +23,9 @@ from .describe import ViewDescriber
 
 __all__ = ["ViewBank"]
 
+LATE = "late."
+"""Before the names of features of late terms."""
+
 
 class ViewBank:
     """N views of one mesh, or of several: descriptors, feature points, silhouettes and the cameras that saw them.
@@ -36,6 +39,7 @@ class ViewBank:
         points, silhouettes: (N, S, S) bool, unpacked on demand; :meth:`points_at` and :meth:`silhouettes_at` unpack a
             few views at a time, which a large bank asks for.
         boxes: (N, 4) float64 boxes of the object in normalised image coordinates, centre of the object on the axis.
+        late: features of the views by the name of their :class:`LateTerm`, (N, D) float16; none in a large bank.
     """
 
     def __init__(
@@ -45,6 +49,7 @@ class ViewBank:
         self.descriptors = tensors["descriptors"].float()
         self.boxes, self.model = tensors["boxes"], tensors["model"]
         self._points, self._silhouettes = tensors["points"], tensors["silhouettes"]
+        self.late = {name.removeprefix(LATE): x for name, x in tensors.items() if name.startswith(LATE)}
 
     def __len__(self) -> int:
         return len(self.views)
@@ -165,10 +170,13 @@ class ViewBank:
             raise InvalidInputError(f"chunk_size: expected >= 1, got {chunk_size}")
         describe = ViewDescriber(mesh, settings, renderer=renderer, device=device)
         rotations, distances = views.rotations, views.distance * mesh_radius(mesh)
+        late = {t.name: t.over(None) for t in pipeline.late_terms(len(views))}
 
         def chunk(start: int) -> dict[str, Tensor]:
-            described = describe(rotations[start : start + chunk_size], distances[start : start + chunk_size])
+            some = rotations[start : start + chunk_size], distances[start : start + chunk_size]
+            described = describe(*some)
             return {
+                **{LATE + name: module.described(describe.shaded(*some)).half() for name, module in late.items()},
                 "descriptors": described.descriptors,
                 "points": _pack(described.points),
                 "silhouettes": _pack(described.silhouettes),
@@ -214,7 +222,8 @@ class ViewBank:
                 raise InvalidInputError(
                     f"banks: expected one device, but bank {i} is on {bank.device}, not {first.device}"
                 )
-        tensors = {name: torch.cat([bank.tensors[name] for bank in banks]) for name in first.tensors}
+        names = [name for name in first.tensors if all(name in bank.tensors for bank in banks)]
+        tensors = {name: torch.cat([bank.tensors[name] for bank in banks]) for name in names}
         shift = torch.tensor([0, *(len(bank.meshes) for bank in banks)]).cumsum(0)[:-1].tolist()
         tensors["model"] = torch.cat([bank.model + n for bank, n in zip(banks, shift, strict=True)])
         views = ViewSphere(*(torch.cat([getattr(b.views, f.name) for b in banks]) for f in fields(ViewSphere)))
@@ -240,6 +249,7 @@ class ViewBank:
             "points": self._points,
             "silhouettes": self._silhouettes,
             "model": self.model,
+            **{LATE + name: features for name, features in self.late.items()},
         }
 
     def save(self, path: str | PathLike[str]) -> None:

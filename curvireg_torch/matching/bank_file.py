@@ -107,6 +107,9 @@ def _check_contents(bank: "ViewBank") -> None:
     boxes, angles = bank.boxes, torch.stack([bank.views.azimuth, bank.views.elevation, bank.views.theta])
     if not bool(angles.isfinite().all() and bank.views.distance.isfinite().all()):
         raise ValueError("viewpoints that are not finite")
+    for name, features in bank.late.items():
+        if features.ndim != 2 or len(features) != N or not bool(features.isfinite().all()):
+            raise ValueError(f"features of {name} that do not fit the views, or are not finite")
     if not bool(bank.descriptors.isfinite().all()) or not bool(bank.descriptors.any()):
         raise ValueError("descriptors that are not finite, or all zero")
     if not bool(boxes.isfinite().all() and (boxes[:, 2:] > boxes[:, :2]).all()):

@@ -9,7 +9,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,16 +76,24 @@ def _code_digest() -> bytes:
     """Digest of the sources that turn a mesh into descriptors: banks of another version of them are not found."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256()
-    for folder in ("descriptors", "filters", "geometry", "rendering"):
+    for folder in ("descriptors", "filters", "geometry", "learned", "rendering"):
         for source in sorted((package / folder).glob("*.py")):
             digest.update(source.read_bytes())
     digest.update((package / "matching" / "describe.py").read_bytes())
     return digest.digest()
 
 
-def bank_key(mesh: trimesh.Trimesh, views: ViewSphere, settings: BankSettings, renderer: str = "auto") -> str:
+def bank_key(
+    mesh: trimesh.Trimesh,
+    views: ViewSphere,
+    settings: BankSettings | None = None,
+    *,
+    pipeline: Pipeline | None = None,
+    renderer: str = "auto",
+) -> str:
     """Digest in hexadecimal: mesh (vertices, faces, unit), views, settings, renderer, the code that describes views."""
-    facts = [FORMAT_VERSION, asdict(settings), mesh.units or "m", renderer]
+    made = _settled(pipeline, settings).made(len(views))
+    facts = [FORMAT_VERSION, made, mesh.units or "m", renderer]
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     digest.update(_code_digest())
     digest.update(np.ascontiguousarray(mesh.vertices, np.float64).tobytes())
@@ -93,6 +101,11 @@ def bank_key(mesh: trimesh.Trimesh, views: ViewSphere, settings: BankSettings, r
     for field in fields(ViewSphere):
         digest.update(getattr(views, field.name).cpu().double().numpy().tobytes())
     return digest.hexdigest()[:32]
+
+
+def _settled(pipeline: Pipeline | None, settings: BankSettings | None) -> Pipeline:
+    pipeline = pipeline or Pipeline()
+    return pipeline if settings is None else replace(pipeline, bank=settings)
 
 
 def cached_bank(
@@ -134,16 +147,16 @@ def cached_bank(
     if views is not None:
         pipeline = pipeline.posed("given")
     views = pipeline.views.sphere(mesh_up(mesh)) if views is None else views
-    pipeline = replace(pipeline, bank=settings or pipeline.bank)
+    pipeline = _settled(pipeline, settings)
     build_options |= {"views": views, "pipeline": pipeline, "renderer": renderer, "device": device}
     if not isinstance(renderer, str):
         return ViewBank.build(mesh, progress=progress, **build_options)
-    key = bank_key(mesh, views, pipeline.bank, renderer)
+    key = bank_key(mesh, views, pipeline=pipeline, renderer=renderer)
     path = folder / "banks" / f"bank-{key}.safetensors"
     if _is_ours(path):
         try:
             bank = ViewBank.load(path, device=device)
-            if bank_key(bank.mesh, bank.views, bank.settings, renderer) != key:
+            if bank_key(bank.mesh, bank.views, pipeline=bank.pipeline, renderer=renderer) != key:
                 raise BankError(f"{path}: holds another bank than its name says")
         except BankError:  # built again, and replaced
             pass

@@ -12,6 +12,7 @@ from ..geometry.crops import crop_transforms, square_boxes
 from ..geometry.mesh import extreme_points, mesh_centre, mesh_radius
 from ..pipeline import BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_views
+from ..rendering.shading import shade
 
 __all__ = ["DescribedViews", "ViewDescriber"]
 
@@ -124,6 +125,14 @@ class ViewDescriber:
         T, K, boxes = self.cameras(rotations, distances)
         depth = render_views(self.renderer, T, K, (S, S), orthographic=self._orthographic)
         return depth.to(self._device), boxes.to(self._device)
+
+    @torch.no_grad()
+    def shaded(self, rotations: Tensor, distances: Tensor) -> Tensor:
+        """(N, 1, S, S) grey pictures of the framed views, see :func:`curvireg_torch.rendering.shade`."""
+        S = self.settings.image_size
+        T, K, _ = self.cameras(rotations, distances)
+        depth = self.renderer.render(T, K, (S, S), orthographic=self._orthographic)
+        return shade(depth, K, orthographic=self._orthographic).to(self._device)
 
     @torch.no_grad()
     def descriptors(self, rotations: Tensor, distances: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -12,11 +13,25 @@ from ..descriptors import field_points
 from ..errors import InvalidInputError
 from ..geometry.crops import crop_images
 from ..pipeline import Pipeline
-from ..terms import Photographs, Whitening, crop_regions, photograph_field, slack_boxes, whole_box_shapes
+from ..terms import (
+    LateModule,
+    LateTerm,
+    Photographs,
+    Whitening,
+    crop_regions,
+    photograph_field,
+    slack_boxes,
+    whole_box_shapes,
+)
 from ..terms.correlation import Correlated
 from .bank import ViewBank
+from .describe import ViewDescriber
+from .distinct import distinct_views
 
 __all__ = ["Ranking", "ViewMatcher"]
+
+KEPT = 2048
+"""Views that late terms described when a photograph asked for them and that stay in memory, 35 kB each at 128 px."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +98,7 @@ class ViewMatcher(nn.Module):
             colour photographs as (B, 3, S, S).
         slack: instead of the pipeline's.
         whitening: compare whitened descriptors (:class:`DescriptorStatistics`), whatever the term "hog" says.
+        renderer: of views that a :class:`LateTerm` asks for.
         chunk_size: photographs in memory at a time.
         deprecated: ``eps``, ``repeatability_mode``, ``repeatability_sigma`` and ``box_sigma`` of version 0.1; use
             :meth:`Pipeline.with_term`.
@@ -107,6 +123,7 @@ class ViewMatcher(nn.Module):
         field: nn.Module | None = None,
         slack: float | None = None,
         whitening: Whitening | None = None,
+        renderer: str = "auto",
         chunk_size: int = 16,
         **deprecated: Any,
     ) -> None:
@@ -120,7 +137,8 @@ class ViewMatcher(nn.Module):
             pipeline = replace(pipeline, slack=slack)
         if chunk_size < 1:
             raise InvalidInputError(f"chunk_size: expected >= 1, got {chunk_size}")
-        self.bank, self.chunk_size = bank, chunk_size
+        self.bank, self.chunk_size, self._renderer = bank, chunk_size, renderer
+        self._kept: dict[str, dict[int, Tensor]] = {}
         self.pipeline = pipeline if field is None else pipeline.with_field(field)
         self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
         self.descriptor = bank.settings.descriptor()
@@ -184,10 +202,92 @@ class ViewMatcher(nn.Module):
 
     def rank(self, query: Photographs) -> Ranking:
         """Compare described photographs with all views."""
-        terms = {name: compare(query) for name, compare in self._comparisons.items()}
-        logs = [t.weight * t.log_score(terms[t.name]) for t in self.pipeline.terms]
-        scores = torch.stack(logs).sum(dim=0).exp()
+        early = [t for t in self.pipeline.terms if not isinstance(t, LateTerm)]
+        terms = {t.name: self._comparisons[t.name](query) for t in early}
+        log = torch.stack([t.weight * t.log_score(terms[t.name]) for t in early]).sum(dim=0)
+        for late in (t for t in self.pipeline.terms if isinstance(t, LateTerm)):
+            terms[late.name], score = self._asked_late(late, query, log)
+            log = log + late.weight * score
+        scores = log.exp()
         return Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), terms)
+
+    def _asked_late(self, term: LateTerm, query: Photographs, log: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, N) raw scores, NaN for views that were not compared; and log scores of all views."""
+        raw, score = torch.full_like(log, torch.nan), torch.zeros_like(log)
+        if len(log) == 0:
+            return raw, score
+        module = self._late(term.name)
+        if len(self.bank) <= term.coarse:
+            raw = module.compare(query, self._features(term.name, torch.arange(len(self.bank)))).to(log)
+            return raw, term.log_score(raw)
+        R, model = self.bank.rotations, self.bank.model
+        order = log.argsort(dim=1, descending=True, stable=True)
+        chosen = [distinct_views(o, R, count=term.top, angle=term.apart, model=model) for o in order]
+        wanted = torch.cat(chosen).unique()
+        found = module.compare(query, self._features(term.name, wanted)).to(log)
+        for b, index in enumerate(chosen):
+            raw[b, index] = found[b, torch.searchsorted(wanted, index)]
+            alike = (R.flatten(1) @ R[index].flatten(1).T).masked_fill(model[:, None] != model[index], -4.0)
+            score[b] = term.log_score(raw[b : b + 1, index])[0, alike.argmax(dim=1)]
+        return raw, score
+
+    def _late(self, name: str) -> LateModule:
+        module = self._comparisons[name]
+        assert isinstance(module, LateModule)
+        return module
+
+    def _features(self, name: str, views: Tensor) -> Tensor:
+        """(U, D) features of (U,) views of the bank: from the bank, or of pictures made now, which are kept."""
+        if name in self.bank.late:
+            return self.bank.late[name][views.to(self.device)]
+        kept = self._kept.setdefault(name, {})
+        missing = [v for v in views.tolist() if v not in kept]
+        if len(kept) + len(missing) > KEPT:
+            kept.clear()
+            missing = views.tolist()
+        for some in torch.tensor(missing, dtype=torch.long, device=self.device).split(64):
+            kept |= dict(zip(some.tolist(), self._late(name).described(self._shaded(some)), strict=True))
+        return torch.stack([kept[v] for v in views.tolist()])
+
+    def late_score(
+        self, name: str, query: Photographs, ranking: Ranking, pictures: Tensor, photograph: Tensor
+    ) -> Tensor:
+        """(H,) float64 log scores by a :class:`LateTerm` of pictures of poses, as if they were views of the ranking.
+
+        Args:
+            name: of the term.
+            query: B photographs.
+            ranking: of them.
+            pictures: (H, 1, S, S), shaded.
+            photograph: (H,) which of the photographs each is compared with.
+        """
+        module, term = self._late(name), next(t for t in self.pipeline.terms if t.name == name)
+        raw = module.compare(query, module.described(pictures)).cpu().double()
+        out = torch.zeros(len(pictures), dtype=torch.float64)
+        for h, b in enumerate(photograph.tolist()):
+            known = ranking.terms[name][b].cpu().double()
+            among = torch.cat([known[known.isfinite()], raw[b, h : h + 1]])
+            scores = term.log_score(among[None])[0]
+            out[h] = scores[-1] - scores[:-1].max()  # above 0 where the pose looks better than every view
+        return out
+
+    def _shaded(self, views: Tensor) -> Tensor:
+        """(U, 1, S, S) grey pictures of (U,) views of the bank."""
+        S = self.bank.settings.image_size
+        out = torch.zeros(len(views), 1, S, S, device=self.device)
+        for m in self.bank.model[views].unique().tolist():
+            mine = views[self.bank.model[views] == m]
+            pictures = self.describers[m].shaded(self.bank.rotations[mine], self.bank.distances[mine])
+            out[self.bank.model[views] == m] = pictures.to(out)
+        return out
+
+    @cached_property
+    def describers(self) -> tuple[ViewDescriber, ...]:
+        """Render and describe further views of each model, as the bank's views are; made on first use."""
+        return tuple(
+            ViewDescriber(mesh, self.bank.settings, renderer=self._renderer, device=self.device)
+            for mesh in self.bank.meshes
+        )
 
 
 def _with_old_options(pipeline: Pipeline, options: dict[str, Any]) -> Pipeline:

@@ -1,8 +1,9 @@
 """From a ranking of views to poses: stages as functions over photographs x hypotheses, joined by the registrar."""
 
+from ..matching import distinct_views
 from .confidence import RELIABLE, confidence, ranking_evidence
 from .contour import ContourFit, fit_contours
-from .hypotheses import Hypotheses, distinct_views, hypotheses
+from .hypotheses import Hypotheses, hypotheses
 from .pose import FailedRegistration, Hypothesis, Registration
 from .registrar import Registrar
 from .search import coherent_views, search

@@ -13,11 +13,11 @@ from ..errors import CurviregError, InvalidInputError
 from ..geometry.cameras import rotation_towards
 from ..geometry.translation import place_view
 from ..geometry.views import ViewSphere
-from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
+from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank, distinct_views
 from ..pipeline import BankSettings, Pipeline
 from .confidence import RELIABLE, confidence
 from .contour import ContourFit, fit_contours
-from .hypotheses import Hypotheses, distinct_views, hypotheses
+from .hypotheses import Hypotheses, hypotheses
 from .inputs import Item, check_crop, items_of, named
 from .pose import FailedRegistration, Hypothesis, Registration
 from .search import FINALISTS, search
@@ -100,7 +100,7 @@ class Registrar:
                     ]
                 )
             bank = bank if device is None else bank.to(device)
-            matcher = ViewMatcher(bank, pipeline=pipeline, field=field)
+            matcher = ViewMatcher(bank, pipeline=pipeline, field=field, renderer=renderer)
             pipeline = matcher.pipeline
         if isinstance(bank_or_mesh, ViewBank | ViewMatcher) and (views is not None or settings is not None):
             raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
@@ -112,7 +112,6 @@ class Registrar:
         )
         self.matcher, self.bank = matcher, matcher.bank
         self.symmetries = symmetries
-        self._renderer = renderer
 
     @cached_property
     def describers(self) -> tuple[ViewDescriber, ...]:
@@ -120,7 +119,8 @@ class Registrar:
         settings = self.bank.settings
         fine = replace(settings, grid=min(2 * settings.grid, settings.image_size))
         return tuple(
-            ViewDescriber(mesh, fine, renderer=self._renderer, device=self.bank.device) for mesh in self.bank.meshes
+            ViewDescriber(mesh, fine, renderer=coarse.renderer, device=self.bank.device)
+            for mesh, coarse in zip(self.bank.meshes, self.matcher.describers, strict=True)
         )
 
     @torch.no_grad()
@@ -200,12 +200,12 @@ class Registrar:
             T = torch.where(believed[:, None, None], fit.transform, T)
             found = self._seen_straight(found, T)
         found = replace(found, score=similarities(self.describers, descriptors, found))
-        evidence = gathered_evidence(starts, found, None if fit is None else fit.support)
+        evidence = self._evidence(starts, found, fit, query, ranking)
         own = self._own_peaks(found, verdict(evidence))
         if not bool(own.all()):
             found, T, fit = self._sent_back(own, starts, found, T, fit, boxes, K)
             found = replace(found, score=similarities(self.describers, descriptors, found))
-            evidence = gathered_evidence(starts, found, None if fit is None else fit.support)
+            evidence = self._evidence(starts, found, fit, query, ranking)
         order = (verdict(evidence) + torch.where(own, 0.0, -1e6)).argsort(descending=True, stable=True)
         trust = confidence(ranking, self.bank.rotations)
         results = []
@@ -215,6 +215,23 @@ class Registrar:
             poses = tuple(self._hypothesis(h, found, T, evidence, fit, reliable, K is not None) for h in mine)
             results.append(Registration(poses, float(trust[b]), ranking[b : b + 1]))
         return results
+
+    def _evidence(
+        self,
+        starts: Hypotheses,
+        found: Hypotheses,
+        fit: ContourFit | None,
+        query: Photographs,
+        ranking: Ranking,
+    ) -> Tensor:
+        looks = None
+        if "appearance" in ranking.terms:
+            S = self.bank.settings.image_size
+            pictures = torch.zeros(len(found), 1, S, S, device=self.bank.device)
+            for model, mine in self._by_model(found):
+                pictures[mine] = self.describers[model].shaded(found.rotation[mine], found.distance[mine]).to(pictures)
+            looks = self.matcher.late_score("appearance", query, ranking, pictures, found.photograph)
+        return gathered_evidence(starts, found, None if fit is None else fit.support, looks)
 
     def _own_peaks(self, found: Hypotheses, score: Tensor) -> Tensor:
         """(H,) bool: False where a hypothesis ended within ``SAME`` degrees of a better one of its photograph."""

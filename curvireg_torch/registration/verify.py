@@ -11,30 +11,33 @@ from .hypotheses import Hypotheses
 
 __all__ = ["EVIDENCE", "WEIGHTS", "gathered_evidence", "similarities", "verdict"]
 
-EVIDENCE = ("rank", "similarity", "support")
+EVIDENCE = ("rank", "similarity", "support", "appearance")
 """Of a hypothesis: log S of the view it comes from, less that of the best view; normalised correlation of the pose that
-was found; strength of the photograph's edges under its contours (0 without the contour stage)."""
+was found; strength of the photograph's edges under its contours (0 without the contour stage); how much the pose that
+was found looks like the photograph, as log S_look (0 without that term)."""
 
-WEIGHTS = (1.0, 10.0, 10.0)
+WEIGHTS = (1.0, 10.0, 10.0, 1.0)
 
 
-def gathered_evidence(starts: Hypotheses, found: Hypotheses, support: Tensor | None) -> Tensor:
-    """(H, 3) float64, see :data:`EVIDENCE`.
+def gathered_evidence(starts: Hypotheses, found: Hypotheses, support: Tensor | None, looks: Tensor | None) -> Tensor:
+    """(H, 4) float64, see :data:`EVIDENCE`.
 
     Args:
         starts: as they were ranked, their score being S.
         found: as they were found, their score being the similarity.
         support: (H,) of the contour stage.
+        looks: (H,) log S_look.
     """
     log = starts.score.clamp(min=torch.finfo(torch.float64).tiny).log()
     count = int(starts.photograph.max()) + 1 if len(starts) else 0
     best = log.new_full((count,), -torch.inf).scatter_reduce(0, starts.photograph, log, "amax")
     rank = log - best[starts.photograph]
-    return torch.stack([rank, found.score, torch.zeros_like(rank) if support is None else support], dim=1)
+    zero = torch.zeros_like(rank)
+    return torch.stack([rank, found.score, zero if support is None else support, zero if looks is None else looks], 1)
 
 
 def verdict(evidence: Tensor) -> Tensor:
-    """(H,) scores of hypotheses from (H, 3) evidence: the higher, the sooner believed."""
+    """(H,) scores of hypotheses from (H, 4) evidence: the higher, the sooner believed."""
     return evidence @ torch.tensor(WEIGHTS, dtype=evidence.dtype)
 
 

@@ -1,6 +1,7 @@
 """Ranking terms: each compares photographs with views, one file each; the ranking multiplies them."""
 
-from .base import Term, Views
+from .appearance import Appearance
+from .base import LateModule, LateTerm, Term, Views
 from .box_shape import BoxShape, box_shape_score, box_shapes, whole_box_shapes
 from .correlation import Correlation, normalized_correlation, unit_score
 from .photographs import Photographs, crop_regions, photograph_field, slack_boxes
@@ -9,9 +10,12 @@ from .whitening import DescriptorStatistics, Whitening
 
 __all__ = [
     "TERMS",
+    "Appearance",
     "BoxShape",
     "Correlation",
     "DescriptorStatistics",
+    "LateModule",
+    "LateTerm",
     "Photographs",
     "Repeatability",
     "Term",
@@ -30,5 +34,5 @@ __all__ = [
     "whole_box_shapes",
 ]
 
-TERMS: dict[str, type[Term]] = {term.name: term for term in (Correlation, Repeatability, BoxShape)}
+TERMS: dict[str, type[Term]] = {term.name: term for term in (Correlation, Repeatability, BoxShape, Appearance)}
 """Terms by name, as JSON files of pipelines name them."""

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, ClassVar, Protocol
 
 from torch import Tensor, nn
 
+from .._checks import check_positive
 from ..errors import InvalidInputError
+from .photographs import Photographs
 
 if TYPE_CHECKING:
     from ..pipeline import BankSettings
 
-__all__ = ["Term", "Views"]
+__all__ = ["LateModule", "LateTerm", "Term", "Views"]
 
 
 class Views(Protocol):
@@ -67,3 +69,43 @@ class Term(ABC):
     @abstractmethod
     def log_score(self, raw: Tensor) -> Tensor:
         """(B, N) log S_t <= 0 from raw scores, 0 for the best view of each photograph or near it."""
+
+
+@dataclass(frozen=True)
+class LateTerm(Term):
+    """A term that costs a picture of every view.
+
+    In banks of up to ``coarse`` views all are described when the bank is built, and compared. In larger ones only the
+    best distinct views of the other terms are, when a photograph asks for them; every other view then has the score of
+    the one nearest to it, and NaN for a raw score.
+
+    Attributes:
+        coarse: views of a bank that is described as a whole.
+        top, apart: otherwise, how many views are compared, and degrees between them.
+    """
+
+    coarse: int = 1000
+    top: int = 32
+    apart: float = 20.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive(self.apart, "apart", zero_ok=True)
+        if self.top < 1 or self.coarse < 0:
+            raise InvalidInputError(f"{self.name}: expected top >= 1 and coarse >= 0, got {self.top} and {self.coarse}")
+
+    @abstractmethod
+    def over(self, views: Views | None) -> "LateModule":
+        """What describes and compares; the same for all views."""
+
+
+class LateModule(nn.Module, ABC):
+    """Describes pictures of views, and compares photographs with them."""
+
+    @abstractmethod
+    def described(self, pictures: Tensor) -> Tensor:
+        """(N, D) features of (N, 1, S, S) shaded pictures of views, see :func:`curvireg_torch.rendering.shade`."""
+
+    @abstractmethod
+    def compare(self, photographs: Photographs, views: Tensor) -> Tensor:
+        """(B, N) raw scores of (N, D) features."""

@@ -5,7 +5,8 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from curvireg_torch import Pipeline, ViewBank, camera_matrix, sample_views
+from curvireg_torch import ViewBank, camera_matrix, sample_views
+from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
 __all__ = ["CAMERA", "SIZE", "scene", "truck_bank"]
@@ -17,7 +18,7 @@ CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
 @cache
 def truck_bank() -> ViewBank:
     views = sample_views(azimuth_step=15, elevations=[0, 15, 30, 45, 60])
-    return ViewBank.build(example_mesh(), views, pipeline=Pipeline(field="focus"), image_size=96, progress=False)
+    return ViewBank.build(example_mesh(), views, pipeline=PRESETS["classical"], image_size=96, progress=False)
 
 
 @cache

@@ -93,7 +93,7 @@ def test_list_and_clear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     cached_bank(trimesh.creation.box(), VIEWS, SETTINGS, progress=False)
     (file,) = list_cache()
     left = file.path.with_name(f"{file.path.name}.{uuid.uuid4().hex[:8]}.tmp")
-    left.write_bytes(file.path.read_bytes()[:2000])  # of a killed process
+    left.write_bytes(file.path.read_bytes()[:9000])  # of a killed process
     assert list_cache() == [file]
     assert file.size == file.path.stat().st_size > 1000
     trim_cache()

@@ -1,0 +1,56 @@
+"""Does the photograph look as the shaded view does?"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInputError
+from ..learned.appearance import describe, similarity
+from ..learned.backbone import SHA256, Backbone
+from .base import LateModule, LateTerm, Views
+from .photographs import Photographs
+
+__all__ = ["Appearance"]
+
+
+@dataclass(frozen=True)
+class Appearance(LateTerm):
+    """S_look: features of an ImageNet network agree, cell by cell, between the photograph's crop and the shaded view.
+
+    Raw scores are mean cosines (:func:`curvireg_torch.learned.appearance.similarity`) in [-1, 1]; with the spread taken
+    over the views that are compared, log S_look = (raw - max raw) / spread.
+
+    Attributes:
+        weights: digest of the network's.
+    """
+
+    name: ClassVar[str] = "appearance"
+    weight: float = 2.0
+    weights: str = SHA256[:16]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.weights != SHA256[:16]:
+            raise InvalidInputError(f"appearance: made with weights {self.weights}, installed are {SHA256[:16]}")
+
+    def over(self, views: Views | None) -> LateModule:
+        return _Looks()
+
+    def log_score(self, raw: Tensor) -> Tensor:
+        spread = raw.std(dim=1, keepdim=True, correction=0)
+        spread = torch.where(spread > 0, spread, torch.ones_like(spread))
+        return (raw - raw.amax(dim=1, keepdim=True)) / spread
+
+
+class _Looks(LateModule):
+    def __init__(self) -> None:
+        super().__init__()
+        self.backbone = Backbone()
+
+    def described(self, pictures: Tensor) -> Tensor:
+        return describe(pictures, self.backbone)
+
+    def compare(self, photographs: Photographs, views: Tensor) -> Tensor:
+        return similarity(describe(photographs.crops, self.backbone)[:, None], views)

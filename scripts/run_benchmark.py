@@ -1,0 +1,105 @@
+"""Registers the benchmark of textured meshes (scripts/make_benchmark.py) and keeps what every hypothesis rests on.
+
+    python scripts/run_benchmark.py FOLDER --out rows.jsonl [--pose upright] [--form sibling] [--limit N] [--share I/N]
+
+One line for each photograph: the errors of the hypotheses in degrees up to the object's symmetries, their evidence,
+the evidence of the ranking, and the errors of the best views. ``exact`` photographs come with their camera matrix,
+``sibling`` ones (another object of the kind) without, as PASCAL3D+ does. Run again, it goes on. --share takes every
+N-th mesh, so that several processes work side by side.
+"""
+
+import argparse
+import json
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import curvireg_torch as cr
+from curvireg_torch.data import read_image
+from curvireg_torch.geometry import rotation_towards
+from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
+from curvireg_torch.registration.confidence import ranking_evidence
+
+
+def error_up_to(R: Tensor, truth: Tensor, symmetries: Tensor) -> Tensor:
+    """(N,) degrees between (N, 3, 3) rotations and the nearest of ``truth`` S."""
+    return cr.rotation_error(R[:, None], (truth @ symmetries)[None]).amin(dim=1)
+
+
+def allocentric(item: dict[str, Any]) -> Tensor:
+    """(3, 3) the true rotation as a camera sees it that looks straight at the given box."""
+    x0, y0, x1, y1 = item["box"]
+    K = torch.tensor(item["K"], dtype=torch.float64)
+    ray = torch.linalg.inv(K) @ torch.tensor([(x0 + x1) / 2, (y0 + y1) / 2, 1.0], dtype=torch.float64)
+    return rotation_towards(ray).T @ torch.tensor(item["R"], dtype=torch.float64)
+
+
+def rows_of(items: list[Any], root: Path, half: Path, pipeline: cr.Pipeline, wrong: Path | None) -> list[Any]:
+    """Rows of photographs of one mesh; ``wrong``: registered to this one instead, which none of them shows."""
+    mesh = cr.load_mesh(wrong or root / items[0]["mesh"])
+    registrar = cr.Registrar(cr.ViewBank.build(mesh, pipeline=pipeline, progress=False), pipeline=pipeline)
+    rows = []
+    for item in items:
+        image, box = read_image(half / item["image"]), torch.tensor([item["box"]])
+        exact = item["form"] == "exact"
+        K = torch.tensor(item["K"], dtype=torch.float64) if exact else None
+        result = registrar([image], box, K)[0]
+        row = {name: item[name] for name in ("id", "form", "pose", "kind", "mesh", "visible", "clutter", "bare")}
+        row["wrong"] = wrong is not None
+        if not result.ok:
+            rows.append({**row, "failed": str(result.error)})
+            continue
+        symmetries = torch.tensor(item["symmetries"], dtype=torch.float64)
+        straight = allocentric(item)
+        truth = torch.tensor(item["R"], dtype=torch.float64) if exact else straight
+        found = torch.stack([h.rotation for h in result.hypotheses])
+        views = registrar.bank.rotations[result.ranking.order[0, :20]].double()
+        row["errors"] = error_up_to(found, truth, symmetries).tolist()
+        row["view_errors"] = error_up_to(views, straight, symmetries).tolist()
+        row["evidence"] = [dict(h.evidence) for h in result.hypotheses]
+        row["ranking"] = ranking_evidence(result.ranking, registrar.bank.rotations)[0].tolist()
+        row["confidence"] = result.confidence
+        rows.append(row)
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--half", default="held-out")
+    parser.add_argument("--pose", choices=("upright", "free"))
+    parser.add_argument("--form", choices=("exact", "sibling"))
+    parser.add_argument("--preset", choices=sorted(PRESETS), default=DEFAULT)
+    parser.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON, instead of --preset")
+    parser.add_argument("--wrong", action="store_true", help="register to the mesh of another photograph")
+    parser.add_argument("--limit", type=int)
+    parser.add_argument("--share", default="0/1", metavar="I/N")
+    parser.add_argument("--out", type=Path, required=True)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    half = arguments.folder / arguments.half
+    items = [json.loads(line) for line in (half / "items.jsonl").read_text().splitlines()]
+    items = [i for i in items if arguments.pose in (None, i["pose"]) and arguments.form in (None, i["form"])]
+    items = items[: arguments.limit]
+    done = set()
+    if arguments.out.exists():
+        done = {json.loads(line)["id"] for line in arguments.out.read_text().splitlines()}
+    pipeline = preset_named(arguments.preset) if arguments.pipeline is None else cr.Pipeline.read(arguments.pipeline)
+    meshes = sorted({i["mesh"] for i in items})
+    index, count = (int(n) for n in arguments.share.split("/"))
+    items = [i for i in items if meshes.index(i["mesh"]) % count == index and i["id"] not in done]
+    items.sort(key=lambda i: (i["mesh"], i["pose"], i["id"]))
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    for (mesh, pose), group in groupby(items, key=lambda i: (i["mesh"], i["pose"])):
+        wrong = arguments.folder / meshes[(meshes.index(mesh) + 1) % len(meshes)] if arguments.wrong else None
+        posed = pipeline.posed("upright" if pose == "upright" else "any")
+        with arguments.out.open("a") as file:
+            for row in rows_of(list(group), arguments.folder, half, posed, wrong):
+                file.write(json.dumps(row) + "\n")
+
+
+if __name__ == "__main__":
+    main()
