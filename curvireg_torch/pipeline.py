@@ -320,9 +320,9 @@ PRESETS: dict[str, Pipeline] = {
         slack=0.0,
     ),
 }
-"""``learned``: the photograph's field by :class:`LearnedCurvilinearSaliency`, and the appearance term; ``classical``: by
-focus curves, nothing learnt; ``fast``: the learnt field alone, without slack, search and contours; ``paper``: the paper's
-own, as far as it is stated."""
+"""``learned``: the photograph's field by :class:`LearnedCurvilinearSaliency`, and the appearance term; ``classical``:
+by focus curves, nothing learnt; ``fast``: the learnt field alone, without slack, search and contours; ``paper``: the
+paper's own, as far as it is stated."""
 
 DEFAULT = "learned"
 

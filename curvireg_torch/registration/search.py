@@ -23,11 +23,12 @@ REACH = 15.0
 FIRST_STEP, FINEST_STEP = 5.0, 1.0
 """Degrees: half the spacing of the bank; finer steps move the contours of a crop by less than a pixel."""
 
-ROUNDS = 12
-"""At most."""
+ROUNDS = 8
+"""At most, of seven poses each."""
 
 FINALISTS, AFTER = 2, 2
-"""So many hypotheses of a photograph are searched to the end; the others stop after so many rounds."""
+"""So many hypotheses of a photograph are followed to the end, by search and by contours; the others are searched
+for so many rounds."""
 
 
 def coherent_views(rotations: Tensor, order: Tensor, *, count: int = 5, angle: float = REACH) -> Tensor:
@@ -57,11 +58,12 @@ def search(
 ) -> Hypotheses:
     """Search around hypotheses in ever smaller steps until each pose stops moving.
 
-    The first round compares the coherent views of the bank themselves (:func:`coherent_views`). Every further round
-    takes the 26 turns by +-step about the camera's axes around the best pose; the step halves whenever nothing is
-    better. With camera matrices, the distance follows in closed form from the box after every round, so that
-    perspective is that of the photograph. The search keeps within ``REACH`` degrees of the hypothesis. All hypotheses
-    of all photographs step together; the best ``FINALISTS`` of each photograph go on to the end.
+    First the coherent views of the bank themselves are compared (:func:`coherent_views`). Every round then takes the
+    six turns by +-step about the camera's axes around the best pose, and the pose where the parabolas through their
+    scores peak; the step halves where the best moves by less than half of it. With camera matrices, the distance
+    follows in closed form from the box twice on the way, so that perspective is that of the photograph. The search
+    keeps within ``REACH`` degrees of the hypothesis. All hypotheses of all photographs step together; the best
+    ``FINALISTS`` of each photograph go on to the end.
 
     Args:
         describers: of the bank's models.
@@ -74,46 +76,74 @@ def search(
         The same hypotheses with better rotation and distance, and ``score``: the normalised correlation in [0, 1].
     """
     order, near = ranking.order.cpu(), bank.rotations.cpu().double()
-    candidates = [
+    state = replace(starts, score=torch.full_like(starts.score, -1.0))
+    coherent = [
         near[_coherent_with(int(view), order[int(b)], near, bank.model.cpu())]
         for b, view in zip(starts.photograph, starts.view, strict=True)
     ]
-    state = replace(starts, score=torch.full_like(starts.score, -1.0))
+    widest = max((len(c) for c in coherent), default=1)
+    candidates = (
+        torch.stack([torch.cat([c, c[:1].expand(widest - len(c), 3, 3)]) for c in coherent]) if coherent else near
+    )
     step = torch.full((len(starts),), FIRST_STEP, dtype=torch.float64)
     active = torch.arange(len(starts))
-    for rounds in range(ROUNDS):
+    for rounds in range(1 + ROUNDS):
         if len(active) == 0:
             break
         before = state[active]
-        owner = torch.repeat_interleave(torch.arange(len(before)), torch.tensor([len(c) for c in candidates]))
-        turned = replace(before[owner], rotation=torch.cat(candidates))
-        scores = similarities(describers, descriptors, turned).split([len(c) for c in candidates])
-        winners = torch.stack([s.argmax() for s in scores])
-        best = torch.stack([s[w] for s, w in zip(scores, winners, strict=True)])
-        improved = best > before.score
-        chosen = torch.stack([c[w] for c, w in zip(candidates, winners, strict=True)])
-        now = replace(
-            before,
-            rotation=torch.where(improved[:, None, None], chosen, before.rotation),
-            score=torch.where(improved, best, before.score),
-        )
-        if camera_matrices is not None and boxes is not None:
-            now = replace(
-                now, distance=torch.where(improved, _placed(describers, now, boxes, camera_matrices), now.distance)
-            )
-        state = _put(state, active, now)
-        fine = (step[active] <= FINEST_STEP) & (_moved(describers, before, now) <= TOLERANCE)
+        scores = _scores(describers, descriptors, before, candidates, starts.rotation[active])
+        now = _best(before, candidates, scores)
         if rounds:
-            step[active] = torch.where(improved, step[active], (step[active] / 2.0).clamp(min=FINEST_STEP))
-            active = active[~fine]
-        if rounds + 1 == AFTER:
+            peak = _peak(before, scores, step[active])[:, None]
+            now = _best(now, peak, _scores(describers, descriptors, before, peak, starts.rotation[active]))
+        if camera_matrices is not None and boxes is not None and rounds in (0, AFTER):
+            filling = _placed(describers, now, boxes, camera_matrices)
+            now = replace(now, distance=torch.where(now.score > before.score, filling, before.distance))
+        state = _put(state, active, now)
+        if rounds:
+            still = rotation_error(before.rotation, now.rotation) < 0.5 * step[active]
+            finished = still & (step[active] <= FINEST_STEP) & (_moved(describers, before, now) <= TOLERANCE)
+            step[active] = torch.where(still, (step[active] / 2.0).clamp(min=FINEST_STEP), step[active])
+            active = active[~finished]
+        if rounds == AFTER:
             active = active[_among_best(state, FINALISTS)[active]]
-        anchors = starts.rotation[active]
-        candidates = [
-            _around(state.rotation[i], float(step[i]), anchor)
-            for i, anchor in zip(active.tolist(), anchors, strict=True)
-        ]
+        candidates = _axes(step[active]) @ state.rotation[active][:, None]
     return state
+
+
+def _scores(
+    describers: Sequence[ViewDescriber], descriptors: Tensor, state: Hypotheses, candidates: Tensor, anchors: Tensor
+) -> Tensor:
+    """(H, C) normalised correlations of (H, C, 3, 3) candidates; -1 beyond the reach of the (H, 3, 3) anchors."""
+    H, C = candidates.shape[:2]
+    each = replace(state[torch.arange(H).repeat_interleave(C)], rotation=candidates.flatten(0, 1))
+    scores = similarities(describers, descriptors, each).view(H, C)
+    return scores.masked_fill(rotation_error(candidates, anchors[:, None]) > REACH, -1.0)
+
+
+def _best(state: Hypotheses, candidates: Tensor, scores: Tensor) -> Hypotheses:
+    """The best of (H, C, 3, 3) candidates where it is better."""
+    score, winner = scores.max(dim=1)
+    chosen = candidates[torch.arange(len(state)), winner]
+    better = score > state.score
+    rotation = torch.where(better[:, None, None], chosen, state.rotation)
+    return replace(state, rotation=rotation, score=torch.where(better, score, state.score))
+
+
+def _axes(step: Tensor) -> Tensor:
+    """(H, 6, 3, 3) turns by +step about x, y, z, then by -step."""
+    turns = torch.cat([torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)])
+    return rotation_from_axis_angle(turns * torch.deg2rad(step)[:, None, None])
+
+
+def _peak(state: Hypotheses, scores: Tensor, step: Tensor) -> Tensor:
+    """(H, 3, 3) poses at the peaks of the parabolas through (H, 6) scores of :func:`_axes`, a step away at most."""
+    up, down = scores.split(3, dim=1)
+    bend = (up - 2.0 * state.score[:, None] + down).clamp(max=-1e-9)
+    offset = (0.5 * (down - up) / bend).clamp(-1.0, 1.0)
+    offset = torch.where((up < 0) | (down < 0), torch.zeros_like(offset), offset)  # one of them lies out of reach
+    turned: Tensor = rotation_from_axis_angle(offset * torch.deg2rad(step)[:, None]) @ state.rotation
+    return turned
 
 
 def _among_best(state: Hypotheses, count: int) -> Tensor:
@@ -129,16 +159,6 @@ def _coherent_with(view: int, order: Tensor, rotations: Tensor, model: Tensor) -
     rest = order[(order != view) & (model[order] == model[view])]
     near = rest[rotation_error(rotations[rest], rotations[view]) <= REACH]
     return coherent_views(rotations, torch.cat([torch.tensor([view]), near]))
-
-
-def _around(rotation: Tensor, step: float, anchor: Tensor) -> Tensor:
-    """(K, 3, 3): 3 x 3 tilts by +-step, each with 3 turns in the image plane, less the pose itself."""
-    s = torch.tensor([0.0, -step, step], dtype=torch.float64).deg2rad()
-    o = torch.zeros(1, dtype=torch.float64)
-    tilts = rotation_from_axis_angle(torch.cartesian_prod(s, s, o))
-    turns = rotation_from_axis_angle(torch.cartesian_prod(o, o, s))
-    candidates = (turns[None] @ tilts[:, None]).flatten(0, 1)[1:] @ rotation
-    return candidates[rotation_error(candidates, anchor) <= REACH]
 
 
 def _placed(describers: Sequence[ViewDescriber], state: Hypotheses, boxes: Tensor, cameras: Tensor) -> Tensor:

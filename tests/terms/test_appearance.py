@@ -1,0 +1,106 @@
+"""The appearance term among the others: over whole small banks, over the best distinct views of large ones."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from curvireg_torch import Pipeline, Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
+from curvireg_torch.learned.appearance import describe, similarity
+from curvireg_torch.learned.backbone import Backbone
+from curvireg_torch.matching import distinct_views
+from curvireg_torch.synthetic import example_mesh
+from curvireg_torch.terms import Appearance
+from tests._support.scenes import CAMERA, scene
+
+VIEWS = sample_views(azimuth_step=30, elevations=[0, 30])
+PIPELINE = replace(Pipeline(field="focus", slack=0.0), bank=replace(Pipeline().bank, image_size=64))
+
+
+@pytest.fixture(scope="module")
+def bank() -> ViewBank:
+    return ViewBank.build(example_mesh(), VIEWS, pipeline=PIPELINE, progress=False)
+
+
+def late(**options) -> Pipeline:
+    return PIPELINE.with_term("appearance", coarse=0, **options)
+
+
+def test_a_small_bank_describes_all_its_views(bank, tmp_path):
+    matcher = ViewMatcher(bank)
+    pictures = matcher._shaded(torch.arange(len(bank)))
+    assert pictures.shape == (len(bank), 1, 64, 64)
+    expected = describe(pictures, Backbone())
+    torch.testing.assert_close(bank.late["appearance"], expected, atol=2e-3, rtol=0)
+    image, box, _ = scene(0)
+    query = matcher.query([image], box[None])
+    ranking = matcher.rank(query)
+    raw = similarity(describe(query.crops, Backbone())[:, None], expected)
+    torch.testing.assert_close(ranking.terms["appearance"], raw, atol=2e-3, rtol=0)
+    bank.save(tmp_path / "bank.safetensors")
+    loaded = ViewMatcher(ViewBank.load(tmp_path / "bank.safetensors"))([image], box[None])
+    torch.testing.assert_close(loaded.scores, ranking.scores, atol=1e-3, rtol=1e-2)
+
+
+def test_its_weight_multiplies_a_score_that_is_1_for_the_best(bank):
+    image, box, _ = scene(1)
+    plain = ViewMatcher(bank, pipeline=PIPELINE.with_term("appearance", weight=0))([image], box[None])
+    weighed = ViewMatcher(bank, pipeline=PIPELINE.with_term("appearance", weight=3))([image], box[None])
+    raw = weighed.terms["appearance"]
+    factor = torch.exp(3 * (raw - raw.max()) / raw.std(correction=0))
+    torch.testing.assert_close(weighed.scores, plain.scores * factor, rtol=1e-3, atol=1e-6)
+
+
+def test_a_large_bank_is_asked_for_its_best_distinct_views(bank):
+    image, box, _ = scene(2)
+    before = ViewMatcher(bank, pipeline=replace(PIPELINE, terms=PIPELINE.terms[:3]))([image], box[None])
+    large = ViewBank.build(example_mesh(), VIEWS, pipeline=late(), progress=False)
+    assert large.late == {}
+    matcher = ViewMatcher(large, pipeline=late(top=5, apart=40.0))
+    ranking = matcher([image], box[None])
+    chosen = distinct_views(before.order[0], bank.rotations, count=5, angle=40.0)
+    raw = ranking.terms["appearance"][0]
+    assert sorted(raw.isfinite().nonzero()[:, 0].tolist()) == sorted(chosen.tolist())
+    whole = ViewMatcher(bank)([image], box[None]).terms["appearance"][0]
+    torch.testing.assert_close(raw[chosen], whole[chosen], atol=3e-3, rtol=0)
+    # Every other view has the score of the chosen one nearest to it.
+    score = Appearance().log_score(raw[chosen][None])[0]
+    away = rotation_error(bank.rotations[:, None], bank.rotations[chosen][None])
+    first, second = away.sort(dim=1).values[:, :2].T
+    clear = second - first > 1.0
+    assert int(clear.sum()) > 10
+    expected = before.scores[0] * torch.exp(2.0 * score[away.argmin(dim=1)])
+    torch.testing.assert_close(ranking.scores[0, clear], expected[clear], rtol=1e-4, atol=1e-7)
+    again = matcher([image], box[None])
+    assert torch.equal(again.scores, ranking.scores), "features that were kept"
+
+
+def test_a_picture_of_a_view_looks_most_like_that_view(bank):
+    matcher = ViewMatcher(bank)
+    for view in (0, 9, 20):
+        query = matcher.features(matcher._shaded(torch.tensor([view])))
+        assert int(matcher.rank(query).terms["appearance"].argmax()) == view
+
+
+def test_poses_are_judged_on_the_scale_of_the_views(bank):
+    """The pose of a view is worth what the view is worth."""
+    image, box, _ = scene(0)
+    matcher = ViewMatcher(bank)
+    query = matcher.query([image], box[None])
+    ranking = matcher.rank(query)
+    views = torch.tensor([3, 11, 3])
+    scores = matcher.late_score("appearance", query, ranking, matcher._shaded(views), torch.zeros(3, dtype=torch.long))
+    raw = ranking.terms["appearance"].double()
+    expected = Appearance().log_score(raw)[0, views]
+    torch.testing.assert_close(scores, expected, atol=0.1, rtol=0.1)
+    assert float(scores[0]) == float(scores[2])
+
+
+def test_hypotheses_tell_how_they_look():
+    image, box, T = scene(0)
+    bank = ViewBank.build(example_mesh(), VIEWS, pipeline=PIPELINE, progress=False)
+    result = Registrar(bank)([image], box[None], CAMERA)[0]
+    assert float(rotation_error(result.rotation, T[:3, :3])) < 5
+    looks = [h.evidence["appearance"] for h in result.hypotheses]
+    assert looks[0] == max(looks)
+    assert looks[0] != 0
