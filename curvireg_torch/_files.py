@@ -9,11 +9,12 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-
-from safetensors.torch import save
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from .errors import OutputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def write_file(path: Path, content: bytes) -> None:
@@ -56,8 +57,10 @@ def probe_folder(folder: Path, name: str) -> None:
         raise OutputError(f"{name} {folder}: cannot be written to ({reason}); choose another {name}") from error
 
 
-def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
+def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: Mapping[str, str] | None = None) -> None:
     """:func:`write_file` of a safetensors file."""
+    from safetensors.torch import save
+
     content = {name: x.detach().cpu().contiguous() for name, x in tensors.items()}
     write_file(path, save(content, dict(metadata or {})))
 

@@ -13,6 +13,7 @@ import torch
 from torch import nn
 
 from ._checks import check_option, check_positive
+from ._choices import DEFAULT
 from .descriptors import HOG
 from .errors import InvalidInputError, MissingFileError
 from .filters import (
@@ -323,8 +324,6 @@ PRESETS: dict[str, Pipeline] = {
 """``learned``: the photograph's field by :class:`LearnedCurvilinearSaliency`, and the appearance term; ``classical``:
 by focus curves, nothing learnt; ``fast``: the learnt field alone, without slack, search and contours; ``paper``: the
 paper's own, as far as it is stated."""
-
-DEFAULT = "learned"
 
 
 def preset_named(name: str) -> Pipeline:

@@ -252,13 +252,13 @@ def test_python_and_the_command_line_give_the_same_bits(files, monkeypatch, pres
 
 
 def test_no_option_is_the_default_pipeline_at_every_door(monkeypatch):
-    from curvireg_torch import cli
+    from curvireg_torch import cli, commands
     from curvireg_torch.evaluation import evaluate
     from curvireg_torch.registration import registrar
 
     assert preset_named(DEFAULT) == Pipeline()
     parsed = cli._parser().parse_args(["register", "a.jpg", "b.stl", "--out", "c"])
-    assert cli._pipeline(parsed) == Pipeline()
+    assert commands.chosen_pipeline(parsed) == Pipeline()
     assert inspect.signature(evaluate).parameters["preset"].default == DEFAULT
     asked = []
     monkeypatch.setattr(registrar, "cached_bank", lambda *_, pipeline, **__: asked.append(pipeline) or truck_bank())
@@ -276,7 +276,7 @@ def test_adapted_field_from_bank_to_register(files, monkeypatch, capsys):
         assert workers == 1
         return adapt(mesh, scenes=16, upright=upright, progress=progress)
 
-    monkeypatch.setattr("curvireg_torch.cli.adapt", quick)
+    monkeypatch.setattr("curvireg_torch.commands.adapt", quick)
     small = Pipeline(views=ViewPolicy(azimuth_step=90, elevations=(20,)), bank=BankSettings(image_size=64))
     monkeypatch.setitem(PRESETS, DEFAULT, small)
     out, field = folder / "own.safetensors", folder / "own_field.safetensors"

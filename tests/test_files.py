@@ -81,7 +81,7 @@ def test_the_place_is_probed_before_the_work(
         raise AssertionError("began to work")
 
     for name in ("cached_bank", "load_mesh"):
-        monkeypatch.setattr(f"curvireg_torch.cli.{name}", work)
+        monkeypatch.setattr(f"curvireg_torch.commands.{name}", work)
     blocked = tmp_path / "file"
     blocked.write_bytes(OLD)
     arguments = {
@@ -103,7 +103,7 @@ def test_interrupted_in_the_middle_of_a_file(
     path = tmp_path / "file"
     write_file(path, OLD)
     monkeypatch.setattr(os, "fsync", lambda _: signal.raise_signal(number))
-    monkeypatch.setattr("curvireg_torch.cli.list_cache", lambda: write_file(path, NEW))
+    monkeypatch.setattr("curvireg_torch.commands.list_cache", lambda: write_file(path, NEW))
     before = signal.getsignal(signal.SIGTERM)
     try:
         ended = main(["cache"])

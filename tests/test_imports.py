@@ -9,12 +9,14 @@ import curvireg_torch
 
 PACKAGE = Path(curvireg_torch.__file__).parent
 
-BASE = {"errors", "limits", "_checks", "_files", "_threads"}
+BASE = {"errors", "limits", "_checks", "_choices", "_files", "_lazy", "_threads"}
 ALLOWED = {
     "errors": set(),
     "limits": set(),
     "_checks": {"errors"},
+    "_choices": set(),
     "_files": {"errors"},
+    "_lazy": set(),
     "_threads": set(),
     "geometry": BASE,
     "filters": BASE,
@@ -36,7 +38,7 @@ FORBIDDEN_LIBRARIES = {
     "filters": {"numpy", "pathlib", "trimesh", "cv2", "scipy", "os"},
     "descriptors": {"numpy", "pathlib", "trimesh", "cv2", "scipy", "os"},
 }
-TOP = {"evaluation", "cli", "__init__", "__main__", "presets"}
+TOP = {"evaluation", "cli", "commands", "__init__", "__main__", "presets"}
 
 
 def parts() -> list[str]:

@@ -4,13 +4,31 @@
 ``-m curvireg_torch.evaluation pascal3d ROOT --out DIR`` shares the objects among processes.
 """
 
-from ..pipeline import DEFAULT, PRESETS, Pipeline
-from .benchmark import Benchmark
-from .bop import BOPBenchmark
-from .command import add_parser, run
-from .loops import evaluate, score
-from .pascal3d import Pascal3DBenchmark
-from .protocol import Protocol
+from typing import TYPE_CHECKING
+
+from .._lazy import lazy
+
+if TYPE_CHECKING:
+    from ..pipeline import DEFAULT, PRESETS, Pipeline
+    from .benchmark import Benchmark
+    from .bop import BOPBenchmark
+    from .command import add_parser, run
+    from .loops import evaluate, score
+    from .pascal3d import Pascal3DBenchmark
+    from .protocol import Protocol
+else:
+    __getattr__, __dir__ = lazy(
+        __name__,
+        {
+            ".pipeline": "DEFAULT PRESETS Pipeline",
+            "benchmark": "Benchmark",
+            "bop": "BOPBenchmark",
+            "command": "add_parser run",
+            "loops": "evaluate score",
+            "pascal3d": "Pascal3DBenchmark",
+            "protocol": "Protocol",
+        },
+    )
 
 __all__ = [
     "DEFAULT",

@@ -3,8 +3,8 @@
 import argparse
 import sys
 
+from .._choices import BACKENDS
 from ..errors import CurviregError
-from ..rendering import BACKENDS
 from .command import add_datasets
 
 

@@ -6,16 +6,13 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..data import BOPDataset, Pascal3DPlus
+from .._choices import DEFAULT, PRESET_NAMES
 from ..errors import InvalidInputError
-from ..pipeline import DEFAULT, PRESETS, Pipeline
-from .benchmark import Benchmark
-from .bop import BOPBenchmark
-from .loops import evaluate
-from .pascal3d import Pascal3DBenchmark
-from .protocol import Protocol
+
+if TYPE_CHECKING:
+    from .benchmark import Benchmark
 
 __all__ = ["add_datasets", "add_parser", "run"]
 
@@ -63,9 +60,9 @@ def add_datasets(datasets: Any, parents: Sequence[argparse.ArgumentParser]) -> N
             nargs="+",
             default=[],
             metavar="KEY=VALUE",
-            help=f"{PROTOCOL} (default: {Protocol(pose=default)})",
+            help=f"{PROTOCOL} (default: cad=annotated pose={default} box=annotated)",
         )
-        parser.add_argument("--preset", choices=sorted(PRESETS), default=DEFAULT, help=f"default: {DEFAULT}")
+        parser.add_argument("--preset", choices=sorted(PRESET_NAMES), default=DEFAULT, help=f"default: {DEFAULT}")
         parser.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
         parser.add_argument(
             "--jobs", type=int, default=1, metavar="N", help="processes that share the objects (default: 1)"
@@ -85,6 +82,9 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.jobs > 1 and "TORCHELASTIC_RUN_ID" not in os.environ:
         _run_jobs(arguments.jobs)
         return
+    from ..pipeline import Pipeline
+    from .loops import evaluate
+
     summary = evaluate(
         arguments.benchmark(arguments),
         arguments.out,
@@ -116,7 +116,11 @@ def _run_jobs(count: int) -> None:
         raise InvalidInputError(f"evaluate: a process ended with {done.returncode}; what it says stands above")
 
 
-def _pascal3d(arguments: argparse.Namespace) -> Benchmark:
+def _pascal3d(arguments: argparse.Namespace) -> "Benchmark":
+    from ..data import Pascal3DPlus
+    from .pascal3d import Pascal3DBenchmark
+    from .protocol import Protocol
+
     dataset = Pascal3DPlus(
         arguments.root,
         arguments.split,
@@ -127,5 +131,9 @@ def _pascal3d(arguments: argparse.Namespace) -> Benchmark:
     return Pascal3DBenchmark(dataset, Protocol.parse(arguments.protocol))
 
 
-def _bop(arguments: argparse.Namespace) -> Benchmark:
+def _bop(arguments: argparse.Namespace) -> "Benchmark":
+    from ..data import BOPDataset
+    from .bop import BOPBenchmark
+    from .protocol import Protocol
+
     return BOPBenchmark(BOPDataset(arguments.root, arguments.split), Protocol.parse(arguments.protocol, pose="any"))

@@ -19,7 +19,16 @@ from .workers import workers
 
 __all__ = ["evaluate", "score"]
 
-BESIDE_THE_POINT = ("cli.py", "detectors", "evaluation", "metrics", "scenes", "synthetic.py", "visualization")
+BESIDE_THE_POINT = (
+    "cli.py",
+    "commands.py",
+    "detectors",
+    "evaluation",
+    "metrics",
+    "scenes",
+    "synthetic.py",
+    "visualization",
+)
 """Parts of the package that no pose depends on."""
 
 NOT_ASKED_FOR = ("other_class", "no_target")

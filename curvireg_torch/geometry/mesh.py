@@ -14,12 +14,13 @@ import trimesh
 from torch import Tensor
 
 from .._checks import check_option
+from .._choices import UNITS, UP_AXES
 from ..errors import MeshError, MissingFileError
 from ..limits import MAX_MESH_BYTES, MAX_MESH_COORDINATE, MAX_MESH_FACES
 from .colours import SurfaceColours, surface_colours
 from .gltf import check_gltf
 from .polygon_files import with_triangles
-from .up import UP_AXES, format_up, mesh_up
+from .up import format_up, mesh_up
 
 __all__ = [
     "UNITS",
@@ -31,9 +32,6 @@ __all__ = [
     "mesh_radius",
     "normalization_transform",
 ]
-
-UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-"""Metres per unit."""
 
 SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 

@@ -7,18 +7,9 @@ import torch
 from torch import Tensor
 
 from .._checks import check_option
+from .._choices import UP_AXES
 
 __all__ = ["UP_AXES", "format_up", "mesh_up", "up_rotation", "with_z_up"]
-
-UP_AXES = {
-    "x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
-    "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
-    "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    "-x": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
-    "-y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
-    "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
-}
-"""Axis that points up: the quarter turns that bring it to z."""
 
 
 def up_rotation(up: str) -> Tensor:

@@ -11,13 +11,12 @@ import trimesh
 from torch import Tensor
 
 from .._checks import check_option
+from .._choices import BACKENDS
 from ..errors import InvalidInputError, MissingDependencyError, RenderingError
 from ..geometry.cameras import check_camera_matrix
 from ..geometry.mesh import as_mesh
 
 __all__ = ["BACKENDS", "NEAREST", "DepthRenderer", "make_renderer", "render_depth"]
-
-BACKENDS = ("auto", "embree", "pyrender", "torch")
 
 NEAREST = 1e-3
 """Surface nearer to the camera's plane than this many object radii, or behind it, is not seen."""

@@ -1,0 +1,23 @@
+"""Names that a user may choose from, apart from what they stand for: the command line shows them without torch."""
+
+BACKENDS = ("auto", "embree", "pyrender", "torch")
+"""Renderers."""
+
+DEFAULT = "learned"
+"""The preset that is taken where none is named."""
+
+PRESET_NAMES = ("learned", "classical", "fast", "paper")
+"""Of :data:`curvireg_torch.pipeline.PRESETS`."""
+
+UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+"""Metres per unit."""
+
+UP_AXES = {
+    "x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
+    "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "-x": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+    "-y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+}
+"""Axis that points up: the quarter turns that bring it to z."""
