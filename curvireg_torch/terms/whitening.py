@@ -3,17 +3,13 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from .._checks import check_option, check_tensor
-from .._files import write_tensors
-from ..errors import BankError, InvalidInputError, MissingFileError
+from ..errors import InvalidInputError
 from ..filters import MultiScaleFocusCurves
 from ..geometry.crops import crop_images
 from .base import Views
@@ -25,7 +21,6 @@ if TYPE_CHECKING:
 __all__ = ["DescriptorStatistics", "Whitening"]
 
 SHRINKAGES = ("oas", "ledoit-wolf")
-_FORMAT = "curvireg_torch.DescriptorStatistics"
 
 
 class Whitening(nn.Module):
@@ -174,34 +169,3 @@ class DescriptorStatistics:
         S = self.covariance
         ridge = a * float(S.diagonal().mean()) * torch.eye(len(S), dtype=S.dtype, device=S.device)
         return Whitening(self.mean, (1.0 - a) * S + ridge)
-
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write a safetensors file, in float16; it appears whole or not at all."""
-        scale = float(self.covariance.abs().amax().clamp(min=torch.finfo(torch.float32).tiny))
-        tensors = {
-            "mean": self.mean.half(),
-            "covariance": (self.covariance / scale).half(),
-            "numbers": torch.tensor([float(self.count), self.fourth, scale], dtype=torch.float64),
-        }
-        write_tensors(Path(path), tensors, {"format": _FORMAT})
-
-    @classmethod
-    def load(cls, path: str | PathLike[str]) -> "DescriptorStatistics":
-        """Read what :meth:`save` wrote.
-
-        Raises:
-            MissingFileError: no such file.
-            BankError: truncated, or another kind of file.
-        """
-        path = Path(path)
-        if not path.is_file():
-            raise MissingFileError(f"{path}: no such statistics; make them with DescriptorStatistics.from_images")
-        try:
-            with safe_open(path, framework="pt") as file:
-                if (file.metadata() or {}).get("format") != _FORMAT:
-                    raise BankError(f"{path}: not descriptor statistics; make them again")
-                mean, covariance, numbers = (file.get_tensor(n) for n in ("mean", "covariance", "numbers"))
-        except (SafetensorError, OSError) as error:
-            raise BankError(f"{path}: truncated or not a safetensors file ({error}); make it again") from error
-        count, fourth, scale = numbers.tolist()
-        return cls(mean.float(), covariance.float() * scale, int(count), fourth)

@@ -4,7 +4,7 @@ import torch
 from sklearn.covariance import ledoit_wolf_shrinkage, oas
 
 from curvireg_torch import ViewMatcher
-from curvireg_torch.errors import BankError, InvalidInputError, MissingFileError
+from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.matching import DescriptorStatistics, Whitening
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import scene, truck_bank
@@ -83,24 +83,6 @@ def test_statistics_of_images_depend_on_images_and_seed_alone():
     assert grey.count == 3
     with pytest.raises(InvalidInputError, match="at least one image"):
         DescriptorStatistics.from_images([], settings)
-
-
-def test_files_give_back_what_was_saved(tmp_path):
-    statistics = DescriptorStatistics.from_descriptors(sample(40))
-    statistics.save(tmp_path / "a" / "s.safetensors")
-    loaded = DescriptorStatistics.load(tmp_path / "a" / "s.safetensors")
-    assert loaded.count == 40
-    assert loaded.shrinkage("ledoit-wolf") == pytest.approx(statistics.shrinkage("ledoit-wolf"), rel=1e-2)
-    torch.testing.assert_close(loaded.covariance, statistics.covariance, rtol=1e-3, atol=0.02)
-    assert [p.name for p in (tmp_path / "a").iterdir()] == ["s.safetensors"]
-    with pytest.raises(MissingFileError, match="from_images"):
-        DescriptorStatistics.load(tmp_path / "none")
-    (tmp_path / "bad").write_bytes(b"x" * 100)
-    with pytest.raises(BankError, match="truncated"):
-        DescriptorStatistics.load(tmp_path / "bad")
-    truck_bank().save(tmp_path / "bank")
-    with pytest.raises(BankError, match="not descriptor statistics"):
-        DescriptorStatistics.load(tmp_path / "bank")
 
 
 def test_a_covariance_of_another_size_is_named():
