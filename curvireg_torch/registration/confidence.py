@@ -1,12 +1,24 @@
 """How far a ranking can be trusted, and its best distinct views."""
 
+from collections.abc import Mapping, Sequence
+
 import torch
 from torch import Tensor
 
 from ..geometry.viewpoint import rotation_error
 from ..matching import Ranking
+from .verify import EVIDENCE as VERDICT
+from .verify import WEIGHTS
 
-__all__ = ["EVIDENCE", "RELIABLE", "confidence", "ranking_evidence"]
+__all__ = [
+    "EVIDENCE",
+    "POSE_EVIDENCE",
+    "RELIABLE",
+    "confidence",
+    "pose_confidence",
+    "pose_evidence",
+    "ranking_evidence",
+]
 
 EVIDENCE = ("similarity", "margin", "concentration")
 """What :func:`ranking_evidence` measures, in its order."""
@@ -19,6 +31,17 @@ _BIAS = -8.803
 """Logistic regression on scenes made in code, by scripts/calibrate_confidence.py."""
 
 _APART = 30.0  # degrees beyond which two views are rival answers
+
+
+POSE_EVIDENCE = ("similarity", "support", "appearance", "margin", "concentration")
+"""What :func:`pose_evidence` measures, in its order."""
+
+_POSE_WEIGHTS = (2.0, 4.0, 0.3, 0.4, 1.0)
+_POSE_BIAS = -4.0
+"""Logistic regression on photographs of textured meshes, by scripts/fit_verdict.py."""
+
+MARGIN = 5.0
+"""A lead that is larger tells no more."""
 
 
 def ranking_evidence(ranking: Ranking, rotations: Tensor) -> Tensor:
@@ -72,3 +95,35 @@ def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
         True
     """
     return probability(ranking_evidence(ranking, rotations))
+
+
+def pose_evidence(hypotheses: Sequence[Mapping[str, float]], concentration: float) -> list[float]:
+    """Numbers that tell right poses from wrong ones, see :data:`POSE_EVIDENCE`, of hypotheses followed to their end.
+
+    similarity, support, appearance: of the best hypothesis (:data:`curvireg_torch.registration.verify.EVIDENCE`).
+    margin: how far its verdict leads that of the next distinct one, at most 5. concentration: of the ranking, see
+    :func:`ranking_evidence`.
+
+    Args:
+        hypotheses: their evidence, best first.
+        concentration: in [0, 1].
+    """
+    lead = MARGIN
+    if len(hypotheses) > 1:
+        best, rival = (sum(w * h[n] for n, w in zip(VERDICT, WEIGHTS, strict=True)) for h in hypotheses[:2])
+        lead = min(best - rival, MARGIN)
+    first = hypotheses[0]
+    return [first["similarity"], first["support"], first["appearance"], lead, concentration]
+
+
+def pose_confidence(evidence: Sequence[float]) -> float:
+    """Probability that the best pose is within 30 degrees of the truth, from :func:`pose_evidence`.
+
+    What it is worth on photographs, and against wrong meshes, is in ``docs/method.md``.
+
+    Example:
+        >>> pose_confidence([0.9, 0.7, 0.0, 5.0, 1.0]) > pose_confidence([0.5, 0.3, -2.0, 0.5, 0.2])
+        True
+    """
+    values, weights = (torch.tensor(v, dtype=torch.float64) for v in (evidence, _POSE_WEIGHTS))
+    return float(torch.sigmoid(values @ weights + _POSE_BIAS))

@@ -15,7 +15,7 @@ from ..geometry.translation import place_view
 from ..geometry.views import ViewSphere
 from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank, distinct_views
 from ..pipeline import BankSettings, Pipeline
-from .confidence import RELIABLE, confidence
+from .confidence import RELIABLE, confidence, pose_confidence, pose_evidence, ranking_evidence
 from .contour import ContourFit, fit_contours
 from .hypotheses import Hypotheses, hypotheses
 from .inputs import Item, check_crop, items_of, named
@@ -195,25 +195,33 @@ class Registrar:
         T, cameras = self._placed(found, boxes, K)
         if self.pipeline.contours:
             fit = self._follow_contours(items, found, boxes, T, cameras)
-            # Without a camera matrix the mesh is often another object of the kind, whose contours lie elsewhere.
-            believed = fit.trustworthy if K is None else torch.ones_like(fit.trustworthy)
-            T = torch.where(believed[:, None, None], fit.transform, T)
-            found = self._seen_straight(found, T)
+            T, found = fit.transform, self._seen_straight(found, fit.transform)
         found = replace(found, score=similarities(self.describers, descriptors, found))
         evidence = self._evidence(starts, found, fit, query, ranking)
         own = self._own_peaks(found, verdict(evidence))
         if not bool(own.all()):
             found, T, fit = self._sent_back(own, starts, found, T, fit, boxes, K)
             found = replace(found, score=similarities(self.describers, descriptors, found))
+            if fit is not None:
+                fit = replace(fit, support=torch.where(own, fit.support, 0.0))
             evidence = self._evidence(starts, found, fit, query, ranking)
+        if fit is not None and K is None:
+            # The mesh is often another object of the kind: where its contours do not fit, the view itself errs less.
+            score = found.score
+            found, T, fit = self._sent_back(own & fit.trustworthy, starts, found, T, fit, boxes, K)
+            found = replace(found, score=score)
         order = (verdict(evidence) + torch.where(own, 0.0, -1e6)).argsort(descending=True, stable=True)
-        trust = confidence(ranking, self.bank.rotations)
+        coarse, concentration = confidence(ranking, self.bank.rotations), ranking_evidence(ranking, self.bank.rotations)
         results = []
         for b in range(len(items)):
-            reliable = float(trust[b]) >= RELIABLE
             mine = order[found.photograph[order] == b].tolist()
+            trust = float(coarse[b])
+            if fit is not None:
+                told = [dict(zip(EVIDENCE, evidence[h].tolist(), strict=True)) for h in mine]
+                trust = pose_confidence(pose_evidence(told, float(concentration[b, 2])))
+            reliable = trust >= RELIABLE
             poses = tuple(self._hypothesis(h, found, T, evidence, fit, reliable, K is not None) for h in mine)
-            results.append(Registration(poses, float(trust[b]), ranking[b : b + 1]))
+            results.append(Registration(poses, trust, ranking[b : b + 1]))
         return results
 
     def _evidence(
@@ -264,7 +272,7 @@ class Registrar:
         )
         if fit is not None:
             covariance = torch.where(own[:, None, None], fit.covariance, torch.nan)
-            fit = replace(fit, transform=T, covariance=covariance, support=torch.where(own, fit.support, 0.0))
+            fit = replace(fit, transform=T, covariance=covariance)
         return found, T, fit
 
     def _hypothesis(

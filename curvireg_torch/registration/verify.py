@@ -16,7 +16,7 @@ EVIDENCE = ("rank", "similarity", "support", "appearance")
 was found; strength of the photograph's edges under its contours (0 without the contour stage); how much the pose that
 was found looks like the photograph, as log S_look (0 without that term)."""
 
-WEIGHTS = (1.0, 10.0, 10.0, 1.0)
+WEIGHTS = (0.3, 10.0, 12.0, 1.5)
 
 
 def gathered_evidence(starts: Hypotheses, found: Hypotheses, support: Tensor | None, looks: Tensor | None) -> Tensor:

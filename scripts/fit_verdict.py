@@ -1,0 +1,139 @@
+"""Fits the constants of registration/verify.py and registration/confidence.py on rows of scripts/run_benchmark.py.
+
+    python scripts/fit_verdict.py ROWS.jsonl ... [--out scripts/results/verdict.json]
+
+Verdict: a softmax over the hypotheses of a photograph, linear in their evidence, that gives the right ones (within 30
+degrees) most of the weight. Confidence: a logistic regression on what is known of the winner and its rival. Both are
+fitted on all rows; what they are worth is measured on meshes left out in turn (five parts). Rows against a wrong mesh
+take no part in the fits.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+from sklearn.linear_model import LogisticRegression
+
+from curvireg_torch.registration.confidence import POSE_EVIDENCE, pose_evidence
+from curvireg_torch.registration.verify import EVIDENCE, WEIGHTS
+
+RIGHT = 30.0
+PARTS = 5
+PRIOR = (0.3, 10.0, 12.0, 1.5)
+"""Chosen on the first 123 upright photographs; the fit is drawn towards it, by as much as a few photographs weigh."""
+
+
+def table(row: dict[str, Any]) -> np.ndarray:
+    """(H, 4) evidence of the hypotheses."""
+    return np.array([[e[name] for name in EVIDENCE] for e in row["evidence"]])
+
+
+def right(row: dict[str, Any]) -> np.ndarray:
+    return np.array(row["errors"]) < RIGHT
+
+
+def fit_verdict(rows: list[dict[str, Any]]) -> np.ndarray:
+    prior = np.array(PRIOR)
+    cases = [(table(r), right(r)) for r in rows if right(r).any() and not right(r).all()]
+
+    def loss(w: np.ndarray) -> float:
+        total = 2.0 * float((((w - prior) / prior) ** 2).sum())
+        for X, good in cases:
+            s = X @ w
+            p = np.exp(s - s.max())
+            total -= float(np.log(p[good].sum() / p.sum()))
+        return total
+
+    return minimize(loss, prior, method="L-BFGS-B", bounds=[(0.0, None)] * len(prior)).x
+
+
+def won(rows: list[dict[str, Any]], w: np.ndarray) -> np.ndarray:
+    """(n,) bool: whether the winner is right."""
+    return np.array([right(r)[np.argmax(table(r) @ w)] for r in rows])
+
+
+def features(rows: list[dict[str, Any]]) -> np.ndarray:
+    """(n, F) of the winners by the constants in use."""
+    out = []
+    for row in rows:
+        order = np.argsort(-(table(row) @ np.array(WEIGHTS)), kind="stable")
+        evidence = [row["evidence"][i] for i in order]
+        out.append(pose_evidence(evidence, row["ranking"][POSE_RANKING]))
+    return np.array(out)
+
+
+POSE_RANKING = 2  # concentration, of the evidence of the ranking
+
+
+def auc(p: np.ndarray, q: np.ndarray) -> float:
+    return float((p[:, None] > q[None]).mean() + 0.5 * (p[:, None] == q[None]).mean())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("rows", type=Path, nargs="+")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "verdict.json")
+    arguments = parser.parse_args()
+    everything = [json.loads(line) for path in arguments.rows for line in path.read_text().splitlines()]
+    everything = [r for r in everything if "errors" in r]
+    rows, wrong = ([r for r in everything if r["wrong"] == kind] for kind in (False, True))
+    meshes = sorted({r["mesh"] for r in rows})
+    part = np.array([meshes.index(r["mesh"]) % PARTS for r in rows])
+    held = np.zeros(len(rows), dtype=bool)
+    p = np.zeros(len(rows))
+    X, y = features(rows), won(rows, np.array(WEIGHTS))
+    for k in range(PARTS):
+        train, test = np.flatnonzero(part != k), np.flatnonzero(part == k)
+        held[test] = won([rows[i] for i in test], fit_verdict([rows[i] for i in train]))
+        p[test] = LogisticRegression(C=1.0, max_iter=1000).fit(X[train], y[train]).predict_proba(X[test])[:, 1]
+    whole = LogisticRegression(C=1.0, max_iter=1000).fit(X, y)
+    order = np.argsort(-p, kind="stable")
+    risk = {f"{c:g}": float(1.0 - y[order[: max(1, round(c * len(y)))]].mean()) for c in (1.0, 0.75, 0.5, 0.25)}
+    result: dict[str, Any] = {
+        "n": len(rows),
+        "shares": {
+            f"{form} {pose}": {
+                "n": len(some),
+                "best_view": float(np.mean([r["view_errors"][0] < RIGHT for r in some])),
+                "winner": float(won(some, np.array(WEIGHTS)).mean()),
+                "among_hypotheses": float(np.mean([right(r).any() for r in some])),
+            }
+            for form in ("exact", "sibling")
+            for pose in ("upright", "free")
+            if (some := [r for r in rows if r["form"] == form and r["pose"] == pose])
+        },
+        "verdict": {
+            "evidence": list(EVIDENCE),
+            "used": list(WEIGHTS),
+            "fitted": [round(float(v), 2) for v in fit_verdict(rows)],
+            "winner_right": float(y.mean()),
+            "winner_right_refitted_held_out": float(held.mean()),
+            "best_view_right": float(np.mean([r["view_errors"][0] < RIGHT for r in rows])),
+        },
+        "confidence": {
+            "evidence": list(POSE_EVIDENCE),
+            "weights": [round(float(v), 3) for v in whole.coef_[0]],
+            "bias": round(float(whole.intercept_[0]), 3),
+            "held_out": {
+                "auc_right_answer": auc(p[y], p[~y]),
+                "risk_at_coverage": risk,
+                "precision_at": {
+                    f"{t:g}": [float(y[p >= t].mean()) if (p >= t).any() else None, float((p >= t).mean())]
+                    for t in (0.5, 0.6, 0.7, 0.8, 0.9)
+                },
+            },
+        },
+    }
+    if wrong:
+        q = whole.predict_proba(features(wrong))[:, 1]
+        result["confidence"]["auc_right_mesh"] = auc(p, q)
+        result["confidence"]["n_wrong"] = len(wrong)
+    arguments.out.write_text(json.dumps(result, indent=2) + "\n")
+    print(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    main()
