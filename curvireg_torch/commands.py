@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import platform
 import time
 from pathlib import Path
@@ -174,7 +175,7 @@ def _document(result: Registration, registrar: Registrar, times: dict[str, float
             "score": h.score,
             "evidence": dict(h.evidence),
             "view": h.view,
-            "terms": {name: float(raw[0, h.view]) for name, raw in result.ranking.terms.items()},
+            "terms": {n: float(r[0, h.view]) for n, r in result.ranking.terms.items() if r[0, h.view].isfinite()},
         }
         for h in result.hypotheses
     ]
@@ -190,7 +191,7 @@ def _document(result: Registration, registrar: Registrar, times: dict[str, float
         "support": result.support,
         "standard_deviations": None
         if deviations is None
-        else {"rotation_deg": deviations[0].tolist(), "translation": deviations[1].tolist()},
+        else {"rotation_deg": _known(deviations[0]), "translation": _known(deviations[1])},
         "covariance": None if result.covariance is None else result.covariance.tolist(),
         "top": top,
         "views": len(bank),
@@ -205,6 +206,11 @@ def _document(result: Registration, registrar: Registrar, times: dict[str, float
         },
         "conventions": CONVENTIONS,
     }
+
+
+def _known(deviations: torch.Tensor) -> list[float | None]:
+    """Numbers that JSON can hold: None for a deviation without bound."""
+    return [None if math.isinf(v) else v for v in deviations.tolist()]
 
 
 def _write(out: Path, document: dict[str, Any], registrar: Registrar, result: Registration, *scene: Any) -> None:
@@ -230,6 +236,9 @@ def _print_result(document: dict[str, Any], out: Path) -> None:
         print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")
     deviations = document["standard_deviations"]
     if deviations is not None:
-        turn, shift = (", ".join(f"{v:.2g}" for v in deviations[name]) for name in ("rotation_deg", "translation"))
+        turn, shift = (
+            ", ".join("unknown" if v is None else f"{v:.2g}" for v in deviations[name])
+            for name in ("rotation_deg", "translation")
+        )
         print(f"standard deviations: {turn} degrees; {shift} {document['unit']}   (about and along the camera's axes)")
     print(f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see {out}/overlay.png")

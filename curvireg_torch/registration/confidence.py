@@ -7,8 +7,6 @@ from torch import Tensor
 
 from ..geometry.viewpoint import rotation_error
 from ..matching import Ranking
-from .verify import EVIDENCE as VERDICT
-from .verify import WEIGHTS
 
 __all__ = [
     "EVIDENCE",
@@ -97,23 +95,18 @@ def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
     return probability(ranking_evidence(ranking, rotations))
 
 
-def pose_evidence(hypotheses: Sequence[Mapping[str, float]], concentration: float) -> list[float]:
+def pose_evidence(best: Mapping[str, float], lead: float, concentration: float) -> list[float]:
     """Numbers that tell right poses from wrong ones, see :data:`POSE_EVIDENCE`, of hypotheses followed to their end.
 
     similarity, support, appearance: of the best hypothesis (:data:`curvireg_torch.registration.verify.EVIDENCE`).
-    margin: how far its verdict leads that of the next distinct one, at most 5. concentration: of the ranking, see
-    :func:`ranking_evidence`.
+    margin: its lead, at most 5. concentration: of the ranking, see :func:`ranking_evidence`.
 
     Args:
-        hypotheses: their evidence, best first.
+        best: evidence of the best hypothesis.
+        lead: how far its verdict leads that of the next distinct one.
         concentration: in [0, 1].
     """
-    lead = MARGIN
-    if len(hypotheses) > 1:
-        best, rival = (sum(w * h[n] for n, w in zip(VERDICT, WEIGHTS, strict=True)) for h in hypotheses[:2])
-        lead = min(best - rival, MARGIN)
-    first = hypotheses[0]
-    return [first["similarity"], first["support"], first["appearance"], lead, concentration]
+    return [best["similarity"], best["support"], best["appearance"], min(lead, MARGIN), concentration]
 
 
 def pose_confidence(evidence: Sequence[float]) -> float:

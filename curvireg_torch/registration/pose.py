@@ -16,6 +16,9 @@ from .confidence import RELIABLE
 
 __all__ = ["FailedRegistration", "Hypothesis", "Registration"]
 
+UNKNOWN_TURN = 1.0
+"""Radians of standard deviation from which a turn is not known at all."""
+
 
 @dataclass(frozen=True)
 class Hypothesis:
@@ -58,11 +61,15 @@ class Hypothesis:
 
     @property
     def standard_deviations(self) -> tuple[Tensor, Tensor] | None:
-        """(3,) degrees about and (3,) model units along the camera's axes; None without a covariance."""
+        """(3,) degrees about and (3,) model units along the camera's axes; None without a covariance.
+
+        ``inf`` where the contours do not tell: about an axis of symmetry, or a shift as large as half the distance.
+        """
         if self.covariance is None:
             return None
-        deviations = self.covariance.diagonal().sqrt()
-        return torch.rad2deg(deviations[:3]), deviations[3:]
+        turn, shift = self.covariance.diagonal().sqrt().split(3)
+        turn = torch.where(turn < UNKNOWN_TURN, torch.rad2deg(turn), torch.inf)
+        return turn, torch.where(shift < 0.5 * self.distance, shift, torch.inf)
 
     @property
     def transform(self) -> Tensor | None:

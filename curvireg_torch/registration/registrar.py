@@ -198,7 +198,7 @@ class Registrar:
             T, found = fit.transform, self._seen_straight(found, fit.transform)
         found = replace(found, score=similarities(self.describers, descriptors, found))
         evidence = self._evidence(starts, found, fit, query, ranking)
-        own = self._own_peaks(found, verdict(evidence))
+        own = self._own_peaks(found, verdict(evidence, with_camera=K is not None))
         if not bool(own.all()):
             found, T, fit = self._sent_back(own, starts, found, T, fit, boxes, K)
             found = replace(found, score=similarities(self.describers, descriptors, found))
@@ -210,15 +210,17 @@ class Registrar:
             score = found.score
             found, T, fit = self._sent_back(own & fit.trustworthy, starts, found, T, fit, boxes, K)
             found = replace(found, score=score)
-        order = (verdict(evidence) + torch.where(own, 0.0, -1e6)).argsort(descending=True, stable=True)
+        score = verdict(evidence, with_camera=K is not None) + torch.where(own, 0.0, -1e6)
+        order = score.argsort(descending=True, stable=True)
         coarse, concentration = confidence(ranking, self.bank.rotations), ranking_evidence(ranking, self.bank.rotations)
         results = []
         for b in range(len(items)):
             mine = order[found.photograph[order] == b].tolist()
             trust = float(coarse[b])
             if fit is not None:
-                told = [dict(zip(EVIDENCE, evidence[h].tolist(), strict=True)) for h in mine]
-                trust = pose_confidence(pose_evidence(told, float(concentration[b, 2])))
+                lead = float(score[mine[0]] - score[mine[1]]) if len(mine) > 1 else torch.inf
+                told = dict(zip(EVIDENCE, evidence[mine[0]].tolist(), strict=True))
+                trust = pose_confidence(pose_evidence(told, lead, float(concentration[b, 2])))
             reliable = trust >= RELIABLE
             poses = tuple(self._hypothesis(h, found, T, evidence, fit, reliable, K is not None) for h in mine)
             results.append(Registration(poses, trust, ranking[b : b + 1]))

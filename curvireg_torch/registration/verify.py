@@ -16,7 +16,8 @@ EVIDENCE = ("rank", "similarity", "support", "appearance")
 was found; strength of the photograph's edges under its contours (0 without the contour stage); how much the pose that
 was found looks like the photograph, as log S_look (0 without that term)."""
 
-WEIGHTS = (0.3, 10.0, 12.0, 1.5)
+WEIGHTS, RANK_ALONE = (1.0, 5.0, 10.0, 1.0), (1.0, 0.0, 0.0, 0.0)
+"""See docs/accuracy.md."""
 
 
 def gathered_evidence(starts: Hypotheses, found: Hypotheses, support: Tensor | None, looks: Tensor | None) -> Tensor:
@@ -36,9 +37,13 @@ def gathered_evidence(starts: Hypotheses, found: Hypotheses, support: Tensor | N
     return torch.stack([rank, found.score, zero if support is None else support, zero if looks is None else looks], 1)
 
 
-def verdict(evidence: Tensor) -> Tensor:
-    """(H,) scores of hypotheses from (H, 4) evidence: the higher, the sooner believed."""
-    return evidence @ torch.tensor(WEIGHTS, dtype=evidence.dtype)
+def verdict(evidence: Tensor, *, with_camera: bool) -> Tensor:
+    """(H,) scores of hypotheses from (H, 4) evidence: the higher, the sooner believed.
+
+    Where the camera is known the mesh is taken to be the object's own, and what was found of it counts
+    (:data:`WEIGHTS`). Where it is not, the mesh is often another object of the kind, and the ranking's order stands.
+    """
+    return evidence @ torch.tensor(WEIGHTS if with_camera else RANK_ALONE, dtype=evidence.dtype)
 
 
 def similarities(describers: Sequence[ViewDescriber], descriptors: Tensor, found: Hypotheses) -> Tensor:

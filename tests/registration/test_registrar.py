@@ -1,4 +1,5 @@
 import pickle
+from dataclasses import replace
 
 import cv2
 import pytest
@@ -7,9 +8,13 @@ import trimesh
 
 from curvireg_torch import ImageGradient, Registrar, ViewBank, ViewMatcher, project_points, rotation_error, sample_views
 from curvireg_torch.errors import CurviregError, InvalidInputError
-from curvireg_torch.registration import RELIABLE, FailedRegistration, distinct_views
+from curvireg_torch.geometry import rotation_from_viewpoint, symmetry_transforms
+from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
+from curvireg_torch.pipeline import PRESETS
+from curvireg_torch.registration import RELIABLE, FailedRegistration, distinct_views, fit_contours
+from curvireg_torch.rendering import make_renderer, render_depth
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import CAMERA, scene, truck_bank
+from tests._support.scenes import CAMERA, SIZE, scene, truck_bank
 
 SEEDS = range(6)
 
@@ -187,3 +192,39 @@ def test_old_names_still_work():
 def test_distinct_views_stop_when_the_sphere_is_used_up():
     R = sample_views(azimuth_step=90, elevations=[0]).rotations
     assert distinct_views(torch.tensor([2, 0, 1, 3]), R, count=9).tolist() == [2, 0, 1, 3]
+
+
+def test_a_turn_that_nothing_shows_has_no_standard_deviation():
+    """A can from above: its turn about its axis is unknown, its lean and its place are known."""
+    mesh = trimesh.creation.cylinder(0.05, 0.2, sections=96)
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, :3] = rotation_from_viewpoint(0.0, 35.0, 0.0)
+    T[2, 3] = 1.0
+    seen = render_depth(mesh, T, CAMERA, SIZE)[0] > 0
+    image = torch.where(seen, 0.8, 0.2).expand(3, -1, -1)
+    rows, columns = seen[0].any(dim=1).nonzero()[:, 0], seen[0].any(dim=0).nonzero()[:, 0]
+    box = torch.tensor([[columns[0] - 0.5, rows[0] - 0.5, columns[-1] + 0.5, rows[-1] + 0.5]])
+    views = sample_views(azimuth_step=90, elevations=[15, 30, 45], thetas=[-15, 0, 15])
+    bank = ViewBank.build(mesh, views, pipeline=PRESETS["classical"], image_size=96, progress=False)
+    turns = symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]})
+    best = Registrar(bank, symmetries=turns)(image[None], box, CAMERA)[0].hypotheses[0]
+    known = replace(best, covariance=fitted_covariance(bank, image, box[0], best))
+    turn, shift = known.standard_deviations
+    assert turn[1] == turn[2] == torch.inf, "the can's axis lies in the camera's y and z"
+    assert float(turn[0]) < 20
+    assert float(shift.max()) < 0.1
+    assert replace(best, covariance=None).standard_deviations is None
+
+
+def fitted_covariance(bank, image, box, pose):
+    mesh = bank.mesh
+    fit = fit_contours(
+        make_renderer(mesh),
+        image,
+        box,
+        CAMERA,
+        pose.transform[None],
+        centre=mesh_centre(mesh),
+        radius=mesh_radius(mesh),
+    )
+    return fit.covariance[0]
