@@ -62,7 +62,7 @@ def features(rows: list[dict[str, Any]]) -> np.ndarray:
         score = np.sort(in_use(row))[::-1]
         best = row["evidence"][int(np.argmax(in_use(row)))]
         lead = float(score[0] - score[1]) if len(score) > 1 else np.inf
-        out.append(pose_evidence(best, lead, row["ranking"][2]))
+        out.append(pose_evidence(best["similarity"], lead, with_camera=row["form"] == "exact"))
     return np.array(out)
 
 

@@ -1,6 +1,6 @@
 """How far a ranking can be trusted, and its best distinct views."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ __all__ = [
 EVIDENCE = ("similarity", "margin", "concentration")
 """What :func:`ranking_evidence` measures, in its order."""
 
-RELIABLE = 0.6
+RELIABLE = 0.8
 """Confidence below which a registration says "no reliable match"."""
 
 _WEIGHTS = (9.513, 1.042, 2.375)
@@ -31,11 +31,11 @@ _BIAS = -8.803
 _APART = 30.0  # degrees beyond which two views are rival answers
 
 
-POSE_EVIDENCE = ("similarity", "support", "appearance", "margin", "concentration")
+POSE_EVIDENCE = ("similarity", "margin", "camera")
 """What :func:`pose_evidence` measures, in its order."""
 
-_POSE_WEIGHTS = (2.0, 4.0, 0.3, 0.4, 1.0)
-_POSE_BIAS = -4.0
+_POSE_WEIGHTS = (0.371, 0.552, 1.59)
+_POSE_BIAS = -0.665
 """Logistic regression on photographs of textured meshes, by scripts/fit_verdict.py."""
 
 MARGIN = 5.0
@@ -95,18 +95,15 @@ def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
     return probability(ranking_evidence(ranking, rotations))
 
 
-def pose_evidence(best: Mapping[str, float], lead: float, concentration: float) -> list[float]:
-    """Numbers that tell right poses from wrong ones, see :data:`POSE_EVIDENCE`, of hypotheses followed to their end.
-
-    similarity, support, appearance: of the best hypothesis (:data:`curvireg_torch.registration.verify.EVIDENCE`).
-    margin: its lead, at most 5. concentration: of the ranking, see :func:`ranking_evidence`.
+def pose_evidence(similarity: float, lead: float, *, with_camera: bool) -> list[float]:
+    """Numbers that tell right poses from wrong ones, see :data:`POSE_EVIDENCE`, of a hypothesis followed to its end.
 
     Args:
-        best: evidence of the best hypothesis.
-        lead: how far its verdict leads that of the next distinct one.
-        concentration: in [0, 1].
+        similarity: normalised correlation of the pose's view with the photograph.
+        lead: how far its verdict leads that of the next distinct hypothesis; at most 5 counts.
+        with_camera: whether the camera matrix is known, and with it, as a rule, the object's own mesh.
     """
-    return [best["similarity"], best["support"], best["appearance"], min(lead, MARGIN), concentration]
+    return [similarity, min(lead, MARGIN), float(with_camera)]
 
 
 def pose_confidence(evidence: Sequence[float]) -> float:
@@ -115,7 +112,7 @@ def pose_confidence(evidence: Sequence[float]) -> float:
     What it is worth on photographs, and against wrong meshes, is in ``docs/method.md``.
 
     Example:
-        >>> pose_confidence([0.9, 0.7, 0.0, 5.0, 1.0]) > pose_confidence([0.5, 0.3, -2.0, 0.5, 0.2])
+        >>> pose_confidence([0.9, 5.0, 1.0]) > pose_confidence([0.5, 0.5, 1.0])
         True
     """
     values, weights = (torch.tensor(v, dtype=torch.float64) for v in (evidence, _POSE_WEIGHTS))

@@ -15,7 +15,7 @@ from ..geometry.translation import place_view
 from ..geometry.views import ViewSphere
 from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank, distinct_views
 from ..pipeline import BankSettings, Pipeline
-from .confidence import RELIABLE, confidence, pose_confidence, pose_evidence, ranking_evidence
+from .confidence import RELIABLE, confidence, pose_confidence, pose_evidence
 from .contour import ContourFit, fit_contours
 from .hypotheses import Hypotheses, hypotheses
 from .inputs import Item, check_crop, items_of, named
@@ -212,15 +212,14 @@ class Registrar:
             found = replace(found, score=score)
         score = verdict(evidence, with_camera=K is not None) + torch.where(own, 0.0, -1e6)
         order = score.argsort(descending=True, stable=True)
-        coarse, concentration = confidence(ranking, self.bank.rotations), ranking_evidence(ranking, self.bank.rotations)
+        coarse = confidence(ranking, self.bank.rotations)
         results = []
         for b in range(len(items)):
             mine = order[found.photograph[order] == b].tolist()
             trust = float(coarse[b])
             if fit is not None:
                 lead = float(score[mine[0]] - score[mine[1]]) if len(mine) > 1 else torch.inf
-                told = dict(zip(EVIDENCE, evidence[mine[0]].tolist(), strict=True))
-                trust = pose_confidence(pose_evidence(told, lead, float(concentration[b, 2])))
+                trust = pose_confidence(pose_evidence(float(found.score[mine[0]]), lead, with_camera=K is not None))
             reliable = trust >= RELIABLE
             poses = tuple(self._hypothesis(h, found, T, evidence, fit, reliable, K is not None) for h in mine)
             results.append(Registration(poses, trust, ranking[b : b + 1]))

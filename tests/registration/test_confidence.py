@@ -1,4 +1,5 @@
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -7,8 +8,19 @@ import torch
 from curvireg_torch import Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
 from curvireg_torch.geometry import symmetry_transforms
 from curvireg_torch.matching import Ranking
-from curvireg_torch.registration import confidence, distinct_views, ranking_evidence
-from curvireg_torch.registration.confidence import _BIAS, _WEIGHTS, EVIDENCE
+from curvireg_torch.registration import confidence, distinct_views, ranking_evidence, verdict
+from curvireg_torch.registration.confidence import (
+    _BIAS,
+    _POSE_BIAS,
+    _POSE_WEIGHTS,
+    _WEIGHTS,
+    EVIDENCE,
+    POSE_EVIDENCE,
+    RELIABLE,
+    pose_confidence,
+    pose_evidence,
+)
+from curvireg_torch.registration.verify import WEIGHTS
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, SIZE, scene, truck_bank
 
@@ -55,6 +67,32 @@ def test_constants_are_those_that_the_script_found():
     assert kept["evidence"] == list(EVIDENCE)
     assert kept["weights"] == pytest.approx(_WEIGHTS)
     assert kept["bias"] == pytest.approx(_BIAS)
+
+
+def test_constants_of_verified_poses_are_those_that_the_script_found():
+    kept = json.loads(CONSTANTS.with_name("verdict.json").read_text())
+    assert kept["confidence"]["evidence"] == list(POSE_EVIDENCE)
+    assert kept["confidence"]["weights"] == pytest.approx(_POSE_WEIGHTS)
+    assert kept["confidence"]["bias"] == pytest.approx(_POSE_BIAS)
+    assert kept["verdict"]["used"] == list(WEIGHTS)
+    precision, coverage = kept["confidence"]["held_out"]["precision_at"][f"{RELIABLE:g}"]
+    assert precision > 0.9
+    assert coverage > 0.3
+
+
+def test_confidence_of_a_pose_is_the_logistic_function():
+    evidence = pose_evidence(0.7, 9.0, with_camera=True)
+    assert evidence == [0.7, 5.0, 1.0], "a lead counts up to 5"
+    x = 0.371 * 0.7 + 0.552 * 5.0 + 1.59 - 0.665
+    assert pose_confidence(evidence) == pytest.approx(1 / (1 + math.exp(-x)))
+    assert pose_confidence(pose_evidence(0.7, 9.0, with_camera=False)) < pose_confidence(evidence)
+    assert pose_confidence(pose_evidence(0.7, 0.1, with_camera=True)) < RELIABLE < pose_confidence(evidence)
+
+
+def test_verdict_counts_what_was_found_only_where_the_camera_is_known():
+    evidence = torch.tensor([[0.0, 0.5, 0.3, 0.0], [-0.5, 0.6, 0.6, 0.1]], dtype=torch.float64)
+    assert verdict(evidence, with_camera=True).tolist() == pytest.approx([2.5 + 3.0, -0.5 + 3.0 + 6.0 + 0.1])
+    assert verdict(evidence, with_camera=False).tolist() == [0.0, -0.5]
 
 
 def test_the_right_object_is_trusted_more_than_clutter():
