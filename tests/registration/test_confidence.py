@@ -83,7 +83,7 @@ def test_constants_of_verified_poses_are_those_that_the_script_found():
 def test_confidence_of_a_pose_is_the_logistic_function():
     evidence = pose_evidence(0.7, 9.0, with_camera=True)
     assert evidence == [0.7, 5.0, 1.0], "a lead counts up to 5"
-    x = 0.371 * 0.7 + 0.552 * 5.0 + 1.59 - 0.665
+    x = 0.7 * _POSE_WEIGHTS[0] + 5.0 * _POSE_WEIGHTS[1] + _POSE_WEIGHTS[2] + _POSE_BIAS
     assert pose_confidence(evidence) == pytest.approx(1 / (1 + math.exp(-x)))
     assert pose_confidence(pose_evidence(0.7, 9.0, with_camera=False)) < pose_confidence(evidence)
     assert pose_confidence(pose_evidence(0.7, 0.1, with_camera=True)) < RELIABLE < pose_confidence(evidence)
