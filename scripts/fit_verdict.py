@@ -14,12 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from results_table import between
 from scipy.optimize import minimize
 from sklearn.linear_model import LogisticRegression
 
 from curvireg_torch.registration.confidence import POSE_EVIDENCE, pose_evidence
 from curvireg_torch.registration.verify import EVIDENCE, RANK_ALONE, WEIGHTS
 
+PAGE = Path(__file__).parents[1] / "docs" / "accuracy.md"
+BEGIN, END = "<!-- verdict:begin -->", "<!-- verdict:end -->"
 RIGHT = 30.0
 PARTS = 5
 PRIOR = WEIGHTS
@@ -73,6 +76,44 @@ def chosen(rows: list[dict[str, Any]]) -> np.ndarray:
 
 def auc(p: np.ndarray, q: np.ndarray) -> float:
     return float((p[:, None] > q[None]).mean() + 0.5 * (p[:, None] == q[None]).mean())
+
+
+def page(result: dict[str, Any]) -> str:
+    """Tables of docs/accuracy.md."""
+    held = result["confidence"]["held_out"]
+    known = {t: v for t, v in held["precision_at"].items() if v[0] is not None}
+    head = ["photographs", "N", "best view", "after search, contours and verdict", "among five hypotheses"]
+    keys = ("best_view", "winner", "among_hypotheses")
+    shares = [[name, str(s["n"]), *(f"{s[k]:.2f}" for k in keys)] for name, s in result["shares"].items()]
+    return "\n".join(
+        [
+            *rows_of_table([head, *shares]),
+            "",
+            f"Confidence, meshes left out in turn: AUC of right answers {held['auc_right_answer']:.2f}.",
+            "",
+            *rows_of_table(
+                [
+                    ["coverage", *held["risk_at_coverage"]],
+                    ["share that is wrong", *(f"{v:.2f}" for v in held["risk_at_coverage"].values())],
+                ]
+            ),
+            "",
+            *rows_of_table(
+                [
+                    ["confidence of at least", *known],
+                    ["right", *(f"{v[0]:.2f}" for v in known.values())],
+                    ["of all", *(f"{v[1]:.2f}" for v in known.values())],
+                ]
+            ),
+            "",
+        ]
+    )
+
+
+def rows_of_table(cells: list[list[str]]) -> list[str]:
+    """Lines of a Markdown table, the first row its head."""
+    lines = ["| " + " | ".join(row) + " |" for row in cells]
+    return [lines[0], "|---" * len(cells[0]) + "|", *lines[1:]]
 
 
 def main() -> None:
@@ -133,6 +174,9 @@ def main() -> None:
         result["confidence"]["n_wrong"] = len(wrong)
     arguments.out.write_text(json.dumps(result, indent=2) + "\n")
     print(json.dumps(result, indent=2))
+    if arguments.out.parent == PAGE.parents[1] / "scripts" / "results":
+        text = PAGE.read_text(encoding="utf-8")
+        PAGE.write_text(between(text, BEGIN, END, page(result)), encoding="utf-8")
 
 
 if __name__ == "__main__":
