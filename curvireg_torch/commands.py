@@ -125,7 +125,7 @@ def register(arguments: argparse.Namespace) -> None:
     document = _document(result, registrar, times)
     document["inputs"] = {"photo": str(arguments.photo), "mesh": str(arguments.mesh), "box": box.tolist()}
     document["inputs"]["picture"] = photo.facts()
-    _write(arguments.out, document, registrar, result, image / 255.0, box, K)
+    _write(arguments.out, document, registrar, result, image, box)
     if photo.notes:
         print(f"{arguments.photo}: {'; '.join(photo.notes)}")
     _print_result(document, arguments.out)
@@ -155,7 +155,7 @@ def demo(arguments: argparse.Namespace) -> None:
     document["translation_error"] = float((result.translation - truth[:3, 3]).norm() / truth[:3, 3].norm())
     document["truth"] = {"rotation": truth[:3, :3].tolist(), "translation": truth[:3, 3].tolist()}
     document["inputs"] = {"seed": arguments.seed, "box": box.tolist()}
-    _write(arguments.out, document, registrar, result, image, box, K)
+    _write(arguments.out, document, registrar, result, image, box)
     write_file(arguments.out / "mesh.ply", mesh.export(file_type="ply"))
     _write_picture(arguments.out / "photo.png", (image.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
     _print_result(document, arguments.out)

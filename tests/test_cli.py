@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch import Registrar, camera_matrix
+from curvireg_torch import Registrar, ViewBank, camera_matrix
 from curvireg_torch.cli import main
 from curvireg_torch.errors import BankError
 from curvireg_torch.geometry import rotation_error, up_rotation
@@ -107,6 +107,9 @@ def test_a_sideways_photograph_is_registered_as_viewers_show_it(files, capsys):
     assert result["inputs"]["picture"]["orientation"] == 6
     assert upright["inputs"]["picture"]["orientation"] == 1
     assert "sideways.png: EXIF orientation 6 applied" in capsys.readouterr().out
+    # A path given in Python is the same photograph.
+    registrar = Registrar(ViewBank.load(folder / "truck.safetensors"), refine=False)
+    assert registrar([folder / "sideways.png"], [[float(v) for v in box]])[0].rotation.tolist() == result["rotation"]
 
 
 @pytest.mark.parametrize(("name", "options", "up"), [("y.glb", [], "y"), ("x.ply", ["--up=-x"], "-x")])

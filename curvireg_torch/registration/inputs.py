@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..data.images import read_image
+from ..data.images import read_photo
 from ..errors import CurviregError, ImageError, InvalidInputError
 from ..geometry.cameras import check_camera_matrix
 from ..geometry.crops import check_boxes
@@ -72,7 +71,7 @@ def _item(image: Any, box: Tensor, K: Tensor | None) -> Item:
 
 def _pixels(image: Any) -> Tensor:
     if isinstance(image, str | PathLike):
-        return read_image(Path(image))
+        return read_photo(image).image  # as viewers show it, as the command line reads it
     if isinstance(image, np.ndarray):
         image = torch.from_numpy(np.ascontiguousarray(image))
         image = image[None] if image.ndim == 2 else image.movedim(-1, 0) if image.ndim == 3 else image

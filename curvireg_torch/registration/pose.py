@@ -33,6 +33,9 @@ class Hypothesis:
         allocentric_rotation: (3, 3) float64 of the same view by a camera that looks straight at the object; equal to
             ``rotation`` without a camera matrix.
         distance: of the object's centre in that view, in model units.
+        seen_by: (4, 4) ``T_cam_from_model`` and (3, 3) camera matrix in px of the photograph, float64, that project the
+            mesh onto the photograph as it was found. Without a camera matrix, that of the camera that was assumed: one
+            that looks straight at the object.
         view: of the bank, where the hypothesis comes from.
         model: which of the bank's meshes.
         support: how strongly edges of the photograph lie under the mesh's contours, in [0, 1]; None without the contour
@@ -48,6 +51,7 @@ class Hypothesis:
     evidence: Mapping[str, float]
     allocentric_rotation: Tensor
     distance: float
+    seen_by: tuple[Tensor, Tensor]
     view: int
     model: int = 0
     support: float | None = None
@@ -139,6 +143,10 @@ class Registration:
     @property
     def distance(self) -> float:
         return self.hypotheses[0].distance
+
+    @property
+    def seen_by(self) -> tuple[Tensor, Tensor]:
+        return self.hypotheses[0].seen_by
 
     @property
     def model(self) -> int:

@@ -15,6 +15,7 @@ from ..geometry.translation import place_view
 from ..geometry.views import ViewSphere
 from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank, distinct_views
 from ..pipeline import BankSettings, Pipeline
+from ..rendering import DepthRenderer
 from .confidence import RELIABLE, confidence, pose_confidence, pose_evidence
 from .contour import ContourFit, fit_contours
 from .hypotheses import Hypotheses, hypotheses
@@ -45,7 +46,8 @@ class Registrar:
         field: photograph filter of one's own, see :class:`ViewMatcher`.
         refine, contours: False leaves out the search and all behind it, or the contour stage.
         hypotheses: distinct hypotheses to carry and to report, instead of the pipeline's; ``top`` is its old name.
-        renderer: of the views rendered in search and contours, and of a bank that is built.
+        renderer: of the views rendered in search and contours, and of a bank that is built; one of your own is of one
+            mesh.
         symmetries: (S, 4, 4) of the mesh, from :func:`curvireg_torch.geometry.symmetry_transforms`; hypotheses that
             differ by one of them are reported once.
         device: where modules, bank and search live.
@@ -73,7 +75,7 @@ class Registrar:
         contours: bool = True,
         hypotheses: int | None = None,
         top: int | None = None,
-        renderer: str = "auto",
+        renderer: str | DepthRenderer = "auto",
         symmetries: Tensor | None = None,
         device: torch.device | str | None = None,
         progress: bool = False,
@@ -111,6 +113,8 @@ class Registrar:
             hypotheses=pipeline.hypotheses if hypotheses is None else hypotheses,
         )
         self.matcher, self.bank = matcher, matcher.bank
+        if not isinstance(renderer, str) and len(self.bank.meshes) != 1:
+            raise InvalidInputError(f"renderer: yours is of one mesh, the bank has {len(self.bank.meshes)}; name one")
         self.symmetries = symmetries
 
     @cached_property
@@ -200,7 +204,7 @@ class Registrar:
         evidence = self._evidence(starts, found, fit, query, ranking)
         own = self._own_peaks(found, verdict(evidence, with_camera=K is not None))
         if not bool(own.all()):
-            found, T, fit = self._sent_back(own, starts, found, T, fit, boxes, K)
+            found, T, cameras, fit = self._sent_back(own, starts, found, T, cameras, fit, boxes, K)
             found = replace(found, score=similarities(self.describers, descriptors, found))
             if fit is not None:
                 fit = replace(fit, support=torch.where(own, fit.support, 0.0))
@@ -208,7 +212,8 @@ class Registrar:
         if fit is not None and K is None:
             # The mesh is often another object of the kind: where its contours do not fit, the view itself errs less.
             score = found.score
-            found, T, fit = self._sent_back(own & fit.trustworthy, starts, found, T, fit, boxes, K)
+            believed = own & fit.trustworthy
+            found, T, cameras, fit = self._sent_back(believed, starts, found, T, cameras, fit, boxes, K)
             found = replace(found, score=score)
         score = verdict(evidence, with_camera=K is not None) + torch.where(own, 0.0, -1e6)
         order = score.argsort(descending=True, stable=True)
@@ -221,7 +226,7 @@ class Registrar:
                 lead = float(score[mine[0]] - score[mine[1]]) if len(mine) > 1 else torch.inf
                 trust = pose_confidence(pose_evidence(float(found.score[mine[0]]), lead, with_camera=K is not None))
             reliable = trust >= RELIABLE
-            poses = tuple(self._hypothesis(h, found, T, evidence, fit, reliable, K is not None) for h in mine)
+            poses = tuple(self._hypothesis(h, found, T, cameras, evidence, fit, reliable, K is not None) for h in mine)
             results.append(Registration(poses, trust, ranking[b : b + 1]))
         return results
 
@@ -259,13 +264,15 @@ class Registrar:
         starts: Hypotheses,
         found: Hypotheses,
         T: Tensor,
+        cameras: Tensor,
         fit: ContourFit | None,
         boxes: Tensor,
         K: Tensor | None,
-    ) -> tuple[Hypotheses, Tensor, ContourFit | None]:
+    ) -> tuple[Hypotheses, Tensor, Tensor, ContourFit | None]:
         """Hypotheses that became another one stand where they started: a rival is a rival, if not a peak."""
-        placed = self._placed(starts, boxes, K)[0]
+        placed, theirs = self._placed(starts, boxes, K)
         T = torch.where(own[:, None, None], T, placed)
+        cameras = torch.where(own[:, None, None], cameras, theirs)
         found = replace(
             found,
             rotation=torch.where(own[:, None, None], found.rotation, starts.rotation),
@@ -274,13 +281,14 @@ class Registrar:
         if fit is not None:
             covariance = torch.where(own[:, None, None], fit.covariance, torch.nan)
             fit = replace(fit, transform=T, covariance=covariance)
-        return found, T, fit
+        return found, T, cameras, fit
 
     def _hypothesis(
         self,
         h: int,
         found: Hypotheses,
         T: Tensor,
+        cameras: Tensor,
         evidence: Tensor,
         fit: ContourFit | None,
         reliable: bool,
@@ -294,6 +302,7 @@ class Registrar:
             evidence=dict(zip(EVIDENCE, evidence[h].tolist(), strict=True)),
             allocentric_rotation=found.rotation[h].clone(),
             distance=float(found.distance[h]),
+            seen_by=(T[h].clone(), cameras[h].clone()),
             view=int(found.view[h]),
             model=int(found.model[h]),
             support=None if fit is None else float(fit.support[h]),

@@ -1,12 +1,16 @@
 """One picture that shows whether a registration can be believed."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..geometry.crops import crop_transforms, square_boxes
-from ..registration import Registrar, Registration
+from ..errors import CurviregError, InvalidInputError
+from ..geometry import rotation_error
+from ..registration import Hypothesis, Registrar, Registration
+from ..registration.inputs import Item, items_of
 
 __all__ = ["contour_overlay", "registration_sheet"]
 
@@ -15,41 +19,54 @@ _TILE = 192
 
 
 def contour_overlay(
-    registrar: Registrar, result: Registration, image: Tensor, box: Tensor, camera_matrix: Tensor | None = None
+    registrar: Registrar,
+    result: Registration | Hypothesis,
+    image: Any,
+    box: Any,
+    camera_matrix: Tensor | None = None,
 ) -> np.ndarray:
     """The photograph with the mesh's outer (green) and inner (orange) contours at the pose, and the box (white).
 
+    What is drawn is what was found (``result.seen_by``), not what would fill the box.
+
     Args:
         registrar: what made ``result``.
-        image: (1 or 3, H, W) in [0, 1].
+        result: a registration, or one of its hypotheses.
+        image: the photograph, as the registrar takes it: a (1 or 3, H, W) tensor, an array or a path.
         box: (4,) px.
-        camera_matrix: (3, 3), as given to the registrar.
+        camera_matrix: (3, 3) of another camera in the same place, for instance of a smaller copy of the photograph;
+            default that of the photograph.
 
     Returns:
         (H, W, 3) uint8 RGB.
+
+    Raises:
+        InvalidInputError: a camera matrix for a pose that was found without one.
     """
-    H, W = image.shape[-2:]
-    if camera_matrix is not None and result.transform is not None:
-        T, K = result.transform, camera_matrix.double().cpu()
-    else:
-        distance = torch.tensor([result.distance], dtype=torch.float64)
-        cameras, crops, _ = registrar.describers[result.model].cameras(result.allocentric_rotation[None], distance)
-        settings = registrar.bank.settings
-        to_crop = crop_transforms(square_boxes(box.double().cpu(), settings.margin), settings.image_size)
-        T, K = cameras[0], torch.linalg.inv(to_crop).triu() @ crops[0]
-    orthographic = registrar.bank.settings.camera == "orthographic" and camera_matrix is None
-    renderer = registrar.describers[result.model].renderer
-    depth = renderer.render(T[None], K, (H, W), orthographic=orthographic)[0, 0].cpu().numpy()
-    picture = to_uint8(image)
+    if camera_matrix is not None and result.translation is None:
+        raise InvalidInputError("camera_matrix: the pose was found without one; leave it out")
+    item = _item(image, box)
+    T, K = result.seen_by
+    K = K if camera_matrix is None else camera_matrix
+    H, W = item.image.shape[-2:]
+    depth = registrar.describers[result.model].renderer.render(T[None], K, (H, W))[0, 0].cpu().numpy()
+    picture = to_uint8(item.image)
     width = max(1, round(max(H, W) / 500))
     mask = (depth > 0).astype(np.uint8)
     inner = _depth_edges(depth) & (cv2.erode(mask, np.ones((3, 3), np.uint8)) > 0)
     picture[_thick(inner, width)] = _INNER
     outline, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(picture, outline, -1, _CONTOUR, width)
-    corners = [round(float(v)) for v in box]
-    cv2.rectangle(picture, (corners[0], corners[1]), (corners[2], corners[3]), _BOX, max(1, width // 2))
+    x0, y0, x1, y1 = (round(v) for v in item.box.tolist())
+    cv2.rectangle(picture, (x0, y0), (x1, y1), _BOX, max(1, width // 2))
     return picture
+
+
+def _item(image: Any, box: Any) -> Item:
+    item = items_of([image], torch.as_tensor(box)[None], None)[0]
+    if isinstance(item, CurviregError):
+        raise item
+    return item
 
 
 def _depth_edges(depth: np.ndarray) -> np.ndarray:
@@ -72,51 +89,61 @@ def _thick(mask: np.ndarray, width: int) -> np.ndarray:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((width, width), np.uint8)) > 0)
 
 
+@torch.no_grad()
 def registration_sheet(
-    registrar: Registrar, result: Registration, image: Tensor, box: Tensor, camera_matrix: Tensor | None = None
+    registrar: Registrar, result: Registration, image: Any, box: Any, camera_matrix: Tensor | None = None
 ) -> np.ndarray:
-    """Contour overlay; beside it the crop, its field, the best view and its field; below the best distinct views.
+    """Contour overlay; beside it the crop, its field, the pose and its field; below the hypotheses' poses, best first.
 
-    Arguments as for :func:`contour_overlay`.
+    Under each hypothesis stand its score and how far it is turned from the best. Arguments as for
+    :func:`contour_overlay`.
 
     Returns:
         (H', W', 3) uint8 RGB.
     """
-    crop = registrar.matcher.crop(image[None], box[None])[0]
-    field = registrar.matcher.features(crop).field[0]
-    rotations = [result.allocentric_rotation, *registrar.bank.rotations[result.candidates].double().cpu()]
-    distances = [result.distance] + [result.distance] * len(result.candidates)
-    depth, _ = registrar.describers[result.model].depth(
-        torch.stack(rotations), torch.tensor(distances, dtype=torch.float64)
-    )
-    view_field = registrar.bank.settings.depth_filter()(depth[:1])[0]
+    item = _item(image, box)
+    overlay = contour_overlay(registrar, result, item.image, item.box, camera_matrix)
+    query = registrar.matcher.query([item.image], item.box[None])
+    depths = [
+        registrar.describers[h.model].depth(h.allocentric_rotation[None], torch.tensor([h.distance]))[0]
+        for h in result.hypotheses
+    ]
+    view_field = registrar.bank.settings.depth_filter()(depths[0])[0]
     side = [
-        _caption(_tile(to_uint8(crop[0])), "photograph"),
-        _caption(_tile(_field_picture(field)), "photograph field"),
-        _caption(_tile(depth_picture(depth[0, 0])), "pose"),
+        _caption(_tile(to_uint8(query.crops[0])), "photograph"),
+        _caption(_tile(_field_picture(query.field[0])), "photograph field"),
+        _caption(_tile(depth_picture(depths[0][0, 0])), "pose"),
         _caption(_tile(_field_picture(view_field)), "view field"),
     ]
-    views = [
-        _caption(
-            _tile(depth_picture(depth[1 + i, 0])), f"{i + 1}: view {int(v)}  {float(result.ranking.scores[0, v]):.2f}"
-        )
-        for i, v in enumerate(result.candidates)
+    poses = [
+        _caption(_tile(depth_picture(depth[0, 0])), _told(registrar, result, i))
+        for i, depth in enumerate(depths, start=1)
     ]
     panel = np.vstack([np.hstack(side[:2]), np.hstack(side[2:])])
-    overlay = contour_overlay(registrar, result, image, box, camera_matrix)
     height = panel.shape[0]
     scale = height / overlay.shape[0]
     shrink = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     overlay = cv2.resize(overlay, (max(1, round(overlay.shape[1] * scale)), height), interpolation=shrink)
-    top, bottom = np.hstack([overlay, panel]), np.hstack(views)
+    top, bottom = np.hstack([overlay, panel]), np.hstack(poses)
     width = max(top.shape[1], bottom.shape[1])
     return np.vstack([_widen(top, width), _widen(bottom, width)])
 
 
+def _told(registrar: Registrar, result: Registration, number: int) -> str:
+    """What stands over the picture of a hypothesis."""
+    best, this = result.hypotheses[0], result.hypotheses[number - 1]
+    mesh = f"mesh {this.model}, " if len(registrar.bank.meshes) > 1 else ""
+    if number == 1 or this.model != best.model:
+        return f"{number}: {mesh}score {this.score:.2f}"
+    return f"{number}: {mesh}score {this.score:.2f}, {float(rotation_error(this.rotation, best.rotation)):.0f} deg"
+
+
 def to_uint8(image: Tensor) -> np.ndarray:
-    """(H, W, 3) uint8 RGB of a (1 or 3, H, W) image in [0, 1]."""
-    pixels = (image.detach().cpu().float().clamp(0, 1) * 255).round().byte().expand(3, -1, -1)
-    return np.ascontiguousarray(pixels.permute(1, 2, 0).numpy())
+    """(H, W, 3) uint8 RGB of a (1 or 3, H, W) image, floating in [0, 1] or uint8."""
+    pixels = image.detach().cpu()
+    if pixels.is_floating_point():
+        pixels = (pixels.float().clamp(0, 1) * 255).round().byte()
+    return np.ascontiguousarray(pixels.expand(3, -1, -1).permute(1, 2, 0).numpy())
 
 
 def depth_picture(depth: Tensor) -> np.ndarray:

@@ -1,0 +1,79 @@
+"""Python in the documentation runs as it stands."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+import trimesh
+
+import curvireg_torch
+from curvireg_torch import Pipeline, ViewBank, sample_views
+from curvireg_torch.synthetic import example_mesh
+
+ROOT = Path(__file__).parents[1]
+
+
+def blocks(page: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
+def run(code: list[str], page: str) -> dict[str, Any]:
+    names: dict[str, Any] = {"__name__": "page"}
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        for block in code:
+            exec(compile(block, page, "exec"), names)
+    return names
+
+
+def test_a_field_and_a_term_as_the_architecture_page_adds_them():
+    page = "docs/architecture.md"
+    names = run(blocks(page), page)
+    assert names["result"].hypotheses[0].rotation.shape == (3, 3)
+    ranking, term = names["ranking"], names["Middle"]()
+    assert set(ranking.terms) == {"hog", "repeatability", "box", "middle"}
+    log = term.log_score(ranking.terms["middle"])
+    assert float(log.max()) == 0.0
+    # It counts, with its weight.
+    plain = names["pipeline"].with_term("middle", weight=0.0)
+    matcher = names["cr"].ViewMatcher(names["bank"], pipeline=plain)
+    without = matcher([names["photograph"]], torch.tensor([names["box"]]))
+    torch.testing.assert_close(ranking.scores, without.scores * (0.5 * log).exp())
+    # Masks with one pixel each: the middle is that pixel.
+    one = torch.zeros(1, 5, 5, dtype=torch.bool)
+    one[0, 1, 4] = True
+    assert names["middles"](one).tolist() == [[1.0, 0.25]]
+
+
+def test_the_readmes_python(tmp_path, monkeypatch):
+    """The views thinned out: what they are is the pipeline's business."""
+    scale = trimesh.transformations.scale_matrix(1000.0)
+    example_mesh().apply_transform(scale).export(tmp_path / "part.stl")
+    photograph = np.random.default_rng(0).integers(0, 255, (1080, 1920, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "photo.jpg"), photograph)
+    views, asked = sample_views(azimuth_step=90, elevations=[20]), []
+
+    def few(mesh, given, *, pipeline, **_):
+        assert given is None
+        asked.append((pipeline, mesh.units))
+        return ViewBank.build(mesh, views, pipeline=pipeline, progress=False)
+
+    monkeypatch.setattr("curvireg_torch.registration.registrar.cached_bank", few)
+    monkeypatch.chdir(tmp_path)
+    names = run(blocks("README.md"), "README.md")
+    assert asked == [(Pipeline(), "mm")]
+    assert names["result"].translation.shape == (3,)
+    assert names["depth_side"](torch.rand(1, 1, 64, 64)).shape == (1, 1764)
+
+
+def test_the_table_of_parts_names_them_all():
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    package = Path(curvireg_torch.__file__).parent
+    folders = {path.parent.name for path in package.glob("*/__init__.py")}
+    missing = {name for name in folders if f"`{name}`" not in text}
+    assert not missing
+    for path in re.findall(r"(?<!tests/)\b((?:matching|registration|terms|evaluation|rendering)/\w+)(?:\.py)?\b", text):
+        assert (package / f"{path}.py").is_file(), path
