@@ -38,7 +38,7 @@ def test_a_field_and_a_term_as_the_architecture_page_adds_them():
     log = term.log_score(ranking.terms["middle"])
     assert float(log.max()) == 0.0
     # It counts, with its weight.
-    plain = names["pipeline"].with_term("middle", weight=0.0)
+    plain = names["bank"].pipeline.with_term("middle", weight=0.0)
     matcher = names["cr"].ViewMatcher(names["bank"], pipeline=plain)
     without = matcher([names["photograph"]], torch.tensor([names["box"]]))
     torch.testing.assert_close(ranking.scores, without.scores * (0.5 * log).exp())
