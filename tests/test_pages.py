@@ -34,7 +34,7 @@ def test_a_field_and_a_term_as_the_architecture_page_adds_them():
     names = run(blocks(page), page)
     assert names["result"].hypotheses[0].rotation.shape == (3, 3)
     ranking, term = names["ranking"], names["Middle"]()
-    assert set(ranking.terms) == {"hog", "repeatability", "box", "middle"}
+    assert set(ranking.terms) == {term.name for term in Pipeline().terms} | {"middle"}
     log = term.log_score(ranking.terms["middle"])
     assert float(log.max()) == 0.0
     # It counts, with its weight.
