@@ -13,6 +13,7 @@ from ..descriptors import field_points
 from ..errors import InvalidInputError
 from ..geometry.crops import crop_images
 from ..pipeline import Pipeline
+from ..rendering import DepthRenderer
 from ..terms import (
     LateModule,
     LateTerm,
@@ -123,7 +124,7 @@ class ViewMatcher(nn.Module):
         field: nn.Module | None = None,
         slack: float | None = None,
         whitening: Whitening | None = None,
-        renderer: str = "auto",
+        renderer: str | DepthRenderer = "auto",
         chunk_size: int = 16,
         **deprecated: Any,
     ) -> None:
