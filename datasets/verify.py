@@ -10,23 +10,17 @@ Exit code 0: sound. 1: usable with defects (missing, corrupt or bad items, which
 import argparse
 import sys
 from collections import Counter
-from pathlib import Path
 
-from curvireg_torch.data import BOPDataset, Pascal3DPlus, WebCollection, read_image
+from torch.utils.data import Dataset
+
+from curvireg_torch.data import read_image
 from curvireg_torch.errors import CurviregError
+from curvireg_torch.evaluation.registry import KINDS, Kind
 
 DEFECTS = ("missing_", "corrupt_", "bad_")
 
 
-def open_dataset(options: argparse.Namespace) -> Pascal3DPlus | BOPDataset | WebCollection:
-    if options.kind == "pascal3d":
-        return Pascal3DPlus(options.root, options.split, part=options.part, categories=options.categories)
-    if options.kind == "bop":
-        return BOPDataset(options.root, options.split)
-    return WebCollection(options.root)
-
-
-def unreadable(dataset: Pascal3DPlus | BOPDataset | WebCollection) -> list[str]:
+def unreadable(dataset: Dataset) -> list[str]:
     """Reads every photograph once."""
     problems = []
     for path in sorted({dataset.annotation(i)["image_path"] for i in range(len(dataset))}):
@@ -37,9 +31,9 @@ def unreadable(dataset: Pascal3DPlus | BOPDataset | WebCollection) -> list[str]:
     return problems
 
 
-def report(dataset: Pascal3DPlus | BOPDataset | WebCollection, images: bool, show: int) -> int:
+def report(dataset: Dataset, kind: Kind, images: bool, show: int) -> int:
     samples = [dataset.annotation(i) for i in range(len(dataset))]
-    counts = Counter(str(s.get("category", s.get("obj_id"))) for s in samples)
+    counts = Counter(kind.category.format_map(s) for s in samples)
     print(f"{len(samples)} objects in {len({s['image_path'] for s in samples})} photographs")
     for name, count in sorted(counts.items()):
         print(f"  {name}: {count}")
@@ -58,21 +52,17 @@ def report(dataset: Pascal3DPlus | BOPDataset | WebCollection, images: bool, sho
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="{pascal3d,bop,web}")
-    for kind in ("pascal3d", "bop", "web"):
-        command = kinds.add_parser(kind)
-        command.add_argument("root", type=Path)
+    kinds = parser.add_subparsers(required=True, metavar=f"{{{','.join(KINDS)}}}")
+    for name, kind in KINDS.items():
+        command = kinds.add_parser(name)
+        kind.add_arguments(command)
         command.add_argument("--images", action="store_true", help="also decode every photograph (slow)")
         command.add_argument("--show", type=int, default=5, help="how many items to name for each defect")
-        if kind == "pascal3d":
-            command.add_argument("--split", default="val")
-            command.add_argument("--part", choices=("pascal", "imagenet"), default="pascal")
-            command.add_argument("--categories", nargs="+")
-        if kind == "bop":
-            command.add_argument("--split", default="test")
+        command.set_defaults(kind=kind)
     options = parser.parse_args(arguments)
     try:
-        return report(open_dataset(options), options.images, options.show)
+        dataset = options.kind.open(options.root, **options.kind.chosen(options))
+        return report(dataset, options.kind, options.images, options.show)
     except CurviregError as error:
         print(error, file=sys.stderr)
         return 2

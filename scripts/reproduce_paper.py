@@ -21,8 +21,8 @@ import sys
 from pathlib import Path
 
 from curvireg_torch.errors import CurviregError
-from curvireg_torch.evaluation import Preset, paper
-from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.evaluation import KINDS, paper
+from curvireg_torch.pipeline import BankSettings, Pipeline
 
 RANKINGS = ("precision", "angles", "ranks")
 TABLES = ("detectors", "repeatability", "curve", *RANKINGS)
@@ -41,13 +41,13 @@ def main() -> int:
 def parser() -> argparse.ArgumentParser:
     result = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     result.add_argument("table", choices=(*TABLES, "all"), metavar="TABLE")
-    result.add_argument("kind", choices=paper.KINDS)
+    result.add_argument("kind", choices=KINDS)
     result.add_argument("root", type=Path, metavar="ROOT")
     result.add_argument("--out", type=Path, required=True, metavar="DIR")
     result.add_argument("--limit", type=int, metavar="N", help="only N photographs, spread evenly over the set")
     result.add_argument("--image-size", type=int, default=128, metavar="PX", help="side of crops (default: 128)")
     result.add_argument("--eps", type=float, default=2.0, metavar="PX", help="radius of a hit in the crop (default: 2)")
-    result.add_argument("--pose", choices=("upright", "any"), help="views of the banks (default: any for bop)")
+    result.add_argument("--pose", choices=("upright", "any"), help="views of the banks (default: the dataset's)")
     result.add_argument("--pixel-origin", type=int, choices=(0, 1), default=1, help="of PASCAL3D+ (default: 1)")
     result.add_argument("--quiet", action="store_true", help="no progress bars")
     return result
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> None:
     if "curve" in wanted:
         tables.append(paper.curve_table(cases, settings, arguments.eps, progress))
     if any(name in wanted for name in RANKINGS):
-        views = Preset().views(arguments.pose or ("any" if arguments.kind == "bop" else "upright"))
+        views = Pipeline().posed(arguments.pose or KINDS[arguments.kind].pose).views.sphere()
         rankings = paper.rank_views(cases, views, settings, progress)
         made = {
             "precision": lambda: [paper.precision_table(rankings)],

@@ -1,7 +1,7 @@
 """Datasets registered and scored: one loop puts predictions on disk, another scores what is there.
 
-``curvireg evaluate pascal3d ROOT --out DIR`` and ``curvireg evaluate bop ROOT --out DIR``; with ``torchrun``,
-``-m curvireg_torch.evaluation pascal3d ROOT --out DIR`` shares the objects among processes.
+``curvireg evaluate pascal3d|bop|web ROOT --out DIR``; with ``torchrun``, ``-m curvireg_torch.evaluation pascal3d ROOT
+--out DIR`` shares the objects among processes. A new dataset: a benchmark, and a row in :mod:`.registry`.
 """
 
 from typing import TYPE_CHECKING
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from .loops import evaluate, score
     from .pascal3d import Pascal3DBenchmark
     from .protocol import Protocol
+    from .registry import KINDS
+    from .web import WebBenchmark
 else:
     __getattr__, __dir__ = lazy(
         __name__,
@@ -27,17 +29,21 @@ else:
             "loops": "evaluate score",
             "pascal3d": "Pascal3DBenchmark",
             "protocol": "Protocol",
+            "registry": "KINDS",
+            "web": "WebBenchmark",
         },
     )
 
 __all__ = [
     "DEFAULT",
+    "KINDS",
     "PRESETS",
     "BOPBenchmark",
     "Benchmark",
     "Pascal3DBenchmark",
     "Pipeline",
     "Protocol",
+    "WebBenchmark",
     "add_parser",
     "evaluate",
     "run",

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from ..data import BOPDataset, Pascal3DPlus
+from ..data import BOPDataset, Pascal3DPlus, WebCollection
 from .protocol import Protocol
 
 __all__ = ["Benchmark", "Item", "Row"]
@@ -48,7 +48,7 @@ class Benchmark(ABC):
     name: ClassVar[str]
     unit: ClassVar[str]
 
-    def __init__(self, dataset: Pascal3DPlus | BOPDataset, protocol: Protocol) -> None:
+    def __init__(self, dataset: Pascal3DPlus | BOPDataset | WebCollection, protocol: Protocol) -> None:
         self.dataset, self.protocol = dataset, protocol
         self.items = [self.item(i) for i in range(len(dataset))]
 
@@ -59,7 +59,8 @@ class Benchmark(ABC):
 
     def settings(self) -> Row:
         """What predictions depend on besides preset and protocol."""
-        return {"dataset": self.name, "root": str(self.dataset.root.resolve()), "split": self.dataset.split}
+        split = getattr(self.dataset, "split", None)  # which a collection of one's own has not
+        return {"dataset": self.name, "root": str(self.dataset.root.resolve()), "split": split}
 
     @abstractmethod
     def item(self, index: int) -> Item:

@@ -1,4 +1,4 @@
-"""``curvireg evaluate pascal3d|bop ROOT --out DIR``."""
+"""``curvireg evaluate pascal3d|bop|web ROOT --out DIR``."""
 
 import argparse
 import os
@@ -6,13 +6,11 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from .._choices import DEFAULT, PRESET_NAMES
 from ..errors import InvalidInputError
-
-if TYPE_CHECKING:
-    from .benchmark import Benchmark
+from .registry import KINDS, Kind
 
 __all__ = ["add_datasets", "add_parser", "run"]
 
@@ -35,32 +33,17 @@ def add_parser(commands: Any, parents: Sequence[argparse.ArgumentParser]) -> Non
 
 
 def add_datasets(datasets: Any, parents: Sequence[argparse.ArgumentParser]) -> None:
-    """Add ``pascal3d`` and ``bop`` to the subparsers ``datasets``; ``parents`` as for :func:`add_parser`."""
+    """Add the kinds of datasets to the subparsers ``datasets``; ``parents`` as for :func:`add_parser`."""
     description = "Writes DIR/summary.json, DIR/predictions.csv and, as it goes, DIR/predictions; run again to go on."
-    pascal = datasets.add_parser("pascal3d", parents=parents, description=description, help="viewpoints on PASCAL3D+")
-    pascal.add_argument("root", type=Path, metavar="ROOT", help="folder with Annotations, Images and CAD")
-    pascal.add_argument("--split", default="val", help="name of the image lists (default: val)")
-    pascal.add_argument("--categories", nargs="+", metavar="CLASS", help="default: all")
-    pascal.add_argument("--part", choices=("pascal", "imagenet"), default="pascal", help="default: pascal")
-    pascal.add_argument(
-        "--pixel-origin",
-        type=int,
-        choices=(0, 1),
-        default=1,
-        help="number of the first pixel (default: 1, the release)",
-    )
-    pascal.set_defaults(benchmark=_pascal3d)
-    bop = datasets.add_parser("bop", parents=parents, description=description, help="6D poses on a BOP set")
-    bop.add_argument("root", type=Path, metavar="ROOT", help="folder with models and the split's folder")
-    bop.add_argument("--split", default="test", help="folder of the scenes (default: test)")
-    bop.set_defaults(benchmark=_bop)
-    for parser, default in ((pascal, "upright"), (bop, "any")):
+    for name, kind in KINDS.items():
+        parser = datasets.add_parser(name, parents=parents, description=description, help=kind.help)
+        kind.add_arguments(parser)
         parser.add_argument(
             "--protocol",
             nargs="+",
             default=[],
             metavar="KEY=VALUE",
-            help=f"{PROTOCOL} (default: cad=annotated pose={default} box=annotated)",
+            help=f"{PROTOCOL} (default: cad=annotated pose={kind.pose} box=annotated)",
         )
         parser.add_argument("--preset", choices=sorted(PRESET_NAMES), default=DEFAULT, help=f"default: {DEFAULT}")
         parser.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
@@ -70,7 +53,7 @@ def add_datasets(datasets: Any, parents: Sequence[argparse.ArgumentParser]) -> N
         parser.add_argument("--limit", type=int, metavar="N", help="only N objects, spread evenly over the set")
         parser.add_argument("--overwrite", action="store_true", help="start anew in a folder with other predictions")
         parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-        parser.set_defaults(run=run)
+        parser.set_defaults(run=run, kind=kind)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -84,9 +67,12 @@ def run(arguments: argparse.Namespace) -> None:
         return
     from ..pipeline import Pipeline
     from .loops import evaluate
+    from .protocol import Protocol
 
+    kind: Kind = arguments.kind
+    dataset = kind.open(arguments.root, **kind.chosen(arguments))
     summary = evaluate(
-        arguments.benchmark(arguments),
+        kind.scored(dataset, Protocol.parse(arguments.protocol, pose=kind.pose)),
         arguments.out,
         preset=arguments.preset if arguments.pipeline is None else Pipeline.read(arguments.pipeline),
         limit=arguments.limit,
@@ -101,7 +87,14 @@ def run(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(f"{arguments.root}: nothing was scored ({told}); see {arguments.out}/summary.json")
     shares = [name for name in summary if name.startswith(("acc_", "add_", "mssd_", "mspd_"))]
     print(f"{summary['n']} objects, {summary['failed']} failed, {sum(summary['skipped'].values())} skipped")
-    print("   ".join([*(f"{n} {summary[n]:.3f}" for n in shares), f"med_err_deg {summary['med_err_deg']:.1f}"]))
+    if "n_posed" in summary:
+        print(f"{summary['reliable']} reliable, mean confidence {summary['mean_confidence']:.2f}")
+        print(
+            f"the pose of {summary['n_posed']} is known: "
+            + ("of these" if summary["n_posed"] else "nothing to compare")
+        )
+    if summary["med_err_deg"] is not None:
+        print("   ".join([*(f"{n} {summary[n]:.3f}" for n in shares), f"med_err_deg {summary['med_err_deg']:.1f}"]))
     print(f"protocol: {summary['protocol']}; see {arguments.out}/summary.json")
 
 
@@ -114,26 +107,3 @@ def _run_jobs(count: int) -> None:
     done = subprocess.run([*torchrun, "-m", "curvireg_torch.evaluation", *words], env=environment, check=False)
     if done.returncode:
         raise InvalidInputError(f"evaluate: a process ended with {done.returncode}; what it says stands above")
-
-
-def _pascal3d(arguments: argparse.Namespace) -> "Benchmark":
-    from ..data import Pascal3DPlus
-    from .pascal3d import Pascal3DBenchmark
-    from .protocol import Protocol
-
-    dataset = Pascal3DPlus(
-        arguments.root,
-        arguments.split,
-        categories=arguments.categories,
-        part=arguments.part,
-        pixel_origin=arguments.pixel_origin,
-    )
-    return Pascal3DBenchmark(dataset, Protocol.parse(arguments.protocol))
-
-
-def _bop(arguments: argparse.Namespace) -> "Benchmark":
-    from ..data import BOPDataset
-    from .bop import BOPBenchmark
-    from .protocol import Protocol
-
-    return BOPBenchmark(BOPDataset(arguments.root, arguments.split), Protocol.parse(arguments.protocol, pose="any"))

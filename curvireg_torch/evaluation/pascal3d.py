@@ -1,7 +1,5 @@
 """PASCAL3D+: viewpoints of objects of twelve classes, with CADs of the class."""
 
-import csv
-import io
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -14,8 +12,7 @@ from ..geometry import rotation_error, viewpoint_from_rotation
 from ..metrics import AVP_BINS, accuracy, axis_rotation_error, binned_accuracy, median_error, symmetric_rotation_error
 from .benchmark import Benchmark, Item, Row
 from .protocol import Protocol
-from .scores import estimated_rotations, or_inf, viewpoint_scores
-from .store import write_text
+from .scores import estimated_rotations, or_inf, viewpoint_scores, write_viewpoints
 
 __all__ = ["Pascal3DBenchmark"]
 
@@ -107,19 +104,8 @@ class Pascal3DBenchmark(Benchmark):
 
     def write_predictions(self, path: Path, items: list[Item], rows: list[Row]) -> None:
         """One line per object: what was estimated, what is true, and the error."""
-        samples, R, _, plain, symmetric = self._judged(items, rows)
-        text = io.StringIO()
-        table = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
-        table.writeheader()
-        for i, (sample, row) in enumerate(zip(samples, rows, strict=True)):
-            names = ("azimuth", "elevation", "theta")
-            line = {**sample, **row, "seconds": row["seconds"]["register"]}
-            line |= {f"true_{name}": float(v) for name, v in zip(names, sample["viewpoint"], strict=True)}
-            line |= {"error_deg": float(plain[i]), "symmetric_error_deg": float(symmetric[i])}
-            if "rotation" in row:
-                line |= {n: float(v) for n, v in zip(names, viewpoint_from_rotation(R[i]), strict=True)}
-            table.writerow({name: _cell(line.get(name, "")) for name in COLUMNS})
-        write_text(path, text.getvalue())
+        samples, _, _, plain, symmetric = self._judged(items, rows)
+        write_viewpoints(path, COLUMNS, samples, rows, {"error_deg": plain, "symmetric_error_deg": symmetric})
 
     def _judged(self, items: list[Item], rows: list[Row]) -> tuple[list[Row], Tensor, Tensor, Tensor, Tensor]:
         """Annotations, estimated and true rotations (N, 3, 3), and their errors (N,) without and with symmetries."""
@@ -132,9 +118,3 @@ class Pascal3DBenchmark(Benchmark):
             mask = torch.tensor([s["category"] == category for s in samples], dtype=torch.bool)
             symmetric = torch.where(mask, error(R, truth), symmetric)
         return samples, R, truth, or_inf(plain, R), or_inf(symmetric, R)
-
-
-def _cell(value: object) -> object:
-    if isinstance(value, bool):
-        return int(value)
-    return f"{value:.6g}" if isinstance(value, float) else value

@@ -1,14 +1,20 @@
-"""Numbers that both benchmarks print."""
+"""Numbers and tables that several benchmarks write."""
 
-from collections.abc import Sequence
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from ..geometry import viewpoint_from_rotation
 from ..metrics import accuracy, median_error
+from .store import write_text
 
-__all__ = ["estimated_rotations", "or_inf", "viewpoint_scores"]
+__all__ = ["estimated_rotations", "or_inf", "viewpoint_scores", "write_viewpoints"]
 
 
 def viewpoint_scores(errors: Tensor, thresholds: dict[str, float]) -> dict[str, Any]:
@@ -26,7 +32,7 @@ def viewpoint_scores(errors: Tensor, thresholds: dict[str, float]) -> dict[str, 
     return {"n": len(errors), **shares, "med_err_deg": median_error(errors)}
 
 
-def estimated_rotations(rows: Sequence[dict[str, Any]]) -> Tensor:
+def estimated_rotations(rows: Sequence[Mapping[str, Any]]) -> Tensor:
     """(N, 3, 3) float64; NaN for rows without an estimate."""
     missing = [[float("nan")] * 3] * 3
     return torch.tensor([row.get("rotation", missing) for row in rows], dtype=torch.float64).view(-1, 3, 3)
@@ -35,3 +41,42 @@ def estimated_rotations(rows: Sequence[dict[str, Any]]) -> Tensor:
 def or_inf(errors: Tensor, R: Tensor) -> Tensor:
     """``errors`` (N,), ``inf`` where the estimate ``R`` (N, 3, 3) is missing (NaN)."""
     return torch.where(R.isfinite().flatten(1).all(1), errors, torch.full_like(errors, torch.inf))
+
+
+def write_viewpoints(
+    path: Path,
+    columns: Sequence[str],
+    samples: Sequence[Mapping[str, Any]],
+    rows: Sequence[Mapping[str, Any]],
+    errors: Mapping[str, Tensor],
+) -> None:
+    """A table with one line per object; ``path`` appears when it is complete.
+
+    Args:
+        path: of the table.
+        columns: those of sample, row and errors, the estimate's angles, and the truth's as ``true_azimuth``, ...
+        samples: annotations with ``viewpoint`` (3,), NaN where unknown.
+        rows: predictions.
+        errors: (N,) degrees, by column.
+    """
+    names = ("azimuth", "elevation", "theta")
+    R = estimated_rotations(rows)
+    text = io.StringIO()
+    table = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
+    table.writeheader()
+    for i, (sample, row) in enumerate(zip(samples, rows, strict=True)):
+        line = {**sample, **row, "seconds": row["seconds"]["register"]}
+        line |= {f"true_{name}": float(v) for name, v in zip(names, sample["viewpoint"], strict=True)}
+        line |= {name: float(values[i]) for name, values in errors.items()}
+        if "rotation" in row:
+            line |= {n: float(v) for n, v in zip(names, viewpoint_from_rotation(R[i]), strict=True)}
+        table.writerow({name: _cell(line.get(name, "")) for name in columns})
+    write_text(path, text.getvalue())
+
+
+def _cell(value: object) -> object:
+    if isinstance(value, bool):
+        return int(value)
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.6g}"
+    return value

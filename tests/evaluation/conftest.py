@@ -1,8 +1,8 @@
 import pytest
 
-from curvireg_torch.data import BOPDataset, Pascal3DPlus
+from curvireg_torch.data import BOPDataset, Pascal3DPlus, WebCollection
 from curvireg_torch.evaluation import DEFAULT, PRESETS
-from tests._support.miniature import write_bop, write_pascal3d
+from tests._support.miniature import write_bop, write_pascal3d, write_web
 
 from .small import SMALL
 
@@ -29,3 +29,10 @@ def bop(tmp_path):
     """Four instances, one of them without a box."""
     write_bop(tmp_path / "bop")
     return BOPDataset(tmp_path / "bop", targets=False)
+
+
+@pytest.fixture
+def web(tmp_path):
+    """Four photographs of two objects, two of them with a pose."""
+    write_web(tmp_path / "web")
+    return WebCollection(tmp_path / "web")

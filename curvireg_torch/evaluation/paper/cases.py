@@ -11,15 +11,15 @@ import trimesh
 from torch import Tensor
 from tqdm import tqdm
 
-from ...data import BOPDataset, Pascal3DPlus, WebCollection, read_image
+from ...data import read_image
 from ...errors import InvalidInputError
 from ...geometry import crop_images, load_mesh, mesh_centre, mesh_radius, rotation_towards
 from ...geometry.views import DEFAULT_DISTANCE
 from ...matching import BankSettings
+from ..bop import UNOCCLUDED
+from ..registry import KINDS, Kind
 
 __all__ = ["KINDS", "Case", "find_cases", "grouped"]
-
-KINDS = ("pascal3d", "bop", "web")
 
 
 @dataclass(frozen=True)
@@ -75,12 +75,10 @@ def find_cases(kind: str, root: Path, *, pixel_origin: int = 1, limit: int | Non
     """
     if kind not in KINDS:
         raise InvalidInputError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
-    dataset: Any
-    if kind == "pascal3d":
-        dataset = Pascal3DPlus(root, occluded=False, truncated=False, pixel_origin=pixel_origin)
-    else:
-        dataset = BOPDataset(root) if kind == "bop" else WebCollection(root)
-    cases = [case for i in range(len(dataset)) if (case := _case(kind, dataset.annotation(i))) is not None]
+    row = KINDS[kind]
+    origin = {"pixel_origin": pixel_origin} if "pixel_origin" in row.options else {}
+    dataset = row.open(root, **row.whole, **origin)
+    cases = [case for i in range(len(dataset)) if (case := _case(row, dataset.annotation(i))) is not None]
     if not cases:
         raise InvalidInputError(f"{root}: holds no whole object with a known pose")
     if limit is not None and limit < len(cases):
@@ -88,17 +86,13 @@ def find_cases(kind: str, root: Path, *, pixel_origin: int = 1, limit: int | Non
     return sorted(cases, key=lambda case: case.mesh_path)
 
 
-def _case(kind: str, s: dict[str, Any]) -> Case | None:
-    unknown = torch.full((3,), math.nan)
-    category, mesh, unit, t = s.get("category"), s.get("cad_path") or s.get("mesh_path"), "m", unknown
-    if kind == "bop":
-        category, mesh, unit, t = f"object {s['obj_id']}", s["model_path"], "mm", s["translation"]
-        if s["visib_fract"] <= 0.95:
-            return None
-    pose = torch.cat([s["rotation"], t[:, None]], dim=1).double()
-    if not bool(pose[:, :3].isfinite().all() and s["box"].isfinite().all()):
+def _case(kind: Kind, s: dict[str, Any]) -> Case | None:
+    translation = s.get("translation", torch.full((3,), math.nan))
+    pose = torch.cat([s["rotation"], translation[:, None]], dim=1).double()
+    known = bool(pose[:, :3].isfinite().all() and s["box"].isfinite().all())
+    if not known or s.get("visib_fract", 1.0) <= UNOCCLUDED:
         return None
-    return Case(str(category), s["image_path"], str(mesh), unit, s["box"], pose)
+    return Case(kind.category.format_map(s), s["image_path"], str(s[kind.mesh]), kind.scored.unit, s["box"], pose)
 
 
 def grouped(cases: list[Case], label: str, progress: bool) -> Iterator[tuple[trimesh.Trimesh, list[Case]]]:
