@@ -18,12 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from _record import REPOSITORY, SETS, benchmark, between, commit, today
 from kornia.color import rgb_to_grayscale
-from results_table import REPOSITORY, between, commit, today
 from torch import Tensor
 
-from curvireg_torch.data import BOPDataset, Pascal3DPlus
-from curvireg_torch.evaluation import Benchmark, BOPBenchmark, Pascal3DBenchmark, Protocol, evaluate
+from curvireg_torch.evaluation import evaluate
 from curvireg_torch.evaluation.store import PredictionStore
 from curvireg_torch.filters import MultiScaleFocusCurves
 from curvireg_torch.learned import LearnedCurvilinearSaliency
@@ -32,7 +31,6 @@ from curvireg_torch.pipeline import PRESETS, Pipeline
 KEPT = REPOSITORY / "scripts" / "results" / "ablation.json"
 PAGE = REPOSITORY / "docs" / "accuracy.md"
 BEGIN, END = "<!-- ablation:begin -->", "<!-- ablation:end -->"
-SETS = {"pascal3d_mini": "upright", "hope": "any", "lm": "any", "dino": "any"}
 RESAMPLES = 2000
 
 
@@ -76,17 +74,10 @@ FIELD_OF: dict[str, Callable[[], torch.nn.Module]] = {"learned + classical": _Bo
 """Rows with a field of their own."""
 
 
-def benchmark(name: str, data: Path) -> Benchmark:
-    protocol = Protocol(pose=SETS[name])
-    if name == "pascal3d_mini":
-        return Pascal3DBenchmark(Pascal3DPlus(data / name, "val", pixel_origin=0), protocol)
-    return BOPBenchmark(BOPDataset(data / "bop" / name, "test"), protocol)
-
-
 def measure(row: str, name: str, data: Path, out: Path) -> dict[str, Any]:
     """Errors of all objects, in the order of the dataset."""
     folder = out / row.replace(" ", "_").replace(",", "") / name
-    objects = benchmark(name, data)
+    objects = benchmark(data, name)
     summary = evaluate(objects, folder, preset=ROWS[row], field=FIELD_OF[row]() if row in FIELD_OF else None)
     assert summary is not None
     store = PredictionStore(folder / "predictions")

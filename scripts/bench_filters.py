@@ -22,8 +22,8 @@ from pathlib import Path
 
 import kornia
 import torch
+from _record import REPOSITORY, between, commit, today
 from make_detector_figure import scene, silhouette
-from results_table import REPOSITORY, between, commit, today
 from torch import Tensor
 
 from curvireg_torch import descriptors, filters

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import torch
+from _record import timed, write_json
 from safetensors import safe_open
 from torch.nn.functional import normalize
 
@@ -34,15 +35,6 @@ def photographs(count: int) -> torch.Tensor:
         shots.append(synthesize_photograph(mesh, random_pose(mesh, K, size, generator), K, size, generator))
     with torch.no_grad():
         return matcher.query([s[0] for s in shots], torch.stack([s[1] for s in shots])).descriptors[:, 0]
-
-
-def fastest(call, repeats: int = 7) -> float:
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return min(times)
 
 
 def main() -> None:
@@ -69,8 +61,8 @@ def main() -> None:
         truth = (q @ views.T).topk(max(TOP), dim=1).indices
         row = {
             "views": size,
-            "brute_1_s": fastest(lambda: (q[:1] @ views.T).topk(100)),  # noqa: B023
-            "brute_32_s": fastest(lambda: (q @ views.T).topk(100)),  # noqa: B023
+            "brute_1_s": timed(lambda: (q[:1] @ views.T).topk(100), 7)[0],  # noqa: B023
+            "brute_32_s": timed(lambda: (q @ views.T).topk(100), 7)[0],  # noqa: B023
         }
         start = time.perf_counter()
         index = ViewIndex(views)
@@ -78,16 +70,15 @@ def main() -> None:
         for probes in (4, 16, 64):
             index._index.nprobe = probes
             row[f"probes_{probes}"] = {
-                "1_s": fastest(lambda: index.search(q[:1], 100)),  # noqa: B023
-                "32_s": fastest(lambda: index.search(q, 100)),  # noqa: B023
+                "1_s": timed(lambda: index.search(q[:1], 100), 7)[0],  # noqa: B023
+                "32_s": timed(lambda: index.search(q, 100), 7)[0],  # noqa: B023
                 # Of the best k of brute force, how many are among the 100 found.
                 **{f"recall_{k}": recall(index.search(q, 100)[1], truth[:, :k]) for k in TOP},
             }
         rows.append(row)
         print(json.dumps(row), flush=True)
         result = {"threads": torch.get_num_threads(), "torch": torch.__version__, "rows": rows}
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps(result, indent=2) + "\n")
+        write_json(arguments.out, result)
 
 
 def recall(found: torch.Tensor, truth: torch.Tensor) -> float:

@@ -5,7 +5,6 @@ the number of faces can be chosen.
 """
 
 import argparse
-import json
 import platform
 import tempfile
 import time
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
+from _record import timed, write_json
 
 from curvireg_torch import BankSettings, Registrar, ViewBank, ViewMatcher, camera_matrix, uniform_views
 from curvireg_torch.synthetic import random_pose, synthesize_photograph
@@ -30,12 +30,7 @@ def dented_sphere(faces: int) -> trimesh.Trimesh:
 
 def seconds(call, repeats: int = 3) -> float:
     """Median of a few runs."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return sorted(times)[len(times) // 2]
+    return timed(call, repeats)[repeats // 2]
 
 
 def ranking_times(bank: ViewBank, image: torch.Tensor, box: torch.Tensor, photographs: int = 32) -> dict[str, float]:
@@ -103,8 +98,7 @@ def main() -> None:
         "machine": platform.machine(),
         "rows": rows,
     }
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(result, indent=2) + "\n")
+    write_json(arguments.out, result)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
+from _record import write_json
 
 import curvireg_torch as cr
 from curvireg_torch.errors import RenderingError
@@ -174,8 +175,7 @@ def main() -> None:
             table[f"{name} faces, {size} px"] = rates(subdivisions, size, arguments.views)
             print(name, size, table[f"{name} faces, {size} px"], flush=True)
     results["views_per_second"] = table
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(results, indent=2) + "\n")
+    write_json(arguments.out, results)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
+from _record import write_json
 from sklearn.linear_model import LogisticRegression
 
 import curvireg_torch as cr
@@ -173,8 +174,7 @@ def main() -> None:
         "scenes_per_mesh": arguments.scenes,
         "meshes": list(arguments.meshes),
     }
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(result, indent=2) + "\n")
+    write_json(arguments.out, result)
     print(json.dumps(result, indent=2))
 
 

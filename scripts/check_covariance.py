@@ -13,6 +13,7 @@ import math
 from pathlib import Path
 
 import torch
+from _record import write_json
 from measure_refinement import CAMERA, MESHES, SIZE
 from scipy.stats import chi2
 from torch import Tensor
@@ -76,8 +77,7 @@ def main() -> None:
         **{name: summary([p for _, own, _, p in found if own == name]) for name in names},
     }
     print(json.dumps(result, indent=1))
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(result, indent=2) + "\n")
+    write_json(arguments.out, result)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from results_table import REPOSITORY, between, commit, today
+from _record import REPOSITORY, between, commit, today
 from torch import Tensor
 
 import curvireg_torch as cr

@@ -16,11 +16,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from _record import REPOSITORY, benchmark, between, write_json
 from torch.nn.functional import normalize
 
 import curvireg_torch as cr
-from curvireg_torch.data import BOPDataset, Pascal3DPlus, read_image
-from curvireg_torch.evaluation import Benchmark, BOPBenchmark, Pascal3DBenchmark, Protocol
+from curvireg_torch.data import read_image
+from curvireg_torch.evaluation import Benchmark
 from curvireg_torch.evaluation.pascal3d import SYMMETRIES
 from curvireg_torch.evaluation.protocol import perturbed_box
 from curvireg_torch.geometry import rotation_towards, whole_image_box
@@ -40,7 +41,6 @@ from curvireg_torch.metrics import symmetric_rotation_error, symmetry_transforms
 from curvireg_torch.pipeline import preset_named
 from curvireg_torch.synthetic import procedural_background
 
-ROOT = Path(__file__).resolve().parents[1]
 SETS = {"pascal3d_mini": "upright", "lm": "any", "dino": "any", "hope": "any"}
 EVERY = {"dino": 4}
 BOXES = {"annotated": 0.0, "5 %": 0.05, "10 %": 0.1, "20 %": 0.2, "whole image": None}
@@ -97,13 +97,6 @@ class Shot:
         R = rotation_towards(torch.linalg.inv(K) @ centre) @ views
         symmetries = symmetry_transforms(sample["model_info"])[:, :3, :3]
         return symmetric_rotation_error(R, truth.expand_as(R), symmetries)
-
-
-def benchmark(data: Path, name: str) -> Benchmark:
-    protocol = Protocol(pose=SETS[name])
-    if name.startswith("pascal"):
-        return Pascal3DBenchmark(Pascal3DPlus(data / name, "val", pixel_origin=0), protocol)
-    return BOPBenchmark(BOPDataset(data / "bop" / name, "test"), protocol)
 
 
 def shots(data: Path, name: str, boxes: dict[str, float | None]) -> Iterator[tuple[ViewBank, Path, list[Shot]]]:
@@ -247,14 +240,13 @@ def main() -> None:
     parser.add_argument("data", type=Path, nargs="?", metavar="DATA")
     parser.add_argument("--sets", nargs="+", default=list(SETS), choices=list(SETS))
     parser.add_argument("--table", action="store_true", help="write docs/method.md from the results")
-    parser.add_argument("--out", type=Path, default=ROOT / "scripts" / "results" / "similarities.json")
+    parser.add_argument("--out", type=Path, default=REPOSITORY / "scripts" / "results" / "similarities.json")
     arguments = parser.parse_args()
     if arguments.data is not None:
         torch.set_num_threads(1)
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps(measure(arguments.data, arguments.sets), indent=1) + "\n")
+        write_json(arguments.out, measure(arguments.data, arguments.sets), 1)
     if arguments.table:
-        page = ROOT / "docs" / "method.md"
+        page = REPOSITORY / "docs" / "method.md"
         text = page.read_text()
         confidence = json.loads((arguments.out.parent / "confidence.json").read_text())
         for name, content in (
@@ -262,7 +254,7 @@ def main() -> None:
             ("confidence", confidence_table(confidence)),
         ):
             begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
-            text = text[: text.index(begin) + len(begin)] + "\n" + content + text[text.index(end) :]
+            text = between(text, begin, end, content)
         page.write_text(text)
 
 

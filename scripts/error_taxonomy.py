@@ -11,14 +11,13 @@ view of the pose that was found; they are for looking at, not for committing.
 
 import argparse
 import csv
-import json
 from collections import Counter
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from results_table import REPOSITORY
+from _record import REPOSITORY, between, write_json
 
 from curvireg_torch.data import Pascal3DPlus, read_image
 from curvireg_torch.geometry import crop_images, load_mesh, rotation_from_viewpoint
@@ -113,10 +112,9 @@ def main() -> None:
         return
     names = arguments.names or [folder.name for folder in arguments.folders]
     results = {name: count(read(folder)) for name, folder in zip(names, arguments.folders, strict=True)}
-    KEPT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    write_json(KEPT, results, 1)
     text = PAGE.read_text(encoding="utf-8")
-    before, after = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
-    PAGE.write_text(f"{before}\n{table(results)}{after}", encoding="utf-8")
+    PAGE.write_text(between(text, BEGIN, END, table(results)), encoding="utf-8")
 
 
 if __name__ == "__main__":

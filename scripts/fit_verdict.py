@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from results_table import between
+from _record import between
 from scipy.optimize import minimize
 from sklearn.linear_model import LogisticRegression
 

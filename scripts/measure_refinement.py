@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
+from _record import write_json
 
 from curvireg_torch import Registrar, camera_matrix, rotation_error
 from curvireg_torch.geometry import axis_angle_from_rotation
@@ -157,8 +158,7 @@ def main() -> None:
         "machine": platform.machine(),
     }
     print(json.dumps({jitter: r["all"] for jitter, r in result["boxes"].items()}, indent=1))
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(result, indent=2) + "\n")
+    write_json(arguments.out, result)
 
 
 if __name__ == "__main__":

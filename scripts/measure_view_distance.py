@@ -12,6 +12,7 @@ import json
 from pathlib import Path
 
 import torch
+from _record import write_json
 
 import curvireg_torch as cr
 from curvireg_torch.data import read_image
@@ -97,8 +98,7 @@ def main() -> None:
             },
         }
         print(root.name, json.dumps(results[root.name], indent=2))
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(results, indent=2) + "\n")
+    write_json(arguments.out, results)
 
 
 if __name__ == "__main__":

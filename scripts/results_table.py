@@ -9,15 +9,13 @@ measuring. The table stands between ``<!-- results:begin -->`` and ``<!-- result
 """
 
 import argparse
-import datetime
 import json
-import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-REPOSITORY = Path(__file__).resolve().parents[1]
+from _record import REPOSITORY, between, commit, today, write_json
+
 BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
 
 PASCAL3D = (
@@ -69,11 +67,6 @@ def main() -> int:
     return 0
 
 
-def between(text: str, begin: str, end: str, body: str) -> str:
-    """``text`` with ``body`` between the two markers."""
-    return f"{text[: text.index(begin) + len(begin)]}\n{body}{text[text.index(end) :]}"
-
-
 def record(summary: Path, name: str, results: Path, root: Path) -> Path:
     """Keep ``summary`` with the day and the commit; returns the path."""
     path = results / f"evaluation_{name}.json"
@@ -83,29 +76,8 @@ def record(summary: Path, name: str, results: Path, root: Path) -> Path:
         "commit": commit(root),
         "summary": json.loads(summary.read_text(encoding="utf-8")),
     }
-    results.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_json(path, content)
     return path
-
-
-def today() -> str:
-    return datetime.datetime.now(datetime.UTC).date().isoformat()
-
-
-def commit(root: Path, *, but: Sequence[str] = ()) -> str:
-    """Short hash of the checkout, "+" where anything ``but`` these paths was changed, "unknown" outside of one."""
-
-    def git(*words: str) -> str:
-        return subprocess.run(
-            ["git", "-C", str(root), *words], capture_output=True, text=True, check=True
-        ).stdout.strip()
-
-    try:
-        return git("rev-parse", "--short", "HEAD") + (
-            "+" if git("status", "--porcelain", "--untracked-files=no", "--", ".", *(f":!{p}" for p in but)) else ""
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
 
 
 def table(results: Path) -> str:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from results_table import REPOSITORY, commit, today
+from _record import REPOSITORY, commit, today
 
 from curvireg_torch import Registrar, camera_matrix, sample_views
 from curvireg_torch.matching import BankSettings, cached_bank

@@ -22,7 +22,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
-from results_table import REPOSITORY, between, commit, today
+from _record import REPOSITORY, between, commit, today
 
 RESULTS = REPOSITORY / "scripts" / "results" / "versions.json"
 DOCUMENT = REPOSITORY / "docs" / "versions.md"
