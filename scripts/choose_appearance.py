@@ -18,6 +18,7 @@ import argparse
 import json
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +36,10 @@ from curvireg_torch.geometry.mesh import mesh_radius
 from curvireg_torch.learned.backbone import Backbone
 from curvireg_torch.matching import ViewBank, ViewMatcher, cached_bank
 from curvireg_torch.matching.describe import ViewDescriber
-from curvireg_torch.matching.query import crop_regions, slack_boxes
 from curvireg_torch.metrics import symmetric_rotation_error
-from curvireg_torch.presets import preset_named
+from curvireg_torch.pipeline import preset_named
 from curvireg_torch.rendering.shading import shade
+from curvireg_torch.terms import crop_regions, slack_boxes
 
 KEPT = REPOSITORY / "scripts" / "results" / "appearance.json"
 PAGE = REPOSITORY / "docs" / "accuracy.md"
@@ -122,16 +123,16 @@ def errors(item: dict[str, Any], rotations: Tensor) -> np.ndarray:
 def measure(mesh: Path, items: list[dict[str, Any]], bench: Path, backbone: Backbone) -> dict[str, np.ndarray]:
     """Raw scores of the photographs that are to be registered to one CAD."""
     upright = items[0]["pose"] == "upright"
-    preset = preset_named("learned")
-    views = preset.views("upright" if upright else "any")
-    bank = cached_bank(cr.load_mesh(mesh, unit="m"), views, preset.bank, progress=False)
+    # The classical bank: this script describes appearance by itself.
+    pipeline = preset_named("classical").posed("upright" if upright else "any")
+    bank = cached_bank(cr.load_mesh(mesh, unit="m"), pipeline=pipeline, progress=False)
     R = bank.rotations.double()
     images = [read_image(bench / item["image"]) for item in items]
     boxes = torch.tensor([item["box"] for item in items])
     scores = {}
     for name in PRESETS:
-        chosen = preset_named(name)
-        scores[name] = ViewMatcher(bank, field=chosen.photograph_filter(), **chosen.matcher)(images, boxes).scores
+        chosen = replace(preset_named(name), terms=preset_named("classical").terms)
+        scores[name] = ViewMatcher(bank, pipeline=chosen)(images, boxes).scores
     judged = []
     for i in range(len(items)):
         orders = [np.argsort(-scores[name][i].numpy(), kind="stable") for name in PRESETS]

@@ -27,7 +27,7 @@ from curvireg_torch.evaluation.protocol import perturbed_box
 from curvireg_torch.geometry import rotation_towards, whole_image_box
 from curvireg_torch.matching import (
     DescriptorStatistics,
-    QueryFeatures,
+    Photographs,
     Ranking,
     ViewBank,
     Whitening,
@@ -125,9 +125,10 @@ def combined(ranking: Ranking, shapes: torch.Tensor, views: torch.Tensor, rep: f
     return scores * box_shape_score(shapes.float(), views, sigma=box) if box else scores
 
 
-def exact(query: QueryFeatures) -> QueryFeatures:
+def exact(query: Photographs) -> Photographs:
     """Without slack."""
-    return replace(query, descriptors=query.descriptors[:, :1], points=query.points[:, :1])
+    first = {name: getattr(query, name)[:, :1] for name in ("regions", "descriptors", "points")}
+    return replace(query, **first)
 
 
 def populations(data: Path) -> dict[str, DescriptorStatistics]:
@@ -186,7 +187,8 @@ def measure(data: Path, names: list[str]) -> dict:
                             if where != "annotated":
                                 continue
                             hog = whitened[similarity][i]
-                            ranking = replace(ranking, hog=(hog if slack else hog[:1]).amax(dim=0, keepdim=True))
+                            best_crop = (hog if slack else hog[:1]).amax(dim=0, keepdim=True)
+                            ranking = replace(ranking, terms={**ranking.terms, "hog": best_crop})
                         scores = combined(ranking, queries[i][where].shapes, shapes, rep, sigma)
                         best.append(int(scores.argmax()))
                         chosen.append(choice)
