@@ -22,7 +22,7 @@ PASCAL3D = (
     ["set", "N", "Acc 30°", "Acc 10°", "median", "Acc 30°, symmetric", "easy: Acc 30°", "median", "s/object"],
     "Acc 30°, Acc 10°: share of the objects whose rotation error acos((tr(R1ᵀR2) - 1) / 2) is below; median: of that "
     "error; symmetric: a bottle's turns about its axis and a table's half turn do not count; easy: neither truncated, "
-    "occluded nor difficult. No camera is given.",
+    "occluded nor difficult. No camera is given. s/object: one thread, with other work on the machine.",
 )
 BOP = (
     [
