@@ -1,6 +1,7 @@
 """The first stages of EfficientNet-Lite0, as trained on ImageNet: what the appearance of views is compared by."""
 
 import hashlib
+from functools import cache
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
@@ -97,7 +98,7 @@ class Backbone(nn.Module):
         self.stem = _Conv(3, 32, 3, 2)
         widths = [32, *(block[-1] for block in _BLOCKS)]
         self.blocks = nn.ModuleList([_Block(inputs, *block) for inputs, block in zip(widths, _BLOCKS, strict=False)])
-        weights = _read_weights()
+        weights = _read_weights(_weights_path())
         self.load_state_dict(_folded(weights))
         for i, blocks in enumerate(_KEPT):
             scales = torch.stack([weights[f"_blocks.{k}._bn2.weight"] for k in blocks])
@@ -149,8 +150,8 @@ def _weights_path() -> Path:
     return Path(found.submodule_search_locations[0]).joinpath(*_FILE[1:])
 
 
-def _read_weights() -> dict[str, Tensor]:
-    path = _weights_path()
+@cache
+def _read_weights(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise MissingFileError(f"weights: {path} is not there; install {PACKAGE} again")
     content = path.read_bytes()

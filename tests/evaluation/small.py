@@ -14,9 +14,41 @@ from curvireg_torch.pipeline import BankSettings, ViewPolicy
 SMALL = Pipeline(
     views=ViewPolicy(directions=18, turn=360.0, azimuth_step=60.0, elevations=(10.0,)),
     bank=BankSettings(image_size=32),
+    terms=PRESETS["classical"].terms,
     search=False,
     contours=False,
 )
+
+
+def assert_same(a: object, b: object) -> None:
+    """The same but for the rounding of other batches; texts of numbers count as numbers."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        assert a.keys() == b.keys()
+        for key in a:
+            assert_same(a[key], b[key])
+    elif isinstance(a, list | tuple) and isinstance(b, list | tuple):
+        assert len(a) == len(b)
+        for x, y in zip(a, b, strict=True):
+            assert_same(x, y)
+    else:
+        x, y = number(a), number(b)
+        if isinstance(x, list) and isinstance(y, list):
+            assert_same(x, y)
+        elif isinstance(x, float) and isinstance(y, float):
+            assert abs(x - y) <= 1e-4 * max(1.0, abs(y)), (a, b)
+        else:
+            assert a == b
+
+
+def number(value: object) -> object:
+    try:
+        return float(value) if isinstance(value, float | str) else value
+    except ValueError:
+        parts = value.split() if isinstance(value, str) else []
+        try:
+            return [float(part) for part in parts] if len(parts) > 1 else value
+        except ValueError:
+            return value
 
 
 def die_at(count: int) -> None:
