@@ -137,7 +137,7 @@ def test_any_cad_takes_the_one_that_ranks_first(pascal, tmp_path):
         row = rows_of(benchmark, tmp_path / "any")[item.key]
         if "rotation" in row:
             image = read_image(pascal.annotation(item.index)["image_path"])
-            scores = ViewMatcher(bank, pipeline=pipeline)([image], item.box[None]).scores[0]
+            scores = ViewMatcher(bank, pipeline=pipeline)([image], item.box[None]).scores[0].detach()
             # A box looks alike from two sides: views that tie may change places.
             found = torch.tensor(row["rotation"])
             same = rotation_error(bank.rotations, found) < 0.1
