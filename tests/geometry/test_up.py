@@ -10,6 +10,7 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import mesh_up, up_rotation, with_z_up
 from curvireg_torch.geometry.mesh import as_mesh
 from curvireg_torch.geometry.up import UP_AXES
+from curvireg_torch.pipeline import PRESETS, ViewPolicy
 
 AXES = {s + a: (-1 if s else 1) * np.eye(3)[i] for i, a in enumerate("xyz") for s in ("", "-")}
 
@@ -49,8 +50,8 @@ def test_default_of_the_format_and_what_is_given(tmp_path, suffix: str, up: str)
 
 def test_a_registrar_of_a_mesh_looks_at_it_upright(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path))
-    monkeypatch.setattr("curvireg_torch.registration.registrar.sample_views", lambda: cr.sample_views(azimuth_step=180))
     trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / "a.glb")
-    rotations = cr.Registrar(tmp_path / "a.glb").bank.rotations
+    few = cr.Pipeline(views=ViewPolicy(pose="upright", azimuth_step=180.0), terms=PRESETS["classical"].terms)
+    rotations = cr.Registrar(tmp_path / "a.glb", pipeline=few).bank.rotations
     up = rotations @ torch.tensor([0.0, 1.0, 0.0])
     assert float(up[:, 1].max()) <= -0.5  # y of the file points up in the picture in every view
