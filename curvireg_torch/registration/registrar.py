@@ -215,15 +215,15 @@ class Registrar:
             believed = own & fit.trustworthy
             found, T, cameras, fit = self._sent_back(believed, starts, found, T, cameras, fit, boxes, K)
             found = replace(found, score=score)
-        score = verdict(evidence, with_camera=K is not None) + torch.where(own, 0.0, -1e6)
-        order = score.argsort(descending=True, stable=True)
+        score = verdict(evidence, with_camera=K is not None)
+        order = (score + torch.where(own, 0.0, -1e6)).argsort(descending=True, stable=True)
         coarse = confidence(ranking, self.bank.rotations)
         results = []
         for b in range(len(items)):
             mine = order[found.photograph[order] == b].tolist()
             trust = float(coarse[b])
             if fit is not None:
-                lead = float(score[mine[0]] - score[mine[1]]) if len(mine) > 1 else torch.inf
+                lead = float(score[mine[0]] - score[mine[1:]].max()) if len(mine) > 1 else torch.inf
                 trust = pose_confidence(pose_evidence(float(found.score[mine[0]]), lead, with_camera=K is not None))
             reliable = trust >= RELIABLE
             poses = tuple(self._hypothesis(h, found, T, cameras, evidence, fit, reliable, K is not None) for h in mine)

@@ -137,3 +137,15 @@ def test_evidence_depends_on_each_photograph_alone():
     together = ranking_evidence(matcher(images, boxes), bank.rotations)
     alone = ranking_evidence(matcher(images[1:], boxes[1:]), bank.rotations)
     torch.testing.assert_close(together[1:], alone, atol=1e-4, rtol=1e-4)
+
+
+def test_confidence_rests_on_the_lead_that_the_hypotheses_tell():
+    """Also where a rival was sent back to its view: it still is a rival, as it was in the photographs of the fit."""
+    for seed in range(2):
+        image, box, _ = scene(seed)
+        result = Registrar(truck_bank())([image], box[None], CAMERA)[0]
+        told = torch.tensor([list(h.evidence.values()) for h in result.hypotheses], dtype=torch.float64)
+        score = verdict(told, with_camera=True)
+        lead = float(score[0] - score[1:].max())
+        expected = pose_confidence(pose_evidence(result.score, lead, with_camera=True))
+        assert result.confidence == pytest.approx(expected)
