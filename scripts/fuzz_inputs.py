@@ -18,7 +18,7 @@ import torch
 import trimesh
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
-from safetensors.torch import save
+from safetensors.torch import load, save
 
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset, WebCollection, read_bop_csv, read_photo
@@ -27,8 +27,9 @@ from curvireg_torch.errors import CurviregError
 from curvireg_torch.geometry import camera_matrix, crop_images, place_view, square_boxes, translation_from_box
 from curvireg_torch.geometry.crops import check_boxes
 from curvireg_torch.geometry.mesh import extreme_points
-from curvireg_torch.matching.query import crop_regions, slack_boxes
+from curvireg_torch.matching.bank_file import _checksum
 from curvireg_torch.synthetic import example_mesh
+from curvireg_torch.terms import crop_regions, slack_boxes
 
 __all__ = ["KINDS", "attack"]
 
@@ -291,11 +292,16 @@ def bank_bytes() -> bytes:
 def bank(rng: np.random.Generator, folder: Path) -> None:
     data = bank_bytes()
     (length,) = struct.unpack_from("<Q", data)
-    broken = mutated(data, rng, data)
-    if rng.random() < 0.6:
+    broken, kind = mutated(data, rng, data), rng.random()
+    if kind < 0.5:  # a header of another sense
         header = dumped(mutated_json(json.loads(data[8 : 8 + length]), rng))
         broken = struct.pack("<Q", len(header)) + header + data[8 + length :]
-    elif rng.random() < 0.1:
+    elif kind < 0.8:  # other numbers, whose checksum is right
+        tensors, metadata = load(data), json.loads(data[8 : 8 + length])["__metadata__"]
+        changed = tensors[str(rng.choice(sorted(tensors)))].view(-1)
+        changed[int(rng.integers(len(changed)))] = rng.choice([0, 1, 2, 255 if changed.dtype == torch.uint8 else -1])
+        broken = save(tensors, {**metadata, "checksum": _checksum(tensors)})
+    elif kind < 0.83:
         broken = save({"descriptors": torch.zeros(2, 3)}, {"format": "curvireg_torch.ViewBank"})
     (folder / "a.safetensors").write_bytes(broken)
     loaded = cr.ViewBank.load(folder / "a.safetensors")

@@ -1,6 +1,8 @@
 """The one value that decides a result."""
 
+import importlib
 import json
+import sys
 from dataclasses import FrozenInstanceError, asdict, fields, replace
 
 import pytest
@@ -162,7 +164,8 @@ def test_views_of_a_policy():
         ViewPolicy(pose="given").sphere()
 
 
-def test_old_place_of_presets():
+def test_old_place_of_presets(monkeypatch):
+    monkeypatch.delitem(sys.modules, "curvireg_torch.presets", raising=False)  # doctests import every module
     with pytest.warns(DeprecationWarning, match=r"curvireg_torch\.pipeline"):
-        from curvireg_torch import presets
+        presets = importlib.import_module("curvireg_torch.presets")
     assert presets.Preset is Pipeline
