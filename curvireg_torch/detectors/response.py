@@ -24,6 +24,7 @@ class Response(nn.Module):
     Input (B, 1 or 3, H, W), and (B,) sigmas of the levels, as kornia passes them; output (B, 1, H, W).
 
     Example:
+        >>> import torch
         >>> from curvireg_torch.filters import ImageCurvilinearSaliency
         >>> Response(ImageCurvilinearSaliency())(torch.rand(1, 3, 32, 32)).shape
         torch.Size([1, 1, 32, 32])

@@ -24,6 +24,7 @@ def image_gradient(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
         InvalidInputError: wrong shape, dtype or sigma.
 
     Example:
+        >>> import torch
         >>> ramp = torch.arange(8.0).expand(1, 1, 8, 8)
         >>> image_gradient(ramp, sigma=0.0)[0, :, 4, 4].tolist()
         [1.0, 0.0]

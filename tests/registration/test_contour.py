@@ -196,8 +196,11 @@ def test_many_photographs_and_hypotheses_are_fitted_as_each_alone():
     for i, b in enumerate(photograph.tolist()):
         alone = fit_contours(renderer, images[b].float() / 255, boxes[b], cameras[b], starts[i : i + 1], **rest)
         assert not alone.transform[0].equal(starts[i])
-        for name in ("transform", "support", "covariance"):
-            torch.testing.assert_close(getattr(fit, name)[i], getattr(alone, name)[0], rtol=0, atol=1e-9)
+        # Crops are float32: how a batch is shared among threads or vectors moves their last bit, a fit of many steps by
+        # some 1e-7, and a point across the border of a cell of the covariance, worth 0.3 % of it. A round shared where
+        # it must not be moves poses by 1e-2 and support by 1e-3.
+        for name, allowed in (("transform", 1e-4), ("support", 1e-4), ("covariance", 0.02 * alone.covariance.max())):
+            torch.testing.assert_close(getattr(fit, name)[i], getattr(alone, name)[0], rtol=0, atol=float(allowed))
     stacked = [F.pad(image, (0, 128 - image.shape[2], 0, 128 - image.shape[1])) for image in images]
     inside = fit_contours(renderer, torch.stack(stacked), boxes, cameras, starts, photograph=photograph, **rest)
     torch.testing.assert_close(inside.transform, fit.transform, rtol=0, atol=0.05)  # crops may see the padding
