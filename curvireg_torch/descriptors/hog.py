@@ -167,6 +167,18 @@ class HOG(nn.Module):
         """Number of entries of a descriptor."""
         return hog_length(grid=self.grid, bins=self.bins, block=self.block)
 
+    def half_turned(self, descriptors: Tensor) -> Tensor:
+        """(B, D) of fields turned by 180 degrees, of the (B, D) of the fields: cells change places, orientations stay.
+
+        Example:
+            >>> field, layer = torch.randn(1, 2, 64, 64), HOG()
+            >>> torch.allclose(layer.half_turned(layer(field)), layer(-field.rot90(2, (2, 3))), atol=1e-6)
+            True
+        """
+        n = self.grid - self.block + 1
+        cells = descriptors.view(-1, n, n, self.block, self.block, self.bins)
+        return cells.flip(1, 2, 3, 4).flatten(1)
+
     def forward(self, field: Tensor) -> Tensor:
         return hog(
             field,

@@ -140,8 +140,8 @@ class ViewBank:
             settings: instead of the pipeline's ``bank``.
             pipeline: what the bank is made for; default ``Pipeline()``.
             progress: show a bar.
-            chunk_size: views that a thread has in memory at a time (about 60 bytes x image_size^2 each). Those of one
-                direction are rendered at once (:func:`render_views`) where they fall into one chunk.
+            chunk_size: views that a thread has in memory at a time (about 60 bytes x image_size^2 each). Those that are
+                quarter turns of each other are rendered once where they fall into one chunk.
             device: where views are filtered and described, and where the bank stays.
 
         Raises:

@@ -11,13 +11,16 @@ from ..geometry.cameras import projected_boxes, transform
 from ..geometry.crops import crop_transforms, square_boxes
 from ..geometry.mesh import extreme_points, mesh_centre, mesh_radius
 from ..pipeline import BankSettings
-from ..rendering import DepthRenderer, make_renderer, render_views
+from ..rendering import DepthRenderer, make_renderer
 from ..rendering.shading import shade
 
 __all__ = ["DescribedViews", "ViewDescriber"]
 
 CHUNK = 64
 """Views in memory at a time."""
+
+SAME = 1e-6
+"""Difference of rotations' entries, and share of distances, that count as none: 1e-4 px in a view."""
 
 FAR = 20.0
 """Distances farther away than usual: parallel projection but for a few per mille."""
@@ -123,7 +126,7 @@ class ViewDescriber:
         """Depth (N, 1, S, S) of the framed views, and their boxes (N, 4)."""
         S = self.settings.image_size
         T, K, boxes = self.cameras(rotations, distances)
-        depth = render_views(self.renderer, T, K, (S, S), orthographic=self._orthographic)
+        depth = self.renderer.render(T, K, (S, S), orthographic=self._orthographic)
         return depth.to(self._device), boxes.to(self._device)
 
     @torch.no_grad()
@@ -145,8 +148,37 @@ class ViewDescriber:
 
     @torch.no_grad()
     def __call__(self, rotations: Tensor, distances: Tensor) -> DescribedViews:
-        """Describe (N, 3, 3) rotations at (N,) distances of the object's centre, in model units."""
-        depth, boxes = self.depth(rotations, distances)
+        """Describe (N, 3, 3) rotations at (N,) distances of the object's centre, in model units.
+
+        Views that differ by quarter turns about the optical axis, as every sixth does in steps of 15 degrees, are
+        pictures turned by 90 degrees: they are rendered and filtered once.
+        """
+        first, turns = quarter_turns(rotations, distances)
+        own = first == torch.arange(len(first))
+        depth, boxes = self.depth(rotations[own], distances[own])
         field = self._filter(depth)
-        points = field_points(field, share=self.settings.point_share)[:, 0]
-        return DescribedViews(self.settings, self.descriptor(field), points, depth[:, 0] > 0, boxes)
+        points, silhouettes = field_points(field, share=self.settings.point_share)[:, 0], depth[:, 0] > 0
+        descriptors = self.descriptor(field)
+        if not bool(own.all()):
+            chosen = turns.to(self._device), (own.cumsum(0) - 1)[first].to(self._device)
+            sideways = self.descriptor(torch.stack([-field[:, 1], field[:, 0]], dim=1).rot90(-1, (2, 3)))
+            halves = (self.descriptor.half_turned(x) for x in (descriptors, sideways))
+            descriptors = torch.stack([descriptors, sideways, *halves])[chosen]
+            points, silhouettes = (
+                torch.stack([x.rot90(-k, (1, 2)) for k in range(4)])[chosen] for x in (points, silhouettes)
+            )
+            x0, y0, x1, y1 = boxes.T
+            clockwise = [x0, y0, x1, y1, -y1, x0, -y0, x1, -x1, -y1, -x0, -y0, y0, -x1, y1, -x0]
+            boxes = torch.stack(clockwise, dim=1).view(-1, 4, 4).transpose(0, 1)[chosen]
+        return DescribedViews(self.settings, descriptors, points, silhouettes, boxes)
+
+
+def quarter_turns(rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
+    """Of (N, 3, 3) views the first that each is a picture of, turned clockwise by (N,) quarters, 0 to 3, on the CPU."""
+    x, y, z = rotations[:, 0].double().cpu(), rotations[:, 1].double().cpu(), distances.double().cpu()
+    frames = [torch.cat(pair, dim=1) for pair in ((x, y), (-y, x), (-x, -y), (y, -x))]
+    apart = torch.cdist(torch.stack(frames), frames[0], compute_mode="donot_use_mm_for_euclid_dist")
+    close = (apart < SAME) & ((z[:, None] - z).abs() <= SAME * z)
+    turned = close.any(dim=0)
+    first = (turned * torch.arange(len(x), 0, -1)[:, None]).argmax(dim=0)
+    return first, close.int().argmax(dim=0).gather(0, first[None])[0]

@@ -2,6 +2,5 @@
 
 from .base import BACKENDS, DepthRenderer, make_renderer, render_depth
 from .colour import render_colour
-from .turned import render_views
 
-__all__ = ["BACKENDS", "DepthRenderer", "make_renderer", "render_colour", "render_depth", "render_views"]
+__all__ = ["BACKENDS", "DepthRenderer", "make_renderer", "render_colour", "render_depth"]
