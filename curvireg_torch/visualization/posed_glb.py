@@ -1,0 +1,127 @@
+"""The mesh at its pose, the camera and the photograph behind it, as one glTF binary file."""
+
+import math
+from io import BytesIO
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+import trimesh
+from PIL import Image
+from torch import Tensor
+
+from .._choices import UNITS
+from ..errors import InvalidInputError
+from ..geometry.cameras import check_camera_matrix
+from ..geometry.colours import surface_colours
+from ..geometry.mesh import mesh_centre, mesh_radius
+
+__all__ = ["posed_glb"]
+
+_PHOTO_SIDE = 1024
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's camera to glTF's: y up, looking along -z
+
+
+def posed_glb(
+    mesh: trimesh.Trimesh, T_cam_from_model: Tensor, camera_matrix: Tensor, image: Tensor, *, photograph: bool = True
+) -> bytes:
+    """A GLB file: the mesh where it was found, a camera at the origin, the photograph on a plane behind the mesh.
+
+    In metres and with y up, as glTF asks: from the camera "photograph" a viewer shows the mesh over the photograph.
+    glTF cameras look straight ahead: a principal point away from the picture's middle and the pose stand, exact and in
+    the mesh's own unit, in the camera node's ``extras``. Of the mesh's colours, those of its corners are kept.
+
+    Args:
+        mesh: as :func:`curvireg_torch.load_mesh` gives it; ``mesh.units`` counts.
+        T_cam_from_model: (4, 4), OpenCV camera, in the mesh's unit.
+        camera_matrix: (3, 3) px.
+        image: (1 or 3, H, W) floating in [0, 1] or uint8.
+        photograph: False leaves the plane out.
+
+    Raises:
+        InvalidInputError: a pose or a camera of another shape, or not finite; an object that is not before the camera.
+
+    Example:
+        >>> K = torch.tensor([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]], dtype=torch.float64)
+        >>> T = torch.eye(4, dtype=torch.float64); T[2, 3] = 4.0
+        >>> posed_glb(trimesh.creation.box(), T, K, torch.rand(3, 64, 64))[:4]
+        b'glTF'
+    """
+    check_camera_matrix(camera_matrix)
+    T, K = T_cam_from_model.detach().cpu().double(), camera_matrix.detach().cpu().double()
+    if tuple(T.shape) != (4, 4) or not bool(T.isfinite().all()):
+        raise InvalidInputError(f"T_cam_from_model: expected finite (4, 4), got shape {tuple(T.shape)}")
+    depth = float((T[:3, :3] @ mesh_centre(mesh) + T[:3, 3])[2])
+    if depth <= 0:
+        raise InvalidInputError("T_cam_from_model: the object lies behind the camera; check the pose")
+    H, W = (int(n) for n in image.shape[-2:])
+    metres = UNITS.get(mesh.units or "m", 1.0)
+    scale = np.diag([metres, metres, metres, 1.0])
+    scene = trimesh.Scene()
+    scene.add_geometry(_coloured(mesh), node_name="object", transform=scale @ _FLIP @ T.numpy())
+    if photograph:
+        plane = _photograph_plane(image, K, depth + 1.05 * mesh_radius(mesh))
+        scene.add_geometry(plane, node_name="picture", transform=scale @ _FLIP)
+    camera = {
+        "type": "perspective",
+        "perspective": {
+            "yfov": 2 * math.atan(H / (2 * float(K[1, 1]))),
+            "aspectRatio": W * float(K[1, 1]) / (H * float(K[0, 0])),
+            "znear": 0.01 * depth * metres,
+        },
+    }
+    exact = {"T_cam_from_model": T.tolist(), "camera_matrix": K.tolist(), "size": [W, H], "unit": mesh.units or "m"}
+
+    def with_camera(tree: dict[str, Any]) -> None:
+        tree["cameras"] = [camera]
+        tree["nodes"].append({"name": "photograph", "camera": 0, "extras": exact})
+        tree["scenes"][0]["nodes"].append(len(tree["nodes"]) - 1)
+        for material in tree.get("materials", []):
+            if material.get("name") == "picture":  # no light falls on it
+                material["extensions"] = {"KHR_materials_unlit": {}}
+                tree["extensionsUsed"] = ["KHR_materials_unlit"]
+
+    return bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=with_camera))
+
+
+def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh alone, with corners of their own so that edges stay sharp, in the colours of its corners."""
+    faces = np.arange(3 * len(mesh.faces)).reshape(-1, 3)
+    plain = trimesh.Trimesh(np.asarray(mesh.triangles).reshape(-1, 3), faces, process=False)
+    rgb = np.full((len(faces), 3, 3), 190, np.uint8)
+    colours = surface_colours(mesh)
+    if colours is not None:
+        index, zero = np.arange(len(faces), dtype=np.int32), np.zeros(len(faces), np.float32)
+        corners = [colours.at(index, u, v) for u, v in ((zero, zero), (zero + 1, zero), (zero, zero + 1))]
+        rgb = (np.stack(corners, axis=1) * 255).round().astype(np.uint8)
+    plain.visual = trimesh.visual.ColorVisuals(plain, vertex_colors=rgb.reshape(-1, 3))
+    return plain
+
+
+def _photograph_plane(image: Tensor, K: Tensor, depth: float) -> trimesh.Trimesh:
+    """The photograph across the optical axis, in OpenCV's camera frame, at a depth where the mesh does not reach."""
+    H, W = (int(n) for n in image.shape[-2:])
+    edges = [(-0.5, -0.5), (W - 0.5, -0.5), (W - 0.5, H - 0.5), (-0.5, H - 0.5)]
+    pixels = torch.tensor([[u, v, 1.0] for u, v in edges], dtype=torch.float64)
+    corners = (depth * pixels @ torch.linalg.inv(K).T).numpy()
+    uv = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
+    faces = np.array([[0, 3, 2], [0, 2, 1]])  # counterclockwise for the camera, once flipped
+    material = trimesh.visual.material.PBRMaterial(
+        name="picture", baseColorTexture=_jpeg(image), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
+    )
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    return trimesh.Trimesh(corners, faces, visual=visual, process=False)
+
+
+def _jpeg(image: Tensor) -> Any:
+    """A small copy of the photograph that exporters write as JPEG."""
+    from .overlay import to_uint8
+
+    pixels = to_uint8(image)
+    shrink = _PHOTO_SIDE / max(pixels.shape[:2])
+    if shrink < 1:
+        size = max(1, round(pixels.shape[1] * shrink)), max(1, round(pixels.shape[0] * shrink))
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    data = cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
+    return Image.open(BytesIO(data))

@@ -1,0 +1,87 @@
+"""The GLB is read back, and its camera sees the mesh and the photograph where the photograph has them."""
+
+import json
+import struct
+from io import BytesIO
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from curvireg_torch import camera_matrix
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import project_points
+from curvireg_torch.visualization import posed_glb
+from tests._support.scenes import CAMERA, SIZE, scene
+
+
+def tree_of(data: bytes) -> dict:
+    (length,) = struct.unpack_from("<I", data, 12)
+    return json.loads(data[20 : 20 + length])
+
+
+def seen(points: np.ndarray, tree: dict) -> np.ndarray:
+    """Pixels at which the file's camera, at the origin and looking along -z, sees points in metres."""
+    W, H = SIZE[1], SIZE[0]
+    lens = tree["cameras"][0]["perspective"]
+    up = 1 / np.tan(lens["yfov"] / 2)
+    x, y = points[:, 0] / -points[:, 2] * up / lens["aspectRatio"], points[:, 1] / -points[:, 2] * up
+    return np.stack([(x + 1) / 2 * W - 0.5, (1 - y) / 2 * H - 0.5], axis=1)
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("mm", 0.001)])
+def test_the_files_camera_sees_the_mesh_where_it_was_found(unit, metres):
+    image, _, T = scene(0)
+    mesh = trimesh.creation.box((0.1, 0.2, 0.05))
+    mesh.units = unit
+    data = posed_glb(mesh, T, CAMERA, image)
+    tree, back = tree_of(data), trimesh.load(BytesIO(data), file_type="glb")
+    parts = {back.graph[name][1]: back.graph[name][0] for name in back.graph.nodes_geometry}
+    boxes = [n for n in parts if len(back.geometry[n].faces) == 12]
+    points = trimesh.transform_points(back.geometry[boxes[0]].vertices, parts[boxes[0]])
+    expected = project_points(torch.from_numpy(np.array(mesh.triangles.reshape(-1, 3))), T, CAMERA).numpy()
+    np.testing.assert_allclose(seen(points, tree), expected, atol=1e-2)
+    depth = float((T[:3, 3])[2])
+    assert -points[:, 2].mean() == pytest.approx(depth * metres, rel=1e-3)
+    # The photograph's plane: its corners are the picture's, behind the mesh.
+    plane = next(n for n in parts if n not in boxes)
+    corners = trimesh.transform_points(back.geometry[plane].vertices, parts[plane])
+    H, W = SIZE
+    expected = np.array([(-0.5, -0.5), (W - 0.5, -0.5), (W - 0.5, H - 0.5), (-0.5, H - 0.5)])
+    np.testing.assert_allclose(seen(corners, tree), expected, atol=1e-2)
+    assert corners[:, 2].max() < points[:, 2].min()
+    # It faces the camera, and its top is the picture's top.
+    assert back.geometry[plane].face_normals[0] @ parts[plane][:3, :3].T @ [0, 0, 1] > 0
+    texture = back.geometry[plane].visual.material.baseColorTexture
+    shown = np.asarray(texture.convert("RGB"), float) / 255
+    assert np.abs(shown - image.permute(1, 2, 0).numpy()).mean() < 0.03
+    np.testing.assert_allclose(back.geometry[plane].visual.uv[0], [0, 1], atol=1e-6)
+
+
+def test_extras_hold_the_exact_pose_and_camera():
+    image, _, T = scene(0)
+    K = camera_matrix(260.0, 255.0, 100.0, 95.0, dtype=torch.float64)
+    tree = tree_of(posed_glb(trimesh.creation.box(), T, K, image, photograph=False))
+    node = next(n for n in tree["nodes"] if "camera" in n)
+    assert node["extras"]["T_cam_from_model"] == T.tolist()
+    assert node["extras"]["camera_matrix"] == K.tolist()
+    assert "images" not in tree
+
+
+def test_colours_of_corners_are_kept():
+    image, _, T = scene(0)
+    mesh = trimesh.creation.box()
+    mesh.visual.face_colors = [[200, 20, 20, 255]] * 6 + [[20, 20, 200, 255]] * 6
+    data = posed_glb(mesh, T, CAMERA, image, photograph=False)
+    back = trimesh.load(BytesIO(data), file_type="glb", force="mesh")
+    assert {tuple(c[:3]) for c in back.visual.vertex_colors} == {(200, 20, 20), (20, 20, 200)}
+
+
+def test_a_pose_behind_the_camera_is_refused():
+    T = torch.eye(4, dtype=torch.float64)
+    T[2, 3] = -2.0
+    with pytest.raises(InvalidInputError, match="behind the camera"):
+        posed_glb(trimesh.creation.box(), T, CAMERA, torch.rand(3, *SIZE))
+    with pytest.raises(InvalidInputError, match="finite"):
+        posed_glb(trimesh.creation.box(), T * torch.nan, CAMERA, torch.rand(3, *SIZE))
