@@ -1,6 +1,6 @@
 """A bank of rendered views of one or several meshes, described once and matched many times."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from os import PathLike
 from pathlib import Path
@@ -126,7 +126,7 @@ class ViewBank:
         renderer: str | DepthRenderer = "auto",
         settings: BankSettings | None = None,
         pipeline: Pipeline | None = None,
-        progress: bool = True,
+        progress: bool | Callable[[str, int, int], object] = True,
         chunk_size: int = 24,
         device: torch.device | str = "cpu",
     ) -> "ViewBank":
@@ -139,7 +139,7 @@ class ViewBank:
             renderer: "auto", "embree", "pyrender", "torch" or a :class:`DepthRenderer` of this mesh.
             settings: instead of the pipeline's ``bank``.
             pipeline: what the bank is made for; default ``Pipeline()``.
-            progress: show a bar.
+            progress: show a bar; or a function that is told "bank", views done and views in all, and may raise to stop.
             chunk_size: views that a thread has in memory at a time (about 60 bytes x image_size^2 each). Those that are
                 quarter turns of each other are rendered once where they fall into one chunk.
             device: where views are filtered and described, and where the bank stays.
@@ -184,10 +184,15 @@ class ViewBank:
             }
 
         parts = []
-        with tqdm(total=len(views), desc="views", unit="view", disable=not progress) as bar, one_thread_each() as pool:
+        with (
+            tqdm(total=len(views), desc="views", unit="view", disable=progress is not True) as bar,
+            one_thread_each() as pool,
+        ):
             for part in pool.map(chunk, range(0, len(views), chunk_size)):
                 parts.append(part)
                 bar.update(len(part["boxes"]))
+                if callable(progress):
+                    progress("bank", min(chunk_size * len(parts), len(views)), len(views))
         tensors = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
         tensors["model"] = torch.zeros(len(views), dtype=torch.long, device=tensors["boxes"].device)
         return cls([mesh], views, pipeline, tensors)

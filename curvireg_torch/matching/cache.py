@@ -8,7 +8,7 @@ import re
 import tempfile
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -117,7 +117,7 @@ def cached_bank(
     renderer: str | DepthRenderer = "auto",
     folder: Path | None = None,
     device: torch.device | str = "cpu",
-    progress: bool = True,
+    progress: bool | Callable[[str, int, int], object] = True,
     **build_options: Any,
 ) -> ViewBank:
     """The bank from the cache, or built and put there; a damaged file is built again, an unwritable folder a warning.

@@ -1,7 +1,7 @@
 """The facade that joins it all: photographs, boxes and meshes to poses."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
 from typing import Any
@@ -51,7 +51,8 @@ class Registrar:
         symmetries: (S, 4, 4) of the mesh, from :func:`curvireg_torch.geometry.symmetry_transforms`; hypotheses that
             differ by one of them are reported once.
         device: where modules, bank and search live.
-        progress: show bars.
+        progress: show bars; or a function that is told a stage ("bank", "ranking", "search", "contours"), how much of
+            it is done and of how much, and may raise to stop.
 
     Example:
         >>> import trimesh
@@ -78,7 +79,7 @@ class Registrar:
         renderer: str | DepthRenderer = "auto",
         symmetries: Tensor | None = None,
         device: torch.device | str | None = None,
-        progress: bool = False,
+        progress: bool | Callable[[str, int, int], object] = False,
     ) -> None:
         if top is not None:
             warnings.warn("Registrar: top is deprecated; use hypotheses", DeprecationWarning, stacklevel=2)
@@ -116,6 +117,7 @@ class Registrar:
         if not isinstance(renderer, str) and len(self.bank.meshes) != 1:
             raise InvalidInputError(f"renderer: yours is of one mesh, the bank has {len(self.bank.meshes)}; name one")
         self.symmetries = symmetries
+        self.progress = progress
 
     @cached_property
     def describers(self) -> tuple[ViewDescriber, ...]:
@@ -185,6 +187,7 @@ class Registrar:
             query: the same, cropped and described by the matcher.
             ranking: of the same; default :meth:`ViewMatcher.rank`.
         """
+        self._tell("ranking")
         ranking = self.matcher.rank(query) if ranking is None else ranking
         boxes = torch.stack([item.box for item in items]).double()
         matrices = [item.camera_matrix for item in items if item.camera_matrix is not None]
@@ -193,11 +196,13 @@ class Registrar:
         descriptors = self.describers[0].descriptor(query.field)
         found, fit = starts, None
         if self.pipeline.search:
+            self._tell("search")
             found = search(
                 self.describers, descriptors, found, bank=self.bank, ranking=ranking, boxes=boxes, camera_matrices=K
             )
         T, cameras = self._placed(found, boxes, K)
         if self.pipeline.contours:
+            self._tell("contours")
             fit = self._follow_contours(items, found, boxes, T, cameras)
             T, found = fit.transform, self._seen_straight(found, fit.transform)
         found = replace(found, score=similarities(self.describers, descriptors, found))
@@ -229,6 +234,10 @@ class Registrar:
             poses = tuple(self._hypothesis(h, found, T, cameras, evidence, fit, reliable, K is not None) for h in mine)
             results.append(Registration(poses, trust, ranking[b : b + 1]))
         return results
+
+    def _tell(self, stage: str) -> None:
+        if callable(self.progress):
+            self.progress(stage, 0, 1)
 
     def _evidence(
         self,

@@ -228,3 +228,24 @@ def fitted_covariance(bank, image, box, pose):
         radius=mesh_radius(mesh),
     )
     return fit.covariance[0]
+
+
+def test_progress_is_told_and_may_stop():
+    told = []
+    views = sample_views(azimuth_step=90, elevations=[0, 30])
+    pipeline = replace(PRESETS["classical"], hypotheses=1)
+    bank = ViewBank.build(
+        example_mesh(), views, pipeline=pipeline, image_size=64, chunk_size=3, progress=lambda *it: told.append(it)
+    )
+    assert told == [("bank", 3, 8), ("bank", 6, 8), ("bank", 8, 8)]
+    told.clear()
+    Registrar(bank, progress=lambda *it: told.append(it))([scene(0)[0]], scene(0)[1][None], CAMERA)
+    assert [stage for stage, *_ in told] == ["ranking", "search", "contours"]
+
+    def stop(stage, *_):
+        raise InvalidInputError(f"stopped in {stage}")
+
+    with pytest.raises(InvalidInputError, match="stopped in bank"):
+        ViewBank.build(example_mesh(), views, image_size=64, progress=stop)
+    with pytest.raises(InvalidInputError, match="stopped in ranking"):
+        Registrar(bank, progress=stop)([scene(0)[0]], scene(0)[1][None])
