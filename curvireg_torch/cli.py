@@ -19,7 +19,7 @@ __all__ = ["main"]
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code: 0, or 2 for input that cannot be used."""
-    arguments = _parser().parse_args(argv)
+    arguments = _parsed(argv)
     with warnings.catch_warnings(), terminable():
         if not arguments.debug:
             warnings.showwarning = _show_warning
@@ -43,6 +43,29 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _show_warning(message: Any, *_: Any, **__: Any) -> None:
     print(f"curvireg: warning: {message}", file=sys.stderr)
+
+
+def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = _parser()
+    arguments, rest = parser.parse_known_args(argv)
+    if hasattr(arguments, "paths") and not any(word.startswith("-") for word in rest):
+        arguments.paths += [Path(word) for word in rest]  # those behind an option
+    elif rest:
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if hasattr(arguments, "paths") and (problem := _misused(arguments)):
+        parser.error(problem)
+    return arguments
+
+
+def _misused(arguments: argparse.Namespace) -> str | None:
+    """What is wrong with the words given to ``register``."""
+    if arguments.list is None and len(arguments.paths) != 2:
+        return f"register: expected PHOTO MESH, got {len(arguments.paths)} paths; or give --list FILE.csv MESH"
+    if arguments.list is not None and len(arguments.paths) > 1:
+        return f"register --list: expected at most one MESH, got {len(arguments.paths)}"
+    if arguments.list is not None and (arguments.box or arguments.camera):
+        return "register --list: the list holds boxes and cameras; leave --box and --camera out"
+    return None
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -76,10 +99,24 @@ def _parser() -> argparse.ArgumentParser:
 
     register = commands.add_parser(
         "register", parents=[common, preset, mesh_options], help="find the pose of MESH in PHOTO",
-        description="Writes DIR/result.json and DIR/overlay.png.",
+        usage="curvireg register PHOTO MESH --out DIR [options]\n       "
+        "curvireg register --list FILE.csv [MESH] --out DIR [options]",
+        description="Writes DIR/result.json and DIR/overlay.png; of a list, DIR/results.csv and DIR/results.jsonl.",
     )  # fmt: skip
-    register.add_argument("photo", type=Path, metavar="PHOTO")
-    register.add_argument("mesh", type=Path, metavar="MESH", help="a mesh (.obj .ply .stl .off .glb) or a bank")
+    register.add_argument(
+        "paths",
+        type=Path,
+        nargs="*",
+        metavar="PHOTO MESH",
+        help="a photograph; a mesh (.obj .ply .stl .off .glb) or a bank",
+    )
+    register.add_argument(
+        "--list",
+        type=Path,
+        metavar="FILE.csv",
+        help="photographs: columns photo,x0,y0,x1,y1 and, if wanted, fx,fy,cx,cy,mesh; paths count from the list's "
+        "folder, empty cells mean the whole image, no camera, MESH. Run again, it goes on where it was",
+    )
     register.add_argument(
         "--box", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help="px; default: the whole image"
     )

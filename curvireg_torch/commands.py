@@ -2,44 +2,29 @@
 
 import argparse
 import json
-import math
-import platform
 import time
 from pathlib import Path
 from typing import Any
 
 import cv2
-import kornia
 import numpy as np
 import torch
-import trimesh
+from torch import nn
 
-from . import __version__
 from ._choices import DEFAULT
 from ._files import probe_folder, write_file
+from .batch import Entry, read_list, register_entry, register_list
 from .data import read_photo
-from .errors import BankError
-from .geometry import camera_matrix, load_mesh, rotation_error, whole_image_box
+from .document import result_document
+from .errors import BankError, InvalidInputError
+from .evaluation.loops import code_digest
+from .geometry import camera_matrix, load_mesh, rotation_error
 from .learned import LearnedCurvilinearSaliency, adapt
 from .matching import ViewBank, cache_folder, cached_bank, clear_cache, list_cache
-from .pipeline import Pipeline, preset_named
-from .registration import RELIABLE, FailedRegistration, Registrar, Registration
+from .pipeline import Pipeline, field_digest, preset_named
+from .registration import Registrar, Registration
 
-__all__ = ["bank", "cache", "chosen_pipeline", "demo", "register"]
-
-CONVENTIONS = {
-    "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
-    "translation": "in the mesh file's unit; null without --camera",
-    "viewpoint": "PASCAL3D+ azimuth, elevation, theta in degrees",
-    "pixels": "(0, 0) is the centre of the top-left pixel of the picture as viewers show it (EXIF orientation applied)",
-    "boxes": "x0, y0, x1, y1 in those pixels",
-    "score": "normalised correlation of photograph and view, 0 to 1",
-    "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
-    "reliable": f"confidence of at least {RELIABLE:g}; false = no reliable match, the pose is a guess",
-    "support": "how strongly edges of the photograph lie under the mesh's contours, 0 to 1",
-    "covariance": "of turn (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
-    "t_true = t + e; null without --camera",
-}
+__all__ = ["bank", "cache", "chosen_pipeline", "demo", "open_registrar", "register"]
 
 
 def bank(arguments: argparse.Namespace) -> None:
@@ -83,52 +68,78 @@ def chosen_pipeline(arguments: argparse.Namespace) -> Pipeline:
     return chosen if arguments.pose is None else chosen.posed(arguments.pose)
 
 
-def _open_bank(arguments: argparse.Namespace, pipeline: Pipeline) -> ViewBank:
-    if arguments.mesh.suffix == ".safetensors":
-        bank = ViewBank.load(arguments.mesh)
+def open_registrar(arguments: argparse.Namespace, mesh: Path, field: nn.Module | None) -> Registrar:
+    """What ``register``'s options ask for, on a mesh or a bank."""
+    pipeline: Pipeline | None = chosen_pipeline(arguments)
+    if mesh.suffix == ".safetensors":
+        bank = ViewBank.load(mesh)
         if arguments.pose not in (None, bank.pipeline.views.pose):
             raise BankError(
-                f"{arguments.mesh}: made for --pose {bank.pipeline.views.pose}, asked for --pose {arguments.pose}; "
+                f"{mesh}: made for --pose {bank.pipeline.views.pose}, asked for --pose {arguments.pose}; "
                 "leave --pose out, or build it again with 'curvireg bank'"
             )
-        return bank
-    mesh = load_mesh(arguments.mesh, unit=arguments.unit, up=arguments.up)
-    return cached_bank(mesh, pipeline=pipeline, renderer=arguments.renderer, progress=not arguments.quiet)
-
-
-def register(arguments: argparse.Namespace) -> None:
-    """``curvireg register``."""
-    times = {"start": time.perf_counter()}
-    photo = read_photo(arguments.photo, dtype=torch.uint8)
-    image = photo.image
-    box = whole_image_box(image) if arguments.box is None else torch.tensor(arguments.box)
-    K = None if arguments.camera is None else camera_matrix(*arguments.camera, dtype=torch.float64)
-    pipeline = chosen_pipeline(arguments)
-    field = None if arguments.field is None else LearnedCurvilinearSaliency(weights=arguments.field)
-    probe_folder(arguments.out, "--out")
-    bank = _open_bank(arguments, pipeline).to(arguments.device)
-    if arguments.mesh.suffix == ".safetensors" and arguments.preset is None and arguments.pipeline is None:
-        pipeline = bank.pipeline
-    times["bank"] = time.perf_counter()
-    registrar = Registrar(
-        bank,
+        if arguments.preset is None and arguments.pipeline is None:
+            pipeline = None  # the bank's own
+    else:
+        shape = load_mesh(mesh, unit=arguments.unit, up=arguments.up)
+        bank = cached_bank(shape, pipeline=pipeline, renderer=arguments.renderer, progress=not arguments.quiet)
+    return Registrar(
+        bank.to(arguments.device),
         pipeline=pipeline,
         field=field,
         refine=not arguments.no_refine,
         hypotheses=arguments.top,
         renderer=arguments.renderer,
     )
-    result = registrar([image], box[None], K)[0]
-    if isinstance(result, FailedRegistration):
-        raise type(result.error)(str(result.error).replace("image 0", str(arguments.photo)))
-    times["register"] = time.perf_counter()
-    document = _document(result, registrar, times)
-    document["inputs"] = {"photo": str(arguments.photo), "mesh": str(arguments.mesh), "box": box.tolist()}
-    document["inputs"]["picture"] = photo.facts()
-    _write(arguments.out, document, registrar, result, image, box)
+
+
+def register(arguments: argparse.Namespace) -> None:
+    """``curvireg register``."""
+    chosen_pipeline(arguments)  # refused before anything is read
+    field = None if arguments.field is None else LearnedCurvilinearSaliency(weights=arguments.field)
+    if arguments.list is not None:
+        _register_list(arguments, field)
+    else:
+        _register_one(arguments, field)
+
+
+def _register_one(arguments: argparse.Namespace, field: nn.Module | None) -> None:
+    start = time.perf_counter()
+    path, mesh = arguments.paths
+    entry = Entry((), str(path), path, mesh, arguments.box, arguments.camera)
+    if arguments.camera is not None:
+        camera_matrix(*arguments.camera)  # refused before the bank is made
+    photo = read_photo(path, dtype=torch.uint8)
+    probe_folder(arguments.out, "--out")
+    registrar = open_registrar(arguments, mesh, field)
+    result, document = register_entry(entry, photo, registrar, bank_seconds=time.perf_counter() - start)
+    _write(arguments.out, document, registrar, result, photo.image, document["inputs"]["box"])
     if photo.notes:
-        print(f"{arguments.photo}: {'; '.join(photo.notes)}")
+        print(f"{path}: {'; '.join(photo.notes)}")
     _print_result(document, arguments.out)
+
+
+def _register_list(arguments: argparse.Namespace, field: nn.Module | None) -> None:
+    listing = read_list(arguments.list, arguments.paths[0] if arguments.paths else None)
+    probe_folder(arguments.out, "--out")
+    settings = {
+        "pipeline": chosen_pipeline(arguments).describe(),
+        "bank_decides": arguments.preset is None and arguments.pipeline is None,
+        "field": None if field is None else field_digest(field),
+        "device": str(arguments.device),
+        "code": code_digest(),
+        **{name: getattr(arguments, name) for name in ("pose", "unit", "up", "top", "no_refine", "renderer")},
+    }
+    counts = register_list(
+        listing,
+        arguments.out,
+        lambda mesh: open_registrar(arguments, mesh, field),
+        settings=settings,
+        progress=not arguments.quiet,
+    )
+    print(f"{counts}; see {arguments.out}/results.csv")
+    if not counts.ok:
+        raise InvalidInputError(f"{arguments.list}: not one photograph could be registered; column message says why")
 
 
 def demo(arguments: argparse.Namespace) -> None:
@@ -136,7 +147,7 @@ def demo(arguments: argparse.Namespace) -> None:
     from .synthetic import example_mesh, random_pose, synthesize_photograph
 
     probe_folder(arguments.out, "--out")
-    times = {"start": time.perf_counter()}
+    start = time.perf_counter()
     generator = torch.Generator().manual_seed(arguments.seed)
     mesh, size = example_mesh(), (360, 480)
     K = camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
@@ -144,12 +155,12 @@ def demo(arguments: argparse.Namespace) -> None:
     image, box = synthesize_photograph(mesh, truth, K, size, generator)
     pipeline = chosen_pipeline(arguments)
     bank = cached_bank(mesh, pipeline=pipeline, renderer=arguments.renderer, progress=not arguments.quiet)
-    times["bank"] = time.perf_counter()
+    ready = time.perf_counter()
     registrar = Registrar(bank, pipeline=pipeline, renderer=arguments.renderer, device=arguments.device)
     result = registrar([image], box[None], K)[0]
     assert isinstance(result, Registration)
-    times["register"] = time.perf_counter()
-    document = _document(result, registrar, times)
+    seconds = {"bank": ready - start, "register": time.perf_counter() - ready}
+    document = result_document(result, registrar, seconds)
     assert result.translation is not None
     document["rotation_error_deg"] = float(rotation_error(result.rotation, truth[:3, :3]))
     document["translation_error"] = float((result.translation - truth[:3, 3]).norm() / truth[:3, 3].norm())
@@ -163,54 +174,6 @@ def demo(arguments: argparse.Namespace) -> None:
         f"error against the truth: rotation {document['rotation_error_deg']:.1f} degrees, "
         f"translation {100 * document['translation_error']:.1f} % of the distance"
     )
-
-
-def _document(result: Registration, registrar: Registrar, times: dict[str, float]) -> dict[str, Any]:
-    bank = registrar.bank
-    top = [
-        {
-            "rotation": h.rotation.tolist(),
-            "translation": None if h.translation is None else h.translation.tolist(),
-            "viewpoint": dict(zip(("azimuth", "elevation", "theta"), h.viewpoint, strict=True)),
-            "score": h.score,
-            "evidence": dict(h.evidence),
-            "view": h.view,
-            "terms": {n: float(r[0, h.view]) for n, r in result.ranking.terms.items() if r[0, h.view].isfinite()},
-        }
-        for h in result.hypotheses
-    ]
-    deviations = result.standard_deviations
-    return {
-        "rotation": result.rotation.tolist(),
-        "translation": None if result.translation is None else result.translation.tolist(),
-        "unit": bank.mesh.units,
-        "viewpoint": dict(zip(("azimuth", "elevation", "theta"), result.viewpoint, strict=True)),
-        "score": result.score,
-        "confidence": result.confidence,
-        "reliable": result.reliable,
-        "support": result.support,
-        "standard_deviations": None
-        if deviations is None
-        else {"rotation_deg": _known(deviations[0]), "translation": _known(deviations[1])},
-        "covariance": None if result.covariance is None else result.covariance.tolist(),
-        "top": top,
-        "views": len(bank),
-        "pipeline": registrar.pipeline.describe(),
-        "seconds": {"bank": times["bank"] - times["start"], "register": times["register"] - times["bank"]},
-        "versions": {
-            "curvireg_torch": __version__,
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-            "kornia": kornia.__version__,
-            "trimesh": trimesh.__version__,
-        },
-        "conventions": CONVENTIONS,
-    }
-
-
-def _known(deviations: torch.Tensor) -> list[float | None]:
-    """Numbers that JSON can hold: None for a deviation without bound."""
-    return [None if math.isinf(v) else v for v in deviations.tolist()]
 
 
 def _write(out: Path, document: dict[str, Any], registrar: Registrar, result: Registration, *scene: Any) -> None:

@@ -20,9 +20,11 @@ from .workers import workers
 __all__ = ["evaluate", "score"]
 
 BESIDE_THE_POINT = (
+    "batch",
     "cli.py",
     "commands.py",
     "detectors",
+    "document.py",
     "evaluation",
     "metrics",
     "scenes",

@@ -1,6 +1,5 @@
 """The first loop: every object's pose, to disk."""
 
-import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 from torch import nn
 from tqdm import tqdm
 
+from .._files import file_digest
 from ..data import read_image
 from ..errors import ImageError, MeshError, MissingFileError
 from ..geometry import load_mesh
@@ -79,12 +79,7 @@ def _is_done(store: PredictionStore, item: Item, digests: dict[str, str]) -> boo
     return "skipped" not in row and row.get("inputs") == digests
 
 
-@cache
-def _file_digest(path: Path) -> str:
-    try:
-        return hashlib.blake2b(path.read_bytes(), digest_size=8).hexdigest()
-    except OSError:
-        return ""
+_file_digest = cache(file_digest)  # objects share their meshes and photographs
 
 
 @dataclass

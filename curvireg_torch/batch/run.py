@@ -1,0 +1,188 @@
+"""The loop over a list: each photograph's result is on disk as soon as it is known."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from .._files import file_digest
+from ..data import Photo, read_photo
+from ..document import result_document
+from ..errors import BankError, CurviregError, ImageError, InvalidInputError, MeshError
+from ..geometry import camera_matrix, whole_image_box
+from ..registration import FailedRegistration, Registrar, Registration
+from .listing import Entry, Listing
+from .records import Record, Records
+
+__all__ = ["Counts", "register_entry", "register_list"]
+
+NONE = {"request": "", "photo": ""}
+"""Digests of what was not asked for."""
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How a list ended: rows with a pose, without, and with one to rely on."""
+
+    ok: int
+    failed: int
+    reliable: int
+
+    def __str__(self) -> str:
+        return f"{self.ok + self.failed} photographs: {self.ok} ok, {self.failed} failed, {self.reliable} reliable"
+
+
+def register_list(
+    listing: Listing,
+    out: Path,
+    open_registrar: Callable[[Path], Registrar],
+    *,
+    settings: Mapping[str, Any],
+    progress: bool = True,
+) -> Counts:
+    """Register the photographs of a list; ``out`` gets ``results.jsonl`` and ``results.csv``.
+
+    Photographs of one mesh follow each other, so that only its bank is in memory, and one photograph at a time: in a
+    batch their numbers would be rounded otherwise, and a pose hang on its neighbours. What ``results.jsonl`` holds of
+    the same photograph, mesh, box, camera and settings is not done again. A row that cannot be registered (photograph
+    or mesh missing or broken, box or camera that is none) ends ``failed``, with the reason.
+
+    Args:
+        listing: the photographs.
+        out: folder for the results.
+        open_registrar: of a mesh's file.
+        settings: plain values, all that results depend on besides the files.
+        progress: show a bar.
+
+    Raises:
+        CurviregError: ``open_registrar`` refuses its options, or ``out`` cannot be written to.
+    """
+    return _Run(Records(out), open_registrar, json.dumps(settings, sort_keys=True), progress)(listing)
+
+
+def register_entry(
+    entry: Entry, photo: Photo, registrar: Registrar, *, bank_seconds: float
+) -> tuple[Registration, Record]:
+    """The pose of one photograph, and its document.
+
+    Args:
+        entry: its name, box and camera.
+        photo: as read from its file.
+        registrar: of its mesh.
+        bank_seconds: what fetching the registrar's bank took.
+
+    Raises:
+        CurviregError: it cannot be registered; the message begins with the photograph's name.
+    """
+    start = time.perf_counter()
+    box = whole_image_box(photo.image) if entry.box is None else torch.tensor(entry.box)
+    K = None if entry.camera is None else camera_matrix(*entry.camera, dtype=torch.float64)
+    result = registrar([photo.image], box[None], K)[0]
+    if isinstance(result, FailedRegistration):
+        raise type(result.error)(
+            str(result.error).replace("image 0: box 0", "image 0: box").replace("image 0", entry.name)
+        )
+    document = result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start})
+    document["inputs"] = {
+        "photo": entry.name,
+        "mesh": str(entry.mesh),
+        "box": box.tolist(),
+        "camera": entry.camera,
+        "picture": photo.facts(),
+    }
+    return result, document
+
+
+@dataclass
+class _Run:
+    records: Records
+    open_registrar: Callable[[Path], Registrar]
+    settings: str
+    progress: bool
+    mesh: Path | None = None
+    registrar: Registrar | Exception | None = None
+    mesh_digests: dict[Path, str] = field(default_factory=dict)
+
+    def __call__(self, listing: Listing) -> Counts:
+        self.records.table.unlink(missing_ok=True)  # an older one never stands beside these lines
+        usable = [entry for entry in listing.entries if not entry.trouble]
+        requests = {self._request(entry): entry for entry in usable}
+        todo = [(request, entry) for request, entry in requests.items() if not self._is_done(request, entry)]
+        order = {mesh: place for place, mesh in enumerate(dict.fromkeys(entry.mesh for entry in usable))}
+        todo.sort(key=lambda pair: order[pair[1].mesh])
+        bar = tqdm(
+            total=len(requests),
+            initial=len(requests) - len(todo),
+            desc="register",
+            unit="photo",
+            disable=not self.progress,
+        )
+        with bar:
+            for request, entry in todo:
+                self.records.append(self._record(request, entry))
+                bar.update()
+        return self._finish(listing)
+
+    def _request(self, entry: Entry) -> str:
+        """Names all that the result depends on but the photograph's content, which is read only where it must be."""
+        assert entry.mesh is not None
+        if entry.mesh not in self.mesh_digests:
+            self.mesh_digests[entry.mesh] = file_digest(entry.mesh)
+        asked = [entry.name, entry.box, entry.camera, entry.mesh.name, self.mesh_digests[entry.mesh], self.settings]
+        return hashlib.blake2b(json.dumps(asked).encode(), digest_size=8).hexdigest()
+
+    def _is_done(self, request: str, entry: Entry) -> bool:
+        before = self.records.photo_digest(request)
+        assert entry.photo is not None
+        return bool(before) and before == file_digest(entry.photo)
+
+    def _record(self, request: str, entry: Entry) -> Record:
+        assert entry.photo is not None
+        assert entry.mesh is not None
+        digests = {"request": request, "photo": file_digest(entry.photo)}
+        try:
+            photo = read_photo(entry.photo, dtype=torch.uint8)
+        except (CurviregError, OSError) as error:
+            return _failed(str(error), digests)
+        start = time.perf_counter()
+        registrar = self._opened(entry.mesh)
+        if not isinstance(registrar, Registrar):
+            return _failed(str(registrar), digests)
+        try:
+            _, document = register_entry(entry, photo, registrar, bank_seconds=time.perf_counter() - start)
+        except (ImageError, InvalidInputError) as error:
+            return _failed(str(error), digests)
+        return {"status": "ok", "message": "", **document, "digests": digests}
+
+    def _opened(self, mesh: Path) -> Registrar | Exception:
+        """Of this mesh, or why there is none."""
+        if self.registrar is None or mesh != self.mesh:
+            self.mesh, self.registrar = mesh, None  # the memory goes before more is asked for
+            try:
+                self.registrar = self.open_registrar(mesh)
+            except (MeshError, BankError, OSError) as error:
+                self.registrar = error
+        return self.registrar
+
+    def _finish(self, listing: Listing) -> Counts:
+        statuses: list[tuple[bool, bool]] = []
+
+        def rows() -> Iterator[tuple[tuple[str, ...], Record]]:
+            for entry in listing.entries:
+                record = _failed(entry.trouble, NONE) if entry.trouble else self.records.read(self._request(entry))
+                statuses.append((record["status"] == "ok", bool(record.get("reliable"))))
+                yield entry.cells, record
+
+        self.records.finish(listing.columns, rows())
+        ok = sum(good for good, _ in statuses)
+        return Counts(ok, len(statuses) - ok, sum(reliable for _, reliable in statuses))
+
+
+def _failed(trouble: str, digests: Mapping[str, str]) -> Record:
+    return {"status": "failed", "message": " ".join(trouble.split()), "digests": dict(digests)}

@@ -1,0 +1,84 @@
+"""The document of a result: what ``result.json`` and every line of ``results.jsonl`` say."""
+
+import math
+import platform
+from collections.abc import Mapping
+from typing import Any
+
+import kornia
+import torch
+import trimesh
+
+from . import __version__
+from .registration import RELIABLE, Registrar, Registration
+
+__all__ = ["CONVENTIONS", "result_document"]
+
+CONVENTIONS = {
+    "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
+    "translation": "in the mesh file's unit; null without --camera",
+    "viewpoint": "PASCAL3D+ azimuth, elevation, theta in degrees",
+    "pixels": "(0, 0) is the centre of the top-left pixel of the picture as viewers show it (EXIF orientation applied)",
+    "boxes": "x0, y0, x1, y1 in those pixels",
+    "score": "normalised correlation of photograph and view, 0 to 1",
+    "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
+    "reliable": f"confidence of at least {RELIABLE:g}; false = no reliable match, the pose is a guess",
+    "support": "how strongly edges of the photograph lie under the mesh's contours, 0 to 1",
+    "covariance": "of turn (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
+    "t_true = t + e; null without --camera",
+}
+
+
+def result_document(result: Registration, registrar: Registrar, seconds: Mapping[str, float]) -> dict[str, Any]:
+    """All that is known of a registration, as plain JSON.
+
+    Args:
+        result: of ``registrar``.
+        registrar: what made it.
+        seconds: what took how long, ``bank`` and ``register``.
+    """
+    bank = registrar.bank
+    top = [
+        {
+            "rotation": h.rotation.tolist(),
+            "translation": None if h.translation is None else h.translation.tolist(),
+            "viewpoint": dict(zip(("azimuth", "elevation", "theta"), h.viewpoint, strict=True)),
+            "score": h.score,
+            "evidence": dict(h.evidence),
+            "view": h.view,
+            "terms": {n: float(r[0, h.view]) for n, r in result.ranking.terms.items() if r[0, h.view].isfinite()},
+        }
+        for h in result.hypotheses
+    ]
+    deviations = result.standard_deviations
+    return {
+        "rotation": result.rotation.tolist(),
+        "translation": None if result.translation is None else result.translation.tolist(),
+        "unit": bank.mesh.units,
+        "viewpoint": dict(zip(("azimuth", "elevation", "theta"), result.viewpoint, strict=True)),
+        "score": result.score,
+        "confidence": result.confidence,
+        "reliable": result.reliable,
+        "support": result.support,
+        "standard_deviations": None
+        if deviations is None
+        else {"rotation_deg": _known(deviations[0]), "translation": _known(deviations[1])},
+        "covariance": None if result.covariance is None else result.covariance.tolist(),
+        "top": top,
+        "views": len(bank),
+        "pipeline": registrar.pipeline.describe(),
+        "seconds": dict(seconds),
+        "versions": {
+            "curvireg_torch": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "kornia": kornia.__version__,
+            "trimesh": trimesh.__version__,
+        },
+        "conventions": CONVENTIONS,
+    }
+
+
+def _known(deviations: torch.Tensor) -> list[float | None]:
+    """Numbers that JSON can hold: None for a deviation without bound."""
+    return [None if math.isinf(v) else v for v in deviations.tolist()]
