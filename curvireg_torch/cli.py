@@ -52,19 +52,22 @@ def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
         arguments.paths += [Path(word) for word in rest]  # those behind an option
     elif rest:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
-    if hasattr(arguments, "paths") and (problem := _misused(arguments)):
-        parser.error(problem)
+    if hasattr(arguments, "paths"):
+        photos = [] if arguments.list else arguments.paths if arguments.mesh else arguments.paths[:-1]
+        arguments.photos, arguments.meshes = photos, [*arguments.paths[len(photos) :], *arguments.mesh]
+        if problem := _misused(arguments):
+            parser.error(f"register: {problem}")
     return arguments
 
 
 def _misused(arguments: argparse.Namespace) -> str | None:
     """What is wrong with the words given to ``register``."""
-    if arguments.list is None and len(arguments.paths) != 2:
-        return f"register: expected PHOTO MESH, got {len(arguments.paths)} paths; or give --list FILE.csv MESH"
+    if arguments.list is None and not (arguments.photos and arguments.meshes):
+        return "expected PHOTO MESH, PHOTO ... --mesh MESH, or --list FILE MESH"
     if arguments.list is not None and len(arguments.paths) > 1:
-        return f"register --list: expected at most one MESH, got {len(arguments.paths)}"
+        return f"with --list, expected at most one MESH, got {len(arguments.paths)}; give several by --mesh"
     if arguments.list is not None and (arguments.box or arguments.camera):
-        return "register --list: the list holds boxes and cameras; leave --box and --camera out"
+        return "the list holds boxes and cameras; leave --box and --camera out"
     return None
 
 
@@ -99,24 +102,31 @@ def _parser() -> argparse.ArgumentParser:
 
     register = commands.add_parser(
         "register", parents=[common, preset, mesh_options], help="find the pose of MESH in PHOTO",
-        usage="curvireg register PHOTO MESH --out DIR [options]\n       "
-        "curvireg register --list FILE.csv [MESH] --out DIR [options]",
-        description="Writes DIR/result.json and DIR/overlay.png; of a list, DIR/results.csv and DIR/results.jsonl.",
+        usage="curvireg register PHOTO... MESH --out DIR [options]\n       "
+        "curvireg register --list LIST [MESH] --out DIR [options]",
+        description="One photograph: writes DIR/result.json and DIR/overlay.png. Several, or a list: DIR/results.csv "
+        "and DIR/results.jsonl; killed and run again, it goes on where it was.",
     )  # fmt: skip
     register.add_argument(
         "paths",
         type=Path,
         nargs="*",
-        metavar="PHOTO MESH",
-        help="a photograph; a mesh (.obj .ply .stl .off .glb) or a bank",
+        metavar="PHOTO... MESH",
+        help="photographs, folders of them, patterns ('shots/*.jpg') or videos; last a mesh (.obj .ply .stl .off .glb) "
+        "or a bank",
+    )
+    register.add_argument(
+        "--mesh", type=Path, action="append", default=[], metavar="MESH", help="several times: which of these is it?"
     )
     register.add_argument(
         "--list",
         type=Path,
-        metavar="FILE.csv",
-        help="photographs: columns photo,x0,y0,x1,y1 and, if wanted, fx,fy,cx,cy,mesh; paths count from the list's "
-        "folder, empty cells mean the whole image, no camera, MESH. Run again, it goes on where it was",
+        metavar="LIST",
+        help="CSV with columns photo,x0,y0,x1,y1 and, if wanted, fx,fy,cx,cy,mesh; paths count from the list's folder, "
+        "empty cells mean the whole image, no camera, MESH. Or JSON of the like, COCO annotations, the folder of a "
+        "BOP scene",
     )
+    register.add_argument("--every", type=int, default=1, metavar="N", help="of a video, every N-th frame (default: 1)")
     register.add_argument(
         "--box", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help="px; default: the whole image"
     )

@@ -2,7 +2,9 @@
 
 import argparse
 import json
+import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,15 @@ from torch import nn
 
 from ._choices import DEFAULT
 from ._files import probe_folder, write_file
-from .batch import Entry, read_list, register_entry, register_list
+from .batch import (
+    Entry,
+    Listing,
+    is_one_photograph,
+    list_photographs,
+    read_list,
+    register_entry,
+    register_list,
+)
 from .data import read_photo
 from .document import result_document
 from .errors import BankError, InvalidInputError
@@ -68,24 +78,14 @@ def chosen_pipeline(arguments: argparse.Namespace) -> Pipeline:
     return chosen if arguments.pose is None else chosen.posed(arguments.pose)
 
 
-def open_registrar(arguments: argparse.Namespace, mesh: Path, field: nn.Module | None) -> Registrar:
-    """What ``register``'s options ask for, on a mesh or a bank."""
-    pipeline: Pipeline | None = chosen_pipeline(arguments)
-    if mesh.suffix == ".safetensors":
-        bank = ViewBank.load(mesh)
-        if arguments.pose not in (None, bank.pipeline.views.pose):
-            raise BankError(
-                f"{mesh}: made for --pose {bank.pipeline.views.pose}, asked for --pose {arguments.pose}; "
-                "leave --pose out, or build it again with 'curvireg bank'"
-            )
-        if arguments.preset is None and arguments.pipeline is None:
-            pipeline = None  # the bank's own
-    else:
-        shape = load_mesh(mesh, unit=arguments.unit, up=arguments.up)
-        bank = cached_bank(shape, pipeline=pipeline, renderer=arguments.renderer, progress=not arguments.quiet)
+def open_registrar(arguments: argparse.Namespace, meshes: Sequence[Path], field: nn.Module | None) -> Registrar:
+    """What ``register``'s options ask for, on a mesh or a bank, or on several."""
+    pipeline = chosen_pipeline(arguments)
+    banks = [_open_bank(arguments, mesh, pipeline) for mesh in meshes]
+    own = all(mesh.suffix == ".safetensors" for mesh in meshes)
     return Registrar(
-        bank.to(arguments.device),
-        pipeline=pipeline,
+        ViewBank.join(banks).to(arguments.device),
+        pipeline=None if own and arguments.preset is None and arguments.pipeline is None else pipeline,
         field=field,
         refine=not arguments.no_refine,
         hypotheses=arguments.top,
@@ -93,25 +93,53 @@ def open_registrar(arguments: argparse.Namespace, mesh: Path, field: nn.Module |
     )
 
 
+def _open_bank(arguments: argparse.Namespace, mesh: Path, pipeline: Pipeline) -> ViewBank:
+    if mesh.suffix != ".safetensors":
+        shape = load_mesh(mesh, unit=arguments.unit, up=arguments.up)
+        return cached_bank(shape, pipeline=pipeline, renderer=arguments.renderer, progress=not arguments.quiet)
+    bank = ViewBank.load(mesh)
+    if arguments.pose not in (None, bank.pipeline.views.pose):
+        raise BankError(
+            f"{mesh}: made for --pose {bank.pipeline.views.pose}, asked for --pose {arguments.pose}; "
+            "leave --pose out, or build it again with 'curvireg bank'"
+        )
+    return bank
+
+
 def register(arguments: argparse.Namespace) -> None:
     """``curvireg register``."""
     chosen_pipeline(arguments)  # refused before anything is read
     field = None if arguments.field is None else LearnedCurvilinearSaliency(weights=arguments.field)
+    if arguments.camera is not None:
+        camera_matrix(*arguments.camera)
+    if arguments.list is None and is_one_photograph(arguments.photos):
+        return _register_one(arguments, field)
     if arguments.list is not None:
-        _register_list(arguments, field)
+        listing = read_list(arguments.list, arguments.meshes)
+        probe_folder(arguments.out, "--out")
     else:
-        _register_one(arguments, field)
+        probe_folder(arguments.out, "--out")
+        listing = list_photographs(
+            arguments.photos,
+            arguments.meshes,
+            box=arguments.box,
+            camera=arguments.camera,
+            every=arguments.every,
+            frames=arguments.out / "frames",
+        )
+        given = [f"--{name}" for name in ("box", "camera") if getattr(arguments, name) is not None]
+        if given:
+            print(f"{' and '.join(given)}: of all {len(listing.entries)} photographs", file=sys.stderr)
+    return _register_list(arguments, listing, field)
 
 
 def _register_one(arguments: argparse.Namespace, field: nn.Module | None) -> None:
     start = time.perf_counter()
-    path, mesh = arguments.paths
-    entry = Entry((), str(path), path, mesh, arguments.box, arguments.camera)
-    if arguments.camera is not None:
-        camera_matrix(*arguments.camera)  # refused before the bank is made
+    path = arguments.photos[0]
+    entry = Entry((), str(path), path, tuple(arguments.meshes), arguments.box, arguments.camera)
     photo = read_photo(path, dtype=torch.uint8)
     probe_folder(arguments.out, "--out")
-    registrar = open_registrar(arguments, mesh, field)
+    registrar = open_registrar(arguments, entry.meshes, field)
     result, document = register_entry(entry, photo, registrar, bank_seconds=time.perf_counter() - start)
     _write(arguments.out, document, registrar, result, photo.image, document["inputs"]["box"])
     if photo.notes:
@@ -119,9 +147,7 @@ def _register_one(arguments: argparse.Namespace, field: nn.Module | None) -> Non
     _print_result(document, arguments.out)
 
 
-def _register_list(arguments: argparse.Namespace, field: nn.Module | None) -> None:
-    listing = read_list(arguments.list, arguments.paths[0] if arguments.paths else None)
-    probe_folder(arguments.out, "--out")
+def _register_list(arguments: argparse.Namespace, listing: Listing, field: nn.Module | None) -> None:
     settings = {
         "pipeline": chosen_pipeline(arguments).describe(),
         "bank_decides": arguments.preset is None and arguments.pipeline is None,
@@ -133,13 +159,13 @@ def _register_list(arguments: argparse.Namespace, field: nn.Module | None) -> No
     counts = register_list(
         listing,
         arguments.out,
-        lambda mesh: open_registrar(arguments, mesh, field),
+        lambda meshes: open_registrar(arguments, meshes, field),
         settings=settings,
         progress=not arguments.quiet,
     )
     print(f"{counts}; see {arguments.out}/results.csv")
     if not counts.ok:
-        raise InvalidInputError(f"{arguments.list}: not one photograph could be registered; column message says why")
+        raise InvalidInputError(f"not one photograph could be registered; {arguments.out}/results.csv says why")
 
 
 def demo(arguments: argparse.Namespace) -> None:
@@ -195,6 +221,8 @@ def _print_result(document: dict[str, Any], out: Path) -> None:
     print(f"viewpoint: {angles} degrees   score {document['score']:.3f}   confidence {document['confidence']:.2f}")
     if not document["reliable"]:
         print("no reliable match: take the pose as a guess; check that the box is tight and the mesh is the object's")
+    if ", " in document.get("inputs", {}).get("mesh", ""):
+        print(f"mesh: {document['mesh']}")
     if document["translation"] is not None:
         print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")
     deviations = document["standard_deviations"]

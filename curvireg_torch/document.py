@@ -54,7 +54,7 @@ def result_document(result: Registration, registrar: Registrar, seconds: Mapping
     return {
         "rotation": result.rotation.tolist(),
         "translation": None if result.translation is None else result.translation.tolist(),
-        "unit": bank.mesh.units,
+        "unit": bank.meshes[result.model].units,
         "viewpoint": dict(zip(("azimuth", "elevation", "theta"), result.viewpoint, strict=True)),
         "score": result.score,
         "confidence": result.confidence,

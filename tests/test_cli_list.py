@@ -1,10 +1,7 @@
 """``curvireg register --list``: the contract of its files."""
 
-import csv
 import json
 
-import cv2
-import numpy as np
 import pytest
 import torch
 
@@ -13,50 +10,18 @@ from curvireg_torch.batch import run as loop
 from curvireg_torch.cli import main
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import scene, truck_bank
-
-CAMERA = ["260", "260", "119.5", "89.5"]
-RESULTS = [*("status", "message", "confidence", "reliable"), *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))]
-RESULTS += ["tx", "ty", "tz"]
+from tests._support.lists import CAMERA, RESULTS, box_of, lines, table, write_files, written
+from tests._support.scenes import scene
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Three photographs, a mesh and banks of it on disk."""
-    folder = tmp_path_factory.mktemp("list")
-    (folder / "photos").mkdir()
-    for seed in range(3):
-        picture = (scene(seed)[0].permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
-        cv2.imwrite(str(folder / "photos" / f"{seed}.png"), picture)
-    cv2.imwrite(str(folder / "flat.png"), np.full((60, 80, 3), 90, np.uint8))
-    (folder / "text.jpg").write_text("not a picture")
-    example_mesh().export(folder / "truck.ply")
-    truck_bank().save(folder / "truck.safetensors")
-    return folder
-
-
-def box_of(seed):
-    return [f"{v:.1f}" for v in scene(seed)[1]]
-
-
-def written(path, header, *rows):
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([header.split(","), *rows])
-    return path
+    return write_files(tmp_path_factory.mktemp("list"))
 
 
 def register(path, *more, mesh="truck.safetensors", out="out"):
     meshes = [] if mesh is None else [str(path.parent / mesh)]
     return main(["register", "--list", str(path), *meshes, "--out", str(path.parent / out), "--quiet", *more])
-
-
-def table(folder):
-    with (folder / "results.csv").open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def lines(folder):
-    return [json.loads(line) for line in (folder / "results.jsonl").read_text(encoding="utf-8").splitlines()]
 
 
 def pose(row):
@@ -243,8 +208,8 @@ def test_none_is_exit_code_2_and_the_table_says_why(folder, capsys):
     ("content", "words"),
     [
         (None, ["no such file"]),
-        (b"", ["empty"]),
-        (b"photo,x0,y0,x1,y1\n\n", ["no rows"]),
+        (b"", ["no column"]),
+        (b"photo,x0,y0,x1,y1\n\n", ["no photographs"]),
         (b"a.png,1,2,3,4\n", ["no column photo"]),
         (b"photo;x0;y0;x1;y1\na.png;1;2;3;4\n", ["no column", "commas"]),
         (b"photo,x0,y0,x1\na.png,1,2,3\n", ["no column y1"]),
@@ -271,6 +236,7 @@ def test_lists_that_cannot_be_used(folder, tmp_path, capsys, content, words):
         (["--list", "a.csv", "a.stl", "b.stl"], "at most one MESH"),
         (["--list", "a.csv", "a.stl", "--box", "1", "2", "3", "4"], "leave --box"),
         (["a.jpg"], "expected PHOTO MESH"),
+        (["--mesh", "a.stl"], "expected PHOTO MESH"),
         (["a.jpg", "a.stl", "--bogus", "3"], "unrecognized arguments: --bogus"),
     ],
 )

@@ -12,7 +12,7 @@ from .._files import write_file
 from ..errors import InvalidInputError, OutputError
 from ..evaluation.store import plain
 
-__all__ = ["RESULT_COLUMNS", "Records"]
+__all__ = ["FOUND_MESH", "RESULT_COLUMNS", "Records"]
 
 Record = dict[str, Any]
 
@@ -22,6 +22,9 @@ RESULT_COLUMNS = (
     *("tx", "ty", "tz"),
 )
 """What ``results.csv`` says of a photograph, behind the columns of the list."""
+
+FOUND_MESH = "found_mesh"
+"""Behind those, where a photograph may show one of several meshes: which of them."""
 
 
 class Records:
@@ -90,18 +93,23 @@ class Records:
             raise OutputError(f"{self.path}: cannot be written ({error.strerror}); make room and run again") from error
         self._places[digests["request"]] = place, digests["photo"]
 
-    def finish(self, columns: Sequence[str], rows: Iterable[tuple[Sequence[str], Record]]) -> None:
+    def finish(
+        self, columns: Sequence[str], rows: Iterable[tuple[Sequence[str], Record]], *, which: bool = False
+    ) -> None:
         """Write ``results.jsonl`` anew, one line for each row in their order, and then ``results.csv``.
 
         Args:
             columns: names of the list's columns.
             rows: the list's cells and the record of each row.
+            which: add the column :data:`FOUND_MESH`.
         """
         table, lines = io.StringIO(newline=""), []
         writer = csv.writer(table, lineterminator="\n")
-        writer.writerow([*columns, *RESULT_COLUMNS])
+        several = [FOUND_MESH] if which else []
+        writer.writerow([*columns, *RESULT_COLUMNS, *several])
         for number, (cells, record) in enumerate(rows, start=1):
-            writer.writerow([*cells, *_result_cells(record)])
+            found = [record.get("mesh", "")] if which else []
+            writer.writerow([*cells, *_result_cells(record), *found])
             head = {"row": number, "columns": dict(zip(columns, cells, strict=True))}
             lines.append(_line({**head, **record, **head}))
         write_file(self.path, b"".join(lines))

@@ -41,7 +41,7 @@ class Counts:
 def register_list(
     listing: Listing,
     out: Path,
-    open_registrar: Callable[[Path], Registrar],
+    open_registrar: Callable[[tuple[Path, ...]], Registrar],
     *,
     settings: Mapping[str, Any],
     progress: bool = True,
@@ -56,7 +56,7 @@ def register_list(
     Args:
         listing: the photographs.
         out: folder for the results.
-        open_registrar: of a mesh's file.
+        open_registrar: of the files of one mesh, or of several.
         settings: plain values, all that results depend on besides the files.
         progress: show a bar.
 
@@ -89,9 +89,12 @@ def register_entry(
             str(result.error).replace("image 0: box 0", "image 0: box").replace("image 0", entry.name)
         )
     document = result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start})
+    document["mesh"] = str(entry.meshes[result.model])
+    for pose, hypothesis in zip(document["top"], result.hypotheses, strict=True):
+        pose["mesh"] = str(entry.meshes[hypothesis.model])
     document["inputs"] = {
         "photo": entry.name,
-        "mesh": str(entry.mesh),
+        "mesh": ", ".join(map(str, entry.meshes)),
         "box": box.tolist(),
         "camera": entry.camera,
         "picture": photo.facts(),
@@ -102,10 +105,10 @@ def register_entry(
 @dataclass
 class _Run:
     records: Records
-    open_registrar: Callable[[Path], Registrar]
+    open_registrar: Callable[[tuple[Path, ...]], Registrar]
     settings: str
     progress: bool
-    mesh: Path | None = None
+    meshes: tuple[Path, ...] = ()
     registrar: Registrar | Exception | None = None
     mesh_digests: dict[Path, str] = field(default_factory=dict)
 
@@ -114,8 +117,8 @@ class _Run:
         usable = [entry for entry in listing.entries if not entry.trouble]
         requests = {self._request(entry): entry for entry in usable}
         todo = [(request, entry) for request, entry in requests.items() if not self._is_done(request, entry)]
-        order = {mesh: place for place, mesh in enumerate(dict.fromkeys(entry.mesh for entry in usable))}
-        todo.sort(key=lambda pair: order[pair[1].mesh])
+        order = {meshes: place for place, meshes in enumerate(dict.fromkeys(entry.meshes for entry in usable))}
+        todo.sort(key=lambda pair: order[pair[1].meshes])
         bar = tqdm(
             total=len(requests),
             initial=len(requests) - len(todo),
@@ -131,10 +134,11 @@ class _Run:
 
     def _request(self, entry: Entry) -> str:
         """Names all that the result depends on but the photograph's content, which is read only where it must be."""
-        assert entry.mesh is not None
-        if entry.mesh not in self.mesh_digests:
-            self.mesh_digests[entry.mesh] = file_digest(entry.mesh)
-        asked = [entry.name, entry.box, entry.camera, entry.mesh.name, self.mesh_digests[entry.mesh], self.settings]
+        for mesh in entry.meshes:
+            if mesh not in self.mesh_digests:
+                self.mesh_digests[mesh] = file_digest(mesh)
+        meshes = [(mesh.name, self.mesh_digests[mesh]) for mesh in entry.meshes]
+        asked = [entry.name, entry.box, entry.camera, meshes, self.settings]
         return hashlib.blake2b(json.dumps(asked).encode(), digest_size=8).hexdigest()
 
     def _is_done(self, request: str, entry: Entry) -> bool:
@@ -144,14 +148,13 @@ class _Run:
 
     def _record(self, request: str, entry: Entry) -> Record:
         assert entry.photo is not None
-        assert entry.mesh is not None
         digests = {"request": request, "photo": file_digest(entry.photo)}
         try:
             photo = read_photo(entry.photo, dtype=torch.uint8)
         except (CurviregError, OSError) as error:
             return _failed(str(error), digests)
         start = time.perf_counter()
-        registrar = self._opened(entry.mesh)
+        registrar = self._opened(entry.meshes)
         if not isinstance(registrar, Registrar):
             return _failed(str(registrar), digests)
         try:
@@ -160,12 +163,12 @@ class _Run:
             return _failed(str(error), digests)
         return {"status": "ok", "message": "", **document, "digests": digests}
 
-    def _opened(self, mesh: Path) -> Registrar | Exception:
-        """Of this mesh, or why there is none."""
-        if self.registrar is None or mesh != self.mesh:
-            self.mesh, self.registrar = mesh, None  # the memory goes before more is asked for
+    def _opened(self, meshes: tuple[Path, ...]) -> Registrar | Exception:
+        """Of these meshes, or why there is none."""
+        if self.registrar is None or meshes != self.meshes:
+            self.meshes, self.registrar = meshes, None  # the memory goes before more is asked for
             try:
-                self.registrar = self.open_registrar(mesh)
+                self.registrar = self.open_registrar(meshes)
             except (MeshError, BankError, OSError) as error:
                 self.registrar = error
         return self.registrar
@@ -179,7 +182,8 @@ class _Run:
                 statuses.append((record["status"] == "ok", bool(record.get("reliable"))))
                 yield entry.cells, record
 
-        self.records.finish(listing.columns, rows())
+        which = any(len(entry.meshes) > 1 for entry in listing.entries)
+        self.records.finish(listing.columns, rows(), which=which)
         ok = sum(good for good, _ in statuses)
         return Counts(ok, len(statuses) - ok, sum(reliable for _, reliable in statuses))
 

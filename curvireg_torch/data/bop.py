@@ -117,7 +117,7 @@ class BOPDataset(ObjectDataset):
             image = images.get(f"{int(key):06d}")
             found: list[Sample] = []
             for index, entry in enumerate(instances):
-                info = _at(infos.get(key), index)
+                info = entry_at(infos.get(key), index)
                 parsed = self._parse(entry, info, cameras.get(key))
                 if isinstance(parsed, str):
                     self._skip(parsed, f"{item} #{index}")
@@ -146,7 +146,7 @@ class BOPDataset(ObjectDataset):
         matrix = finite_numbers(camera.get("cam_K"), 9)
         if rotation is None or translation is None or matrix is None or not _is_rotation(rotation):
             return "corrupt_annotation"
-        box = _xyxy(info["bbox_obj"]) if "bbox_obj" in info else _UNKNOWN_BOX
+        box = bop_box(info["bbox_obj"]) if "bbox_obj" in info else _UNKNOWN_BOX
         if box is None or box[0] == box[2] or box[1] == box[3]:
             return "bad_box"
         visible = finite_numbers([info.get("visib_fract")], 1)
@@ -158,7 +158,7 @@ class BOPDataset(ObjectDataset):
             return "missing_model_info"
         return {
             "box": box,
-            "box_visible": _xyxy(info.get("bbox_visib")) or _UNKNOWN_BOX,
+            "box_visible": bop_box(info.get("bbox_visib")) or _UNKNOWN_BOX,
             "camera_matrix": _rows(matrix),
             "rotation": _rows(rotation),
             "translation": translation,
@@ -169,7 +169,7 @@ class BOPDataset(ObjectDataset):
         }
 
 
-def _xyxy(values: object) -> tuple[float, ...] | None:
+def bop_box(values: object) -> tuple[float, ...] | None:
     """BOP's x, y, width, height as x0, y0, x1, y1; None for no box (BOP writes -1 four times)."""
     numbers = finite_numbers(values, 4)
     if numbers is None or numbers[2] < 0 or numbers[3] < 0:
@@ -203,7 +203,7 @@ def _chosen(samples: list[Sample], wanted: dict[tuple[int, int, int], int] | Non
     return samples
 
 
-def _at(infos: object, index: int) -> dict[str, Any]:
+def entry_at(infos: object, index: int) -> dict[str, Any]:
     """Entry ``index`` of an image's list in ``scene_gt_info.json``, empty where there is none."""
     entry = infos[index] if isinstance(infos, list) and index < len(infos) else None
     return entry if isinstance(entry, dict) else {}

@@ -1,0 +1,48 @@
+"""Lists of photographs on disk, and the results of a list."""
+
+import csv
+import json
+
+import cv2
+import numpy as np
+
+from curvireg_torch.synthetic import example_mesh
+from tests._support.scenes import scene, truck_bank
+
+__all__ = ["CAMERA", "RESULTS", "box_of", "lines", "table", "write_files", "written"]
+
+CAMERA = ["260", "260", "119.5", "89.5"]
+RESULTS = [*("status", "message", "confidence", "reliable"), *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))]
+RESULTS += ["tx", "ty", "tz"]
+
+
+def write_files(folder):
+    """Three photographs, pictures that are none, a mesh and a bank of it."""
+    (folder / "photos").mkdir()
+    for seed in range(3):
+        picture = (scene(seed)[0].permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
+        cv2.imwrite(str(folder / "photos" / f"{seed}.png"), picture)
+    cv2.imwrite(str(folder / "flat.png"), np.full((60, 80, 3), 90, np.uint8))
+    (folder / "text.jpg").write_text("not a picture")
+    example_mesh().export(folder / "truck.ply")
+    truck_bank().save(folder / "truck.safetensors")
+    return folder
+
+
+def box_of(seed):
+    return [f"{v:.1f}" for v in scene(seed)[1]]
+
+
+def written(path, header, *rows):
+    with path.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([header.split(","), *rows])
+    return path
+
+
+def table(folder):
+    with (folder / "results.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def lines(folder):
+    return [json.loads(line) for line in (folder / "results.jsonl").read_text(encoding="utf-8").splitlines()]
