@@ -12,6 +12,7 @@ import pytest
 
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.evaluation import Benchmark, BOPBenchmark, Pascal3DBenchmark, Protocol, evaluate
+from curvireg_torch.evaluation.__main__ import main
 
 from .small import assert_same
 
@@ -69,8 +70,10 @@ def test_two_processes_do_the_same_as_one(request, tmp_path, kind):
     assert two.stdout.count("protocol:") == 1, "one process reports"
 
 
-def test_errors_are_one_line(tmp_path):
-    result = start("pascal3d", tmp_path / "nowhere", "--out", tmp_path / "out")
-    assert result.returncode == 2
-    assert result.stderr.startswith("curvireg_torch.evaluation: error: ")
-    assert result.stderr.count("\n") == 1
+def test_errors_are_one_line(tmp_path, capsys, monkeypatch):
+    words = ["pascal3d", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"), "--quiet"]
+    monkeypatch.setattr(sys, "argv", ["curvireg_torch.evaluation", *words])
+    assert main() == 2
+    said = capsys.readouterr().err
+    assert said.startswith("curvireg_torch.evaluation: error: ")
+    assert said.count("\n") == 1

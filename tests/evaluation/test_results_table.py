@@ -1,3 +1,4 @@
+import importlib
 import json
 import subprocess
 import sys
@@ -7,13 +8,22 @@ import pytest
 
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, evaluate
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "results_table.py"
+SCRIPTS = Path(__file__).parents[2] / "scripts"
 
 
-def run(root, *words):
-    return subprocess.run(
-        [sys.executable, str(SCRIPT), "--root", str(root), *map(str, words)], capture_output=True, text=True, timeout=60
-    )
+@pytest.fixture
+def run(monkeypatch):
+    """The script's exit code for a repository and words."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    script = importlib.import_module("results_table")
+
+    def exit_code(root, *words):
+        monkeypatch.setattr(sys, "argv", ["results_table.py", "--root", str(root), *map(str, words)])
+        return script.main()
+
+    yield exit_code
+    for name in ("results_table", "_record"):
+        sys.modules.pop(name)
 
 
 @pytest.fixture
@@ -24,16 +34,16 @@ def repository(tmp_path):
     return root
 
 
-def test_table_from_summaries(repository, pascal, bop, tmp_path):
+def test_table_from_summaries(run, repository, pascal, bop, tmp_path):
     for name, benchmark in (
         ("mini", Pascal3DBenchmark(pascal, Protocol())),
         ("cubes", BOPBenchmark(bop, Protocol(pose="any", box=0.1))),
     ):
         evaluate(benchmark, tmp_path / name, progress=False)
-        assert run(repository, "--record", tmp_path / name / "summary.json", name).returncode == 0
-    assert run(repository, "--check").returncode == 1, "the README still has the old table"
-    assert run(repository).returncode == 0
-    assert run(repository, "--check").returncode == 0
+        assert run(repository, "--record", tmp_path / name / "summary.json", name) == 0
+    assert run(repository, "--check") == 1, "the README still has the old table"
+    assert run(repository) == 0
+    assert run(repository, "--check") == 0
     text = (repository / "README.md").read_text()
     assert text.startswith("# Title\n\n<!-- results:begin -->\n**Viewpoints")
     assert text.endswith("<!-- results:end -->\n\nend\n")
@@ -44,24 +54,22 @@ def test_table_from_summaries(repository, pascal, bop, tmp_path):
     widths = [line.count("|") for line in text.splitlines() if line.startswith("|")]
     assert set(widths[:3]) == {widths[0]}
     assert set(widths[3:]) == {widths[3]}
-    again = run(repository)
-    assert again.returncode == 0
+    assert run(repository) == 0
     assert (repository / "README.md").read_text() == text
 
 
-def test_readme_without_markers(repository):
+def test_readme_without_markers(run, repository, capsys):
     repository.joinpath("README.md").write_text("# Title\n")
-    result = run(repository)
-    assert result.returncode == 2
-    assert "results:begin" in result.stderr
+    assert run(repository) == 2
+    assert "results:begin" in capsys.readouterr().err
 
 
-def test_no_results_no_table(repository):
-    assert run(repository).returncode == 0
+def test_no_results_no_table(run, repository):
+    assert run(repository) == 0
     assert "<!-- results:begin -->\n<!-- results:end -->" in (repository / "README.md").read_text()
 
 
-def test_commit_is_kept(repository, tmp_path):
+def test_commit_is_kept(run, repository, tmp_path):
     tmp_path.joinpath("summary.json").write_text("{}")
     run(repository, "--record", tmp_path / "summary.json", "x")
     path = repository / "scripts" / "results" / "evaluation_x.json"

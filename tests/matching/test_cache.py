@@ -183,9 +183,15 @@ def _builder(folder: str, edges: tuple[float, ...]) -> float:
     return sum(float(build(Path(folder), edge).descriptors.sum()) for edge in edges)
 
 
+# Forked processes: spawned ones would import everything anew, some seconds each.
+forking = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+
+
+@forking
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 warns of fork beside threads
 def test_concurrent_builders(tmp_path: Path) -> None:
     edges = (1.0, 2.0, 3.0)
-    with multiprocessing.get_context("spawn").Pool(2) as pool:
+    with multiprocessing.get_context("fork").Pool(2) as pool:
         sums = pool.starmap(_builder, [(str(tmp_path), edges)] * 4, chunksize=1)
     assert max(sums) - min(sums) < 1e-3 * sums[0]
     assert len(list((tmp_path / "banks").iterdir())) == len(edges)  # nothing half-written is left
@@ -194,6 +200,8 @@ def test_concurrent_builders(tmp_path: Path) -> None:
 
 
 def _die_while_saving(folder: str) -> None:
+    torch.set_num_threads(1)
+
     def die(file: int) -> None:
         os.truncate(file, os.stat(file).st_size // 2)
         os._exit(9)
@@ -202,8 +210,10 @@ def _die_while_saving(folder: str) -> None:
     build(Path(folder))
 
 
+@forking
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_killed_builder_leaves_no_bank(tmp_path: Path) -> None:
-    process = multiprocessing.get_context("spawn").Process(target=_die_while_saving, args=(str(tmp_path),))
+    process = multiprocessing.get_context("fork").Process(target=_die_while_saving, args=(str(tmp_path),))
     process.start()
     process.join(60)
     assert process.exitcode == 9
