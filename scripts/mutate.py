@@ -171,6 +171,7 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="print the sample and run nothing")
     options = parser.parse_args()
     if not options.list:
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
         for name in PRELOADED:
             importlib.import_module(name)
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:

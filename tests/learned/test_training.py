@@ -94,8 +94,8 @@ def test_a_few_steps_lower_the_loss(batch):
 def test_adapting_changes_the_network_and_leaves_its_statistics():
     mesh = trimesh.creation.box((1, 2, 3))
     before = FieldNetwork().state_dict().keys()
-    field = adapt(mesh, scenes=16, workers=0, progress=False)
-    again = adapt(mesh, scenes=16, workers=0, progress=False)
+    field = adapt(mesh, scenes=8, workers=0, progress=False)
+    again = adapt(mesh, scenes=8, workers=0, progress=False)
     packaged = LearnedCurvilinearSaliency().network.state_dict()
     adapted = field.network.state_dict()
     assert adapted.keys() == before

@@ -267,7 +267,10 @@ def test_the_registrar_ends_with_the_contours(camera):
     errors: dict[bool, list[float]] = {True: [], False: []}
     for seed in (0, 1, 2):
         image, box, T = scene(seed)
-        results = {c: Registrar(truck_bank(), contours=c)(image[None], box[None], camera)[0] for c in (True, False)}
+        results = {
+            contours: Registrar(truck_bank(), contours=contours, hypotheses=2)(image[None], box[None], camera)[0]
+            for contours in (True, False)
+        }
         truth = T[:3, :3]
         if camera is None:
             ray = truth @ mesh_centre(truck_bank().mesh) + T[:3, 3]

@@ -1,3 +1,0 @@
-from tests._support.threads import one_thread
-
-__all__ = ["one_thread"]
