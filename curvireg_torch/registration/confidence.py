@@ -43,7 +43,7 @@ MARGIN = 5.0
 
 
 def ranking_evidence(ranking: Ranking, rotations: Tensor) -> Tensor:
-    """(B, 3) numbers that tell right answers from wrong ones, see :data:`EVIDENCE`.
+    """(B, 3) numbers that tell right answers from wrong ones, by the names in ``EVIDENCE``.
 
     similarity: normalised correlation of the best view, in [0, 1]. margin: how far its score leads the best view more
     than 30 degrees away, log S - log S', at most 5. concentration: of the sum of S^4 over all views, the share within
@@ -96,7 +96,7 @@ def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
 
 
 def pose_evidence(similarity: float, lead: float, *, with_camera: bool) -> list[float]:
-    """Numbers that tell right poses from wrong ones, see :data:`POSE_EVIDENCE`, of a hypothesis followed to its end.
+    """Numbers that tell right poses from wrong ones (``POSE_EVIDENCE``), of a hypothesis followed to its end.
 
     Args:
         similarity: normalised correlation of the pose's view with the photograph.

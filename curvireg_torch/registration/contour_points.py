@@ -158,8 +158,8 @@ class EdgeField:
     def strength(self, uv: Tensor, normals: Tensor, offsets: Tensor, photograph: Tensor) -> Tensor:
         """How strongly the picture changes across a contour at places beside it.
 
-        With g the gradient and c = |n . g| / |g|, r = |n . g| c^4 is compared with the crop's mean gradient m: the
-        strength is r / (r + m): halved where they differ by 33 degrees, 0 outside the crop.
+        With g the gradient and c = ``|n . g| / |g|``, r = ``|n . g| c^4`` is compared with the crop's mean gradient m:
+        the strength is r / (r + m): halved where they differ by 33 degrees, 0 outside the crop.
 
         Args:
             uv, normals: (N, P, 2) pixels of the crops, and unit vectors.

@@ -66,7 +66,7 @@ class DescriptorStatistics:
         mean: (D,) float32.
         covariance: (D, D) float32, of the sample, not shrunk.
         count: descriptors that were counted.
-        fourth: mean of |x - mean|^4, which Ledoit and Wolf's shrinkage asks for.
+        fourth: mean of ``|x - mean|^4``, which Ledoit and Wolf's shrinkage asks for.
 
     Example:
         >>> statistics = DescriptorStatistics.from_descriptors(torch.rand(50, 8))

@@ -104,11 +104,11 @@ def test_layers_in_kornias_sequences(layer: nn.Module) -> None:
 
 
 def test_the_page_runs_as_it_stands() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "detectors.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "guides" / "kornia.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
     names: dict[str, object] = {}
     with torch.random.fork_rng():
-        exec(compile(code, "docs/detectors.md", "exec"), names)
+        exec(compile(code, "docs/guides/kornia.md", "exec"), names)
     assert isinstance(names["descriptors"], Tensor)
     assert names["descriptors"].shape == (1, 50, 324)
 

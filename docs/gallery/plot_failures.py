@@ -1,0 +1,126 @@
+"""
+A gallery of failures
+=====================
+
+A toy truck, drawn and registered with its own mesh and camera. The first picture is as it should be; each of the others
+breaks one of the library's conditions, and the answer is wrong. Contours are drawn at the pose that was found.
+
+**Look at the confidence.** It was fitted on generated photographs that keep most of these conditions. Where they are
+broken it is lower, but often not low enough: from 0.8 on an answer is called reliable. The support, how strongly edges
+lie under the contours, drops more clearly. So look at the overlay before you believe a number.
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+
+import curvireg_torch as cr
+from curvireg_torch.scenes import random_shape
+from curvireg_torch.synthetic import example_mesh, procedural_background, random_pose, synthesize_photograph
+from curvireg_torch.visualization import contour_overlay
+
+torch.set_grad_enabled(False)
+mesh, size = example_mesh(), (360, 480)
+K = cr.camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
+upright = cr.Pipeline().posed("upright")
+truck = cr.Registrar(mesh, pipeline=upright, progress=False)
+
+
+def photograph(seed):
+    generator = torch.Generator().manual_seed(seed)
+    truth = random_pose(mesh, K, size, generator)
+    picture, box = synthesize_photograph(mesh, truth, K, size, generator)
+    return picture, box, truth[:3, :3]
+
+
+def show(picture, box, truth, title, registrar=truck):
+    result = registrar([picture], box[None], K)[0]
+    error = float(cr.rotation_error(result.rotation, truth))
+    told = f"confidence {result.confidence:.2f}, support {result.support:.2f}"
+    _, ax = plt.subplots(figsize=(5, 4.1), layout="constrained")
+    ax.imshow(contour_overlay(registrar, result, picture, box))
+    ax.set(title=f"{title}\n{error:.0f}° from the truth; {told}", xticks=[], yticks=[])
+    (x0, y0, x1, y1), room = box.tolist(), 50
+    height, width = picture.shape[1:]
+    ax.set(xlim=(max(x0 - room, 0), min(x1 + room, width)), ylim=(min(y1 + room, height), max(y0 - room, 0)))
+    plt.show()
+
+
+# %%
+# As it should be
+# ---------------
+#
+# The object whole, the box tight, the mesh the object's own.
+
+picture, box, truth = photograph(3)
+show(picture, box, truth, "all conditions kept")
+
+# %%
+# Cut off by the border of the photograph
+# ---------------------------------------
+#
+# The box holds what is left of the object. The crop shows half of it where the views show all.
+
+x0, y0, x1, y1 = box.tolist()
+middle = int((x0 + x1) / 2)
+show(picture[:, :, :middle], torch.tensor([x0, y0, middle - 0.5, y1]), truth, "cut off")
+
+# %%
+# Upside down, told to be upright
+# -------------------------------
+#
+# ``--pose upright`` compares upright views alone: the right one is not among them.
+
+show(
+    picture.rot90(2, (1, 2)),
+    torch.tensor([479 - x1, 359 - y1, 479 - x0, 359 - y0]),
+    torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)) @ truth,
+    "upside down",
+)
+
+# %%
+# The mesh of another object
+# --------------------------
+#
+# A car's mesh for a truck's photograph, both with their front along -y. At times a similar mesh does, here it turns
+# back to front.
+
+car = random_shape(np.random.default_rng(3), "car").mesh()
+show(picture, box, truth, "another object's mesh", cr.Registrar(car, pipeline=upright, progress=False))
+
+# %%
+# A box that is far too large
+# ---------------------------
+#
+# By 30 and 40 % of the object to the left and below. Boxes that are 10 % wrong are allowed for.
+
+picture, box, truth = photograph(1)
+x0, y0, x1, y1 = box.tolist()
+wide, high = x1 - x0, y1 - y0
+show(picture, torch.tensor([x0 - 0.3 * wide, y0 - 0.1 * high, x1 + 0.1 * wide, y1 + 0.4 * high]), truth, "a wrong box")
+
+# %%
+# No box at all
+# -------------
+#
+# The whole image taken for the box: the library does not look for the object, it takes it to fill the box.
+
+picture, box, truth = photograph(5)
+show(picture, torch.tensor([-0.5, -0.5, 479.5, 359.5]), truth, "the whole image")
+
+# %%
+# Four fifths hidden
+# ------------------
+#
+# Something stands before the object. The box is that of the whole object. With six tenths hidden, this truck is still
+# found.
+
+picture, box, truth = photograph(2)
+x0, y0, x1, y1 = box.tolist()
+seen = int(x0 + 0.2 * (x1 - x0))
+screen = procedural_background(size, torch.Generator().manual_seed(102))
+picture[:, :, seen : int(x1 + 10)] = screen[:, :, seen : int(x1 + 10)]
+show(picture, box, truth, "hidden")
+
+# %%
+# What follows from it for use: :doc:`/limits`.
