@@ -10,6 +10,7 @@ from typing import Any
 
 from . import __version__
 from ._choices import BACKENDS, DEFAULT, PRESET_NAMES, UNITS, UP_AXES
+from ._examples import examples
 from ._files import terminable
 from .errors import CurviregError
 from .evaluation import add_parser as add_evaluate
@@ -64,6 +65,8 @@ def _misused(arguments: argparse.Namespace) -> str | None:
     """What is wrong with the words given to ``register``."""
     if arguments.list is None and not (arguments.photos and arguments.meshes):
         return "expected PHOTO MESH, PHOTO ... --mesh MESH, or --list FILE MESH"
+    if arguments.out is None and not arguments.json:
+        return "expected --out DIR, or --json"
     if arguments.list is not None and len(arguments.paths) > 1:
         return f"with --list, expected at most one MESH, got {len(arguments.paths)}; give several by --mesh"
     if arguments.list is not None and (arguments.box or arguments.camera):
@@ -104,6 +107,13 @@ def _parser() -> argparse.ArgumentParser:
         "register", parents=[common, preset, mesh_options], help="find the pose of MESH in PHOTO",
         usage="curvireg register PHOTO... MESH --out DIR [options]\n       "
         "curvireg register --list LIST [MESH] --out DIR [options]",
+        **examples(
+            "curvireg register photo.jpg part.stl --unit mm --box 410 220 890 700 --out out/part",
+            "curvireg register photo.jpg part.stl --camera 1450 1450 960 540 --json",
+            "curvireg register --list photos.csv part.stl --out out/parts",
+            "curvireg register shots/ turn.mp4 part.stl --every 10 --out out/shots",
+            "curvireg register photo.jpg --mesh mug.obj --mesh bowl.obj --out out/which",
+        ),
         description="One photograph: writes DIR/result.json and DIR/overlay.png. Several, or a list: DIR/results.csv "
         "and DIR/results.jsonl; killed and run again, it goes on where it was.",
     )  # fmt: skip
@@ -136,12 +146,17 @@ def _parser() -> argparse.ArgumentParser:
     register.add_argument("--field", type=Path, metavar="FILE", help="weights from curvireg bank --adapt")
     register.add_argument("--top", type=int, metavar="K", help="hypotheses to carry and report (default: 5)")
     register.add_argument("--no-refine", action="store_true", help="stop at the best view of the bank")
-    register.add_argument("--out", type=Path, required=True, metavar="DIR")
+    register.add_argument("--json", action="store_true", help="print the documents and nothing else; --out is optional")
+    register.add_argument("--out", type=Path, metavar="DIR")
     register.set_defaults(run=_later("register"))
 
     bank = commands.add_parser(
-        "bank", parents=[common, preset, mesh_options], help="render and describe the views of MESH"
-    )
+        "bank", parents=[common, preset, mesh_options], help="render and describe the views of MESH",
+        **examples(
+            "curvireg bank part.stl --unit mm --out part.safetensors",
+            "curvireg bank chair.glb --pose upright --out chair.safetensors --adapt chair_field.safetensors",
+        ),
+    )  # fmt: skip
     bank.add_argument("mesh", type=Path, metavar="MESH")
     bank.add_argument("--out", type=Path, required=True, metavar="FILE")
     bank.add_argument(
@@ -153,19 +168,34 @@ def _parser() -> argparse.ArgumentParser:
     )
     bank.set_defaults(run=_later("bank"))
 
-    cache = commands.add_parser("cache", parents=[common], help="list or clear the banks that were kept on disk")
+    cache = commands.add_parser(
+        "cache", parents=[common], help="list or clear the banks that were kept on disk",
+        **examples("curvireg cache", "curvireg cache --clear"),
+    )  # fmt: skip
     cache.add_argument("--clear", action="store_true", help="remove them all")
     cache.set_defaults(run=_later("cache"))
 
     add_evaluate(commands, [common])
 
     demo = commands.add_parser(
-        "demo", parents=[common, preset], help="register a scene made in code, where the truth is known"
-    )
+        "demo", parents=[common, preset], help="register a scene made in code, where the truth is known",
+        **examples("curvireg demo --out out/demo", "curvireg demo --seed 7 --preset fast --out out/demo"),
+    )  # fmt: skip
     demo.add_argument("--seed", type=int, default=0)
     demo.add_argument("--out", type=Path, required=True, metavar="DIR")
     demo.set_defaults(run=_later("demo"), pose="upright")
+
+    schema = commands.add_parser(
+        "schema", help="print the JSON schema of results",
+        **examples("curvireg schema", "curvireg schema > result.schema.json"),
+    )  # fmt: skip
+    schema.add_argument("--debug", action="store_true", help="show tracebacks")
+    schema.set_defaults(run=_print_schema)
     return parser
+
+
+def _print_schema(_: argparse.Namespace) -> None:
+    print(Path(__file__).with_name("result.schema.json").read_text(encoding="utf-8"), end="")
 
 
 def _later(name: str) -> Callable[[argparse.Namespace], None]:

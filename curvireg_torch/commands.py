@@ -1,12 +1,12 @@
 """What the commands of ``curvireg`` do, once :mod:`curvireg_torch.cli` has read their options."""
 
 import argparse
-import json
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import cv2
 import numpy as np
@@ -28,6 +28,7 @@ from .data import read_photo
 from .document import result_document
 from .errors import BankError, InvalidInputError
 from .evaluation.loops import code_digest
+from .evaluation.store import to_json
 from .geometry import camera_matrix, load_mesh, rotation_error
 from .learned import LearnedCurvilinearSaliency, adapt
 from .matching import ViewBank, cache_folder, cached_bank, clear_cache, list_cache
@@ -113,24 +114,12 @@ def register(arguments: argparse.Namespace) -> None:
     if arguments.camera is not None:
         camera_matrix(*arguments.camera)
     if arguments.list is None and is_one_photograph(arguments.photos):
-        return _register_one(arguments, field)
-    if arguments.list is not None:
-        listing = read_list(arguments.list, arguments.meshes)
-        probe_folder(arguments.out, "--out")
+        _register_one(arguments, field)
+    elif arguments.out is not None:
+        _register_several(arguments, arguments.out, field)
     else:
-        probe_folder(arguments.out, "--out")
-        listing = list_photographs(
-            arguments.photos,
-            arguments.meshes,
-            box=arguments.box,
-            camera=arguments.camera,
-            every=arguments.every,
-            frames=arguments.out / "frames",
-        )
-        given = [f"--{name}" for name in ("box", "camera") if getattr(arguments, name) is not None]
-        if given:
-            print(f"{' and '.join(given)}: of all {len(listing.entries)} photographs", file=sys.stderr)
-    return _register_list(arguments, listing, field)
+        with tempfile.TemporaryDirectory() as folder:
+            _register_several(arguments, Path(folder), field)
 
 
 def _register_one(arguments: argparse.Namespace, field: nn.Module | None) -> None:
@@ -138,16 +127,21 @@ def _register_one(arguments: argparse.Namespace, field: nn.Module | None) -> Non
     path = arguments.photos[0]
     entry = Entry((), str(path), path, tuple(arguments.meshes), arguments.box, arguments.camera)
     photo = read_photo(path, dtype=torch.uint8)
-    probe_folder(arguments.out, "--out")
+    if arguments.out is not None:
+        probe_folder(arguments.out, "--out")
     registrar = open_registrar(arguments, entry.meshes, field)
     result, document = register_entry(entry, photo, registrar, bank_seconds=time.perf_counter() - start)
-    _write(arguments.out, document, registrar, result, photo.image, document["inputs"]["box"])
+    if arguments.out is not None:
+        _write(arguments.out, document, registrar, result, photo.image, document["inputs"]["box"])
     if photo.notes:
-        print(f"{path}: {'; '.join(photo.notes)}")
-    _print_result(document, arguments.out)
+        print(f"{path}: {'; '.join(photo.notes)}", file=_notes_to(arguments))
+    if arguments.json:
+        print(to_json(document), end="")
+    else:
+        _print_result(document, arguments.out)
 
 
-def _register_list(arguments: argparse.Namespace, listing: Listing, field: nn.Module | None) -> None:
+def _register_several(arguments: argparse.Namespace, out: Path, field: nn.Module | None) -> None:
     settings = {
         "pipeline": chosen_pipeline(arguments).describe(),
         "bank_decides": arguments.preset is None and arguments.pipeline is None,
@@ -157,15 +151,37 @@ def _register_list(arguments: argparse.Namespace, listing: Listing, field: nn.Mo
         **{name: getattr(arguments, name) for name in ("pose", "unit", "up", "top", "no_refine", "renderer")},
     }
     counts = register_list(
-        listing,
-        arguments.out,
+        _listing(arguments, out),
+        out,
         lambda meshes: open_registrar(arguments, meshes, field),
         settings=settings,
         progress=not arguments.quiet,
     )
-    print(f"{counts}; see {arguments.out}/results.csv")
+    if arguments.json:
+        print((out / "results.jsonl").read_text(encoding="utf-8"), end="")
+    table = "" if arguments.out is None else f"; see {out}/results.csv"
+    print(f"{counts}{table}", file=_notes_to(arguments))
     if not counts.ok:
-        raise InvalidInputError(f"not one photograph could be registered; {arguments.out}/results.csv says why")
+        raise InvalidInputError("not one photograph could be registered; the message of each says why")
+
+
+def _listing(arguments: argparse.Namespace, out: Path) -> Listing:
+    if arguments.list is not None:
+        listing = read_list(arguments.list, arguments.meshes)
+        probe_folder(out, "--out")
+        return listing
+    probe_folder(out, "--out")
+    options = {"box": arguments.box, "camera": arguments.camera, "every": arguments.every}
+    listing = list_photographs(arguments.photos, arguments.meshes, **options, frames=out / "frames")
+    given = [f"--{name}" for name in ("box", "camera") if getattr(arguments, name) is not None]
+    if given:
+        print(f"{' and '.join(given)}: of all {len(listing.entries)} photographs", file=sys.stderr)
+    return listing
+
+
+def _notes_to(arguments: argparse.Namespace) -> TextIO:
+    """Where is printed what is no result: with ``--json``, standard output holds results alone."""
+    return sys.stderr if arguments.json else sys.stdout
 
 
 def demo(arguments: argparse.Namespace) -> None:
@@ -208,7 +224,7 @@ def _write(out: Path, document: dict[str, Any], registrar: Registrar, result: Re
     sheet = registration_sheet(registrar, result, *scene)
     (out / "result.json").unlink(missing_ok=True)  # an older one never stands beside this picture
     _write_picture(out / "overlay.png", sheet)
-    write_file(out / "result.json", (json.dumps(document, indent=2) + "\n").encode())
+    write_file(out / "result.json", to_json(document).encode())
 
 
 def _write_picture(path: Path, picture: np.ndarray) -> None:

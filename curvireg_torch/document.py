@@ -1,4 +1,4 @@
-"""The document of a result: what ``result.json`` and every line of ``results.jsonl`` say."""
+"""The document of a result: what ``result.json`` and every line of ``results.jsonl`` say (docs/results.md)."""
 
 import math
 import platform
@@ -12,7 +12,10 @@ import trimesh
 from . import __version__
 from .registration import RELIABLE, Registrar, Registration
 
-__all__ = ["CONVENTIONS", "result_document"]
+__all__ = ["CONVENTIONS", "SCHEMA", "result_document"]
+
+SCHEMA = 1
+"""Version of ``result.schema.json``; raised when a key goes or changes its meaning."""
 
 CONVENTIONS = {
     "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
@@ -52,6 +55,7 @@ def result_document(result: Registration, registrar: Registrar, seconds: Mapping
     ]
     deviations = result.standard_deviations
     return {
+        "schema": SCHEMA,
         "rotation": result.rotation.tolist(),
         "translation": None if result.translation is None else result.translation.tolist(),
         "unit": bank.meshes[result.model].units,

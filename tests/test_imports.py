@@ -9,12 +9,13 @@ import curvireg_torch
 
 PACKAGE = Path(curvireg_torch.__file__).parent
 
-BASE = {"errors", "limits", "_checks", "_choices", "_files", "_lazy", "_threads"}
+BASE = {"errors", "limits", "_checks", "_choices", "_examples", "_files", "_lazy", "_threads"}
 ALLOWED = {
     "errors": set(),
     "limits": set(),
     "_checks": {"errors"},
     "_choices": set(),
+    "_examples": set(),
     "_files": {"errors"},
     "_lazy": set(),
     "_threads": set(),

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from .._files import file_digest
 from ..data import Photo, read_photo
-from ..document import result_document
+from ..document import SCHEMA, result_document
 from ..errors import BankError, CurviregError, ImageError, InvalidInputError, MeshError
 from ..geometry import camera_matrix, whole_image_box
 from ..registration import FailedRegistration, Registrar, Registration
@@ -97,6 +97,7 @@ def register_entry(
         "mesh": ", ".join(map(str, entry.meshes)),
         "box": box.tolist(),
         "camera": entry.camera,
+        "camera_source": None if entry.camera is None else "given",
         "picture": photo.facts(),
     }
     return result, document
@@ -189,4 +190,4 @@ class _Run:
 
 
 def _failed(trouble: str, digests: Mapping[str, str]) -> Record:
-    return {"status": "failed", "message": " ".join(trouble.split()), "digests": dict(digests)}
+    return {"schema": SCHEMA, "status": "failed", "message": " ".join(trouble.split()), "digests": dict(digests)}

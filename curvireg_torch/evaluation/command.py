@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from .._choices import DEFAULT, PRESET_NAMES
+from .._examples import examples
 from ..errors import InvalidInputError
 from .registry import KINDS, Kind
 
@@ -28,7 +29,9 @@ def add_parser(commands: Any, parents: Sequence[argparse.ArgumentParser]) -> Non
         commands: what ``ArgumentParser.add_subparsers`` returned.
         parents: parsers with at least ``--quiet`` and ``--renderer``.
     """
-    parser = commands.add_parser("evaluate", help="register and score a dataset")
+    parser = commands.add_parser(
+        "evaluate", help="register and score a dataset", **examples("curvireg evaluate bop data/bop/lm --out out/lm")
+    )
     add_datasets(parser.add_subparsers(required=True, metavar="DATASET"), parents)
 
 
@@ -36,7 +39,11 @@ def add_datasets(datasets: Any, parents: Sequence[argparse.ArgumentParser]) -> N
     """Add the kinds of datasets to the subparsers ``datasets``; ``parents`` as for :func:`add_parser`."""
     description = "Writes DIR/summary.json, DIR/predictions.csv and, as it goes, DIR/predictions; run again to go on."
     for name, kind in KINDS.items():
-        parser = datasets.add_parser(name, parents=parents, description=description, help=kind.help)
+        shown = examples(
+            f"curvireg evaluate {name} {kind.example} --out out/{name}",
+            f"curvireg evaluate {name} {kind.example} --jobs 2 --limit 100 --preset fast --out out/{name}-fast",
+        )
+        parser = datasets.add_parser(name, parents=parents, description=description, help=kind.help, **shown)
         kind.add_arguments(parser)
         parser.add_argument(
             "--protocol",

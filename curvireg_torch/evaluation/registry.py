@@ -21,7 +21,7 @@ class Kind:
 
     Attributes:
         dataset, benchmark: names of the classes, in :mod:`curvireg_torch.data` and :mod:`curvireg_torch.evaluation`.
-        help, root: for the command line: what it is, and what ROOT must hold.
+        help, root, example: for the command line: what it is, what ROOT must hold, and a ROOT.
         pose: default of the protocol's ``pose``.
         category, mesh: of a sample: a format of its group's name, and the key of its mesh.
         options: of the dataset's class, each as ``ArgumentParser.add_argument`` takes it.
@@ -32,6 +32,7 @@ class Kind:
     benchmark: str
     help: str
     root: str
+    example: str
     pose: str = "any"
     category: str = "{category}"
     mesh: str = "mesh_path"
@@ -69,6 +70,7 @@ KINDS = {
         benchmark="Pascal3DBenchmark",
         help="viewpoints on PASCAL3D+",
         root="folder with Annotations, Images and CAD",
+        example="data/PASCAL3D+_release1.1",
         pose="upright",
         mesh="cad_path",
         options={
@@ -89,6 +91,7 @@ KINDS = {
         benchmark="BOPBenchmark",
         help="6D poses on a BOP set",
         root="folder with models and the split's folder",
+        example="data/bop/lm",
         category="object {obj_id}",
         mesh="model_path",
         options={"split": {"default": "test", "help": "folder of the scenes (default: test)"}},
@@ -98,6 +101,7 @@ KINDS = {
         benchmark="WebBenchmark",
         help="viewpoints on a collection of your own",
         root="folder with one folder per object",
+        example="data/web",
     ),
 }
 """By the name that stands on the command line."""
