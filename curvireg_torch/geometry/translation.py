@@ -8,7 +8,6 @@ from .cameras import projected_boxes, rotation_towards, transform
 __all__ = ["place_view", "translation_from_box"]
 
 _ITERATIONS = 20
-_RAYS = 4  # each is tens of times nearer to the ray of the object's centre than the one before
 
 
 def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor) -> Tensor:
@@ -34,36 +33,15 @@ def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tenso
         >>> [round(v, 3) for v in t.tolist()]
         [0.0, 0.0, 5.0]
     """
-    points, R, box, K = (v.detach().cpu().double() for v in (points, rotation, box, K))
-    centre = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
-    extent = torch.linalg.vector_norm(points - centre, dim=1).max()
-    size, middle = box[..., 2:] - box[..., :2], 0.5 * (box[..., :2] + box[..., 2:])
-    inverse = torch.linalg.inv(K)
-    # Start far enough away for every point to be in front of the camera.
-    z = torch.maximum(2.0 * extent * K[..., 0, 0] / size.amax(dim=-1), 2.0 * extent)
-    position = _rays(inverse, middle) * z[..., None]
-    for _ in range(_ITERATIONS):
-        low, high = projected_boxes(points - centre, transform(R, position), K).split(2, dim=-1)
-        zoom = ((high - low) * size).sum(dim=-1, keepdim=True) / (size * size).sum(dim=-1, keepdim=True)
-        shift = torch.nn.functional.pad(middle - 0.5 * (low + high), (0, 1))
-        # Move sideways at the object's depth, then along its ray; never closer than its own extent.
-        position = position + (inverse @ shift[..., None])[..., 0] * position[..., 2:]
-        position = position * torch.maximum(zoom, 1.05 * extent / position[..., 2:])
-    translation: Tensor = position - R @ centre
-    return translation
-
-
-def _rays(inverse: Tensor, pixels: Tensor) -> Tensor:
-    """(..., 3) rays through (..., 2) pixels."""
-    return (inverse @ torch.nn.functional.pad(pixels, (0, 1), value=1.0)[..., None])[..., 0]
+    return _filled(points, rotation, box, K, towards=False)[1]
 
 
 def place_view(points: Tensor, view_rotation: Tensor, box: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """Pose of an object that a camera looking straight at its centre would see with ``view_rotation``.
 
-    An object away from the principal point is seen along a ray, not along the optical axis: the view is turned towards
-    that ray, and the box gives the translation. The ray is first that of the box's centre, then that of the object's,
-    which the translation tells. With the true view and box the pose is the true one.
+    An object away from the principal point is seen along a ray, not along the optical axis: every step of
+    :func:`translation_from_box` turns the view towards the ray of the object's centre as it is known by then. With the
+    true view and box the pose is the true one.
 
     Args:
         points, box, K: of :func:`translation_from_box`.
@@ -72,11 +50,26 @@ def place_view(points: Tensor, view_rotation: Tensor, box: Tensor, K: Tensor) ->
     Returns:
         rotation (..., 3, 3) and translation (..., 3) in the photograph's camera, float64.
     """
-    points, R_view, box, K = (v.detach().cpu().double() for v in (points, view_rotation, box, K))
+    return _filled(points, view_rotation, box, K, towards=True)
+
+
+def _filled(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor, *, towards: bool) -> tuple[Tensor, Tensor]:
+    """Rotation and translation of :func:`translation_from_box`; of :func:`place_view` where the view turns ``towards``
+    the ray."""
+    points, view, box, K = (v.detach().cpu().double() for v in (points, rotation, box, K))
     centre = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
-    ray = _rays(torch.linalg.inv(K), 0.5 * (box[..., :2] + box[..., 2:]))
-    for _ in range(_RAYS):
-        rotation = rotation_towards(ray) @ R_view
-        translation = translation_from_box(points, rotation, box, K)
-        ray = rotation @ centre + translation
-    return rotation, translation
+    extent = torch.linalg.vector_norm(points - centre, dim=1).max()
+    size, middle = box[..., 2:] - box[..., :2], 0.5 * (box[..., :2] + box[..., 2:])
+    inverse = torch.linalg.inv(K)
+    # Start far enough away for every point to be in front of the camera.
+    z = torch.maximum(2.0 * extent * K[..., 0, 0] / size.amax(dim=-1), 2.0 * extent)
+    position = (inverse @ torch.nn.functional.pad(middle, (0, 1), value=1.0)[..., None])[..., 0] * z[..., None]
+    for _ in range(_ITERATIONS):
+        R = rotation_towards(position) @ view if towards else view
+        low, high = projected_boxes(points - centre, transform(R, position), K).split(2, dim=-1)
+        zoom = ((high - low) * size).sum(dim=-1, keepdim=True) / (size * size).sum(dim=-1, keepdim=True)
+        shift = torch.nn.functional.pad(middle - 0.5 * (low + high), (0, 1))
+        # Move sideways at the object's depth, then along its ray; never closer than its own extent.
+        position = position + (inverse @ shift[..., None])[..., 0] * position[..., 2:]
+        position = position * torch.maximum(zoom, 1.05 * extent / position[..., 2:])
+    return R, position - R @ centre

@@ -206,14 +206,18 @@ class Registrar:
             fit = self._follow_contours(items, found, boxes, T, cameras)
             T, found = fit.transform, self._seen_straight(found, fit.transform)
         found = replace(found, score=similarities(self.describers, descriptors, found))
-        evidence = self._evidence(starts, found, fit, query, ranking)
+        looks = self._looks(found, query, ranking)
+        evidence = gathered_evidence(starts, found, None if fit is None else fit.support, looks)
         own = self._own_peaks(found, verdict(evidence, with_camera=K is not None))
         if not bool(own.all()):
             found, T, cameras, fit = self._sent_back(own, starts, found, T, cameras, fit, boxes, K)
-            found = replace(found, score=similarities(self.describers, descriptors, found))
+            back = found[~own]
+            found.score[~own] = similarities(self.describers, descriptors, back)
+            if looks is not None:
+                looks[~own] = self._looks(back, query, ranking)
             if fit is not None:
                 fit = replace(fit, support=torch.where(own, fit.support, 0.0))
-            evidence = self._evidence(starts, found, fit, query, ranking)
+            evidence = gathered_evidence(starts, found, None if fit is None else fit.support, looks)
         if fit is not None and K is None:
             # The mesh is often another object of the kind: where its contours do not fit, the view itself errs less.
             score = found.score
@@ -239,22 +243,15 @@ class Registrar:
         if callable(self.progress):
             self.progress(stage, 0, 1)
 
-    def _evidence(
-        self,
-        starts: Hypotheses,
-        found: Hypotheses,
-        fit: ContourFit | None,
-        query: Photographs,
-        ranking: Ranking,
-    ) -> Tensor:
-        looks = None
-        if "appearance" in ranking.terms:
-            S = self.bank.settings.image_size
-            pictures = torch.zeros(len(found), 1, S, S, device=self.bank.device)
-            for model, mine in self._by_model(found):
-                pictures[mine] = self.describers[model].shaded(found.rotation[mine], found.distance[mine]).to(pictures)
-            looks = self.matcher.late_score("appearance", query, ranking, pictures, found.photograph)
-        return gathered_evidence(starts, found, None if fit is None else fit.support, looks)
+    def _looks(self, found: Hypotheses, query: Photographs, ranking: Ranking) -> Tensor | None:
+        """(H,) how much poses look like their photographs; None without that term."""
+        if "appearance" not in ranking.terms:
+            return None
+        S = self.bank.settings.image_size
+        pictures = torch.zeros(len(found), 1, S, S, device=self.bank.device)
+        for model, mine in self._by_model(found):
+            pictures[mine] = self.describers[model].shaded(found.rotation[mine], found.distance[mine]).to(pictures)
+        return self.matcher.late_score("appearance", query, ranking, pictures, found.photograph)
 
     def _own_peaks(self, found: Hypotheses, score: Tensor) -> Tensor:
         """(H,) bool: False where a hypothesis ended within ``SAME`` degrees of a better one of its photograph."""

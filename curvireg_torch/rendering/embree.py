@@ -138,8 +138,9 @@ class EmbreeRenderer:
         x = (np.arange(size[1]) - K[0, 2]) / K[0, 0]
         skew = K[0, 1] / K[0, 0]
         axes = np.stack([R[0], R[1] - skew * R[0], R[2]])  # what x, y and z of the camera are in the model
-        starts = _combined(mask, reach * x - t[0] - skew * t[1], reach * y - t[1], near - t[2], axes)
-        return mask, starts, _float32(R[2:]) if orthographic else _combined(mask, x, y, 1.0, axes), near
+        pixels = np.nonzero(mask)
+        starts = _combined(pixels, reach * x - t[0] - skew * t[1], reach * y - t[1], near - t[2], axes)
+        return mask, starts, _float32(R[2:]) if orthographic else _combined(pixels, x, y, 1.0, axes), near
 
     def _mask(self, outline: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool) -> np.ndarray:
         """(H, W) bool: the pixels inside the outline's projection, with a rim of a pixel."""
@@ -158,11 +159,10 @@ class EmbreeRenderer:
         return np.asarray(cv2.dilate(mask, np.ones((3, 3), np.uint8))).view(bool)
 
 
-def _combined(mask: np.ndarray, x: np.ndarray, y: np.ndarray, z: float, axes: np.ndarray) -> np.ndarray:
-    """(N, 3) float32 x(column) axes[0] + y(row) axes[1] + z axes[2] for the N pixels of a mask."""
-    a = np.broadcast_to(x.astype(np.float32), mask.shape)[mask]
-    b = np.broadcast_to(y.astype(np.float32)[:, None], mask.shape)[mask]
-    rays = np.empty((len(a), 3), dtype=np.float32)
-    for i in range(3):
-        rays[:, i] = a * np.float32(axes[0, i]) + (b * np.float32(axes[1, i]) + np.float32(z * axes[2, i]))
+def _combined(pixels: tuple[np.ndarray, ...], x: np.ndarray, y: np.ndarray, z: float, axes: np.ndarray) -> np.ndarray:
+    """(N, 3) float32 x(column) axes[0] + y(row) axes[1] + z axes[2] for the N rows and columns of pixels."""
+    across = x.astype(np.float32)[:, None] * axes[0].astype(np.float32)
+    down = y.astype(np.float32)[:, None] * axes[1].astype(np.float32) + (z * axes[2]).astype(np.float32)
+    rays: np.ndarray = across[pixels[1]]
+    rays += down[pixels[0]]
     return rays

@@ -48,9 +48,12 @@ class _Looks(LateModule):
     def __init__(self) -> None:
         super().__init__()
         self.backbone = Backbone()
+        self._last: tuple[Tensor, Tensor] | None = None  # crops, and what they are described by
 
     def described(self, pictures: Tensor) -> Tensor:
         return describe(pictures, self.backbone)
 
     def compare(self, photographs: Photographs, views: Tensor) -> Tensor:
-        return similarity(describe(photographs.crops, self.backbone)[:, None], views)
+        if self._last is None or self._last[0] is not photographs.regions:  # ranking and verdict ask about the same
+            self._last = photographs.regions, describe(photographs.crops, self.backbone)
+        return similarity(self._last[1][:, None], views)
