@@ -213,8 +213,7 @@ class Registrar:
             found, T, cameras, fit = self._sent_back(own, starts, found, T, cameras, fit, boxes, K)
             back = found[~own]
             found.score[~own] = similarities(self.describers, descriptors, back)
-            if looks is not None:
-                looks[~own] = self._looks(back, query, ranking)
+            looks[~own] = self._looks(back, query, ranking)
             if fit is not None:
                 fit = replace(fit, support=torch.where(own, fit.support, 0.0))
             evidence = gathered_evidence(starts, found, None if fit is None else fit.support, looks)
@@ -243,10 +242,10 @@ class Registrar:
         if callable(self.progress):
             self.progress(stage, 0, 1)
 
-    def _looks(self, found: Hypotheses, query: Photographs, ranking: Ranking) -> Tensor | None:
-        """(H,) how much poses look like their photographs; None without that term."""
+    def _looks(self, found: Hypotheses, query: Photographs, ranking: Ranking) -> Tensor:
+        """(H,) float64 how much poses look like their photographs; 0 without that term."""
         if "appearance" not in ranking.terms:
-            return None
+            return torch.zeros(len(found), dtype=torch.float64)
         S = self.bank.settings.image_size
         pictures = torch.zeros(len(found), 1, S, S, device=self.bank.device)
         for model, mine in self._by_model(found):
