@@ -15,8 +15,10 @@ __all__ = [
     "MAX_MESH_COORDINATE",
     "MAX_MESH_DEPTH",
     "MAX_MESH_FACES",
+    "MAX_MESH_LINES",
     "MAX_MESH_PARTS",
     "MAX_POLYGON_CORNERS",
+    "MAX_POLYGON_WORK",
     "MAX_TABLE_BYTES",
 ]
 
@@ -35,6 +37,9 @@ MAX_MESH_BYTES = 1 << 29
 MAX_MESH_FACES = 10_000_000
 """Triangles of a mesh, every placed copy of a part counted."""
 
+MAX_MESH_LINES = 50_000_000
+"""Lines of a text file with faces of more than three corners; each takes some 50 bytes more than its text."""
+
 MAX_MESH_COORDINATE = 1e12
 """Distance of a vertex from the origin along an axis, in the file's unit; squares and products stay finite."""
 
@@ -47,14 +52,17 @@ MAX_MESH_DEPTH = 200
 MAX_POLYGON_CORNERS = 2000
 """Corners of one face that is not convex; dividing it into triangles takes time with their square."""
 
+MAX_POLYGON_WORK = 40_000_000
+"""Squares of the corners of all faces that are not convex: of two million quads, or of ten faces of 2000 corners."""
+
 MAX_TABLE_BYTES = 1 << 26
 """Bytes of a JSON or CSV file."""
 
 MAX_MAT_BYTES = 1 << 24
 """Bytes of a MATLAB annotation file."""
 
-MAX_MAT_UNPACKED_BYTES = 1 << 26
-"""Bytes that all of its compressed variables unpack to."""
+MAX_MAT_UNPACKED_BYTES = 1 << 24
+"""Bytes that all of its compressed variables unpack to; a struct in them may take 60 times as much memory."""
 
 MAX_MAT_DEPTH = 16
 """Structs within structs of a MATLAB annotation file."""

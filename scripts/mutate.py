@@ -4,10 +4,10 @@
     python scripts/mutate.py metrics --sample 30 --again      # survivors once more, after new tests
     python scripts/mutate.py metrics --list                   # what would be changed
 
-One mutant (``mutants.py``) at a time, in a temporary copy; the first failing test kills it. Tests of a module: its own
-file in the folder of its package, the rest of that folder (where there is none, files that import it by name), and its
-doctests; not those marked slow or data. The sample is drawn by a hash of the mutant and the seed, so it stays where the
-code does.
+One mutant (``mutants.py``) at a time, in a temporary copy; the first failing test kills it. Tests of a module: those of
+the folder of its package (where there is none, files that import it by name), and its doctests; not those marked slow
+or data. They run once as they are, under coverage; a mutant then meets those that run its line, the quickest first. The
+sample is drawn by a hash of the mutant and the seed, so it stays where the code does.
 
 ``scripts/results/mutation.json``: score per package (killed / sampled) and every survivor. A ``reason`` written there
 beside a survivor is kept: why no test can or need tell it from the original.
@@ -26,10 +26,13 @@ import sys
 import tempfile
 import time
 import traceback
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from coverage import Coverage, CoverageData
 from mutants import Mutant, mutants_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -37,8 +40,9 @@ RESULT = ROOT / "scripts" / "results" / "mutation.json"
 PACKAGE = "curvireg_torch"
 PRELOADED = ("torch", "numpy", "scipy.spatial", "kornia", "cv2", "trimesh", "sklearn.covariance", "skimage.feature")
 PRELOADED += ("pytest",)
+TOGETHER = {"terms": "matching", "matching": "terms"}  # packages that are tested with another
 WALL_LIMIT_S = 400.0
-LOG = "log.txt"
+LOG, SEEN, TIMES = "log.txt", "seen.db", "times.json"
 
 
 def sample(mutants: Iterable[Mutant], count: int, seed: int) -> list[Mutant]:
@@ -53,7 +57,7 @@ def sample(mutants: Iterable[Mutant], count: int, seed: int) -> list[Mutant]:
 
 def snapshot(folder: Path) -> None:
     """What tests need of the repository as it is now."""
-    for name in (PACKAGE, "tests", "scripts", "docs"):
+    for name in (PACKAGE, "tests", "scripts", "docs", "datasets"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md"):
         shutil.copy(ROOT / name, folder / name)
@@ -67,22 +71,60 @@ def files_of(copy: Path, package: str) -> list[str]:
 
 
 def tests_of(copy: Path, path: str) -> list[str]:
-    """Test files of a source, the likeliest to notice first, and its doctests last."""
+    """Test files of a source."""
     parts = Path(path).with_suffix("").parts[1:]
     home, stem = copy.joinpath("tests", *parts[:-1]), parts[-1].strip("_")
     everywhere = sorted((copy / "tests").rglob("test_*.py"))
     module = rf"{PACKAGE}\.{re.escape('.'.join(parts))}\b"
     if len(parts) > 1:
-        near = [p for p in everywhere if home in p.parents]
+        homes = {home, copy / "tests" / TOGETHER.get(parts[0], parts[0])}
+        near = [p for p in everywhere if homes & set(p.parents)]
         module += rf"|{PACKAGE}\.{re.escape('.'.join(parts[:-1]))} import [^\n]*\b{parts[-1]}\b"
     else:
         near = [p for p in everywhere if p.parent == home and stem in p.stem]
-    ordered = sorted(near, key=lambda p: stem not in p.stem)
-    ordered = ordered or [p for p in everywhere if re.search(module, p.read_text())]
-    return [*(p.relative_to(copy).as_posix() for p in ordered), path]
+    near = near or [p for p in everywhere if re.search(module, p.read_text())]
+    return [p.relative_to(copy).as_posix() for p in near]
 
 
-def run_tests(copy: Path, tests: list[str], *, cpu_s: int | None, write_bytecode: bool = False) -> tuple[str, float]:
+class Times:
+    """A plugin of pytest: seconds of each test function, all its cases and their fixtures together."""
+
+    def __init__(self) -> None:
+        self.seconds = defaultdict[str, float](float)
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        self.seconds[report.nodeid.split("[")[0]] += report.duration
+
+
+@dataclass
+class Course:
+    """What ran in the tests of a package: test functions by line of each file, and their seconds."""
+
+    lines: dict[str, dict[int, list[str]]]
+    seconds: dict[str, float]
+
+    def tests(self, mutant: Mutant) -> list[str]:
+        """Functions that run the mutant's line, the quickest first; those that run its file, if that is at import."""
+        lines = self.lines.get(mutant.path, {})
+        at = max((line for line in lines if line <= mutant.line), default=0)
+        names = {name for name in lines.get(at, []) if name} or {n for some in lines.values() for n in some if n}
+        ids = {"{}.py::{}".format(*name.replace(".", "/").rsplit("/", 1)) for name in names}
+        return sorted(ids & self.seconds.keys(), key=lambda name: self.seconds[name])
+
+
+def watched(copy: Path, tests: list[str]) -> Course:
+    """The course of tests that pass."""
+    if run_tests(copy, tests, cpu_s=None, watch=True)[0] != "survived":
+        raise SystemExit(f"the tests fail by themselves:\n{(copy / LOG).read_text()}")
+    data = CoverageData(str(copy / SEEN))
+    data.read()
+    lines = {Path(p).relative_to(copy).as_posix(): data.contexts_by_lineno(p) for p in data.measured_files()}
+    for stale in (copy / PACKAGE).rglob("__pycache__"):
+        shutil.rmtree(stale)
+    return Course(lines, json.loads((copy / TIMES).read_text()))
+
+
+def run_tests(copy: Path, tests: list[str], *, cpu_s: int | None, watch: bool = False) -> tuple[str, float]:
     """``survived``, ``killed`` or ``timeout``, and the seconds, of a forked process that runs tests in the copy."""
     start = time.monotonic()
     log = copy / LOG
@@ -95,14 +137,23 @@ def run_tests(copy: Path, tests: list[str], *, cpu_s: int | None, write_bytecode
         os.dup2(output, 2)
         if cpu_s is not None:
             resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s))
-        sys.dont_write_bytecode = not write_bytecode
+        sys.dont_write_bytecode = True
         sys.path.insert(0, str(copy))
         os.environ["PYTHONPATH"] = str(copy)
         import pytest
 
-        code = 3
+        seen = Coverage(data_file=str(copy / SEEN), include=[str(copy / PACKAGE / "*")], config_file=False)
+        seen.set_option("run:dynamic_context", "test_function")
+        code, times = 3, Times()
+        if watch:
+            seen.start()
         try:
-            code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow and not data", *tests])
+            words = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow and not data"]
+            code = pytest.main([*words, *tests], plugins=[times])
+            if watch:
+                seen.stop()
+                seen.save()
+                (copy / TIMES).write_text(json.dumps(times.seconds))
         except BaseException:
             traceback.print_exc()
         finally:
@@ -110,35 +161,30 @@ def run_tests(copy: Path, tests: list[str], *, cpu_s: int | None, write_bytecode
             sys.stderr.flush()
             os._exit(int(code))
     while (status := os.waitpid(child, os.WNOHANG))[0] == 0:
-        if time.monotonic() - start > WALL_LIMIT_S:
+        if cpu_s is not None and time.monotonic() - start > WALL_LIMIT_S:
             os.killpg(child, signal.SIGKILL)
         time.sleep(0.02)
     seconds = time.monotonic() - start
     if os.WIFSIGNALED(status[1]):
         return "timeout", seconds
     code = os.WEXITSTATUS(status[1])
-    if code not in (0, 1, 2):
+    if code not in (0, 1, 2, 5):  # 5: no tests
         raise SystemExit(f"pytest ended with {code}:\n{log.read_text()[-2000:]}")
-    return ("survived" if code == 0 else "killed"), seconds
+    return ("survived" if code in (0, 5) else "killed"), seconds
 
 
 def judged(copy: Path, mutants: list[Mutant]) -> Iterator[tuple[Mutant, str, float]]:
     """Each mutant with its outcome and the seconds."""
-    cpu: dict[str, int] = {}
+    files = sorted({path for mutant in mutants for path in tests_of(copy, mutant.path)})
+    sources = sorted({mutant.path for mutant in mutants})
+    course = watched(copy, [*files, *sources]) if mutants else Course({}, {})
     for mutant in mutants:
-        tests, target = tests_of(copy, mutant.path), copy / mutant.path
-        if mutant.path not in cpu:
-            before = resource.getrusage(resource.RUSAGE_CHILDREN)
-            if run_tests(copy, tests, cpu_s=None, write_bytecode=True)[0] != "survived":
-                raise SystemExit(f"the tests of {mutant.path} fail by themselves:\n{(copy / LOG).read_text()}")
-            after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            cpu[mutant.path] = int(3.0 * (after.ru_utime - before.ru_utime) + 15.0)
-            for stale in (target.parent / "__pycache__").glob(f"{target.stem}.*"):
-                stale.unlink()
+        tests, target = course.tests(mutant), copy / mutant.path
         source = target.read_bytes()
         target.write_bytes(mutant.apply(source))
         try:
-            outcome, seconds = run_tests(copy, tests, cpu_s=cpu[mutant.path])
+            limit = int(3.0 * sum(course.seconds[name] for name in tests) + 20.0)
+            outcome, seconds = run_tests(copy, [*tests, mutant.path], cpu_s=limit)
         finally:
             target.write_bytes(source)
         yield mutant, outcome, seconds

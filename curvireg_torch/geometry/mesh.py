@@ -138,7 +138,7 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
         return load_mesh(source)
     if isinstance(source, trimesh.Scene):
         try:
-            parts = [part for part in source.dump() if isinstance(part, trimesh.Trimesh)]
+            parts = _placed(source)
         except Exception as error:  # transforms that are none, parts that hang on nothing
             raise MeshError(f"{name}: its parts cannot be placed ({error}); re-export the file") from error
         source = _joined(parts) if parts else None
@@ -168,6 +168,25 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
     if colours is not None:
         mesh.metadata["colours"] = colours[area > 0]
     return mesh
+
+
+def _placed(scene: trimesh.Scene) -> list[trimesh.Trimesh]:
+    """The meshes of a scene where they stand: its own ``dump``, which takes time with the cube of a part's depth."""
+    forest = scene.graph.transforms
+    world = {scene.graph.base_frame: np.eye(4)}
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        path = [node]
+        while path[-1] not in world and path[-1] in forest.parents:
+            path.append(forest.parents[path[-1]])
+        if path[-1] not in world:  # does not hang on the base: trimesh finds another way
+            world[path[-1]] = scene.graph.get(path[-1])[0]
+        for child, parent in zip(path[-2::-1], path[:0:-1], strict=True):
+            world[child] = world[parent] @ forest.edge_data[parent, child].get("matrix", np.eye(4))
+        part = scene.geometry[forest.node_data[node]["geometry"]]
+        if isinstance(part, trimesh.Trimesh):
+            parts.append(part.copy().apply_transform(world[node]))
+    return parts
 
 
 def _colours(mesh: trimesh.Trimesh) -> SurfaceColours | None:

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from .polygons import Floats, triangulate
+from ..limits import MAX_MESH_FACES, MAX_MESH_LINES, MAX_POLYGON_WORK
+from .polygons import Floats, ear_work, triangulate
 
 __all__ = ["with_triangles"]
 
@@ -22,7 +23,7 @@ def with_triangles(data: bytes, suffix: str) -> bytes:
     """The content of a file of format ``suffix`` with every face a triangle; the same bytes if all are.
 
     Raises:
-        ValueError: the file is damaged.
+        ValueError: the file is damaged, or beyond :mod:`curvireg_torch.limits`.
     """
     try:
         return {".obj": _obj, ".off": _off, ".ply": _ply}[suffix](data)
@@ -32,7 +33,8 @@ def with_triangles(data: bytes, suffix: str) -> bytes:
 
 def _divided(vertices: Floats, faces: list[list[int]]) -> Iterator[tuple[int, list[list[int]]]]:
     """For each face its place in ``faces`` and its triangles as numbers of corners; lines and points have none."""
-    places = defaultdict(list)
+    _check_faces(sum(max(len(face) - 2, 0) for face in faces))
+    places, work = defaultdict(list), 0
     for place, face in enumerate(faces):
         places[len(face)].append(place)
         if face and not 0 <= min(face) <= max(face) < len(vertices):
@@ -40,7 +42,20 @@ def _divided(vertices: Floats, faces: list[list[int]]) -> Iterator[tuple[int, li
     for corners, some in places.items():
         if corners >= 3:
             polygons = vertices[np.array([faces[place] for place in some])]
+            work += ear_work(polygons)
+            if work > MAX_POLYGON_WORK:
+                raise ValueError("faces that are not convex have too many corners; triangulate the mesh")
             yield from zip(some, triangulate(polygons).tolist(), strict=True)
+
+
+def _check_faces(count: int) -> None:
+    if count > MAX_MESH_FACES:
+        raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
+
+
+def _check_lines(data: bytes) -> None:
+    if max(data.count(b"\n"), data.count(b"\r")) > MAX_MESH_LINES:
+        raise ValueError(f"more than {MAX_MESH_LINES:,} lines; simplify it")
 
 
 _OBJ_OTHER = re.compile(rb"^f[ \t]+(?:(?:[^ \t\r\n]+[ \t]+){3}[^ \t\r\n#]|[^\r\n]*-)", re.MULTILINE)
@@ -50,6 +65,7 @@ def _obj(data: bytes) -> bytes:
     data = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
     if _OBJ_OTHER.search(data) is None:
         return data
+    _check_lines(data)
     lines = data.splitlines()
     vertices: list[list[bytes]] = []
     counts, places, faces = {b"v": 0, b"vt": 0, b"vn": 0}, [], []
@@ -81,12 +97,14 @@ def _from_the_start(corner: bytes, counts: dict[bytes, int]) -> bytes:
 
 def _off(data: bytes) -> bytes:
     header, _, rest = re.sub(rb"#[^\r\n]*", b"", data).partition(b"OFF")
+    _check_lines(rest)
     lines = [line for line in rest.splitlines() if line.strip()]
     if len(header) > 16 or not lines:
         raise ValueError("not an OFF file")
     V, F = (int(n) for n in lines[0].split()[:2])
     if V < 0 or F < 0 or len(lines) < 1 + V + F:
         raise ValueError("the file ends too early")
+    _check_faces(F)
     words = [line.split() for line in lines[1 + V : 1 + V + F]]
     if all(line[0] == b"3" for line in words):
         return data
@@ -150,6 +168,7 @@ def _ply(data: bytes) -> bytes:
     if any(element.lists for element in before) or key is None:
         raise ValueError("only faces may hold lists, and they must")
     index = [name for name, _, _ in face.properties].index(key)
+    _check_faces(face.count)
     read = _ply_text if order == "" else _ply_binary
     vertices, rows, start, stop, write = read(data, _Layout(order, end.end(), before, face, index))
     faces = [[int(n) for n in row[index]] for row in rows]
@@ -195,6 +214,7 @@ def _ply_header(header: str) -> tuple[str, list[_Element]]:
 def _ply_text(data: bytes, layout: _Layout) -> tuple[Any, ...]:
     """Vertices, values of the faces, first and last byte of them, and what writes one."""
     face, start = layout.face, layout.start
+    _check_lines(data)
     lines = data[start:].splitlines(keepends=True)
     skipped = 0
     for element in layout.before:

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from ..limits import MAX_POLYGON_CORNERS
 
-__all__ = ["triangulate"]
+__all__ = ["ear_work", "triangulate"]
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -41,6 +41,17 @@ def triangulate(polygons: Floats) -> Indices:
             raise ValueError(f"a concave face of {n} corners, more than {MAX_POLYGON_CORNERS}; triangulate the mesh")
         triangles[concave] = _cut_ears(flat[concave])
     return triangles
+
+
+def ear_work(polygons: Floats) -> int:
+    """Squared corners of those of N polygons that are not convex: what :func:`triangulate` takes time with.
+
+    Example:
+        >>> ear_work(np.array([[[0.0, 0, 0], [1, 2, 0], [0, 1, 0], [-1, 2, 0]]] * 3))
+        48
+    """
+    n = polygons.shape[1]
+    return n * n * int((~_convex(_flattened(polygons))).sum()) if n > 3 else 0
 
 
 def _flattened(polygons: Floats) -> Floats:

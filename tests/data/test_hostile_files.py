@@ -1,5 +1,6 @@
 """Photographs and annotations made to harm end in one line of ours, soon and in little memory."""
 
+import contextlib
 import struct
 import time
 import tracemalloc
@@ -11,7 +12,7 @@ import pytest
 import torch
 
 import curvireg_torch as cr
-from curvireg_torch.data import BOPDataset, images, read_bop_csv, read_photo
+from curvireg_torch.data import BOPDataset, _json, images, read_bop_csv, read_photo
 from curvireg_torch.data._matfile import read_mat
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError
 from tests._support.miniature import write_bop, write_image
@@ -148,7 +149,7 @@ def test_json_made_to_harm(tmp_path: Path, content: bytes) -> None:
     assert len(str(caught.value)) < 1000
 
 
-def test_tables_are_bounded(tmp_path: Path) -> None:
+def test_tables_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_bop(tmp_path)
     for path, read in (
         (tmp_path / "camera.json", lambda: BOPDataset(tmp_path)),
@@ -158,3 +159,8 @@ def test_tables_are_bounded(tmp_path: Path) -> None:
             file.truncate(1 << 27)  # a hole: takes no disk
         with pytest.raises(InvalidInputError, match="67,108,864 bytes"):
             read()
+    (tmp_path / "some").write_bytes(bytes(100))
+    for limit in (99, 100):
+        monkeypatch.setattr(_json, "MAX_TABLE_BYTES", limit)
+        with contextlib.nullcontext() if limit == 100 else pytest.raises(InvalidInputError, match="99 bytes"):
+            _json.check_table_size(tmp_path / "some")

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from curvireg_torch.data import read_image, read_photo
+from curvireg_torch.data._image_headers import read_header
 from curvireg_torch.errors import ImageError, InvalidInputError, MissingFileError
 from tests._support.exif import exif, with_exif
 from tests._support.miniature import write_image
@@ -168,6 +169,15 @@ def test_bytes_after_the_end_are_allowed(tmp_path):
         photo = read_photo(tmp_path / f"a{suffix}")
         assert photo.image.shape == (3, 60, 80)
         assert photo.notes == ("2,052 bytes behind the picture's end ignored",)
+
+
+def test_what_stands_before_a_jpegs_frame_is_passed_over(tmp_path):
+    write_image(tmp_path / "a.jpg")
+    data = (tmp_path / "a.jpg").read_bytes()
+    arithmetic = b"\xff\xcc\0\x09\x08\0\x07\0\x09\x03\0"  # its conditioning; as a frame it would be 9 x 7 px
+    for more in (b"\xff\x01", b"\xff\xd8", arithmetic):
+        header = read_header(data[:2] + more + data[2:])
+        assert (header.width, header.height, header.scans) == (80, 60, 1)
 
 
 @pytest.mark.parametrize("content", [b"", b"no image at all", b"\xff\xd8\xff\xd9", b"\x89PNG\r\n\x1a\nIEND"])

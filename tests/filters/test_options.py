@@ -38,6 +38,7 @@ WRONG: list[tuple[tuple[Callable[..., Tensor], Callable[..., nn.Module], Callabl
     (ICS, {"sigma": math.inf}),
     (DIFFUSION, {"iterations": -1}),
     (DIFFUSION, {"iterations": 1, "step": 0.3}),
+    (DIFFUSION, {"iterations": 1, "step": 0.0}),
     (DIFFUSION, {"iterations": 1, "kappa": 0.0}),
     (MCS, {"scales": 0}),
     (MCS, {"kappa": -1.0}),
@@ -65,6 +66,12 @@ def test_constructors_check_what_functions_check(
     with pytest.raises(InvalidInputError) as by_module:
         module(**options)
     assert str(by_function.value) == str(by_module.value)
+
+
+@pytest.mark.parametrize("layer", [CS, ASG, HFN, IG, ICS, MFC], ids=lambda layer: layer[0].__name__)
+def test_no_smoothing_is_allowed(layer: tuple[Callable[..., Tensor], object, Callable[..., Tensor]]) -> None:
+    function, _, inputs = layer
+    assert torch.isfinite(function(inputs(), sigma=0.0)).all()
 
 
 def test_masks_broadcast() -> None:

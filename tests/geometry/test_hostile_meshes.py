@@ -2,6 +2,7 @@
 
 import base64
 import json
+import math
 import struct
 import time
 import tracemalloc
@@ -15,7 +16,7 @@ import trimesh
 import curvireg_torch as cr
 from curvireg_torch import limits
 from curvireg_torch.errors import MeshError
-from curvireg_torch.geometry import gltf
+from curvireg_torch.geometry import gltf, polygon_files
 from curvireg_torch.geometry import mesh as mesh_module
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
@@ -134,7 +135,7 @@ def test_an_obj_names_materials_that_are_not_opened(tmp_path: Path) -> None:
 
 
 AXES = b"".join(b"property float %c\n" % axis for axis in b"xyz")
-PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"element face 1000000000\n"
+PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"element face 9000000\n"
 PLY += b"property list uchar int vertex_indices\nend_header\n"
 
 
@@ -146,6 +147,8 @@ PLY += b"property list uchar int vertex_indices\nend_header\n"
         ("a.ply", PLY % (b"binary_little_endian", 10**9) + b"\0\0", "early"),
         ("a.ply", PLY % (b"binary_big_endian", 0), "early"),
         ("a.ply", PLY % (b"ascii", 0), "early"),
+        ("a.ply", PLY.replace(b"9000000", b"10000001") % (b"ascii", 0), "more than 10,000,000 faces"),
+        ("a.off", b"OFF\n3 10000001 0\n" + b"\n".join([b"0 0 0"] * 3), "early"),
         ("a.stl", b"\0" * 80 + struct.pack("<I", 10**9) + b"\0" * 50, "got none"),
         ("a.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", r"\(3, 2\)"),
         ("a.obj", b"v 0 0 0\nv 1e300 0 0\nv 0 1 0\nf 1 2 3\n", r"1e\+12"),
@@ -164,3 +167,52 @@ def test_size_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(mesh_module, "MAX_MESH_BYTES", 1000)
     refused(tmp_path / "a.stl", content, "larger than 1,000 bytes")
     assert limits.MAX_MESH_FACES > 1_000_000
+
+
+def test_parts_stand_where_a_deep_tree_puts_them_and_soon(tmp_path: Path) -> None:
+    """trimesh alone multiplies the whole chain anew for each part, in an order that takes the cube of its length."""
+    turn = {"rotation": [0.0, 0.0, math.sin(math.radians(0.25)), math.cos(math.radians(0.25))]}  # half a degree
+    chain = [{"children": [i + 1], "translation": [0.01, 0, 0], **turn} for i in range(179)]
+    leaves = [{"mesh": 0, "translation": [0, 0, 0.1 * i]} for i in range(500)]
+    nodes = [*chain, {"children": list(range(180, 680))}, *leaves]
+    (tmp_path / "a.gltf").write_text(json.dumps(tree(nodes=nodes)))
+    start = time.process_time()
+    mesh = cr.load_mesh(tmp_path / "a.gltf")
+    assert time.process_time() - start < 10
+    assert len(mesh.faces) == 500
+    at = 0.01 * np.exp(1j * np.radians(0.5 * np.arange(179))).sum()  # the chain's end, in the complex plane
+    far = at + np.exp(1j * np.radians(0.5 * 179))  # the corner at x = 1 of a part
+    vertices = mesh.vertices[np.isclose(mesh.vertices[:, 2], 0.7)]
+    for place in (at, far):
+        assert np.abs(vertices - [place.real, place.imag, 0.7]).max(axis=1).min() < 1e-6
+
+
+def test_parts_that_do_not_hang_on_the_base_are_placed_all_the_same() -> None:
+    scene = trimesh.Scene()
+    scene.add_geometry(
+        trimesh.creation.box(), node_name="a", transform=trimesh.transformations.translation_matrix([2, 0, 0])
+    )
+    scene.add_geometry(trimesh.creation.box(), node_name="b", parent_node_name="a")
+    scene.graph.base_frame = "b"
+    found = mesh_module.as_mesh(scene)
+    expected = trimesh.util.concatenate(scene.dump())
+    assert np.allclose(np.sort(found.vertices, axis=0), np.sort(expected.vertices, axis=0))
+
+
+def test_polygons_are_counted_before_they_are_divided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dart = b"OFF\n4 %d 0\n0 0 0\n1 2 0\n0 1 0\n-1 2 0\n" + b"4 0 1 2 3\n" * 10
+    ply = PLY.replace(b"9000000", b"10") % (b"ascii", 4) + dart.split(b"\n", 2)[2]
+    obj = b"v 0 0 0\nv 1 2 0\nv 0 1 0\nv -1 2 0\n" + b"f 1 2 3 4\n" * 10
+    for name, content in (("a.off", dart % 10), ("a.ply", ply), ("a.obj", obj)):
+        monkeypatch.undo()
+        (tmp_path / name).write_bytes(content)
+        assert len(cr.load_mesh(tmp_path / name).faces) == 20
+        monkeypatch.setattr(polygon_files, "MAX_POLYGON_WORK", 159)
+        refused(tmp_path / name, content, "not convex have too many corners")
+        monkeypatch.setattr(polygon_files, "MAX_MESH_FACES", 19)
+        refused(tmp_path / name, content, "more than 19 faces")
+        monkeypatch.setattr(polygon_files, "MAX_MESH_LINES", 9)
+        refused(tmp_path / name, content, "more than 9 lines")
+    monkeypatch.undo()
+    monkeypatch.setattr(polygon_files, "MAX_POLYGON_WORK", 160)
+    assert len(cr.load_mesh(tmp_path / "a.off").faces) == 20
