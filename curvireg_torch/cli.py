@@ -5,6 +5,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,11 @@ def _show_warning(message: Any, *_: Any, **__: Any) -> None:
 
 def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = _parser()
-    arguments, rest = parser.parse_known_args(argv)
+    words = list(sys.argv[1:] if argv is None else argv)
+    if ("--camera", "exif") in pairwise(words):
+        place = words.index("--camera")
+        words[place : place + 2] = ["--exif"]
+    arguments, rest = parser.parse_known_args(words)
     if hasattr(arguments, "paths") and not any(word.startswith("-") for word in rest):
         arguments.paths += [Path(word) for word in rest]  # those behind an option
     elif rest:
@@ -69,6 +74,8 @@ def _misused(arguments: argparse.Namespace) -> str | None:
         return "expected --out DIR, or --json"
     if arguments.list is not None and len(arguments.paths) > 1:
         return f"with --list, expected at most one MESH, got {len(arguments.paths)}; give several by --mesh"
+    if sum(map(bool, (arguments.camera, arguments.exif, arguments.fov))) > 1:
+        return "expected one of --camera FX FY CX CY, --camera exif, --fov DEG"
     if arguments.list is not None and (arguments.box or arguments.camera):
         return "the list holds boxes and cameras; leave --box and --camera out"
     return None
@@ -110,6 +117,7 @@ def _parser() -> argparse.ArgumentParser:
         **examples(
             "curvireg register photo.jpg part.stl --unit mm --box 410 220 890 700 --out out/part",
             "curvireg register photo.jpg part.stl --camera 1450 1450 960 540 --json",
+            "curvireg register photo.jpg part.stl --camera exif --out out/part",
             "curvireg register --list photos.csv part.stl --out out/parts",
             "curvireg register shots/ turn.mp4 part.stl --every 10 --out out/shots",
             "curvireg register photo.jpg --mesh mug.obj --mesh bowl.obj --out out/which",
@@ -141,8 +149,12 @@ def _parser() -> argparse.ArgumentParser:
         "--box", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help="px; default: the whole image"
     )
     register.add_argument(
-        "--camera", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="px; gives the translation"
-    )
+        "--camera", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="px; gives the translation. "
+        "Where it is not known, guess it and get no covariance: --camera exif, by the focal length in the photograph's "
+        "file, or --fov"
+    )  # fmt: skip
+    register.add_argument("--exif", action="store_true", help=argparse.SUPPRESS)
+    register.add_argument("--fov", type=float, metavar="DEG", help="degrees that the picture shows across its width")
     register.add_argument("--field", type=Path, metavar="FILE", help="weights from curvireg bank --adapt")
     register.add_argument("--top", type=int, metavar="K", help="hypotheses to carry and report (default: 5)")
     register.add_argument("--no-refine", action="store_true", help="stop at the best view of the bank")

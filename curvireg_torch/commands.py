@@ -5,6 +5,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -30,6 +31,7 @@ from .errors import BankError, InvalidInputError
 from .evaluation.loops import code_digest
 from .evaluation.store import to_json
 from .geometry import camera_matrix, load_mesh, rotation_error
+from .geometry.cameras import camera_of_view
 from .learned import LearnedCurvilinearSaliency, adapt
 from .matching import ViewBank, cache_folder, cached_bank, clear_cache, list_cache
 from .pipeline import Pipeline, field_digest, preset_named
@@ -125,7 +127,7 @@ def register(arguments: argparse.Namespace) -> None:
 def _register_one(arguments: argparse.Namespace, field: nn.Module | None) -> None:
     start = time.perf_counter()
     path = arguments.photos[0]
-    entry = Entry((), str(path), path, tuple(arguments.meshes), arguments.box, arguments.camera)
+    entry = Entry((), str(path), path, tuple(arguments.meshes), arguments.box, arguments.camera, _guess(arguments))
     photo = read_photo(path, dtype=torch.uint8)
     if arguments.out is not None:
         probe_folder(arguments.out, "--out")
@@ -133,6 +135,11 @@ def _register_one(arguments: argparse.Namespace, field: nn.Module | None) -> Non
     result, document = register_entry(entry, photo, registrar, bank_seconds=time.perf_counter() - start)
     if arguments.out is not None:
         _write(arguments.out, document, registrar, result, photo.image, document["inputs"]["box"])
+    if document["inputs"]["camera_source"] in ("exif", "fov"):
+        focal = document["inputs"]["camera"][0]
+        print(
+            f"{path}: camera guessed, focal length {focal:.0f} px; distances err as it does", file=_notes_to(arguments)
+        )
     if photo.notes:
         print(f"{path}: {'; '.join(photo.notes)}", file=_notes_to(arguments))
     if arguments.json:
@@ -169,14 +176,25 @@ def _listing(arguments: argparse.Namespace, out: Path) -> Listing:
     if arguments.list is not None:
         listing = read_list(arguments.list, arguments.meshes)
         probe_folder(out, "--out")
+    else:
+        probe_folder(out, "--out")
+        options = {"box": arguments.box, "camera": arguments.camera, "every": arguments.every}
+        listing = list_photographs(arguments.photos, arguments.meshes, **options, frames=out / "frames")
+        given = [f"--{name}" for name in ("box", "camera") if getattr(arguments, name) is not None]
+        if given:
+            print(f"{' and '.join(given)}: of all {len(listing.entries)} photographs", file=sys.stderr)
+    guess = _guess(arguments)
+    if guess is None:
         return listing
-    probe_folder(out, "--out")
-    options = {"box": arguments.box, "camera": arguments.camera, "every": arguments.every}
-    listing = list_photographs(arguments.photos, arguments.meshes, **options, frames=out / "frames")
-    given = [f"--{name}" for name in ("box", "camera") if getattr(arguments, name) is not None]
-    if given:
-        print(f"{' and '.join(given)}: of all {len(listing.entries)} photographs", file=sys.stderr)
-    return listing
+    print("cameras that are not given are guessed; distances err as the guesses do", file=sys.stderr)
+    return replace(listing, entries=tuple(replace(entry, guess=guess) for entry in listing.entries))
+
+
+def _guess(arguments: argparse.Namespace) -> str | float | None:
+    """What is taken where no camera is given."""
+    if arguments.fov is not None:
+        camera_of_view(arguments.fov, (1, 1))  # says what is wrong with it
+    return "exif" if arguments.exif else arguments.fov
 
 
 def _notes_to(arguments: argparse.Namespace) -> TextIO:

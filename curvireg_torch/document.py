@@ -19,7 +19,7 @@ SCHEMA = 1
 
 CONVENTIONS = {
     "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
-    "translation": "in the mesh file's unit; null without --camera",
+    "translation": "in the mesh file's unit; null without a camera",
     "viewpoint": "PASCAL3D+ azimuth, elevation, theta in degrees",
     "pixels": "(0, 0) is the centre of the top-left pixel of the picture as viewers show it (EXIF orientation applied)",
     "boxes": "x0, y0, x1, y1 in those pixels",
@@ -28,7 +28,7 @@ CONVENTIONS = {
     "reliable": f"confidence of at least {RELIABLE:g}; false = no reliable match, the pose is a guess",
     "support": "how strongly edges of the photograph lie under the mesh's contours, 0 to 1",
     "covariance": "of turn (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
-    "t_true = t + e; null without --camera",
+    "t_true = t + e; null without a camera, and with a guessed one, whose error nobody knows",
 }
 
 

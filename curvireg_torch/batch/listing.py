@@ -26,6 +26,8 @@ class Entry:
         meshes: files; several: which of them is it?
         box: x0, y0, x1, y1 in px, None for the whole image.
         camera: fx, fy, cx, cy in px, None where it is not known.
+        guess: where it is not known: "exif" takes the focal length that the photograph's file tells, a number is the
+            degrees that the picture shows across its width; None: no camera.
         trouble: why the row cannot be used, "" where it can.
     """
 
@@ -35,6 +37,7 @@ class Entry:
     meshes: tuple[Path, ...] = ()
     box: Sequence[float] | None = None
     camera: Sequence[float] | None = None
+    guess: str | float | None = None
     trouble: str = ""
 
 

@@ -16,6 +16,7 @@ from ..data import Photo, read_photo
 from ..document import SCHEMA, result_document
 from ..errors import BankError, CurviregError, ImageError, InvalidInputError, MeshError
 from ..geometry import camera_matrix, whole_image_box
+from ..geometry.cameras import camera_of_view
 from ..registration import FailedRegistration, Registrar, Registration
 from .listing import Entry, Listing
 from .records import Record, Records
@@ -82,7 +83,7 @@ def register_entry(
     """
     start = time.perf_counter()
     box = whole_image_box(photo.image) if entry.box is None else torch.tensor(entry.box)
-    K = None if entry.camera is None else camera_matrix(*entry.camera, dtype=torch.float64)
+    K, source = _camera(entry, photo)
     result = registrar([photo.image], box[None], K)[0]
     if isinstance(result, FailedRegistration):
         raise type(result.error)(
@@ -96,11 +97,28 @@ def register_entry(
         "photo": entry.name,
         "mesh": ", ".join(map(str, entry.meshes)),
         "box": box.tolist(),
-        "camera": entry.camera,
-        "camera_source": None if entry.camera is None else "given",
+        "camera": None if K is None else [float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))],
+        "camera_source": source,
         "picture": photo.facts(),
     }
+    if source in ("exif", "fov"):  # how far a guess is off, nobody knows
+        document["covariance"] = document["standard_deviations"] = None
     return result, document
+
+
+def _camera(entry: Entry, photo: Photo) -> tuple[torch.Tensor | None, str | None]:
+    """(3, 3) camera matrix, and where it is from: "given", "exif" or "fov"."""
+    if entry.camera is not None:
+        return camera_matrix(*entry.camera, dtype=torch.float64), "given"
+    if entry.guess is None:
+        return None, None
+    if isinstance(entry.guess, float):
+        H, W = photo.image.shape[-2:]
+        return camera_of_view(entry.guess, (H, W)), "fov"
+    K = photo.guessed_camera_matrix()
+    if K is None:
+        raise InvalidInputError(f"{entry.name}: no focal length in its EXIF; give --camera FX FY CX CY, or --fov DEG")
+    return K, "exif"
 
 
 @dataclass
@@ -139,7 +157,7 @@ class _Run:
             if mesh not in self.mesh_digests:
                 self.mesh_digests[mesh] = file_digest(mesh)
         meshes = [(mesh.name, self.mesh_digests[mesh]) for mesh in entry.meshes]
-        asked = [entry.name, entry.box, entry.camera, meshes, self.settings]
+        asked = [entry.name, entry.box, entry.camera, entry.guess, meshes, self.settings]
         return hashlib.blake2b(json.dumps(asked).encode(), digest_size=8).hexdigest()
 
     def _is_done(self, request: str, entry: Entry) -> bool:

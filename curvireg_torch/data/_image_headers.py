@@ -123,6 +123,8 @@ def _tiff(data: bytes) -> ImageHeader:
     width, height, bits, kind, samples = (
         directory.get(tag, default) for tag, default in ((256, 0), (257, 0), (258, 1), (262, 1), (277, 1))
     )
+    if kind in (8, 9, 10):  # decoded with other colours
+        raise ValueError("a TIFF in CIELAB is not read; convert it to RGB")
     colour = {0: "grey", 1: "grey", 3: "palette", 5: "CMYK"}.get(kind, "RGB")
     exif = read_exif(data)
     if exif.orientation != 1:  # OpenCV turns a TIFF whatever it is told

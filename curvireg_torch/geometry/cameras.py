@@ -1,11 +1,21 @@
 """OpenCV pinhole cameras, projection, and translations from boxes."""
 
+import math
+
 import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
 
-__all__ = ["camera_matrix", "check_camera_matrix", "project_points", "projected_boxes", "rotation_towards", "transform"]
+__all__ = [
+    "camera_matrix",
+    "camera_of_view",
+    "check_camera_matrix",
+    "project_points",
+    "projected_boxes",
+    "rotation_towards",
+    "transform",
+]
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -18,6 +28,29 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dt
     K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=dtype)
     check_camera_matrix(K)
     return K
+
+
+def camera_of_view(fov: float, size: tuple[int, int]) -> Tensor:
+    """(3, 3) float64 camera matrix of a picture that shows ``fov`` degrees from its left to its right border.
+
+    Pixels are square, the principal point is the middle.
+
+    Args:
+        fov: degrees, 0 < fov < 180.
+        size: (H, W) of the picture in px.
+
+    Raises:
+        InvalidInputError: another angle.
+
+    Example:
+        >>> camera_of_view(90.0, (480, 640))[0].round(decimals=6).tolist()
+        [320.0, 0.0, 319.5]
+    """
+    if not 0.0 < fov < 180.0:
+        raise InvalidInputError(f"fov: expected 0 < degrees < 180 across the picture's width, got {fov:g}")
+    H, W = size
+    focal = W / 2 / math.tan(math.radians(fov) / 2)
+    return camera_matrix(focal, focal, (W - 1) / 2, (H - 1) / 2, dtype=torch.float64)
 
 
 def check_camera_matrix(K: Tensor) -> None:
