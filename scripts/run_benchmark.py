@@ -3,9 +3,9 @@
     python scripts/run_benchmark.py FOLDER --out rows.jsonl [--pose upright] [--form sibling] [--limit N] [--share I/N]
 
 One line for each photograph: the errors of the hypotheses in degrees up to the object's symmetries, their evidence,
-the evidence of the ranking, and the errors of the best views. ``exact`` photographs come with their camera matrix,
-``sibling`` ones (another object of the kind) without, as PASCAL3D+ does. Run again, it goes on. --share takes every
-N-th mesh, so that several processes work side by side.
+the evidence of the ranking, the errors of the best views, and how far off the pose is in units of its covariance.
+``exact`` photographs come with their camera matrix, ``sibling`` ones (another object of the kind) without, as
+PASCAL3D+ does. Run again, it goes on. --share takes every N-th mesh, so that several processes work side by side.
 """
 
 import argparse
@@ -15,18 +15,24 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from check_covariance import squared_distance
 from torch import Tensor
 
 import curvireg_torch as cr
 from curvireg_torch.data import read_image
-from curvireg_torch.geometry import rotation_towards
+from curvireg_torch.geometry import rotation_towards, transform
 from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
 from curvireg_torch.registration.confidence import ranking_evidence
 
 
 def error_up_to(R: Tensor, truth: Tensor, symmetries: Tensor) -> Tensor:
     """(N,) degrees between (N, 3, 3) rotations and the nearest of ``truth`` S."""
-    return cr.rotation_error(R[:, None], (truth @ symmetries)[None]).amin(dim=1)
+    return error_up_to_each(R, truth, symmetries).amin(dim=1)
+
+
+def error_up_to_each(R: Tensor, truth: Tensor, symmetries: Tensor) -> Tensor:
+    """(N, S) degrees between (N, 3, 3) rotations and each of ``truth`` S."""
+    return cr.rotation_error(R[:, None], (truth @ symmetries)[None])
 
 
 def allocentric(item: dict[str, Any]) -> Tensor:
@@ -62,6 +68,10 @@ def rows_of(items: list[Any], root: Path, half: Path, pipeline: cr.Pipeline, wro
         row["evidence"] = [dict(h.evidence) for h in result.hypotheses]
         row["ranking"] = ranking_evidence(result.ranking, registrar.bank.rotations)[0].tolist()
         row["confidence"] = result.confidence
+        if result.covariance is not None and not row["wrong"]:
+            nearest = truth @ symmetries[error_up_to_each(found[:1], truth, symmetries)[0].argmin()]
+            poses = transform(found[0], result.translation), transform(nearest, torch.tensor(item["t"]).double())
+            row["squared_distance"] = squared_distance(*poses, result.covariance)
         rows.append(row)
     return rows
 
