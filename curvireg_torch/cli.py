@@ -15,6 +15,7 @@ from ._examples import examples
 from ._files import terminable
 from .errors import CurviregError
 from .evaluation import add_parser as add_evaluate
+from .viewer import add_parser as add_view
 
 __all__ = ["main"]
 
@@ -188,6 +189,7 @@ def _parser() -> argparse.ArgumentParser:
     cache.set_defaults(run=_later("cache"))
 
     add_evaluate(commands, [common])
+    add_view(commands, [common, preset, mesh_options])
 
     demo = commands.add_parser(
         "demo", parents=[common, preset], help="register a scene made in code, where the truth is known",

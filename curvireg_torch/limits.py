@@ -20,6 +20,9 @@ __all__ = [
     "MAX_POLYGON_CORNERS",
     "MAX_POLYGON_WORK",
     "MAX_TABLE_BYTES",
+    "MAX_VIEWER_FACES",
+    "MAX_VIEWER_PAGES",
+    "MAX_VIEWER_SECONDS",
 ]
 
 MAX_IMAGE_BYTES = 1 << 28
@@ -66,3 +69,12 @@ MAX_MAT_UNPACKED_BYTES = 1 << 24
 
 MAX_MAT_DEPTH = 16
 """Structs within structs of a MATLAB annotation file."""
+
+MAX_VIEWER_FACES = 300_000
+"""Triangles that the viewer sends to the browser for its 3D view, 96 bytes each; of larger meshes it says so."""
+
+MAX_VIEWER_PAGES = 8
+"""Pages open at a time, each with a photograph, a mesh and a bank in memory."""
+
+MAX_VIEWER_SECONDS = 600.0
+"""Time that a registration in the viewer may take."""

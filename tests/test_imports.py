@@ -39,7 +39,7 @@ FORBIDDEN_LIBRARIES = {
     "filters": {"numpy", "pathlib", "trimesh", "cv2", "scipy", "os"},
     "descriptors": {"numpy", "pathlib", "trimesh", "cv2", "scipy", "os"},
 }
-TOP = {"batch", "document", "evaluation", "cli", "commands", "__init__", "__main__", "presets"}
+TOP = {"batch", "document", "evaluation", "viewer", "cli", "commands", "__init__", "__main__", "presets"}
 
 
 def parts() -> list[str]:

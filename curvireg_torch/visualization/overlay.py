@@ -12,7 +12,7 @@ from ..geometry import rotation_error
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import Item, items_of
 
-__all__ = ["contour_overlay", "registration_sheet"]
+__all__ = ["contour_overlay", "registration_sheet", "side_pictures"]
 
 _CONTOUR, _INNER, _BOX = (0, 255, 80), (255, 170, 0), (255, 255, 255)
 _TILE = 192
@@ -51,15 +51,22 @@ def contour_overlay(
     H, W = item.image.shape[-2:]
     depth = registrar.describers[result.model].renderer.render(T[None], K, (H, W))[0, 0].cpu().numpy()
     picture = to_uint8(item.image)
-    width = max(1, round(max(H, W) / 500))
-    mask = (depth > 0).astype(np.uint8)
-    inner = _depth_edges(depth) & (cv2.erode(mask, np.ones((3, 3), np.uint8)) > 0)
-    picture[_thick(inner, width)] = _INNER
-    outline, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(picture, outline, -1, _CONTOUR, width)
+    width = draw_contours(picture, depth)
     x0, y0, x1, y1 = (round(v) for v in item.box.tolist())
     cv2.rectangle(picture, (x0, y0), (x1, y1), _BOX, max(1, width // 2))
     return picture
+
+
+def draw_contours(picture: np.ndarray, depth: np.ndarray) -> int:
+    """Draw the outer and inner contours of a (H, W) depth image into an (H, W, 3 or 4) picture; returns their width."""
+    width = max(1, round(max(int(n) for n in depth.shape) / 500))
+    opaque = (255,) * (picture.shape[2] - 3)
+    mask = (depth > 0).astype(np.uint8)
+    inner = _depth_edges(depth) & (cv2.erode(mask, np.ones((3, 3), np.uint8)) > 0)
+    picture[_thick(inner, width)] = (*_INNER, *opaque)
+    outline, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(picture, outline, -1, (*_CONTOUR, *opaque), width)
+    return width
 
 
 def _item(image: Any, box: Any) -> Item:
@@ -103,21 +110,10 @@ def registration_sheet(
     """
     item = _item(image, box)
     overlay = contour_overlay(registrar, result, item.image, item.box, camera_matrix)
-    query = registrar.matcher.query([item.image], item.box[None])
-    depths = [
-        registrar.describers[h.model].depth(h.allocentric_rotation[None], torch.tensor([h.distance]))[0]
-        for h in result.hypotheses
-    ]
-    view_field = registrar.bank.settings.depth_filter()(depths[0])[0]
-    side = [
-        _caption(_tile(to_uint8(query.crops[0])), "photograph"),
-        _caption(_tile(_field_picture(query.field[0])), "photograph field"),
-        _caption(_tile(depth_picture(depths[0][0, 0])), "pose"),
-        _caption(_tile(_field_picture(view_field)), "view field"),
-    ]
+    side = [_caption(_tile(p), name) for name, p in side_pictures(registrar, result, item.image, item.box).items()]
     poses = [
-        _caption(_tile(depth_picture(depth[0, 0])), _told(registrar, result, i))
-        for i, depth in enumerate(depths, start=1)
+        _caption(_tile(depth_picture(_depth(registrar, h)[0, 0])), _told(registrar, result, i))
+        for i, h in enumerate(result.hypotheses, start=1)
     ]
     panel = np.vstack([np.hstack(side[:2]), np.hstack(side[2:])])
     height = panel.shape[0]
@@ -127,6 +123,30 @@ def registration_sheet(
     top, bottom = np.hstack([overlay, panel]), np.hstack(poses)
     width = max(top.shape[1], bottom.shape[1])
     return np.vstack([_widen(top, width), _widen(bottom, width)])
+
+
+@torch.no_grad()
+def side_pictures(
+    registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any
+) -> dict[str, np.ndarray]:
+    """What the two sides compare, (S, S, 3) uint8 RGB each: "photograph", "photograph field", "pose", "view field".
+
+    Arguments as for :func:`contour_overlay`.
+    """
+    item = _item(image, box)
+    query = registrar.matcher.query([item.image], item.box[None])
+    depth = _depth(registrar, result)
+    return {
+        "photograph": to_uint8(query.crops[0]),
+        "photograph field": _field_picture(query.field[0]),
+        "pose": depth_picture(depth[0, 0]),
+        "view field": _field_picture(registrar.bank.settings.depth_filter()(depth)[0]),
+    }
+
+
+def _depth(registrar: Registrar, pose: Registration | Hypothesis) -> Tensor:
+    """(1, 1, S, S) of the view of a pose."""
+    return registrar.describers[pose.model].depth(pose.allocentric_rotation[None], torch.tensor([pose.distance]))[0]
 
 
 def _told(registrar: Registrar, result: Registration, number: int) -> str:

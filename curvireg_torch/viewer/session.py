@@ -1,0 +1,299 @@
+"""What one page holds: a photograph, a box, a mesh, the answer, and the pose shown. Knows nothing of the page."""
+
+import argparse
+import json
+import math
+import shlex
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..commands import _document, chosen_pipeline
+from ..data import read_photo
+from ..data.images import Photo
+from ..errors import BankError, CurviregError, InvalidInputError
+from ..geometry import camera_matrix, load_mesh, rotation_error, rotation_from_axis_angle, whole_image_box
+from ..limits import MAX_VIEWER_SECONDS
+from ..matching import ViewBank, cached_bank
+from ..registration import FailedRegistration, Hypothesis, Registrar, Registration, fit_contours
+from ..visualization import posed_glb
+from .pictures import at
+
+__all__ = ["Answer", "Session", "Shown"]
+
+OPTIONS = ("unit", "up", "pose", "preset", "pipeline", "renderer", "device")
+DEFAULTS = {"unit": "m", "renderer": "auto", "device": "cpu"}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What was found, of what, and by which command line."""
+
+    registrar: Registrar
+    result: Registration
+    image: Tensor
+    box: Tensor
+    inputs: dict[str, Any]
+    command: str
+    times: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The pose on the page: a hypothesis, by its number from 0, and what was done to it by hand, in words."""
+
+    pose: Hypothesis
+    number: int
+    by_hand: tuple[str, ...] = ()
+
+
+@dataclass
+class Session:
+    """Everything that a page knows; computing methods may take long and belong into a thread.
+
+    Attributes:
+        options: of ``curvireg view``; unit, up, pose and preset may be changed.
+        photo, mesh: where they are on disk, or None.
+        names: what the user calls them, for messages and the command line.
+        box, camera: as ``--box`` and ``--camera``, or None.
+        answer, shown: what was found, and the pose on the page; None before. The answer's command line is another than
+            :meth:`command` where the inputs have changed since.
+        limit: seconds that a registration may take.
+    """
+
+    options: argparse.Namespace
+    photo: Path | None = None
+    mesh: Path | None = None
+    names: dict[Path, str] = field(default_factory=dict)
+    picture: Photo | None = None
+    box: tuple[float, float, float, float] | None = None
+    camera: tuple[float, float, float, float] | None = None
+    answer: Answer | None = None
+    shown: Shown | None = None
+    limit: float = MAX_VIEWER_SECONDS
+    progress: tuple[str, int, int] = ("", 0, 1)
+    stopped: bool = False
+    _registrar: tuple[tuple[Any, ...], Registrar] | None = None
+
+    def take_photo(self, path: Path, name: str | None = None) -> Photo:
+        """Read a photograph; box, camera and answer of another are forgotten.
+
+        Raises:
+            MissingFileError, ImageError.
+        """
+        self.names[path] = name or str(path)
+        with self._named():
+            photo = read_photo(path, dtype=torch.uint8)
+        self.photo, self.picture, self.box, self.camera = path, photo, None, None
+        self._forget()
+        return photo
+
+    def take_mesh(self, path: Path, name: str | None = None) -> str:
+        """Read a mesh, or a bank, to see whether it can be used; says what it is.
+
+        Raises:
+            MissingFileError, MeshError, BankError.
+        """
+        self.names[path] = name or str(path)
+        with self._named():
+            if path.suffix == ".safetensors":
+                told = f"bank of {len(ViewBank.load(path))} views"
+            else:
+                mesh = load_mesh(path, unit=self.options.unit, up=self.options.up)
+                size = " x ".join(f"{v:.4g}" for v in mesh.extents)
+                told = f"{len(mesh.faces):,} faces, {size} {self.options.unit}"
+        self.mesh = path
+        self._forget()
+        return told
+
+    def guessed_camera(self) -> tuple[float, float, float, float] | None:
+        """FX FY CX CY by the photograph's EXIF focal length, to 0.01 px; None where it says none."""
+        K = None if self.picture is None else self.picture.guessed_camera_matrix()
+        if K is None:
+            return None
+        fx, fy, cx, cy = (round(float(K[i, j]), 2) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return fx, fy, cx, cy
+
+    def command(self) -> str:
+        """The command line that gives the same answer."""
+        words = ["curvireg", "register"]
+        words += [self._name(self.photo, "PHOTO"), self._name(self.mesh, "MESH")]
+        for option, numbers in (("--box", self.box), ("--camera", self.camera)):
+            words += [] if numbers is None else [option, *(_short(v) for v in numbers)]
+        for option in OPTIONS:
+            value = getattr(self.options, option)
+            if value is not None and value != DEFAULTS.get(option):
+                words += [f"--{option}={value}"] if str(value).startswith("-") else [f"--{option}", str(value)]
+        return shlex.join([*words, "--out", "result"])
+
+    def register(self) -> Registration:
+        """Find the pose, as ``curvireg register`` does.
+
+        Raises:
+            CurviregError: something is missing or cannot be used, it was stopped, or took too long.
+        """
+        if self.picture is None or self.mesh is None:
+            raise InvalidInputError("register: choose a photograph and a mesh first")
+        image, command, start = self.picture.image, self.command(), time.perf_counter()
+        box = whole_image_box(image) if self.box is None else torch.tensor(self.box)
+        K = None if self.camera is None else camera_matrix(*self.camera, dtype=torch.float64)
+        inputs: dict[str, Any] = {"photo": self._name(self.photo, ""), "mesh": self._name(self.mesh, "")}
+        inputs |= {"box": box.tolist(), "picture": self.picture.facts(), "command": command}
+        self.stopped, tell = False, self._teller(start)
+        with self._named():
+            registrar = self._made(self.mesh, tell)
+            registrar.progress = tell
+            middle = time.perf_counter()
+            result = registrar([image], box[None], K)[0]
+        if isinstance(result, FailedRegistration):
+            raise type(result.error)(str(result.error).removeprefix("image 0: "))
+        times = {"start": start, "bank": middle, "register": time.perf_counter()}
+        self.answer = Answer(registrar, result, image, box, inputs, command, times)
+        self.choose(0)
+        return result
+
+    def seen(self) -> tuple[Answer, Shown]:
+        """The answer and the pose on the page.
+
+        Raises:
+            InvalidInputError: there is none yet.
+        """
+        if self.answer is None or self.shown is None:
+            raise InvalidInputError("there is no answer yet; register first")
+        return self.answer, self.shown
+
+    def choose(self, number: int) -> None:
+        """Show one of the hypotheses."""
+        assert self.answer is not None
+        self.shown = Shown(self.answer.result.hypotheses[number], number)
+
+    def nudge(self, *, turn: Sequence[float] = (0, 0, 0), shift: Sequence[float] = (0, 0, 0)) -> None:
+        """Move the pose shown by hand.
+
+        Args:
+            turn: degrees about the camera's x, y and z axes through the object's centre.
+            shift: along them, in units of the object's radius; the object stays before the camera.
+        """
+        answer, shown = self.seen()
+        describe = answer.registrar.describers[shown.pose.model]
+        T = shown.pose.seen_by[0].clone()
+        vector = torch.deg2rad(torch.tensor([float(v) for v in turn], dtype=torch.float64))
+        centre = T[:3, :3] @ describe.centre + T[:3, 3]
+        centre = centre + describe.radius * torch.tensor([float(v) for v in shift], dtype=torch.float64)
+        if float(centre[2]) < 1.2 * describe.radius:
+            raise InvalidInputError("nudge: the object would touch the camera; move it away")
+        T[:3, :3] = rotation_from_axis_angle(vector) @ T[:3, :3]
+        T[:3, 3] = centre - T[:3, :3] @ describe.centre
+        told = [f"turned {v:g} degrees about {axis}" for v, axis in zip(turn, "xyz", strict=True) if v]
+        told += [f"moved {v:g} radii along {axis}" for v, axis in zip(shift, "xyz", strict=True) if v]
+        self.shown = Shown(at(describe.centre, shown.pose, T), shown.number, (*shown.by_hand, *told))
+
+    def pull_in(self) -> str:
+        """Let the mesh's contours pull the pose shown onto the photograph's edges; says how far that went."""
+        answer, shown = self.seen()
+        describe = answer.registrar.describers[shown.pose.model]
+        T, K = shown.pose.seen_by
+        fit = fit_contours(
+            describe.renderer,
+            answer.image,
+            answer.box,
+            K,
+            T[None],
+            centre=describe.centre,
+            radius=describe.radius,
+            margin=answer.registrar.bank.settings.margin,
+        )
+        turned = float(rotation_error(fit.transform[0, :3, :3], T[:3, :3]))
+        support = f"support {float(fit.start_support[0]):.2f} to {float(fit.support[0]):.2f}"
+        told = f"pulled in by contours: {turned:.1f} degrees, {support}"
+        moved = at(describe.centre, shown.pose, fit.transform[0])
+        self.shown = Shown(moved, shown.number, (*shown.by_hand, told))
+        return told
+
+    def document(self) -> dict[str, Any]:
+        """``result.json`` of the command line, and ``shown``: the pose on the page, chosen and moved by hand."""
+        answer, shown = self.seen()
+        pose = shown.pose
+        document = {**_document(answer.result, answer.registrar, answer.times), "inputs": answer.inputs}
+        document["shown"] = {
+            "hypothesis": shown.number,
+            "by_hand": list(shown.by_hand),
+            "rotation": pose.rotation.tolist(),
+            "translation": None if pose.translation is None else pose.translation.tolist(),
+            "viewpoint": dict(zip(("azimuth", "elevation", "theta"), pose.viewpoint, strict=True)),
+        }
+        return document
+
+    def json(self) -> bytes:
+        """:meth:`document` as a file."""
+        return (json.dumps(self.document(), indent=2) + "\n").encode()
+
+    def glb(self) -> bytes:
+        """The pose shown as a GLB file, see :func:`curvireg_torch.visualization.posed_glb`."""
+        answer, shown = self.seen()
+        return posed_glb(answer.registrar.bank.mesh, *shown.pose.seen_by, answer.image)
+
+    def stop(self) -> None:
+        """End a registration at its next step."""
+        self.stopped = True
+
+    def _forget(self) -> None:
+        self.answer, self.shown = None, None
+
+    def _teller(self, start: float) -> Callable[[str, int, int], None]:
+        def tell(stage: str, done: int, of: int) -> None:
+            self.progress = (stage, done, of)
+            if self.stopped:
+                raise CurviregError("stopped")
+            if time.perf_counter() - start > self.limit:
+                raise CurviregError(
+                    f"stopped after {self.limit:g} s in the stage {stage!r}; "
+                    "take a simpler mesh, a pose that stands upright, or the command line, which has no limit"
+                )
+
+        return tell
+
+    def _made(self, path: Path, tell: Callable[[str, int, int], None]) -> Registrar:
+        """For the mesh and the options; the last one where nothing has changed."""
+        options, pipeline = self.options, chosen_pipeline(self.options)
+        key = (path, *(getattr(options, name) for name in OPTIONS))
+        if self._registrar is not None and self._registrar[0] == key:
+            return self._registrar[1]
+        if path.suffix == ".safetensors":
+            bank = ViewBank.load(path)
+            if options.pose not in (None, bank.pipeline.views.pose):
+                raise BankError(f"{path}: made for pose {bank.pipeline.views.pose}, asked for {options.pose}")
+            pipeline = bank.pipeline if options.preset is None and options.pipeline is None else pipeline
+        else:
+            mesh = load_mesh(path, unit=options.unit, up=options.up)
+            bank = cached_bank(mesh, pipeline=pipeline, renderer=options.renderer, progress=tell)
+        registrar = Registrar(bank.to(options.device), pipeline=pipeline, renderer=options.renderer)
+        self._registrar = (key, registrar)
+        return registrar
+
+    def _name(self, path: Path | None, other: str) -> str:
+        return other if path is None else self.names[path]
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """Errors within call files what the user calls them."""
+        try:
+            yield
+        except CurviregError as error:
+            raise type(error)(self.said(str(error))) from error
+
+    def said(self, text: str) -> str:
+        """A message that calls files what the user calls them."""
+        for path, name in self.names.items():
+            text = text.replace(str(path), name)
+        return text
+
+
+def _short(value: float) -> str:
+    return repr(int(value)) if math.isfinite(value) and value == int(value) else repr(float(value))

@@ -1,0 +1,92 @@
+"""Scores of a ranking over the directions from which an object can be seen."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..errors import InvalidInputError
+from ..matching import Ranking, ViewBank
+
+__all__ = ["direction_scores", "sphere_map"]
+
+
+def direction_scores(
+    bank: ViewBank, ranking: Ranking, *, photograph: int = 0, model: int = 0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Of every direction of a bank the best score over turns in the image plane and distances.
+
+    Args:
+        bank: N views.
+        ranking: of them.
+        photograph: which of the ranking's.
+        model: which of the bank's meshes.
+
+    Returns:
+        azimuth and elevation (M,) in degrees, [0, 360) and [-90, 90], and score (M,); all float64.
+
+    Raises:
+        InvalidInputError: a ranking of other views, or a photograph or model that is not there.
+
+    Example:
+        >>> import trimesh
+        >>> from curvireg_torch import ViewMatcher, sample_views
+        >>> views = sample_views(azimuth_step=90, elevations=[0, 30], thetas=[0, 90])
+        >>> bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), views, image_size=64, progress=False)
+        >>> ranking = ViewMatcher(bank)(torch.rand(1, 3, 64, 64), torch.tensor([[8.0, 8, 56, 56]]))
+        >>> len(bank), len(direction_scores(bank, ranking)[0])
+        (16, 8)
+    """
+    if ranking.scores.shape[1] != len(bank) or not 0 <= photograph < len(ranking):
+        raise InvalidInputError(
+            f"ranking: expected {len(bank)} views and photograph {photograph}, got {tuple(ranking.scores.shape)}"
+        )
+    mine = (bank.model == model).nonzero()[:, 0].cpu()
+    if len(mine) == 0:
+        raise InvalidInputError(f"model: the bank has {len(bank.meshes)} meshes, got {model}")
+    azimuth = bank.views.azimuth.cpu().double()[mine] % 360.0
+    elevation = bank.views.elevation.cpu().double()[mine]
+    azimuth = torch.where(elevation.abs() > 89.999, 0.0, azimuth)  # at a pole it is a turn
+    keys = torch.stack([azimuth, elevation], dim=1).mul(1000).round().long()
+    _, group = keys.unique(dim=0, return_inverse=True)
+    count = int(group.max()) + 1
+    score = torch.full((count,), -torch.inf, dtype=torch.float64)
+    score = score.scatter_reduce(0, group, ranking.scores[photograph].cpu().double()[mine], "amax")
+    first = torch.full((count,), len(mine)).scatter_reduce(0, group, torch.arange(len(mine)), "amin")
+    return azimuth[first], elevation[first], score
+
+
+def sphere_map(
+    azimuth: Tensor, elevation: Tensor, score: Tensor, *, size: tuple[int, int] = (90, 180)
+) -> NDArray[np.float64]:
+    """The scores on a map: rows from elevation 90 down to -90, columns from azimuth 0 to 360.
+
+    Args:
+        azimuth, elevation, score: (M,) of directions.
+        size: (rows, columns).
+
+    Returns:
+        The score of the direction nearest to each cell's centre; NaN where none is within twice the usual distance of a
+        direction from its nearest.
+
+    Example:
+        >>> sky = sphere_map(torch.tensor([0.0, 180.0]), torch.zeros(2), torch.tensor([1.0, 2.0]), size=(1, 4))
+        >>> sky.tolist()
+        [[1.0, 2.0, 2.0, 1.0]]
+    """
+    rows, columns = size
+    e = 90.0 - (torch.arange(rows, dtype=torch.float64) + 0.5) * 180.0 / rows
+    a = (torch.arange(columns, dtype=torch.float64) + 0.5) * 360.0 / columns
+    directions = _unit(azimuth.double(), elevation.double())
+    cells = _unit(a[None].expand(rows, columns), e[:, None].expand(rows, columns)).reshape(-1, 3)
+    cosine, nearest = (cells @ directions.T).max(dim=1)
+    own = (directions @ directions.T).fill_diagonal_(-1.0).amax(dim=1).clamp(-1.0, 1.0)
+    reach = 2.0 * torch.acos(own).median() if len(own) > 1 else torch.tensor(torch.pi)
+    near = torch.acos(cosine.clamp(-1.0, 1.0)) <= reach
+    found = torch.where(near, score.double()[nearest], torch.nan)
+    return np.asarray(found.view(rows, columns).numpy())
+
+
+def _unit(azimuth: Tensor, elevation: Tensor) -> Tensor:
+    a, e = torch.deg2rad(azimuth), torch.deg2rad(elevation)
+    return torch.stack([e.cos() * a.cos(), e.cos() * a.sin(), e.sin()], dim=-1)
