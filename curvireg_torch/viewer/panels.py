@@ -1,5 +1,6 @@
 """What was found, in tabs below the photograph; each is drawn when it is looked at."""
 
+import math
 from collections.abc import Callable
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
@@ -91,6 +92,13 @@ class Panels:
     def _overlay(self) -> bytes:
         answer, shown = self.page.session.seen()
         return png(contour_overlay(answer.registrar, shown.pose, answer.image, answer.box))
+
+    def clear(self) -> None:
+        """There is no answer any more."""
+        self.tools.set_visibility(False)
+        self.facts.text = ""
+        for place in self.place.values():
+            place.clear()
 
     async def changed(self, *, answer: bool) -> None:
         """The pose shown, or the whole answer, has changed."""
@@ -211,6 +219,10 @@ class Panels:
         T = shown.pose.seen_by[0]
         unit = UNITS.get(mesh.units or "m", 1.0)
         x, y, z = ((T[:3, :3] @ describe.centre + T[:3, 3]) / describe.radius).tolist()
-        with self.place["3D"], ui.scene(width=760, height=480, grid=False, background_color="#222") as scene:
+        fov = 2 * math.degrees(math.atan(answer.image.shape[-2] / (1.7 * float(shown.pose.seen_by[1][1, 1]))))
+        camera = ui.scene.perspective_camera(fov=min(fov, 120.0), near=0.05, far=1000.0)
+        with self.place["3D"]:
+            scene = ui.scene(width=760, height=480, grid=False, camera=camera, background_color="#222")
+        with scene:
             scene.gltf(url).scale(1.0 / (describe.radius * unit))
         scene.move_camera(0, 0, 0, x, -y, -z, up_x=0, up_y=1, up_z=0, duration=0)

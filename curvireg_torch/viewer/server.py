@@ -45,7 +45,7 @@ def serve(arguments: argparse.Namespace) -> None:
     Raises:
         CurviregError: a photograph, mesh, box or camera was named that cannot be used.
     """
-    Page.started(Session(arguments), arguments)  # says what is wrong before anything opens
+    Page.load(Session(arguments), arguments)  # says what is wrong before anything opens
     token = secrets.token_urlsafe(16)
     pages: dict[str, Page] = {}
 

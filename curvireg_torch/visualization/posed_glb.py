@@ -21,6 +21,7 @@ __all__ = ["posed_glb"]
 
 _PHOTO_SIDE = 1024
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's camera to glTF's: y up, looking along -z
+_MATT = {"name": "matt", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}, "doubleSided": True}
 
 
 def posed_glb(
@@ -77,7 +78,11 @@ def posed_glb(
         tree["cameras"] = [camera]
         tree["nodes"].append({"name": "photograph", "camera": 0, "extras": exact})
         tree["scenes"][0]["nodes"].append(len(tree["nodes"]) - 1)
-        for material in tree.get("materials", []):
+        tree.setdefault("materials", []).append(_MATT)
+        for mesh in tree["meshes"]:
+            for part in mesh["primitives"]:
+                part.setdefault("material", len(tree["materials"]) - 1)
+        for material in tree["materials"]:
             if material.get("name") == "picture":  # no light falls on it
                 material["extensions"] = {"KHR_materials_unlit": {}}
                 tree["extensionsUsed"] = ["KHR_materials_unlit"]

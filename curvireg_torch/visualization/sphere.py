@@ -57,7 +57,7 @@ def direction_scores(
 
 
 def sphere_map(
-    azimuth: Tensor, elevation: Tensor, score: Tensor, *, size: tuple[int, int] = (90, 180)
+    azimuth: Tensor, elevation: Tensor, score: Tensor, *, size: tuple[int, int] = (180, 360)
 ) -> NDArray[np.float64]:
     """The scores on a map: rows from elevation 90 down to -90, columns from azimuth 0 to 360.
 
@@ -66,8 +66,8 @@ def sphere_map(
         size: (rows, columns).
 
     Returns:
-        The score of the direction nearest to each cell's centre; NaN where none is within twice the usual distance of a
-        direction from its nearest.
+        The score of the direction nearest to each cell's centre; NaN where none is as near as directions are to their
+        neighbours.
 
     Example:
         >>> sky = sphere_map(torch.tensor([0.0, 180.0]), torch.zeros(2), torch.tensor([1.0, 2.0]), size=(1, 4))
@@ -79,9 +79,9 @@ def sphere_map(
     a = (torch.arange(columns, dtype=torch.float64) + 0.5) * 360.0 / columns
     directions = _unit(azimuth.double(), elevation.double())
     cells = _unit(a[None].expand(rows, columns), e[:, None].expand(rows, columns)).reshape(-1, 3)
-    cosine, nearest = (cells @ directions.T).max(dim=1)
+    cosine, nearest = (cells @ directions.T).mul(1e9).round().div(1e9).max(dim=1)  # of equals the first
     own = (directions @ directions.T).fill_diagonal_(-1.0).amax(dim=1).clamp(-1.0, 1.0)
-    reach = 2.0 * torch.acos(own).median() if len(own) > 1 else torch.tensor(torch.pi)
+    reach = torch.acos(own).amax() if len(own) > 1 else torch.tensor(torch.pi)
     near = torch.acos(cosine.clamp(-1.0, 1.0)) <= reach
     found = torch.where(near, score.double()[nearest], torch.nan)
     return np.asarray(found.view(rows, columns).numpy())
