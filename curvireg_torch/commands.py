@@ -4,7 +4,7 @@ import argparse
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
@@ -81,10 +81,16 @@ def chosen_pipeline(arguments: argparse.Namespace) -> Pipeline:
     return chosen if arguments.pose is None else chosen.posed(arguments.pose)
 
 
-def open_registrar(arguments: argparse.Namespace, meshes: Sequence[Path], field: nn.Module | None) -> Registrar:
-    """What ``register``'s options ask for, on a mesh or a bank, or on several."""
-    pipeline = chosen_pipeline(arguments)
-    banks = [_open_bank(arguments, mesh, pipeline) for mesh in meshes]
+def open_registrar(
+    arguments: argparse.Namespace,
+    meshes: Sequence[Path],
+    field: nn.Module | None,
+    *,
+    progress: Callable[[str, int, int], object] | None = None,
+) -> Registrar:
+    """What ``register``'s options ask for, on a mesh or a bank, or on several; ``progress`` is told instead of a bar."""
+    pipeline, told = chosen_pipeline(arguments), progress or not arguments.quiet
+    banks = [_open_bank(arguments, mesh, pipeline, told) for mesh in meshes]
     own = all(mesh.suffix == ".safetensors" for mesh in meshes)
     return Registrar(
         ViewBank.join(banks).to(arguments.device),
@@ -96,10 +102,12 @@ def open_registrar(arguments: argparse.Namespace, meshes: Sequence[Path], field:
     )
 
 
-def _open_bank(arguments: argparse.Namespace, mesh: Path, pipeline: Pipeline) -> ViewBank:
+def _open_bank(
+    arguments: argparse.Namespace, mesh: Path, pipeline: Pipeline, progress: bool | Callable[[str, int, int], object]
+) -> ViewBank:
     if mesh.suffix != ".safetensors":
         shape = load_mesh(mesh, unit=arguments.unit, up=arguments.up)
-        return cached_bank(shape, pipeline=pipeline, renderer=arguments.renderer, progress=not arguments.quiet)
+        return cached_bank(shape, pipeline=pipeline, renderer=arguments.renderer, progress=progress)
     bank = ViewBank.load(mesh)
     if arguments.pose not in (None, bank.pipeline.views.pose):
         raise BankError(

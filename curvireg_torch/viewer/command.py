@@ -34,7 +34,7 @@ def add_parser(commands: Any, parents: Sequence[argparse.ArgumentParser]) -> Non
     )
     parser.add_argument("--port", type=int, default=0, help="default: one that is free")
     parser.add_argument("--no-browser", action="store_true", help="print the address and open nothing")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, top=None, no_refine=False)
 
 
 def run(arguments: argparse.Namespace) -> None:

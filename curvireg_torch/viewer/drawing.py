@@ -48,16 +48,9 @@ class BoxDrawing:
         if not (x0 - reach <= x <= x1 + reach and y0 - reach <= y <= y1 + reach):
             return
         self._corners = self.box
-        self._held = (
-            min((i for i in (0, 2) if abs(x - self.box[i]) <= reach), key=lambda i: abs(x - self._at(i)), default=None),
-            min((i for i in (1, 3) if abs(y - self.box[i]) <= reach), key=lambda i: abs(y - self._at(i)), default=None),
-        )
+        self._held = (_seized(x, x0, x1, reach, 0), _seized(y, y0, y1, reach, 1))
         if self._held == (None, None):
             self._from = (x, y)
-
-    def _at(self, i: int) -> float:
-        assert self.box is not None
-        return self.box[i]
 
     def move(self, x: float, y: float) -> None:
         """The mouse moves; without the button nothing happens."""
@@ -87,3 +80,11 @@ class BoxDrawing:
             x0, y0, x1, y1 = (round(v, 1) for v in self.box)
             self.box = (x0, y0, x1, y1)
         self._corners = None
+
+
+def _seized(at: float, low: float, high: float, reach: float, index: int) -> int | None:
+    """Which of two edges the mouse seizes; from within a small box it reaches no farther than a third of it."""
+    inside = min(reach, (high - low) / 3)
+    if at <= low + inside:
+        return index
+    return index + 2 if at >= high - inside else None

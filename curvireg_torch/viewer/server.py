@@ -76,7 +76,7 @@ def serve(arguments: argparse.Namespace) -> None:
     app.add_middleware(_UploadLimit)
     port = arguments.port or _free_port(arguments.host)
     address = f"http://{arguments.host}:{port}/{token}/"
-    print(f"curvireg: {address}   (Ctrl-C ends it)", flush=True)
+    app.on_startup(lambda: print(f"curvireg: {address}   (Ctrl-C ends it)", flush=True))
     if arguments.host not in ("127.0.0.1", "localhost", "::1"):
         print("curvireg: whoever has this address and reaches this machine can use the page", file=sys.stderr)
     with warnings.catch_warnings():

@@ -14,14 +14,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..commands import _document, chosen_pipeline
+from ..batch import Entry, register_entry
+from ..commands import open_registrar
 from ..data import read_photo
 from ..data.images import Photo
-from ..errors import BankError, CurviregError, InvalidInputError
-from ..geometry import camera_matrix, load_mesh, rotation_error, rotation_from_axis_angle, whole_image_box
+from ..errors import CurviregError, InvalidInputError
+from ..geometry import camera_matrix, load_mesh, rotation_error, rotation_from_axis_angle
 from ..limits import MAX_VIEWER_SECONDS
-from ..matching import ViewBank, cached_bank
-from ..registration import FailedRegistration, Hypothesis, Registrar, Registration, fit_contours
+from ..matching import ViewBank
+from ..registration import Hypothesis, Registrar, Registration, fit_contours
 from ..visualization import posed_glb
 from .pictures import at
 
@@ -37,11 +38,10 @@ class Answer:
 
     registrar: Registrar
     result: Registration
+    document: dict[str, Any]
     image: Tensor
     box: Tensor
-    inputs: dict[str, Any]
     command: str
-    times: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -120,12 +120,18 @@ class Session:
         fx, fy, cx, cy = (round(float(K[i, j]), 2) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
         return fx, fy, cx, cy
 
+    @property
+    def guessed(self) -> bool:
+        """Whether the camera is the one that the EXIF block tells, as ``--camera exif`` takes it."""
+        return self.camera is not None and self.camera == self.guessed_camera()
+
     def command(self) -> str:
         """The command line that gives the same answer."""
         words = ["curvireg", "register"]
         words += [self._name(self.photo, "PHOTO"), self._name(self.mesh, "MESH")]
-        for option, numbers in (("--box", self.box), ("--camera", self.camera)):
-            words += [] if numbers is None else [option, *(_short(v) for v in numbers)]
+        words += [] if self.box is None else ["--box", *map(_short, self.box)]
+        words += ["--camera", "exif"] if self.guessed else []
+        words += ["--camera", *map(_short, self.camera)] if self.camera and not self.guessed else []
         for option in OPTIONS:
             value = getattr(self.options, option)
             if value is not None and value != DEFAULTS.get(option):
@@ -140,21 +146,21 @@ class Session:
         """
         if self.picture is None or self.mesh is None:
             raise InvalidInputError("register: choose a photograph and a mesh first")
-        image, command, start = self.picture.image, self.command(), time.perf_counter()
-        box = whole_image_box(image) if self.box is None else torch.tensor(self.box)
-        K = None if self.camera is None else camera_matrix(*self.camera, dtype=torch.float64)
-        inputs: dict[str, Any] = {"photo": self._name(self.photo, ""), "mesh": self._name(self.mesh, "")}
-        inputs |= {"box": box.tolist(), "picture": self.picture.facts(), "command": command}
+        command, start, picture = self.command(), time.perf_counter(), self.picture
+        camera = None if self.guessed else self.camera
+        if camera is not None:
+            camera_matrix(*camera)  # refused before the bank is made
         self.stopped, tell = False, self._teller(start)
         with self._named():
             registrar = self._made(self.mesh, tell)
             registrar.progress = tell
-            middle = time.perf_counter()
-            result = registrar([image], box[None], K)[0]
-        if isinstance(result, FailedRegistration):
-            raise type(result.error)(str(result.error).removeprefix("image 0: "))
-        times = {"start": start, "bank": middle, "register": time.perf_counter()}
-        self.answer = Answer(registrar, result, image, box, inputs, command, times)
+            name, meshes = self._name(self.photo, ""), (Path(self._name(self.mesh, "")),)
+            guess = "exif" if self.guessed else None
+            entry = Entry(name=name, cells=(), meshes=meshes, box=self.box, camera=camera, guess=guess)
+            ready = time.perf_counter() - start
+            result, document = register_entry(entry, picture, registrar, bank_seconds=ready)
+        box = torch.tensor(document["inputs"]["box"])
+        self.answer = Answer(registrar, result, document, picture.image, box, command)
         self.choose(0)
         return result
 
@@ -217,10 +223,10 @@ class Session:
         return told
 
     def document(self) -> dict[str, Any]:
-        """``result.json`` of the command line, and ``shown``: the pose on the page, chosen and moved by hand."""
+        """``result.json`` of the command line, that command, and ``shown``: the pose on the page."""
         answer, shown = self.seen()
         pose = shown.pose
-        document = {**_document(answer.result, answer.registrar, answer.times), "inputs": answer.inputs}
+        document = {**answer.document, "command": answer.command}
         document["shown"] = {
             "hypothesis": shown.number,
             "by_hand": list(shown.by_hand),
@@ -261,21 +267,10 @@ class Session:
 
     def _made(self, path: Path, tell: Callable[[str, int, int], None]) -> Registrar:
         """For the mesh and the options; the last one where nothing has changed."""
-        options, pipeline = self.options, chosen_pipeline(self.options)
-        key = (path, *(getattr(options, name) for name in OPTIONS))
-        if self._registrar is not None and self._registrar[0] == key:
-            return self._registrar[1]
-        if path.suffix == ".safetensors":
-            bank = ViewBank.load(path)
-            if options.pose not in (None, bank.pipeline.views.pose):
-                raise BankError(f"{path}: made for pose {bank.pipeline.views.pose}, asked for {options.pose}")
-            pipeline = bank.pipeline if options.preset is None and options.pipeline is None else pipeline
-        else:
-            mesh = load_mesh(path, unit=options.unit, up=options.up)
-            bank = cached_bank(mesh, pipeline=pipeline, renderer=options.renderer, progress=tell)
-        registrar = Registrar(bank.to(options.device), pipeline=pipeline, renderer=options.renderer)
-        self._registrar = (key, registrar)
-        return registrar
+        key = (path, *(getattr(self.options, name) for name in OPTIONS))
+        if self._registrar is None or self._registrar[0] != key:
+            self._registrar = key, open_registrar(self.options, [path], None, progress=tell)
+        return self._registrar[1]
 
     def _name(self, path: Path | None, other: str) -> str:
         return other if path is None else self.names[path]

@@ -1,0 +1,49 @@
+import pytest
+
+from curvireg_torch.viewer.drawing import BoxDrawing
+
+
+def drag(drawing, start, *way, reach=4.0):
+    drawing.press(*start, reach=reach)
+    for point in way:
+        drawing.move(*point)
+    drawing.release()
+    return drawing.box
+
+
+def test_a_box_is_drawn_whichever_way():
+    assert drag(BoxDrawing(), (60, 50), (10, 20)) == (10, 20, 60, 50)
+    assert drag(BoxDrawing(), (10, 50), (30, 30), (60, 20.26)) == (10, 20.3, 60, 50)
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "box"),
+    [
+        ((11, 35), (5, 99), (5, 20, 60, 50)),
+        ((60, 35), (70, 0), (10, 20, 70, 50)),
+        ((30, 19), (0, 25), (10, 25, 60, 50)),
+        ((30, 52), (0, 45), (10, 20, 60, 45)),
+        ((12, 21), (0, 0), (0, 0, 60, 50)),
+        ((59, 51), (80, 90), (10, 20, 80, 90)),
+        ((30, 35), (35, 25), (15, 10, 65, 40)),
+        ((100, 100), (120, 130), (100, 100, 120, 130)),
+        ((10, 35), (90, 35), (60, 20, 90, 50)),
+    ],
+    ids=["left", "right", "top", "bottom", "corner", "other corner", "inside", "outside", "across"],
+)
+def test_edges_corners_and_the_box_itself_are_dragged(start, end, box):
+    assert drag(BoxDrawing((10, 20, 60, 50)), start, end) == box
+
+
+def test_a_click_leaves_the_box_and_draws_none():
+    assert drag(BoxDrawing((10, 20, 60, 50)), (200, 200), (201, 202)) == (10, 20, 60, 50)
+    assert drag(BoxDrawing(), (5, 5)) is None
+    drawing = BoxDrawing((10, 20, 60, 50))
+    drawing.move(0, 0)  # without the button
+    drawing.release()
+    assert drawing.box == (10, 20, 60, 50)
+
+
+def test_a_small_box_can_be_corrected():
+    """Both edges are within reach: the nearer one moves."""
+    assert drag(BoxDrawing((10, 10, 16, 16)), (15.5, 13), (30, 13), reach=8) == (10, 10, 30, 16)

@@ -1,0 +1,196 @@
+"""What the page computes, without a page: the command line's answer, then moved by hand and pulled in again."""
+
+import json
+import shlex
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from curvireg_torch.cli import _parser, main
+from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, MeshError
+from curvireg_torch.geometry import rotation_error
+from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
+from curvireg_torch.synthetic import example_mesh
+from curvireg_torch.viewer.session import Session
+from tests._support.exif import exif, with_exif
+from tests._support.scenes import scene
+
+VIEWS = ViewPolicy(pose="upright", azimuth_step=30.0, elevations=(10.0, 40.0))
+
+
+def write_scene(folder: Path, seed: int = 0) -> tuple[list[float], torch.Tensor]:
+    """photo.png, truck.ply and small.json; the photograph's box and the truth."""
+    image, box, T = scene(seed)
+    picture = (image.permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
+    cv2.imwrite(str(folder / "photo.png"), picture)
+    example_mesh().export(folder / "truck.ply")
+    small = replace(PRESETS["classical"], views=VIEWS, bank=BankSettings(image_size=96), hypotheses=2)
+    (folder / "small.json").write_text(small.to_json())
+    return [float(v) for v in box], T
+
+
+def options(*words):
+    return _parser().parse_args(["view", *words])
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def answered(tmp_path_factory):
+    """A session with an answer, its folder and the truth."""
+    folder = tmp_path_factory.mktemp("viewer")
+    box, T = write_scene(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CURVIREG_CACHE", str(folder / "cache"))
+        session = Session(options("--pipeline", str(folder / "small.json")))
+        session.take_photo(folder / "photo.png", "my photo.png")
+        session.take_mesh(folder / "truck.ply")
+        session.box, session.camera = tuple(round(v, 1) for v in box), (260.0, 260.0, 119.5, 89.5)
+        session.register()
+        yield session, folder, T
+
+
+def test_the_command_gives_the_same_answer_to_the_digit(answered):
+    session, folder, truth = answered
+    session.choose(0)
+    words = shlex.split(session.command())
+    assert words[:4] == ["curvireg", "register", "my photo.png", str(folder / "truck.ply")]
+    (folder / "my photo.png").write_bytes((folder / "photo.png").read_bytes())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert main([*words[1:], "--quiet"]) == 0
+    written = json.loads((folder / "result" / "result.json").read_text())
+    ours = json.loads(session.json())
+    for key in ("rotation", "translation", "score", "confidence", "covariance", "top", "pipeline"):
+        assert ours[key] == written[key], key
+    assert ours["inputs"]["box"] == written["inputs"]["box"]
+    assert ours["command"] == session.command()
+    assert ours["shown"] == {key: ours["top"][0].get(key, ours["shown"][key]) for key in ours["shown"]}
+    assert float(rotation_error(torch.tensor(ours["rotation"]).double(), truth[:3, :3])) < 10
+
+
+def test_a_nudge_turns_about_the_centre_and_the_contours_bring_it_back(answered):
+    session, _, _ = answered
+    session.choose(0)
+    before = session.shown.pose
+    describe = session.answer.registrar.describers[0]
+    centre = before.rotation @ describe.centre + before.translation
+    session.nudge(turn=(0, 6, 0))
+    turned = session.shown.pose
+    assert float(rotation_error(turned.rotation, before.rotation)) == pytest.approx(6, abs=1e-4)
+    torch.testing.assert_close(turned.rotation @ describe.centre + turned.translation, centre)
+    # Right-handed about the camera's y, which points down: what was before the centre goes to the right.
+    front = before.rotation.T @ torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
+    assert float((turned.rotation @ front)[0]) < 0
+    session.nudge(shift=(0.05, 0, 0))
+    moved = session.shown.pose.rotation @ describe.centre + session.shown.pose.translation - centre
+    torch.testing.assert_close(moved, torch.tensor([0.05 * describe.radius, 0, 0], dtype=torch.float64))
+    assert np.isnan(session.shown.pose.score)
+    told = session.pull_in()
+    assert told.startswith("pulled in by contours: ")
+    assert float(rotation_error(session.shown.pose.rotation, before.rotation)) < 1.5
+    assert float((session.shown.pose.translation - before.translation).norm()) < 0.03 * float(centre.norm())
+    assert [word.split()[0] for word in session.shown.by_hand] == ["turned", "moved", "pulled"]
+    document = session.document()
+    assert document["shown"]["rotation"] == session.shown.pose.rotation.tolist()
+    assert document["rotation"] == before.rotation.tolist()
+    session.choose(1)
+    assert session.document()["shown"]["hypothesis"] == 1
+    assert session.shown.by_hand == ()
+    with pytest.raises(InvalidInputError, match="touch the camera"):
+        session.nudge(shift=(0, 0, -100))
+
+
+def test_without_a_camera_the_rotation_is_that_of_the_view(answered):
+    session, _, _ = answered
+    camera, session.camera = session.camera, None
+    try:
+        session.register()
+        before = session.shown.pose
+        session.nudge(turn=(0, 0, 5))
+        pose = session.shown.pose
+        assert pose.translation is None
+        assert float(rotation_error(pose.rotation, before.rotation)) == pytest.approx(5, abs=1e-3)
+        # A shift moves the object in the picture, not its rotation as a camera sees it that looks straight at it.
+        T = pose.seen_by[0]
+        session.nudge(shift=(0.1, 0, 0))
+        assert torch.equal(session.shown.pose.seen_by[0][:3, :3], T[:3, :3])
+        assert 0.1 < float(rotation_error(session.shown.pose.rotation, pose.rotation)) < 5
+        assert session.document()["shown"]["translation"] is None
+    finally:
+        session.camera = camera
+
+
+def test_files_are_called_what_the_user_calls_them(folder):
+    session = Session(options())
+    (folder / "upload-1").write_text("not a picture")
+    with pytest.raises(ImageError, match=r"^cat\.jpg: "):
+        session.take_photo(folder / "upload-1", "cat.jpg")
+    (folder / "upload-2.obj").write_text("")
+    with pytest.raises(MeshError, match=r"^cat\.obj: ") as found:
+        session.take_mesh(folder / "upload-2.obj", "cat.obj")
+    assert str(folder) not in str(found.value)
+    assert session.photo is None
+    assert session.mesh is None
+    with pytest.raises(InvalidInputError, match="choose a photograph and a mesh"):
+        session.register()
+    with pytest.raises(InvalidInputError, match="register first"):
+        session.nudge(turn=(1, 0, 0))
+
+
+def test_a_broken_file_leaves_the_photograph_that_was_there(folder):
+    write_scene(folder)
+    session = Session(options())
+    session.take_photo(folder / "photo.png")
+    (folder / "broken.png").write_bytes((folder / "photo.png").read_bytes()[:200])
+    with pytest.raises(ImageError):
+        session.take_photo(folder / "broken.png")
+    assert session.photo == folder / "photo.png"
+
+
+def test_the_exif_guess_and_the_command(folder):
+    write_scene(folder)
+    session = Session(options("--unit", "mm", "--up=-y", "--pose", "any", "--preset", "fast"))
+    session.take_photo(folder / "photo.png", "photo.png")
+    assert session.guessed_camera() is None
+    with_exif(folder / "photo.png", exif(1, 50))
+    session.take_photo(folder / "photo.png", "photo.png")
+    focal = 50 * np.hypot(180, 240) / np.hypot(36, 24)
+    assert session.guessed_camera() == pytest.approx((focal, focal, 119.5, 89.5), abs=0.005)
+    session.camera, session.box = session.guessed_camera(), (10.0, 20.5, 90.0, 80.0)
+    assert session.command() == (
+        "curvireg register photo.png MESH --box 10 20.5 90 80 --camera 346.69 346.69 119.5 89.5 "
+        "--unit mm --up=-y --pose any --preset fast --out result"
+    )
+
+
+def test_it_is_stopped_and_has_a_limit(folder):
+    box, _ = write_scene(folder)
+    session = Session(options("--pipeline", "small.json"))
+    session.take_photo(folder / "photo.png")
+    session.take_mesh(folder / "truck.ply")
+    session.box, session.limit = tuple(box), 0.0
+    with pytest.raises(CurviregError, match=r"stopped after 0 s in the stage .bank."):
+        session.register()
+    assert session.answer is None
+    session.limit, told = 600.0, session._teller
+
+    def stopping(start):
+        def tell(*told_of):
+            session.stop()
+            told(start)(*told_of)
+
+        return tell
+
+    session._teller = stopping
+    with pytest.raises(CurviregError, match=r"^stopped$"):
+        session.register()

@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+import torch
+
+from curvireg_torch import Ranking, Registrar, ViewBank, sample_views, uniform_views
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.synthetic import example_mesh
+from curvireg_torch.visualization.plots import view_sphere
+from curvireg_torch.visualization.sphere import direction_scores, sphere_map
+from tests._support.scenes import CAMERA, scene
+
+
+@pytest.fixture(scope="module")
+def bank():
+    views = sample_views(azimuth_step=90, elevations=[0, 30], thetas=[0, 90], distances=[4, 5])
+    return ViewBank.build(example_mesh(), views, image_size=64, progress=False)
+
+
+def ranked(scores):
+    return Ranking(scores, scores.argsort(dim=1, descending=True), {"hog": scores})
+
+
+def test_each_direction_has_its_best_turn_and_distance(bank):
+    scores = torch.rand(2, len(bank), generator=torch.Generator().manual_seed(0))
+    azimuth, elevation, best = direction_scores(bank, ranked(scores), photograph=1)
+    assert len(best) == 8
+    for a, e, s in zip(azimuth.tolist(), elevation.tolist(), best.tolist(), strict=True):
+        mine = (bank.views.azimuth == a) & (bank.views.elevation == e)
+        assert int(mine.sum()) == 4
+        assert s == float(scores[1][mine].max())
+    with pytest.raises(InvalidInputError, match="photograph 2"):
+        direction_scores(bank, ranked(scores), photograph=2)
+    with pytest.raises(InvalidInputError, match="1 meshes"):
+        direction_scores(bank, ranked(scores), model=1)
+
+
+def test_the_map_shows_the_nearest_direction():
+    views = uniform_views(200)
+    score = torch.arange(200.0)
+    sky = sphere_map(views.azimuth, views.elevation, score, size=(18, 36))
+    assert sky.shape == (18, 36)
+    assert not np.isnan(sky).any()
+    for row, column in ((0, 3), (9, 30), (17, 17)):
+        e, a = np.radians(90 - (row + 0.5) * 10), np.radians((column + 0.5) * 10)
+        cell = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        az, el = np.radians(views.azimuth.numpy()), np.radians(views.elevation.numpy())
+        all_of = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=1)
+        assert sky[row, column] == float((all_of @ cell).argmax())
+    # Where nothing was looked at, nothing is shown.
+    upright = sample_views(azimuth_step=10, elevations=[0, 10, 20])
+    sky = sphere_map(upright.azimuth, upright.elevation, torch.ones(len(upright)), size=(18, 36))
+    assert np.isnan(sky[:5]).all()
+    assert np.isnan(sky[11:]).all()
+    assert not np.isnan(sky[7:9]).any()
+
+
+def test_the_picture_holds_the_map_and_the_hypotheses(bank):
+    image, box, _ = scene(0)
+    registrar = Registrar(bank, refine=False, hypotheses=3)
+    result = registrar([image], box[None], CAMERA)[0]
+    figure = view_sphere(bank, result)
+    axes = figure.axes[0]
+    expected = sphere_map(*direction_scores(bank, result.ranking))
+    np.testing.assert_array_equal(np.asarray(axes.images[0].get_array().filled(np.nan)), expected)
+    assert axes.images[0].get_extent() == [0, 360, -90, 90]
+    drawn = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines]
+    assert drawn == [(h.viewpoint[0] % 360, h.viewpoint[1]) for h in result.hypotheses]
+    assert [text.get_text() for text in axes.texts] == ["1", "2", "3"]
+    assert not view_sphere(bank, result.ranking).axes[0].lines
