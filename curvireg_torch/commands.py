@@ -88,7 +88,7 @@ def open_registrar(
     *,
     progress: Callable[[str, int, int], object] | None = None,
 ) -> Registrar:
-    """What ``register``'s options ask for, on a mesh or a bank, or on several; ``progress`` is told instead of a bar."""
+    """What ``register``'s options ask for, on a mesh or bank, or on several; ``progress`` is told instead of a bar."""
     pipeline, told = chosen_pipeline(arguments), progress or not arguments.quiet
     banks = [_open_bank(arguments, mesh, pipeline, told) for mesh in meshes]
     own = all(mesh.suffix == ".safetensors" for mesh in meshes)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from .._examples import examples
 from ..errors import MissingDependencyError
 
 __all__ = ["add_parser", "run"]
@@ -24,6 +25,7 @@ def add_parser(commands: Any, parents: Sequence[argparse.ArgumentParser]) -> Non
         parents=parents,
         help="register in the browser: draw the box, look at the answer, correct it",
         description="Opens a page on this machine; needs pip install 'curvireg_torch[viewer]'.",
+        **examples("curvireg view", "curvireg view photo.jpg part.stl --unit mm"),
     )
     parser.add_argument("photo", type=Path, nargs="?", metavar="PHOTO")
     parser.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help="a mesh or a bank; both can come later")

@@ -46,6 +46,8 @@ class Inputs:
         with ui.row().classes("gap-2"):
             ui.button("whole picture", on_click=lambda: self.set_box(None)).props("flat dense no-caps")
             ui.button("no camera", on_click=lambda: self.set_camera(None)).props("flat dense no-caps")
+            self.exif = ui.button("guess by EXIF", on_click=lambda: self.set_camera(self.session.guessed_camera()))
+            self.exif.props("flat dense no-caps data-testid=exif").set_visibility(False)
 
     def _told(self, test: str = "") -> Any:
         return ui.label().classes("text-caption leading-tight").props(f"data-testid={test}" if test else "")
@@ -74,7 +76,6 @@ class Inputs:
     async def _photo_came(self, event: Any) -> None:
         path = await self._saved(event.file, "photo", "")
         if await self.page.do(lambda: self.session.take_photo(path, event.file.name)):
-            self.session.camera = self.session.guessed_camera()
             await self.page.show_photograph()
 
     async def _mesh_came(self, event: Any) -> None:
@@ -145,10 +146,11 @@ class Inputs:
     def _camera_typed(self) -> None:
         fx, fy, cx, cy = (number.value for number in self.camera)
         self.session.camera = None if None in (fx, fy, cx, cy) else (float(fx), float(fy), float(cx), float(cy))
-        guess, focal = self.session.guessed_camera(), self.session.picture and self.session.picture.focal_35mm
-        if self.session.camera is None:
-            self.camera_facts.text = "unknown: the answer is a rotation, without translation"
-        elif self.session.camera == guess:
-            self.camera_facts.text = f"a guess by the photograph's EXIF: {focal:g} mm of a 35 mm camera"
+        guess = self.session.guessed_camera()
+        self.exif.set_visibility(guess is not None)
+        if self.session.guessed and self.session.picture is not None:
+            focal = self.session.picture.focal_35mm
+            self.camera_facts.text = f"a guess by the photograph's EXIF, {focal:g} mm of a 35 mm camera: no covariance"
         else:
-            self.camera_facts.text = ""
+            unknown = "unknown: the answer is a rotation without translation"
+            self.camera_facts.text = "" if self.session.camera is not None else unknown

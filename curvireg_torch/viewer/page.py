@@ -49,7 +49,7 @@ class Page:
             session.take_photo(arguments.photo)
         told = "" if arguments.mesh is None else session.take_mesh(arguments.mesh)
         session.box = arguments.box and tuple(arguments.box)
-        session.camera = tuple(arguments.camera) if arguments.camera else session.guessed_camera()
+        session.camera = arguments.camera and tuple(arguments.camera)
         return told
 
     @staticmethod

@@ -223,18 +223,18 @@ class Session:
         return told
 
     def document(self) -> dict[str, Any]:
-        """``result.json`` of the command line, that command, and ``shown``: the pose on the page."""
+        """``result.json`` of the command line, and in ``viewer`` that command and the pose on the page."""
         answer, shown = self.seen()
         pose = shown.pose
-        document = {**answer.document, "command": answer.command}
-        document["shown"] = {
+        on_page = {
+            "command": answer.command,
             "hypothesis": shown.number,
             "by_hand": list(shown.by_hand),
             "rotation": pose.rotation.tolist(),
             "translation": None if pose.translation is None else pose.translation.tolist(),
             "viewpoint": dict(zip(("azimuth", "elevation", "theta"), pose.viewpoint, strict=True)),
         }
-        return document
+        return {**answer.document, "viewer": on_page}
 
     def json(self) -> bytes:
         """:meth:`document` as a file."""

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+import curvireg_torch
 from curvireg_torch.cli import _parser, main
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, MeshError
 from curvireg_torch.geometry import rotation_error
@@ -73,9 +74,17 @@ def test_the_command_gives_the_same_answer_to_the_digit(answered):
     for key in ("rotation", "translation", "score", "confidence", "covariance", "top", "pipeline"):
         assert ours[key] == written[key], key
     assert ours["inputs"]["box"] == written["inputs"]["box"]
-    assert ours["command"] == session.command()
-    assert ours["shown"] == {key: ours["top"][0].get(key, ours["shown"][key]) for key in ours["shown"]}
+    assert ours["viewer"]["command"] == session.command()
+    assert {key: ours["viewer"][key] for key in ("rotation", "translation", "viewpoint")} == {
+        key: written[key] for key in ("rotation", "translation", "viewpoint")
+    }
     assert float(rotation_error(torch.tensor(ours["rotation"]).double(), truth[:3, :3])) < 10
+
+
+def test_the_document_is_of_the_schema(answered):
+    jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
+    schema = json.loads((Path(curvireg_torch.__file__).parent / "result.schema.json").read_text())
+    jsonschema.validate(json.loads(answered[0].json()), schema)
 
 
 def test_a_nudge_turns_about_the_centre_and_the_contours_bring_it_back(answered):
@@ -101,10 +110,10 @@ def test_a_nudge_turns_about_the_centre_and_the_contours_bring_it_back(answered)
     assert float((session.shown.pose.translation - before.translation).norm()) < 0.03 * float(centre.norm())
     assert [word.split()[0] for word in session.shown.by_hand] == ["turned", "moved", "pulled"]
     document = session.document()
-    assert document["shown"]["rotation"] == session.shown.pose.rotation.tolist()
+    assert document["viewer"]["rotation"] == session.shown.pose.rotation.tolist()
     assert document["rotation"] == before.rotation.tolist()
     session.choose(1)
-    assert session.document()["shown"]["hypothesis"] == 1
+    assert session.document()["viewer"]["hypothesis"] == 1
     assert session.shown.by_hand == ()
     with pytest.raises(InvalidInputError, match="touch the camera"):
         session.nudge(shift=(0, 0, -100))
@@ -125,7 +134,7 @@ def test_without_a_camera_the_rotation_is_that_of_the_view(answered):
         session.nudge(shift=(0.1, 0, 0))
         assert torch.equal(session.shown.pose.seen_by[0][:3, :3], T[:3, :3])
         assert 0.1 < float(rotation_error(session.shown.pose.rotation, pose.rotation)) < 5
-        assert session.document()["shown"]["translation"] is None
+        assert session.document()["viewer"]["translation"] is None
     finally:
         session.camera = camera
 
@@ -168,9 +177,11 @@ def test_the_exif_guess_and_the_command(folder):
     assert session.guessed_camera() == pytest.approx((focal, focal, 119.5, 89.5), abs=0.005)
     session.camera, session.box = session.guessed_camera(), (10.0, 20.5, 90.0, 80.0)
     assert session.command() == (
-        "curvireg register photo.png MESH --box 10 20.5 90 80 --camera 346.69 346.69 119.5 89.5 "
+        "curvireg register photo.png MESH --box 10 20.5 90 80 --camera exif "
         "--unit mm --up=-y --pose any --preset fast --out result"
     )
+    session.camera = (300.0, 300.5, 119.5, 89.5)
+    assert "--camera 300 300.5 119.5 89.5" in session.command()
 
 
 def test_it_is_stopped_and_has_a_limit(folder):
