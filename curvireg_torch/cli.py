@@ -59,6 +59,9 @@ def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
         arguments.paths += [Path(word) for word in rest]  # those behind an option
     elif rest:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if getattr(arguments, "unit", "m") is None:
+        of_bop = getattr(arguments, "list", None) is not None and arguments.list.is_dir()
+        arguments.unit = "mm" if of_bop else "m"
     if hasattr(arguments, "paths"):
         photos = [] if arguments.list else arguments.paths if arguments.mesh else arguments.paths[:-1]
         arguments.photos, arguments.meshes = photos, [*arguments.paths[len(photos) :], *arguments.mesh]
@@ -99,7 +102,9 @@ def _parser() -> argparse.ArgumentParser:
     preset.add_argument("--device", default="cpu", help="where modules, bank and search live (default: cpu)")
 
     mesh_options = argparse.ArgumentParser(add_help=False)
-    mesh_options.add_argument("--unit", choices=sorted(UNITS), default="m", help="the mesh file's unit (default: m)")
+    mesh_options.add_argument(
+        "--unit", choices=sorted(UNITS), help="the mesh file's unit (default: m; of a BOP scene mm)"
+    )
     mesh_options.add_argument(
         "--pose",
         choices=("any", "upright"),
@@ -123,8 +128,8 @@ def _parser() -> argparse.ArgumentParser:
             "curvireg register shots/ turn.mp4 part.stl --every 10 --out out/shots",
             "curvireg register photo.jpg --mesh mug.obj --mesh bowl.obj --out out/which",
         ),
-        description="One photograph: writes DIR/result.json and DIR/overlay.png. Several, or a list: DIR/results.csv "
-        "and DIR/results.jsonl; killed and run again, it goes on where it was.",
+        description="One photograph: writes DIR/result.json, DIR/overlay.png and DIR/pose.glb. Several, or a list: "
+        "DIR/results.csv, DIR/results.jsonl and DIR/index.html; killed and run again, it goes on where it was.",
     )  # fmt: skip
     register.add_argument(
         "paths",

@@ -40,6 +40,10 @@ from .registration import Registrar, Registration
 __all__ = ["bank", "cache", "chosen_pipeline", "demo", "open_registrar", "register"]
 
 
+MAX_GLB_FACES = 300_000
+"""Of a mesh that is written to ``pose.glb``; a larger file than 30 MB is more than viewers open with ease."""
+
+
 def bank(arguments: argparse.Namespace) -> None:
     """``curvireg bank``."""
     probe_folder(arguments.out.parent, "--out")
@@ -245,11 +249,15 @@ def demo(arguments: argparse.Namespace) -> None:
 
 
 def _write(out: Path, document: dict[str, Any], registrar: Registrar, result: Registration, *scene: Any) -> None:
-    from .visualization import registration_sheet
+    from .visualization import posed_glb, registration_sheet
 
     sheet = registration_sheet(registrar, result, *scene)
-    (out / "result.json").unlink(missing_ok=True)  # an older one never stands beside this picture
+    mesh = registrar.bank.meshes[result.model]
+    for older in ("result.json", "pose.glb"):
+        (out / older).unlink(missing_ok=True)  # never stands beside this picture
     _write_picture(out / "overlay.png", sheet)
+    if len(mesh.faces) <= MAX_GLB_FACES:
+        write_file(out / "pose.glb", posed_glb(mesh, *result.seen_by, scene[0]))
     write_file(out / "result.json", to_json(document).encode())
 
 

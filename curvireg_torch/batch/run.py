@@ -3,7 +3,7 @@
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,15 +11,17 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from .._files import file_digest
+from .._files import file_digest, write_file
 from ..data import Photo, read_photo
 from ..document import SCHEMA, result_document
 from ..errors import BankError, CurviregError, ImageError, InvalidInputError, MeshError
 from ..geometry import camera_matrix, whole_image_box
 from ..geometry.cameras import camera_of_view
 from ..registration import FailedRegistration, Registrar, Registration
+from .bop import write_bop_results
 from .listing import Entry, Listing
 from .records import Record, Records
+from .sheet import Shown, thumbnail, write_sheet
 
 __all__ = ["Counts", "register_entry", "register_list"]
 
@@ -47,7 +49,7 @@ def register_list(
     settings: Mapping[str, Any],
     progress: bool = True,
 ) -> Counts:
-    """Register the photographs of a list; ``out`` gets ``results.jsonl`` and ``results.csv``.
+    """Register the photographs of a list; ``out`` gets ``results.jsonl``, ``results.csv`` and ``index.html``.
 
     Photographs of one mesh follow each other, so that only its bank is in memory, and one photograph at a time: in a
     batch their numbers would be rounded otherwise, and a pose hang on its neighbours. What ``results.jsonl`` holds of
@@ -132,7 +134,8 @@ class _Run:
     mesh_digests: dict[Path, str] = field(default_factory=dict)
 
     def __call__(self, listing: Listing) -> Counts:
-        self.records.table.unlink(missing_ok=True)  # an older one never stands beside these lines
+        for older in ("results.csv", "index.html", "bop.csv"):  # never stand beside newer lines
+            (self.records.table.parent / older).unlink(missing_ok=True)
         usable = [entry for entry in listing.entries if not entry.trouble]
         requests = {self._request(entry): entry for entry in usable}
         todo = [(request, entry) for request, entry in requests.items() if not self._is_done(request, entry)]
@@ -177,10 +180,15 @@ class _Run:
         if not isinstance(registrar, Registrar):
             return _failed(str(registrar), digests)
         try:
-            _, document = register_entry(entry, photo, registrar, bank_seconds=time.perf_counter() - start)
+            result, document = register_entry(entry, photo, registrar, bank_seconds=time.perf_counter() - start)
         except (ImageError, InvalidInputError) as error:
             return _failed(str(error), digests)
+        picture = thumbnail(registrar, result, photo.image, document["inputs"]["box"])
+        write_file(self._picture(request), picture)  # before the line that says that all is done
         return {"status": "ok", "message": "", **document, "digests": digests}
+
+    def _picture(self, request: str) -> Path:
+        return self.records.table.parent / "thumbnails" / f"{request}.jpg"
 
     def _opened(self, meshes: tuple[Path, ...]) -> Registrar | Exception:
         """Of these meshes, or why there is none."""
@@ -193,18 +201,32 @@ class _Run:
         return self.registrar
 
     def _finish(self, listing: Listing) -> Counts:
-        statuses: list[tuple[bool, bool]] = []
-
-        def rows() -> Iterator[tuple[tuple[str, ...], Record]]:
-            for entry in listing.entries:
-                record = _failed(entry.trouble, NONE) if entry.trouble else self.records.read(self._request(entry))
-                statuses.append((record["status"] == "ok", bool(record.get("reliable"))))
-                yield entry.cells, record
-
+        shown = [
+            Shown(
+                row=number,
+                name=entry.name,
+                message=record["message"],
+                confidence=record.get("confidence", 0.0),
+                reliable=record.get("reliable", False),
+                picture=self._picture(record["digests"]["request"]),
+            )
+            for number, (entry, record) in enumerate(self._answers(listing), start=1)
+        ]
+        ok = sum(not one.message for one in shown)
+        counts = Counts(ok, len(shown) - ok, sum(one.reliable for one in shown))
+        folder = self.records.table.parent
+        write_bop_results(folder / "bop.csv", listing.columns, self._rows(listing))
+        write_sheet(folder / "index.html", str(counts), shown)
         which = any(len(entry.meshes) > 1 for entry in listing.entries)
-        self.records.finish(listing.columns, rows(), which=which)
-        ok = sum(good for good, _ in statuses)
-        return Counts(ok, len(statuses) - ok, sum(reliable for _, reliable in statuses))
+        self.records.finish(listing.columns, self._rows(listing), which=which)  # last: it moves the lines
+        return counts
+
+    def _answers(self, listing: Listing) -> Iterator[tuple[Entry, Record]]:
+        for entry in listing.entries:
+            yield entry, _failed(entry.trouble, NONE) if entry.trouble else self.records.read(self._request(entry))
+
+    def _rows(self, listing: Listing) -> Iterator[tuple[Sequence[str], Record]]:
+        return ((entry.cells, record) for entry, record in self._answers(listing))
 
 
 def _failed(trouble: str, digests: Mapping[str, str]) -> Record:
