@@ -1,7 +1,9 @@
 """Times the path from mesh to pose: build a bank, open it from disk, register one photograph.
 
 Prints a table and writes scripts/results/bench_pipeline.json. The mesh is a sphere with dents, made in code, so that
-the number of faces can be chosen.
+the number of faces can be chosen. --peers compares with OpenCV's LINEMOD and other people's HOG instead, on
+photographs of scripts/make_benchmark.py, and writes scripts/results/bench_peers.json and the table of
+docs/performance.md.
 """
 
 import argparse
@@ -13,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
-from _record import timed, write_json
+from _record import REPOSITORY, between, commit, timed, today, write_json
 
 from curvireg_torch import BankSettings, Registrar, ViewBank, ViewMatcher, camera_matrix, uniform_views
 from curvireg_torch.synthetic import random_pose, synthesize_photograph
@@ -54,12 +56,31 @@ def ranking_times(bank: ViewBank, image: torch.Tensor, box: torch.Tensor, photog
     return times
 
 
+def compare_peers(folder: Path, photographs: int) -> None:
+    from _peers import compare, table
+
+    rows = compare(folder, photographs)
+    record = {"date": today(), "commit": commit(REPOSITORY), "threads": torch.get_num_threads(), "rows": rows}
+    write_json(REPOSITORY / "scripts" / "results" / "bench_peers.json", record)
+    page = REPOSITORY / "docs" / "performance.md"
+    text = between(page.read_text(encoding="utf-8"), "<!-- peers:begin -->", "<!-- peers:end -->", table(rows))
+    page.write_text(text, encoding="utf-8")
+    print(table(rows))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, default=700)
     parser.add_argument("--faces", type=int, default=20_000)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "bench_pipeline.json")
+    parser.add_argument(
+        "--peers", type=Path, metavar="BENCH", help="compare with others on the benchmark's photographs"
+    )
+    parser.add_argument("--photographs", type=int, default=100, help="of --peers (default: 100)")
     arguments = parser.parse_args()
+    if arguments.peers is not None:
+        compare_peers(arguments.peers, arguments.photographs)
+        return
 
     mesh, K, size = dented_sphere(arguments.faces), camera_matrix(900.0, 900.0, 319.5, 239.5), (480, 640)
     generator = torch.Generator().manual_seed(0)
