@@ -6,17 +6,20 @@ import subprocess
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from curvireg_torch.evaluation import KINDS, Benchmark, Protocol
+if TYPE_CHECKING:  # versions.py runs where nothing is installed yet
+    from curvireg_torch.evaluation import Benchmark
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SETS = {"pascal3d_mini": "upright", "hope": "any", "lm": "any", "dino": "any"}
 """The real sets, and the protocol's pose."""
 
 
-def benchmark(data: Path, name: str) -> Benchmark:
+def benchmark(data: Path, name: str) -> "Benchmark":
     """One of the real sets: pascal3d_* in ``data``, pixels counted from 0; others in its folder bop."""
+    from curvireg_torch.evaluation import KINDS, Protocol
+
     mini = name.startswith("pascal")
     kind = KINDS["pascal3d" if mini else "bop"]
     dataset = kind.open(data / name, pixel_origin=0) if mini else kind.open(data / "bop" / name)

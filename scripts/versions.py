@@ -28,6 +28,7 @@ RESULTS = REPOSITORY / "scripts" / "results" / "versions.json"
 DOCUMENT = REPOSITORY / "docs" / "versions.md"
 MARKERS = "<!-- versions:begin -->", "<!-- versions:end -->"
 CELLS = ["3.11-newest", "3.11-lowest", "3.12-newest", "3.13-newest", "3.14-newest"]
+PARALLEL = ["--numprocesses", "auto", "--maxprocesses", "4"]
 SHOWN = ["torch", "kornia", "numpy", "scipy", "opencv-python-headless", "trimesh", "scikit-learn", "safetensors"]
 
 
@@ -68,7 +69,7 @@ def test(cell: str, select: str, *, keep: bool) -> dict[str, Any]:
         for command in (
             [found, "-m", "venv", folder],
             [python, "-m", "pip", "install", "--quiet", "-e", f"{REPOSITORY}[dev,faiss]", "-c", constraints],
-            [python, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", select, f"--junitxml={report}"],
+            [python, "-m", "pytest", "-q", *PARALLEL, "-p", "no:cacheprovider", "-m", select, f"--junitxml={report}"],
         ):
             print(f"{cell}: {shlex.join(map(str, command))}", flush=True)
             code = subprocess.run(command, stdout=output, stderr=subprocess.STDOUT, cwd=REPOSITORY).returncode
