@@ -6,8 +6,8 @@
 
 One mutant (``mutants.py``) at a time, in a temporary copy; the first failing test kills it. Tests of a module: those of
 the folder of its package (where there is none, files that import it by name), and its doctests; not those marked slow
-or data. They run once as they are, under coverage; a mutant then meets those that run its line, the quickest first. The
-sample is drawn by a hash of the mutant and the seed, so it stays where the code does.
+or data. They run once as they are, under coverage; a mutant then meets those that run its line, the quickest first,
+half a minute of them at most. The sample is drawn by a hash of the mutant and the seed, so it stays where the code does.
 
 ``scripts/results/mutation.json``: score per package (killed / sampled) and every survivor. A ``reason`` written there
 beside a survivor is kept: why no test can or need tell it from the original.
@@ -29,6 +29,7 @@ import traceback
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ PRELOADED = ("torch", "numpy", "scipy.spatial", "kornia", "cv2", "trimesh", "skl
 PRELOADED += ("pytest",)
 TOGETHER = {"terms": "matching", "matching": "terms"}  # packages that are tested with another
 WALL_LIMIT_S = 400.0
+ENOUGH_S = 30.0  # of tests for one mutant
 LOG, SEEN, TIMES = "log.txt", "seen.db", "times.json"
 
 
@@ -87,13 +89,16 @@ def tests_of(copy: Path, path: str) -> list[str]:
 
 
 class Times:
-    """A plugin of pytest: seconds of each test function, all its cases and their fixtures together."""
+    """A plugin of pytest: seconds of CPU of each test function, all its cases and their fixtures together."""
 
     def __init__(self) -> None:
         self.seconds = defaultdict[str, float](float)
 
-    def pytest_runtest_logreport(self, report: Any) -> None:
-        self.seconds[report.nodeid.split("[")[0]] += report.duration
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        self.seconds[nodeid.split("[")[0]] -= time.process_time()
+
+    def pytest_runtest_logfinish(self, nodeid: str) -> None:
+        self.seconds[nodeid.split("[")[0]] += time.process_time()
 
 
 @dataclass
@@ -109,7 +114,9 @@ class Course:
         at = max((line for line in lines if line <= mutant.line), default=0)
         names = {name for name in lines.get(at, []) if name} or {n for some in lines.values() for n in some if n}
         ids = {"{}.py::{}".format(*name.replace(".", "/").rsplit("/", 1)) for name in names}
-        return sorted(ids & self.seconds.keys(), key=lambda name: self.seconds[name])
+        chosen = sorted(ids & self.seconds.keys(), key=lambda name: self.seconds[name])
+        total = accumulate(self.seconds[name] for name in chosen)
+        return [name for name, so_far in zip(chosen, total, strict=True) if so_far < ENOUGH_S]
 
 
 def watched(copy: Path, tests: list[str]) -> Course:
