@@ -7,7 +7,7 @@
 One mutant (``mutants.py``) at a time, in a temporary copy; the first failing test kills it. Tests of a module: those of
 the folder of its package (where there is none, files that import it by name), and its doctests; not those marked slow
 or data. They run once as they are, under coverage; a mutant then meets those that run its line, the quickest first,
-half a minute of them at most. The sample is drawn by a hash of the mutant and the seed, so it stays where the code does.
+half a minute of them at most. The sample is drawn by a hash of the mutant and the seed, it stays where the code does.
 
 ``scripts/results/mutation.json``: score per package (killed / sampled) and every survivor. A ``reason`` written there
 beside a survivor is kept: why no test can or need tell it from the original.
