@@ -139,9 +139,9 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
     if isinstance(source, trimesh.Scene):
         try:
             parts = _placed(source)
-        except Exception as error:  # transforms that are none, parts that hang on nothing
-            raise MeshError(f"{name}: its parts cannot be placed ({error}); re-export the file") from error
-        source = _joined(parts) if parts else None
+            source = _joined(parts) if parts else None
+        except Exception as error:  # transforms that are none, parts that hang on nothing, vertices of one number
+            raise MeshError(f"{name}: its parts cannot be put together ({error}); re-export the file") from error
     if not isinstance(source, trimesh.Trimesh) or len(source.faces) == 0:
         raise MeshError(f"{name}: expected a mesh with faces, got none; point clouds and curves cannot be rendered")
     if len(source.faces) > MAX_MESH_FACES:

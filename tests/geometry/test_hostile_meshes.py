@@ -216,3 +216,9 @@ def test_polygons_are_counted_before_they_are_divided(tmp_path: Path, monkeypatc
     monkeypatch.undo()
     monkeypatch.setattr(polygon_files, "MAX_POLYGON_WORK", 160)
     assert len(cr.load_mesh(tmp_path / "a.off").faces) == 20
+
+
+def test_a_part_whose_vertices_are_no_points_is_named():
+    odd = trimesh.Trimesh(np.zeros((3, 1)), [[0, 1, 2]], process=False)
+    with pytest.raises(MeshError, match="put together"):
+        mesh_module.as_mesh(trimesh.Scene([trimesh.creation.box(), odd]))
