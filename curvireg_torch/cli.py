@@ -15,6 +15,7 @@ from ._examples import examples
 from ._files import terminable
 from .errors import CurviregError
 from .evaluation import add_parser as add_evaluate
+from .plotting import add_parser as add_plot
 from .viewer import add_parser as add_view
 
 __all__ = ["main"]
@@ -195,6 +196,7 @@ def _parser() -> argparse.ArgumentParser:
 
     add_evaluate(commands, [common])
     add_view(commands, [common, preset, mesh_options])
+    add_plot(commands, common, [preset, mesh_options])
 
     demo = commands.add_parser(
         "demo", parents=[common, preset], help="register a scene made in code, where the truth is known",

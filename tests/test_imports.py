@@ -33,13 +33,13 @@ ALLOWED = {
     "scenes": BASE | {"geometry", "rendering"},
     "learned": BASE | {"geometry", "filters", "matching", "scenes"},
     "registration": BASE | {"geometry", "filters", "data", "descriptors", "rendering", "pipeline", "matching"},
-    "visualization": BASE | {"geometry", "filters", "descriptors", "rendering", "matching", "registration"},
+    "visualization": BASE | {"geometry", "metrics", "filters", "descriptors", "rendering", "matching", "registration"},
 }
 FORBIDDEN_LIBRARIES = {
     "filters": {"numpy", "pathlib", "trimesh", "cv2", "scipy", "os"},
     "descriptors": {"numpy", "pathlib", "trimesh", "cv2", "scipy", "os"},
 }
-TOP = {"batch", "document", "evaluation", "viewer", "cli", "commands", "__init__", "__main__", "presets"}
+TOP = {"batch", "document", "evaluation", "plotting", "viewer", "cli", "commands", "__init__", "__main__", "presets"}
 
 
 def parts() -> list[str]:

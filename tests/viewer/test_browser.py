@@ -104,7 +104,7 @@ class Browser:
     def text(self, name):
         return self.part(name).get_attribute("value") or self.part(name).text
 
-    def until(self, true, what, seconds=40):
+    def until(self, true, what, seconds=90):
         deadline, error = time.monotonic() + seconds, None
         while True:
             try:
@@ -118,7 +118,7 @@ class Browser:
     def click(self, name):
         button = self.part(name)
         self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
-        self.until(lambda: button.click() or True, f"click {name}", 5)
+        self.until(lambda: button.click() or True, f"click {name}", 20)
 
     def upload(self, what, path):
         self.part(f"upload-{what}").find_element("css selector", "input[type=file]").send_keys(str(path))
@@ -143,7 +143,7 @@ class Browser:
 
     def downloaded(self, name):
         path = self.folder / "downloads" / name
-        self.until(lambda: path.is_file() and not list(path.parent.glob("*.crdownload")), f"download of {name}", 20)
+        self.until(lambda: path.is_file() and not list(path.parent.glob("*.crdownload")), f"download of {name}")
         return path.read_bytes()
 
 
@@ -226,7 +226,7 @@ def test_what_was_found_is_shown(browser):
     slider = browser.part("wipe")
     browser.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", slider)
     slider.click()  # in the middle
-    browser.until(lambda: re.search(r"inset\(0(px)? (4\d|5\d)(\.\d)?% 0", layer.get_attribute("style")), "wipe", 5)
+    browser.until(lambda: re.search(r"inset\(0(px)? (4\d|5\d)(\.\d)?% 0", layer.get_attribute("style")), "wipe", 20)
     for tab, pictures in (("answer", 2), ("fields", 4), ("views", 12), ("view sphere", 1)):
         browser.click(f"tab-{tab}")
         panel = browser.until(lambda tab=tab: browser.part(f"panel-{tab}"), tab)
@@ -242,7 +242,7 @@ def test_what_was_found_is_shown(browser):
     count = """
         const id = document.querySelector('.nicegui-scene').id.slice(1);
         let n = 0; getElement(id).scene.traverse(x => { if (x.isMesh) n++; }); return n;"""
-    browser.until(lambda: browser.driver.execute_script(count) == 2, "mesh and photograph in the scene", 15)
+    browser.until(lambda: browser.driver.execute_script(count) == 2, "mesh and photograph in the scene")
 
 
 def test_by_hand_and_pulled_in(browser):
