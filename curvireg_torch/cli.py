@@ -11,6 +11,7 @@ from typing import Any
 
 from . import __version__
 from ._choices import BACKENDS, DEFAULT, PRESET_NAMES, UNITS, UP_AXES
+from ._completion import SHELLS, script
 from ._examples import examples
 from ._files import terminable
 from .errors import CurviregError
@@ -212,6 +213,16 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     schema.add_argument("--debug", action="store_true", help="show tracebacks")
     schema.set_defaults(run=_print_schema)
+
+    completion = commands.add_parser(
+        "completion", help="print a script that completes this command line",
+        **examples("curvireg completion bash > ~/.local/share/bash-completion/completions/curvireg",
+                   "curvireg completion zsh >> ~/.zshrc",
+                   "curvireg completion fish > ~/.config/fish/completions/curvireg.fish"),
+    )  # fmt: skip
+    completion.add_argument("shell", choices=SHELLS)
+    completion.add_argument("--debug", action="store_true", help="show tracebacks")
+    completion.set_defaults(run=lambda arguments: print(script(parser, arguments.shell), end=""))
     return parser
 
 

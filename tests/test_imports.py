@@ -39,7 +39,19 @@ FORBIDDEN_LIBRARIES = {
     "filters": {"numpy", "pathlib", "trimesh", "cv2", "scipy", "os"},
     "descriptors": {"numpy", "pathlib", "trimesh", "cv2", "scipy", "os"},
 }
-TOP = {"batch", "document", "evaluation", "plotting", "viewer", "cli", "commands", "__init__", "__main__", "presets"}
+TOP = {
+    "_completion",
+    "batch",
+    "document",
+    "evaluation",
+    "plotting",
+    "viewer",
+    "cli",
+    "commands",
+    "__init__",
+    "__main__",
+}
+TOP |= {"presets"}
 
 
 def parts() -> list[str]:

@@ -20,6 +20,7 @@ from .workers import workers
 __all__ = ["evaluate", "score"]
 
 BESIDE_THE_POINT = (
+    "_completion.py",
     "_examples.py",
     "batch",
     "cli.py",
