@@ -24,6 +24,7 @@ WORKER = ThreadPoolExecutor(1, thread_name_prefix="viewer")
 
 STAGES = {"bank": "rendering views", "ranking": "ranking them", "search": "searching", "contours": "following contours"}
 STYLE = ".curvireg-drop .q-uploader__list, .curvireg-drop .q-uploader__subtitle { display: none }"
+SEEN = "sticky top-0 z-10 bg-white"  # wherever the page is scrolled to
 _here = threading.local()
 
 
@@ -98,7 +99,7 @@ class Page:
     def say(self, text: str, *, wrong: bool = False) -> None:
         """Put a message on the page."""
         self.message.text = self.session.said(text)
-        self.message.classes(replace="text-negative" if wrong else "text-warning")
+        self.message.classes(replace=f"{SEEN} text-negative" if wrong else f"{SEEN} text-orange-9")
 
     def build(self, arguments: argparse.Namespace) -> None:
         """Lay out the page, and load what the command line named."""

@@ -123,9 +123,10 @@ class Panels:
             lines[0] += f";  translation {', '.join(f'{v:.4g}' for v in shown.pose.translation.tolist())} {unit}"
         sure = f"confidence {answer.result.confidence:.2f}"
         lines.append(sure if answer.result.reliable else f"{sure}: no reliable match; take the pose as a guess")
+        if shown.number:
+            lines[1] = f"hypothesis {shown.number + 1}, a rival; of the first: {lines[1]}"
         if shown.by_hand:
-            lines.append(f"hypothesis {shown.number + 1}, by hand: {'; '.join(shown.by_hand)}")
-            lines.append("the command line gives the answer before that")
+            lines.append(f"by hand: {'; '.join(shown.by_hand)}; the command line gives the answer before that")
         return "\n".join(lines)
 
     async def _pictures(self, panel: str, cards: Any, width: int) -> list[Any]:
