@@ -1,11 +1,12 @@
 """Does the covariance tell the truth? Shares of generated scenes whose true pose lies in the 50, 90, 95 % ellipsoids.
 
-    python scripts/check_covariance.py [--scenes 240] [--jobs 2] [--evaluated DATA RUNS]
+    python scripts/check_covariance.py [--scenes 240] [--jobs 2] [--evaluated DATA RUNS] [--rows ROWS]
 
 The meshes of ``measure_refinement.py``, half of the scenes before clutter and half before one colour; the contour stage
 starts about 3 degrees and 1.5 % of the distance off. Poses within 15 degrees after it count. Scenes of even number are
-those that constants may be chosen on, the others are the report. --evaluated takes the real sets in DATA and what
-``curvireg evaluate bop DATA/bop/NAME --out RUNS/NAME`` predicted, where covariances come with reliable answers alone.
+those that constants may be chosen on, the others are the report. --rows takes what ``run_benchmark.py`` wrote:
+photographs of textured meshes, on half of which SCALE was chosen. --evaluated takes the real sets in DATA and what
+``curvireg evaluate bop DATA/bop/NAME --out RUNS/NAME`` predicted. Both have covariances where answers are reliable.
 Writes scripts/results/covariance.json and the table of docs/method.md.
 """
 
@@ -27,6 +28,7 @@ from curvireg_torch.geometry import axis_angle_from_rotation, rotation_error, ro
 from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
 from curvireg_torch.metrics import symmetry_transforms
 from curvireg_torch.registration import fit_contours
+from curvireg_torch.registration.contour_covariance import SCALE
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import random_pose, synthesize_photograph
 
@@ -92,6 +94,15 @@ def evaluated(data: Path, runs: Path, name: str) -> list[float | None]:
     return rows
 
 
+def benchmarked(paths: list[Path], half: int) -> list[float | None]:
+    """The same of reliable answers for the meshes of one half of the benchmark."""
+    rows = [json.loads(line) for path in paths for line in path.read_text(encoding="utf-8").splitlines()]
+    rows = [r for r in rows if "squared_distance" in r and sum(map(ord, r["mesh"])) % 2 == half]
+    right = [r["errors"][0] <= math.degrees(WITHIN) for r in rows]
+    squares = [(r["squared_distance"][0] / SCALE, r["squared_distance"][1]) for r in rows]
+    return [float(chi2.cdf(*s)) if good else None for s, good in zip(squares, right, strict=True)]
+
+
 def summary(rows: list[float | None]) -> dict[str, float]:
     right = [row for row in rows if row is not None]
     shares = {f"{level:g}": sum(row <= level for row in right) / max(len(right), 1) for level in LEVELS}
@@ -107,13 +118,14 @@ def table(record: dict[str, Any]) -> str:
         cells = [str(row["scenes"]), str(row["within 15 degrees"]), *(f"{row[f'{level:g}']:.2f}" for level in LEVELS)]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     where = f"`python scripts/check_covariance.py`, {record['date']}, commit {record['commit']}"
-    return "\n".join([*lines, "", f"{where}. Odd scenes are the report; even ones and the constants had to do.", ""])
+    return "\n".join([*lines, "", f"{where}. Of generated scenes the odd ones are the report.", ""])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=240)
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--rows", type=Path, nargs="+", default=[])
     parser.add_argument("--evaluated", type=Path, nargs=2, metavar=("DATA", "RUNS"))
     parser.add_argument("--out", type=Path, default=KEPT)
     arguments = parser.parse_args()
@@ -129,6 +141,9 @@ def main() -> None:
         "before one colour": summary([p for (_, _, clutter), p in each if not clutter]),
         **{name: summary([p for (_, own, _), p in each if own == name]) for name in names},
     }
+    if arguments.rows:
+        shares["textured meshes, half that SCALE was chosen on"] = summary(benchmarked(arguments.rows, 0))
+        shares["textured meshes, the others"] = summary(benchmarked(arguments.rows, 1))
     for name in (n for n in SETS if arguments.evaluated and not n.startswith("pascal")):
         shares[f"{name}, reliable"] = summary(evaluated(*arguments.evaluated, name))
     record = {"date": today(), "commit": commit(REPOSITORY, but=["docs", "scripts/results"]), "shares": shares}

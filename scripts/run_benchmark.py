@@ -3,7 +3,7 @@
     python scripts/run_benchmark.py FOLDER --out rows.jsonl [--pose upright] [--form sibling] [--limit N] [--share I/N]
 
 One line for each photograph: the errors of the hypotheses in degrees up to the object's symmetries, their evidence,
-the evidence of the ranking, the errors of the best views, and how far off the pose is in units of its covariance.
+the evidence of the ranking, the errors of the best views, and how far off it is in its unscaled covariance's units.
 ``exact`` photographs come with their camera matrix, ``sibling`` ones (another object of the kind) without, as
 PASCAL3D+ does. Run again, it goes on. --share takes every N-th mesh, so that several processes work side by side.
 """
@@ -23,6 +23,7 @@ from curvireg_torch.data import read_image
 from curvireg_torch.geometry import rotation_towards, transform
 from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
 from curvireg_torch.registration.confidence import ranking_evidence
+from curvireg_torch.registration.contour_covariance import SCALE
 
 
 def error_up_to(R: Tensor, truth: Tensor, symmetries: Tensor) -> Tensor:
@@ -71,7 +72,7 @@ def rows_of(items: list[Any], root: Path, half: Path, pipeline: cr.Pipeline, wro
         if result.covariance is not None and not row["wrong"]:
             nearest = truth @ symmetries[error_up_to_each(found[:1], truth, symmetries)[0].argmin()]
             poses = transform(found[0], result.translation), transform(nearest, torch.tensor(item["t"]).double())
-            row["squared_distance"] = squared_distance(*poses, result.covariance)
+            row["squared_distance"] = squared_distance(*poses, result.covariance / SCALE)
         rows.append(row)
     return rows
 
