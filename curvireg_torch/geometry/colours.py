@@ -44,6 +44,19 @@ class SurfaceColours:
     def __getitem__(self, faces: Any) -> "SurfaceColours":
         return SurfaceColours(self.corners[faces], self.uv[faces], self.texture[faces], self.textures)
 
+    def check(self, faces: int) -> None:
+        """Raise ValueError unless these are colours of so many faces."""
+        parts = (self.corners, (faces, 3, 3), np.uint8), (self.uv, (faces, 3, 2), np.float32)
+        fits = all(x.shape == shape and x.dtype == kind for x, shape, kind in parts)
+        fits = fits and self.texture.shape == (faces,) and self.texture.dtype == np.int32
+        fits = fits and all(t.ndim == 3 and t.shape[2] == 3 and t.size and t.dtype == np.uint8 for t in self.textures)
+        if (
+            not fits
+            or not np.isfinite(self.uv).all()
+            or not -1 <= self.texture.min() <= self.texture.max() < len(self.textures)
+        ):
+            raise ValueError("colours that do not fit the mesh")
+
     @classmethod
     def plain(cls, faces: int, colour: Sequence[int] = (_PLAIN,) * 3) -> "SurfaceColours":
         """One colour everywhere, white unless told otherwise."""

@@ -39,7 +39,8 @@ class ViewBank:
         points, silhouettes: (N, S, S) bool, unpacked on demand; :meth:`points_at` and :meth:`silhouettes_at` unpack a
             few views at a time, which a large bank asks for.
         boxes: (N, 4) float64 boxes of the object in normalised image coordinates, centre of the object on the axis.
-        late: features of the views by the name of their :class:`LateTerm`, (N, D) float16; none in a large bank.
+        late: features of the views by the name of their :class:`LateTerm`, (N, D) float16; none in a large bank. Of
+            meshes with colours grey and coloured features one after the other.
     """
 
     def __init__(
@@ -228,7 +229,7 @@ class ViewBank:
                     f"banks: expected one device, but bank {i} is on {bank.device}, not {first.device}"
                 )
         names = [name for name in first.tensors if all(name in bank.tensors for bank in banks)]
-        tensors = {name: torch.cat([bank.tensors[name] for bank in banks]) for name in names}
+        tensors = {name: _joined([bank.tensors[name] for bank in banks]) for name in names}
         shift = torch.tensor([0, *(len(bank.meshes) for bank in banks)]).cumsum(0)[:-1].tolist()
         tensors["model"] = torch.cat([bank.model + n for bank, n in zip(banks, shift, strict=True)])
         views = ViewSphere(*(torch.cat([getattr(b.views, f.name) for b in banks]) for f in fields(ViewSphere)))
@@ -278,6 +279,12 @@ class ViewBank:
         from .bank_file import read_bank
 
         return read_bank(Path(path)).to(device)
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    """One after the other; those of meshes without colours hold their grey features twice beside others."""
+    widest = max(part.shape[1:].numel() for part in parts)
+    return torch.cat([p.repeat(1, widest // p.shape[1]) if p.ndim == 2 else p for p in parts])
 
 
 def _pack(mask: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from .._files import write_tensors
 from ..errors import BankError, CurviregError, MissingFileError
+from ..geometry.colours import SurfaceColours, surface_colours
 from ..geometry.up import mesh_up
 from ..geometry.views import ViewSphere
 from ..pipeline import Pipeline
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["FORMAT", "FORMAT_VERSION", "read_bank", "write_bank"]
 
-FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 2
+FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 3
 
 
 def write_bank(bank: "ViewBank", path: Path) -> None:
@@ -33,6 +34,7 @@ def write_bank(bank: "ViewBank", path: Path) -> None:
     for i, mesh in enumerate(bank.meshes):
         meshes[f"mesh{i}.vertices"] = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
         meshes[f"mesh{i}.faces"] = torch.from_numpy(np.array(mesh.faces, dtype=np.int32))
+        meshes |= {f"mesh{i}.{name}": torch.from_numpy(x.copy()) for name, x in _colour_arrays(mesh).items()}
     tensors = {**bank.tensors, "descriptors": bank.descriptors.half(), **views, **meshes}
     metadata = {
         "format": FORMAT,
@@ -87,7 +89,27 @@ def _mesh(tensors: Mapping[str, Tensor], index: int, unit: str, up: str) -> trim
     mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
     mesh.units = unit
     mesh.metadata["up"] = up
+    own = f"mesh{index}.colours."
+    arrays = {name.removeprefix(own): x.numpy() for name, x in tensors.items() if name.startswith(own)}
+    if arrays:
+        textures = tuple(arrays[f"picture{k}"] for k in range(len(arrays) - 3))
+        colours = SurfaceColours(arrays["corners"], arrays["uv"].astype(np.float32), arrays["texture"], textures)
+        colours.check(len(faces))
+        mesh.metadata["colours"] = colours
     return mesh
+
+
+def _colour_arrays(mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
+    colours = surface_colours(mesh)
+    if colours is None:
+        return {}
+    parts: dict[str, np.ndarray] = {
+        "corners": colours.corners,
+        "uv": colours.uv.astype(np.float16),
+        "texture": colours.texture,
+    }
+    parts |= {f"picture{k}": texture for k, texture in enumerate(colours.textures)}
+    return {f"colours.{name}": x for name, x in parts.items()}
 
 
 def _check_contents(bank: "ViewBank") -> None:

@@ -18,6 +18,7 @@ import torch
 import trimesh
 
 from ..errors import BankError
+from ..geometry.colours import surface_colours
 from ..geometry.mesh import as_mesh
 from ..geometry.up import mesh_up
 from ..geometry.views import ViewSphere
@@ -91,13 +92,16 @@ def bank_key(
     pipeline: Pipeline | None = None,
     renderer: str = "auto",
 ) -> str:
-    """Digest in hexadecimal: mesh (vertices, faces, unit), views, settings, renderer, the code that describes views."""
+    """Digest in hexadecimal: mesh (colours and unit too), views, settings, renderer, the code that describes views."""
     made = _settled(pipeline, settings).made(len(views))
     facts = [FORMAT_VERSION, made, mesh.units or "m", renderer]
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     digest.update(_code_digest())
     digest.update(np.ascontiguousarray(mesh.vertices, np.float64).tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, np.int64).tobytes())
+    if (colours := surface_colours(mesh)) is not None:
+        for part in (colours.corners, colours.uv, colours.texture, *colours.textures):
+            digest.update(np.ascontiguousarray(part).tobytes())
     for field in fields(ViewSphere):
         digest.update(getattr(views, field.name).cpu().double().numpy().tobytes())
     return digest.hexdigest()[:32]

@@ -8,10 +8,11 @@ from torch import Tensor
 
 from ..descriptors import field_points
 from ..geometry.cameras import projected_boxes, transform
+from ..geometry.colours import has_colours
 from ..geometry.crops import crop_transforms, square_boxes
 from ..geometry.mesh import extreme_points, mesh_centre, mesh_radius
 from ..pipeline import BankSettings
-from ..rendering import DepthRenderer, make_renderer
+from ..rendering import DepthRenderer, make_renderer, render_colour
 from ..rendering.shading import shade
 
 __all__ = ["DescribedViews", "ViewDescriber"]
@@ -63,6 +64,7 @@ class ViewDescriber:
         mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
         settings: what views are made with.
         renderer: "auto", "embree", "pyrender" or a :class:`DepthRenderer` of this mesh.
+        coloured: whether :meth:`shaded` shows the mesh's own colours too; default: where it has some.
         device: where views are filtered and described.
     """
 
@@ -72,9 +74,11 @@ class ViewDescriber:
         settings: BankSettings,
         *,
         renderer: str | DepthRenderer = "auto",
+        coloured: bool | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.settings = settings
+        self.settings, self._mesh = settings, mesh
+        self._coloured = has_colours(mesh) if coloured is None else coloured
         self.centre = mesh_centre(mesh)
         self.renderer = make_renderer(mesh, renderer, device=device)
         self.hull = extreme_points(mesh)
@@ -131,11 +135,15 @@ class ViewDescriber:
 
     @torch.no_grad()
     def shaded(self, rotations: Tensor, distances: Tensor) -> Tensor:
-        """(N, 1, S, S) grey pictures of the framed views, see :func:`curvireg_torch.rendering.shade`."""
-        S = self.settings.image_size
+        """(N, 1, S, S) grey pictures of the framed views, see :func:`curvireg_torch.rendering.shade`; with the mesh's
+        colours (N, 4, S, S): grey, then red, green and blue of :func:`curvireg_torch.rendering.render_colour`."""
+        S, parallel = self.settings.image_size, {"orthographic": self._orthographic}
         T, K, _ = self.cameras(rotations, distances)
-        depth = self.renderer.render(T, K, (S, S), orthographic=self._orthographic)
-        return shade(depth, K, orthographic=self._orthographic).to(self._device)
+        grey = shade(self.renderer.render(T, K, (S, S), **parallel), K, **parallel).to(self._device)
+        if not self._coloured:
+            return grey
+        colour = render_colour(self._mesh, T, K, (S, S), renderer=self.renderer, **parallel)
+        return torch.cat([grey, colour.to(grey)], dim=1)
 
     @torch.no_grad()
     def descriptors(self, rotations: Tensor, distances: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ..descriptors import field_points
 from ..errors import InvalidInputError
+from ..geometry.colours import has_colours
 from ..geometry.crops import crop_images
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
@@ -246,7 +247,8 @@ class ViewMatcher(nn.Module):
         if len(kept) + len(missing) > KEPT:
             kept.clear()
             missing = views.tolist()
-        for some in torch.tensor(missing, dtype=torch.long, device=self.device).split(64):
+        for k in range(0, len(missing), 64):
+            some = torch.tensor(missing[k : k + 64], device=self.device)
             kept |= dict(zip(some.tolist(), self._late(name).described(self._shaded(some)), strict=True))
         return torch.stack([kept[v] for v in views.tolist()])
 
@@ -259,7 +261,7 @@ class ViewMatcher(nn.Module):
             name: of the term.
             query: B photographs.
             ranking: of them.
-            pictures: (H, 1, S, S), shaded.
+            pictures: (H, C, S, S), of :meth:`pictures`.
             photograph: (H,) which of the photographs each is compared with.
         """
         module, term = self._late(name), next(t for t in self.pipeline.terms if t.name == name)
@@ -273,20 +275,24 @@ class ViewMatcher(nn.Module):
         return out
 
     def _shaded(self, views: Tensor) -> Tensor:
-        """(U, 1, S, S) grey pictures of (U,) views of the bank."""
-        S = self.bank.settings.image_size
-        out = torch.zeros(len(views), 1, S, S, device=self.device)
-        for m in self.bank.model[views].unique().tolist():
-            mine = views[self.bank.model[views] == m]
-            pictures = self.describers[m].shaded(self.bank.rotations[mine], self.bank.distances[mine])
-            out[self.bank.model[views] == m] = pictures.to(out)
-        return out
+        """Pictures of (U,) views of the bank, see :meth:`ViewDescriber.shaded`."""
+        return self.pictures(self.bank.model[views], self.bank.rotations[views], self.bank.distances[views])
+
+    def pictures(self, model: Tensor, rotations: Tensor, distances: Tensor) -> Tensor:
+        """(N, C, S, S) pictures of views of (N,) models, see :meth:`ViewDescriber.shaded`."""
+        parts, index = [], []
+        for m in model.unique().tolist():
+            mine = (model == m).nonzero()[:, 0]
+            parts.append(self.describers[m].shaded(rotations[mine], distances[mine]))
+            index.append(mine)
+        return torch.cat(parts)[torch.cat(index).argsort().to(parts[0].device)]
 
     @cached_property
     def describers(self) -> tuple[ViewDescriber, ...]:
         """Render and describe further views of each model, as the bank's views are; made on first use."""
+        coloured = any(has_colours(mesh) for mesh in self.bank.meshes)
         return tuple(
-            ViewDescriber(mesh, self.bank.settings, renderer=self._renderer, device=self.device)
+            ViewDescriber(mesh, self.bank.settings, renderer=self._renderer, coloured=coloured, device=self.device)
             for mesh in self.bank.meshes
         )
 

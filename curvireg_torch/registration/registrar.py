@@ -246,10 +246,7 @@ class Registrar:
         """(H,) float64 how much poses look like their photographs; 0 without that term."""
         if "appearance" not in ranking.terms:
             return torch.zeros(len(found), dtype=torch.float64)
-        S = self.bank.settings.image_size
-        pictures = torch.zeros(len(found), 1, S, S, device=self.bank.device)
-        for model, mine in self._by_model(found):
-            pictures[mine] = self.describers[model].shaded(found.rotation[mine], found.distance[mine]).to(pictures)
+        pictures = self.matcher.pictures(found.model, found.rotation, found.distance)
         return self.matcher.late_score("appearance", query, ranking, pictures, found.photograph)
 
     def _own_peaks(self, found: Hypotheses, score: Tensor) -> Tensor:

@@ -63,13 +63,14 @@ def render_colour(
     K = FINENESS * zoom.double() @ K
     fine = FINENESS * size[0], FINENESS * size[1]
     backend = make_renderer(mesh, renderer)
-    depth = backend.render(T, K, fine, orthographic=orthographic).cpu()
-    picture = shade(depth, K, orthographic=orthographic).expand(-1, 3, -1, -1)
     colours, faces_at = surface_colours(mesh), getattr(backend, "faces_at", None)
-    if colours is not None and faces_at is not None:
-        face, u, v = faces_at(T, K, fine, orthographic=orthographic)
+    if colours is None or faces_at is None:
+        depth = backend.render(T, K, fine, orthographic=orthographic).cpu()
+        picture = shade(depth, K, orthographic=orthographic).expand(-1, 3, -1, -1)
+    else:
+        face, u, v, depth = faces_at(T, K, fine, orthographic=orthographic)
         albedo = np.ones((*face.shape, 3), np.float32)
         seen = face >= 0
         albedo[seen] = colours.at(face[seen], u[seen], v[seen])
-        picture = picture * torch.from_numpy(albedo).permute(0, 3, 1, 2)
+        picture = shade(depth, K, orthographic=orthographic) * torch.from_numpy(albedo).permute(0, 3, 1, 2)
     return F.avg_pool2d(picture.contiguous(), FINENESS)

@@ -49,10 +49,12 @@ class RayScene:
         found = self._scene.run(_float32(origins), _float32(directions), query="INTERSECT", output=True)
         return np.where(found["tfar"] < _MISS, found["tfar"], np.inf), found["primID"], found["Ng"]
 
-    def places(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The triangle hit first (N,), -1 for none, and the shares u, v (N,) of its second and third corner there."""
+    def places(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The triangle hit first (N,), -1 for none, the shares u, v (N,) of its second and third corner there, and
+        :meth:`distance`."""
         found = self._scene.run(_float32(origins), _float32(directions), query="INTERSECT", output=True)
-        return np.where(found["tfar"] < _MISS, found["primID"], -1), found["u"], found["v"]
+        hit = found["tfar"] < _MISS
+        return np.where(hit, found["primID"], -1), found["u"], found["v"], np.where(hit, found["tfar"], np.inf)
 
     def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """(N,) bool: whether rays hit anything."""
@@ -91,33 +93,37 @@ class EmbreeRenderer:
 
     def faces_at(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The face that each pixel of :meth:`render` sees, and where on it.
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tensor]:
+        """The face that each pixel of :meth:`render` sees, where on it, and what :meth:`render` returns.
 
         Returns:
-            (N, H, W) int32 numbers of faces, -1 for none, and (N, H, W) float32 u and v: the point is
-            (1 - u - v) a + u b + v c, with the face's corners a, b, c.
+            (N, H, W) int32 numbers of faces, -1 for none; (N, H, W) float32 u and v: the point is
+            (1 - u - v) a + u b + v c, with the face's corners a, b, c; (N, 1, H, W) depth.
         """
         T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
         face = np.full((len(T), *size), -1, dtype=np.int32)
-        u, v = np.zeros(face.shape, np.float32), np.zeros(face.shape, np.float32)
+        u, v, depth = (np.zeros(face.shape, np.float32) for _ in range(3))
 
         def one(i: int) -> None:
             rays = self._rays(T[i], K[i], size, orthographic)
             if rays is not None:
-                mask, starts, directions, _ = rays
-                face[i][mask], u[i][mask], v[i][mask] = self._scene.places(starts, directions)
+                mask, starts, directions, near = rays
+                face[i][mask], u[i][mask], v[i][mask], along = self._scene.places(starts, directions)
+                depth[i][mask] = self._depth(along, near)
 
         for_each(len(T), one)
-        return face, u, v
+        return face, u, v, torch.from_numpy(depth)[:, None]
 
     def _render_view(self, T: np.ndarray, K: np.ndarray, out: np.ndarray, orthographic: bool) -> None:
         rays = self._rays(T, K, out.shape, orthographic)
         if rays is not None:
             mask, starts, directions, near = rays
-            z = (self._scene.distance(starts, directions) + np.float32(near)) * np.float32(self._radius)
-            z[np.isinf(z)] = 0.0
-            out[mask] = z
+            out[mask] = self._depth(self._scene.distance(starts, directions), near)
+
+    def _depth(self, along: np.ndarray, near: float) -> np.ndarray:
+        z = (along + np.float32(near)) * np.float32(self._radius)
+        z[np.isinf(z)] = 0.0
+        return z
 
     def _rays(
         self, T: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool

@@ -19,8 +19,10 @@ __all__ = ["Appearance"]
 class Appearance(LateTerm):
     """S_look: features of an ImageNet network agree, cell by cell, between the photograph's crop and the shaded view.
 
-    Raw scores are mean cosines (:func:`curvireg_torch.learned.appearance.similarity`) in [-1, 1]; with the spread taken
-    over the views that are compared, log S_look = (raw - max raw) / spread.
+    A mesh with colours of its own is shown twice, shaded grey and in its colours, and what agrees better counts for
+    each view: prints tell top from bottom, and where they mislead the grey picture is left. Raw scores are mean cosines
+    (:func:`curvireg_torch.learned.appearance.similarity`) in [-1, 1]; with the spread taken over the views that are
+    compared, log S_look = (raw - max raw) / spread.
 
     Attributes:
         weights: digest of the network's.
@@ -51,9 +53,13 @@ class _Looks(LateModule):
         self._last: tuple[Tensor, Tensor] | None = None  # crops, and what they are described by
 
     def described(self, pictures: Tensor) -> Tensor:
-        return describe(pictures, self.backbone)
+        grey, colour = pictures[:, :1], pictures[:, 1:]
+        ways = [describe(picture, self.backbone) for picture in (grey, colour) if picture.shape[1]]
+        return torch.cat(ways, dim=1)
 
     def compare(self, photographs: Photographs, views: Tensor) -> Tensor:
         if self._last is None or self._last[0] is not photographs.regions:  # ranking and verdict ask about the same
             self._last = photographs.regions, describe(photographs.crops, self.backbone)
-        return similarity(self._last[1][:, None], views)
+        looks = self._last[1]
+        each = similarity(looks[:, None], views.reshape(-1, looks.shape[1]))
+        return each.view(len(looks), len(views), -1).amax(dim=2)

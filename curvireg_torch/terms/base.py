@@ -104,7 +104,7 @@ class LateModule(nn.Module, ABC):
 
     @abstractmethod
     def described(self, pictures: Tensor) -> Tensor:
-        """(N, D) features of (N, 1, S, S) shaded pictures of views, see :func:`curvireg_torch.rendering.shade`."""
+        """(N, D) features of pictures of views: (N, 1, S, S) grey, or (N, 4, S, S) grey and in the mesh's colours."""
 
     @abstractmethod
     def compare(self, photographs: Photographs, views: Tensor) -> Tensor:

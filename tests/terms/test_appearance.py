@@ -2,10 +2,13 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+import trimesh
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
+from curvireg_torch.geometry.mesh import as_mesh
 from curvireg_torch.learned.appearance import describe, similarity
 from curvireg_torch.learned.backbone import Backbone
 from curvireg_torch.matching import distinct_views
@@ -104,3 +107,44 @@ def test_hypotheses_tell_how_they_look():
     looks = [h.evidence["appearance"] for h in result.hypotheses]
     assert looks[0] == max(looks)
     assert looks[0] != 0
+
+
+def painted() -> trimesh.Trimesh:
+    """A box whose front is red and whose back is blue: turned by 180 degrees, only its colours differ."""
+    box = trimesh.creation.box((0.6, 0.6, 1.0)).subdivide().subdivide()
+    colours = np.full((len(box.faces), 4), 255, np.uint8)
+    colours[box.triangles_center[:, 1] < -0.29] = [220, 30, 30, 255]
+    colours[box.triangles_center[:, 1] > 0.29] = [30, 30, 220, 255]
+    box.visual.face_colors = colours
+    return as_mesh(box)
+
+
+@pytest.mark.parametrize("coarse", [1000, 0])
+def test_colours_tell_the_front_from_the_back(tmp_path, coarse):
+    mesh, pipeline = painted(), PIPELINE.with_term("appearance", coarse=coarse)
+    bank = ViewBank.build(mesh, VIEWS, pipeline=pipeline, progress=False)
+    bank.save(tmp_path / "bank.safetensors")
+    bank = ViewBank.load(tmp_path / "bank.safetensors")  # the colours travel with the mesh
+    describe = ViewMatcher(bank, pipeline=pipeline).describers[0]
+    views = [v for v in range(len(VIEWS)) if float(VIEWS.elevation[v]) == 30 and float(VIEWS.azimuth[v]) in (0, 180)]
+    pictures = describe.shaded(bank.rotations[views], bank.distances[views])
+    assert pictures.shape == (2, 4, 64, 64)
+    box = torch.tensor([[4.0, 4, 59, 59]])
+    for view, picture in zip(views, pictures, strict=True):
+        registrar = Registrar(bank, pipeline=pipeline, refine=False, hypotheses=2)
+        best = registrar([picture[1:]], box)[0]
+        assert rotation_error(best.rotation, bank.rotations[view].double()) < 20
+        assert best.hypotheses[0].view != best.hypotheses[1].view
+
+
+def test_a_bank_of_coloured_and_grey_meshes_is_one_bank():
+    meshes = painted(), example_mesh()
+    banks = [ViewBank.build(m, VIEWS, pipeline=PIPELINE, progress=False) for m in meshes]
+    both = ViewBank.join(banks)
+    coloured, grey = both.late["appearance"].split(len(VIEWS))
+    assert torch.equal(coloured, banks[0].late["appearance"])
+    assert torch.equal(grey, banks[1].late["appearance"].repeat(1, 2))
+    image, box, _ = scene(1)
+    alone = ViewMatcher(banks[1])([image], box[None]).terms["appearance"]
+    joined = ViewMatcher(both)([image], box[None]).terms["appearance"][:, len(VIEWS) :]
+    torch.testing.assert_close(joined, alone, atol=1e-5, rtol=0)
