@@ -34,8 +34,8 @@ _APART = 30.0  # degrees beyond which two views are rival answers
 POSE_EVIDENCE = ("similarity", "margin", "camera")
 """What :func:`pose_evidence` measures, in its order."""
 
-_POSE_WEIGHTS = (0.381, 0.557, 1.618)
-_POSE_BIAS = -0.674
+_POSE_WEIGHTS = (1.593, 0.584, 1.706)
+_POSE_BIAS = -1.615
 """Logistic regression on photographs of textured meshes, by scripts/fit_verdict.py."""
 
 MARGIN = 5.0
