@@ -55,8 +55,8 @@ MAX_MESH_DEPTH = 200
 MAX_POLYGON_CORNERS = 2000
 """Corners of one face that is not convex; dividing it into triangles takes time with their square."""
 
-MAX_POLYGON_WORK = 40_000_000
-"""Squares of the corners of all faces that are not convex: of two million quads, or of ten faces of 2000 corners."""
+MAX_POLYGON_WORK = 20_000_000
+"""Squares of the corners of all faces that are not convex: of a million quads, or of five faces of 2000 corners."""
 
 MAX_TABLE_BYTES = 1 << 26
 """Bytes of a JSON or CSV file."""

@@ -3,6 +3,7 @@
     python scripts/mutate.py metrics geometry --sample 30     # go on where the last run stopped
     python scripts/mutate.py metrics --sample 30 --again      # survivors once more, after new tests
     python scripts/mutate.py metrics --list                   # what would be changed
+    python scripts/mutate.py --table                          # the scores into CONTRIBUTING.md
 
 One mutant (``mutants.py``) at a time, in a temporary copy; the first failing test kills it. Tests of a module: those of
 the folder of its package (where there is none, files that import it by name), and its doctests; not those marked slow
@@ -38,6 +39,8 @@ from mutants import Mutant, mutants_of
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULT = ROOT / "scripts" / "results" / "mutation.json"
+TABLE = ROOT / "CONTRIBUTING.md"
+BEGIN, END = "<!-- mutants:begin -->", "<!-- mutants:end -->"
 PACKAGE = "curvireg_torch"
 PRELOADED = ("torch", "numpy", "scipy.spatial", "kornia", "cv2", "trimesh", "sklearn.covariance", "skimage.feature")
 PRELOADED += ("pytest",)
@@ -214,15 +217,36 @@ def store(package: str, mutants: int, chosen: list[Mutant], outcomes: dict[str, 
     return row
 
 
+def table() -> str:
+    """Markdown of what is stored: the scores, then the survivors."""
+    rows = [
+        f"| {package} | {row['mutants']} | {row['sampled']} | {row['killed']} | {100 * row['score']:.0f} % |"
+        for package, row in stored().items()
+    ]
+    lines = ["| package | mutants | tried | noticed | score |", "| --- | --- | --- | --- | --- |", *rows, ""]
+    for row in stored().values():
+        for s in row["survivors"]:
+            path, change = s["key"].split(" ", 1)
+            before, after = change.rsplit(" #", 1)[0].split(": ", 1)[1].split(" -> ", 1)
+            lines.append(f"- {path}, `{before}` to `{after}`: {s['reason'] or 'no test yet'}")
+    return "\n".join([*lines, ""])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("packages", nargs="+", help="metrics, geometry, cli, ...")
+    parser.add_argument("packages", nargs="*", help="metrics, geometry, cli, ...")
     parser.add_argument("--sample", type=int, default=30, help="mutants of each package; 0: all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="files whose path holds this; the rest of the sample stays as it is")
     parser.add_argument("--again", action="store_true", help="run known survivors once more")
     parser.add_argument("--list", action="store_true", help="print the sample and run nothing")
+    parser.add_argument("--table", action="store_true", help="write what is stored into CONTRIBUTING.md")
     options = parser.parse_args()
+    if options.table:
+        text = TABLE.read_text(encoding="utf-8")
+        head, tail = text.split(BEGIN)[0], text.split(END)[1]
+        TABLE.write_text(f"{head}{BEGIN}\n{table()}{END}{tail}", encoding="utf-8")
+        return
     if not options.list:
         os.environ.setdefault("OMP_NUM_THREADS", "1")
         for name in PRELOADED:

@@ -72,3 +72,13 @@ def test_keys_outlive_a_shift_of_lines_but_not_a_change_of_the_function(mutants)
     assert len(keys) == 25
     assert shifted == keys
     assert changed & keys == {k for k in keys if "SIZE" in k}
+
+
+@pytest.mark.usefixtures("mutants")
+def test_the_page_has_the_scores_that_are_stored():
+    mutate = importlib.import_module("mutate")
+    sys.modules.pop("mutate")
+    text = mutate.TABLE.read_text()
+    assert text.split(mutate.BEGIN)[1].split(mutate.END)[0] == f"\n{mutate.table()}"
+    for package, row in mutate.stored().items():
+        assert row["killed"] + len(row["survivors"]) == row["sampled"] == len(row["outcomes"]), package

@@ -1,5 +1,6 @@
 """Every detector answers in one form, and as the library that it wraps, or its definition, says."""
 
+import inspect
 import math
 
 import cv2
@@ -103,6 +104,10 @@ def test_edge_detectors_find_the_outline_of_a_box_and_little_else(name: str) -> 
     points = DETECTORS[name](_box(), share=0.05).points[0, 0].numpy()
     assert _near(points, outline, 2) > 0.95
     assert _near(outline, points, 2) > 0.9
+
+
+def test_all_detectors_keep_the_same_share_of_the_pixels() -> None:
+    assert {inspect.signature(detector).parameters["share"].default for detector in DETECTORS.values()} == {0.04}
 
 
 @pytest.mark.parametrize("name", ["harris", "mineig"])

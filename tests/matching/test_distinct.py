@@ -4,9 +4,10 @@ import math
 
 import torch
 
-from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch import ViewBank
+from curvireg_torch.geometry import rotation_from_axis_angle, sample_views
 from curvireg_torch.matching import distinct_views
-from tests._support.scenes import truck_bank
+from curvireg_torch.synthetic import example_mesh
 
 
 def test_symmetries_turn_the_model_and_not_the_camera():
@@ -20,10 +21,10 @@ def test_symmetries_turn_the_model_and_not_the_camera():
 
 
 def test_a_banks_silhouettes_fill_their_crops_but_for_the_margin():
-    bank = truck_bank()
-    shown = bank.silhouettes[::20]
+    views = sample_views(azimuth_step=90, elevations=[20])
+    bank = ViewBank.build(example_mesh(), views, image_size=96, progress=False)
     share = bank.settings.image_size / (1.0 + 2.0 * bank.settings.margin)
-    for one in shown:
+    for one in bank.silhouettes:
         y, x = one.nonzero(as_tuple=True)
         longer = max(int(y.max() - y.min()), int(x.max() - x.min())) + 1
         assert abs(longer - share) < 2.5
