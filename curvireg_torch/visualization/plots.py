@@ -27,6 +27,9 @@ __all__ = [
     "view_sphere",
 ]
 
+_MISS = 200.0
+"""Where in degrees an object without an estimate is drawn."""
+
 
 def _figure(width: float, height: float) -> Any:
     try:
@@ -210,9 +213,11 @@ def risk_coverage(confidence: Tensor, right: Tensor) -> Any:
     order = confidence.argsort(descending=True, stable=True)
     count = torch.arange(1, len(order) + 1)
     risk = (~right.bool()[order]).cumsum(0) / count
+    ranked = confidence[order]
+    whole = torch.cat([ranked[1:] != ranked[:-1], torch.ones(1, dtype=torch.bool)])  # equals have no order
     figure = _figure(5.6, 3.8)
     axes = figure.subplots()
-    axes.plot((count / len(order)).numpy(), risk.numpy(), label="by confidence")
+    axes.plot((count / len(order))[whole].numpy(), risk[whole].numpy(), label="by confidence")
     axes.axhline(float(risk[-1]), color="grey", lw=1, ls="--", label="all answers")
     axes.set(xlabel="coverage: share of the answers that are kept", ylabel="risk: share of them that is wrong")
     axes.set(xlim=(0, 1), ylim=(0, None))
@@ -245,15 +250,15 @@ def errors_by_class(categories: Sequence[str], errors: Tensor, *, threshold_deg:
     figure = _figure(7.0, 1.2 + 0.36 * len(names))
     axes = figure.subplots()
     for row, name in enumerate(names):
-        shown = mine[name].clamp(max=188.0)
+        shown = mine[name].clamp(max=_MISS)
         axes.plot(shown.numpy(), [row] * len(shown), "|", ms=12, alpha=0.6, color="tab:blue")
-        axes.plot(min(median_error(mine[name]), 188.0), row, "d", color="tab:orange")
+        axes.plot(min(median_error(mine[name]), _MISS), row, "d", color="tab:orange")
     told = [f"{name}  {accuracy(mine[name], threshold_deg):.2f} of {len(mine[name])}" for name in names]
     axes.set_yticks(range(len(names)), told)
     axes.axvline(threshold_deg, color="grey", lw=1)
-    axes.set_xticks([*range(0, 181, 30), 188], [*map(str, range(0, 181, 30)), "none"])
-    axes.set(xlabel=f"error, degrees; beside the names, the share below {threshold_deg:g}", xlim=(-3, 192))
-    axes.invert_yaxis()
+    axes.set_xticks([*range(0, 181, 30), _MISS], [*map(str, range(0, 181, 30)), "none"])
+    axes.set(xlabel=f"error, degrees; beside the names, the share below {threshold_deg:g}", xlim=(-3, _MISS + 5))
+    axes.set_ylim(len(names) - 0.4, -0.6)
     axes.grid(alpha=0.3, axis="x")
     return figure
 

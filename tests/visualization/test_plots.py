@@ -49,13 +49,17 @@ def test_risk_falls_where_confidence_knows():
     np.testing.assert_allclose(axes.lines[0].get_xdata(), [0.25, 0.5, 0.75, 1.0])
     np.testing.assert_allclose(axes.lines[0].get_ydata(), [0, 0, 1 / 3, 0.5], atol=1e-6)
     assert axes.lines[1].get_ydata()[0] == 0.5
+    # Answers of one confidence come together: whichever of them stands first says nothing.
+    for right in ([True, False, False], [False, True, False]):
+        line = plots.risk_coverage(torch.tensor([0.9, 0.9, 0.1]), torch.tensor(right)).axes[0].lines[0]
+        np.testing.assert_allclose(line.get_xydata(), [[2 / 3, 0.5], [1, 2 / 3]], atol=1e-6)
 
 
 def test_classes_are_sorted_by_their_median_and_misses_stand_aside():
     errors = torch.tensor([100.0, 5.0, 20.0, torch.inf, 40.0])
     axes = plots.errors_by_class(["car", "sofa", "sofa", "car", "car"], errors).axes[0]
     assert [t.get_text() for t in axes.get_yticklabels()] == ["sofa  1.00 of 2", "car  0.00 of 3"]
-    assert sorted(axes.lines[2].get_xdata()) == [40, 100, 188]
+    assert sorted(axes.lines[2].get_xdata()) == [40, 100, 200]
     assert [axes.lines[1].get_xdata()[0], axes.lines[3].get_xdata()[0]] == [12.5, 100]
 
 
