@@ -31,6 +31,7 @@ html_copy_source = False
 myst_heading_anchors = 4  # named as GitHub names them
 
 autodoc_member_order = "bysource"
+autodoc_inherit_docstrings = False  # torch says the same of every forward()
 autodoc_typehints_format = "short"
 autodoc_default_options = {"members": True, "imported-members": True}
 napoleon_custom_sections = ["Shape"]

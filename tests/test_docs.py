@@ -1,12 +1,14 @@
 """Pages of the documentation say what is there: names, options, files, links, and a text for every picture."""
 
 import argparse
+import inspect
 import re
 import shlex
 from importlib import import_module
 from pathlib import Path
 
 import pytest
+from torch import nn
 
 import curvireg_torch
 from curvireg_torch import cli
@@ -105,6 +107,32 @@ def test_the_reference_lists_every_name_of_the_package() -> None:
     assert sorted(name for name, _ in listed) == sorted(curvireg_torch.__all__)
     for name, place in listed:
         assert found(place) is getattr(curvireg_torch, name), place
+
+
+LAYERS = sorted(
+    {
+        thing
+        for package in ("filters", "descriptors", "detectors", "learned")
+        for name in import_module(f"curvireg_torch.{package}").__all__
+        if inspect.isclass(thing := getattr(import_module(f"curvireg_torch.{package}"), name))
+        and issubclass(thing, nn.Module)
+    },
+    key=lambda layer: layer.__name__,
+)
+
+
+@pytest.mark.parametrize("layer", LAYERS, ids=lambda layer: layer.__name__)
+def test_layers_have_args_shape_and_example_of_their_own(layer: type[nn.Module]) -> None:
+    text = inspect.cleandoc(layer.__doc__ or "")
+    sections = dict(re.findall(r"^(\w+):\n((?:    .*\n?|\n)+)", text, flags=re.MULTILINE))
+    assert {"Args", "Shape", "Example"} <= set(sections)
+    described = {
+        name
+        for line in re.findall(r"^    ([\w, ]+):", sections["Args"], flags=re.MULTILINE)
+        for name in line.split(", ")
+    }
+    assert described == set(inspect.signature(layer).parameters)
+    assert ">>>" in sections["Example"]
 
 
 def commands(page: Path) -> list[list[str]]:

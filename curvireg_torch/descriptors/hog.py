@@ -140,9 +140,24 @@ def _normalised_blocks(cells: Tensor, block: int, clip: float) -> Tensor:
 
 
 class HOG(nn.Module):
-    """Module twin of :func:`hog`; ``nn.Sequential(MultiScaleFocusCurves(), HOG())`` describes a photograph.
+    """HOG of a vector field, as a layer; module twin of :func:`hog`.
 
-    ``learnable=True`` makes the weights of the bins, 1 at first, a parameter.
+    Args:
+        grid: cells along each side.
+        bins: orientations over 180 degrees.
+        block: cells along a block's side, <= grid.
+        clip: upper limit of L2-Hys in (0, 1].
+        voting: ``"linear"`` or ``"hard"``.
+        learnable: make the weights of the bins, 1 at first, a parameter, ``bin_weights``.
+
+    Shape:
+        Input (B, 2, H, W); output (B, D), D = :func:`hog_length` of grid, bins and block.
+
+    Example:
+        >>> import torch
+        >>> layer = HOG(grid=4)
+        >>> layer(torch.randn(2, 2, 32, 32)).shape, layer.length
+        (torch.Size([2, 324]), 324)
     """
 
     bin_weights: nn.Parameter | None

@@ -16,12 +16,12 @@ class Response(nn.Module):
     Args:
         layer: from photographs (B, 1 or 3, H, W) to a vector field (B, 2, H, W), whose length is the response, to a
             :class:`Detection`, whose response it is, or to a map (B, 1, H, W).
-
         power: p of the factor sigma^p on the response of a level of scale sigma px, without which no level is a maximum
             over scales: the number of derivatives that the response multiplies, 1 for a gradient, 2 for its square or a
             curvature, 4 for the product of two curvatures.
 
-    Input (B, 1 or 3, H, W), and (B,) sigmas of the levels, as kornia passes them; output (B, 1, H, W).
+    Shape:
+        Input (B, 1 or 3, H, W), and (B,) sigmas of the levels, as kornia passes them; output (B, 1, H, W).
 
     Example:
         >>> import torch

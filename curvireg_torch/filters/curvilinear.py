@@ -199,7 +199,23 @@ def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) ->
 
 
 class DepthCurvilinearSaliency(nn.Module):
-    """Module twin of :func:`depth_curvilinear_saliency`; ``learnable=True`` makes log sigma a parameter."""
+    """Curvilinear saliency of depth images, as a layer; module twin of :func:`depth_curvilinear_saliency`.
+
+    Args:
+        sigma: smoothing in px before differentiation, >= 0.
+        formula: ``"geometric"`` or ``"paper"``.
+        depth_scale: None rescales each image's visible depth range to 1; a number multiplies the depth.
+        learnable: make the logarithm of sigma a parameter, ``log_sigma``; then sigma > 0.
+
+    Shape:
+        Input (B, 1, H, W) depth and, optionally, a mask that broadcasts to it; output (B, 2, H, W).
+
+    Example:
+        >>> import torch
+        >>> plane = torch.arange(32.0).expand(1, 1, 32, 32) + 10
+        >>> round(float(DepthCurvilinearSaliency()(plane).norm()), 3)
+        0.0
+    """
 
     sigma = positive_option("sigma")
 
@@ -228,7 +244,21 @@ class DepthCurvilinearSaliency(nn.Module):
 
 
 class ImageCurvilinearSaliency(nn.Module):
-    """Module twin of :func:`image_curvilinear_saliency`; ``learnable=True`` makes log sigma a parameter."""
+    """Curvilinear saliency of photographs, as a layer; module twin of :func:`image_curvilinear_saliency`.
+
+    Args:
+        sigma: smoothing in px before differentiation, >= 0.
+        learnable: make its logarithm a parameter, ``log_sigma``; then > 0.
+
+    Shape:
+        Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
+
+    Example:
+        >>> import torch
+        >>> layer = ImageCurvilinearSaliency(learnable=True)
+        >>> layer(torch.rand(2, 3, 32, 32)).shape, [name for name, _ in layer.named_parameters()]
+        (torch.Size([2, 2, 32, 32]), ['log_sigma'])
+    """
 
     sigma = positive_option("sigma")
 

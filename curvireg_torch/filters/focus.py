@@ -163,7 +163,20 @@ def _check_focus(scales: int, mode: str, saliency_weight: float, threshold: floa
 
 
 class EdgeBlur(nn.Module):
-    """Module twin of :func:`edge_blur`."""
+    """Blur of the step edge through each pixel, as a layer; module twin of :func:`edge_blur`.
+
+    Args:
+        reblur_sigmas: S re-blurring sigmas in px, > 0.
+        mode: ``"reblur-image"`` or ``"reblur-saliency"``.
+
+    Shape:
+        Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, S, H, W) in px.
+
+    Example:
+        >>> import torch
+        >>> EdgeBlur(reblur_sigmas=(1.0, 2.0))(torch.rand(1, 1, 32, 32)).shape
+        torch.Size([1, 2, 32, 32])
+    """
 
     def __init__(self, *, reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0), mode: str = "reblur-image") -> None:
         super().__init__()
@@ -178,7 +191,25 @@ class EdgeBlur(nn.Module):
 
 
 class MultiScaleFocusCurves(nn.Module):
-    """Module twin of :func:`multiscale_focus_curves`; ``learnable=True`` makes log sigma a parameter."""
+    """MFC, as a layer; module twin of :func:`multiscale_focus_curves`.
+
+    Args:
+        scales: n >= 2; the image is re-blurred by 1, 2, ..., n-1 px.
+        sigma: smoothing in px before everything else, >= 0.
+        mode: of :func:`edge_blur`.
+        saliency_weight: p >= 0: the focus is multiplied by CS^p.
+        threshold: T >= 0 in 1/px; None is e^-n.
+        learnable: make the logarithm of sigma a parameter, ``log_sigma``; then sigma > 0.
+
+    Shape:
+        Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
+
+    Example:
+        >>> import torch
+        >>> from curvireg_torch import HOG
+        >>> torch.nn.Sequential(MultiScaleFocusCurves(), HOG())(torch.rand(2, 3, 64, 64)).shape
+        torch.Size([2, 1764])
+    """
 
     sigma = positive_option("sigma")
 

@@ -34,7 +34,21 @@ def image_gradient(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
 
 
 class ImageGradient(nn.Module):
-    """Module twin of :func:`image_gradient`; ``learnable=True`` makes log sigma a parameter."""
+    """Gradient of the Gaussian-smoothed image, as a layer; module twin of :func:`image_gradient`.
+
+    Args:
+        sigma: smoothing in px before differentiation, >= 0.
+        learnable: make its logarithm a parameter, ``log_sigma``; then > 0.
+
+    Shape:
+        Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
+
+    Example:
+        >>> import torch
+        >>> ramp = torch.arange(8.0).expand(1, 1, 8, 8)
+        >>> ImageGradient(sigma=0.0)(ramp)[0, :, 4, 4].tolist()
+        [1.0, 0.0]
+    """
 
     sigma = positive_option("sigma")
 

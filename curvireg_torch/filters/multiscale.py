@@ -113,7 +113,26 @@ def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> tuple[Tensor, 
 
 
 class MultiScaleCurvilinearSaliency(nn.Module):
-    """Module twin of :func:`multiscale_curvilinear_saliency`; learnable: log sigma and log kappa."""
+    """MCS, as a layer; module twin of :func:`multiscale_curvilinear_saliency`.
+
+    Args:
+        scales: number n of levels, >= 1, the image itself included.
+        sigma: smoothing in px before differentiation, >= 0.
+        smoothing: ``"perona-malik"``, ``"bilateral"`` or ``"guided"``.
+        kappa: contrast in grey levels above which an edge is kept, > 0.
+        conductance: of :func:`anisotropic_diffusion`.
+        diffusion_time: of the last level in px^2; None is 2^(n-2).
+        threshold: T in [0, 1); None is e^-n.
+        learnable: make the logarithms of sigma and kappa parameters, ``log_sigma`` and ``log_kappa``; then sigma > 0.
+
+    Shape:
+        Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
+
+    Example:
+        >>> import torch
+        >>> MultiScaleCurvilinearSaliency(scales=3)(torch.rand(2, 3, 32, 32)).norm(dim=1).amax() <= 1.0001
+        tensor(True)
+    """
 
     sigma, kappa = positive_option("sigma"), positive_option("kappa")
 

@@ -71,7 +71,22 @@ def _check_scales(sigmas: Sequence[float], eigenvalue: str) -> list[float]:
 
 
 class PrincipalCurvatureImage(nn.Module):
-    """Module twin of :func:`principal_curvature_image`."""
+    """Principal curvature image, as a layer; module twin of :func:`principal_curvature_image`.
+
+    Args:
+        sigmas: scales in px, > 0.
+        eigenvalue: ``"largest"``, dark lines, or ``"smallest"``, bright ones.
+
+    Shape:
+        Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
+
+    Example:
+        >>> import torch
+        >>> line = torch.zeros(1, 1, 33, 33)
+        >>> line[..., 16] = 1.0                                                     # bright, along y
+        >>> int(PrincipalCurvatureImage(eigenvalue="smallest")(line)[0, 0, 16].abs().argmax())
+        16
+    """
 
     def __init__(self, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0), eigenvalue: str = "largest") -> None:
         super().__init__()

@@ -66,7 +66,24 @@ def apparent_ridges(
 
 
 class ApparentRidges(WithCamera):
-    """Module twin of :func:`apparent_ridges`; ``camera_matrix`` moves with the module, its dtype kept."""
+    """Apparent ridges, as a layer; module twin of :func:`apparent_ridges`.
+
+    Args:
+        camera_matrix: (3, 3), (1, 3, 3) or (B, 3, 3), px; it moves with the module and keeps its dtype. None:
+            orthographic.
+        sigma: smoothing in px before differentiation, >= 0.
+        depth_scale: of :func:`depth_curvilinear_saliency`; orthographic only.
+        maxima: False keeps the view-dependent curvature everywhere.
+
+    Shape:
+        Input (B, 1, H, W) depth and, optionally, a mask that broadcasts to it; output (B, 2, H, W).
+
+    Example:
+        >>> import torch
+        >>> roof = 10 + (torch.arange(33.0) - 16).abs().expand(1, 1, 33, 33)
+        >>> int(ApparentRidges(depth_scale=1.0)(roof)[0, :, 16].norm(dim=0).argmax())
+        16
+    """
 
     def __init__(
         self,

@@ -191,7 +191,24 @@ class WithCamera(nn.Module):
 
 
 class AverageShadingGradient(WithCamera):
-    """Module twin of :func:`average_shading_gradient`; ``camera_matrix`` moves with the module, its dtype kept."""
+    """Average shading gradient, as a layer; module twin of :func:`average_shading_gradient`.
+
+    Args:
+        camera_matrix: (3, 3), (1, 3, 3) or (B, 3, 3), px; it moves with the module and keeps its dtype. None:
+            orthographic.
+        sigma: smoothing in px before differentiation, >= 0.
+        depth_scale: of :func:`depth_curvilinear_saliency`; orthographic only.
+
+    Shape:
+        Input (B, 1, H, W) depth and, optionally, a mask that broadcasts to it; output (B, 2, H, W).
+
+    Example:
+        >>> import torch
+        >>> camera = torch.tensor([[50.0, 0.0, 15.5], [0.0, 50.0, 15.5], [0.0, 0.0, 1.0]])
+        >>> wall = torch.full((1, 1, 32, 32), 3.0)
+        >>> round(float(AverageShadingGradient(camera_matrix=camera)(wall).norm()), 3)
+        0.0
+    """
 
     def __init__(
         self, *, camera_matrix: Tensor | None = None, sigma: float = 1.0, depth_scale: float | None = None
@@ -211,7 +228,22 @@ class AverageShadingGradient(WithCamera):
 
 
 class HessianFrobeniusNorm(nn.Module):
-    """Module twin of :func:`hessian_frobenius_norm`."""
+    """Hessian Frobenius norm, as a layer; module twin of :func:`hessian_frobenius_norm`.
+
+    Args:
+        sigma: smoothing in px before differentiation, >= 0.
+        depth_scale: None rescales each image's visible depth range to 1; a number multiplies the depth.
+
+    Shape:
+        Input (B, 1, H, W) depth and, optionally, a mask that broadcasts to it; output (B, 2, H, W).
+
+    Example:
+        >>> import torch
+        >>> x = torch.arange(33.0) - 16
+        >>> bowl = (1 + 0.5 * x**2).expand(1, 1, 33, 33)
+        >>> HessianFrobeniusNorm(sigma=0.0, depth_scale=1.0)(bowl)[0, :, 16, 16].tolist()
+        [1.0, 0.0]
+    """
 
     def __init__(self, *, sigma: float = 1.0, depth_scale: float | None = None) -> None:
         super().__init__()

@@ -73,6 +73,14 @@ class FieldNetwork(nn.Module):
 
     Args:
         widths: channels at strides 2, 4, 8 and 16.
+
+    Shape:
+        Input (B, 3, H, W), H and W multiples of 16; output (B, 3, H/2, W/2).
+
+    Example:
+        >>> import torch
+        >>> FieldNetwork((4, 4, 8, 8))(torch.rand(1, 3, 64, 48)).shape
+        torch.Size([1, 3, 32, 24])
     """
 
     def __init__(self, widths: tuple[int, int, int, int] = (24, 48, 96, 160)) -> None:
@@ -112,8 +120,9 @@ class LearnedCurvilinearSaliency(nn.Module):
     Args:
         weights: safetensors file of another training; None is the packaged one.
 
-    Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 2, H, W), sign free (x >= 0), without unit. Photographs of
-    another size than ``WORK_SIZE`` are resampled and the field enlarged again. dtype kept. Differentiable.
+    Shape:
+        Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 2, H, W), sign free (x >= 0), without unit. Photographs
+        of another size than ``WORK_SIZE`` are resampled and the field enlarged again. dtype kept. Differentiable.
 
     Raises:
         InvalidInputError: wrong shape or dtype, or a file with other weights than those of this network.
