@@ -128,7 +128,7 @@ def test_layers_have_args_shape_and_example_of_their_own(layer: type[nn.Module])
     assert {"Args", "Shape", "Example"} <= set(sections)
     described = {
         name
-        for line in re.findall(r"^    ([\w, ]+):", sections["Args"], flags=re.MULTILINE)
+        for line in re.findall(r"^    (\w[\w, ]*):", sections["Args"], flags=re.MULTILINE)
         for name in line.split(", ")
     }
     assert described == set(inspect.signature(layer).parameters)
@@ -141,7 +141,7 @@ def commands(page: Path) -> list[list[str]]:
     blocks = re.findall(r"^ *```(?:bash)?\n(.*?)^ *```", text, flags=re.DOTALL | re.MULTILINE)
     lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
     inline = re.findall(r"`((?:curvireg|python|torchrun) [^`\n]+)`", text)
-    lines += [code for code in inline if "|" not in code and len(code.split()) > 2]  # two words name a command
+    lines += [code for code in inline if "|" not in code and " --out " in code]  # others name a command, or a part
     return [
         shlex.split(line, comments=True) for line in lines if re.match(r" *(\S*/)?(curvireg|python|torchrun) ", line)
     ]
@@ -203,7 +203,7 @@ def test_what_these_tests_find(tmp_path: Path) -> None:
     page.write_text(
         "# A `b` (c)\n[x](gone.md) [y](page.md#a-b-c) [z](#no)\n`[code](not.md)`\n\n```bash\ncurvireg bank\n"
         "torchrun --nproc-per-node 2 \\\n  -m curvireg_torch.evaluation web D --out R --jobs 2\n```\n"
-        "`python scripts/ablate.py --no`\n"
+        "`python scripts/ablate.py DATA --out R --no`\n"
     )
     assert links(page) == ["gone.md", "page.md#a-b-c", "#no"]
     assert anchors(page) == {"a-b-c"}
