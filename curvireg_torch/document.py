@@ -25,7 +25,8 @@ CONVENTIONS = {
     "boxes": "x0, y0, x1, y1 in those pixels",
     "score": "normalised correlation of photograph and view, 0 to 1",
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
-    "reliable": f"confidence of at least {RELIABLE:g}; false = no reliable match, the pose is a guess",
+    "reliable": f"confidence of at least {RELIABLE:g}; false = no reliable match, the pose is a guess; "
+    "never true without a box",
     "support": "how strongly edges of the photograph lie under the mesh's contours, 0 to 1",
     "covariance": "of turn (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
     "t_true = t + e; null without a camera, and with a guessed one, whose error nobody knows",

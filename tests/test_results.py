@@ -51,6 +51,20 @@ def test_json_is_all_that_is_printed(folder, capsys, check):
     assert printed(capsys) == ""
 
 
+def test_without_a_box_nothing_is_reliable(folder, capsys, monkeypatch):
+    monkeypatch.setattr("curvireg_torch.registration.registrar.RELIABLE", 0.0)
+    words = [folder / "photos" / "0.png", folder / "truck.safetensors", "--camera", *CAMERA, "--json"]
+    found = []
+    for box in (["--box", *box_of(0)], []):
+        assert register(*words, *box) == 0
+        found.append(json.loads(printed(capsys)))
+    monkeypatch.undo()
+    given, whole = found
+    assert given["covariance"] is not None
+    assert not whole["reliable"]
+    assert whole["covariance"] is None
+
+
 def test_json_of_a_list_is_one_line_each(folder, capsys, check):
     rows = [["photos/0.png", *box_of(0)], ["none.png", "", "", "", ""], ["photos/1.png", "1", "", "", ""]]
     path = written(folder / "list.csv", "photo,x0,y0,x1,y1", *rows)

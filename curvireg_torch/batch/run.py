@@ -103,7 +103,9 @@ def register_entry(
         "camera_source": source,
         "picture": photo.facts(),
     }
-    if source in ("exif", "fov"):  # how far a guess is off, nobody knows
+    if entry.box is None:  # confidence was fitted on boxes around objects
+        document["reliable"] = False
+    if source in ("exif", "fov") or entry.box is None:  # how far a guess is off, nobody knows
         document["covariance"] = document["standard_deviations"] = None
     return result, document
 
