@@ -5,4 +5,4 @@ set -euo pipefail
 "$venv/bin/ruff" check .
 "$venv/bin/ruff" format --check .
 "$venv/bin/mypy"
-"$venv/bin/python" -m pytest --numprocesses auto --maxprocesses 4 "$@"
+"$venv/bin/python" -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile "$@"

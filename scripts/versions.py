@@ -28,7 +28,7 @@ RESULTS = REPOSITORY / "scripts" / "results" / "versions.json"
 DOCUMENT = REPOSITORY / "docs" / "versions.md"
 MARKERS = "<!-- versions:begin -->", "<!-- versions:end -->"
 CELLS = ["3.11-newest", "3.11-lowest", "3.12-newest", "3.13-newest", "3.14-newest"]
-PARALLEL = ["--numprocesses", "auto", "--maxprocesses", "4"]
+PARALLEL = ["--numprocesses", "auto", "--maxprocesses", "4", "--dist", "loadfile"]
 SHOWN = ["torch", "kornia", "numpy", "scipy", "opencv-python-headless", "trimesh", "scikit-learn", "safetensors"]
 
 

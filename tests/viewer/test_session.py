@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import curvireg_torch
-from curvireg_torch.cli import _parser, main
+from curvireg_torch.cli import _parsed, main
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, MeshError
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
@@ -35,7 +35,7 @@ def write_scene(folder: Path, seed: int = 0) -> tuple[list[float], torch.Tensor]
 
 
 def options(*words):
-    return _parser().parse_args(["view", *words])
+    return _parsed(["view", *words])
 
 
 @pytest.fixture
