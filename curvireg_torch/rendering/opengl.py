@@ -3,6 +3,8 @@
 import atexit
 import os
 import threading
+from contextlib import suppress
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -31,6 +33,9 @@ def _offscreen() -> Any:
         )
     if _context is None:
         os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+        with suppress(ImportError):
+            # Mesa and triton (torch.compile) each bring an LLVM: where that of Mesa comes first, the process dies.
+            import_module("triton")
         try:
             import pyrender
 

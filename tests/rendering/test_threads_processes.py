@@ -94,3 +94,15 @@ print(len(opengl._context[1]._renderer._meshes))
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout.split(), done.stderr) == (0, ["1", "None"], "")
+
+
+def test_torch_may_compile_after_opengl_has_drawn():
+    """Mesa's LLVM and triton's in one process: a crash, unless triton's was there first."""
+    pytest.importorskip("triton")
+    require("pyrender")
+    code = (
+        "import torch, trimesh; from curvireg_torch.rendering import render_depth\n"
+        "K = torch.tensor([[50.0, 0, 15], [0, 50, 15], [0, 0, 1]]); T = torch.eye(4); T[2, 3] = 4\n"
+        "render_depth(trimesh.creation.box(), T, K, (32, 32), renderer='pyrender'); import triton"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
