@@ -103,7 +103,7 @@ def compare(folder: Path, photographs: int) -> list[dict[str, Any]]:
             answers[name] = lambda m=matcher: int(m([image], box).order[0, 0])  # noqa: B023
         bank, crop = matcher.bank, matcher.query([image], box).crops[0]
         start = time.perf_counter()
-        views = matcher.describers[0].shaded(bank.rotations, bank.distances)
+        views = matcher.describers[0].shaded(bank.rotations, bank.distances)[:, :1]  # grey
         shading = time.perf_counter() - start
         for name, make in peers.items():
             start = time.perf_counter()
