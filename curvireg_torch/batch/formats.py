@@ -10,11 +10,10 @@ from typing import Any
 from ..data._json import check_table_size, finite_numbers
 from ..data.bop import bop_box, entry_at
 from ..errors import InvalidInputError, MissingFileError
-from .listing import Listing, listing
+from .listing import BOX, CAMERA, Listing, listing
 
 __all__ = ["read_list"]
 
-_BOX, _CAMERA = ("x0", "y0", "x1", "y1"), ("fx", "fy", "cx", "cy")
 Row = dict[str, Any]
 
 
@@ -69,7 +68,7 @@ def read_list(path: Path, meshes: Sequence[Path] = ()) -> Listing:
 
 def _listed(path: Path, rows: Sequence[Row], folder: Path, meshes: Sequence[Path]) -> Listing:
     """A table of all keys that rows have."""
-    columns = list(dict.fromkeys(["photo", *_BOX, *(key for row in rows for key in row)]))
+    columns = list(dict.fromkeys(["photo", *BOX, *(key for row in rows for key in row)]))
     return listing(str(path), columns, [[_text(row.get(name)) for name in columns] for row in rows], folder, meshes)
 
 
@@ -80,7 +79,7 @@ def _text(value: Any) -> str:
 def _row(entry: Mapping[str, Any]) -> Row:
     """``box`` and ``camera`` as columns; what are no four numbers stand there as they are, to be refused."""
     row: Row = {"photo": entry.get("photo")}
-    for key, names in (("box", _BOX), ("camera", _CAMERA)):
+    for key, names in (("box", BOX), ("camera", CAMERA)):
         values = entry.get(key)
         if values is not None:
             four = values if isinstance(values, list) and len(values) == 4 else [values] * 4
@@ -101,7 +100,7 @@ def _coco_rows(path: Path, content: Mapping[str, Any]) -> list[Row]:
             rows.append(
                 {
                     "photo": files[annotation["image_id"]],
-                    **dict(zip(_BOX, corners, strict=True)),
+                    **dict(zip(BOX, corners, strict=True)),
                     "image_id": annotation["image_id"],
                     "annotation_id": annotation.get("id"),
                     "category": kinds.get(annotation.get("category_id")),
@@ -142,8 +141,8 @@ def _bop_objects(folder: Path, cameras: Any, truths: Any, infos: Any) -> Iterato
             box = bop_box(entry_at(infos.get(key), index).get("bbox_obj")) or ["no bbox_obj"] * 4
             yield {
                 "photo": photo,
-                **dict(zip(_BOX, box, strict=True)),
-                **dict(zip(_CAMERA, (K[0], K[4], K[2], K[5]), strict=True)),
+                **dict(zip(BOX, box, strict=True)),
+                **dict(zip(CAMERA, (K[0], K[4], K[2], K[5]), strict=True)),
                 "mesh": model if model and (folder / model).is_file() else None,
                 "scene_id": int(folder.resolve().name),
                 "im_id": int(key) if key.isdecimal() else key,

@@ -8,11 +8,11 @@ from ..errors import InvalidInputError
 from ..geometry import camera_matrix
 from .records import FOUND_MESH, RESULT_COLUMNS
 
-__all__ = ["Entry", "Listing", "listing"]
+__all__ = ["BOX", "CAMERA", "Entry", "Listing", "listing"]
 
-_BOX, _CAMERA = ("x0", "y0", "x1", "y1"), ("fx", "fy", "cx", "cy")
-_NEEDED = ("photo", *_BOX)
-_KNOWN = (*_NEEDED, *_CAMERA, "mesh")
+BOX, CAMERA = ("x0", "y0", "x1", "y1"), ("fx", "fy", "cx", "cy")
+_NEEDED = ("photo", *BOX)
+_KNOWN = (*_NEEDED, *CAMERA, "mesh")
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def _entry(cells: list[str], count: int, places: Mapping[str, int], folder: Path
         named = (folder / given["mesh"],) if given.get("mesh") else meshes
         if not named:
             raise InvalidInputError("mesh: empty, and no MESH was given; name one")
-        box, camera = _numbers(given, _BOX), _numbers(given, _CAMERA)
+        box, camera = _numbers(given, BOX), _numbers(given, CAMERA)
         if camera is not None:
             camera_matrix(*camera)  # says what is wrong with it
     except InvalidInputError as error:

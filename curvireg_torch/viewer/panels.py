@@ -122,7 +122,7 @@ class Panels:
             unit = answer.registrar.bank.mesh.units
             lines[0] += f";  translation {', '.join(f'{v:.4g}' for v in shown.pose.translation.tolist())} {unit}"
         sure = f"confidence {answer.result.confidence:.2f}"
-        lines.append(sure if answer.result.reliable else f"{sure}: no reliable match; take the pose as a guess")
+        lines.append(sure if answer.document["reliable"] else f"{sure}: no reliable match; take the pose as a guess")
         if shown.number:
             lines[1] = f"hypothesis {shown.number + 1}, a rival; of the first: {lines[1]}"
         if shown.by_hand:

@@ -1,7 +1,6 @@
 """What one page holds: a photograph, a box, a mesh, the answer, and the pose shown. Knows nothing of the page."""
 
 import argparse
-import json
 import math
 import shlex
 import time
@@ -19,6 +18,7 @@ from ..commands import open_registrar
 from ..data import read_photo
 from ..data.images import Photo
 from ..errors import CurviregError, InvalidInputError
+from ..evaluation.store import to_json
 from ..geometry import camera_matrix, load_mesh, rotation_error, rotation_from_axis_angle
 from ..limits import MAX_VIEWER_SECONDS
 from ..matching import ViewBank
@@ -238,7 +238,7 @@ class Session:
 
     def json(self) -> bytes:
         """:meth:`document` as a file."""
-        return (json.dumps(self.document(), indent=2) + "\n").encode()
+        return to_json(self.document()).encode()
 
     def glb(self) -> bytes:
         """The pose shown as a GLB file, see :func:`curvireg_torch.visualization.posed_glb`."""
