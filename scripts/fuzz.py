@@ -1,9 +1,11 @@
 """Throws broken files at every reader: each must end in a result or in one of our errors, in time and memory.
 
-    python scripts/fuzz.py --inputs 100000 --out fuzz.json
+    python scripts/fuzz.py                                  the 100,000 inputs of the record
+    python scripts/fuzz.py --inputs 1000 --out fuzz.json    some, beside it
 
 Batches run in processes of their own, which a stuck or killed one takes along with nothing else; the report is written
-after each, and another run continues from it. Exit code 1 if anything failed.
+after each, and another run continues from it. ``scripts/results/fuzz.json`` is the record, and SECURITY.md has its
+table. Exit code 1 if anything failed.
 """
 
 import argparse
@@ -20,6 +22,11 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from _record import REPOSITORY, between, commit, today
+
+RESULT = REPOSITORY / "scripts" / "results" / "fuzz.json"
+DOCUMENT = REPOSITORY / "SECURITY.md"
+BEGIN, END = "<!-- fuzz:begin -->", "<!-- fuzz:end -->"
 SHARES = {"images": 0.3, "meshes": 0.35, "mat": 0.1, "tables": 0.1, "banks": 0.05, "boxes": 0.05, "cameras": 0.05}
 BATCH = 5000
 SECONDS = 20.0  # for one input
@@ -93,13 +100,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--inputs", type=int, default=100_000)
     parser.add_argument("--kinds", nargs="+", choices=SHARES, default=list(SHARES))
-    parser.add_argument("--out", type=Path, default=Path("fuzz.json"))
+    parser.add_argument("--out", type=Path, default=RESULT)
     parser.add_argument("--worker", nargs=4, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.worker:
         kind, start, count, folder = arguments.worker
         worker(kind, int(start), int(count), Path(folder))
         return 0
+    here = commit(REPOSITORY, but=[str(path.relative_to(REPOSITORY)) for path in (RESULT, DOCUMENT)])
     report: dict[str, Any] = json.loads(arguments.out.read_text()) if arguments.out.is_file() else {"kinds": {}}
     for kind in arguments.kinds:
         fresh = {"tried": 0, "seconds": 0.0, "outcomes": {}, "slowest_s": 0.0, "peak_mb": 0.0, "failures": []}
@@ -113,6 +121,7 @@ def main() -> int:
             own["slowest_s"] = round(max(own["slowest_s"], batch["slowest"]), 3)
             own["peak_mb"] = round(max(own["peak_mb"], batch["peak_mb"]), 1)
             own["failures"] += batch["failures"]
+            own |= {"date": today(), "commit": here}
             report["inputs"] = sum(k["tried"] for k in report["kinds"].values())
             report["failures"] = sum(len(k["failures"]) for k in report["kinds"].values())
             temporary = arguments.out.with_suffix(".tmp")
@@ -120,7 +129,20 @@ def main() -> int:
             os.replace(temporary, arguments.out)
         print(f"{kind}: {own['tried']} inputs, {own['seconds']} s, slowest {own['slowest_s']} s, "
               f"{own['peak_mb']} MB, {len(own['failures'])} failures; {own['outcomes']}")  # fmt: skip
+    if arguments.out == RESULT:
+        text = DOCUMENT.read_text(encoding="utf-8")
+        DOCUMENT.write_text(between(text, BEGIN, END, table(report)), encoding="utf-8")
     return 1 if report["failures"] else 0
+
+
+def table(report: dict[str, Any]) -> str:
+    rows = [
+        f"| {kind} | {own['tried']:,} | {own['seconds']:.0f} | {own['slowest_s']:.1f} | {own['peak_mb']:.0f} "
+        f"| {len(own['failures'])} | {own['date']}, {own['commit']} |"
+        for kind, own in report["kinds"].items()
+    ]
+    head = ["| of | inputs | s | slowest, s | peak, MB | failures | day, commit |", f"|{' --- |' * 7}"]
+    return "\n".join([*head, *rows, ""])
 
 
 if __name__ == "__main__":

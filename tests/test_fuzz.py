@@ -19,8 +19,8 @@ def fuzz(monkeypatch):
     import fuzz_inputs
 
     yield fuzz, fuzz_inputs
-    for name in ("fuzz", "fuzz_inputs"):
-        sys.modules.pop(name)
+    for name in ("fuzz", "fuzz_inputs", "_record"):
+        sys.modules.pop(name, None)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -78,3 +78,13 @@ def test_the_report_continues_and_names_what_killed_a_process(fuzz, tmp_path, mo
     assert "mat 4: exit code -11" in report["kinds"]["mat"]["failures"][0]
     assert script.main() == 1  # nothing is left to do
     assert len(batches) == 2
+
+
+def test_the_long_run_found_nothing_and_stands_in_security(fuzz):
+    script, _ = fuzz
+    report = json.loads(script.RESULT.read_text())
+    assert report["inputs"] >= 100_000
+    assert set(report["kinds"]) == set(script.SHARES)
+    assert report["failures"] == 0
+    text = script.DOCUMENT.read_text()
+    assert script.between(text, script.BEGIN, script.END, script.table(report)) == text
