@@ -110,6 +110,18 @@ def test_missing_depth_is_background_however_it_is_written() -> None:
     torch.testing.assert_close(filters.depth_curvilinear_saliency(full, ~missing), want)
 
 
+def test_the_background_lies_a_quarter_of_the_range_behind_the_object() -> None:
+    """As if depth had been seen there, with and without a camera."""
+    depth = sphere(33, 12.0, 50.0)
+    near, far = float(depth[depth > 0].min()), float(depth.max())
+    seen, camera = torch.where(depth > 0, depth, near + 1.25 * (far - near)), {"camera_matrix": _camera(60.0, 33)}
+    for layer, options, as_seen in (
+        (filters.hessian_frobenius_norm, {}, {"depth_scale": 1.0 / (far - near)}),
+        (filters.average_shading_gradient, camera, camera),
+    ):  # lengths: the sign is free
+        torch.testing.assert_close(layer(depth, **options).norm(dim=1), layer(seen, **as_seen).norm(dim=1))
+
+
 def test_average_shading_gradient_of_a_sphere() -> None:
     """N = (x, y, .) / r, so |N_x|^2 + |N_y|^2 = (2 + rho^2 / (r^2 - rho^2)) / r^2."""
     radius = 60.0
