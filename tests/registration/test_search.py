@@ -1,6 +1,6 @@
 """The search in small steps, on similarities that are known in closed form."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -22,13 +22,10 @@ def turn(x: float, y: float, z: float) -> Tensor:
     return rotation_from_axis_angle(torch.deg2rad(torch.tensor([x, y, z], dtype=torch.float64)))
 
 
-@dataclass(frozen=True)
 class Turns:
     """Describes a view by its rotation: the similarity of two is (1 + 2 cos of the angle between them) / 3."""
 
-    hull: Tensor = CORNERS
-    centre: Tensor = torch.zeros(3, dtype=torch.float64)
-    radius: float = 1.0
+    hull, centre, radius = CORNERS, torch.zeros(3, dtype=torch.float64), 1.0
 
     def descriptors(self, rotation: Tensor, _: Tensor) -> Tensor:
         return rotation.flatten(1)
@@ -59,9 +56,10 @@ def test_a_hypothesis_stays_within_its_reach(away):
 
 
 def test_coherent_views_of_the_bank_come_first():
-    views = torch.stack([turn(0, 0, 0), turn(0, 14.9, 0), turn(0, 15.1, 0), turn(9, 0, 0), turn(0, 0, 3), turn(1, 0, 0)])
+    turns = ((0, 0, 0), (0, 14.9, 0), (0, 15.1, 0), (9, 0, 0), (0, 0, 3), (1, 0, 0))
+    views = torch.stack([turn(*angles) for angles in turns])
     assert coherent_views(views, torch.tensor([0, 1, 2, 3, 4, 5])).tolist() == [0, 1, 3, 4]
-    # Steps of 5 degrees from the hypothesis would meet a better pose only beyond a hollow: the bank's view is past it.
+    # Steps alone would end near the bank's view, not in it.
     truth = turn(0.0, 12.0, 5.0)
     assert float(rotation_error(around(truth, turn(0, 0, 0), truth).rotation[0], truth)) < 1e-4
 
