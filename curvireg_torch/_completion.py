@@ -10,7 +10,7 @@ SHELLS = ("bash", "zsh", "fish")
 
 _BASH = """\
 _curvireg() {{
-    local word path='' words=''
+    local word path='' words='' commands=''
     COMPREPLY=()
     for word in "${{COMP_WORDS[@]:1:$((COMP_CWORD - 1))}}"; do
         case "$path $word" in
@@ -23,7 +23,7 @@ _curvireg() {{
         case "$path" in
 {words}
         esac
-        [[ ${{COMP_WORDS[COMP_CWORD]}} == -* || -z $path || $path == *evaluate ]] || return 0
+        [[ ${{COMP_WORDS[COMP_CWORD]}} == -* || -n $commands ]] || return 0
         ;;
     esac
     COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
@@ -73,7 +73,8 @@ def _bash(tables: Sequence[tuple[tuple[str, ...], dict[str, str], list[argparse.
                 names = option.option_strings or [path[-1]]  # behind the command stands its first argument
                 values += [f"    '{place} {name}') words='{choices}' ;;" for name in names]
         flags = [name for option in options for name in option.option_strings]
-        words.append(f"        '{place}') words='{' '.join([*commands, *flags])}' ;;")
+        more = " commands=yes" if commands else ""
+        words.append(f"        '{place}') words='{' '.join([*commands, *flags])}'{more} ;;")
     return _BASH.format(paths="\n".join(paths), values="\n".join(values), words="\n".join(words))
 
 

@@ -1,7 +1,11 @@
 """Completion of the command line, asked of the shells themselves."""
 
+import os
+import pty
+import select
 import shutil
 import subprocess
+import time
 
 import pytest
 
@@ -11,6 +15,7 @@ from curvireg_torch.cli import main
 ASKED = [
     ("curvireg reg", {"register"}),
     ("curvireg evaluate ", {"pascal3d", "bop", "web", "--help", "-h"}),
+    ("curvireg plot s", {"sphere", "sheet"}),
     ("curvireg register --preset ", set(PRESET_NAMES)),
     ("curvireg register a.jpg b.stl --unit ", set(UNITS)),
     ("curvireg register a.jpg --no-re", {"--no-refine"}),
@@ -60,5 +65,32 @@ def test_fish(line, words, tmp_path, capsys):
 
 
 @pytest.mark.skipif(shutil.which("zsh") is None, reason="zsh is not installed")
-def test_zsh_reads_it(tmp_path, capsys):
-    answer("zsh", "-f", "-c", f"autoload -U compinit && compinit -D; . {script('zsh', tmp_path, capsys)}")
+@pytest.mark.parametrize(("line", "words"), ASKED)
+def test_zsh(line, words, tmp_path, capsys):
+    """Typed into a terminal, with the tab; what zsh would offer is written down."""
+    (tmp_path / "setup").write_text(
+        f"autoload -U compinit && compinit -D -u; . {script('zsh', tmp_path, capsys)}; cd {tmp_path}\n"
+        'compadd() { local -a found; builtin compadd -O found "$@"; print -rl -- $found >> offered; }\n'
+        "zstyle ':completion:*' insert-tab false\ntouch offered\n"
+        "zle-line-init() { touch ready; }; zle -N zle-line-init\n"
+    )
+    keyboard, screen = pty.openpty()
+    environment = {"PATH": os.environ["PATH"], "TERM": "dumb", "HOME": str(tmp_path)}
+    shell = subprocess.Popen(
+        ["zsh", "-f", "-i"], stdin=screen, stdout=screen, stderr=screen, env=environment, start_new_session=True
+    )
+    try:
+        for keys, sign in ((f". {tmp_path}/setup\n", "ready"), (f"{line}\t\x15touch done\n", "done")):
+            os.write(keyboard, keys.encode())
+            deadline = time.monotonic() + 30
+            while not (tmp_path / sign).exists():
+                assert time.monotonic() < deadline, sign
+                if select.select([keyboard], [], [], 0.05)[0]:
+                    os.read(keyboard, 4096)  # what it draws
+    finally:
+        shell.kill()
+        shell.wait()
+        os.close(keyboard)
+        os.close(screen)
+    offered = set((tmp_path / "offered").read_text().split())
+    assert offered == words
