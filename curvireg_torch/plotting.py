@@ -25,8 +25,14 @@ EVALUATED = {
     "reliability": "share of right answers over confidence",
     "risk": "share of wrong answers over the share that is kept, by confidence",
     "classes": "every error, class by class",
+    "sheet": "a page of the best and the worst photographs, with the contours that were found",
+}
+TABLES = {
+    "curves": "columns of a table over its first one",
+    "bars": "a group of bars for each row of a table",
 }
 FORMATS = (".png", ".svg", ".pdf")
+PAGES = (".html",)
 
 
 def add_parser(commands: Any, common: argparse.ArgumentParser, parents: Sequence[argparse.ArgumentParser]) -> None:
@@ -43,17 +49,19 @@ def add_parser(commands: Any, common: argparse.ArgumentParser, parents: Sequence
         **examples(
             "curvireg plot sphere photo.jpg part.stl --unit mm --box 410 220 890 700 --out sphere.png",
             "curvireg plot confusion results/pascal3d --out confusion.png",
+            "curvireg plot sheet results/pascal3d --out sheet.html",
             "curvireg plot curves results/paper/ranks.csv --out ranks.svg",
         ),
     )
     kinds = plot.add_subparsers(required=True, metavar="KIND")
-    for kind, told in {**REGISTERED, **EVALUATED, "curves": "columns of a table over its first one"}.items():
-        source = {**dict.fromkeys(REGISTERED, "photo.jpg part.stl"), "curves": "table.csv"}.get(kind, "results")
+    for kind, told in {**REGISTERED, **EVALUATED, **TABLES}.items():
+        source = "photo.jpg part.stl" if kind in REGISTERED else "table.csv" if kind in TABLES else "results/pascal3d"
+        formats = _formats(kind)
         parser = kinds.add_parser(
             kind,
             parents=[common, *parents] if kind in REGISTERED else [common],
             help=told,
-            **examples(f"curvireg plot {kind} {source} --out {kind}.png"),
+            **examples(f"curvireg plot {kind} {source} --out {kind}{formats[0]}"),
         )
         if kind in REGISTERED:
             parser.add_argument("photo", type=Path, metavar="PHOTO")
@@ -61,7 +69,8 @@ def add_parser(commands: Any, common: argparse.ArgumentParser, parents: Sequence
             parser.add_argument("--box", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help="px")
             parser.add_argument("--camera", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="px")
         elif kind in EVALUATED:
-            parser.add_argument("source", type=Path, metavar="DIR", help="of curvireg evaluate pascal3d or web")
+            sets = "pascal3d, bop or web" if kind == "sheet" else "pascal3d or web"
+            parser.add_argument("source", type=Path, metavar="DIR", help=f"of curvireg evaluate {sets}")
         else:
             parser.add_argument("source", type=Path, metavar="FILE.csv")
         if kind == "confusion":
@@ -70,7 +79,11 @@ def add_parser(commands: Any, common: argparse.ArgumentParser, parents: Sequence
             )
         elif kind in EVALUATED:
             parser.add_argument("--within", type=float, default=30.0, metavar="DEG", help="that is right (default: 30)")
-        parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=f"{', '.join(FORMATS)}")
+        if kind == "sheet":
+            parser.add_argument(
+                "--each", type=int, default=30, metavar="N", help="of the best, and of the worst (default: 30)"
+            )
+        parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=", ".join(formats))
         parser.set_defaults(run=run, kind=kind, top=None, no_refine=False)
 
 
@@ -80,13 +93,24 @@ def run(arguments: argparse.Namespace) -> None:
     Raises:
         CurviregError: a file is missing or not what it should be, or matplotlib is not installed.
     """
-    if arguments.out.suffix.lower() not in FORMATS:
-        raise InvalidInputError(f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}")
+    formats = _formats(arguments.kind)
+    if arguments.out.suffix.lower() not in formats:
+        raise InvalidInputError(f"--out {arguments.out}: expected a name that ends in {', '.join(formats)}")
+    if arguments.kind == "sheet":
+        from .evaluation import contact_sheet
+
+        n = contact_sheet(arguments.source, arguments.out, each=arguments.each, within_deg=arguments.within)
+        print(f"{arguments.out}: {n} objects")
+        return
     figure = _of_registration(arguments) if arguments.kind in REGISTERED else _of_table(arguments)
     content = BytesIO()
     figure.savefig(content, format=arguments.out.suffix[1:].lower(), dpi=150)
     write_file(arguments.out, content.getvalue())
     print(arguments.out)
+
+
+def _formats(kind: str) -> tuple[str, ...]:
+    return PAGES if kind == "sheet" else FORMATS
 
 
 def _of_registration(arguments: argparse.Namespace) -> Any:
@@ -107,11 +131,14 @@ def _of_registration(arguments: argparse.Namespace) -> Any:
 def _of_table(arguments: argparse.Namespace) -> Any:
     from .visualization import plots
 
-    if arguments.kind == "curves":
+    if arguments.kind in TABLES:
         columns, rows = _table(arguments.source)
-        return plots.curves(columns, [[_number(cell, arguments.source) for cell in row] for row in rows])
+        first: Callable[[str], str | float] = str if arguments.kind == "bars" else _number_of(arguments.source)
+        number = _number_of(arguments.source)
+        return getattr(plots, arguments.kind)(columns, [[first(row[0]), *map(number, row[1:])] for row in rows])
     path = arguments.source / "predictions.csv"
     columns, rows = _table(path)
+    number = _number_of(path)
 
     def column(name: str) -> list[str]:
         if name not in columns:
@@ -121,7 +148,7 @@ def _of_table(arguments: argparse.Namespace) -> Any:
     def numbers(name: str) -> "Tensor":
         import torch
 
-        return torch.tensor([_number(cell or "nan", path) for cell in column(name)], dtype=torch.float64)
+        return torch.tensor([number(cell or "nan") for cell in column(name)], dtype=torch.float64)
 
     if arguments.kind == "confusion":
         return plots.azimuth_confusion(numbers("azimuth"), numbers("true_azimuth"), bins=arguments.bins)
@@ -148,8 +175,13 @@ def _table(path: Path) -> tuple[list[str], list[list[str]]]:
     return columns, rows
 
 
-def _number(cell: str, path: Path) -> float:
-    try:
-        return float(cell)
-    except ValueError as error:
-        raise InvalidInputError(f"{path}: expected a number, got {cell[:40]!r}") from error
+def _number_of(path: Path) -> Callable[[str], float]:
+    """Reads a cell of that table."""
+
+    def number(cell: str) -> float:
+        try:
+            return float(cell)
+        except ValueError as error:
+            raise InvalidInputError(f"{path}: expected a number, got {cell[:40]!r}") from error
+
+    return number

@@ -13,10 +13,10 @@ import torch
 import trimesh
 
 from curvireg_torch import Registrar, camera_matrix
-from curvireg_torch.batch import sheet
 from curvireg_torch.cli import main
 from curvireg_torch.data import read_bop_csv
 from curvireg_torch.geometry import load_mesh, project_points
+from curvireg_torch.visualization import sheet
 from tests._support.lists import CAMERA, box_of, lines, table, write_files, written
 from tests._support.scenes import scene, truck_bank
 
@@ -78,7 +78,8 @@ def test_contours_of_a_thumbnail_lie_on_the_object(scale):
     registrar = Registrar(truck_bank(), refine=False)
     result = registrar([photograph], [edges])[0]
     grey = torch.full_like(photograph, 100)
-    pixels = cv2.imdecode(np.frombuffer(sheet.thumbnail(registrar, result, grey, edges), np.uint8), 1)
+    jpeg = sheet.thumbnail(registrar.describers[0].renderer, result.seen_by, grey, edges)
+    pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), 1)
     y, x = np.nonzero(pixels[..., 1].astype(int) - pixels[..., 2] > 60)  # the outline's green
     assert len(x) > 50
     # The same corners, from the photograph's pixels to the thumbnail's.
@@ -96,14 +97,15 @@ def test_contours_of_a_thumbnail_lie_on_the_object(scale):
 
 def test_of_many_the_best_and_the_worst_are_shown(tmp_path, monkeypatch):
     monkeypatch.setattr(sheet, "SHOWN", 2)
+    asked = []
     rows = [
-        sheet.Shown(row=k, name=f"{k}.png", message="", confidence=k / 10, reliable=k > 5, picture=tmp_path / "none")
-        for k in range(1, 8)
+        sheet.Shown(number=k, name=f"{k}.png", said="", kind="doubtful", picture=lambda k=k: asked.append(k))
+        for k in range(7, 0, -1)
     ]
-    sheet.write_sheet(tmp_path / "index.html", "7 photographs", rows)
+    sheet.write_sheet(tmp_path / "index.html", "7 photographs", rows, table="results.csv")
     page = (tmp_path / "index.html").read_text()
-    assert [int(n) for n in re.findall(r"<b>(\d+)</b>", page)] == [7, 6, 2, 1]
-    assert "The 2 best, then the 2 worst" in page
+    assert [int(n) for n in re.findall(r"<b>(\d+)</b>", page)] == asked == [7, 6, 2, 1]
+    assert "The 2 best, then the 2 worst; results.csv has them all" in page
 
 
 def test_the_posed_mesh_is_written_beside_the_overlay(folder, monkeypatch):

@@ -5,6 +5,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,10 @@ from ..errors import BankError, CurviregError, ImageError, InvalidInputError, Me
 from ..geometry import camera_matrix, whole_image_box
 from ..geometry.cameras import camera_of_view
 from ..registration import FailedRegistration, Registrar, Registration
+from ..visualization.sheet import Shown, thumbnail, write_sheet
 from .bop import write_bop_results
 from .listing import Entry, Listing
 from .records import Record, Records
-from .sheet import Shown, thumbnail, write_sheet
 
 __all__ = ["Counts", "register_entry", "register_list"]
 
@@ -185,7 +186,8 @@ class _Run:
             result, document = register_entry(entry, photo, registrar, bank_seconds=time.perf_counter() - start)
         except (ImageError, InvalidInputError) as error:
             return _failed(str(error), digests)
-        picture = thumbnail(registrar, result, photo.image, document["inputs"]["box"])
+        renderer = registrar.describers[result.model].renderer
+        picture = thumbnail(renderer, result.seen_by, photo.image, document["inputs"]["box"])
         write_file(self._picture(request), picture)  # before the line that says that all is done
         return {"status": "ok", "message": "", **document, "digests": digests}
 
@@ -203,25 +205,31 @@ class _Run:
         return self.registrar
 
     def _finish(self, listing: Listing) -> Counts:
-        shown = [
-            Shown(
-                row=number,
-                name=entry.name,
-                message=record["message"],
-                confidence=record.get("confidence", 0.0),
-                reliable=record.get("reliable", False),
-                picture=self._picture(record["digests"]["request"]),
-            )
-            for number, (entry, record) in enumerate(self._answers(listing), start=1)
-        ]
-        ok = sum(not one.message for one in shown)
-        counts = Counts(ok, len(shown) - ok, sum(one.reliable for one in shown))
+        shown = list(starmap(self._shown, enumerate(self._answers(listing), start=1)))
+        kinds = [one.kind for one, _ in shown]
+        counts = Counts(len(kinds) - kinds.count("failed"), kinds.count("failed"), kinds.count("reliable"))
+        shown.sort(key=lambda pair: pair[1])
         folder = self.records.table.parent
         write_bop_results(folder / "bop.csv", listing.columns, self._rows(listing))
-        write_sheet(folder / "index.html", str(counts), shown)
+        write_sheet(folder / "index.html", str(counts), [one for one, _ in shown], table="results.csv")
         which = any(len(entry.meshes) > 1 for entry in listing.entries)
         self.records.finish(listing.columns, self._rows(listing), which=which)  # last: it moves the lines
         return counts
+
+    def _shown(self, number: int, answer: tuple[Entry, Record]) -> tuple[Shown, tuple[bool, bool, float, int]]:
+        """A row on the page, and by what it is sorted."""
+        entry, record = answer
+        message, reliable, confidence = record["message"], record.get("reliable", False), record.get("confidence", 0.0)
+        kind = "failed" if message else "reliable" if reliable else "doubtful"
+        path = self._picture(record["digests"]["request"])
+        shown = Shown(
+            number=number,
+            name=entry.name,
+            said=message or f"confidence {confidence:.2f}, {kind}",
+            kind=kind,
+            picture=lambda: path.read_bytes() if not message and path.is_file() else None,
+        )
+        return shown, (bool(message), not reliable, -confidence, number)
 
     def _answers(self, listing: Listing) -> Iterator[tuple[Entry, Record]]:
         for entry in listing.entries:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .pascal3d import Pascal3DBenchmark
     from .protocol import Protocol
     from .registry import KINDS
+    from .sheet import contact_sheet
     from .web import WebBenchmark
 else:
     __getattr__, __dir__ = lazy(
@@ -30,6 +31,7 @@ else:
             "pascal3d": "Pascal3DBenchmark",
             "protocol": "Protocol",
             "registry": "KINDS",
+            "sheet": "contact_sheet",
             "web": "WebBenchmark",
         },
     )
@@ -45,6 +47,7 @@ __all__ = [
     "Protocol",
     "WebBenchmark",
     "add_parser",
+    "contact_sheet",
     "evaluate",
     "run",
     "score",

@@ -21,9 +21,9 @@ def estimate_poses(registrar: Registrar, items: Sequence[Item]) -> list[Row]:
 
     Returns:
         For each ``rotation`` (3 x 3 numbers), ``translation`` (3 numbers, unit of the mesh, or None), ``score``,
-        ``confidence``, ``reliable``, ``support`` and ``covariance`` (see :class:`Hypothesis`), ``mesh``: the place of
-        the chosen mesh in the bank, and ``rivals``: rotation, score and evidence of the other hypotheses; or ``failed``
-        with the reason.
+        ``confidence``, ``reliable``, ``support``, ``covariance`` and ``seen_by`` (see :class:`Hypothesis`), ``mesh``:
+        the place of the chosen mesh in the bank, and ``rivals``: rotation, score and evidence of the other hypotheses;
+        or ``failed`` with the reason.
     """
     cameras = [item.camera_matrix for item in items if item.camera_matrix is not None]
     results = registrar(
@@ -48,6 +48,7 @@ def _row(result: Registration | FailedRegistration) -> Row:
         "evidence": dict(best.evidence),
         "covariance": None if best.covariance is None else best.covariance.tolist(),
         "mesh": best.model,
+        "seen_by": [matrix.tolist() for matrix in best.seen_by],
         "rivals": [
             {"rotation": r.rotation.tolist(), "score": r.score, "mesh": r.model, "evidence": dict(r.evidence)}
             for r in rivals

@@ -1,5 +1,6 @@
 """One picture that shows whether a registration can be believed."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -11,6 +12,7 @@ from ..errors import CurviregError, InvalidInputError
 from ..geometry import rotation_error
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import Item, items_of
+from ..rendering.base import DepthRenderer
 
 __all__ = ["contour_overlay", "registration_sheet", "side_pictures"]
 
@@ -48,13 +50,20 @@ def contour_overlay(
     item = _item(image, box)
     T, K = result.seen_by
     K = K if camera_matrix is None else camera_matrix
-    H, W = item.image.shape[-2:]
-    depth = registrar.describers[result.model].renderer.render(T[None], K, (H, W))[0, 0].cpu().numpy()
     picture = to_uint8(item.image)
-    width = draw_contours(picture, depth)
-    x0, y0, x1, y1 = (round(v) for v in item.box.tolist())
-    cv2.rectangle(picture, (x0, y0), (x1, y1), _BOX, max(1, width // 2))
+    draw_pose(picture, registrar.describers[result.model].renderer, (T, K), item.box.tolist())
     return picture
+
+
+def draw_pose(
+    picture: np.ndarray, renderer: DepthRenderer, seen_by: tuple[Tensor, Tensor], box: Sequence[float]
+) -> None:
+    """Draw a mesh's contours, seen by (4, 4) ``T_cam_from_model`` and (3, 3) camera, and a box into (H, W, 3) uint8."""
+    T, K = seen_by
+    H, W = picture.shape[:2]
+    width = draw_contours(picture, renderer.render(T[None], K, (H, W))[0, 0].cpu().numpy())
+    x0, y0, x1, y1 = (round(v) for v in box)
+    cv2.rectangle(picture, (x0, y0), (x1, y1), _BOX, max(1, width // 2))
 
 
 def draw_contours(picture: np.ndarray, depth: np.ndarray) -> int:

@@ -19,6 +19,7 @@ from .sphere import direction_scores, sphere_map
 
 __all__ = [
     "azimuth_confusion",
+    "bars",
     "curves",
     "errors_by_class",
     "fields",
@@ -86,7 +87,10 @@ def fields(registrar: Registrar, result: Registration | Hypothesis, image: Any, 
     return figure
 
 
-def curves(columns: Sequence[str], rows: Sequence[Sequence[float]], *, title: str = "", ylabel: str = "share") -> Any:
+Cells = Sequence[str | float]
+
+
+def curves(columns: Sequence[str], rows: Sequence[Cells], *, title: str = "", ylabel: str = "share") -> Any:
     """Curves over the first column: repeatability around the right view, precision at rank k.
 
     Args:
@@ -102,17 +106,54 @@ def curves(columns: Sequence[str], rows: Sequence[Sequence[float]], *, title: st
         >>> figure.axes[0].lines[0].get_ydata().tolist()
         [0.5, 0.7, 0.8]
     """
-    if len(columns) < 2 or not rows or any(len(row) != len(columns) for row in rows):
-        raise InvalidInputError(f"curves: expected rows of {len(columns)} >= 2 numbers, as many as columns")
-    values = torch.tensor([[float(v) for v in row] for row in rows], dtype=torch.float64)
+    values = _columns(columns, rows)
+    x = [float(row[0]) for row in rows]
     figure = _figure(7.0, 4.0)
     axes = figure.subplots()
-    for name, y in zip(columns[1:], values.T[1:], strict=True):
-        axes.plot(values[:, 0].numpy(), y.numpy(), marker="." if len(rows) < 12 else "", label=name)
+    for name, y in values.items():
+        axes.plot(x, y, marker="." if len(rows) < 12 else "", label=name)
     axes.set(xlabel=columns[0], ylabel=ylabel, title=title)
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small", ncols=2)
     return figure
+
+
+def bars(columns: Sequence[str], rows: Sequence[Cells], *, title: str = "", ylabel: str = "share") -> Any:
+    """A group of bars for each row: precision by class, errors by filter.
+
+    Args:
+        columns: names; the first is that of the groups' names.
+        rows: as long as ``columns``: a group's name and its numbers.
+
+    Raises:
+        InvalidInputError: rows of other lengths, or none.
+        MissingDependencyError.
+
+    Example:
+        >>> figure = bars(["class", "CS/MFC", "CS/IG"], [["car", 0.5, 0.4], ["sofa", 0.7, 0.6]], ylabel="precision")
+        >>> [float(bar.get_height()) for bar in figure.axes[0].containers[1]]
+        [0.4, 0.6]
+    """
+    values = _columns(columns, rows)
+    figure = _figure(8.0, 4.5)
+    axes = figure.subplots()
+    width = 0.8 / len(values)
+    for k, (name, heights) in enumerate(values.items()):
+        axes.bar([i + (k + 0.5) * width - 0.4 for i in range(len(rows))], heights, width, label=name)
+    axes.set_xticks(range(len(rows)), [str(row[0]) for row in rows], rotation=30, ha="right")
+    axes.set(ylabel=ylabel, title=title)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small", ncols=2)
+    return figure
+
+
+def _columns(columns: Sequence[str], rows: Sequence[Cells]) -> dict[str, list[float]]:
+    """The numbers of each column but the first."""
+    if len(columns) < 2 or not rows or any(len(row) != len(columns) for row in rows):
+        raise InvalidInputError(
+            f"rows: expected rows of {len(columns)} >= 2 cells, as many as columns, and at least one"
+        )
+    return {name: [float(row[k]) for row in rows] for k, name in enumerate(columns) if k}
 
 
 def azimuth_confusion(azimuth: Tensor, truth: Tensor, *, bins: int = 8) -> Any:

@@ -1,19 +1,18 @@
-"""One page that shows how a list ended: thumbnails, the best and the worst first."""
+"""One page that shows how many photographs ended: thumbnails with the contours that were found, best or worst first."""
 
 import base64
 import html
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import torch
 from torch import Tensor
 
 from .._files import write_file
-from ..registration import Registrar, Registration
-from ..visualization import contour_overlay
+from ..rendering.base import DepthRenderer
+from .overlay import draw_pose
 
 __all__ = ["Shown", "thumbnail", "write_sheet"]
 
@@ -28,7 +27,7 @@ _PAGE = """<!DOCTYPE html>
 body {{ font: 14px/1.4 system-ui, sans-serif; margin: 1.5rem; background: #fff; color: #222 }}
 #all {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(14rem, 1fr)); gap: 1rem }}
 figure {{ margin: 0; padding: .5rem; border: 1px solid #ccc; border-top: 4px solid #b33 }}
-figure.reliable {{ border-top-color: #2a7 }} figure.doubtful {{ border-top-color: #d90 }}
+figure.reliable, figure.right {{ border-top-color: #2a7 }} figure.doubtful {{ border-top-color: #d90 }}
 img {{ width: 100%; height: 14rem; object-fit: contain; background: #eee }}
 figcaption {{ overflow-wrap: anywhere }}
 </style></head><body><h1>{title}</h1>
@@ -41,21 +40,30 @@ figcaption {{ overflow-wrap: anywhere }}
 
 @dataclass(frozen=True)
 class Shown:
-    """A row on the page: number, photograph, status, message, confidence, whether reliable, file of the thumbnail."""
+    """A photograph on the page.
 
-    row: int
+    Attributes:
+        number: of its row, from 1.
+        name: of the photograph.
+        said: how it ended.
+        kind: "right" or "reliable" (green), "doubtful" (orange), "wrong" or "failed" (red).
+        picture: makes or reads its thumbnail, None where there is none; asked only of what is shown.
+    """
+
+    number: int
     name: str
-    message: str
-    confidence: float
-    reliable: bool
-    picture: Path
+    said: str
+    kind: str
+    picture: Callable[[], bytes | None]
 
 
-def thumbnail(registrar: Registrar, result: Registration, image: Tensor, box: Sequence[float]) -> bytes:
+def thumbnail(renderer: DepthRenderer, seen_by: tuple[Tensor, Tensor], image: Tensor, box: Sequence[float]) -> bytes:
     """JPEG of the photograph around the box, with the mesh's contours at the pose.
 
     Args:
-        registrar: what made ``result``.
+        renderer: of the mesh.
+        seen_by: (4, 4) ``T_cam_from_model`` and (3, 3) camera matrix in px of the photograph, see
+            :class:`~curvireg_torch.registration.Hypothesis`.
         image: (3, H, W) uint8.
         box: x0, y0, x1, y1 px.
     """
@@ -72,38 +80,36 @@ def thumbnail(registrar: Registrar, result: Registration, image: Tensor, box: Se
     to_small = torch.tensor(
         [[x, 0.0, x * (0.5 - left) - 0.5], [0.0, y, y * (0.5 - top) - 0.5], [0.0, 0.0, 1.0]], dtype=torch.float64
     )
-    T, K = result.seen_by
     corners = torch.tensor([[box[0], box[2]], [box[1], box[3]], [1.0, 1.0]], dtype=torch.float64)
     (x0, x1), (y0, y1), _ = (to_small @ corners).tolist()
-    pose = replace(result.hypotheses[0], seen_by=(T, to_small @ K))
-    picture = contour_overlay(registrar, pose, small, [x0, y0, x1, y1])
-    return bytes(cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes())
+    T, K = seen_by
+    draw_pose(small, renderer, (T, to_small @ K), (x0, y0, x1, y1))
+    return bytes(cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes())
 
 
-def write_sheet(path: Path, title: str, rows: Sequence[Shown]) -> None:
+def write_sheet(path: Path, title: str, rows: Sequence[Shown], *, table: str, each: int | None = None) -> None:
     """Write the page, whole in one file.
 
     Args:
         path: of the page.
-        title: how the list ended.
-        rows: in any order; of many, the best and the worst are shown.
+        title: how they ended.
+        rows: the best first.
+        table: name of the file that has them all.
+        each: how many of the best, and of the worst, are shown where there are more (default: 500).
     """
-    ordered = sorted(rows, key=lambda shown: (bool(shown.message), not shown.reliable, -shown.confidence, shown.row))
+    each = SHOWN if each is None else each
     note = "Best first; failed ones last."
-    if len(ordered) > 2 * SHOWN:
-        ordered = [*ordered[:SHOWN], *ordered[-SHOWN:]]
-        note = f"The {SHOWN} best, then the {SHOWN} worst; results.csv has them all."
-    figures = "\n".join(map(_figure, ordered))
+    if len(rows) > 2 * each:
+        rows = [*rows[:each], *rows[-each:]]
+        note = f"The {each} best, then the {each} worst; {table} has them all."
+    figures = "\n".join(map(_figure, rows))
     write_file(path, _PAGE.format(title=html.escape(title), note=note, figures=figures).encode())
 
 
 def _figure(shown: Shown) -> str:
-    kind = "failed" if shown.message else "reliable" if shown.reliable else "doubtful"
-    said = shown.message or f"confidence {shown.confidence:.2f}, {kind}"
-    text: dict[str, Any] = {"name": html.escape(shown.name), "said": html.escape(said), "row": shown.row, "kind": kind}
-    picture = ""
-    if not shown.message and shown.picture.is_file():
-        data = base64.b64encode(shown.picture.read_bytes()).decode()
-        picture = f'<img alt="contours over {text["name"]}" src="data:image/jpeg;base64,{data}">'
-    caption = "<b>{row}</b> {name}<br>{said}".format(**text)
-    return f'<figure class="{kind}">{picture}<figcaption>{caption}</figcaption></figure>'
+    name, jpeg, picture = html.escape(shown.name), shown.picture(), ""
+    if jpeg is not None:
+        data = base64.b64encode(jpeg).decode()
+        picture = f'<img alt="contours over {name}" src="data:image/jpeg;base64,{data}">'
+    caption = f"<b>{shown.number}</b> {name}<br>{html.escape(shown.said)}"
+    return f'<figure class="{shown.kind}">{picture}<figcaption>{caption}</figcaption></figure>'

@@ -68,8 +68,13 @@ def test_curves_are_the_columns():
     assert [line.get_label() for line in axes.lines] == ["mfc", "ig"]
     assert axes.lines[1].get_xdata().tolist() == [-10, 0, 10]
     assert axes.lines[1].get_ydata().tolist() == [0.2, 0.4, 0.1]
-    with pytest.raises(InvalidInputError, match="rows of 2"):
-        plots.curves(["k", "a"], [[1, 2, 3]])
+    axes = plots.bars(["class", "mfc", "ig"], [["car", 0.1, 0.2], ["sofa", 0.5, 0.4]], title="Precision").axes[0]
+    assert [[bar.get_height() for bar in group] for group in axes.containers] == [[0.1, 0.5], [0.2, 0.4]]
+    assert [text.get_text() for text in axes.get_xticklabels()] == ["car", "sofa"]
+    assert [round(bar.get_x(), 6) for bar in axes.containers[1]] == [0.0, 1.0], "beside the first, from the middle on"
+    for draw in (plots.curves, plots.bars):
+        with pytest.raises(InvalidInputError, match="rows of 2"):
+            draw(["k", "a"], [[1, 2, 3]])
 
 
 @pytest.fixture
@@ -119,6 +124,9 @@ def test_the_command_draws_curves_and_registrations(tmp_path, drawn, monkeypatch
     (tmp_path / "ranks.csv").write_text("k,CS/MFC\n1,0.5\n3,0.75\n")
     assert main(["plot", "curves", str(tmp_path / "ranks.csv"), "--out", str(tmp_path / "ranks.png")]) == 0
     assert drawn[0][1] == (["k", "CS/MFC"], [[1.0, 0.5], [3.0, 0.75]])
+    (tmp_path / "precision.csv").write_text("category,CS/MFC\ncar,0.5\n")
+    assert main(["plot", "bars", str(tmp_path / "precision.csv"), "--out", str(tmp_path / "bars.png")]) == 0
+    assert drawn.pop()[1] == (["category", "CS/MFC"], [["car", 0.5]])
     box, _ = write_scene(tmp_path)
     words = [str(tmp_path / "photo.png"), str(tmp_path / "truck.ply"), "--pipeline", str(tmp_path / "small.json")]
     words += ["--quiet", "--box", *map(str, box)]

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..._files import write_file
+from ...errors import MissingDependencyError
+from ...visualization import plots
 from ..store import write_text
 
 __all__ = ["Table", "write_table"]
@@ -64,26 +66,9 @@ def write_table(table: Table, folder: Path) -> list[Path]:
     write_text(paths[0], table.csv())
     write_text(paths[1], table.markdown())
     try:
-        from matplotlib.figure import Figure
-    except ImportError:
+        figure = (plots.curves if table.curve else plots.bars)(table.columns, table.rows, title=table.title, ylabel="")
+    except MissingDependencyError:
         return paths
-    figure = Figure(figsize=(8, 4.5), layout="constrained")
-    axes = figure.add_subplot()
-    numbers = [[float(v) for v in row[1:]] for row in table.rows]
-    for k, name in enumerate(table.columns[1:]):
-        values = [row[k] for row in numbers]
-        if table.curve:
-            axes.plot([float(row[0]) for row in table.rows], values, label=name)
-        else:
-            width = 0.8 / len(table.columns[1:])
-            axes.bar([i + (k + 0.5) * width - 0.4 for i in range(len(values))], values, width, label=name)
-    if table.curve:
-        axes.set_xlabel(table.columns[0])
-    else:
-        axes.set_xticks(range(len(table.rows)), [str(row[0]) for row in table.rows], rotation=30, ha="right")
-    axes.set_title(table.title)
-    axes.legend(fontsize="small", ncols=2)
-    axes.grid(alpha=0.3)
     picture = io.BytesIO()
     figure.savefig(picture, dpi=120, format="png")
     write_file(folder / f"{table.name}.png", picture.getvalue())
