@@ -31,6 +31,7 @@ def add_parser(commands: Any, parents: Sequence[argparse.ArgumentParser]) -> Non
     parser.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help="a mesh or a bank; both can come later")
     parser.add_argument("--box", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help="px; can be drawn")
     parser.add_argument("--camera", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="px")
+    parser.add_argument("--fov", type=float, metavar="DEG", help="degrees that the picture shows across its width")
     parser.add_argument(
         "--host", default=LOCAL, help=f"who may connect: {LOCAL}, this machine alone (default), or 0.0.0.0, all"
     )

@@ -42,6 +42,8 @@ class Inputs:
         self.box = self._numbers("box", ("x0", "y0", "x1", "y1"), self._box_typed)
         self._told().text = "camera, px: gives the translation"
         self.camera = self._numbers("camera", ("fx", "fy", "cx", "cy"), self._camera_typed)
+        self.fov = ui.number("or its field of view, degrees across", on_change=self._fov_typed)
+        self.fov.classes("w-full").props("dense data-testid=fov")
         self.camera_facts = self._told("camera-facts")
         with ui.row().classes("gap-2"):
             ui.button("whole picture", on_click=lambda: self.set_box(None)).props("flat dense no-caps")
@@ -139,6 +141,7 @@ class Inputs:
 
     def set_camera(self, camera: Any) -> None:
         """Take a camera, or None for an unknown one."""
+        self.fov.value = None
         for number, value in zip(self.camera, camera or (None,) * 4, strict=True):
             number.value = value
         self._camera_typed()
@@ -146,11 +149,26 @@ class Inputs:
     def _camera_typed(self) -> None:
         fx, fy, cx, cy = (number.value for number in self.camera)
         self.session.camera = None if None in (fx, fy, cx, cy) else (float(fx), float(fy), float(cx), float(cy))
-        guess = self.session.guessed_camera()
-        self.exif.set_visibility(guess is not None)
-        if self.session.guessed and self.session.picture is not None:
-            focal = self.session.picture.focal_35mm
+        if self.session.camera is not None:
+            self.fov.value = None
+        self._tell_camera()
+
+    def _fov_typed(self) -> None:
+        fov = self.session.fov = None if self.fov.value is None else float(self.fov.value)
+        if fov is not None:
+            for number in self.camera:
+                number.value = None
+        self._tell_camera()
+
+    def _tell_camera(self) -> None:
+        """Say where the camera is from."""
+        session = self.session
+        self.exif.set_visibility(session.guessed_camera() is not None)
+        if session.guessed and session.picture is not None:
+            focal = session.picture.focal_35mm
             self.camera_facts.text = f"a guess by the photograph's EXIF, {focal:g} mm of a 35 mm camera: no covariance"
+        elif session.guess is not None:
+            self.camera_facts.text = "a guess by the field of view: no covariance"
         else:
             unknown = "unknown: the answer is a rotation without translation"
-            self.camera_facts.text = "" if self.session.camera is not None else unknown
+            self.camera_facts.text = "" if session.camera is not None else unknown

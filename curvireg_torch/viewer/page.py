@@ -51,6 +51,7 @@ class Page:
         told = "" if arguments.mesh is None else session.take_mesh(arguments.mesh)
         session.box = arguments.box and tuple(arguments.box)
         session.camera = arguments.camera and tuple(arguments.camera)
+        session.fov = arguments.fov
         return told
 
     @staticmethod
@@ -160,7 +161,9 @@ class Page:
         self.image.style(f"width: min(100%, calc(60vh * {W} / {H}))")
         self.inputs.photo_facts.text = "; ".join([f"{W} x {H} px", *picture.notes])
         self.inputs.set_box(self.session.box)
+        fov = self.session.fov
         self.inputs.set_camera(self.session.camera)
+        self.inputs.fov.value = None if self.session.camera else fov
         self.arrange_layers()
 
     async def _register(self) -> None:

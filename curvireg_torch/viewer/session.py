@@ -20,6 +20,7 @@ from ..data.images import Photo
 from ..errors import CurviregError, InvalidInputError
 from ..evaluation.store import to_json
 from ..geometry import camera_matrix, load_mesh, rotation_error, rotation_from_axis_angle
+from ..geometry.cameras import camera_of_view
 from ..limits import MAX_VIEWER_SECONDS
 from ..matching import ViewBank
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
@@ -61,7 +62,7 @@ class Session:
         options: of ``curvireg view``; unit, up, pose and preset may be changed.
         photo, mesh: where they are on disk, or None.
         names: what the user calls them, for messages and the command line.
-        box, camera: as ``--box`` and ``--camera``, or None.
+        box, camera, fov: as ``--box``, ``--camera`` and ``--fov``, or None; a camera goes before the field of view.
         answer, shown: what was found, and the pose on the page; None before. The answer's command line is another than
             :meth:`command` where the inputs have changed since.
         limit: seconds that a registration may take.
@@ -74,6 +75,7 @@ class Session:
     picture: Photo | None = None
     box: tuple[float, float, float, float] | None = None
     camera: tuple[float, float, float, float] | None = None
+    fov: float | None = None
     answer: Answer | None = None
     shown: Shown | None = None
     limit: float = MAX_VIEWER_SECONDS
@@ -125,6 +127,11 @@ class Session:
         """Whether the camera is the one that the EXIF block tells, as ``--camera exif`` takes it."""
         return self.camera is not None and self.camera == self.guessed_camera()
 
+    @property
+    def guess(self) -> str | float | None:
+        """What the camera is guessed by: "exif", or the field of view in degrees; None where it is given or unknown."""
+        return "exif" if self.guessed else self.fov if self.camera is None else None
+
     def command(self) -> str:
         """The command line that gives the same answer."""
         words = ["curvireg", "register"]
@@ -132,6 +139,7 @@ class Session:
         words += [] if self.box is None else ["--box", *map(_short, self.box)]
         words += ["--camera", "exif"] if self.guessed else []
         words += ["--camera", *map(_short, self.camera)] if self.camera and not self.guessed else []
+        words += ["--fov", _short(self.guess)] if isinstance(self.guess, float) else []
         for option in OPTIONS:
             value = getattr(self.options, option)
             if value is not None and value != DEFAULTS.get(option):
@@ -150,13 +158,14 @@ class Session:
         camera = None if self.guessed else self.camera
         if camera is not None:
             camera_matrix(*camera)  # refused before the bank is made
+        if isinstance(self.guess, float):
+            camera_of_view(self.guess, (1, 1))
         self.stopped, tell = False, self._teller(start)
         with self._named():
             registrar = self._made(self.mesh, tell)
             registrar.progress = tell
             name, meshes = self._name(self.photo, ""), (Path(self._name(self.mesh, "")),)
-            guess = "exif" if self.guessed else None
-            entry = Entry(name=name, cells=(), meshes=meshes, box=self.box, camera=camera, guess=guess)
+            entry = Entry(name=name, cells=(), meshes=meshes, box=self.box, camera=camera, guess=self.guess)
             ready = time.perf_counter() - start
             result, document = register_entry(entry, picture, registrar, bank_seconds=ready)
         box = torch.tensor(document["inputs"]["box"])

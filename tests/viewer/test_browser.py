@@ -182,7 +182,11 @@ def test_from_upload_to_download(browser, folder):
     browser.upload("photograph", folder / "photo.png")
     browser.until(lambda: browser.text("photo-facts") == "240 x 180 px", "photograph")
     assert browser.text("camera-facts").startswith("unknown")
+    browser.part("fov").send_keys("65")
+    browser.until(lambda: browser.text("camera-facts").startswith("a guess by the field of view"), "field of view")
+    browser.until(lambda: "--fov 65" in browser.text("command"), "command")
     browser.click("exif")
+    browser.until(lambda: browser.text("fov") == "", "the camera goes before it")
     told = "a guess by the photograph's EXIF, 37 mm of a 35 mm camera: no covariance"
     browser.until(lambda: browser.text("camera-facts") == told, "EXIF")
     browser.upload("mesh", folder / "truck.ply")

@@ -1,6 +1,7 @@
 """What the page computes, without a page: the command line's answer, then moved by hand and pulled in again."""
 
 import json
+import math
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -139,6 +140,22 @@ def test_without_a_camera_the_rotation_is_that_of_the_view(answered):
         session.camera = camera
 
 
+def test_a_field_of_view_is_the_camera_that_it_says(answered):
+    session, _, _ = answered
+    session.choose(0)
+    camera, session.camera = session.camera, None
+    session.fov = 2 * math.degrees(math.atan(120 / 260))
+    try:
+        session.register()
+        document = session.document()
+        assert document["inputs"]["camera_source"] == "fov"
+        assert document["inputs"]["camera"] == pytest.approx(camera)
+        assert document["translation"] is not None
+        assert document["covariance"] is None
+    finally:
+        session.camera, session.fov = camera, None
+
+
 def test_files_are_called_what_the_user_calls_them(folder):
     session = Session(options())
     (folder / "upload-1").write_text("not a picture")
@@ -181,7 +198,14 @@ def test_the_exif_guess_and_the_command(folder):
         "--unit mm --up=-y --pose any --preset fast --out result"
     )
     session.camera = (300.0, 300.5, 119.5, 89.5)
-    assert "--camera 300 300.5 119.5 89.5" in session.command()
+    session.fov = 65.0
+    assert "--camera 300 300.5 119.5 89.5 --unit" in session.command(), "a camera goes before the field of view"
+    session.camera = None
+    assert "--box 10 20.5 90 80 --fov 65 --unit" in session.command()
+    session.fov = 180.0
+    session.take_mesh(folder / "truck.ply")
+    with pytest.raises(InvalidInputError, match="180"):
+        session.register()
 
 
 def test_it_is_stopped_and_has_a_limit(folder):
