@@ -46,6 +46,7 @@ if TYPE_CHECKING:
         viewpoint_from_rotation,
     )
     from .learned import LearnedCurvilinearSaliency
+    from .location import locate
     from .matching import BankCollection, BankSettings, Ranking, ViewBank, ViewMatcher
     from .pipeline import Pipeline
     from .registration import Registrar, Registration
@@ -70,6 +71,7 @@ else:
                 "rotation_from_viewpoint sample_views uniform_views viewpoint_from_rotation"
             ),
             "learned": "LearnedCurvilinearSaliency",
+            "location": "locate",
             "matching": "BankCollection BankSettings Ranking ViewBank ViewMatcher",
             "pipeline": "Pipeline",
             "registration": "Registrar Registration",
@@ -119,6 +121,7 @@ __all__ = [
     "image_curvilinear_saliency",
     "image_gradient",
     "load_mesh",
+    "locate",
     "multiscale_curvilinear_saliency",
     "multiscale_focus_curves",
     "paper_views",

@@ -82,6 +82,8 @@ def _misused(arguments: argparse.Namespace) -> str | None:
         return f"with --list, expected at most one MESH, got {len(arguments.paths)}; give several by --mesh"
     if sum(map(bool, (arguments.camera, arguments.exif, arguments.fov))) > 1:
         return "expected one of --camera FX FY CX CY, --camera exif, --fov DEG"
+    if arguments.box and (arguments.instances != 1 or arguments.distance):
+        return "--instances and --distance are for objects that are looked for; leave --box out"
     if arguments.list is not None and (arguments.box or arguments.camera):
         return "the list holds boxes and cameras; leave --box and --camera out"
     return None
@@ -126,6 +128,7 @@ def _parser() -> argparse.ArgumentParser:
             "curvireg register photo.jpg part.stl --unit mm --box 410 220 890 700 --out out/part",
             "curvireg register photo.jpg part.stl --camera 1450 1450 960 540 --json",
             "curvireg register photo.jpg part.stl --camera exif --out out/part",
+            "curvireg register shelf.jpg part.stl --instances 4 --out out/shelf",
             "curvireg register --list photos.csv part.stl --out out/parts",
             "curvireg register shots/ turn.mp4 part.stl --every 10 --out out/shots",
             "curvireg register photo.jpg --mesh mug.obj --mesh bowl.obj --out out/which",
@@ -149,12 +152,22 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="LIST",
         help="CSV with columns photo,x0,y0,x1,y1 and, if wanted, fx,fy,cx,cy,mesh; paths count from the list's folder, "
-        "empty cells mean the whole image, no camera, MESH. Or JSON of the like, COCO annotations, the folder of a "
-        "BOP scene",
+        "empty cells mean that the object is looked for, no camera, MESH. Or JSON of the like, COCO annotations, the "
+        "folder of a BOP scene",
     )
     register.add_argument("--every", type=int, default=1, metavar="N", help="of a video, every N-th frame (default: 1)")
     register.add_argument(
-        "--box", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help="px; default: the whole image"
+        "--box", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help="px; default: the object is looked for"
+    )
+    register.add_argument(
+        "--instances", type=int, default=1, metavar="N", help="without a box: up to N objects (default: 1)"
+    )
+    register.add_argument(
+        "--distance",
+        type=float,
+        nargs=2,
+        metavar=("MIN", "MAX"),
+        help="without a box: how near and far the object's centre may be, in the mesh's unit; needs --camera",
     )
     register.add_argument(
         "--camera", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="px; gives the translation. "

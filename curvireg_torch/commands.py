@@ -139,7 +139,7 @@ def register(arguments: argparse.Namespace) -> None:
 def _register_one(arguments: argparse.Namespace, field: nn.Module | None) -> None:
     start = time.perf_counter()
     path = arguments.photos[0]
-    entry = Entry((), str(path), path, tuple(arguments.meshes), arguments.box, arguments.camera, _guess(arguments))
+    entry = _asked(arguments, Entry((), str(path), path, tuple(arguments.meshes), arguments.box, arguments.camera))
     photo = read_photo(path, dtype=torch.uint8)
     if arguments.out is not None:
         probe_folder(arguments.out, "--out")
@@ -195,11 +195,15 @@ def _listing(arguments: argparse.Namespace, out: Path) -> Listing:
         given = [f"--{name}" for name in ("box", "camera") if getattr(arguments, name) is not None]
         if given:
             print(f"{' and '.join(given)}: of all {len(listing.entries)} photographs", file=sys.stderr)
-    guess = _guess(arguments)
-    if guess is None:
-        return listing
-    print("cameras that are not given are guessed; distances err as the guesses do", file=sys.stderr)
-    return replace(listing, entries=tuple(replace(entry, guess=guess) for entry in listing.entries))
+    if _guess(arguments) is not None:
+        print("cameras that are not given are guessed; distances err as the guesses do", file=sys.stderr)
+    return replace(listing, entries=tuple(_asked(arguments, entry) for entry in listing.entries))
+
+
+def _asked(arguments: argparse.Namespace, entry: Entry) -> Entry:
+    """An entry with the options that hold for all photographs."""
+    distance = None if arguments.distance is None else tuple(arguments.distance)
+    return replace(entry, guess=_guess(arguments), instances=arguments.instances, distance=distance)
 
 
 def _guess(arguments: argparse.Namespace) -> str | float | None:
@@ -273,6 +277,10 @@ def _print_result(document: dict[str, Any], out: Path) -> None:
         print("no reliable match: take the pose as a guess; check that the box is tight and the mesh is the object's")
     if ", " in document.get("inputs", {}).get("mesh", ""):
         print(f"mesh: {document['mesh']}")
+    if "found" in document:
+        for found in document["found"]["instances"]:
+            corners = " ".join(f"{v:.0f}" for v in found["box"])
+            print(f"found in box {corners}: there with probability {found['presence']:.2f}")
     if document["translation"] is not None:
         print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")
     deviations = document["standard_deviations"]

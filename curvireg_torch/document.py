@@ -2,7 +2,7 @@
 
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import kornia
@@ -12,7 +12,7 @@ import trimesh
 from . import __version__
 from .registration import RELIABLE, Registrar, Registration
 
-__all__ = ["CONVENTIONS", "SCHEMA", "result_document"]
+__all__ = ["CONVENTIONS", "SCHEMA", "found_document", "result_document"]
 
 SCHEMA = 1
 """Version of ``result.schema.json``; raised when a key goes or changes its meaning."""
@@ -24,9 +24,10 @@ CONVENTIONS = {
     "pixels": "(0, 0) is the centre of the top-left pixel of the picture as viewers show it (EXIF orientation applied)",
     "boxes": "x0, y0, x1, y1 in those pixels",
     "score": "normalised correlation of photograph and view, 0 to 1",
-    "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
-    "reliable": f"confidence of at least {RELIABLE:g}; false = no reliable match, the pose is a guess; "
-    "never true without a box",
+    "confidence": "estimated probability that the rotation is within 30 degrees of the truth; of an object that was "
+    "looked for, times presence",
+    "presence": "estimated probability that the photograph shows the object in that box",
+    "reliable": f"confidence of at least {RELIABLE:g}; false = no reliable match, the pose is a guess",
     "support": "how strongly edges of the photograph lie under the mesh's contours, 0 to 1",
     "covariance": "of turn (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
     "t_true = t + e; null without a camera, and with a guessed one, whose error nobody knows",
@@ -81,6 +82,34 @@ def result_document(result: Registration, registrar: Registrar, seconds: Mapping
             "trimesh": trimesh.__version__,
         },
         "conventions": CONVENTIONS,
+    }
+
+
+def found_document(results: Sequence[Registration]) -> dict[str, Any]:
+    """What is known of objects that were looked for, the surest first.
+
+    Args:
+        results: of one photograph, see :func:`curvireg_torch.registration.find`.
+    """
+    placed = [(result, result.found) for result in results if result.found is not None]
+    places = placed[0][1]
+    return {
+        "presence": places.presence,
+        "proposals": [
+            {"box": box, "score": score}
+            for box, score in zip(places.boxes.tolist(), places.scores.tolist(), strict=True)
+        ],
+        "instances": [
+            {
+                "box": found.box.tolist(),
+                "presence": found.presence,
+                "confidence": result.confidence,
+                "rotation": result.rotation.tolist(),
+                "translation": None if result.translation is None else result.translation.tolist(),
+                "viewpoint": dict(zip(("azimuth", "elevation", "theta"), result.viewpoint, strict=True)),
+            }
+            for result, found in placed
+        ],
     }
 
 

@@ -29,7 +29,17 @@ from .geometry import ViewSphere, sample_views, uniform_views
 from .geometry.views import DEFAULT_DISTANCE
 from .terms import TERMS, Appearance, BoxShape, Correlation, LateTerm, Repeatability, Term, slack_boxes
 
-__all__ = ["DEFAULT", "FIELDS", "PRESETS", "BankSettings", "Pipeline", "ViewPolicy", "field_digest", "preset_named"]
+__all__ = [
+    "DEFAULT",
+    "FIELDS",
+    "PRESETS",
+    "BankSettings",
+    "LocateSettings",
+    "Pipeline",
+    "ViewPolicy",
+    "field_digest",
+    "preset_named",
+]
 
 VERSION = 1
 """Of the JSON form."""
@@ -141,6 +151,29 @@ class BankSettings:
 
 
 @dataclass(frozen=True)
+class LocateSettings:
+    """How an object without a box is looked for, see :class:`curvireg_torch.location.Locator`.
+
+    Attributes:
+        views: of each model, that stand for all of its views.
+        smallest: longer side of the smallest object that is looked for, as a share of the photograph's.
+        proposals: boxes that are proposed.
+        followed: the best of them, which are ranked against all views; the surest is registered.
+    """
+
+    views: int = 96
+    smallest: float = 0.08
+    proposals: int = 20
+    followed: int = 5
+
+    def __post_init__(self) -> None:
+        if min(self.views, self.proposals, self.followed) < 1:
+            raise InvalidInputError(f"locate: expected views, proposals and followed >= 1, got {self}")
+        if not 0.02 <= self.smallest <= 1.0:
+            raise InvalidInputError(f"locate: smallest: expected a share in [0.02, 1], got {self.smallest}")
+
+
+@dataclass(frozen=True)
 class Pipeline:
     """From a photograph, a box and a mesh to a pose: all settings, as plain numbers and texts.
 
@@ -154,6 +187,7 @@ class Pipeline:
         hypotheses: distinct views that are carried through search and contours.
         search: search around them in small steps.
         contours: pull the mesh's contours onto the photograph's edges.
+        locate: how boxes are found that are not given.
 
     Raises:
         InvalidInputError: an unknown name or a number out of range.
@@ -174,6 +208,7 @@ class Pipeline:
     hypotheses: int = 5
     search: bool = True
     contours: bool = True
+    locate: LocateSettings = LocateSettings()
 
     def __post_init__(self) -> None:
         if not self.field.startswith("own:"):
@@ -238,9 +273,18 @@ class Pipeline:
     def describe(self) -> dict[str, Any]:
         """Plain numbers and texts, as JSON holds them."""
         terms = {term.name: {f.name: getattr(term, f.name) for f in fields(term)} for term in self.terms}
-        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("views", "bank", "terms")}
+        own = {
+            f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("views", "bank", "terms", "locate")
+        }
         views = {**asdict(self.views), "elevations": list(self.views.elevations)}
-        return {"version": VERSION, "views": views, "bank": asdict(self.bank), "terms": terms, **own}
+        return {
+            "version": VERSION,
+            "views": views,
+            "bank": asdict(self.bank),
+            "terms": terms,
+            **own,
+            "locate": asdict(self.locate),
+        }
 
     def to_json(self) -> str:
         """The pipeline as a JSON text, which :meth:`from_json` reads."""
@@ -266,6 +310,8 @@ class Pipeline:
                 data["views"] = ViewPolicy(**data["views"])
             if "bank" in data:
                 data["bank"] = BankSettings(**data["bank"])
+            if "locate" in data:
+                data["locate"] = LocateSettings(**data["locate"])
             if "terms" in data:
                 data["terms"] = tuple(_term(name, options) for name, options in data["terms"].items())
             return cls(**data)

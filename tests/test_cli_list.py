@@ -46,7 +46,7 @@ def test_every_row_is_answered_in_the_lists_order(folder, capsys):
         ["negative", "photos/0.png", *box_of(0), "-260", "260", "119.5", "89.5"],
         ["one colour", "flat.png", *nothing, *nothing],
         ["short", "photos/0.png"],
-        ["whole image", "photos/2.png", *nothing, *nothing],
+        ["looked for", "photos/2.png", *nothing, *nothing],
         ["last", " photos/2.png ", *box_of(2), *CAMERA],
     ]
     path = written(folder / "all.csv", header, *rows)

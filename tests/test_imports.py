@@ -30,9 +30,11 @@ ALLOWED = {
     "terms": BASE | {"geometry", "filters", "descriptors", "learned", "pipeline"},  # pipeline: types alone
     "pipeline": BASE | {"geometry", "filters", "descriptors", "terms", "learned"},
     "matching": BASE | {"geometry", "filters", "descriptors", "rendering", "terms", "pipeline"},
+    "location": BASE | {"geometry", "descriptors", "terms", "learned", "pipeline", "matching"},
     "scenes": BASE | {"geometry", "rendering"},
     "learned": BASE | {"geometry", "filters", "matching", "scenes"},
-    "registration": BASE | {"geometry", "filters", "data", "descriptors", "rendering", "pipeline", "matching"},
+    "registration": BASE
+    | {"geometry", "filters", "data", "descriptors", "rendering", "pipeline", "matching", "location"},
     "visualization": BASE | {"geometry", "metrics", "filters", "descriptors", "rendering", "matching", "registration"},
 }
 FORBIDDEN_LIBRARIES = {

@@ -51,18 +51,25 @@ def test_json_is_all_that_is_printed(folder, capsys, check):
     assert printed(capsys) == ""
 
 
-def test_without_a_box_nothing_is_reliable(folder, capsys, monkeypatch):
-    monkeypatch.setattr("curvireg_torch.registration.registrar.RELIABLE", 0.0)
-    words = [folder / "photos" / "0.png", folder / "truck.safetensors", "--camera", *CAMERA, "--json"]
-    found = []
-    for box in (["--box", *box_of(0)], []):
-        assert register(*words, *box) == 0
-        found.append(json.loads(printed(capsys)))
-    monkeypatch.undo()
-    given, whole = found
-    assert given["covariance"] is not None
-    assert not whole["reliable"]
-    assert whole["covariance"] is None
+def test_without_a_box_it_says_what_was_found_where(folder, capsys, check):
+    words = [folder / "photos" / "0.png", folder / "truck.safetensors", "--camera", *CAMERA, "--no-refine"]
+    assert register(*words, "--json", "--instances", "2") == 0
+    document = json.loads(printed(capsys))
+    check(document)
+    found = document["found"]
+    assert document["inputs"]["box"] == found["instances"][0]["box"] == found["proposals"][0]["box"]
+    assert document["rotation"] == found["instances"][0]["rotation"]
+    assert found["presence"] == found["instances"][0]["presence"] >= found["instances"][-1]["presence"]
+    assert document["confidence"] <= found["presence"]
+    assert register(*words, "--out", folder / "found") == 0
+    assert re.search(r"found in box [-\d ]+: there with probability 0\.\d\d", printed(capsys))
+    given = [*words, "--box", *box_of(0), "--json"]
+    assert register(*given) == 0
+    assert "found" not in json.loads(printed(capsys))
+    for more in (["--instances", "2"], ["--distance", "1", "2"]):
+        with pytest.raises(SystemExit):
+            register(*given, *more)
+        assert "are for objects that are looked for" in capsys.readouterr().err
 
 
 def test_json_of_a_list_is_one_line_each(folder, capsys, check):

@@ -24,10 +24,11 @@ class Entry:
         name: the photograph, as the list calls it.
         photo: its file; None where ``trouble`` is.
         meshes: files; several: which of them is it?
-        box: x0, y0, x1, y1 in px, None for the whole image.
+        box: x0, y0, x1, y1 in px, None: the object is looked for.
         camera: fx, fy, cx, cy in px, None where it is not known.
         guess: where it is not known: "exif" takes the focal length that the photograph's file tells, a number is the
             degrees that the picture shows across its width; None: no camera.
+        instances, distance: without a box, see :func:`curvireg_torch.registration.find`.
         trouble: why the row cannot be used, "" where it can.
     """
 
@@ -38,6 +39,8 @@ class Entry:
     box: Sequence[float] | None = None
     camera: Sequence[float] | None = None
     guess: str | float | None = None
+    instances: int = 1
+    distance: tuple[float, float] | None = None
     trouble: str = ""
 
 
@@ -55,8 +58,8 @@ def listing(
     """The photographs of a table of texts.
 
     Columns, in any order: ``photo``, ``x0``, ``y0``, ``x1``, ``y1``, and, if wanted, ``fx``, ``fy``, ``cx``, ``cy``,
-    ``mesh``; others are passed through. Empty cells: the whole image, no camera, ``meshes``. A row that cannot be used
-    says so in its ``trouble``.
+    ``mesh``; others are passed through. Empty cells: the object is looked for, no camera, ``meshes``.
+    A row that cannot be used says so in its ``trouble``.
 
     Args:
         name: of the table, for errors.

@@ -37,7 +37,7 @@ def list_photographs(
     Args:
         paths: photographs, folders of them, patterns such as ``shots/*.jpg``, videos.
         meshes: of all of them; several: which of them is it?
-        box: x0, y0, x1, y1 in px of every photograph; default the whole image.
+        box: x0, y0, x1, y1 in px of every photograph; default: the object is looked for.
         camera: fx, fy, cx, cy in px of every photograph.
         every: of a video, every how many frames.
         frames: folder for frames of videos, as PNG.

@@ -14,11 +14,11 @@ from tqdm import tqdm
 
 from .._files import file_digest, write_file
 from ..data import Photo, read_photo
-from ..document import SCHEMA, result_document
+from ..document import SCHEMA, found_document, result_document
 from ..errors import BankError, CurviregError, ImageError, InvalidInputError, MeshError
-from ..geometry import camera_matrix, whole_image_box
+from ..geometry import camera_matrix
 from ..geometry.cameras import camera_of_view
-from ..registration import FailedRegistration, Registrar, Registration
+from ..registration import FailedRegistration, Registrar, Registration, find
 from ..visualization.sheet import Shown, thumbnail, write_sheet
 from .bop import write_bop_results
 from .listing import Entry, Listing
@@ -85,13 +85,17 @@ def register_entry(
         CurviregError: it cannot be registered; the message begins with the photograph's name.
     """
     start = time.perf_counter()
-    box = whole_image_box(photo.image) if entry.box is None else torch.tensor(entry.box)
     K, source = _camera(entry, photo)
-    result = registrar([photo.image], box[None], K)[0]
+    if entry.box is None:
+        results = find(registrar, [photo.image], K, instances=entry.instances, distance=entry.distance)[0]
+    else:
+        results = registrar([photo.image], torch.tensor(entry.box)[None], K)
+    result = results[0]
     if isinstance(result, FailedRegistration):
         raise type(result.error)(
             str(result.error).replace("image 0: box 0", "image 0: box").replace("image 0", entry.name)
         )
+    box = torch.tensor(entry.box) if result.found is None else result.found.box
     document = result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start})
     document["mesh"] = str(entry.meshes[result.model])
     for pose, hypothesis in zip(document["top"], result.hypotheses, strict=True):
@@ -104,9 +108,9 @@ def register_entry(
         "camera_source": source,
         "picture": photo.facts(),
     }
-    if entry.box is None:  # confidence was fitted on boxes around objects
-        document["reliable"] = False
-    if source in ("exif", "fov") or entry.box is None:  # how far a guess is off, nobody knows
+    if result.found is not None:
+        document["found"] = found_document([r for r in results if isinstance(r, Registration)])
+    if source in ("exif", "fov"):  # how far a guess is off, nobody knows
         document["covariance"] = document["standard_deviations"] = None
     return result, document
 
@@ -163,7 +167,10 @@ class _Run:
             if mesh not in self.mesh_digests:
                 self.mesh_digests[mesh] = file_digest(mesh)
         meshes = [(mesh.name, self.mesh_digests[mesh]) for mesh in entry.meshes]
-        asked = [entry.name, entry.box, entry.camera, entry.guess, meshes, self.settings]
+        asked = [
+            *(entry.name, entry.box, entry.camera, entry.guess, entry.instances, entry.distance),
+            *(meshes, self.settings),
+        ]
         return hashlib.blake2b(json.dumps(asked).encode(), digest_size=8).hexdigest()
 
     def _is_done(self, request: str, entry: Entry) -> bool:

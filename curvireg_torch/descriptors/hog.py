@@ -11,7 +11,7 @@ from ..filters.blocks import Planes, in_blocks
 from ..filters.inputs import finite_vectors
 from ..filters.numerics import at_least_float32, floor, full_precision, image_maximum, safe_sqrt
 
-__all__ = ["HOG", "hog", "hog_length"]
+__all__ = ["HOG", "hog", "hog_length", "orientation_cells"]
 
 VOTINGS = ("linear", "hard")
 
@@ -86,6 +86,35 @@ def hog(
         return (_normalised_blocks(cells, block, limit),)
 
     return in_blocks(layer, at_least_float32(field)).to(field.dtype)
+
+
+def orientation_cells(field: Tensor, *, grid: tuple[int, int], bins: int = 9) -> Tensor:
+    """The histograms of :func:`hog` before blocks are made of them, on a grid that need not be square.
+
+    Args:
+        field: (B, 2, H, W), channel 0 = x, 1 = y; vectors that are not finite have no vote.
+        grid: rows and columns of cells, at most H and W.
+        bins: orientations over 180 degrees.
+
+    Returns:
+        (B, bins, rows, columns) mean length of the vectors of each orientation, in the field's unit.
+
+    Raises:
+        InvalidInputError: wrong shape, dtype or option, or fewer pixels than cells.
+
+    Example:
+        >>> orientation_cells(torch.randn(1, 2, 48, 64), grid=(6, 8)).shape
+        torch.Size([1, 9, 6, 8])
+    """
+    check_field(field)
+    _check_options(min(grid), bins, 1, 1.0, "linear")
+    H, W = field.shape[-2:]
+    if grid[0] > H or grid[1] > W:
+        raise InvalidInputError(f"field: expected at least {grid[0]} x {grid[1]} px for {grid=}, got {H} x {W}")
+    votes = _orientation_votes(finite_vectors(at_least_float32(field)), bins, "linear")
+    rows, columns = (_cell_weights(n, cells, "linear", votes) for n, cells in zip((H, W), grid, strict=True))
+    with full_precision(votes):
+        return (rows @ (votes @ columns.T)).to(field.dtype)
 
 
 def _check_options(grid: int, bins: int, block: int, clip: float, voting: str) -> float:

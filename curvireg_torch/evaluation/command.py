@@ -18,7 +18,7 @@ __all__ = ["add_datasets", "add_parser", "run"]
 PROTOCOL = (
     "cad=annotated|any|fused: the annotated CAD, the best of the class, or one vote of all of the class; "
     "pose=upright|any: whether objects are known to stand upright; "
-    "box=annotated|SHARE: each edge moved by up to SHARE of the side (seed=N)"
+    "box=annotated|none|SHARE: as annotated; looked for; or each edge moved by up to SHARE of the side (seed=N)"
 )
 
 
@@ -102,6 +102,8 @@ def run(arguments: argparse.Namespace) -> None:
         )
     if summary["med_err_deg"] is not None:
         print("   ".join([*(f"{n} {summary[n]:.3f}" for n in shares), f"med_err_deg {summary['med_err_deg']:.1f}"]))
+    if "localisation" in summary:
+        print("   ".join(f"{name} {value:.3f}" for name, value in summary["localisation"].items() if name != "n"))
     print(f"protocol: {summary['protocol']}; see {arguments.out}/summary.json")
 
 

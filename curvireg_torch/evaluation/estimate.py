@@ -5,30 +5,31 @@ from collections.abc import Sequence
 import torch
 
 from ..matching import Photographs, Ranking, ViewMatcher
-from ..registration import FailedRegistration, Registrar, Registration
+from ..registration import FailedRegistration, Found, Registrar, Registration
 from ..registration.inputs import Item
 from .benchmark import Row
 
 __all__ = ["FusedMatcher", "estimate_poses"]
 
 
-def estimate_poses(registrar: Registrar, items: Sequence[Item]) -> list[Row]:
+def estimate_poses(registrar: Registrar, items: Sequence[Item], *, boxes: bool = True) -> list[Row]:
     """Register photographs to one mesh, or to the best of several.
 
     Args:
         registrar: of the bank of the meshes.
         items: photographs with their boxes, all with a camera matrix or all without.
+        boxes: whether the registrar is given the boxes; without, it looks for the objects.
 
     Returns:
         For each ``rotation`` (3 x 3 numbers), ``translation`` (3 numbers, unit of the mesh, or None), ``score``,
         ``confidence``, ``reliable``, ``support``, ``covariance`` and ``seen_by`` (see :class:`Hypothesis`), ``mesh``:
         the place of the chosen mesh in the bank, and ``rivals``: rotation, score and evidence of the other hypotheses;
-        or ``failed`` with the reason.
+        of objects that were looked for, ``found``: the presence and the proposed boxes; or ``failed`` with the reason.
     """
     cameras = [item.camera_matrix for item in items if item.camera_matrix is not None]
     results = registrar(
         [item.image for item in items],
-        torch.stack([item.box for item in items]),
+        torch.stack([item.box for item in items]) if boxes else None,
         torch.stack(cameras) if cameras else None,
     )
     return [_row(result) for result in results]
@@ -49,11 +50,16 @@ def _row(result: Registration | FailedRegistration) -> Row:
         "covariance": None if best.covariance is None else best.covariance.tolist(),
         "mesh": best.model,
         "seen_by": [matrix.tolist() for matrix in best.seen_by],
+        **({} if result.found is None else {"found": _found(result.found)}),
         "rivals": [
             {"rotation": r.rotation.tolist(), "score": r.score, "mesh": r.model, "evidence": dict(r.evidence)}
             for r in rivals
         ],
     }
+
+
+def _found(found: Found) -> Row:
+    return {"presence": found.presence, "boxes": found.boxes.tolist(), "scores": found.scores.tolist()}
 
 
 class FusedMatcher(ViewMatcher):

@@ -13,6 +13,7 @@ from .. import __version__
 from .._checks import check_positive
 from ..pipeline import DEFAULT, PRESETS, Pipeline, preset_named
 from .benchmark import Benchmark, Row
+from .localisation import localisation
 from .predict import predict
 from .store import PredictionStore, to_json, write_text
 from .workers import workers
@@ -119,6 +120,7 @@ def score(benchmark: Benchmark, out: Path, *, limit: int | None = None) -> Row:
     settings["root"] = Path(settings["root"]).name  # summaries are shared; where data lies is nobody's business
     summary = {
         **benchmark.summary(items, rows),
+        **({"localisation": localisation(items, rows)} if benchmark.protocol.box is None else {}),
         "failed": sum("failed" in row for row in rows),
         "skipped": dict(sorted(skipped.items())),
         "protocol": settings["protocol"],

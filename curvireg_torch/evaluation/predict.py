@@ -99,7 +99,7 @@ class _Workshop:
         rows: dict[str, Row] = {}
         photographs: dict[str, Photograph] = {}
         for item in items:
-            if not bool(item.box.isfinite().all()):
+            if protocol.box is not None and not bool(item.box.isfinite().all()):
                 rows[item.key] = {"skipped": "unknown_box"}
                 continue
             try:
@@ -116,7 +116,7 @@ class _Workshop:
             return [rows.get(item.key, skipped) for item in items]
         ready = time.perf_counter()
         if registrar is not None:
-            found = estimate_poses(registrar, list(photographs.values()))
+            found = estimate_poses(registrar, list(photographs.values()), boxes=protocol.box is not None)
             each = {"bank": ready - start, "register": time.perf_counter() - ready}
             seconds = {name: value / len(found) for name, value in each.items()}
             for (key, photograph), row in zip(photographs.items(), found, strict=True):

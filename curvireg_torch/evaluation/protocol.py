@@ -23,7 +23,8 @@ class Protocol:
         cad: "annotated": the CAD that the annotation names. "any": every CAD of the class is registered, the best score
             wins. "fused": the scores of a view are averaged over the CADs of the class, and the best view wins.
         pose: "upright": the object stands upright and is not seen from below. "any": nothing is known.
-        box: 0 for the annotated box; x > 0 moves each edge by a random share, up to x, of the box's side.
+        box: 0 for the annotated box; x > 0 moves each edge by a random share, up to x, of the box's side; None: no box
+            is given, the object is looked for.
         seed: of those moves. The move of an object depends on its name and on nothing else.
 
     Raises:
@@ -39,13 +40,13 @@ class Protocol:
 
     cad: str = "annotated"
     pose: str = "upright"
-    box: float = 0.0
+    box: float | None = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
         for name, options in CHOICES.items():
             check_option(getattr(self, name), options, name)
-        if not 0.0 <= self.box <= 0.45:
+        if self.box is not None and not 0.0 <= self.box <= 0.45:
             raise InvalidInputError(f"box: expected a share in [0, 0.45], got {self.box}")
 
     @classmethod
@@ -53,19 +54,20 @@ class Protocol:
         """From words such as ``cad=any``, ``pose=any``, ``box=0.1``, ``seed=1``; what is not named keeps its default.
 
         Args:
-            words: KEY=VALUE each; ``box=annotated`` is 0.
+            words: KEY=VALUE each; ``box=annotated`` is 0, ``box=none`` is None.
             pose: the default of ``pose``.
 
         Raises:
             InvalidInputError: an unknown key or value.
         """
-        values: dict[str, str | float | int] = {"pose": pose}
+        values: dict[str, str | float | int | None] = {"pose": pose}
+        named = {"annotated": 0.0, "none": None}
         for word in words:
             key, _, value = word.partition("=")
             check_option(key, [f.name for f in fields(cls)], "protocol")
             try:
                 if key == "box":
-                    values[key] = 0.0 if value == "annotated" else float(value)
+                    values[key] = named[value] if value in named else float(value)
                 else:
                     values[key] = int(value) if key == "seed" else value
             except ValueError as error:
@@ -73,7 +75,7 @@ class Protocol:
         return cls(**values)  # type: ignore[arg-type]
 
     def __str__(self) -> str:
-        box = f"box={self.box:g} seed={self.seed}" if self.box else "box=annotated"
+        box = f"box={self.box:g} seed={self.seed}" if self.box else f"box={'none' if self.box is None else 'annotated'}"
         return f"cad={self.cad} pose={self.pose} {box}"
 
 
@@ -84,7 +86,7 @@ def perturbed_box(box: Tensor, protocol: Protocol, key: str) -> Tensor:
         box: (4,) x0, y0, x1, y1 in px.
 
     Returns:
-        (4,) px, the edges moved as ``protocol.box`` says.
+        (4,) px, the edges moved as ``protocol.box`` says; as it is if that is 0 or None.
 
     Example:
         >>> box = torch.tensor([0.0, 0.0, 100.0, 50.0])
@@ -92,7 +94,7 @@ def perturbed_box(box: Tensor, protocol: Protocol, key: str) -> Tensor:
         >>> bool(((moved - box).abs() <= torch.tensor([10.0, 5.0, 10.0, 5.0])).all() and (moved != box).all())
         True
     """
-    if protocol.box == 0:
+    if not protocol.box:
         return box
     seed = int.from_bytes(hashlib.sha256(f"{protocol.seed} {key}".encode()).digest()[:7])
     shift = 2.0 * torch.rand(4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1.0

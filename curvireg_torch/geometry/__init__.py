@@ -22,7 +22,7 @@ from .conversions import (
     rotation_from_axis_angle,
     rotation_from_quaternion,
 )
-from .crops import crop_images, crop_transforms, square_boxes, whole_image_box
+from .crops import box_iou, crop_images, crop_transforms, square_boxes, whole_image_box
 from .mesh import load_mesh, mesh_centre, mesh_radius, normalization_transform
 from .neighbours import nearest_views
 from .symmetry import symmetry_transforms, views_without_symmetric
@@ -35,6 +35,7 @@ __all__ = [
     "SurfaceColours",
     "ViewSphere",
     "axis_angle_from_rotation",
+    "box_iou",
     "camera_matrix",
     "crop_images",
     "crop_transforms",

@@ -8,7 +8,7 @@ from torch import Tensor
 from .._checks import check_positive, check_tensor
 from ..errors import InvalidInputError
 
-__all__ = ["check_boxes", "crop_images", "crop_transforms", "square_boxes", "whole_image_box"]
+__all__ = ["box_iou", "check_boxes", "crop_images", "crop_transforms", "square_boxes", "whole_image_box"]
 
 
 def whole_image_box(image: Tensor) -> Tensor:
@@ -36,6 +36,20 @@ def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
             raise InvalidInputError(
                 f"{shown}: wholly outside the {W} x {H} image; give pixel coordinates of this image"
             )
+
+
+def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
+    """(N, M) intersection over union of (N, 4) and (M, 4) boxes x0, y0, x1, y1; 0 where the union is empty.
+
+    Example:
+        >>> box_iou(torch.tensor([[0.0, 0.0, 2.0, 2.0]]), torch.tensor([[1.0, 0.0, 3.0, 2.0]]))
+        tensor([[0.3333]])
+    """
+    common = torch.minimum(boxes[:, None, 2:], others[:, 2:]) - torch.maximum(boxes[:, None, :2], others[:, :2])
+    overlap = common.clamp(min=0).prod(dim=-1)
+    first, second = ((box[:, 2:] - box[:, :2]).clamp(min=0).prod(dim=-1) for box in (boxes, others))
+    union = first[:, None] + second - overlap
+    return overlap / torch.where(union > 0, union, torch.ones_like(union))
 
 
 def square_boxes(boxes: Tensor, margin: float) -> Tensor:

@@ -146,10 +146,16 @@ class ViewDescriber:
         return torch.cat([grey, colour.to(grey)], dim=1)
 
     @torch.no_grad()
+    def fields(self, rotations: Tensor, distances: Tensor) -> Tensor:
+        """(N, 2, S, S) fields of the framed views."""
+        out: Tensor = self._filter(self.depth(rotations, distances)[0])
+        return out
+
+    @torch.no_grad()
     def descriptors(self, rotations: Tensor, distances: Tensor) -> Tensor:
         """(N, D) of (N, 3, 3) rotations at (N,) distances of the object's centre, in model units."""
         parts = [
-            self.descriptor(self._filter(self.depth(R, z)[0]))
+            self.descriptor(self.fields(R, z))
             for R, z in zip(rotations.split(CHUNK), distances.split(CHUNK), strict=True)
         ]
         return torch.cat(parts)

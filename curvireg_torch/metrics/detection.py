@@ -18,7 +18,7 @@ from torch import Tensor
 
 from curvireg_torch._checks import check_positive, check_same_device, check_tensor
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import viewpoint_from_rotation
+from curvireg_torch.geometry import box_iou, viewpoint_from_rotation
 
 from ._samples import check_finite, shown
 from .viewpoint import same_bin, symmetric_rotation_error
@@ -151,14 +151,6 @@ def average_rotation_precision(detections: Detections, objects: Objects, *, thre
     return _area(detections.scores, claimed >= 0, right, len(objects.image))
 
 
-def _iou(a: Tensor, b: Tensor) -> Tensor:
-    """(N, 4) x (M, 4) -> (N, M), 0 where the union is empty."""
-    overlap = (torch.minimum(a[:, None, 2:], b[:, 2:]) - torch.maximum(a[:, None, :2], b[:, :2])).clamp(min=0).prod(-1)
-    area_a, area_b = ((box[:, 2:] - box[:, :2]).clamp(min=0).prod(-1) for box in (a, b))
-    union = area_a[:, None] + area_b - overlap
-    return overlap / torch.where(union > 0, union, torch.ones_like(union))
-
-
 def _claims(detections: Detections, objects: Objects) -> Tensor:
     """(N,) index of the object that each detection claims, -1 for none."""
     check_finite(objects.boxes, "objects.boxes")
@@ -172,7 +164,7 @@ def _claims(detections: Detections, objects: Objects) -> Tensor:
         there = torch.nonzero(objects.image == image).flatten()
         if len(there) == 0:
             continue
-        iou, best = _iou(detections.boxes[mine], objects.boxes[there]).max(1)
+        iou, best = box_iou(detections.boxes[mine], objects.boxes[there]).max(1)
         free = set(range(len(there)))
         for d, overlap, o in zip(mine.tolist(), iou.tolist(), best.tolist(), strict=True):
             if overlap >= _MIN_IOU and o in free:

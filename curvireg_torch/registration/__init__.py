@@ -3,8 +3,9 @@
 from ..matching import distinct_views
 from .confidence import RELIABLE, confidence, ranking_evidence
 from .contour import ContourFit, fit_contours
+from .finding import find
 from .hypotheses import Hypotheses, hypotheses
-from .pose import FailedRegistration, Hypothesis, Registration
+from .pose import FailedRegistration, Found, Hypothesis, Registration
 from .registrar import Registrar
 from .search import coherent_views, search
 from .verify import verdict
@@ -13,6 +14,7 @@ __all__ = [
     "RELIABLE",
     "ContourFit",
     "FailedRegistration",
+    "Found",
     "Hypotheses",
     "Hypothesis",
     "Registrar",
@@ -20,6 +22,7 @@ __all__ = [
     "coherent_views",
     "confidence",
     "distinct_views",
+    "find",
     "fit_contours",
     "hypotheses",
     "ranking_evidence",

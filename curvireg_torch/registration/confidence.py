@@ -11,10 +11,13 @@ from ..matching import Ranking
 __all__ = [
     "EVIDENCE",
     "POSE_EVIDENCE",
+    "PRESENCE_EVIDENCE",
     "RELIABLE",
     "confidence",
     "pose_confidence",
     "pose_evidence",
+    "presence",
+    "presence_evidence",
     "ranking_evidence",
 ]
 
@@ -37,6 +40,13 @@ POSE_EVIDENCE = ("similarity", "margin", "camera")
 _POSE_WEIGHTS = (1.593, 0.584, 1.706)
 _POSE_BIAS = -1.615
 """Logistic regression on photographs of textured meshes, by scripts/fit_verdict.py."""
+
+PRESENCE_EVIDENCE = ("place", "similarity", "look")
+"""What :func:`presence_evidence` measures, in its order."""
+
+_PRESENCE_WEIGHTS = (0.5, 5.0, 14.0)
+_PRESENCE_BIAS = -11.7
+"""Logistic regression on mosaics of photographs of textured meshes."""
 
 MARGIN = 5.0
 """A lead that is larger tells no more."""
@@ -117,3 +127,26 @@ def pose_confidence(evidence: Sequence[float]) -> float:
     """
     values, weights = (torch.tensor(v, dtype=torch.float64) for v in (evidence, _POSE_WEIGHTS))
     return float(torch.sigmoid(values @ weights + _POSE_BIAS))
+
+
+def presence_evidence(score: float, ranking: Ranking) -> list[float]:
+    """Numbers that tell whether the object is there at all (``PRESENCE_EVIDENCE``).
+
+    Args:
+        score: of the locator for the box.
+        ranking: of the one box; the best raw scores of correlation and of appearance count, 0 without that term.
+    """
+    looks = ranking.terms.get("appearance")
+    look = 0.0 if looks is None else float(looks.detach()[looks.isfinite()].max())
+    return [score, float(ranking.hog.detach().max()), look]
+
+
+def presence(evidence: Sequence[float]) -> float:
+    """Probability that the photograph shows the object where its pose was found, from :func:`presence_evidence`.
+
+    Example:
+        >>> presence([8.0, 0.9, 0.5]) > presence([4.0, 0.6, 0.2])
+        True
+    """
+    values, weights = (torch.tensor(v, dtype=torch.float64) for v in (evidence, _PRESENCE_WEIGHTS))
+    return float(torch.sigmoid(values @ weights + _PRESENCE_BIAS))

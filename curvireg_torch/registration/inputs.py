@@ -12,7 +12,7 @@ from torch import Tensor
 from ..data.images import read_photo
 from ..errors import CurviregError, ImageError, InvalidInputError
 from ..geometry.cameras import check_camera_matrix
-from ..geometry.crops import check_boxes
+from ..geometry.crops import check_boxes, whole_image_box
 
 __all__ = ["Item", "check_crop", "items_of", "named"]
 
@@ -31,7 +31,7 @@ def items_of(images: Tensor | Sequence[Any], boxes: Any, camera_matrices: Any | 
 
     Args:
         images: (B, C, H, W), or a list of tensors (C, H, W), arrays (H, W) or (H, W, C), or paths.
-        boxes: (B, 4) x0, y0, x1, y1 in px.
+        boxes: (B, 4) x0, y0, x1, y1 in px; None: the whole images.
         camera_matrices: (B, 3, 3), or (3, 3) for all, in px; None: unknown.
 
     Raises:
@@ -40,7 +40,8 @@ def items_of(images: Tensor | Sequence[Any], boxes: Any, camera_matrices: Any | 
     if isinstance(images, str | PathLike) or (isinstance(images, Tensor) and images.ndim != 4):
         raise InvalidInputError("images: expected a batch (B, C, H, W) or a list; put a single one into a list")
     n = len(images)
-    boxes = torch.as_tensor(boxes)
+    whole = boxes is None
+    boxes = torch.zeros(n, 4) if whole else torch.as_tensor(boxes)
     boxes = boxes.view(0, 4) if n == 0 and boxes.numel() == 0 else boxes
     if tuple(boxes.shape) != (n, 4):
         raise InvalidInputError(f"boxes: expected shape ({n}, 4), one for each image, got {tuple(boxes.shape)}")
@@ -55,14 +56,15 @@ def items_of(images: Tensor | Sequence[Any], boxes: Any, camera_matrices: Any | 
     out: list[Item | CurviregError] = []
     for i in range(n):
         try:
-            out.append(_item(images[i], boxes[i].detach().cpu().float(), cameras[i]))
+            out.append(_item(images[i], None if whole else boxes[i].detach().cpu().float(), cameras[i]))
         except CurviregError as error:
             out.append(named(error, f"image {i}"))
     return out
 
 
-def _item(image: Any, box: Tensor, K: Tensor | None) -> Item:
+def _item(image: Any, box: Tensor | None, K: Tensor | None) -> Item:
     pixels = _pixels(image)
+    box = whole_image_box(pixels).cpu() if box is None else box
     check_boxes(box[None], [(int(pixels.shape[-2]), int(pixels.shape[-1]))])
     if K is not None:
         check_camera_matrix(K)

@@ -14,7 +14,7 @@ from ..geometry.viewpoint import viewpoint_from_rotation
 from ..matching import Ranking
 from .confidence import RELIABLE
 
-__all__ = ["FailedRegistration", "Hypothesis", "Registration"]
+__all__ = ["FailedRegistration", "Found", "Hypothesis", "Registration"]
 
 UNKNOWN_TURN = 1.0
 """Radians of standard deviation from which a turn is not known at all."""
@@ -82,6 +82,25 @@ class Hypothesis:
 
 
 @dataclass(frozen=True)
+class Found:
+    """Where an object was found that came without a box.
+
+    Attributes:
+        box: (4,) float64 x0, y0, x1, y1 in px, around the pose.
+        presence: probability that the photograph shows the object there, see
+            :func:`curvireg_torch.registration.confidence.presence`.
+        score: of the locator for the place it started from.
+        boxes: (P, 4) float64 all places that were proposed, the answers first, with their ``scores`` (P,).
+    """
+
+    box: Tensor
+    presence: float
+    score: float
+    boxes: Tensor
+    scores: Tensor
+
+
+@dataclass(frozen=True)
 class Registration:
     """Poses of one object in one photograph, best first.
 
@@ -91,13 +110,16 @@ class Registration:
     Attributes:
         hypotheses: distinct poses, best first; the others are rivals, such as half a turn.
         confidence: probability that the best is within 30 degrees of the truth, see
-            :func:`curvireg_torch.registration.confidence`.
+            :func:`curvireg_torch.registration.confidence`; of an object without a box, times the probability that it
+            is there.
         ranking: of the bank's views for this photograph (B = 1).
+        found: of an object without a box.
     """
 
     hypotheses: tuple[Hypothesis, ...]
     confidence: float
     ranking: Ranking
+    found: Found | None = None
 
     ok = True
     """False of a :class:`FailedRegistration`."""

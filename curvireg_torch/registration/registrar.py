@@ -13,11 +13,13 @@ from ..errors import CurviregError, InvalidInputError
 from ..geometry.cameras import rotation_towards
 from ..geometry.translation import place_view
 from ..geometry.views import ViewSphere
+from ..location import Locator
 from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank, distinct_views
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
 from .confidence import RELIABLE, confidence, pose_confidence, pose_evidence
 from .contour import ContourFit, fit_contours
+from .finding import find
 from .hypotheses import Hypotheses, hypotheses
 from .inputs import Item, check_crop, items_of, named
 from .pose import FailedRegistration, Hypothesis, Registration
@@ -129,18 +131,29 @@ class Registrar:
             for mesh, coarse in zip(self.bank.meshes, self.matcher.describers, strict=True)
         )
 
+    @cached_property
+    def locator(self) -> Locator:
+        """Proposes boxes where none are given; made on first use."""
+        return Locator(self.matcher)
+
     @torch.no_grad()
     def __call__(
-        self, images: Tensor | Sequence[Any], boxes: Any, camera_matrices: Any | None = None
+        self,
+        images: Tensor | Sequence[Any],
+        boxes: Any | None = None,
+        camera_matrices: Any | None = None,
+        *,
+        distance: tuple[float, float] | None = None,
     ) -> list[Registration | FailedRegistration]:
         """Register a batch.
 
         Args:
             images: (B, C, H, W) or a list of (C, H, W) tensors, (H, W, C) arrays or paths, C = 1 or 3, floating in
                 [0, 1] or uint8.
-            boxes: (B, 4) x0, y0, x1, y1 in px.
+            boxes: (B, 4) x0, y0, x1, y1 in px; None: the object is looked for, see :func:`find`.
             camera_matrices: (B, 3, 3) or (3, 3) in px; without them translations are None and rotations are relative to
                 a camera that looks straight at the box.
+            distance: without boxes, nearest and farthest that the object's centre may be, in the mesh's unit.
 
         Returns:
             One :class:`Registration` for each photograph, in their order; a :class:`FailedRegistration` for one that
@@ -150,6 +163,8 @@ class Registrar:
         Raises:
             InvalidInputError: not as many boxes or cameras as images.
         """
+        if boxes is None:
+            return [each[0] for each in find(self, images, camera_matrices, distance=distance)]
         items = items_of(images, boxes, camera_matrices)
         results: list[Registration | FailedRegistration] = []
         for i in range(0, len(items), self.matcher.chunk_size):

@@ -1,6 +1,6 @@
 """The left side of the page: photograph, mesh, what is known of them, box and camera."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from .page import Page
 
 __all__ = ["Inputs"]
+
+SHOWN = 5
+"""Places that were proposed which are drawn."""
 
 MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".safetensors")
 
@@ -38,7 +41,9 @@ class Inputs:
         with ui.row().classes("w-full no-wrap gap-2"):
             self._choice("pose", {None: "default", "any": "any", "upright": "upright"}, options.pose)
             self._choice("preset", {None: "default", **{p: p for p in PRESET_NAMES}}, options.preset)
-        self._told().text = "box, px: draw it on the photograph; drag edges, corners or the box to correct it"
+        self._told().text = (
+            "box, px: draw it on the photograph; drag edges, corners or the box to correct it; none: it is looked for"
+        )
         self.box = self._numbers("box", ("x0", "y0", "x1", "y1"), self._box_typed)
         self._told().text = "camera, px: gives the translation"
         self.camera = self._numbers("camera", ("fx", "fy", "cx", "cy"), self._camera_typed)
@@ -46,7 +51,7 @@ class Inputs:
         self.fov.classes("w-full").props("dense data-testid=fov")
         self.camera_facts = self._told("camera-facts")
         with ui.row().classes("gap-2"):
-            ui.button("whole picture", on_click=lambda: self.set_box(None)).props("flat dense no-caps")
+            ui.button("no box", on_click=lambda: self.set_box(None)).props("flat dense no-caps")
             ui.button("no camera", on_click=lambda: self.set_camera(None)).props("flat dense no-caps")
             self.exif = ui.button("guess by EXIF", on_click=lambda: self.set_camera(self.session.guessed_camera()))
             self.exif.props("flat dense no-caps data-testid=exif").set_visibility(False)
@@ -116,7 +121,7 @@ class Inputs:
             self.set_box(self.drawing.box)
 
     def set_box(self, box: Any) -> None:
-        """Take a box, or None for the whole picture."""
+        """Take a box, or None: the object is looked for."""
         self.session.box = self.drawing.box = box
         for number, value in zip(self.box, box or (None,) * 4, strict=True):
             number.value = value
@@ -129,15 +134,21 @@ class Inputs:
             self._draw()
 
     def _draw(self) -> None:
-        if self.drawing.box is None:
-            self.page.image.content = ""
-            return
-        x0, y0, x1, y1 = ((v + 0.5) * self.page.scale for v in self.drawing.box)
-        place = f"x='{x0}' y='{y0}' width='{x1 - x0}' height='{y1 - y0}'"
-        self.page.image.content = "".join(
+        given = self.drawing.box
+        boxes = [(given, "")] if given is not None else [(b, "4 6") for b in self.session.proposals()[:SHOWN]]
+        self.page.image.content = "".join(self._outline(box, dashes) for box, dashes in boxes)
+
+    def _outline(self, box: Sequence[float], dashes: str) -> str:
+        x0, y0, x1, y1 = ((v + 0.5) * self.page.scale for v in box)
+        place = f"x='{x0}' y='{y0}' width='{x1 - x0}' height='{y1 - y0}' stroke-dasharray='{dashes}'"
+        return "".join(
             f"<rect {place} fill='none' vector-effect='non-scaling-stroke' stroke='{colour}' stroke-width='{width}'/>"
             for colour, width in (("black", 4), ("white", 2))
         )
+
+    def proposals_changed(self) -> None:
+        """Draw where the object was looked for."""
+        self._draw()
 
     def set_camera(self, camera: Any) -> None:
         """Take a camera, or None for an unknown one."""

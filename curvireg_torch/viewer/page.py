@@ -128,6 +128,7 @@ class Page:
     def _actions(self) -> None:
         with ui.row().classes("w-full no-wrap gap-2"):
             self.go = ui.button("register", on_click=self._register).classes("grow").props("data-testid=register")
+            ui.button("find it", on_click=self._find).props("outline data-testid=find")
             ui.button("stop", on_click=self.session.stop).props("outline data-testid=stop")
         self.progress = ui.linear_progress(0, show_value=False).props("instant-feedback")
         self.stage = ui.label().classes("text-caption").props("data-testid=stage")
@@ -169,7 +170,13 @@ class Page:
     async def _register(self) -> None:
         self.message.text = ""
         if await self.do(self.session.register):
+            self.inputs.proposals_changed()
             await self.pose_changed(answer=True)
+
+    async def _find(self) -> None:
+        if not self.busy:
+            self.inputs.set_box(None)
+            await self._register()
 
     async def pose_changed(self, *, answer: bool = False) -> None:
         """Show the pose of the session; ``answer``: of a new answer."""

@@ -183,6 +183,11 @@ class Session:
             raise InvalidInputError("there is no answer yet; register first")
         return self.answer, self.shown
 
+    def proposals(self) -> list[list[float]]:
+        """Boxes in which the object was looked for, the answer's first; none where the box was given."""
+        found = {} if self.answer is None else self.answer.document.get("found", {})
+        return [proposal["box"] for proposal in found.get("proposals", [])]
+
     def choose(self, number: int) -> None:
         """Show one of the hypotheses."""
         assert self.answer is not None

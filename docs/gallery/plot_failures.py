@@ -100,10 +100,10 @@ wide, high = x1 - x0, y1 - y0
 show(picture, torch.tensor([x0 - 0.3 * wide, y0 - 0.1 * high, x1 + 0.1 * wide, y1 + 0.4 * high]), truth, "a wrong box")
 
 # %%
-# No box at all
-# -------------
+# The whole image as the box
+# --------------------------
 #
-# The whole image taken for the box: the library does not look for the object, it takes it to fill the box.
+# A box that is given is believed: the object is taken to fill it. Without one it would have been looked for.
 
 picture, box, truth = photograph(5)
 show(picture, torch.tensor([-0.5, -0.5, 479.5, 359.5]), truth, "the whole image")

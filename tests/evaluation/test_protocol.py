@@ -8,7 +8,16 @@ from curvireg_torch.evaluation.protocol import perturbed_box
 BOX = torch.tensor([10.0, 20.0, 110.0, 70.0])
 
 
-@pytest.mark.parametrize("words", [[], ["cad=fused", "pose=any"], ["box=0.2", "seed=7"], ["box=annotated"]])
+def test_no_box_at_all():
+    protocol = Protocol.parse(["box=none"])
+    assert protocol.box is None
+    assert str(protocol) == "cad=annotated pose=upright box=none"
+    assert Protocol.parse(["box=annotated"]).box == 0.0
+
+
+@pytest.mark.parametrize(
+    "words", [[], ["cad=fused", "pose=any"], ["box=0.2", "seed=7"], ["box=annotated"], ["box=none"]]
+)
 def test_text_is_what_was_parsed(words):
     protocol = Protocol.parse(words)
     assert Protocol.parse(str(protocol).split()) == protocol

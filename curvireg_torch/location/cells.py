@@ -1,0 +1,90 @@
+"""Local features of whole photographs and of views, on grids of cells: what a search for objects compares."""
+
+from abc import ABC, abstractmethod
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ..descriptors import orientation_cells
+from ..learned.backbone import STRIDES, Backbone
+from ..matching import ViewDescriber, ViewMatcher
+from ..terms import photograph_field
+
+__all__ = ["Cells", "FieldCells", "LookCells", "cells_for"]
+
+
+FLAT = 0.01
+"""Share of the strongest edges' energy that counts as none."""
+
+
+class Cells(nn.Module, ABC):
+    """Feature maps at one stride, or at two, the second twice as coarse.
+
+    Attributes:
+        strides: px of a cell.
+    """
+
+    strides: tuple[int, ...]
+
+    def comparable(self, cells: Tensor, common: Tensor) -> Tensor:
+        """(B, C, h, w) of the same, so that inner products tell how alike cells are.
+
+        Args:
+            cells: of :meth:`of_photograph` or :meth:`of_views`.
+            common: (C, 1, 1) mean of the photograph at that size, or of the object in its views.
+        """
+        return F.normalize(cells - common, dim=1)
+
+    @abstractmethod
+    def of_photograph(self, image: Tensor) -> list[Tensor]:
+        """(1, C, H / stride, W / stride) for each stride, of a (1, 1 or 3, H, W) image in [0, 1]."""
+
+    @abstractmethod
+    def of_views(self, describer: ViewDescriber, rotations: Tensor, distances: Tensor, side: int) -> list[list[Tensor]]:
+        """(K, C, side / stride, side / stride) for each stride, for each way to show K views of a mesh."""
+
+
+class LookCells(Cells):
+    """Features of the appearance term's network. Views are shaded grey, and in colours where the mesh has some."""
+
+    strides = STRIDES
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.backbone = Backbone()
+
+    def of_photograph(self, image: Tensor) -> list[Tensor]:
+        return [f / s[:, None, None] for f, s in zip(self.backbone(image), self.backbone.spreads, strict=True)]
+
+    def of_views(self, describer: ViewDescriber, rotations: Tensor, distances: Tensor, side: int) -> list[list[Tensor]]:
+        pictures = describer.shaded(rotations, distances)
+        small = F.interpolate(pictures, size=(side, side), mode="bilinear", antialias=True, align_corners=False)
+        return [self.of_photograph(way) for way in (small[:, :1], small[:, 1:]) if way.shape[1]]
+
+
+class FieldCells(Cells):
+    """Orientations of the photograph's field and of depth fields, for pipelines in which nothing looks at pictures."""
+
+    strides = (8,)
+
+    def __init__(self, field: nn.Module) -> None:
+        super().__init__()
+        self.field = field
+
+    def comparable(self, cells: Tensor, common: Tensor) -> Tensor:
+        """Divided by the length of the cells around, as blocks of HOG are: where there is no edge, nothing is alike."""
+        around = F.avg_pool2d(cells.square().sum(dim=1, keepdim=True), 3, stride=1, padding=1)
+        return cells / (around + FLAT * around.amax(dim=(2, 3), keepdim=True)).clamp(min=1e-12).sqrt()
+
+    def of_photograph(self, image: Tensor) -> list[Tensor]:
+        H, W = image.shape[-2:]
+        return [orientation_cells(photograph_field(self.field, image), grid=(H // 8, W // 8))]
+
+    def of_views(self, describer: ViewDescriber, rotations: Tensor, distances: Tensor, side: int) -> list[list[Tensor]]:
+        return [[orientation_cells(describer.fields(rotations, distances), grid=(side // 8, side // 8))]]
+
+
+def cells_for(matcher: ViewMatcher) -> Cells:
+    """What the matcher's pipeline looks at: pictures where a term does, else its fields."""
+    looks = any(term.name == "appearance" for term in matcher.pipeline.terms)
+    return (LookCells() if looks else FieldCells(matcher.field)).to(matcher.device)

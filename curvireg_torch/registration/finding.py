@@ -1,0 +1,165 @@
+"""Poses without a box: places that the locator proposes are followed to poses, and what was found decides."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from ..errors import CurviregError, InvalidInputError
+from ..geometry.cameras import projected_boxes
+from ..geometry.crops import box_iou
+from ..location import Located
+from ..matching import Photographs, Ranking
+from .confidence import presence, presence_evidence
+from .inputs import Item, check_crop, items_of, named
+from .pose import FailedRegistration, Found, Registration
+
+if TYPE_CHECKING:
+    from .registrar import Registrar
+
+__all__ = ["find"]
+
+SAME = 0.5
+"""Intersection over union from which two boxes show the same object."""
+
+
+@torch.no_grad()
+def find(
+    registrar: "Registrar",
+    images: Tensor | Sequence[Any],
+    camera_matrices: Any | None = None,
+    *,
+    instances: int = 1,
+    distance: tuple[float, float] | None = None,
+) -> list[list[Registration | FailedRegistration]]:
+    """The objects in whole photographs, the surest first.
+
+    The locator's best places are ranked as given boxes are, which tells how surely each shows the object
+    (:func:`curvireg_torch.registration.confidence.presence`); the surest are registered. The box around each pose is
+    then ranked too, which makes good for the locator's steps, and registered once more where it is the surer one.
+
+    Args:
+        registrar: of the meshes.
+        images, camera_matrices: see :class:`Registrar`.
+        instances: at most so many objects of each photograph.
+        distance: nearest and farthest that an object's centre may be, in the mesh's unit; needs cameras.
+
+    Returns:
+        For each photograph one to ``instances`` registrations, whose ``found`` is set; or one failed.
+
+    Raises:
+        InvalidInputError: not as many cameras as images, ``instances`` < 1, or a bad ``distance``.
+    """
+    if instances < 1:
+        raise InvalidInputError(f"instances: expected >= 1, got {instances}")
+    out: list[list[Registration | FailedRegistration]] = []
+    for i, item in enumerate(items_of(images, None, camera_matrices)):
+        if not isinstance(item, Item):
+            out.append([FailedRegistration(item)])
+            continue
+        try:
+            check_crop(item.image / 255.0 if item.image.dtype == torch.uint8 else item.image)
+            cameras = None if item.camera_matrix is None else [item.camera_matrix]
+            if distance is not None and cameras is None:
+                raise InvalidInputError("distance: needs the camera matrix of every photograph")
+            located = registrar.locator([item.image], camera_matrices=cameras, distance=distance)[0]
+            out.append([*_followed(registrar, item, located, instances)])
+        except CurviregError as error:
+            if distance is not None and isinstance(error, InvalidInputError) and str(error).startswith("distance"):
+                raise
+            out.append([FailedRegistration(named(error, f"image {i}"))])
+    return out
+
+
+def _followed(registrar: "Registrar", item: Item, located: Located, instances: int) -> list[Registration]:
+    """The best ``instances`` objects among the places of one photograph."""
+    count = max(registrar.pipeline.locate.followed, instances + 1)
+    places = _Places.judged(registrar, item, located.boxes[:count], located.scores[:count])
+    order = places.presence.argsort(descending=True, stable=True)
+    chosen: list[int] = []
+    for k in order.tolist():
+        apart = not chosen or bool((box_iou(places.boxes[k, None], places.boxes[chosen]) <= SAME).all())
+        if apart and len(chosen) < instances:
+            chosen.append(k)
+    if not chosen:
+        raise InvalidInputError("nothing like the object was found; give the box")
+    answers = [_corrected(registrar, item, places.registered(registrar, item, k)) for k in chosen]
+    answers.sort(key=_surely, reverse=True)
+    boxes = torch.cat([torch.stack([found_in(a).box for a in answers]), located.boxes.double()])
+    scores = torch.cat([torch.tensor([found_in(a).score for a in answers]), located.scores])
+    own = _own_places(boxes)
+    return [
+        replace(
+            answer,
+            confidence=answer.confidence * _surely(answer),
+            found=replace(found_in(answer), boxes=boxes[own], scores=scores[own]),
+        )
+        for answer in answers
+    ]
+
+
+@dataclass(frozen=True)
+class _Places:
+    """P boxes of one photograph, described and ranked, and how surely each shows the object."""
+
+    boxes: Tensor
+    scores: Tensor
+    query: Photographs
+    ranking: Ranking
+    presence: Tensor
+
+    @classmethod
+    def judged(cls, registrar: "Registrar", item: Item, boxes: Tensor, scores: Tensor) -> "_Places":
+        query = registrar.matcher.query([item.image] * len(boxes), boxes)
+        ranking = registrar.matcher.rank(query)
+        sure = [presence(presence_evidence(s, ranking[k : k + 1])) for k, s in enumerate(scores.tolist())]
+        return cls(boxes, scores, query, ranking, torch.tensor(sure, dtype=torch.float64))
+
+    def registered(self, registrar: "Registrar", item: Item, k: int) -> Registration:
+        """Box ``k`` as a registration, the box around its pose in the place of the one it began with."""
+        one = slice(k, k + 1)
+        result = registrar.register([replace(item, box=self.boxes[k])], self.query[one], self.ranking[one])[0]
+        found = Found(
+            box=posed_box(registrar, result),
+            presence=float(self.presence[k]),
+            score=float(self.scores[k]),
+            boxes=self.boxes[:0].double(),
+            scores=self.scores[:0],
+        )
+        return replace(result, found=found)
+
+
+def _corrected(registrar: "Registrar", item: Item, answer: Registration) -> Registration:
+    """The better of an answer and of what the box around its pose leads to."""
+    found = found_in(answer)
+    places = _Places.judged(registrar, item, found.box[None].float(), torch.tensor([found.score]))
+    if float(places.presence[0]) <= found.presence:
+        return answer
+    return places.registered(registrar, item, 0)
+
+
+def posed_box(registrar: "Registrar", result: Registration) -> Tensor:
+    """(4,) box around the pose that was found, px of the photograph."""
+    T, K = result.seen_by
+    return projected_boxes(registrar.describers[result.model].hull, T[None], K)[0]
+
+
+def found_in(result: Registration) -> Found:
+    """``found`` of a result that has it."""
+    assert result.found is not None
+    return result.found
+
+
+def _surely(result: Registration) -> float:
+    return found_in(result).presence
+
+
+def _own_places(boxes: Tensor) -> Tensor:
+    """(P,) bool: False for a box that shows what an earlier one does."""
+    alike = box_iou(boxes, boxes) > SAME
+    own = torch.ones(len(boxes), dtype=torch.bool)
+    for i in range(len(boxes)):
+        own[i] = not bool((alike[i, :i] & own[:i]).any())
+    return own

@@ -1,0 +1,53 @@
+"""K-medoids of a bank's views."""
+
+import pytest
+import torch
+
+from curvireg_torch import ViewBank
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.location import representative_views
+from curvireg_torch.location.representatives import _medoids
+from tests._support.scenes import truck_bank
+
+
+def test_medoids_are_the_middles_of_clusters() -> None:
+    """Three tight groups on a line: their middle points, whatever the order."""
+    places = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1, 5.2, 9.0, 9.1, 9.2])[torch.randperm(9)]
+    apart = (places[:, None] - places).square()
+    assert sorted(places[_medoids(apart, 3)].tolist()) == pytest.approx([0.1, 5.1, 9.1])
+
+
+def test_medoids_lie_nearer_to_all_views_than_as_many_taken_at_random() -> None:
+    points = torch.randn(300, 4, generator=torch.Generator().manual_seed(0))
+    apart = torch.cdist(points, points).square()
+    cost = apart[:, _medoids(apart, 12)].amin(dim=1).sum()
+    chance = [apart[:, torch.randperm(300)[:12]].amin(dim=1).sum() for _ in range(20)]
+    assert cost < 0.9 * min(chance)
+
+
+def test_twins_do_not_make_two_medoids_of_one() -> None:
+    apart = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 4.0], [4.0, 4.0, 0.0]])
+    assert sorted(_medoids(apart, 2).tolist()) in ([0, 2], [1, 2])
+
+
+def test_each_model_has_its_own() -> None:
+    bank = ViewBank.join([truck_bank(), truck_bank()])
+    views = representative_views(bank, 7)
+    assert torch.equal(views, views.unique())
+    assert bank.model[views].bincount().tolist() == [7, 7]
+    assert len(representative_views(truck_bank(), 10_000)) == len(truck_bank()), "all of a smaller bank"
+    with pytest.raises(InvalidInputError, match="count: expected >= 1, got 0"):
+        representative_views(bank, 0)
+
+
+def test_boxes_count_beside_descriptors() -> None:
+    """Views with one descriptor and two shapes of boxes: both shapes are represented."""
+    bank = truck_bank()
+    plain = bank.__class__.__new__(bank.__class__)
+    plain.__dict__.update(bank.__dict__)
+    plain.descriptors = torch.ones_like(bank.descriptors)
+    wide = torch.tensor([-2.0, -1.0, 2.0, 1.0], dtype=bank.boxes.dtype)
+    tall = torch.tensor([-1.0, -2.0, 1.0, 2.0], dtype=bank.boxes.dtype)
+    plain.boxes = torch.where((torch.arange(len(bank)) < 5)[:, None], tall, wide)
+    views = representative_views(plain, 2)
+    assert (views < 5).tolist() == [True, False]

@@ -1,0 +1,97 @@
+"""Objects without a box: found, followed to a pose, counted, or said not to be there."""
+
+import pytest
+import torch
+
+import curvireg_torch as cr
+from curvireg_torch.errors import ImageError, InvalidInputError
+from curvireg_torch.geometry import box_iou, rotation_error
+from curvireg_torch.registration import find
+from curvireg_torch.registration.confidence import presence
+from curvireg_torch.synthetic import procedural_background
+from tests._support.scenes import CAMERA, scene
+from tests.location.test_locator import SIZE, bank, placed
+
+
+@pytest.fixture(scope="module")
+def registrar():
+    return cr.Registrar(bank(), refine=False)
+
+
+def test_an_object_is_found_and_posed(registrar):
+    """The box around the pose lies where the object was put; its pose is near that with the box given."""
+    image, box = placed(5, (90, 40), 0.9)
+    result = registrar([image])[0]
+    place = result.found
+    assert box_iou(place.box[None], box[None].double()) > 0.6
+    size = (box[2:] - box[:2]).max()
+    middle = 0.5 * (place.box[:2] + place.box[2:]) - 0.5 * (box[:2] + box[2:])
+    assert middle.abs().max() < 0.1 * size, "to a tenth of its size"
+    assert torch.equal(place.boxes[0], place.box), "the answer is the first of the proposals"
+    assert len(place.boxes) == len(place.scores)
+    given = registrar([image], box[None])[0]
+    assert given.found is None
+    assert rotation_error(result.rotation, given.rotation) < 35, "one step of this bank"
+    assert 0.0 <= result.confidence <= place.presence <= 1.0
+
+
+def test_with_a_camera_the_pose_has_a_place(registrar):
+    image, _, truth = scene(5)
+    result = registrar([image], camera_matrices=CAMERA)[0]
+    assert (result.translation - truth[:3, 3]).norm() < 0.25 * truth[:3, 3].norm()
+    far = float(truth[2, 3])
+    within = registrar([image], camera_matrices=CAMERA, distance=(0.8 * far, 1.2 * far))[0]
+    assert 0.75 * far < float(within.translation[2]) < 1.3 * far
+
+
+def test_photographs_without_the_object_are_less_sure(registrar):
+    there = [registrar([placed(seed, (40, 30), 0.9)[0]])[0].found.presence for seed in (0, 1, 5)]
+    absent = [procedural_background(SIZE, torch.Generator().manual_seed(20 + k)) for k in range(3)]
+    assert min(there) > max(result.found.presence for result in registrar(absent))
+
+
+def test_several_objects_of_one_photograph(registrar):
+    """Two trucks, one and the other: both are found, each once, and no third is needed."""
+    first, box = placed(5, (0, 0), 0.7)
+    second, other = placed(5, (150, 70), 0.7)
+    image = first.clone()
+    image[:, 70:, 150:] = second[:, 70:, 150:]
+    results = find(registrar, [image], instances=2)[0]
+    overlap = box_iou(torch.stack([r.found.box for r in results]), torch.stack([box, other]).double())
+    assert len(results) == 2
+    assert sorted(overlap.argmax(dim=1).tolist()) == [0, 1]
+    assert overlap.amax(dim=1).min() > 0.5
+    assert results[0].found.presence >= results[1].found.presence
+    assert torch.equal(results[0].found.boxes[:2], torch.stack([r.found.box for r in results]))
+    with pytest.raises(InvalidInputError, match="instances: expected >= 1, got 0"):
+        find(registrar, [image], instances=0)
+
+
+def test_what_cannot_be_searched_takes_nothing_else_down(registrar):
+    image = placed(5, (90, 40), 0.9)[0]
+    nan = image.clone()
+    nan[0, 3, 3] = torch.nan
+    results = registrar([torch.full((3, 80, 100), 0.5), image, nan, torch.rand(2, 9, 9)])
+    assert [result.ok for result in results] == [False, True, False, False]
+    for failed, word, error in zip(
+        (results[0], results[2], results[3]),
+        ("image 0: .*one colour", "image 2: NaN", "image 3: expected 1"),
+        (ImageError, ImageError, InvalidInputError),
+        strict=True,
+    ):
+        with pytest.raises(error, match=word):
+            _ = failed.rotation
+    alone = registrar([image])[0]
+    assert torch.equal(alone.found.boxes, results[1].found.boxes)
+    with pytest.raises(InvalidInputError, match="distance: needs the camera"):
+        registrar([image], distance=(1.0, 2.0))
+    with pytest.raises(InvalidInputError, match="distance: expected 0 < MIN"):
+        registrar([image], camera_matrices=CAMERA, distance=(3.0, 2.0))
+
+
+def test_presence_rises_with_each_piece_of_evidence():
+    base = [6.0, 0.5, 0.2]
+    for k, step in enumerate((1.0, 0.1, 0.1)):
+        more = list(base)
+        more[k] += step
+        assert presence(more) > presence(base)
