@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -129,7 +130,7 @@ def _row(cells: list[str], name: str) -> BOPRow:
         R, t = [float(v) for v in cells[4].split()], [float(v) for v in cells[5].split()]
     except ValueError as error:
         raise InvalidInputError(f"{name}: {error}") from error
-    if len(R) != 9 or len(t) != 3 or finite_numbers([score, time, *R, *t], 14) is None:
+    if len(R) != 9 or len(t) != 3 or not all(map(math.isfinite, (score, time, *R, *t))):
         raise InvalidInputError(f"{name}: expected 9 finite numbers in R and 3 in t, got {len(R)} and {len(t)}")
     return BOPRow(
         scene_id=scene_id,
