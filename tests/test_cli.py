@@ -14,7 +14,7 @@ from curvireg_torch import Registrar, ViewBank, camera_matrix
 from curvireg_torch.cli import main
 from curvireg_torch.errors import BankError
 from curvireg_torch.geometry import rotation_error, up_rotation
-from curvireg_torch.learned import adapt
+from curvireg_torch.learned import LearnedCurvilinearSaliency, adapt
 from curvireg_torch.pipeline import DEFAULT, PRESETS, BankSettings, Pipeline, ViewPolicy, preset_named
 from curvireg_torch.synthetic import example_mesh
 from tests._support.exif import exif, with_exif
@@ -288,4 +288,6 @@ def test_adapted_field_from_bank_to_register(files, monkeypatch, capsys):
     assert called["upright"] == 1.0
     assert "adapted field" in capsys.readouterr().out
     assert run(folder, "photo.png", "own.safetensors", "--field", str(field), "--no-refine", box=box) == 0
+    told = json.loads((folder / "out" / "result.json").read_text())["pipeline"]
+    assert told["weights"] == small.with_field(LearnedCurvilinearSaliency(weights=field)).weights != small.weights
     assert run(folder, "photo.png", "own.safetensors", "--field", str(folder / "none"), box=box) == 2

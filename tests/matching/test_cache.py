@@ -25,6 +25,7 @@ from curvireg_torch.matching import (
     list_cache,
     trim_cache,
 )
+from curvireg_torch.rendering import make_renderer
 
 SETTINGS = BankSettings(image_size=64)
 VIEWS = sample_views(azimuth_step=90, elevations=[20])
@@ -52,9 +53,30 @@ def test_key_depends_on_everything(monkeypatch: pytest.MonkeyPatch) -> None:
     flipped.faces = flipped.faces[::-1]
     keys = [bank_key(m, VIEWS, SETTINGS) for m in (mesh, millimetres, moved, flipped)]
     keys += [bank_key(mesh, VIEWS[:3], SETTINGS), bank_key(mesh, VIEWS, replace(SETTINGS, sigma=1.5))]
+    keys.append(bank_key(mesh, VIEWS, SETTINGS, renderer="torch"))
     monkeypatch.setattr(cache, "_code_digest", lambda: b"another version")
     keys.append(bank_key(mesh, VIEWS, SETTINGS))
-    assert len(set(keys)) == 7
+    assert len(set(keys)) == 8
+
+
+def test_a_renderer_of_ones_own_neither_fills_the_cache_nor_takes_from_it(tmp_path: Path) -> None:
+    class Half:
+        name = "embree"
+
+        def __init__(self) -> None:
+            self.inner = make_renderer(trimesh.creation.box())
+
+        def render(self, *arguments: object, **options: object) -> torch.Tensor:
+            depth = self.inner.render(*arguments, **options)
+            depth[..., depth.shape[-1] // 2 :] = 0.0
+            return depth
+
+    own = build(tmp_path, renderer=Half())
+    assert list_cache(tmp_path) == []
+    whole = build(tmp_path)
+    again = build(tmp_path, renderer=Half())
+    assert torch.equal(again.silhouettes, own.silhouettes)
+    assert int(whole.silhouettes.sum()) > 1.5 * int(own.silhouettes.sum())
 
 
 def test_damaged_and_mislabelled_files_are_built_again(tmp_path: Path) -> None:
