@@ -58,8 +58,8 @@ MAX_POLYGON_CORNERS = 2000
 MAX_POLYGON_WORK = 20_000_000
 """Squares of the corners of all faces that are not convex: of a million quads, or of five faces of 2000 corners."""
 
-MAX_TABLE_BYTES = 3 << 24
-"""Bytes of a JSON or CSV file: 48 MiB; a row of a CSV of poses takes up to 60 times as much memory as text."""
+MAX_TABLE_BYTES = 1 << 25
+"""Bytes of a JSON or CSV file: 32 MiB; a row of a CSV of poses takes up to 60 times as much memory as text."""
 
 MAX_MAT_BYTES = 1 << 24
 """Bytes of a MATLAB annotation file."""

@@ -258,8 +258,8 @@ CASES = {
     "quads": Case("OFF, quads", quads_of(2_000_000), mesh, 180, 9000),
     "tangled": Case("OFF, five faces of 2000 corners that cross themselves", tangled(5, 2000), mesh, 180, 9000),
     "gltf": Case("glTF, 10,000 parts 200 deep", parts, mesh, 60, 4000),
-    "json": Case("JSON, 48 MiB of empty lists", deep_json, json_file, 60, 4000),
-    "csv": Case("CSV, 48 MiB of poses", csv_rows, table, 60, 4000),
+    "json": Case("JSON, 32 MiB of empty lists", deep_json, json_file, 60, 4000),
+    "csv": Case("CSV, 32 MiB of poses", csv_rows, table, 60, 4000),
     "mat": Case("MATLAB, 16 MiB unpacked", mat_bomb, mat, 60, 4000),
     "sliver": Case("registration of a picture of 2 x 600 px", nothing, sliver, 60, 4000),
 }
