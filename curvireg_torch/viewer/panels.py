@@ -13,7 +13,8 @@ from ..geometry import rotation_error
 from ..limits import MAX_VIEWER_FACES
 from ..visualization import contour_overlay, side_pictures
 from ..visualization.plots import view_sphere
-from .pictures import hypothesis_picture, png, view_pictures
+from ..visualization.sheet import thumbnail
+from .pictures import png, view_pictures
 
 if TYPE_CHECKING:
     from .page import Page
@@ -129,12 +130,12 @@ class Panels:
             lines.append(f"by hand: {'; '.join(shown.by_hand)}; the command line gives the answer before that")
         return "\n".join(lines)
 
-    async def _pictures(self, panel: str, cards: Any, width: int) -> list[Any]:
+    async def _pictures(self, panel: str, cards: Any, width: int, kind: str = "png") -> list[Any]:
         """Cards with a picture and words under it."""
         rows = []
         for number, (content, words) in enumerate(cards):
             with self.place[panel], ui.card().tight().style(f"width: {width}px") as card:
-                url = self.page.put(f"{panel.replace(' ', '-')}-{number}.png", content)
+                url = self.page.put(f"{panel.replace(' ', '-')}-{number}.{kind}", content, f"image/{kind}")
                 ui.element("img").props(f'src="{url}" alt="{words.splitlines()[0]}"').classes("w-full")
                 ui.label(words).classes("whitespace-pre-line text-caption p-1")
             rows.append(card)
@@ -152,11 +153,13 @@ class Panels:
                 told = f"{number}: score {pose.score:.2f}" + (f", {away:.0f} degrees from 1" if number > 1 else "")
                 support = "" if pose.support is None else f"support {pose.support:.2f}\n"
                 evidence = ", ".join(f"{name} {value:.2f}" for name, value in pose.evidence.items())
-                cards.append((hypothesis_picture(registrar, pose, answer.image), f"{told}\n{support}{evidence}"))
+                renderer = registrar.describers[pose.model].renderer
+                picture = thumbnail(renderer, pose.seen_by, answer.image, answer.box.tolist())
+                cards.append((picture, f"{told}\n{support}{evidence}"))
             return cards
 
         cards = await self.page.do(make)
-        for number, card in enumerate(await self._pictures("answer", cards or [], 240)):
+        for number, card in enumerate(await self._pictures("answer", cards or [], 240, "jpeg")):
             with card:
                 ui.button("show", on_click=lambda number=number: self._choose(number)).props(
                     f"flat dense no-caps data-testid=show-{number + 1}"

@@ -13,7 +13,7 @@ from ..registration import Hypothesis, Registrar
 from ..rendering.shading import shade
 from ..visualization.overlay import depth_picture, draw_contours, to_uint8
 
-__all__ = ["SIDE", "at", "hypothesis_picture", "png", "pose_layers", "shown_photograph", "view_pictures"]
+__all__ = ["SIDE", "at", "png", "pose_layers", "shown_photograph", "view_pictures"]
 
 SIDE = 1400
 """Longer side of the photograph as the page shows it, in px."""
@@ -84,16 +84,6 @@ def _seen(registrar: Registrar, pose: Hypothesis, size: tuple[int, int], scale: 
     smaller = torch.tensor([[scale, 0.0, half], [0.0, scale, half], [0.0, 0.0, 1.0]], dtype=torch.float64)
     K = smaller @ K
     return registrar.describers[pose.model].renderer.render(T[None], K, size)[0, 0].cpu().float(), K
-
-
-def hypothesis_picture(registrar: Registrar, pose: Hypothesis, image: Tensor, side: int = 320) -> bytes:
-    """A small photograph with the contours of a pose."""
-    scale = min(1.0, side / max(image.shape[-2:]))
-    pixels = to_uint8(image)
-    H, W = (max(1, round(n * scale)) for n in pixels.shape[:2])
-    small = np.ascontiguousarray(cv2.resize(pixels, (W, H), interpolation=cv2.INTER_AREA).astype(np.uint8))
-    draw_contours(small, _seen(registrar, pose, (H, W), scale)[0].numpy())
-    return png(small)
 
 
 def view_pictures(registrar: Registrar, views: Tensor) -> list[bytes]:

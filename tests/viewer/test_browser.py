@@ -223,7 +223,7 @@ def test_from_upload_to_download(browser, folder):
     assert ours["translation"] is not None
 
 
-def test_what_was_found_is_shown(browser):
+def test_what_was_found_is_shown(browser, folder):
     layer = browser.part("photograph").find_elements("css selector", "img")[1]
     assert layer.get_attribute("naturalWidth") == "240"
     assert "opacity: 0.35" in layer.get_attribute("style")
@@ -238,6 +238,12 @@ def test_what_was_found_is_shown(browser):
         images = panel.find_elements("css selector", "img")
         assert len(images) == pictures
         browser.until(lambda i=images: all(int(x.get_attribute("naturalWidth")) > 50 for x in i), "loaded")
+        if tab == "answer":  # the object, not the whole photograph
+            x0, y0, x1, y1 = json.loads((folder / "box.json").read_text())
+            room = 0.25 * max(x1 - x0, y1 - y0)
+            wide = min(240, int(x1 + room) + 1) - max(0, int(x0 - room))
+            assert wide < 200
+            assert [int(x.get_attribute("naturalWidth")) for x in images] == pytest.approx([wide] * 2, abs=2)
         told = panel.text if tab == "views" else ""
         assert tab != "views" or re.search(r"S 0\.\d+\n.*\nhog 0\.\d+\nrepeatability 0\.\d+\nbox", told)
     browser.click("tab-3D")
