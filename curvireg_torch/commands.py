@@ -274,7 +274,12 @@ def _print_result(document: dict[str, Any], out: Path) -> None:
     seconds = document["seconds"]
     print(f"viewpoint: {angles} degrees   score {document['score']:.3f}   confidence {document['confidence']:.2f}")
     if not document["reliable"]:
-        print("no reliable match: take the pose as a guess; check that the box is tight and the mesh is the object's")
+        upright = document["pipeline"]["views"]["pose"] == "upright"
+        stands = ", and that it stands as in its file (--pose upright, --up)" if upright else ""
+        print(
+            "no reliable match: take the pose as a guess; check that the box is tight and the mesh is the object's"
+            f"{stands}"
+        )
     if ", " in document.get("inputs", {}).get("mesh", ""):
         print(f"mesh: {document['mesh']}")
     if "found" in document:

@@ -12,6 +12,7 @@ import trimesh
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix
 from curvireg_torch.cli import main
+from curvireg_torch.commands import _print_result
 from curvireg_torch.errors import BankError
 from curvireg_torch.geometry import rotation_error, up_rotation
 from curvireg_torch.learned import LearnedCurvilinearSaliency, adapt
@@ -291,3 +292,14 @@ def test_adapted_field_from_bank_to_register(files, monkeypatch, capsys):
     told = json.loads((folder / "out" / "result.json").read_text())["pipeline"]
     assert told["weights"] == small.with_field(LearnedCurvilinearSaliency(weights=field)).weights != small.weights
     assert run(folder, "photo.png", "own.safetensors", "--field", str(folder / "none"), box=box) == 2
+
+
+@pytest.mark.parametrize(("pose", "told"), [("any", "the object's\n"), ("upright", "(--pose upright, --up)\n")])
+def test_what_to_check_where_nothing_is_reliable(pose, told, tmp_path, capsys):
+    document = {
+        "viewpoint": {"azimuth": 1.0}, "score": 0.2, "confidence": 0.1, "reliable": False, "translation": None,
+        "standard_deviations": None, "seconds": {"bank": 1.0, "register": 2.0},
+        "pipeline": Pipeline().posed(pose).describe(),
+    }  # fmt: skip
+    _print_result(document, tmp_path)
+    assert told in capsys.readouterr().out
