@@ -14,15 +14,8 @@ import curvireg_torch
 from curvireg_torch import cli
 from curvireg_torch.evaluation.command import add_datasets
 
-ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
-MADE = ("_build", "auto_gallery", "project")
-"""Folders that the build of the site makes."""
-PAGES = [
-    *ROOT.glob("*.md"),
-    *ROOT.glob("datasets/*/README.md"),
-    *(p for p in DOCS.rglob("*.md") if p.relative_to(DOCS).parts[0] not in MADE),
-]
+from ._support.pages import DOCS, MADE, PAGES, ROOT, steps, words_of
+
 SOURCES = [*PAGES, *DOCS.glob("gallery/*.py")]
 
 by_page = pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
@@ -136,15 +129,9 @@ def test_layers_have_args_shape_and_example_of_their_own(layer: type[nn.Module])
 
 
 def commands(page: Path) -> list[list[str]]:
-    """The lines of ``bash`` and plain blocks, and whole commands within the text, split into words."""
-    text = page.read_text(encoding="utf-8")
-    blocks = re.findall(r"^ *```(?:bash)?\n(.*?)^ *```", text, flags=re.DOTALL | re.MULTILINE)
-    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
-    inline = re.findall(r"`((?:curvireg|python|torchrun) [^`\n]+)`", text)
-    lines += [code for code in inline if "|" not in code and " --out " in code]  # others name a command, or a part
-    return [
-        shlex.split(line, comments=True) for line in lines if re.match(r" *(\S*/)?(curvireg|python|torchrun) ", line)
-    ]
+    """Those of a page that one of our own programs gets, split into words."""
+    lines = [words_of(text) for kind, text in steps(page) if kind == "command"]
+    return [words for words in lines if Path(words[0]).name in ("curvireg", "python", "torchrun")]
 
 
 def parsed(words: list[str]) -> None:
