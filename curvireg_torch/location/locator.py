@@ -126,21 +126,23 @@ class Locator(nn.Module):
     def _one(self, image: Tensor, focal: float | None, distance: tuple[float, float] | None) -> Located:
         if not isinstance(image, Tensor) or image.ndim != 3 or image.shape[0] not in (1, 3) or min(image.shape) < 1:
             raise InvalidInputError("images: expected (C, H, W) tensors, C = 1 or 3")
-        image = image.to(self.matcher.device)
-        image = image.float() / 255.0 if image.dtype == torch.uint8 else image.float()
         known = self._templates
         reach = (known.boxes[:, 2:] - known.boxes[:, :2]).amax(dim=1)
         scales = self._scales(image, focal, distance, float(reach.median()))
         maps, allowed, sizes = [], [], []
+        largest: Tensor | None = None  # and first: the others are made of it
         for scale in scales:
-            small, ratio = _resized(image, scale)
-            maps.append(self._agreement(small))
-            sizes.append(ratio)
+            h, w = (max(1, round(side * scale / 16)) * 16 for side in image.shape[-2:])
+            largest = _resized(image, (h, w)).to(self.matcher.device) if largest is None else largest
+            maps.append(self._agreement(_resized(largest, (h, w))[None]))
+            sizes.append((w / image.shape[-1], h / image.shape[-2]))
             fits = torch.ones_like(reach, dtype=torch.bool)
             if distance is not None and focal is not None:
                 away = known.unit * focal * scale  # what this size means
                 fits = (away >= distance[0] / STEP**0.5) & (away <= distance[1] * STEP**0.5)
             allowed.append(fits)
+        if not maps:
+            return Located(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, dtype=torch.long))
         return self._peaks(maps, allowed, sizes)
 
     def _scales(
@@ -152,7 +154,7 @@ class Locator(nn.Module):
         if focal is not None and distance is not None:
             extent = reach * focal * self._templates.unit  # px at distance 1
             small = max(small, float(extent.min()) / distance[1])
-            large = max(small, min(large, float(extent.max()) / distance[0]))
+            large = min(large, float(extent.max()) / distance[0])
         scales, side = [], small
         while side <= large * STEP**0.5:
             scales.append(reach / side)
@@ -234,12 +236,16 @@ def _by_model(
     ]
 
 
-def _resized(image: Tensor, scale: float) -> tuple[Tensor, tuple[float, float]]:
-    """(1, C, h, w), h and w multiples of 16, and w / W, h / H."""
-    H, W = image.shape[-2:]
-    h, w = (max(1, round(side * scale / 16)) * 16 for side in (H, W))
-    small = F.interpolate(image[None], size=(h, w), mode="bilinear", antialias=True, align_corners=False)
-    return small, (w / W, h / H)
+def _resized(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """(C, h, w) float32 in [0, 1]."""
+    if tuple(image.shape[-2:]) == size and image.is_floating_point():
+        return image.float()
+    channels = [  # one at a time: photographs are large
+        F.interpolate(channel[None, None].float(), size=size, mode="bilinear", antialias=True, align_corners=False)[0]
+        for channel in image
+    ]
+    small = torch.cat(channels)
+    return small / 255.0 if image.dtype == torch.uint8 else small
 
 
 def locate(

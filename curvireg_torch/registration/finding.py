@@ -60,7 +60,7 @@ def find(
             out.append([FailedRegistration(item)])
             continue
         try:
-            check_crop(item.image / 255.0 if item.image.dtype == torch.uint8 else item.image)
+            check_crop(_extremes(item.image))
             cameras = None if item.camera_matrix is None else [item.camera_matrix]
             if distance is not None and cameras is None:
                 raise InvalidInputError("distance: needs the camera matrix of every photograph")
@@ -75,6 +75,8 @@ def find(
 
 def _followed(registrar: "Registrar", item: Item, located: Located, instances: int) -> list[Registration]:
     """The best ``instances`` objects among the places of one photograph."""
+    if not len(located.boxes):
+        raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
     count = max(registrar.pipeline.locate.followed, instances + 1)
     places = _Places.judged(registrar, item, located.boxes[:count], located.scores[:count])
     order = places.presence.argsort(descending=True, stable=True)
@@ -83,8 +85,6 @@ def _followed(registrar: "Registrar", item: Item, located: Located, instances: i
         apart = not chosen or bool((box_iou(places.boxes[k, None], places.boxes[chosen]) <= SAME).all())
         if apart and len(chosen) < instances:
             chosen.append(k)
-    if not chosen:
-        raise InvalidInputError("nothing like the object was found; give the box")
     answers = [_corrected(registrar, item, places.registered(registrar, item, k)) for k in chosen]
     answers.sort(key=_surely, reverse=True)
     boxes = torch.cat([torch.stack([found_in(a).box for a in answers]), located.boxes.double()])
@@ -138,6 +138,12 @@ def _corrected(registrar: "Registrar", item: Item, answer: Registration) -> Regi
     if float(places.presence[0]) <= found.presence:
         return answer
     return places.registered(registrar, item, 0)
+
+
+def _extremes(image: Tensor) -> Tensor:
+    """(C, 2) smallest and largest value of each channel, NaN where there is one, of what is large as a whole."""
+    pair = torch.stack([image.flatten(1).amin(dim=1), image.flatten(1).amax(dim=1)], dim=1)
+    return pair.float() / 255.0 if image.dtype == torch.uint8 else pair
 
 
 def posed_box(registrar: "Registrar", result: Registration) -> Tensor:

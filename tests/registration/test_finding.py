@@ -85,6 +85,9 @@ def test_what_cannot_be_searched_takes_nothing_else_down(registrar):
     assert torch.equal(alone.found.boxes, results[1].found.boxes)
     with pytest.raises(InvalidInputError, match="distance: needs the camera"):
         registrar([image], distance=(1.0, 2.0))
+    nowhere = registrar([image], camera_matrices=CAMERA, distance=(1e-3, 2e-3))[0]
+    with pytest.raises(InvalidInputError, match="image 0: nothing of such a size fits"):
+        _ = nowhere.rotation
     with pytest.raises(InvalidInputError, match="distance: expected 0 < MIN"):
         registrar([image], camera_matrices=CAMERA, distance=(3.0, 2.0))
 
