@@ -19,7 +19,7 @@ from .pose import FailedRegistration, Found, Registration
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-__all__ = ["find"]
+__all__ = ["Places", "find"]
 
 SAME = 0.5
 """Intersection over union from which two boxes show the same object."""
@@ -78,7 +78,7 @@ def _followed(registrar: "Registrar", item: Item, located: Located, instances: i
     if not len(located.boxes):
         raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
     count = max(registrar.pipeline.locate.followed, instances + 1)
-    places = _Places.judged(registrar, item, located.boxes[:count], located.scores[:count])
+    places = Places.judged(registrar, item, located.boxes[:count], located.scores[:count])
     order = places.presence.argsort(descending=True, stable=True)
     chosen: list[int] = []
     for k in order.tolist():
@@ -101,7 +101,7 @@ def _followed(registrar: "Registrar", item: Item, located: Located, instances: i
 
 
 @dataclass(frozen=True)
-class _Places:
+class Places:
     """P boxes of one photograph, described and ranked, and how surely each shows the object."""
 
     boxes: Tensor
@@ -111,7 +111,7 @@ class _Places:
     presence: Tensor
 
     @classmethod
-    def judged(cls, registrar: "Registrar", item: Item, boxes: Tensor, scores: Tensor) -> "_Places":
+    def judged(cls, registrar: "Registrar", item: Item, boxes: Tensor, scores: Tensor) -> "Places":
         query = registrar.matcher.query([item.image] * len(boxes), boxes)
         ranking = registrar.matcher.rank(query)
         sure = [presence(presence_evidence(s, ranking[k : k + 1])) for k, s in enumerate(scores.tolist())]
@@ -134,7 +134,7 @@ class _Places:
 def _corrected(registrar: "Registrar", item: Item, answer: Registration) -> Registration:
     """The better of an answer and of what the box around its pose leads to."""
     found = found_in(answer)
-    places = _Places.judged(registrar, item, found.box[None].float(), torch.tensor([found.score]))
+    places = Places.judged(registrar, item, found.box[None].float(), torch.tensor([found.score]))
     if float(places.presence[0]) <= found.presence:
         return answer
     return places.registered(registrar, item, 0)
