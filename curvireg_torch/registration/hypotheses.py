@@ -7,7 +7,10 @@ from torch import Tensor
 
 from ..matching import Ranking, ViewBank, distinct_views
 
-__all__ = ["Hypotheses", "hypotheses"]
+__all__ = ["Hypotheses", "hypotheses", "own_peaks"]
+
+SAME = 15.0
+"""Degrees within which two hypotheses have become one."""
 
 
 @dataclass(frozen=True)
@@ -57,3 +60,20 @@ def hypotheses(ranking: Ranking, bank: ViewBank, *, count: int, symmetries: Tens
         distance=bank.distances.cpu()[view],
         score=ranking.scores.cpu()[photograph, view].double(),
     )
+
+
+def own_peaks(found: Hypotheses, score: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
+    """(H,) bool: False where a hypothesis ended within ``SAME`` degrees of a better one of its photograph.
+
+    Args:
+        score: (H,) the higher the better.
+        symmetries: of :func:`distinct_views`.
+    """
+    own = torch.zeros(len(found), dtype=torch.bool)
+    order = score.argsort(descending=True, stable=True)
+    for b in found.photograph.unique():
+        mine = order[found.photograph[order] == b]
+        R, model, best_first = found.rotation[mine].float(), found.model[mine], torch.arange(len(mine))
+        apart = distinct_views(best_first, R, count=len(mine), angle=SAME, symmetries=symmetries, model=model)
+        own[mine[apart]] = True
+    return own

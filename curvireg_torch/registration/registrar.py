@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -10,26 +10,22 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import CurviregError, InvalidInputError
-from ..geometry.cameras import rotation_towards
-from ..geometry.translation import place_view
 from ..geometry.views import ViewSphere
 from ..location import Locator
-from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank, distinct_views
+from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
 from .confidence import RELIABLE, confidence, pose_confidence, pose_evidence
-from .contour import ContourFit, fit_contours
+from .contour import ContourFit
 from .finding import find
-from .hypotheses import Hypotheses, hypotheses
+from .hypotheses import Hypotheses, hypotheses, own_peaks
 from .inputs import Item, check_crop, items_of, named
+from .placing import follow_contours, placed, seen_straight
 from .pose import FailedRegistration, Hypothesis, Registration
-from .search import FINALISTS, search
+from .search import search
 from .verify import EVIDENCE, gathered_evidence, similarities, verdict
 
 __all__ = ["Registrar"]
-
-SAME = 15.0
-"""Degrees within which two hypotheses have become one."""
 
 
 class Registrar:
@@ -215,15 +211,15 @@ class Registrar:
             found = search(
                 self.describers, descriptors, found, bank=self.bank, ranking=ranking, boxes=boxes, camera_matrices=K
             )
-        T, cameras = self._placed(found, boxes, K)
+        T, cameras = placed(self.describers, found, boxes, K)
         if self.pipeline.contours:
             self._tell("contours")
-            fit = self._follow_contours(items, found, boxes, T, cameras)
-            T, found = fit.transform, self._seen_straight(found, fit.transform)
+            fit = follow_contours(self.describers, [item.image for item in items], found, boxes, T, cameras)
+            T, found = fit.transform, seen_straight(self.describers, found, fit.transform)
         found = replace(found, score=similarities(self.describers, descriptors, found))
         looks = self._looks(found, query, ranking)
         evidence = gathered_evidence(starts, found, None if fit is None else fit.support, looks)
-        own = self._own_peaks(found, verdict(evidence, with_camera=K is not None))
+        own = own_peaks(found, verdict(evidence, with_camera=K is not None), symmetries=self.symmetries)
         if not bool(own.all()):
             found, T, cameras, fit = self._sent_back(own, starts, found, T, cameras, fit, boxes, K)
             back = found[~own]
@@ -264,17 +260,6 @@ class Registrar:
         pictures = self.matcher.pictures(found.model, found.rotation, found.distance)
         return self.matcher.late_score("appearance", query, ranking, pictures, found.photograph)
 
-    def _own_peaks(self, found: Hypotheses, score: Tensor) -> Tensor:
-        """(H,) bool: False where a hypothesis ended within ``SAME`` degrees of a better one of its photograph."""
-        own = torch.zeros(len(found), dtype=torch.bool)
-        order = score.argsort(descending=True, stable=True)
-        for b in found.photograph.unique():
-            mine = order[found.photograph[order] == b]
-            R, model, best_first = found.rotation[mine].float(), found.model[mine], torch.arange(len(mine))
-            apart = distinct_views(best_first, R, count=len(mine), angle=SAME, symmetries=self.symmetries, model=model)
-            own[mine[apart]] = True
-        return own
-
     def _sent_back(
         self,
         own: Tensor,
@@ -287,8 +272,8 @@ class Registrar:
         K: Tensor | None,
     ) -> tuple[Hypotheses, Tensor, Tensor, ContourFit | None]:
         """Hypotheses that became another one stand where they started: a rival is a rival, if not a peak."""
-        placed, theirs = self._placed(starts, boxes, K)
-        T = torch.where(own[:, None, None], T, placed)
+        back, theirs = placed(self.describers, starts, boxes, K)
+        T = torch.where(own[:, None, None], T, back)
         cameras = torch.where(own[:, None, None], cameras, theirs)
         found = replace(
             found,
@@ -325,57 +310,3 @@ class Registrar:
             support=None if fit is None else float(fit.support[h]),
             covariance=fit.covariance[h].clone() if fit is not None and known else None,
         )
-
-    def _placed(self, found: Hypotheses, boxes: Tensor, K: Tensor | None) -> tuple[Tensor, Tensor]:
-        """T_cam_from_model (H, 4, 4) and camera matrices (H, 3, 3) of hypotheses that fill their boxes."""
-        T = torch.eye(4, dtype=torch.float64).repeat(len(found), 1, 1)
-        cameras = torch.eye(3, dtype=torch.float64).repeat(len(found), 1, 1)
-        for model, mine in self._by_model(found):
-            describe, photograph = self.describers[model], found.photograph[mine]
-            if K is None:
-                T[mine], cameras[mine] = describe.cameras_of_boxes(
-                    found.rotation[mine], found.distance[mine], boxes[photograph]
-                )
-            else:
-                cameras[mine] = K[photograph]
-                T[mine, :3, :3], T[mine, :3, 3] = place_view(
-                    describe.hull, found.rotation[mine], boxes[photograph], K[photograph]
-                )
-        return T, cameras
-
-    def _follow_contours(
-        self, items: Sequence[Item], found: Hypotheses, boxes: Tensor, T: Tensor, cameras: Tensor
-    ) -> ContourFit:
-        parts, index = [], []
-        for model, mine in self._by_model(found):
-            describe = self.describers[model]
-            parts.append(
-                fit_contours(
-                    describe.renderer,
-                    [item.image for item in items],
-                    boxes,
-                    cameras[mine],
-                    T[mine],
-                    photograph=found.photograph[mine],
-                    centre=describe.centre,
-                    radius=describe.radius,
-                    margin=self.bank.settings.margin,
-                    finish=FINALISTS,
-                )
-            )
-            index.append(mine)
-        place = torch.cat(index).argsort()
-        return ContourFit(*(torch.cat([getattr(part, f.name) for part in parts])[place] for f in fields(ContourFit)))
-
-    def _seen_straight(self, found: Hypotheses, T: Tensor) -> Hypotheses:
-        """Allocentric rotations and distances of poses."""
-        rotation, distance = found.rotation.clone(), found.distance.clone()
-        for model, mine in self._by_model(found):
-            R, t = T[mine, :3, :3], T[mine, :3, 3]
-            position = R @ self.describers[model].centre + t
-            rotation[mine] = rotation_towards(position).mT @ R
-            distance[mine] = torch.linalg.vector_norm(position, dim=1)
-        return replace(found, rotation=rotation, distance=distance)
-
-    def _by_model(self, found: Hypotheses) -> list[tuple[int, Tensor]]:
-        return [(m, (found.model == m).nonzero()[:, 0]) for m in found.model.unique().tolist()]

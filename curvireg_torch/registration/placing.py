@@ -1,0 +1,88 @@
+"""Hypotheses as poses before cameras, and back: of several models, each by its own describer."""
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import torch
+from torch import Tensor
+
+from ..geometry.cameras import rotation_towards
+from ..geometry.translation import place_view
+from ..matching import ViewDescriber
+from .contour import ContourFit, fit_contours
+from .hypotheses import Hypotheses
+from .search import FINALISTS
+
+__all__ = ["follow_contours", "placed", "seen_straight"]
+
+
+def placed(
+    describers: Sequence[ViewDescriber], found: Hypotheses, boxes: Tensor, K: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """T_cam_from_model (H, 4, 4) and camera matrices (H, 3, 3) of hypotheses that fill their boxes.
+
+    Args:
+        describers: of the bank's models.
+        boxes: (B, 4) of the photographs, px.
+        K: (B, 3, 3) of the photographs; None: unknown, a camera that looks straight at the box is assumed.
+    """
+    T = torch.eye(4, dtype=torch.float64).repeat(len(found), 1, 1)
+    cameras = torch.eye(3, dtype=torch.float64).repeat(len(found), 1, 1)
+    for model, mine in _by_model(found):
+        describe, photograph = describers[model], found.photograph[mine]
+        if K is None:
+            T[mine], cameras[mine] = describe.cameras_of_boxes(
+                found.rotation[mine], found.distance[mine], boxes[photograph]
+            )
+        else:
+            cameras[mine] = K[photograph]
+            T[mine, :3, :3], T[mine, :3, 3] = place_view(
+                describe.hull, found.rotation[mine], boxes[photograph], K[photograph]
+            )
+    return T, cameras
+
+
+def seen_straight(describers: Sequence[ViewDescriber], found: Hypotheses, T: Tensor) -> Hypotheses:
+    """The hypotheses with the allocentric rotations and distances of poses (H, 4, 4)."""
+    rotation, distance = found.rotation.clone(), found.distance.clone()
+    for model, mine in _by_model(found):
+        R, t = T[mine, :3, :3], T[mine, :3, 3]
+        position = R @ describers[model].centre + t
+        rotation[mine] = rotation_towards(position).mT @ R
+        distance[mine] = torch.linalg.vector_norm(position, dim=1)
+    return replace(found, rotation=rotation, distance=distance)
+
+
+def follow_contours(
+    describers: Sequence[ViewDescriber],
+    images: Sequence[Tensor],
+    found: Hypotheses,
+    boxes: Tensor,
+    T: Tensor,
+    cameras: Tensor,
+) -> ContourFit:
+    """:func:`fit_contours` of hypotheses of all models, from poses (H, 4, 4) before cameras (H, 3, 3)."""
+    parts, index = [], []
+    for model, mine in _by_model(found):
+        describe = describers[model]
+        parts.append(
+            fit_contours(
+                describe.renderer,
+                images,
+                boxes,
+                cameras[mine],
+                T[mine],
+                photograph=found.photograph[mine],
+                centre=describe.centre,
+                radius=describe.radius,
+                margin=describe.settings.margin,
+                finish=FINALISTS,
+            )
+        )
+        index.append(mine)
+    place = torch.cat(index).argsort()
+    return ContourFit(*(torch.cat([getattr(part, f.name) for part in parts])[place] for f in fields(ContourFit)))
+
+
+def _by_model(found: Hypotheses) -> list[tuple[int, Tensor]]:
+    return [(m, (found.model == m).nonzero()[:, 0]) for m in found.model.unique().tolist()]
