@@ -44,9 +44,9 @@ _POSE_BIAS = -1.615
 PRESENCE_EVIDENCE = ("place", "similarity", "look")
 """What :func:`presence_evidence` measures, in its order."""
 
-_PRESENCE_WEIGHTS = (0.5, 5.0, 14.0)
-_PRESENCE_BIAS = -11.7
-"""Logistic regression on mosaics of photographs of textured meshes."""
+_PRESENCE_WEIGHTS = (1.045, 2.175, 5.372)
+_PRESENCE_BIAS = -13.147
+"""Logistic regression on mosaics of photographs of textured meshes, by scripts/bench_location.py."""
 
 MARGIN = 5.0
 """A lead that is larger tells no more."""
