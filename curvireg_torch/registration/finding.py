@@ -12,7 +12,7 @@ from ..geometry.cameras import projected_boxes
 from ..geometry.crops import box_iou
 from ..location import Located
 from ..matching import Photographs, Ranking
-from .confidence import presence, presence_evidence
+from .confidence import RELIABLE, presence, presence_evidence
 from .inputs import Item, check_crop, items_of, named
 from .pose import FailedRegistration, Found, Registration
 
@@ -90,14 +90,16 @@ def _followed(registrar: "Registrar", item: Item, located: Located, instances: i
     boxes = torch.cat([torch.stack([found_in(a).box for a in answers]), located.boxes.double()])
     scores = torch.cat([torch.tensor([found_in(a).score for a in answers]), located.scores])
     own = _own_places(boxes)
-    return [
-        replace(
-            answer,
-            confidence=answer.confidence * _surely(answer),
-            found=replace(found_in(answer), boxes=boxes[own], scores=scores[own]),
-        )
-        for answer in answers
-    ]
+    answers = [replace(a, found=replace(found_in(a), boxes=boxes[own], scores=scores[own])) for a in answers]
+    return [_doubted(answer, answer.confidence * _surely(answer)) for answer in answers]
+
+
+def _doubted(answer: Registration, confidence: float) -> Registration:
+    """An answer with less confidence, and no covariance where that is too little to rely on."""
+    if confidence >= RELIABLE:
+        return replace(answer, confidence=confidence)
+    guesses = tuple(replace(h, covariance=None) for h in answer.hypotheses)
+    return replace(answer, confidence=confidence, hypotheses=guesses)
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,21 @@ def test_with_a_camera_the_pose_has_a_place(registrar):
     assert 0.75 * far < float(within.translation[2]) < 1.3 * far
 
 
+def test_a_place_that_is_not_sure_has_no_covariance(monkeypatch):
+    """The pose alone would be believed; where the object hardly is, it is a guess, and says no deviations."""
+    whole = cr.Registrar(bank(), hypotheses=1)
+    image, box, _ = scene(5)
+    monkeypatch.setattr("curvireg_torch.registration.registrar.RELIABLE", 0.0)
+    given = whole([image], box[None], CAMERA)[0]
+    assert given.covariance is not None
+    for sure, kept in ((0.5, False), (1.0, True)):
+        monkeypatch.setattr("curvireg_torch.registration.finding.presence", lambda _, p=sure: p)
+        monkeypatch.setattr("curvireg_torch.registration.finding.RELIABLE", 0.6 * given.confidence)
+        result = whole([image], camera_matrices=CAMERA)[0]
+        assert (result.covariance is not None) == kept
+        assert result.confidence <= sure
+
+
 def test_photographs_without_the_object_are_less_sure(registrar):
     there = [registrar([placed(seed, (40, 30), 0.9)[0]])[0].found.presence for seed in (0, 1, 5)]
     absent = [procedural_background(SIZE, torch.Generator().manual_seed(20 + k)) for k in range(3)]
