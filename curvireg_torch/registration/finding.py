@@ -91,10 +91,10 @@ def _followed(registrar: "Registrar", item: Item, located: Located, instances: i
     scores = torch.cat([torch.tensor([found_in(a).score for a in answers]), located.scores])
     own = _own_places(boxes)
     answers = [replace(a, found=replace(found_in(a), boxes=boxes[own], scores=scores[own])) for a in answers]
-    return [_doubted(answer, answer.confidence * _surely(answer)) for answer in answers]
+    return [doubted(answer, answer.confidence * _surely(answer)) for answer in answers]
 
 
-def _doubted(answer: Registration, confidence: float) -> Registration:
+def doubted(answer: Registration, confidence: float) -> Registration:
     """An answer with less confidence, and no covariance where that is too little to rely on."""
     if confidence >= RELIABLE:
         return replace(answer, confidence=confidence)

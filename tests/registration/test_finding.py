@@ -1,13 +1,16 @@
 """Objects without a box: found, followed to a pose, counted, or said not to be there."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 import curvireg_torch as cr
 from curvireg_torch.errors import ImageError, InvalidInputError
 from curvireg_torch.geometry import box_iou, rotation_error
-from curvireg_torch.registration import find
+from curvireg_torch.registration import RELIABLE, find
 from curvireg_torch.registration.confidence import presence
+from curvireg_torch.registration.finding import doubted
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, scene
 from tests.location.test_locator import SIZE, bank, placed
@@ -44,19 +47,16 @@ def test_with_a_camera_the_pose_has_a_place(registrar):
     assert 0.75 * far < float(within.translation[2]) < 1.3 * far
 
 
-def test_a_place_that_is_not_sure_has_no_covariance(monkeypatch):
+def test_a_place_that_is_not_sure_has_no_covariance(registrar):
     """The pose alone would be believed; where the object hardly is, it is a guess, and says no deviations."""
-    whole = cr.Registrar(bank(), hypotheses=1)
     image, box, _ = scene(5)
-    monkeypatch.setattr("curvireg_torch.registration.registrar.RELIABLE", 0.0)
-    given = whole([image], box[None], CAMERA)[0]
-    assert given.covariance is not None
-    for sure, kept in ((0.5, False), (1.0, True)):
-        monkeypatch.setattr("curvireg_torch.registration.finding.presence", lambda _, p=sure: p)
-        monkeypatch.setattr("curvireg_torch.registration.finding.RELIABLE", 0.6 * given.confidence)
-        result = whole([image], camera_matrices=CAMERA)[0]
-        assert (result.covariance is not None) == kept
-        assert result.confidence <= sure
+    given = registrar([image], box[None], CAMERA)[0]
+    sure = replace(given, hypotheses=tuple(replace(h, covariance=torch.eye(6)) for h in given.hypotheses))
+    assert doubted(sure, RELIABLE).covariance is not None
+    unsure = doubted(sure, RELIABLE - 0.01)
+    assert [h.covariance for h in unsure.hypotheses] == [None] * len(given.hypotheses)
+    assert unsure.confidence == RELIABLE - 0.01
+    assert not unsure.reliable
 
 
 def test_photographs_without_the_object_are_less_sure(registrar):
