@@ -1,6 +1,9 @@
 """Objects without a box: found, followed to a pose, counted, or said not to be there."""
 
+import json
+import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -105,6 +108,14 @@ def test_what_cannot_be_searched_takes_nothing_else_down(registrar):
         _ = nowhere.rotation
     with pytest.raises(InvalidInputError, match="distance: expected 0 < MIN"):
         registrar([image], camera_matrices=CAMERA, distance=(3.0, 2.0))
+
+
+def test_constants_of_presence_are_those_that_the_script_found():
+    record = Path(__file__).parents[2] / "scripts" / "results" / "location.json"
+    found = json.loads(record.read_text(encoding="utf-8"))["presence"]
+    evidence = [7.0, 0.6, 0.25]
+    logit = sum(w * v for w, v in zip(found["weights"], evidence, strict=True)) + found["bias"]
+    assert presence(evidence) == pytest.approx(1 / (1 + math.exp(-logit)))
 
 
 def test_presence_rises_with_each_piece_of_evidence():
