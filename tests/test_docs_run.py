@@ -141,8 +141,16 @@ def typed(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int | str:
     return 0
 
 
+LONG = {DOCS / "evaluation.md", DOCS / "guides" / "several.md"}
+"""Half a minute and more on one core: run with the slow tests."""
+
+
 @pytest.mark.usefixtures("here")
-@pytest.mark.parametrize("page", [p for p in PAGES if steps(p)], ids=lambda p: str(p.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(p, marks=[pytest.mark.slow] if p in LONG else []) for p in PAGES if steps(p)],
+    ids=lambda p: str(p.relative_to(ROOT)),
+)
 def test_a_page_works_as_it_stands(
     page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -68,6 +68,7 @@ def test_the_report_continues_and_names_what_killed_a_process(fuzz, tmp_path, mo
         return done
 
     monkeypatch.setattr(script.subprocess, "run", process)
+    monkeypatch.setattr(script, "commit", lambda *_, **__: "abc1234")  # which runs git
     monkeypatch.setattr(script, "SHARES", {"mat": 1.0})
     monkeypatch.setattr(sys, "argv", ["fuzz.py", "--inputs", "11", "--out", str(out)])
     assert script.main() == 1

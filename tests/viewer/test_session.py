@@ -202,7 +202,7 @@ def test_the_exif_guess_and_the_command(folder):
     assert "--camera 300 300.5 119.5 89.5 --unit" in session.command(), "a camera goes before the field of view"
     session.camera = None
     assert "--box 10 20.5 90 80 --fov 65 --unit" in session.command()
-    session.fov = 180.0
+    session.fov, session.options.unit = 180.0, "m"
     session.take_mesh(folder / "truck.ply")
     with pytest.raises(InvalidInputError, match="180"):
         session.register()
