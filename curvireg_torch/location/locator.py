@@ -64,7 +64,7 @@ class Locator(nn.Module):
     r"""Looks for a bank's objects in whole photographs, in place of a detector.
 
     A few representative views (:func:`representative_views`) are compared with every place of the photograph at sizes
-    in steps of :math:`\sqrt 2`: features of both (:mod:`curvireg_torch.location.cells`) lose what is common to the
+    in steps of :math:`\sqrt 2`: features of both (``location/cells.py``) lose what is common to the
     object, or to the photograph at that size, cells become unit vectors, and a view's raw score is the mean cosine of
     the cells that it covers, one convolution. What a view scores by is how far that lies above its scores elsewhere in
     the same photograph, in standard deviations. Peaks over place, size and view are boxes.
