@@ -10,9 +10,9 @@ import torch
 import trimesh
 
 from . import __version__
-from .registration import RELIABLE, Registrar, Registration
+from .registration import RELIABLE, Hypothesis, Registrar, Registration
 
-__all__ = ["CONVENTIONS", "SCHEMA", "found_document", "result_document"]
+__all__ = ["CONVENTIONS", "SCHEMA", "found_document", "pose_document", "result_document"]
 
 SCHEMA = 1
 """Version of ``result.schema.json``; raised when a key goes or changes its meaning."""
@@ -45,9 +45,7 @@ def result_document(result: Registration, registrar: Registrar, seconds: Mapping
     bank = registrar.bank
     top = [
         {
-            "rotation": h.rotation.tolist(),
-            "translation": None if h.translation is None else h.translation.tolist(),
-            "viewpoint": dict(zip(("azimuth", "elevation", "theta"), h.viewpoint, strict=True)),
+            **pose_document(h),
             "score": h.score,
             "evidence": dict(h.evidence),
             "view": h.view,
@@ -58,10 +56,8 @@ def result_document(result: Registration, registrar: Registrar, seconds: Mapping
     deviations = result.standard_deviations
     return {
         "schema": SCHEMA,
-        "rotation": result.rotation.tolist(),
-        "translation": None if result.translation is None else result.translation.tolist(),
+        **pose_document(result),
         "unit": bank.meshes[result.model].units,
-        "viewpoint": dict(zip(("azimuth", "elevation", "theta"), result.viewpoint, strict=True)),
         "score": result.score,
         "confidence": result.confidence,
         "reliable": result.reliable,
@@ -104,12 +100,19 @@ def found_document(results: Sequence[Registration]) -> dict[str, Any]:
                 "box": found.box.tolist(),
                 "presence": found.presence,
                 "confidence": result.confidence,
-                "rotation": result.rotation.tolist(),
-                "translation": None if result.translation is None else result.translation.tolist(),
-                "viewpoint": dict(zip(("azimuth", "elevation", "theta"), result.viewpoint, strict=True)),
+                **pose_document(result),
             }
             for result, found in placed
         ],
+    }
+
+
+def pose_document(found: Registration | Hypothesis) -> dict[str, Any]:
+    """``rotation``, ``translation`` and ``viewpoint``."""
+    return {
+        "rotation": found.rotation.tolist(),
+        "translation": None if found.translation is None else found.translation.tolist(),
+        "viewpoint": dict(zip(("azimuth", "elevation", "theta"), found.viewpoint, strict=True)),
     }
 
 

@@ -79,7 +79,7 @@ def linemod_boxes(registrar: cr.Registrar, image: Tensor, count: int) -> tuple[T
     side = located.settings.smallest * longer
     while side <= longer:
         detector = cv2.linemod.getDefaultLINE()
-        S = round(side * pictures.shape[-1] / (0.83 * pictures.shape[-1]))
+        S = round(side / 0.83)  # with the margin around the object
         small = F.interpolate(pictures, size=(S, S), mode="bilinear", antialias=True)
         places = {}
         for view in small:

@@ -103,7 +103,8 @@ def run(arguments: argparse.Namespace) -> None:
     if summary["med_err_deg"] is not None:
         print("   ".join([*(f"{n} {summary[n]:.3f}" for n in shares), f"med_err_deg {summary['med_err_deg']:.1f}"]))
     if "localisation" in summary:
-        print("   ".join(f"{name} {value:.3f}" for name, value in summary["localisation"].items() if name != "n"))
+        n, *shares = summary["localisation"].items()
+        print("   ".join(f"{name} {value:.3f}" for name, value in shares if n[1]) or "no box is annotated")
     print(f"protocol: {summary['protocol']}; see {arguments.out}/summary.json")
 
 

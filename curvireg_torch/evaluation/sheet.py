@@ -116,7 +116,8 @@ def _picture(benchmark: Benchmark, item: Item, row: Row) -> bytes | None:
         renderer = None if mesh is None else _renderer(mesh, benchmark.unit)
     except CurviregError:
         return None
-    box = perturbed_box(item.box, benchmark.protocol, item.key).tolist()
+    given = perturbed_box(item.box, benchmark.protocol, item.key).tolist()
+    box = row["found"]["boxes"][0] if "found" in row else given
     return None if renderer is None else thumbnail(renderer, (T, K), image, box)
 
 

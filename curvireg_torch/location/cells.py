@@ -78,10 +78,12 @@ class FieldCells(Cells):
 
     def of_photograph(self, image: Tensor) -> list[Tensor]:
         H, W = image.shape[-2:]
-        return [orientation_cells(photograph_field(self.field, image), grid=(H // 8, W // 8))]
+        (cell,) = self.strides
+        return [orientation_cells(photograph_field(self.field, image), grid=(H // cell, W // cell))]
 
     def of_views(self, describer: ViewDescriber, rotations: Tensor, distances: Tensor, side: int) -> list[list[Tensor]]:
-        return [[orientation_cells(describer.fields(rotations, distances), grid=(side // 8, side // 8))]]
+        (cell,) = self.strides
+        return [[orientation_cells(describer.fields(rotations, distances), grid=(side // cell, side // cell))]]
 
 
 def cells_for(matcher: ViewMatcher) -> Cells:

@@ -16,7 +16,7 @@ from ..pipeline import Pipeline
 from .cells import Cells, cells_for
 from .representatives import representative_views
 
-__all__ = ["Located", "Locator", "locate"]
+__all__ = ["OVERLAP", "Located", "Locator", "check_distance", "locate"]
 
 SIDE = 96
 """Of the views that are looked for, px."""
@@ -108,12 +108,8 @@ class Locator(nn.Module):
             InvalidInputError: wrong shape or dtype, an image of one px, or a ``distance`` without cameras or not
                 0 < MIN <= MAX.
         """
-        if distance is not None:
-            low, high = distance
-            if not 0.0 < low <= high < float("inf"):
-                raise InvalidInputError(f"distance: expected 0 < MIN <= MAX, got {low:g} {high:g}")
-            if camera_matrices is None or any(K is None for K in camera_matrices):
-                raise InvalidInputError("distance: needs the camera matrix of every photograph")
+        known = camera_matrices is not None and all(K is not None for K in camera_matrices)
+        check_distance(distance, with_cameras=known)
         out = []
         for i, image in enumerate(images):
             K = None if camera_matrices is None else camera_matrices[i]
@@ -165,7 +161,7 @@ class Locator(nn.Module):
         """(K, h, w) mean cosines; place (i, j) is that of a view whose middle lies at px 8 i, 8 j."""
         out = None
         features = self.cells.of_photograph(image)
-        for stride, (feature, ways) in enumerate(zip(features, self._templates.weights, strict=True)):
+        for n, (feature, ways) in enumerate(zip(features, self._templates.weights, strict=True)):
             cells = self.cells.comparable(feature, feature.mean(dim=(0, 2, 3))[:, None, None])
             pad = ways[0].shape[-1] // 2
             padded = F.pad(cells, (pad, pad, pad, pad))
@@ -174,7 +170,7 @@ class Locator(nn.Module):
                 out = found
             else:
                 fine = F.interpolate(found[None], size=out.shape[1:], mode="bilinear", align_corners=True)[0]
-                out = (out * stride + fine) / (stride + 1)
+                out = (out * n + fine) / (n + 1)
         assert out is not None
         return out
 
@@ -197,6 +193,17 @@ class Locator(nn.Module):
         box, view = torch.cat(boxes)[index], torch.cat(views)[index.cpu()]
         kept = nms(box, score[:PEAKS], OVERLAP)[: self.settings.proposals]
         return Located(box[kept].cpu(), score[kept].cpu(), view[kept.cpu()])
+
+
+def check_distance(distance: tuple[float, float] | None, *, with_cameras: bool) -> None:
+    """Raise :class:`InvalidInputError` for distances that are not 0 < MIN <= MAX, or that come without cameras."""
+    if distance is None:
+        return
+    low, high = distance
+    if not 0.0 < low <= high < float("inf"):
+        raise InvalidInputError(f"distance: expected 0 < MIN <= MAX, got {low:g} {high:g}")
+    if not with_cameras:
+        raise InvalidInputError("distance: needs the camera matrix of every photograph")
 
 
 def _templates(cells: Cells, matcher: ViewMatcher, count: int) -> _Templates:
@@ -229,10 +236,9 @@ def _by_model(
         parts.append(of_views(matcher.describers[m], mine))
         index.append(mine)
     back = torch.cat(index).argsort()
-    ways = max(len(part) for part in parts)
     return [
-        [torch.cat(stride)[back] for stride in zip(*(part[min(w, len(part) - 1)] for part in parts), strict=True)]
-        for w in range(ways)
+        [torch.cat(stride)[back] for stride in zip(*way, strict=True)]
+        for way in zip(*parts, strict=True)  # all models are shown in the same ways
     ]
 
 

@@ -5,12 +5,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
+from kornia.geometry.bbox import nms
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError
 from ..geometry.cameras import projected_boxes
-from ..geometry.crops import box_iou
 from ..location import Located
+from ..location.locator import OVERLAP, check_distance
 from ..matching import Photographs, Ranking
 from .confidence import RELIABLE, presence, presence_evidence
 from .inputs import Item, check_crop, items_of, named
@@ -20,9 +21,6 @@ if TYPE_CHECKING:
     from .registrar import Registrar
 
 __all__ = ["Places", "find"]
-
-SAME = 0.5
-"""Intersection over union from which two boxes show the same object."""
 
 
 @torch.no_grad()
@@ -54,6 +52,7 @@ def find(
     """
     if instances < 1:
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
+    check_distance(distance, with_cameras=camera_matrices is not None)
     out: list[list[Registration | FailedRegistration]] = []
     for i, item in enumerate(items_of(images, None, camera_matrices)):
         if not isinstance(item, Item):
@@ -62,13 +61,9 @@ def find(
         try:
             check_crop(_extremes(item.image))
             cameras = None if item.camera_matrix is None else [item.camera_matrix]
-            if distance is not None and cameras is None:
-                raise InvalidInputError("distance: needs the camera matrix of every photograph")
             located = registrar.locator([item.image], camera_matrices=cameras, distance=distance)[0]
             out.append([*_followed(registrar, item, located, instances)])
         except CurviregError as error:
-            if distance is not None and isinstance(error, InvalidInputError) and str(error).startswith("distance"):
-                raise
             out.append([FailedRegistration(named(error, f"image {i}"))])
     return out
 
@@ -79,17 +74,12 @@ def _followed(registrar: "Registrar", item: Item, located: Located, instances: i
         raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
     count = max(registrar.pipeline.locate.followed, instances + 1)
     places = Places.judged(registrar, item, located.boxes[:count], located.scores[:count])
-    order = places.presence.argsort(descending=True, stable=True)
-    chosen: list[int] = []
-    for k in order.tolist():
-        apart = not chosen or bool((box_iou(places.boxes[k, None], places.boxes[chosen]) <= SAME).all())
-        if apart and len(chosen) < instances:
-            chosen.append(k)
-    answers = [_corrected(registrar, item, places.registered(registrar, item, k)) for k in chosen]
+    chosen = nms(places.boxes, places.presence, OVERLAP)[:instances]
+    answers = [_corrected(registrar, item, places.registered(registrar, item, k)) for k in chosen.tolist()]
     answers.sort(key=_surely, reverse=True)
     boxes = torch.cat([torch.stack([found_in(a).box for a in answers]), located.boxes.double()])
     scores = torch.cat([torch.tensor([found_in(a).score for a in answers]), located.scores])
-    own = _own_places(boxes)
+    own = nms(boxes, -torch.arange(len(boxes)), OVERLAP)  # in the order that they have
     answers = [replace(a, found=replace(found_in(a), boxes=boxes[own], scores=scores[own])) for a in answers]
     return [doubted(answer, answer.confidence * _surely(answer)) for answer in answers]
 
@@ -162,12 +152,3 @@ def found_in(result: Registration) -> Found:
 
 def _surely(result: Registration) -> float:
     return found_in(result).presence
-
-
-def _own_places(boxes: Tensor) -> Tensor:
-    """(P,) bool: False for a box that shows what an earlier one does."""
-    alike = box_iou(boxes, boxes) > SAME
-    own = torch.ones(len(boxes), dtype=torch.bool)
-    for i in range(len(boxes)):
-        own[i] = not bool((alike[i, :i] & own[:i]).any())
-    return own

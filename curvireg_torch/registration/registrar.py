@@ -157,10 +157,12 @@ class Registrar:
             asked for a pose.
 
         Raises:
-            InvalidInputError: not as many boxes or cameras as images.
+            InvalidInputError: not as many boxes or cameras as images, or a ``distance`` beside boxes.
         """
         if boxes is None:
             return [each[0] for each in find(self, images, camera_matrices, distance=distance)]
+        if distance is not None:
+            raise InvalidInputError("distance: for objects that are looked for; leave the boxes out, or the distance")
         items = items_of(images, boxes, camera_matrices)
         results: list[Registration | FailedRegistration] = []
         for i in range(0, len(items), self.matcher.chunk_size):

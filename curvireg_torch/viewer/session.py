@@ -17,6 +17,7 @@ from ..batch import Entry, register_entry
 from ..commands import open_registrar
 from ..data import read_photo
 from ..data.images import Photo
+from ..document import pose_document
 from ..errors import CurviregError, InvalidInputError
 from ..evaluation.store import to_json
 from ..geometry import camera_matrix, load_mesh, rotation_error, rotation_from_axis_angle
@@ -239,14 +240,11 @@ class Session:
     def document(self) -> dict[str, Any]:
         """``result.json`` of the command line, and in ``viewer`` that command and the pose on the page."""
         answer, shown = self.seen()
-        pose = shown.pose
         on_page = {
             "command": answer.command,
             "hypothesis": shown.number,
             "by_hand": list(shown.by_hand),
-            "rotation": pose.rotation.tolist(),
-            "translation": None if pose.translation is None else pose.translation.tolist(),
-            "viewpoint": dict(zip(("azimuth", "elevation", "theta"), pose.viewpoint, strict=True)),
+            **pose_document(shown.pose),
         }
         return {**answer.document, "viewer": on_page}
 

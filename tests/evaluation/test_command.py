@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 
 from curvireg_torch.errors import InvalidInputError, MissingFileError
-from curvireg_torch.evaluation import add_parser
+from curvireg_torch.evaluation import add_parser, contact_sheet
+from curvireg_torch.evaluation.localisation import localisation
 
 from .small import SMALL
 
@@ -44,6 +45,28 @@ def test_bop_supposes_any_orientation(bop, tmp_path):
     assert summary["settings"]["dataset"] == "bop"
     views = summary["settings"]["pipeline"]["views"]
     assert (views["pose"], views["directions"], views["turn"]) == ("any", 18, 360.0)
+
+
+def test_without_boxes(pascal, tmp_path, capsys, monkeypatch):
+    """Recall of boxes is told beside the pose's scores; where no box is annotated, that is said."""
+    evaluate("pascal3d", pascal.root, "--limit", "2", "--out", tmp_path / "out", "--protocol", "box=none")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["localisation"]["n"] == 2
+    assert f"recall_1 {summary['localisation']['recall_1']:.3f}   recall_5" in capsys.readouterr().out
+    contact_sheet(tmp_path / "out", tmp_path / "sheet.html")
+    row = next(row for row in rows_of(tmp_path / "out") if "found" in row)
+    seen = []
+    monkeypatch.setattr("curvireg_torch.evaluation.sheet.thumbnail", lambda *a: seen.append(a[3]) or b"")
+    contact_sheet(tmp_path / "out", tmp_path / "sheet.html")
+    assert row["found"]["boxes"][0] in seen, "the page shows the box that was found"
+    summary["localisation"] = localisation([], [])
+    monkeypatch.setattr("curvireg_torch.evaluation.loops.evaluate", lambda *_, **__: summary)
+    evaluate("pascal3d", pascal.root, "--limit", "2", "--out", tmp_path / "out", "--protocol", "box=none")
+    assert "no box is annotated" in capsys.readouterr().out
+
+
+def rows_of(folder):
+    return [json.loads(path.read_text()) for path in (folder / "predictions").glob("*%2F*.json")]
 
 
 def test_errors_come_before_any_work(pascal, bop, tmp_path):

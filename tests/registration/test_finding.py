@@ -103,6 +103,8 @@ def test_what_cannot_be_searched_takes_nothing_else_down(registrar):
     assert torch.equal(alone.found.boxes, results[1].found.boxes)
     with pytest.raises(InvalidInputError, match="distance: needs the camera"):
         registrar([image], distance=(1.0, 2.0))
+    with pytest.raises(InvalidInputError, match="distance: for objects that are looked for"):
+        registrar([image], [[4.0, 4.0, 40.0, 40.0]], CAMERA, distance=(1.0, 2.0))
     nowhere = registrar([image], camera_matrices=CAMERA, distance=(1e-3, 2e-3))[0]
     with pytest.raises(InvalidInputError, match="image 0: nothing of such a size fits"):
         _ = nowhere.rotation
