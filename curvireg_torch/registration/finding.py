@@ -126,7 +126,10 @@ class Places:
 def _corrected(registrar: "Registrar", item: Item, answer: Registration) -> Registration:
     """The better of an answer and of what the box around its pose leads to."""
     found = found_in(answer)
-    places = Places.judged(registrar, item, found.box[None].float(), torch.tensor([found.score]))
+    try:
+        places = Places.judged(registrar, item, found.box[None].float(), torch.tensor([found.score]))
+    except InvalidInputError:  # the pose has left the photograph: it is of nothing that is there
+        return replace(answer, found=replace(found, presence=0.0))
     if float(places.presence[0]) <= found.presence:
         return answer
     return places.registered(registrar, item, 0)

@@ -11,7 +11,7 @@ import torch
 import curvireg_torch as cr
 from curvireg_torch.errors import ImageError, InvalidInputError
 from curvireg_torch.geometry import box_iou, rotation_error
-from curvireg_torch.registration import RELIABLE, find
+from curvireg_torch.registration import RELIABLE, find, finding
 from curvireg_torch.registration.confidence import presence
 from curvireg_torch.registration.finding import doubted
 from curvireg_torch.synthetic import procedural_background
@@ -60,6 +60,16 @@ def test_a_place_that_is_not_sure_has_no_covariance(registrar):
     assert [h.covariance for h in unsure.hypotheses] == [None] * len(given.hypotheses)
     assert unsure.confidence == RELIABLE - 0.01
     assert not unsure.reliable
+
+
+def test_a_pose_that_left_the_photograph_is_of_nothing(registrar, monkeypatch):
+    """It stays an answer, which nobody is to believe; the photograph does not fail."""
+    image, _ = placed(5, (90, 40), 0.9)
+    outside = torch.tensor([-300.0, -200.0, -100.0, -50.0], dtype=torch.float64)
+    monkeypatch.setattr(finding, "posed_box", lambda *_: outside)
+    result = registrar([image])[0]
+    assert result.ok
+    assert (result.found.presence, result.confidence) == (0.0, 0.0)
 
 
 def test_photographs_without_the_object_are_less_sure(registrar):
