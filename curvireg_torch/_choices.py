@@ -12,6 +12,11 @@ PRESET_NAMES = ("learned", "classical", "fast", "paper")
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 """Metres per unit."""
 
+IMAGES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp")
+VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm")
+MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+"""How names of files end, in small letters."""
+
 UP_AXES = {
     "x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
     "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],

@@ -1,6 +1,7 @@
 """``curvireg``: register a photograph, build a bank, evaluate a dataset, run the demo."""
 
 import argparse
+import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -14,12 +15,16 @@ from ._choices import BACKENDS, DEFAULT, PRESET_NAMES, UNITS, UP_AXES
 from ._completion import SHELLS, script
 from ._examples import examples
 from ._files import terminable
+from ._given import check_given
 from .errors import CurviregError
 from .evaluation import add_parser as add_evaluate
 from .plotting import add_parser as add_plot
 from .viewer import add_parser as add_view
 
 __all__ = ["main"]
+
+_NUMBERS = {"--box": 4, "--camera": 4, "--distance": 2}
+_NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -29,6 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not arguments.debug:
             warnings.showwarning = _show_warning
         try:
+            check_given(*_named(arguments))
             arguments.run(arguments)
         except CurviregError as error:
             if arguments.debug:
@@ -52,10 +58,7 @@ def _show_warning(message: Any, *_: Any, **__: Any) -> None:
 
 def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = _parser()
-    words = list(sys.argv[1:] if argv is None else argv)
-    if ("--camera", "exif") in pairwise(words):
-        place = words.index("--camera")
-        words[place : place + 2] = ["--exif"]
+    words = _spelled(sys.argv[1:] if argv is None else argv)
     arguments, rest = parser.parse_known_args(words)
     if hasattr(arguments, "paths") and not any(word.startswith("-") for word in rest):
         arguments.paths += [Path(word) for word in rest]  # those behind an option
@@ -70,6 +73,35 @@ def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
         if problem := _misused(arguments):
             parser.error(f"register: {problem}")
     return arguments
+
+
+def _spelled(words: Sequence[str]) -> list[str]:
+    """One word for each number: those of --box, --camera and --distance may be divided by commas, too."""
+    spelled: list[str] = []
+    expected = 0
+    for word in words:
+        option, equals, value = word.partition("=")
+        if option in _NUMBERS:
+            expected, word = _NUMBERS[option], value
+            spelled.append(option)
+            if not equals:
+                continue
+        parts = re.split(r"[,\s]+", word.strip(", "))
+        numbers = len(parts) <= expected and all(re.fullmatch(_NUMBER, part) for part in parts)
+        expected = expected - len(parts) if numbers else 0
+        spelled += parts if numbers else [word]
+    if ("--camera", "exif") in pairwise(spelled):
+        place = spelled.index("--camera")
+        spelled[place : place + 2] = ["--exif"]
+    return spelled
+
+
+def _named(arguments: argparse.Namespace) -> tuple[Sequence[Path], Sequence[Path], Path | None]:
+    """Photographs, meshes and the list that a command names."""
+    if hasattr(arguments, "photos"):
+        return arguments.photos, arguments.meshes, arguments.list
+    photo, mesh = (getattr(arguments, name, None) for name in ("photo", "mesh"))
+    return [photo] if photo else [], [mesh] if mesh else [], None
 
 
 def _misused(arguments: argparse.Namespace) -> str | None:

@@ -276,10 +276,9 @@ def _print_result(document: dict[str, Any], out: Path) -> None:
     if not document["reliable"]:
         upright = document["pipeline"]["views"]["pose"] == "upright"
         stands = ", and that it stands as in its file (--pose upright, --up)" if upright else ""
-        print(
-            "no reliable match: take the pose as a guess; check that the box is tight and the mesh is the object's"
-            f"{stands}"
-        )
+        looked_for = "the object was looked for: give its --box, and check that"
+        checks = looked_for if "found" in document else "check that the box is tight and"
+        print(f"no reliable match: take the pose as a guess; {checks} the mesh is the object's{stands}")
     if ", " in document.get("inputs", {}).get("mesh", ""):
         print(f"mesh: {document['mesh']}")
     if "found" in document:

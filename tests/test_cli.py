@@ -294,12 +294,21 @@ def test_adapted_field_from_bank_to_register(files, monkeypatch, capsys):
     assert run(folder, "photo.png", "own.safetensors", "--field", str(folder / "none"), box=box) == 2
 
 
-@pytest.mark.parametrize(("pose", "told"), [("any", "the object's\n"), ("upright", "(--pose upright, --up)\n")])
-def test_what_to_check_where_nothing_is_reliable(pose, told, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("pose", "more", "told", "untold"),
+    [
+        ("any", {}, "the box is tight and the mesh is the object's\n", "looked for"),
+        ("upright", {}, "(--pose upright, --up)\n", "looked for"),
+        ("any", {"found": {"instances": []}}, "the object was looked for: give its --box", "tight"),
+    ],
+)
+def test_what_to_check_where_nothing_is_reliable(pose, more, told, untold, tmp_path, capsys):
     document = {
         "viewpoint": {"azimuth": 1.0}, "score": 0.2, "confidence": 0.1, "reliable": False, "translation": None,
         "standard_deviations": None, "seconds": {"bank": 1.0, "register": 2.0},
-        "pipeline": Pipeline().posed(pose).describe(),
+        "pipeline": Pipeline().posed(pose).describe(), **more,
     }  # fmt: skip
     _print_result(document, tmp_path)
-    assert told in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert told in printed
+    assert untold not in printed

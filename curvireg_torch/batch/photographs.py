@@ -6,21 +6,16 @@ from pathlib import Path
 
 import cv2
 
+from .._choices import IMAGES, VIDEOS
 from .._files import write_file
+from .._given import is_one_photograph, is_pattern
 from ..errors import ImageError, InvalidInputError, MissingFileError
 from ..limits import MAX_IMAGE_PIXELS
 from .listing import Listing, listing
 
 __all__ = ["is_one_photograph", "list_photographs"]
 
-IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
-VIDEOS = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm"}
 _COLUMNS = ["photo", "x0", "y0", "x1", "y1", "fx", "fy", "cx", "cy"]
-
-
-def is_one_photograph(paths: Sequence[Path]) -> bool:
-    """Whether they are a single file that is no video."""
-    return len(paths) == 1 and not (_is_pattern(paths[0]) or paths[0].is_dir() or paths[0].suffix.lower() in VIDEOS)
 
 
 def list_photographs(
@@ -53,18 +48,14 @@ def list_photographs(
     return listing("photographs", _COLUMNS, rows, Path(), meshes)
 
 
-def _is_pattern(path: Path) -> bool:
-    return glob.has_magic(str(path)) and not path.exists()
-
-
 def _found(path: Path, every: int, frames: Path) -> Iterator[Path]:
     if path.suffix.lower() in VIDEOS and path.is_file():
         yield from _frames(path, every, frames)
-    elif path.is_dir() or _is_pattern(path):
+    elif path.is_dir() or is_pattern(path):
         inside = path.iterdir() if path.is_dir() else map(Path, glob.glob(str(path), recursive=True))
         photographs = sorted(found for found in inside if found.suffix.lower() in IMAGES and found.is_file())
         if not photographs:
-            raise MissingFileError(f"{path}: no photographs ({', '.join(sorted(IMAGES))}); check the path")
+            raise MissingFileError(f"{path}: no photographs ({', '.join(IMAGES)}); check the path")
         yield from photographs
     else:
         yield path

@@ -14,7 +14,7 @@ import trimesh
 from torch import Tensor
 
 from .._checks import check_option
-from .._choices import UNITS, UP_AXES
+from .._choices import MESHES, UNITS, UP_AXES
 from ..errors import MeshError, MissingFileError
 from ..limits import MAX_MESH_BYTES, MAX_MESH_COORDINATE, MAX_MESH_FACES
 from .colours import SurfaceColours, surface_colours
@@ -32,8 +32,6 @@ __all__ = [
     "mesh_radius",
     "normalization_transform",
 ]
-
-SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 
 
 def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = None) -> trimesh.Trimesh:
@@ -63,9 +61,9 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
     up = format_up(path.suffix) if up is None else up
     check_option(up, UP_AXES, "up")
     if not path.is_file():
-        raise MissingFileError(f"{path}: no such mesh file")
-    if path.suffix.lower() not in SUFFIXES:
-        raise MeshError(f"{path}: expected a mesh file ({', '.join(SUFFIXES)}); convert it first")
+        raise MissingFileError(f"{path}: no such file; check the path of the mesh")
+    if path.suffix.lower() not in MESHES:
+        raise MeshError(f"{path}: expected a mesh file ({', '.join(MESHES)}); convert it first")
     mesh = as_mesh(_load(path), name=str(path))
     mesh.units = unit
     mesh.metadata.update(file_name=path.name, up=up)

@@ -58,6 +58,7 @@ def find(
         if not isinstance(item, Item):
             out.append([FailedRegistration(item)])
             continue
+        registrar.tell("looking")
         try:
             check_crop(_extremes(item.image))
             cameras = None if item.camera_matrix is None else [item.camera_matrix]

@@ -49,8 +49,8 @@ class Registrar:
         symmetries: (S, 4, 4) of the mesh, from :func:`curvireg_torch.geometry.symmetry_transforms`; hypotheses that
             differ by one of them are reported once.
         device: where modules, bank and search live.
-        progress: show bars; or a function that is told a stage ("bank", "ranking", "search", "contours"), how much of
-            it is done and of how much, and may raise to stop.
+        progress: show bars; or a function that is told a stage ("bank", "ranking", "search", "contours"; before
+            ranking "looking", without a box), how much of it is done and of how much, and may raise to stop.
 
     Example:
         >>> import trimesh
@@ -200,7 +200,7 @@ class Registrar:
             query: the same, cropped and described by the matcher.
             ranking: of the same; default :meth:`ViewMatcher.rank`.
         """
-        self._tell("ranking")
+        self.tell("ranking")
         ranking = self.matcher.rank(query) if ranking is None else ranking
         boxes = torch.stack([item.box for item in items]).double()
         matrices = [item.camera_matrix for item in items if item.camera_matrix is not None]
@@ -209,13 +209,13 @@ class Registrar:
         descriptors = self.describers[0].descriptor(query.field)
         found, fit = starts, None
         if self.pipeline.search:
-            self._tell("search")
+            self.tell("search")
             found = search(
                 self.describers, descriptors, found, bank=self.bank, ranking=ranking, boxes=boxes, camera_matrices=K
             )
         T, cameras = placed(self.describers, found, boxes, K)
         if self.pipeline.contours:
-            self._tell("contours")
+            self.tell("contours")
             fit = follow_contours(self.describers, [item.image for item in items], found, boxes, T, cameras)
             T, found = fit.transform, seen_straight(self.describers, found, fit.transform)
         found = replace(found, score=similarities(self.describers, descriptors, found))
@@ -251,7 +251,8 @@ class Registrar:
             results.append(Registration(poses, trust, ranking[b : b + 1]))
         return results
 
-    def _tell(self, stage: str) -> None:
+    def tell(self, stage: str) -> None:
+        """Call ``progress`` at the beginning of a stage, where it is a function."""
         if callable(self.progress):
             self.progress(stage, 0, 1)
 

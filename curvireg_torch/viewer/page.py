@@ -22,7 +22,13 @@ __all__ = ["Page"]
 WORKER = ThreadPoolExecutor(1, thread_name_prefix="viewer")
 """All computing of all pages, one job after the other: two at a time would only slow each other down."""
 
-STAGES = {"bank": "rendering views", "ranking": "ranking them", "search": "searching", "contours": "following contours"}
+STAGES = {
+    "bank": "rendering views",
+    "looking": "looking for the object",
+    "ranking": "ranking views",
+    "search": "searching",
+    "contours": "following contours",
+}
 STYLE = ".curvireg-drop .q-uploader__list, .curvireg-drop .q-uploader__subtitle { display: none }"
 SEEN = "sticky top-0 z-10 bg-white"  # wherever the page is scrolled to
 _here = threading.local()

@@ -241,6 +241,9 @@ def test_progress_is_told_and_may_stop():
     told.clear()
     Registrar(bank, progress=lambda *it: told.append(it))([scene(0)[0]], scene(0)[1][None], CAMERA)
     assert [stage for stage, *_ in told] == ["ranking", "search", "contours"]
+    told.clear()
+    Registrar(bank, progress=lambda *it: told.append(it))([scene(0)[0]])
+    assert [stage for stage, *_ in told][:4] == ["looking", "ranking", "search", "contours"]
 
     def stop(stage, *_):
         raise InvalidInputError(f"stopped in {stage}")
@@ -249,3 +252,5 @@ def test_progress_is_told_and_may_stop():
         ViewBank.build(example_mesh(), views, image_size=64, progress=stop)
     with pytest.raises(InvalidInputError, match="stopped in ranking"):
         Registrar(bank, progress=stop)([scene(0)[0]], scene(0)[1][None])
+    with pytest.raises(InvalidInputError, match="stopped in looking"):
+        Registrar(bank, progress=stop)([scene(0)[0]])
