@@ -17,6 +17,7 @@ ALLOWED = {
     "_choices": set(),
     "_examples": set(),
     "_files": {"errors"},
+    "_given": {"_choices", "errors"},
     "_lazy": set(),
     "_threads": set(),
     "geometry": BASE,
