@@ -15,9 +15,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Inputs"]
 
-SHOWN = 5
-"""Places that were proposed which are drawn."""
-
 MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".safetensors")
 
 
@@ -42,7 +39,8 @@ class Inputs:
             self._choice("pose", {None: "default", "any": "any", "upright": "upright"}, options.pose)
             self._choice("preset", {None: "default", **{p: p for p in PRESET_NAMES}}, options.preset)
         self._told().text = (
-            "box, px: draw it on the photograph; drag edges, corners or the box to correct it; none: it is looked for"
+            "box, px: draw it on the photograph; drag edges, corners or the box to correct it; none: it is looked for, "
+            "and a click on a dashed box takes that"
         )
         self.box = self._numbers("box", ("x0", "y0", "x1", "y1"), self._box_typed)
         self._told().text = "camera, px: gives the translation"
@@ -118,7 +116,14 @@ class Inputs:
             self._draw()
         elif self.drawing.active:  # also where the button came up beside the photograph
             self.drawing.release()
-            self.set_box(self.drawing.box)
+            self.set_box(self.drawing.box or self._proposed(x, y))
+
+    def _proposed(self, x: float, y: float) -> Any:
+        """The first of the dashed boxes in which a click lies, to 0.1 px; None where there is none."""
+        for x0, y0, x1, y1 in self.session.proposals():
+            if x0 <= x <= x1 and y0 <= y <= y1:
+                return tuple(round(v, 1) for v in (x0, y0, x1, y1))
+        return None
 
     def set_box(self, box: Any) -> None:
         """Take a box, or None: the object is looked for."""
@@ -135,7 +140,7 @@ class Inputs:
 
     def _draw(self) -> None:
         given = self.drawing.box
-        boxes = [(given, "")] if given is not None else [(b, "4 6") for b in self.session.proposals()[:SHOWN]]
+        boxes = [(given, "")] if given is not None else [(b, "4 6") for b in self.session.proposals()]
         self.page.image.content = "".join(self._outline(box, dashes) for box, dashes in boxes)
 
     def _outline(self, box: Sequence[float], dashes: str) -> str:

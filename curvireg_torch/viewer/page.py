@@ -134,7 +134,7 @@ class Page:
     def _actions(self) -> None:
         with ui.row().classes("w-full no-wrap gap-2"):
             self.go = ui.button("register", on_click=self._register).classes("grow").props("data-testid=register")
-            ui.button("find it", on_click=self._find).props("outline data-testid=find")
+            self.find = ui.button("find it", on_click=self._find).props("outline data-testid=find")
             ui.button("stop", on_click=self.session.stop).props("outline data-testid=stop")
         self.progress = ui.linear_progress(0, show_value=False).props("instant-feedback")
         self.stage = ui.label().classes("text-caption").props("data-testid=stage")
@@ -174,7 +174,7 @@ class Page:
         self.arrange_layers()
 
     async def _register(self) -> None:
-        self.message.text = ""
+        self.message.text, self.stage.text = "", "starting"
         if await self.do(self.session.register):
             self.inputs.proposals_changed()
             await self.pose_changed(answer=True)
@@ -208,14 +208,16 @@ class Page:
     def _tick(self) -> None:
         """What changes by itself: the command line, and how far the work is."""
         self.command.value = self.session.command()
-        self.go.set_enabled(not self.busy)
+        for button in (self.go, self.find):
+            button.set_enabled(not self.busy)
         stage, done, of = self.session.progress
-        if self.busy and stage:
-            self.progress.value = (list(STAGES).index(stage) + done / of) / len(STAGES)
-            self.stage.text = STAGES[stage] + (f": {done} of {of}" if of > 1 else "")
+        if self.busy:
+            if stage:
+                self.progress.value = (list(STAGES).index(stage) + done / of) / len(STAGES)
+                self.stage.text = STAGES[stage] + (f": {done} of {of}" if of > 1 else "")
         elif self.session.answer is not None:
             self.progress.value = 1.0
             changed = self.session.answer.command != self.session.command()
             self.stage.text = "the inputs have changed since this answer" if changed else "done"
-        elif not self.busy:
+        else:
             self.progress.value, self.stage.text = 0.0, ""

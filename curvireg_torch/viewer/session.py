@@ -31,6 +31,9 @@ from .pictures import at
 __all__ = ["Answer", "Session", "Shown"]
 
 OPTIONS = ("unit", "up", "pose", "preset", "pipeline", "renderer", "device")
+SHOWN = 5
+"""Places where the object was looked for that are shown."""
+
 DEFAULTS = {"unit": "m", "renderer": "auto", "device": "cpu"}
 
 
@@ -185,9 +188,9 @@ class Session:
         return self.answer, self.shown
 
     def proposals(self) -> list[list[float]]:
-        """Boxes in which the object was looked for, the answer's first; none where the box was given."""
+        """The best boxes in which the object was looked for, the answer's first; none where the box was given."""
         found = {} if self.answer is None else self.answer.document.get("found", {})
-        return [proposal["box"] for proposal in found.get("proposals", [])]
+        return [proposal["box"] for proposal in found.get("proposals", [])[:SHOWN]]
 
     def choose(self, number: int) -> None:
         """Show one of the hypotheses."""

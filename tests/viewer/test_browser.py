@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from curvireg_torch.cli import main
+from curvireg_torch.viewer.session import SHOWN
 from tests._support.exif import exif, with_exif
 from tests.viewer.test_session import write_scene
 
@@ -280,3 +281,52 @@ def test_broken_and_hostile_files_are_refused_and_nothing_is_lost(browser, folde
     assert "NaN" in browser.text("message")
     browser.click("register")  # the photograph and the mesh from before are still there
     browser.until(lambda: browser.text("message") == "" and browser.text("stage") == "done", "answer")
+
+
+def test_find_it_draws_what_it_thought_of_and_a_click_takes_it(browser, folder):
+    watch = """
+        const stage = document.querySelector('[data-testid=stage]');
+        window.stages = [];
+        new MutationObserver(() => stages.push(stage.textContent)).observe(
+            stage, {childList: true, subtree: true, characterData: true})"""
+    browser.driver.execute_script(watch)
+
+    def stages():
+        return browser.driver.execute_script("return stages")
+
+    assert browser.box() == pytest.approx(json.loads((folder / "box.json").read_text()), abs=0.7)
+    browser.until(lambda: "starting" in stages() or browser.click("find"), "pressed")
+    browser.until(lambda: stages()[-1] == "done", "answer without a box")
+    assert "looking for the object" in stages()
+    assert browser.text("message") == browser.text("box-x0") == ""
+    command = browser.text("command")
+    assert "--box" not in command
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("CURVIREG_CACHE", str(folder / "cache"))
+        assert main([*shlex.split(command)[1:], "--quiet"]) == 0
+    written = json.loads((folder / "result" / "result.json").read_text())
+    proposals = [place["box"] for place in written["found"]["proposals"]][:SHOWN]
+    assert proposals[0] == written["inputs"]["box"]
+    assert len(proposals) > 1
+
+    def dashed():
+        """Boxes that are drawn for choice, each once."""
+        photograph = browser.part("photograph")
+        zoom = int(photograph.find_element("css selector", "img").get_attribute("naturalWidth")) / 240
+        assert zoom == 1
+        shown = photograph.find_elements("css selector", 'rect[stroke="white"][stroke-dasharray="4 6"]')
+        sides = [[float(rect.get_attribute(name)) for name in ("x", "y", "width", "height")] for rect in shown]
+        return [[x - 0.5, y - 0.5, x + w - 0.5, y + h - 0.5] for x, y, w, h in sides]
+
+    drawn = browser.until(dashed, "proposals")
+    assert len(drawn) == len(proposals)
+    for one, other in zip(drawn, proposals, strict=True):
+        assert one == pytest.approx(other)
+    x0, y0, x1, y1 = proposals[0]
+    middle = ((x0 + x1) / 2, (y0 + y1) / 2)
+    browser.drag(middle, middle, 240)
+    browser.until(lambda: browser.box() == [round(v, 1) for v in proposals[0]], "the box that was clicked on")
+    assert not dashed()
+    browser.until(lambda: "--box" in browser.text("command"), "the command has it")
+    assert browser.text("stage") == "the inputs have changed since this answer"
