@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from curvireg_torch import ViewBank, ViewMatcher, load_mesh
 from curvireg_torch.data import read_image
+from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.pipeline import preset_named
 
 RIGHT = 30.0
@@ -103,7 +104,8 @@ def compare(folder: Path, photographs: int) -> list[dict[str, Any]]:
             answers[name] = lambda m=matcher: int(m([image], box).order[0, 0])  # noqa: B023
         bank, crop = matcher.bank, matcher.query([image], box).crops[0]
         start = time.perf_counter()
-        views = matcher.describers[0].shaded(bank.rotations, bank.distances)[:, :1]  # grey
+        grey = ViewDescriber(mesh, bank.settings, coloured=False)
+        views = grey.shaded(bank.rotations, bank.distances)
         shading = time.perf_counter() - start
         for name, make in peers.items():
             start = time.perf_counter()

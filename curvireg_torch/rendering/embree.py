@@ -169,6 +169,6 @@ def _combined(pixels: tuple[np.ndarray, ...], x: np.ndarray, y: np.ndarray, z: f
     """(N, 3) float32 x(column) axes[0] + y(row) axes[1] + z axes[2] for the N rows and columns of pixels."""
     across = x.astype(np.float32)[:, None] * axes[0].astype(np.float32)
     down = y.astype(np.float32)[:, None] * axes[1].astype(np.float32) + (z * axes[2]).astype(np.float32)
-    rays: np.ndarray = across[pixels[1]]
-    rays += down[pixels[0]]
+    rays: np.ndarray = across.take(pixels[1], axis=0)  # four times as fast as across[pixels[1]]
+    rays += down.take(pixels[0], axis=0)
     return rays
