@@ -173,8 +173,8 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         nargs="*",
         metavar="PHOTO... MESH",
-        help="photographs, folders of them, patterns ('shots/*.jpg') or videos; last a mesh (.obj .ply .stl .off .glb) "
-        "or a bank",
+        help="photographs, folders of them, patterns ('shots/*.jpg') or videos; last a mesh (.obj .ply .stl .off .glb; "
+        "textures and colours of .glb .obj .ply are compared too, a mesh without is seen in grey) or a bank",
     )
     register.add_argument(
         "--mesh", type=Path, action="append", default=[], metavar="MESH", help="several times: which of these is it?"

@@ -20,7 +20,7 @@ from ..data.images import Photo
 from ..document import pose_document
 from ..errors import CurviregError, InvalidInputError
 from ..evaluation.store import to_json
-from ..geometry import camera_matrix, load_mesh, rotation_error, rotation_from_axis_angle
+from ..geometry import camera_matrix, has_colours, load_mesh, rotation_error, rotation_from_axis_angle
 from ..geometry.cameras import camera_of_view
 from ..limits import MAX_VIEWER_SECONDS
 from ..matching import ViewBank
@@ -113,7 +113,8 @@ class Session:
             else:
                 mesh = load_mesh(path, unit=self.options.unit, up=self.options.up)
                 size = " x ".join(f"{v:.4g}" for v in mesh.extents)
-                told = f"{len(mesh.faces):,} faces, {size} {self.options.unit}"
+                seen = "its own colours" if has_colours(mesh) else "grey"
+                told = f"{len(mesh.faces):,} faces, {size} {self.options.unit}, seen in {seen}"
         self.mesh = path
         self._forget()
         return told

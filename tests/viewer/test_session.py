@@ -173,6 +173,16 @@ def test_files_are_called_what_the_user_calls_them(folder):
         session.nudge(turn=(1, 0, 0))
 
 
+def test_it_says_whether_a_mesh_is_seen_in_its_colours(folder):
+    mesh = example_mesh()
+    mesh.export(folder / "grey.ply")
+    mesh.visual.face_colors = [200, 20, 20, 255]
+    mesh.export(folder / "red.ply")
+    session = Session(options())
+    assert session.take_mesh(folder / "grey.ply").endswith(" m, seen in grey")
+    assert session.take_mesh(folder / "red.ply").endswith(" m, seen in its own colours")
+
+
 def test_a_broken_file_leaves_the_photograph_that_was_there(folder):
     write_scene(folder)
     session = Session(options())
