@@ -34,6 +34,7 @@ else:
             "sheet": "contact_sheet",
             "web": "WebBenchmark",
         },
+        {"Preset": "curvireg_torch.pipeline.Pipeline"},
     )
 
 __all__ = [

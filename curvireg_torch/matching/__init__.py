@@ -2,7 +2,9 @@
 
 import warnings
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
+from .._lazy import lazy
 from ..pipeline import BankSettings
 from ..terms import (
     DescriptorStatistics,
@@ -65,6 +67,9 @@ __all__ = [
     "unit_score",
     "whole_box_shapes",
 ]
+
+if not TYPE_CHECKING:
+    __getattr__, _ = lazy(__name__, {}, {"QueryFeatures": "curvireg_torch.matching.Photographs"})
 
 
 def BankCollection(banks: Sequence[ViewBank]) -> ViewBank:  # noqa: N802 (the name of version 0.1)

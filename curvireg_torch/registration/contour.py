@@ -13,8 +13,8 @@ from ..geometry import crop_images
 from ..geometry.cameras import check_camera_matrix
 from ..rendering import DepthRenderer
 from .contour_covariance import pose_covariance
-from .contour_descent import Views, moved
-from .contour_points import ContourPoints, EdgeField
+from .contour_descent import Seen, Views, moved
+from .contour_points import EdgeField
 
 __all__ = ["ContourFit", "fit_contours"]
 
@@ -45,7 +45,7 @@ class ContourFit:
         covariance: (N, 6, 6) float64, see :func:`fit_contours`; NaN where too few edges were found.
         support: (N,) float64 in [0, 1): mean strength of the edges within about 1 px of the contour points, weighted by
             distance; 0 where the mesh shows no contour in the crop.
-        start_support: (N,) the same of the starts.
+        start_support: (N,) the same of the starts (in a crop half as large, of starts that are not finished).
         observable: (N,) int64, how many of a pose's six directions the contours fix; the covariance of the others is
             that of not knowing them.
         matched: (N,) share of the contour points that lie within 2 px of an edge.
@@ -96,9 +96,10 @@ def fit_contours(
 
     W being the edge's strength times Tukey's weight of what remains. Strong edges near where the step leads are chosen
     again within a step; the search narrows from round to round, and the mesh is rendered anew where contours have
-    moved. From each start and from four poses turned away from it the fit begins at half size; the best (by support)
-    and the next best that differs from it go on, and end at full size. The start itself is returned where nothing has
-    more support than it has. All starts of all photographs share a round's rendering.
+    moved. The fit begins at half size from each start and, where that ends with a support below 0.5, from four poses
+    turned away from it; the best (by support) or the next best that differs from it goes on, at full size. The start
+    itself is returned where that has no more support than it has. All starts of all photographs share a round's
+    rendering.
 
     The order of the covariance is turn (rad) about the camera's x, y, z, then translation (model units) along them:
     with the true pose R, t,
@@ -152,54 +153,62 @@ def fit_contours(
     full = Views(renderer, EdgeField(crops), photograph, K, SIZE, centre, radius)
     K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ K
     half = Views(renderer, EdgeField(F.avg_pool2d(crops, 2)), photograph, K, SIZE // 2, centre, radius)
-    every = torch.arange(N)
-    screened = T0
-    tried = torch.ones(N, dtype=torch.bool)
-    if finish is not None:
-        screened, seen = half.descend(T0, FIRST)
-        tried = _among_best(half.support(screened, seen), photograph, finish)
-    of, T = _around(half, T0, every[tried])
-    T, _ = half.of(of).descend(T, SECOND)
-    T, seen = full.of(of).descend(T, FINE)
-    # The starts, and what was only screened, as they are. Of equals the first wins.
-    owner, still = torch.cat([every, every[~tried]]), torch.cat([T0, screened[~tried]])
-    seen = ContourPoints.cat([full.of(owner).points(still), seen])
-    T, owner = torch.cat([still, T]), torch.cat([owner, of])
-    support = full.of(owner).support(T, seen)
-    winner = torch.where(owner == every[:, None], support, -1.0).argmax(dim=1)
-    T, seen = T[winner], seen[winner]
-    found = full.matches(T, seen, FINE[-1])
-    covariance, observable = pose_covariance(found, seen, T, full.K, centre, radius=radius)
+    start = half.seen(T0)
+    before = half.support(start)
+    first = half.descend(start, FIRST)
+    support = half.support(first)
+    tried = torch.ones(N, dtype=torch.bool) if finish is None else _among_best(support, photograph, finish)
+    index, others = tried.nonzero()[:, 0], (~tried).nonzero()[:, 0]
+    T = _around(half.of(index), T0[index], first[index], support[index])
+    # The start, and what was only begun with, as they are. Of equals the start wins.
+    of, rest = full.of(index), full.of(others)
+    still, fitted = of.seen(T0[index]), of.descend(of.seen(T), FINE)
+    begun = rest.seen(torch.where((support > before)[others, None, None], first.T[others], T0[others]))
+    supports = [of.support(still), of.support(fitted), rest.support(begun)]
+    better, place = supports[1] > supports[0], torch.empty(N, dtype=torch.long)
+    place[index] = torch.arange(len(index)) + len(index) * better
+    place[others] = torch.arange(len(others)) + 2 * len(index)
+    seen, support = Seen.cat([still, fitted, begun])[place], torch.cat(supports)[place]
+    before[index] = supports[0]
+    found = full.matches(seen, FINE[-1])
+    covariance, observable = pose_covariance(found, seen.points, seen.T, full.K, centre, radius=radius)
     weight = found.weight[..., 0]
     mean_square = (weight * found.distance[..., 0].square()).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-12)
     return ContourFit(
-        transform=T,
+        transform=seen.T,
         covariance=covariance,
-        support=support[winner],
-        start_support=support[:N],
+        support=support,
+        start_support=before,
         observable=observable,
-        matched=(weight > 0).sum(dim=1) / seen.valid.sum(dim=1).clamp(min=1),
+        matched=(weight > 0).sum(dim=1) / seen.points.valid.sum(dim=1).clamp(min=1),
         residual=mean_square.sqrt(),
-        moved=full.way(seen, T0, T),
+        moved=full.way(seen.points, T0, seen.T),
     )
 
 
-def _around(half: Views, T0: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
-    """After the first rounds from the starts and from four turns of each: the best of five, and the next best that is
-    another pose. Returns which start each belongs to, and the poses."""
-    turns = torch.zeros(5, 6, dtype=torch.float64)
-    turns[1:, :2] = torch.deg2rad(TURN * torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]))
-    five = index.repeat_interleave(5)
-    views = half.of(five)
-    T, seen = views.descend(moved(T0[five], turns.repeat(len(index), 1), half.centre), FIRST)
-    support = views.support(T, seen).view(-1, 5)
-    first = 5 * torch.arange(len(index))
-    best = support.argmax(dim=1) + first
-    reference = best.repeat_interleave(5)
-    gap = views.way(seen[reference], T[reference], T).view(-1, 5)
-    rival, second = torch.where(gap > SAME, support, -1.0).max(dim=1)
-    chosen = torch.cat([best, (second + first)[rival >= 0]])
-    return five[chosen], T[chosen]
+def _around(half: Views, T0: Tensor, first: Seen, support: Tensor) -> Tensor:
+    """Poses at half size from what the first rounds made of starts ``T0``, (N, 4, 4). Where edges support that too
+    little, from four turns of the start too; then the best, or the next best that is another pose."""
+    N, every = len(T0), torch.arange(len(T0))
+    turns = torch.zeros(4, 6, dtype=torch.float64)
+    turns[:, :2] = torch.deg2rad(TURN * torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]))
+    unsure = (support < SUPPORTED).nonzero()[:, 0]
+    four = unsure.repeat_interleave(4)
+    views = half.of(four)
+    turned = views.descend(views.seen(moved(T0[four], turns.repeat(len(unsure), 1), half.centre)), FIRST)
+    five, supports = every[:, None].repeat(1, 5), torch.full((N, 5), -1.0, dtype=torch.float64)
+    five[unsure, 1:] = N + torch.arange(len(four)).view(-1, 4)
+    supports[:, 0], supports[unsure, 1:] = support, views.support(turned).view(-1, 4)
+    seen, best = Seen.cat([first, turned]), supports.argmax(dim=1)
+    other, reference = seen[five.flatten()], seen[five[every, best].repeat_interleave(5)]
+    gap = half.of(every.repeat_interleave(5)).way(reference.points, reference.T, other.T).view(-1, 5)
+    rival, second = torch.where(gap > SAME, supports, -1.0).max(dim=1)
+    owner = torch.cat([every, every[rival >= 0]])
+    chosen = five[owner, torch.cat([best, second[rival >= 0]])]
+    views = half.of(owner)
+    seen = views.descend(seen[chosen], SECOND)
+    T: Tensor = seen.T[torch.where(owner == every[:, None], views.support(seen), -1.0).argmax(dim=1)]
+    return T
 
 
 def _among_best(support: Tensor, photograph: Tensor, count: int) -> Tensor:

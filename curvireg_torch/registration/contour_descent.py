@@ -1,5 +1,6 @@
 """Poses pulled onto edges by robust least squares: the inside of :func:`fit_contours`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,7 +11,7 @@ from ..geometry.cameras import transform
 from ..rendering import DepthRenderer
 from .contour_points import ContourPoints, EdgeField, contour_points
 
-__all__ = ["Matches", "Views", "cross", "moved", "project"]
+__all__ = ["Matches", "Seen", "Views", "cross", "moved", "project"]
 
 STEPS, SELECTIONS = 2, 3
 """Least-squares steps per round, and choices of edges per step."""
@@ -33,6 +34,24 @@ class Matches:
     J: Tensor
     distance: Tensor
     weight: Tensor
+
+
+@dataclass(frozen=True)
+class Seen:
+    """N poses ``T`` on their way, (N, 4, 4), the poses ``rendered`` in which the mesh was last rendered, near them, and
+    the contour points seen from there."""
+
+    T: Tensor
+    rendered: Tensor
+    points: ContourPoints
+
+    def __getitem__(self, index: Tensor) -> "Seen":
+        return Seen(self.T[index], self.rendered[index], self.points[index])
+
+    @staticmethod
+    def cat(parts: Sequence["Seen"]) -> "Seen":
+        T, rendered = (torch.cat([getattr(part, name) for part in parts]) for name in ("T", "rendered"))
+        return Seen(T, rendered, ContourPoints.cat([part.points for part in parts]))
 
 
 @dataclass(frozen=True)
@@ -61,31 +80,28 @@ class Views:
             self.renderer, self.edges, self.photograph[index], self.K[index], self.size, self.centre, self.radius
         )
 
-    def points(self, T: Tensor) -> ContourPoints:
-        depth = self.renderer.render(T, self.K, (self.size, self.size)).cpu()
-        return contour_points(depth, T, self.K, radius=self.radius)
+    def seen(self, T: Tensor) -> Seen:
+        """Poses (N, 4, 4) and their contour points."""
+        size = (self.size, self.size)
+        depth = self.renderer.render(T, self.K, size).cpu() if len(T) else torch.zeros(0, 1, *size)
+        return Seen(T, T, contour_points(depth, T, self.K, radius=self.radius))
 
-    def descend(self, T: Tensor, reaches: tuple[float, ...]) -> tuple[Tensor, ContourPoints]:
-        """Poses (N, 4, 4) after one round per reach, and contour points seen from about there."""
-        rendered, points = T, self.points(T)
+    def descend(self, seen: Seen, reaches: tuple[float, ...]) -> Seen:
+        """One round per reach; the mesh is rendered anew where contours have moved."""
         for reach in reaches:
+            T = seen.T
             for _ in range(STEPS):
-                T = moved(T, self._bounded(self._step(points, T, reach), T), self.centre)
-            rendered, points = self._refreshed(rendered, points, T)
-        return T, points
+                T = moved(T, self._bounded(self._step(seen.points, T, reach), T), self.centre)
+            seen = self._refreshed(Seen(T, seen.rendered, seen.points))
+        return seen
 
-    def _refreshed(self, rendered: Tensor, points: ContourPoints, T: Tensor) -> tuple[Tensor, ContourPoints]:
-        """The same points, but new ones where contours have moved since."""
+    def _refreshed(self, seen: Seen) -> Seen:
         # Each pose by itself: a result does not depend on what shares its batch.
-        stale = (self.way(points, rendered, T) > STALE).nonzero()[:, 0]
-        if len(stale) == 0:
-            return rendered, points
-        new = self.of(stale).points(T[stale])
-        return rendered.index_copy(0, stale, T[stale]), ContourPoints(
-            points.model.index_copy(0, stale, new.model),
-            points.normals.index_copy(0, stale, new.normals),
-            points.valid.index_copy(0, stale, new.valid),
-        )
+        stale = self.way(seen.points, seen.rendered, seen.T) > STALE
+        if not bool(stale.any()):
+            return seen
+        new, every = self.of(stale.nonzero()[:, 0]).seen(seen.T[stale]), torch.arange(len(stale))
+        return Seen.cat([seen, new])[torch.where(stale, len(stale) - 1 + stale.cumsum(0), every)]
 
     def way(self, points: ContourPoints, before: Tensor, after: Tensor) -> Tensor:
         """(N,) mean way in px of the points from one pose to another."""
@@ -129,16 +145,18 @@ class Views:
         share = torch.minimum(MAX_TURN / turn, MAX_SHIFT * z / shift).clamp(max=1.0)
         return step * share[:, None]
 
-    def support(self, T: Tensor, points: ContourPoints) -> Tensor:
+    def support(self, seen: Seen) -> Tensor:
         """(N,) mean strength of the edges within about 1 px of the contour points."""
-        uv, _ = project(points.model, T, self.K, self.centre)
+        points = seen.points
+        uv = pixels(points.model, seen.T, self.K, self.centre)
         offsets = torch.arange(-3, 4, dtype=torch.float64)
         near = self.edges.strength(uv, points.normals, offsets, self.photograph) * torch.exp(-0.5 * offsets**2)
         return (near.amax(dim=-1) * points.valid).sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
 
-    def matches(self, T: Tensor, points: ContourPoints, reach: float) -> Matches:
+    def matches(self, seen: Seen, reach: float) -> Matches:
         """What the last round's least squares saw."""
-        uv, du = project(points.model, T, self.K, self.centre)
+        points = seen.points
+        uv, du = project(points.model, seen.T, self.K, self.centre)
         distance, strength = self._candidates(uv, points, reach)
         index = (strength * torch.exp(-0.5 * distance**2)).argmax(dim=-1, keepdim=True)
         d = distance.gather(-1, index)

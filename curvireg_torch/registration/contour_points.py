@@ -1,5 +1,6 @@
 """The two sides of the contour stage: contours of a rendered mesh as 3D points, and a photograph's edges."""
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -80,32 +81,25 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
     seen = depth > 0
     z = torch.where(seen, depth, depth.amax(dim=(1, 2, 3), keepdim=True) + 4.0 * radius)
     slope = torch.cat(central_gradient(smooth(fill_depth(depth, None, None), 1.0)), dim=1)
-    v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in (H, W)), indexing="ij")
-    pixels = torch.stack([u, v], dim=-1)
-    beside = torch.zeros_like(seen)
-    pairs: list[tuple[Tensor, ...]] = []
+    beside, jumps = torch.zeros_like(seen), []
     for dim in (-1, -2):
         a, b = _ends(z, dim)
-        step = (b - a).abs()
+        change = (b - a).abs().diff(dim=dim)
         # What exceeds the steps before and behind is no steep face.
-        first, last = step.narrow(dim, 0, 1), step.narrow(dim, step.shape[dim] - 1, 1)
-        around = torch.cat([first, step, last], dim=dim)
-        usual = torch.minimum(around.narrow(dim, 0, step.shape[dim]), around.narrow(dim, 2, step.shape[dim]))
-        jump = step - usual > JUMP * radius
-        pads = ((0, 1), (1, 0)) if dim == -1 else ((0, 0, 0, 1), (0, 0, 1, 0))
-        beside |= F.pad(jump, pads[0]) | F.pad(jump, pads[1])
-        pairs.append((jump, _middle(pixels, dim - 1).reshape(-1, 2), torch.minimum(a, b), _middle(slope, dim)))
-    places, counts = torch.cat([p[1] for p in pairs]), (OCCLUDING, CREASES)
-    jumps, depths, normals = (torch.cat([p[i].flatten(2) for p in pairs], dim=2) for i in (0, 2, 3))
+        first, last = ((1, 0), (0, 1)) if dim == -1 else ((0, 0, 1, 0), (0, 0, 0, 1))
+        jump = F.pad(change > JUMP * radius, first) | F.pad(change < -JUMP * radius, last)
+        beside |= F.pad(jump, first) | F.pad(jump, last)
+        jumps.append(jump.flatten(1))
     # Depth in px: saliency is then a curvature in 1 / px, and a threshold has a meaning.
     scale = K[:, 0, 0].view(-1, 1, 1, 1) / z.amax(dim=(1, 2, 3), keepdim=True)
     field = depth_curvilinear_saliency(depth * scale.float(), depth_scale=1.0)
     creases = field_points(field * ~(_widened(beside) | ~seen), share=CREASE_SHARE, threshold=CREASE)
-    kinds = (
-        (jumps, places, depths, normals),
-        (creases.flatten(2), pixels.view(-1, 2), depth.flatten(2), field.flatten(2)),
-    )
-    samples = [_sample(*kind, count) for kind, count in zip(kinds, counts, strict=True)]
+    pixel = torch.arange(H * W).view(H, W)
+    neighbours = [torch.stack([x.flatten() for x in _ends(pixel, dim)]) for dim in (-1, -2)]
+    samples = [
+        _sample(torch.cat(jumps, dim=1), torch.cat(neighbours, dim=1), z, slope, OCCLUDING),
+        _sample(creases.flatten(1), pixel.view(1, -1), z, field, CREASES),
+    ]
     uv, z, n, valid = (torch.cat(parts, dim=1) for parts in zip(*samples, strict=True))
     rays = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1) @ torch.linalg.inv(K).mT
     model = (rays * z[..., None] - T_cam_from_model[:, None, :3, 3]) @ T_cam_from_model[:, :3, :3]
@@ -119,11 +113,6 @@ def _ends(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     return x.narrow(dim, 0, n), x.narrow(dim, 1, n)
 
 
-def _middle(x: Tensor, dim: int) -> Tensor:
-    a, b = _ends(x, dim)
-    return 0.5 * (a + b)
-
-
 def _widened(mask: Tensor) -> Tensor:
     """What is true within a square of 9 px."""
     for dim in (-1, -2):
@@ -135,12 +124,20 @@ def _widened(mask: Tensor) -> Tensor:
     return mask
 
 
-def _sample(found: Tensor, places: Tensor, depths: Tensor, normals: Tensor, count: int) -> tuple[Tensor, ...]:
-    """``count`` of the found ones of M places: uv (N, P, 2), depth (N, P), normal (N, P, 2), valid (N, P)."""
-    keys = torch.rand(len(places), generator=torch.Generator().manual_seed(0))
-    best, index = torch.where(found[:, 0], keys, -1.0).topk(min(count, len(places)), dim=1)
-    chosen = normals.gather(2, index[:, None].expand(-1, 2, -1)).mT
-    return places[index], depths[:, 0].gather(1, index).double(), chosen.double(), best >= 0
+def _sample(found: Tensor, pixels: Tensor, depth: Tensor, normals: Tensor, count: int) -> tuple[Tensor, ...]:
+    """``count`` of the (N, M) found ones of M places, each the middle of (k, M) pixels: uv (N, P, 2), the nearer depth
+    (N, P), normal (N, P, 2), valid (N, P)."""
+    best, index = torch.where(found, _random(found.shape[1]), -1.0).topk(min(count, found.shape[1]), dim=1)
+    of, W = pixels[:, index], depth.shape[-1]  # (k, N, P)
+    z = torch.stack([depth.flatten(1).gather(1, i) for i in of]).amin(dim=0)
+    n = torch.stack([normals.flatten(2).gather(2, i[:, None].expand(-1, 2, -1)) for i in of]).mean(dim=0)
+    return torch.stack([of % W, of // W], dim=-1).double().mean(dim=0), z.double(), n.mT.double(), best >= 0
+
+
+@functools.cache
+def _random(count: int) -> Tensor:
+    """(count,) the same numbers each time."""
+    return torch.rand(count, generator=torch.Generator().manual_seed(0))
 
 
 class EdgeField:

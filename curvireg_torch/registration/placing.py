@@ -1,7 +1,7 @@
 """Hypotheses as poses before cameras, and back: of several models, each by its own describer."""
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -13,13 +13,42 @@ from .contour import ContourFit, fit_contours
 from .hypotheses import Hypotheses
 from .search import FINALISTS
 
-__all__ = ["follow_contours", "placed", "seen_straight"]
+__all__ = ["Poses", "follow_contours", "placed", "seen_straight"]
 
 
-def placed(
-    describers: Sequence[ViewDescriber], found: Hypotheses, boxes: Tensor, K: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """T_cam_from_model (H, 4, 4) and camera matrices (H, 3, 3) of hypotheses that fill their boxes.
+@dataclass(frozen=True)
+class Poses:
+    """H hypotheses before their photographs.
+
+    Attributes:
+        found: the hypotheses.
+        T: (H, 4, 4) ``T_cam_from_model``.
+        cameras: (H, 3, 3) in px of the photographs.
+        fit: what the contour stage made of them, or None.
+    """
+
+    found: Hypotheses
+    T: Tensor
+    cameras: Tensor
+    fit: ContourFit | None = None
+
+    def where(self, kept: Tensor, others: "Poses") -> "Poses":
+        """These where ``kept`` (H,), else the others, whose covariance nobody knows; scores are these poses'."""
+        pose = kept[:, None, None]
+        T = torch.where(pose, self.T, others.T)
+        found = replace(
+            self.found,
+            rotation=torch.where(pose, self.found.rotation, others.found.rotation),
+            distance=torch.where(kept, self.found.distance, others.found.distance),
+        )
+        fit = self.fit
+        if fit is not None:
+            fit = replace(fit, transform=T, covariance=torch.where(pose, fit.covariance, torch.nan))
+        return Poses(found, T, torch.where(pose, self.cameras, others.cameras), fit)
+
+
+def placed(describers: Sequence[ViewDescriber], found: Hypotheses, boxes: Tensor, K: Tensor | None) -> Poses:
+    """Hypotheses as poses that fill their boxes.
 
     Args:
         describers: of the bank's models.
@@ -39,7 +68,7 @@ def placed(
             T[mine, :3, :3], T[mine, :3, 3] = place_view(
                 describe.hull, found.rotation[mine], boxes[photograph], K[photograph]
             )
-    return T, cameras
+    return Poses(found, T, cameras)
 
 
 def seen_straight(describers: Sequence[ViewDescriber], found: Hypotheses, T: Tensor) -> Hypotheses:
@@ -54,25 +83,20 @@ def seen_straight(describers: Sequence[ViewDescriber], found: Hypotheses, T: Ten
 
 
 def follow_contours(
-    describers: Sequence[ViewDescriber],
-    images: Sequence[Tensor],
-    found: Hypotheses,
-    boxes: Tensor,
-    T: Tensor,
-    cameras: Tensor,
-) -> ContourFit:
-    """:func:`fit_contours` of hypotheses of all models, from poses (H, 4, 4) before cameras (H, 3, 3)."""
-    parts, index = [], []
-    for model, mine in _by_model(found):
+    describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor
+) -> Poses:
+    """What :func:`fit_contours` makes of poses of all models."""
+    parts, index, photograph = [], [], poses.found.photograph
+    for model, mine in _by_model(poses.found):
         describe = describers[model]
         parts.append(
             fit_contours(
                 describe.renderer,
                 images,
                 boxes,
-                cameras[mine],
-                T[mine],
-                photograph=found.photograph[mine],
+                poses.cameras[mine],
+                poses.T[mine],
+                photograph=photograph[mine],
                 centre=describe.centre,
                 radius=describe.radius,
                 margin=describe.settings.margin,
@@ -81,7 +105,8 @@ def follow_contours(
         )
         index.append(mine)
     place = torch.cat(index).argsort()
-    return ContourFit(*(torch.cat([getattr(part, f.name) for part in parts])[place] for f in fields(ContourFit)))
+    fit = ContourFit(*(torch.cat([getattr(part, f.name) for part in parts])[place] for f in fields(ContourFit)))
+    return Poses(seen_straight(describers, poses.found, fit.transform), fit.transform, poses.cameras, fit)
 
 
 def _by_model(found: Hypotheses) -> list[tuple[int, Tensor]]:

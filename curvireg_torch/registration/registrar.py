@@ -16,11 +16,10 @@ from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatche
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
 from .confidence import RELIABLE, confidence, pose_confidence, pose_evidence
-from .contour import ContourFit
 from .finding import find
 from .hypotheses import Hypotheses, hypotheses, own_peaks
 from .inputs import Item, check_crop, items_of, named
-from .placing import follow_contours, placed, seen_straight
+from .placing import Poses, follow_contours, placed
 from .pose import FailedRegistration, Hypothesis, Registration
 from .search import search
 from .verify import EVIDENCE, gathered_evidence, similarities, verdict
@@ -207,48 +206,54 @@ class Registrar:
         K = torch.stack(matrices) if matrices else None
         starts = hypotheses(ranking, self.bank, count=self.pipeline.hypotheses, symmetries=self.symmetries)
         descriptors = self.describers[0].descriptor(query.field)
-        found, fit = starts, None
+        found = starts
         if self.pipeline.search:
             self.tell("search")
             found = search(
-                self.describers, descriptors, found, bank=self.bank, ranking=ranking, boxes=boxes, camera_matrices=K
+                self.describers,
+                descriptors,
+                found,
+                bank=self.bank,
+                ranking=ranking,
+                boxes=boxes,
+                camera_matrices=K,
+                brief=self.pipeline.contours,
             )
-        T, cameras = placed(self.describers, found, boxes, K)
+        poses = placed(self.describers, found, boxes, K)
         if self.pipeline.contours:
             self.tell("contours")
-            fit = follow_contours(self.describers, [item.image for item in items], found, boxes, T, cameras)
-            T, found = fit.transform, seen_straight(self.describers, found, fit.transform)
-        found = replace(found, score=similarities(self.describers, descriptors, found))
-        looks = self._looks(found, query, ranking)
-        evidence = gathered_evidence(starts, found, None if fit is None else fit.support, looks)
-        own = own_peaks(found, verdict(evidence, with_camera=K is not None), symmetries=self.symmetries)
+            poses = follow_contours(self.describers, [item.image for item in items], poses, boxes)
+
+        def judged(found: Hypotheses) -> tuple[Tensor, Tensor]:
+            return similarities(self.describers, descriptors, found), self._looks(found, query, ranking)
+
+        (score, looks), fit = judged(poses.found), poses.fit
+        support = torch.zeros_like(score) if fit is None else fit.support
+        evidence = gathered_evidence(starts, replace(poses.found, score=score), support, looks)
+        own = own_peaks(poses.found, verdict(evidence, with_camera=K is not None), symmetries=self.symmetries)
         if not bool(own.all()):
-            found, T, cameras, fit = self._sent_back(own, starts, found, T, cameras, fit, boxes, K)
-            back = found[~own]
-            found.score[~own] = similarities(self.describers, descriptors, back)
-            looks[~own] = self._looks(back, query, ranking)
-            if fit is not None:
-                fit = replace(fit, support=torch.where(own, fit.support, 0.0))
-            evidence = gathered_evidence(starts, found, None if fit is None else fit.support, looks)
+            # Hypotheses that became another one stand where they started: a rival is a rival, if not a peak.
+            poses = poses.where(own, placed(self.describers, starts, boxes, K))
+            score[~own], looks[~own] = judged(poses.found[~own])
+            support = torch.where(own, support, 0.0)
+            evidence = gathered_evidence(starts, replace(poses.found, score=score), support, looks)
         if fit is not None and K is None:
             # The mesh is often another object of the kind: where its contours do not fit, the view itself errs less.
-            score = found.score
-            believed = own & fit.trustworthy
-            found, T, cameras, fit = self._sent_back(believed, starts, found, T, cameras, fit, boxes, K)
-            found = replace(found, score=score)
-        score = verdict(evidence, with_camera=K is not None)
-        order = (score + torch.where(own, 0.0, -1e6)).argsort(descending=True, stable=True)
+            poses = poses.where(own & fit.trustworthy, placed(self.describers, starts, boxes, K))
+        poses = replace(poses, found=replace(poses.found, score=score))
+        verdicts = verdict(evidence, with_camera=K is not None)
+        order = (verdicts + torch.where(own, 0.0, -1e6)).argsort(descending=True, stable=True)
         coarse = confidence(ranking, self.bank.rotations)
         results = []
         for b in range(len(items)):
-            mine = order[found.photograph[order] == b].tolist()
+            mine = order[starts.photograph[order] == b].tolist()
             trust = float(coarse[b])
             if fit is not None:
-                lead = float(score[mine[0]] - score[mine[1:]].max()) if len(mine) > 1 else torch.inf
-                trust = pose_confidence(pose_evidence(float(found.score[mine[0]]), lead, with_camera=K is not None))
+                lead = float(verdicts[mine[0]] - verdicts[mine[1:]].max()) if len(mine) > 1 else torch.inf
+                trust = pose_confidence(pose_evidence(float(score[mine[0]]), lead, with_camera=K is not None))
             reliable = trust >= RELIABLE
-            poses = tuple(self._hypothesis(h, found, T, cameras, evidence, fit, reliable, K is not None) for h in mine)
-            results.append(Registration(poses, trust, ranking[b : b + 1]))
+            answers = tuple(_hypothesis(h, poses, support, evidence, reliable, K is not None) for h in mine)
+            results.append(Registration(answers, trust, ranking[b : b + 1]))
         return results
 
     def tell(self, stage: str) -> None:
@@ -263,53 +268,22 @@ class Registrar:
         pictures = self.matcher.pictures(found.model, found.rotation, found.distance)
         return self.matcher.late_score("appearance", query, ranking, pictures, found.photograph)
 
-    def _sent_back(
-        self,
-        own: Tensor,
-        starts: Hypotheses,
-        found: Hypotheses,
-        T: Tensor,
-        cameras: Tensor,
-        fit: ContourFit | None,
-        boxes: Tensor,
-        K: Tensor | None,
-    ) -> tuple[Hypotheses, Tensor, Tensor, ContourFit | None]:
-        """Hypotheses that became another one stand where they started: a rival is a rival, if not a peak."""
-        back, theirs = placed(self.describers, starts, boxes, K)
-        T = torch.where(own[:, None, None], T, back)
-        cameras = torch.where(own[:, None, None], cameras, theirs)
-        found = replace(
-            found,
-            rotation=torch.where(own[:, None, None], found.rotation, starts.rotation),
-            distance=torch.where(own, found.distance, starts.distance),
-        )
-        if fit is not None:
-            covariance = torch.where(own[:, None, None], fit.covariance, torch.nan)
-            fit = replace(fit, transform=T, covariance=covariance)
-        return found, T, cameras, fit
 
-    def _hypothesis(
-        self,
-        h: int,
-        found: Hypotheses,
-        T: Tensor,
-        cameras: Tensor,
-        evidence: Tensor,
-        fit: ContourFit | None,
-        reliable: bool,
-        with_camera: bool,
-    ) -> Hypothesis:
-        known = fit is not None and with_camera and reliable and bool(fit.covariance[h].isfinite().all())
-        return Hypothesis(
-            rotation=T[h, :3, :3].clone() if with_camera else found.rotation[h].clone(),
-            translation=T[h, :3, 3].clone() if with_camera else None,
-            score=float(found.score[h]),
-            evidence=dict(zip(EVIDENCE, evidence[h].tolist(), strict=True)),
-            allocentric_rotation=found.rotation[h].clone(),
-            distance=float(found.distance[h]),
-            seen_by=(T[h].clone(), cameras[h].clone()),
-            view=int(found.view[h]),
-            model=int(found.model[h]),
-            support=None if fit is None else float(fit.support[h]),
-            covariance=fit.covariance[h].clone() if fit is not None and known else None,
-        )
+def _hypothesis(
+    h: int, poses: Poses, support: Tensor, evidence: Tensor, reliable: bool, with_camera: bool
+) -> Hypothesis:
+    found, T, fit = poses.found, poses.T[h], poses.fit
+    known = fit is not None and with_camera and reliable and bool(fit.covariance[h].isfinite().all())
+    return Hypothesis(
+        rotation=T[:3, :3].clone() if with_camera else found.rotation[h].clone(),
+        translation=T[:3, 3].clone() if with_camera else None,
+        score=float(found.score[h]),
+        evidence=dict(zip(EVIDENCE, evidence[h].tolist(), strict=True)),
+        allocentric_rotation=found.rotation[h].clone(),
+        distance=float(found.distance[h]),
+        seen_by=(T.clone(), poses.cameras[h].clone()),
+        view=int(found.view[h]),
+        model=int(found.model[h]),
+        support=None if fit is None else float(support[h]),
+        covariance=fit.covariance[h].clone() if fit is not None and known else None,
+    )

@@ -55,6 +55,7 @@ def search(
     ranking: Ranking,
     boxes: Tensor | None = None,
     camera_matrices: Tensor | None = None,
+    brief: bool = False,
 ) -> Hypotheses:
     """Search around hypotheses in ever smaller steps until each pose stops moving.
 
@@ -71,23 +72,16 @@ def search(
         starts: hypotheses of those photographs.
         bank, ranking: where they come from.
         boxes, camera_matrices: (B, 4) px and (B, 3, 3) of the photographs; both or none.
+        brief: for contours to go on from: ``AFTER`` rounds around the hypotheses' own views, no coherent ones.
 
     Returns:
         The same hypotheses with better rotation and distance, and ``score``: the normalised correlation in [0, 1].
     """
-    order, near = ranking.order.cpu(), bank.rotations.cpu().double()
     state = replace(starts, score=torch.full_like(starts.score, -1.0))
-    coherent = [
-        near[_coherent_with(int(view), order[int(b)], near, bank.model.cpu())]
-        for b, view in zip(starts.photograph, starts.view, strict=True)
-    ]
-    widest = max((len(c) for c in coherent), default=1)
-    candidates = (
-        torch.stack([torch.cat([c, c[:1].expand(widest - len(c), 3, 3)]) for c in coherent]) if coherent else near
-    )
+    candidates = starts.rotation[:, None] if brief else _all_coherent(starts, bank, ranking)
     step = torch.full((len(starts),), FIRST_STEP, dtype=torch.float64)
     active = torch.arange(len(starts))
-    for rounds in range(1 + ROUNDS):
+    for rounds in range(1 + (AFTER if brief else ROUNDS)):
         if len(active) == 0:
             break
         before = state[active]
@@ -154,11 +148,17 @@ def _among_best(state: Hypotheses, count: int) -> Tensor:
     return torch.zeros(len(state), dtype=torch.bool).index_put((order,), place < count)
 
 
-def _coherent_with(view: int, order: Tensor, rotations: Tensor, model: Tensor) -> Tensor:
-    """The coherent views of the ranking that begins with ``view``."""
-    rest = order[(order != view) & (model[order] == model[view])]
-    near = rest[rotation_error(rotations[rest], rotations[view]) <= REACH]
-    return coherent_views(rotations, torch.cat([torch.tensor([view]), near]))
+def _all_coherent(starts: Hypotheses, bank: ViewBank, ranking: Ranking) -> Tensor:
+    """(H, C, 3, 3) coherent views around the hypotheses, the first again where there are fewer."""
+    rotations, model = bank.rotations.cpu().double(), bank.model.cpu()
+    views = []
+    for view, order in zip(starts.view.tolist(), ranking.order.cpu()[starts.photograph], strict=True):
+        rest = order[(order != view) & (model[order] == model[view])]
+        near = rest[rotation_error(rotations[rest], rotations[view]) <= REACH]
+        views.append(coherent_views(rotations, torch.cat([torch.tensor([view]), near])))
+    most = max(map(len, views), default=1)
+    same = [torch.cat([v, v[:1].expand(most - len(v))]) for v in views]
+    return rotations[torch.stack(same)] if same else rotations[:0, None]
 
 
 def _placed(describers: Sequence[ViewDescriber], state: Hypotheses, boxes: Tensor, cameras: Tensor) -> Tensor:

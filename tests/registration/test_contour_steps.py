@@ -10,7 +10,7 @@ from torch import Tensor
 from curvireg_torch import camera_matrix
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
-from curvireg_torch.registration.contour_descent import Views, project
+from curvireg_torch.registration.contour_descent import Seen, Views, project
 from curvireg_torch.registration.contour_points import ContourPoints
 
 K = camera_matrix(300.0, 310.0, 63.5, 60.0, dtype=torch.float64)[None]
@@ -43,13 +43,17 @@ def points(count: int, valid: int | None = None) -> ContourPoints:
     return ContourPoints(model, normals, torch.arange(count)[None] < (count if valid is None else valid))
 
 
+def there(some: ContourPoints) -> Seen:
+    return Seen(T, T, some)
+
+
 def at(count: int, *places: float) -> Tensor:
     return torch.tensor(places, dtype=torch.float64)[:, None].expand(-1, count)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_the_nearer_of_two_edges_is_matched_to_a_fraction_of_a_pixel(side):
-    found = views(at(9, 1.2 * side, -2.0 * side), [0.5, 0.6]).matches(T, points(9, valid=7), 4.0)
+    found = views(at(9, 1.2 * side, -2.0 * side), [0.5, 0.6]).matches(there(points(9, valid=7)), 4.0)
     torch.testing.assert_close(found.distance[0, :7, 0], torch.full((7,), 1.2 * side, dtype=torch.float64))
     seen = 0.5 * (1.0 - (0.2 / 1.5) ** 2)  # at the whole pixel
     tukey = (1.0 - (1.2 / 4.0) ** 2) ** 2
@@ -58,12 +62,12 @@ def test_the_nearer_of_two_edges_is_matched_to_a_fraction_of_a_pixel(side):
 
 def test_support_is_the_mean_strength_near_points_that_count():
     some = points(8, valid=4)
-    assert float(views(at(8, 0.0), [0.7]).support(T, some)) == pytest.approx(0.7)
-    assert float(views(at(8, 1.0), [0.7]).support(T, some)) == pytest.approx(0.7 * math.exp(-0.5))
-    assert float(views(at(8, -3.0), [0.7]).support(T, some)) == pytest.approx(0.7 * (1 - 1 / 2.25) * math.exp(-2.0))
+    assert float(views(at(8, 0.0), [0.7]).support(there(some))) == pytest.approx(0.7)
+    assert float(views(at(8, 1.0), [0.7]).support(there(some))) == pytest.approx(0.7 * math.exp(-0.5))
+    assert float(views(at(8, -3.0), [0.7]).support(there(some))) == pytest.approx(0.7 * (1 - 1 / 2.25) * math.exp(-2.0))
     half = torch.where(torch.arange(8) % 2 == 0, 0.0, 50.0)[None].double()
-    assert float(views(half, [0.7]).support(T, some)) == pytest.approx(0.35)
-    assert float(views(half, [0.7]).support(T, points(8, valid=0))) == 0.0
+    assert float(views(half, [0.7]).support(there(some))) == pytest.approx(0.35)
+    assert float(views(half, [0.7]).support(there(points(8, valid=0)))) == 0.0
 
 
 def test_a_step_undoes_a_motion_though_stronger_edges_lie_elsewhere():

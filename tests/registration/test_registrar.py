@@ -6,11 +6,22 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch import ImageGradient, Registrar, ViewBank, ViewMatcher, project_points, rotation_error, sample_views
+from curvireg_torch import (
+    ImageGradient,
+    Registrar,
+    ViewBank,
+    ViewMatcher,
+    evaluation,
+    matching,
+    project_points,
+    rotation_error,
+    sample_views,
+)
 from curvireg_torch.errors import CurviregError, InvalidInputError
+from curvireg_torch.evaluation import paper
 from curvireg_torch.geometry import rotation_from_viewpoint, symmetry_transforms
 from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
-from curvireg_torch.pipeline import PRESETS
+from curvireg_torch.pipeline import DEPTH_FIELDS, PRESETS, BankSettings, Pipeline
 from curvireg_torch.registration import RELIABLE, FailedRegistration, distinct_views, fit_contours
 from curvireg_torch.rendering import make_renderer, render_depth
 from curvireg_torch.synthetic import example_mesh
@@ -187,6 +198,22 @@ def test_old_names_still_work():
         assert result.view_rotation.equal(result.allocentric_rotation)
     with pytest.warns(DeprecationWarning, match="distance"):
         assert result.view_distance == result.distance
+
+
+@pytest.mark.parametrize(
+    ("package", "name", "now"),
+    [
+        (matching, "QueryFeatures", matching.Photographs),
+        (evaluation, "Preset", Pipeline),
+        (paper, "FieldSettings", BankSettings),
+        (paper, "DEPTH_FIELDS", DEPTH_FIELDS),
+    ],
+)
+def test_names_that_moved_say_where_to(package, name, now):
+    with pytest.warns(DeprecationWarning, match=rf"{name} is deprecated; use curvireg_torch\.\w+\."):
+        assert getattr(package, name) is now
+    with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
+        package.Nothing  # noqa: B018
 
 
 def test_distinct_views_stop_when_the_sphere_is_used_up():

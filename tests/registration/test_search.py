@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from curvireg_torch import Registrar, camera_matrix, project_points, rotation_error
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.registration import coherent_views
+from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.search import REACH, _peak, search
 from tests._support.scenes import CAMERA, scene, truck_bank
@@ -27,18 +29,22 @@ class Turns:
 
     hull, centre, radius = CORNERS, torch.zeros(3, dtype=torch.float64), 1.0
 
+    def __init__(self) -> None:
+        self.asked: list[int] = []
+
     def descriptors(self, rotation: Tensor, _: Tensor) -> Tensor:
+        self.asked.append(len(rotation))
         return rotation.flatten(1)
 
 
-def around(truth: Tensor, start: Tensor, *others: Tensor, **seen: Tensor) -> Hypotheses:
+def around(truth: Tensor, start: Tensor, *others: Tensor, describe: Turns | None = None, **seen: Any) -> Hypotheses:
     """The search from ``start``, the first view of a bank, for ``truth``."""
     views = torch.stack([start, *others])
     one = torch.zeros(1, dtype=torch.long)
     begin = Hypotheses(one, one, one, start[None], torch.tensor([9.0], dtype=torch.float64), torch.ones(1).double())
     bank = SimpleNamespace(rotations=views, model=torch.zeros(len(views), dtype=torch.long))
     ranking = SimpleNamespace(order=torch.arange(len(views))[None])
-    return search([Turns()], truth.flatten()[None], begin, bank=bank, ranking=ranking, **seen)
+    return search([describe or Turns()], truth.flatten()[None], begin, bank=bank, ranking=ranking, **seen)
 
 
 def test_the_peak_between_the_views_is_found():
@@ -62,6 +68,16 @@ def test_coherent_views_of_the_bank_come_first():
     # Steps alone would end near the bank's view, not in it.
     truth = turn(0.0, 12.0, 5.0)
     assert float(rotation_error(around(truth, turn(0, 0, 0), truth).rotation[0], truth)) < 1e-4
+
+
+def test_a_brief_search_takes_two_rounds_around_the_view_alone():
+    truth, whole, brief = turn(0.0, 12.0, 5.0), Turns(), Turns()
+    assert float(around(truth, turn(0, 0, 0), truth, describe=whole).score) == pytest.approx(1.0, abs=1e-6)
+    found = around(truth, turn(0, 0, 0), truth, describe=brief, brief=True)
+    assert brief.asked == [1, 6, 1, 6, 1]
+    assert whole.asked[0] == 2
+    assert sum(whole.asked) > sum(brief.asked)
+    assert 0.1 < float(rotation_error(found.rotation[0], truth)) < 5.0
 
 
 def test_parabolas_peak_where_they_do():
@@ -88,11 +104,15 @@ def test_the_distance_is_that_at_which_the_object_fills_its_box():
     assert float(found.distance) == pytest.approx(4.0, rel=0.02)
 
 
-def test_the_registrar_searches_with_its_box_and_camera():
+def test_the_registrar_searches_with_its_box_and_camera(monkeypatch):
     image, box, T = scene(0)
     pipeline = replace(truck_bank().pipeline, contours=False)
     registrar = Registrar(truck_bank(), pipeline=pipeline)
+    rounds = []
+    monkeypatch.setattr(registrar_module, "search", lambda *a, brief, **k: rounds.append(brief) or search(*a, **k))
     result = registrar([image], box[None], CAMERA)[0]
+    Registrar(truck_bank())([image], box[None], CAMERA)
+    assert rounds == [False, True]
     centre = T[:3, :3] @ registrar.describers[0].centre + T[:3, 3]
     assert result.distance == pytest.approx(float(centre.norm()), rel=0.05)
     blind = registrar([image], box[None])[0].distance
