@@ -8,7 +8,7 @@ from torch import Tensor
 from .._checks import check_positive, check_tensor
 from ..errors import InvalidInputError
 
-__all__ = ["box_iou", "check_boxes", "crop_images", "crop_transforms", "square_boxes", "whole_image_box"]
+__all__ = ["box_iou", "check_boxes", "crop_images", "crop_transforms", "image_transforms", "square_boxes", "whole_image_box"]
 
 
 def whole_image_box(image: Tensor) -> Tensor:
@@ -75,6 +75,18 @@ def crop_transforms(squares: Tensor, size: int) -> Tensor:
     rows = [
         torch.stack([scale, zero, -squares[..., 0] * scale - 0.5], -1),
         torch.stack([zero, scale, -squares[..., 1] * scale - 0.5], -1),
+        torch.stack([zero, zero, one], -1),
+    ]
+    return torch.stack(rows, -2)
+
+
+def image_transforms(squares: Tensor, size: int) -> Tensor:
+    """The inverse of :func:`crop_transforms`, exact zeros and ones in their places."""
+    side = (squares[..., 2] - squares[..., 0]) / size
+    zero, one = torch.zeros_like(side), torch.ones_like(side)
+    rows = [
+        torch.stack([side, zero, squares[..., 0] + 0.5 * side], -1),
+        torch.stack([zero, side, squares[..., 1] + 0.5 * side], -1),
         torch.stack([zero, zero, one], -1),
     ]
     return torch.stack(rows, -2)

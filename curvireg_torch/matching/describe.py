@@ -9,7 +9,7 @@ from torch import Tensor
 from ..descriptors import field_points
 from ..geometry.cameras import projected_boxes, transform
 from ..geometry.colours import has_colours
-from ..geometry.crops import crop_transforms, square_boxes
+from ..geometry.crops import crop_transforms, image_transforms, square_boxes
 from ..geometry.mesh import extreme_points, mesh_centre, mesh_radius
 from ..pipeline import BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_colour
@@ -123,8 +123,8 @@ class ViewDescriber:
             T, K = T.clone(), K.clone()
             T[:, 2, 3] += FAR * z
             K[:, :2, :2] *= (1.0 + FAR) * z[:, None, None]
-        to_crop = crop_transforms(square_boxes(boxes.double().cpu(), self.settings.margin), self.settings.image_size)
-        return T, torch.linalg.inv(to_crop).triu() @ K  # exact zeros below; torch 2.5 leaves 1e-16
+        squares = square_boxes(boxes.double().cpu(), self.settings.margin)
+        return T, image_transforms(squares, self.settings.image_size) @ K
 
     def depth(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
         """Depth (N, 1, S, S) of the framed views, and their boxes (N, 4)."""

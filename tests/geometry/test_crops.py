@@ -5,7 +5,8 @@ import torch
 
 from curvireg_torch import geometry as g
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry.crops import check_boxes
+from curvireg_torch.geometry.cameras import check_camera_matrix
+from curvireg_torch.geometry.crops import check_boxes, image_transforms
 
 
 def ramp(height: int, width: int) -> torch.Tensor:
@@ -31,6 +32,14 @@ def test_borders_of_the_square_become_borders_of_the_crop() -> None:
     A = g.crop_transforms(square, 32)[0]
     corners = torch.tensor([[10.0, 30.0, 1.0], [26.0, 46.0, 1.0]]) @ A.T
     assert corners.tolist() == [[-0.5, -0.5, 1.0], [31.5, 31.5, 1.0]]
+
+
+def test_back_from_the_crop_with_nothing_where_cameras_have_nothing() -> None:
+    """A camera matrix with 1e-16 where zeros belong is refused; inverses by LAPACK leave such, by version."""
+    squares = torch.tensor([[10.0, 30.0, 26.3, 46.3], [-3.7, 2.1, 0.4, 6.2]], dtype=torch.float64)
+    back = image_transforms(squares, 32)
+    torch.testing.assert_close(back @ g.crop_transforms(squares, 32), torch.eye(3).double().expand(2, 3, 3))
+    check_camera_matrix(back)
 
 
 @pytest.mark.parametrize(("side", "size", "off"), [(8.0, 8, 2e-4), (8.0, 16, 2e-4), (24.0, 8, 2e-4), (20.5, 12, 0.1)])
