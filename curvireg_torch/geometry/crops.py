@@ -8,7 +8,15 @@ from torch import Tensor
 from .._checks import check_positive, check_tensor
 from ..errors import InvalidInputError
 
-__all__ = ["box_iou", "check_boxes", "crop_images", "crop_transforms", "image_transforms", "square_boxes", "whole_image_box"]
+__all__ = [
+    "box_iou",
+    "check_boxes",
+    "crop_images",
+    "crop_transforms",
+    "image_transforms",
+    "square_boxes",
+    "whole_image_box",
+]
 
 
 def whole_image_box(image: Tensor) -> Tensor:
