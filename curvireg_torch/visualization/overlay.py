@@ -45,14 +45,37 @@ def contour_overlay(
     Raises:
         InvalidInputError: a camera matrix for a pose that was found without one.
     """
+    item = _item(image, box)
+    H, W = item.image.shape[-2:]
+    return _overlay(registrar, result, item, camera_matrix, (0, 0, W, H))
+
+
+def _overlay(
+    registrar: Registrar,
+    result: Registration | Hypothesis,
+    item: Item,
+    camera_matrix: Tensor | None,
+    part: tuple[int, int, int, int],
+) -> np.ndarray:
+    """:func:`contour_overlay` of columns x0 to x1 - 1 and rows y0 to y1 - 1."""
     if camera_matrix is not None and result.translation is None:
         raise InvalidInputError("camera_matrix: the pose was found without one; leave it out")
-    item = _item(image, box)
+    x0, y0, x1, y1 = part
     T, K = result.seen_by
-    K = K if camera_matrix is None else camera_matrix
-    picture = to_uint8(item.image)
-    draw_pose(picture, registrar.describers[result.model].renderer, (T, K), item.box.tolist())
+    K = (K if camera_matrix is None else camera_matrix).clone()
+    K[:2, 2] -= K.new_tensor([x0, y0])
+    picture = to_uint8(item.image[:, y0:y1, x0:x1])
+    box = (item.box - item.box.new_tensor([x0, y0, x0, y0])).tolist()
+    draw_pose(picture, registrar.describers[result.model].renderer, (T, K), box)
     return picture
+
+
+def _around(item: Item) -> tuple[int, int, int, int]:
+    """The part of a photograph that holds the box and half of its longer side on every side."""
+    H, W = item.image.shape[-2:]
+    x0, y0, x1, y1 = item.box.tolist()
+    room = 0.5 * max(x1 - x0, y1 - y0)
+    return max(0, round(x0 - room)), max(0, round(y0 - room)), min(W, round(x1 + room)), min(H, round(y1 + room))
 
 
 def draw_pose(
@@ -111,14 +134,15 @@ def registration_sheet(
 ) -> np.ndarray:
     """Contour overlay; beside it the crop, its field, the pose and its field; below the hypotheses' poses, best first.
 
-    Under each hypothesis stand its score and how far it is turned from the best. Arguments as for
+    The overlay shows the box and half of its longer side on every side, so that contours of a small object are seen,
+    too. Over each hypothesis stand its score and how far it is turned from the best. Arguments as for
     :func:`contour_overlay`.
 
     Returns:
         (H', W', 3) uint8 RGB.
     """
     item = _item(image, box)
-    overlay = contour_overlay(registrar, result, item.image, item.box, camera_matrix)
+    overlay = _overlay(registrar, result, item, camera_matrix, _around(item))
     side = [_caption(_tile(p), name) for name, p in side_pictures(registrar, result, item.image, item.box).items()]
     poses = [
         _caption(_tile(depth_picture(_depth(registrar, h)[0, 0])), _told(registrar, result, i))

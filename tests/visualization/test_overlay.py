@@ -187,6 +187,25 @@ def test_the_sheet_shows_each_hypothesis_at_its_own_pose_and_distance(found):
     assert np.array_equal(tile(other, 1), tile(other, 2))
 
 
+def test_a_small_object_is_drawn_large(found):
+    """In a photograph four times as wide and high, what lies around the box fills the same place."""
+    registrar, result, image, box, _ = found
+    sheet = registration_sheet(registrar, result, image, box)
+    H, W = SIZE
+    room = torch.zeros(3, 4 * H, 4 * W)
+    room[:, H : 2 * H, W : 2 * W] = image
+    shift = torch.tensor([W, H], dtype=torch.float64)
+    T, K = result.seen_by
+    K = K.clone()
+    K[:2, 2] += shift
+    moved = replace(result, hypotheses=(replace(result.hypotheses[0], seen_by=(T, K)), *result.hypotheses[1:]))
+    other = registration_sheet(registrar, moved, room, box + shift.repeat(2))
+    wide = sheet.shape[1] - 2 * 192
+    assert other.shape == sheet.shape
+    assert drawn(sheet[:HEIGHT, :wide]).any()
+    assert np.array_equal(other[:HEIGHT, :wide], sheet[:HEIGHT, :wide])
+
+
 def test_photographs_as_the_registrar_takes_them(found):
     registrar, result, image, box, _ = found
     pixels = (image * 255).round().byte()
