@@ -49,9 +49,9 @@ class LookCells(Cells):
 
     strides = STRIDES
 
-    def __init__(self) -> None:
+    def __init__(self, backbone: Backbone) -> None:
         super().__init__()
-        self.backbone = Backbone()
+        self.backbone = backbone
 
     def of_photograph(self, image: Tensor) -> list[Tensor]:
         return [f / s[:, None, None] for f, s in zip(self.backbone(image), self.backbone.spreads, strict=True)]
@@ -89,4 +89,5 @@ class FieldCells(Cells):
 def cells_for(matcher: ViewMatcher) -> Cells:
     """What the matcher's pipeline looks at: pictures where a term does, else its fields."""
     looks = any(term.name == "appearance" for term in matcher.pipeline.terms)
-    return (LookCells() if looks else FieldCells(matcher.field)).to(matcher.device)
+    networks = (module for module in matcher.modules() if isinstance(module, Backbone))
+    return (LookCells(next(networks)) if looks else FieldCells(matcher.field)).to(matcher.device)

@@ -96,10 +96,9 @@ def fit_contours(
 
     W being the edge's strength times Tukey's weight of what remains. Strong edges near where the step leads are chosen
     again within a step; the search narrows from round to round, and the mesh is rendered anew where contours have
-    moved. The fit begins at half size from each start and, where that ends with a support below 0.5, from four poses
-    turned away from it; the best (by support) or the next best that differs from it goes on, at full size. The start
-    itself is returned where that has no more support than it has. All starts of all photographs share a round's
-    rendering.
+    moved. From each start and from four poses turned away from it the fit begins at half size; the best (by support)
+    and the next best that differs from it go on, and end at full size. The start itself is returned where nothing has
+    more support than it has. All starts of all photographs share a round's rendering.
 
     The order of the covariance is turn (rad) about the camera's x, y, z, then translation (model units) along them:
     with the true pose R, t,
@@ -159,17 +158,16 @@ def fit_contours(
     support = half.support(first)
     tried = torch.ones(N, dtype=torch.bool) if finish is None else _among_best(support, photograph, finish)
     index, others = tried.nonzero()[:, 0], (~tried).nonzero()[:, 0]
-    T = _around(half.of(index), T0[index], first[index], support[index])
-    # The start, and what was only begun with, as they are. Of equals the start wins.
-    of, rest = full.of(index), full.of(others)
-    still, fitted = of.seen(T0[index]), of.descend(of.seen(T), FINE)
-    begun = rest.seen(torch.where((support > before)[others, None, None], first.T[others], T0[others]))
-    supports = [of.support(still), of.support(fitted), rest.support(begun)]
-    better, place = supports[1] > supports[0], torch.empty(N, dtype=torch.long)
-    place[index] = torch.arange(len(index)) + len(index) * better
-    place[others] = torch.arange(len(others)) + 2 * len(index)
-    seen, support = Seen.cat([still, fitted, begun])[place], torch.cat(supports)[place]
-    before[index] = supports[0]
+    of, T = _around(half.of(index), T0[index], first[index], support[index])
+    # The starts, and what was only begun with, as they are. Of equals the first wins.
+    owner = torch.cat([index, others, index[of]])
+    still = torch.cat([T0[index], torch.where((support > before)[others, None, None], first.T[others], T0[others])])
+    as_they_are, two = full.of(owner[: len(still)]), full.of(index[of])
+    seen = Seen.cat([as_they_are.seen(still), two.descend(two.seen(T), FINE)])
+    support = full.of(owner).support(seen)
+    before[index] = support[: len(index)]
+    best = torch.where(owner == torch.arange(N)[:, None], support, -1.0).argmax(dim=1)
+    seen, support = seen[best], support[best]
     found = full.matches(seen, FINE[-1])
     covariance, observable = pose_covariance(found, seen.points, seen.T, full.K, centre, radius=radius)
     weight = found.weight[..., 0]
@@ -186,29 +184,23 @@ def fit_contours(
     )
 
 
-def _around(half: Views, T0: Tensor, first: Seen, support: Tensor) -> Tensor:
-    """Poses at half size from what the first rounds made of starts ``T0``, (N, 4, 4). Where edges support that too
-    little, from four turns of the start too; then the best, or the next best that is another pose."""
+def _around(half: Views, T0: Tensor, first: Seen, support: Tensor) -> tuple[Tensor, Tensor]:
+    """Poses at half size from what the first rounds made of starts ``T0``, (N, 4, 4), and make of four turns of each:
+    the best of five, and the next best that is another pose. Returns which start each belongs to, and the poses."""
     N, every = len(T0), torch.arange(len(T0))
     turns = torch.zeros(4, 6, dtype=torch.float64)
     turns[:, :2] = torch.deg2rad(TURN * torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]))
-    unsure = (support < SUPPORTED).nonzero()[:, 0]
-    four = unsure.repeat_interleave(4)
-    views = half.of(four)
-    turned = views.descend(views.seen(moved(T0[four], turns.repeat(len(unsure), 1), half.centre)), FIRST)
-    five, supports = every[:, None].repeat(1, 5), torch.full((N, 5), -1.0, dtype=torch.float64)
-    five[unsure, 1:] = N + torch.arange(len(four)).view(-1, 4)
-    supports[:, 0], supports[unsure, 1:] = support, views.support(turned).view(-1, 4)
+    views = half.of(every.repeat_interleave(4))
+    turned = views.descend(views.seen(moved(T0.repeat_interleave(4, 0), turns.repeat(N, 1), half.centre)), FIRST)
+    supports = torch.cat([support[:, None], views.support(turned).view(-1, 4)], dim=1)
+    five = torch.cat([every[:, None], N + torch.arange(4 * N).view(-1, 4)], dim=1)
     seen, best = Seen.cat([first, turned]), supports.argmax(dim=1)
     other, reference = seen[five.flatten()], seen[five[every, best].repeat_interleave(5)]
     gap = half.of(every.repeat_interleave(5)).way(reference.points, reference.T, other.T).view(-1, 5)
     rival, second = torch.where(gap > SAME, supports, -1.0).max(dim=1)
     owner = torch.cat([every, every[rival >= 0]])
     chosen = five[owner, torch.cat([best, second[rival >= 0]])]
-    views = half.of(owner)
-    seen = views.descend(seen[chosen], SECOND)
-    T: Tensor = seen.T[torch.where(owner == every[:, None], views.support(seen), -1.0).argmax(dim=1)]
-    return T
+    return owner, half.of(owner).descend(seen[chosen], SECOND).T
 
 
 def _among_best(support: Tensor, photograph: Tensor, count: int) -> Tensor:

@@ -23,8 +23,8 @@ REACH = 15.0
 FIRST_STEP, FINEST_STEP = 5.0, 1.0
 """Degrees: half the spacing of the bank; finer steps move the contours of a crop by less than a pixel."""
 
-ROUNDS = 8
-"""At most, of seven poses each."""
+ROUNDS, BRIEF = 8, 4
+"""At most, of seven poses each; of a brief search."""
 
 FINALISTS, AFTER = 2, 2
 """So many hypotheses of a photograph are followed to the end, by search and by contours; the others are searched
@@ -72,7 +72,7 @@ def search(
         starts: hypotheses of those photographs.
         bank, ranking: where they come from.
         boxes, camera_matrices: (B, 4) px and (B, 3, 3) of the photographs; both or none.
-        brief: for contours to go on from: ``AFTER`` rounds around the hypotheses' own views, no coherent ones.
+        brief: for contours to go on from: ``BRIEF`` rounds at most, from the hypotheses' own views, no coherent ones.
 
     Returns:
         The same hypotheses with better rotation and distance, and ``score``: the normalised correlation in [0, 1].
@@ -81,7 +81,7 @@ def search(
     candidates = starts.rotation[:, None] if brief else _all_coherent(starts, bank, ranking)
     step = torch.full((len(starts),), FIRST_STEP, dtype=torch.float64)
     active = torch.arange(len(starts))
-    for rounds in range(1 + (AFTER if brief else ROUNDS)):
+    for rounds in range(1 + (BRIEF if brief else ROUNDS)):
         if len(active) == 0:
             break
         before = state[active]

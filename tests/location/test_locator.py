@@ -10,6 +10,7 @@ import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import box_iou
 from curvireg_torch.location import Locator
+from curvireg_torch.location.cells import LookCells, cells_for
 from curvireg_torch.matching import ViewMatcher
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from tests._support.scenes import CAMERA, scene, truck_bank
@@ -27,6 +28,13 @@ def bank(preset="learned"):
 @cache
 def locator(preset="learned"):
     return Locator(ViewMatcher(bank(preset)))
+
+
+def test_the_network_of_the_appearance_term_is_not_loaded_again():
+    matcher = ViewMatcher(bank())
+    cells = cells_for(matcher)
+    assert isinstance(cells, LookCells)
+    assert any(cells.backbone is module for module in matcher.modules())
 
 
 def placed(seed, corner, scale, size=SIZE):

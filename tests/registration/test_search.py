@@ -70,14 +70,14 @@ def test_coherent_views_of_the_bank_come_first():
     assert float(rotation_error(around(truth, turn(0, 0, 0), truth).rotation[0], truth)) < 1e-4
 
 
-def test_a_brief_search_takes_two_rounds_around_the_view_alone():
+def test_a_brief_search_takes_four_rounds_around_the_view_alone():
     truth, whole, brief = turn(0.0, 12.0, 5.0), Turns(), Turns()
-    assert float(around(truth, turn(0, 0, 0), truth, describe=whole).score) == pytest.approx(1.0, abs=1e-6)
-    found = around(truth, turn(0, 0, 0), truth, describe=brief, brief=True)
-    assert brief.asked == [1, 6, 1, 6, 1]
+    around(truth, turn(0, 0, 0), turn(0, 1, 0), describe=whole)
+    found = around(truth, turn(0, 0, 0), turn(0, 1, 0), describe=brief, brief=True)
+    assert brief.asked == [1] + [6, 1] * 4
     assert whole.asked[0] == 2
-    assert sum(whole.asked) > sum(brief.asked)
-    assert 0.1 < float(rotation_error(found.rotation[0], truth)) < 5.0
+    assert len(whole.asked) > len(brief.asked)
+    assert float(rotation_error(found.rotation[0], truth)) < 0.1
 
 
 def test_parabolas_peak_where_they_do():
