@@ -119,6 +119,24 @@ class Repeatability(Term):
         return _log_score(raw, self.mode, self.sigma)
 
 
+def cell_shares(points: Tensor, cell: int) -> Tensor:
+    """(N, C, C) float32 share of set pixels in cells of ``cell`` px, the last ones cut, from (N, S, S) bool.
+
+    ``avg_pool2d`` with ``ceil_mode``, to the bit, several times as fast: whole numbers are added.
+    """
+    S = points.shape[-1]
+    over = -S % cell
+    count = F.pad(points.view(torch.uint8), (0, over, 0, over))
+    for dim in (1, 2):  # rows first: they lie together in memory
+        parts = count.unfold(dim, cell, cell).unbind(dim=3)
+        count = parts[0].short()
+        for part in parts[1:]:
+            count = count + part
+    side = torch.full((count.shape[-1],), cell, device=points.device)
+    side[-1] -= over
+    return count.float() / (side[:, None] * side)
+
+
 class _Points(nn.Module):
     def __init__(self, views: Views, eps: float) -> None:
         super().__init__()
@@ -134,7 +152,7 @@ class _Points(nn.Module):
 
     def _in_cells(self, points: Tensor) -> Tensor:
         """(N, C, C) share of each cell's pixels that are set, from (N, S, S)."""
-        return F.avg_pool2d(points[:, None].float(), self.cell, ceil_mode=True)[:, 0]
+        return cell_shares(points, self.cell)
 
     def forward(self, photographs: Photographs) -> Tensor:
         B, K = photographs.points.shape[:2]
