@@ -85,9 +85,15 @@ def test_register_writes_result_and_overlay(files, capsys):
     assert "standard deviations: " in printed
 
 
-def test_without_box_and_camera(files):
-    folder, _, _ = files
+def test_without_box_and_camera(files, capsys):
+    folder, box, _ = files
+    words = ["register", str(folder / "photo.png"), str(folder / "truck.safetensors"), "--no-refine", "--json"]
+    assert main([*words, "--box", *box]) == 0
+    assert "looking for the object" not in capsys.readouterr().err
+    assert main(words) == 0
+    assert "photo.png: looking for the object" in capsys.readouterr().err
     assert run(folder, "photo.png", "truck.safetensors", "--no-refine") == 0
+    assert capsys.readouterr().err == ""
     result = json.loads((folder / "out" / "result.json").read_text())
     assert result["translation"] is None
     assert result["covariance"] is None
