@@ -146,8 +146,7 @@ def _register_one(arguments: argparse.Namespace, field: nn.Module | None) -> Non
     registrar = open_registrar(arguments, entry.meshes, field)
     ready = time.perf_counter() - start
     if entry.box is None and not arguments.quiet:
-        told = "looking for the object, a minute in a large photograph; --box X0 Y0 X1 Y1 is faster and surer"
-        print(f"{path}: {told}", file=sys.stderr)
+        print(f"{path}: looking for the object; --box X0 Y0 X1 Y1 is faster and surer", file=sys.stderr)
     result, document = register_entry(entry, photo, registrar, bank_seconds=ready)
     if arguments.out is not None:
         _write(arguments.out, document, registrar, result, photo.image, document["inputs"]["box"])
