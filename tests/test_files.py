@@ -84,10 +84,12 @@ def test_the_place_is_probed_before_the_work(
         monkeypatch.setattr(f"curvireg_torch.commands.{name}", work)
     blocked = tmp_path / "file"
     blocked.write_bytes(OLD)
+    (tmp_path / "mesh.ply").write_bytes(OLD)
+    mesh = str(tmp_path / "mesh.ply")
     arguments = {
         "demo": ["demo", "--out", str(blocked / "out")],
-        "bank": ["bank", "mesh.ply", "--out", str(blocked / "a.safetensors")],
-        "bank --adapt": ["bank", "mesh.ply", "--out", str(tmp_path / "a"), "--adapt", str(blocked / "b")],
+        "bank": ["bank", mesh, "--out", str(blocked / "a.safetensors")],
+        "bank --adapt": ["bank", mesh, "--out", str(tmp_path / "a"), "--adapt", str(blocked / "b")],
     }[command]
     option = "--adapt" if "--adapt" in arguments else "--out"
     assert main(arguments) == 2
