@@ -6,9 +6,10 @@
     python scripts/mutate.py --table                          # the scores into CONTRIBUTING.md
 
 One mutant (``mutants.py``) at a time, in a temporary copy; the first failing test kills it. Tests of a module: those of
-the folder of its package (where there is none, files that import it by name), and its doctests; not those marked slow
-or data. They run once as they are, under coverage; a mutant then meets those that run its line, the quickest first,
-half a minute of them at most. The sample is drawn by a hash of the mutant and the seed, it stays where the code does.
+the folder of its package (of a module beside the packages: files that have its name or import it), and its doctests;
+not those marked slow or data. They run once as they are, under coverage; a mutant then meets those that run its line,
+the quickest first, half a minute of them at most. The sample is drawn by a hash of the mutant and the seed, it stays
+where the code does.
 
 ``scripts/results/mutation.json``: score per package (killed / sampled) and every survivor. A ``reason`` written there
 beside a survivor is kept: why no test can or need tell it from the original.
@@ -86,7 +87,7 @@ def tests_of(copy: Path, path: str) -> list[str]:
         near = [p for p in everywhere if homes & set(p.parents)]
         module += rf"|{PACKAGE}\.{re.escape('.'.join(parts[:-1]))} import [^\n]*\b{parts[-1]}\b"
     else:
-        near = [p for p in everywhere if p.parent == home and stem in p.stem]
+        near = [p for p in everywhere if p.parent == home and (stem in p.stem or re.search(module, p.read_text()))]
     near = near or [p for p in everywhere if re.search(module, p.read_text())]
     return [p.relative_to(copy).as_posix() for p in near]
 

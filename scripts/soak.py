@@ -23,6 +23,7 @@ from typing import Any
 
 import torch
 from _record import REPOSITORY, commit, today
+from tqdm import tqdm
 
 from curvireg_torch import Registrar, camera_matrix, sample_views
 from curvireg_torch.matching import BankSettings, cached_bank
@@ -66,7 +67,7 @@ def soak(count: int, reopen: int, seed: int) -> list[Sample]:
     image, box = synthesize_photograph(mesh, truth, K, SIZE, generator)
     views = sample_views(azimuth_step=30, elevations=[0, 30])
     course, start = [], time.monotonic()
-    for i in range(count):
+    for i in tqdm(range(count), unit="registration", position=seed):
         if i % reopen == 0:
             settings = BankSettings(image_size=64 if i // reopen % 2 else 96)  # each removes the other's bank
             registrar = Registrar(cached_bank(mesh, views, settings, progress=False))

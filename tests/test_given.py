@@ -1,10 +1,13 @@
 """Files named on the command line: looked at at once, and known from each other."""
 
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
 
+from curvireg_torch import cli
 from curvireg_torch.cli import _parsed, main
+from curvireg_torch.errors import CurviregError
 from tests.test_lazy import HEAVY, imported_by
 
 
@@ -93,3 +96,21 @@ def test_other_numbers_are_refused(numbers, capsys):
     with pytest.raises(SystemExit):
         _parsed(["register", "a.jpg", "b.stl", "--box", numbers, "--json"])
     assert "argument --box: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "said"),
+    [
+        (KeyboardInterrupt(), 130, "curvireg: interrupted\n"),
+        (PermissionError(13, "denied", "x.ply"), 2, "curvireg: error: [Errno 13] denied: 'x.ply'; check that it is "),
+        (CurviregError("no good"), 2, "curvireg: error: no good\n"),
+    ],
+)
+def test_what_stops_a_command_is_one_line_and_a_code(raised, code, said, monkeypatch, capsys):
+    def stop(_):
+        raise raised
+
+    monkeypatch.setattr(cli, "check_given", lambda *_: None)
+    monkeypatch.setattr(cli, "_parsed", lambda _: Namespace(run=stop, debug=False, photo=None, mesh=None))
+    assert main(["cache"]) == code
+    assert capsys.readouterr().err.startswith(said)
