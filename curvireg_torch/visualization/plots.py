@@ -68,7 +68,7 @@ def view_sphere(bank: ViewBank, ranking: Ranking | Registration, *, photograph: 
     for number, pose in enumerate(poses, start=1):
         if pose.model == model:
             azimuth, elevation, _ = pose.viewpoint
-            axes.plot(azimuth % 360.0, elevation, "o", mfc="white", mec="black", ms=11)
+            axes.plot(azimuth % 360.0, elevation, "o", mfc="white", mec="black", ms=11, clip_on=False)
             axes.annotate(str(number), (azimuth % 360.0, elevation), ha="center", va="center_baseline", fontsize=8)
     return figure
 

@@ -66,4 +66,5 @@ def test_the_picture_holds_the_map_and_the_hypotheses(bank):
     drawn = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines]
     assert drawn == [(h.viewpoint[0] % 360, h.viewpoint[1]) for h in result.hypotheses]
     assert [text.get_text() for text in axes.texts] == ["1", "2", "3"]
+    assert not any(line.get_clip_on() for line in axes.lines)  # whole on the border, too
     assert not view_sphere(bank, result.ranking).axes[0].lines
