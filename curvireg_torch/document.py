@@ -12,7 +12,7 @@ import trimesh
 from . import __version__
 from .registration import RELIABLE, Hypothesis, Registrar, Registration
 
-__all__ = ["CONVENTIONS", "SCHEMA", "found_document", "pose_document", "result_document"]
+__all__ = ["CONVENTIONS", "SCHEMA", "fitting_box", "found_document", "pose_document", "result_document"]
 
 SCHEMA = 1
 """Version of ``result.schema.json``; raised when a key goes or changes its meaning."""
@@ -66,6 +66,7 @@ def result_document(result: Registration, registrar: Registrar, seconds: Mapping
         if deviations is None
         else {"rotation_deg": _known(deviations[0]), "translation": _known(deviations[1])},
         "covariance": None if result.covariance is None else result.covariance.tolist(),
+        "corrected_box": None if result.corrected_box is None else result.corrected_box.tolist(),
         "top": top,
         "views": len(bank),
         "pipeline": registrar.pipeline.describe(),
@@ -79,6 +80,12 @@ def result_document(result: Registration, registrar: Registrar, seconds: Mapping
         },
         "conventions": CONVENTIONS,
     }
+
+
+def fitting_box(document: Mapping[str, Any]) -> list[float]:
+    """The box that the answer of a document was made with."""
+    box: list[float] = document["corrected_box"] or document["inputs"]["box"]
+    return box
 
 
 def found_document(results: Sequence[Registration]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ One line for each photograph: the errors of the hypotheses in degrees up to the 
 the evidence of the ranking, the errors of the best views, and how far off it is in its unscaled covariance's units.
 ``exact`` photographs come with their camera matrix, ``sibling`` ones (another object of the kind) without, as
 PASCAL3D+ does. Run again, it goes on. --share takes every N-th mesh, so that several processes work side by side.
+--box moves each edge of the boxes by up to that share of the side, as `curvireg evaluate --protocol box=SHARE` does.
 """
 
 import argparse
@@ -20,6 +21,7 @@ from torch import Tensor
 
 import curvireg_torch as cr
 from curvireg_torch.data import read_image
+from curvireg_torch.evaluation.protocol import Protocol, perturbed_box
 from curvireg_torch.geometry import rotation_towards, transform
 from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
 from curvireg_torch.registration.confidence import ranking_evidence
@@ -44,13 +46,16 @@ def allocentric(item: dict[str, Any]) -> Tensor:
     return rotation_towards(ray).T @ torch.tensor(item["R"], dtype=torch.float64)
 
 
-def rows_of(items: list[Any], root: Path, half: Path, pipeline: cr.Pipeline, wrong: Path | None) -> list[Any]:
+def rows_of(
+    items: list[Any], root: Path, half: Path, pipeline: cr.Pipeline, wrong: Path | None, protocol: Protocol
+) -> list[Any]:
     """Rows of photographs of one mesh; ``wrong``: registered to this one instead, which none of them shows."""
     mesh = cr.load_mesh(wrong or root / items[0]["mesh"])
     registrar = cr.Registrar(cr.ViewBank.build(mesh, pipeline=pipeline, progress=False), pipeline=pipeline)
     rows = []
     for item in items:
-        image, box = read_image(half / item["image"]), torch.tensor([item["box"]])
+        image = read_image(half / item["image"])
+        box = perturbed_box(torch.tensor(item["box"]), protocol, str(item["id"]))[None]
         exact = item["form"] == "exact"
         K = torch.tensor(item["K"], dtype=torch.float64) if exact else None
         result = registrar([image], box, K)[0]
@@ -69,6 +74,7 @@ def rows_of(items: list[Any], root: Path, half: Path, pipeline: cr.Pipeline, wro
         row["evidence"] = [dict(h.evidence) for h in result.hypotheses]
         row["ranking"] = ranking_evidence(result.ranking, registrar.bank.rotations)[0].tolist()
         row["confidence"] = result.confidence
+        row["corrected_box"] = None if result.corrected_box is None else result.corrected_box.tolist()
         if result.covariance is not None and not row["wrong"]:
             nearest = truth @ symmetries[error_up_to_each(found[:1], truth, symmetries)[0].argmin()]
             poses = transform(found[0], result.translation), transform(nearest, torch.tensor(item["t"]).double())
@@ -86,6 +92,7 @@ def main() -> None:
     parser.add_argument("--preset", choices=sorted(PRESETS), default=DEFAULT)
     parser.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON, instead of --preset")
     parser.add_argument("--wrong", action="store_true", help="register to the mesh of another photograph")
+    parser.add_argument("--box", type=float, default=0.0, metavar="SHARE", help="how far edges of boxes are off")
     parser.add_argument("--limit", type=int)
     parser.add_argument("--share", default="0/1", metavar="I/N")
     parser.add_argument("--out", type=Path, required=True)
@@ -108,7 +115,7 @@ def main() -> None:
         wrong = arguments.folder / meshes[(meshes.index(mesh) + 1) % len(meshes)] if arguments.wrong else None
         posed = pipeline.posed("upright" if pose == "upright" else "any")
         with arguments.out.open("a") as file:
-            for row in rows_of(list(group), arguments.folder, half, posed, wrong):
+            for row in rows_of(list(group), arguments.folder, half, posed, wrong, Protocol(box=arguments.box)):
                 file.write(json.dumps(row) + "\n")
 
 

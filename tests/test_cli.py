@@ -306,12 +306,13 @@ def test_adapted_field_from_bank_to_register(files, monkeypatch, capsys):
         ("any", {}, "the box is tight and the mesh is the object's\n", "looked for"),
         ("upright", {}, "(--pose upright, --up)\n", "looked for"),
         ("any", {"found": {"instances": []}}, "the object was looked for: give its --box", "tight"),
+        ("any", {"corrected_box": [1.2, 2.0, 30.6, 40.0]}, "did not fit the pose; one that does: 1 2 31 40\n", "found"),
     ],
 )
 def test_what_to_check_where_nothing_is_reliable(pose, more, told, untold, tmp_path, capsys):
     document = {
         "viewpoint": {"azimuth": 1.0}, "score": 0.2, "confidence": 0.1, "reliable": False, "translation": None,
-        "standard_deviations": None, "seconds": {"bank": 1.0, "register": 2.0},
+        "standard_deviations": None, "seconds": {"bank": 1.0, "register": 2.0}, "corrected_box": None,
         "pipeline": Pipeline().posed(pose).describe(), **more,
     }  # fmt: skip
     _print_result(document, tmp_path)

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from .._files import file_digest, write_file
 from ..data import Photo, read_photo
-from ..document import SCHEMA, found_document, result_document
+from ..document import SCHEMA, fitting_box, found_document, result_document
 from ..errors import BankError, CurviregError, ImageError, InvalidInputError, MeshError
 from ..geometry import camera_matrix
 from ..geometry.cameras import camera_of_view
@@ -194,7 +194,7 @@ class _Run:
         except (ImageError, InvalidInputError) as error:
             return _failed(str(error), digests)
         renderer = registrar.describers[result.model].renderer
-        picture = thumbnail(renderer, result.seen_by, photo.image, document["inputs"]["box"])
+        picture = thumbnail(renderer, result.seen_by, photo.image, fitting_box(document))
         write_file(self._picture(request), picture)  # before the line that says that all is done
         return {"status": "ok", "message": "", **document, "digests": digests}
 

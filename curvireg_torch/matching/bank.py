@@ -171,7 +171,7 @@ class ViewBank:
             raise InvalidInputError(f"chunk_size: expected >= 1, got {chunk_size}")
         describe = ViewDescriber(mesh, settings, renderer=renderer, device=device)
         rotations, distances = views.rotations, views.distance * mesh_radius(mesh)
-        late = {t.name: t.over(None) for t in pipeline.late_terms(len(views))}
+        late = {t.name: t.over(None).to(device) for t in pipeline.late_terms(len(views))}
 
         def chunk(start: int) -> dict[str, Tensor]:
             some = rotations[start : start + chunk_size], distances[start : start + chunk_size]

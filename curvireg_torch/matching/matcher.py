@@ -144,7 +144,7 @@ class ViewMatcher(nn.Module):
         self.pipeline = pipeline if field is None else pipeline.with_field(field)
         self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
         self.descriptor = bank.settings.descriptor()
-        self._comparisons = nn.ModuleDict({term.name: term.over(bank) for term in pipeline.terms})
+        self._comparisons = nn.ModuleDict({term.name: term.over(bank) for term in pipeline.terms}).to(bank.device)
         if whitening is not None:
             self._comparisons["hog"] = Correlated(bank.descriptors, whitening)
 

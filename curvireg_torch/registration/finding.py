@@ -9,11 +9,11 @@ from kornia.geometry.bbox import nms
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError
-from ..geometry.cameras import projected_boxes
 from ..location import Located
 from ..location.locator import OVERLAP, check_distance
 from ..matching import Photographs, Ranking
 from .confidence import RELIABLE, presence, presence_evidence
+from .correction import posed_box
 from .inputs import Item, check_crop, items_of, named
 from .pose import FailedRegistration, Found, Registration
 
@@ -140,12 +140,6 @@ def _extremes(image: Tensor) -> Tensor:
     """(C, 2) smallest and largest value of each channel, NaN where there is one, of what is large as a whole."""
     pair = torch.stack([image.flatten(1).amin(dim=1), image.flatten(1).amax(dim=1)], dim=1)
     return pair.float() / 255.0 if image.dtype == torch.uint8 else pair
-
-
-def posed_box(registrar: "Registrar", result: Registration) -> Tensor:
-    """(4,) box around the pose that was found, px of the photograph."""
-    T, K = result.seen_by
-    return projected_boxes(registrar.describers[result.model].hull, T[None], K)[0]
 
 
 def found_in(result: Registration) -> Found:

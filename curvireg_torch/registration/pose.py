@@ -114,12 +114,14 @@ class Registration:
             is there.
         ranking: of the bank's views for this photograph (B = 1).
         found: of an object without a box.
+        corrected_box: (4,) float64 the box that the answer was made with, where the given one did not fit.
     """
 
     hypotheses: tuple[Hypothesis, ...]
     confidence: float
     ranking: Ranking
     found: Found | None = None
+    corrected_box: Tensor | None = None
 
     ok = True
     """False of a :class:`FailedRegistration`."""

@@ -16,6 +16,7 @@ from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatche
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
 from .confidence import RELIABLE, confidence, pose_confidence, pose_evidence
+from .correction import corrected
 from .finding import find
 from .hypotheses import Hypotheses, hypotheses, own_peaks
 from .inputs import Item, check_crop, items_of, named
@@ -165,10 +166,15 @@ class Registrar:
         items = items_of(images, boxes, camera_matrices)
         results: list[Registration | FailedRegistration] = []
         for i in range(0, len(items), self.matcher.chunk_size):
-            results += self._chunk(items[i : i + self.matcher.chunk_size], i)
+            some = items[i : i + self.matcher.chunk_size]
+            answers = self.answers(some, first=i)
+            results += corrected(self, some, answers) if self.pipeline.slack and self.pipeline.search else answers
         return results
 
-    def _chunk(self, items: Sequence[Item | CurviregError], first: int) -> list[Registration | FailedRegistration]:
+    def answers(
+        self, items: Sequence[Item | CurviregError], *, first: int = 0
+    ) -> list[Registration | FailedRegistration]:
+        """:meth:`register` for photographs that may be unfit, their boxes taken as they are; ``first``: its number."""
         out: list[Registration | FailedRegistration | None] = [
             None if isinstance(item, Item) else FailedRegistration(item) for item in items
         ]

@@ -17,7 +17,7 @@ from ..batch import Entry, register_entry
 from ..commands import open_registrar
 from ..data import read_photo
 from ..data.images import Photo
-from ..document import pose_document
+from ..document import fitting_box, pose_document
 from ..errors import CurviregError, InvalidInputError
 from ..evaluation.store import to_json
 from ..geometry import camera_matrix, has_colours, load_mesh, rotation_error, rotation_from_axis_angle
@@ -173,7 +173,7 @@ class Session:
             entry = Entry(name=name, cells=(), meshes=meshes, box=self.box, camera=camera, guess=self.guess)
             ready = time.perf_counter() - start
             result, document = register_entry(entry, picture, registrar, bank_seconds=ready)
-        box = torch.tensor(document["inputs"]["box"])
+        box = torch.tensor(fitting_box(document))
         self.answer = Answer(registrar, result, document, picture.image, box, command)
         self.choose(0)
         return result

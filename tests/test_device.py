@@ -1,0 +1,127 @@
+"""One device: photographs are described, compared and searched where the bank lives, and give what the CPU gives.
+
+No GPU is needed: the device is pretended (``_support/pretended.py``). What only a real one shows are its own rounding,
+its memory and its speed.
+"""
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+
+import curvireg_torch as cr
+from curvireg_torch.pipeline import PRESETS
+from curvireg_torch.registration import find
+from curvireg_torch.synthetic import example_mesh
+from tests._support.pretended import Pretended, pretended_gpu
+from tests._support.scenes import CAMERA, scene, truck_bank
+
+pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a real device")
+
+VIEWS = cr.sample_views(azimuth_step=45, elevations=[10, 40])
+
+
+@pytest.fixture(scope="module")
+def bank():
+    return cr.ViewBank.build(example_mesh(), VIEWS, image_size=64, progress=False)
+
+
+def test_what_a_gpu_refuses_is_refused():
+    with pretended_gpu() as device:
+        x, here = torch.ones(2, 3, device=device), torch.ones(2, 3)
+        for mix in (lambda: x + here, lambda: here[x[:, 0].long() - 1], lambda: torch.cat([x, here]), x.numpy):
+            with pytest.raises((RuntimeError, TypeError), match="device"):
+                mix()
+        assert isinstance(x[torch.tensor([0])] + torch.tensor(1.0), Pretended)  # what it does not
+        assert x.add_(1.0) is x
+        assert x.cpu().tolist() == x.tolist() == [[2.0] * 3] * 2
+        assert torch.zeros_like(x).device == torch.tensor([1.0], device=device).device == device
+
+
+LAYERS = [
+    cr.AnisotropicDiffusion(iterations=3),
+    cr.ApparentRidges(),
+    cr.AverageShadingGradient(),
+    cr.DepthCurvilinearSaliency(),
+    cr.EdgeBlur(),
+    cr.HessianFrobeniusNorm(),
+    cr.ImageCurvilinearSaliency(),
+    cr.ImageGradient(),
+    cr.LearnedCurvilinearSaliency(),
+    cr.MultiScaleCurvilinearSaliency(),
+    cr.MultiScaleFocusCurves(),
+    cr.PrincipalCurvatureImage(),
+]
+
+
+@pytest.mark.parametrize("layer", LAYERS, ids=lambda layer: type(layer).__name__)
+def test_layers(layer):
+    image = torch.rand(2, 1, 48, 56, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        expected = layer(image)
+    with pretended_gpu() as device, torch.no_grad():
+        out = copy.deepcopy(layer).to(device)(image.to(device))
+        out = cr.HOG()(out) if expected.shape[1] == 2 else out
+        assert out.device == device
+        expected = cr.HOG()(expected) if expected.shape[1] == 2 else expected
+        assert torch.equal(out.cpu(), expected)
+
+
+def test_a_bank_is_made_there(bank):
+    with pretended_gpu() as device:
+        made = cr.ViewBank.build(example_mesh(), VIEWS, image_size=64, progress=False, device=device)
+        assert made.device == device
+        for name, tensor in bank.tensors.items():
+            assert torch.equal(made.tensors[name].cpu(), tensor), name
+        rendered = cr.ViewBank.build(
+            example_mesh(), VIEWS, image_size=64, progress=False, device=device, renderer="torch"
+        )
+        assert (rendered.descriptors.cpu() - bank.descriptors).abs().mean() < 0.01
+
+
+def same(ours, expected):
+    assert torch.equal(ours.rotation.cpu(), expected.rotation)
+    assert torch.equal(ours.translation.cpu(), expected.translation)
+    assert ours.score == expected.score
+    assert ours.confidence == expected.confidence
+    assert len(ours.hypotheses) == len(expected.hypotheses)
+
+
+@pytest.mark.parametrize("preset", ["learned", "classical"])
+def test_photographs_are_registered_there(preset):
+    """Wherever they come from; one of them with a box that is corrected."""
+    pipeline = replace(PRESETS[preset], bank=replace(PRESETS[preset].bank, image_size=64), hypotheses=2)
+    bank = cr.ViewBank.build(example_mesh(), VIEWS, pipeline=pipeline, progress=False)
+    image, box, _ = scene(0)
+    wrong = box + 0.2 * (box[2:] - box[:2]).repeat(2) * torch.tensor([-1.0, 1.0, 0.0, 1.0])
+    images, boxes = [image, (255 * image).round().byte()], torch.stack([box, wrong])
+    expected = cr.Registrar(bank)(images, boxes, CAMERA)
+    with pretended_gpu() as device:
+        results = cr.Registrar(bank, device=device)(
+            [images[0].to(device), images[1]], boxes.to(device), CAMERA.to(device)
+        )
+        for result, one in zip(results, expected, strict=True):
+            same(result, one)
+
+
+def test_objects_are_found_there(bank):
+    image, _, _ = scene(0)
+    expected = find(cr.Registrar(bank), [image], CAMERA)[0]
+    with pretended_gpu() as device:
+        found = find(cr.Registrar(bank, device=device), [image.to(device)], CAMERA)[0]
+        same(found[0], expected[0])
+        assert torch.equal(found[0].found.box.cpu(), expected[0].found.box)
+        assert found[0].found.presence == expected[0].found.presence
+
+
+def test_another_default_dtype_changes_nothing():
+    image, box, _ = scene(0)
+    expected = cr.Registrar(truck_bank())([image], box[None], CAMERA)[0]
+    torch.set_default_dtype(torch.float64)
+    try:
+        result = cr.Registrar(truck_bank())([image], box[None], CAMERA)[0]
+    finally:
+        torch.set_default_dtype(torch.float32)
+    torch.testing.assert_close(result.transform, expected.transform, atol=1e-6, rtol=0.0)
+    assert result.score == pytest.approx(expected.score, abs=1e-6)
