@@ -1,23 +1,25 @@
-"""Times the path from mesh to pose: build a bank, open it from disk, register one photograph.
+"""Times the path from mesh to pose: build a bank, open it from disk, rank and register one photograph and many.
 
-Prints a table and writes scripts/results/bench_pipeline.json. The mesh is a sphere with dents, made in code, so that
-the number of faces can be chosen. --peers compares with OpenCV's LINEMOD and other people's HOG instead, on
-photographs of scripts/make_benchmark.py, and writes scripts/results/bench_peers.json and the table of
-docs/performance.md.
+    python scripts/bench_pipeline.py                    # scripts/results/bench_pipeline.json, docs/performance.md
+    python scripts/bench_pipeline.py --peers BENCH      # scripts/results/bench_peers.json, docs/performance.md
+
+All with the default pipeline. The mesh is a sphere with dents, made in code, so that the number of faces can be chosen.
+--peers compares with OpenCV's LINEMOD and other people's HOG instead, on photographs of scripts/make_benchmark.py.
 """
 
 import argparse
 import platform
 import tempfile
-import time
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import trimesh
 from _record import REPOSITORY, between, commit, timed, today, write_json
 
-from curvireg_torch import BankSettings, Registrar, ViewBank, ViewMatcher, camera_matrix, uniform_views
+from curvireg_torch import Pipeline, Registrar, ViewBank, ViewMatcher, camera_matrix
 from curvireg_torch.synthetic import random_pose, synthesize_photograph
 
 
@@ -35,25 +37,63 @@ def seconds(call, repeats: int = 3) -> float:
     return timed(call, repeats)[repeats // 2]
 
 
-def ranking_times(bank: ViewBank, image: torch.Tensor, box: torch.Tensor, photographs: int = 32) -> dict[str, float]:
-    """Ranking of described photographs against the bare matrix products that it consists of, turn about; minima."""
-    times = {}
-    for slack, name in ((0.0, "rank_32"), (0.1, "rank_32_slack")):
-        matcher = ViewMatcher(bank, slack=slack)
-        with torch.no_grad():
-            query = matcher.query([image] * photographs, box.expand(photographs, 4))
-            descriptors = query.descriptors.flatten(0, 1).contiguous()
-            cells = torch.rand(len(descriptors), matcher._view_points.shape[1])
-            bare, whole = [], []
-            for _ in range(30):
-                start = time.perf_counter()
-                descriptors @ matcher._views.T, cells @ matcher._view_points.T
-                middle = time.perf_counter()
-                matcher.rank(query)
-                bare.append(middle - start)
-                whole.append(time.perf_counter() - middle)
-        times |= {f"{name}_s": min(whole), f"{name}_over_products": min(whole) / min(bare)}
+def over_products(matcher: ViewMatcher, images: list[torch.Tensor], boxes: torch.Tensor) -> float:
+    """Ranking of described photographs by S_hog S_rep S_box over the bare matrix products in it, turn about; minima."""
+    hog, points = matcher.get_submodule("_comparisons.hog"), matcher.get_submodule("_comparisons.repeatability")
+    with torch.no_grad():
+        query = matcher.query(images, boxes)
+        descriptors = query.descriptors.flatten(0, 1).contiguous()
+        cells = torch.rand(len(descriptors), points.near.shape[1])
+        bare, whole = [], []
+        for _ in range(10):
+            bare += timed(lambda: (descriptors @ hog.views.T, cells @ points.near.T), 1)
+            whole += timed(lambda: matcher.rank(query), 1)
+    return min(whole) / min(bare)
+
+
+def pipeline_times(faces: int, photographs: int) -> dict[str, float]:
+    """Seconds by what takes them."""
+    mesh, K, size = dented_sphere(faces), camera_matrix(900.0, 900.0, 319.5, 239.5), (480, 640)
+    generator = torch.Generator().manual_seed(0)
+    poses = [random_pose(mesh, K, size, generator) for _ in range(photographs)]
+    scenes = [synthesize_photograph(mesh, T, K, size, generator) for T in poses]
+    images, boxes = [image for image, _ in scenes], torch.stack([box for _, box in scenes])
+    pipeline = Pipeline()
+    bank = ViewBank.build(mesh, pipeline=pipeline, progress=False)
+    times = {"build": seconds(lambda: ViewBank.build(mesh, pipeline=pipeline, progress=False))}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "bank.safetensors"
+        bank.save(path)
+        times["megabytes"] = path.stat().st_size / 1e6
+        times["open"] = seconds(lambda: Registrar(ViewBank.load(path)))
+    ranked, single, whole = Registrar(bank, refine=False), Registrar(bank, hypotheses=1), Registrar(bank)
+    one = images[:1], boxes[:1], K
+    for name, registrar in (("rank", ranked), ("register_1_hypothesis", single), ("register", whole)):
+        registrar(*one)  # makes what is made once
+        times[name] = seconds(lambda: registrar(*one))  # noqa: B023
+    times["register_many_each"] = seconds(lambda: whole(images, boxes, K), 1) / photographs
+    three = [term for term in pipeline.terms if term.name != "appearance"]
+    matcher = ViewMatcher(bank, pipeline=replace(pipeline, terms=tuple(three)))
+    times["rank_over_products"] = over_products(matcher, images, boxes)
     return times
+
+
+def pipeline_table(record: dict[str, Any]) -> str:
+    t, n = record["times"], record["photographs"]
+    rows = [
+        (f"bank of {record['views']} views ({t['megabytes']:.0f} MB on disk)", t["build"]),
+        ("open it from disk", t["open"]),
+        ("rank a photograph", t["rank"]),
+        ("register it, one hypothesis", t["register_1_hypothesis"]),
+        ("register it, five hypotheses", t["register"]),
+        (f"{n} photographs in one call, each", t["register_many_each"]),
+    ]
+    lines = ["| what | seconds |", "|---|---|", *(f"| {what} | {value:.2f} |" for what, value in rows)]
+    products = (
+        f"Ranking by the first three terms takes {t['rank_over_products']:.1f} times the bare matrix products in it."
+    )
+    stamp = f"{record['threads']} threads, {record['faces']} faces, {record['date']}, commit {record['commit']}."
+    return "\n".join([*lines, "", products, stamp, ""])
 
 
 def compare_peers(folder: Path, photographs: int) -> None:
@@ -70,56 +110,33 @@ def compare_peers(folder: Path, photographs: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--views", type=int, default=700)
     parser.add_argument("--faces", type=int, default=20_000)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "bench_pipeline.json")
     parser.add_argument(
         "--peers", type=Path, metavar="BENCH", help="compare with others on the benchmark's photographs"
     )
-    parser.add_argument("--photographs", type=int, default=100, help="of --peers (default: 100)")
+    parser.add_argument("--photographs", type=int, help="default: 32; of --peers 100")
     arguments = parser.parse_args()
     if arguments.peers is not None:
-        compare_peers(arguments.peers, arguments.photographs)
+        compare_peers(arguments.peers, arguments.photographs or 100)
         return
-
-    mesh, K, size = dented_sphere(arguments.faces), camera_matrix(900.0, 900.0, 319.5, 239.5), (480, 640)
-    generator = torch.Generator().manual_seed(0)
-    T = random_pose(mesh, K, size, generator)
-    image, box = synthesize_photograph(mesh, T, K, size, generator)
-    rows = []
-    for image_size in (128, 256):
-        settings = BankSettings(image_size=image_size)
-        views = uniform_views(arguments.views)
-        bank = ViewBank.build(mesh, views, settings=settings, progress=False)
-        build = seconds(lambda: ViewBank.build(mesh, views, settings=settings, progress=False))  # noqa: B023
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "bank.safetensors"
-            bank.save(path)
-            megabytes = path.stat().st_size / 1e6
-            opened = seconds(lambda: Registrar(ViewBank.load(path)))  # noqa: B023
-        ranking = ranking_times(bank, image, box)
-        coarse, fine = Registrar(bank, refine=False), Registrar(bank)
-        rows.append(
-            {
-                "image_size": image_size,
-                "build_s": build,
-                "open_s": opened,
-                "rank_s": seconds(lambda: coarse([image], box[None], K)),  # noqa: B023
-                "rank_and_refine_s": seconds(lambda: fine([image], box[None], K)),  # noqa: B023
-                "bank_mb": megabytes,
-                **ranking,
-            }
-        )
-        print("  ".join(f"{k} {v:.3g}" for k, v in rows[-1].items()))
-    result = {
-        "views": arguments.views,
-        "faces": len(mesh.faces),
+    photographs = arguments.photographs or 32
+    record = {
+        "date": today(),
+        "commit": commit(REPOSITORY),
+        "views": len(Pipeline().views.sphere("z")),
+        "faces": len(dented_sphere(arguments.faces).faces),
+        "photographs": photographs,
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
         "machine": platform.machine(),
-        "rows": rows,
+        "times": pipeline_times(arguments.faces, photographs),
     }
-    write_json(arguments.out, result)
+    write_json(REPOSITORY / "scripts" / "results" / "bench_pipeline.json", record)
+    page = REPOSITORY / "docs" / "performance.md"
+    text = page.read_text(encoding="utf-8")
+    marks = "<!-- pipeline:begin -->", "<!-- pipeline:end -->"
+    page.write_text(between(text, *marks, pipeline_table(record)), encoding="utf-8")
+    print(pipeline_table(record))
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import curvireg_torch as cr
+from curvireg_torch.detectors import DETECTORS
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import find
 from curvireg_torch.synthetic import example_mesh
@@ -66,6 +67,24 @@ def test_layers(layer):
         assert out.device == device
         expected = cr.HOG()(expected) if expected.shape[1] == 2 else expected
         assert torch.equal(out.cpu(), expected)
+
+
+@pytest.mark.parametrize("name", DETECTORS)
+def test_detectors(name):
+    image = torch.rand(1, 1, 40, 48, generator=torch.Generator().manual_seed(0))
+    expected = DETECTORS[name](image)
+    with pretended_gpu() as device:
+        found = DETECTORS[name](image.to(device))
+        assert torch.equal(found.points.cpu(), expected.points)
+
+
+def test_numbers_beside_tensors():
+    with pretended_gpu() as device:
+        azimuth = torch.tensor([10.0, 20.0], device=device)
+        assert torch.equal(
+            cr.rotation_from_viewpoint(azimuth, 30.0, 5.0).cpu(), cr.rotation_from_viewpoint(azimuth.cpu(), 30.0, 5.0)
+        )
+        assert cr.rotation_from_viewpoint(0.0, azimuth).device == device
 
 
 def test_a_bank_is_made_there(bank):

@@ -18,7 +18,8 @@ __all__ = ["rotation_error", "rotation_from_viewpoint", "viewpoint_from_rotation
 
 
 def _as_floating(*values: Tensor | float) -> list[Tensor]:
-    tensors = [v if isinstance(v, Tensor) else torch.tensor(float(v), dtype=torch.get_default_dtype()) for v in values]
+    device = next((v.device for v in values if isinstance(v, Tensor)), None)  # numbers go where tensors are
+    tensors = [v if isinstance(v, Tensor) else torch.tensor(float(v), device=device) for v in values]
     tensors = [t if t.is_floating_point() else t.to(torch.get_default_dtype()) for t in tensors]
     dtype = tensors[0].dtype
     for t in tensors[1:]:
