@@ -26,7 +26,7 @@ from .batch import (
     register_list,
 )
 from .data import read_photo
-from .document import fitting_box, result_document
+from .document import corners, correction, fitting_box, result_document
 from .errors import BankError, InvalidInputError
 from .evaluation.loops import code_digest
 from .evaluation.store import to_json
@@ -272,10 +272,6 @@ def _write_picture(path: Path, picture: np.ndarray) -> None:
     write_file(path, cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
-def _corners(box: list[float]) -> str:
-    return " ".join(f"{v:.0f}" for v in box)
-
-
 def _print_result(document: dict[str, Any], out: Path) -> None:
     angles = ", ".join(f"{name} {value:.1f}" for name, value in document["viewpoint"].items())
     seconds = document["seconds"]
@@ -288,11 +284,11 @@ def _print_result(document: dict[str, Any], out: Path) -> None:
         print(f"no reliable match: take the pose as a guess; {checks} the mesh is the object's{stands}")
     if ", " in document.get("inputs", {}).get("mesh", ""):
         print(f"mesh: {document['mesh']}")
-    if document["corrected_box"] is not None:
-        print(f"the box did not fit the pose; one that does: {_corners(document['corrected_box'])}")
+    for line in correction(document):
+        print(line)
     if "found" in document:
         for found in document["found"]["instances"]:
-            print(f"found in box {_corners(found['box'])}: there with probability {found['presence']:.2f}")
+            print(f"found in box {corners(found['box'])}: there with probability {found['presence']:.2f}")
     if document["translation"] is not None:
         print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")
     deviations = document["standard_deviations"]

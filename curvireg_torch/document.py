@@ -12,7 +12,16 @@ import trimesh
 from . import __version__
 from .registration import RELIABLE, Hypothesis, Registrar, Registration
 
-__all__ = ["CONVENTIONS", "SCHEMA", "fitting_box", "found_document", "pose_document", "result_document"]
+__all__ = [
+    "CONVENTIONS",
+    "SCHEMA",
+    "corners",
+    "correction",
+    "fitting_box",
+    "found_document",
+    "pose_document",
+    "result_document",
+]
 
 SCHEMA = 1
 """Version of ``result.schema.json``; raised when a key goes or changes its meaning."""
@@ -86,6 +95,17 @@ def fitting_box(document: Mapping[str, Any]) -> list[float]:
     """The box that the answer of a document was made with."""
     box: list[float] = document["corrected_box"] or document["inputs"]["box"]
     return box
+
+
+def corners(box: Sequence[float]) -> str:
+    """A box in whole px, as ``--box`` takes it."""
+    return " ".join(f"{v:.0f}" for v in box)
+
+
+def correction(document: Mapping[str, Any]) -> list[str]:
+    """A line that says by which box the given one was replaced; none where it was not."""
+    box = document["corrected_box"]
+    return [] if box is None else [f"the box did not fit the pose; one that does: {corners(box)}"]
 
 
 def found_document(results: Sequence[Registration]) -> dict[str, Any]:

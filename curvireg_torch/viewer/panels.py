@@ -9,6 +9,7 @@ import numpy as np
 from nicegui import ui
 
 from .._choices import UNITS
+from ..document import correction
 from ..geometry import rotation_error
 from ..limits import MAX_VIEWER_FACES
 from ..visualization import contour_overlay, side_pictures
@@ -126,6 +127,7 @@ class Panels:
         lines.append(sure if answer.document["reliable"] else f"{sure}: no reliable match; take the pose as a guess")
         if shown.number:
             lines[1] = f"hypothesis {shown.number + 1}, a rival; of the first: {lines[1]}"
+        lines += correction(answer.document)
         if shown.by_hand:
             lines.append(f"by hand: {'; '.join(shown.by_hand)}; the command line gives the answer before that")
         return "\n".join(lines)
