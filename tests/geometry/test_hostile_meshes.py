@@ -93,6 +93,37 @@ def test_gltf_that_claims_or_asks_too_much(tmp_path: Path, changes: dict[str, An
         refused(tmp_path / "a.glb", glb(tree(**changes)), match)
 
 
+BINARY = struct.pack("<4sII", b"glTF", 2, 100)
+
+
+@pytest.mark.parametrize(
+    ("data", "match"),
+    [
+        (b"glTF", "ends too early"),
+        (struct.pack("<4sII", b"glTG", 2, 20) + struct.pack("<I4s", 2, b"JSON") + b"{}", "not a GLB file"),
+        (BINARY + struct.pack("<I4s", 2, b"BIN\0") + b"{}", "not a GLB file"),
+        (struct.pack("<4sII", b"glTF", 1, 20) + struct.pack("<I4s", 2, b"JSON") + b"{}", "version 1 is not read"),
+        (BINARY + struct.pack("<I4s", 3, b"JSON") + b"{}", "ends too early"),
+        (BINARY + struct.pack("<I4s", 2, b"JSON") + b"{}" + struct.pack("<I4s", 1, b"BIN\0"), "ends too early"),
+        (BINARY + struct.pack("<I4s", 2, b"JSON") + b"[]", "JSON is no object"),
+    ],
+)
+def test_glb_files_that_are_none(tmp_path: Path, data: bytes, match: str) -> None:
+    refused(tmp_path / "a.glb", data, match)
+
+
+@pytest.mark.parametrize(
+    ("buffer", "match"),
+    [
+        ({"byteLength": 36}, "a buffer without content"),
+        ({"byteLength": 36, "uri": "data:text/plain,abc"}, "not base64"),
+        ({"byteLength": 36, "uri": "data:;base64,AAAA"}, "a buffer claims 36 bytes, 3 are there"),
+    ],
+)
+def test_gltf_whose_buffers_are_none(tmp_path: Path, buffer: dict[str, Any], match: str) -> None:
+    refused(tmp_path / "a.gltf", json.dumps(tree(buffers=[buffer])).encode(), match)
+
+
 def test_copies_of_a_part_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gltf, "MAX_MESH_FACES", 100)
     refused(tmp_path / "a.gltf", json.dumps(tree(nodes=[{"mesh": 0}] * 200)).encode(), "more than 100 faces")
