@@ -45,7 +45,7 @@ BEGIN, END = "<!-- mutants:begin -->", "<!-- mutants:end -->"
 PACKAGE = "curvireg_torch"
 PRELOADED = ("torch", "numpy", "scipy.spatial", "kornia", "cv2", "trimesh", "sklearn.covariance", "skimage.feature")
 PRELOADED += ("pytest",)
-TOGETHER = {"terms": "matching", "matching": "terms"}  # packages that are tested with another
+TOGETHER = {"terms": "matching", "matching": "terms", "commands": "cli"}  # what is tested with another
 WALL_LIMIT_S = 400.0
 ENOUGH_S = 30.0  # of tests for one mutant
 LOG, SEEN, TIMES = "log.txt", "seen.db", "times.json"
@@ -82,6 +82,8 @@ def tests_of(copy: Path, path: str) -> list[str]:
     home, stem = copy.joinpath("tests", *parts[:-1]), parts[-1].strip("_")
     everywhere = sorted((copy / "tests").rglob("test_*.py"))
     module = rf"{PACKAGE}\.{re.escape('.'.join(parts))}\b"
+    if parts[0] in TOGETHER and len(parts) == 1:
+        module += rf"|{PACKAGE}\.{TOGETHER[parts[0]]}\b"
     if len(parts) > 1:
         homes = {home, copy / "tests" / TOGETHER.get(parts[0], parts[0])}
         near = [p for p in everywhere if homes & set(p.parents)]
