@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch import Registrar, ViewBank, camera_matrix
+from curvireg_torch import Registrar, ViewBank, camera_matrix, commands
 from curvireg_torch.cli import main
 from curvireg_torch.commands import _print_result
 from curvireg_torch.errors import BankError
@@ -221,6 +221,37 @@ def test_demo_runs_as_a_module_and_is_right(tmp_path, monkeypatch):
     assert "error against the truth" in done.stdout
     assert trimesh.load(tmp_path / "demo" / "mesh.ply").is_empty is False
     assert (tmp_path / "demo" / "overlay.png").stat().st_size > 10_000
+
+
+def test_the_demo_shows_what_it_says(tmp_path, monkeypatch, capsys):
+    """Its truth projects into its box, its photograph shows the object there, its error is that of its answer."""
+    asked = {}
+    monkeypatch.setattr(commands, "cached_bank", lambda _, **options: asked.update(options) or truck_bank())
+    monkeypatch.setattr(commands, "chosen_pipeline", lambda _: truck_bank().pipeline)
+    assert main(["demo", "--out", str(tmp_path), "--quiet"]) == 0
+    assert asked["progress"] is False
+    result = json.loads((tmp_path / "result.json").read_text())
+    R, t = (torch.tensor(result["truth"][name], dtype=torch.float64) for name in ("rotation", "translation"))
+    found = torch.tensor(result["rotation"], dtype=torch.float64)
+    assert result["rotation_error_deg"] == pytest.approx(float(rotation_error(found, R)))
+    apart = (torch.tensor(result["translation"], dtype=torch.float64) - t).norm() / t.norm()
+    assert result["translation_error"] == pytest.approx(float(apart))
+    seen = torch.tensor(trimesh.load(tmp_path / "mesh.ply").vertices.copy()) @ R.T + t
+    pixels = 520.0 * seen[:, :2] / seen[:, 2:] + torch.tensor([239.5, 179.5])
+    box = torch.cat([pixels.amin(dim=0), pixels.amax(dim=0)])
+    assert (torch.tensor(result["inputs"]["box"]) - box).abs().max() < 1.5
+    photo = cv2.imread(str(tmp_path / "photo.png"))
+    assert photo.shape == (360, 480, 3)
+    assert photo.max() > 150
+    assert result["inputs"]["seed"] == 0
+    said = capsys.readouterr().out
+    assert f"rotation {result['rotation_error_deg']:.1f} degrees" in said
+
+
+def test_a_camera_that_is_none_is_refused_before_anything_is_read(files, monkeypatch, capsys):
+    monkeypatch.setattr(commands, "read_photo", lambda *_, **__: pytest.fail("it was read"))
+    assert run(files[0], "photo.png", "truck.safetensors", "--camera", "0", "260", "119", "89") == 2
+    assert "focal" in capsys.readouterr().err
 
 
 def test_every_preset_that_shares_the_banks_settings_registers(files):
