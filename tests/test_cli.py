@@ -246,6 +246,7 @@ def test_the_demo_shows_what_it_says(tmp_path, monkeypatch, capsys):
     assert result["inputs"]["seed"] == 0
     said = capsys.readouterr().out
     assert f"rotation {result['rotation_error_deg']:.1f} degrees" in said
+    assert f"translation: {', '.join(f'{v:.4g}' for v in result['translation'])} m\n" in said
 
 
 def test_a_camera_that_is_none_is_refused_before_anything_is_read(files, monkeypatch, capsys):
