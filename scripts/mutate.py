@@ -82,13 +82,12 @@ def tests_of(copy: Path, path: str) -> list[str]:
     home, stem = copy.joinpath("tests", *parts[:-1]), parts[-1].strip("_")
     everywhere = sorted((copy / "tests").rglob("test_*.py"))
     module = rf"{PACKAGE}\.{re.escape('.'.join(parts))}\b"
-    if parts[0] in TOGETHER and len(parts) == 1:
-        module += rf"|{PACKAGE}\.{TOGETHER[parts[0]]}\b"
     if len(parts) > 1:
         homes = {home, copy / "tests" / TOGETHER.get(parts[0], parts[0])}
         near = [p for p in everywhere if homes & set(p.parents)]
         module += rf"|{PACKAGE}\.{re.escape('.'.join(parts[:-1]))} import [^\n]*\b{parts[-1]}\b"
     else:
+        module += rf"|{PACKAGE}\.{TOGETHER.get(stem, stem)}\b"
         near = [p for p in everywhere if p.parent == home and (stem in p.stem or re.search(module, p.read_text()))]
     near = near or [p for p in everywhere if re.search(module, p.read_text())]
     return [p.relative_to(copy).as_posix() for p in near]

@@ -88,8 +88,6 @@ def computed(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         on_device = isinstance(args[0], Pretended)
     if device is not None:
         kwargs = {**kwargs, "device": torch.device("cpu")}
-    if on_device and kwargs.get("pin_memory"):
-        kwargs = {**kwargs, "pin_memory": False}
     owners = {id(x.inner): x for x in there}
     args, kwargs = tree_map(lambda x: x.inner if isinstance(x, Pretended) else x, (args, kwargs))
     out = func(*args, **kwargs)
