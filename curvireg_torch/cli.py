@@ -1,6 +1,7 @@
 """``curvireg``: register a photograph, build a bank, evaluate a dataset, run the demo."""
 
 import argparse
+import os
 import re
 import sys
 import warnings
@@ -28,7 +29,18 @@ _NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code: 0, or 2 for input that cannot be used."""
+    """Entry point; returns the exit code: 0, 2 for input that cannot be used, 141 where a pipe has lost its reader."""
+    try:
+        try:
+            return _main(argv)
+        finally:
+            print(end="", flush=True)  # while it can still be told that nobody reads it
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is printed but not written
+        return 128 + 13  # what a shell calls the end of its own tools by SIGPIPE
+
+
+def _main(argv: Sequence[str] | None) -> int:
     arguments = _parsed(argv)
     with warnings.catch_warnings(), terminable():
         if not arguments.debug:
@@ -42,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"curvireg: error: {error}", file=sys.stderr)
             return 2
         except OSError as error:
-            if arguments.debug:
+            if arguments.debug or isinstance(error, BrokenPipeError):
                 raise
             print(f"curvireg: error: {error}; check that it is there and may be read", file=sys.stderr)
             return 2

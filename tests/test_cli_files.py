@@ -1,10 +1,14 @@
-"""What ``curvireg register`` writes besides the poses: the page of a list, GLB, BOP csv."""
+"""What ``curvireg register`` writes besides the poses: the page of a list, GLB, BOP csv; pipes that nobody reads."""
 
 import base64
 import html
 import json
+import os
 import re
 import shutil
+import signal
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -143,3 +147,15 @@ def test_bop_csv_of_a_list_that_names_images_and_objects(folder):
     torch.testing.assert_close(row["t"].double(), metres * 1000, rtol=1e-6, atol=0)
     K = camera_matrix(*map(float, CAMERA), dtype=torch.float64)
     assert float((K @ metres)[2]) > 0
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_that_left_ends_the_command_quietly(unbuffered):
+    """As in ``curvireg ... | head``: no message, and the exit code of a shell's own tools, whenever it is noticed."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "curvireg_torch", "schema"]
+    said = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, env=said, check=False, timeout=120)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")

@@ -104,8 +104,10 @@ def test_the_schema_refuses_what_is_no_result(folder, capsys, check):
     ):
         with pytest.raises(jsonschema.ValidationError):
             check({**good, **change})
-    with pytest.raises(jsonschema.ValidationError):
-        check({key: value for key, value in good.items() if key != "conventions"})
+    assert "corrected_box" in good
+    for missing in set(good) - {"found", "mesh"}:
+        with pytest.raises(jsonschema.ValidationError, match=f"'{missing}' is a required property"):
+            check({key: value for key, value in good.items() if key != missing})
 
 
 def test_the_demos_document_is_of_the_schema(tmp_path, monkeypatch, check):
