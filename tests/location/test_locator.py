@@ -84,6 +84,22 @@ def test_pictures_without_the_object_score_lower():
     assert min(with_it) > max(without)
 
 
+def test_a_view_that_agrees_with_everything_tells_nothing():
+    """How much a view agrees on the whole, and how unevenly, does not count: it scores against itself elsewhere."""
+    generator = torch.Generator().manual_seed(3)
+    K = len(locator()._templates.views)
+    maps = [0.1 * torch.rand(K, *size, generator=generator) for size in ((15, 20), (21, 28))]
+    fits = [torch.ones(K, dtype=torch.bool)] * 2
+    gain, level = 0.5 + torch.rand(2, K, 1, 1, generator=generator)
+    plain = locator()._peaks(maps, fits, [(1.0, 1.0), (1.4, 1.4)])
+    biased = locator()._peaks([gain * m + level for m in maps], fits, [(1.0, 1.0), (1.4, 1.4)])
+    assert torch.equal(biased.views, plain.views)
+    assert torch.allclose(biased.scores, plain.scores, atol=1e-4)
+    every = torch.cat([m.flatten(1) for m in maps], dim=1)
+    z = (every - every.mean(dim=1, keepdim=True)) / every.std(dim=1, keepdim=True)
+    assert float(plain.scores[0]) == pytest.approx(float(z.max()), rel=1e-4)
+
+
 def test_a_photograph_is_answered_the_same_alone_grey_or_as_bytes():
     images = [placed(0, (10, 20), 0.8)[0], placed(1, (60, 30), 0.8)[0]]
     both, alone = locator()(images), locator()(images[1:])

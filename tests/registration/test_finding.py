@@ -41,6 +41,20 @@ def test_an_object_is_found_and_posed(registrar):
     assert 0.0 <= result.confidence <= place.presence <= 1.0
 
 
+@pytest.mark.parametrize(("seed", "corner", "scale"), [(5, (30, 60), 0.6), (3, (40, 10), 1.1)])
+def test_an_object_is_found_to_a_tenth_of_its_size(seed, corner, scale):
+    """Rendered, put into clutter elsewhere and at another scale, followed to its end: each edge of the box and the pose
+    are those that it was rendered with, seen by the camera of the scene, which went along."""
+    image, box = placed(seed, corner, scale)
+    K, truth = CAMERA.clone(), scene(seed)[2]
+    K[:2, :2] *= scale
+    K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5 + torch.tensor(corner)
+    result = cr.Registrar(bank())([image], camera_matrices=K)[0]
+    assert (result.found.box - box).abs().max() < 0.1 * (box[2:] - box[:2]).max()
+    assert rotation_error(result.rotation, truth[:3, :3]) < 5
+    assert (result.translation - truth[:3, 3]).norm() < 0.05 * truth[:3, 3].norm()
+
+
 def test_with_a_camera_the_pose_has_a_place(registrar):
     image, _, truth = scene(5)
     result = registrar([image], camera_matrices=CAMERA)[0]
