@@ -12,20 +12,16 @@ the difference within 30 degrees with its interval over paired resamples.
 
 import argparse
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from _record import REPOSITORY, SETS, benchmark, between, commit, today
-from kornia.color import rgb_to_grayscale
 from torch import Tensor
 
 from curvireg_torch.evaluation import evaluate
 from curvireg_torch.evaluation.store import PredictionStore
-from curvireg_torch.filters import MultiScaleFocusCurves
-from curvireg_torch.learned import LearnedCurvilinearSaliency
 from curvireg_torch.pipeline import PRESETS, Pipeline
 
 KEPT = REPOSITORY / "scripts" / "results" / "ablation.json"
@@ -34,51 +30,42 @@ BEGIN, END = "<!-- ablation:begin -->", "<!-- ablation:end -->"
 RESAMPLES = 2000
 
 
-class _Both(torch.nn.Module):
-    """Where the learned field is, the photograph's own edges: MFC times the root of the learned length."""
-
-    colour = True
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.learned, self.focus = LearnedCurvilinearSaliency(), MultiScaleFocusCurves()
-
-    def forward(self, image: Tensor) -> Tensor:
-        grey = rgb_to_grayscale(image) if image.shape[1] == 3 else image
-        field: Tensor = self.focus(grey) * self.learned(image).norm(dim=1, keepdim=True).sqrt()
-        return field
+_learned, _classical = PRESETS["learned"], PRESETS["classical"]
 
 
-_classical = replace(PRESETS["classical"], search=False, contours=False)
-_learned = replace(PRESETS["learned"], search=False, contours=False)
+def _ranked(pipeline: Pipeline) -> Pipeline:
+    """Nothing behind the ranking."""
+    return replace(pipeline, search=False, contours=False)
+
+
+def _without(pipeline: Pipeline, name: str) -> Pipeline:
+    return replace(pipeline, terms=tuple(term for term in pipeline.terms if term.name != name))
+
 
 ROWS: dict[str, Pipeline] = {
-    "classical": _classical,
-    "without S_rep": _classical.with_term("repeatability", weight=0.0),
-    "without S_box": _classical.with_term("box", weight=0.0),
-    "without slack": replace(_classical, slack=0.0),
-    "gradient instead of MFC": replace(_classical, field="gradient"),
-    "MCS instead of MFC": replace(_classical, field="saliency"),
-    "paper": replace(PRESETS["paper"], search=False, contours=False),
-    "classical, refined": PRESETS["classical"],
     "learned": _learned,
-    "learned, without S_rep": _learned.with_term("repeatability", weight=0.0),
-    "learned, without S_box": _learned.with_term("box", weight=0.0),
-    "learned, without slack": replace(_learned, slack=0.0),
-    "learned + classical": _learned,
-    "learned, refined": PRESETS["learned"],
+    "without S_look": _without(_learned, "appearance"),
+    "one hypothesis": replace(_learned, hypotheses=1),
+    "without contours": replace(_learned, contours=False),
+    "ranking alone": _ranked(_learned),
+    "ranking, without S_look": _ranked(_without(_learned, "appearance")),
+    "ranking, without S_rep": _ranked(_without(_learned, "repeatability")),
+    "ranking, without S_box": _ranked(_without(_learned, "box")),
+    "ranking, without slack": _ranked(replace(_learned, slack=0.0)),
+    "classical": _classical,
+    "classical ranking": _ranked(_classical),
+    "gradient instead of MFC": _ranked(replace(_classical, field="gradient")),
+    "MCS instead of MFC": _ranked(replace(_classical, field="saliency")),
+    "paper": _ranked(PRESETS["paper"]),
 }
 """Name -> pipeline; differences are taken against the first."""
-
-FIELD_OF: dict[str, Callable[[], torch.nn.Module]] = {"learned + classical": _Both}
-"""Rows with a field of their own."""
 
 
 def measure(row: str, name: str, data: Path, out: Path) -> dict[str, Any]:
     """Errors of all objects, in the order of the dataset."""
     folder = out / row.replace(" ", "_").replace(",", "") / name
     objects = benchmark(data, name)
-    summary = evaluate(objects, folder, preset=ROWS[row], field=FIELD_OF[row]() if row in FIELD_OF else None)
+    summary = evaluate(objects, folder, preset=ROWS[row])
     assert summary is not None
     store = PredictionStore(folder / "predictions")
     rows = [(item, store.read(item.key)) for item in objects.items]

@@ -1,6 +1,7 @@
 """Times the path from mesh to pose: build a bank, open it from disk, rank and register one photograph and many.
 
     python scripts/bench_pipeline.py                    # scripts/results/bench_pipeline.json, docs/performance.md
+    python scripts/bench_pipeline.py --device cuda      # scripts/results/bench_pipeline_cuda.json, with the GPU's name
     python scripts/bench_pipeline.py --peers BENCH      # scripts/results/bench_peers.json, docs/performance.md
 
 All with the default pipeline. The mesh is a sphere with dents, made in code, so that the number of faces can be chosen.
@@ -43,7 +44,7 @@ def over_products(matcher: ViewMatcher, images: list[torch.Tensor], boxes: torch
     with torch.no_grad():
         query = matcher.query(images, boxes)
         descriptors = query.descriptors.flatten(0, 1).contiguous()
-        cells = torch.rand(len(descriptors), points.near.shape[1])
+        cells = torch.rand(len(descriptors), points.near.shape[1], device=descriptors.device)
         bare, whole = [], []
         for _ in range(10):
             bare += timed(lambda: (descriptors @ hog.views.T, cells @ points.near.T), 1)
@@ -51,29 +52,36 @@ def over_products(matcher: ViewMatcher, images: list[torch.Tensor], boxes: torch
     return min(whole) / min(bare)
 
 
-def pipeline_times(mesh: trimesh.Trimesh, photographs: int) -> dict[str, float]:
-    """Seconds by what takes them."""
+def pipeline_times(mesh: trimesh.Trimesh, pipeline: Pipeline, photographs: int, device: str) -> dict[str, float]:
+    """Seconds by what takes them; on another device the torch renderer draws the views there."""
+    renderer = "auto" if device == "cpu" else "torch"
+
+    def build() -> ViewBank:
+        return ViewBank.build(mesh, pipeline=pipeline, renderer=renderer, device=device, progress=False)
+
+    def registrar_of(bank: ViewBank, **options: Any) -> Registrar:
+        return Registrar(bank, renderer=renderer, device=device, **options)
+
     K, size = camera_matrix(900.0, 900.0, 319.5, 239.5), (480, 640)
     generator = torch.Generator().manual_seed(0)
     poses = [random_pose(mesh, K, size, generator) for _ in range(photographs)]
     scenes = [synthesize_photograph(mesh, T, K, size, generator) for T in poses]
     images, boxes = [image for image, _ in scenes], torch.stack([box for _, box in scenes])
-    pipeline = Pipeline()
-    bank = ViewBank.build(mesh, pipeline=pipeline, progress=False)
-    times = {"build": seconds(lambda: ViewBank.build(mesh, pipeline=pipeline, progress=False))}
+    bank = build()
+    times = {"build": seconds(build)}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bank.safetensors"
         bank.save(path)
         times["megabytes"] = path.stat().st_size / 1e6
-        times["open"] = seconds(lambda: Registrar(ViewBank.load(path)))
-    ranked, single, whole = Registrar(bank, refine=False), Registrar(bank, hypotheses=1), Registrar(bank)
+        times["open"] = seconds(lambda: registrar_of(ViewBank.load(path)))
+    ranked, single, whole = registrar_of(bank, refine=False), registrar_of(bank, hypotheses=1), registrar_of(bank)
     one = images[:1], boxes[:1], K
     for name, registrar in (("rank", ranked), ("register_1_hypothesis", single), ("register", whole)):
         registrar(*one)  # makes what is made once
         times[name] = seconds(lambda: registrar(*one))  # noqa: B023
     times["register_many_each"] = seconds(lambda: whole(images, boxes, K), 1) / photographs
     three = [term for term in pipeline.terms if term.name != "appearance"]
-    matcher = ViewMatcher(bank, pipeline=replace(pipeline, terms=tuple(three)))
+    matcher = ViewMatcher(bank, pipeline=replace(pipeline, terms=tuple(three)), renderer=renderer)
     times["rank_over_products"] = over_products(matcher, images, boxes)
     return times
 
@@ -111,6 +119,7 @@ def compare_peers(folder: Path, photographs: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faces", type=int, default=20_000)
+    parser.add_argument("--device", default="cpu", help="of modules, bank, search and the views' renderer")
     parser.add_argument(
         "--peers", type=Path, metavar="BENCH", help="compare with others on the benchmark's photographs"
     )
@@ -129,8 +138,14 @@ def main() -> None:
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
         "machine": platform.machine(),
-        "times": pipeline_times(mesh, photographs),
+        "times": pipeline_times(mesh, Pipeline(), photographs, arguments.device),
     }
+    if arguments.device != "cpu":
+        record["machine"] = torch.cuda.get_device_name(arguments.device)
+        kind = torch.device(arguments.device).type
+        write_json(REPOSITORY / "scripts" / "results" / f"bench_pipeline_{kind}.json", record)
+        print(pipeline_table(record))
+        return
     write_json(REPOSITORY / "scripts" / "results" / "bench_pipeline.json", record)
     page = REPOSITORY / "docs" / "performance.md"
     text = page.read_text(encoding="utf-8")

@@ -3,11 +3,15 @@
 import importlib
 import json
 import sys
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from curvireg_torch import ViewMatcher
+from curvireg_torch import Pipeline, Registrar, ViewMatcher
+from curvireg_torch.pipeline import BankSettings, ViewPolicy
+from tests._support.pretended import PRETENDING, pretended_gpu
 from tests._support.scenes import scene, truck_bank
 
 ROOT = Path(__file__).parents[1]
@@ -24,6 +28,21 @@ def script(monkeypatch):
 def test_ranking_is_compared_with_the_products_in_it(script):
     image, box, _ = scene(0)
     assert script.over_products(ViewMatcher(truck_bank()), [image], box[None]) > 0.0
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=[*PRETENDING, pytest.mark.slow])])
+def test_everything_is_timed_on_a_device(script, device, monkeypatch):
+    few = replace(Pipeline(), search=False, contours=False)  # which tests/test_device.py has
+    few = replace(few, views=ViewPolicy(directions=4, turn=180.0), bank=BankSettings(image_size=64))
+    on = nullcontext() if device == "cpu" else pretended_gpu()
+    used = []
+    monkeypatch.setattr(script, "seconds", lambda call, *_: script.timed(call, 1)[0])
+    monkeypatch.setattr(script, "Registrar", lambda bank, **o: used.append(bank.device.type) or Registrar(bank, **o))
+    with on:
+        times = script.pipeline_times(script.dented_sphere(200), few, 1, device)
+    assert set(times) == set(json.loads((ROOT / "scripts" / "results" / "bench_pipeline.json").read_text())["times"])
+    assert all(value > 0.0 for value in times.values())
+    assert used[-3:] == [device] * 3  # the others are read from disk first
 
 
 def test_the_page_has_the_table_of_the_record(script):

@@ -15,13 +15,10 @@ from curvireg_torch.detectors import DETECTORS
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import find
 from curvireg_torch.synthetic import example_mesh
-from tests._support.pretended import Pretended, pretended_gpu
+from tests._support.pretended import PRETENDING, Pretended, pretended_gpu
 from tests._support.scenes import CAMERA, scene, truck_bank
 
-pytestmark = [
-    pytest.mark.skipif(torch.cuda.is_available(), reason="there is a real device"),
-    pytest.mark.skipif(not hasattr(torch._C, "_ensureCUDADeviceGuardSet"), reason="this torch can pretend no device"),
-]
+pytestmark = PRETENDING
 
 VIEWS = cr.sample_views(azimuth_step=45, elevations=[10, 40])
 

@@ -11,7 +11,13 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
-__all__ = ["pretended_gpu"]
+__all__ = ["PRETENDING", "Pretended", "pretended_gpu"]
+
+PRETENDING = [
+    pytest.mark.skipif(torch.cuda.is_available(), reason="there is a real device"),
+    pytest.mark.skipif(not hasattr(torch._C, "_ensureCUDADeviceGuardSet"), reason="this torch can pretend no device"),
+]
+"""Marks of tests that need the pretended device."""
 
 DEVICE = torch.device("cuda", 0)
 CROSSING = {"copy_", "_to_copy"}
