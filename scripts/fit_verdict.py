@@ -78,18 +78,35 @@ def auc(p: np.ndarray, q: np.ndarray) -> float:
     return float((p[:, None] > q[None]).mean() + 0.5 * (p[:, None] == q[None]).mean())
 
 
+def share(values: list[bool], rows: list[dict[str, Any]]) -> list[float]:
+    """Mean and its 95 % interval by bootstrap over the rows' meshes."""
+    index = {mesh: i for i, mesh in enumerate(sorted({r["mesh"] for r in rows}))}
+    of = [index[r["mesh"]] for r in rows]
+    right, all_of = np.bincount(of, weights=values), np.bincount(of)
+    picks = np.random.default_rng(0).integers(len(index), size=(2000, len(index)))
+    low, high = np.quantile(right[picks].sum(axis=1) / all_of[picks].sum(axis=1), [0.025, 0.975])
+    return [float(np.mean(values)), float(low), float(high)]
+
+
 def page(result: dict[str, Any]) -> str:
     """Tables of docs/accuracy.md."""
     held = result["confidence"]["held_out"]
     known = {t: v for t, v in held["precision_at"].items() if v[0] is not None}
     head = ["photographs", "N", "best view", "after search, contours and verdict", "among five hypotheses"]
     keys = ("best_view", "winner", "among_hypotheses")
-    shares = [[name, str(s["n"]), *(f"{s[k]:.2f}" for k in keys)] for name, s in result["shares"].items()]
+    shares = [
+        [name, str(s["n"]), *("{:.2f} ({:.2f} to {:.2f})".format(*s[k]) for k in keys)]
+        for name, s in result["shares"].items()
+    ]
+    mesh = ""
+    if "auc_right_mesh" in result["confidence"]:
+        auc_mesh, n = result["confidence"]["auc_right_mesh"], result["confidence"]["n_wrong"]
+        mesh = f" Of right meshes against wrong ones ({n} photographs, another one's mesh): {auc_mesh:.2f}."
     return "\n".join(
         [
             *rows_of_table([head, *shares]),
             "",
-            f"Confidence, meshes left out in turn: AUC of right answers {held['auc_right_answer']:.2f}.",
+            f"Confidence, meshes left out in turn: AUC of right answers {held['auc_right_answer']:.2f}.{mesh}",
             "",
             *rows_of_table(
                 [
@@ -139,9 +156,9 @@ def main() -> None:
         "shares": {
             f"{form} {pose}": {
                 "n": len(some),
-                "best_view": float(np.mean([r["view_errors"][0] < RIGHT for r in some])),
-                "winner": float(chosen(some).mean()),
-                "among_hypotheses": float(np.mean([right(r).any() for r in some])),
+                "best_view": share([r["view_errors"][0] < RIGHT for r in some], some),
+                "winner": share(chosen(some).tolist(), some),
+                "among_hypotheses": share([bool(right(r).any()) for r in some], some),
             }
             for form in ("exact", "sibling")
             for pose in ("upright", "free")

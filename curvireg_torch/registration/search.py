@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ..errors import InvalidInputError
 from ..geometry import rotation_error, rotation_from_axis_angle
 from ..geometry.translation import place_view
 from ..matching import Ranking, ViewBank, ViewDescriber
@@ -51,8 +52,8 @@ def search(
     descriptors: Tensor,
     starts: Hypotheses,
     *,
-    bank: ViewBank,
-    ranking: Ranking,
+    bank: ViewBank | None = None,
+    ranking: Ranking | None = None,
     boxes: Tensor | None = None,
     camera_matrices: Tensor | None = None,
     brief: bool = False,
@@ -70,15 +71,23 @@ def search(
         describers: of the bank's models.
         descriptors: (B, D) of the photographs' fields, as the describers make them.
         starts: hypotheses of those photographs.
-        bank, ranking: where they come from.
+        bank, ranking: where they come from; not needed for a brief search.
         boxes, camera_matrices: (B, 4) px and (B, 3, 3) of the photographs; both or none.
         brief: for contours to go on from: ``BRIEF`` rounds at most, from the hypotheses' own views, no coherent ones.
 
     Returns:
         The same hypotheses with better rotation and distance, and ``score``: the normalised correlation in [0, 1].
+
+    Raises:
+        InvalidInputError: neither brief nor with bank and ranking.
     """
     state = replace(starts, score=torch.full_like(starts.score, -1.0))
-    candidates = starts.rotation[:, None] if brief else _all_coherent(starts, bank, ranking)
+    if brief:
+        candidates = starts.rotation[:, None]
+    elif bank is None or ranking is None:
+        raise InvalidInputError("search: needs bank and ranking, whose coherent views it compares first, or brief=True")
+    else:
+        candidates = _all_coherent(starts, bank, ranking)
     step = torch.full((len(starts),), FIRST_STEP, dtype=torch.float64)
     active = torch.arange(len(starts))
     for rounds in range(1 + (BRIEF if brief else ROUNDS)):

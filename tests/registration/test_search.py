@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from curvireg_torch import Registrar, camera_matrix, project_points, rotation_error
+from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.registration import coherent_views
 from curvireg_torch.registration import registrar as registrar_module
@@ -117,3 +118,9 @@ def test_the_registrar_searches_with_its_box_and_camera(monkeypatch):
     assert result.distance == pytest.approx(float(centre.norm()), rel=0.05)
     blind = registrar([image], box[None])[0].distance
     assert blind != pytest.approx(float(centre.norm()), rel=0.1)
+
+
+def test_a_search_that_is_not_brief_needs_the_ranking():
+    start = replace(around(turn(0, 0, 0), turn(1, 0, 0)), view=torch.zeros(1, dtype=torch.long))
+    with pytest.raises(InvalidInputError, match="needs bank and ranking"):
+        search([Turns()], torch.eye(3, dtype=torch.float64).view(1, 9), start, bank=truck_bank())
