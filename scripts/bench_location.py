@@ -1,7 +1,7 @@
 """How well and how fast objects are found without a box, beside OpenCV's LINEMOD, and what ``presence`` is worth.
 
-    python scripts/bench_location.py BENCH --rows rows.jsonl [--pose upright] [--form exact] [--photographs 40]
-    python scripts/bench_location.py --rows rows.jsonl --table          # fits presence, writes the record and a table
+    python scripts/bench_location.py BENCH --rows rows.jsonl [--preset learned] [--pose upright] [--form exact]
+    python scripts/bench_location.py --rows rows.jsonl --table          # fits presence, writes record, table, picture
 
 BENCH is the folder of scripts/make_benchmark.py. Each photograph becomes a quarter of a mosaic of 640 x 480 px, three
 others, of other kinds of objects, the rest; a second mosaic has none of it. Rows say where the proposals lie (overlap
@@ -13,16 +13,18 @@ import argparse
 import json
 import random
 import time
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
 from _record import REPOSITORY, between, commit, today, write_json
+from matplotlib.figure import Figure
 from sklearn.linear_model import LogisticRegression
-from sklearn.metrics import roc_auc_score
+from sklearn.metrics import roc_auc_score, roc_curve
 from sklearn.model_selection import GroupKFold, cross_val_predict
 from torch import Tensor
 from tqdm import tqdm
@@ -32,17 +34,27 @@ from curvireg_torch.data import read_image
 from curvireg_torch.geometry import box_iou
 from curvireg_torch.location import representative_views
 from curvireg_torch.matching import cached_bank
-from curvireg_torch.registration.confidence import presence_evidence
+from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
+from curvireg_torch.registration.confidence import presence
 from curvireg_torch.registration.finding import Places
 from curvireg_torch.registration.inputs import Item
 
 Row = dict[str, Any]
+Curves = dict[str, tuple[list[bool], list[float]]]
+"""For each question: whether it is so, and how sure presence is."""
 
 SIZE = (480, 640)
 RECORD = REPOSITORY / "scripts" / "results" / "location.json"
 PAGE = REPOSITORY / "docs" / "guides" / "without-a-box.md"
 MARKERS = "<!-- location:begin -->", "<!-- location:end -->"
-UNITS = np.array([1.0, 0.1, 0.1])  # of the evidence, so that weights are of one size
+PICTURE = REPOSITORY / "docs" / "images" / "presence.png"
+UNITS = np.array([1.0, 0.1])  # of the evidence, so that weights are of one size
+FORMS = ("exact", "sibling")
+FITTED = ("learned", "classical")
+"""Presets by whose rows presence is fitted: where the locator looks at pictures, and where it compares fields."""
+
+QUESTIONS = {"photographs": "photographs with the object", "places": "places that are right"}
+"""What presence is to tell from photographs without the object, and from other places."""
 
 
 def mosaic(half: Path, items: list[Row], shown: Row | None, seed: int) -> tuple[Tensor, Tensor | None]:
@@ -101,8 +113,11 @@ def linemod_boxes(registrar: cr.Registrar, image: Tensor, count: int) -> tuple[T
     return found[kept], time.perf_counter() - start
 
 
-def rows_of(folder: Path, item: Row, items: list[Row], half: Path) -> Row:
-    pipeline = cr.Pipeline().posed("upright" if item["pose"] == "upright" else "any").with_term("appearance", coarse=0)
+def rows_of(folder: Path, item: Row, items: list[Row], half: Path, preset: str) -> Row:
+    pipeline = preset_named(preset).posed("upright" if item["pose"] == "upright" else "any")
+    looks = any(term.name == "appearance" for term in pipeline.terms)
+    if looks:
+        pipeline = pipeline.with_term("appearance", coarse=0)
     bank = cached_bank(cr.load_mesh(folder / item["mesh"]), pipeline=pipeline, progress=False)
     registrar = cr.Registrar(bank, pipeline=pipeline)
     others = [
@@ -112,7 +127,7 @@ def rows_of(folder: Path, item: Row, items: list[Row], half: Path) -> Row:
         and o["mesh"] != item["mesh"]
         and (item["kind"] is None or o["kind"] != item["kind"])
     ]
-    row: Row = {name: item[name] for name in ("id", "pose", "form", "mesh")}
+    row: Row = {"preset": preset, **{name: item[name] for name in ("id", "pose", "form", "mesh")}}
     registrar.locator  # noqa: B018 (its views are made once)
     for name, shown in (("present", item), ("absent", None)):
         image, box = mosaic(half, others, shown, item["id"])
@@ -123,9 +138,8 @@ def rows_of(folder: Path, item: Row, items: list[Row], half: Path) -> Row:
         with torch.no_grad():
             places = Places.judged(registrar, Item(image, box, None), located.boxes[:count], located.scores[:count])
         overlaps = [0.0] * len(located.boxes) if box is None else box_iou(located.boxes, box[None])[:, 0].tolist()
-        evidence = [presence_evidence(float(s), places.ranking[k : k + 1]) for k, s in enumerate(places.scores)]
-        row[name] = {"overlaps": overlaps, "evidence": evidence, "seconds": seconds}
-        if hasattr(cv2, "linemod") and box is not None:
+        row[name] = {"overlaps": overlaps, "evidence": places.evidence, "seconds": seconds}
+        if hasattr(cv2, "linemod") and looks and box is not None:
             boxes, spent = linemod_boxes(registrar, image, len(located.boxes))
             row["linemod"] = {"overlaps": box_iou(boxes, box[None])[:, 0].tolist(), "seconds": spent}
     return row
@@ -135,70 +149,127 @@ def recall(rows: list[Row], name: str, count: int) -> float:
     return float(np.mean([max(row[name]["overlaps"][:count], default=0.0) >= 0.5 for row in rows]))
 
 
-def table(rows: list[Row]) -> tuple[Row, str]:
-    """The record and the docs' table."""
-    X, y, mesh, group = [], [], [], []
-    for n, row in enumerate(rows):
-        for name in ("present", "absent"):
-            for k, evidence in enumerate(row[name]["evidence"]):
-                X.append(evidence / UNITS)
-                y.append(row[name]["overlaps"][k] >= 0.5)
-                mesh.append(row["mesh"])
-                group.append((n, name))
-    values, right = np.array(X), np.array(y)
-    model = LogisticRegression(C=10.0, max_iter=1000)
-    sure = cross_val_predict(model, values, right, groups=mesh, cv=GroupKFold(5), method="predict_proba")[:, 1]
-    fitted = model.fit(values, right)
-    best: dict[tuple[int, str], tuple[float, bool]] = {}
-    for key, p, good in zip(group, sure, right, strict=True):
-        best[key] = max(best.get(key, (-1.0, False)), (float(p), bool(good)))
-    # Photographs with the object, where the surest place is right, against those without it.
-    told = [(p, name == "present") for (_, name), (p, good) in best.items() if name == "absent" or good]
-    record: Row = {
-        "commit": commit(REPOSITORY),
-        "date": today(),
-        "presence": {
-            "places": len(right),
-            "right": int(right.sum()),
-            "weights": (fitted.coef_[0] / UNITS).round(3).tolist(),
-            "bias": round(float(fitted.intercept_[0]), 3),
-            "auc_places": float(roc_auc_score(right, sure)),
-            "auc_photographs": float(roc_auc_score([there for _, there in told], [p for p, _ in told])),
-            "photographs": len(told),
-        },
-        "sets": [],
-    }
-    lines = ["| set | N | recall@1 | @5 | @20 | surest of 5 is right | LINEMOD @1 | @5 | @20 |", "|---" * 9 + "|"]
-    for pose in ("upright", "free"):
-        for form in ("exact", "sibling"):
-            some = [(n, row) for n, row in enumerate(rows) if (row["pose"], row["form"]) == (pose, form)]
-            if not some:
-                continue
-            mine = [row for _, row in some]
-            peers = [row for row in mine if "linemod" in row]
-            one: Row = {
-                "set": f"{form} {pose}",
-                "n": len(mine),
-                **{f"recall_{k}": recall(mine, "present", k) for k in (1, 5, 20)},
-                "surest": float(np.mean([best.get((n, "present"), (0.0, False))[1] for n, _ in some])),
-                "seconds": float(np.median([row["present"]["seconds"] for row in mine])),
-                "linemod": {f"recall_{k}": recall(peers, "linemod", k) for k in (1, 5, 20)} if peers else None,
-                "linemod_n": len(peers),
-                "linemod_seconds": float(np.median([row["linemod"]["seconds"] for row in peers])) if peers else None,
-            }
-            record["sets"].append(one)
-            theirs = [f"{one['linemod'][f'recall_{k}']:.2f}" for k in (1, 5, 20)] if peers else ["", "", ""]
-            ours = [f"{one[f'recall_{k}']:.2f}" for k in (1, 5, 20)]
-            lines.append("| " + " | ".join([one["set"], str(one["n"]), *ours, f"{one['surest']:.2f}", *theirs]) + " |")
-    p = record["presence"]
-    lines += [
-        "",
-        f"Presence tells places that are right from others with an AUC of {p['auc_places']:.2f} ({p['right']} of "
-        f"{p['places']}), and photographs where it is right from those without the object with "
-        f"{p['auc_photographs']:.2f} (N = {p['photographs']}), meshes left out in turn. "
-        f"{record['date']}, commit {record['commit']}.",
+class Place(NamedTuple):
+    """One of the places of a photograph that were ranked, and how sure presence is of it."""
+
+    photograph: tuple[int, str]
+    right: bool
+    sure: float
+
+
+def judged(rows: list[Row], *, fit: bool) -> tuple[Row, list[Place]]:
+    """Presence of each place: fitted, meshes left out in turn, and what was fitted; or as the library says it."""
+    every = [
+        ((n, name), evidence, overlap >= 0.5, row["mesh"])
+        for n, row in enumerate(rows)
+        for name in ("present", "absent")
+        for evidence, overlap in zip(row[name]["evidence"], row[name]["overlaps"], strict=False)  # more are proposed
     ]
-    return record, "\n".join(lines) + "\n"
+    where, evidence, right, meshes = (list(column) for column in zip(*every, strict=True))
+    told: Row = {}
+    if fit:
+        values, units = np.array(evidence), UNITS[-len(evidence[0]) :]
+        model = LogisticRegression(C=10.0, max_iter=1000)
+        sure = cross_val_predict(model, values / units, right, groups=meshes, cv=GroupKFold(5), method="predict_proba")[
+            :, 1
+        ].tolist()
+        model.fit(values / units, right)
+        told = {"weights": (model.coef_[0] / units).round(3).tolist(), "bias": round(float(model.intercept_[0]), 3)}
+    else:
+        sure = [presence(one) for one in evidence]
+    return told, [Place(*one) for one in zip(where, right, sure, strict=True)]
+
+
+def surest(places: list[Place]) -> list[Place]:
+    """The one of each photograph."""
+    best: dict[tuple[int, str], Place] = {}
+    for place in places:
+        best[place.photograph] = max(best.get(place.photograph, place), place, key=lambda p: p.sure)
+    return list(best.values())
+
+
+def curves(places: list[Place]) -> Curves:
+    best = surest(places)
+    return {
+        "photographs": ([p.photograph[1] == "present" for p in best], [p.sure for p in best]),
+        "places": ([p.right for p in places], [p.sure for p in places]),
+    }
+
+
+def record_of(rows: list[Row]) -> tuple[Row, dict[str, Curves]]:
+    """The record, and the curves of the picture."""
+    record: Row = {"commit": commit(REPOSITORY), "date": today(), "presence": {}, "sets": []}
+    drawn = {}
+    for preset in PRESETS:
+        some = [row for row in rows if row["preset"] == preset]
+        if not some:
+            continue
+        told, places = judged(some, fit=preset in FITTED)
+        if preset in FITTED:
+            record["presence"][preset] = {**told, "forms": {}}
+            for form in FORMS:
+                if mine := [p for p in places if some[p.photograph[0]]["form"] == form]:
+                    drawn[f"{preset}, {form}"] = curves(mine)
+                    record["presence"][preset]["forms"][form] = {
+                        name: {"n": len(truth), "true": sum(truth), "auc": float(roc_auc_score(truth, sure))}
+                        for name, (truth, sure) in curves(mine).items()
+                    }
+        right = {p.photograph: p.right for p in surest(places)}
+        for pose, form in product(("upright", "free"), FORMS):
+            numbers = [n for n, row in enumerate(some) if (row["pose"], row["form"]) == (pose, form)]
+            mine = [some[n] for n in numbers]
+            peers = [row for row in mine if "linemod" in row]
+            if mine:
+                one: Row = {
+                    "set": f"{form} {pose}",
+                    "preset": preset,
+                    "n": len(mine),
+                    **{f"recall_{k}": recall(mine, "present", k) for k in (1, 5, 20)},
+                    "surest": float(np.mean([right[n, "present"] for n in numbers])),
+                    "linemod_n": len(peers),
+                    "linemod": {f"recall_{k}": recall(peers, "linemod", k) for k in (1, 5, 20)} if peers else None,
+                }
+                record["sets"].append(one)
+    return record, drawn
+
+
+def table(record: Row) -> str:
+    """The docs' table."""
+    lines = [
+        "| set | preset | N | recall@1 | @5 | @20 | surest of 5 is right | LINEMOD, N | @1 | @5 | @20 |",
+        "|---" * 11 + "|",
+    ]
+    for one in record["sets"]:
+        theirs = [f"{one['linemod'][f'recall_{k}']:.2f}" for k in (1, 5, 20)] if one["linemod"] else [""] * 3
+        ours = [*(f"{one[f'recall_{k}']:.2f}" for k in (1, 5, 20)), f"{one['surest']:.2f}"]
+        cells = [one["set"], f"`{one['preset']}`", str(one["n"]), *ours, str(one["linemod_n"] or ""), *theirs]
+        lines.append("| " + " | ".join(cells) + " |")
+    lines += ["", "| presence tells | preset | form | N | of them so | AUC |", "|---" * 6 + "|"]
+    for preset, told in record["presence"].items():
+        for form, answers in told["forms"].items():
+            lines += [
+                f"| {QUESTIONS[name]} | `{preset}` | {form} | {one['n']} | {one['true']} | {one['auc']:.2f} |"
+                for name, one in answers.items()
+            ]
+    return "\n".join([*lines, "", f"{record['date']}, commit {record['commit']}.", ""])
+
+
+def draw(drawn: dict[str, Curves]) -> Figure:
+    """Receiver operating characteristics, a panel for each question."""
+    figure = Figure(figsize=(9.0, 4.8), layout="constrained")
+    for name, axes in zip(QUESTIONS, figure.subplots(1, 2), strict=True):
+        for who, found in drawn.items():
+            truth, sure = found[name]
+            false, true, _ = roc_curve(truth, sure)
+            count = f"{sum(truth)} of {len(truth)}"
+            axes.plot(false, true, label=f"{who}: AUC {roc_auc_score(truth, sure):.2f} ({count})")
+        axes.plot([0, 1], [0, 1], color="0.8", linewidth=0.8, zorder=0)
+        axes.set(
+            title=QUESTIONS[name], xlim=(0, 1), ylim=(0, 1.01), xlabel="share of the others called so", aspect="equal"
+        )
+        axes.legend(loc="lower right", fontsize="small")
+    figure.axes[0].set_ylabel("share of those that are so, called so")
+    return figure
 
 
 def main() -> None:
@@ -206,16 +277,20 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?", metavar="BENCH")
     parser.add_argument("--half", default="held-out")
     parser.add_argument("--pose", choices=("upright", "free"), default="upright")
-    parser.add_argument("--form", choices=("exact", "sibling"), default="exact")
+    parser.add_argument("--form", choices=FORMS, default="exact")
+    parser.add_argument("--preset", choices=sorted(PRESETS), default=DEFAULT)
     parser.add_argument("--photographs", type=int, default=40)
     parser.add_argument("--rows", type=Path, required=True)
-    parser.add_argument("--table", action="store_true", help="fit presence, and write the record and the docs' table")
+    parser.add_argument(
+        "--table", action="store_true", help="fit presence; write the record and the docs' table and picture"
+    )
     arguments = parser.parse_args()
     rows = [json.loads(line) for line in arguments.rows.read_text().splitlines()] if arguments.rows.exists() else []
     if arguments.table:
-        record, text = table(rows)
+        record, drawn = record_of(rows)
         write_json(RECORD, record)
-        PAGE.write_text(between(PAGE.read_text(encoding="utf-8"), *MARKERS, text), encoding="utf-8")
+        PAGE.write_text(between(PAGE.read_text(encoding="utf-8"), *MARKERS, table(record)), encoding="utf-8")
+        draw(drawn).savefig(PICTURE, dpi=90)
         print(json.dumps(record["presence"], indent=2))
         return
     torch.set_num_threads(1)
@@ -223,11 +298,11 @@ def main() -> None:
     items = [json.loads(line) for line in (half / "items.jsonl").read_text().splitlines()]
     wanted = [i for i in items if (i["pose"], i["form"]) == (arguments.pose, arguments.form) and i["visible"] > 0.7]
     random.Random(7).shuffle(wanted)
-    done = {row["id"] for row in rows}
+    done = {row["id"] for row in rows if row["preset"] == arguments.preset}
     with arguments.rows.open("a") as file:
         for item in tqdm(wanted[: arguments.photographs]):
             if item["id"] not in done:
-                file.write(json.dumps(rows_of(arguments.folder, item, items, half)) + "\n")
+                file.write(json.dumps(rows_of(arguments.folder, item, items, half, arguments.preset)) + "\n")
                 file.flush()
 
 

@@ -22,9 +22,11 @@ class Cells(nn.Module, ABC):
 
     Attributes:
         strides: px of a cell.
+        pictures: whether a network looked at them; how alike fields are hardly tells an object from what is beside it.
     """
 
     strides: tuple[int, ...]
+    pictures: bool
 
     def comparable(self, cells: Tensor, common: Tensor) -> Tensor:
         """(B, C, h, w) of the same, so that inner products tell how alike cells are.
@@ -48,6 +50,7 @@ class LookCells(Cells):
     """Features of the appearance term's network. Views are shaded grey, and in colours where the mesh has some."""
 
     strides = STRIDES
+    pictures = True
 
     def __init__(self, backbone: Backbone) -> None:
         super().__init__()
@@ -63,9 +66,10 @@ class LookCells(Cells):
 
 
 class FieldCells(Cells):
-    """Orientations of the photograph's field and of depth fields, for pipelines in which nothing looks at pictures."""
+    """Orientations of the photograph's field and of depth fields, for pipelines in which nothing was learnt."""
 
     strides = (8,)
+    pictures = False
 
     def __init__(self, field: nn.Module) -> None:
         super().__init__()
@@ -87,7 +91,9 @@ class FieldCells(Cells):
 
 
 def cells_for(matcher: ViewMatcher) -> Cells:
-    """What the matcher's pipeline looks at: pictures where a term does, else its fields."""
-    looks = any(term.name == "appearance" for term in matcher.pipeline.terms)
-    networks = (module for module in matcher.modules() if isinstance(module, Backbone))
-    return (LookCells(next(networks)) if looks else FieldCells(matcher.field)).to(matcher.device)
+    """Pictures, as the appearance term's network sees them; fields for pipelines in which nothing was learnt."""
+    pipeline = matcher.pipeline
+    if pipeline.field == "learned" or any(term.name == "appearance" for term in pipeline.terms):
+        networks = (module for module in matcher.modules() if isinstance(module, Backbone))
+        return LookCells(next(networks, None) or Backbone()).to(matcher.device)
+    return FieldCells(matcher.field).to(matcher.device)

@@ -41,12 +41,12 @@ _POSE_WEIGHTS = (1.593, 0.584, 1.706)
 _POSE_BIAS = -1.615
 """Logistic regression on photographs of textured meshes, by scripts/fit_verdict.py."""
 
-PRESENCE_EVIDENCE = ("place", "similarity", "look")
-"""What :func:`presence_evidence` measures, in its order."""
+PRESENCE_EVIDENCE = ("place", "similarity")
+"""What :func:`presence_evidence` measures, in its order; similarity alone where nothing was learnt."""
 
-_PRESENCE_WEIGHTS = (1.116, 5.283, 1.962)
-_PRESENCE_BIAS = -15.247
-"""Logistic regression on mosaics of photographs of textured meshes, by scripts/bench_location.py."""
+_PRESENCE = {2: ((1.313, 6.38), -17.123), 1: ((16.756,), -14.856)}
+"""Logistic regressions on mosaics of photographs of textured meshes, by scripts/bench_location.py: weights and bias for
+both pieces of evidence, and for the one."""
 
 MARGIN = 5.0
 """A lead that is larger tells no more."""
@@ -129,24 +129,27 @@ def pose_confidence(evidence: Sequence[float]) -> float:
     return float(torch.sigmoid(values @ weights + _POSE_BIAS))
 
 
-def presence_evidence(score: float, ranking: Ranking) -> list[float]:
+def presence_evidence(score: float, ranking: Ranking, *, pictures: bool) -> list[float]:
     """Numbers that tell whether the object is there at all (``PRESENCE_EVIDENCE``).
 
     Args:
         score: of the locator for the box.
-        ranking: of the one box; the best raw scores of correlation and of appearance count, 0 without that term.
+        ranking: of the one box; its best raw correlation counts.
+        pictures: whether the locator looked at pictures; where it compared fields its score tells nothing.
     """
-    looks = ranking.terms.get("appearance")
-    look = 0.0 if looks is None else float(looks.detach()[looks.isfinite()].max())
-    return [score, float(ranking.hog.detach().max()), look]
+    similarity = float(ranking.hog.detach().max())
+    return [score, similarity] if pictures else [similarity]
 
 
 def presence(evidence: Sequence[float]) -> float:
     """Probability that the photograph shows the object where its pose was found, from :func:`presence_evidence`.
 
     Example:
-        >>> presence([8.0, 0.9, 0.5]) > presence([4.0, 0.6, 0.2])
+        >>> presence([8.0, 0.9]) > presence([4.0, 0.6])
+        True
+        >>> presence([0.9]) > presence([0.6])
         True
     """
-    values, weights = (torch.tensor(v, dtype=torch.float64) for v in (evidence, _PRESENCE_WEIGHTS))
-    return float(torch.sigmoid(values @ weights + _PRESENCE_BIAS))
+    weights, bias = _PRESENCE[len(evidence)]
+    values = torch.tensor([evidence, weights], dtype=torch.float64)
+    return float(torch.sigmoid(values.prod(dim=0).sum() + bias))

@@ -101,14 +101,18 @@ class Places:
     scores: Tensor
     query: Photographs
     ranking: Ranking
+    evidence: list[list[float]]
     presence: Tensor
 
     @classmethod
     def judged(cls, registrar: "Registrar", item: Item, boxes: Tensor, scores: Tensor) -> "Places":
         query = registrar.matcher.query([item.image] * len(boxes), boxes)
         ranking = registrar.matcher.rank(query)
-        sure = [presence(presence_evidence(s, ranking[k : k + 1])) for k, s in enumerate(scores.tolist())]
-        return cls(boxes, scores, query, ranking, torch.tensor(sure, dtype=torch.float64))
+        pictures = registrar.locator.cells.pictures
+        ones = (ranking[k : k + 1] for k in range(len(boxes)))
+        evidence = [presence_evidence(s, one, pictures=pictures) for s, one in zip(scores.tolist(), ones, strict=True)]
+        sure = torch.tensor([presence(known) for known in evidence], dtype=torch.float64)
+        return cls(boxes, scores, query, ranking, evidence, sure)
 
     def registered(self, registrar: "Registrar", item: Item, k: int) -> Registration:
         """Box ``k`` as a registration, the box around its pose in the place of the one it began with."""

@@ -37,6 +37,16 @@ def test_the_network_of_the_appearance_term_is_not_loaded_again():
     assert any(cells.backbone is module for module in matcher.modules())
 
 
+def test_pictures_are_looked_at_wherever_something_was_learnt():
+    """A preset without the appearance term, but with the learnt field, finds as the default does: 0 of 14 without."""
+    assert locator("fast").cells.pictures
+    assert not locator("classical").cells.pictures
+    image, box = placed(1, (100, 30), 0.8)
+    fast, default = locator("fast")([image])[0], locator()([image])[0]
+    assert torch.equal(fast.boxes, default.boxes)
+    assert box_iou(fast.boxes[:1], box[None]) > 0.6
+
+
 def placed(seed, corner, scale, size=SIZE):
     """The scene's truck, its background and all, pasted into other clutter: image (3, H, W) and box (4,)."""
     image, box, _ = scene(seed)

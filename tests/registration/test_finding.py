@@ -13,7 +13,8 @@ from curvireg_torch.errors import ImageError, InvalidInputError
 from curvireg_torch.geometry import box_iou, rotation_error
 from curvireg_torch.registration import RELIABLE, find, finding
 from curvireg_torch.registration.confidence import presence
-from curvireg_torch.registration.finding import doubted
+from curvireg_torch.registration.finding import Places, doubted
+from curvireg_torch.registration.inputs import Item
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, scene
 from tests.location.test_locator import SIZE, bank, placed
@@ -136,17 +137,30 @@ def test_what_cannot_be_searched_takes_nothing_else_down(registrar):
         registrar([image], camera_matrices=CAMERA, distance=(3.0, 2.0))
 
 
-def test_constants_of_presence_are_those_that_the_script_found():
+@pytest.mark.parametrize(("preset", "evidence"), [("learned", [7.0, 0.6]), ("classical", [0.6])])
+def test_constants_of_presence_are_those_that_the_script_found(preset, evidence):
     record = Path(__file__).parents[2] / "scripts" / "results" / "location.json"
-    found = json.loads(record.read_text(encoding="utf-8"))["presence"]
-    evidence = [7.0, 0.6, 0.25]
+    found = json.loads(record.read_text(encoding="utf-8"))["presence"][preset]
     logit = sum(w * v for w, v in zip(found["weights"], evidence, strict=True)) + found["bias"]
     assert presence(evidence) == pytest.approx(1 / (1 + math.exp(-logit)))
 
 
-def test_presence_rises_with_each_piece_of_evidence():
-    base = [6.0, 0.5, 0.2]
-    for k, step in enumerate((1.0, 0.1, 0.1)):
+@pytest.mark.parametrize("base", [[6.0, 0.5], [0.5]])
+def test_presence_rises_with_each_piece_of_evidence(base):
+    for k in range(len(base)):
         more = list(base)
-        more[k] += step
+        more[k] += 0.1
         assert presence(more) > presence(base)
+
+
+@pytest.mark.parametrize(("preset", "pieces"), [("learned", 2), ("fast", 2), ("classical", 1), ("paper", 1)])
+def test_presence_is_judged_by_what_it_was_fitted_on(preset, pieces):
+    """Scores of places count where the locator looks at pictures; those of fields mean nothing to what was fitted."""
+    registrar = cr.Registrar(bank(preset))
+    image, box = placed(5, (90, 40), 0.9)
+    places = [
+        Places.judged(registrar, Item(image, box, None), box[None], torch.tensor([score])) for score in (4.0, 9.0)
+    ]
+    low, high = (float(place.presence[0]) for place in places)
+    assert [len(place.evidence[0]) for place in places] == [pieces] * 2
+    assert low < high if pieces == 2 else low == high
