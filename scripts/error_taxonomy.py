@@ -11,6 +11,7 @@ view of the pose that was found; they are for looking at, not for committing.
 
 import argparse
 import csv
+import json
 from collections import Counter
 from pathlib import Path
 
@@ -62,10 +63,10 @@ def count(rows: list[dict[str, str]]) -> dict[str, dict[str, int]]:
 
 
 def table(results: dict[str, dict[str, dict[str, int]]]) -> str:
-    lines = [["errors", *(f"{name}, {part}" for name, parts in results.items() for part in parts)]]
-    lines.append(["---"] * len(lines[0]))
-    for k in KINDS:
-        lines.append([k, *(str(counts.get(k, 0)) for parts in results.values() for counts in parts.values())])
+    lines = [["pipeline", "objects", "N", *KINDS], ["---"] * (3 + len(KINDS))]
+    for name, parts in results.items():
+        for part, counts in parts.items():
+            lines.append([name, part, str(sum(counts.values())), *(str(counts.get(k, 0)) for k in KINDS)])
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
@@ -102,6 +103,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="results of an evaluation")
     parser.add_argument("--names", nargs="+", metavar="NAME", help="of the columns; default: names of the folders")
+    parser.add_argument("--add", action="store_true", help="columns beside those of the record")
     parser.add_argument("--pictures", type=Path, metavar="OUT", help="draw the first folder's errors; no table")
     parser.add_argument("--root", type=Path, help="of the dataset, for --pictures")
     parser.add_argument("--pixel-origin", type=int, choices=(0, 1), default=1)
@@ -111,7 +113,8 @@ def main() -> None:
         draw(read(arguments.folders[0]), dataset, arguments.pictures)
         return
     names = arguments.names or [folder.name for folder in arguments.folders]
-    results = {name: count(read(folder)) for name, folder in zip(names, arguments.folders, strict=True)}
+    results = json.loads(KEPT.read_text()) if arguments.add else {}
+    results |= {name: count(read(folder)) for name, folder in zip(names, arguments.folders, strict=True)}
     write_json(KEPT, results, 1)
     text = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(between(text, BEGIN, END, table(results)), encoding="utf-8")

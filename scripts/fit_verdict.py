@@ -58,6 +58,15 @@ def in_use(row: dict[str, Any]) -> np.ndarray:
     return table(row) @ np.array(WEIGHTS if row["form"] == "exact" else RANK_ALONE)
 
 
+def without(rows: list[dict[str, Any]]) -> dict[str, list[float]]:
+    """Share of right winners, the constants in use, with all evidence and with each left out: mean and interval."""
+    out = {}
+    for name in ("", *EVIDENCE):
+        weights = np.array(WEIGHTS) * [name != other for other in EVIDENCE]
+        out[name or "nothing"] = share([bool(right(r)[np.argmax(table(r) @ weights)]) for r in rows], rows)
+    return out
+
+
 def features(rows: list[dict[str, Any]]) -> np.ndarray:
     """(n, F) of the winners by the constants in use."""
     out = []
@@ -105,6 +114,13 @@ def page(result: dict[str, Any]) -> str:
     return "\n".join(
         [
             *rows_of_table([head, *shares]),
+            "",
+            *rows_of_table(
+                [
+                    ["exact photographs, verdict without", *result["verdict"]["without"]],
+                    ["right", *(f"{v[0]:.3f}" for v in result["verdict"]["without"].values())],
+                ]
+            ),
             "",
             f"Confidence, meshes left out in turn: AUC of right answers {held['auc_right_answer']:.2f}.{mesh}",
             "",
@@ -168,6 +184,7 @@ def main() -> None:
             "evidence": list(EVIDENCE),
             "used": list(WEIGHTS),
             "fitted_with_camera": [round(float(v), 2) for v in fit_verdict([r for r in rows if r["form"] == "exact"])],
+            "without": without([r for r in rows if r["form"] == "exact"]),
             "winner_right": float(y.mean()),
             "best_view_right": float(np.mean([r["view_errors"][0] < RIGHT for r in rows])),
         },
