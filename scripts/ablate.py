@@ -74,7 +74,6 @@ def measure(row: str, name: str, data: Path, out: Path) -> dict[str, Any]:
     return {
         "errors": [round(float(e), 3) for e in objects.rotation_errors(items, predictions)],
         "whole": [objects.easy(item) for item in items],
-        "seconds": summary["seconds"]["register_each"],
         "add_recall_0.1d": summary.get("add_recall_0.1d"),
         "plain_acc_30": summary.get("acc_pi_6"),
         "date": today(),
@@ -102,12 +101,11 @@ def cells(name: str, kept: dict[str, Any], base: dict[str, Any]) -> list[str]:
         f"{float((errors < 15).float().mean()):.3f}",
         f"{float(errors.median()):.1f}°",
         f"{float((errors[whole] < 30).float().mean()):.3f} ({int(whole.sum())})",
-        f"{kept['seconds']:.2f}",
     ]
 
 
 def table(results: dict[str, Any]) -> str:
-    head = ["row", "N", "within 30°", "against the first", "15°", "median", "seen whole: 30° (N)", "s/object"]
+    head = ["row", "N", "within 30°", "against the first", "15°", "median", "seen whole: 30° (N)"]
     parts = []
     for name in SETS:
         rows = {row: results[row][name] for row in ROWS if name in results.get(row, {})}
