@@ -209,10 +209,10 @@ def record_of(rows: list[Row]) -> tuple[Row, dict[str, Curves]]:
             record["presence"][preset] = {**told, "forms": {}}
             for form in FORMS:
                 if mine := [p for p in places if some[p.photograph[0]]["form"] == form]:
-                    drawn[f"{preset}, {form}"] = curves(mine)
+                    found = drawn[f"{preset}, {form}"] = curves(mine)
                     record["presence"][preset]["forms"][form] = {
                         name: {"n": len(truth), "true": sum(truth), "auc": float(roc_auc_score(truth, sure))}
-                        for name, (truth, sure) in curves(mine).items()
+                        for name, (truth, sure) in found.items()
                     }
         right = {p.photograph: p.right for p in surest(places)}
         for pose, form in product(("upright", "free"), FORMS):

@@ -119,7 +119,9 @@ def compare_peers(folder: Path, photographs: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faces", type=int, default=20_000)
-    parser.add_argument("--device", default="cpu", help="of modules, bank, search and the views' renderer")
+    parser.add_argument(
+        "--device", choices=("cpu", "cuda"), default="cpu", help="of modules, bank, search and the views' renderer"
+    )
     parser.add_argument(
         "--peers", type=Path, metavar="BENCH", help="compare with others on the benchmark's photographs"
     )
@@ -128,7 +130,7 @@ def main() -> None:
     if arguments.peers is not None:
         compare_peers(arguments.peers, arguments.photographs or 100)
         return
-    mesh, photographs = dented_sphere(arguments.faces), arguments.photographs or 32
+    mesh, photographs, device = dented_sphere(arguments.faces), arguments.photographs or 32, arguments.device
     record = {
         "date": today(),
         "commit": commit(REPOSITORY),
@@ -137,21 +139,19 @@ def main() -> None:
         "photographs": photographs,
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
-        "machine": platform.machine(),
-        "times": pipeline_times(mesh, Pipeline(), photographs, arguments.device),
+        "machine": platform.machine() if device == "cpu" else torch.cuda.get_device_name(device),
+        "times": pipeline_times(mesh, Pipeline(), photographs, device),
     }
-    if arguments.device != "cpu":
-        record["machine"] = torch.cuda.get_device_name(arguments.device)
-        kind = torch.device(arguments.device).type
-        write_json(REPOSITORY / "scripts" / "results" / f"bench_pipeline_{kind}.json", record)
-        print(pipeline_table(record))
+    print(pipeline_table(record))
+    results = REPOSITORY / "scripts" / "results"
+    if device != "cpu":
+        write_json(results / "bench_pipeline_cuda.json", record)
         return
-    write_json(REPOSITORY / "scripts" / "results" / "bench_pipeline.json", record)
+    write_json(results / "bench_pipeline.json", record)
     page = REPOSITORY / "docs" / "performance.md"
     text = page.read_text(encoding="utf-8")
     marks = "<!-- pipeline:begin -->", "<!-- pipeline:end -->"
     page.write_text(between(text, *marks, pipeline_table(record)), encoding="utf-8")
-    print(pipeline_table(record))
 
 
 if __name__ == "__main__":

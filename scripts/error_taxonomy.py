@@ -1,6 +1,6 @@
 """What the errors on PASCAL3D+ are made of, before and after: the second table of docs/accuracy.md.
 
-    python scripts/error_taxonomy.py DIR [DIR ...]           --out of "curvireg evaluate pascal3d", one column each
+    python scripts/error_taxonomy.py DIR [DIR ...]           --out of "curvireg evaluate pascal3d", beside the record
     python scripts/error_taxonomy.py DIR --pictures OUT --root ROOT [--pixel-origin 0]      draws the errors
 
 Every object gets the first kind that holds: right (within 30 degrees, symmetries of the class taken into account);
@@ -102,8 +102,7 @@ def draw(rows: list[dict[str, str]], dataset: Pascal3DPlus, out: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="results of an evaluation")
-    parser.add_argument("--names", nargs="+", metavar="NAME", help="of the columns; default: names of the folders")
-    parser.add_argument("--add", action="store_true", help="columns beside those of the record")
+    parser.add_argument("--names", nargs="+", metavar="NAME", help="of the pipelines; default: names of the folders")
     parser.add_argument("--pictures", type=Path, metavar="OUT", help="draw the first folder's errors; no table")
     parser.add_argument("--root", type=Path, help="of the dataset, for --pictures")
     parser.add_argument("--pixel-origin", type=int, choices=(0, 1), default=1)
@@ -113,7 +112,7 @@ def main() -> None:
         draw(read(arguments.folders[0]), dataset, arguments.pictures)
         return
     names = arguments.names or [folder.name for folder in arguments.folders]
-    results = json.loads(KEPT.read_text()) if arguments.add else {}
+    results = json.loads(KEPT.read_text())
     results |= {name: count(read(folder)) for name, folder in zip(names, arguments.folders, strict=True)}
     write_json(KEPT, results, 1)
     text = PAGE.read_text(encoding="utf-8")

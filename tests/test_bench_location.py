@@ -1,23 +1,18 @@
 """``scripts/bench_location.py``: what it makes of its rows, and that its table stands in the guide."""
 
-import importlib
 import json
-import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+from tests._support.scripts import ROOT, imported
 
 
 @pytest.fixture
-def script(monkeypatch):
+def script():
     for name in ("sklearn", "matplotlib"):
         pytest.importorskip(name, reason=f"{name} is not installed")
-    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
-    yield importlib.import_module("bench_location")
-    for name in ("bench_location", "_record"):
-        sys.modules.pop(name)
+    with imported("bench_location") as script:
+        yield script
 
 
 def row(number, *, right, preset="learned", linemod=False):

@@ -1,11 +1,8 @@
 """``scripts/bench_pipeline.py``: it reads what the terms hold, and its table stands in docs/performance.md."""
 
-import importlib
 import json
-import sys
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -13,16 +10,13 @@ from curvireg_torch import Pipeline, Registrar, ViewMatcher
 from curvireg_torch.pipeline import BankSettings, ViewPolicy
 from tests._support.pretended import PRETENDING, pretended_gpu
 from tests._support.scenes import scene, truck_bank
-
-ROOT = Path(__file__).parents[1]
+from tests._support.scripts import ROOT, imported
 
 
 @pytest.fixture
-def script(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
-    yield importlib.import_module("bench_pipeline")
-    for name in ("bench_pipeline", "_record"):
-        sys.modules.pop(name)
+def script():
+    with imported("bench_pipeline") as script:
+        yield script
 
 
 def test_ranking_is_compared_with_the_products_in_it(script):

@@ -17,7 +17,9 @@ def test_refine_pose_searches_around_the_best_of_the_views():
     )
     query = describe.descriptors(truth[None], z)
     with pytest.warns(DeprecationWarning, match="refine_pose is deprecated; use registration.search"):
-        found = registration.refine_pose(describe, query, bank.rotations[[4, 5, 6]], distance=float(z))
+        found = registration.refine_pose(
+            describe, query, bank.rotations[[4, 5, 6]], distance=float(z), radius=describe.radius, step=5.0
+        )
     assert isinstance(found, registration.RefinedPose)
     assert float(rotation_error(found.rotation, truth)) < 1.0
     assert found.score > 0.95

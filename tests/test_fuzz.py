@@ -2,25 +2,19 @@
 
 import json
 import sys
-from pathlib import Path
 
 import pytest
 
 from curvireg_torch.errors import ImageError
+from tests._support.scripts import imported
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
 COUNTS = {"images": 150, "meshes": 100, "mat": 150, "tables": 20, "banks": 20, "boxes": 60, "cameras": 60}
 
 
 @pytest.fixture
-def fuzz(monkeypatch):
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    import fuzz
-    import fuzz_inputs
-
-    yield fuzz, fuzz_inputs
-    for name in ("fuzz", "fuzz_inputs", "_record"):
-        sys.modules.pop(name, None)
+def fuzz():
+    with imported("fuzz") as script, imported("fuzz_inputs") as inputs:
+        yield script, inputs
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -1,12 +1,10 @@
 """The mutation script changes what it says, and tells a test that bites from one that does not."""
 
 import importlib
-import sys
-from pathlib import Path
 
 import pytest
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
+from tests._support.scripts import imported
 
 SOURCE = b'''"""A docstring with 1 < 2."""
 import math
@@ -28,10 +26,9 @@ def area(a: float | None, b=2.0, *, exact=True):
 
 
 @pytest.fixture
-def mutants(monkeypatch):
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    yield importlib.import_module("mutants")
-    sys.modules.pop("mutants")
+def mutants():
+    with imported("mutants") as script:
+        yield script
 
 
 def test_every_kind_is_found_and_nothing_that_the_rules_leave_out(mutants):
@@ -77,7 +74,6 @@ def test_keys_outlive_a_shift_of_lines_but_not_a_change_of_the_function(mutants)
 @pytest.mark.usefixtures("mutants")
 def test_the_page_has_the_scores_that_are_stored():
     mutate = importlib.import_module("mutate")
-    sys.modules.pop("mutate")
     text = mutate.TABLE.read_text()
     assert text.split(mutate.BEGIN)[1].split(mutate.END)[0] == f"\n{mutate.table()}"
     for package, row in mutate.stored().items():

@@ -3,17 +3,22 @@
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
+from tests._support.scripts import SCRIPTS, imported
 
 
-def test_growth_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    import soak
+@pytest.fixture
+def soak() -> Iterator[ModuleType]:
+    with imported("soak") as script:
+        yield script
 
+
+def test_growth_is_seen(soak: ModuleType) -> None:
     def course(rss: float, files: float, threads: float) -> list[dict[str, float]]:
         return [
             {"rss_mb": 500 + rss * i + 300 * (i > 10), "files": 9 + int(files * i), "threads": 2 + int(threads * i)}

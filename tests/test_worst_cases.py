@@ -1,21 +1,16 @@
 """``scripts/worst_cases.py``: it measures what it says, and its table stands in SECURITY.md."""
 
-import importlib
 import json
-import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+from tests._support.scripts import ROOT, imported
 
 
 @pytest.fixture
-def script(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
-    yield importlib.import_module("worst_cases")
-    for name in ("worst_cases", "_record"):
-        sys.modules.pop(name)
+def script():
+    with imported("worst_cases") as script:
+        yield script
 
 
 def test_a_case_is_read_or_refused_in_our_words(script, monkeypatch, capsys, tmp_path):

@@ -125,8 +125,7 @@ def pose_confidence(evidence: Sequence[float]) -> float:
         >>> pose_confidence([0.9, 5.0, 1.0]) > pose_confidence([0.5, 0.5, 1.0])
         True
     """
-    values, weights = (torch.tensor(v, dtype=torch.float64) for v in (evidence, _POSE_WEIGHTS))
-    return float(torch.sigmoid(values @ weights + _POSE_BIAS))
+    return _logistic(evidence, _POSE_WEIGHTS, _POSE_BIAS)
 
 
 def presence_evidence(score: float, ranking: Ranking, *, pictures: bool) -> list[float]:
@@ -150,6 +149,9 @@ def presence(evidence: Sequence[float]) -> float:
         >>> presence([0.9]) > presence([0.6])
         True
     """
-    weights, bias = _PRESENCE[len(evidence)]
-    values = torch.tensor([evidence, weights], dtype=torch.float64)
-    return float(torch.sigmoid(values.prod(dim=0).sum() + bias))
+    return _logistic(evidence, *_PRESENCE[len(evidence)])
+
+
+def _logistic(evidence: Sequence[float], weights: Sequence[float], bias: float) -> float:
+    x, w = (torch.tensor(v, dtype=torch.float64) for v in (evidence, weights))
+    return float(torch.sigmoid(x @ w + bias))

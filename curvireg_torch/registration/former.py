@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ..matching import ViewDescriber
 from .hypotheses import Hypotheses
-from .search import search
+from .search import BRIEF, search
 from .verify import similarities
 
 __all__ = ["RefinedPose", "refine_pose"]
@@ -16,11 +16,16 @@ __all__ = ["RefinedPose", "refine_pose"]
 
 @dataclass(frozen=True)
 class RefinedPose:
-    """Deprecated: a view (allocentric rotation and distance, model units) with its similarity to the photograph."""
+    """Deprecated: a view (allocentric rotation and distance, model units) with its similarity to the photograph.
+
+    Attributes:
+        iterations: rounds at most.
+    """
 
     rotation: Tensor
     distance: float
     score: float
+    iterations: int
 
 
 def refine_pose(
@@ -29,8 +34,11 @@ def refine_pose(
     rotations: Tensor,
     *,
     distance: float,
+    radius: float = 0.0,  # noqa: ARG001
     box: Tensor | None = None,
     camera_matrix: Tensor | None = None,
+    step: float = 10.0,  # noqa: ARG001
+    max_iterations: int = 12,  # noqa: ARG001
 ) -> RefinedPose:
     """Deprecated: :func:`search` around the best of (K, 3, 3) views, for one photograph.
 
@@ -40,6 +48,7 @@ def refine_pose(
         rotations: (K, 3, 3) views near each other.
         distance: of the object's centre in them, model units.
         box, camera_matrix: (4,) px and (3, 3) of the photograph; both or none.
+        radius, step, max_iterations: no longer asked: the search knows its own.
     """
     warnings.warn("refine_pose is deprecated; use registration.search", DeprecationWarning, stacklevel=2)
     K = len(rotations)
@@ -49,4 +58,4 @@ def refine_pose(
     boxes = None if box is None else box[None].double()
     cameras = None if camera_matrix is None else camera_matrix[None].double()
     found = search([describe], query, views[best[None]], boxes=boxes, camera_matrices=cameras, brief=True)
-    return RefinedPose(found.rotation[0], float(found.distance[0]), float(found.score[0]))
+    return RefinedPose(found.rotation[0], float(found.distance[0]), float(found.score[0]), BRIEF)

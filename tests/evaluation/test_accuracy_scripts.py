@@ -1,23 +1,15 @@
 """The scripts behind docs/accuracy.md."""
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 
-SCRIPTS = Path(__file__).parents[2] / "scripts"
+from tests._support.scripts import imported
 
 
 @pytest.fixture
-def scripts(monkeypatch):
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    import ablate
-    import error_taxonomy
-
-    yield ablate, error_taxonomy
-    for name in ("ablate", "error_taxonomy", "results_table"):
-        sys.modules.pop(name, None)
+def scripts():
+    with imported("ablate") as ablate, imported("error_taxonomy") as taxonomy:
+        yield ablate, taxonomy
 
 
 def test_interval_is_that_of_a_share(scripts):
@@ -70,3 +62,49 @@ def test_kinds_of_errors(scripts, azimuth, elevation_error, kind):
     _, taxonomy = scripts
     row = {"azimuth": str(azimuth), "true_azimuth": "40", "symmetric_error_deg": str(elevation_error)}
     assert taxonomy.kind(row) == kind
+
+
+@pytest.fixture
+def verdicts():
+    pytest.importorskip("sklearn", reason="scikit-learn is not installed")
+    with imported("fit_verdict") as script:
+        yield script
+
+
+def row(mesh, errors, evidence):
+    names = ("rank", "similarity", "support", "appearance")
+    known = [dict(zip(names, one, strict=True)) for one in evidence]
+    return {"mesh": mesh, "form": "exact", "errors": errors, "evidence": known}
+
+
+def test_shares_vary_with_meshes_not_with_photographs(verdicts):
+    one = [row("a", [], [])] * 400
+    assert verdicts.share([True] * 100 + [False] * 300, one) == [0.25, 0.25, 0.25], "one mesh: nothing to vary"
+    each = [{**r, "mesh": f"m{k}"} for k, r in enumerate(one)]
+    mean, low, high = verdicts.share([True] * 100 + [False] * 300, each)
+    half = 1.96 * (0.25 * 0.75 / 400) ** 0.5
+    assert mean == 0.25
+    assert (low, high) == (pytest.approx(mean - half, abs=0.006), pytest.approx(mean + half, abs=0.006))
+
+
+def test_the_verdict_without_each_piece_of_evidence(verdicts):
+    """By support the first hypothesis is right, by rank and similarity the second."""
+    rows = [row(f"m{k}", [5.0, 90.0], [(-1.0, 0.5, 0.9, 0.0), (0.0, 0.6, 0.1, 0.0)]) for k in range(3)]
+    found = {name: mean for name, (mean, _, _) in verdicts.without(rows).items()}
+    assert found == {"nothing": 1.0, "rank": 1.0, "similarity": 1.0, "support": 0.0, "appearance": 1.0}
+    held = {
+        "auc_right_answer": 0.75,
+        "precision_at": {"0.5": [0.9, 0.4], "0.9": [None, 0.0]},
+        "risk_at_coverage": {"1": 0.1},
+    }
+    shares = {key: [0.5, 0.25, 0.75] for key in ("best_view", "winner", "among_hypotheses")}
+    result = {
+        "shares": {"exact upright": {"n": 3, **shares}},
+        "verdict": {"without": verdicts.without(rows)},
+        "confidence": {"held_out": held, "auc_right_mesh": 0.625, "n_wrong": 8},
+    }
+    text = verdicts.page(result)
+    assert "| exact upright | 3 | 0.50 (0.25 to 0.75) | 0.50 (0.25 to 0.75) | 0.50 (0.25 to 0.75) |" in text
+    assert "| exact photographs, verdict without | nothing | rank | similarity | support | appearance |" in text
+    assert "| right | 1.000 | 1.000 | 1.000 | 0.000 | 1.000 |" in text
+    assert "right answers 0.75. Of right meshes against wrong ones (8 photographs, another one's mesh): 0.62." in text

@@ -1,29 +1,23 @@
-import importlib
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, evaluate
-
-SCRIPTS = Path(__file__).parents[2] / "scripts"
+from tests._support.scripts import imported
 
 
 @pytest.fixture
 def run(monkeypatch):
     """The script's exit code for a repository and words."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    script = importlib.import_module("results_table")
+    with imported("results_table") as script:
 
-    def exit_code(root, *words):
-        monkeypatch.setattr(sys, "argv", ["results_table.py", "--root", str(root), *map(str, words)])
-        return script.main()
+        def exit_code(root, *words):
+            monkeypatch.setattr(sys, "argv", ["results_table.py", "--root", str(root), *map(str, words)])
+            return script.main()
 
-    yield exit_code
-    for name in ("results_table", "_record"):
-        sys.modules.pop(name)
+        yield exit_code
 
 
 @pytest.fixture
