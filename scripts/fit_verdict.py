@@ -18,13 +18,14 @@ from _record import between
 from scipy.optimize import minimize
 from sklearn.linear_model import LogisticRegression
 
-from curvireg_torch.registration.confidence import POSE_EVIDENCE, pose_evidence
+from curvireg_torch.registration.confidence import POSE_EVIDENCE, RELIABLE, pose_evidence
 from curvireg_torch.registration.verify import EVIDENCE, RANK_ALONE, WEIGHTS
 
 PAGE = Path(__file__).parents[1] / "docs" / "accuracy.md"
 BEGIN, END = "<!-- verdict:begin -->", "<!-- verdict:end -->"
 RIGHT = 30.0
 PARTS = 5
+WRONG = {"any": "another mesh", "kind": "another mesh of the object's kind"}
 PRIOR = WEIGHTS
 """The fit is drawn towards what is in use, by as much as a few photographs weigh."""
 
@@ -107,10 +108,11 @@ def page(result: dict[str, Any]) -> str:
         [name, str(s["n"]), *("{:.2f} ({:.2f} to {:.2f})".format(*s[k]) for k in keys)]
         for name, s in result["shares"].items()
     ]
-    mesh = ""
-    if "auc_right_mesh" in result["confidence"]:
-        auc_mesh, n = result["confidence"]["auc_right_mesh"], result["confidence"]["n_wrong"]
-        mesh = f" Of right meshes against wrong ones ({n} photographs, another one's mesh): {auc_mesh:.2f}."
+    mesh = "".join(
+        f" Of right meshes against {WRONG[which]} ({v['n']} photographs): {v['auc']:.2f};"
+        f" {v['believed']:.2f} of the wrong ones are believed."
+        for which, v in result["confidence"].get("right_mesh", {}).items()
+    )
     return "\n".join(
         [
             *rows_of_table([head, *shares]),
@@ -156,7 +158,7 @@ def main() -> None:
     arguments = parser.parse_args()
     everything = [json.loads(line) for path in arguments.rows for line in path.read_text().splitlines()]
     everything = [r for r in everything if "errors" in r]
-    rows, wrong = ([r for r in everything if r["wrong"] == kind] for kind in (False, True))
+    rows, wrong = ([r for r in everything if bool(r["wrong"]) == kind] for kind in (False, True))
     meshes = sorted({r["mesh"] for r in rows})
     part = np.array([meshes.index(r["mesh"]) % PARTS for r in rows])
     p = np.zeros(len(rows))
@@ -202,10 +204,11 @@ def main() -> None:
             },
         },
     }
-    if wrong:
-        q = whole.predict_proba(features(wrong))[:, 1]
-        result["confidence"]["auc_right_mesh"] = auc(p, q)
-        result["confidence"]["n_wrong"] = len(wrong)
+    same = [any((r["form"], r["pose"]) == (w["form"], w["pose"]) for w in wrong) for r in rows]
+    for which in sorted({r["wrong"] for r in wrong}):
+        q = whole.predict_proba(features(some := [r for r in wrong if r["wrong"] == which]))[:, 1]
+        entry = {"auc": auc(p[same], q), "n": len(some), "believed": float((q >= RELIABLE).mean())}
+        result["confidence"].setdefault("right_mesh", {})[which] = entry
     arguments.out.write_text(json.dumps(result, indent=2) + "\n")
     print(json.dumps(result, indent=2))
     if arguments.out.parent == PAGE.parents[1] / "scripts" / "results":

@@ -7,6 +7,7 @@ the evidence of the ranking, the errors of the best views, and how far off it is
 ``exact`` photographs come with their camera matrix, ``sibling`` ones (another object of the kind) without, as
 PASCAL3D+ does. Run again, it goes on. --share takes every N-th mesh, so that several processes work side by side.
 --box moves each edge of the boxes by up to that share of the side, as `curvireg evaluate --protocol box=SHARE` does.
+--wrong registers "exact" photographs to a mesh that they do not show: any other, or another of the object's kind.
 """
 
 import argparse
@@ -47,10 +48,10 @@ def allocentric(item: dict[str, Any]) -> Tensor:
 
 
 def rows_of(
-    items: list[Any], root: Path, half: Path, pipeline: cr.Pipeline, wrong: Path | None, protocol: Protocol
+    items: list[Any], root: Path, half: Path, pipeline: cr.Pipeline, wrong: str | None, protocol: Protocol
 ) -> list[Any]:
     """Rows of photographs of one mesh; ``wrong``: registered to this one instead, which none of them shows."""
-    mesh = cr.load_mesh(wrong or root / items[0]["mesh"])
+    mesh = cr.load_mesh(root / (wrong or items[0]["mesh"]))
     registrar = cr.Registrar(cr.ViewBank.build(mesh, pipeline=pipeline, progress=False), pipeline=pipeline)
     rows = []
     for item in items:
@@ -60,7 +61,6 @@ def rows_of(
         K = torch.tensor(item["K"], dtype=torch.float64) if exact else None
         result = registrar([image], box, K)[0]
         row = {name: item[name] for name in ("id", "form", "pose", "kind", "mesh", "visible", "clutter", "bare")}
-        row["wrong"] = wrong is not None
         if not result.ok:
             rows.append({**row, "failed": str(result.error)})
             continue
@@ -75,12 +75,29 @@ def rows_of(
         row["ranking"] = ranking_evidence(result.ranking, registrar.bank.rotations)[0].tolist()
         row["confidence"] = result.confidence
         row["corrected_box"] = None if result.corrected_box is None else result.corrected_box.tolist()
-        if result.covariance is not None and not row["wrong"]:
+        if result.covariance is not None and wrong is None:
             nearest = truth @ symmetries[error_up_to_each(found[:1], truth, symmetries)[0].argmin()]
             poses = transform(found[0], result.translation), transform(nearest, torch.tensor(item["t"]).double())
             row["squared_distance"] = squared_distance(*poses, result.covariance / SCALE)
         rows.append(row)
     return rows
+
+
+def wrong_meshes(which: str | None, items: list[Any], like: dict[str, str]) -> dict[str, str | None]:
+    """The mesh to register to in place of each: none, the next one, or the next one of its kind where there is one.
+
+    ``like`` names what a mesh is a copy of: copies are not wrong.
+    """
+    kinds = {i["mesh"]: i["kind"] for i in items}
+    names = sorted(kinds)
+    out: dict[str, str | None] = {}
+    for n, name in enumerate(names):
+        others = [m for m in names[n + 1 :] + names[:n] if like[m] != like[name]]
+        if which == "kind":
+            others = [m for m in others if kinds[name] is not None and kinds[m] == kinds[name]]
+        if which is None or others:
+            out[name] = others[0] if which else None
+    return out
 
 
 def main() -> None:
@@ -91,7 +108,7 @@ def main() -> None:
     parser.add_argument("--form", choices=("exact", "sibling"))
     parser.add_argument("--preset", choices=sorted(PRESETS), default=DEFAULT)
     parser.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON, instead of --preset")
-    parser.add_argument("--wrong", action="store_true", help="register to the mesh of another photograph")
+    parser.add_argument("--wrong", choices=("any", "kind"), help="register to another mesh, if need be of the kind")
     parser.add_argument("--box", type=float, default=0.0, metavar="SHARE", help="how far edges of boxes are off")
     parser.add_argument("--limit", type=int)
     parser.add_argument("--share", default="0/1", metavar="I/N")
@@ -100,8 +117,11 @@ def main() -> None:
     torch.set_num_threads(1)
     half = arguments.folder / arguments.half
     items = [json.loads(line) for line in (half / "items.jsonl").read_text().splitlines()]
-    items = [i for i in items if arguments.pose in (None, i["pose"]) and arguments.form in (None, i["form"])]
-    items = items[: arguments.limit]
+    form = "exact" if arguments.wrong else arguments.form
+    items = [i for i in items if arguments.pose in (None, i["pose"]) and form in (None, i["form"])]
+    like = {m["path"]: m["like"] for m in json.loads((arguments.folder / "meshes.json").read_text())["meshes"]}
+    wrong = wrong_meshes(arguments.wrong, items, like)
+    items = [i for i in items if i["mesh"] in wrong][: arguments.limit]
     done = set()
     if arguments.out.exists():
         done = {json.loads(line)["id"] for line in arguments.out.read_text().splitlines()}
@@ -112,11 +132,10 @@ def main() -> None:
     items.sort(key=lambda i: (i["mesh"], i["pose"], i["id"]))
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     for (mesh, pose), group in groupby(items, key=lambda i: (i["mesh"], i["pose"])):
-        wrong = arguments.folder / meshes[(meshes.index(mesh) + 1) % len(meshes)] if arguments.wrong else None
         posed = pipeline.posed("upright" if pose == "upright" else "any")
         with arguments.out.open("a") as file:
-            for row in rows_of(list(group), arguments.folder, half, posed, wrong, Protocol(box=arguments.box)):
-                file.write(json.dumps(row) + "\n")
+            for row in rows_of(list(group), arguments.folder, half, posed, wrong[mesh], Protocol(box=arguments.box)):
+                file.write(json.dumps({**row, "wrong": arguments.wrong}) + "\n")
 
 
 if __name__ == "__main__":

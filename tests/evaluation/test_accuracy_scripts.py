@@ -71,6 +71,12 @@ def verdicts():
         yield script
 
 
+@pytest.fixture
+def runner():
+    with imported("run_benchmark") as script:
+        yield script
+
+
 def row(mesh, errors, evidence):
     names = ("rank", "similarity", "support", "appearance")
     known = [dict(zip(names, one, strict=True)) for one in evidence]
@@ -101,10 +107,20 @@ def test_the_verdict_without_each_piece_of_evidence(verdicts):
     result = {
         "shares": {"exact upright": {"n": 3, **shares}},
         "verdict": {"without": verdicts.without(rows)},
-        "confidence": {"held_out": held, "auc_right_mesh": 0.625, "n_wrong": 8},
+        "confidence": {"held_out": held, "right_mesh": {"kind": {"auc": 0.625, "n": 8, "believed": 0.25}}},
     }
     text = verdicts.page(result)
     assert "| exact upright | 3 | 0.50 (0.25 to 0.75) | 0.50 (0.25 to 0.75) | 0.50 (0.25 to 0.75) |" in text
     assert "| exact photographs, verdict without | nothing | rank | similarity | support | appearance |" in text
     assert "| right | 1.000 | 1.000 | 1.000 | 0.000 | 1.000 |" in text
-    assert "right answers 0.75. Of right meshes against wrong ones (8 photographs, another one's mesh): 0.62." in text
+    assert "answers 0.75. Of right meshes against another mesh of the object's kind (8 photographs): 0.62;" in text
+    assert "; 0.25 of the wrong ones are believed." in text
+
+
+def test_wrong_meshes_are_no_copies_and_of_the_kind_where_asked(runner):
+    kinds = {"a": "chair", "b": "chair", "c": "car", "d": "chair", "e": None, "f": None}
+    items = [{"mesh": mesh, "kind": kind} for mesh, kind in kinds.items()]
+    like = {**{mesh: mesh for mesh in kinds}, "b": "a"}
+    assert runner.wrong_meshes(None, items, like) == dict.fromkeys(kinds)
+    assert runner.wrong_meshes("any", items, like) == dict(zip("abcdef", "ccdefa", strict=True))
+    assert runner.wrong_meshes("kind", items, like) == {"a": "d", "b": "d", "d": "a"}, "no car stands by"
