@@ -1,0 +1,147 @@
+"""AC3D files, and vehicles made of them."""
+
+import numpy as np
+import pytest
+
+from tests._support.scripts import imported
+
+FILE = """AC3Db
+MATERIAL "paint" rgb 1 0.5 0  amb 1 1 1  emis 0 0 0  spec 0.4 0.4 0.4  shi 10  trans 0
+OBJECT world
+kids 2
+OBJECT group
+name "body"
+loc 10 0 0
+data 3
+ab
+kids 1
+OBJECT poly
+name "hull"
+texture "paint.png"
+texrep 2 1
+texoff 0 0.5
+rot 0 1 0 -1 0 0 0 0 1
+loc 0 1 0
+numvert 4
+0 0 0
+2 0 0
+2 1 0
+0 1 0
+numsurf 3
+SURF 0x20
+mat 0
+refs 4
+0 0 0
+1 1 0
+2 1 1
+3 0 1
+SURF 0x14
+mat 0
+refs 4
+0 0 0
+1 1 0
+2 1 1
+3 0 1
+SURF 0x2
+mat 0
+refs 2
+0 0 0
+1 1 0
+kids 0
+OBJECT poly
+name "navlight glow"
+numvert 3
+0 0 0
+1 0 0
+0 1 0
+numsurf 1
+SURF 0x0
+mat 0
+refs 3
+0 0 0
+1 0 0
+2 0 0
+kids 0
+"""
+
+
+@pytest.fixture(scope="module")
+def scripts():
+    with imported("_ac3d") as ac3d, imported("vehicle_meshes") as vehicles:
+        yield ac3d, vehicles
+
+
+def test_objects_lie_in_the_frames_of_their_parents(scripts, tmp_path):
+    path = tmp_path / "a.ac"
+    path.write_text(FILE)
+    (part,) = scripts[0].read(path)
+    assert (part.colour, part.gloss, part.texture) == ([1.0, 0.5, 0.0], 0.4, "paint.png")
+    # x goes along y ("rot" lists images of the axes), then up by 1, then 10 along x
+    corners = np.array([[10, 1, 0], [10, 3, 0], [9, 3, 0], [9, 1, 0]], float)
+    fan, strip = corners[[[0, 1, 2], [0, 2, 3]]], corners[[[0, 1, 2], [2, 1, 3]]]
+    assert part.corners.tolist() == [*fan.tolist(), *strip.tolist()], "lines and glow are left out"
+    assert part.places[0].tolist() == [[0.0, 0.5], [2.0, 0.5], [2.0, 1.5]]
+
+
+def test_more_children_promised_than_there_are(scripts, tmp_path):
+    (tmp_path / "a.ac").write_text(FILE.replace("kids 2", "kids 3"))
+    assert len(scripts[0].read(tmp_path / "a.ac")) == 1
+
+
+@pytest.mark.parametrize("content", ["", "solid\n", FILE[: len(FILE) // 2], FILE.replace("SURF 0x20", "SURF")])
+def test_broken_files_are_refused(scripts, tmp_path, content):
+    path = tmp_path / "a.ac"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=r"a\.ac"):
+        scripts[0].read(path)
+
+
+def test_a_vehicle_stands_on_the_floor_and_looks_along_minus_y(scripts, tmp_path):
+    _, vehicles = scripts
+    vehicles.FEWEST_FACES, kept = 1, vehicles.FEWEST_FACES
+    (tmp_path / "b.ac").write_text(FILE)
+    row = {"id": "aircraft-b", "file": tmp_path / "b.ac"}
+    assert vehicles.convert(row, tmp_path / "out") is None
+    vehicles.FEWEST_FACES = kept
+    assert vehicles.convert(row, tmp_path / "out") == "few faces"
+    lines = (tmp_path / "out" / "model.obj").read_text().splitlines()
+    points = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float)
+    assert np.ptp(points, axis=0).tolist() == [0.0, 1.0, 2.0], "the file's z, x and y"
+    assert points[:, 2].min() == 0.0
+    assert points[:3, 1].tolist() == [0.5, 0.5, -0.5], "x points aft"
+    assert "Kd 1.0 0.5 0.0" in (tmp_path / "out" / "model.mtl").read_text(), "no picture: the material's colour"
+
+
+def test_wheels_stand_where_the_car_says(scripts, tmp_path):
+    axles = "".join(
+        f'<section name="{axle} Axle"><attnum name="xpos" val="{x}"/></section>'
+        + "".join(
+            f'<section name="{axle} {side} Wheel"><attnum name="ypos" unit="m" val="{y}"/>'
+            '<attnum name="rim diameter" unit="in" val="20"/><attnum name="tire width" unit="mm" val="200"/>'
+            '<attnum name="tire height-width ratio" val=".5"/></section>'
+            for side, y in (("Right", -0.8), ("Left", 0.8))
+        )
+        for axle, x in (("Front", 1.5), ("Rear", -1.0))
+    )
+    (tmp_path / "car.xml").write_text(axles)
+    tyre, hub = scripts[1].wheels(tmp_path / "car.acc")
+    radius = 0.5 * 20 * 0.0254 + 0.1
+    low, high = tyre.corners.reshape(-1, 3).min(axis=0), tyre.corners.reshape(-1, 3).max(axis=0)
+    np.testing.assert_allclose(low, [-1.0 - radius, 0.0, -0.9], atol=1e-9)
+    np.testing.assert_allclose(high, [1.5 + radius, 2 * radius, 0.9], atol=1e-9)
+    assert len(tyre.corners) == 4 * 16 * 6
+    assert len(hub.corners) == 4 * 16 * 2
+    (tmp_path / "car.xml").write_text(axles.replace("rim diameter", "rim"))
+    with pytest.raises(ValueError, match="Front Right Wheel has no rim diameter"):
+        scripts[1].wheels(tmp_path / "car.acc")
+
+
+def test_kinds(scripts):
+    kind = scripts[1].kind_of
+    assert [kind("aircraft", n) for n in ("f16", "cub", "738", "sr71")] == [
+        "fighter",
+        "propeller aircraft",
+        "airliner",
+        None,
+    ]
+    assert [kind("ship", "tanker"), kind("ship", "barge"), kind("car", "p406")] == ["ship", None, "car"]
