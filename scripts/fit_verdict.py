@@ -5,7 +5,8 @@
 Verdict: a softmax over the hypotheses of a photograph, linear in their evidence, that gives the right ones (within 30
 degrees) most of the weight. Confidence: a logistic regression on what is known of the winner and its rival. Both are
 fitted on all rows; what they are worth is measured on meshes left out in turn (five parts). Rows against a wrong mesh
-take no part in the fits.
+(--wrong) teach the confidence alone, and together weigh a tenth: any other mesh is wrong whatever its pose, one of the
+kind where its pose is.
 """
 
 import argparse
@@ -26,6 +27,8 @@ BEGIN, END = "<!-- verdict:begin -->", "<!-- verdict:end -->"
 RIGHT = 30.0
 PARTS = 5
 WRONG = {"any": "another mesh", "kind": "another mesh of the object's kind"}
+WRONG_SHARE = 0.1
+"""Of the weight that the confidence is fitted with."""
 PRIOR = WEIGHTS
 """The fit is drawn towards what is in use, by as much as a few photographs weigh."""
 
@@ -36,7 +39,7 @@ def table(row: dict[str, Any]) -> np.ndarray:
 
 
 def right(row: dict[str, Any]) -> np.ndarray:
-    return np.array(row["errors"]) < RIGHT
+    return (np.array(row["errors"]) < RIGHT) & (row.get("wrong") != "any")
 
 
 def fit_verdict(rows: list[dict[str, Any]]) -> np.ndarray:
@@ -75,7 +78,8 @@ def features(rows: list[dict[str, Any]]) -> np.ndarray:
         score = np.sort(in_use(row))[::-1]
         best = row["evidence"][int(np.argmax(in_use(row)))]
         lead = float(score[0] - score[1]) if len(score) > 1 else np.inf
-        out.append(pose_evidence(best["similarity"], lead, with_camera=row["form"] == "exact"))
+        known = {"with_camera": row["form"] == "exact", "support": best["support"]}
+        out.append(pose_evidence(best["similarity"], lead, **known))
     return np.array(out)
 
 
@@ -109,8 +113,8 @@ def page(result: dict[str, Any]) -> str:
         for name, s in result["shares"].items()
     ]
     mesh = "".join(
-        f" Of right meshes against {WRONG[which]} ({v['n']} photographs): {v['auc']:.2f};"
-        f" {v['believed']:.2f} of the wrong ones are believed."
+        f" Of right meshes against {WRONG[which]} ({v['n']} photographs): {v['auc']:.2f}; of these wrong meshes"
+        f" {v['believed']} are believed, {v['right_of_them']} of them with a pose within 30 degrees."
         for which, v in result["confidence"].get("right_mesh", {}).items()
     )
     return "\n".join(
@@ -159,14 +163,18 @@ def main() -> None:
     everything = [json.loads(line) for path in arguments.rows for line in path.read_text().splitlines()]
     everything = [r for r in everything if "errors" in r]
     rows, wrong = ([r for r in everything if bool(r["wrong"]) == kind] for kind in (False, True))
-    meshes = sorted({r["mesh"] for r in rows})
-    part = np.array([meshes.index(r["mesh"]) % PARTS for r in rows])
-    p = np.zeros(len(rows))
-    X, y = features(rows), chosen(rows)
+    meshes = sorted({r["mesh"] for r in everything})
+    part = np.array([meshes.index(r["mesh"]) % PARTS for r in rows + wrong])
+    weight = np.ones(len(part))
+    weight[len(rows) :] = WRONG_SHARE / (1.0 - WRONG_SHARE) * len(rows) / max(1, len(wrong))
+    sure = np.zeros(len(part))
+    X, truth = features(rows + wrong), chosen(rows + wrong)
     for k in range(PARTS):
         train, test = np.flatnonzero(part != k), np.flatnonzero(part == k)
-        p[test] = LogisticRegression(C=1.0, max_iter=1000).fit(X[train], y[train]).predict_proba(X[test])[:, 1]
-    whole = LogisticRegression(C=1.0, max_iter=1000).fit(X, y)
+        model = LogisticRegression(C=1.0, max_iter=1000).fit(X[train], truth[train], sample_weight=weight[train])
+        sure[test] = model.predict_proba(X[test])[:, 1]
+    whole = LogisticRegression(C=1.0, max_iter=1000).fit(X, truth, sample_weight=weight)
+    p, y = sure[: len(rows)], truth[: len(rows)]
     order = np.argsort(-p, kind="stable")
     risk = {f"{c:g}": float(1.0 - y[order[: max(1, round(c * len(y)))]].mean()) for c in (1.0, 0.75, 0.5, 0.25)}
     result: dict[str, Any] = {
@@ -206,9 +214,14 @@ def main() -> None:
     }
     same = [any((r["form"], r["pose"]) == (w["form"], w["pose"]) for w in wrong) for r in rows]
     for which in sorted({r["wrong"] for r in wrong}):
-        q = whole.predict_proba(features(some := [r for r in wrong if r["wrong"] == which]))[:, 1]
-        entry = {"auc": auc(p[same], q), "n": len(some), "believed": float((q >= RELIABLE).mean())}
-        result["confidence"].setdefault("right_mesh", {})[which] = entry
+        here = np.array([r.get("wrong") == which for r in rows + wrong])
+        believed = here & (sure >= RELIABLE)
+        result["confidence"].setdefault("right_mesh", {})[which] = {
+            "auc": auc(p[same], sure[here]),
+            "n": int(here.sum()),
+            "believed": int(believed.sum()),
+            "right_of_them": int((np.array([min(r["errors"][:1]) < RIGHT for r in rows + wrong]) & believed).sum()),
+        }
     arguments.out.write_text(json.dumps(result, indent=2) + "\n")
     print(json.dumps(result, indent=2))
     if arguments.out.parent == PAGE.parents[1] / "scripts" / "results":

@@ -34,12 +34,12 @@ _BIAS = -8.803
 _APART = 30.0  # degrees beyond which two views are rival answers
 
 
-POSE_EVIDENCE = ("similarity", "margin", "camera")
+POSE_EVIDENCE = ("similarity", "margin", "camera", "support")
 """What :func:`pose_evidence` measures, in its order."""
 
-_POSE_WEIGHTS = (1.593, 0.584, 1.706)
-_POSE_BIAS = -1.615
-"""Logistic regression on photographs of textured meshes, by scripts/fit_verdict.py."""
+_POSE_WEIGHTS = (3.216, 0.477, 0.529, 2.433)
+_POSE_BIAS = -3.292
+"""Logistic regression on photographs of textured meshes, one in ten with a wrong mesh, by scripts/fit_verdict.py."""
 
 PRESENCE_EVIDENCE = ("place", "similarity")
 """What :func:`presence_evidence` measures, in its order; similarity alone where nothing was learnt."""
@@ -105,15 +105,16 @@ def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
     return probability(ranking_evidence(ranking, rotations))
 
 
-def pose_evidence(similarity: float, lead: float, *, with_camera: bool) -> list[float]:
+def pose_evidence(similarity: float, lead: float, *, with_camera: bool, support: float = 0.0) -> list[float]:
     """Numbers that tell right poses from wrong ones (``POSE_EVIDENCE``), of a hypothesis followed to its end.
 
     Args:
         similarity: normalised correlation of the pose's view with the photograph.
         lead: how far its verdict leads that of the next distinct hypothesis; at most 5 counts.
         with_camera: whether the camera matrix is known, and with it, as a rule, the object's own mesh.
+        support: strength of the photograph's edges under the pose's contours.
     """
-    return [similarity, min(lead, MARGIN), float(with_camera)]
+    return [similarity, min(lead, MARGIN), float(with_camera), support]
 
 
 def pose_confidence(evidence: Sequence[float]) -> float:
@@ -122,7 +123,7 @@ def pose_confidence(evidence: Sequence[float]) -> float:
     What it is worth on photographs, and against wrong meshes, is in ``docs/method.md``.
 
     Example:
-        >>> pose_confidence([0.9, 5.0, 1.0]) > pose_confidence([0.5, 0.5, 1.0])
+        >>> pose_confidence([0.9, 5.0, 1.0, 0.5]) > pose_confidence([0.5, 0.5, 1.0, 0.2])
         True
     """
     return _logistic(evidence, _POSE_WEIGHTS, _POSE_BIAS)

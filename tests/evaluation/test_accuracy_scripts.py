@@ -1,8 +1,11 @@
 """The scripts behind docs/accuracy.md."""
 
+import numpy as np
 import pytest
 import torch
 
+import curvireg_torch as cr
+from tests._support.scenes import CAMERA, scene, truck_bank
 from tests._support.scripts import imported
 
 
@@ -124,3 +127,31 @@ def test_wrong_meshes_are_no_copies_and_of_the_kind_where_asked(runner):
     assert runner.wrong_meshes(None, items, like) == dict.fromkeys(kinds)
     assert runner.wrong_meshes("any", items, like) == dict(zip("abcdef", "ccdefa", strict=True))
     assert runner.wrong_meshes("kind", items, like) == {"a": "d", "b": "d", "d": "a"}, "no car stands by"
+
+
+@pytest.fixture
+def believed():
+    with imported("check_verdict") as script:
+        yield script
+
+
+def test_what_confidences_are_worth(believed):
+    sure, right = np.array([0.9, 0.8, 0.6, 0.3]), np.array([True, True, False, True])
+    found = believed.judged(sure, right)
+    assert found["auc"] == pytest.approx(2 / 3)
+    assert found["wrong_at"] == {"1": 0.25, "0.75": pytest.approx(1 / 3), "0.5": 0.0, "0.25": 0.0}
+    assert (found["reliable"], found["right_of_them"]) == (0.5, 1.0)
+    none = believed.judged(np.array([0.1, 0.2]), np.array([True, True]))
+    assert (none["auc"], none["reliable"], none["right_of_them"]) == (None, 0.0, None)
+    text = believed.table({"sets": {"lm": found, "dino": none}, "date": "today", "commit": "abc"})
+    assert "| lm | 4 | 0.75 | 0.65 | 0.67 | 0.25 | 0.33 | 0.00 | 0.00 | 0.50 | 1.00 |" in text
+    assert "| dino | 2 | 1.00 | 0.15 | - | 0.00 | 0.00 | 0.00 | 0.00 | 0.00 | - |" in text
+
+
+def test_confidence_is_that_of_the_registration(believed):
+    found = cr.Registrar(truck_bank())([scene(0)[0]], scene(0)[1][None], CAMERA)[0]
+    kept = {"evidence": dict(found.hypotheses[0].evidence)}
+    kept["rivals"] = [{"evidence": dict(h.evidence)} for h in found.hypotheses[1:]]
+    assert believed.confidence_of(kept, with_camera=True) == pytest.approx(found.confidence)
+    assert believed.confidence_of(kept, with_camera=False) != pytest.approx(found.confidence)
+    assert believed.confidence_of({"failed": "no"}, with_camera=True) == 0.0

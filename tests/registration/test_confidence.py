@@ -81,12 +81,13 @@ def test_constants_of_verified_poses_are_those_that_the_script_found():
 
 
 def test_confidence_of_a_pose_is_the_logistic_function():
-    evidence = pose_evidence(0.7, 9.0, with_camera=True)
-    assert evidence == [0.7, 5.0, 1.0], "a lead counts up to 5"
-    x = 0.7 * _POSE_WEIGHTS[0] + 5.0 * _POSE_WEIGHTS[1] + _POSE_WEIGHTS[2] + _POSE_BIAS
+    evidence = pose_evidence(0.7, 9.0, with_camera=True, support=0.4)
+    assert evidence == [0.7, 5.0, 1.0, 0.4], "a lead counts up to 5"
+    x = 0.7 * _POSE_WEIGHTS[0] + 5.0 * _POSE_WEIGHTS[1] + _POSE_WEIGHTS[2] + 0.4 * _POSE_WEIGHTS[3] + _POSE_BIAS
     assert pose_confidence(evidence) == pytest.approx(1 / (1 + math.exp(-x)))
-    assert pose_confidence(pose_evidence(0.7, 9.0, with_camera=False)) < pose_confidence(evidence)
-    assert pose_confidence(pose_evidence(0.7, 0.1, with_camera=True)) < RELIABLE < pose_confidence(evidence)
+    assert pose_confidence(pose_evidence(0.7, 9.0, with_camera=False, support=0.4)) < pose_confidence(evidence)
+    few = pose_evidence(0.7, 0.1, with_camera=True, support=0.4), pose_evidence(0.7, 2.0, with_camera=True)
+    assert max(map(pose_confidence, few)) < RELIABLE < pose_confidence(evidence), "no lead; no edges under the contours"
 
 
 def test_verdict_counts_what_was_found_only_where_the_camera_is_known():
@@ -147,5 +148,6 @@ def test_confidence_rests_on_the_lead_that_the_hypotheses_tell():
         told = torch.tensor([list(h.evidence.values()) for h in result.hypotheses], dtype=torch.float64)
         score = verdict(told, with_camera=True)
         lead = float(score[0] - score[1:].max())
-        expected = pose_confidence(pose_evidence(result.score, lead, with_camera=True))
+        support = result.hypotheses[0].evidence["support"]
+        expected = pose_confidence(pose_evidence(result.score, lead, with_camera=True, support=support))
         assert result.confidence == pytest.approx(expected)
