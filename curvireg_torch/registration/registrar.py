@@ -256,8 +256,8 @@ class Registrar:
             trust = float(coarse[b])
             if fit is not None:
                 lead = float(verdicts[mine[0]] - verdicts[mine[1:]].max()) if len(mine) > 1 else torch.inf
-                known = {"with_camera": K is not None, "support": float(support[mine[0]])}
-                trust = pose_confidence(pose_evidence(float(score[mine[0]]), lead, **known))
+                similarity, edges = float(score[mine[0]]), float(support[mine[0]])
+                trust = pose_confidence(pose_evidence(similarity, lead, with_camera=K is not None, support=edges))
             reliable = trust >= RELIABLE
             answers = tuple(_hypothesis(h, poses, support, evidence, reliable, K is not None) for h in mine)
             results.append(Registration(answers, trust, ranking[b : b + 1]))

@@ -107,17 +107,18 @@ def test_the_verdict_without_each_piece_of_evidence(verdicts):
         "risk_at_coverage": {"1": 0.1},
     }
     shares = {key: [0.5, 0.25, 0.75] for key in ("best_view", "winner", "among_hypotheses")}
+    alike = {"kind": {"auc": 0.625, "n": 8, "believed": 3, "right_of_them": 2}}
     result = {
         "shares": {"exact upright": {"n": 3, **shares}},
         "verdict": {"without": verdicts.without(rows)},
-        "confidence": {"held_out": held, "right_mesh": {"kind": {"auc": 0.625, "n": 8, "believed": 0.25}}},
+        "confidence": {"held_out": held, "right_mesh": alike},
     }
     text = verdicts.page(result)
     assert "| exact upright | 3 | 0.50 (0.25 to 0.75) | 0.50 (0.25 to 0.75) | 0.50 (0.25 to 0.75) |" in text
     assert "| exact photographs, verdict without | nothing | rank | similarity | support | appearance |" in text
     assert "| right | 1.000 | 1.000 | 1.000 | 0.000 | 1.000 |" in text
     assert "answers 0.75. Of right meshes against another mesh of the object's kind (8 photographs): 0.62;" in text
-    assert "; 0.25 of the wrong ones are believed." in text
+    assert "; of these wrong meshes 3 are believed, 2 of them with a pose within 30 degrees." in text
 
 
 def test_wrong_meshes_are_no_copies_and_of_the_kind_where_asked(runner):
