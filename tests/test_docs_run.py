@@ -178,7 +178,7 @@ def test_what_is_not_typed_is_counted() -> None:
     assert counts == {
         "download": 10,
         "measures for long": 12,
-        "placeholder": 8,
+        "placeholder": 9,
         "suite": 5,
         "writes into the project": 4,
         "3000 photographs": 2,

@@ -5,9 +5,10 @@ A gallery of failures
 A toy truck, drawn and registered with its own mesh and camera. The first picture is as it should be; each of the others
 breaks one of the library's conditions, and the answer is wrong. Contours are drawn at the pose that was found.
 
-**Look at the confidence.** It was fitted on generated photographs that keep most of these conditions. Where they are
-broken it is lower, but often not low enough: from 0.8 on an answer is called reliable. The support, how strongly edges
-lie under the contours, drops more clearly. So look at the overlay before you believe a number.
+**Look at the confidence.** It was fitted on generated photographs that keep most of these conditions, some of them with
+a wrong mesh. Where they are broken it drops, and so does the support, how strongly edges lie under the contours: none
+of the wrong answers below is called reliable (from 0.8 on). That is no promise, so look at the overlay before you
+believe a number.
 """
 
 import matplotlib.pyplot as plt
