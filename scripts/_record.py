@@ -31,6 +31,12 @@ def between(text: str, begin: str, end: str, body: str) -> str:
     return f"{text[: text.index(begin) + len(begin)]}\n{body}{text[text.index(end) :]}"
 
 
+def table_lines(cells: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table, the first row its head."""
+    lines = ["| " + " | ".join(row) + " |" for row in cells]
+    return [lines[0], "|---" * len(cells[0]) + "|", *lines[1:]]
+
+
 def write_json(path: Path, content: Any, indent: int = 2) -> None:
     """A record and its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -15,16 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _record import between
+from _record import between, table_lines
+from check_verdict import RIGHT, auc, evidence_of, wrong_at
 from scipy.optimize import minimize
 from sklearn.linear_model import LogisticRegression
 
-from curvireg_torch.registration.confidence import POSE_EVIDENCE, RELIABLE, pose_evidence
+from curvireg_torch.registration.confidence import POSE_EVIDENCE, RELIABLE
 from curvireg_torch.registration.verify import EVIDENCE, RANK_ALONE, WEIGHTS
 
 PAGE = Path(__file__).parents[1] / "docs" / "accuracy.md"
 BEGIN, END = "<!-- verdict:begin -->", "<!-- verdict:end -->"
-RIGHT = 30.0
 PARTS = 5
 WRONG = {"any": "another mesh", "kind": "another mesh of the object's kind"}
 WRONG_SHARE = 0.1
@@ -75,21 +75,14 @@ def features(rows: list[dict[str, Any]]) -> np.ndarray:
     """(n, F) of the winners by the constants in use."""
     out = []
     for row in rows:
-        score = np.sort(in_use(row))[::-1]
-        best = row["evidence"][int(np.argmax(in_use(row)))]
-        lead = float(score[0] - score[1]) if len(score) > 1 else np.inf
-        known = {"with_camera": row["form"] == "exact", "support": best["support"]}
-        out.append(pose_evidence(best["similarity"], lead, **known))
+        order = np.argsort(-in_use(row), kind="stable")
+        out.append(evidence_of([row["evidence"][k] for k in order], with_camera=row["form"] == "exact"))
     return np.array(out)
 
 
 def chosen(rows: list[dict[str, Any]]) -> np.ndarray:
     """(n,) bool: whether the winner by the constants in use is right."""
     return np.array([right(r)[np.argmax(in_use(r))] for r in rows])
-
-
-def auc(p: np.ndarray, q: np.ndarray) -> float:
-    return float((p[:, None] > q[None]).mean() + 0.5 * (p[:, None] == q[None]).mean())
 
 
 def share(values: list[bool], rows: list[dict[str, Any]]) -> list[float]:
@@ -119,9 +112,9 @@ def page(result: dict[str, Any]) -> str:
     )
     return "\n".join(
         [
-            *rows_of_table([head, *shares]),
+            *table_lines([head, *shares]),
             "",
-            *rows_of_table(
+            *table_lines(
                 [
                     ["exact photographs, verdict without", *result["verdict"]["without"]],
                     ["right", *(f"{v[0]:.3f}" for v in result["verdict"]["without"].values())],
@@ -130,14 +123,14 @@ def page(result: dict[str, Any]) -> str:
             "",
             f"Confidence, meshes left out in turn: AUC of right answers {held['auc_right_answer']:.2f}.{mesh}",
             "",
-            *rows_of_table(
+            *table_lines(
                 [
                     ["coverage", *held["risk_at_coverage"]],
                     ["share that is wrong", *(f"{v:.2f}" for v in held["risk_at_coverage"].values())],
                 ]
             ),
             "",
-            *rows_of_table(
+            *table_lines(
                 [
                     ["confidence of at least", *known],
                     ["right", *(f"{v[0]:.2f}" for v in known.values())],
@@ -147,12 +140,6 @@ def page(result: dict[str, Any]) -> str:
             "",
         ]
     )
-
-
-def rows_of_table(cells: list[list[str]]) -> list[str]:
-    """Lines of a Markdown table, the first row its head."""
-    lines = ["| " + " | ".join(row) + " |" for row in cells]
-    return [lines[0], "|---" * len(cells[0]) + "|", *lines[1:]]
 
 
 def main() -> None:
@@ -175,8 +162,6 @@ def main() -> None:
         sure[test] = model.predict_proba(X[test])[:, 1]
     whole = LogisticRegression(C=1.0, max_iter=1000).fit(X, truth, sample_weight=weight)
     p, y = sure[: len(rows)], truth[: len(rows)]
-    order = np.argsort(-p, kind="stable")
-    risk = {f"{c:g}": float(1.0 - y[order[: max(1, round(c * len(y)))]].mean()) for c in (1.0, 0.75, 0.5, 0.25)}
     result: dict[str, Any] = {
         "n": len(rows),
         "shares": {
@@ -204,7 +189,7 @@ def main() -> None:
             "bias": round(float(whole.intercept_[0]), 3),
             "held_out": {
                 "auc_right_answer": auc(p[y], p[~y]),
-                "risk_at_coverage": risk,
+                "risk_at_coverage": wrong_at(p, y),
                 "precision_at": {
                     f"{t:g}": [float(y[p >= t].mean()) if (p >= t).any() else None, float((p >= t).mean())]
                     for t in (0.5, 0.6, 0.7, 0.8, 0.9)
