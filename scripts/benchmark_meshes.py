@@ -66,19 +66,25 @@ UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 """From the catalogue's frame (y up, front +z) to ours (z up, front -y)."""
 
 
+def fetched(source: Path, package: str, sha256: str) -> Path:
+    """The package's file in ``source``, downloaded where it is not there: of no other edition."""
+    source.mkdir(parents=True, exist_ok=True)
+    if not list(source.glob(f"{package}_*.deb")):
+        subprocess.run(["apt-get", "download", package], cwd=source, check=True)
+    return checked(next(iter(source.glob(f"{package}_*.deb"))), sha256)
+
+
+def checked(deb: Path, sha256: str) -> Path:
+    found = hashlib.sha256(deb.read_bytes()).hexdigest()
+    if found != sha256:
+        sys.exit(f"{deb}: another edition (sha256 {found}); the benchmark's list is that of {sha256}")
+    return deb
+
+
 def fetch(out: Path, deb: Path | None) -> Path:
     """Folder with the unpacked libraries."""
     source = out / "source"
-    source.mkdir(parents=True, exist_ok=True)
-    if deb is None:
-        found = list(source.glob(f"{PACKAGE}_*.deb"))
-        if not found:
-            subprocess.run(["apt-get", "download", PACKAGE], cwd=source, check=True)
-            found = list(source.glob(f"{PACKAGE}_*.deb"))
-        deb = found[0]
-    digest = hashlib.sha256(deb.read_bytes()).hexdigest()
-    if digest != SHA256:
-        sys.exit(f"{deb}: another edition of {PACKAGE} (sha256 {digest}); the benchmark's list is that of 1.8-1")
+    deb = fetched(source, PACKAGE, SHA256) if deb is None else checked(deb, SHA256)
     unpacked = source / "unpacked"
     if not (unpacked / "done").exists():
         subprocess.run(["dpkg-deb", "-x", deb.resolve(), unpacked], check=True)
@@ -209,17 +215,30 @@ def examine(task: tuple[dict, Path, Path]) -> tuple[dict, str | None, np.ndarray
     except Exception as error:  # whatever the reader meets in a file
         return row, f"unreadable ({type(error).__name__})", None
     cloud = samples(model)
-    alike = symmetries(cloud)
     described = {
         **{k: row[k] for k in ("id", "name", "category", "licence", "creator", "source")},
         "kind": kind_of(row["name"]),
-        "path": f"meshes/{row['id']}/model.obj",
+        **measured(row["id"], model, cloud),
+    }
+    return described, None, cloud
+
+
+def measured(name: str, model: Textured, cloud: np.ndarray) -> dict:
+    """What make_benchmark.py asks of the mesh ``name`` in the folder meshes, whose surface has these points."""
+    alike = symmetries(cloud)
+    return {
+        "path": f"meshes/{name}/model.obj",
         "faces": len(model.triangles),
         "extents": np.ptp(model.points(), axis=0).round(4).tolist(),
         "shape_symmetries": alike,
         "look_symmetries": look_symmetries(model, alike, turns()),
     }
-    return described, None, cloud
+
+
+def write_listing(out: Path, listing: dict) -> None:
+    part = out / "meshes.json.part"
+    part.write_text(json.dumps(listing, indent=1))
+    part.replace(out / "meshes.json")
 
 
 def main() -> None:
@@ -245,9 +264,7 @@ def main() -> None:
                 continue
             kept[row["id"]] = np.ptp(cloud, axis=0), cKDTree(cloud)
             listing["meshes"].append({**row, "half": half, "like": like or row["id"]})
-        part = arguments.out / "meshes.json.part"
-        part.write_text(json.dumps(listing, indent=1))
-        part.replace(arguments.out / "meshes.json")
+        write_listing(arguments.out, listing)
         print(
             f"{half}: {sum(m['half'] == half for m in listing['meshes'])} meshes; left out {len(listing['left_out'])}"
         )

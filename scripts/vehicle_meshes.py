@@ -15,13 +15,12 @@ import json
 import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import _ac3d
 import numpy as np
-from _textured import Textured, look_symmetries
-from benchmark_meshes import copy_of, half_of, samples, symmetries, turns
+from _textured import Textured
+from benchmark_meshes import copy_of, fetched, half_of, measured, samples, turns, write_listing
 from PIL import Image
 from scipy.spatial import cKDTree
 from tqdm import tqdm
@@ -58,14 +57,8 @@ FORE_UP = np.array([[0, 0, -1.0], [-1, 0, 0], [0, 1, 0]])
 def fetch(out: Path) -> Path:
     """Folder with the unpacked packages."""
     source = out / "source"
-    source.mkdir(parents=True, exist_ok=True)
-    for package, digest in PACKAGES.items():
-        if not list(source.glob(f"{package}_*.deb")):
-            subprocess.run(["apt-get", "download", package], cwd=source, check=True)
-        deb = next(iter(source.glob(f"{package}_*.deb")))
-        found = hashlib.sha256(deb.read_bytes()).hexdigest()
-        if found != digest:
-            sys.exit(f"{deb}: another edition of {package} (sha256 {found}); the list is that of {digest[:8]}...")
+    for package, sha256 in PACKAGES.items():
+        deb = fetched(source, package, sha256)
         if not (source / package / "usr").exists():
             subprocess.run(["dpkg-deb", "-x", deb.resolve(), source / package], check=True)
     return source
@@ -78,7 +71,7 @@ def largest(folder: Path, unwanted: str = "light|prop|refuel|gear|pilot|wheel|sh
 
 
 def catalogue(source: Path) -> list[dict]:
-    """Name, kind, file and frame of every vehicle."""
+    """Id, name, kind and file of every vehicle."""
     air = source / "flightgear-data-ai/usr/share/games/flightgear/AI/Aircraft"
     models = source / "flightgear-data-models/usr/share/games/flightgear/Models"
     cars = source / "torcs-data/usr/share/games/torcs/cars"
@@ -94,12 +87,11 @@ def catalogue(source: Path) -> list[dict]:
         files += [("ship", name, path) for path in largest(models / "Geometry" / name)]
     land = [*sorted((models / "Transport").glob("*.ac")), *sorted((models / "Military").glob("humvee*.ac"))]
     files += [("train", path.stem, path) for path in [*land, *sorted((models / "Airport/Vehicle").glob("*.ac"))]]
-    files += [("car", path.name, path / f"{path.name}.acc") for path in sorted(cars.iterdir())]
+    files += [("car", path.stem, path) for path in sorted(cars.glob("*/*.acc")) if path.stem == path.parent.name]
     rows = []
     for group, name, path in files:
         short = re.sub(r"\W|_", "", name).lower()
-        if path.is_file():
-            rows.append({"id": f"{group}-{short}", "name": name, "kind": kind_of(group, short), "file": path})
+        rows.append({"id": f"{group}-{short}", "name": name, "kind": kind_of(group, short), "file": path})
     return rows
 
 
@@ -244,24 +236,11 @@ def main() -> None:
             listing["left_out"][row["id"]] = why
             continue
         kept[row["id"]] = np.ptp(cloud, axis=0), cKDTree(cloud)
-        alike = symmetries(cloud)
-        listing["meshes"].append(
-            {
-                **{k: row[k] for k in ("id", "name", "kind")},
-                "path": f"meshes/{row['id']}/model.obj",
-                "faces": len(model.triangles),
-                "extents": np.ptp(model.points(), axis=0).round(4).tolist(),
-                "shape_symmetries": alike,
-                "look_symmetries": look_symmetries(model, alike, turns()),
-                "half": half_of(row["id"]),
-                "like": like or row["id"],
-            }
-        )
+        known = {k: row[k] for k in ("id", "name", "kind")} | measured(row["id"], model, cloud)
+        listing["meshes"].append({**known, "half": half_of(row["id"]), "like": like or row["id"]})
     vehicles = len(listing["meshes"])
     listing["meshes"] += furniture(arguments.bench, arguments.out)
-    part = arguments.out / "meshes.json.part"
-    part.write_text(json.dumps(listing, indent=1))
-    part.replace(arguments.out / "meshes.json")
+    write_listing(arguments.out, listing)
     print(f"{vehicles} vehicles; left out {len(listing['left_out'])}")
 
 

@@ -136,7 +136,17 @@ def believed():
         yield script
 
 
+def test_what_the_confidence_rests_on(believed):
+    """Verdicts: 8, 6 and 4.5 with a camera; 0, -1 and -0.5, by rank alone, without."""
+    rows = (0.0, 1.0, 0.3, 0.0), (-1.0, 1.0, 0.2, 0.0), (-0.5, 0.6, 0.2, 0.0)
+    known = [dict(zip(("rank", "similarity", "support", "appearance"), one, strict=True)) for one in rows]
+    assert believed.evidence_of(known, with_camera=True) == pytest.approx([1.0, 2.0, 1.0, 0.3]), "the nearest rival's"
+    assert believed.evidence_of(known, with_camera=False) == pytest.approx([1.0, 0.5, 0.0, 0.3])
+    assert believed.evidence_of(known[:1], with_camera=True) == pytest.approx([1.0, 5.0, 1.0, 0.3]), "alone"
+
+
 def test_what_confidences_are_worth(believed):
+    assert believed.auc(np.array([0.5, 0.9]), np.array([0.5, 0.1])) == pytest.approx(3.5 / 4), "a tie counts half"
     sure, right = np.array([0.9, 0.8, 0.6, 0.3]), np.array([True, True, False, True])
     found = believed.judged(sure, right)
     assert found["auc"] == pytest.approx(2 / 3)
