@@ -113,6 +113,9 @@ class Registration:
             :func:`curvireg_torch.registration.confidence`; of an object without a box, times the probability that it
             is there.
         ranking: of the bank's views for this photograph (B = 1).
+        lead: how far the best hypothesis leads its best rival in :func:`verdict`, rivals that are not reported
+            included; below 0 where the rival is a view that belongs to no peak of its own. None where the bank has no
+            view that could be a rival: then nothing tells how sure the answer is, and little confidence is given.
         found: of an object without a box.
         corrected_box: (4,) float64 the box that the answer was made with, where the given one did not fit.
     """
@@ -120,6 +123,7 @@ class Registration:
     hypotheses: tuple[Hypothesis, ...]
     confidence: float
     ranking: Ranking
+    lead: float | None = None
     found: Found | None = None
     corrected_box: Tensor | None = None
 
