@@ -116,9 +116,7 @@ def follow_contours(
     return Poses(seen_straight(describers, poses.found, fit.transform), fit.transform, poses.cameras, fit)
 
 
-def supports(
-    describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor
-) -> Tensor:
+def supports(describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor) -> Tensor:
     """(H,) contour support of poses of all models as they are, see :func:`contour_support`."""
     out = torch.zeros(len(poses.found), dtype=torch.float64)
     for model, mine in _by_model(poses.found):

@@ -41,8 +41,8 @@ class Hypothesis:
         support: how strongly edges of the photograph lie under the mesh's contours, in [0, 1]; None without the contour
             stage (:func:`curvireg_torch.registration.fit_contours`).
         covariance: (6, 6) float64 of turn (rad) about the camera's x, y, z and translation (model units) along them,
-            ``R_true = exp([w]x) R``, ``t_true = t + e``; None without a camera matrix, without the contour stage, where
-            the contours do not fix the pose, and where the answer is not reliable.
+            ``R_true = exp([w]x) R``, ``t_true = t + e``, should this pose be the right one; None without a camera
+            matrix, without the contour stage, and where the contours do not fix the pose.
     """
 
     rotation: Tensor
@@ -105,7 +105,7 @@ class Registration:
     """Poses of one object in one photograph, best first.
 
     Everything that a :class:`Hypothesis` has is here too, of the best one: ``rotation``, ``translation``, ``score``,
-    ``viewpoint``, ``covariance`` and so on.
+    ``viewpoint`` and so on; ``covariance`` and ``standard_deviations`` are None where the answer is not reliable.
 
     Attributes:
         hypotheses: distinct poses, best first; the others are rivals, such as half a turn.
@@ -186,7 +186,7 @@ class Registration:
 
     @property
     def covariance(self) -> Tensor | None:
-        return self.hypotheses[0].covariance
+        return self.hypotheses[0].covariance if self.reliable else None
 
     @property
     def viewpoint(self) -> tuple[float, float, float]:
@@ -194,7 +194,7 @@ class Registration:
 
     @property
     def standard_deviations(self) -> tuple[Tensor, Tensor] | None:
-        return self.hypotheses[0].standard_deviations
+        return self.hypotheses[0].standard_deviations if self.reliable else None
 
     @property
     def transform(self) -> Tensor | None:

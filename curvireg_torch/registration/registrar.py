@@ -16,7 +16,7 @@ from ..location import Locator
 from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
-from .confidence import RELIABLE, confidence, pose_confidence, pose_evidence
+from .confidence import confidence, pose_confidence, pose_evidence
 from .correction import corrected
 from .finding import find
 from .hypotheses import Hypotheses, hypotheses, own_peaks
@@ -292,8 +292,7 @@ class Registrar:
                 known = float(similarity[mine[0]]), float(support[mine[0]])
                 trust = pose_confidence(pose_evidence(known[0], lead, with_camera=with_camera, support=known[1]))
             answers = tuple(
-                _hypothesis(h, poses, support, evidence, trust >= RELIABLE, with_camera)
-                for h in mine[: self.pipeline.hypotheses]
+                _hypothesis(h, poses, support, evidence, with_camera) for h in mine[: self.pipeline.hypotheses]
             )
             results.append(Registration(answers, trust, ranking[b : b + 1], lead))
         return results
@@ -311,11 +310,9 @@ class Registrar:
         return self.matcher.late_score("appearance", query, ranking, pictures, found.photograph)
 
 
-def _hypothesis(
-    h: int, poses: Poses, support: Tensor, evidence: Tensor, reliable: bool, with_camera: bool
-) -> Hypothesis:
+def _hypothesis(h: int, poses: Poses, support: Tensor, evidence: Tensor, with_camera: bool) -> Hypothesis:
     found, T, fit = poses.found, poses.T[h], poses.fit
-    known = fit is not None and with_camera and reliable and bool(fit.covariance[h].isfinite().all())
+    known = fit is not None and with_camera and bool(fit.covariance[h].isfinite().all())
     return Hypothesis(
         rotation=T[:3, :3].clone() if with_camera else found.rotation[h].clone(),
         translation=T[:3, 3].clone() if with_camera else None,
