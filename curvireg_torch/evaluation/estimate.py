@@ -23,8 +23,9 @@ def estimate_poses(registrar: Registrar, items: Sequence[Item], *, boxes: bool =
     Returns:
         For each ``rotation`` (3 x 3 numbers), ``translation`` (3 numbers, unit of the mesh, or None), ``score``,
         ``confidence``, ``reliable``, ``lead``, ``support``, ``covariance`` and ``seen_by`` (see :class:`Registration`),
-        ``mesh``: the place of the chosen mesh in the bank, and ``rivals``: rotation, score and evidence of the other hypotheses;
-        of objects that were looked for, ``found``: the presence and the proposed boxes; or ``failed`` with the reason.
+        ``mesh``: the place of the chosen mesh in the bank, and ``rivals``: rotation, score and evidence of the other
+        hypotheses; of objects that were looked for, ``found``: the presence and the proposed boxes; or ``failed`` with
+        the reason.
     """
     cameras = [item.camera_matrix for item in items if item.camera_matrix is not None]
     results = registrar(
