@@ -22,10 +22,10 @@ def estimate_poses(registrar: Registrar, items: Sequence[Item], *, boxes: bool =
 
     Returns:
         For each ``rotation`` (3 x 3 numbers), ``translation`` (3 numbers, unit of the mesh, or None), ``score``,
-        ``confidence``, ``reliable``, ``lead``, ``support``, ``covariance`` and ``seen_by`` (see :class:`Registration`),
-        ``mesh``: the place of the chosen mesh in the bank, and ``rivals``: rotation, score and evidence of the other
-        hypotheses; of objects that were looked for, ``found``: the presence and the proposed boxes; or ``failed`` with
-        the reason.
+        ``confidence``, ``reliable``, ``confidence_features``, ``support``, ``covariance`` and ``seen_by`` (see
+        :class:`Registration`), ``mesh``: the place of the chosen mesh in the bank, and ``rivals``: rotation, score and
+        evidence of the other hypotheses; of objects that were looked for, ``found``: the presence and the proposed
+        boxes; or ``failed`` with the reason.
     """
     cameras = [item.camera_matrix for item in items if item.camera_matrix is not None]
     results = registrar(
@@ -46,7 +46,7 @@ def _row(result: Registration | FailedRegistration) -> Row:
         "score": best.score,
         "confidence": result.confidence,
         "reliable": result.reliable,
-        "lead": result.lead,
+        "confidence_features": dict(result.confidence_features),
         "support": best.support,
         "evidence": dict(best.evidence),
         "covariance": None if result.covariance is None else result.covariance.tolist(),

@@ -105,7 +105,8 @@ class Backbone(nn.Module):
             self.register_buffer(f"_spread{i}", torch.linalg.vector_norm(scales, dim=0), persistent=False)
         self.requires_grad_(False)
         self.eval()
-        self.to(memory_format=torch.channels_last)
+        for weight in (p for p in self.parameters() if p.ndim == 4):
+            weight.data = weight.data.to(memory_format=torch.channels_last)
 
     @property
     def spreads(self) -> tuple[Tensor, Tensor]:

@@ -1,45 +1,49 @@
-"""How far a ranking can be trusted, and its best distinct views."""
+"""How far a ranking, a pose or a place can be trusted: logistic models of what was measured.
 
-from collections.abc import Sequence
+Their constants are in ``calibration.json``, which scripts/calibrate.py writes from registered photographs of the
+benchmark. What they are worth on photographs that had no part in it is in docs/accuracy.md.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..geometry.viewpoint import rotation_error
 from ..matching import Ranking
+from .verify import EVIDENCE
 
 __all__ = [
-    "EVIDENCE",
-    "POSE_EVIDENCE",
+    "CALIBRATION",
+    "FEATURES",
     "PRESENCE_EVIDENCE",
     "RELIABLE",
+    "LogisticModel",
     "confidence",
-    "pose_confidence",
-    "pose_evidence",
+    "confidence_model",
+    "pose_features",
     "presence",
     "presence_evidence",
     "ranking_evidence",
+    "ranking_features",
 ]
 
-EVIDENCE = ("similarity", "margin", "concentration")
-"""What :func:`ranking_evidence` measures, in its order."""
+CALIBRATION: dict[str, Any] = json.loads(Path(__file__).with_name("calibration.json").read_text(encoding="utf-8"))
+"""What scripts/calibrate.py found: the models of confidence, and what it takes for the covariance to be true."""
 
 RELIABLE = 0.8
 """Confidence below which a registration says "no reliable match"."""
 
-_WEIGHTS = (9.513, 1.042, 2.375)
-_BIAS = -8.803
-"""Logistic regression on scenes made in code, by scripts/calibrate_confidence.py."""
+RANKING_EVIDENCE = ("similarity", "margin", "concentration")
+"""What :func:`ranking_evidence` measures, in its order."""
 
-_APART = 30.0  # degrees beyond which two views are rival answers
-
-
-POSE_EVIDENCE = ("similarity", "margin", "camera", "support")
-"""What :func:`pose_evidence` measures, in its order."""
-
-_POSE_WEIGHTS = (3.216, 0.477, 0.529, 2.433)
-_POSE_BIAS = -3.292
-"""Logistic regression on photographs of textured meshes, one in ten with a wrong mesh, by scripts/fit_verdict.py."""
+FEATURES = ("similarity", "lead", "support", "appearance_lead", "concentration")
+"""What the confidence in a pose that was followed to its end rests on, see :func:`pose_features`."""
 
 PRESENCE_EVIDENCE = ("place", "similarity")
 """What :func:`presence_evidence` measures, in its order; similarity alone where nothing was learnt."""
@@ -49,48 +53,86 @@ _PRESENCE = {2: ((1.128, 7.819), -16.897), 1: ((16.756,), -14.856)}
 both pieces of evidence, and for the one."""
 
 MARGIN = 5.0
-"""A lead that is larger tells no more."""
+"""A lead that is larger says no more."""
+
+_APART = 30.0  # degrees beyond which two views are rival answers
+
+Features = Mapping[str, float | None]
+"""By name; None where there is no rival view to compare with."""
 
 
-def ranking_evidence(ranking: Ranking, rotations: Tensor) -> Tensor:
-    """(B, 3) numbers that tell right answers from wrong ones, by the names in ``EVIDENCE``.
+@dataclass(frozen=True)
+class LogisticModel:
+    """P = 1 / (1 + exp(-(bias + sum of weight x feature))).
+
+    Attributes:
+        weights: of the features, by name.
+        bias: where all features are 0.
+    """
+
+    weights: Mapping[str, float]
+    bias: float
+
+    def __call__(self, features: Features) -> float:
+        """Probability in (0, 1). A feature that is None counts as 0, which is what a tie with a rival has."""
+        logit = self.bias + sum(weight * (features[name] or 0.0) for name, weight in self.weights.items())
+        return 0.5 * (1.0 + math.tanh(0.5 * logit))  # the logistic function, which overflows nowhere
+
+
+def confidence_model(stage: str, *, with_camera: bool, with_appearance: bool) -> LogisticModel:
+    """The model of one way to register.
+
+    Args:
+        stage: "ranking" of answers that are views, "contours" of poses that were followed to their end.
+        with_camera: whether the camera matrix is known, and with it, as a rule, the object's own mesh. A ranking does
+            not depend on it.
+        with_appearance: whether the pipeline has the appearance term.
+    """
+    camera = [] if stage == "ranking" else ["camera" if with_camera else "no camera"]
+    name = ", ".join([stage, *camera, "appearance" if with_appearance else "no appearance"])
+    model = CALIBRATION["confidence"][name]
+    return LogisticModel(model["weights"], model["bias"])
+
+
+def ranking_evidence(ranking: Ranking, rotations: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
+    """(B, 3) numbers that tell right answers from wrong ones, by the names in ``RANKING_EVIDENCE``.
 
     similarity: normalised correlation of the best view, in [0, 1]. margin: how far its score leads the best view more
     than 30 degrees away, log S - log S', at most 5. concentration: of the sum of S^4 over all views, the share within
-    30 degrees of the best.
+    30 degrees of the best. Both are 0 where no view is that far away: then nothing was compared.
 
     Args:
         ranking: of N views for B photographs.
         rotations: (N, 3, 3) of the views.
+        symmetries: (K, 4, 4) or (K, 3, 3) of the mesh: views that differ by one of them are the same answer.
     """
     scores, best = ranking.scores.double(), ranking.order[:, :1]
-    near = rotation_error(rotations[best], rotations[None]) <= _APART
+    turns = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
+    alike = rotations[best] @ turns.to(rotations)  # (B, K, 3, 3)
+    near = torch.stack([rotation_error(same[:, None], rotations[None]).amin(dim=0) <= _APART for same in alike])
     tiny = 1e-300  # of scores that are all 0
     leader = scores.gather(1, best).clamp(min=tiny)
     rival = scores.masked_fill(near, 0.0).amax(dim=1, keepdim=True)
-    margin = (leader / rival.clamp(min=tiny)).log().clamp(max=5.0)
+    margin = (leader / rival.clamp(min=tiny)).log().clamp(max=MARGIN)
     weights = (scores / leader) ** 4
     concentration = (weights * near).sum(dim=1, keepdim=True) / weights.sum(dim=1, keepdim=True).clamp(min=tiny)
-    parts = [ranking.hog.gather(1, best), margin, concentration]
+    compared = ~near.all(dim=1, keepdim=True)
+    parts = [ranking.hog.gather(1, best), margin * compared, concentration * compared]
     return torch.cat([part.double() for part in parts], dim=1).float()
 
 
-def probability(evidence: Tensor) -> Tensor:
-    """(B,) in (0, 1) from (B, 3) evidence, the logistic function of :func:`confidence`."""
-    return torch.sigmoid(evidence @ evidence.new_tensor(_WEIGHTS) + _BIAS)
+def ranking_features(evidence: Tensor) -> dict[str, float | None]:
+    """Features of one ranking, from (3,) :func:`ranking_evidence`."""
+    return dict(zip(RANKING_EVIDENCE, evidence.tolist(), strict=True))
 
 
-def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
+def confidence(ranking: Ranking, rotations: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
     """Probability that the best view is within 30 degrees of the truth, from :func:`ranking_evidence`.
-
-    A logistic function whose constants were fitted on scenes made in code (scripts/calibrate_confidence.py), each with
-    its own mesh. What it is worth on photographs, and against wrong meshes, is in ``docs/method.md``. An object with
-    symmetries has several right answers, which look like doubt here; whitened descriptors have another similarity,
-    which the constants do not know.
 
     Args:
         ranking: of N views for B photographs.
         rotations: (N, 3, 3) of the views.
+        symmetries: see :func:`ranking_evidence`.
 
     Returns:
         (B,) in (0, 1).
@@ -98,36 +140,41 @@ def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
     Example:
         >>> one = torch.tensor([[1.0, 0.0]])
         >>> R = torch.stack([torch.eye(3), torch.diag(torch.tensor([1.0, -1.0, -1.0]))])
-        >>> clear = Ranking(one, torch.tensor([[0, 1]]), {"hog": 0.9 * one})
-        >>> bool(confidence(clear, R) > 0.9)
+        >>> clear, tied = (Ranking(s, torch.tensor([[0, 1]]), {"hog": 0.9 * s}) for s in (one, torch.ones(1, 2)))
+        >>> bool(confidence(clear, R) > confidence(tied, R))
         True
     """
-    return probability(ranking_evidence(ranking, rotations))
+    model = confidence_model("ranking", with_camera=False, with_appearance="appearance" in ranking.terms)
+    evidence = ranking_evidence(ranking, rotations, symmetries=symmetries)
+    return torch.tensor([model(ranking_features(one)) for one in evidence])
 
 
-def pose_evidence(similarity: float, lead: float | None, *, with_camera: bool, support: float = 0.0) -> list[float]:
-    """Numbers that tell right poses from wrong ones (``POSE_EVIDENCE``), of a hypothesis followed to its end.
+def pose_features(evidence: Tensor, verdicts: Tensor, concentration: float) -> dict[str, float | None]:
+    """Features of the best of the hypotheses that were followed for one photograph, by the names in ``FEATURES``.
+
+    similarity and support: of the best one. lead: how far it leads its best rival in :func:`verdict`;
+    appearance_lead: how much more it looks like the photograph than any rival. Leads are at most 5, and None where
+    there is no rival. concentration: of the ranking, see :func:`ranking_evidence`.
 
     Args:
-        similarity: normalised correlation of the pose's view with the photograph.
-        lead: how far its verdict leads that of the best rival; at most 5 counts. None where the bank has no rival
-            view: it counts as no lead at all, for nothing tells how much less another pose would fit.
-        with_camera: whether the camera matrix is known, and with it, as a rule, the object's own mesh.
-        support: strength of the photograph's edges under the pose's contours.
+        evidence: (H, 4) of the hypotheses, see :data:`EVIDENCE`, the best first.
+        verdicts: (H,) of the same.
+        concentration: of the ranking.
     """
-    return [similarity, 0.0 if lead is None else min(lead, MARGIN), float(with_camera), support]
+    best = dict(zip(EVIDENCE, evidence[0].tolist(), strict=True))
+    looks = evidence[:, EVIDENCE.index("appearance")]
+    return {
+        "similarity": best["similarity"],
+        "lead": _lead(verdicts),
+        "support": best["support"],
+        "appearance_lead": _lead(looks),
+        "concentration": concentration,
+    }
 
 
-def pose_confidence(evidence: Sequence[float]) -> float:
-    """Probability that the best pose is within 30 degrees of the truth, from :func:`pose_evidence`.
-
-    What it is worth on photographs, and against wrong meshes, is in ``docs/method.md``.
-
-    Example:
-        >>> pose_confidence([0.9, 5.0, 1.0, 0.5]) > pose_confidence([0.5, 0.5, 1.0, 0.2])
-        True
-    """
-    return _logistic(evidence, _POSE_WEIGHTS, _POSE_BIAS)
+def _lead(values: Tensor) -> float | None:
+    """How far the first is above the largest of the others, within +-``MARGIN``."""
+    return float((values[0] - values[1:].max()).clamp(-MARGIN, MARGIN)) if len(values) > 1 else None
 
 
 def presence_evidence(score: float, ranking: Ranking, *, pictures: bool) -> list[float]:
@@ -151,9 +198,7 @@ def presence(evidence: Sequence[float]) -> float:
         >>> presence([0.9]) > presence([0.6])
         True
     """
-    return _logistic(evidence, *_PRESENCE[len(evidence)])
-
-
-def _logistic(evidence: Sequence[float], weights: Sequence[float], bias: float) -> float:
-    x, w = (torch.tensor(v, dtype=torch.float64) for v in (evidence, weights))
-    return float(torch.sigmoid(x @ w + bias))
+    weights, bias = _PRESENCE[len(evidence)]
+    names = PRESENCE_EVIDENCE[-len(evidence) :]
+    model = LogisticModel(dict(zip(names, weights, strict=True)), bias)
+    return model(dict(zip(names, evidence, strict=True)))

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -113,9 +113,9 @@ class Registration:
             :func:`curvireg_torch.registration.confidence`; of an object without a box, times the probability that it
             is there.
         ranking: of the bank's views for this photograph (B = 1).
-        lead: how far the best hypothesis leads its best rival in :func:`verdict`, rivals that are not reported
-            included; below 0 where the rival is a view that belongs to no peak of its own. None where the bank has no
-            view that could be a rival: then nothing tells how sure the answer is, and little confidence is given.
+        confidence_features: what the confidence rests on, by name, see :func:`.confidence.pose_features` and
+            :func:`.confidence.ranking_evidence`; rivals that are not reported are included. ``lead`` is None where the
+            bank has no view that could be a rival: then little confidence is given.
         found: of an object without a box.
         corrected_box: (4,) float64 the box that the answer was made with, where the given one did not fit.
     """
@@ -123,7 +123,7 @@ class Registration:
     hypotheses: tuple[Hypothesis, ...]
     confidence: float
     ranking: Ranking
-    lead: float | None = None
+    confidence_features: Mapping[str, float | None] = field(default_factory=dict)
     found: Found | None = None
     corrected_box: Tensor | None = None
 

@@ -16,7 +16,7 @@ from ..location import Locator
 from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
-from .confidence import confidence, pose_confidence, pose_evidence
+from .confidence import confidence_model, pose_features, ranking_evidence, ranking_features
 from .correction import corrected
 from .finding import find
 from .hypotheses import Hypotheses, hypotheses, own_peaks
@@ -282,19 +282,22 @@ class Registrar:
         poses = replace(poses, found=replace(poses.found, score=similarity))
         verdicts = verdict(evidence, with_camera=with_camera)
         order = (verdicts + torch.where(own, 0.0, -1e6)).argsort(descending=True, stable=True)
-        coarse = confidence(ranking, self.bank.rotations)
+        ranked = ranking_evidence(ranking, self.bank.rotations, symmetries=self.symmetries)
+        model = confidence_model(
+            "ranking" if fit is None else "contours",
+            with_camera=with_camera,
+            with_appearance="appearance" in ranking.terms,
+        )
         results = []
         for b in range(len(items)):
-            mine = order[starts.photograph[order] == b].tolist()
-            lead = float(verdicts[mine[0]] - verdicts[mine[1:]].max()) if len(mine) > 1 else None
-            trust = float(coarse[b])
+            mine = order[starts.photograph[order] == b]
+            features = ranking_features(ranked[b])
             if fit is not None:
-                known = float(similarity[mine[0]]), float(support[mine[0]])
-                trust = pose_confidence(pose_evidence(known[0], lead, with_camera=with_camera, support=known[1]))
+                features = pose_features(evidence[mine], verdicts[mine], float(ranked[b, 2]))
             answers = tuple(
-                _hypothesis(h, poses, support, evidence, with_camera) for h in mine[: self.pipeline.hypotheses]
+                _hypothesis(h, poses, support, evidence, with_camera) for h in mine[: self.pipeline.hypotheses].tolist()
             )
-            results.append(Registration(answers, trust, ranking[b : b + 1], lead))
+            results.append(Registration(answers, model(features), ranking[b : b + 1], features))
         return results
 
     def tell(self, stage: str) -> None:

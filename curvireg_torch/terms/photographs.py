@@ -1,7 +1,8 @@
 """What is compared of a photograph: crops around a box that need not be exact, and their features."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
+from dataclasses import field as dataclass_field
 
 import torch
 from kornia.color import rgb_to_grayscale
@@ -35,7 +36,7 @@ class Photographs:
     descriptors: Tensor
     points: Tensor
     shapes: Tensor
-    late: dict[str, Tensor] = field(default_factory=dict, compare=False)
+    late: dict[str, Tensor] = dataclass_field(default_factory=dict, compare=False)
 
     def __len__(self) -> int:
         return self.regions.shape[0]

@@ -33,8 +33,9 @@ def bank() -> ViewBank:
 def numbers(result: Registration) -> list[torch.Tensor]:
     """Everything that a result says, as tensors."""
     poses = [t for h in result.hypotheses for t in (h.rotation, h.translation, torch.tensor(list(h.evidence.values())))]
-    known = torch.tensor([result.confidence, result.score, result.support, result.lead], dtype=torch.float64)
-    return [*poses, known, result.ranking.scores, result.ranking.order]
+    known = torch.tensor([result.confidence, result.score, result.support], dtype=torch.float64)
+    features = torch.tensor(list(result.confidence_features.values()), dtype=torch.float64)
+    return [*poses, known, features, result.ranking.scores, result.ranking.order]
 
 
 def test_alone_in_a_batch_and_on_any_number_of_threads_to_the_bit(bank: ViewBank) -> None:

@@ -11,22 +11,19 @@ from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
 from curvireg_torch.matching import Ranking
 from curvireg_torch.registration import confidence, distinct_views, ranking_evidence, verdict
 from curvireg_torch.registration.confidence import (
-    _BIAS,
-    _POSE_BIAS,
-    _POSE_WEIGHTS,
-    _WEIGHTS,
-    EVIDENCE,
-    POSE_EVIDENCE,
+    CALIBRATION,
+    FEATURES,
+    RANKING_EVIDENCE,
     RELIABLE,
-    pose_confidence,
-    pose_evidence,
+    LogisticModel,
+    confidence_model,
+    pose_features,
 )
 from curvireg_torch.registration.contour import contour_support
-from curvireg_torch.registration.verify import WEIGHTS
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, SIZE, scene, truck_bank
 
-CONSTANTS = Path(__file__).parents[2] / "scripts" / "results" / "confidence_calibration.json"
+RECORD = Path(__file__).parents[2] / "scripts" / "results" / "calibration.json"
 
 
 def ranking(scores: torch.Tensor, hog: float = 0.8, rep: float = 0.6) -> Ranking:
@@ -39,7 +36,7 @@ def test_evidence_in_closed_form():
     R = sample_views(azimuth_step=12, elevations=[0]).rotations
     scores = torch.full((1, 30), 0.1)
     scores[0, 3], scores[0, 4], scores[0, 20] = 1.0, 0.9, 0.5
-    got = dict(zip(EVIDENCE, ranking_evidence(ranking(scores), R)[0].tolist(), strict=True))
+    got = dict(zip(RANKING_EVIDENCE, ranking_evidence(ranking(scores), R)[0].tolist(), strict=True))
     near = 1 + 0.9**4 + 3 * 0.1**4  # views 1 to 5 lie within 30 degrees
     assert got["similarity"] == pytest.approx(0.8)
     assert got["margin"] == pytest.approx(0.6931, abs=1e-3)  # log(1 / 0.5)
@@ -64,32 +61,54 @@ def test_confidence_is_a_probability_that_grows_with_the_evidence():
     assert 0 < low < 0.5 < high < 1
 
 
+def test_views_that_a_symmetry_makes_one_are_no_rivals():
+    half_turn = symmetry_transforms({"symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]})
+    R = sample_views(azimuth_step=90, elevations=[0]).rotations
+    scores = torch.tensor([[1.0, 0.2, 0.9, 0.1]])
+    plain, symmetric = (ranking_evidence(ranking(scores), R, symmetries=s)[0, 1] for s in (None, half_turn))
+    assert float(plain) == pytest.approx(math.log(1 / 0.9), rel=1e-5)
+    assert float(symmetric) == pytest.approx(math.log(1 / 0.2), rel=1e-5)
+
+
+def test_without_a_view_far_away_nothing_was_compared():
+    R = sample_views(azimuths=[0.0, 10.0, 20.0], elevations=[0]).rotations
+    assert ranking_evidence(ranking(torch.tensor([[1.0, 0.1, 0.1]])), R)[0, 1:].tolist() == [0.0, 0.0]
+
+
 def test_constants_are_those_that_the_script_found():
-    kept = json.loads(CONSTANTS.read_text())
-    assert kept["evidence"] == list(EVIDENCE)
-    assert kept["weights"] == pytest.approx(_WEIGHTS)
-    assert kept["bias"] == pytest.approx(_BIAS)
-
-
-def test_constants_of_verified_poses_are_those_that_the_script_found():
-    kept = json.loads(CONSTANTS.with_name("verdict.json").read_text())
-    assert kept["confidence"]["evidence"] == list(POSE_EVIDENCE)
-    assert kept["confidence"]["weights"] == pytest.approx(_POSE_WEIGHTS)
-    assert kept["confidence"]["bias"] == pytest.approx(_POSE_BIAS)
-    assert kept["verdict"]["used"] == list(WEIGHTS)
-    precision, coverage = kept["confidence"]["held_out"]["precision_at"][f"{RELIABLE:g}"]
-    assert precision > 0.9
-    assert coverage > 0.3
+    record = json.loads(RECORD.read_text(encoding="utf-8"))
+    assert record["confidence"].keys() == CALIBRATION["confidence"].keys()
+    for name, model in CALIBRATION["confidence"].items():
+        assert record["confidence"][name]["weights"] == model["weights"]
+        assert record["confidence"][name]["bias"] == model["bias"]
+        assert list(model["weights"]) == list(RANKING_EVIDENCE if name.startswith("ranking") else FEATURES)
 
 
 def test_confidence_of_a_pose_is_the_logistic_function():
-    evidence = pose_evidence(0.7, 9.0, with_camera=True, support=0.4)
-    assert evidence == [0.7, 5.0, 1.0, 0.4], "a lead counts up to 5"
-    x = 0.7 * _POSE_WEIGHTS[0] + 5.0 * _POSE_WEIGHTS[1] + _POSE_WEIGHTS[2] + 0.4 * _POSE_WEIGHTS[3] + _POSE_BIAS
-    assert pose_confidence(evidence) == pytest.approx(1 / (1 + math.exp(-x)))
-    assert pose_confidence(pose_evidence(0.7, 9.0, with_camera=False, support=0.4)) < pose_confidence(evidence)
-    few = pose_evidence(0.7, 0.1, with_camera=True, support=0.4), pose_evidence(0.7, 2.0, with_camera=True)
-    assert max(map(pose_confidence, few)) < RELIABLE < pose_confidence(evidence), "no lead; no edges under the contours"
+    model = LogisticModel({"similarity": 3.0, "lead": 0.5}, -2.0)
+    assert model({"similarity": 0.7, "lead": 2.0}) == pytest.approx(1 / (1 + math.exp(-(2.1 + 1.0 - 2.0))))
+    assert model({"similarity": 0.7, "lead": None}) == model({"similarity": 0.7, "lead": 0.0})
+    assert LogisticModel({}, 1e4)({}) == 1.0
+    assert LogisticModel({}, -1e4)({}) == 0.0
+
+
+@pytest.mark.parametrize("with_appearance", [True, False])
+def test_more_evidence_is_more_confidence(with_appearance):
+    model = confidence_model("contours", with_camera=True, with_appearance=with_appearance)
+    tied = {"similarity": 0.7, "lead": 0.0, "support": 0.5, "appearance_lead": 0.0, "concentration": 0.3}
+    clear = {**tied, "lead": 5.0, "appearance_lead": 3.0, "concentration": 0.9}
+    assert model(tied) < RELIABLE < model(clear)
+
+
+def test_features_of_a_pose():
+    evidence = torch.tensor([[0.0, 0.7, 0.4, 1.0], [-1.0, 0.6, 0.5, 0.4], [-2.0, 0.5, 0.1, 0.8]], dtype=torch.float64)
+    verdicts = torch.tensor([9.0, 2.0, 3.0], dtype=torch.float64)
+    assert pose_features(evidence, verdicts, 0.3) == pytest.approx(
+        {"similarity": 0.7, "lead": 5.0, "support": 0.4, "appearance_lead": 0.2, "concentration": 0.3}
+    ), "the lead is over the best rival, and 5 at most"
+    alone = pose_features(evidence[:1], verdicts[:1], 0.0)
+    assert alone["lead"] is None
+    assert alone["appearance_lead"] is None
 
 
 def test_verdict_counts_what_was_found_only_where_the_camera_is_known():
@@ -142,17 +161,25 @@ def test_evidence_depends_on_each_photograph_alone():
     torch.testing.assert_close(together[1:], alone, atol=1e-4, rtol=1e-4)
 
 
-def test_confidence_rests_on_the_lead_that_the_hypotheses_tell():
-    """Also where a rival was sent back to its view: it still is a rival, as it was in the photographs of the fit."""
-    for seed in range(2):
+def test_confidence_rests_on_what_the_hypotheses_say():
+    """Also where a rival returned to its view: it still is a rival, as it was in the photographs of the fit."""
+    for seed, K in ((0, CAMERA), (1, None)):
         image, box, _ = scene(seed)
-        result = Registrar(truck_bank())([image], box[None], CAMERA)[0]
-        told = torch.tensor([list(h.evidence.values()) for h in result.hypotheses], dtype=torch.float64)
-        score = verdict(told, with_camera=True)
-        lead = float(score[0] - score[1:].max())
-        support = result.hypotheses[0].evidence["support"]
-        expected = pose_confidence(pose_evidence(result.score, lead, with_camera=True, support=support))
-        assert result.confidence == pytest.approx(expected)
+        result = Registrar(truck_bank())([image], box[None], K)[0]
+        evidence = torch.tensor([list(h.evidence.values()) for h in result.hypotheses], dtype=torch.float64)
+        verdicts = verdict(evidence, with_camera=K is not None)
+        concentration = float(ranking_evidence(result.ranking, truck_bank().rotations)[0, 2])
+        features = pose_features(evidence, verdicts, concentration)
+        assert result.confidence_features == pytest.approx(features)
+        model = confidence_model("contours", with_camera=K is not None, with_appearance=False)
+        assert result.confidence == pytest.approx(model(features))
+
+
+def test_without_contours_the_confidence_is_that_of_the_ranking():
+    image, box, _ = scene(0)
+    result = Registrar(truck_bank(), refine=False)([image], box[None], CAMERA)[0]
+    assert result.confidence == pytest.approx(float(confidence(result.ranking, truck_bank().rotations)))
+    assert list(result.confidence_features) == list(RANKING_EVIDENCE)
 
 
 def test_one_hypothesis_is_not_believed_for_want_of_a_rival() -> None:
@@ -162,7 +189,8 @@ def test_one_hypothesis_is_not_believed_for_want_of_a_rival() -> None:
         one, two = (Registrar(truck_bank(), hypotheses=n)([image], box[None], CAMERA)[0] for n in (1, 2))
         assert (len(one.hypotheses), len(two.hypotheses)) == (1, 2)
         assert torch.equal(one.rotation, two.rotation)
-        assert one.lead == two.lead is not None
+        assert one.confidence_features == two.confidence_features
+        assert one.confidence_features["lead"] is not None
         assert one.confidence == two.confidence
 
 
@@ -171,12 +199,8 @@ def test_a_bank_without_a_rival_view_has_no_lead() -> None:
     near = sample_views(azimuths=[0.0, 10.0, 20.0], elevations=[10])
     bank = ViewBank.build(truck_bank().mesh, near, pipeline=truck_bank().pipeline, image_size=96, progress=False)
     result = Registrar(bank)([image], box[None], CAMERA)[0]
-    assert result.lead is None
-    support, similarity = result.support, result.score
-    tied = pose_confidence(pose_evidence(similarity, 0.0, with_camera=True, support=support))
-    assert (
-        result.confidence == tied < pose_confidence(pose_evidence(similarity, 5.0, with_camera=True, support=support))
-    )
+    assert result.confidence_features["lead"] is None
+    assert result.confidence_features["concentration"] == 0.0
     assert not result.reliable
 
 
