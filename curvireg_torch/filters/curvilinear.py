@@ -84,7 +84,8 @@ def depth_curvilinear_saliency(
         sigma: smoothing in px before differentiation, >= 0.
         formula: ``"geometric"`` or ``"paper"``.
         depth_scale: None rescales each image's visible depth range to 1, so that the vector points across occluding
-            contours (a range of at most 1e-6 of the largest depth is rounding and counts as none); a number multiplies the depth (1 with depth in px gives curvature in 1/px).
+            contours (a range of at most 1e-6 of the largest depth is rounding and counts as none); a number multiplies
+            the depth (1 with depth in px gives curvature in 1/px).
 
     Returns:
         (B, 2, H, W) vector field, finite everywhere; its length is CS >= 0. dtype kept (half types compute in float32).
