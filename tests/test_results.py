@@ -67,6 +67,7 @@ def test_a_mesh_without_a_unit_of_ours_has_none_also_from_a_file(tmp_path, check
     bank = cr.ViewBank.build(mesh, views, image_size=32, progress=False)
     bank.save(tmp_path / "box.safetensors")
     for one in (bank, cr.ViewBank.load(tmp_path / "box.safetensors")):
+        assert one.mesh.units == unit
         registrar = cr.Registrar(one, refine=False)
         result = registrar([torch.rand(3, 64, 64)], torch.tensor([[10.0, 10, 50, 50]]))[0]
         document = result_document(result, registrar, {"bank": 0.0, "register": 0.0})

@@ -80,8 +80,8 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     pole = planar < 4 * torch.finfo(R.dtype).eps
     # At the pole R[0] = (cos(a -+ theta), sin(a -+ theta), 0).
     a = torch.atan2(torch.where(pole, R[..., 0, 1], cx), torch.where(pole, R[..., 0, 0], -cy))
-    # Near the pole rounding decides the azimuth. The first column of R Rz(a) is (cos theta, -sin theta, 0): it gives the
-    # theta that belongs to this azimuth, so that the rotation comes back all the same.
+    # Near the pole rounding decides the azimuth. The first column of R Rz(a) is (cos theta, -sin theta, 0): it gives
+    # the theta that belongs to this azimuth, so that the rotation comes back all the same.
     ca, sa = a.cos(), a.sin()
     theta = torch.atan2(-(R[..., 1, 0] * ca + R[..., 1, 1] * sa), R[..., 0, 0] * ca + R[..., 0, 1] * sa)
     theta = torch.where(pole, torch.zeros_like(theta), theta)

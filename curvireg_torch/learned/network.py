@@ -176,7 +176,7 @@ def save_weights(network: FieldNetwork, path: Path) -> None:
 
 
 def _without_values() -> FieldNetwork:
-    """The network on the meta device: values to be replaced at once need no numbers of the caller's random generator."""
+    """The network on the meta device: initial values would advance the caller's random generator for nothing."""
     with torch.device("meta"):
         return FieldNetwork()
 
