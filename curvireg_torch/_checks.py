@@ -75,3 +75,9 @@ def check_positive(value: float, name: str, *, zero_ok: bool = False) -> float:
     if not math.isfinite(value) or value < 0 or (value == 0 and not zero_ok):
         raise InvalidInputError(f"{name}: expected a finite number {'>=' if zero_ok else '>'} 0, got {value}")
     return value
+
+
+def check_share(value: float, name: str) -> None:
+    """``value`` is a share in (0, 1]."""
+    if not 0 < value <= 1:
+        raise InvalidInputError(f"{name}: expected 0 < {name} <= 1, got {value}")

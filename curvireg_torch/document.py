@@ -10,6 +10,7 @@ import torch
 import trimesh
 
 from . import __version__
+from .geometry.mesh import mesh_unit
 from .registration import RELIABLE, Hypothesis, Registrar, Registration
 
 __all__ = [
@@ -68,7 +69,7 @@ def result_document(result: Registration, registrar: Registrar, seconds: Mapping
     return {
         "schema": SCHEMA,
         **pose_document(result),
-        "unit": bank.meshes[result.model].units,
+        "unit": mesh_unit(bank.meshes[result.model]),
         "score": result.score,
         "confidence": result.confidence,
         "reliable": result.reliable,

@@ -46,7 +46,7 @@ def test_twins_share_options_and_defaults(module, function):
         return {p.name: p.default for p in found if p.kind is inspect.Parameter.KEYWORD_ONLY}
 
     assert issubclass(getattr(cr, module), nn.Module)
-    # HOG's bin weights are the module's own parameter: learnable=True.
+    # HOG's bin weights are the module's own parameter, as logarithms: learnable=True.
     of_function, of_module = options(getattr(cr, function)), options(getattr(cr, module).__init__)
     of_function.pop("bin_weights", None)
     assert of_function.items() <= of_module.items()

@@ -7,8 +7,12 @@ import shlex
 from pathlib import Path
 
 import pytest
+import torch
+import trimesh
 
+import curvireg_torch as cr
 from curvireg_torch.cli import _parsed, _parser, main
+from curvireg_torch.document import result_document
 from tests._support.lists import CAMERA, box_of, write_files, written
 
 ROOT = Path(__file__).parents[1]
@@ -49,6 +53,26 @@ def test_json_is_all_that_is_printed(folder, capsys, check):
     assert {**again, "seconds": 0} == {**document, "seconds": 0}
     assert register(folder / "none.png", files[1], "--json") == 2
     assert printed(capsys) == ""
+
+
+@pytest.mark.parametrize(
+    ("named", "unit"), [(None, None), ("none", None), ("yards", None), ("mm", "mm"), ("ft", "ft"), ("meters", "m")]
+)
+def test_a_mesh_without_a_unit_of_ours_has_none_also_from_a_file(tmp_path, check, named, unit):
+    """trimesh writes "none" for None, and "meters" where we say "m"."""
+    mesh = trimesh.creation.box((1.0, 2.0, 3.0))
+    if named is not None:
+        mesh.units = named
+    views = cr.sample_views(azimuth_step=90, elevations=[20])
+    bank = cr.ViewBank.build(mesh, views, image_size=32, progress=False)
+    bank.save(tmp_path / "box.safetensors")
+    for one in (bank, cr.ViewBank.load(tmp_path / "box.safetensors")):
+        assert one.mesh.units == unit
+        registrar = cr.Registrar(one, refine=False)
+        result = registrar([torch.rand(3, 64, 64)], torch.tensor([[10.0, 10, 50, 50]]))[0]
+        document = result_document(result, registrar, {"bank": 0.0, "register": 0.0})
+        assert document["unit"] == unit
+        check({**json.loads(json.dumps(document)), "inputs": {"box": [10, 10, 50, 50]}})
 
 
 def test_without_a_box_it_says_what_was_found_where(folder, capsys, check):

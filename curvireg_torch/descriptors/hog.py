@@ -9,7 +9,7 @@ from .._checks import check_field, check_option, check_positive, check_tensor
 from ..errors import InvalidInputError
 from ..filters.blocks import Planes, in_blocks
 from ..filters.inputs import finite_vectors
-from ..filters.numerics import at_least_float32, floor, full_precision, image_maximum, safe_sqrt
+from ..filters.numerics import at_least_float32, floor, full_precision, image_maximum, readable, safe_sqrt
 
 __all__ = ["HOG", "hog", "hog_length", "orientation_cells"]
 
@@ -55,7 +55,8 @@ def hog(
         block: cells along a block's side, <= grid.
         clip: upper limit of L2-Hys in (0, 1]; 1 switches it off.
         voting: ``"linear"`` or ``"hard"``.
-        bin_weights: (bins,) factor on every vote for a bin, >= 0; differentiated through.
+        bin_weights: (bins,) factor on every vote for a bin, >= 0; differentiated through. In a graph (compiled,
+            exported, under vmap) and on another device than the CPU the sign is not checked.
 
     Returns:
         (B, D), D = (grid - block + 1)^2 block^2 bins = 1764 by default, ordered block row, block column, cell row, cell
@@ -75,6 +76,8 @@ def hog(
         raise InvalidInputError(f"field: expected at least {grid} x {grid} px for grid={grid}, got {H} x {W}")
     if bin_weights is not None:
         check_tensor(bin_weights, "bin_weights", (bins,))
+        if readable(bin_weights) and not bool((bin_weights >= 0).all()):
+            raise InvalidInputError(f"bin_weights: expected factors >= 0, got {bin_weights.tolist()}")
 
     def layer(field: Tensor) -> Planes:
         votes = _orientation_votes(finite_vectors(field), bins, voting)
@@ -176,7 +179,7 @@ class HOG(nn.Module):
         block: cells along a block's side, <= grid.
         clip: upper limit of L2-Hys in (0, 1].
         voting: ``"linear"`` or ``"hard"``.
-        learnable: make the weights of the bins, 1 at first, a parameter, ``bin_weights``.
+        learnable: make the logarithms of the weights of the bins, 0 at first, a parameter, ``log_bin_weights``.
 
     Shape:
         Input (B, 2, H, W); output (B, D), D = :func:`hog_length` of grid, bins and block.
@@ -188,7 +191,7 @@ class HOG(nn.Module):
         (torch.Size([2, 324]), 324)
     """
 
-    bin_weights: nn.Parameter | None
+    log_bin_weights: nn.Parameter | None
 
     def __init__(
         self,
@@ -203,7 +206,12 @@ class HOG(nn.Module):
         super().__init__()
         _check_options(grid, bins, block, clip, voting)
         self.grid, self.bins, self.block, self.clip, self.voting = grid, bins, block, clip, voting
-        self.bin_weights = nn.Parameter(torch.ones(bins)) if learnable else None
+        self.log_bin_weights = nn.Parameter(torch.zeros(bins)) if learnable else None
+
+    @property
+    def bin_weights(self) -> Tensor | None:
+        """(bins,) learnt factors on the votes, positive after any step; None if not learnable."""
+        return None if self.log_bin_weights is None else self.log_bin_weights.exp()
 
     @property
     def length(self) -> int:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from .._checks import check_field
+from .._checks import check_field, check_share
 from ..errors import InvalidInputError
 from ..filters.inputs import finite_vectors
 from ..filters.numerics import at_least_float32, safe_sqrt
@@ -50,8 +50,7 @@ def field_points(field: Tensor, *, share: float = 0.04, threshold: float = 0.0, 
 
 def strongest_points(response: Tensor, candidates: Tensor, share: float) -> Tensor:
     """Of the candidates (B, 1, H, W) those of largest response > 0, up to ``share`` of each image's pixels."""
-    if not 0 < share <= 1:
-        raise InvalidInputError(f"share: expected 0 < share <= 1, got {share}")
+    check_share(share, "share")
     B, _, H, W = response.shape
     if B == 0:
         return candidates

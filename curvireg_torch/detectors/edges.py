@@ -1,10 +1,11 @@
 """Sobel, Laplacian of Gaussian and Canny."""
 
 import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
-from .._checks import check_positive
+from .._checks import check_positive, check_share
 from ..descriptors.points import strongest_points
 from ..filters.derivatives import central_derivatives, replicate_pad, smooth
 from ..filters.numerics import safe_sqrt
@@ -55,9 +56,10 @@ def canny(image: Tensor, *, sigma: float = 1.4, edges: float = 0.3, share: float
     """Canny (1986) by OpenCV, its thresholds set per image as MATLAB's ``edge`` sets them.
 
     The response is the length of the Sobel gradient of the smoothed image per px; the upper threshold leaves the share
-    ``edges`` of the pixels above it, the lower one is 0.4 times as high. Runs on the CPU.
+    ``edges``, in (0, 1], of the pixels above it, the lower one is 0.4 times as high. Runs on the CPU.
     """
     check_positive(sigma, "sigma")
+    check_share(edges, "edges")
     responses, points = [], []
     for grey in grey_bytes(image):
         # Derivatives as whole numbers of 16 bit, as cv2.Canny wants them, 32 times finer than a grey level.
@@ -67,7 +69,8 @@ def canny(image: Tensor, *, sigma: float = 1.4, edges: float = 0.3, share: float
             for order in ((1, 0), (0, 1))
         )
         length = safe_sqrt(torch.from_numpy(dx) ** 2 + torch.from_numpy(dy) ** 2)
-        high = max(float(length.flatten().quantile(1.0 - edges)), 1e-3) * 32.0
+        # NumPy's quantile: torch refuses more than 16 million pixels.
+        high = max(float(np.quantile(length.numpy(), 1.0 - edges)), 1e-3) * 32.0
         mask = cv2.Canny(
             (dx * 32.0).round().astype("int16"), (dy * 32.0).round().astype("int16"), 0.4 * high, high, L2gradient=True
         )

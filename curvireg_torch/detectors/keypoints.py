@@ -4,6 +4,7 @@ import cv2
 import torch
 from torch import Tensor
 
+from .._checks import check_share
 from .base import Detection, detector, grey_bytes
 
 
@@ -13,6 +14,7 @@ def sift(image: Tensor, *, share: float = 0.04) -> Detection:
 
     The response is OpenCV's contrast of the keypoint at its pixel (the largest where several meet), 0 elsewhere.
     """
+    check_share(share, "share")
     greys = grey_bytes(image)
     response = torch.zeros(image.shape, dtype=torch.float32)
     H, W = image.shape[-2:]

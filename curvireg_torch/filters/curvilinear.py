@@ -23,13 +23,18 @@ __all__ = [
 BACKGROUND = 1.25
 """Depth given to missing pixels, in units of the visible depth range behind the nearest visible point."""
 
+FLATTEST = 1e-6
+"""Visible range, as a share of the largest depth, below which depths differ by rounding only: 8 ulp of float32."""
+
 FORMULAS = ("geometric", "paper")
 
 
 def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Depth with missing pixels at the largest number, and each image's nearest depth and range, (B, 1, 1, 1).
 
-    Missing is 0 or negative, inf, NaN, or outside ``mask``. A range of zero counts as 1.
+    Missing is 0 or negative, inf, NaN, or outside ``mask``. A range of at most ``FLATTEST`` of the largest depth is a
+    renderer's rounding on a surface parallel to the image and must not be stretched: the largest depth is returned
+    instead, so that the unit of depth does not matter. An empty image has the range 1.
     """
     # The same twice: eager, torch.where takes seven times as long; compiled, nan_to_num is not vectorised.
     compiling = torch.compiler.is_compiling()
@@ -37,11 +42,11 @@ def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, T
     if mask is not None:
         clean = torch.where(mask, clean, 0.0)
     far = clean.amax(dim=(1, 2, 3), keepdim=True)
+    seen = far > 0
     surface = F.threshold(clean, 0.0, torch.finfo(depth.dtype).max)
-    # An empty image has no depth at all, a fronto-parallel plane no range.
-    near = torch.where(far > 0, surface.amin(dim=(1, 2, 3), keepdim=True), 1.0)
+    near = torch.where(seen, surface.amin(dim=(1, 2, 3), keepdim=True), 1.0)
     span = far - near
-    return surface, near, torch.where(span > 0, span, 1.0)
+    return surface, near, torch.where(span > FLATTEST * far, span, torch.where(seen, far, 1.0))
 
 
 def fill_depth(depth: Tensor, mask: Tensor | None, depth_scale: float | None) -> Tensor:
@@ -79,7 +84,8 @@ def depth_curvilinear_saliency(
         sigma: smoothing in px before differentiation, >= 0.
         formula: ``"geometric"`` or ``"paper"``.
         depth_scale: None rescales each image's visible depth range to 1, so that the vector points across occluding
-            contours; a number multiplies the depth (1 with depth in px gives curvature in 1/px).
+            contours (a range of at most 1e-6 of the largest depth is rounding and counts as none); a number multiplies
+            the depth (1 with depth in px gives curvature in 1/px).
 
     Returns:
         (B, 2, H, W) vector field, finite everywhere; its length is CS >= 0. dtype kept (half types compute in float32).

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .learnable import check_width
-from .numerics import readable
+from .numerics import at_least_float32, readable
 
 __all__ = ["central_derivatives", "central_gradient", "extrapolate_pad", "gaussian_smooth", "replicate_pad", "smooth"]
 
@@ -23,7 +23,7 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
     """Separable Gaussian smoothing with replicated borders.
 
     Args:
-        x: (B, C, H, W), any floating dtype (kept). NaN stays NaN and spreads.
+        x: (B, C, H, W), any floating dtype (kept; half types compute in float32). NaN stays NaN and spreads.
         sigma: standard deviation in px, >= 0; 0 returns ``x``. A scalar tensor is differentiated through. The kernel is
             cut at ceil(4 sigma) px, for a tensor at 16 px at most; in a graph (compiled, exported, under vmap), where
             its sign cannot be checked, a tensor below 0.001 px counts as 0.001 px.
@@ -35,7 +35,7 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
         >>> gaussian_smooth(torch.ones(1, 1, 5, 5), 1.0).shape
         torch.Size([1, 1, 5, 5])
     """
-    return smooth(x, check_width(sigma, "sigma", zero_ok=True), margin=0)
+    return smooth(at_least_float32(x), check_width(sigma, "sigma", zero_ok=True), margin=0).to(x.dtype)
 
 
 def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = False) -> Tensor:

@@ -113,8 +113,9 @@ def multiscale_focus_curves(
 
     The image is re-blurred by 1, 2, ..., n-1 px. A pixel is kept where its focus :math:`1/s_i` exceeds T at all n-1
     scales and its saliency exceeds 0.1 % of the image's largest (flat noise is infinitely sharp). Its value is
-    :math:`1/\max_i s_i` (the paper's ``ratiogradientMerge``, whose arg is a slip), where the measured blur includes the
-    pre-smoothing ``sigma``, so the value is at most 1/sigma.
+    :math:`1/\max_i s_i` (the paper's ``ratiogradientMerge``, whose arg is a slip). The measured blur of a step edge
+    includes the pre-smoothing ``sigma``, so that its value is at most 1/sigma. Noise, thin lines and corners are not
+    step edges: their value is limited at every sigma by the derivative kernel alone, to 1/0.6 = 1.67 per px.
 
     Args:
         image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB; NaN pixels are missing (0 in the result).

@@ -1,6 +1,7 @@
 """Mesh files to one cleaned ``trimesh.Trimesh``, and a normalised model frame."""
 
 import logging
+import math
 import urllib.parse
 import warnings
 from io import BytesIO
@@ -30,6 +31,7 @@ __all__ = [
     "load_mesh",
     "mesh_centre",
     "mesh_radius",
+    "mesh_unit",
     "normalization_transform",
 ]
 
@@ -161,11 +163,33 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
     colours = _colours(source)
     mesh = trimesh.Trimesh(vertices=vertices, faces=faces[area > 0], process=False)
     mesh.remove_unreferenced_vertices()
-    mesh.units = source.units
+    unit = mesh_unit(source)
+    if unit is not None:  # trimesh keeps None as the word "none"
+        mesh.units = unit
     mesh.metadata["up"] = mesh_up(source)
     if colours is not None:
         mesh.metadata["colours"] = colours[area > 0]
     return mesh
+
+
+def mesh_unit(mesh: trimesh.Trimesh) -> str | None:
+    """The unit that ``mesh.units`` names, as a key of ``UNITS``; None where it names none of them.
+
+    Example:
+        >>> mesh = trimesh.creation.box()
+        >>> mesh_unit(mesh) is None
+        True
+        >>> mesh.units = "millimeters"
+        >>> mesh_unit(mesh)
+        'mm'
+    """
+    if mesh.units in UNITS:
+        return str(mesh.units)
+    try:
+        metres = trimesh.units.unit_conversion(mesh.units, "meters")
+    except (AttributeError, ValueError):
+        return None
+    return next((unit for unit, length in UNITS.items() if math.isclose(metres, length, rel_tol=1e-6)), None)
 
 
 def _placed(scene: trimesh.Scene) -> list[trimesh.Trimesh]:

@@ -63,6 +63,8 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     Returns:
         azimuth in [0, 360), elevation in [-90, 90], theta in [-180, 180), degrees, each of shape (...). Looking
         straight down or up (elevation +-90) azimuth and theta are not separable: theta is 0, azimuth carries the turn.
+        Where R is so near a pole that only rounding separates them, the azimuth is arbitrary and theta fits it. The
+        three angles give R back everywhere, within 5e-5 rad in float32.
 
     Example:
         >>> a, e, t = viewpoint_from_rotation(rotation_from_viewpoint(30.0, 20.0, -10.0))
@@ -71,15 +73,19 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """
     if R.shape[-2:] != (3, 3) or not R.is_floating_point():
         raise InvalidInputError(f"R: expected a floating (..., 3, 3) tensor, got {R.dtype} of shape {tuple(R.shape)}")
-    # Camera centre direction is -R[2]; the image of the model's z axis gives theta.
+    # The direction to the camera's centre is -R[2].
     cx, cy, cz = -R[..., 2, 0], -R[..., 2, 1], -R[..., 2, 2]
     planar = torch.hypot(cx, cy)
     elevation = torch.atan2(cz, planar)
     pole = planar < 4 * torch.finfo(R.dtype).eps
     # At the pole R[0] = (cos(a -+ theta), sin(a -+ theta), 0).
-    azimuth = torch.where(pole, torch.atan2(R[..., 0, 1], R[..., 0, 0]), torch.atan2(cx, -cy))
-    theta = torch.where(pole, torch.zeros_like(planar), torch.atan2(-R[..., 0, 2], -R[..., 1, 2]))
-    azimuth = torch.rad2deg(azimuth) % 360.0
+    a = torch.atan2(torch.where(pole, R[..., 0, 1], cx), torch.where(pole, R[..., 0, 0], -cy))
+    # Near the pole rounding decides the azimuth. The first column of R Rz(a) is (cos theta, -sin theta, 0): it gives
+    # the theta that belongs to this azimuth, so that the rotation comes back all the same.
+    ca, sa = a.cos(), a.sin()
+    theta = torch.atan2(-(R[..., 1, 0] * ca + R[..., 1, 1] * sa), R[..., 0, 0] * ca + R[..., 0, 1] * sa)
+    theta = torch.where(pole, torch.zeros_like(theta), theta)
+    azimuth = torch.rad2deg(a) % 360.0
     theta = (torch.rad2deg(theta) + 180.0) % 360.0 - 180.0
     # x % 360 may round up to 360 itself for a tiny negative x.
     return torch.where(azimuth >= 360.0, torch.zeros_like(azimuth), azimuth), torch.rad2deg(elevation), theta

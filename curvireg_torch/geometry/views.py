@@ -137,6 +137,11 @@ def _in_turn(angle: Tensor, start: float, stop: float) -> Tensor:
     return (angle - start + 1e-3) % 360.0 <= (stop - start) % 360.0 + 2e-3
 
 
+def _check_elevations(values: Sequence[float], name: str) -> None:
+    if not all(-90.0 <= float(v) <= 90.0 for v in values):
+        raise InvalidInputError(f"{name}: expected degrees in [-90, 90], got {tuple(values)}")
+
+
 def sample_views(
     *,
     azimuth_step: float = 10.0,
@@ -177,8 +182,7 @@ def sample_views(
         if len(values) == 0:
             raise InvalidInputError(f"{name}: expected at least one value, got none")
     axes = [torch.tensor([float(v) for v in values]) for values in (elevations, azimuths, thetas, distances)]
-    if bool((axes[0].abs() > 90).any()):
-        raise InvalidInputError("elevations: expected degrees in [-90, 90]")
+    _check_elevations(elevations, "elevations")
     elevation, azimuth, theta, distance = (v.flatten() for v in torch.meshgrid(*axes, indexing="ij"))
     return ViewSphere(azimuth, elevation, theta, distance)
 
@@ -230,9 +234,12 @@ def uniform_views(
 
     Args:
         count: view directions; each comes with every theta and distance.
-        elevation_range: degrees.
+        elevation_range: (low, high) in degrees, within [-90, 90].
         thetas: degrees in the image plane.
         distances: in units of the object's radius, > 1.
+
+    Raises:
+        InvalidInputError: count < 1, a range that is empty or leaves [-90, 90], an empty option, or a distance <= 1.
 
     Example:
         >>> len(uniform_views(100, thetas=[0, 90, 180, 270]))
@@ -240,6 +247,7 @@ def uniform_views(
     """
     if count < 1:
         raise InvalidInputError(f"count: expected >= 1, got {count}")
+    _check_elevations(elevation_range, "elevation_range")
     low, high = (math.sin(math.radians(e)) for e in elevation_range)
     if not low <= high:
         raise InvalidInputError(f"elevation_range: expected (low, high), got {elevation_range}")

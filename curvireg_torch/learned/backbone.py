@@ -95,13 +95,16 @@ class Backbone(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.stem = _Conv(3, 32, 3, 2)
         widths = [32, *(block[-1] for block in _BLOCKS)]
-        self.blocks = nn.ModuleList([_Block(inputs, *block) for inputs, block in zip(widths, _BLOCKS, strict=False)])
+        with torch.device("meta"):  # random first values would advance the caller's generator
+            self.stem = _Conv(3, 32, 3, 2)
+            blocks = [_Block(inputs, *block) for inputs, block in zip(widths, _BLOCKS, strict=False)]
+        self.blocks = nn.ModuleList(blocks)
+        self.to_empty(device=torch.get_default_device())
         weights = _read_weights(_weights_path())
         self.load_state_dict(_folded(weights))
-        for i, blocks in enumerate(_KEPT):
-            scales = torch.stack([weights[f"_blocks.{k}._bn2.weight"] for k in blocks])
+        for i, kept in enumerate(_KEPT):
+            scales = torch.stack([weights[f"_blocks.{k}._bn2.weight"] for k in kept])
             self.register_buffer(f"_spread{i}", torch.linalg.vector_norm(scales, dim=0), persistent=False)
         self.requires_grad_(False)
         self.eval()

@@ -139,7 +139,7 @@ class LearnedCurvilinearSaliency(nn.Module):
 
     def __init__(self, *, weights: Path | str | None = None) -> None:
         super().__init__()
-        self.network = FieldNetwork()
+        self.network = _without_values().to_empty(device=torch.get_default_device())
         self.weights = None if weights is None else str(weights)
         self.network.load_state_dict(_read_weights(Path(weights or WEIGHTS), packaged=weights is None))
         self.eval()
@@ -175,13 +175,19 @@ def save_weights(network: FieldNetwork, path: Path) -> None:
     write_tensors(path, {k: v.half() if v.is_floating_point() else v for k, v in state.items()})
 
 
+def _without_values() -> FieldNetwork:
+    """The network on the meta device: initial values would advance the caller's random generator for nothing."""
+    with torch.device("meta"):
+        return FieldNetwork()
+
+
 def _read_weights(path: Path, *, packaged: bool) -> dict[str, Tensor]:
     if not path.is_file():
         raise MissingFileError(f"weights: {path} is not there; train them with scripts/train_learned_field.py")
     content = path.read_bytes()
     if packaged and hashlib.sha256(content).hexdigest() != SHA256:
         raise InvalidInputError(f"weights: {path} is damaged; install curvireg_torch again")
-    wanted = {k: v.shape for k, v in FieldNetwork().state_dict().items()}
+    wanted = {k: v.shape for k, v in _without_values().state_dict().items()}
     try:
         weights = load(content)
     except SafetensorError as error:

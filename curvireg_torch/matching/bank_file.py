@@ -15,6 +15,7 @@ from torch import Tensor
 from .._files import write_tensors
 from ..errors import BankError, CurviregError, MissingFileError
 from ..geometry.colours import SurfaceColours, surface_colours
+from ..geometry.mesh import mesh_unit
 from ..geometry.up import mesh_up
 from ..geometry.views import ViewSphere
 from ..pipeline import Pipeline
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["FORMAT", "FORMAT_VERSION", "read_bank", "write_bank"]
 
 FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 3
+_NO_UNIT = "none"
 
 
 def write_bank(bank: "ViewBank", path: Path) -> None:
@@ -40,7 +42,7 @@ def write_bank(bank: "ViewBank", path: Path) -> None:
         "format": FORMAT,
         "version": str(FORMAT_VERSION),
         "pipeline": bank.pipeline.to_json(),
-        "units": " ".join(mesh.units or "m" for mesh in bank.meshes),
+        "units": " ".join(mesh_unit(mesh) or _NO_UNIT for mesh in bank.meshes),
         "up": " ".join(mesh_up(mesh) for mesh in bank.meshes),
         "checksum": _checksum(tensors),
     }
@@ -87,7 +89,8 @@ def _mesh(tensors: Mapping[str, Tensor], index: int, unit: str, up: str) -> trim
     if faces.size == 0 or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
         raise ValueError(f"mesh {index} is not a mesh")
     mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
-    mesh.units = unit
+    if unit != _NO_UNIT:
+        mesh.units = unit
     mesh.metadata["up"] = up
     own = f"mesh{index}.colours."
     arrays = {name.removeprefix(own): x.numpy() for name, x in tensors.items() if name.startswith(own)}

@@ -19,7 +19,7 @@ import trimesh
 
 from ..errors import BankError
 from ..geometry.colours import surface_colours
-from ..geometry.mesh import as_mesh
+from ..geometry.mesh import as_mesh, mesh_unit
 from ..geometry.up import mesh_up
 from ..geometry.views import ViewSphere
 from ..pipeline import BankSettings, Pipeline
@@ -94,7 +94,7 @@ def bank_key(
 ) -> str:
     """Digest in hexadecimal: mesh (colours and unit too), views, settings, renderer, the code that describes views."""
     made = _settled(pipeline, settings).made(len(views))
-    facts = [FORMAT_VERSION, made, mesh.units or "m", renderer]
+    facts = [FORMAT_VERSION, made, mesh_unit(mesh), renderer]
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     digest.update(_code_digest())
     digest.update(np.ascontiguousarray(mesh.vertices, np.float64).tobytes())

@@ -5,6 +5,10 @@ they overlap most, if the IoU is at least 0.5 and nobody claimed it before. Reca
 the height of the curve is the share of the detections so far that are claims *with the right viewpoint*. That is what
 PASCAL3D+'s own evaluation does, recall counting every claim, and why AVP on ground-truth boxes is the binned accuracy.
 
+The order in which detections and objects are listed does not matter. Detections of equal score enter the curve
+together; where several of them claim one box, each has an equal part of the claim, the mean over all orders. Where a
+detection overlaps several true boxes equally, it claims the first of them, sorted by corners, then rotations.
+
 A detection whose rotation has NaN in it has no viewpoint, and a wrong one therefore; one whose box has NaN claims
 nothing. True objects have finite boxes and rotations.
 """
@@ -12,6 +16,8 @@ nothing. True objects have finite boxes and rotations.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 
 import torch
 from torch import Tensor
@@ -89,8 +95,8 @@ def average_precision(detections: Detections, objects: Objects) -> float:
         >>> average_precision(Detections(found.image, found.boxes, found.rotations, torch.ones(1)), found)
         1.0
     """
-    claimed = _claims(detections, objects)
-    return _area(detections.scores, claimed >= 0, claimed >= 0, len(objects.image))
+    _, part = _claims(detections, objects)
+    return _area(detections.scores, part, part, len(objects.image))
 
 
 def average_viewpoint_precision(detections: Detections, objects: Objects, bins: int) -> float:
@@ -101,8 +107,7 @@ def average_viewpoint_precision(detections: Detections, objects: Objects, bins: 
         bins: 4, 8, 16 or 24.
 
     Returns:
-        [0, 1]; 0 without detections, NaN without objects. Detections with equal scores enter the curve together, so
-        that the result does not depend on their order.
+        [0, 1]; 0 without detections, NaN without objects. The order of the rows, ties among them, does not matter.
 
     Raises:
         InvalidInputError: another number of bins; true boxes or rotations as for :func:`average_precision`.
@@ -112,13 +117,13 @@ def average_viewpoint_precision(detections: Detections, objects: Objects, bins: 
         >>> average_viewpoint_precision(Detections(found.image, found.boxes, found.rotations, torch.ones(1)), found, 24)
         1.0
     """
-    claimed = _claims(detections, objects)
+    claimed, part = _claims(detections, objects)
     # One lost number makes all of a rotation missing, also where the azimuth does not need it.
     lost = ~detections.rotations.isfinite().flatten(1).all(1)
     est = viewpoint_from_rotation(detections.rotations)[0].masked_fill(lost, torch.nan)
     gt = viewpoint_from_rotation(objects.rotations)[0]
-    right = _right(claimed, lambda d, o: same_bin(est[d], gt[o], bins))
-    return _area(detections.scores, claimed >= 0, right, len(objects.image))
+    right = _right(claimed, part, lambda d, o: same_bin(est[d], gt[o], bins))
+    return _area(detections.scores, part, right, len(objects.image))
 
 
 def average_rotation_precision(detections: Detections, objects: Objects, *, threshold_deg: float = 30.0) -> float:
@@ -141,43 +146,57 @@ def average_rotation_precision(detections: Detections, objects: Objects, *, thre
         0.0
     """
     check_positive(threshold_deg, "threshold_deg")
-    claimed = _claims(detections, objects)
+    claimed, part = _claims(detections, objects)
     none = objects.rotations[:0]
 
     def agrees(d: Tensor, o: Tensor) -> Tensor:
         return symmetric_rotation_error(detections.rotations[d], objects.rotations[o], none) < threshold_deg
 
-    right = _right(claimed, agrees)
-    return _area(detections.scores, claimed >= 0, right, len(objects.image))
+    right = _right(claimed, part, agrees)
+    return _area(detections.scores, part, right, len(objects.image))
 
 
-def _claims(detections: Detections, objects: Objects) -> Tensor:
-    """(N,) index of the object that each detection claims, -1 for none."""
+def _claims(detections: Detections, objects: Objects) -> tuple[Tensor, Tensor]:
+    """(N,) index of the object that each detection claims, -1 for none; and (N,) float64 its part of that claim."""
     check_finite(objects.boxes, "objects.boxes")
     check_finite(objects.rotations, "objects.rotations")
     if not bool((objects.boxes[:, 2:] > objects.boxes[:, :2]).all()):
         raise InvalidInputError("objects.boxes: expected X0 < X1 and Y0 < Y1; give corners, not width and height")
     claimed = torch.full_like(detections.image, -1, dtype=torch.int64)
+    part = torch.zeros_like(claimed, dtype=torch.float64)
     by_score = torch.argsort(detections.scores, descending=True, stable=True)
+    in_order = _in_order(objects)
     for image in set(detections.image.tolist()):
         mine = by_score[detections.image[by_score] == image]
-        there = torch.nonzero(objects.image == image).flatten()
+        there = in_order[objects.image[in_order] == image]
         if len(there) == 0:
             continue
+        # Of equal overlaps max gives the first.
         iou, best = box_iou(detections.boxes[mine], objects.boxes[there]).max(1)
-        free = set(range(len(there)))
-        for d, overlap, o in zip(mine.tolist(), iou.tolist(), best.tolist(), strict=True):
-            if overlap >= _MIN_IOU and o in free:
-                free.remove(o)
-                claimed[d] = there[o]
-    return claimed
+        free = set(there.tolist())
+        rows = zip(detections.scores[mine].tolist(), mine.tolist(), iou.tolist(), there[best].tolist(), strict=True)
+        for _, tied in groupby(rows, key=itemgetter(0)):
+            claims: dict[int, list[int]] = {}
+            for _, d, overlap, o in tied:
+                if overlap >= _MIN_IOU and o in free:
+                    claims.setdefault(o, []).append(d)
+            for o, claimants in claims.items():
+                claimed[claimants], part[claimants] = o, 1.0 / len(claimants)
+            free.difference_update(claims)
+    return claimed, part
 
 
-def _right(claimed: Tensor, agrees: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """(N,) bool: the detection claims an object, and ``agrees(detections, objects)`` holds for the pair."""
-    right = claimed >= 0
-    index = torch.nonzero(right).flatten()
-    right[index] = agrees(index, claimed[index])
+def _in_order(objects: Objects) -> Tensor:
+    """(M,) indices of the objects by their boxes, then rotations, however they are listed."""
+    rows = torch.cat([objects.boxes.double(), objects.rotations.flatten(1).double()], dim=1).tolist()
+    return torch.tensor(sorted(range(len(rows)), key=rows.__getitem__), dtype=torch.int64, device=objects.image.device)
+
+
+def _right(claimed: Tensor, part: Tensor, agrees: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """(N,) the parts of the claims for which ``agrees(detections, objects)`` holds, 0 elsewhere."""
+    right = torch.zeros_like(part)
+    index = torch.nonzero(claimed >= 0).flatten()
+    right[index] = torch.where(agrees(index, claimed[index]), part[index], 0.0)
     return right
 
 
@@ -190,7 +209,7 @@ def _area(scores: Tensor, hits: Tensor, right: Tensor, n_objects: int) -> float:
     ordered, by_score = torch.sort(scores, descending=True, stable=True)
     last_of_ties = torch.cat([ordered[1:] != ordered[:-1], ordered.new_ones(1, dtype=torch.bool)])
     rank = torch.arange(1, len(scores) + 1, device=scores.device, dtype=torch.float64)
-    recall = (hits[by_score].double().cumsum(0) / n_objects)[last_of_ties]
-    height = (right[by_score].double().cumsum(0) / rank)[last_of_ties]
+    recall = (hits[by_score].cumsum(0) / n_objects)[last_of_ties]
+    height = (right[by_score].cumsum(0) / rank)[last_of_ties]
     envelope = height.flip(0).cummax(0).values.flip(0)
     return float((torch.diff(recall, prepend=recall.new_zeros(1)) * envelope).sum())

@@ -30,10 +30,16 @@ class Shape(NamedTuple):
 
 
 def shape_from_mesh(mesh: trimesh.Trimesh) -> Shape:
-    """A user's mesh, centred and scaled to radius 1; its connected parts get materials of their own."""
-    vertices = np.asarray(mesh.vertices, dtype=float)
-    labels = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
-    return _normalised(vertices, np.asarray(mesh.faces), np.asarray(labels) % 12)
+    """A user's mesh, centred and scaled to radius 1; its connected parts get materials of their own.
+
+    Triangles are connected where they share an edge in space: an STL file lists every corner anew, and other formats
+    do so along seams of texture.
+    """
+    vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces)
+    places = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)
+    adjacent = trimesh.graph.face_adjacency(faces=places[faces])
+    labels = trimesh.graph.connected_component_labels(adjacent, node_count=len(faces))
+    return _normalised(vertices, faces, np.asarray(labels) % 12)
 
 
 def random_shape(rng: Rng, family: str | None = None) -> Shape:

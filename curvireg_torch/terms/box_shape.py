@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from .._checks import check_positive, check_tensor
+from ..errors import InvalidInputError
 from .base import Term, Views
 from .photographs import Photographs
 
@@ -54,11 +55,14 @@ def box_shape_score(queries: Tensor, views: Tensor, *, sigma: float = 0.2) -> Te
 
     Args:
         queries: (B,) shapes of the photographs' boxes; NaN = unknown, every view then scores 1.
-        views: (N,) shapes of the views' boxes.
+        views: (N,) shapes of the views' boxes, finite.
         sigma: 0.2 = a box a fifth too wide.
 
     Returns:
         (B, N).
+
+    Raises:
+        InvalidInputError: wrong shape, dtype or sigma; a view's shape that is NaN or infinite, an infinite query.
 
     Example:
         >>> box_shape_score(torch.tensor([0.0, float("nan")]), torch.tensor([0.0, 0.2])).round(decimals=2)
@@ -68,8 +72,22 @@ def box_shape_score(queries: Tensor, views: Tensor, *, sigma: float = 0.2) -> Te
     check_tensor(queries, "queries", (None,))
     check_tensor(views, "views", (None,))
     check_positive(sigma, "sigma")
-    difference = (queries[:, None] - views.to(queries)[None]).nan_to_num(0.0)
-    square = difference.square()
+    if bool(queries.isinf().any()):
+        raise InvalidInputError("queries: expected finite shapes, or NaN for unknown ones, got inf; a box has no area")
+    _check_views(views)
+    return _score(queries, views, sigma)
+
+
+def _check_views(shapes: Tensor) -> None:
+    broken = int((~shapes.isfinite()).sum())
+    if broken:
+        raise InvalidInputError(
+            f"views: expected finite shapes, got {broken} of {len(shapes)} NaN or infinite; their boxes have no area"
+        )
+
+
+def _score(queries: Tensor, views: Tensor, sigma: float) -> Tensor:
+    square = (queries[:, None] - views.to(queries)[None]).nan_to_num(0.0).square()
     return torch.exp((square.amin(dim=1, keepdim=True) - square) / (2.0 * sigma**2))
 
 
@@ -98,9 +116,10 @@ class BoxShape(Term):
 class _Shapes(nn.Module):
     def __init__(self, shapes: Tensor, sigma: float) -> None:
         super().__init__()
+        _check_views(shapes)
         self.sigma = sigma
         self.shapes: Tensor
         self.register_buffer("shapes", shapes, persistent=False)
 
     def forward(self, photographs: Photographs) -> Tensor:
-        return box_shape_score(photographs.shapes.float(), self.shapes, sigma=self.sigma)
+        return _score(photographs.shapes.float(), self.shapes, self.sigma)

@@ -61,7 +61,10 @@ class Correlation(Term):
     """S_hog: normalised correlation of descriptors, the best over the slack crops, mapped by :func:`unit_score`.
 
     Attributes:
-        whitening: "none", or "bank": by the statistics of the bank, shrunk by Ledoit-Wolf, as the paper does.
+        whitening: "none", or "bank": the cosine is taken after both descriptors were whitened by the mean mu and the
+            covariance Sigma of the bank's views. The paper takes mu and Sigma of the views as well, but scores
+            (D_view - mu)^T Sigma^-1 D_query: here the photograph's descriptor is centred too, lengths are divided out,
+            and Sigma is shrunk (Ledoit-Wolf), since a bank has fewer views than a descriptor has entries.
     """
 
     name: ClassVar[str] = "hog"

@@ -119,22 +119,27 @@ class Repeatability(Term):
         return _log_score(raw, self.mode, self.sigma)
 
 
-def cell_shares(points: Tensor, cell: int) -> Tensor:
-    """(N, C, C) float32 share of set pixels in cells of ``cell`` px, the last ones cut, from (N, S, S) bool.
-
-    ``avg_pool2d`` with ``ceil_mode``, to the bit, several times as fast: whole numbers are added.
-    """
-    S = points.shape[-1]
-    over = -S % cell
+def cell_counts(points: Tensor, cell: int) -> Tensor:
+    """(N, C, C) float32 number of set pixels in cells of ``cell`` px, the last ones cut, from (N, S, S) bool."""
+    over = -points.shape[-1] % cell
     count = F.pad(points.view(torch.uint8), (0, over, 0, over))
     for dim in (1, 2):  # rows first: they lie together in memory
         parts = count.unfold(dim, cell, cell).unbind(dim=3)
         count = parts[0].short()
         for part in parts[1:]:
             count = count + part
+    return count.float()
+
+
+def cell_shares(points: Tensor, cell: int) -> Tensor:
+    """(N, C, C) float32 share of the pixels of each cell that are set.
+
+    ``avg_pool2d`` with ``ceil_mode``, to the bit, several times as fast: whole numbers are added.
+    """
+    count = cell_counts(points, cell)
     side = torch.full((count.shape[-1],), cell, device=points.device)
-    side[-1] -= over
-    return count.float() / (side[:, None] * side)
+    side[-1] -= -points.shape[-1] % cell
+    return count / (side[:, None] * side)
 
 
 class _Points(nn.Module):
@@ -144,17 +149,14 @@ class _Points(nn.Module):
         # Points are counted in cells of eps px or less, so that the product stays small.
         self.cell = max(1, min(int(eps * S), S // 64))
         near = [
-            self._in_cells(dilate_points(views.points_at(slice(i, i + 64)), eps * S)).flatten(1)
+            cell_shares(dilate_points(views.points_at(slice(i, i + 64)), eps * S), self.cell).flatten(1)
             for i in range(0, len(views), 64)
         ]
         self.near: Tensor
         self.register_buffer("near", torch.cat(near), persistent=False)
 
-    def _in_cells(self, points: Tensor) -> Tensor:
-        """(N, C, C) share of each cell's pixels that are set, from (N, S, S)."""
-        return cell_shares(points, self.cell)
-
     def forward(self, photographs: Photographs) -> Tensor:
         B, K = photographs.points.shape[:2]
-        points = self._in_cells(photographs.points.flatten(0, 1)).flatten(1)
+        # Counts, not shares: a point in a cut cell weighs as much as any other.
+        points = cell_counts(photographs.points.flatten(0, 1), self.cell).flatten(1)
         return repeatability(points, self.near).view(B, K, len(self.near)).amax(dim=1)

@@ -11,6 +11,7 @@ from nicegui import ui
 from .._choices import UNITS
 from ..document import correction
 from ..geometry import rotation_error
+from ..geometry.mesh import mesh_unit
 from ..limits import MAX_VIEWER_FACES
 from ..visualization import contour_overlay, side_pictures
 from ..visualization.plots import view_sphere
@@ -121,7 +122,7 @@ class Panels:
         a, e, t = shown.pose.viewpoint
         lines = [f"azimuth {a:.1f}, elevation {e:.1f}, theta {t:.1f} degrees"]
         if shown.pose.translation is not None:
-            unit = answer.registrar.bank.mesh.units
+            unit = mesh_unit(answer.registrar.bank.mesh) or "in the mesh's own unit"
             lines[0] += f";  translation {', '.join(f'{v:.4g}' for v in shown.pose.translation.tolist())} {unit}"
         sure = f"confidence {answer.result.confidence:.2f}"
         lines.append(sure if answer.document["reliable"] else f"{sure}: no reliable match; take the pose as a guess")
@@ -223,7 +224,7 @@ class Panels:
         url = self.page.put("scene.glb", content, "model/gltf-binary")
         describe = registrar.describers[shown.pose.model]
         T = shown.pose.seen_by[0]
-        unit = UNITS.get(mesh.units or "m", 1.0)
+        unit = UNITS[mesh_unit(mesh) or "m"]
         x, y, z = ((T[:3, :3] @ describe.centre + T[:3, 3]) / describe.radius).tolist()
         fov = 2 * math.degrees(math.atan(answer.image.shape[-2] / (1.7 * float(shown.pose.seen_by[1][1, 1]))))
         camera = ui.scene.perspective_camera(fov=min(fov, 120.0), near=0.05, far=1000.0)

@@ -15,7 +15,7 @@ from .._choices import UNITS
 from ..errors import InvalidInputError
 from ..geometry.cameras import check_camera_matrix
 from ..geometry.colours import surface_colours
-from ..geometry.mesh import mesh_centre, mesh_radius
+from ..geometry.mesh import mesh_centre, mesh_radius, mesh_unit
 
 __all__ = ["posed_glb"]
 
@@ -57,7 +57,8 @@ def posed_glb(
     if depth <= 0:
         raise InvalidInputError("T_cam_from_model: the object lies behind the camera; check the pose")
     H, W = (int(n) for n in image.shape[-2:])
-    metres = UNITS.get(mesh.units or "m", 1.0)
+    unit = mesh_unit(mesh) or "m"  # glTF is in metres
+    metres = UNITS[unit]
     scale = np.diag([metres, metres, metres, 1.0])
     scene = trimesh.Scene()
     scene.add_geometry(_coloured(mesh), node_name="object", transform=scale @ _FLIP @ T.numpy())
@@ -72,7 +73,7 @@ def posed_glb(
             "znear": 0.01 * depth * metres,
         },
     }
-    exact = {"T_cam_from_model": T.tolist(), "camera_matrix": K.tolist(), "size": [W, H], "unit": mesh.units or "m"}
+    exact = {"T_cam_from_model": T.tolist(), "camera_matrix": K.tolist(), "size": [W, H], "unit": unit}
 
     def with_camera(tree: dict[str, Any]) -> None:
         tree["cameras"] = [camera]

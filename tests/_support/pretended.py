@@ -1,13 +1,15 @@
 """A device that pretends to be a GPU: values are computed on the CPU, and what a GPU would refuse is refused."""
 
+import functools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import torch
 from torch import Tensor
+from torch.utils import backend_registration
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
@@ -15,11 +17,9 @@ __all__ = ["PRETENDING", "Pretended", "pretended_gpu"]
 
 PRETENDING = [
     pytest.mark.skipif(torch.cuda.is_available(), reason="there is a real device"),
-    pytest.mark.skipif(not hasattr(torch._C, "_ensureCUDADeviceGuardSet"), reason="this torch can pretend no device"),
 ]
-"""Marks of tests that need the pretended device."""
+"""Marks of tests that need the pretended device; :func:`pretended_gpu` skips them where torch cannot pretend one."""
 
-DEVICE = torch.device("cuda", 0)
 CROSSING = {"copy_", "_to_copy"}
 """Operators that take tensors from one device to another."""
 
@@ -31,6 +31,7 @@ class Pretended(Tensor):
     """A tensor on the device, and where it is in truth, ``inner``."""
 
     inner: Tensor
+    on: ClassVar[torch.device]
 
     @staticmethod
     def __new__(cls, inner: Tensor) -> "Pretended":
@@ -40,7 +41,7 @@ class Pretended(Tensor):
             strides=inner.stride(),
             storage_offset=inner.storage_offset(),
             dtype=inner.dtype,
-            device=DEVICE,
+            device=cls.on,
         )
         made.inner = inner
         return made
@@ -89,7 +90,7 @@ def computed(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         shapes = [(str(x.device), tuple(x.shape)) for x in given]
         raise RuntimeError(f"{func}: expected all tensors on one device, got {shapes}")
     device = kwargs.get("device")
-    on_device = bool(there) if device is None else torch.device(device).type == DEVICE.type
+    on_device = bool(there) if device is None else torch.device(device).type == Pretended.on.type
     if name == "copy_":
         on_device = isinstance(args[0], Pretended)
     if device is not None:
@@ -106,6 +107,32 @@ def computed(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     return tree_map(wrapped, out)
 
 
+def _python_backend() -> torch.device:
+    """torch 2.10 and later, with or without CUDA: a backend written in Python."""
+    backend_registration._setup_privateuseone_for_python_backend("pretended")
+    return torch.device("pretended", 0)
+
+
+def _cuda_without_driver() -> torch.device:
+    """Before, only torch that is linked with CUDA."""
+    torch._C._ensureCUDADeviceGuardSet()
+    return torch.device("cuda", 0)
+
+
+@functools.cache
+def _why_not() -> str:
+    """Set up the device, once per process; why that cannot be done, or nothing."""
+    reasons = []
+    for set_up in (_python_backend, _cuda_without_driver):
+        try:
+            Pretended.on = set_up()
+            Pretended(torch.zeros(2))[:1]  # what a device that is not linked refuses
+            return ""
+        except (AttributeError, RuntimeError) as error:
+            reasons.append(str(error).splitlines()[0])
+    return "; ".join(reasons)
+
+
 @contextmanager
 def _this_thread() -> Iterator[None]:
     lifted = torch._C._only_lift_cpu_tensors()
@@ -119,8 +146,12 @@ def _this_thread() -> Iterator[None]:
 
 @contextmanager
 def pretended_gpu() -> Iterator[torch.device]:
-    """Within, ``torch.device("cuda", 0)`` can be computed on where there is no such device, in pools of threads too."""
-    torch._C._ensureCUDADeviceGuardSet()
+    """Within, tensors can be computed on the device that it gives, in pools of threads too.
+
+    Skips the test where this torch cannot pretend a device.
+    """
+    if reason := _why_not():
+        pytest.skip(f"this torch can pretend no device: {reason}")
     submit = ThreadPoolExecutor.submit
 
     def submitted(pool: ThreadPoolExecutor, job: Any, /, *args: Any, **kwargs: Any) -> Any:
@@ -136,6 +167,6 @@ def pretended_gpu() -> Iterator[torch.device]:
         with pytest.MonkeyPatch.context() as patch, torch.backends.cudnn.flags(enabled=False), _this_thread():
             patch.setattr(torch.cuda, "_lazy_init", lambda: None)
             patch.setattr(ThreadPoolExecutor, "submit", submitted)
-            yield DEVICE
+            yield Pretended.on
     finally:
         torch.__future__.set_overwrite_module_params_on_conversion(overwritten)

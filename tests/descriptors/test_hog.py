@@ -104,10 +104,31 @@ def test_bin_weights_act_on_votes_and_learn() -> None:
     module = descriptors.HOG(learnable=True)
     torch.testing.assert_close(module(field), hog(field))
     module(field)[:, ::9].sum().backward()
-    assert module.bin_weights is not None
-    assert module.bin_weights.grad is not None
-    assert float(module.bin_weights.grad[0]) > 0.0
+    assert module.log_bin_weights is not None
+    assert module.log_bin_weights.grad is not None
+    assert float(module.log_bin_weights.grad[0]) > 0.0
     assert descriptors.HOG().state_dict() == {}
+
+
+def test_bin_weights_stay_positive_at_any_step() -> None:
+    field = torch.randn(2, 2, 32, 32, generator=torch.Generator().manual_seed(1))
+    module = descriptors.HOG(learnable=True)
+    optimizer = torch.optim.SGD(module.parameters(), lr=0.1)
+    for _ in range(3):
+        optimizer.zero_grad()
+        module(field)[:, ::9].sum().backward()
+        optimizer.step()
+    with torch.no_grad():
+        weights, out = module.bin_weights, module(field)
+    assert weights is not None
+    assert 0.0 < float(weights.min()) < 0.1  # a step of the weights themselves leads to -2.5
+    assert float(out.min()) >= 0.0
+
+
+@pytest.mark.parametrize("weight", [-1e-3, math.nan])
+def test_negative_bin_weights_are_refused(weight: float) -> None:
+    with pytest.raises(InvalidInputError, match="bin_weights: expected factors >= 0"):
+        hog(torch.zeros(1, 2, 16, 16), bin_weights=torch.tensor([weight, *[1.0] * 8]))
 
 
 def test_bad_input_is_refused() -> None:

@@ -170,3 +170,25 @@ def test_bad_options_are_refused() -> None:
     ):
         with pytest.raises(InvalidInputError, match="expected a finite number > 0"):
             call()
+
+
+@pytest.mark.parametrize("name", detectors.DETECTORS)
+@pytest.mark.parametrize("share", [-1.0, 0.0, 1.5, float("nan")])
+def test_shares_that_are_none_are_refused(name: str, share: float) -> None:
+    with pytest.raises(InvalidInputError, match="share: expected 0 < share <= 1"):
+        detectors.DETECTORS[name](torch.rand(1, 1, 32, 32), share=share)
+
+
+@pytest.mark.parametrize("edges", [-0.5, 0.0, 1.5, float("nan")])
+def test_canny_refuses_a_share_of_edges_that_is_none(edges: float) -> None:
+    with pytest.raises(InvalidInputError, match="edges: expected 0 < edges <= 1"):
+        detectors.canny(torch.rand(1, 1, 32, 32), edges=edges)
+
+
+def test_canny_of_more_than_16_million_pixels() -> None:
+    image = torch.zeros(1, 1, 4001, 4000)
+    image[..., 2000:] = 1.0
+    points = detectors.canny(image, edges=0.002, share=1e-3).points[0, 0]
+    assert points[:, 1990:2010].sum() >= 4001
+    assert not points[:, :1990].any()
+    assert not points[:, 2010:].any()

@@ -247,6 +247,18 @@ def test_focus_curves_rank_edges_by_sharpness() -> None:
     assert float(1 / focus[90]) == pytest.approx(math.sqrt(9 + 1), rel=0.03)
 
 
+@pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0, 3.0])
+def test_focus_curves_are_limited_by_the_smoothing_on_edges_only(sigma: float) -> None:
+    step = (torch.arange(65.0) > 32).to(torch.float64).expand(1, 1, 65, 65)
+    noise = torch.rand(1, 1, 65, 65, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    of_step, of_noise = (
+        float(filters.multiscale_focus_curves(x, sigma=sigma, saliency_weight=0.0).norm(dim=1).max())
+        for x in (step, noise)
+    )
+    assert 0.7 / sigma < of_step <= 1.0 / sigma
+    assert of_noise == pytest.approx(1.0 / 0.6, rel=1e-3)
+
+
 def test_image_gradient_and_saliency_of_a_ramp() -> None:
     x, y = grid(33)
     ramp = (0.03 * x - 0.04 * y)[None, None]
@@ -269,3 +281,13 @@ def test_pci_finds_a_dark_line_with_the_largest_eigenvalue_and_a_bright_one_with
         # s^2 2 / (4 + s^2)^1.5 is largest at s = 2 sqrt 2: the scale of 2.8 px wins.
         assert float(field[:, 32].norm()) == pytest.approx(2.8**2 * 2 / (4 + 2.8**2) ** 1.5, rel=0.03)
         assert float(field[1, 32].abs()) < 1e-9
+
+
+@pytest.mark.parametrize(("dtype", "ulp"), [(torch.float16, 2**-11), (torch.bfloat16, 2**-8)])
+@pytest.mark.parametrize("sigma", [1.0, 8.0, torch.tensor(3.0)])
+def test_smoothing_rounds_half_types_once(dtype: torch.dtype, ulp: float, sigma: float | Tensor) -> None:
+    x = torch.rand(1, 2, 64, 64, generator=torch.Generator().manual_seed(0)).to(dtype)
+    smooth = filters.gaussian_smooth(x, sigma)
+    assert smooth.dtype == dtype
+    exact = filters.gaussian_smooth(x.double(), sigma)
+    assert float((smooth.double() - exact).abs().max()) <= 0.51 * ulp  # half a unit in the last place of 0.5 to 1

@@ -28,6 +28,28 @@ def test_at_a_pole_theta_is_0_and_azimuth_carries_the_turn(elevation: float, dty
     torch.testing.assert_close(g.rotation_from_viewpoint(a, e, t), R, rtol=0, atol=2e-6)
 
 
+@pytest.mark.parametrize("elevation", [90.0, -90.0])
+@pytest.mark.parametrize("noise", [0.0, 1e-7, 1e-6, 1e-5, 1e-3])
+def test_float32_rotations_come_back_near_the_poles(elevation: float, noise: float) -> None:
+    """Poses from an optimiser are not exact rotations; their entries carry rounding of their own."""
+    generator = torch.Generator().manual_seed(0)
+    azimuth, theta = (360.0 * torch.rand(50, 20, generator=generator, dtype=torch.float64) for _ in range(2))
+    exact = g.rotation_from_viewpoint(azimuth, elevation, theta)
+    off_the_pole = torch.randn(exact.shape[:-1], generator=generator, dtype=torch.float64) * noise
+    tilt = torch.from_numpy(Rotation.from_rotvec(off_the_pole.view(-1, 3).numpy()).as_matrix()).view(exact.shape)
+    rounded = (tilt @ exact).float() + 5e-7 * torch.randn(exact.shape, generator=generator)
+    back = g.rotation_from_viewpoint(*g.viewpoint_from_rotation(rounded))
+    assert back.shape == rounded.shape
+    assert math.radians(float(g.rotation_error(back.double(), rounded.double()).max())) < 5e-5
+
+
+def test_gradients_stay_finite_near_the_poles() -> None:
+    R = g.rotation_from_viewpoint(torch.tensor([30.0, 200.0, 10.0]), torch.tensor([89.999, -89.99, 0.0]), 20.0)
+    R.requires_grad_()
+    sum(angle.sum() for angle in g.viewpoint_from_rotation(R)).backward()
+    assert bool(R.grad.isfinite().all())
+
+
 def test_a_full_turn_is_0_and_half_a_turn_is_minus_180() -> None:
     R = g.rotation_from_viewpoint(torch.tensor([-1e-9, 720.0]), 0.0, torch.tensor([180.0, -180.0]))
     a, _, t = g.viewpoint_from_rotation(R)

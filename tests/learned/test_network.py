@@ -8,6 +8,7 @@ from safetensors.torch import save_file
 
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.learned import FieldNetwork, LearnedCurvilinearSaliency, doubled_angle, halved_angle
+from curvireg_torch.learned.backbone import Backbone
 from curvireg_torch.learned.network import SHA256, WEIGHTS
 
 
@@ -44,6 +45,14 @@ def test_size_of_network_and_file():
     assert sum(p.numel() for p in FieldNetwork().parameters()) <= 2_000_000
     assert WEIGHTS.stat().st_size <= 8_000_000
     assert len(SHA256) == 64
+
+
+@pytest.mark.parametrize("make", [LearnedCurvilinearSaliency, Backbone])
+def test_making_a_network_leaves_the_random_generator_alone(make):
+    before = torch.get_rng_state()
+    made = make()
+    assert torch.equal(torch.get_rng_state(), before)
+    assert {p.device.type for p in made.parameters()} == {"cpu"}
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 128, 128), (2, 3, 256, 256), (1, 3, 60, 90), (1, 1, 1, 1)])

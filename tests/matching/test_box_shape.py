@@ -1,4 +1,5 @@
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -6,6 +7,7 @@ import torch
 from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.matching import box_shape_score, box_shapes, whole_box_shapes
+from curvireg_torch.terms import BoxShape
 from tests._support.scenes import scene, truck_bank
 
 
@@ -58,3 +60,19 @@ def test_the_matcher_weighs_views_by_the_shape_of_the_whole_box():
 def test_bad_options_are_named():
     with pytest.raises(InvalidInputError, match="sigma"):
         box_shape_score(torch.zeros(1), torch.zeros(1), sigma=0.0)
+
+
+@pytest.mark.parametrize("shape", [math.nan, math.inf, -math.inf])
+def test_shapes_of_boxes_without_area_are_refused(shape):
+    """They would score 1 or turn every score into NaN."""
+    with pytest.raises(InvalidInputError, match="views: expected finite shapes, got 1 of 3"):
+        box_shape_score(torch.zeros(1), torch.tensor([0.0, shape, 0.5]))
+    if math.isinf(shape):
+        with pytest.raises(InvalidInputError, match="queries: expected finite shapes"):
+            box_shape_score(torch.tensor([0.0, shape]), torch.zeros(2))
+
+
+def test_a_bank_with_a_view_without_box_makes_no_matcher():
+    views = SimpleNamespace(boxes=torch.tensor([[0.0, 0, 20, 10], [math.nan] * 4]))
+    with pytest.raises(InvalidInputError, match="views: expected finite shapes, got 1 of 2"):
+        BoxShape().over(views)

@@ -47,16 +47,16 @@ def test_key_depends_on_everything(monkeypatch: pytest.MonkeyPatch) -> None:
     from curvireg_torch.matching import cache
 
     mesh = trimesh.creation.box()
-    millimetres, moved, flipped = mesh.copy(), mesh.copy(), mesh.copy()
-    millimetres.units = "mm"
+    millimetres, metres, moved, flipped = (mesh.copy() for _ in range(4))
+    millimetres.units, metres.units = "mm", "m"  # and none
     moved.vertices[0] += 1e-9
     flipped.faces = flipped.faces[::-1]
-    keys = [bank_key(m, VIEWS, SETTINGS) for m in (mesh, millimetres, moved, flipped)]
+    keys = [bank_key(m, VIEWS, SETTINGS) for m in (mesh, millimetres, metres, moved, flipped)]
     keys += [bank_key(mesh, VIEWS[:3], SETTINGS), bank_key(mesh, VIEWS, replace(SETTINGS, sigma=1.5))]
     keys.append(bank_key(mesh, VIEWS, SETTINGS, renderer="torch"))
     monkeypatch.setattr(cache, "_code_digest", lambda: b"another version")
     keys.append(bank_key(mesh, VIEWS, SETTINGS))
-    assert len(set(keys)) == 8
+    assert len(set(keys)) == 9
 
 
 def test_a_renderer_of_ones_own_neither_fills_the_cache_nor_takes_from_it(tmp_path: Path) -> None:

@@ -1,3 +1,5 @@
+import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -69,6 +71,50 @@ def test_order_of_ties_and_of_the_rows_does_not_matter() -> None:
     value = metrics.average_viewpoint_precision(detections, objects, 8)
     assert value == metrics.average_viewpoint_precision(shuffled, objects, 8)
     assert value == pytest.approx(1 / 4 * 1 + 3 / 4 * 2 / 4)
+
+
+def _score_all(detections: metrics.Detections, objects: metrics.Objects) -> list[float]:
+    return [
+        metrics.average_precision(detections, objects),
+        metrics.average_viewpoint_precision(detections, objects, 8),
+        metrics.average_rotation_precision(detections, objects),
+    ]
+
+
+def _listed(rows: metrics.Objects, order: tuple[int, ...]) -> metrics.Objects:
+    return type(rows)(*(getattr(rows, f.name)[list(order)] for f in dataclasses.fields(rows)))
+
+
+def test_ties_that_compete_for_a_box_share_it() -> None:
+    """Three detections of one box and one score, of which two are right; a better one of another box before them."""
+    objects = _objects([0.0, 90.0], image=[0, 0])
+    boxes = objects.boxes[[1, 0, 0, 0]] + torch.tensor([[0.0], [0.0], [0.5], [-0.5]])
+    R = rotation_from_viewpoint(torch.tensor([90.0, 0.0, 180.0, 3.0]), 10.0)
+    scores = torch.tensor([2.0, 1.0, 1.0, 1.0])
+    detections = metrics.Detections(torch.zeros(4, dtype=torch.int64), boxes, R, scores)
+    for order in itertools.permutations(range(4)):
+        # Recall 1/2, 1 at heights 1, (1 + 2/3) / 4; of the boxes alone 1, 2/4.
+        expected = [0.5 + 0.5 * 2 / 4, *[0.5 + 0.5 * (1 + 2 / 3) / 4] * 2]
+        assert _score_all(_listed(detections, order), objects) == pytest.approx(expected, abs=1e-12)
+    # A later one finds the box taken, whoever of the three had it.
+    late = metrics.Detections(
+        torch.zeros(5, dtype=torch.int64),
+        torch.cat([boxes, objects.boxes[:1]]),
+        torch.cat([R, objects.rotations[:1]]),
+        torch.cat([scores, torch.tensor([0.5])]),
+    )
+    assert _score_all(late, objects) == pytest.approx(expected, abs=1e-12)
+
+
+def test_the_order_of_objects_that_a_box_overlaps_equally_does_not_matter() -> None:
+    image, same = torch.zeros(3, dtype=torch.int64), SQUARE.expand(3, 4).clone()
+    same[2] += 3.0
+    objects = metrics.Objects(image, same, rotation_from_viewpoint(torch.tensor([0.0, 90.0, 180.0]), 10.0))
+    detections = metrics.Detections(
+        image, same, rotation_from_viewpoint(torch.tensor([0.0, 0.0, 180.0]), 10.0), torch.tensor([3.0, 2.0, 1.0])
+    )
+    values = [_score_all(detections, _listed(objects, order)) for order in itertools.permutations(range(3))]
+    assert all(value == values[0] for value in values)
 
 
 def test_against_a_slow_loop() -> None:

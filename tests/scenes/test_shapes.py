@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from curvireg_torch.geometry import load_mesh
 from curvireg_torch.rendering.embree import RayScene
 from curvireg_torch.scenes import FAMILIES, random_shape, shape_from_mesh
 from curvireg_torch.scenes.surfaces import bar, box, lathe, superquadric, torus
@@ -64,3 +65,19 @@ def test_a_users_mesh_is_centred_scaled_and_split_into_its_parts():
     shape = shape_from_mesh(trimesh.util.concatenate(parts))
     assert np.linalg.norm(shape.vertices, axis=1).max() == pytest.approx(1.0)
     assert len(set(shape.materials)) == 2
+
+
+def test_parts_of_an_stl_are_connected_where_their_corners_coincide(tmp_path):
+    """Such a file lists the corners of every triangle anew."""
+    parts = [trimesh.creation.box(), trimesh.creation.icosphere(subdivisions=1), trimesh.creation.box((0.5, 2, 3))]
+    for i, part in enumerate(parts):
+        part.apply_translation((5 * i, 0, 0))
+    trimesh.util.concatenate(parts).export(tmp_path / "parts.stl")
+    mesh = load_mesh(tmp_path / "parts.stl")
+    assert len(mesh.vertices) == 3 * len(mesh.faces)
+    shape = shape_from_mesh(mesh)
+    assert len(shape.vertices) == len(mesh.vertices)
+    of_part = np.repeat([0, 1, 2], [len(part.faces) for part in parts])
+    labels = [set(shape.materials[of_part == i].tolist()) for i in range(3)]
+    assert [len(label) for label in labels] == [1, 1, 1]
+    assert len(set.union(*labels)) == 3
