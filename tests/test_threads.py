@@ -92,3 +92,18 @@ def test_a_forked_process_starts_its_own() -> None:
         os.waitpid(child, 0)
         pytest.fail("the child hangs")
     assert os.waitstatus_to_exitcode(status) == 0
+
+
+def test_the_process_has_its_threads_back_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a library underneath counts threads for the whole process, a worker's one thread is everybody's."""
+    threads = [2]
+    monkeypatch.setattr(torch, "set_num_threads", lambda n: threads.__setitem__(0, n))
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads[0])
+    with one_thread_each() as pool:
+        pool.submit(threading.get_ident).result()
+        assert threads == [1]
+    assert threads == [2]
+    with pytest.raises(ValueError, match="within"), one_thread_each() as pool:
+        pool.submit(threading.get_ident).result()
+        raise ValueError("within")
+    assert threads == [2]

@@ -206,3 +206,17 @@ def test_scores_tell_the_protocol_of_the_predictions(pascal, tmp_path):
     run(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out")
     summary = score(Pascal3DBenchmark(pascal, Protocol(pose="any")), tmp_path / "out")
     assert summary["protocol"] == str(Protocol())
+
+
+def test_an_object_whose_box_was_changed_is_registered_again(pascal, tmp_path):
+    benchmark = Pascal3DBenchmark(pascal, Protocol())
+    run(benchmark, tmp_path / "out", limit=2)
+    before = rows_of(benchmark, tmp_path / "out")
+    item = next(item for item in benchmark.items if "rotation" in before.get(item.key, {}))
+    corrected = Pascal3DBenchmark(pascal, Protocol())
+    moved = replace(item, box=item.box + torch.tensor([4.0, 3.0, 0.0, 0.0]))
+    corrected.items = [moved if one.key == item.key else one for one in corrected.items]
+    run(corrected, tmp_path / "out", limit=2)
+    after = rows_of(benchmark, tmp_path / "out")
+    assert [key for key in before if after[key] != before[key]] == [item.key]
+    assert after[item.key]["score"] != before[item.key]["score"]

@@ -5,6 +5,7 @@ import json
 
 import pytest
 import torch
+import trimesh
 
 from curvireg_torch.data import Pascal3DPlus, read_bop_csv
 from curvireg_torch.errors import InvalidInputError
@@ -175,3 +176,19 @@ def test_missing_prediction_is_named(furniture, tmp_path):
     PredictionStore(tmp_path / "out" / "predictions").open({"root": "x"})
     with pytest.raises(InvalidInputError, match=r"bottle.*run again"):
         score(furniture, tmp_path / "out")
+
+
+def test_mspd_is_scaled_by_the_width_of_the_image(bop, tmp_path):
+    """An error of 3 px: thresholds of 5 to 50 px at 640 px are 0.625 to 6.25 px at 80 px of width, of which six are
+    above it; of the height, 60 px, five would be."""
+    benchmark = BOPBenchmark(bop, Protocol(pose="any"))
+    samples = [bop.annotation(i) for i in range(len(bop))]
+    rows = []
+    for sample in samples:
+        t = sample["translation"].double().clone()
+        points = torch.from_numpy(trimesh.load(sample["model_path"]).vertices.copy()) @ sample["rotation"].double().T
+        nearest = float((points[:, 2] + t[2]).min())
+        t[0] += 3.0 * nearest / float(sample["camera_matrix"][0, 0])
+        rows.append({"rotation": sample["rotation"].tolist(), "translation": t.tolist()})
+    write_predictions(benchmark, tmp_path / "out", rows)
+    assert score(benchmark, tmp_path / "out")["mspd_ar"] == pytest.approx(0.6)

@@ -269,3 +269,15 @@ def test_pci_finds_a_dark_line_with_the_largest_eigenvalue_and_a_bright_one_with
         # s^2 2 / (4 + s^2)^1.5 is largest at s = 2 sqrt 2: the scale of 2.8 px wins.
         assert float(field[:, 32].norm()) == pytest.approx(2.8**2 * 2 / (4 + 2.8**2) ** 1.5, rel=0.03)
         assert float(field[1, 32].abs()) < 1e-9
+
+
+def test_pci_takes_the_direction_of_the_scale_that_won() -> None:
+    """Length and direction together are those of the single scale with the largest curvature."""
+    image = torch.rand(1, 1, 48, 48, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    sigmas = (1.0, 2.0, 4.0)
+    single = torch.cat([filters.principal_curvature_image(image, sigmas=[sigma]) for sigma in sigmas])
+    winner = single.norm(dim=1).argmax(dim=0)
+    assert len(winner.unique()) == 3
+    best = single.gather(0, winner.expand(1, 2, -1, -1))
+    found = filters.principal_curvature_image(image, sigmas=sigmas)
+    torch.testing.assert_close((found * best).sum(dim=1).abs(), best.square().sum(dim=1))  # the sign is free

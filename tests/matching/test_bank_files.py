@@ -220,3 +220,15 @@ def test_any_device(bank: ViewBank) -> None:
         moved = bank.to(device)
         assert moved.device.type == moved.rotations.device.type == moved.points.device.type == device
         assert torch.equal(moved.silhouettes.cpu(), bank.silhouettes)
+
+
+def test_a_joined_bank_can_be_joined_again() -> None:
+    """Models are numbered through, as the list of meshes is."""
+    meshes = [trimesh.creation.box((1, 1, height)) for height in (1, 2, 3, 4)]
+    views = sample_views(azimuth_step=180, elevations=[20])
+    banks = [ViewBank.build(mesh, views, settings=SETTINGS, progress=False) for mesh in meshes]
+    nested = ViewBank.join([ViewBank.join(banks[:2]), ViewBank.join(banks[2:])])
+    flat = ViewBank.join(banks)
+    assert nested.model.tolist() == flat.model.tolist() == sorted([0, 1, 2, 3] * len(views))
+    assert [float(mesh.extents[2]) for mesh in nested.meshes] == [1.0, 2.0, 3.0, 4.0]
+    same(nested, flat)

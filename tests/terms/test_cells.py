@@ -1,10 +1,12 @@
 """Feature points are counted in cells as average pooling does, to the bit."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 import torch.nn.functional as F
 
-from curvireg_torch.terms.repeatability import cell_shares
+from curvireg_torch.terms.repeatability import Repeatability, cell_shares
 
 
 @pytest.mark.parametrize(("size", "cell"), [(128, 2), (64, 1), (65, 2), (100, 3), (1030, 16)])
@@ -13,3 +15,36 @@ def test_shares_are_those_of_average_pooling(size, cell):
     points[1] = True
     expected = F.avg_pool2d(points[:, None].float(), cell, ceil_mode=True)[:, 0]
     assert torch.equal(cell_shares(points, cell), expected)
+
+
+class OnePoint:
+    """Views of S px, each with one point in the middle row, at the given columns."""
+
+    def __init__(self, side, columns):
+        self.settings = SimpleNamespace(image_size=side)
+        self.points = torch.zeros(len(columns), side, side, dtype=torch.bool)
+        self.points[range(len(columns)), side // 2, columns] = True
+
+    def __len__(self):
+        return len(self.points)
+
+    def points_at(self, index):
+        return self.points[index]
+
+
+@pytest.mark.parametrize(("side", "cells"), [(64, 64), (128, 64), (256, 64)])
+def test_points_are_counted_in_64_cells_a_side_however_far_they_may_be_apart(side, cells):
+    """A point 3 px nearer than eps is found and one 3 px farther is not: a cell is small beside eps."""
+    eps = 0.1
+    away = int(eps * side)
+    views = OnePoint(side, [side // 2 + away - 3, side // 2 + away + 4])
+    term = Repeatability(eps=eps).over(views)
+    assert term.near.shape == (2, cells**2)
+    query = OnePoint(side, [side // 2]).points[None]
+    assert term(SimpleNamespace(points=query)).tolist() == [[1.0, 0.0]]
+
+
+def test_cells_are_never_larger_than_eps():
+    """2 px at 128 px allow cells of 2 px, 1 px allows pixels alone."""
+    sides = [Repeatability(eps=eps).over(OnePoint(128, [64])).near.shape[1] ** 0.5 for eps in (0.016, 0.008)]
+    assert sides == [64, 128]
