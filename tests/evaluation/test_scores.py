@@ -179,8 +179,8 @@ def test_missing_prediction_is_named(furniture, tmp_path):
 
 
 def test_mspd_is_scaled_by_the_width_of_the_image(bop, tmp_path):
-    """An error of 3 px: thresholds of 5 to 50 px at 640 px are 0.625 to 6.25 px at 80 px of width, of which six are
-    above it; of the height, 60 px, five would be."""
+    """An error of 3 px at 80 px of width is one of 24 px at 640 px: below six of the thresholds 5, 10, ..., 50 px.
+    By the height of 60 px it would be one of 32 px, below four."""
     benchmark = BOPBenchmark(bop, Protocol(pose="any"))
     samples = [bop.annotation(i) for i in range(len(bop))]
     rows = []
