@@ -2,7 +2,8 @@
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -103,7 +104,21 @@ def test_the_process_has_its_threads_back_afterwards(monkeypatch: pytest.MonkeyP
         pool.submit(threading.get_ident).result()
         assert threads == [1]
     assert threads == [2]
-    with pytest.raises(ValueError, match="within"), one_thread_each() as pool:
+
+
+def test_the_process_has_its_threads_back_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(torch, "set_num_threads", asked.append)
+
+    def failing(pool: ThreadPoolExecutor) -> None:
         pool.submit(threading.get_ident).result()
         raise ValueError("within")
-    assert threads == [2]
+
+    with pytest.raises(ValueError, match="within"):
+        with_pool(failing)
+    assert asked == [1, 2]
+
+
+def with_pool(job: Callable[[ThreadPoolExecutor], None]) -> None:
+    with one_thread_each() as pool:
+        job(pool)

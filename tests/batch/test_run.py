@@ -12,6 +12,7 @@ from curvireg_torch import Registrar, ViewBank, sample_views
 from curvireg_torch.batch import run
 from curvireg_torch.batch.listing import Entry, Listing
 from curvireg_torch.data import read_photo
+from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import Registration
 from curvireg_torch.synthetic import example_mesh
@@ -32,9 +33,7 @@ def entry(tmp_path):
     picture = (scene(0)[0].permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
     cv2.imwrite(str(tmp_path / "photo.png"), picture)
     (tmp_path / "mesh.ply").write_text("a mesh")
-    return Entry(
-        (), "photo.png", tmp_path / "photo.png", (tmp_path / "mesh.ply",), box=tuple(scene(0)[1].tolist())
-    )
+    return Entry((), "photo.png", tmp_path / "photo.png", (tmp_path / "mesh.ply",), box=tuple(scene(0)[1].tolist()))
 
 
 def test_what_was_asked_otherwise_is_done_again(registrar, entry, tmp_path, monkeypatch):
@@ -86,9 +85,7 @@ def test_a_guessed_camera_has_no_covariance(registrar, entry, monkeypatch, camer
         __call__ = staticmethod(with_covariance)
 
     photo = read_photo(entry.photo)
-    monkeypatch.setattr(
-        type(photo), "guessed_camera_matrix", lambda _: run.camera_of_view(40.0, SIZE), raising=True
-    )
+    monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: run.camera_of_view(40.0, SIZE), raising=True)
     one = replace(entry, camera=camera, guess=guess)
     result, document = run.register_entry(one, photo, Sure(), bank_seconds=0.0)
     assert document["inputs"]["camera_source"] == source
@@ -97,3 +94,27 @@ def test_a_guessed_camera_has_no_covariance(registrar, entry, monkeypatch, camer
     assert (document["standard_deviations"] is not None) == known
     assert (result.translation is not None) == (source is not None)
     json.dumps(document, allow_nan=False)
+
+
+def test_the_page_shows_reliable_answers_first_and_failures_last(registrar, entry, tmp_path, monkeypatch):
+    """Among alike ones the more confident, and of equals the one that the list names first."""
+    told = {"a": 0.3, "b": 0.95, "c": None, "d": 0.85, "e": 0.5, "f": 0.95}
+    rows = [replace(entry, name=name) for name in told]
+
+    def register_entry(one, photo, registrar, **_):
+        if told[one.name] is None:
+            raise InvalidInputError("dark")
+        plain = replace(one, name="photo.png")
+        result, document = registered(plain, photo, registrar, bank_seconds=0.0)
+        return result, {**document, "confidence": told[one.name], "reliable": told[one.name] >= 0.8}
+
+    shown = []
+    registered = run.register_entry
+    monkeypatch.setattr(run, "register_entry", register_entry)
+    monkeypatch.setattr(run, "write_sheet", lambda _path, _title, some, **_: shown.extend(some))
+    counts = run.register_list(
+        Listing((), tuple(rows)), tmp_path / "out", lambda _: registrar, settings={}, progress=False
+    )
+    assert [one.name for one in shown] == ["b", "f", "d", "e", "a", "c"]
+    assert [one.kind for one in shown] == ["reliable"] * 3 + ["doubtful"] * 2 + ["failed"]
+    assert (counts.ok, counts.failed, counts.reliable) == (5, 1, 3)

@@ -106,6 +106,7 @@ def test_pascal3d_table(furniture, tmp_path):
     assert [float(first["true_" + k]) for k in ("azimuth", "elevation", "theta")] == samples[0]["viewpoint"].tolist()
     assert float(first["symmetric_error_deg"]) == pytest.approx(0, abs=1e-3)
     assert 150 < float(first["error_deg"]) <= 170
+    assert first["seconds"] == "0.5", "of the registration, without the bank"
     assert (second["failed"], second["azimuth"], second["error_deg"]) == ("?", "", "inf")
 
 

@@ -190,3 +190,28 @@ def test_boxes_of_places_are_those_of_the_rendered_views_to_a_hundredth_of_a_pix
         expected = (drawn[k] - 47.5 + middle) / torch.tensor(ratio * 2, dtype=torch.float64) - 0.5
         torch.testing.assert_close(best.boxes[0].double(), expected, rtol=0, atol=0.01)
         assert int(best.views[0]) == int(views[k])
+
+
+def test_every_box_is_as_large_as_its_view_would_be_at_a_distance_that_was_given():
+    """Half a step of sizes beyond it at most, and what rounding a size to cells of 16 px does."""
+    image, _, T = scene(1)
+    low, high = 0.95 * float(T[2, 3]), 1.05 * float(T[2, 3])
+    found = locator()([image], camera_matrices=[CAMERA], distance=(low, high))[0]
+    known, views = bank(), found.views
+    sides = (known.boxes[views, 2:] - known.boxes[views, :2]).amax(dim=1) * known.distances[views]
+    shown = (found.boxes[:, 2:] - found.boxes[:, :2]).amax(dim=1)
+    away = sides * float(CAMERA[0, 0]) / shown
+    assert len(away) > 5
+    assert float(away.min()) > low / 2.0**0.25 * 0.9
+    assert float(away.max()) < high * 2.0**0.25 * 1.1
+
+
+def test_objects_of_less_than_32_px_are_not_looked_for():
+    """In a small photograph the least size counts, not the share of its longer side; a smaller one is looked at as a
+    whole."""
+    reach = 80.0
+    for shape, least in (((60, 80), 32.0), ((20, 24), 24.0)):
+        scales = locator()._scales(torch.zeros(3, *shape), None, None, reach)
+        assert reach / max(scales) == pytest.approx(least)
+    large = locator()._scales(torch.zeros(3, 900, 1200), None, None, reach)
+    assert reach / max(large) == pytest.approx(1200 * locator().settings.smallest)

@@ -289,18 +289,3 @@ def test_the_registrar_ends_with_the_contours(camera):
         assert 0 <= with_contours.score <= 1
     assert sorted(errors[True])[1] < 1.0
     assert sorted(errors[True])[1] < sorted(errors[False])[1]
-
-
-def test_starts_that_the_first_rounds_made_no_better_come_back_as_they_were():
-    """On noise, where fits lead anywhere: only one start is finished, and four others, all the same, gain nothing."""
-    mesh, generator = trimesh.creation.box((1.0, 1.4, 0.8)), torch.Generator().manual_seed(3)
-    noise = torch.rand(3, 128, 128, generator=torch.Generator().manual_seed(0))
-    T = pose([0.4, 0.5, 0.1], [0.0, 0.0, 8.0])
-    off = 0.3 * torch.randn(12, 6, generator=generator, dtype=torch.float64)
-    off[:4] = 0.0
-    starts = contour_descent.moved(T.repeat(12, 1, 1), off, mesh_centre(mesh))
-    rest = {"centre": mesh_centre(mesh), "radius": mesh_radius(mesh), "finish": 1}
-    fit = fit_contours(make_renderer(mesh), noise, torch.tensor([40.0, 36, 88, 84]), K, starts, **rest)
-    as_they_were = (fit.transform == starts).all(dim=(1, 2))
-    assert int(as_they_were.sum()) >= 3
-    assert int(as_they_were.sum()) < 9

@@ -5,13 +5,16 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
+import trimesh
 from torch import Tensor
 
 from curvireg_torch import camera_matrix
-from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.geometry import mesh_centre, mesh_radius, rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
-from curvireg_torch.registration.contour_descent import Seen, Views, project
+from curvireg_torch.registration import fit_contours
+from curvireg_torch.registration.contour_descent import Seen, Views, moved, project
 from curvireg_torch.registration.contour_points import ContourPoints
+from curvireg_torch.rendering import make_renderer
 
 K = camera_matrix(300.0, 310.0, 63.5, 60.0, dtype=torch.float64)[None]
 CENTRE = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
@@ -93,3 +96,28 @@ def test_nothing_found_is_no_step_and_a_long_one_is_cut():
     ):
         whole = torch.tensor([step], dtype=torch.float64)
         torch.testing.assert_close(views(at(1, 0.0), [1.0])._bounded(whole, T), share * whole)
+
+
+def test_starts_that_the_first_rounds_made_no_better_come_back_as_they_were() -> None:
+    """On noise, where fits lead anywhere: only one start is finished, and four others, all the same, gain nothing."""
+    mesh, generator = trimesh.creation.box((1.0, 1.4, 0.8)), torch.Generator().manual_seed(3)
+    noise = torch.rand(3, 128, 128, generator=torch.Generator().manual_seed(0))
+    pose = transform(
+        rotation_from_axis_angle(torch.tensor([0.4, 0.5, 0.1]).double()), torch.tensor([0.0, 0.0, 8.0]).double()
+    )
+    off = 0.3 * torch.randn(12, 6, generator=generator, dtype=torch.float64)
+    off[:4] = 0.0
+    starts = moved(pose.repeat(12, 1, 1), off, mesh_centre(mesh))
+    fit = fit_contours(
+        make_renderer(mesh),
+        noise,
+        torch.tensor([40.0, 36, 88, 84]),
+        K[0],
+        starts,
+        centre=mesh_centre(mesh),
+        radius=mesh_radius(mesh),
+        finish=1,
+    )
+    as_they_were = (fit.transform == starts).all(dim=(1, 2))
+    assert int(as_they_were.sum()) >= 3
+    assert int(as_they_were.sum()) < 9

@@ -151,7 +151,7 @@ def test_a_bank_of_coloured_and_grey_meshes_is_one_bank():
     torch.testing.assert_close(joined, alone, atol=1e-5, rtol=0)
 
 
-def test_features_that_are_made_anew_when_too_many_were_kept_are_the_same(bank, monkeypatch):
+def test_features_that_are_made_anew_when_too_many_were_kept_are_the_same(monkeypatch):
     """A photograph that asks for views of which some were kept, and for more than may be kept, is ranked as by a
     matcher that kept none."""
     large = ViewBank.build(example_mesh(), VIEWS, pipeline=late(), progress=False)
