@@ -33,7 +33,7 @@ def registration(covariance=None, confidence=0.9, found=None, distance=2.0):
         )
         for view in (0, 1)
     )
-    return Registration(poses, confidence, ranking, found)
+    return Registration(poses, confidence, ranking, found=found)
 
 
 class Bank(list):

@@ -34,8 +34,8 @@ def test_a_hypothesis_within_15_degrees_of_a_better_one_is_no_peak_of_its_own():
 def test_ranks_are_told_beside_the_best_of_the_same_photograph():
     """Logarithms of scores, whatever those of other photographs are."""
     starts = found([0, 0, 1, 1], [0.0, 90.0, 0.0, 90.0], [1.0, 0.5, 0.01, 0.04])
-    ends = found([0, 0, 1, 1], [0.0, 90.0, 0.0, 90.0], [0.6, 0.7, 0.8, 0.9])
+    similarity = torch.tensor([0.6, 0.7, 0.8, 0.9]).double()
     support, looks = torch.tensor([0.1, 0.2, 0.3, 0.4]).double(), torch.tensor([-1.0, -2.0, -3.0, -4.0]).double()
-    evidence = gathered_evidence(starts, ends, support, looks)
+    evidence = gathered_evidence(starts, similarity, support, looks)
     rank = torch.tensor([1.0, 0.5, 0.25, 1.0], dtype=torch.float64).log()
-    torch.testing.assert_close(evidence, torch.stack([rank, ends.score, support, looks], dim=1))
+    torch.testing.assert_close(evidence, torch.stack([rank, similarity, support, looks], dim=1))
