@@ -3,7 +3,7 @@
     python scripts/mutate.py metrics geometry --sample 30     # go on where the last run stopped
     python scripts/mutate.py metrics --sample 30 --again      # survivors once more, after new tests
     python scripts/mutate.py metrics --list                   # what would be changed
-    python scripts/mutate.py --table                          # the scores into CONTRIBUTING.md
+    python scripts/mutate.py --table                          # the counts into CONTRIBUTING.md
 
 One mutant (``mutants.py``) at a time, in a temporary copy; the first failing test kills it. Tests of a module: those of
 the folder of its package (of a module beside the packages: files that have its name or import it), and its doctests;
@@ -11,8 +11,9 @@ not those marked slow or data. They run once as they are, under coverage; a muta
 the quickest first, half a minute of them at most. The sample is drawn by a hash of the mutant and the seed, it stays
 where the code does.
 
-``scripts/results/mutation.json``: score per package (killed / sampled) and every survivor. A ``reason`` written there
-beside a survivor is kept: why no test can or need tell it from the original.
+``scripts/results/mutation.json``: how many of a package's mutants were sampled and killed, and every survivor. A
+``reason`` written there beside a survivor is kept: why no test can or need tell it from the original.
+``mutation_by_hand.json`` beside it lists mutants that were placed by hand where gaps were suspected.
 """
 
 import argparse
@@ -37,9 +38,11 @@ from typing import Any
 
 from coverage import Coverage, CoverageData
 from mutants import Mutant, mutants_of
+from scipy.stats import binomtest
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULT = ROOT / "scripts" / "results" / "mutation.json"
+BY_HAND = RESULT.with_name("mutation_by_hand.json")
 TABLE = ROOT / "CONTRIBUTING.md"
 BEGIN, END = "<!-- mutants:begin -->", "<!-- mutants:end -->"
 PACKAGE = "curvireg_torch"
@@ -212,25 +215,38 @@ def store(package: str, mutants: int, chosen: list[Mutant], outcomes: dict[str, 
     reasons = {s["key"]: s["reason"] for s in result.get(package, {}).get("survivors", [])}
     alive = [m for m in chosen if outcomes.get(m.key) == "survived"]
     n = len(outcomes)
-    row = {"mutants": mutants, "sampled": n, "killed": n - len(alive), "score": round(1 - len(alive) / max(n, 1), 3)}
+    row = {"mutants": mutants, "sampled": n, "killed": n - len(alive)}
     survivors = [{"key": m.key, "line": m.line, "reason": reasons.get(m.key, "")} for m in alive]
     result[package] = {**row, "survivors": survivors, "outcomes": outcomes}
     RESULT.write_text(json.dumps(dict(sorted(result.items())), indent=1, ensure_ascii=False) + "\n")
     return row
 
 
+def share(killed: int, sampled: int) -> str:
+    """The 95 % interval (Wilson's) of the share of all mutants that the tests notice, from a sample of them."""
+    if sampled == 0:
+        return "unknown"
+    found = binomtest(killed, sampled).proportion_ci(method="wilson")
+    return f"{100 * found.low:.0f} to {100 * found.high:.0f} %"
+
+
 def table() -> str:
-    """Markdown of what is stored: the scores, then the survivors."""
+    """Markdown of what is stored: the counts, then the survivors, then what was placed by hand."""
     rows = [
-        f"| {package} | {row['mutants']} | {row['sampled']} | {row['killed']} | {100 * row['score']:.0f} % |"
+        f"| {package} | {row['killed']} of {row['sampled']} tried, of {row['mutants']} possible | "
+        f"{share(row['killed'], row['sampled'])} |"
         for package, row in stored().items()
     ]
-    lines = ["| package | mutants | tried | noticed | score |", "| --- | --- | --- | --- | --- |", *rows, ""]
+    lines = ["| package | noticed | share of all, 95 % interval |", "| --- | --- | --- |", *rows, ""]
     for row in stored().values():
         for s in row["survivors"]:
             path, change = s["key"].split(" ", 1)
             before, after = change.rsplit(" #", 1)[0].split(": ", 1)[1].split(" -> ", 1)
             lines.append(f"- {path}, `{before}` to `{after}`: {s['reason'] or 'no test yet'}")
+    by_hand = json.loads(BY_HAND.read_text())
+    lines += ["", f"Placed by hand where gaps were suspected (`scripts/results/{BY_HAND.name}`): the tests notice"]
+    lines += [f"{by_hand['killed']} of {by_hand['placed']}. This is no sample, and says nothing of the others.", ""]
+    lines += [f"- {s['file']}, `{s['before']}` to `{s['after']}`: {s['reason']}" for s in by_hand["survivors"]]
     return "\n".join([*lines, ""])
 
 

@@ -1,6 +1,7 @@
 """The mutation script changes what it says, and tells a test that bites from one that does not."""
 
 import importlib
+import json
 
 import pytest
 
@@ -78,3 +79,25 @@ def test_the_page_has_the_scores_that_are_stored():
     assert text.split(mutate.BEGIN)[1].split(mutate.END)[0] == f"\n{mutate.table()}"
     for package, row in mutate.stored().items():
         assert row["killed"] + len(row["survivors"]) == row["sampled"] == len(row["outcomes"]), package
+
+
+@pytest.mark.usefixtures("mutants")
+def test_a_small_sample_does_not_say_much():
+    """Wilson's interval: 11 of 12 are 64.6 to 98.5 %, 12 of 12 are 75.7 to 100 %."""
+    mutate = importlib.import_module("mutate")
+    assert mutate.share(11, 12) == "65 to 99 %"
+    assert mutate.share(12, 12) == "76 to 100 %"
+    assert mutate.share(0, 0) == "unknown"
+
+
+@pytest.mark.usefixtures("mutants")
+def test_mutants_placed_by_hand_are_counted():
+    mutate = importlib.import_module("mutate")
+    found = json.loads(mutate.BY_HAND.read_text())
+    assert found["placed"] == found["killed"] + len(found["survivors"])
+    assert found["killed"] == len(found["noticed"])
+    for one in (*found["noticed"], *found["survivors"]):
+        assert (mutate.ROOT / one["file"]).is_file()
+    for one in found["noticed"]:
+        path, test = one["by"].split("::")
+        assert f"def {test.partition('[')[0]}(" in (mutate.ROOT / path).read_text(), one

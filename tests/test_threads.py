@@ -2,7 +2,8 @@
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -92,6 +93,35 @@ def test_a_forked_process_starts_its_own() -> None:
         os.waitpid(child, 0)
         pytest.fail("the child hangs")
     assert os.waitstatus_to_exitcode(status) == 0
+
+
+def test_the_process_has_its_threads_back_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a library underneath counts threads for the whole process, a worker's one thread is everybody's."""
+    threads = [2]
+    monkeypatch.setattr(torch, "set_num_threads", lambda n: threads.__setitem__(0, n))
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads[0])
+    with one_thread_each() as pool:
+        pool.submit(threading.get_ident).result()
+        assert threads == [1]
+    assert threads == [2]
+
+
+def test_the_process_has_its_threads_back_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(torch, "set_num_threads", asked.append)
+
+    def failing(pool: ThreadPoolExecutor) -> None:
+        pool.submit(threading.get_ident).result()
+        raise ValueError("within")
+
+    with pytest.raises(ValueError, match="within"):
+        with_pool(failing)
+    assert asked == [1, 2]
+
+
+def with_pool(job: Callable[[ThreadPoolExecutor], None]) -> None:
+    with one_thread_each() as pool:
+        job(pool)
 
 
 def test_mapped_jobs_keep_their_order_and_each_has_one_thread_of_torch() -> None:

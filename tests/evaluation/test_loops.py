@@ -1,5 +1,7 @@
+import itertools
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import pytest
@@ -206,3 +208,38 @@ def test_scores_tell_the_protocol_of_the_predictions(pascal, tmp_path):
     run(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out")
     summary = score(Pascal3DBenchmark(pascal, Protocol(pose="any")), tmp_path / "out")
     assert summary["protocol"] == str(Protocol())
+
+
+def test_an_object_whose_box_was_changed_is_registered_again(pascal, tmp_path):
+    benchmark = Pascal3DBenchmark(pascal, Protocol())
+    run(benchmark, tmp_path / "out", limit=2)
+    before = rows_of(benchmark, tmp_path / "out")
+    item = next(item for item in benchmark.items if "rotation" in before.get(item.key, {}))
+    corrected = Pascal3DBenchmark(pascal, Protocol())
+    moved = replace(item, box=item.box + torch.tensor([4.0, 3.0, 0.0, 0.0]))
+    corrected.items = [moved if one.key == item.key else one for one in corrected.items]
+    run(corrected, tmp_path / "out", limit=2)
+    after = rows_of(benchmark, tmp_path / "out")
+    assert [key for key in before if after[key] != before[key]] == [item.key]
+    assert after[item.key]["score"] != before[item.key]["score"]
+
+
+def test_seconds_of_a_batch_are_shared_by_its_objects(pascal, tmp_path, monkeypatch):
+    """By a clock that goes one second further each time that it is looked at, a batch takes two."""
+    clock = itertools.count()
+    monkeypatch.setattr(predict, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    benchmark = Pascal3DBenchmark(pascal, Protocol())
+    run(benchmark, tmp_path / "out")
+    found = [row["seconds"] for row in rows_of(benchmark, tmp_path / "out").values() if "rotation" in row]
+    assert found == [{"bank": pytest.approx(1 / 3), "register": pytest.approx(1 / 3)}] * 3
+
+
+def test_fused_models_that_agree_share_nothing():
+    """Two models that are the same score alike from everywhere: each view stands once all the same, at the first."""
+    views = SMALL.posed("upright").views.sphere()
+    bank = ViewBank.build(trimesh.creation.box((1, 2, 1)), views, pipeline=SMALL, progress=False)
+    image, box = torch.rand(3, 60, 80, generator=torch.Generator().manual_seed(0)), torch.tensor([[10.0, 5, 70, 55]])
+    with torch.no_grad():
+        scores = estimate.FusedMatcher(ViewBank.join([bank, bank]))([image], box).scores[0]
+        torch.testing.assert_close(scores[: len(views)], ViewMatcher(bank)([image], box).scores[0])
+    assert not scores[len(views) :].any()

@@ -5,6 +5,7 @@ import json
 
 import pytest
 import torch
+import trimesh
 
 from curvireg_torch.data import Pascal3DPlus, read_bop_csv
 from curvireg_torch.errors import InvalidInputError
@@ -105,6 +106,7 @@ def test_pascal3d_table(furniture, tmp_path):
     assert [float(first["true_" + k]) for k in ("azimuth", "elevation", "theta")] == samples[0]["viewpoint"].tolist()
     assert float(first["symmetric_error_deg"]) == pytest.approx(0, abs=1e-3)
     assert 150 < float(first["error_deg"]) <= 170
+    assert first["seconds"] == "0.5", "of the registration, without the bank"
     assert (second["failed"], second["azimuth"], second["error_deg"]) == ("?", "", "inf")
 
 
@@ -175,3 +177,19 @@ def test_missing_prediction_is_named(furniture, tmp_path):
     PredictionStore(tmp_path / "out" / "predictions").open({"root": "x"})
     with pytest.raises(InvalidInputError, match=r"bottle.*run again"):
         score(furniture, tmp_path / "out")
+
+
+def test_mspd_is_scaled_by_the_width_of_the_image(bop, tmp_path):
+    """An error of 3 px at 80 px of width is one of 24 px at 640 px: below six of the thresholds 5, 10, ..., 50 px.
+    By the height of 60 px it would be one of 32 px, below four."""
+    benchmark = BOPBenchmark(bop, Protocol(pose="any"))
+    samples = [bop.annotation(i) for i in range(len(bop))]
+    rows = []
+    for sample in samples:
+        t = sample["translation"].double().clone()
+        points = torch.from_numpy(trimesh.load(sample["model_path"]).vertices.copy()) @ sample["rotation"].double().T
+        nearest = float((points[:, 2] + t[2]).min())
+        t[0] += 3.0 * nearest / float(sample["camera_matrix"][0, 0])
+        rows.append({"rotation": sample["rotation"].tolist(), "translation": t.tolist()})
+    write_predictions(benchmark, tmp_path / "out", rows)
+    assert score(benchmark, tmp_path / "out")["mspd_ar"] == pytest.approx(0.6)

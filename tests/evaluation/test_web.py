@@ -39,6 +39,7 @@ def test_scores_are_of_known_poses_alone(web):
     summary = benchmark.summary(benchmark.items, rows)
     assert (summary["n"], summary["n_posed"], summary["reliable"]) == (4, 2, 1)
     assert (summary["acc_30_deg"], summary["mean_confidence"]) == (0.5, 0.375)
+    assert summary["per_object"]["cup"]["mean_confidence"] == 0.5
     assert summary["per_object"]["shoe"] == {
         "n": 1, "n_posed": 0, "reliable": 0, "mean_confidence": 0.0,
         "acc_15_deg": None, "acc_30_deg": None, "med_err_deg": None,

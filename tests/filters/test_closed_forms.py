@@ -291,3 +291,15 @@ def test_smoothing_rounds_half_types_once(dtype: torch.dtype, ulp: float, sigma:
     assert smooth.dtype == dtype
     exact = filters.gaussian_smooth(x.double(), sigma)
     assert float((smooth.double() - exact).abs().max()) <= 0.51 * ulp  # half a unit in the last place of 0.5 to 1
+
+
+def test_pci_takes_the_direction_of_the_scale_that_won() -> None:
+    """Length and direction together are those of the single scale with the largest curvature."""
+    image = torch.rand(1, 1, 48, 48, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    sigmas = (1.0, 2.0, 4.0)
+    single = torch.cat([filters.principal_curvature_image(image, sigmas=[sigma]) for sigma in sigmas])
+    winner = single.norm(dim=1).argmax(dim=0)
+    assert len(winner.unique()) == 3
+    best = single.gather(0, winner.expand(1, 2, -1, -1))
+    found = filters.principal_curvature_image(image, sigmas=sigmas)
+    torch.testing.assert_close((found * best).sum(dim=1).abs(), best.square().sum(dim=1))  # the sign is free

@@ -107,3 +107,16 @@ def test_vectors_that_are_not_finite_count_as_zero(value: float) -> None:
     broken[0, 1, 9, 12:15] = value
     torch.testing.assert_close(hog(broken), hog(zero), rtol=0.0, atol=0.0)
     assert torch.equal(field_points(broken), field_points(zero))
+
+
+def test_holes_of_up_to_32_px_are_filled_from_around_them() -> None:
+    """A hole that leaves one row and column of its 32 px square free is filled from that row and column, 0 like all
+    that is near; a hole that leaves one row and column of a 64 px square free is filled with the mean in its middle."""
+    for side, expected in ((31, 0.0), (63, None)):
+        image = torch.zeros(1, 1, 256, 256, dtype=torch.float64)
+        image[..., 192:, :] = 1.0
+        holes = torch.zeros_like(image, dtype=torch.bool)
+        holes[..., 64 : 64 + side, 64 : 64 + side] = True
+        mean = float(image[~holes].mean())
+        filled = fill_missing(image.masked_fill(holes, math.nan), holes)
+        assert float(filled[0, 0, 70, 70]) == pytest.approx(mean if expected is None else expected, abs=1e-3)

@@ -70,3 +70,15 @@ def test_rotation_towards_takes_the_axis_there_by_the_shortest_way() -> None:
     torch.testing.assert_close(R[:, :, 2], unit, rtol=0, atol=1e-12)
     angle = torch.rad2deg(torch.acos(unit[:, 2]))
     torch.testing.assert_close(g.rotation_error(R, torch.eye(3, dtype=torch.float64).expand(50, 3, 3)), angle)
+
+
+def test_the_object_stays_in_front_of_the_camera_whatever_the_box() -> None:
+    """Boxes that only an object at the camera would fill: its centre stays 1.05 extents away, so that no turn of it
+    reaches the camera."""
+    cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
+    box = torch.tensor([-1e5, -1e5, 1e5, 1e5], dtype=torch.float64) + K[:2, 2].repeat(2)
+    nearest = 1.05 * 3.0**0.5
+    straight = g.translation_from_box(cube, torch.eye(3, dtype=torch.float64), box, K)
+    assert float(straight[2]) == pytest.approx(nearest, rel=1e-6)
+    turned = g.rotation_from_viewpoint(20.0, 30.0, 10.0).double()
+    assert float(g.translation_from_box(cube, turned, box, K)[2]) > nearest - 1e-6

@@ -131,3 +131,18 @@ def test_adapting_works_from_a_plain_script(tmp_path):
 def test_errors():
     with pytest.raises(InvalidInputError, match="scenes"):
         adapt(trimesh.creation.box(), scenes=0)
+
+
+def test_pictures_are_mirrored_with_their_answers():
+    """What is drawn in one half of a picture stays on the side of the mask, whatever becomes of its colours."""
+    B = 32
+    image, mask = torch.full((B, 3, 16, 16), 0.5), torch.zeros(B, 1, 8, 8)
+    image[..., ::2, :8] = 0.9
+    mask[..., :4] = 1.0
+    width = SETTINGS.descriptor()(torch.zeros(1, 2, 128, 128)).shape[1]
+    batch = {"image": image, "mask": mask, "code": torch.zeros(B, 2, 8, 8), "descriptors": torch.zeros(B, 7, width)}
+    found = altered(batch, torch.Generator().manual_seed(0))
+    left, right = (half.std(dim=2).mean(dim=(1, 2)) for half in found["image"].split(8, dim=3))
+    mirrored = found["mask"][:, 0, 0, 0] == 0
+    assert 5 < int(mirrored.sum()) < B - 5
+    assert torch.equal(right > left, mirrored)

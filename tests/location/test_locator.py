@@ -1,5 +1,6 @@
 """Objects rendered into clutter at known places are found there."""
 
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -8,10 +9,10 @@ import torch.nn.functional as F
 
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import box_iou
+from curvireg_torch.geometry import box_iou, projected_boxes
 from curvireg_torch.location import Locator
 from curvireg_torch.location.cells import LookCells, cells_for
-from curvireg_torch.matching import ViewMatcher
+from curvireg_torch.matching import ViewDescriber, ViewMatcher
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from tests._support.scenes import CAMERA, scene, truck_bank
 
@@ -171,3 +172,46 @@ def test_size_of_the_picture_does_not_matter():
     found = [locator()([picture])[0].boxes[0] for picture in (image, large)]
     assert box_iou(found[0][None], (found[1][None] + 0.5) / 3 - 0.5) > 0.7
     assert box_iou(found[0][None], box[None]) > 0.4
+
+
+def test_boxes_of_places_are_those_of_the_rendered_views_to_a_hundredth_of_a_pixel():
+    """A view's picture of 96 px is scaled and moved as a peak says; its hull, projected by the camera of that picture
+    and moved along, has the box that is proposed. Pixel centres are whole numbers."""
+    views = locator()._templates.views
+    describe = ViewDescriber(example_mesh(), replace(bank().settings, image_size=96))
+    T, K, _ = describe.cameras(bank().rotations[views], bank().distances[views])
+    drawn = projected_boxes(describe.hull, T, K)
+    for k, i, j, ratio in ((0, 8, 11, (1.0, 1.0)), (3, 5, 9, (0.5, 0.4)), (5, 9, 3, (1.5, 1.6))):
+        found = torch.zeros(len(views), 15, 20)
+        found[k, i, j] = 1.0
+        best = locator()._peaks([found], [torch.ones(len(views), dtype=torch.bool)], [ratio])
+        # A point at the picture's middle, 47.5 px, lies 8 j px from the left border of the resized photograph.
+        middle = torch.tensor([8.0 * j, 8.0 * i] * 2, dtype=torch.float64)
+        expected = (drawn[k] - 47.5 + middle) / torch.tensor(ratio * 2, dtype=torch.float64) - 0.5
+        torch.testing.assert_close(best.boxes[0].double(), expected, rtol=0, atol=0.01)
+        assert int(best.views[0]) == int(views[k])
+
+
+def test_every_box_is_as_large_as_its_view_would_be_at_a_distance_that_was_given():
+    """Half a step of sizes beyond it at most, and what rounding a size to cells of 16 px does."""
+    image, _, T = scene(1)
+    low, high = 0.95 * float(T[2, 3]), 1.05 * float(T[2, 3])
+    found = locator()([image], camera_matrices=[CAMERA], distance=(low, high))[0]
+    known, views = bank(), found.views
+    sides = (known.boxes[views, 2:] - known.boxes[views, :2]).amax(dim=1) * known.distances[views]
+    shown = (found.boxes[:, 2:] - found.boxes[:, :2]).amax(dim=1)
+    away = sides * float(CAMERA[0, 0]) / shown
+    assert len(away) > 5
+    assert float(away.min()) > low / 2.0**0.25 * 0.9
+    assert float(away.max()) < high * 2.0**0.25 * 1.1
+
+
+def test_objects_of_less_than_32_px_are_not_looked_for():
+    """In a small photograph the least size counts, not the share of its longer side; a smaller one is looked at as a
+    whole."""
+    reach = 80.0
+    for shape, least in (((60, 80), 32.0), ((20, 24), 24.0)):
+        scales = locator()._scales(torch.zeros(3, *shape), None, None, reach)
+        assert reach / max(scales) == pytest.approx(least)
+    large = locator()._scales(torch.zeros(3, 900, 1200), None, None, reach)
+    assert reach / max(large) == pytest.approx(1200 * locator().settings.smallest)

@@ -5,7 +5,7 @@ import torch
 
 from curvireg_torch import ViewBank
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.location import representative_views
+from curvireg_torch.location import representative_views, representatives
 from curvireg_torch.location.representatives import _medoids
 from tests._support.scenes import truck_bank
 
@@ -52,3 +52,23 @@ def test_boxes_count_beside_descriptors() -> None:
     plain.boxes = torch.where((torch.arange(len(bank)) < 5)[:, None], tall, wide)
     views = representative_views(plain, 2)
     assert (views < 5).tolist() == [True, False]
+
+
+def test_the_most_central_view_starts_and_the_farthest_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(representatives, "ROUNDS", 0)
+    places = torch.tensor([1.0, 0.0, 3.0, 10.0, 2.0])
+    apart = (places[:, None] - places).square()
+    assert places[_medoids(apart, 3)].tolist() == [3.0, 10.0, 0.0]
+
+
+def test_proportions_of_boxes_differ_by_their_logarithms() -> None:
+    """Boxes 8 times as tall as wide differ more from squares than boxes 3 times as wide as tall do."""
+    bank = truck_bank()
+    plain = bank.__class__.__new__(bank.__class__)
+    plain.__dict__.update(bank.__dict__)
+    plain.descriptors = torch.ones_like(bank.descriptors)
+    proportion = torch.ones(len(bank), dtype=bank.boxes.dtype)
+    proportion[:2], proportion[2:12] = 1.0 / 8.0, 3.0
+    corner = torch.stack([proportion, torch.ones_like(proportion)], dim=1)
+    plain.boxes = torch.cat([-corner, corner], dim=1)
+    assert sorted(proportion[representative_views(plain, 2)].tolist()) == [0.125, 1.0]

@@ -13,6 +13,7 @@ from safetensors.torch import load_file, save_file
 
 from curvireg_torch.errors import BankError, InvalidInputError, MissingFileError
 from curvireg_torch.geometry import sample_views, uniform_views
+from curvireg_torch.geometry.up import mesh_up
 from curvireg_torch.matching import BankCollection, BankSettings, ViewBank, ViewMatcher, normalized_correlation
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.synthetic import example_mesh
@@ -220,3 +221,32 @@ def test_any_device(bank: ViewBank) -> None:
         moved = bank.to(device)
         assert moved.device.type == moved.rotations.device.type == moved.points.device.type == device
         assert torch.equal(moved.silhouettes.cpu(), bank.silhouettes)
+
+
+def test_a_joined_bank_can_be_joined_again() -> None:
+    """Models are numbered through, as the list of meshes is."""
+    meshes = [trimesh.creation.box((1, 1, height)) for height in (1, 2, 3, 4)]
+    views = sample_views(azimuth_step=180, elevations=[20])
+    banks = [ViewBank.build(mesh, views, settings=SETTINGS, progress=False) for mesh in meshes]
+    nested = ViewBank.join([ViewBank.join(banks[:2]), ViewBank.join(banks[2:])])
+    flat = ViewBank.join(banks)
+    assert nested.model.tolist() == flat.model.tolist() == sorted([0, 1, 2, 3] * len(views))
+    assert [float(mesh.extents[2]) for mesh in nested.meshes] == [1.0, 2.0, 3.0, 4.0]
+    same(nested, flat)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_a_mesh_comes_back_with_the_axis_that_points_up(up: str, tmp_path: Path) -> None:
+    mesh = example_mesh()
+    mesh.metadata["up"] = up
+    views = sample_views(azimuth_step=180, elevations=[20])
+    ViewBank.build(mesh, views, settings=SETTINGS, progress=False).save(tmp_path / "bank.safetensors")
+    assert mesh_up(ViewBank.load(tmp_path / "bank.safetensors").mesh) == up
+
+
+def test_a_bank_with_an_empty_box_is_refused(bank: ViewBank, tmp_path: Path) -> None:
+    boxes = bank.boxes.clone()
+    boxes[3, 3] = boxes[3, 1]
+    ViewBank(bank.meshes, bank.views, bank.pipeline, {**bank.tensors, "boxes": boxes}).save(tmp_path / "bank.st")
+    with pytest.raises(BankError, match="boxes that are empty"):
+        ViewBank.load(tmp_path / "bank.st")

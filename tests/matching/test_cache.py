@@ -9,12 +9,14 @@ import uuid
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import safetensors.torch
 import torch
 import trimesh
 
 from curvireg_torch.geometry import sample_views
+from curvireg_torch.geometry.colours import SurfaceColours
 from curvireg_torch.matching import (
     BankSettings,
     ViewBank,
@@ -243,3 +245,16 @@ def test_killed_builder_leaves_no_bank(tmp_path: Path) -> None:
     assert list_cache(tmp_path) == []
     assert len(build(tmp_path)) == len(VIEWS)
     assert len(list_cache(tmp_path)) == 1
+
+
+def test_key_depends_on_each_texture() -> None:
+    """Two meshes that differ in one px of one of two textures have two keys."""
+    mesh, other = trimesh.creation.box(), trimesh.creation.box()
+    for one, level in ((mesh, 10), (other, 11)):
+        textures = np.full((4, 4, 3), 200, np.uint8), np.full((4, 4, 3), 10, np.uint8)
+        textures[1][3, 3, 2] = level
+        F = len(one.faces)
+        corners, uv = np.full((F, 3, 3), 255, np.uint8), np.zeros((F, 3, 2), np.float32)
+        one.metadata["colours"] = SurfaceColours(corners, uv, (np.arange(F) % 2).astype(np.int32), textures)
+    assert bank_key(mesh, VIEWS, SETTINGS) != bank_key(other, VIEWS, SETTINGS)
+    assert bank_key(mesh, VIEWS, SETTINGS) == bank_key(mesh.copy(), VIEWS, SETTINGS)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from curvireg_torch.geometry import sample_views
+from curvireg_torch.geometry import projected_boxes, sample_views
 from curvireg_torch.matching.describe import ViewDescriber, quarter_turns
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.synthetic import example_mesh
@@ -43,3 +43,17 @@ def test_which_views_are_quarter_turns():
     assert len(own) == len(set(first.tolist())) == 5  # 0 and 45 of two directions, and the one farther away
     assert first[1] == 1
     assert turns.tolist() == ((theta[first] - theta) // 90 % 4).tolist()
+
+
+def test_a_parallel_view_seen_from_far_away_fills_the_box_of_the_photograph():
+    """Without a camera matrix, an object of a parallel bank is seen from 20 distances farther away, as large as its
+    box: but for perspective of one radius in 21 distances, its projection is the box."""
+    describe = ViewDescriber(example_mesh(), BankSettings(image_size=64, camera="orthographic"))
+    views = sample_views(azimuth_step=90, elevations=[20])
+    rotations, distances = views.rotations.double(), 5.0 * views.distance.double() * describe.radius
+    _, _, flat = describe.cameras(rotations, distances)
+    boxes = 130.0 * flat / (flat[:, 2:] - flat[:, :2]).amax(dim=1, keepdim=True) + torch.tensor([200.0, 150.0] * 2)
+    T, K = describe.cameras_of_boxes(rotations, distances, boxes)
+    near = describe.cameras(rotations, distances)[0]
+    torch.testing.assert_close(T[:, 2, 3] + (near[:, :3, :3] @ describe.centre)[:, 2], 21.0 * distances)
+    assert float((projected_boxes(describe.hull, T, K) - boxes).abs().max()) < 130.0 * 0.02

@@ -171,3 +171,14 @@ def test_empty_sides_and_bad_input() -> None:
         _detections(objects, [1.0, math.nan], [0.0, 0.0])
     with pytest.raises(InvalidInputError, match="threshold_deg"):
         metrics.average_rotation_precision(detections, objects, threshold_deg=-1.0)
+
+
+def test_scores_that_are_nearly_equal_are_no_tie() -> None:
+    """A right detection before a false one is worth 1, in a tie with it 1/2, however small the lead."""
+    objects = _objects([0.0])
+    R, image = objects.rotations[[0, 0]], torch.tensor([0, 0])
+    boxes = torch.stack([SQUARE, SQUARE + 100.0])
+    for lead, expected in ((1e-6, 1.0), (0.0, 0.5)):
+        scores = torch.tensor([0.5 + lead, 0.5], dtype=torch.float64)
+        found = metrics.Detections(image, boxes.double(), R, scores)
+        assert metrics.average_precision(found, objects) == pytest.approx(expected)

@@ -1,17 +1,21 @@
 """The steps of the contour stage on edges at known places along the normals."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
 import torch.nn.functional as F
+import trimesh
 from torch import Tensor
 
 from curvireg_torch import camera_matrix
-from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.geometry import mesh_centre, mesh_radius, rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
-from curvireg_torch.registration.contour_descent import Seen, Views, project
+from curvireg_torch.registration import fit_contours
+from curvireg_torch.registration.contour_descent import Seen, Views, moved, project
 from curvireg_torch.registration.contour_points import ContourPoints
+from curvireg_torch.rendering import make_renderer
 
 K = camera_matrix(300.0, 310.0, 63.5, 60.0, dtype=torch.float64)[None]
 CENTRE = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
@@ -93,3 +97,60 @@ def test_nothing_found_is_no_step_and_a_long_one_is_cut():
     ):
         whole = torch.tensor([step], dtype=torch.float64)
         torch.testing.assert_close(views(at(1, 0.0), [1.0])._bounded(whole, T), share * whole)
+
+
+def test_starts_that_the_first_rounds_made_no_better_come_back_as_they_were() -> None:
+    """On noise, where fits lead anywhere: only one start is finished, and four others, all the same, gain nothing."""
+    mesh, generator = trimesh.creation.box((1.0, 1.4, 0.8)), torch.Generator().manual_seed(3)
+    noise = torch.rand(3, 128, 128, generator=torch.Generator().manual_seed(0))
+    pose = transform(
+        rotation_from_axis_angle(torch.tensor([0.4, 0.5, 0.1]).double()), torch.tensor([0.0, 0.0, 8.0]).double()
+    )
+    off = 0.3 * torch.randn(12, 6, generator=generator, dtype=torch.float64)
+    off[:4] = 0.0
+    starts = moved(pose.repeat(12, 1, 1), off, mesh_centre(mesh))
+    fit = fit_contours(
+        make_renderer(mesh),
+        noise,
+        torch.tensor([40.0, 36, 88, 84]),
+        K[0],
+        starts,
+        centre=mesh_centre(mesh),
+        radius=mesh_radius(mesh),
+        finish=1,
+    )
+    as_they_were = (fit.transform == starts).all(dim=(1, 2))
+    assert int(as_they_were.sum()) >= 3
+    assert int(as_they_were.sum()) < 9
+
+
+class Counting:
+    """A renderer that notes how many poses are rendered at full size at a time."""
+
+    name = "counting"
+
+    def __init__(self, mesh: trimesh.Trimesh) -> None:
+        self.inner, self.poses = make_renderer(mesh), [0]
+
+    def render(self, T: Tensor, K: Tensor, size: tuple[int, int], **options: Any) -> Tensor:
+        if size[0] == 256:
+            self.poses.append(len(T))
+        return self.inner.render(T, K, size, **options)
+
+
+def test_a_second_fit_goes_on_where_it_is_another_pose() -> None:
+    """Around the true pose in a picture of two grey levels all turns lead back to it, and one pose goes on to full
+    size; on noise they lead elsewhere, and two do."""
+    mesh = trimesh.creation.box((1.0, 1.4, 0.8))
+    pose = transform(
+        rotation_from_axis_angle(torch.tensor([0.4, 0.5, 0.1]).double()), torch.tensor([0, 0, 8.0]).double()
+    )
+    clear = (make_renderer(mesh).render(pose[None], K[0], (128, 128))[0] > 0).float()
+    noise = torch.rand(3, 128, 128, generator=torch.Generator().manual_seed(0))
+    most = []
+    for image in (clear, noise):
+        renderer = Counting(mesh)
+        box, places = torch.tensor([40.0, 36, 88, 84]), {"centre": mesh_centre(mesh), "radius": mesh_radius(mesh)}
+        fit_contours(renderer, image, box, K[0], pose[None], **places)
+        most.append(max(renderer.poses))
+    assert most == [1, 2]

@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -191,3 +192,27 @@ def test_presence_is_judged_by_what_it_was_fitted_on(preset, pieces):
     low, high = (float(place.presence[0]) for place in places)
     assert [len(place.evidence[0]) for place in places] == [pieces] * 2
     assert low < high if pieces == 2 else low == high
+
+
+class Proposed:
+    """A locator that proposes these boxes, whatever the photograph."""
+
+    cells = SimpleNamespace(pictures=True)
+
+    def __init__(self, boxes, scores):
+        self.located = Located(torch.stack(boxes), torch.tensor(scores), torch.zeros(len(boxes), dtype=torch.long))
+
+    def __call__(self, images, **_):
+        return [self.located] * len(images)
+
+
+def test_one_place_more_than_objects_is_looked_at():
+    """The locator likes a place of the background a little better than the object's: the one that is surer is taken,
+    also where only one place is to be followed."""
+    pipeline = replace(bank().pipeline, locate=replace(bank().pipeline.locate, followed=1))
+    registrar = cr.Registrar(bank(), pipeline=pipeline, refine=False)
+    image, box = placed(5, (90, 40), 0.9)
+    elsewhere = torch.tensor([2.0, 2.0, 60.0, 40.0])
+    registrar.__dict__["locator"] = Proposed([elsewhere, box], [6.2, 6.0])
+    result = find(registrar, [image], instances=1)[0][0]
+    assert box_iou(result.found.box[None], box[None].double()) > 0.5

@@ -11,6 +11,7 @@ from torch import Tensor
 from curvireg_torch import Registrar, camera_matrix, project_points, rotation_error
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.geometry.translation import place_view
 from curvireg_torch.registration import coherent_views
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration.hypotheses import Hypotheses
@@ -124,3 +125,17 @@ def test_a_search_that_is_not_brief_needs_the_ranking():
     start = replace(around(turn(0, 0, 0), turn(1, 0, 0)), view=torch.zeros(1, dtype=torch.long))
     with pytest.raises(InvalidInputError, match="needs bank and ranking"):
         search([Turns()], torch.eye(3, dtype=torch.float64).view(1, 9), start, bank=truck_bank())
+
+
+def test_a_round_that_finds_nothing_better_leaves_the_distance():
+    """The first step of 5 degrees meets the truth, the second finds nothing better: rotation, score and distance stay
+    those that belong together, the distance being the one at which the start filled the box."""
+    K = camera_matrix(500.0, 500.0, 320.0, 240.0, dtype=torch.float64)
+    start, truth = turn(0.0, 40.0, 0.0), turn(5.0, 0.0, 0.0) @ turn(0.0, 40.0, 0.0)
+    box = torch.tensor([[260.0, 150.0, 380.0, 330.0]], dtype=torch.float64)
+    filled = {name: place_view(CORNERS, R, box[0], K) for name, R in (("start", start), ("truth", truth))}
+    away = {name: float(t.norm()) for name, (_, t) in filled.items()}
+    assert abs(away["start"] / away["truth"] - 1.0) > 0.001
+    found = around(truth, start, boxes=box, camera_matrices=K[None])
+    torch.testing.assert_close(found.rotation[0], truth)
+    assert float(found.distance) == pytest.approx(away["start"], rel=1e-9)

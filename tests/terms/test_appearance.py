@@ -12,6 +12,7 @@ from curvireg_torch.geometry.mesh import as_mesh
 from curvireg_torch.learned.appearance import describe, similarity
 from curvireg_torch.learned.backbone import Backbone
 from curvireg_torch.matching import distinct_views
+from curvireg_torch.matching import matcher as matcher_module
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.terms import Appearance
 from tests._support.scenes import CAMERA, scene
@@ -148,3 +149,22 @@ def test_a_bank_of_coloured_and_grey_meshes_is_one_bank():
     alone = ViewMatcher(banks[1])([image], box[None]).terms["appearance"]
     joined = ViewMatcher(both)([image], box[None]).terms["appearance"][:, len(VIEWS) :]
     torch.testing.assert_close(joined, alone, atol=1e-5, rtol=0)
+
+
+def test_features_that_are_made_anew_when_too_many_were_kept_are_the_same(monkeypatch):
+    """A photograph that asks for views of which some were kept, and for more than may be kept, is ranked as by a
+    matcher that kept none."""
+    large = ViewBank.build(example_mesh(), VIEWS, pipeline=late(), progress=False)
+    pipeline = late(top=6, apart=20.0)
+    queries = [ViewMatcher(large, pipeline=pipeline).query([scene(k)[0]], scene(k)[1][None]) for k in range(3)]
+    fresh = [ViewMatcher(large, pipeline=pipeline).rank(query).scores for query in queries]
+    monkeypatch.setattr(matcher_module, "KEPT", 8)
+    matcher, asked = ViewMatcher(large, pipeline=pipeline), []
+    for query, expected in zip(queries, fresh, strict=True):
+        known = set(matcher._kept.get("appearance", {}))
+        ranking = matcher.rank(query)
+        wanted = set(ranking.terms["appearance"][0].isfinite().nonzero()[:, 0].tolist())
+        asked.append(bool(known & wanted) and len(known | wanted) > 8)
+        torch.testing.assert_close(ranking.scores, expected, rtol=1e-4, atol=1e-7)
+        assert len(matcher._kept["appearance"]) <= 8
+    assert any(asked), "views kept and wanted again, and too many in all"

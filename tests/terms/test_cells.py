@@ -42,3 +42,36 @@ def test_a_point_in_a_cut_cell_counts_once(size, cell):
     term = Repeatability().over(OneView(size))
     assert term.cell == cell
     assert term(SimpleNamespace(points=points)).item() == 0.5
+
+
+class OnePoint:
+    """Views of S px, each with one point in the middle row, at the given columns."""
+
+    def __init__(self, side, columns):
+        self.settings = SimpleNamespace(image_size=side)
+        self.points = torch.zeros(len(columns), side, side, dtype=torch.bool)
+        self.points[range(len(columns)), side // 2, columns] = True
+
+    def __len__(self):
+        return len(self.points)
+
+    def points_at(self, index):
+        return self.points[index]
+
+
+@pytest.mark.parametrize(("side", "cells"), [(64, 64), (128, 64), (256, 64)])
+def test_points_are_counted_in_64_cells_a_side_however_far_they_may_be_apart(side, cells):
+    """A point 3 px nearer than eps is found and one 3 px farther is not: a cell is small beside eps."""
+    eps = 0.1
+    away = int(eps * side)
+    views = OnePoint(side, [side // 2 + away - 3, side // 2 + away + 4])
+    term = Repeatability(eps=eps).over(views)
+    assert term.near.shape == (2, cells**2)
+    query = OnePoint(side, [side // 2]).points[None]
+    assert term(SimpleNamespace(points=query)).tolist() == [[1.0, 0.0]]
+
+
+def test_cells_are_never_larger_than_eps():
+    """2 px at 128 px allow cells of 2 px, 1 px allows pixels alone."""
+    sides = [Repeatability(eps=eps).over(OnePoint(128, [64])).near.shape[1] ** 0.5 for eps in (0.016, 0.008)]
+    assert sides == [64, 128]

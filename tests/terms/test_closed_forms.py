@@ -18,7 +18,7 @@ from curvireg_torch.terms import (
     repeatability_score,
     whole_box_shapes,
 )
-from curvireg_torch.terms.correlation import Correlated
+from curvireg_torch.terms.correlation import Correlated, unit_score
 from curvireg_torch.terms.whitening import DescriptorStatistics
 
 
@@ -81,3 +81,10 @@ def test_slack_is_at_most_nearly_half():
     assert slack_boxes(box, 0.45).shape == (1, 7, 4)
     with pytest.raises(InvalidInputError, match="slack"):
         slack_boxes(box, 0.46)
+
+
+def test_the_score_of_a_correlation_is_an_exponential_of_standard_deviations():
+    """0, 0, 0 and 1 have a standard deviation of sqrt(3) / 4 (N in the denominator); 0 lies 4 / sqrt(3) below 1."""
+    score = unit_score(torch.tensor([[0.0, 0.0, 0.0, 1.0], [3.0, 3.0, 3.0, 5.0]]))
+    low = math.exp(-4.0 / math.sqrt(3.0))
+    torch.testing.assert_close(score, torch.tensor([[low, low, low, 1.0]] * 2))
