@@ -111,7 +111,7 @@ def register_entry(
     if result.found is not None:
         document["found"] = found_document([r for r in results if isinstance(r, Registration)])
     if source in ("exif", "fov"):  # how far a guess is off, nobody knows
-        document["covariance"] = document["standard_deviations"] = None
+        document["covariance"] = document["standard_deviations"] = document["squared_radius"] = None
     return result, document
 
 

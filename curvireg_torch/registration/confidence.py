@@ -1,25 +1,22 @@
 """How far a ranking, a pose or a place can be trusted: logistic models of what was measured.
 
-Their constants are in ``calibration.json``, which scripts/calibrate.py writes from registered photographs of the
-benchmark. What they are worth on photographs that had no part in it is in docs/accuracy.md.
+Their constants are those of :mod:`.calibration`. What they are worth on photographs that had no part in them is in
+docs/accuracy.md.
 """
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..geometry.viewpoint import rotation_error
 from ..matching import Ranking
+from .calibration import CALIBRATION
 from .verify import EVIDENCE
 
 __all__ = [
-    "CALIBRATION",
     "FEATURES",
     "PRESENCE_EVIDENCE",
     "RELIABLE",
@@ -32,9 +29,6 @@ __all__ = [
     "ranking_evidence",
     "ranking_features",
 ]
-
-CALIBRATION: dict[str, Any] = json.loads(Path(__file__).with_name("calibration.json").read_text(encoding="utf-8"))
-"""What scripts/calibrate.py found: the models of confidence, and what it takes for the covariance to be true."""
 
 RELIABLE = 0.8
 """Confidence below which a registration says "no reliable match"."""

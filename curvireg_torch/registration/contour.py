@@ -12,6 +12,7 @@ from ..errors import InvalidInputError
 from ..geometry import crop_images
 from ..geometry.cameras import check_camera_matrix
 from ..rendering import DepthRenderer
+from .calibration import covariance_scale
 from .contour_covariance import pose_covariance
 from .contour_descent import Seen, Views, moved
 from .contour_points import EdgeField
@@ -106,8 +107,8 @@ def fit_contours(
         R = exp([w]x) R_fit,   t = t_fit + e,   (w, e) ~ N(0, covariance).
 
     It is :func:`pose_covariance`'s: what contours do not fix (turns of a sphere, a cylinder's about its axis) has a
-    standard deviation of pi or of the distance. It holds for a fit that has found the right edges, and knows nothing
-    of others. Computed on the CPU.
+    standard deviation of pi or of the distance. The least squares know nothing of wrong edges: their covariance is
+    scaled by what reliable answers on photographs were off (:mod:`.calibration`). Computed on the CPU.
 
     Args:
         renderer: of the mesh.
@@ -169,8 +170,10 @@ def fit_contours(
     best = torch.where(owner == torch.arange(N)[:, None], support, -1.0).argmax(dim=1)
     seen, support = seen[best], support[best]
     found = full.matches(seen, FINE[-1])
-    covariance, observable = pose_covariance(found, seen.points, seen.T, full.K, centre, radius=radius)
     weight = found.weight[..., 0]
+    matched = (weight > 0).sum(dim=1) / seen.points.valid.sum(dim=1).clamp(min=1)
+    scale = covariance_scale(matched)
+    covariance, observable = pose_covariance(found, seen.points, seen.T, full.K, centre, radius=radius, scale=scale)
     mean_square = (weight * found.distance[..., 0].square()).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-12)
     return ContourFit(
         transform=seen.T,
@@ -178,7 +181,7 @@ def fit_contours(
         support=support,
         start_support=before,
         observable=observable,
-        matched=(weight > 0).sum(dim=1) / seen.points.valid.sum(dim=1).clamp(min=1),
+        matched=matched,
         residual=mean_square.sqrt(),
         moved=full.way(seen.points, T0, seen.T),
     )

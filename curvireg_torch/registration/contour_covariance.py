@@ -23,21 +23,16 @@ POINT, SHARED = 0.6, 6.0
 OBSERVABLE = 0.75
 """A direction is known if this share of its information is more than such errors make."""
 
-SCALE = 30.0
-"""Of the covariance. The constants above were chosen on 90 generated scenes of five meshes, on which 3 would do; on
-photographs of textured meshes in clutter a third of the right poses has caught some wrong edges, and lies far outside.
-With 30 the 90 and 95 % ellipsoids hold about what they say (docs/method.md); the 50 % ellipsoid holds more."""
-
 UNKNOWN = math.pi
 """Standard deviation in rad of turns that the contours do not fix; of shifts that they do not fix, the distance."""
 
 
 def pose_covariance(
-    found: Matches, points: ContourPoints, T: Tensor, K: Tensor, centre: Tensor, *, radius: float
+    found: Matches, points: ContourPoints, T: Tensor, K: Tensor, centre: Tensor, *, radius: float, scale: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Covariance of poses by least squares over contour points, and how many directions they fix.
 
-    With J the derivatives, W the weights, A = J^T W J and r the residuals, the covariance is ``SCALE`` A^-1 B A^-1 with
+    With J the derivatives, W the weights, A = J^T W J and r the residuals, the covariance is A^-1 B A^-1 with
 
         B = sum_c g_c g_c^T + (0.36 px^2 + 6 s^2) J^T W^2 J,
 
@@ -53,6 +48,8 @@ def pose_covariance(
         T: (N, 4, 4).
         K: (N, 3, 3) of the crops.
         centre, radius: of the object, (3,) and model units.
+        scale: (N,) by what to multiply it, see :func:`.calibration.covariance_scale`; directions that are unknown stay
+            as unknown as they are.
 
     Returns:
         (N, 6, 6) of (turn, translation of the model's origin), NaN where too few edges were found; (N,) directions
@@ -82,7 +79,7 @@ def pose_covariance(
     square = (W * found.distance**2).sum(dim=1, keepdim=True) / W.sum(dim=1, keepdim=True).clamp(min=1e-12)
     B = g.mT @ g + (POINT**2 + SHARED * square) * (found.J.mT @ (W * W * found.J))
     inverse = basis * (known / share.clamp(min=1e-12))[:, None]
-    C = SCALE * inverse @ (basis.mT @ B @ basis) @ inverse.mT
+    C = scale[:, None, None] * inverse @ (basis.mT @ B @ basis) @ inverse.mT
     position = T[:, :3, :3] @ centre + T[:, :3, 3]
     turn, shift = (torch.linalg.vector_norm(part, dim=1).clamp(min=1e-300) for part in basis.split(3, dim=1))
     distance = torch.linalg.vector_norm(position, dim=1)[:, None]

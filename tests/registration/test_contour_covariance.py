@@ -15,6 +15,8 @@ from curvireg_torch.registration.contour_descent import Matches, moved, project
 from curvireg_torch.registration.contour_points import ContourPoints
 from curvireg_torch.rendering import make_renderer
 
+SCALE = 30.0
+
 K = camera_matrix(300.0, 310.0, 63.5, 60.0, dtype=torch.float64)
 
 
@@ -39,7 +41,9 @@ def test_covariance_is_the_sandwich_of_turn_and_translation_of_the_origin():
     generator = torch.Generator().manual_seed(1)
     W, d = (torch.rand(1, 60, 1, generator=generator, dtype=torch.float64) for _ in range(2))
     J = (points.normals[..., None, :] @ project(points.model, T, K[None], centre)[1])[..., 0, :]
-    found, known = pose_covariance(Matches(J, d, W), points, T, K[None], centre, radius=1.7)
+    found, known = pose_covariance(
+        Matches(J, d, W), points, T, K[None], centre, radius=1.7, scale=torch.full((1,), SCALE)
+    )
     assert int(known) == 6
 
     def pixels(step: torch.Tensor) -> torch.Tensor:
@@ -58,7 +62,7 @@ def test_covariance_is_the_sandwich_of_turn_and_translation_of_the_origin():
         g = (w * r * rows)[(cells == cell).all(dim=1)].sum(dim=0)
         B += g[:, None] * g
     inverse = torch.linalg.inv(rows.T @ (w * rows))
-    expected = contour_covariance.SCALE * inverse @ B @ inverse
+    expected = SCALE * inverse @ B @ inverse
     torch.testing.assert_close(found[0], expected, rtol=1e-3, atol=1e-9)
 
 
@@ -78,12 +82,13 @@ def test_injected_noise_lies_within():
         K.expand(400, 3, 3),
         centre,
         radius=1.7,
+        scale=torch.full((400,), SCALE),
     )
     spread = torch.cov(off.T)
     # The mean covariance is the spread times what is allowed for errors that neighbours share.
-    allowed = contour_covariance.SCALE * (contour_covariance.POINT**2 / 0.36 + contour_covariance.SHARED + 1)
+    allowed = SCALE * (contour_covariance.POINT**2 / 0.36 + contour_covariance.SHARED + 1)
     ratio = found.mean(dim=0).diagonal() / spread.diagonal()
-    assert float(ratio.min()) > 0.8 * (allowed - contour_covariance.SCALE)
+    assert float(ratio.min()) > 0.8 * (allowed - SCALE)
     assert float(ratio.max()) < 1.25 * allowed
 
 
@@ -127,6 +132,8 @@ def test_a_box_is_known_all_around():
 def test_nothing_found_is_not_a_number():
     points, T, centre = cloud(20)
     zero = torch.zeros(1, 20, 1, dtype=torch.float64)
-    C, known = pose_covariance(Matches(zero.expand(1, 20, 6), zero, zero), points, T, K[None], centre, radius=1.0)
+    C, known = pose_covariance(
+        Matches(zero.expand(1, 20, 6), zero, zero), points, T, K[None], centre, radius=1.0, scale=torch.ones(1)
+    )
     assert bool(C.isnan().all())
     assert int(known) == 0
