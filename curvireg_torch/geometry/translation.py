@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from .._checks import check_camera_matrix, check_finite, check_rotation
+from ..errors import InvalidInputError
 from .cameras import boxes_around, projected, rotation_towards, transform
 
 __all__ = ["place_view", "translation_from_box"]
@@ -28,7 +29,7 @@ def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tenso
         (..., 3) float64 translation in model units, the object in front of the camera.
 
     Raises:
-        InvalidInputError: a matrix that is no rotation, or an unusable camera matrix.
+        InvalidInputError: a matrix that is no rotation, an empty box, or an unusable camera matrix.
 
     Example:
         >>> cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
@@ -63,6 +64,8 @@ def _filled(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor, *, towards
     check_finite(rotation, "rotation")
     check_rotation(rotation, "rotation")
     check_camera_matrix(K)
+    if not bool((box[..., 2:] > box[..., :2]).all() and box.isfinite().all()):
+        raise InvalidInputError(f"box: expected finite X0 < X1 and Y0 < Y1, got {box.tolist()}")
     points, view, box, K = (v.detach().cpu().double() for v in (points, rotation, box, K))
     centre = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
     extent = torch.linalg.vector_norm(points - centre, dim=1).max()

@@ -232,7 +232,9 @@ def _batch(
     check_tensor(starts, "starts", (None, 4, 4))
     check_pose(starts, "starts")
     if isinstance(images, Tensor) and images.ndim == 3:  # one photograph
-        images, boxes = images[None], as_numbers(boxes, "box")[None]
+        box = as_numbers(boxes, "box")
+        check_tensor(box, "box", (4,))
+        images, boxes = images[None], box[None]
     for image in images:
         check_photograph(image)
     B, N = len(images), len(starts)

@@ -26,11 +26,22 @@ __all__ = ["Item", "check_crop", "items_of", "named"]
 
 @dataclass(frozen=True)
 class Item:
-    """One photograph to register: ``image`` (1 or 3, H, W) float or uint8, ``box`` (4,), ``camera_matrix`` (3, 3)."""
+    """One photograph to register: ``image`` (1 or 3, H, W) float or uint8, ``box`` (4,), ``camera_matrix`` (3, 3).
+
+    Raises:
+        InvalidInputError: something else, an empty box or one outside the image, skew, or pixels that are not square.
+    """
 
     image: Tensor
     box: Tensor
     camera_matrix: Tensor | None
+
+    def __post_init__(self) -> None:
+        check_photograph(self.image, "photograph")
+        check_boxes(self.box[None], [(int(self.image.shape[-2]), int(self.image.shape[-1]))])
+        if self.camera_matrix is not None:
+            check_camera_matrix(self.camera_matrix)
+            check_square_pixels(self.camera_matrix)
 
 
 def items_of(images: Tensor | Sequence[Any], boxes: Any, camera_matrices: Any | None) -> list[Item | CurviregError]:
@@ -63,12 +74,7 @@ def items_of(images: Tensor | Sequence[Any], boxes: Any, camera_matrices: Any | 
 
 def _item(image: Any, box: Tensor | None, K: Tensor | None) -> Item:
     pixels = _pixels(image)
-    box = whole_image_box(pixels).cpu() if box is None else box
-    check_boxes(box[None], [(int(pixels.shape[-2]), int(pixels.shape[-1]))])
-    if K is not None:
-        check_camera_matrix(K)
-        check_square_pixels(K)
-    return Item(pixels, box, K)
+    return Item(pixels, whole_image_box(pixels).cpu() if box is None else box, K)
 
 
 def _pixels(image: Any) -> Tensor:

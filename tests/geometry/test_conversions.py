@@ -26,10 +26,10 @@ def points() -> torch.Tensor:
 @pytest.mark.parametrize("orthographic", [False, True])
 def test_opengl_window_coordinates_are_the_pixels(orthographic: bool) -> None:
     T, X = poses(), points()
-    K = K.clone()
+    camera = K.clone()
     if orthographic:
-        K[:2, :2] /= 5.0
-    P = g.opengl_projection(K, SIZE, near=2.0, far=9.0, orthographic=orthographic)
+        camera[:2, :2] /= 5.0
+    P = g.opengl_projection(camera, SIZE, near=2.0, far=9.0, orthographic=orthographic)
     homogeneous = torch.cat([X, torch.ones(50, 1, dtype=torch.float64)], 1)
     clip = homogeneous @ (P @ g.opengl_from_opencv(T)).mT
     ndc = clip[..., :3] / clip[..., 3:]
@@ -37,7 +37,7 @@ def test_opengl_window_coordinates_are_the_pixels(orthographic: bool) -> None:
     # OpenGL's viewport transform; its window counts from the lower left corner of the corner pixel
     window = 0.5 * (ndc[..., :2] + 1.0) * torch.tensor([SIZE[1], SIZE[0]])
     pixels = torch.stack([window[..., 0], SIZE[0] - window[..., 1]], -1) - 0.5
-    torch.testing.assert_close(pixels, g.project_points(X, T, K, orthographic=orthographic), rtol=0, atol=1e-9)
+    torch.testing.assert_close(pixels, g.project_points(X, T, camera, orthographic=orthographic), rtol=0, atol=1e-9)
     back = g.opencv_from_opengl(g.opengl_from_opencv(T))
     torch.testing.assert_close(back, T, rtol=0, atol=0)
 
