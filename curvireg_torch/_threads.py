@@ -3,13 +3,17 @@
 import itertools
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import TypeVar
 
 import torch
 
-__all__ = ["for_each", "one_thread_each"]
+__all__ = ["for_each", "map_on_threads", "one_thread_each"]
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 _workers: tuple[int, ThreadPoolExecutor] | None = None
 _here = threading.local()
@@ -18,10 +22,10 @@ _here = threading.local()
 def for_each(count: int, job: Callable[[int], object]) -> None:
     """Call ``job(0)`` to ``job(count - 1)`` on as many threads as torch may use; they are started once for the process.
 
-    On a thread on which torch computes alone, as those of :func:`one_thread_each`, and in a job, nothing is shared.
-    For jobs that do not call torch. The first error ends all threads after their present job and is raised.
+    On a thread of :func:`one_thread_each`, and in a job, nothing is shared, unless :func:`map_on_threads` has threads
+    to spare. For jobs that do not call torch. The first error ends all threads after their present job and is raised.
     """
-    threads = min(torch.get_num_threads(), count)
+    threads = min(getattr(_here, "threads", None) or torch.get_num_threads(), count)
     numbers = itertools.count()
     stopped = False
 
@@ -53,6 +57,26 @@ def _pool() -> ThreadPoolExecutor:
     if _workers is None or _workers[0] != os.getpid():
         _workers = os.getpid(), ThreadPoolExecutor(max(os.cpu_count() or 1, torch.get_num_threads()))
     return _workers[1]
+
+
+def map_on_threads(job: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """``job`` of every item, in their order, each on one thread on which torch computes alone.
+
+    How torch divides an operation among threads decides how it rounds: a result that is computed by one thread does
+    not depend on how many items there are, nor on how many threads torch may use. Threads that are left over, as with a
+    single item, share the jobs of :func:`for_each`, which do not call torch.
+    """
+    threads = torch.get_num_threads()
+    if threads == 1:
+        return [job(item) for item in items]
+    share = max(1, threads // max(1, len(items)))
+
+    def alone(item: Item) -> Result:
+        _here.threads = share
+        return job(item)
+
+    with one_thread_each() as pool:
+        return list(pool.map(alone, items))
 
 
 @contextmanager

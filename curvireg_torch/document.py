@@ -37,6 +37,8 @@ CONVENTIONS = {
     "looked for, times presence",
     "presence": "estimated probability that the photograph shows the object in that box",
     "reliable": f"confidence of at least {RELIABLE:g}; false = no reliable match, the pose is a guess",
+    "lead": "how far the best pose leads its best rival in the order of poses; null where the bank has no rival view: "
+    "then little confidence is given",
     "support": "how strongly edges of the photograph lie under the mesh's contours, 0 to 1",
     "covariance": "of turn (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
     "t_true = t + e; null without a camera, and with a guessed one, whose error nobody knows",
@@ -70,6 +72,7 @@ def result_document(result: Registration, registrar: Registrar, seconds: Mapping
         "score": result.score,
         "confidence": result.confidence,
         "reliable": result.reliable,
+        "lead": result.lead,
         "support": result.support,
         "standard_deviations": None
         if deviations is None

@@ -87,6 +87,7 @@ def fetch(out: Path, deb: Path | None) -> Path:
     deb = fetched(source, PACKAGE, SHA256) if deb is None else checked(deb, SHA256)
     unpacked = source / "unpacked"
     if not (unpacked / "done").exists():
+        unpacked.mkdir(parents=True, exist_ok=True)
         subprocess.run(["dpkg-deb", "-x", deb.resolve(), unpacked], check=True)
         for archive in unpacked.rglob("*.sh3f"):
             with zipfile.ZipFile(archive) as file:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from curvireg_torch._threads import for_each, one_thread_each
+from curvireg_torch._threads import for_each, map_on_threads, one_thread_each
 
 
 @pytest.fixture(autouse=True)
@@ -92,3 +92,33 @@ def test_a_forked_process_starts_its_own() -> None:
         os.waitpid(child, 0)
         pytest.fail("the child hangs")
     assert os.waitstatus_to_exitcode(status) == 0
+
+
+def test_mapped_jobs_keep_their_order_and_each_has_one_thread_of_torch() -> None:
+    def job(number: int) -> tuple[int, int, int]:
+        return number, torch.get_num_threads(), threading.get_ident()
+
+    out = map_on_threads(job, range(5))
+    assert [number for number, *_ in out] == list(range(5))
+    assert {threads for _, threads, _ in out} == {1}
+    assert threading.get_ident() not in {thread for *_, thread in out}
+    assert torch.get_num_threads() == 2
+    assert map_on_threads(job, []) == []
+
+
+def test_a_single_mapped_job_shares_its_rays_among_the_threads_that_are_left() -> None:
+    both = threading.Barrier(2, timeout=20)
+    assert map_on_threads(lambda _: for_each(2, lambda _: both.wait()), [0]) == [None]
+    here: list[int] = []
+    map_on_threads(lambda _: for_each(3, lambda _: here.append(threading.get_ident())), [0, 1])
+    assert len(here) == 6
+    assert len(set(here)) <= 2, "with two jobs no thread is left over"
+
+
+def test_an_error_in_a_mapped_job_is_raised_and_threads_are_restored() -> None:
+    def job(number: int) -> None:
+        raise ValueError(f"job {number}")
+
+    with pytest.raises(ValueError, match="job 0"):
+        map_on_threads(job, [0, 1, 2])
+    assert torch.get_num_threads() == 2

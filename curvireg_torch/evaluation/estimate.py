@@ -22,8 +22,8 @@ def estimate_poses(registrar: Registrar, items: Sequence[Item], *, boxes: bool =
 
     Returns:
         For each ``rotation`` (3 x 3 numbers), ``translation`` (3 numbers, unit of the mesh, or None), ``score``,
-        ``confidence``, ``reliable``, ``support``, ``covariance`` and ``seen_by`` (see :class:`Hypothesis`), ``mesh``:
-        the place of the chosen mesh in the bank, and ``rivals``: rotation, score and evidence of the other hypotheses;
+        ``confidence``, ``reliable``, ``lead``, ``support``, ``covariance`` and ``seen_by`` (see :class:`Registration`),
+        ``mesh``: the place of the chosen mesh in the bank, and ``rivals``: rotation, score and evidence of the other hypotheses;
         of objects that were looked for, ``found``: the presence and the proposed boxes; or ``failed`` with the reason.
     """
     cameras = [item.camera_matrix for item in items if item.camera_matrix is not None]
@@ -45,9 +45,10 @@ def _row(result: Registration | FailedRegistration) -> Row:
         "score": best.score,
         "confidence": result.confidence,
         "reliable": result.reliable,
+        "lead": result.lead,
         "support": best.support,
         "evidence": dict(best.evidence),
-        "covariance": None if best.covariance is None else best.covariance.tolist(),
+        "covariance": None if result.covariance is None else result.covariance.tolist(),
         "mesh": best.model,
         "seen_by": [matrix.tolist() for matrix in best.seen_by],
         **({} if result.found is None else {"found": _found(result.found)}),

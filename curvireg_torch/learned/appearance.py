@@ -10,7 +10,8 @@ from .backbone import Backbone
 __all__ = ["describe", "similarity"]
 
 CHUNK = 16
-"""Images in the network at a time: more are no faster on a CPU."""
+"""Images in the network at a time on a GPU. On a CPU it is one: more are no faster there, and convolutions of a batch
+round each image in a way that depends on how many there are."""
 
 
 @torch.no_grad()
@@ -36,7 +37,8 @@ def describe(images: Tensor, backbone: Backbone) -> Tensor:
         >>> describe(torch.rand(2, 3, 64, 64), Backbone()).shape
         torch.Size([2, 4352])
     """
-    parts = [_described(chunk, backbone) for chunk in images.split(CHUNK)] or [_described(images, backbone)]
+    chunks = images.split(1 if images.device.type == "cpu" else CHUNK)
+    parts = [_described(chunk, backbone) for chunk in chunks] or [_described(images, backbone)]
     return torch.cat(parts)
 
 

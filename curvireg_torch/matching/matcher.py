@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from .._checks import as_boxes, check_photograph, check_pixels
+from .._threads import map_on_threads
 from ..descriptors import field_points
 from ..errors import InvalidInputError
 from ..geometry.colours import has_colours
@@ -35,6 +36,9 @@ __all__ = ["Ranking", "ViewMatcher"]
 
 KEPT = 2048
 """Views that late terms described when a photograph asked for them and that stay in memory, 35 kB each at 128 px."""
+
+SOME = 16
+"""Views that are described at a time."""
 
 
 @dataclass(frozen=True)
@@ -252,14 +256,21 @@ class ViewMatcher(nn.Module):
         if name in self.bank.late:
             return self.bank.late[name][views.to(self.device)]
         kept = self._kept.setdefault(name, {})
-        missing = [v for v in views.tolist() if v not in kept]
-        if len(kept) + len(missing) > KEPT:
+        found = {view: known for view in views.tolist() if (known := kept.get(view)) is not None}
+        missing = [view for view in views.tolist() if view not in found]
+        module = self._late(name)
+
+        def described(some: list[int]) -> Tensor:
+            return module.described(self._shaded(torch.tensor(some, device=self.device)))
+
+        # On one thread each, as the bank's own: which photograph asked first does not decide how features are rounded.
+        parts = map_on_threads(described, [missing[k : k + SOME] for k in range(0, len(missing), SOME)])
+        new = dict(zip(missing, (feature for part in parts for feature in part), strict=True))
+        if len(kept) + len(new) > KEPT:
             kept.clear()
-            missing = views.tolist()
-        for k in range(0, len(missing), 64):
-            some = torch.tensor(missing[k : k + 64], device=self.device)
-            kept |= dict(zip(some.tolist(), self._late(name).described(self._shaded(some)), strict=True))
-        return torch.stack([kept[v] for v in views.tolist()])
+        kept.update(new)
+        found.update(new)
+        return torch.stack([found[view] for view in views.tolist()])
 
     def late_score(
         self, name: str, query: Photographs, ranking: Ranking, pictures: Tensor, photograph: Tensor

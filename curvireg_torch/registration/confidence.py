@@ -105,16 +105,17 @@ def confidence(ranking: Ranking, rotations: Tensor) -> Tensor:
     return probability(ranking_evidence(ranking, rotations))
 
 
-def pose_evidence(similarity: float, lead: float, *, with_camera: bool, support: float = 0.0) -> list[float]:
+def pose_evidence(similarity: float, lead: float | None, *, with_camera: bool, support: float = 0.0) -> list[float]:
     """Numbers that tell right poses from wrong ones (``POSE_EVIDENCE``), of a hypothesis followed to its end.
 
     Args:
         similarity: normalised correlation of the pose's view with the photograph.
-        lead: how far its verdict leads that of the next distinct hypothesis; at most 5 counts.
+        lead: how far its verdict leads that of the best rival; at most 5 counts. None where the bank has no rival
+            view: it counts as no lead at all, for nothing tells how much less another pose would fit.
         with_camera: whether the camera matrix is known, and with it, as a rule, the object's own mesh.
         support: strength of the photograph's edges under the pose's contours.
     """
-    return [similarity, min(lead, MARGIN), float(with_camera), support]
+    return [similarity, 0.0 if lead is None else min(lead, MARGIN), float(with_camera), support]
 
 
 def pose_confidence(evidence: Sequence[float]) -> float:

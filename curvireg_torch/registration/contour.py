@@ -25,7 +25,7 @@ from .contour_covariance import pose_covariance
 from .contour_descent import Seen, Views, moved
 from .contour_points import EdgeField
 
-__all__ = ["ContourFit", "fit_contours"]
+__all__ = ["ContourFit", "contour_support", "fit_contours"]
 
 SIZE = 256
 """Side of the crop in px; the first rounds use half of it."""
@@ -193,6 +193,31 @@ def fit_contours(
         residual=mean_square.sqrt(),
         moved=full.way(seen.points, T0, seen.T),
     )
+
+
+@torch.no_grad()
+def contour_support(
+    renderer: DepthRenderer,
+    images: Tensor | Sequence[Tensor],
+    boxes: Tensor,
+    camera_matrices: Tensor,
+    poses: Tensor,
+    *,
+    photograph: Tensor | None = None,
+    centre: Tensor,
+    radius: float,
+    margin: float = 0.1,
+) -> Tensor:
+    """(N,) support of poses that are taken as they are, as :class:`ContourFit` has it of fitted ones.
+
+    Args and errors: those of :func:`fit_contours`, whose ``starts`` are the ``poses`` here.
+    """
+    images, boxes, K, photograph = _batch(images, boxes, camera_matrices, poses, photograph)
+    if len(poses) == 0:
+        return torch.zeros(0, dtype=torch.float64)
+    crops, A = crop_images(images, boxes, size=SIZE, margin=margin)
+    views = Views(renderer, EdgeField(crops), photograph, A.double()[photograph] @ K, SIZE, centre.double(), radius)
+    return views.support(views.seen(poses.detach().cpu().double()))
 
 
 def _around(half: Views, T0: Tensor, first: Seen, support: Tensor) -> tuple[Tensor, Tensor]:

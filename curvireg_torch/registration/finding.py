@@ -9,10 +9,11 @@ from kornia.geometry.bbox import nms
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError
+from ..geometry.crops import box_iou
 from ..location import Located
 from ..location.locator import OVERLAP, check_distance
 from ..matching import Photographs, Ranking
-from .confidence import RELIABLE, presence, presence_evidence
+from .confidence import presence, presence_evidence
 from .correction import posed_box
 from .inputs import Item, check_crop, items_of, named
 from .pose import FailedRegistration, Found, Registration
@@ -53,20 +54,33 @@ def find(
     if instances < 1:
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
     check_distance(distance, with_cameras=camera_matrices is not None)
-    out: list[list[Registration | FailedRegistration]] = []
-    for i, item in enumerate(items_of(images, None, camera_matrices)):
-        if not isinstance(item, Item):
-            out.append([FailedRegistration(item)])
-            continue
-        registrar.tell("looking")
-        try:
-            check_crop(_extremes(item.image))
-            cameras = None if item.camera_matrix is None else [item.camera_matrix]
-            located = registrar.locator([item.image], camera_matrices=cameras, distance=distance)[0]
-            out.append([*_followed(registrar, item, located, instances)])
-        except CurviregError as error:
-            out.append([FailedRegistration(named(error, f"image {i}"))])
-    return out
+    _ = registrar.locator  # made once, before threads ask for it
+
+    def looked_for(some: Sequence[Item | CurviregError], first: int) -> list[list[Registration | FailedRegistration]]:
+        numbered = enumerate(some, start=first)
+        return [_found_objects(registrar, item, f"image {i}", instances, distance) for i, item in numbered]
+
+    return registrar.each(items_of(images, None, camera_matrices), looked_for)
+
+
+def _found_objects(
+    registrar: "Registrar",
+    item: Item | CurviregError,
+    name: str,
+    instances: int,
+    distance: tuple[float, float] | None,
+) -> list[Registration | FailedRegistration]:
+    """:func:`find` for one photograph."""
+    if not isinstance(item, Item):
+        return [FailedRegistration(item)]
+    registrar.tell("looking")
+    try:
+        check_crop(_extremes(item.image))
+        cameras = None if item.camera_matrix is None else [item.camera_matrix]
+        located = registrar.locator([item.image], camera_matrices=cameras, distance=distance)[0]
+        return [*_followed(registrar, item, located, instances)]
+    except CurviregError as error:
+        return [FailedRegistration(named(error, name))]
 
 
 def _followed(registrar: "Registrar", item: Item, located: Located, instances: int) -> list[Registration]:
@@ -75,22 +89,26 @@ def _followed(registrar: "Registrar", item: Item, located: Located, instances: i
         raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
     count = max(registrar.pipeline.locate.followed, instances + 1)
     places = Places.judged(registrar, item, located.boxes[:count], located.scores[:count])
-    chosen = nms(places.boxes, places.presence, OVERLAP)[:instances]
-    answers = [_corrected(registrar, item, places.registered(registrar, item, k)) for k in chosen.tolist()]
+    answers: list[Registration] = []
+    for k in nms(places.boxes, places.presence, OVERLAP).tolist():
+        if len(answers) < instances:
+            _add(answers, _corrected(registrar, item, places.registered(registrar, item, k)))
     answers.sort(key=_surely, reverse=True)
     boxes = torch.cat([torch.stack([found_in(a).box for a in answers]), located.boxes.double()])
     scores = torch.cat([torch.tensor([found_in(a).score for a in answers]), located.scores])
     own = nms(boxes, -torch.arange(len(boxes)), OVERLAP)  # in the order that they have
     answers = [replace(a, found=replace(found_in(a), boxes=boxes[own], scores=scores[own])) for a in answers]
-    return [doubted(answer, answer.confidence * _surely(answer)) for answer in answers]
+    return [replace(answer, confidence=answer.confidence * _surely(answer)) for answer in answers]
 
 
-def doubted(answer: Registration, confidence: float) -> Registration:
-    """An answer with less confidence, and no covariance where that is too little to rely on."""
-    if confidence >= RELIABLE:
-        return replace(answer, confidence=confidence)
-    guesses = tuple(replace(h, covariance=None) for h in answer.hypotheses)
-    return replace(answer, confidence=confidence, hypotheses=guesses)
+def _add(answers: list[Registration], new: Registration) -> None:
+    """Add an answer. Of answers whose boxes overlap only the surest stays: two places may lead to one object."""
+    boxes = torch.stack([found_in(new).box, *(found_in(answer).box for answer in answers)])
+    overlap = box_iou(boxes[:1], boxes[1:])[0].tolist()
+    same = [answer for answer, iou in zip(answers, overlap, strict=True) if iou > OVERLAP]
+    if all(_surely(new) > _surely(answer) for answer in same):
+        answers[:] = [answer for answer in answers if not any(answer is other for other in same)]
+        answers.append(new)
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from torch import Tensor
 from ..geometry.cameras import rotation_towards
 from ..geometry.translation import place_view
 from ..matching import ViewDescriber
-from .contour import ContourFit, fit_contours
+from .contour import ContourFit, contour_support, fit_contours
 from .hypotheses import Hypotheses
 from .search import FINALISTS
 
-__all__ = ["Poses", "follow_contours", "placed", "seen_straight"]
+__all__ = ["Poses", "follow_contours", "placed", "seen_straight", "supports"]
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,10 @@ class Poses:
     fit: ContourFit | None = None
 
     def where(self, kept: Tensor, others: "Poses") -> "Poses":
-        """These where ``kept`` (H,), else the others, whose covariance nobody knows; scores are these poses'."""
+        """Select per hypothesis: these poses where ``kept`` (H,) is True, else ``others``.
+
+        Scores are those of ``self``. The covariance is NaN where the pose is taken from ``others``.
+        """
         pose = kept[:, None, None]
         T = torch.where(pose, self.T, others.T)
         found = replace(
@@ -45,6 +48,10 @@ class Poses:
         if fit is not None:
             fit = replace(fit, transform=T, covariance=torch.where(pose, fit.covariance, torch.nan))
         return Poses(found, T, torch.where(pose, self.cameras, others.cameras), fit)
+
+    def __getitem__(self, index: Tensor) -> "Poses":
+        """Some of the poses, without their fit."""
+        return Poses(self.found[index], self.T[index], self.cameras[index])
 
 
 def placed(describers: Sequence[ViewDescriber], found: Hypotheses, boxes: Tensor, K: Tensor | None) -> Poses:
@@ -107,6 +114,25 @@ def follow_contours(
     place = torch.cat(index).argsort()
     fit = ContourFit(*(torch.cat([getattr(part, f.name) for part in parts])[place] for f in fields(ContourFit)))
     return Poses(seen_straight(describers, poses.found, fit.transform), fit.transform, poses.cameras, fit)
+
+
+def supports(describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor) -> Tensor:
+    """(H,) contour support of poses of all models as they are, see :func:`contour_support`."""
+    out = torch.zeros(len(poses.found), dtype=torch.float64)
+    for model, mine in _by_model(poses.found):
+        describe = describers[model]
+        out[mine] = contour_support(
+            describe.renderer,
+            images,
+            boxes,
+            poses.cameras[mine],
+            poses.T[mine],
+            photograph=poses.found.photograph[mine],
+            centre=describe.centre,
+            radius=describe.radius,
+            margin=describe.settings.margin,
+        )
+    return out
 
 
 def _by_model(found: Hypotheses) -> list[tuple[int, Tensor]]:

@@ -41,8 +41,8 @@ class Hypothesis:
         support: how strongly edges of the photograph lie under the mesh's contours, in [0, 1]; None without the contour
             stage (:func:`curvireg_torch.registration.fit_contours`).
         covariance: (6, 6) float64 of turn (rad) about the camera's x, y, z and translation (model units) along them,
-            ``R_true = exp([w]x) R``, ``t_true = t + e``; None without a camera matrix, without the contour stage, where
-            the contours do not fix the pose, and where the answer is not reliable.
+            ``R_true = exp([w]x) R``, ``t_true = t + e``, should this pose be the right one; None without a camera
+            matrix, without the contour stage, and where the contours do not fix the pose.
     """
 
     rotation: Tensor
@@ -105,7 +105,7 @@ class Registration:
     """Poses of one object in one photograph, best first.
 
     Everything that a :class:`Hypothesis` has is here too, of the best one: ``rotation``, ``translation``, ``score``,
-    ``viewpoint``, ``covariance`` and so on.
+    ``viewpoint`` and so on; ``covariance`` and ``standard_deviations`` are None where the answer is not reliable.
 
     Attributes:
         hypotheses: distinct poses, best first; the others are rivals, such as half a turn.
@@ -113,6 +113,9 @@ class Registration:
             :func:`curvireg_torch.registration.confidence`; of an object without a box, times the probability that it
             is there.
         ranking: of the bank's views for this photograph (B = 1).
+        lead: how far the best hypothesis leads its best rival in :func:`verdict`, rivals that are not reported
+            included; below 0 where the rival is a view that belongs to no peak of its own. None where the bank has no
+            view that could be a rival: then nothing tells how sure the answer is, and little confidence is given.
         found: of an object without a box.
         corrected_box: (4,) float64 the box that the answer was made with, where the given one did not fit.
     """
@@ -120,6 +123,7 @@ class Registration:
     hypotheses: tuple[Hypothesis, ...]
     confidence: float
     ranking: Ranking
+    lead: float | None = None
     found: Found | None = None
     corrected_box: Tensor | None = None
 
@@ -182,7 +186,7 @@ class Registration:
 
     @property
     def covariance(self) -> Tensor | None:
-        return self.hypotheses[0].covariance
+        return self.hypotheses[0].covariance if self.reliable else None
 
     @property
     def viewpoint(self) -> tuple[float, float, float]:
@@ -190,7 +194,7 @@ class Registration:
 
     @property
     def standard_deviations(self) -> tuple[Tensor, Tensor] | None:
-        return self.hypotheses[0].standard_deviations
+        return self.hypotheses[0].standard_deviations if self.reliable else None
 
     @property
     def transform(self) -> Tensor | None:

@@ -10,23 +10,27 @@ import torch
 from torch import Tensor, nn
 
 from .._checks import check_symmetries
+from .._threads import map_on_threads
 from ..errors import CurviregError, InvalidInputError
 from ..geometry.views import ViewSphere
 from ..location import Locator
 from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
-from .confidence import RELIABLE, confidence, pose_confidence, pose_evidence
+from .confidence import confidence, pose_confidence, pose_evidence
 from .correction import corrected
 from .finding import find
 from .hypotheses import Hypotheses, hypotheses, own_peaks
 from .inputs import Item, check_crop, items_of, named
-from .placing import Poses, follow_contours, placed
+from .placing import Poses, follow_contours, placed, supports
 from .pose import FailedRegistration, Hypothesis, Registration
 from .search import search
 from .verify import EVIDENCE, gathered_evidence, similarities, verdict
 
 __all__ = ["Registrar"]
+
+CARRIED = 2
+"""Hypotheses that are always followed, however few are reported: without a rival nothing tells how sure the best is."""
 
 
 class Registrar:
@@ -167,12 +171,33 @@ class Registrar:
         if distance is not None:
             raise InvalidInputError("distance: for objects that are looked for; leave the boxes out, or the distance")
         items = items_of(images, boxes, camera_matrices)
-        results: list[Registration | FailedRegistration] = []
-        for i in range(0, len(items), self.matcher.chunk_size):
-            some = items[i : i + self.matcher.chunk_size]
-            answers = self.answers(some, first=i)
-            results += corrected(self, some, answers) if self.pipeline.slack and self.pipeline.search else answers
-        return results
+        return self.each(items, self._answers_to_boxes)
+
+    def each(
+        self,
+        items: Sequence[Item | CurviregError],
+        answer: Callable[[Sequence[Item | CurviregError], int], list[Any]],
+    ) -> list[Any]:
+        """``answer(some items, number of the first)`` for all items, joined in their order.
+
+        On a CPU each photograph is registered by itself, on a thread of its own, on which torch computes alone: its
+        answer is the same to the bit whatever else is registered, on however many threads. On a GPU ``chunk_size`` of
+        the matcher are registered at a time.
+        """
+        size = 1 if self.bank.device.type == "cpu" else self.matcher.chunk_size
+        _ = self.describers, self.matcher.describers  # made once, before threads ask for them
+
+        @torch.no_grad()  # a thread does not inherit it
+        def some(first: int) -> list[Any]:
+            return answer(items[first : first + size], first)
+
+        return [each for part in map_on_threads(some, range(0, len(items), size)) for each in part]
+
+    def _answers_to_boxes(
+        self, items: Sequence[Item | CurviregError], first: int
+    ) -> list[Registration | FailedRegistration]:
+        answers = self.answers(items, first=first)
+        return list(corrected(self, items, answers)) if self.pipeline.slack and self.pipeline.search else answers
 
     def answers(
         self, items: Sequence[Item | CurviregError], *, first: int = 0
@@ -210,10 +235,12 @@ class Registrar:
         """
         self.tell("ranking")
         ranking = self.matcher.rank(query) if ranking is None else ranking
+        images = [item.image for item in items]
         boxes = torch.stack([item.box for item in items]).double()
         matrices = [item.camera_matrix for item in items if item.camera_matrix is not None]
         K = torch.stack(matrices) if matrices else None
-        starts = hypotheses(ranking, self.bank, count=self.pipeline.hypotheses, symmetries=self.symmetries)
+        count = max(CARRIED, self.pipeline.hypotheses)
+        starts = hypotheses(ranking, self.bank, count=count, symmetries=self.symmetries)
         descriptors = self.describers[0].descriptor(query.field)
         found = starts
         if self.pipeline.search:
@@ -231,39 +258,46 @@ class Registrar:
         poses = placed(self.describers, found, boxes, K)
         if self.pipeline.contours:
             self.tell("contours")
-            poses = follow_contours(self.describers, [item.image for item in items], poses, boxes)
+            poses = follow_contours(self.describers, images, poses, boxes)
 
-        def judged(found: Hypotheses) -> tuple[Tensor, Tensor]:
-            return similarities(self.describers, descriptors, found), self._looks(found, query, ranking)
+        def measured(poses: Poses) -> tuple[Tensor, Tensor]:
+            similarity = similarities(self.describers, descriptors, poses.found)
+            return similarity, self._looks(poses.found, query, ranking)
 
-        (score, looks), fit = judged(poses.found), poses.fit
-        support = torch.zeros_like(score) if fit is None else fit.support
-        evidence = gathered_evidence(starts, replace(poses.found, score=score), support, looks)
-        own = own_peaks(poses.found, verdict(evidence, with_camera=K is not None), symmetries=self.symmetries)
-        if not bool(own.all()):
-            # Hypotheses that became another one stand where they started: a rival is a rival, if not a peak.
-            poses = poses.where(own, placed(self.describers, starts, boxes, K))
-            score[~own], looks[~own] = judged(poses.found[~own])
-            support = torch.where(own, support, 0.0)
-            evidence = gathered_evidence(starts, replace(poses.found, score=score), support, looks)
-        if fit is not None and K is None:
+        fit, with_camera = poses.fit, K is not None
+        similarity, looks = measured(poses)
+        support = torch.zeros_like(similarity) if fit is None else fit.support.clone()
+        evidence = gathered_evidence(starts, similarity, support, looks)
+        own = own_peaks(poses.found, verdict(evidence, with_camera=with_camera), symmetries=self.symmetries)
+        kept = own
+        if fit is not None and not with_camera:
             # The mesh is often another object of the kind: where its contours do not fit, the view itself errs less.
-            poses = poses.where(own & fit.trustworthy, placed(self.describers, starts, boxes, K))
-        poses = replace(poses, found=replace(poses.found, score=score))
-        verdicts = verdict(evidence, with_camera=K is not None)
+            kept = own & fit.trustworthy
+        if not bool(kept.all()):
+            # A hypothesis that became another one is still a rival: it returns to the view that it started from, and
+            # is measured there.
+            views = placed(self.describers, starts, boxes, K)
+            poses, back = poses.where(kept, views), ~kept
+            similarity[back], looks[back] = measured(views[back])
+            if fit is not None:
+                support[back] = supports(self.describers, images, views[back], boxes)
+            evidence = gathered_evidence(starts, similarity, support, looks)
+        poses = replace(poses, found=replace(poses.found, score=similarity))
+        verdicts = verdict(evidence, with_camera=with_camera)
         order = (verdicts + torch.where(own, 0.0, -1e6)).argsort(descending=True, stable=True)
         coarse = confidence(ranking, self.bank.rotations)
         results = []
         for b in range(len(items)):
             mine = order[starts.photograph[order] == b].tolist()
+            lead = float(verdicts[mine[0]] - verdicts[mine[1:]].max()) if len(mine) > 1 else None
             trust = float(coarse[b])
             if fit is not None:
-                lead = float(verdicts[mine[0]] - verdicts[mine[1:]].max()) if len(mine) > 1 else torch.inf
-                similarity, edges = float(score[mine[0]]), float(support[mine[0]])
-                trust = pose_confidence(pose_evidence(similarity, lead, with_camera=K is not None, support=edges))
-            reliable = trust >= RELIABLE
-            answers = tuple(_hypothesis(h, poses, support, evidence, reliable, K is not None) for h in mine)
-            results.append(Registration(answers, trust, ranking[b : b + 1]))
+                known = float(similarity[mine[0]]), float(support[mine[0]])
+                trust = pose_confidence(pose_evidence(known[0], lead, with_camera=with_camera, support=known[1]))
+            answers = tuple(
+                _hypothesis(h, poses, support, evidence, with_camera) for h in mine[: self.pipeline.hypotheses]
+            )
+            results.append(Registration(answers, trust, ranking[b : b + 1], lead))
         return results
 
     def tell(self, stage: str) -> None:
@@ -279,11 +313,9 @@ class Registrar:
         return self.matcher.late_score("appearance", query, ranking, pictures, found.photograph)
 
 
-def _hypothesis(
-    h: int, poses: Poses, support: Tensor, evidence: Tensor, reliable: bool, with_camera: bool
-) -> Hypothesis:
+def _hypothesis(h: int, poses: Poses, support: Tensor, evidence: Tensor, with_camera: bool) -> Hypothesis:
     found, T, fit = poses.found, poses.T[h], poses.fit
-    known = fit is not None and with_camera and reliable and bool(fit.covariance[h].isfinite().all())
+    known = fit is not None and with_camera and bool(fit.covariance[h].isfinite().all())
     return Hypothesis(
         rotation=T[:3, :3].clone() if with_camera else found.rotation[h].clone(),
         translation=T[:3, 3].clone() if with_camera else None,

@@ -20,12 +20,12 @@ WEIGHTS, RANK_ALONE = (1.0, 5.0, 10.0, 1.0), (1.0, 0.0, 0.0, 0.0)
 """See docs/accuracy.md."""
 
 
-def gathered_evidence(starts: Hypotheses, found: Hypotheses, support: Tensor, looks: Tensor) -> Tensor:
+def gathered_evidence(starts: Hypotheses, similarity: Tensor, support: Tensor, looks: Tensor) -> Tensor:
     """(H, 4) float64, see :data:`EVIDENCE`.
 
     Args:
         starts: as they were ranked, their score being S.
-        found: as they were found, their score being the similarity.
+        similarity: (H,) of the poses that were found.
         support: (H,) of the contour stage, 0 without it.
         looks: (H,) log S_look, 0 without that term.
     """
@@ -33,7 +33,7 @@ def gathered_evidence(starts: Hypotheses, found: Hypotheses, support: Tensor, lo
     count = int(starts.photograph.max()) + 1 if len(starts) else 0
     best = log.new_full((count,), -torch.inf).scatter_reduce(0, starts.photograph, log, "amax")
     rank = log - best[starts.photograph]
-    return torch.stack([rank, found.score, support, looks], dim=1)
+    return torch.stack([rank, similarity, support, looks], dim=1)
 
 
 def verdict(evidence: Tensor, *, with_camera: bool) -> Tensor:

@@ -50,7 +50,6 @@ class _Looks(LateModule):
     def __init__(self) -> None:
         super().__init__()
         self.backbone = Backbone()
-        self._last: tuple[Tensor, Tensor] | None = None  # crops, and what they are described by
 
     def described(self, pictures: Tensor) -> Tensor:
         grey, colour = pictures[:, :1], pictures[:, 1:]
@@ -58,8 +57,8 @@ class _Looks(LateModule):
         return torch.cat(ways, dim=1)
 
     def compare(self, photographs: Photographs, views: Tensor) -> Tensor:
-        if self._last is None or self._last[0] is not photographs.regions:  # ranking and verdict ask about the same
-            self._last = photographs.regions, describe(photographs.crops, self.backbone)
-        looks = self._last[1]
+        if Appearance.name not in photographs.late:  # ranking and verdict ask about the same
+            photographs.late[Appearance.name] = describe(photographs.crops, self.backbone)
+        looks = photographs.late[Appearance.name]
         each = similarity(looks[:, None], views.reshape(-1, looks.shape[1]))
         return each.view(len(looks), len(views), -1).amax(dim=2)

@@ -1,7 +1,7 @@
 """What is compared of a photograph: crops around a box that need not be exact, and their features."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import torch
 from kornia.color import rgb_to_grayscale
@@ -28,6 +28,7 @@ class Photographs:
         descriptors: (B, K, D).
         points: (B, K, S, S) bool feature points.
         shapes: (B,) log of width / height of the boxes, NaN where unknown.
+        late: features of the crops that late terms have computed, by the term's name.
     """
 
     regions: Tensor
@@ -35,12 +36,13 @@ class Photographs:
     descriptors: Tensor
     points: Tensor
     shapes: Tensor
+    late: dict[str, Tensor] = field(default_factory=dict, compare=False)
 
     def __len__(self) -> int:
         return self.regions.shape[0]
 
     def __getitem__(self, index: slice | Tensor) -> "Photographs":
-        return Photographs(*(getattr(self, f.name)[index] for f in fields(self)))
+        return Photographs(*(getattr(self, f.name)[index] for f in fields(self) if f.name != "late"))
 
     @property
     def crops(self) -> Tensor:

@@ -7,6 +7,7 @@ import torch
 
 from curvireg_torch import Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
 from curvireg_torch.geometry import symmetry_transforms
+from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
 from curvireg_torch.matching import Ranking
 from curvireg_torch.registration import confidence, distinct_views, ranking_evidence, verdict
 from curvireg_torch.registration.confidence import (
@@ -20,6 +21,7 @@ from curvireg_torch.registration.confidence import (
     pose_confidence,
     pose_evidence,
 )
+from curvireg_torch.registration.contour import contour_support
 from curvireg_torch.registration.verify import WEIGHTS
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, SIZE, scene, truck_bank
@@ -151,3 +153,58 @@ def test_confidence_rests_on_the_lead_that_the_hypotheses_tell():
         support = result.hypotheses[0].evidence["support"]
         expected = pose_confidence(pose_evidence(result.score, lead, with_camera=True, support=support))
         assert result.confidence == pytest.approx(expected)
+
+
+def test_one_hypothesis_is_not_believed_for_want_of_a_rival() -> None:
+    """Its rivals are followed all the same: the confidence is that of two hypotheses, of which one is reported."""
+    for seed in range(3):
+        image, box, _ = scene(seed)
+        one, two = (Registrar(truck_bank(), hypotheses=n)([image], box[None], CAMERA)[0] for n in (1, 2))
+        assert (len(one.hypotheses), len(two.hypotheses)) == (1, 2)
+        assert torch.equal(one.rotation, two.rotation)
+        assert one.lead == two.lead is not None
+        assert one.confidence == two.confidence
+
+
+def test_a_bank_without_a_rival_view_has_no_lead() -> None:
+    image, box, _ = scene(0)
+    near = sample_views(azimuths=[0.0, 10.0, 20.0], elevations=[10])
+    bank = ViewBank.build(truck_bank().mesh, near, pipeline=truck_bank().pipeline, image_size=96, progress=False)
+    result = Registrar(bank)([image], box[None], CAMERA)[0]
+    assert result.lead is None
+    support, similarity = result.support, result.score
+    tied = pose_confidence(pose_evidence(similarity, 0.0, with_camera=True, support=support))
+    assert (
+        result.confidence == tied < pose_confidence(pose_evidence(similarity, 5.0, with_camera=True, support=support))
+    )
+    assert not result.reliable
+
+
+def test_what_is_said_of_a_pose_is_measured_of_that_pose() -> None:
+    """Also without a camera, and of hypotheses that returned to their view: similarity, support and score."""
+    for K in (CAMERA, None):
+        registrar = Registrar(truck_bank())
+        for seed in range(2):
+            image, box, _ = scene(seed)
+            result = registrar([image], box[None], K)[0]
+            descriptors = registrar.describers[0].descriptor(registrar.matcher.query([image], box[None]).field)
+            for h in result.hypotheses:
+                pose = registrar.describers[0].descriptors(
+                    h.allocentric_rotation[None], torch.tensor([h.distance], dtype=torch.float64)
+                )
+                cosine = torch.nn.functional.cosine_similarity(pose, descriptors)
+                assert h.score == pytest.approx(float(cosine), abs=1e-5)
+                assert h.evidence["similarity"] == h.score
+                T, camera = h.seen_by
+                support = contour_support(
+                    registrar.describers[0].renderer,
+                    image,
+                    box,
+                    camera,
+                    T[None],
+                    centre=mesh_centre(truck_bank().mesh),
+                    radius=mesh_radius(truck_bank().mesh),
+                    margin=truck_bank().settings.margin,
+                )
+                assert h.support == pytest.approx(float(support), abs=0.02)
+                assert h.evidence["support"] == h.support

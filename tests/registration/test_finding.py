@@ -11,9 +11,10 @@ import torch
 import curvireg_torch as cr
 from curvireg_torch.errors import ImageError, InvalidInputError
 from curvireg_torch.geometry import box_iou, rotation_error
+from curvireg_torch.location import Located
 from curvireg_torch.registration import RELIABLE, find, finding
 from curvireg_torch.registration.confidence import presence
-from curvireg_torch.registration.finding import Places, doubted
+from curvireg_torch.registration.finding import Places
 from curvireg_torch.registration.inputs import Item
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, scene
@@ -69,12 +70,14 @@ def test_a_place_that_is_not_sure_has_no_covariance(registrar):
     """The pose alone would be believed; where the object hardly is, it is a guess, and says no deviations."""
     image, box, _ = scene(5)
     given = registrar([image], box[None], CAMERA)[0]
-    sure = replace(given, hypotheses=tuple(replace(h, covariance=torch.eye(6)) for h in given.hypotheses))
-    assert doubted(sure, RELIABLE).covariance is not None
-    unsure = doubted(sure, RELIABLE - 0.01)
-    assert [h.covariance for h in unsure.hypotheses] == [None] * len(given.hypotheses)
-    assert unsure.confidence == RELIABLE - 0.01
+    known = tuple(replace(h, covariance=torch.eye(6, dtype=torch.float64)) for h in given.hypotheses)
+    sure = replace(given, hypotheses=known, confidence=RELIABLE)
+    assert sure.covariance is not None
+    assert sure.standard_deviations is not None
+    unsure = replace(sure, confidence=RELIABLE - 0.01)
     assert not unsure.reliable
+    assert unsure.covariance is None
+    assert unsure.standard_deviations is None
 
 
 def test_a_pose_that_left_the_photograph_is_of_nothing(registrar, monkeypatch):
@@ -108,6 +111,30 @@ def test_several_objects_of_one_photograph(registrar):
     assert torch.equal(results[0].found.boxes[:2], torch.stack([r.found.box for r in results]))
     with pytest.raises(InvalidInputError, match="instances: expected >= 1, got 0"):
         find(registrar, [image], instances=0)
+
+
+def test_places_that_lead_to_one_object_give_one_answer(registrar, monkeypatch):
+    """Two places beside each other are followed to the same truck, and two objects are asked for."""
+    image, box = placed(5, (60, 40), 0.9)
+    side = float((box[2:] - box[:2]).max())
+    beside = torch.stack([box - 0.36 * side, box + 0.36 * side]).float()
+    assert box_iou(beside[:1], beside[1:]) < 0.5, "places that the locator takes for two"
+    located = Located(beside, torch.tensor([9.0, 8.0]), torch.zeros(2, dtype=torch.long))
+    monkeypatch.setattr(registrar, "locator", _Proposing(located, registrar.locator.cells))
+    monkeypatch.setattr(finding, "posed_box", lambda *_: box.double())
+    results = find(registrar, [image], instances=2)[0]
+    assert len(results) == 1
+    assert torch.equal(results[0].found.box, box.double())
+
+
+class _Proposing:
+    """A locator that always proposes the same places."""
+
+    def __init__(self, located, cells):
+        self.located, self.cells = located, cells
+
+    def __call__(self, *_, **__):
+        return [self.located]
 
 
 def test_what_cannot_be_searched_takes_nothing_else_down(registrar):

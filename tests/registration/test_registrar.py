@@ -23,7 +23,7 @@ from curvireg_torch.geometry import rotation_from_viewpoint, symmetry_transforms
 from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import DEPTH_FIELDS, PRESETS, BankSettings, Pipeline
 from curvireg_torch.registration import RELIABLE, FailedRegistration, distinct_views, fit_contours
-from curvireg_torch.registration import registrar as registrar_module
+from curvireg_torch.registration import pose as pose_module
 from curvireg_torch.rendering import make_renderer, render_depth
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import CAMERA, SIZE, scene, truck_bank
@@ -246,7 +246,7 @@ def test_a_turn_that_nothing_shows_has_no_standard_deviation():
 
 @pytest.mark.parametrize("limit", [0.0, 1.01])
 def test_what_is_not_reliable_has_no_covariance(monkeypatch, limit):
-    monkeypatch.setattr(registrar_module, "RELIABLE", limit)
+    monkeypatch.setattr(pose_module, "RELIABLE", limit)
     image, box, _ = scene(0)
     result = Registrar(truck_bank(), hypotheses=2)([image], box[None], CAMERA)[0]
     assert (result.covariance is not None) == (limit == 0.0)
