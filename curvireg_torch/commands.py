@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from ._checks import check_square_pixels
 from ._choices import DEFAULT
 from ._files import probe_folder, write_file
 from .batch import (
@@ -126,7 +127,7 @@ def register(arguments: argparse.Namespace) -> None:
     chosen_pipeline(arguments)  # refused before anything is read
     field = None if arguments.field is None else LearnedCurvilinearSaliency(weights=arguments.field)
     if arguments.camera is not None:
-        camera_matrix(*arguments.camera)
+        check_square_pixels(camera_matrix(*arguments.camera), "--camera")
     if arguments.list is None and is_one_photograph(arguments.photos):
         _register_one(arguments, field)
     elif arguments.out is not None:

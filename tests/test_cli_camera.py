@@ -93,3 +93,18 @@ def test_one_camera_is_enough(capsys):
     with pytest.raises(SystemExit):
         main(["register", "a.jpg", "b.stl", "--json", "--camera", "exif", "--fov", "50"])
     assert "expected one of --camera" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        (["0", "260", "120", "90"], "FX, FY > 0"),
+        (["260", "-260", "120", "90"], "FX, FY > 0"),
+        (["260", "nan", "120", "90"], "finite"),
+        (["130", "260", "120", "90"], "--camera: expected square pixels"),
+    ],
+)
+def test_cameras_that_are_none(folder, capsys, camera, message):
+    files = [str(folder / "photos" / "0.png"), str(folder / "truck.safetensors")]
+    assert main(["register", *files, "--json", "--camera", *camera]) == 2
+    assert message in capsys.readouterr().err

@@ -5,9 +5,9 @@ import os
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import torch
 
-from .._checks import check_positive
+from .._checks import check_camera_matrix, check_positive, check_rotation
 from ..errors import InvalidInputError, MissingFileError
 from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name
 from ._json import finite_numbers, read_json
@@ -144,7 +144,12 @@ class BOPDataset(ObjectDataset):
             return "missing_annotation"
         rotation, translation = finite_numbers(entry.get("cam_R_m2c"), 9), finite_numbers(entry.get("cam_t_m2c"), 3)
         matrix = finite_numbers(camera.get("cam_K"), 9)
-        if rotation is None or translation is None or matrix is None or not _is_rotation(rotation):
+        if rotation is None or translation is None or matrix is None:
+            return "corrupt_annotation"
+        try:
+            check_rotation(torch.tensor(_rows(rotation), dtype=torch.float64), "cam_R_m2c")
+            check_camera_matrix(torch.tensor(_rows(matrix), dtype=torch.float64), "cam_K")
+        except InvalidInputError:
             return "corrupt_annotation"
         box = bop_box(info["bbox_obj"]) if "bbox_obj" in info else _UNKNOWN_BOX
         if box is None or box[0] == box[2] or box[1] == box[3]:
@@ -211,8 +216,3 @@ def entry_at(infos: object, index: int) -> dict[str, Any]:
 
 def _rows(values: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
     return values[:3], values[3:6], values[6:]
-
-
-def _is_rotation(values: tuple[float, ...]) -> bool:
-    R = np.array(values).reshape(3, 3)
-    return bool(np.abs(R @ R.T - np.eye(3)).max() < 1e-2 and np.linalg.det(R) > 0)

@@ -7,7 +7,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_same_device, check_tensor
+from .._checks import check_camera_matrix, check_same_device, check_tensor
 from ..errors import InvalidInputError
 from .blocks import Planes, in_blocks
 from .curvilinear import (
@@ -22,7 +22,7 @@ from .curvilinear import (
 )
 from .derivatives import central_derivatives, smooth
 from .learnable import check_width
-from .numerics import at_least_float32, safe_sqrt
+from .numerics import at_least_float32, readable, safe_sqrt
 
 __all__ = ["AverageShadingGradient", "HessianFrobeniusNorm", "average_shading_gradient", "hessian_frobenius_norm"]
 
@@ -80,6 +80,8 @@ def check_shading(
     """sigma and depth_scale."""
     if camera_matrix is not None:
         check_tensor(camera_matrix, "camera_matrix", (None,) * (camera_matrix.ndim == 3) + (3, 3))
+        if readable(camera_matrix):
+            check_camera_matrix(camera_matrix)
         if depth_scale is not None:
             raise InvalidInputError("depth_scale: has no meaning with a camera_matrix; leave one of them out")
     return check_width(sigma, "sigma", zero_ok=True), check_scale(depth_scale)

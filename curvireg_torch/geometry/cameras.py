@@ -5,12 +5,12 @@ import math
 import torch
 from torch import Tensor
 
+from .._checks import check_camera_matrix, check_pose
 from ..errors import InvalidInputError
 
 __all__ = [
     "camera_matrix",
     "camera_of_view",
-    "check_camera_matrix",
     "project_points",
     "projected_boxes",
     "rotation_towards",
@@ -53,23 +53,6 @@ def camera_of_view(fov: float, size: tuple[int, int]) -> Tensor:
     return camera_matrix(focal, focal, (W - 1) / 2, (H - 1) / 2, dtype=torch.float64)
 
 
-def check_camera_matrix(K: Tensor) -> None:
-    """Raise :class:`InvalidInputError` unless K is (..., 3, 3), finite, upper triangular, with focal lengths > 0."""
-    if K.shape[-2:] != (3, 3) or not K.is_floating_point():
-        raise InvalidInputError(
-            f"camera matrix: expected floating (..., 3, 3), got {K.dtype} of shape {tuple(K.shape)}"
-        )
-    if not bool(torch.isfinite(K).all()):
-        raise InvalidInputError("camera matrix: expected finite entries, got NaN or inf")
-    if not bool((K[..., 0, 0] > 0).all() and (K[..., 1, 1] > 0).all()):
-        raise InvalidInputError(
-            "camera matrix: expected focal lengths FX, FY > 0 (in pixels); check their order FX FY CX CY"
-        )
-    last = torch.tensor([0.0, 0.0, 1.0], dtype=K.dtype, device=K.device)
-    if not bool((K[..., 2, :] == last).all() and (K[..., 1, 0] == 0).all()):
-        raise InvalidInputError("camera matrix: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]]")
-
-
 def transform(R: Tensor, t: Tensor) -> Tensor:
     """(..., 4, 4) rigid transform from (..., 3, 3) and (..., 3)."""
     top = torch.cat([R, t[..., None]], dim=-1)
@@ -82,12 +65,16 @@ def project_points(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, ortho
 
     Args:
         points: (P, 3) or (N, P, 3) in model units.
-        T_cam_from_model: (N, 4, 4) or (4, 4).
-        K: (N, 3, 3) or (3, 3). An orthographic camera uses ``u = fx x + cx``, with fx in px per model unit.
+        T_cam_from_model: (N, 4, 4) or (4, 4), rigid.
+        K: (N, 3, 3) or (3, 3), without skew. An orthographic camera uses ``u = fx x + cx``, with fx in px per model
+            unit.
         orthographic: drop the division by z.
 
     Returns:
         (..., P, 2) pixel coordinates; pixel (0, 0) is the centre of the top-left pixel.
+
+    Raises:
+        InvalidInputError: a pose that is not rigid and finite, or an unusable camera matrix.
 
     Example:
         >>> K = camera_matrix(100.0, 100.0, 50.0, 50.0)
@@ -95,6 +82,13 @@ def project_points(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, ortho
         >>> project_points(torch.tensor([[1.0, 0.0, 0.0]]), T, K).tolist()
         [[100.0, 50.0]]
     """
+    check_pose(T_cam_from_model, "T_cam_from_model")
+    check_camera_matrix(K)
+    return projected(points, T_cam_from_model, K, orthographic=orthographic)
+
+
+def projected(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False) -> Tensor:
+    """:func:`project_points` without its checks, for loops over poses that the library has made."""
     cam = points @ T_cam_from_model[..., :3, :3].mT + T_cam_from_model[..., None, :3, 3]
     xy = cam[..., :2] if orthographic else cam[..., :2] / cam[..., 2:]
     return xy @ K[..., :2, :2].mT + K[..., None, :2, 2]
@@ -105,8 +99,12 @@ def projected_boxes(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orth
 
     Points must lie in front of a perspective camera.
     """
-    uv = project_points(points, T_cam_from_model, K, orthographic=orthographic)
-    return torch.cat([uv.amin(dim=-2), uv.amax(dim=-2)], dim=-1)
+    return boxes_around(project_points(points, T_cam_from_model, K, orthographic=orthographic))
+
+
+def boxes_around(pixels: Tensor) -> Tensor:
+    """(..., 4) smallest boxes x0, y0, x1, y1 that hold (..., P, 2) pixel coordinates."""
+    return torch.cat([pixels.amin(dim=-2), pixels.amax(dim=-2)], dim=-1)
 
 
 def rotation_towards(rays: Tensor) -> Tensor:

@@ -13,9 +13,9 @@ import torch
 from kornia.geometry import conversions as kornia_conversions
 from torch import Tensor
 
-from .._checks import check_tensor
+from .._checks import check_camera_matrix, check_pose, check_rotation, check_tensor
 from ..errors import InvalidInputError
-from .cameras import check_camera_matrix, transform
+from .cameras import transform
 
 __all__ = [
     "axis_angle_from_rotation",
@@ -45,13 +45,13 @@ def opengl_from_opencv(T_cam_from_model: Tensor) -> Tensor:
         which trimesh, pyrender and Blender ask for.
 
     Raises:
-        InvalidInputError: not floating (..., 4, 4).
+        InvalidInputError: not rigid, finite and floating (..., 4, 4).
 
     Example:
         >>> opengl_from_opencv(torch.eye(4)).diagonal().tolist()
         [1.0, -1.0, -1.0, 1.0]
     """
-    check_tensor(T_cam_from_model, "T_cam_from_model", (None,) * (T_cam_from_model.ndim - 2) + (4, 4))
+    check_pose(T_cam_from_model, "T_cam_from_model")
     return _flip(T_cam_from_model, (1.0, -1.0, -1.0, 1.0))
 
 
@@ -88,11 +88,11 @@ def opengl_projection(
         raise InvalidInputError(f"size: expected (H, W) >= 1, got {size}")
     if not near < far or (near <= 0 and not orthographic):
         raise InvalidInputError(f"near, far: expected 0 < near < far, got {near}, {far}")
-    fx, fy, skew = K[..., 0, 0], K[..., 1, 1], K[..., 0, 1]
+    fx, fy = K[..., 0, 0], K[..., 1, 1]
     # The pixel's centre lies half a pixel from the corner that OpenGL counts from.
     x0, y0 = 2.0 * (K[..., 0, 2] + 0.5) / W - 1.0, 1.0 - 2.0 * (K[..., 1, 2] + 0.5) / H
     P = torch.zeros(*K.shape[:-2], 4, 4, dtype=K.dtype, device=K.device)
-    P[..., 0, 0], P[..., 0, 1], P[..., 1, 1] = 2.0 * fx / W, -2.0 * skew / W, 2.0 * fy / H
+    P[..., 0, 0], P[..., 1, 1] = 2.0 * fx / W, 2.0 * fy / H
     if orthographic:
         P[..., 0, 3], P[..., 1, 3] = x0, y0
         P[..., 2, 2], P[..., 2, 3] = -2.0 / (far - near), -(far + near) / (far - near)
@@ -116,21 +116,21 @@ def pytorch3d_from_opencv(T_cam_from_model: Tensor) -> tuple[Tensor, Tensor]:
         R (..., 3, 3), T (..., 3) with ``x_cam = x R + T`` for row vectors x; x left, y up, z forward.
 
     Raises:
-        InvalidInputError: not floating (..., 4, 4).
+        InvalidInputError: not rigid, finite and floating (..., 4, 4).
 
     Example:
         >>> R, T = pytorch3d_from_opencv(transform(torch.eye(3), torch.tensor([1.0, 2.0, 3.0])))
         >>> R.diagonal().tolist(), T.tolist()
         ([-1.0, -1.0, 1.0], [-1.0, -2.0, 3.0])
     """
-    check_tensor(T_cam_from_model, "T_cam_from_model", (None,) * (T_cam_from_model.ndim - 2) + (4, 4))
+    check_pose(T_cam_from_model, "T_cam_from_model")
     flipped = _flip(T_cam_from_model, (-1.0, -1.0, 1.0, 1.0))
     return flipped[..., :3, :3].mT.contiguous(), flipped[..., :3, 3].contiguous()
 
 
 def opencv_from_pytorch3d(R: Tensor, T: Tensor) -> Tensor:
     """Inverse of :func:`pytorch3d_from_opencv`: (..., 3, 3) and (..., 3) to (..., 4, 4)."""
-    check_tensor(R, "R", (None,) * (R.ndim - 2) + (3, 3))
+    check_rotation(R, "R")
     check_tensor(T, "T", (*R.shape[:-2], 3))
     return _flip(transform(R.mT, T), (-1.0, -1.0, 1.0, 1.0))
 
@@ -142,7 +142,7 @@ def quaternion_from_rotation(R: Tensor) -> Tensor:
         >>> quaternion_from_rotation(torch.eye(3)).tolist()
         [1.0, 0.0, 0.0, 0.0]
     """
-    check_tensor(R, "R", (None,) * (R.ndim - 2) + (3, 3))
+    check_rotation(R, "R")
     quaternion: Tensor = kornia_conversions.rotation_matrix_to_quaternion(R.contiguous())
     return quaternion
 
@@ -166,7 +166,6 @@ def axis_angle_from_rotation(R: Tensor) -> Tensor:
         >>> axis_angle_from_rotation(torch.diag(torch.tensor([1.0, -1.0, -1.0]))).abs().tolist()[0]
         3.1415927410125732
     """
-    check_tensor(R, "R", (None,) * (R.ndim - 2) + (3, 3))
     axis_angle: Tensor = kornia_conversions.quaternion_to_axis_angle(quaternion_from_rotation(R))
     return axis_angle
 

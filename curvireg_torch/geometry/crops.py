@@ -1,11 +1,12 @@
 """Boxes of photographs to square crops of fixed size, with the matching change of the camera matrix."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from .._checks import check_positive, check_tensor
+from .._checks import as_boxes, check_positive, check_tensor
 from ..errors import InvalidInputError
 
 __all__ = [
@@ -101,18 +102,22 @@ def image_transforms(squares: Tensor, size: int) -> Tensor:
 
 
 def crop_images(
-    images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int = 256, margin: float = 0.1
+    images: Tensor | Sequence[Tensor], boxes: Any, *, size: int = 256, margin: float = 0.1
 ) -> tuple[Tensor, Tensor]:
     """Square crops around boxes, resampled bilinearly, with a widened triangle (no aliasing) when shrinking.
 
+    A pixel of an image that is NaN or infinite is missing: pixels of the crop that it has a share in are NaN, no
+    others are. Half types are resampled in float32.
+
     Args:
         images: (B, C, H, W), or a list of (C, H, W) of different sizes. Pixels outside an image repeat its border.
-        boxes: (B, 4) x0, y0, x1, y1 in px; may stick out of the image.
+        boxes: (B, 4) x0, y0, x1, y1 in px, a tensor, an array or lists; may stick out of the image.
         size: side of the crops in px.
         margin: room around the box on each side, as a share of its longer side.
 
     Returns:
-        crops (B, C, size, size) and (B, 3, 3) transforms A, ``A @ K`` being the crops' camera matrices.
+        crops (B, C, size, size) in the dtype of the images, and (B, 3, 3) transforms A, at least float32, ``A @ K``
+        being the crops' camera matrices.
 
     Raises:
         InvalidInputError: wrong shapes, or a box that is empty or wholly outside its image.
@@ -127,23 +132,32 @@ def crop_images(
     else:
         for image in images:
             check_tensor(image, "images", (None, None, None))
-    boxes = boxes.float() if isinstance(boxes, Tensor) and not boxes.is_floating_point() else boxes
+    boxes = as_boxes(boxes, len(images))
     check_boxes(boxes, [(int(image.shape[-2]), int(image.shape[-1])) for image in images])
     squares = square_boxes(boxes, margin)
     A = crop_transforms(squares, size)
     if isinstance(images, Tensor):
-        return _resample(images, squares.to(images), size), A
-    crops = [_resample(image[None], squares[i : i + 1].to(image), size) for i, image in enumerate(images)]
+        return _resample(images, squares, size), A
+    crops = [_resample(image[None], squares[i : i + 1], size) for i, image in enumerate(images)]
     if not crops:
         raise InvalidInputError("images: expected at least one image in the list")
     return torch.cat(crops), A
 
 
 def _resample(images: Tensor, squares: Tensor, size: int) -> Tensor:
+    """(B, C, size, size) of (B, C, H, W) images, in their dtype; NaN where a missing pixel has a share."""
     H, W = images.shape[-2:]
+    # Half types cannot name the pixels of a photograph: bfloat16 has eight bits.
+    x = images.to(torch.promote_types(images.dtype, torch.float32))
+    squares = squares.to(x)
     rows = _triangle_weights(squares[:, 1], squares[:, 3], size, H)[:, None]
     columns = _triangle_weights(squares[:, 0], squares[:, 2], size, W)[:, None]
-    return rows @ (images @ columns.mT)
+    crops = rows @ (x @ columns.mT)
+    if not bool(crops.isfinite().all()):  # 0 times NaN is NaN: one missing pixel spoils its row and column
+        lost = ~x.isfinite()
+        share = rows @ (lost.to(x) @ columns.mT)
+        crops = torch.where(share > 0, torch.nan, rows @ (torch.where(lost, 0.0, x) @ columns.mT))
+    return crops.to(images.dtype)
 
 
 def _triangle_weights(low: Tensor, high: Tensor, size: int, length: int) -> Tensor:

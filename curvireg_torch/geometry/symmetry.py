@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._checks import check_positive
+from .._checks import check_positive, check_symmetries
 from ..errors import InvalidInputError
 from .views import ViewSphere
 
@@ -62,7 +62,7 @@ def views_without_symmetric(views: ViewSphere, symmetries: Tensor, *, tolerance:
 
     Args:
         views: N views.
-        symmetries: (S, 4, 4) of the model, from :func:`symmetry_transforms`.
+        symmetries: (S, 4, 4) or (S, 3, 3) of the model, from :func:`symmetry_transforms`.
         tolerance: degrees within which two views count as the same. A regular grid needs no more than half a step of
             the symmetries (0.6 degrees for BOP's 315 turns); views of a scattered sampling never coincide: give its
             covering radius.
@@ -71,7 +71,7 @@ def views_without_symmetric(views: ViewSphere, symmetries: Tensor, *, tolerance:
         K <= N views, in their order.
 
     Raises:
-        InvalidInputError: symmetries of another shape or a bad tolerance.
+        InvalidInputError: symmetries of another shape or that are not rigid, or a bad tolerance.
 
     Example:
         >>> from curvireg_torch.geometry import sample_views
@@ -81,8 +81,7 @@ def views_without_symmetric(views: ViewSphere, symmetries: Tensor, *, tolerance:
         (72, 2)
     """
     check_positive(tolerance, "tolerance", zero_ok=True)
-    if symmetries.ndim != 3 or symmetries.shape[1:] != (4, 4):
-        raise InvalidInputError(f"symmetries: expected shape (S, 4, 4), got {tuple(symmetries.shape)}")
+    check_symmetries(symmetries)
     R = views.rotations.double()
     turns = symmetries[:, :3, :3].to(R)
     # |A - B|_F = 2 sqrt(2) sin(angle / 2); float32 angles carry about 1e-5 degrees.

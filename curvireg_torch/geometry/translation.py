@@ -3,7 +3,9 @@
 import torch
 from torch import Tensor
 
-from .cameras import projected_boxes, rotation_towards, transform
+from .._checks import check_camera_matrix, check_finite, check_rotation
+from ..errors import InvalidInputError
+from .cameras import boxes_around, projected, rotation_towards, transform
 
 __all__ = ["place_view", "translation_from_box"]
 
@@ -25,6 +27,9 @@ def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tenso
 
     Returns:
         (..., 3) float64 translation in model units, the object in front of the camera.
+
+    Raises:
+        InvalidInputError: a matrix that is no rotation, an empty box, or an unusable camera matrix.
 
     Example:
         >>> cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
@@ -56,6 +61,11 @@ def place_view(points: Tensor, view_rotation: Tensor, box: Tensor, K: Tensor) ->
 def _filled(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor, *, towards: bool) -> tuple[Tensor, Tensor]:
     """Rotation and translation of :func:`translation_from_box`; of :func:`place_view` where the view turns ``towards``
     the ray."""
+    check_finite(rotation, "rotation")
+    check_rotation(rotation, "rotation")
+    check_camera_matrix(K)
+    if not bool((box[..., 2:] > box[..., :2]).all() and box.isfinite().all()):
+        raise InvalidInputError(f"box: expected finite X0 < X1 and Y0 < Y1, got {box.tolist()}")
     points, view, box, K = (v.detach().cpu().double() for v in (points, rotation, box, K))
     centre = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
     extent = torch.linalg.vector_norm(points - centre, dim=1).max()
@@ -66,7 +76,7 @@ def _filled(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor, *, towards
     position = (inverse @ torch.nn.functional.pad(middle, (0, 1), value=1.0)[..., None])[..., 0] * z[..., None]
     for _ in range(_ITERATIONS):
         R = rotation_towards(position) @ view if towards else view
-        low, high = projected_boxes(points - centre, transform(R, position), K).split(2, dim=-1)
+        low, high = boxes_around(projected(points - centre, transform(R, position), K)).split(2, dim=-1)
         zoom = ((high - low) * size).sum(dim=-1, keepdim=True) / (size * size).sum(dim=-1, keepdim=True)
         shift = torch.nn.functional.pad(middle - 0.5 * (low + high), (0, 1))
         # Move sideways at the object's depth, then along its ray; never closer than its own extent.

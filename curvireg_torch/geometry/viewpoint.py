@@ -11,8 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from .._checks import check_tensor
-from ..errors import InvalidInputError
+from .._checks import check_rotation
 
 __all__ = ["rotation_error", "rotation_from_viewpoint", "viewpoint_from_rotation"]
 
@@ -66,13 +65,15 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         Where R is so near a pole that only rounding separates them, the azimuth is arbitrary and theta fits it. The
         three angles give R back everywhere, within 5e-5 rad in float32.
 
+    Raises:
+        InvalidInputError: another shape or dtype, or a matrix that is no rotation.
+
     Example:
         >>> a, e, t = viewpoint_from_rotation(rotation_from_viewpoint(30.0, 20.0, -10.0))
         >>> round(float(a)), round(float(e)), round(float(t))
         (30, 20, -10)
     """
-    if R.shape[-2:] != (3, 3) or not R.is_floating_point():
-        raise InvalidInputError(f"R: expected a floating (..., 3, 3) tensor, got {R.dtype} of shape {tuple(R.shape)}")
+    check_rotation(R, "R")
     # The direction to the camera's centre is -R[2].
     cx, cy, cz = -R[..., 2, 0], -R[..., 2, 1], -R[..., 2, 2]
     planar = torch.hypot(cx, cy)
@@ -97,16 +98,19 @@ def rotation_error(R1: Tensor, R2: Tensor) -> Tensor:
     Computed as ``2 asin(|R1 - R2|_F / (2 sqrt 2))``, the same angle without the loss of digits of ``acos`` near 0.
 
     Args:
-        R1, R2: (..., 3, 3), broadcast against each other.
+        R1, R2: (..., 3, 3), broadcast against each other; NaN for a missing estimate.
 
     Returns:
-        (...) degrees in [0, 180].
+        (...) degrees in [0, 180]; NaN for a missing estimate.
+
+    Raises:
+        InvalidInputError: another shape or dtype, or a matrix that is no rotation.
 
     Example:
         >>> round(float(rotation_error(rotation_from_viewpoint(0.0, 0.0), rotation_from_viewpoint(30.0, 0.0))), 3)
         30.0
     """
-    for name, R in (("R1", R1), ("R2", R2)):
-        check_tensor(R, name, (None,) * (R.ndim - 2) + (3, 3))
+    check_rotation(R1, "R1")
+    check_rotation(R2, "R2")
     chord = torch.linalg.matrix_norm(R1 - R2) / (2.0 * math.sqrt(2.0))
     return torch.rad2deg(2.0 * torch.asin(chord.clamp(max=1.0)))

@@ -24,6 +24,7 @@ def describe(images: Tensor, backbone: Backbone) -> Tensor:
 
     Args:
         images: (N, 1 or 3, S, S) in [0, 1]; photographs in colour, views from :func:`curvireg_torch.rendering.shade`.
+            Missing pixels (NaN or infinite) are filled from around them.
         backbone: where they are described.
 
     Returns:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from .._checks import check_colour_image
 from ..errors import InvalidInputError, MissingDependencyError, MissingFileError
+from ..filters.inputs import filled
 
 __all__ = ["CHANNELS", "PACKAGE", "SHA256", "STRIDES", "Backbone"]
 
@@ -78,7 +79,7 @@ class Backbone(nn.Module):
     ours. For inference: parameters ask for no gradient, images may.
 
     Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 40, ceil(H / 8), ceil(W / 8)) and
-    (B, 112, ceil(H / 16), ceil(W / 16)), float32.
+    (B, 112, ceil(H / 16), ceil(W / 16)), float32. Missing pixels (NaN or infinite) are filled from around them.
 
     Raises:
         MissingDependencyError, MissingFileError: the package, or its file, is not installed.
@@ -117,7 +118,7 @@ class Backbone(nn.Module):
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         check_colour_image(image)
-        x = 2.0 * image.to(self.stem.weight.dtype).expand(-1, 3, -1, -1) - 1.0
+        x = 2.0 * filled(image.to(self.stem.weight.dtype)).expand(-1, 3, -1, -1) - 1.0
         x = F.relu6(self.stem(x.contiguous(memory_format=torch.channels_last)), inplace=True)
         kept = []
         for i, block in enumerate(self.blocks):

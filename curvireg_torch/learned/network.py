@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from .._checks import check_colour_image
 from .._files import write_tensors
 from ..errors import InvalidInputError, MissingFileError
+from ..filters.inputs import filled, may_lack_pixels, missing
 from ..filters.numerics import at_least_float32, floor, safe_sqrt
 
 __all__ = ["FieldNetwork", "LearnedCurvilinearSaliency", "doubled_angle", "halved_angle"]
@@ -122,7 +123,8 @@ class LearnedCurvilinearSaliency(nn.Module):
 
     Shape:
         Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 2, H, W), sign free (x >= 0), without unit. Photographs
-        of another size than ``WORK_SIZE`` are resampled and the field enlarged again. dtype kept. Differentiable.
+        of another size than ``WORK_SIZE`` are resampled and the field enlarged again. Missing pixels (NaN or infinite)
+        are filled from around them, and the field is 0 there. dtype kept. Differentiable.
 
     Raises:
         InvalidInputError: wrong shape or dtype, or a file with other weights than those of this network.
@@ -145,7 +147,8 @@ class LearnedCurvilinearSaliency(nn.Module):
         self.eval()
 
     def forward(self, image: Tensor) -> Tensor:
-        return halved_angle(self._answer(image)[:, :2]).to(image.dtype)
+        field = halved_angle(self._answer(image)[:, :2]).to(image.dtype)
+        return field.masked_fill(missing(image).any(dim=1, keepdim=True), 0.0) if may_lack_pixels(image) else field
 
     def mask(self, image: Tensor) -> Tensor:
         """(B, 1, H, W) probability that a pixel shows the object in the middle, hidden parts included."""
@@ -156,7 +159,7 @@ class LearnedCurvilinearSaliency(nn.Module):
         H, W = image.shape[-2:]
         zoom = min(WORK_SIZE / min(H, W), 8 * WORK_SIZE / max(H, W))  # slivers do not become wide pictures
         size = [max(1, round(side * zoom / _STRIDE)) * _STRIDE for side in (H, W)]
-        x = image.to(self.network.head.weight.dtype).expand(-1, 3, -1, -1)
+        x = filled(image.to(self.network.head.weight.dtype)).expand(-1, 3, -1, -1)
         if size != [H, W]:
             x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=True)
         return F.interpolate(self.network(x), (H, W), mode="bilinear", align_corners=False)

@@ -8,8 +8,8 @@ import torch.nn.functional as F
 from kornia.geometry.bbox import nms
 from torch import Tensor, nn
 
+from .._checks import as_numbers, check_camera_matrix, check_photograph, check_pixels, check_square_pixels
 from ..errors import InvalidInputError
-from ..geometry.cameras import check_camera_matrix
 from ..geometry.crops import crop_transforms, square_boxes
 from ..matching import ViewBank, ViewDescriber, ViewMatcher
 from ..pipeline import Pipeline
@@ -107,6 +107,7 @@ class Locator(nn.Module):
         Raises:
             InvalidInputError: wrong shape or dtype, an image of one px, or a ``distance`` without cameras or not
                 0 < MIN <= MAX.
+            ImageError: missing pixels (NaN or infinite), or pixels outside [0, 1].
         """
         known = camera_matrices is not None and all(K is not None for K in camera_matrices)
         check_distance(distance, with_cameras=known)
@@ -114,14 +115,15 @@ class Locator(nn.Module):
         for i, image in enumerate(images):
             K = None if camera_matrices is None else camera_matrices[i]
             if K is not None:
+                K = as_numbers(K, "camera_matrices", least=torch.float64)
                 check_camera_matrix(K)
+                check_square_pixels(K)
             focal = None if K is None else float(K[0, 0])
             out.append(self._one(image, focal, distance))
         return out
 
     def _one(self, image: Tensor, focal: float | None, distance: tuple[float, float] | None) -> Located:
-        if not isinstance(image, Tensor) or image.ndim != 3 or image.shape[0] not in (1, 3) or min(image.shape) < 1:
-            raise InvalidInputError("images: expected (C, H, W) tensors, C = 1 or 3")
+        check_photograph(image)
         known = self._templates
         reach = (known.boxes[:, 2:] - known.boxes[:, :2]).amax(dim=1)
         scales = self._scales(image, focal, distance, float(reach.median()))
@@ -129,7 +131,9 @@ class Locator(nn.Module):
         largest: Tensor | None = None  # and first: the others are made of it
         for scale in scales:
             h, w = (max(1, round(side * scale / 16)) * 16 for side in image.shape[-2:])
-            largest = _resized(image, (h, w)).to(self.matcher.device) if largest is None else largest
+            if largest is None:
+                largest = _resized(image, (h, w)).to(self.matcher.device)
+                check_pixels(largest, "of the photograph")  # the few of the small copy: what is missing spreads to them
             maps.append(self._agreement(_resized(largest, (h, w))[None]))
             sizes.append((w / image.shape[-1], h / image.shape[-2]))
             fits = torch.ones_like(reach, dtype=torch.bool)

@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from .._checks import check_symmetries
+
 __all__ = ["distinct_views"]
 
 
@@ -32,8 +34,11 @@ def distinct_views(
         >>> distinct_views(torch.tensor([1, 0]), R, count=2, symmetries=R).tolist()
         [1]
     """
-    turns = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
-    turns = turns.to(rotations)
+    if symmetries is None:
+        symmetries = torch.eye(3)[None]
+    else:
+        check_symmetries(symmetries)
+    turns = symmetries[:, :3, :3].to(rotations)
     kept: list[int] = []
     open_views = torch.ones(len(rotations), dtype=torch.bool, device=order.device)
     while len(kept) < count:

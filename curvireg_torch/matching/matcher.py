@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from .._checks import as_boxes, check_photograph, check_pixels
 from .._threads import map_on_threads
 from ..descriptors import field_points
 from ..errors import InvalidInputError
@@ -157,33 +158,36 @@ class ViewMatcher(nn.Module):
         """Where photographs are described and compared: that of the bank."""
         return self.bank.device
 
-    def crop(self, images: Tensor | Sequence[Tensor], boxes: Tensor) -> tuple[Tensor, Tensor]:
+    def crop(self, images: Tensor | Sequence[Tensor], boxes: Any) -> tuple[Tensor, Tensor]:
         """(B, C, S, S) crops and (B, 3, 3) crop transforms, cut as the bank's views are."""
         settings = self.bank.settings
         return crop_images(images, boxes, size=settings.image_size, margin=settings.margin)
 
-    def forward(self, images: Tensor | Sequence[Tensor], boxes: Tensor) -> Ranking:
+    def forward(self, images: Tensor | Sequence[Tensor], boxes: Any) -> Ranking:
         """Rank all views.
 
         Args:
             images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, floating in [0, 1] or uint8, on any device.
-            boxes: (B, 4) x0, y0, x1, y1 in px.
+            boxes: (B, 4) x0, y0, x1, y1 in px, a tensor, an array or lists.
 
         Raises:
             InvalidInputError: wrong shape, dtype, as many boxes as images not given, or an unusable box.
+            ImageError: missing (NaN or infinite) pixels in the crop of a box, or pixels outside [0, 1]. Missing pixels
+                beside it do not matter.
         """
-        if len(images) != len(boxes):
-            raise InvalidInputError(f"boxes: expected one for each of {len(images)} images, got {len(boxes)}")
+        boxes = as_boxes(boxes, len(images))
         parts = [
             self.rank(self.query(images[i : i + self.chunk_size], boxes[i : i + self.chunk_size]))
             for i in range(0, max(1, len(images)), self.chunk_size)
         ]
         return Ranking.cat(parts)
 
-    def query(self, images: Tensor | Sequence[Tensor], boxes: Tensor) -> Photographs:
-        """Crop and describe photographs, see :meth:`forward`."""
+    def query(self, images: Tensor | Sequence[Tensor], boxes: Any) -> Photographs:
+        """Crop and describe photographs, see :meth:`forward`; missing pixels are refused by :meth:`rank`."""
         settings = self.bank.settings
-        boxes = boxes.to(self.device, torch.float32)
+        boxes = as_boxes(boxes, len(images)).to(self.device, torch.float32)
+        for image in images:
+            check_photograph(image)
         images = [image.to(self.device) for image in images]
         several = slack_boxes(boxes, self.pipeline.slack)
         regions = crop_regions(images, several, size=settings.image_size, margin=settings.margin)
@@ -207,7 +211,12 @@ class ViewMatcher(nn.Module):
         )
 
     def rank(self, query: Photographs) -> Ranking:
-        """Compare described photographs with all views."""
+        """Compare described photographs with all views.
+
+        Raises:
+            ImageError: missing pixels in the crop of a box, or pixels outside [0, 1].
+        """
+        check_pixels(query.crops, "of the box")
         early = [t for t in self.pipeline.terms if not isinstance(t, LateTerm)]
         terms = {t.name: self._comparisons[t.name](query) for t in early}
         log = torch.stack([t.weight * t.log_score(terms[t.name]) for t in early]).sum(dim=0)

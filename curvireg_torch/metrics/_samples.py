@@ -22,12 +22,6 @@ def shown(x: object) -> str:
     return f"{x.dtype} of shape {tuple(x.shape)}" if isinstance(x, Tensor) else type(x).__name__
 
 
-def check_finite(x: Tensor, name: str) -> None:
-    """``x``, which is true or given and not estimated, has no NaN and no inf."""
-    if not bool(x.isfinite().all()):
-        raise InvalidInputError(f"{name}: expected finite numbers, got NaN or inf")
-
-
 def or_inf(errors: Tensor, valid: Tensor) -> Tensor:
     """``errors``, ``inf`` where they are not valid."""
     return torch.where(valid, errors, torch.full_like(errors, torch.inf))

@@ -22,11 +22,11 @@ from operator import itemgetter
 import torch
 from torch import Tensor
 
-from curvireg_torch._checks import check_positive, check_same_device, check_tensor
+from curvireg_torch._checks import check_finite, check_positive, check_rotation, check_same_device, check_tensor
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import box_iou, viewpoint_from_rotation
 
-from ._samples import check_finite, shown
+from ._samples import shown
 from .viewpoint import same_bin, symmetric_rotation_error
 
 __all__ = [
@@ -51,7 +51,7 @@ class Objects:
         rotations: (M, 3, 3) model -> camera.
 
     Raises:
-        InvalidInputError: wrong shape, dtype or device.
+        InvalidInputError: wrong shape, dtype or device, or a matrix that is no rotation.
     """
 
     image: Tensor
@@ -66,6 +66,7 @@ class Objects:
         check_tensor(self.rotations, "rotations", (n, 3, 3))
         check_same_device(self.boxes, self.image, "boxes")
         check_same_device(self.rotations, self.image, "rotations")
+        check_rotation(self.rotations, "rotations")
 
 
 @dataclass(frozen=True)

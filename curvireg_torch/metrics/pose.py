@@ -16,19 +16,22 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from curvireg_torch._checks import check_positive, check_same_device, check_tensor
+from curvireg_torch._checks import (
+    check_camera_matrix,
+    check_finite,
+    check_pose,
+    check_positive,
+    check_same_device,
+    check_tensor,
+)
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry.cameras import check_camera_matrix
 
-from ._samples import check_errors, check_finite, or_inf, per_item, share
+from ._samples import check_errors, or_inf, per_item, share
 
 __all__ = ["add_error", "add_recall", "adds_error", "mspd_error", "mspd_recall", "mssd_error", "mssd_recall"]
 
 _CHUNK = 1 << 22
 """Points transformed at a time: 50 MB of float32 for their coordinates."""
-
-_RIGID = 1e-2
-"""Largest entry of R R' - I that passes: poses in files are rounded, and half precision rounds to 5e-4."""
 
 _MSSD_THRESHOLDS = tuple(step / 20.0 for step in range(1, 11))
 _MSPD_THRESHOLDS = tuple(5.0 * step for step in range(1, 11))
@@ -238,26 +241,13 @@ def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tenso
     check_same_device(points, T_est, "points")
     if len(points) == 0:
         raise InvalidInputError("points: expected at least one point, got none")
-    check_finite(T_gt, "T_gt")
     check_finite(points, "points")
+    check_pose(T_gt, "T_gt")
     T_gt = T_gt.to(T_est.dtype)
     found = T_est.isfinite().flatten(1).all(1)
     T_est = torch.where(found.view(-1, 1, 1), T_est, T_gt)
-    for name, T in (("T_est", T_est), ("T_gt", T_gt)):
-        _check_rigid(T, name)
+    check_pose(T_est, "T_est")
     return T_est, T_gt, points.to(T_est.dtype), found
-
-
-def _check_rigid(T: Tensor, name: str) -> None:
-    T = T.detach().double()
-    eye = torch.eye(4, dtype=T.dtype, device=T.device)
-    off = (T[:, :3, :3] @ T[:, :3, :3].mT - eye[:3, :3]).abs().amax((1, 2)) > _RIGID
-    bad = int((off | (torch.linalg.det(T[:, :3, :3]) <= 0) | (T[:, 3] != eye[3]).any(1)).sum())
-    if bad:
-        raise InvalidInputError(
-            f"{name}: expected rigid transforms [[R, t], [0, 0, 0, 1]], got {bad} that are not; "
-            "a missing estimate is NaN"
-        )
 
 
 def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:
@@ -266,7 +256,7 @@ def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:
     check_tensor(symmetries, "symmetries", (None, 4, 4))
     if len(symmetries) == 0:
         raise InvalidInputError("symmetries: expected at least the identity, got none")
-    check_finite(symmetries, "symmetries")
+    check_pose(symmetries, "symmetries")
     return symmetries.to(like)
 
 

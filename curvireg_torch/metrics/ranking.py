@@ -12,11 +12,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from curvireg_torch._checks import check_last_axes, check_positive, check_same_device, check_tensor
+from curvireg_torch._checks import check_finite, check_last_axes, check_positive, check_same_device, check_tensor
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint
 
-from ._samples import check_finite, or_inf, share, shown
+from ._samples import or_inf, share, shown
 
 __all__ = ["closest_view", "pose_parameter_errors", "rank_precision", "viewpoint_differences"]
 

@@ -15,11 +15,19 @@ import math
 import torch
 from torch import Tensor
 
-from curvireg_torch._checks import check_last_axes, check_option, check_positive, check_same_device, check_tensor
+from curvireg_torch._checks import (
+    check_finite,
+    check_last_axes,
+    check_option,
+    check_positive,
+    check_rotation,
+    check_same_device,
+    check_tensor,
+)
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_error
 
-from ._samples import check_errors, check_finite, or_inf, share
+from ._samples import check_errors, or_inf, share
 
 __all__ = [
     "AVP_BINS",
@@ -107,6 +115,7 @@ def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) ->
     check_tensor(symmetries, "symmetries", (None, 3, 3))
     check_same_device(symmetries, R_gt, "symmetries")
     check_finite(symmetries, "symmetries")
+    check_rotation(symmetries, "symmetries")
     plain = rotation_error(R_est, R_gt)
     turned = rotation_error(R_est.unsqueeze(-3), R_gt.unsqueeze(-3) @ symmetries.to(R_gt.dtype))
     return or_inf(torch.cat([plain.unsqueeze(-1), turned], -1).amin(-1), found)
@@ -151,6 +160,8 @@ def _found(R_est: Tensor, R_gt: Tensor) -> Tensor:
     for name, R in (("R_est", R_est), ("R_gt", R_gt)):
         check_last_axes(R, name, (3, 3))
     check_same_device(R_est, R_gt, "R_est")
+    check_rotation(R_gt, "R_gt")
+    check_rotation(R_est, "R_est")
     check_finite(R_gt, "R_gt")
     return R_est.isfinite().flatten(-2).all(-1)
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..geometry.viewpoint import rotation_error
 from ..matching import Ranking
 from .calibration import CALIBRATION
 from .verify import EVIDENCE
@@ -103,7 +102,8 @@ def ranking_evidence(ranking: Ranking, rotations: Tensor, *, symmetries: Tensor 
     scores, best = ranking.scores.double(), ranking.order[:, :1]
     turns = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
     alike = rotations[best] @ turns.to(rotations)  # (B, K, 3, 3)
-    near = torch.stack([rotation_error(same[:, None], rotations[None]).amin(dim=0) <= _APART for same in alike])
+    traces = (alike.flatten(2) @ rotations.flatten(1).T).amax(dim=1)
+    near = traces >= 1.0 + 2.0 * math.cos(math.radians(_APART)) - 1e-5
     tiny = 1e-300  # of scores that are all 0
     leader = scores.gather(1, best).clamp(min=tiny)
     rival = scores.masked_fill(near, 0.0).amax(dim=1, keepdim=True)

@@ -2,15 +2,24 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .._checks import check_positive, check_tensor
+from .._checks import (
+    as_boxes,
+    as_numbers,
+    check_camera_matrix,
+    check_photograph,
+    check_pose,
+    check_positive,
+    check_tensor,
+)
 from ..errors import InvalidInputError
+from ..filters.inputs import filled
 from ..geometry import crop_images
-from ..geometry.cameras import check_camera_matrix
 from ..rendering import DepthRenderer
 from .calibration import covariance_scale
 from .contour_covariance import pose_covariance
@@ -77,8 +86,8 @@ class ContourFit:
 def fit_contours(
     renderer: DepthRenderer,
     images: Tensor | Sequence[Tensor],
-    boxes: Tensor,
-    camera_matrices: Tensor,
+    boxes: Any,
+    camera_matrices: Any,
     starts: Tensor,
     *,
     photograph: Tensor | None = None,
@@ -113,9 +122,10 @@ def fit_contours(
     Args:
         renderer: of the mesh.
         images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, in [0, 1] or uint8; or one photograph (C, H, W).
+            Missing pixels (NaN or infinite) are filled from around them.
         boxes: (B, 4) x0, y0, x1, y1 in px: where to look; need not be exact. (4,) for one photograph.
         camera_matrices: (B, 3, 3) or (3, 3) in px; or (N, 3, 3), one of each start.
-        starts: (N, 4, 4) poses, within about 15 degrees.
+        starts: (N, 4, 4) rigid poses, within about 15 degrees.
         photograph: (N,) index of the photograph that a start belongs to; may be left out for one photograph.
         centre, radius: of the object, (3,) and model units.
         margin: room around the box, as a share of its longer side.
@@ -123,7 +133,7 @@ def fit_contours(
             themselves alone; the others come back as those rounds left them. None fits all: each as if it were alone.
 
     Raises:
-        InvalidInputError: wrong shapes, a pose that is not finite, an unusable box or camera matrix.
+        InvalidInputError: wrong shapes, a pose that is not rigid and finite, an unusable box or camera matrix.
 
     Example:
         >>> import curvireg_torch as cr, trimesh
@@ -149,6 +159,7 @@ def fit_contours(
         none = T0.new_zeros(0)
         return ContourFit(T0, T0.new_zeros(0, 6, 6), none, none, none.long(), none, none, none)
     crops, A = crop_images(images, boxes, size=SIZE, margin=margin)
+    crops = filled(crops)
     K = A.double()[photograph] @ K
     full = Views(renderer, EdgeField(crops), photograph, K, SIZE, centre, radius)
     K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ K
@@ -240,22 +251,26 @@ def _among_best(support: Tensor, photograph: Tensor, count: int) -> Tensor:
 
 def _batch(
     images: Tensor | Sequence[Tensor],
-    boxes: Tensor,
-    camera_matrices: Tensor,
+    boxes: Any,
+    camera_matrices: Any,
     starts: Tensor,
     photograph: Tensor | None,
 ) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
     """Float images, boxes (B, 4), camera matrices (N, 3, 3) of the starts and (N,) photographs, all on the CPU."""
     check_tensor(starts, "starts", (None, 4, 4))
-    if not bool(torch.isfinite(starts).all()):
-        raise InvalidInputError("starts: expected finite poses, got NaN or inf")
-    check_camera_matrix(camera_matrices)
+    check_pose(starts, "starts")
     if isinstance(images, Tensor) and images.ndim == 3:  # one photograph
-        check_tensor(boxes, "box", (4,))
-        images, boxes = images[None], boxes[None]
-    B = len(images)
-    N, given = len(starts), len(camera_matrices) if camera_matrices.ndim == 3 else 1
-    if given not in (1, B, N):
+        box = as_numbers(boxes, "box")
+        check_tensor(box, "box", (4,))
+        images, boxes = images[None], box[None]
+    for image in images:
+        check_photograph(image)
+    B, N = len(images), len(starts)
+    boxes = as_boxes(boxes, B)
+    K = as_numbers(camera_matrices, "camera_matrices", least=torch.float64)
+    check_camera_matrix(K)
+    given = len(K) if K.ndim == 3 else 1
+    if given not in (1, B, N) or K.ndim not in (2, 3):
         raise InvalidInputError(f"camera_matrices: expected one or {B} matrices (or {N}), got {given}")
     if photograph is None:
         if B != 1:
@@ -269,7 +284,7 @@ def _batch(
     if len(starts) and not 0 <= int(photograph.min()) <= int(photograph.max()) < B:
         raise InvalidInputError(f"photograph: expected indices of {B} images, got {photograph.tolist()}")
     photograph = photograph.long()
-    K = camera_matrices.detach().cpu().double()
+    K = K.detach().cpu()
     return (
         [image.detach().cpu().float() / (1 if image.is_floating_point() else 255) for image in images],
         boxes.detach().cpu().float(),

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from .._checks import check_symmetries
 from .._threads import map_on_threads
 from ..errors import CurviregError, InvalidInputError
 from ..geometry.views import ViewSphere
@@ -118,6 +119,8 @@ class Registrar:
         self.matcher, self.bank = matcher, matcher.bank
         if not isinstance(renderer, str) and len(self.bank.meshes) != 1:
             raise InvalidInputError(f"renderer: yours is of one mesh, the bank has {len(self.bank.meshes)}; name one")
+        if symmetries is not None:
+            check_symmetries(symmetries)
         self.symmetries = symmetries
         self.progress = progress
 

@@ -10,10 +10,9 @@ import torch
 import trimesh
 from torch import Tensor
 
-from .._checks import check_option
+from .._checks import check_camera_matrix, check_option, check_pose
 from .._choices import BACKENDS
 from ..errors import InvalidInputError, MissingDependencyError, RenderingError
-from ..geometry.cameras import check_camera_matrix
 from ..geometry.mesh import as_mesh
 
 __all__ = ["BACKENDS", "NEAREST", "DepthRenderer", "make_renderer", "render_depth"]
@@ -34,7 +33,7 @@ class DepthRenderer(Protocol):
 
         Args:
             T_cam_from_model: (N, 4, 4) rigid transforms into the OpenCV camera.
-            camera_matrix: (N, 3, 3) or (3, 3); see :func:`curvireg_torch.geometry.project_points`.
+            camera_matrix: (N, 3, 3) or (3, 3), without skew; see :func:`curvireg_torch.geometry.project_points`.
             size: (H, W) in px.
             orthographic: parallel projection along z; fx, fy are then px per model unit.
 
@@ -135,7 +134,7 @@ class _FirstThatWorks:
 
 
 def check_render_arguments(T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """float64 CPU (N, 4, 4) and (N, 3, 3), or a clear error."""
+    """float64 CPU poses (N, 4, 4), rigid, and cameras (N, 3, 3), or a clear error: what every backend renders."""
     if T.ndim != 3 or T.shape[1:] != (4, 4):
         raise InvalidInputError(f"T_cam_from_model: expected shape (N, 4, 4), got {tuple(T.shape)}")
     if len(size) != 2 or min(size) < 1:
@@ -143,8 +142,7 @@ def check_render_arguments(T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple
     check_camera_matrix(K)
     if K.ndim == 3 and K.shape[0] not in (1, T.shape[0]):
         raise InvalidInputError(f"camera_matrix: expected one or {T.shape[0]} matrices, got {K.shape[0]}")
-    if not bool(torch.isfinite(T).all()):
-        raise InvalidInputError("T_cam_from_model: expected finite entries, got NaN or inf")
+    check_pose(T, "T_cam_from_model")
     T = T.detach().to("cpu", torch.float64)
     return T, K.detach().to("cpu", torch.float64).expand(T.shape[0], 3, 3)
 
@@ -162,7 +160,7 @@ def render_depth(
 
     Args:
         mesh: a mesh, a scene (all its parts, placed by their transforms) or the path of one.
-        T_cam_from_model: (N, 4, 4) or (4, 4), model to OpenCV camera.
+        T_cam_from_model: (N, 4, 4) or (4, 4), rigid, model to OpenCV camera.
         camera_matrix: (N, 3, 3) or (3, 3) in px; pixel (0, 0) is the centre of the top-left pixel.
         size: (H, W).
         renderer: "auto", "embree", "pyrender" or "torch", see :func:`make_renderer`, or a :class:`DepthRenderer`.

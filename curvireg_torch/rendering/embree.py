@@ -142,11 +142,9 @@ class EmbreeRenderer:
         reach = 1.0 / self._radius if orthographic else near
         y = (np.arange(size[0]) - K[1, 2]) / K[1, 1]
         x = (np.arange(size[1]) - K[0, 2]) / K[0, 0]
-        skew = K[0, 1] / K[0, 0]
-        axes = np.stack([R[0], R[1] - skew * R[0], R[2]])  # what x, y and z of the camera are in the model
         pixels = np.nonzero(mask)
-        starts = _combined(pixels, reach * x - t[0] - skew * t[1], reach * y - t[1], near - t[2], axes)
-        return mask, starts, _float32(R[2:]) if orthographic else _combined(pixels, x, y, 1.0, axes), near
+        starts = _combined(pixels, reach * x - t[0], reach * y - t[1], near - t[2], R)
+        return mask, starts, _float32(R[2:]) if orthographic else _combined(pixels, x, y, 1.0, R), near
 
     def _mask(self, outline: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool) -> np.ndarray:
         """(H, W) bool: the pixels inside the outline's projection, with a rim of a pixel."""

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from .._checks import check_image, check_tensor
+from .._checks import check_camera_matrix, check_image, check_tensor
 
 __all__ = ["shade"]
 
@@ -38,6 +38,7 @@ def shade(depth: Tensor, camera_matrix: Tensor, *, orthographic: bool = False) -
     if camera_matrix.ndim == 2:
         camera_matrix = camera_matrix.expand(depth.shape[0], -1, -1)
     check_tensor(camera_matrix, "camera_matrix", (depth.shape[0], 3, 3))
+    check_camera_matrix(camera_matrix)
     z = depth.float()
     seen = z > 0
     fx, fy, cx, cy = (camera_matrix.to(z)[:, i, j].view(-1, 1, 1, 1) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))

@@ -8,8 +8,9 @@ import torch
 from kornia.color import rgb_to_grayscale
 from torch import Tensor, nn
 
-from .._checks import check_tensor
+from .._checks import as_numbers, check_photograph, check_tensor
 from ..errors import InvalidInputError
+from ..filters.inputs import fill_missing, may_lack_pixels, missing
 from ..geometry.crops import check_boxes, crop_images, square_boxes
 
 __all__ = ["Photographs", "crop_regions", "photograph_field", "slack_boxes"]
@@ -23,7 +24,7 @@ class Photographs:
     """B photographs, each described in K crops: of its box first, then of the box moved and scaled a little.
 
     Attributes:
-        regions: (B, K, C, S, S) the crops, in [0, 1].
+        regions: (B, K, C, S, S) the crops, in [0, 1]; NaN where pixels of the photograph are missing.
         field: (B, 2, S, S) of the first of them.
         descriptors: (B, K, D).
         points: (B, K, S, S) bool feature points.
@@ -51,12 +52,17 @@ class Photographs:
 
 
 def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
-    """(B, 2, S, S) of (B, 1 or 3, S, S) crops: in grey, unless the filter has an attribute ``colour = True``."""
+    """(B, 2, S, S) of (B, 1 or 3, S, S) crops: in grey, unless the filter has an attribute ``colour = True``.
+
+    Missing pixels (NaN or infinite) are filled from around them before the filter; its field is 0 there.
+    """
     if crops.shape[1] not in (1, 3):
         raise InvalidInputError(f"images: expected 1 (grey) or 3 (RGB) channels, got {crops.shape[1]}")
     grey = crops.shape[1] == 3 and not getattr(field, "colour", False)
+    holes = missing(crops) if may_lack_pixels(crops) else None
+    crops = crops if holes is None else fill_missing(crops, holes)
     out: Tensor = field(rgb_to_grayscale(crops) if grey else crops)
-    return out
+    return out if holes is None else out.masked_fill(holes.any(dim=1, keepdim=True), 0.0)
 
 
 def slack_boxes(boxes: Tensor, slack: float) -> Tensor:
@@ -70,6 +76,7 @@ def slack_boxes(boxes: Tensor, slack: float) -> Tensor:
         >>> slack_boxes(torch.tensor([[0.0, 0.0, 100.0, 50.0]]), 0.1)[0, 1].tolist()
         [-7.5, 0.0, 92.5, 50.0]
     """
+    boxes = as_numbers(boxes, "boxes")
     check_tensor(boxes, "boxes", (None, 4))
     if not 0.0 <= slack <= 0.45:
         raise InvalidInputError(f"slack: expected a share in [0, 0.45], got {slack}")
@@ -98,9 +105,9 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
         InvalidInputError: wrong shapes, or a first box that is empty or wholly outside its image.
     """
     for image in images:
-        if not isinstance(image, Tensor) or image.ndim != 3 or not (image.is_floating_point() or _is_bytes(image)):
-            raise InvalidInputError(f"images: expected floating or uint8 (C, H, W), got {_shown(image)}")
+        check_photograph(image)
     sizes = [(int(image.shape[-2]), int(image.shape[-1])) for image in images]
+    boxes = as_numbers(boxes, "boxes")
     check_tensor(boxes, "boxes", (len(sizes), None, 4))
     check_boxes(boxes[:, 0], sizes)
     if not sizes:
@@ -117,7 +124,7 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
         some = torch.where(seen[:, None], some, some[:1])
         x0, y0 = min(x0, W - 1), min(y0, H - 1)
         part = image[:, y0 : max(min(y1, H), y0 + 1), x0 : max(min(x1, W), x0 + 1)]
-        part = part.to(boxes.dtype) / 255.0 if _is_bytes(part) else part
+        part = part.to(torch.float32) / 255.0 if _is_bytes(part) else part
         part = part.expand(channels, -1, -1) if len(part) == 1 else part
         origin = torch.tensor([x0, y0, x0, y0], dtype=some.dtype, device=some.device)
         crops.append(crop_images(part.expand(len(some), *part.shape), some - origin, size=size, margin=margin)[0])
@@ -126,7 +133,3 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
 
 def _is_bytes(image: Tensor) -> bool:
     return image.dtype == torch.uint8
-
-
-def _shown(image: object) -> str:
-    return f"{image.dtype} {tuple(image.shape)}" if isinstance(image, Tensor) else type(image).__name__

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .._checks import check_option, check_positive
+from .._checks import check_masks, check_option, check_positive
 from ..errors import InvalidInputError
 from .base import Term, Views
 from .photographs import Photographs
@@ -28,7 +28,11 @@ def dilate_points(points: Tensor, eps: float) -> Tensor:
 
     Returns:
         (N, H, W) bool.
+
+    Raises:
+        InvalidInputError: masks of another shape or dtype, one without the batch axis too, or a bad radius.
     """
+    check_masks(points, "points")
     check_positive(eps, "eps", zero_ok=True)
     radius = int(eps)
     if radius == 0:

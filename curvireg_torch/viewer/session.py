@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._checks import check_square_pixels
 from ..batch import Entry, register_entry
 from ..commands import open_registrar
 from ..data import read_photo
@@ -162,7 +163,7 @@ class Session:
         command, start, picture = self.command(), time.perf_counter(), self.picture
         camera = None if self.guessed else self.camera
         if camera is not None:
-            camera_matrix(*camera)  # refused before the bank is made
+            check_square_pixels(camera_matrix(*camera))  # refused before the bank is made
         if isinstance(self.guess, float):
             camera_of_view(self.guess, (1, 1))
         self.stopped, tell = False, self._teller(start)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._checks import as_numbers, check_camera_matrix
 from ..errors import CurviregError, InvalidInputError
 from ..geometry import rotation_error
 from ..registration import Hypothesis, Registrar, Registration
@@ -25,7 +26,7 @@ def contour_overlay(
     result: Registration | Hypothesis,
     image: Any,
     box: Any,
-    camera_matrix: Tensor | None = None,
+    camera_matrix: Any | None = None,
 ) -> np.ndarray:
     """The photograph with the mesh's outer (green) and inner (orange) contours at the pose, and the box (white).
 
@@ -54,7 +55,7 @@ def _overlay(
     registrar: Registrar,
     result: Registration | Hypothesis,
     item: Item,
-    camera_matrix: Tensor | None,
+    camera_matrix: Any | None,
     part: tuple[int, int, int, int],
 ) -> np.ndarray:
     """:func:`contour_overlay` of columns x0 to x1 - 1 and rows y0 to y1 - 1."""
@@ -62,7 +63,10 @@ def _overlay(
         raise InvalidInputError("camera_matrix: the pose was found without one; leave it out")
     x0, y0, x1, y1 = part
     T, K = result.seen_by
-    K = (K if camera_matrix is None else camera_matrix).clone()
+    if camera_matrix is not None:
+        K = as_numbers(camera_matrix, "camera_matrix", least=torch.float64)
+        check_camera_matrix(K)
+    K = K.clone()
     K[:2, 2] -= K.new_tensor([x0, y0])
     picture = to_uint8(item.image[:, y0:y1, x0:x1])
     box = (item.box - item.box.new_tensor([x0, y0, x0, y0])).tolist()
@@ -102,7 +106,7 @@ def draw_contours(picture: np.ndarray, depth: np.ndarray) -> int:
 
 
 def _item(image: Any, box: Any) -> Item:
-    item = items_of([image], torch.as_tensor(box)[None], None)[0]
+    item = items_of([image], as_numbers(box, "box")[None], None)[0]
     if isinstance(item, CurviregError):
         raise item
     return item
@@ -130,7 +134,7 @@ def _thick(mask: np.ndarray, width: int) -> np.ndarray:
 
 @torch.no_grad()
 def registration_sheet(
-    registrar: Registrar, result: Registration, image: Any, box: Any, camera_matrix: Tensor | None = None
+    registrar: Registrar, result: Registration, image: Any, box: Any, camera_matrix: Any | None = None
 ) -> np.ndarray:
     """Contour overlay; beside it the crop, its field, the pose and its field; below the hypotheses' poses, best first.
 
@@ -192,10 +196,10 @@ def _told(registrar: Registrar, result: Registration, number: int) -> str:
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
-    """(H, W, 3) uint8 RGB of a (1 or 3, H, W) image, floating in [0, 1] or uint8."""
+    """(H, W, 3) uint8 RGB of a (1 or 3, H, W) image, floating in [0, 1] or uint8; black where pixels are missing."""
     pixels = image.detach().cpu()
     if pixels.is_floating_point():
-        pixels = (pixels.float().clamp(0, 1) * 255).round().byte()
+        pixels = (pixels.float().nan_to_num(0.0, 0.0, 0.0).clamp(0, 1) * 255).round().byte()
     return np.ascontiguousarray(pixels.expand(3, -1, -1).permute(1, 2, 0).numpy())
 
 

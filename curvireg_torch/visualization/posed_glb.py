@@ -11,9 +11,9 @@ import trimesh
 from PIL import Image
 from torch import Tensor
 
+from .._checks import check_camera_matrix, check_photograph, check_pose, check_tensor
 from .._choices import UNITS
 from ..errors import InvalidInputError
-from ..geometry.cameras import check_camera_matrix
 from ..geometry.colours import surface_colours
 from ..geometry.mesh import mesh_centre, mesh_radius, mesh_unit
 
@@ -41,7 +41,8 @@ def posed_glb(
         photograph: False leaves the plane out.
 
     Raises:
-        InvalidInputError: a pose or a camera of another shape, or not finite; an object that is not before the camera.
+        InvalidInputError: a pose that is not rigid, an unusable camera or image, or an object that is not before the
+            camera.
 
     Example:
         >>> K = torch.tensor([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]], dtype=torch.float64)
@@ -50,9 +51,10 @@ def posed_glb(
         b'glTF'
     """
     check_camera_matrix(camera_matrix)
+    check_tensor(T_cam_from_model, "T_cam_from_model", (4, 4))
+    check_pose(T_cam_from_model, "T_cam_from_model")
+    check_photograph(image, "image")
     T, K = T_cam_from_model.detach().cpu().double(), camera_matrix.detach().cpu().double()
-    if tuple(T.shape) != (4, 4) or not bool(T.isfinite().all()):
-        raise InvalidInputError(f"T_cam_from_model: expected finite (4, 4), got shape {tuple(T.shape)}")
     depth = float((T[:3, :3] @ mesh_centre(mesh) + T[:3, 3])[2])
     if depth <= 0:
         raise InvalidInputError("T_cam_from_model: the object lies behind the camera; check the pose")

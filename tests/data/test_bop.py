@@ -121,6 +121,19 @@ def test_odd_values_are_counted(tree, value):
     assert dataset.skipped["corrupt_annotation"] == tree[1]["corrupt_annotation"] + 1
 
 
+@pytest.mark.parametrize(("place", "value"), [(0, 0.0), (4, -500.0), (1, 2.0), (8, 2.0)])
+def test_a_camera_that_nothing_can_be_projected_with_is_corrupt(tree, place, value):
+    path = tree[0] / "test" / "000001" / "scene_camera.json"
+    content = json.loads(path.read_text())
+    before = BOPDataset(tree[0], targets=False)
+    content["0"]["cam_K"][place] = value
+    path.write_text(json.dumps(content))
+    after = BOPDataset(tree[0], targets=False)
+    lost = len(before) - len(after)
+    assert lost > 0
+    assert after.skipped["corrupt_annotation"] == before.skipped["corrupt_annotation"] + lost
+
+
 def test_mirrored_rotation_is_corrupt(tree):
     path = tree[0] / "test" / "000002" / "scene_gt.json"
     path.write_text(path.read_text().replace("[1.0, 0.0", "[-1.0, 0.0"))

@@ -7,8 +7,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from curvireg_torch import geometry as g
+from curvireg_torch._checks import check_camera_matrix
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry.cameras import check_camera_matrix
 
 K = torch.tensor([[240.0, 0.0, 70.3], [0, 260.0, 51.8], [0, 0, 1]], dtype=torch.float64)
 
@@ -40,14 +40,12 @@ def test_projection_is_opencvs() -> None:
     np.testing.assert_allclose(box, [*theirs.min(0), *theirs.max(0)], atol=1e-9)
 
 
-def test_orthographic_projection_forgets_the_depth_and_skew_leans() -> None:
-    leaning = K.clone()
-    leaning[0, 1] = 10.0
+def test_orthographic_projection_forgets_the_depth() -> None:
     X = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 30.0]], dtype=torch.float64)
-    uv = g.project_points(X, torch.eye(4, dtype=torch.float64), leaning, orthographic=True)
-    expected = torch.tensor([240.0 + 20.0 + 70.3, 520.0 + 51.8], dtype=torch.float64)
+    uv = g.project_points(X, torch.eye(4, dtype=torch.float64), K, orthographic=True)
+    expected = torch.tensor([240.0 + 70.3, 520.0 + 51.8], dtype=torch.float64)
     torch.testing.assert_close(uv, expected.expand(2, 2))
-    box = g.projected_boxes(X, torch.eye(4, dtype=torch.float64), leaning, orthographic=True)
+    box = g.projected_boxes(X, torch.eye(4, dtype=torch.float64), K, orthographic=True)
     torch.testing.assert_close(box, expected.repeat(2))
 
 
@@ -62,6 +60,7 @@ def test_orthographic_projection_forgets_the_depth_and_skew_leans() -> None:
         (torch.diag(torch.tensor([1.0, 0.0, 1.0])), "FX FY CX CY"),
         (torch.stack([torch.eye(3), torch.diag(torch.tensor([1.0, -1.0, 1.0]))]), "FX FY CX CY"),
         (torch.diag(torch.tensor([1.0, 1.0, 2.0])), r"\[0, fy, cy\]"),
+        (torch.eye(3) + torch.tensor([[0.0, 0.5, 0.0], [0.0] * 3, [0.0] * 3]), "no skew"),
         (torch.eye(3) + torch.tensor([[0.0] * 3, [0.5, 0, 0], [0.0] * 3]), r"\[0, fy, cy\]"),
         (K.T.contiguous(), r"\[0, fy, cy\]"),
     ],

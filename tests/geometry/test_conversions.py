@@ -11,7 +11,7 @@ from curvireg_torch import geometry as g
 from curvireg_torch.errors import InvalidInputError
 
 SIZE = (108, 154)
-K = torch.tensor([[240.0, 4.0, 70.3], [0, 260.0, 51.8], [0, 0, 1]], dtype=torch.float64)
+K = torch.tensor([[240.0, 0.0, 70.3], [0, 260.0, 51.8], [0, 0, 1]], dtype=torch.float64)
 
 
 def poses(count: int = 7) -> torch.Tensor:
@@ -26,10 +26,10 @@ def points() -> torch.Tensor:
 @pytest.mark.parametrize("orthographic", [False, True])
 def test_opengl_window_coordinates_are_the_pixels(orthographic: bool) -> None:
     T, X = poses(), points()
-    K_used = K.clone()
+    camera = K.clone()
     if orthographic:
-        K_used[:2, :2] /= 5.0
-    P = g.opengl_projection(K_used, SIZE, near=2.0, far=9.0, orthographic=orthographic)
+        camera[:2, :2] /= 5.0
+    P = g.opengl_projection(camera, SIZE, near=2.0, far=9.0, orthographic=orthographic)
     homogeneous = torch.cat([X, torch.ones(50, 1, dtype=torch.float64)], 1)
     clip = homogeneous @ (P @ g.opengl_from_opencv(T)).mT
     ndc = clip[..., :3] / clip[..., 3:]
@@ -37,7 +37,7 @@ def test_opengl_window_coordinates_are_the_pixels(orthographic: bool) -> None:
     # OpenGL's viewport transform; its window counts from the lower left corner of the corner pixel
     window = 0.5 * (ndc[..., :2] + 1.0) * torch.tensor([SIZE[1], SIZE[0]])
     pixels = torch.stack([window[..., 0], SIZE[0] - window[..., 1]], -1) - 0.5
-    torch.testing.assert_close(pixels, g.project_points(X, T, K_used, orthographic=orthographic), rtol=0, atol=1e-9)
+    torch.testing.assert_close(pixels, g.project_points(X, T, camera, orthographic=orthographic), rtol=0, atol=1e-9)
     back = g.opencv_from_opengl(g.opengl_from_opencv(T))
     torch.testing.assert_close(back, T, rtol=0, atol=0)
 
@@ -54,13 +54,11 @@ def test_pytorch3d_screen_coordinates_are_the_pixels() -> None:
     # The formulas of PyTorch3D's documentation: x_view = x R + T; screen = principal point - focal x / z, where +x is
     # left, +y is up and the first pixel covers [0, 1].
     T, X = poses(), points()
-    K_used = K.clone()
-    K_used[0, 1] = 0.0
     R, t = g.pytorch3d_from_opencv(T)
     view = X @ R + t[:, None]
-    focal, principal = K_used.diagonal()[:2], K_used[:2, 2] + 0.5
+    focal, principal = K.diagonal()[:2], K[:2, 2] + 0.5
     pixels = principal - focal * view[..., :2] / view[..., 2:] - 0.5
-    torch.testing.assert_close(pixels, g.project_points(X, T, K_used), rtol=0, atol=1e-9)
+    torch.testing.assert_close(pixels, g.project_points(X, T, K), rtol=0, atol=1e-9)
     torch.testing.assert_close(g.opencv_from_pytorch3d(R, t), T, rtol=0, atol=1e-15)
 
 

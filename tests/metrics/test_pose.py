@@ -12,7 +12,7 @@ from curvireg_torch.metrics import pose
 
 from .helpers import poses
 
-K = torch.tensor([[600.0, 0.5, 320.0], [0.0, 620.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+K = torch.tensor([[600.0, 0.0, 320.0], [0.0, 620.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 POINTS = torch.rand(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
 GT = poses(5, 1)
 EST = poses(5, 2, near=GT)

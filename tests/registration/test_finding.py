@@ -146,7 +146,7 @@ def test_what_cannot_be_searched_takes_nothing_else_down(registrar):
     assert [result.ok for result in results] == [False, True, False, False]
     for failed, word, error in zip(
         (results[0], results[2], results[3]),
-        ("image 0: .*one colour", "image 2: NaN", "image 3: expected 1"),
+        ("image 0: .*one colour", "image 2: NaN", "image 3: photograph: expected 1"),
         (ImageError, ImageError, InvalidInputError),
         strict=True,
     ):

@@ -40,7 +40,7 @@ def camera(
     t = -(R @ centre)
     t[:, 2] += 4.0 * radius
     f = 60.0 / radius if orthographic else 240.0
-    K = torch.tensor([[f, 3.0 * f / 100, 70.3], [0, 1.1 * f, 51.8], [0, 0, 1]], dtype=torch.float64)
+    K = torch.tensor([[f, 0.0, 70.3], [0, 1.1 * f, 51.8], [0, 0, 1]], dtype=torch.float64)
     return transform(R, t), K, (108, 154)
 
 

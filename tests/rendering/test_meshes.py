@@ -10,7 +10,7 @@ from curvireg_torch.errors import InvalidInputError, MeshError, RenderingError
 from curvireg_torch.geometry.mesh import as_mesh
 from curvireg_torch.rendering import make_renderer
 
-from .scenes import BACKENDS, camera, require
+from .scenes import BACKENDS, camera, interior, require
 
 
 def render(mesh: object, backend: str, **options: bool) -> torch.Tensor:
@@ -201,7 +201,8 @@ def test_another_takes_over_from_one_that_dies(monkeypatch: pytest.MonkeyPatch) 
     with pytest.warns(UserWarning, match="'embree' failed.*out of memory.*'torch'"):
         found = renderer.render(T, K, size)
     assert renderer.name == "torch"
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
+    even = interior(found, expected)
+    torch.testing.assert_close(found[even], expected[even], rtol=0, atol=1e-4)
     renderer.render(T, K, size)  # said once: a second warning would fail this test
     with pytest.raises(RenderingError, match="embree"):  # who asked for one renderer gets no other
         cr.render_depth(trimesh.creation.box(), T, K, size, renderer="embree")
