@@ -97,8 +97,11 @@ def open_registrar(
     pipeline, told = chosen_pipeline(arguments), progress or not arguments.quiet
     banks = [_open_bank(arguments, mesh, pipeline, told) for mesh in meshes]
     own = all(mesh.suffix == ".safetensors" for mesh in meshes)
+    bank = ViewBank.join(banks).to(arguments.device)
+    if own and arguments.pose is None and arguments.pipeline is None:  # presets say nothing of the views
+        pipeline = replace(pipeline, views=bank.pipeline.views)
     return Registrar(
-        ViewBank.join(banks).to(arguments.device),
+        bank,
         pipeline=None if own and arguments.preset is None and arguments.pipeline is None else pipeline,
         field=field,
         refine=not arguments.no_refine,

@@ -87,6 +87,11 @@ class ViewPolicy:
         check_positive(self.turn, "turn")
         object.__setattr__(self, "elevations", tuple(float(e) for e in self.elevations))
 
+    def decisive(self) -> dict[str, Any]:
+        """The attributes that decide the viewpoints; the others belong to another ``pose``."""
+        names = {"any": ("directions", "turn", "distance"), "upright": ("azimuth_step", "elevations", "distance")}
+        return {name: getattr(self, name) for name in ("pose", *names.get(self.pose, ()))}
+
     def sphere(self, up: str = "z") -> ViewSphere:
         """The viewpoints.
 

@@ -12,8 +12,10 @@ if TYPE_CHECKING:  # versions.py runs where nothing is installed yet
     from curvireg_torch.evaluation import Benchmark
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-SETS = {"pascal3d_mini": "upright", "hope": "any", "lm": "any", "dino": "any"}
+SETS = {"pascal3d_mini": "upright", "hope": "any", "lm": "any", "dino": "any", "buddha": "any"}
 """The real sets, and the protocol's pose."""
+WRITTEN = ("scripts/results", "docs", "README.md")
+"""What scripts write; nothing that they measure depends on it."""
 
 
 def benchmark(data: Path, name: str) -> "Benchmark":
@@ -47,7 +49,7 @@ def today() -> str:
     return datetime.datetime.now(datetime.UTC).date().isoformat()
 
 
-def commit(root: Path, *, but: Sequence[str] = ()) -> str:
+def commit(root: Path, *, but: Sequence[str] = WRITTEN) -> str:
     """Short hash of the checkout, "+" where anything ``but`` these paths was changed, "unknown" outside of one."""
 
     def git(*words: str) -> str:

@@ -3,10 +3,11 @@
     python scripts/bench_location.py BENCH --rows rows.jsonl [--preset learned] [--pose upright] [--form exact]
     python scripts/bench_location.py --rows rows.jsonl --table          # fits presence, writes record, table, picture
 
-BENCH is the folder of scripts/make_benchmark.py. Each photograph becomes a quarter of a mosaic of 640 x 480 px, three
-others, of other kinds of objects, the rest; a second mosaic has none of it. Rows say where the proposals lie (overlap
-with the visible box) and what presence is judged by; run again, it goes on. LINEMOD gets the same representative
-views, shaded grey, at the same sizes; it needs opencv-contrib-python-headless in place of opencv-python-headless.
+BENCH is the folder of scripts/make_benchmark.py. Each photograph in which more than 0.7 of the object's silhouette is
+seen becomes a quarter of a mosaic of 640 x 480 px, three others, of other kinds of objects, the rest; a second mosaic
+has none of it. Rows say where the proposals lie (overlap with the visible box) and what presence is judged by; run
+again, it goes on. LINEMOD gets the same representative views, shaded grey, at the same sizes; it needs
+opencv-contrib-python-headless in place of opencv-python-headless.
 """
 
 import argparse
@@ -44,6 +45,8 @@ Curves = dict[str, tuple[list[bool], list[float]]]
 """For each question: whether it is so, and how sure presence is."""
 
 SIZE = (480, 640)
+VISIBLE = 0.7
+"""Photographs become mosaics where more than this share of the object's silhouette is seen."""
 RECORD = REPOSITORY / "scripts" / "results" / "location.json"
 PAGE = REPOSITORY / "docs" / "guides" / "without-a-box.md"
 MARKERS = "<!-- location:begin -->", "<!-- location:end -->"
@@ -236,6 +239,9 @@ def record_of(rows: list[Row]) -> tuple[Row, dict[str, Curves]]:
 def table(record: Row) -> str:
     """The docs' table."""
     lines = [
+        f"Only photographs in which more than {VISIBLE:g} of the object's silhouette is seen became mosaics; objects "
+        "that are hidden more are not measured here.",
+        "",
         "| set | preset | N | recall@1 | @5 | @20 | surest of 5 is right | LINEMOD, N | @1 | @5 | @20 |",
         "|---" * 11 + "|",
     ]
@@ -296,7 +302,7 @@ def main() -> None:
     torch.set_num_threads(1)
     half = arguments.folder / arguments.half
     items = [json.loads(line) for line in (half / "items.jsonl").read_text().splitlines()]
-    wanted = [i for i in items if (i["pose"], i["form"]) == (arguments.pose, arguments.form) and i["visible"] > 0.7]
+    wanted = [i for i in items if (i["pose"], i["form"]) == (arguments.pose, arguments.form) and i["visible"] > VISIBLE]
     random.Random(7).shuffle(wanted)
     done = {row["id"] for row in rows if row["preset"] == arguments.preset}
     with arguments.rows.open("a") as file:

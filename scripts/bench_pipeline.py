@@ -10,6 +10,7 @@ All with the default pipeline. The mesh is a sphere with dents, made in code, so
 
 import argparse
 import platform
+import statistics
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +36,7 @@ def dented_sphere(faces: int) -> trimesh.Trimesh:
 
 def seconds(call, repeats: int = 3) -> float:
     """Median of a few runs."""
-    return timed(call, repeats)[repeats // 2]
+    return statistics.median(timed(call, repeats))
 
 
 def over_products(matcher: ViewMatcher, images: list[torch.Tensor], boxes: torch.Tensor) -> float:

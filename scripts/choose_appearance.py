@@ -11,7 +11,7 @@ Each object is ranked against the bank of its CAD by S_hog S_rep S_box, preset b
 (upright) or of the best distinct ones (free) is then compared in every variant, and the raw scores of each CAD's
 photographs are kept in RAW as one .npz, so that weights are swept without measuring again. Stop it and run it again at
 will. The table goes to scripts/results/appearance.json and to docs/accuracy.md: shares of photographs within 30
-degrees, and differences to the ranking without the term with the 95 % interval of paired resamples.
+degrees, and differences to the ranking without the term with the 95 % interval of paired resamples over CADs.
 """
 
 import argparse
@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from _intervals import interval
 from _record import REPOSITORY, between, commit, today
 from torch import Tensor
 
@@ -61,7 +62,6 @@ WAYS = {
 """Which views are judged: how many, and degrees apart."""
 USED = {"upright": ("all", "both", "all", 1), "free": ("40, 20°", "both", "all", 1)}
 """What the term does."""
-RESAMPLES = 2000
 
 
 def distinct(order: np.ndarray, rotations: np.ndarray, angle: float, count: int) -> np.ndarray:
@@ -131,7 +131,7 @@ def measure(mesh: Path, items: list[dict[str, Any]], bench: Path, backbone: Back
     boxes = torch.tensor([item["box"] for item in items])
     scores = {}
     for name in PRESETS:
-        chosen = replace(preset_named(name), terms=preset_named("classical").terms)
+        chosen = replace(preset_named(name), views=pipeline.views, terms=pipeline.terms)
         scores[name] = ViewMatcher(bank, pipeline=chosen)(images, boxes).scores
     judged = []
     for i in range(len(items)):
@@ -186,7 +186,7 @@ def photographs(folder: Path) -> Iterator[dict[str, Any]]:
         raw = np.load(path)
         for i in sorted({int(key.split()[0]) for key in raw.files}):
             own = {key.split(" ", 1)[1]: raw[key] for key in raw.files if key.split()[0] == str(i)}
-            yield {**own, **json.loads(str(own["item"]))}
+            yield {**own, **json.loads(str(own["item"])), "mesh": path.stem}
 
 
 def appearance(shot: dict[str, Any], stride: str, mask: str, crops: int) -> np.ndarray:
@@ -201,11 +201,10 @@ def error_of_best(shot: dict[str, Any], preset: str, variant: tuple[str, str, in
     return float(shot["error"][judged][int(np.argmax(score))])
 
 
-def difference(right: np.ndarray, base: np.ndarray) -> tuple[float, float, float, float]:
-    """Share, difference to ``base``, and its 95 % interval over paired resamples."""
-    picks = np.random.default_rng(0).integers(0, len(right), (RESAMPLES, len(right)))
-    low, high = np.quantile((right - base)[picks].mean(axis=1), [0.025, 0.975])
-    return tuple(round(float(v), 4) for v in (right.mean(), (right - base).mean(), low, high))  # type: ignore[return-value]
+def difference(right: np.ndarray, base: np.ndarray, meshes: list[str]) -> tuple[float, float, float, float]:
+    """Share, difference to ``base``, and its 95 % interval over paired resamples of the CADs."""
+    found = right.mean(), *interval(right - base, meshes)
+    return tuple(round(float(v), 4) for v in found)  # type: ignore[return-value]
 
 
 def sweep(shots: list[dict[str, Any]], preset: str, pose: str) -> list[dict[str, Any]]:
@@ -218,7 +217,8 @@ def sweep(shots: list[dict[str, Any]], preset: str, pose: str) -> list[dict[str,
         for variant in VARIANTS[pose]:
             for weight in WEIGHTS:
                 best = [error_of_best(s, preset, variant, weight, j) for s, j in zip(shots, judged, strict=True)]
-                share, gain, low, high = difference(np.array([e < 30 for e in best], float), base)
+                right, meshes = np.array([e < 30 for e in best], float), [shot["mesh"] for shot in shots]
+                share, gain, low, high = difference(right, base, meshes)
                 row = {"preset": preset, "n": len(shots), "views": way, "stride": variant[0], "cells": variant[1]}
                 rows.append({**row, "crops": variant[2], "weight": weight, "share": share, "gain": [gain, low, high]})
     return rows

@@ -3,10 +3,11 @@
     python scripts/compare_similarities.py DATA [--out scripts/results/similarities.json]
     python scripts/compare_similarities.py --table        write the tables again from the results, nothing else
 
-DATA holds pascal3d_mini (PASCAL3D+ layout), bop/lm, bop/dino, bop/hope and backgrounds (photographs without the
-objects). Each object is ranked against the bank of its annotated mesh, default preset, and the best view is compared
-with the annotation (no refinement, symmetries of the objects taken into account). Boxes are as annotated, moved by up
-to 5, 10 and 20 % of their sides, or the whole image. PASCAL3D+ objects are known to stand upright; the others are not.
+DATA holds pascal3d_mini (PASCAL3D+ layout), bop/lm, bop/dino, bop/hope, bop/buddha and backgrounds (photographs without
+the objects). Each object is ranked against the bank of its annotated mesh, default preset, and the best view is
+compared with the annotation (no refinement, symmetries of the objects taken into account). Boxes are as annotated,
+moved by up to 5, 10 and 20 % of their sides, or the whole image. PASCAL3D+ objects are known to stand upright; the
+others are not.
 """
 
 import argparse
@@ -16,7 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from _record import REPOSITORY, benchmark, between, write_json
+from _record import REPOSITORY, SETS, benchmark, between, write_json
 from torch.nn.functional import normalize
 
 import curvireg_torch as cr
@@ -41,7 +42,6 @@ from curvireg_torch.metrics import symmetric_rotation_error, symmetry_transforms
 from curvireg_torch.pipeline import preset_named
 from curvireg_torch.synthetic import procedural_background
 
-SETS = {"pascal3d_mini": "upright", "lm": "any", "dino": "any", "hope": "any"}
 EVERY = {"dino": 4}
 BOXES = {"annotated": 0.0, "5 %": 0.05, "10 %": 0.1, "20 %": 0.2, "whole image": None}
 

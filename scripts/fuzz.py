@@ -107,7 +107,7 @@ def main() -> int:
         kind, start, count, folder = arguments.worker
         worker(kind, int(start), int(count), Path(folder))
         return 0
-    here = commit(REPOSITORY, but=[str(path.relative_to(REPOSITORY)) for path in (RESULT, DOCUMENT)])
+    here = commit(REPOSITORY)
     report: dict[str, Any] = json.loads(arguments.out.read_text()) if arguments.out.is_file() else {"kinds": {}}
     for kind in arguments.kinds:
         fresh = {"tried": 0, "seconds": 0.0, "outcomes": {}, "slowest_s": 0.0, "peak_mb": 0.0, "failures": []}

@@ -25,6 +25,7 @@ from _record import write_json
 from curvireg_torch import Registrar, camera_matrix, rotation_error
 from curvireg_torch.geometry import axis_angle_from_rotation
 from curvireg_torch.matching import cached_bank
+from curvireg_torch.metrics import median_error
 from curvireg_torch.pipeline import DEFAULT, PRESETS
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
@@ -97,7 +98,7 @@ def measure(registrars: dict[str, Registrar], mesh: trimesh.Trimesh, seed: int, 
     row["sigmas"] = math.nan
     if result.standard_deviations is not None:
         turn = torch.rad2deg(axis_angle_from_rotation(T[:3, :3] @ result.rotation.T))
-        row["sigmas"] = float((turn / result.standard_deviations[0]).abs().median())
+        row["sigmas"] = median_error((turn / result.standard_deviations[0]).abs())
     return row
 
 
@@ -109,14 +110,15 @@ def summary(rows: list[dict[str, float]]) -> dict[str, float]:
     result = {"n": len(rows), "right": int(right.sum())}
     for stage in STAGES:
         turn, shift = table[f"rotation {stage}"][right], table[f"translation {stage}"][right]
-        result[f"{stage}: rotation median"] = float(turn.median())
+        result[f"{stage}: rotation median"] = median_error(turn)
         result[f"{stage}: rotation 90 %"] = float(turn.quantile(0.9))
         result[f"{stage}: within 1 degree"] = float((turn < 1).double().mean())
-        result[f"{stage}: translation median %"] = float(shift.median())
-        result[f"{stage}: seconds"] = float(table[f"seconds {stage}"].median())
+        result[f"{stage}: translation median %"] = median_error(shift)
+        result[f"{stage}: seconds"] = median_error(table[f"seconds {stage}"])
     result["within 5 degrees after the search"] = int(near.sum())
     result["made worse"] = float(worse[near].double().mean()) if bool(near.any()) else 0.0
-    result["sigmas"] = float(table["sigmas"][right & (table["rotation contours"] < WITHIN)].nanmedian())
+    sigmas = table["sigmas"][right & (table["rotation contours"] < WITHIN)]
+    result["sigmas"] = median_error(sigmas[~sigmas.isnan()])
     return result
 
 

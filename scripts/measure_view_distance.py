@@ -9,6 +9,7 @@ photograph's crop (cosine of HOG descriptors), beside 150 views of other orienta
 
 import argparse
 import json
+import statistics
 from pathlib import Path
 
 import torch
@@ -91,7 +92,11 @@ def main() -> None:
         distances = sorted(r["true"] for r in rows)
         results[root.name] = {
             "n": len(rows),
-            "true_distance_in_radii": {"min": distances[0], "median": distances[len(rows) // 2], "max": distances[-1]},
+            "true_distance_in_radii": {
+                "min": distances[0],
+                "median": statistics.median(distances),
+                "max": distances[-1],
+            },
             "mean_cosine": {str(d): sum(r[f"cosine {d}"] for r in rows) / len(rows) for d in views},
             "share_first_of_150": {
                 str(d): sum(r[f"first {d}"] for r in rows) / len(rows) for d in views if d != "true"

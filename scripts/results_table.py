@@ -44,6 +44,10 @@ BOP = (
 )
 
 
+LIGHTINGS = {"hope": 5}
+"""Sets in which each view was photographed under so many lightings: their objects are not independent."""
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--record", nargs=2, metavar=("SUMMARY", "NAME"), help="keep a summary.json under a name")
@@ -120,7 +124,13 @@ def bop_cells(name: str, s: dict[str, Any]) -> list[str]:
     whole = s["subsets"]["unoccluded"]
     shares = [percent(s["acc_15_deg"]), percent(s["acc_30_deg"]), degrees(s["med_err_deg"])]
     recalls = [percent(s[key]) for key in ("add_recall_0.1d", "mssd_ar", "mspd_ar")]
-    return [name, str(s["n"]), *shares, *recalls, str(whole["n"]), percent(whole["acc_30_deg"]), each(s)]
+    return [name, counted(name, s["n"]), *shares, *recalls, str(whole["n"]), percent(whole["acc_30_deg"]), each(s)]
+
+
+def counted(name: str, n: int) -> str:
+    """The number of objects, and how many views and lightings it is made of."""
+    lightings = LIGHTINGS.get(name, 1)
+    return str(n) if lightings == 1 or n % lightings else f"{n} ({n // lightings} views x {lightings} lightings)"
 
 
 def percent(share: float | None) -> str:

@@ -302,7 +302,7 @@ def main() -> int:
         worker(options.worker[0], Path(options.worker[1]))
         return 0
     kept = json.loads(RESULT.read_text()) if RESULT.is_file() else {}
-    here = commit(REPOSITORY, but=[str(path.relative_to(REPOSITORY)) for path in (RESULT, DOCUMENT)])
+    here = commit(REPOSITORY)
     bad = 0
     for name in options.names or CASES:
         found = measured(name)

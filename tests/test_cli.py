@@ -272,6 +272,19 @@ def test_a_bank_of_another_pipeline_is_refused(files, capsys):
     assert "--pose" in capsys.readouterr().err
 
 
+def test_a_bank_decides_the_views_unless_the_user_does(files, capsys):
+    """A preset says nothing of the views; the file of a pipeline does."""
+    folder, box, _ = files
+    views = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
+    bank = ViewBank.build(example_mesh(), pipeline=replace(PRESETS["fast"], views=views), progress=False)
+    bank.save(folder / "upright.safetensors")
+    assert run(folder, "photo.png", "upright.safetensors", "--preset", "fast", box=box) == 0
+    assert json.loads((folder / "out" / "result.json").read_text())["pipeline"]["views"]["azimuth_step"] == 120.0
+    (folder / "own.json").write_text(PRESETS["fast"].to_json())
+    assert run(folder, "photo.png", "upright.safetensors", "--pipeline", str(folder / "own.json"), box=box) == 2
+    assert "pose upright, asked for any" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("preset", sorted(PRESETS))
 def test_python_and_the_command_line_give_the_same_bits(files, monkeypatch, preset):
     """One source of defaults: the facade on a mesh file, and the command, for every preset."""

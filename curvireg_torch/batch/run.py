@@ -18,6 +18,7 @@ from ..document import SCHEMA, fitting_box, found_document, result_document
 from ..errors import BankError, CurviregError, ImageError, InvalidInputError, MeshError
 from ..geometry import camera_matrix
 from ..geometry.cameras import camera_of_view
+from ..geometry.mesh_files import mesh_digest
 from ..registration import FailedRegistration, Registrar, Registration, find
 from ..visualization.sheet import Shown, thumbnail, write_sheet
 from .bop import write_bop_results
@@ -165,7 +166,7 @@ class _Run:
         """Names all that the result depends on but the photograph's content, which is read only where it must be."""
         for mesh in entry.meshes:
             if mesh not in self.mesh_digests:
-                self.mesh_digests[mesh] = file_digest(mesh)
+                self.mesh_digests[mesh] = mesh_digest(mesh)
         meshes = [(mesh.name, self.mesh_digests[mesh]) for mesh in entry.meshes]
         asked = [
             *(entry.name, entry.box, entry.camera, entry.guess, entry.instances, entry.distance),

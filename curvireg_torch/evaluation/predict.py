@@ -7,13 +7,14 @@ from functools import cache
 from itertools import groupby
 from pathlib import Path
 
-from torch import nn
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from .._files import file_digest
 from ..data import read_image
 from ..errors import ImageError, MeshError, MissingFileError
 from ..geometry import load_mesh
+from ..geometry.mesh_files import mesh_digest
 from ..matching import ViewBank, ViewMatcher, cached_bank
 from ..pipeline import Pipeline
 from ..registration import Registrar
@@ -48,7 +49,7 @@ def predict(
     refuses gives a row ``failed``, which scores count as a miss. Any other error is a defect and ends the loop.
     """
     workshop = _Workshop(benchmark, pipeline, renderer, field)
-    digests = {item.key: input_digests(benchmark, item) for item in items}
+    digests = input_digests(benchmark, items)
     todo = [item for item in items if not _is_done(store, item, digests[item.key])]
     with tqdm(
         total=len(items), initial=len(items) - len(todo), desc=benchmark.name, unit="object", disable=not progress
@@ -62,14 +63,26 @@ def predict(
                     bar.update()
 
 
-def input_digests(benchmark: Benchmark, item: Item) -> dict[str, str]:
-    """Digests of the files that a prediction rests on; "" of one that cannot be read."""
-    photograph = Path(benchmark.dataset.annotation(item.index)["image_path"])
+def input_digests(benchmark: Benchmark, items: Sequence[Item]) -> dict[str, dict[str, str]]:
+    """By the items' keys: what each prediction rests on, in short texts that differ where it does.
+
+    Photographs and meshes, with all the files that a mesh consists of, are told by digests of their content; box and
+    camera matrix by their numbers, to the last digit.
+    """
+    photograph_digest, digest_of_mesh = cache(file_digest), cache(mesh_digest)  # objects share photographs and meshes
     return {
-        "photograph": _file_digest(photograph),
-        "meshes": " ".join(_file_digest(path) for path in item.meshes),
-        "box": " ".join(f"{v:g}" for v in item.box.tolist()),
+        item.key: {
+            "photograph": photograph_digest(Path(benchmark.dataset.annotation(item.index)["image_path"])),
+            "meshes": " ".join(map(digest_of_mesh, item.meshes)),
+            "box": _digits(item.box),
+            "camera": "" if item.camera_matrix is None else _digits(item.camera_matrix),
+        }
+        for item in items
     }
+
+
+def _digits(numbers: Tensor) -> str:
+    return " ".join(map(repr, numbers.flatten().tolist()))
 
 
 def _is_done(store: PredictionStore, item: Item, digests: dict[str, str]) -> bool:
@@ -77,9 +90,6 @@ def _is_done(store: PredictionStore, item: Item, digests: dict[str, str]) -> boo
         return False
     row = store.read(item.key)
     return "skipped" not in row and row.get("inputs") == digests
-
-
-_file_digest = cache(file_digest)  # objects share their meshes and photographs
 
 
 @dataclass

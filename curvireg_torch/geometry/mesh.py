@@ -1,10 +1,7 @@
 """Mesh files to one cleaned ``trimesh.Trimesh``, and a normalised model frame."""
 
-import logging
 import math
-import urllib.parse
 import warnings
-from io import BytesIO
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -17,10 +14,9 @@ from torch import Tensor
 from .._checks import check_option
 from .._choices import MESHES, UNITS, UP_AXES
 from ..errors import MeshError, MissingFileError
-from ..limits import MAX_MESH_BYTES, MAX_MESH_COORDINATE, MAX_MESH_FACES
+from ..limits import MAX_MESH_COORDINATE, MAX_MESH_FACES
 from .colours import SurfaceColours, surface_colours
-from .gltf import check_gltf
-from .polygon_files import with_triangles
+from .mesh_files import read_mesh
 from .up import format_up, mesh_up
 
 __all__ = [
@@ -66,7 +62,7 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
         raise MissingFileError(f"{path}: no such file; check the path of the mesh")
     if path.suffix.lower() not in MESHES:
         raise MeshError(f"{path}: expected a mesh file ({', '.join(MESHES)}); convert it first")
-    mesh = as_mesh(_load(path), name=str(path))
+    mesh = as_mesh(read_mesh(path), name=str(path))
     mesh.units = unit
     mesh.metadata.update(file_name=path.name, up=up)
     size = float(np.linalg.norm(mesh.extents)) * UNITS[unit]
@@ -76,60 +72,6 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
             stacklevel=2,
         )
     return mesh
-
-
-def _load(path: Path) -> Any:
-    """What trimesh makes of a file that was found in order."""
-    suffix, folder = path.suffix.lower(), _Folder(path)
-    logger = logging.getLogger("trimesh")
-    level = logger.level
-    try:
-        logger.setLevel(logging.CRITICAL)  # its tracebacks of files that it cannot read
-        if path.stat().st_size > MAX_MESH_BYTES:
-            raise ValueError(f"larger than {MAX_MESH_BYTES:,} bytes")
-        data = path.read_bytes()
-        if suffix in (".obj", ".off", ".ply"):
-            data = with_triangles(data, suffix)
-        elif suffix in (".glb", ".gltf"):
-            check_gltf(data, suffix, folder.size)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy's, of numbers that the checks in as_mesh find
-            return trimesh.load(BytesIO(data), file_type=suffix[1:], resolver=folder, process=False)
-    except Exception as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".removeprefix("ValueError: ").split())[:300]
-        raise MeshError(f"{path}: cannot be read as a mesh ({reason}); re-export the file") from error
-    finally:
-        logger.setLevel(level)
-
-
-class _Folder(trimesh.resolvers.Resolver):  # type: ignore[misc]
-    """Files beside a mesh, which it may name; no others, and nothing from the network."""
-
-    def __init__(self, path: Path) -> None:
-        self.folder, self.file_name = path.parent.resolve(), path.name
-
-    def _path(self, name: str) -> Path:
-        path = (self.folder / urllib.parse.unquote(name)).resolve()
-        if "://" in name or not path.is_relative_to(self.folder) or not path.is_file():
-            raise ValueError(f"it names {name[:100]!r}, which is no file of its folder")
-        return path
-
-    def size(self, name: str) -> int:
-        return self._path(name).stat().st_size
-
-    def get(self, key: str) -> bytes:
-        if self.size(key) > MAX_MESH_BYTES:
-            raise ValueError(f"{key[:100]!r} is larger than {MAX_MESH_BYTES:,} bytes")
-        return self._path(key).read_bytes()
-
-    def keys(self) -> list[str]:
-        return []
-
-    def write(self, name: str, data: Any) -> None:
-        raise NotImplementedError
-
-    def namespaced(self, namespace: str) -> "_Folder":
-        raise NotImplementedError
 
 
 def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:

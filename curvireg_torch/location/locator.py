@@ -126,7 +126,7 @@ class Locator(nn.Module):
         check_photograph(image)
         known = self._templates
         reach = (known.boxes[:, 2:] - known.boxes[:, :2]).amax(dim=1)
-        scales = self._scales(image, focal, distance, float(reach.median()))
+        scales = self._scales(image, focal, distance, float(reach.quantile(0.5)))
         maps, allowed, sizes = [], [], []
         largest: Tensor | None = None  # and first: the others are made of it
         for scale in scales:

@@ -1,7 +1,7 @@
 """A bank of rendered views of one or several meshes, described once and matched many times."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -109,11 +109,17 @@ class ViewBank:
         return _unpack(self._silhouettes[index], self.settings.image_size)
 
     def check_made_for(self, pipeline: Pipeline) -> None:
-        """Raise :class:`BankError` if the views were made in another way than ``pipeline`` asks for."""
-        if pipeline.bank != self.settings:
-            names = [f.name for f in fields(BankSettings)]
-            differ = [n for n in names if getattr(pipeline.bank, n) != getattr(self.settings, n)]
-            told = ", ".join(f"{n} {getattr(self.settings, n)}, asked for {getattr(pipeline.bank, n)}" for n in differ)
+        """Raise :class:`BankError` if the views were made in another way than ``pipeline`` asks for.
+
+        Views that came with the call (``pose="given"``) were chosen by the caller and go with every ``pipeline.views``.
+        """
+        made, asked = asdict(self.settings), asdict(pipeline.bank)
+        if self.pipeline.views.pose != "given":
+            made |= self.pipeline.views.decisive()
+            asked |= pipeline.views.decisive()
+        differ = [name for name in {**made, **asked} if made.get(name) != asked.get(name)]
+        if differ:
+            told = ", ".join(f"{n} {made[n]}, asked for {asked[n]}" for n in differ if n in made and n in asked)
             raise BankError(f"bank: made with other settings ({told}); build it again, or use bank.pipeline")
 
     @classmethod
@@ -223,6 +229,11 @@ class ViewBank:
             if bank.settings != first.settings:
                 raise InvalidInputError(
                     f"banks: expected one set of settings, but bank {i} has {bank.settings} and bank 0 {first.settings}"
+                )
+            if bank.pipeline.views.decisive() != first.pipeline.views.decisive():
+                raise InvalidInputError(
+                    f"banks: expected one view policy, but bank {i} has {bank.pipeline.views.decisive()} and bank 0 "
+                    f"{first.pipeline.views.decisive()}"
                 )
             if bank.device != first.device:
                 raise InvalidInputError(

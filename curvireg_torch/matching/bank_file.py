@@ -36,7 +36,7 @@ def write_bank(bank: "ViewBank", path: Path) -> None:
     for i, mesh in enumerate(bank.meshes):
         meshes[f"mesh{i}.vertices"] = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
         meshes[f"mesh{i}.faces"] = torch.from_numpy(np.array(mesh.faces, dtype=np.int32))
-        meshes |= {f"mesh{i}.{name}": torch.from_numpy(x.copy()) for name, x in _colour_arrays(mesh).items()}
+        meshes |= {f"mesh{i}.{name}": torch.from_numpy(x.copy()) for name, x in colour_arrays(mesh).items()}
     tensors = {**bank.tensors, "descriptors": bank.descriptors.half(), **views, **meshes}
     metadata = {
         "format": FORMAT,
@@ -102,13 +102,14 @@ def _mesh(tensors: Mapping[str, Tensor], index: int, unit: str, up: str) -> trim
     return mesh
 
 
-def _colour_arrays(mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
+def colour_arrays(mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
+    """The mesh's colours as a bank's file holds them, exact, so that a bank read again shows the same mesh."""
     colours = surface_colours(mesh)
     if colours is None:
         return {}
     parts: dict[str, np.ndarray] = {
         "corners": colours.corners,
-        "uv": colours.uv.astype(np.float16),
+        "uv": colours.uv,
         "texture": colours.texture,
     }
     parts |= {f"picture{k}": texture for k, texture in enumerate(colours.textures)}

@@ -18,14 +18,13 @@ import torch
 import trimesh
 
 from ..errors import BankError
-from ..geometry.colours import surface_colours
 from ..geometry.mesh import as_mesh, mesh_unit
 from ..geometry.up import mesh_up
 from ..geometry.views import ViewSphere
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
 from .bank import ViewBank
-from .bank_file import FORMAT_VERSION
+from .bank_file import FORMAT_VERSION, colour_arrays
 
 __all__ = [
     "CACHE_LIMIT",
@@ -77,7 +76,7 @@ def _code_digest() -> bytes:
     """Digest of the sources that turn a mesh into descriptors: banks of another version of them are not found."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256()
-    for folder in ("descriptors", "filters", "geometry", "learned", "rendering"):
+    for folder in ("descriptors", "filters", "geometry", "learned", "rendering", "terms"):
         for source in sorted((package / folder).glob("*.py")):
             digest.update(source.read_bytes())
     digest.update((package / "matching" / "describe.py").read_bytes())
@@ -92,16 +91,16 @@ def bank_key(
     pipeline: Pipeline | None = None,
     renderer: str = "auto",
 ) -> str:
-    """Digest in hexadecimal: mesh (colours and unit too), views, settings, renderer, the code that describes views."""
+    """Digest in hexadecimal: mesh (colours, unit and up too), views, settings, renderer, code that describes views."""
     made = _settled(pipeline, settings).made(len(views))
-    facts = [FORMAT_VERSION, made, mesh_unit(mesh), renderer]
+    facts = [FORMAT_VERSION, made, mesh_unit(mesh), mesh_up(mesh), renderer]
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     digest.update(_code_digest())
     digest.update(np.ascontiguousarray(mesh.vertices, np.float64).tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, np.int64).tobytes())
-    if (colours := surface_colours(mesh)) is not None:
-        for part in (colours.corners, colours.uv, colours.texture, *colours.textures):
-            digest.update(np.ascontiguousarray(part).tobytes())
+    for name, part in colour_arrays(mesh).items():
+        digest.update(f"{name} {part.shape}".encode())
+        digest.update(np.ascontiguousarray(part).tobytes())
     for field in fields(ViewSphere):
         digest.update(getattr(views, field.name).cpu().double().numpy().tobytes())
     return digest.hexdigest()[:32]

@@ -100,7 +100,8 @@ class ViewMatcher(nn.Module):
 
     Args:
         bank: the views of one model, or of several (which one is it?).
-        pipeline: field, terms and slack; default the one the bank was made with.
+        pipeline: field, terms and slack; default the one the bank was made with. Its bank settings and view policy must
+            be those of the bank, whose views may also have come with the call.
         field: photograph filter (B, 1, S, S) -> (B, 2, S, S) of one's own. One with an attribute ``colour = True`` gets
             colour photographs as (B, 3, S, S).
         slack: instead of the pipeline's.
@@ -111,7 +112,8 @@ class ViewMatcher(nn.Module):
             :meth:`Pipeline.with_term`.
 
     Raises:
-        InvalidInputError: a bank made for another pipeline, or an option out of range.
+        BankError: the bank was made with other settings or for another pose than ``pipeline`` says.
+        InvalidInputError: an option out of range.
 
     Example:
         >>> import trimesh
@@ -137,7 +139,7 @@ class ViewMatcher(nn.Module):
         super().__init__()
         pipeline = bank.pipeline if pipeline is None else pipeline
         bank.check_made_for(pipeline)
-        pipeline = replace(pipeline, views=bank.pipeline.views)
+        pipeline = replace(pipeline, views=bank.pipeline.views)  # "given" where they came with the call
         if deprecated:
             pipeline = _with_old_options(pipeline, deprecated)
         if slack is not None:

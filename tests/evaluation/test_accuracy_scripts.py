@@ -1,12 +1,22 @@
 """The scripts behind docs/accuracy.md."""
 
+import json
+import math
+import re
+from collections import Counter
+
 import numpy as np
 import pytest
 import torch
 
 import curvireg_torch as cr
+from curvireg_torch.data import BOPDataset
+from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol
+from tests._support.real_data import real_data
 from tests._support.scenes import CAMERA, scene, truck_bank
-from tests._support.scripts import imported
+from tests._support.scripts import ROOT, SCRIPTS, imported
+
+STAGES = ("view", "search", "contours")
 
 
 @pytest.fixture
@@ -15,11 +25,12 @@ def scripts():
         yield ablate, taxonomy
 
 
-def test_interval_is_that_of_a_share(scripts):
-    """Against the normal approximation of a binomial share."""
+@pytest.mark.parametrize("members", [1, 5])
+def test_interval_is_that_of_a_share_of_units(scripts, members):
+    """Against the normal approximation of a binomial share: copies of a photograph make nothing surer."""
     ablate, _ = scripts
-    values = (torch.arange(400) % 4 == 0).float()
-    mean, low, high = ablate.interval(values)
+    values = (torch.arange(400) % 4 == 0).float().repeat(members)
+    mean, low, high = ablate.interval(values, [f"unit {k % 400}" for k in range(400 * members)])
     assert mean == 0.25
     half = 1.96 * (0.25 * 0.75 / 400) ** 0.5
     assert low == pytest.approx(mean - half, abs=0.006)
@@ -31,22 +42,75 @@ def test_paired_differences_are_sharper_than_their_parts(scripts):
     one = (torch.arange(100) % 2).float()
     better = one.clone()
     better[::20] = 1.0
-    mean, low, high = ablate.interval(better - one)
+    mean, low, high = ablate.interval(better - one, range(100))
     assert mean == pytest.approx(0.05)
     assert low >= 0.0
     assert high <= 0.1
 
 
+def test_there_is_one_median():
+    """``Tensor.median`` takes the lower of the middle two; ``median_error`` and ``quantile(0.5)`` take their mean."""
+    sources = [*(ROOT / "curvireg_torch").rglob("*.py"), *SCRIPTS.glob("*.py")]
+    assert len(sources) > 200
+    assert [path.name for path in sources if re.search(r"\.(nan)?median\(\)", path.read_text(encoding="utf-8"))] == []
+
+
+def test_medians_of_the_refinement_are_means_of_the_middle_two():
+    numbers = [1.0, 2.0, 4.0, 9.0]
+    names = [f"{what} {stage}" for what in ("rotation", "translation", "seconds") for stage in STAGES]
+    with imported("measure_refinement") as script:
+        found = script.summary([{**dict.fromkeys(names, x), "sigmas": x} for x in numbers[:-1]])
+        assert (found["search: rotation median"], found["sigmas"]) == (2.0, 2.0)
+        rows = [{**dict.fromkeys(names, x), "sigmas": math.nan if x == 4.0 else x} for x in numbers]
+        found = script.summary(rows)
+    medians = [found[f"contours: {name}"] for name in ("rotation median", "translation median %", "seconds")]
+    assert medians == [3.0, 3.0, 3.0]
+    assert found["sigmas"] == 1.5, "of 1 and 2; 4 is unknown and 9 too far off"
+
+
+def test_unequal_units_weigh_by_their_members(scripts):
+    """A hundred units of nine right members each, and a hundred of one wrong member."""
+    ablate, _ = scripts
+    mean, low, high = ablate.interval([1.0] * 900 + [0.0] * 100, [k // 9 for k in range(900)] + list(range(100, 200)))
+    assert mean == 0.9
+    assert 0.85 < low < 0.9 < high < 0.93
+
+
+def test_independent_units(pascal, bop):
+    """Objects of one CAD; an object of a scene in one pose, under whatever light."""
+    with imported("_intervals") as intervals:
+        benchmark = Pascal3DBenchmark(pascal, Protocol())
+        meshes = [item.meshes for item in benchmark.items]
+        units = intervals.independent_units(benchmark)
+        assert [units[i] == units[k] for i in range(5) for k in range(5)] == [a == b for a in meshes for b in meshes]
+        path = bop.root / "test" / "000001"
+        for name in ("scene_gt", "scene_gt_info", "scene_camera"):
+            kept = json.loads((path / f"{name}.json").read_text())
+            (path / f"{name}.json").write_text(json.dumps({"0": kept["0"], "3": kept["0"]}))
+        benchmark = BOPBenchmark(BOPDataset(bop.root, targets=False), Protocol(pose="any"))
+        units = intervals.independent_units(benchmark)
+        keys = [item.key for item in benchmark.items]
+        assert keys == ["1/0/0", "1/0/1", "1/0/2", "1/3/0", "1/3/1", "1/3/2", "2/7/0"]
+        assert units == [0, 1, 2, 0, 1, 2, 3]
+
+
+def test_hope_is_sixteen_views_in_five_lightings():
+    objects = BOPBenchmark(BOPDataset(real_data("bop/hope")), Protocol(pose="any"))
+    with imported("_intervals") as intervals:
+        assert set(Counter(intervals.independent_units(objects)).values()) == {5}
+        assert len(set(intervals.independent_units(objects))) == 16
+
+
 def test_table_has_a_line_for_every_row_that_was_measured(scripts):
     ablate, _ = scripts
-    kept = {"errors": [5.0, 20.0, 50.0, 10.0], "whole": [True, True, False, False]}
+    kept = {"errors": [5.0, 20.0, 50.0, 10.0], "whole": [True, True, False, False], "units": [0, 1, 2, 2]}
     worse = {**kept, "errors": [5.0, 80.0, 50.0, 10.0]}
     text = ablate.table({"learned": {"lm": kept}, "classical": {"lm": worse}})
     lines = text.splitlines()
     assert lines[0] == "**lm**"
-    assert lines[4].startswith("| learned | 4 | 0.750 (")
-    assert "| 0.500 | 10.0° | 1.000 (2) |" in lines[4]
-    assert lines[5].startswith("| classical | 4 | 0.500 (")
+    assert lines[4].startswith("| learned | 4 (3) | 0.750 (")
+    assert "| 0.500 | 15.0° | 1.000 (2) |" in lines[4], "the mean of 10 and 20"
+    assert lines[5].startswith("| classical | 4 (3) | 0.500 (")
     assert "-0.250 (" in lines[5]
 
 

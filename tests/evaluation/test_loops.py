@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch.data import read_bop_csv, read_image
+from curvireg_torch.data import BOPDataset, read_bop_csv, read_image
 from curvireg_torch.errors import InvalidInputError, RenderingError
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, estimate, evaluate, predict, score
 from curvireg_torch.evaluation.store import PredictionStore
@@ -194,7 +194,6 @@ def test_repaired_and_changed_files_are_registered_again(pascal, tmp_path):
     (photographs / "2008_000003.jpg").write_bytes((photographs / "2008_000001.jpg").read_bytes())
     image = cv2.imread(str(photographs / "2008_000002.jpg"))
     cv2.imwrite(str(photographs / "2008_000002.jpg"), image[::-1])
-    predict._file_digest.cache_clear()
     run(benchmark, tmp_path / "out")
     after = rows_of(benchmark, tmp_path / "out")
     assert before["car/2008_000003/8"]["skipped"] == "unreadable_image"
@@ -202,6 +201,61 @@ def test_repaired_and_changed_files_are_registered_again(pascal, tmp_path):
     assert after["car/2008_000001/0"] == before["car/2008_000001/0"], "seconds included"
     for key in ("car/2008_000002/1", "car/2008_000002/2"):
         assert after[key]["score"] != before[key]["score"]
+
+
+def registered_again(benchmark, out, fresh):
+    """The keys that a resumed run registers again; its rows must be those of a fresh run."""
+    before = rows_of(benchmark, out)
+    run(benchmark, out)
+    after = rows_of(benchmark, out)
+    run(benchmark, fresh)
+    assert_same(without_seconds(after), without_seconds(rows_of(benchmark, fresh)))
+    return {key for key in after if after[key] != before[key]}
+
+
+def test_a_camera_put_right_is_registered_again(bop, tmp_path):
+    def benchmark():
+        return BOPBenchmark(BOPDataset(bop.root, targets=False), Protocol(pose="any"))
+
+    run(benchmark(), tmp_path / "out")
+    before = rows_of(benchmark(), tmp_path / "out")
+    path = bop.root / "test" / "000001" / "scene_camera.json"
+    cameras = json.loads(path.read_text())
+    cameras["0"]["cam_K"][0] = cameras["0"]["cam_K"][4] = 450.0
+    path.write_text(json.dumps(cameras))
+    again = registered_again(benchmark(), tmp_path / "out", tmp_path / "fresh")
+    mine = {item.key for item in benchmark().items if item.key.startswith("1/0/")}
+    assert again == mine
+    assert len(mine) < len(before), "others have the camera that they had"
+    after = rows_of(benchmark(), tmp_path / "out")
+    key = min(mine)
+    assert after[key]["translation"][2] == pytest.approx(1.5 * before[key]["translation"][2], rel=0.1)
+
+
+@pytest.mark.parametrize(("name", "place"), [("box", k) for k in range(4)] + [("camera", k) for k in (0, 2, 4, 5)])
+def test_numbers_that_differ_by_a_hair_are_registered_again(bop, name, place):
+    benchmark = BOPBenchmark(bop, Protocol(pose="any"))
+    item = benchmark.items[0]
+    changed = {"box": item.box + 1000.0, "camera": item.camera_matrix.clone()}
+    first = replace(item, box=changed["box"].clone())
+    changed[name].view(-1)[place] += 1e-3
+    second = replace(item, box=changed["box"], camera_matrix=changed["camera"])
+    digests = [predict.input_digests(benchmark, [one])[item.key] for one in (first, second)]
+    assert {key for key in digests[0] if digests[0][key] != digests[1][key]} == {name}
+    assert predict.input_digests(benchmark, [replace(item, camera_matrix=None)])[item.key]["camera"] == ""
+
+
+def test_a_changed_texture_is_registered_again(bop):
+    path = bop.root / "models" / "obj_000001.ply"
+    path.write_text(path.read_text().replace("ascii 1.0\n", "ascii 1.0\ncomment TextureFile skin.png\n"))
+    cv2.imwrite(str(path.with_name("skin.png")), torch.zeros(4, 4, 3, dtype=torch.uint8).numpy())
+    benchmark = BOPBenchmark(bop, Protocol(pose="any"))
+    before = predict.input_digests(benchmark, benchmark.items)
+    cv2.imwrite(str(path.with_name("skin.png")), torch.ones(4, 4, 3, dtype=torch.uint8).numpy())
+    after = predict.input_digests(benchmark, benchmark.items)
+    changed = {item.key for item in benchmark.items if before[item.key] != after[item.key]}
+    assert changed == {item.key for item in benchmark.items if item.meshes == (path,)}
+    assert changed
 
 
 def test_scores_tell_the_protocol_of_the_predictions(pascal, tmp_path):

@@ -52,6 +52,13 @@ def test_table_from_summaries(run, repository, pascal, bop, tmp_path):
     assert (repository / "README.md").read_text() == text
 
 
+def test_objects_that_were_photographed_under_several_lightings_are_told():
+    with imported("results_table") as script:
+        assert script.counted("hope", 80) == "80 (16 views x 5 lightings)"
+        assert script.counted("hope", 12) == "12", "a limited run"
+        assert script.counted("dino", 105) == "105"
+
+
 def test_readme_without_markers(run, repository, capsys):
     repository.joinpath("README.md").write_text("# Title\n")
     assert run(repository) == 2
@@ -69,11 +76,16 @@ def test_commit_is_kept(run, repository, tmp_path):
     path = repository / "scripts" / "results" / "evaluation_x.json"
     assert json.loads(path.read_text())["commit"] == "unknown"
     git = ["git", "-C", str(repository), "-c", "user.name=a", "-c", "user.email=a@b"]
-    for words in (["init", "-q"], ["add", "README.md"], ["commit", "-qm", "x"]):
+    (repository / "code.py").write_text("x = 1\n")
+    for words in (["init", "-q"], ["add", "README.md", "code.py"], ["commit", "-qm", "x"]):
         subprocess.run([*git, *words], check=True)
     run(repository, "--record", tmp_path / "summary.json", "x")
     clean = json.loads(path.read_text())["commit"]
     assert clean.isalnum()
+    subprocess.run([*git, "add", "scripts"], check=True)
     repository.joinpath("README.md").write_text("changed")
+    run(repository, "--record", tmp_path / "summary.json", "x")
+    assert json.loads(path.read_text())["commit"] == clean, "no measurement depends on what the script itself writes"
+    (repository / "code.py").write_text("x = 2\n")
     run(repository, "--record", tmp_path / "summary.json", "x")
     assert json.loads(path.read_text())["commit"] == clean + "+"

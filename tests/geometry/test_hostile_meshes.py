@@ -16,7 +16,7 @@ import trimesh
 import curvireg_torch as cr
 from curvireg_torch import limits
 from curvireg_torch.errors import MeshError
-from curvireg_torch.geometry import gltf, polygon_files
+from curvireg_torch.geometry import gltf, mesh_files, polygon_files
 from curvireg_torch.geometry import mesh as mesh_module
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
@@ -195,7 +195,7 @@ def test_size_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     content = (tmp_path / "a.stl").read_bytes()
     monkeypatch.setattr(mesh_module, "MAX_MESH_FACES", 1000)
     refused(tmp_path / "a.stl", content, "1,280 faces")
-    monkeypatch.setattr(mesh_module, "MAX_MESH_BYTES", 1000)
+    monkeypatch.setattr(mesh_files, "MAX_MESH_BYTES", 1000)
     refused(tmp_path / "a.stl", content, "larger than 1,000 bytes")
     assert limits.MAX_MESH_FACES > 1_000_000
 

@@ -15,7 +15,8 @@ from curvireg_torch.errors import BankError, InvalidInputError, MissingFileError
 from curvireg_torch.geometry import sample_views, uniform_views
 from curvireg_torch.geometry.up import mesh_up
 from curvireg_torch.matching import BankCollection, BankSettings, ViewBank, ViewMatcher, normalized_correlation
-from curvireg_torch.pipeline import Pipeline
+from curvireg_torch.pipeline import Pipeline, ViewPolicy
+from curvireg_torch.registration import Registrar
 from curvireg_torch.synthetic import example_mesh
 
 SETTINGS = BankSettings(image_size=64)
@@ -139,6 +140,40 @@ def test_every_changed_bit_is_found(bank: ViewBank, tmp_path: Path) -> None:
 def test_a_bank_of_another_pipeline_is_refused(bank: ViewBank) -> None:
     with pytest.raises(BankError, match=r"made with other settings \(image_size 64, asked for 128\)"):
         ViewMatcher(bank, pipeline=Pipeline())
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"pose": "any"}, "pose upright, asked for any"),
+        ({"pose": "given"}, "pose upright, asked for given"),
+        ({"azimuth_step": 60.0}, r"azimuth_step 120\.0, asked for 60\.0"),
+        ({"elevations": (5.0,)}, r"elevations \(10\.0,\), asked for \(5\.0,\)"),
+        ({"distance": 6.0}, r"distance 5\.0, asked for 6\.0"),
+    ],
+)
+def test_a_bank_of_another_pose_is_refused(change: dict[str, object], told: str) -> None:
+    policy = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
+    pipeline = Pipeline(views=policy, bank=SETTINGS)
+    bank = ViewBank.build(example_mesh(), pipeline=pipeline, progress=False)
+    other = replace(pipeline, views=replace(policy, **change))
+    for make in (ViewMatcher, Registrar):
+        with pytest.raises(BankError, match=told):
+            make(bank, pipeline=other)
+    beside_the_point = replace(pipeline, views=replace(policy, directions=9, turn=9.0))  # of pose="any"
+    assert ViewMatcher(bank, pipeline=beside_the_point).pipeline.views == policy
+
+
+def test_views_that_came_with_the_call_go_with_every_policy(bank: ViewBank) -> None:
+    for pose in ("any", "upright", "given"):
+        assert ViewMatcher(bank, pipeline=Pipeline(bank=SETTINGS).posed(pose)).pipeline.views.pose == "given"
+
+
+def test_banks_of_different_poses_are_not_joined(bank: ViewBank) -> None:
+    policy = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
+    upright = ViewBank.build(example_mesh(), pipeline=Pipeline(views=policy, bank=SETTINGS), progress=False)
+    with pytest.raises(InvalidInputError, match=r"one view policy, but bank 1 has .*upright.* and bank 0 .*given"):
+        ViewBank.join([bank, upright])
 
 
 def test_old_name_of_join(bank: ViewBank) -> None:

@@ -14,9 +14,11 @@ import pytest
 import safetensors.torch
 import torch
 import trimesh
+from PIL import Image
 
 from curvireg_torch.geometry import sample_views
 from curvireg_torch.geometry.colours import SurfaceColours
+from curvireg_torch.geometry.mesh import as_mesh
 from curvireg_torch.matching import (
     BankSettings,
     ViewBank,
@@ -53,12 +55,50 @@ def test_key_depends_on_everything(monkeypatch: pytest.MonkeyPatch) -> None:
     millimetres.units, metres.units = "mm", "m"  # and none
     moved.vertices[0] += 1e-9
     flipped.faces = flipped.faces[::-1]
-    keys = [bank_key(m, VIEWS, SETTINGS) for m in (mesh, millimetres, metres, moved, flipped)]
+    standing = mesh.copy()
+    standing.metadata["up"] = "y"
+    keys = [bank_key(m, VIEWS, SETTINGS) for m in (mesh, millimetres, metres, moved, flipped, standing)]
     keys += [bank_key(mesh, VIEWS[:3], SETTINGS), bank_key(mesh, VIEWS, replace(SETTINGS, sigma=1.5))]
     keys.append(bank_key(mesh, VIEWS, SETTINGS, renderer="torch"))
     monkeypatch.setattr(cache, "_code_digest", lambda: b"another version")
     keys.append(bank_key(mesh, VIEWS, SETTINGS))
-    assert len(set(keys)) == 9
+    assert len(set(keys)) == 10
+
+
+def textured(*, uv: float = 0.0, shade: int = 0, side: int = 4) -> trimesh.Trimesh:
+    """A box with a texture of 16 pixels, whose coordinates no half-precision number holds."""
+    mesh = trimesh.creation.box()
+    pixels = np.arange(48, dtype=np.uint8).reshape(side, 16 // side, 3) + np.uint8(shade)
+    places = np.random.default_rng(0).random((len(mesh.vertices), 2)) + uv
+    mesh.visual = trimesh.visual.TextureVisuals(uv=places, image=Image.fromarray(pixels))
+    return mesh
+
+
+def test_key_depends_on_colours() -> None:
+    painted = trimesh.creation.box()
+    painted.visual.vertex_colors[0] = (9, 8, 7, 255)
+    meshes = [trimesh.creation.box(), painted]
+    meshes += [textured(), textured(uv=1e-4), textured(shade=1), textured(side=8), textured(side=2)]
+    assert len({bank_key(mesh, VIEWS, SETTINGS) for mesh in meshes}) == len(meshes)
+
+
+def test_the_cached_bank_of_a_mesh_shows_that_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Found again with its own up axis and its own texture, to the last digit of its coordinates."""
+    standing = trimesh.creation.box()
+    standing.metadata["up"] = "y"
+    meshes = [trimesh.creation.box(), standing, textured(uv=100.0), textured(uv=100.0, shade=1)]
+    options = {"folder": tmp_path, "progress": False}
+    for mesh in meshes:
+        cached_bank(mesh, VIEWS, SETTINGS, **options)
+    monkeypatch.setattr(ViewBank, "build", None)  # would fail
+    for mesh in meshes:
+        found, given = cached_bank(mesh, VIEWS, SETTINGS, **options).mesh, as_mesh(mesh)
+        assert found.metadata["up"] == given.metadata["up"]
+        assert ("colours" in found.metadata) == ("colours" in given.metadata)
+        if "colours" in given.metadata:
+            mine, theirs = found.metadata["colours"], given.metadata["colours"]
+            np.testing.assert_array_equal(mine.uv, theirs.uv)
+            np.testing.assert_array_equal(mine.textures[0], theirs.textures[0])
 
 
 def test_a_renderer_of_ones_own_neither_fills_the_cache_nor_takes_from_it(tmp_path: Path) -> None:

@@ -1,0 +1,91 @@
+"""Real photographs, the default pipeline: the poses that come out are the annotated ones, in the right frame and unit.
+
+Only photographs are taken that are registered rightly with room to spare; shares of right answers are measured
+elsewhere (docs/accuracy.md). About 70 seconds of one core, most of it for banks of any orientation.
+"""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+import curvireg_torch as cr
+from curvireg_torch.data import BOPDataset, Pascal3DPlus, read_image
+from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol
+from curvireg_torch.geometry import rotation_error, symmetry_transforms
+from curvireg_torch.metrics import symmetric_rotation_error
+from tests._support.real_data import real_data
+
+pytestmark = pytest.mark.data
+
+
+@dataclass(frozen=True)
+class Case:
+    """Photographs of one mesh and what their poses may be off.
+
+    Attributes:
+        name: of the set.
+        keys: of the benchmark's objects.
+        rotation: degrees, up to the object's symmetries.
+        sideways, depth: across and along the optical axis, as shares of the distance.
+    """
+
+    name: str
+    keys: tuple[str, ...]
+    rotation: float
+    sideways: float = 0.0
+    depth: float = 0.0
+
+
+EXACT = [
+    Case("dino", ("1/55/0", "1/235/0"), rotation=2.0, sideways=0.002, depth=0.02),
+    Case("lm", ("6/0/0", "6/500/0"), rotation=8.0, sideways=0.006, depth=0.08),
+    Case("hope", ("8/0/0", "8/0/2"), rotation=6.0, sideways=0.01, depth=0.03),
+    Case("buddha", ("1/13/0", "1/61/0"), rotation=4.0, sideways=0.006, depth=0.02),
+]
+SIMILAR = [
+    Case("car", ("car/2009_002117/0", "car/2011_002410/0"), rotation=15.0),
+    Case("car", ("car/2010_004258/0",), rotation=15.0),
+    Case("sofa", ("sofa/2008_006784/0",), rotation=15.0),
+]
+
+
+def registered(benchmark, case):
+    """(annotation, result) of each photograph, registered by itself to the bank of the mesh that they share."""
+    items = {item.key: item for item in benchmark.items}
+    chosen = [items[key] for key in case.keys]
+    assert len({item.meshes for item in chosen}) == 1
+    mesh = cr.load_mesh(chosen[0].meshes[0], unit=benchmark.unit)
+    pipeline = cr.Pipeline().posed(benchmark.protocol.pose)
+    registrar = cr.Registrar(cr.ViewBank.build(mesh, pipeline=pipeline, progress=False))
+    for item in chosen:
+        known = benchmark.dataset.annotation(item.index)
+        K = None if item.camera_matrix is None else item.camera_matrix[None]
+        yield known, registrar([read_image(known["image_path"])], item.box[None], K)[0]
+
+
+@pytest.mark.parametrize("case", EXACT, ids=lambda case: case.name)
+def test_poses_of_exact_meshes(case):
+    """Camera and box given; the mesh is in millimetres, and so is the translation."""
+    benchmark = BOPBenchmark(BOPDataset(real_data(f"bop/{case.name}")), Protocol(pose="any"))
+    for key, (known, result) in zip(case.keys, registered(benchmark, case), strict=True):
+        turns = symmetry_transforms(known["model_info"])[:, :3, :3]
+        R, t = result.rotation.double(), known["translation"].double()
+        error = float(symmetric_rotation_error(R[None], known["rotation"].double()[None], turns)[0])
+        assert error < case.rotation, f"{key}: {error:.1f} degrees"
+        shift = (result.translation.double() - t) / t[2]
+        assert float(shift[:2].norm()) < case.sideways, f"{key}: {shift.tolist()} of the distance"
+        assert abs(float(shift[2])) < case.depth, f"{key}: {shift.tolist()} of the distance"
+
+
+@pytest.mark.parametrize("case", SIMILAR, ids=lambda case: case.keys[0])
+def test_viewpoints_of_similar_meshes(case):
+    """No camera, another object's CAD that stands upright: a viewpoint in the annotation's angles."""
+    dataset = Pascal3DPlus(real_data("pascal3d_mini"), pixel_origin=0, categories=[case.name])
+    benchmark = Pascal3DBenchmark(dataset, Protocol(pose="upright"))
+    for key, (known, result) in zip(case.keys, registered(benchmark, case), strict=True):
+        error = float(rotation_error(result.rotation.double(), known["rotation"].double()))
+        assert error < case.rotation, f"{key}: {error:.1f} degrees"
+        told = cr.rotation_from_viewpoint(*(torch.as_tensor(v, dtype=torch.float64) for v in result.viewpoint))
+        assert float(rotation_error(told, known["rotation"].double())) < case.rotation, key
+        assert result.translation is None
