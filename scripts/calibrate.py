@@ -15,7 +15,6 @@ sets in DATA, of which ``curvireg evaluate --out RUNS/NAME`` has written the pre
 """
 
 import argparse
-import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,8 +23,11 @@ from typing import Any
 import numpy as np
 import torch
 from _intervals import independent_units
+from _intervals import interval as mean_of
 from _record import REPOSITORY, SETS, benchmark, between, commit, table_lines, today, write_json
 from run_benchmark import register_benchmark
+from scipy.optimize import minimize
+from scipy.special import logsumexp
 from scipy.stats import chi2
 from sklearn.linear_model import LogisticRegression
 
@@ -36,19 +38,17 @@ from curvireg_torch.registration.confidence import (
     FEATURES,
     RANKING_EVIDENCE,
     RELIABLE,
-    Features,
     LogisticModel,
     pose_features,
 )
-from curvireg_torch.registration.contour_covariance import LEVELS, covariance_scale
-from curvireg_torch.registration.verify import EVIDENCE, verdict
+from curvireg_torch.registration.verify import EVIDENCE, WEIGHTS, verdict
 
 CONSTANTS = REPOSITORY / "curvireg_torch" / "registration" / "calibration.json"
 RECORD = REPOSITORY / "scripts" / "results" / "calibration.json"
 PAGE = REPOSITORY / "docs" / "accuracy.md"
 BEGIN, END = "<!-- calibration:begin -->", "<!-- calibration:end -->"
 
-PARTS: dict[str, tuple[str | None, int | None]] = {"right": (None, None), "any": ("any", 300), "kind": ("kind", 300)}
+PARTS: dict[str, tuple[str | None, int | None]] = {"right": (None, None), "any": ("any", 200), "kind": ("kind", 200)}
 """What is registered: --wrong and --limit of scripts/run_benchmark.py."""
 
 FOLDS = 5
@@ -59,6 +59,10 @@ WRONG_SHARE = 0.1
 """Of the weight that confidence is fitted with: as if one user in ten took a wrong mesh."""
 
 RISK = 0.05
+LEVELS = (0.5, 0.9, 0.95)
+UNKNOWN = 0.5
+"""Standard deviation of a direction that counts as unknown, in units of pi (turns) and of the distance (shifts)."""
+
 COVERAGES = (1.0, 0.75, 0.5, 0.25)
 RESAMPLES = 2000
 
@@ -70,12 +74,9 @@ def features_of(row: Row, *, with_appearance: bool = True) -> tuple[dict[str, fl
     evidence = torch.tensor([[one[name] for name in EVIDENCE] for one in row["evidence"]], dtype=torch.float64)
     if not with_appearance:
         evidence[:, EVIDENCE.index("appearance")] = 0.0
-    verdicts = verdict(evidence, with_camera=row["form"] == "exact")
-    # Hypotheses that returned to their view come last, whatever their score.
-    order = verdicts.masked_fill(~torch.tensor(row["own"]), -torch.inf).argsort(descending=True, stable=True)
-    order = order if not with_appearance else torch.arange(len(order))
-    features = pose_features(evidence[order], verdicts[order], row["ranking"][RANKING_EVIDENCE.index("concentration")])
-    return features, row["errors"][int(order[0])]
+    concentration = row["ranking"][RANKING_EVIDENCE.index("concentration")]
+    features = pose_features(evidence, verdict(evidence, with_camera=row["form"] == "exact"), concentration)
+    return features, row["errors"][0]
 
 
 def ranking_case(row: Row, *, with_appearance: bool = True) -> tuple[dict[str, float | None], float]:
@@ -120,30 +121,52 @@ def is_right(row: Row, error: float) -> bool:
 
 
 def fitted(X: np.ndarray, y: np.ndarray, weight: np.ndarray, names: Sequence[str]) -> LogisticModel:
-    """Logistic regression, drawn towards 0 by as much as one unit of each standardised weight."""
-    spread = X.std(axis=0) + 1e-9
-    model = LogisticRegression(max_iter=2000).fit(X / spread, y, sample_weight=weight)
-    weights = {name: round(float(w), 4) for name, w in zip(names, model.coef_[0] / spread, strict=True)}
-    return LogisticModel(weights, round(float(model.intercept_[0]), 4))
+    """Logistic regression of features (n, F), drawn towards 0 by as much as one unit of each standardised weight."""
+    mean, spread = X.mean(axis=0), X.std(axis=0)
+    spread[spread < 1e-6] = np.inf  # a feature that is always the same says nothing
+    model = LogisticRegression(max_iter=2000).fit((X - mean) / spread, y, sample_weight=weight)
+    w = model.coef_[0] / spread
+    weights = {name: round(float(value), 4) for name, value in zip(names, w, strict=True)}
+    return LogisticModel(weights, round(float(model.intercept_[0] - w @ mean), 4))
+
+
+def transferred(own: LogisticModel, X: np.ndarray, y: np.ndarray) -> LogisticModel:
+    """A model of the object's own mesh, for another object's: how much its logit is worth there, and a bias.
+
+    Among siblings hardly anything tells right from wrong, and weights of their own would be those of chance.
+    """
+    logit = X @ np.array(list(own.weights.values()))
+    slope = fitted(logit[:, None], y, np.ones(len(y)), ["logit"])
+    factor = max(0.0, slope.weights["logit"])
+    return LogisticModel({name: round(factor * w, 4) for name, w in own.weights.items()}, slope.bias)
 
 
 def fit_confidence(rows: Sequence[Row], name: str) -> tuple[LogisticModel, list[Row], np.ndarray, np.ndarray]:
     """The model, its rows, what they get from models that other folds made, and whether they are right."""
     case, with_appearance, form, names = MODELS[name]
-    rows = [row for row in rows if form in (None, row["form"]) and (not row["wrong"] or form != "sibling")]
+    teaching = "exact" if form == "sibling" else form
+    rows = [row for row in rows if form is None or row["form"] in (form, teaching)]
     cases = [case(row, with_appearance=with_appearance) for row in rows]
     X = np.array([[features[n] or 0.0 for n in names] for features, _ in cases])
     y = np.array([is_right(row, error) for row, (_, error) in zip(rows, cases, strict=True)])
     wrong, fold = np.array([bool(row["wrong"]) for row in rows]), folds_of(rows)
+    teaches, asked = (np.array([want in (None, row["form"]) for row in rows]) for want in (teaching, form))
     weight = np.ones(len(rows))
     if wrong.any():
-        weight[wrong] = WRONG_SHARE / (1.0 - WRONG_SHARE) * (~wrong).sum() / wrong.sum()
+        weight[wrong] = WRONG_SHARE / (1.0 - WRONG_SHARE) * (~wrong & teaches).sum() / wrong.sum()
+
+    def fit(train: np.ndarray) -> LogisticModel:
+        some = train & teaches
+        own = fitted(X[some], y[some], weight[some], names)
+        return own if form == teaching else transferred(own, X[train & asked], y[train & asked])
+
     sure = np.zeros(len(rows))
     for k in range(FOLDS):
-        train, test = fold != k, np.flatnonzero(fold == k)
-        model = fitted(X[train], y[train], weight[train], names)
-        sure[test] = [model(cases[i][0]) for i in test]
-    return fitted(X, y, weight, names), rows, sure, y
+        model = fit(fold != k)
+        for i in np.flatnonzero(fold == k):
+            sure[i] = model(cases[i][0])
+    used = [row for row, a in zip(rows, asked, strict=True) if a]
+    return fit(np.full(len(rows), True)), used, sure[asked], y[asked]
 
 
 def auc(sure: np.ndarray, right: np.ndarray) -> float | None:
@@ -196,46 +219,79 @@ def worth(sure: np.ndarray, right: np.ndarray, units: Sequence[Any]) -> Row:
     }
 
 
-def squared_distance(error: Sequence[float], covariance: Sequence[Sequence[float]]) -> float:
-    """e^T C^-1 e."""
-    e, C = np.array(error), np.array(covariance)
-    unit = 1.0 / np.sqrt(np.diag(C))
-    return float((e * unit) @ np.linalg.solve(C * unit[:, None] * unit, e * unit))
+def squared_distance(error: Sequence[float], covariance: Sequence[Sequence[float]], distance: float) -> float:
+    """e^T C^-1 e along the directions that are known; the others have a deviation of pi or of the distance."""
+    wide = np.array([math.pi] * 3 + [distance] * 3)
+    value, axes = np.linalg.eigh(np.array(covariance) / wide[:, None] / wide)
+    known = value < UNKNOWN**2
+    return float((((axes.T @ (np.array(error) / wide)) ** 2 / value)[known]).sum())
 
 
-def ellipsoids(squares: np.ndarray) -> dict[str, float]:
+def radii(squares: np.ndarray) -> dict[str, float]:
     """Squared radii of the ellipsoids that hold LEVELS of these squared distances (the conformal quantiles)."""
     rank = [min(len(squares) - 1, math.ceil(level * (len(squares) + 1)) - 1) for level in LEVELS]
     return {f"{level:g}": round(float(np.sort(squares)[k]), 4) for level, k in zip(LEVELS, rank, strict=True)}
 
 
-def held(squares: np.ndarray, radii: dict[str, float]) -> dict[str, int]:
+def held(squares: np.ndarray, radius: dict[str, float]) -> dict[str, int]:
     """How many squared distances lie within each ellipsoid."""
-    return {level: int((squares <= radius).sum()) for level, radius in radii.items()}
+    return {level: int((squares <= r).sum()) for level, r in radius.items()}
 
 
 def fit_covariance(rows: Sequence[Row], sure: np.ndarray) -> tuple[Row, Row]:
     """Constants of the covariance from the believed answers, wrong ones among them, and their worth by folds."""
-    believed = [row for row, p in zip(rows, sure, strict=True) if p >= RELIABLE and row.get("pose_error")]
-    residual = np.array([row["residual"] for row in believed])
-    raw = np.array([squared_distance(row["pose_error"], row["covariance"]) for row in believed])
-    fold, inside = folds_of(believed), dict.fromkeys((f"{level:g}" for level in LEVELS), 0)
+    believed = [row for row, p in zip(rows, sure, strict=True) if p >= RELIABLE and row.get("covariance")]
+    # Of the covariance before it was scaled.
+    raw = np.array([r["scale"] * squared_distance(r["pose_error"], r["covariance"], r["distance"]) for r in believed])
 
     def fit(index: np.ndarray) -> Row:
-        """The scale that grows with the residual; the 95 % ellipsoid then has the radius of a Gaussian's."""
-        slope = np.polyfit(np.log(np.maximum(residual[index], 0.1)), np.log(raw[index]), 1)[0]
-        constants: Row = {"power": round(float(slope), 3), "factor": 1.0}
-        scaled = raw[index] / covariance_scale(residual[index], constants)
-        constants["factor"] = round(ellipsoids(scaled)["0.95"] / float(chi2.ppf(0.95, 6)), 4)
-        constants["squared_radius"] = ellipsoids(scaled / constants["factor"])
-        return constants
+        """The ellipsoid of 95 % has a Gaussian's radius."""
+        scale = round(radii(raw[index])["0.95"] / float(chi2.ppf(0.95, 6)), 3)
+        return {"scale": scale, "squared_radius": radii(raw[index] / scale)}
 
+    fold, inside = folds_of(believed), dict.fromkeys((f"{level:g}" for level in LEVELS), 0)
     for k in range(FOLDS):
-        constants, test = fit(np.flatnonzero(fold != k)), np.flatnonzero(fold == k)
-        squares = raw[test] / covariance_scale(residual[test], constants)
-        for level, count in held(squares, constants["squared_radius"]).items():
+        constants = fit(np.flatnonzero(fold != k))
+        for level, count in held(raw[fold == k] / constants["scale"], constants["squared_radius"]).items():
             inside[level] += count
     return fit(np.arange(len(believed))), {"n": len(believed), "inside": inside}
+
+
+def fit_verdict(rows: Sequence[Row]) -> list[float]:
+    """Weights of the verdict by which right hypotheses have most of a softmax, drawn towards those in use."""
+    cases = [
+        (np.array([[one[name] for name in EVIDENCE] for one in row["evidence"]]), np.array(row["errors"]) < RIGHT)
+        for row in rows
+        if row["form"] == "exact" and not row["wrong"]
+    ]
+    cases = [(X, right) for X, right in cases if right.any() and not right.all()]
+    prior = np.array(WEIGHTS)
+
+    def loss(w: np.ndarray) -> float:
+        return 2.0 * float((((w - prior) / prior) ** 2).sum()) + sum(
+            float(logsumexp(X @ w) - logsumexp((X @ w)[right])) for X, right in cases
+        )
+
+    found = minimize(loss, prior, method="L-BFGS-B", bounds=[(0.0, None)] * len(prior))
+    return [round(float(w), 2) for w in found.x]
+
+
+def shares(rows: Sequence[Row]) -> dict[str, Row]:
+    """How many answers are right, by form and pose, with intervals over groups."""
+    out = {}
+    for form in ("exact", "sibling"):
+        for pose in ("upright", "free"):
+            some = [r for r in rows if not r["wrong"] and (r["form"], r["pose"]) == (form, pose)]
+            if some:
+                units = [group_of(row) for row in some]
+                found = {
+                    "best view": [r["view_errors"][0] < RIGHT for r in some],
+                    "answer": [r["errors"][0] < RIGHT for r in some],
+                    "answer within 5 degrees": [r["errors"][0] < 5.0 for r in some],
+                    "among the hypotheses": [min(r["errors"]) < RIGHT for r in some],
+                }
+                out[f"{form} {pose}"] = {"n": len(some)} | {k: list(mean_of(v, units)) for k, v in found.items()}
+    return out
 
 
 def real_set(data: Path, runs: Path, name: str, covariance: Row) -> Row:
@@ -255,8 +311,9 @@ def real_set(data: Path, runs: Path, name: str, covariance: Row) -> Row:
             R, t = (torch.tensor(row[k], dtype=torch.float64) for k in ("rotation", "translation"))
             near = poses[rotation_error(poses[:, :3, :3], R).argmin()]
             error = torch.cat([axis_angle_from_rotation(near[:3, :3] @ R.T), near[:3, 3] - t])
-            squares.append(squared_distance(error.tolist(), row["covariance"]))
-    return {**found, "covariance": {"n": len(squares), "inside": held(np.array(squares), covariance["squared_radius"])}}
+            squares.append(squared_distance(error.tolist(), row["covariance"], float(t.norm())))
+    inside = held(np.array(squares), covariance["squared_radius"])
+    return {**found, "covariance": {"n": len(squares), "inside": inside}}
 
 
 def shown(value: float | None, bounds: Sequence[float] | None) -> str:
@@ -291,8 +348,15 @@ def page(record: Row) -> str:
         [name, str(found["n"]), *(f"{k} ({k / found['n']:.2f})" for k in found["inside"].values())]
         for name, found in sets.items()
     ]
+    measures = list(next(iter(record["shares"].values())))[1:]
+    right = [["benchmark", "N", *measures]]
+    right += [
+        [name, str(found["n"]), *(shown(found[m][0], found[m][1:]) for m in measures)]
+        for name, found in record["shares"].items()
+    ]
     where = f"`python scripts/calibrate.py`, {record['date']}, commit {record['commit']}."
-    return "\n".join([*table_lines(lines), "", *table_lines(ellipsoid), "", where, ""])
+    tables = (table_lines(rows) for rows in (right, lines, ellipsoid))
+    return "\n".join([*(line for table in tables for line in [*table, ""]), where, ""])
 
 
 def slices(rows: Sequence[Row], sure: np.ndarray, right: np.ndarray, name: str) -> dict[str, Row]:
@@ -307,7 +371,9 @@ def slices(rows: Sequence[Row], sure: np.ndarray, right: np.ndarray, name: str) 
             wrong = np.array([row["wrong"] == which for row in rows])
             if wrong.any():
                 units = [group_of(r) for r, w in zip(rows, wrong, strict=True) if w]
-                out[f"{name}, {'wrong' if which == 'any' else 'similar'} mesh"] = worth(sure[wrong], right[wrong], units)
+                out[f"{name}, {'wrong' if which == 'any' else 'similar'} mesh"] = worth(
+                    sure[wrong], right[wrong], units
+                )
     return out
 
 
@@ -340,6 +406,7 @@ def main() -> None:
     constants, worthy = calibrate(rows)
     write_json(CONSTANTS, constants)
     record = {"date": today(), "commit": commit(REPOSITORY), "n": len(rows), **constants, **worthy}
+    record |= {"shares": shares(rows), "verdict": {"used": list(WEIGHTS), "fitted": fit_verdict(rows)}}
     if arguments.real:
         record["real"] = {name: real_set(*arguments.real, name, constants["covariance"]) for name in SETS}
     write_json(RECORD, record)

@@ -1,32 +1,37 @@
 """Registers the benchmark of textured meshes (scripts/make_benchmark.py) and keeps what every hypothesis rests on.
 
-    python scripts/run_benchmark.py FOLDER --out rows.jsonl [--pose upright] [--form sibling] [--limit N] [--share I/N]
+    python scripts/run_benchmark.py FOLDER --out rows.jsonl [--pose upright] [--form sibling] [--limit N] [--jobs 2]
 
 One line for each photograph: the errors of the hypotheses in degrees up to the object's symmetries, their evidence,
-the evidence of the ranking, the errors of the best views, and how far off it is in its unscaled covariance's units.
-``exact`` photographs come with their camera matrix, ``sibling`` ones (another object of the kind) without, as
-PASCAL3D+ does. Run again, it goes on. --share takes every N-th mesh, so that several processes work side by side.
+the evidence of the ranking (also of the preset "fast"), the errors of the best views, and how far the pose is off, with
+its covariance. ``exact`` photographs come with their camera matrix, ``sibling`` ones (another object of the kind)
+without, as PASCAL3D+ does. Run again, it goes on. --limit takes the first photographs of the list.
 --box moves each edge of the boxes by up to that share of the side, as `curvireg evaluate --protocol box=SHARE` does.
 --wrong registers "exact" photographs to a mesh that they do not show: any other, or another of the object's kind.
 """
 
 import argparse
+import hashlib
 import json
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import groupby
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import torch
-from check_covariance import squared_distance
 from torch import Tensor
+from tqdm import tqdm
 
 import curvireg_torch as cr
 from curvireg_torch.data import read_image
 from curvireg_torch.evaluation.protocol import Protocol, perturbed_box
-from curvireg_torch.geometry import rotation_towards, transform
+from curvireg_torch.geometry import axis_angle_from_rotation, rotation_towards
 from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
+from curvireg_torch.registration.calibration import COVARIANCE_SCALE
 from curvireg_torch.registration.confidence import ranking_evidence
-from curvireg_torch.registration.contour_covariance import SCALE
+
+KEPT = ("id", "form", "pose", "kind", "mesh", "visible", "clutter", "bare")
 
 
 def error_up_to(R: Tensor, truth: Tensor, symmetries: Tensor) -> Tensor:
@@ -47,20 +52,23 @@ def allocentric(item: dict[str, Any]) -> Tensor:
     return rotation_towards(ray).T @ torch.tensor(item["R"], dtype=torch.float64)
 
 
-def rows_of(
-    items: list[Any], root: Path, half: Path, pipeline: cr.Pipeline, wrong: str | None, protocol: Protocol
-) -> list[Any]:
+def rows_of(task: dict[str, Any]) -> list[Any]:
     """Rows of photographs of one mesh; ``wrong``: registered to this one instead, which none of them shows."""
-    mesh = cr.load_mesh(root / (wrong or items[0]["mesh"]))
-    registrar = cr.Registrar(cr.ViewBank.build(mesh, pipeline=pipeline, progress=False), pipeline=pipeline)
+    torch.set_num_threads(1)
+    folder, half, pipeline, protocol = task["folder"], task["half"], task["pipeline"], Protocol(box=task["box"])
+    mesh = cr.load_mesh(folder / (task["wrong"] or task["items"][0]["mesh"]))
+    bank = cr.ViewBank.build(mesh, pipeline=pipeline, progress=False)
+    registrar = cr.Registrar(bank, pipeline=pipeline)
+    # The preset "fast" of the same views: its ranking alone.
+    fast = cr.ViewMatcher(bank, pipeline=PRESETS["fast"].posed(pipeline.views.pose))
     rows = []
-    for item in items:
-        image = read_image(half / item["image"])
+    for item in task["items"]:
+        image = read_image(folder / half / item["image"])
         box = perturbed_box(torch.tensor(item["box"]), protocol, str(item["id"]))[None]
         exact = item["form"] == "exact"
         K = torch.tensor(item["K"], dtype=torch.float64) if exact else None
         result = registrar([image], box, K)[0]
-        row = {name: item[name] for name in ("id", "form", "pose", "kind", "mesh", "visible", "clutter", "bare")}
+        row = {name: item[name] for name in KEPT} | {"wrong": task["which"], "like": task["like"][item["shown"]]}
         if not result.ok:
             rows.append({**row, "failed": str(result.error)})
             continue
@@ -68,18 +76,84 @@ def rows_of(
         straight = allocentric(item)
         truth = torch.tensor(item["R"], dtype=torch.float64) if exact else straight
         found = torch.stack([h.rotation for h in result.hypotheses])
-        views = registrar.bank.rotations[result.ranking.order[0, :20]].double()
+        views = bank.rotations[result.ranking.order[0, :20]].double()
         row["errors"] = error_up_to(found, truth, symmetries).tolist()
         row["view_errors"] = error_up_to(views, straight, symmetries).tolist()
         row["evidence"] = [dict(h.evidence) for h in result.hypotheses]
-        row["ranking"] = ranking_evidence(result.ranking, registrar.bank.rotations)[0].tolist()
+        row["ranking"] = ranking_evidence(result.ranking, bank.rotations)[0].tolist()
+        quick = fast([image], box)
+        best = bank.rotations[quick.order[0, :1]].double()
+        row["fast"] = {
+            "ranking": ranking_evidence(quick, bank.rotations)[0].tolist(),
+            "error": float(error_up_to(best, straight, symmetries)),
+        }
         row["confidence"] = result.confidence
         row["corrected_box"] = None if result.corrected_box is None else result.corrected_box.tolist()
-        if result.covariance is not None and wrong is None:
+        answer = result.hypotheses[0]
+        if answer.covariance is not None and task["wrong"] is None:
             nearest = truth @ symmetries[error_up_to_each(found[:1], truth, symmetries)[0].argmin()]
-            poses = transform(found[0], result.translation), transform(nearest, torch.tensor(item["t"]).double())
-            row["squared_distance"] = squared_distance(*poses, result.covariance / SCALE)
+            turn = axis_angle_from_rotation(nearest @ answer.rotation.T)
+            row["pose_error"] = [*turn.tolist(), *(torch.tensor(item["t"]) - answer.translation).tolist()]
+            row["distance"] = float(answer.translation.norm())
+            row["covariance"] = answer.covariance.tolist()
+            row["scale"] = COVARIANCE_SCALE
         rows.append(row)
+    return rows
+
+
+def register_benchmark(
+    folder: Path,
+    out: Path,
+    *,
+    half: str = "held-out",
+    pose: str | None = None,
+    form: str | None = None,
+    wrong: str | None = None,
+    limit: int | None = None,
+    box: float = 0.0,
+    pipeline: cr.Pipeline | None = None,
+    jobs: int = 1,
+) -> list[dict[str, Any]]:
+    """Register what ``out`` does not hold yet, and return all rows of what was asked for; see the options of main."""
+    items = [json.loads(line) for line in (folder / half / "items.jsonl").read_text().splitlines()]
+    form = "exact" if wrong else form
+    items = [i for i in items if pose in (None, i["pose"]) and form in (None, i["form"])]
+    like = {m["path"]: m["like"] for m in json.loads((folder / "meshes.json").read_text())["meshes"]}
+    meshes = wrong_meshes(wrong, items, like)
+    items = [i for i in items if i["mesh"] in meshes][:limit]
+    wanted = {i["id"] for i in items}
+    out.parent.mkdir(parents=True, exist_ok=True)
+    done = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+    rows = [row for row in done if row["id"] in wanted]
+    known = {row["id"] for row in rows}
+    # In an order that has nothing to do with the names: what is done when a run is stopped is a fair sample.
+    todo = [i for i in items if i["id"] not in known]
+    todo.sort(key=lambda i: (hashlib.md5(i["mesh"].encode()).hexdigest(), i["pose"], i["id"]))
+    pipeline = preset_named(DEFAULT) if pipeline is None else pipeline
+    tasks = [
+        {
+            "folder": folder,
+            "half": half,
+            "items": list(group),
+            "wrong": meshes[mesh],
+            "which": wrong,
+            "like": like,
+            "box": box,
+            "pipeline": pipeline.posed("upright" if stands == "upright" else "any"),
+        }
+        for (mesh, stands), group in groupby(todo, key=lambda i: (i["mesh"], i["pose"]))
+    ]
+    with (
+        ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool,
+        out.open("a") as file,
+        tqdm(total=len(items), initial=len(rows), desc=out.stem, unit="photograph") as bar,
+    ):
+        for future in as_completed([pool.submit(rows_of, task) for task in tasks]):
+            for row in future.result():
+                rows.append(row)
+                file.write(json.dumps(row) + "\n")
+                bar.update()
+            file.flush()
     return rows
 
 
@@ -111,31 +185,13 @@ def main() -> None:
     parser.add_argument("--wrong", choices=("any", "kind"), help="register to another mesh, if need be of the kind")
     parser.add_argument("--box", type=float, default=0.0, metavar="SHARE", help="how far edges of boxes are off")
     parser.add_argument("--limit", type=int)
-    parser.add_argument("--share", default="0/1", metavar="I/N")
+    parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    half = arguments.folder / arguments.half
-    items = [json.loads(line) for line in (half / "items.jsonl").read_text().splitlines()]
-    form = "exact" if arguments.wrong else arguments.form
-    items = [i for i in items if arguments.pose in (None, i["pose"]) and form in (None, i["form"])]
-    like = {m["path"]: m["like"] for m in json.loads((arguments.folder / "meshes.json").read_text())["meshes"]}
-    wrong = wrong_meshes(arguments.wrong, items, like)
-    items = [i for i in items if i["mesh"] in wrong][: arguments.limit]
-    done = set()
-    if arguments.out.exists():
-        done = {json.loads(line)["id"] for line in arguments.out.read_text().splitlines()}
-    pipeline = preset_named(arguments.preset) if arguments.pipeline is None else cr.Pipeline.read(arguments.pipeline)
-    meshes = sorted({i["mesh"] for i in items})
-    index, count = (int(n) for n in arguments.share.split("/"))
-    items = [i for i in items if meshes.index(i["mesh"]) % count == index and i["id"] not in done]
-    items.sort(key=lambda i: (i["mesh"], i["pose"], i["id"]))
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    for (mesh, pose), group in groupby(items, key=lambda i: (i["mesh"], i["pose"])):
-        posed = pipeline.posed("upright" if pose == "upright" else "any")
-        with arguments.out.open("a") as file:
-            for row in rows_of(list(group), arguments.folder, half, posed, wrong[mesh], Protocol(box=arguments.box)):
-                file.write(json.dumps({**row, "wrong": arguments.wrong}) + "\n")
+    options = vars(parser.parse_args())
+    preset, file = options.pop("preset"), options.pop("pipeline")
+    pipeline = preset_named(preset) if file is None else cr.Pipeline.read(file)
+    rows = register_benchmark(options.pop("folder"), options.pop("out"), pipeline=pipeline, **options)
+    print(f"{len(rows)} photographs, {sum('failed' in row for row in rows)} failed")
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ __all__ = [
     "ranking_features",
 ]
 
-RELIABLE = 0.8
+RELIABLE = 0.9
 """Confidence below which a registration says "no reliable match"."""
 
 RANKING_EVIDENCE = ("similarity", "margin", "concentration")

@@ -21,7 +21,6 @@ from ..errors import InvalidInputError
 from ..filters.inputs import filled
 from ..geometry import crop_images
 from ..rendering import DepthRenderer
-from .calibration import covariance_scale
 from .contour_covariance import pose_covariance
 from .contour_descent import Seen, Views, moved
 from .contour_points import EdgeField
@@ -181,10 +180,8 @@ def fit_contours(
     best = torch.where(owner == torch.arange(N)[:, None], support, -1.0).argmax(dim=1)
     seen, support = seen[best], support[best]
     found = full.matches(seen, FINE[-1])
+    covariance, observable = pose_covariance(found, seen.points, seen.T, full.K, centre, radius=radius)
     weight = found.weight[..., 0]
-    matched = (weight > 0).sum(dim=1) / seen.points.valid.sum(dim=1).clamp(min=1)
-    scale = covariance_scale(matched)
-    covariance, observable = pose_covariance(found, seen.points, seen.T, full.K, centre, radius=radius, scale=scale)
     mean_square = (weight * found.distance[..., 0].square()).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-12)
     return ContourFit(
         transform=seen.T,
@@ -192,7 +189,7 @@ def fit_contours(
         support=support,
         start_support=before,
         observable=observable,
-        matched=matched,
+        matched=(weight > 0).sum(dim=1) / seen.points.valid.sum(dim=1).clamp(min=1),
         residual=mean_square.sqrt(),
         moved=full.way(seen.points, T0, seen.T),
     )

@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor
 
+from .calibration import COVARIANCE_SCALE
 from .contour_descent import Matches, cross, project
 from .contour_points import ContourPoints
 
@@ -28,11 +29,12 @@ UNKNOWN = math.pi
 
 
 def pose_covariance(
-    found: Matches, points: ContourPoints, T: Tensor, K: Tensor, centre: Tensor, *, radius: float, scale: Tensor
+    found: Matches, points: ContourPoints, T: Tensor, K: Tensor, centre: Tensor, *, radius: float
 ) -> tuple[Tensor, Tensor]:
     """Covariance of poses by least squares over contour points, and how many directions they fix.
 
-    With J the derivatives, W the weights, A = J^T W J and r the residuals, the covariance is A^-1 B A^-1 with
+    With J the derivatives, W the weights, A = J^T W J and r the residuals, the covariance is
+    ``COVARIANCE_SCALE`` A^-1 B A^-1 with
 
         B = sum_c g_c g_c^T + (0.36 px^2 + 6 s^2) J^T W^2 J,
 
@@ -48,8 +50,6 @@ def pose_covariance(
         T: (N, 4, 4).
         K: (N, 3, 3) of the crops.
         centre, radius: of the object, (3,) and model units.
-        scale: (N,) by what to multiply it, see :func:`.calibration.covariance_scale`; directions that are unknown stay
-            as unknown as they are.
 
     Returns:
         (N, 6, 6) of (turn, translation of the model's origin), NaN where too few edges were found; (N,) directions
@@ -79,7 +79,7 @@ def pose_covariance(
     square = (W * found.distance**2).sum(dim=1, keepdim=True) / W.sum(dim=1, keepdim=True).clamp(min=1e-12)
     B = g.mT @ g + (POINT**2 + SHARED * square) * (found.J.mT @ (W * W * found.J))
     inverse = basis * (known / share.clamp(min=1e-12))[:, None]
-    C = scale[:, None, None] * inverse @ (basis.mT @ B @ basis) @ inverse.mT
+    C = COVARIANCE_SCALE * inverse @ (basis.mT @ B @ basis) @ inverse.mT
     position = T[:, :3, :3] @ centre + T[:, :3, 3]
     turn, shift = (torch.linalg.vector_norm(part, dim=1).clamp(min=1e-300) for part in basis.split(3, dim=1))
     distance = torch.linalg.vector_norm(position, dim=1)[:, None]

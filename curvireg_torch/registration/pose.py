@@ -40,8 +40,6 @@ class Hypothesis:
         model: which of the bank's meshes.
         support: how strongly edges of the photograph lie under the mesh's contours, in [0, 1]; None without the contour
             stage (:func:`curvireg_torch.registration.fit_contours`).
-        matched: share of the mesh's contour points that lie by an edge of the photograph; None without the contour
-            stage, and for a hypothesis that returned to its view.
         covariance: (6, 6) float64 of turn (rad) about the camera's x, y, z and translation (model units) along them,
             ``R_true = exp([w]x) R``, ``t_true = t + e``, should this pose be the right one; None without a camera
             matrix, without the contour stage, and where the contours do not fix the pose. Its errors have heavier
@@ -58,7 +56,6 @@ class Hypothesis:
     view: int
     model: int = 0
     support: float | None = None
-    matched: float | None = None
     covariance: Tensor | None = None
 
     @property

@@ -330,6 +330,5 @@ def _hypothesis(h: int, poses: Poses, support: Tensor, evidence: Tensor, with_ca
         view=int(found.view[h]),
         model=int(found.model[h]),
         support=None if fit is None else float(support[h]),
-        matched=float(fit.matched[h]) if fit is not None and known else None,
         covariance=fit.covariance[h].clone() if fit is not None and known else None,
     )

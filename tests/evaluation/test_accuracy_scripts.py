@@ -5,15 +5,12 @@ import math
 import re
 from collections import Counter
 
-import numpy as np
 import pytest
 import torch
 
-import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol
 from tests._support.real_data import real_data
-from tests._support.scenes import CAMERA, scene, truck_bank
 from tests._support.scripts import ROOT, SCRIPTS, imported
 
 STAGES = ("view", "search", "contours")
@@ -132,57 +129,9 @@ def test_kinds_of_errors(scripts, azimuth, elevation_error, kind):
 
 
 @pytest.fixture
-def verdicts():
-    pytest.importorskip("sklearn", reason="scikit-learn is not installed")
-    with imported("fit_verdict") as script:
-        yield script
-
-
-@pytest.fixture
 def runner():
     with imported("run_benchmark") as script:
         yield script
-
-
-def row(mesh, errors, evidence):
-    names = ("rank", "similarity", "support", "appearance")
-    known = [dict(zip(names, one, strict=True)) for one in evidence]
-    return {"mesh": mesh, "form": "exact", "errors": errors, "evidence": known}
-
-
-def test_shares_vary_with_meshes_not_with_photographs(verdicts):
-    one = [row("a", [], [])] * 400
-    assert verdicts.share([True] * 100 + [False] * 300, one) == [0.25, 0.25, 0.25], "one mesh: nothing to vary"
-    each = [{**r, "mesh": f"m{k}"} for k, r in enumerate(one)]
-    mean, low, high = verdicts.share([True] * 100 + [False] * 300, each)
-    half = 1.96 * (0.25 * 0.75 / 400) ** 0.5
-    assert mean == 0.25
-    assert (low, high) == (pytest.approx(mean - half, abs=0.006), pytest.approx(mean + half, abs=0.006))
-
-
-def test_the_verdict_without_each_piece_of_evidence(verdicts):
-    """By support the first hypothesis is right, by rank and similarity the second."""
-    rows = [row(f"m{k}", [5.0, 90.0], [(-1.0, 0.5, 0.9, 0.0), (0.0, 0.6, 0.1, 0.0)]) for k in range(3)]
-    found = {name: mean for name, (mean, _, _) in verdicts.without(rows).items()}
-    assert found == {"nothing": 1.0, "rank": 1.0, "similarity": 1.0, "support": 0.0, "appearance": 1.0}
-    held = {
-        "auc_right_answer": 0.75,
-        "precision_at": {"0.5": [0.9, 0.4], "0.9": [None, 0.0]},
-        "risk_at_coverage": {"1": 0.1},
-    }
-    shares = {key: [0.5, 0.25, 0.75] for key in ("best_view", "winner", "among_hypotheses")}
-    alike = {"kind": {"auc": 0.625, "n": 8, "believed": 3, "right_of_them": 2}}
-    result = {
-        "shares": {"exact upright": {"n": 3, **shares}},
-        "verdict": {"without": verdicts.without(rows)},
-        "confidence": {"held_out": held, "right_mesh": alike},
-    }
-    text = verdicts.page(result)
-    assert "| exact upright | 3 | 0.50 (0.25 to 0.75) | 0.50 (0.25 to 0.75) | 0.50 (0.25 to 0.75) |" in text
-    assert "| exact photographs, verdict without | nothing | rank | similarity | support | appearance |" in text
-    assert "| right | 1.000 | 1.000 | 1.000 | 0.000 | 1.000 |" in text
-    assert "answers 0.75. Of right meshes against another mesh of the object's kind (8 photographs): 0.62;" in text
-    assert "; of these wrong meshes 3 are believed, 2 of them with a pose within 30 degrees." in text
 
 
 def test_wrong_meshes_are_no_copies_and_of_the_kind_where_asked(runner):
@@ -192,41 +141,3 @@ def test_wrong_meshes_are_no_copies_and_of_the_kind_where_asked(runner):
     assert runner.wrong_meshes(None, items, like) == dict.fromkeys(kinds)
     assert runner.wrong_meshes("any", items, like) == dict(zip("abcdef", "ccdefa", strict=True))
     assert runner.wrong_meshes("kind", items, like) == {"a": "d", "b": "d", "d": "a"}, "no car stands by"
-
-
-@pytest.fixture
-def believed():
-    with imported("check_verdict") as script:
-        yield script
-
-
-def test_what_the_confidence_rests_on(believed):
-    """Verdicts: 8, 6 and 4.5 with a camera; 0, -1 and -0.5, by rank alone, without."""
-    rows = (0.0, 1.0, 0.3, 0.0), (-1.0, 1.0, 0.2, 0.0), (-0.5, 0.6, 0.2, 0.0)
-    known = [dict(zip(("rank", "similarity", "support", "appearance"), one, strict=True)) for one in rows]
-    assert believed.evidence_of(known, with_camera=True) == pytest.approx([1.0, 2.0, 1.0, 0.3]), "the nearest rival's"
-    assert believed.evidence_of(known, with_camera=False) == pytest.approx([1.0, 0.5, 0.0, 0.3])
-    assert believed.evidence_of(known[:1], with_camera=True) == pytest.approx([1.0, 5.0, 1.0, 0.3]), "alone"
-
-
-def test_what_confidences_are_worth(believed):
-    assert believed.auc(np.array([0.5, 0.9]), np.array([0.5, 0.1])) == pytest.approx(3.5 / 4), "a tie counts half"
-    sure, right = np.array([0.9, 0.8, 0.6, 0.3]), np.array([True, True, False, True])
-    found = believed.judged(sure, right)
-    assert found["auc"] == pytest.approx(2 / 3)
-    assert found["wrong_at"] == {"1": 0.25, "0.75": pytest.approx(1 / 3), "0.5": 0.0, "0.25": 0.0}
-    assert (found["reliable"], found["right_of_them"]) == (0.5, 1.0)
-    none = believed.judged(np.array([0.1, 0.2]), np.array([True, True]))
-    assert (none["auc"], none["reliable"], none["right_of_them"]) == (None, 0.0, None)
-    text = believed.table({"sets": {"lm": found, "dino": none}, "date": "today", "commit": "abc"})
-    assert "| lm | 4 | 0.75 | 0.65 | 0.67 | 0.25 | 0.33 | 0.00 | 0.00 | 0.50 | 1.00 |" in text
-    assert "| dino | 2 | 1.00 | 0.15 | - | 0.00 | 0.00 | 0.00 | 0.00 | 0.00 | - |" in text
-
-
-def test_confidence_is_that_of_the_registration(believed):
-    found = cr.Registrar(truck_bank())([scene(0)[0]], scene(0)[1][None], CAMERA)[0]
-    kept = {"evidence": dict(found.hypotheses[0].evidence)}
-    kept["rivals"] = [{"evidence": dict(h.evidence)} for h in found.hypotheses[1:]]
-    assert believed.confidence_of(kept, with_camera=True) == pytest.approx(found.confidence)
-    assert believed.confidence_of(kept, with_camera=False) != pytest.approx(found.confidence)
-    assert believed.confidence_of({"failed": "no"}, with_camera=True) == 0.0

@@ -10,12 +10,11 @@ from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis
 from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import contour_covariance, fit_contours
+from curvireg_torch.registration.calibration import COVARIANCE_SCALE as SCALE
 from curvireg_torch.registration.contour_covariance import pose_covariance
 from curvireg_torch.registration.contour_descent import Matches, moved, project
 from curvireg_torch.registration.contour_points import ContourPoints
 from curvireg_torch.rendering import make_renderer
-
-SCALE = 30.0
 
 K = camera_matrix(300.0, 310.0, 63.5, 60.0, dtype=torch.float64)
 
@@ -41,9 +40,7 @@ def test_covariance_is_the_sandwich_of_turn_and_translation_of_the_origin():
     generator = torch.Generator().manual_seed(1)
     W, d = (torch.rand(1, 60, 1, generator=generator, dtype=torch.float64) for _ in range(2))
     J = (points.normals[..., None, :] @ project(points.model, T, K[None], centre)[1])[..., 0, :]
-    found, known = pose_covariance(
-        Matches(J, d, W), points, T, K[None], centre, radius=1.7, scale=torch.full((1,), SCALE)
-    )
+    found, known = pose_covariance(Matches(J, d, W), points, T, K[None], centre, radius=1.7)
     assert int(known) == 6
 
     def pixels(step: torch.Tensor) -> torch.Tensor:
@@ -82,7 +79,6 @@ def test_injected_noise_lies_within():
         K.expand(400, 3, 3),
         centre,
         radius=1.7,
-        scale=torch.full((400,), SCALE),
     )
     spread = torch.cov(off.T)
     # The mean covariance is the spread times what is allowed for errors that neighbours share.
@@ -132,8 +128,6 @@ def test_a_box_is_known_all_around():
 def test_nothing_found_is_not_a_number():
     points, T, centre = cloud(20)
     zero = torch.zeros(1, 20, 1, dtype=torch.float64)
-    C, known = pose_covariance(
-        Matches(zero.expand(1, 20, 6), zero, zero), points, T, K[None], centre, radius=1.0, scale=torch.ones(1)
-    )
+    C, known = pose_covariance(Matches(zero.expand(1, 20, 6), zero, zero), points, T, K[None], centre, radius=1.0)
     assert bool(C.isnan().all())
     assert int(known) == 0
