@@ -221,22 +221,6 @@ def tables(result: dict) -> str:
     return "\n".join(lines) + "\n"
 
 
-def confidence_table(checked: dict) -> str:
-    """Markdown of what check_confidence.py found."""
-    columns = ["set", "N", "right", "mean confidence", "ECE", "error at coverage 1", "0.5", "0.25"]
-    columns += ["AUC right answer", "AUC right mesh", "reliable", "right of them", "wrong meshes called reliable"]
-    lines = ["| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
-    for name, c in checked.items():
-        cover, reliable = c["error_at_coverage"], c["reliable"]
-        cells = [c["right"], c["mean_confidence"], c["ece"], cover["1.0"], cover["0.5"], cover["0.25"]]
-        cells += [c["auc_right_answer"], c["auc_right_mesh"]]
-        cells += [reliable["share"], reliable["right"], reliable["wrong_mesh_share"]]
-        lines.append(f"| {name} | {c['n']} | " + " | ".join("-" if v is None else f"{v:.2f}" for v in cells) + " |")
-    bins = [f"{b['confidence']:.2f}: {b['right']:.2f} ({b['n']})" for b in checked["all"]["diagram"]]
-    lines += ["", "Reliability, all sets, mean confidence: share right (N): " + "; ".join(bins) + "."]
-    return "\n".join(lines) + "\n"
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, nargs="?", metavar="DATA")
@@ -249,15 +233,8 @@ def main() -> None:
         write_json(arguments.out, measure(arguments.data, arguments.sets), 1)
     if arguments.table:
         page = REPOSITORY / "docs" / "method.md"
-        text = page.read_text()
-        confidence = json.loads((arguments.out.parent / "confidence.json").read_text())
-        for name, content in (
-            ("similarities", tables(json.loads(arguments.out.read_text()))),
-            ("confidence", confidence_table(confidence)),
-        ):
-            begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
-            text = between(text, begin, end, content)
-        page.write_text(text)
+        begin, end = "<!-- similarities:begin -->", "<!-- similarities:end -->"
+        page.write_text(between(page.read_text(), begin, end, tables(json.loads(arguments.out.read_text()))))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ breaks one of the library's conditions, and the answer is wrong. Contours are dr
 
 **Look at the confidence.** It was fitted on generated photographs that keep most of these conditions, some of them with
 a wrong mesh. Where they are broken it drops, and so does the support, how strongly edges lie under the contours: none
-of the wrong answers below is called reliable (from 0.8 on). That is no promise, so look at the overlay before you
+of the wrong answers below is called reliable (from 0.9 on). That is no promise, so look at the overlay before you
 believe a number.
 """
 
