@@ -199,7 +199,7 @@ def test_what_these_tests_find(tmp_path: Path) -> None:
     for words in (bank, script):
         with pytest.raises(SystemExit):
             parsed(words)
-    assert found("curvireg_torch.registration.confidence.pose_confidence") is not None
+    assert found("curvireg_torch.registration.confidence.confidence_model") is not None
     assert found("curvireg_torch.Registar") is None
     assert "--box" in options()
     assert "--bocks" not in options()
