@@ -127,8 +127,8 @@ def check_positive(value: float, name: str, *, zero_ok: bool = False) -> float:
 
 def check_share(value: float, name: str) -> None:
     """``value`` is a share in (0, 1]."""
-    if not 0 < value <= 1:
-        raise InvalidInputError(f"{name}: expected 0 < {name} <= 1, got {value}")
+    if not (isinstance(value, int | float) and 0 < value <= 1):
+        raise InvalidInputError(f"{name}: expected 0 < {name} <= 1, got {value!r}")
 
 
 def check_finite(x: Tensor, name: str) -> None:
@@ -195,7 +195,7 @@ def check_camera_matrix(K: Tensor, name: str = "camera matrix") -> None:
     last = torch.tensor([0.0, 0.0, 1.0], dtype=K.dtype, device=K.device)
     if not bool((K[..., 2, :] == last).all() and (K[..., 1, 0] == 0).all()):
         raise InvalidInputError(f"{name}: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    if not bool((K[..., 0, 1] == 0).all()):
+    if not bool((K[..., 0, 1].abs() <= 1e-6 * K[..., 0, 0]).all()):  # what rounding leaves of none
         raise InvalidInputError(f"{name}: expected no skew, K[0, 1] = 0; rectify the image")
 
 
@@ -213,8 +213,9 @@ def as_numbers(values: Any, name: str, *, least: torch.dtype = torch.float32) ->
     """A floating tensor, of dtype ``least`` or a wider one, of a tensor, an array, or nested lists of any of them."""
     try:
         if isinstance(values, list | tuple):
-            plain = all(isinstance(value, int | float) for value in values)
-            x = torch.tensor(values, dtype=least) if plain else torch.stack([as_numbers(v, name) for v in values])
+            plain = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+            parts = [] if plain else [as_numbers(value, name, least=least) for value in values]
+            x = torch.tensor(values, dtype=least) if plain else torch.stack(parts)
         else:
             x = torch.as_tensor(values)
     except (TypeError, ValueError, RuntimeError) as error:

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import torch
 
-__all__ = ["for_each", "map_on_threads", "one_thread_each"]
+__all__ = ["available_threads", "for_each", "map_on_threads", "one_thread_each"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -25,7 +25,7 @@ def for_each(count: int, job: Callable[[int], object]) -> None:
     On a thread of :func:`one_thread_each`, and in a job, nothing is shared, unless :func:`map_on_threads` has threads
     to spare. For jobs that do not call torch. The first error ends all threads after their present job and is raised.
     """
-    threads = min(getattr(_here, "threads", None) or torch.get_num_threads(), count)
+    threads = min(available_threads(), count)
     numbers = itertools.count()
     stopped = False
 
@@ -59,6 +59,11 @@ def _pool() -> ThreadPoolExecutor:
     return _workers[1]
 
 
+def available_threads() -> int:
+    """Threads that a job may use here: those of torch, and on a thread of :func:`map_on_threads` those left over."""
+    return max(getattr(_here, "threads", 1), torch.get_num_threads())
+
+
 def map_on_threads(job: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """``job`` of every item, in their order, each on one thread on which torch computes alone.
 
@@ -81,13 +86,13 @@ def map_on_threads(job: Callable[[Item], Result], items: Sequence[Item]) -> list
 
 @contextmanager
 def one_thread_each() -> Iterator[ThreadPoolExecutor]:
-    """A pool of ``torch.get_num_threads()`` threads, on each of which torch computes alone.
+    """A pool of :func:`available_threads` threads, on each of which torch computes alone.
 
     Operations on a few images are too short to be shared among threads inside: waiting for each other then costs more
     than the work. An error, Ctrl-C among them, does not wait for jobs that have not begun.
     """
     threads = torch.get_num_threads()
-    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+    with ThreadPoolExecutor(available_threads(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
         try:
             yield pool
         except BaseException:

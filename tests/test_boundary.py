@@ -25,7 +25,7 @@ from curvireg_torch.visualization import contour_overlay, posed_glb, registratio
 
 SIZE = (96, 128)
 BACKENDS = ("torch", "embree")
-CAMERA = torch.tensor([[220.0, 0.0, 63.5], [0.0, 220.0, 47.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+CAMERA = torch.tensor([[220.1, 0.0, 63.5], [0.0, 220.1, 47.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
@@ -185,8 +185,8 @@ BAD_CAMERAS = {
     "infinite": altered(CAMERA, (1, 1, math.inf)),
     "fx = 0": altered(CAMERA, (0, 0, 0.0)),
     "fy = 0": altered(CAMERA, (1, 1, 0.0)),
-    "fx < 0": altered(CAMERA, (0, 0, -220.0)),
-    "both < 0": altered(CAMERA, (0, 0, -220.0), (1, 1, -220.0)),
+    "fx < 0": altered(CAMERA, (0, 0, -220.1)),
+    "both < 0": altered(CAMERA, (0, 0, -220.1), (1, 1, -220.1)),
     "skew": altered(CAMERA, (0, 1, 0.5)),
     "last row": altered(CAMERA, (2, 0, 0.01)),
     "not scaled": 2.0 * CAMERA,
@@ -219,10 +219,10 @@ def test_only_what_compares_views_asks_for_square_pixels(entries: Entries, fx: f
 
 def test_square_pixels_are_within_ten_per_cent_either_way() -> None:
     for ratio in (1.0 / 1.099, 1.0, 1.099):
-        check_square_pixels(altered(CAMERA, (0, 0, 220.0 * ratio)))
+        check_square_pixels(altered(CAMERA, (0, 0, 220.1 * ratio)))
     for ratio in (1.0 / 1.101, 1.101):
         with pytest.raises(InvalidInputError, match="square"):
-            check_square_pixels(torch.stack([CAMERA, altered(CAMERA, (0, 0, 220.0 * ratio))]))
+            check_square_pixels(torch.stack([CAMERA, altered(CAMERA, (0, 0, 220.1 * ratio))]))
 
 
 def bad_poses(T: Tensor) -> dict[str, Tensor]:

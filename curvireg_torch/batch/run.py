@@ -2,10 +2,11 @@
 
 import hashlib
 import json
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import starmap
+from itertools import groupby, starmap
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import torch
 from tqdm import tqdm
 
 from .._files import file_digest, write_file
+from .._threads import map_on_threads
 from ..data import Photo, read_photo
 from ..document import SCHEMA, fitting_box, found_document, result_document
 from ..errors import BankError, CurviregError, ImageError, InvalidInputError, MeshError
@@ -53,8 +55,8 @@ def register_list(
 ) -> Counts:
     """Register the photographs of a list; ``out`` gets ``results.jsonl``, ``results.csv`` and ``index.html``.
 
-    Photographs of one mesh follow each other, so that only its bank is in memory, and one photograph at a time: in a
-    batch their numbers would be rounded otherwise, and a pose hang on its neighbours. What ``results.jsonl`` holds of
+    Photographs of one mesh follow each other, so that only its bank is in memory; as many as torch has threads are
+    registered side by side. What ``results.jsonl`` holds of
     the same photograph, mesh, box, camera and settings is not done again. A row that cannot be registered (photograph
     or mesh missing or broken, box or camera that is none) ends ``failed``, with the reason.
 
@@ -157,10 +159,26 @@ class _Run:
             disable=not self.progress,
         )
         with bar:
-            for request, entry in todo:
-                self.records.append(self._record(request, entry))
-                bar.update()
+            for meshes, group in groupby(todo, key=lambda pair: pair[1].meshes):
+                self._register(meshes, list(group), bar)
         return self._finish(listing)
+
+    def _register(self, meshes: tuple[Path, ...], some: Sequence[tuple[str, Entry]], bar: "tqdm[Any]") -> None:
+        """Photographs of the same meshes, side by side; each is on disk as soon as it is done."""
+        start = time.perf_counter()
+        registrar = self._opened(meshes)
+        seconds = [time.perf_counter() - start]  # the first photograph's
+        lock = threading.Lock()
+
+        def one(pair: tuple[str, Entry]) -> None:
+            with lock:
+                bank_seconds = seconds.pop() if seconds else 0.0
+            record = self._record(*pair, registrar, bank_seconds)
+            with lock:
+                self.records.append(record)
+                bar.update()
+
+        map_on_threads(one, some)
 
     def _request(self, entry: Entry) -> str:
         """Names all that the result depends on but the photograph's content, which is read only where it must be."""
@@ -179,19 +197,17 @@ class _Run:
         assert entry.photo is not None
         return bool(before) and before == file_digest(entry.photo)
 
-    def _record(self, request: str, entry: Entry) -> Record:
+    def _record(self, request: str, entry: Entry, registrar: Registrar | Exception, bank_seconds: float) -> Record:
         assert entry.photo is not None
         digests = {"request": request, "photo": file_digest(entry.photo)}
         try:
             photo = read_photo(entry.photo, dtype=torch.uint8)
         except (CurviregError, OSError) as error:
             return _failed(str(error), digests)
-        start = time.perf_counter()
-        registrar = self._opened(entry.meshes)
         if not isinstance(registrar, Registrar):
             return _failed(str(registrar), digests)
         try:
-            result, document = register_entry(entry, photo, registrar, bank_seconds=time.perf_counter() - start)
+            result, document = register_entry(entry, photo, registrar, bank_seconds=bank_seconds)
         except (ImageError, InvalidInputError) as error:
             return _failed(str(error), digests)
         renderer = registrar.describers[result.model].renderer

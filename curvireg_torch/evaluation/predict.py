@@ -12,8 +12,9 @@ from tqdm import tqdm
 
 from .._files import file_digest
 from ..data import read_image
-from ..errors import ImageError, MeshError, MissingFileError
+from ..errors import ImageError, InvalidInputError, MeshError, MissingFileError
 from ..geometry import load_mesh
+from ..geometry.crops import whole_image_box
 from ..geometry.mesh_files import mesh_digest
 from ..matching import ViewBank, ViewMatcher, cached_bank
 from ..pipeline import Pipeline
@@ -43,7 +44,7 @@ def predict(
     """Register those of ``items`` that ``store`` does not hold yet, holds as skipped, or holds of other files.
 
     Objects of one mesh follow each other, so that a bank is made once and only those in use are in memory, and are
-    registered in batches. More cores: more processes (``--jobs``, ``torchrun``).
+    registered side by side on torch's threads. More cores: more processes (``--jobs``, ``torchrun``).
 
     A photograph or mesh that cannot be read, or an unknown box, gives a row ``skipped``; an object that the method
     refuses gives a row ``failed``, which scores count as a miss. Any other error is a defect and ends the loop.
@@ -117,7 +118,11 @@ class _Workshop:
             except (ImageError, MissingFileError) as error:
                 rows[item.key] = {"skipped": "unreadable_image", "reason": str(error)}
                 continue
-            photographs[item.key] = Photograph(image, perturbed_box(item.box, protocol, item.key), item.camera_matrix)
+            try:
+                box = whole_image_box(image) if protocol.box is None else perturbed_box(item.box, protocol, item.key)
+                photographs[item.key] = Photograph(image, box, item.camera_matrix)
+            except InvalidInputError as error:
+                rows[item.key] = {"failed": str(error), "seconds": {"bank": 0.0, "register": 0.0}}
         start = time.perf_counter()
         try:
             registrar = self._registrar(items[0].meshes, protocol) if photographs else None

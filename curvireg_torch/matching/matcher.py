@@ -98,6 +98,9 @@ class ViewMatcher(nn.Module):
     compares it with all views, and :math:`S = \prod_t S_t^{w_t}`. A box is never exact: terms take the best over a few
     crops that are moved and scaled a little.
 
+    Photographs are described and compared in batches: what shares a batch, and the number of torch's threads, change
+    scores by rounding, by about 1e-5 of themselves. :class:`curvireg_torch.Registrar` does not let that happen.
+
     Args:
         bank: the views of one model, or of several (which one is it?).
         pipeline: field, terms and slack; default the one the bank was made with. Its bank settings and view policy must
@@ -266,7 +269,8 @@ class ViewMatcher(nn.Module):
             return module.described(self._shaded(torch.tensor(some, device=self.device)))
 
         # On one thread each, as the bank's own: which photograph asked first does not decide how features are rounded.
-        parts = map_on_threads(described, [missing[k : k + SOME] for k in range(0, len(missing), SOME)])
+        some = [missing[k : k + SOME] for k in range(0, len(missing), SOME)]
+        parts = map_on_threads(described, some) if self.device.type == "cpu" else [described(part) for part in some]
         new = dict(zip(missing, (feature for part in parts for feature in part), strict=True))
         if len(kept) + len(new) > KEPT:
             kept.clear()

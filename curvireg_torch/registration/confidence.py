@@ -48,6 +48,9 @@ both pieces of evidence, and for the one."""
 MARGIN = 5.0
 """A lead that is larger says no more."""
 
+UNCOMPARED = 0.5
+"""Confidence in an answer that has no rival, at most."""
+
 _APART = 30.0  # degrees beyond which two views are rival answers
 
 Features = Mapping[str, float | None]
@@ -67,9 +70,14 @@ class LogisticModel:
     bias: float
 
     def __call__(self, features: Features) -> float:
-        """Probability in (0, 1). A feature that is None counts as 0, which is what a tie with a rival has."""
+        """Probability in (0, 1).
+
+        A feature that is None, for want of a rival to compare with, counts as 0, as that of a tie does, and the
+        probability is ``UNCOMPARED`` at most: nothing was seen that speaks against another pose.
+        """
         logit = self.bias + sum(weight * (features[name] or 0.0) for name, weight in self.weights.items())
-        return 0.5 * (1.0 + math.tanh(0.5 * logit))  # the logistic function, which overflows nowhere
+        probability = 0.5 * (1.0 + math.tanh(0.5 * logit))  # the logistic function, which overflows nowhere
+        return probability if None not in features.values() else min(probability, UNCOMPARED)
 
 
 def confidence_model(stage: str, *, with_camera: bool, with_appearance: bool) -> LogisticModel:
@@ -87,19 +95,23 @@ def confidence_model(stage: str, *, with_camera: bool, with_appearance: bool) ->
     return LogisticModel(model["weights"], model["bias"])
 
 
-def ranking_evidence(ranking: Ranking, rotations: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
+def ranking_evidence(
+    ranking: Ranking, rotations: Tensor, *, answer: Tensor | None = None, symmetries: Tensor | None = None
+) -> Tensor:
     """(B, 3) numbers that tell right answers from wrong ones, by the names in ``RANKING_EVIDENCE``.
 
-    similarity: normalised correlation of the best view, in [0, 1]. margin: how far its score leads the best view more
-    than 30 degrees away, log S - log S', at most 5. concentration: of the sum of S^4 over all views, the share within
-    30 degrees of the best. Both are 0 where no view is that far away: then nothing was compared.
+    similarity: normalised correlation of the answer's view, in [0, 1]. margin: how far its score leads the best view
+    more than 30 degrees away, log S - log S', within +-5. concentration: of the sum of S^4 over all views, the share
+    within 30 degrees of it. Both are NaN where no view is that far away: then nothing was compared.
 
     Args:
         ranking: of N views for B photographs.
         rotations: (N, 3, 3) of the views.
+        answer: (B,) views that are the answers; default the best of each ranking.
         symmetries: (K, 4, 4) or (K, 3, 3) of the mesh: views that differ by one of them are the same answer.
     """
-    scores, best = ranking.scores.double(), ranking.order[:, :1]
+    scores = ranking.scores.double()
+    best = ranking.order[:, :1] if answer is None else answer.to(ranking.order)[:, None]
     turns = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
     alike = rotations[best] @ turns.to(rotations)  # (B, K, 3, 3)
     traces = (alike.flatten(2) @ rotations.flatten(1).T).amax(dim=1)
@@ -107,17 +119,18 @@ def ranking_evidence(ranking: Ranking, rotations: Tensor, *, symmetries: Tensor 
     tiny = 1e-300  # of scores that are all 0
     leader = scores.gather(1, best).clamp(min=tiny)
     rival = scores.masked_fill(near, 0.0).amax(dim=1, keepdim=True)
-    margin = (leader / rival.clamp(min=tiny)).log().clamp(max=MARGIN)
-    weights = (scores / leader) ** 4
+    margin = (leader / rival.clamp(min=tiny)).log().clamp(-MARGIN, MARGIN)
+    weights = (scores / scores.amax(dim=1, keepdim=True).clamp(min=tiny)) ** 4
     concentration = (weights * near).sum(dim=1, keepdim=True) / weights.sum(dim=1, keepdim=True).clamp(min=tiny)
-    compared = ~near.all(dim=1, keepdim=True)
-    parts = [ranking.hog.gather(1, best), margin * compared, concentration * compared]
+    alone = near.all(dim=1, keepdim=True)
+    parts = [ranking.hog.gather(1, best), *(x.masked_fill(alone, torch.nan) for x in (margin, concentration))]
     return torch.cat([part.double() for part in parts], dim=1).float()
 
 
 def ranking_features(evidence: Tensor) -> dict[str, float | None]:
-    """Features of one ranking, from (3,) :func:`ranking_evidence`."""
-    return dict(zip(RANKING_EVIDENCE, evidence.tolist(), strict=True))
+    """Features of one ranking, from (3,) :func:`ranking_evidence`; None for what could not be compared."""
+    known = zip(RANKING_EVIDENCE, evidence.tolist(), strict=True)
+    return {name: None if math.isnan(value) else value for name, value in known}
 
 
 def confidence(ranking: Ranking, rotations: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
@@ -143,7 +156,7 @@ def confidence(ranking: Ranking, rotations: Tensor, *, symmetries: Tensor | None
     return torch.tensor([model(ranking_features(one)) for one in evidence])
 
 
-def pose_features(evidence: Tensor, verdicts: Tensor, concentration: float) -> dict[str, float | None]:
+def pose_features(evidence: Tensor, verdicts: Tensor, concentration: float | None) -> dict[str, float | None]:
     """Features of the best of the hypotheses that were followed for one photograph, by the names in ``FEATURES``.
 
     similarity and support: of the best one. lead: how far it leads its best rival in :func:`verdict`;

@@ -13,6 +13,7 @@ from .._checks import (
     as_numbers,
     check_camera_matrix,
     check_photograph,
+    check_pixels,
     check_pose,
     check_positive,
     check_tensor,
@@ -157,8 +158,7 @@ def fit_contours(
     if N == 0:
         none = T0.new_zeros(0)
         return ContourFit(T0, T0.new_zeros(0, 6, 6), none, none, none.long(), none, none, none)
-    crops, A = crop_images(images, boxes, size=SIZE, margin=margin)
-    crops = filled(crops)
+    crops, A = _crops(images, boxes, margin)
     K = A.double()[photograph] @ K
     full = Views(renderer, EdgeField(crops), photograph, K, SIZE, centre, radius)
     K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ K
@@ -215,9 +215,17 @@ def contour_support(
     images, boxes, K, photograph = _batch(images, boxes, camera_matrices, poses, photograph)
     if len(poses) == 0:
         return torch.zeros(0, dtype=torch.float64)
-    crops, A = crop_images(images, boxes, size=SIZE, margin=margin)
+    crops, A = _crops(images, boxes, margin)
     views = Views(renderer, EdgeField(crops), photograph, A.double()[photograph] @ K, SIZE, centre.double(), radius)
     return views.support(views.seen(poses.detach().cpu().double()))
+
+
+def _crops(images: Sequence[Tensor], boxes: Tensor, margin: float) -> tuple[Tensor, Tensor]:
+    """(B, C, S, S) crops without missing pixels, and (B, 3, 3) transforms."""
+    crops, A = crop_images(images, boxes, size=SIZE, margin=margin)
+    crops = filled(crops)
+    check_pixels(crops, "of the box")
+    return crops, A
 
 
 def _around(half: Views, T0: Tensor, first: Seen, support: Tensor) -> tuple[Tensor, Tensor]:

@@ -55,7 +55,9 @@ class Registrar:
             differ by one of them are reported once.
         device: where modules, bank and search live.
         progress: show bars; or a function that is told a stage ("bank", "ranking", "search", "contours"; before
-            ranking "looking", without a box), how much of it is done and of how much, and may raise to stop.
+            ranking "looking", without a box), how much of it is done and of how much, and may raise to stop. On a CPU
+            photographs are registered side by side: the function, a renderer and a field of your own are then called
+            by several threads at a time.
 
     Example:
         >>> import trimesh
@@ -191,7 +193,9 @@ class Registrar:
         def some(first: int) -> list[Any]:
             return answer(items[first : first + size], first)
 
-        return [each for part in map_on_threads(some, range(0, len(items), size)) for each in part]
+        firsts = range(0, len(items), size)
+        parts = map_on_threads(some, firsts) if size == 1 else [some(first) for first in firsts]
+        return [each for part in parts for each in part]
 
     def _answers_to_boxes(
         self, items: Sequence[Item | CurviregError], first: int
@@ -285,7 +289,11 @@ class Registrar:
         poses = replace(poses, found=replace(poses.found, score=similarity))
         verdicts = verdict(evidence, with_camera=with_camera)
         order = (verdicts + torch.where(own, 0.0, -1e6)).argsort(descending=True, stable=True)
-        ranked = ranking_evidence(ranking, self.bank.rotations, symmetries=self.symmetries)
+        photograph = starts.photograph[order]
+        first = torch.stack([(photograph == b).int().argmax() for b in range(len(items))])
+        ranked = ranking_evidence(
+            ranking, self.bank.rotations, answer=starts.view[order[first]], symmetries=self.symmetries
+        )
         model = confidence_model(
             "ranking" if fit is None else "contours",
             with_camera=with_camera,
@@ -293,10 +301,10 @@ class Registrar:
         )
         results = []
         for b in range(len(items)):
-            mine = order[starts.photograph[order] == b]
+            mine = order[photograph == b]
             features = ranking_features(ranked[b])
             if fit is not None:
-                features = pose_features(evidence[mine], verdicts[mine], float(ranked[b, 2]))
+                features = pose_features(evidence[mine], verdicts[mine], features["concentration"])
             answers = tuple(
                 _hypothesis(h, poses, support, evidence, with_camera) for h in mine[: self.pipeline.hypotheses].tolist()
             )

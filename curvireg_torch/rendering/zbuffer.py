@@ -5,7 +5,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from .._threads import one_thread_each
+from .._threads import available_threads, one_thread_each
 from ..geometry.mesh import mesh_centre, mesh_radius
 from .base import NEAREST, check_render_arguments
 
@@ -66,7 +66,7 @@ class TorchRenderer:
                 block = depth[i : i + views].view(-1)
                 self._draw(block, faces, R[i : i + views], t[i : i + views], K[i : i + views], size, orthographic)
 
-        if self.device.type == "cpu" and torch.get_num_threads() > 1:
+        if self.device.type == "cpu" and available_threads() > 1:
             with one_thread_each() as pool:
                 list(pool.map(draw, range(0, len(T), views)))
         else:

@@ -4,17 +4,21 @@ from pathlib import Path
 
 import pytest
 import torch
+import trimesh
 
 from curvireg_torch import Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
-from curvireg_torch.geometry import symmetry_transforms
+from curvireg_torch.geometry import symmetry_transforms, views_without_symmetric
 from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
 from curvireg_torch.matching import Ranking
+from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import confidence, distinct_views, ranking_evidence, verdict
+from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration.confidence import (
     CALIBRATION,
     FEATURES,
     RANKING_EVIDENCE,
     RELIABLE,
+    UNCOMPARED,
     LogisticModel,
     confidence_model,
     pose_features,
@@ -72,7 +76,18 @@ def test_views_that_a_symmetry_makes_one_are_no_rivals():
 
 def test_without_a_view_far_away_nothing_was_compared():
     R = sample_views(azimuths=[0.0, 10.0, 20.0], elevations=[0]).rotations
-    assert ranking_evidence(ranking(torch.tensor([[1.0, 0.1, 0.1]])), R)[0, 1:].tolist() == [0.0, 0.0]
+    alone = ranking_evidence(ranking(torch.tensor([[1.0, 0.1, 0.1]])), R)
+    assert bool(alone[0, 1:].isnan().all())
+    assert float(confidence(ranking(torch.tensor([[1.0, 0.1, 0.1]])), R)) <= UNCOMPARED
+
+
+def test_evidence_of_another_answer_than_the_best_view():
+    R = sample_views(azimuth_step=90, elevations=[0]).rotations
+    scores = torch.tensor([[1.0, 0.2, 0.5, 0.1]])
+    similarity, margin, concentration = ranking_evidence(ranking(scores), R, answer=torch.tensor([2]))[0].tolist()
+    assert similarity == pytest.approx(0.8)
+    assert margin == pytest.approx(math.log(0.5))
+    assert concentration == pytest.approx(0.5**4 / (1 + 0.2**4 + 0.5**4 + 0.1**4), rel=1e-5)
 
 
 def test_constants_are_those_that_the_script_found():
@@ -87,7 +102,8 @@ def test_constants_are_those_that_the_script_found():
 def test_confidence_of_a_pose_is_the_logistic_function():
     model = LogisticModel({"similarity": 3.0, "lead": 0.5}, -2.0)
     assert model({"similarity": 0.7, "lead": 2.0}) == pytest.approx(1 / (1 + math.exp(-(2.1 + 1.0 - 2.0))))
-    assert model({"similarity": 0.7, "lead": None}) == model({"similarity": 0.7, "lead": 0.0})
+    assert model({"similarity": 0.1, "lead": None}) == model({"similarity": 0.1, "lead": 0.0}) < UNCOMPARED
+    assert model({"similarity": 5.0, "lead": None}) == UNCOMPARED, "an answer without a rival is not believed"
     assert LogisticModel({}, 1e4)({}) == 1.0
     assert LogisticModel({}, -1e4)({}) == 0.0
 
@@ -175,11 +191,20 @@ def test_confidence_rests_on_what_the_hypotheses_say():
         assert result.confidence == pytest.approx(model(features))
 
 
-def test_without_contours_the_confidence_is_that_of_the_ranking():
+def test_without_contours_the_confidence_is_that_of_the_answers_view(monkeypatch):
     image, box, _ = scene(0)
-    result = Registrar(truck_bank(), refine=False)([image], box[None], CAMERA)[0]
-    assert result.confidence == pytest.approx(float(confidence(result.ranking, truck_bank().rotations)))
+    registrar = Registrar(truck_bank(), refine=False)
+    result = registrar([image], box[None], CAMERA)[0]
     assert list(result.confidence_features) == list(RANKING_EVIDENCE)
+    assert result.confidence == pytest.approx(float(confidence(result.ranking, truck_bank().rotations)))
+    # Where the order of the hypotheses is not that of the ranking, the answer is judged, not the best view.
+    monkeypatch.setattr(registrar_module, "verdict", lambda evidence, **_: evidence[:, 0].neg())
+    other = registrar([image], box[None], CAMERA)[0]
+    view = int(other.candidates[0])
+    assert view != int(other.ranking.order[0, 0])
+    assert other.confidence_features["similarity"] == pytest.approx(float(other.ranking.hog[0, view]))
+    assert other.confidence_features["margin"] < 0.0
+    assert other.confidence < result.confidence
 
 
 def test_one_hypothesis_is_not_believed_for_want_of_a_rival() -> None:
@@ -200,8 +225,24 @@ def test_a_bank_without_a_rival_view_has_no_lead() -> None:
     bank = ViewBank.build(truck_bank().mesh, near, pipeline=truck_bank().pipeline, image_size=96, progress=False)
     result = Registrar(bank)([image], box[None], CAMERA)[0]
     assert result.confidence_features["lead"] is None
-    assert result.confidence_features["concentration"] == 0.0
-    assert not result.reliable
+    assert result.confidence_features["concentration"] is None
+    assert result.confidence <= UNCOMPARED
+    ranked = Registrar(bank, refine=False)([image], box[None], CAMERA)[0]
+    assert ranked.confidence_features["margin"] is None
+    assert ranked.confidence <= UNCOMPARED
+
+
+def test_a_bottle_with_its_symmetry_said_is_not_believed_for_want_of_rivals() -> None:
+    """The recipe of docs/guides/symmetric.md: four views are left, and hardly one of them is a rival."""
+    bottle = trimesh.creation.revolve([[0, 0], [0.04, 0], [0.04, 0.15], [0.015, 0.2], [0.015, 0.25], [0, 0.25]])
+    turns = symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]})
+    views = views_without_symmetric(sample_views(elevations=[0, 15]), turns)
+    bank = ViewBank.build(bottle, views, pipeline=PRESETS["classical"], progress=False)
+    empty = procedural_background(SIZE, torch.Generator().manual_seed(3))
+    result = Registrar(bank, symmetries=turns)([empty], torch.tensor([[80.0, 30, 140, 150]]), CAMERA)[0]
+    assert len(views) == 2
+    assert result.confidence_features["lead"] is None
+    assert result.confidence <= UNCOMPARED
 
 
 def test_what_is_said_of_a_pose_is_measured_of_that_pose() -> None:
