@@ -122,7 +122,8 @@ class _Workshop:
                 box = whole_image_box(image) if protocol.box is None else perturbed_box(item.box, protocol, item.key)
                 photographs[item.key] = Photograph(image, box, item.camera_matrix)
             except InvalidInputError as error:
-                rows[item.key] = {"failed": str(error), "seconds": {"bank": 0.0, "register": 0.0}}
+                size = list(image.shape[1:])
+                rows[item.key] = {"image_size": size, "failed": str(error), "seconds": {"bank": 0.0, "register": 0.0}}
         start = time.perf_counter()
         try:
             registrar = self._registrar(items[0].meshes, protocol) if photographs else None

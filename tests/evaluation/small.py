@@ -20,37 +20,6 @@ SMALL = Pipeline(
 )
 
 
-def assert_same(a: object, b: object) -> None:
-    """The same but for the rounding of other batches; texts of numbers count as numbers."""
-    if isinstance(a, dict) and isinstance(b, dict):
-        assert a.keys() == b.keys()
-        for key in a:
-            assert_same(a[key], b[key])
-    elif isinstance(a, list | tuple) and isinstance(b, list | tuple):
-        assert len(a) == len(b)
-        for x, y in zip(a, b, strict=True):
-            assert_same(x, y)
-    elif a != b:
-        x, y = number(a), number(b)
-        if isinstance(x, list) and isinstance(y, list):
-            assert_same(x, y)
-        elif isinstance(x, float) and isinstance(y, float):
-            assert abs(x - y) <= 1e-4 * max(1.0, abs(y)), (a, b)
-        else:
-            raise AssertionError((a, b))
-
-
-def number(value: object) -> object:
-    try:
-        return float(value) if isinstance(value, float | str) else value
-    except ValueError:
-        parts = value.split() if isinstance(value, str) else []
-        try:
-            return [float(part) for part in parts] if len(parts) > 1 else value
-        except ValueError:
-            return value
-
-
 def die_at(count: int) -> None:
     """Kill this process at its ``count``-th rename within an evaluation's folder."""
     replace, seen = os.replace, 0

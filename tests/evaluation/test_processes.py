@@ -14,8 +14,6 @@ from curvireg_torch.data import BOPDataset
 from curvireg_torch.evaluation import Benchmark, BOPBenchmark, Pascal3DBenchmark, Protocol, evaluate
 from curvireg_torch.evaluation.__main__ import main
 
-from .small import assert_same
-
 REPOSITORY = Path(__file__).parents[2]
 
 
@@ -50,7 +48,7 @@ def test_killed_and_started_again(pascal, tmp_path):
         assert not (tmp_path / "killed" / "predictions.csv").exists()
     done = start(*words)
     assert done.returncode == 0, done.stderr
-    assert_same(results(tmp_path / "killed"), results(tmp_path / "whole"))
+    assert results(tmp_path / "killed") == results(tmp_path / "whole")
     assert len(list((tmp_path / "killed" / "predictions").glob("*.json"))) == 6, "five objects and the settings"
 
 
@@ -66,7 +64,7 @@ def test_two_processes_do_the_same_as_one(request, tmp_path, kind):
     torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m")
     two = start(kind, dataset.root, "--out", tmp_path / "two", launcher=torchrun)
     assert two.returncode == 0, two.stderr
-    assert_same(results(tmp_path / "two"), results(tmp_path / "one"))
+    assert results(tmp_path / "two") == results(tmp_path / "one")
     assert two.stdout.count("protocol:") == 1, "one process reports"
 
 
