@@ -54,7 +54,6 @@ TOP = {
     "__init__",
     "__main__",
 }
-TOP |= {"presets"}
 
 
 def parts() -> list[str]:

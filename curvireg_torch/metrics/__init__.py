@@ -14,7 +14,7 @@ from .detection import (
     average_rotation_precision,
     average_viewpoint_precision,
 )
-from .points import hausdorff_distance, intersection_percentage, repeatability, view_repeatability
+from .points import hausdorff_distance, intersection_percentage, view_repeatability
 from .pose import add_error, add_recall, adds_error, mspd_error, mspd_recall, mssd_error, mssd_recall
 from .ranking import closest_view, pose_parameter_errors, rank_precision, viewpoint_differences
 from .viewpoint import (
@@ -55,7 +55,6 @@ __all__ = [
     "mssd_recall",
     "pose_parameter_errors",
     "rank_precision",
-    "repeatability",
     "symmetric_rotation_error",
     "symmetry_transforms",
     "view_repeatability",
