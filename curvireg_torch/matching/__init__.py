@@ -28,7 +28,6 @@ from .cache import (
 )
 from .describe import DescribedViews, ViewDescriber
 from .distinct import distinct_views
-from .index import ViewIndex
 from .matcher import Ranking, ViewMatcher
 
 __all__ = [
@@ -41,7 +40,6 @@ __all__ = [
     "Ranking",
     "ViewBank",
     "ViewDescriber",
-    "ViewIndex",
     "ViewMatcher",
     "Whitening",
     "bank_key",
