@@ -1,12 +1,10 @@
-"""Scores of poses, rankings, feature points and detections, as functions and as classes that accumulate.
+"""Scores of poses, rankings, feature points and detections, as functions of a whole set.
 
-Functions take a whole set at once. The classes take it batch by batch and merge across processes. An average over
-nothing is NaN; a missing estimate has the error ``inf`` and counts as a miss. Every threshold is strict: equal is not
-good enough, except for a radius in pixels and for the IoU, which are inclusive.
+An average over nothing is NaN; a missing estimate has the error ``inf`` and counts as a miss. Every threshold is
+strict: equal is not good enough, except for a radius in pixels and for the IoU, which are inclusive.
 """
 
 from ..geometry.symmetry import symmetry_transforms
-from .classes import Metric, PoseRecall, RankPrecision, ViewpointAccuracy
 from .detection import (
     Detections,
     Objects,
@@ -30,11 +28,7 @@ from .viewpoint import (
 __all__ = [
     "AVP_BINS",
     "Detections",
-    "Metric",
     "Objects",
-    "PoseRecall",
-    "RankPrecision",
-    "ViewpointAccuracy",
     "accuracy",
     "add_error",
     "add_recall",
