@@ -114,6 +114,12 @@ def test_trimesh_and_pyrender_stay_where_they_belong():
             assert not imported(path)[1] & {"pyrender", "embreex", "OpenGL"}, path
 
 
+def test_scikit_learn_is_not_imported():
+    """It belongs to the extra ``dev``: tests and scripts use it."""
+    for path in PACKAGE.rglob("*.py"):
+        assert "sklearn" not in imported(path)[1], path
+
+
 def test_public_names_are_sorted_explicit_and_documented():
     names = curvireg_torch.__all__
     assert names == sorted(names, key=lambda n: (not n.isupper(), n[0].islower(), n))
