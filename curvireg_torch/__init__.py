@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     )
     from .learned import LearnedCurvilinearSaliency
     from .location import locate
-    from .matching import BankCollection, BankSettings, Ranking, ViewBank, ViewMatcher
+    from .matching import BankSettings, Ranking, ViewBank, ViewMatcher
     from .pipeline import Pipeline
     from .registration import Registrar, Registration
     from .rendering import render_depth
@@ -72,7 +72,7 @@ else:
             ),
             "learned": "LearnedCurvilinearSaliency",
             "location": "locate",
-            "matching": "BankCollection BankSettings Ranking ViewBank ViewMatcher",
+            "matching": "BankSettings Ranking ViewBank ViewMatcher",
             "pipeline": "Pipeline",
             "registration": "Registrar Registration",
             "rendering": "render_depth",
@@ -87,7 +87,6 @@ __all__ = [
     "ApparentRidges",
     "AverageShadingGradient",
     "BOPDataset",
-    "BankCollection",
     "BankSettings",
     "CurviregError",
     "DepthCurvilinearSaliency",

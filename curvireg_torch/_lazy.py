@@ -1,29 +1,21 @@
 """Packages whose names are imported when they are first asked for (PEP 562)."""
 
 import sys
-import warnings
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
 
 
-def lazy(
-    package: str, places: Mapping[str, str], former: Mapping[str, str] | None = None
-) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def lazy(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """``__getattr__`` and ``__dir__`` of ``package``.
 
     Args:
         package: its ``__name__``.
         places: names, divided by spaces, by the submodule that has them; the submodules can be asked for, too.
-        former: deprecated names, and the module and name that took their place.
     """
     where = {name: place for place, names in places.items() for name in names.split()}
 
     def get(name: str) -> Any:
-        if former and name in former:
-            module, _, now = former[name].rpartition(".")
-            warnings.warn(f"{package}.{name} is deprecated; use {former[name]}", DeprecationWarning, stacklevel=2)
-            return getattr(import_module(module), now)
         if name not in where and name not in places:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         place = import_module("." + where.get(name, name), package)

@@ -68,7 +68,7 @@ def test(cell: str, select: str, *, keep: bool) -> dict[str, Any]:
     with log.open("w") as output:
         for command in (
             [found, "-m", "venv", folder],
-            [python, "-m", "pip", "install", "--quiet", "-e", f"{REPOSITORY}[dev,faiss]", "-c", constraints],
+            [python, "-m", "pip", "install", "--quiet", "-e", f"{REPOSITORY}[dev]", "-c", constraints],
             [python, "-m", "pytest", "-q", *PARALLEL, "-p", "no:cacheprovider", "-m", select, f"--junitxml={report}"],
         ):
             print(f"{cell}: {shlex.join(map(str, command))}", flush=True)

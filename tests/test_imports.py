@@ -54,7 +54,6 @@ TOP = {
     "__init__",
     "__main__",
 }
-TOP |= {"presets"}
 
 
 def parts() -> list[str]:
@@ -113,6 +112,12 @@ def test_trimesh_and_pyrender_stay_where_they_belong():
     for path in PACKAGE.rglob("*.py"):
         if path.parent.name != "rendering":
             assert not imported(path)[1] & {"pyrender", "embreex", "OpenGL"}, path
+
+
+def test_scikit_learn_is_not_imported():
+    """It belongs to the extra ``dev``: tests and scripts use it."""
+    for path in PACKAGE.rglob("*.py"):
+        assert "sklearn" not in imported(path)[1], path
 
 
 def test_public_names_are_sorted_explicit_and_documented():

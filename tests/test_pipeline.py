@@ -1,8 +1,6 @@
 """The one value that decides a result."""
 
-import importlib
 import json
-import sys
 from dataclasses import FrozenInstanceError, asdict, fields, replace
 
 import pytest
@@ -162,10 +160,3 @@ def test_views_of_a_policy():
     assert upright.distance.tolist() == [3.0] * 4
     with pytest.raises(InvalidInputError, match="came with the call"):
         ViewPolicy(pose="given").sphere()
-
-
-def test_old_place_of_presets(monkeypatch):
-    monkeypatch.delitem(sys.modules, "curvireg_torch.presets", raising=False)  # doctests import every module
-    with pytest.warns(DeprecationWarning, match=r"curvireg_torch\.pipeline"):
-        presets = importlib.import_module("curvireg_torch.presets")
-    assert presets.Preset is Pipeline

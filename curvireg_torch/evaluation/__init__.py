@@ -34,7 +34,6 @@ else:
             "sheet": "contact_sheet",
             "web": "WebBenchmark",
         },
-        {"Preset": "curvireg_torch.pipeline.Pipeline"},
     )
 
 __all__ = [

@@ -24,7 +24,6 @@ from .conversions import (
 )
 from .crops import box_iou, crop_images, crop_transforms, square_boxes, whole_image_box
 from .mesh import load_mesh, mesh_centre, mesh_radius, normalization_transform
-from .neighbours import nearest_views
 from .symmetry import symmetry_transforms, views_without_symmetric
 from .translation import place_view, translation_from_box
 from .up import mesh_up, up_rotation, with_z_up
@@ -44,7 +43,6 @@ __all__ = [
     "mesh_centre",
     "mesh_radius",
     "mesh_up",
-    "nearest_views",
     "normalization_transform",
     "opencv_from_opengl",
     "opencv_from_pytorch3d",

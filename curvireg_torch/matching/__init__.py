@@ -1,10 +1,5 @@
 """Banks of described views, and the matcher that ranks them for photographs."""
 
-import warnings
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
-from .._lazy import lazy
 from ..pipeline import BankSettings
 from ..terms import (
     DescriptorStatistics,
@@ -33,12 +28,10 @@ from .cache import (
 )
 from .describe import DescribedViews, ViewDescriber
 from .distinct import distinct_views
-from .index import ViewIndex
 from .matcher import Ranking, ViewMatcher
 
 __all__ = [
     "CACHE_LIMIT",
-    "BankCollection",
     "BankSettings",
     "CachedBank",
     "DescribedViews",
@@ -47,7 +40,6 @@ __all__ = [
     "Ranking",
     "ViewBank",
     "ViewDescriber",
-    "ViewIndex",
     "ViewMatcher",
     "Whitening",
     "bank_key",
@@ -67,12 +59,3 @@ __all__ = [
     "unit_score",
     "whole_box_shapes",
 ]
-
-if not TYPE_CHECKING:
-    __getattr__, _ = lazy(__name__, {}, {"QueryFeatures": "curvireg_torch.matching.Photographs"})
-
-
-def BankCollection(banks: Sequence[ViewBank]) -> ViewBank:  # noqa: N802 (the name of version 0.1)
-    """Deprecated name of :meth:`ViewBank.join`."""
-    warnings.warn("BankCollection is deprecated; use ViewBank.join", DeprecationWarning, stacklevel=2)
-    return ViewBank.join(banks)

@@ -1,6 +1,5 @@
 """All views of a bank ranked for every photograph of a batch."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -111,8 +110,6 @@ class ViewMatcher(nn.Module):
         whitening: compare whitened descriptors (:class:`DescriptorStatistics`), whatever the term "hog" says.
         renderer: of views that a :class:`LateTerm` asks for.
         chunk_size: photographs in memory at a time.
-        deprecated: ``eps``, ``repeatability_mode``, ``repeatability_sigma`` and ``box_sigma`` of version 0.1; use
-            :meth:`Pipeline.with_term`.
 
     Raises:
         BankError: the bank was made with other settings or for another pose than ``pipeline`` says.
@@ -137,14 +134,11 @@ class ViewMatcher(nn.Module):
         whitening: Whitening | None = None,
         renderer: str | DepthRenderer = "auto",
         chunk_size: int = 16,
-        **deprecated: Any,
     ) -> None:
         super().__init__()
         pipeline = bank.pipeline if pipeline is None else pipeline
         bank.check_made_for(pipeline)
         pipeline = replace(pipeline, views=bank.pipeline.views)  # "given" where they came with the call
-        if deprecated:
-            pipeline = _with_old_options(pipeline, deprecated)
         if slack is not None:
             pipeline = replace(pipeline, slack=slack)
         if chunk_size < 1:
@@ -321,24 +315,3 @@ class ViewMatcher(nn.Module):
             ViewDescriber(mesh, self.bank.settings, renderer=self._renderer, coloured=coloured, device=self.device)
             for mesh in self.bank.meshes
         )
-
-
-def _with_old_options(pipeline: Pipeline, options: dict[str, Any]) -> Pipeline:
-    """The options that :class:`ViewMatcher` had in version 0.1."""
-    known = {"eps", "repeatability_mode", "repeatability_sigma", "box_sigma"}
-    if not options.keys() <= known:
-        raise TypeError(f"ViewMatcher: unexpected options {sorted(options.keys() - known)}")
-    warnings.warn(
-        f"ViewMatcher: {', '.join(sorted(options))} are deprecated; use pipeline=Pipeline().with_term(...)",
-        DeprecationWarning,
-        stacklevel=3,
-    )
-    if options.get("eps") is not None:
-        pipeline = pipeline.with_term("repeatability", eps=options["eps"] / pipeline.bank.image_size)
-    if "repeatability_mode" in options:
-        pipeline = pipeline.with_term("repeatability", mode=options["repeatability_mode"])
-    for name in ("repeatability", "box"):
-        if f"{name}_sigma" in options:
-            sigma = options[f"{name}_sigma"]
-            pipeline = pipeline.with_term(name, **({"weight": 0.0} if sigma is None else {"sigma": sigma}))
-    return pipeline

@@ -1,12 +1,10 @@
-"""Scores of poses, rankings, feature points and detections, as functions and as classes that accumulate.
+"""Scores of poses, rankings, feature points and detections, as functions of a whole set.
 
-Functions take a whole set at once. The classes take it batch by batch and merge across processes. An average over
-nothing is NaN; a missing estimate has the error ``inf`` and counts as a miss. Every threshold is strict: equal is not
-good enough, except for a radius in pixels and for the IoU, which are inclusive.
+An average over nothing is NaN; a missing estimate has the error ``inf`` and counts as a miss. Every threshold is
+strict: equal is not good enough, except for a radius in pixels and for the IoU, which are inclusive.
 """
 
 from ..geometry.symmetry import symmetry_transforms
-from .classes import Metric, PoseRecall, RankPrecision, ViewpointAccuracy
 from .detection import (
     Detections,
     Objects,
@@ -14,7 +12,7 @@ from .detection import (
     average_rotation_precision,
     average_viewpoint_precision,
 )
-from .points import hausdorff_distance, intersection_percentage, repeatability, view_repeatability
+from .points import hausdorff_distance, intersection_percentage, view_repeatability
 from .pose import add_error, add_recall, adds_error, mspd_error, mspd_recall, mssd_error, mssd_recall
 from .ranking import closest_view, pose_parameter_errors, rank_precision, viewpoint_differences
 from .viewpoint import (
@@ -30,11 +28,7 @@ from .viewpoint import (
 __all__ = [
     "AVP_BINS",
     "Detections",
-    "Metric",
     "Objects",
-    "PoseRecall",
-    "RankPrecision",
-    "ViewpointAccuracy",
     "accuracy",
     "add_error",
     "add_recall",
@@ -55,7 +49,6 @@ __all__ = [
     "mssd_recall",
     "pose_parameter_errors",
     "rank_precision",
-    "repeatability",
     "symmetric_rotation_error",
     "symmetry_transforms",
     "view_repeatability",

@@ -1,6 +1,5 @@
 """How well two sets of feature points, given as boolean masks, fall on each other."""
 
-import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -14,7 +13,7 @@ from curvireg_torch.errors import InvalidInputError
 
 from ._samples import shown
 
-__all__ = ["hausdorff_distance", "intersection_percentage", "repeatability", "view_repeatability"]
+__all__ = ["hausdorff_distance", "intersection_percentage", "view_repeatability"]
 
 
 def intersection_percentage(photo: Tensor, view: Tensor, *, eps_px: float = 2.0) -> Tensor:
@@ -66,13 +65,6 @@ def view_repeatability(view: Tensor, photo: Tensor, *, eps_px: float = 2.0) -> T
     """
     check_positive(eps_px, "eps_px", zero_ok=True)
     return _per_image(_share_near(eps_px), view, photo, ("view", "photo"))
-
-
-def repeatability(view: Tensor, photo: Tensor, *, eps_px: float = 2.0) -> Tensor:
-    """Former name of :func:`view_repeatability`."""
-    message = "metrics.repeatability is now called view_repeatability; matching.repeatability is the other direction"
-    warnings.warn(message, DeprecationWarning, stacklevel=2)
-    return view_repeatability(view, photo, eps_px=eps_px)
 
 
 def hausdorff_distance(a: Tensor, b: Tensor, *, percentile: float = 100.0, directed: bool = False) -> Tensor:

@@ -48,19 +48,10 @@ def rank_precision(
         >>> rank_precision(order, errors, ks=(1, 3)), rank_precision(order, errors, ks=(1, 3), threshold_deg=30.0)
         ({1: 0.0, 3: 1.0}, {1: 1.0, 3: 1.0})
     """
-    check_ranks(ks, threshold_deg)
-    return precision_from_rows(rank_rows(order, errors, ks), ks, threshold_deg)
-
-
-def check_ranks(ks: Sequence[int], threshold_deg: float | None) -> None:
     if len(ks) == 0 or any(k < 1 for k in ks):
         raise InvalidInputError(f"ks: expected ranks >= 1, got {tuple(ks)}")
     if threshold_deg is not None:
         check_positive(threshold_deg, "threshold_deg")
-
-
-def rank_rows(order: Tensor, errors: Tensor, ks: Sequence[int]) -> Tensor:
-    """(B, 1 + len(ks)): the smallest error of the bank, then the smallest among the first k for each k."""
     check_tensor(errors, "errors", (None, None))
     n = errors.shape[1]
     needed = min(max(ks), n)
@@ -77,13 +68,10 @@ def rank_rows(order: Tensor, errors: Tensor, ks: Sequence[int]) -> Tensor:
     if not bool(((order >= 0) & (order < n)).all()):
         raise InvalidInputError(f"order: expected indices in [0, {n}), got some outside")
     best = errors.gather(1, order.long()).cummin(1).values
-    return torch.stack([errors.amin(1), *(best[:, min(k, n) - 1] for k in ks)], 1)
-
-
-def precision_from_rows(rows: Tensor, ks: Sequence[int], threshold_deg: float | None) -> dict[int, float]:
-    """Precision at each k of rows made by :func:`rank_rows`."""
-    counts = rows[:, 1:] <= rows[:, :1] + _SAME_DEG if threshold_deg is None else rows[:, 1:] < threshold_deg
-    return {k: share(counts[:, i]) for i, k in enumerate(ks)}
+    smallest = {k: best[:, min(k, n) - 1] for k in ks}
+    if threshold_deg is None:
+        return {k: share(e <= errors.amin(1) + _SAME_DEG) for k, e in smallest.items()}
+    return {k: share(e < threshold_deg) for k, e in smallest.items()}
 
 
 def viewpoint_differences(a: Tensor, b: Tensor) -> Tensor:

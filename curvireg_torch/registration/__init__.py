@@ -1,8 +1,5 @@
 """From a ranking of views to poses: stages as functions over photographs x hypotheses, joined by the registrar."""
 
-from typing import TYPE_CHECKING
-
-from .._lazy import lazy
 from ..matching import distinct_views
 from .confidence import RELIABLE, confidence, ranking_evidence
 from .contour import ContourFit, fit_contours
@@ -32,6 +29,3 @@ __all__ = [
     "search",
     "verdict",
 ]
-
-if not TYPE_CHECKING:
-    __getattr__, _ = lazy(__name__, {"former": "RefinedPose refine_pose"})

@@ -1,6 +1,5 @@
 """The result of a registration."""
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -140,18 +139,6 @@ class Registration:
     def candidates(self) -> Tensor:
         """(K,) view indices of the hypotheses."""
         return torch.tensor([h.view for h in self.hypotheses])
-
-    @property
-    def view_rotation(self) -> Tensor:
-        """Deprecated name of ``allocentric_rotation``."""
-        warnings.warn("view_rotation is deprecated; use allocentric_rotation", DeprecationWarning, stacklevel=2)
-        return self.hypotheses[0].allocentric_rotation
-
-    @property
-    def view_distance(self) -> float:
-        """Deprecated name of ``distance``."""
-        warnings.warn("view_distance is deprecated; use distance", DeprecationWarning, stacklevel=2)
-        return self.hypotheses[0].distance
 
     @property
     def rotation(self) -> Tensor:

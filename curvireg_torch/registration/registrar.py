@@ -1,6 +1,5 @@
 """The facade that joins it all: photographs, boxes and meshes to poses."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -48,7 +47,7 @@ class Registrar:
         views, settings: viewpoints and bank settings of one's own, for a mesh.
         field: photograph filter of one's own, see :class:`ViewMatcher`.
         refine, contours: False leaves out the search and all behind it, or the contour stage.
-        hypotheses: distinct hypotheses to carry and to report, instead of the pipeline's; ``top`` is its old name.
+        hypotheses: distinct hypotheses to carry and to report, instead of the pipeline's.
         renderer: of the views rendered in search and contours, and of a bank that is built; one of your own is of one
             mesh.
         symmetries: (S, 4, 4) of the mesh, from :func:`curvireg_torch.geometry.symmetry_transforms`; hypotheses that
@@ -80,15 +79,11 @@ class Registrar:
         refine: bool = True,
         contours: bool = True,
         hypotheses: int | None = None,
-        top: int | None = None,
         renderer: str | DepthRenderer = "auto",
         symmetries: Tensor | None = None,
         device: torch.device | str | None = None,
         progress: bool | Callable[[str, int, int], object] = False,
     ) -> None:
-        if top is not None:
-            warnings.warn("Registrar: top is deprecated; use hypotheses", DeprecationWarning, stacklevel=2)
-            hypotheses = top
         if isinstance(bank_or_mesh, ViewMatcher):
             if pipeline is not None or field is not None:
                 raise InvalidInputError("Registrar: pipeline and field belong to the matcher; give them to ViewMatcher")

@@ -1,26 +1,16 @@
 """Statistics of descriptors, and the linear map after which their entries are uncorrelated (LDA, Aubry et al. 2014)."""
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 from .._checks import check_option, check_tensor
 from ..errors import InvalidInputError
-from ..filters import MultiScaleFocusCurves
-from ..geometry.crops import crop_images
 from .base import Views
-from .photographs import photograph_field
-
-if TYPE_CHECKING:
-    from ..pipeline import BankSettings
 
 __all__ = ["DescriptorStatistics", "Whitening"]
-
-SHRINKAGES = ("oas", "ledoit-wolf")
 
 
 class Whitening(nn.Module):
@@ -70,7 +60,7 @@ class DescriptorStatistics:
 
     Example:
         >>> statistics = DescriptorStatistics.from_descriptors(torch.rand(50, 8))
-        >>> statistics.whitening(shrinkage="oas")(torch.rand(3, 8)).shape
+        >>> statistics.whitening(shrinkage="ledoit-wolf")(torch.rand(3, 8)).shape
         torch.Size([3, 8])
     """
 
@@ -96,74 +86,34 @@ class DescriptorStatistics:
         """Of the views of a bank: whitening by them brings out what tells views from each other (the paper)."""
         return cls.from_descriptors(bank.descriptors)
 
-    @classmethod
-    def from_images(
-        cls,
-        images: Iterable[Tensor],
-        settings: "BankSettings",
-        *,
-        crops: int = 200,
-        field: nn.Module | None = None,
-        generator: torch.Generator | None = None,
-    ) -> "DescriptorStatistics":
-        """Of random squares of images: whitening by them brings out what is unusual in images (Hariharan et al. 2012).
-
-        Squares have sides of 0.3 to 0.9 times the image's shorter side.
-
-        Args:
-            images: (C, H, W) each, C = 1 or 3, in [0, 1]; natural ones, without the objects to be found.
-            settings: of the banks that will be compared.
-            crops: squares of each image.
-            field: photograph filter, as given to :class:`ViewMatcher`.
-            generator: of the squares; default seed 0.
-        """
-        if crops < 1:
-            raise InvalidInputError(f"crops: expected >= 1, got {crops}")
-        field = MultiScaleFocusCurves() if field is None else field
-        generator = torch.Generator().manual_seed(0) if generator is None else generator
-        describe, found = settings.descriptor(), []
-        for image in images:
-            check_tensor(image, "images", (None, None, None))
-            H, W = image.shape[-2:]
-            u = torch.rand(crops, 3, generator=generator)
-            side = (0.3 + 0.6 * u[:, :1]) * min(H, W)
-            corner = u[:, 1:] * (torch.tensor([W, H]) - side) - 0.5
-            for boxes in torch.cat([corner, corner + side], dim=1).split(16):
-                cut = crop_images([image] * len(boxes), boxes, size=settings.image_size, margin=0.0)[0]
-                with torch.no_grad():
-                    found.append(describe(photograph_field(field, cut)))
-        if not found:
-            raise InvalidInputError("images: expected at least one image")
-        return cls.from_descriptors(torch.cat(found))
-
     def shrinkage(self, rule: str | float) -> float:
         """The share a in [0, 1] of the identity in (1 - a) Sigma + a tr(Sigma)/D Id.
 
         Args:
-            rule: a number, or ``"oas"`` (Chen et al. 2010) or ``"ledoit-wolf"`` (2004), the closed forms that estimate
+            rule: a number, or ``"ledoit-wolf"``, the closed form of Ledoit and Wolf (2004) for the share that estimates
                 the population's covariance best.
+
+        Raises:
+            InvalidInputError: another rule, or a number outside [0, 1].
         """
         if not isinstance(rule, str):
             if not (math.isfinite(rule) and 0.0 <= rule <= 1.0):
                 raise InvalidInputError(f"shrinkage: expected a number in [0, 1], got {rule}")
             return float(rule)
-        check_option(rule, SHRINKAGES, "shrinkage")
+        check_option(rule, ("ledoit-wolf",), "shrinkage")
         S = self.covariance.double()
-        D, n = len(S), self.count
-        trace, square = float(S.trace()), float(S.square().sum())
-        spread = square - trace**2 / D  # squared distance of S from its multiple of the identity
+        square = float(S.square().sum())
+        spread = square - float(S.trace()) ** 2 / len(S)  # squared distance of S from its multiple of the identity
         if spread <= 0:
             return 1.0
-        if rule == "oas":
-            return min(1.0, (square / D**2 + (trace / D) ** 2) / ((n + 1) * spread / D**2))
-        return min(1.0, max(0.0, (self.fourth - square) / n / spread))
+        return min(1.0, max(0.0, (self.fourth - square) / self.count / spread))
 
     def whitening(self, *, shrinkage: str | float = 0.5) -> Whitening:
         """The map that a :class:`ViewMatcher` takes.
 
         Args:
             shrinkage: see :meth:`shrinkage`. Descriptors of photographs and of renderings are not of one population,
-                and more than the closed forms give (nearly 0) matches better: ``docs/method.md``.
+                and more than the closed form gives (nearly 0) matches better: ``docs/method.md``.
         """
         a = self.shrinkage(shrinkage)
         S = self.covariance

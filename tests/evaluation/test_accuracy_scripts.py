@@ -17,15 +17,14 @@ STAGES = ("view", "search", "contours")
 
 
 @pytest.fixture
-def scripts():
-    with imported("ablate") as ablate, imported("error_taxonomy") as taxonomy:
-        yield ablate, taxonomy
+def ablate():
+    with imported("ablate") as script:
+        yield script
 
 
 @pytest.mark.parametrize("members", [1, 5])
-def test_interval_is_that_of_a_share_of_units(scripts, members):
+def test_interval_is_that_of_a_share_of_units(ablate, members):
     """Against the normal approximation of a binomial share: copies of a photograph make nothing surer."""
-    ablate, _ = scripts
     values = (torch.arange(400) % 4 == 0).float().repeat(members)
     mean, low, high = ablate.interval(values, [f"unit {k % 400}" for k in range(400 * members)])
     assert mean == 0.25
@@ -34,8 +33,7 @@ def test_interval_is_that_of_a_share_of_units(scripts, members):
     assert high == pytest.approx(mean + half, abs=0.006)
 
 
-def test_paired_differences_are_sharper_than_their_parts(scripts):
-    ablate, _ = scripts
+def test_paired_differences_are_sharper_than_their_parts(ablate):
     one = (torch.arange(100) % 2).float()
     better = one.clone()
     better[::20] = 1.0
@@ -65,9 +63,8 @@ def test_medians_of_the_refinement_are_means_of_the_middle_two():
     assert found["sigmas"] == 1.5, "of 1 and 2; 4 is unknown and 9 too far off"
 
 
-def test_unequal_units_weigh_by_their_members(scripts):
+def test_unequal_units_weigh_by_their_members(ablate):
     """A hundred units of nine right members each, and a hundred of one wrong member."""
-    ablate, _ = scripts
     mean, low, high = ablate.interval([1.0] * 900 + [0.0] * 100, [k // 9 for k in range(900)] + list(range(100, 200)))
     assert mean == 0.9
     assert 0.85 < low < 0.9 < high < 0.93
@@ -98,8 +95,7 @@ def test_hope_is_sixteen_views_in_five_lightings():
         assert len(set(intervals.independent_units(objects))) == 16
 
 
-def test_table_has_a_line_for_every_row_that_was_measured(scripts):
-    ablate, _ = scripts
+def test_table_has_a_line_for_every_row_that_was_measured(ablate):
     kept = {"errors": [5.0, 20.0, 50.0, 10.0], "whole": [True, True, False, False], "units": [0, 1, 2, 2]}
     worse = {**kept, "errors": [5.0, 80.0, 50.0, 10.0]}
     text = ablate.table({"learned": {"lm": kept}, "classical": {"lm": worse}})
@@ -109,23 +105,6 @@ def test_table_has_a_line_for_every_row_that_was_measured(scripts):
     assert "| 0.500 | 15.0° | 1.000 (2) |" in lines[4], "the mean of 10 and 20"
     assert lines[5].startswith("| classical | 4 (3) | 0.500 (")
     assert "-0.250 (" in lines[5]
-
-
-@pytest.mark.parametrize(
-    ("azimuth", "elevation_error", "kind"),
-    [
-        (42.0, 12.0, "right"),
-        (215.0, 170.0, "half a turn"),
-        (-35.0, 75.0, "mirrored"),
-        (50.0, 40.0, "elevation or in-plane angle"),
-        (130.0, 90.0, "other"),
-        ("", float("inf"), "other"),
-    ],
-)
-def test_kinds_of_errors(scripts, azimuth, elevation_error, kind):
-    _, taxonomy = scripts
-    row = {"azimuth": str(azimuth), "true_azimuth": "40", "symmetric_error_deg": str(elevation_error)}
-    assert taxonomy.kind(row) == kind
 
 
 @pytest.fixture

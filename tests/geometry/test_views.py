@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import (
     ViewSphere,
-    nearest_views,
     paper_views,
     rotation_error,
     sample_views,
@@ -99,21 +98,6 @@ def test_every_dropped_view_is_still_seen_from_a_kept_one() -> None:
     off = rotation_error(R[None], turned)
     off[torch.arange(len(R)), torch.arange(len(R))] = 180.0
     assert float(off.min()) > 12.0
-
-
-@pytest.mark.filterwarnings("ignore:nearest_views is deprecated")
-def test_neighbours_are_the_nearest() -> None:
-    views = uniform_views(60, thetas=[0, 90])
-    indices, degrees = nearest_views(views.rotations, 5)
-    everything = rotation_error(views.rotations[:, None].double(), views.rotations[None].double())
-    everything.fill_diagonal_(torch.inf)
-    torch.testing.assert_close(degrees.double(), everything.sort(dim=1).values[:, :5], rtol=0, atol=1e-4)
-    torch.testing.assert_close(everything.gather(1, indices), degrees.double(), rtol=0, atol=1e-4)
-    for count in (0, 120):
-        with pytest.raises(InvalidInputError, match="count"):
-            nearest_views(views.rotations, count)
-    with pytest.warns(DeprecationWarning, match="nearest_views"):
-        nearest_views(views.rotations, 1)
 
 
 def test_bad_view_sets() -> None:

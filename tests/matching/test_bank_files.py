@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from curvireg_torch.errors import BankError, InvalidInputError, MissingFileError
 from curvireg_torch.geometry import sample_views, uniform_views
 from curvireg_torch.geometry.up import mesh_up
-from curvireg_torch.matching import BankCollection, BankSettings, ViewBank, ViewMatcher, normalized_correlation
+from curvireg_torch.matching import BankSettings, ViewBank, ViewMatcher, normalized_correlation
 from curvireg_torch.pipeline import Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
 from curvireg_torch.synthetic import example_mesh
@@ -174,11 +174,6 @@ def test_banks_of_different_poses_are_not_joined(bank: ViewBank) -> None:
     upright = ViewBank.build(example_mesh(), pipeline=Pipeline(views=policy, bank=SETTINGS), progress=False)
     with pytest.raises(InvalidInputError, match=r"one view policy, but bank 1 has .*upright.* and bank 0 .*given"):
         ViewBank.join([bank, upright])
-
-
-def test_old_name_of_join(bank: ViewBank) -> None:
-    with pytest.warns(DeprecationWarning, match=r"ViewBank\.join"):
-        assert len(BankCollection([bank, bank])) == 2 * len(bank)
 
 
 def test_files_that_do_not_fit_are_refused(bank: ViewBank, tmp_path: Path) -> None:

@@ -188,14 +188,3 @@ def test_a_term_that_is_not_in_the_pipeline_is_not_computed():
     bank = truck_bank()
     ranking = ViewMatcher(bank, pipeline=replace(bank.pipeline, terms=(Correlation(),)))(*batch(0))
     assert set(ranking.terms) == {"hog"}
-
-
-def test_old_options_are_terms_now():
-    images, boxes = batch(0, 1)
-    with pytest.warns(DeprecationWarning, match="with_term"):
-        old = ViewMatcher(truck_bank(), repeatability_sigma=None, box_sigma=0.3, repeatability_mode="paper", eps=3.0)
-    now = truck_bank().pipeline.with_term("repeatability", weight=0, mode="paper", eps=3 / 96)
-    new = ViewMatcher(truck_bank(), pipeline=now.with_term("box", sigma=0.3))
-    assert torch.equal(old(images, boxes).scores, new(images, boxes).scores)
-    with pytest.raises(TypeError, match="sigmas"):
-        ViewMatcher(truck_bank(), sigmas=3)

@@ -36,8 +36,6 @@ def test_matching_ranks_by_the_papers_rep_which_is_ip_and_not_view_repeatability
     torch.testing.assert_close(rep, metrics.intersection_percentage(photo, view, eps_px=1.5))
     ours = metrics.view_repeatability(view, photo, eps_px=1.5)
     assert not np.allclose(ours, rep)
-    with pytest.warns(DeprecationWarning, match="view_repeatability"):
-        torch.testing.assert_close(metrics.repeatability(view, photo, eps_px=1.5), ours)
 
 
 def test_hausdorff_against_scikit_image() -> None:

@@ -11,17 +11,14 @@ from curvireg_torch import (
     Registrar,
     ViewBank,
     ViewMatcher,
-    evaluation,
-    matching,
     project_points,
     rotation_error,
     sample_views,
 )
 from curvireg_torch.errors import CurviregError, InvalidInputError
-from curvireg_torch.evaluation import paper
 from curvireg_torch.geometry import rotation_from_viewpoint, symmetry_transforms
 from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
-from curvireg_torch.pipeline import DEPTH_FIELDS, PRESETS, BankSettings, Pipeline
+from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import RELIABLE, FailedRegistration, distinct_views, fit_contours
 from curvireg_torch.registration import pose as pose_module
 from curvireg_torch.rendering import make_renderer, render_depth
@@ -187,34 +184,6 @@ def test_several_meshes_one_answer(tmp_path, monkeypatch):
     result = Registrar(meshes, views=views)([image], box[None], CAMERA)[0]
     assert result.model == 1
     assert float(rotation_error(result.rotation, T[:3, :3])) < 5
-
-
-def test_old_names_still_work():
-    image, box, _ = scene(0)
-    with pytest.warns(DeprecationWarning, match="hypotheses"):
-        registrar = Registrar(truck_bank(), refine=False, top=2)
-    result = registrar([image], box[None])[0]
-    assert len(result.hypotheses) == 2
-    with pytest.warns(DeprecationWarning, match="allocentric_rotation"):
-        assert result.view_rotation.equal(result.allocentric_rotation)
-    with pytest.warns(DeprecationWarning, match="distance"):
-        assert result.view_distance == result.distance
-
-
-@pytest.mark.parametrize(
-    ("package", "name", "now"),
-    [
-        (matching, "QueryFeatures", matching.Photographs),
-        (evaluation, "Preset", Pipeline),
-        (paper, "FieldSettings", BankSettings),
-        (paper, "DEPTH_FIELDS", DEPTH_FIELDS),
-    ],
-)
-def test_names_that_moved_say_where_to(package, name, now):
-    with pytest.warns(DeprecationWarning, match=rf"{name} is deprecated; use curvireg_torch\.\w+\."):
-        assert getattr(package, name) is now
-    with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
-        package.Nothing  # noqa: B018
 
 
 def test_distinct_views_stop_when_the_sphere_is_used_up():

@@ -1,8 +1,5 @@
 """The measurements of the paper, on any of the datasets; ``scripts/reproduce_paper.py`` runs them."""
 
-from typing import TYPE_CHECKING
-
-from ..._lazy import lazy
 from .cases import KINDS, Case, find_cases
 from .fields import PHOTO_FIELDS, photo_detectors
 from .points import curve_table, detector_tables, repeatability_table
@@ -26,13 +23,3 @@ __all__ = [
     "repeatability_table",
     "write_table",
 ]
-
-if not TYPE_CHECKING:
-    __getattr__, _ = lazy(
-        __name__,
-        {},
-        {
-            "DEPTH_FIELDS": "curvireg_torch.pipeline.DEPTH_FIELDS",
-            "FieldSettings": "curvireg_torch.pipeline.BankSettings",
-        },
-    )
