@@ -48,7 +48,7 @@ RECORD = REPOSITORY / "scripts" / "results" / "calibration.json"
 PAGE = REPOSITORY / "docs" / "accuracy.md"
 BEGIN, END = "<!-- calibration:begin -->", "<!-- calibration:end -->"
 
-PARTS: dict[str, tuple[str | None, int | None]] = {"right": (None, None), "any": ("any", 200), "kind": ("kind", 200)}
+PARTS: dict[str, tuple[str | None, int | None]] = {"right": (None, None), "any": ("any", 100), "kind": ("kind", 100)}
 """What is registered: --wrong and --limit of scripts/run_benchmark.py."""
 
 FOLDS = 5
