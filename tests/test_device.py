@@ -12,6 +12,7 @@ import torch
 
 import curvireg_torch as cr
 from curvireg_torch.detectors import DETECTORS
+from curvireg_torch.learned import appearance
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import find
 from curvireg_torch.synthetic import example_mesh
@@ -21,6 +22,16 @@ from tests._support.scenes import CAMERA, scene, truck_bank
 pytestmark = PRETENDING
 
 VIEWS = cr.sample_views(azimuth_step=45, elevations=[10, 40])
+
+
+@pytest.fixture(autouse=True)
+def _one_picture_at_a_time(monkeypatch):
+    """As on a CPU, and on one thread: convolutions round in a way that depends on how many pictures and threads."""
+    monkeypatch.setattr(appearance, "CHUNK", 1)
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -107,7 +107,7 @@ def here(files: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pyt
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
     monkeypatch.chdir(files)
     threads = torch.get_num_threads()
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         yield
     torch.set_num_threads(threads)
@@ -177,8 +177,8 @@ def test_what_is_not_typed_is_counted() -> None:
     assert counts.pop(None) >= 35
     assert counts == {
         "download": 10,
-        "measures for long": 12,
-        "placeholder": 9,
+        "measures for long": 10,
+        "placeholder": 7,
         "suite": 5,
         "writes into the project": 4,
         "3000 photographs": 2,

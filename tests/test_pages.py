@@ -18,7 +18,7 @@ def blocks(page: str) -> list[str]:
 
 def run(code: list[str], page: str) -> dict[str, Any]:
     names: dict[str, Any] = {"__name__": "page"}
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         for block in code:
             exec(compile(block, page, "exec"), names)

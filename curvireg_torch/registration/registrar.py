@@ -103,7 +103,10 @@ class Registrar:
                     ]
                 )
             bank = bank if device is None else bank.to(device)
-            matcher = ViewMatcher(bank, pipeline=pipeline, field=field, renderer=renderer)
+            # Made on one thread, so that nothing in it is rounded otherwise where torch has several.
+            matcher = map_on_threads(
+                lambda bank: ViewMatcher(bank, pipeline=pipeline, field=field, renderer=renderer), [bank]
+            )[0]
             pipeline = matcher.pipeline
         if isinstance(bank_or_mesh, ViewBank | ViewMatcher) and (views is not None or settings is not None):
             raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
@@ -134,7 +137,7 @@ class Registrar:
     @cached_property
     def locator(self) -> Locator:
         """Proposes boxes where none are given; made on first use."""
-        return Locator(self.matcher)
+        return map_on_threads(lambda _: Locator(self.matcher), [0])[0]  # rounded alike whatever torch's threads
 
     @torch.no_grad()
     def __call__(

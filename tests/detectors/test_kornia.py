@@ -107,7 +107,7 @@ def test_the_page_runs_as_it_stands() -> None:
     page = (Path(__file__).parents[2] / "docs" / "guides" / "kornia.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
     names: dict[str, object] = {}
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):
         exec(compile(code, "docs/guides/kornia.md", "exec"), names)
     assert isinstance(names["descriptors"], Tensor)
     assert names["descriptors"].shape == (1, 50, 324)
