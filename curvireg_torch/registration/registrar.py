@@ -29,8 +29,8 @@ from .verify import EVIDENCE, gathered_evidence, similarities, verdict
 __all__ = ["Registrar"]
 
 CARRIED = 3
-"""Hypotheses that are always followed, however few are reported: without rivals nothing tells how sure the best is. Of 15
-photographs of another object 14 were believed with one, 2 with two, none with three, as with five."""
+"""Hypotheses that are always followed, however few are reported: without rivals nothing tells how sure the best is. Of
+15 photographs of another object 14 were believed with one, 2 with two, none with three, as with five."""
 
 
 class Registrar:
