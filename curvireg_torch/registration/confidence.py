@@ -1,7 +1,7 @@
 """How far a ranking, a pose or a place can be trusted: logistic models of what was measured.
 
-Their constants are those of :mod:`.calibration`. What they are worth on photographs that had no part in them is in
-docs/accuracy.md.
+Their constants are those of :mod:`curvireg_torch.registration.calibration`. What they are worth on photographs that had
+no part in them is in docs/accuracy.md.
 """
 
 import math

@@ -113,11 +113,12 @@ def fit_contours(
     The order of the covariance is turn (rad) about the camera's x, y, z, then translation (model units) along them:
     with the true pose R, t,
 
-        R = exp([w]x) R_fit,   t = t_fit + e,   (w, e) ~ N(0, covariance).
+        R = exp([w]x) R_fit,   t = t_fit + e,   (w, e) of mean 0 and that covariance.
 
     It is :func:`pose_covariance`'s: what contours do not fix (turns of a sphere, a cylinder's about its axis) has a
     standard deviation of pi or of the distance. The least squares know nothing of wrong edges: their covariance is
-    scaled by what reliable answers on photographs were off (:mod:`.calibration`). Computed on the CPU.
+    scaled by what reliable answers on photographs were off (:mod:`curvireg_torch.registration.calibration`). Computed on
+    the CPU.
 
     Args:
         renderer: of the mesh.

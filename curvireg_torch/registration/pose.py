@@ -42,7 +42,7 @@ class Hypothesis:
         covariance: (6, 6) float64 of turn (rad) about the camera's x, y, z and translation (model units) along them,
             ``R_true = exp([w]x) R``, ``t_true = t + e``, should this pose be the right one; None without a camera
             matrix, without the contour stage, and where the contours do not fix the pose. Its errors have heavier
-            tails than a Gaussian's: see :data:`.calibration.SQUARED_RADIUS`.
+            tails than a Gaussian's: see :data:`curvireg_torch.registration.calibration.SQUARED_RADIUS`.
     """
 
     rotation: Tensor
