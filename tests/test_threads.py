@@ -139,10 +139,15 @@ def test_mapped_jobs_keep_their_order_and_each_has_one_thread_of_torch() -> None
 def test_a_single_mapped_job_shares_its_rays_among_the_threads_that_are_left() -> None:
     both = threading.Barrier(2, timeout=20)
     assert map_on_threads(lambda _: for_each(2, lambda _: both.wait()), [0]) == [None]
-    here: list[int] = []
-    map_on_threads(lambda _: for_each(3, lambda _: here.append(threading.get_ident())), [0, 1])
+    here: list[tuple[int, int]] = []
+
+    def job(_: int) -> None:
+        mine = threading.get_ident()
+        for_each(3, lambda _: here.append((mine, threading.get_ident())))
+
+    map_on_threads(job, [0, 1])
     assert len(here) == 6
-    assert len(set(here)) <= 2, "with two jobs no thread is left over"
+    assert all(mine == other for mine, other in here), "with two jobs no thread is left over"
 
 
 def test_an_error_in_a_mapped_job_is_raised_and_threads_are_restored() -> None:

@@ -117,8 +117,8 @@ def fit_contours(
 
     It is :func:`pose_covariance`'s: what contours do not fix (turns of a sphere, a cylinder's about its axis) has a
     standard deviation of pi or of the distance. The least squares know nothing of wrong edges: their covariance is
-    scaled by what reliable answers on photographs were off (:mod:`curvireg_torch.registration.calibration`). Computed on
-    the CPU.
+    scaled by what reliable answers on photographs were off (:mod:`curvireg_torch.registration.calibration`).
+    Computed on the CPU.
 
     Args:
         renderer: of the mesh.

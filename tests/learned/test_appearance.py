@@ -76,3 +76,13 @@ def test_ranks_the_right_view_of_a_photograph_first(backbone):
         crops.append(crop_images(photograph[None], box[None], size=128)[0])
     found = similarity(describe(torch.cat(crops), backbone)[:, None], shaded).argmax(dim=1)
     assert (found == torch.arange(len(views))).float().mean() >= 0.75
+
+
+def test_an_image_is_described_alike_in_any_batch_to_the_bit():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    images, network = torch.rand(18, 1, 64, 64, generator=torch.Generator().manual_seed(0)), Backbone()
+    whole = describe(images, network)
+    parts = [describe(images[:n], network) for n in (1, 3, 17)]
+    torch.set_num_threads(before)
+    assert all(torch.equal(part, whole[: len(part)]) for part in parts)

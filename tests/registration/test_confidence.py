@@ -122,6 +122,8 @@ def test_features_of_a_pose():
     assert pose_features(evidence, verdicts, 0.3) == pytest.approx(
         {"similarity": 0.7, "lead": 5.0, "support": 0.4, "appearance_lead": 0.2, "concentration": 0.3}
     ), "the lead is over the best rival, and 5 at most"
+    behind = pose_features(evidence, verdicts.flip(0) - torch.tensor([9.0, 0.0, 0.0]), 0.3)
+    assert behind["lead"] == -5.0, "nor less than -5"
     alone = pose_features(evidence[:1], verdicts[:1], 0.0)
     assert alone["lead"] is None
     assert alone["appearance_lead"] is None

@@ -128,6 +128,19 @@ def test_places_that_lead_to_one_object_give_one_answer(registrar, monkeypatch):
     assert torch.equal(results[0].found.box, box.double())
 
 
+def test_of_answers_that_overlap_the_surest_stays(registrar):
+    image, _ = placed(5, (90, 40), 0.9)
+    sure = registrar([image])[0]
+    beside = replace(sure, found=replace(sure.found, box=sure.found.box + 500.0, presence=0.1))
+    less = replace(sure, found=replace(sure.found, presence=0.5 * sure.found.presence))
+    for first, second in ((sure, less), (less, sure)):
+        answers = [beside, first]
+        finding._add(answers, second)
+        assert len(answers) == 2
+        assert answers[0] is beside
+        assert answers[1] is sure
+
+
 class _Proposing:
     """A locator that always proposes the same places."""
 
