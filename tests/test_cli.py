@@ -77,6 +77,7 @@ def test_register_writes_result_and_overlay(files, capsys):
     assert overlay is not None
     assert overlay.std() > 20
     assert np.shape(result["covariance"]) == (6, 6)
+    assert set(result["squared_radius"]) == {"0.5", "0.9", "0.95"}
     deviations = result["standard_deviations"]
     assert deviations["translation"] == pytest.approx([result["covariance"][i][i] ** 0.5 for i in (3, 4, 5)])
     assert all(0 < v < 30 for v in deviations["rotation_deg"])
@@ -97,6 +98,7 @@ def test_without_box_and_camera(files, capsys):
     result = json.loads((folder / "out" / "result.json").read_text())
     assert result["translation"] is None
     assert result["covariance"] is None
+    assert result["squared_radius"] is None
     assert result["standard_deviations"] is None
 
 

@@ -91,6 +91,7 @@ def test_a_guessed_camera_has_no_covariance(registrar, entry, monkeypatch, camer
     assert document["inputs"]["camera_source"] == source
     known = source == "given"
     assert document["covariance"] == (torch.eye(6).tolist() if known else None)
+    assert (document["squared_radius"] is not None) == known
     assert (document["standard_deviations"] is not None) == known
     assert (result.translation is not None) == (source is not None)
     json.dumps(document, allow_nan=False)
