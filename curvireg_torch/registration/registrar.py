@@ -288,19 +288,17 @@ class Registrar:
         poses = replace(poses, found=replace(poses.found, score=similarity))
         verdicts = verdict(evidence, with_camera=with_camera)
         order = (verdicts + torch.where(own, 0.0, -1e6)).argsort(descending=True, stable=True)
-        photograph = starts.photograph[order]
-        first = torch.stack([(photograph == b).int().argmax() for b in range(len(items))])
-        ranked = ranking_evidence(
-            ranking, self.bank.rotations, answer=starts.view[order[first]], symmetries=self.symmetries
-        )
+        ordered = [order[starts.photograph[order] == b] for b in range(len(items))]
+        # Of a pose the calibration knows the ranking's own best view; without contours the answer is a view itself.
+        answer = None if fit is not None else starts.view[torch.stack([mine[0] for mine in ordered])]
+        ranked = ranking_evidence(ranking, self.bank.rotations, answer=answer, symmetries=self.symmetries)
         model = confidence_model(
             "ranking" if fit is None else "contours",
             with_camera=with_camera,
             with_appearance="appearance" in ranking.terms,
         )
         results = []
-        for b in range(len(items)):
-            mine = order[photograph == b]
+        for b, mine in enumerate(ordered):
             features = ranking_features(ranked[b])
             if fit is not None:
                 features = pose_features(evidence[mine], verdicts[mine], features["concentration"])

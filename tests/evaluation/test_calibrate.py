@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from curvireg_torch import Registrar
+from curvireg_torch.registration import ranking_evidence, verify
+from tests._support.scenes import CAMERA, scene, truck_bank
 from tests._support.scripts import imported
 
 
@@ -166,3 +169,21 @@ def test_weights_of_the_verdict_follow_what_is_right(script):
     found = dict(zip(names, script.fit_verdict(rows), strict=True))
     assert found["support"] > 10.0
     assert found["rank"] < 1.0
+
+
+@pytest.mark.parametrize("camera", [CAMERA, None])
+def test_features_of_a_row_are_those_of_the_registration(script, camera, monkeypatch):
+    """Also where the answer comes from another view than the ranking's best."""
+    weights = (-1.0, 5.0, 10.0, 1.0)  # the view that ranks last is preferred
+    monkeypatch.setattr(verify, "WEIGHTS", weights)
+    monkeypatch.setattr(verify, "RANK_ALONE", (-1.0, 0.0, 0.0, 0.0))
+    image, box, _ = scene(0)
+    result = Registrar(truck_bank())([image], box[None], camera)[0]
+    assert int(result.candidates[0]) != int(result.ranking.order[0, 0])
+    kept = {
+        "form": "sibling" if camera is None else "exact",
+        "evidence": [dict(h.evidence) for h in result.hypotheses],
+        "ranking": ranking_evidence(result.ranking, truck_bank().rotations)[0].tolist(),
+        "errors": [0.0],
+    }
+    assert script.features_of(kept)[0] == pytest.approx(result.confidence_features)
