@@ -74,7 +74,7 @@ def check_pixels(x: Tensor, where: str) -> None:
     """The pixels of floating ``x`` are finite and in [0, 1], or a thousandth beyond.
 
     Args:
-        where: they are, for the message: "of the box".
+        where: which pixels the message names, "of the box" for instance.
 
     Raises:
         ImageError: they are not.

@@ -64,15 +64,20 @@ def available_threads() -> int:
     return max(getattr(_here, "threads", 1), torch.get_num_threads())
 
 
-def map_on_threads(job: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+def map_on_threads(
+    job: Callable[[Item], Result], items: Sequence[Item], *, device: torch.device | str = "cpu"
+) -> list[Result]:
     """``job`` of every item, in their order, each on one thread on which torch computes alone.
 
     How torch divides an operation among threads decides how it rounds: a result that is computed by one thread does
     not depend on how many items there are, nor on how many threads torch may use. Threads that are left over, as with a
     single item, share the jobs of :func:`for_each`, which do not call torch.
+
+    Args:
+        device: where the jobs compute; on another than the CPU they follow each other on this thread.
     """
     threads = torch.get_num_threads()
-    if threads == 1:
+    if threads == 1 or torch.device(device).type != "cpu":
         return [job(item) for item in items]
     share = max(1, threads // max(1, len(items)))
 

@@ -1,6 +1,6 @@
 """Intervals of shares and of differences, over what is independent in the real sets."""
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,3 +45,23 @@ def interval(values: ArrayLike, units: Sequence[Hashable]) -> tuple[float, float
     picks = np.random.default_rng(0).integers(len(count), size=(RESAMPLES, len(count)))
     low, high = np.quantile(total[picks].sum(axis=1) / count[picks].sum(axis=1), [0.025, 0.975])
     return float(values.mean()), float(low), float(high)
+
+
+def interval_of(units: Sequence[Hashable], measure: Callable[[np.ndarray], float | None]) -> tuple[float, float] | None:
+    """95 % interval of ``measure(indices)`` by bootstrap over units; None of one unit, or where it is mostly undefined.
+
+    Args:
+        units: what each of the N answers belongs to.
+        measure: of (M,) indices of answers, some of them several times; None where it is undefined.
+    """
+    number = np.array(_numbered(units))
+    members = [np.flatnonzero(number == k) for k in range(number.max() + 1)]
+    if len(members) < 2:
+        return None
+    rng = np.random.default_rng(0)
+    picks = (rng.integers(len(members), size=len(members)) for _ in range(RESAMPLES))
+    values = [v for pick in picks if (v := measure(np.concatenate([members[k] for k in pick]))) is not None]
+    if len(values) <= RESAMPLES / 2:
+        return None
+    low, high = np.quantile(values, [0.025, 0.975])
+    return float(low), float(high)

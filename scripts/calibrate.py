@@ -22,8 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from _intervals import independent_units
-from _intervals import interval as mean_of
+from _intervals import independent_units, interval, interval_of
 from _record import REPOSITORY, SETS, benchmark, between, commit, table_lines, today, write_json
 from run_benchmark import register_benchmark
 from scipy.optimize import minimize
@@ -64,7 +63,6 @@ UNKNOWN = 0.5
 """Standard deviation of a direction that counts as unknown, in units of pi (turns) and of the distance (shifts)."""
 
 COVERAGES = (1.0, 0.75, 0.5, 0.25)
-RESAMPLES = 2000
 
 Row = dict[str, Any]
 
@@ -187,18 +185,6 @@ def coverage_at_risk(sure: np.ndarray, right: np.ndarray) -> float:
     return float(good.max() + 1) / len(right) if len(good) else 0.0
 
 
-def interval(units: Sequence[Any], measure: Callable[[np.ndarray], float | None]) -> list[float] | None:
-    """95 % interval of ``measure(index of answers)`` by bootstrap over units."""
-    _, of = np.unique([str(unit) for unit in units], return_inverse=True)
-    members = [np.flatnonzero(of == k) for k in range(of.max() + 1)]
-    if len(members) < 2:
-        return None
-    rng = np.random.default_rng(0)
-    picks = (rng.integers(len(members), size=len(members)) for _ in range(RESAMPLES))
-    values = [v for pick in picks if (v := measure(np.concatenate([members[k] for k in pick]))) is not None]
-    return [float(v) for v in np.quantile(values, [0.025, 0.975])] if len(values) > RESAMPLES / 2 else None
-
-
 def worth(sure: np.ndarray, right: np.ndarray, units: Sequence[Any]) -> Row:
     """What confidences are worth, with counts and intervals over units."""
     risk, believed = risks(sure, right), sure >= RELIABLE
@@ -208,9 +194,9 @@ def worth(sure: np.ndarray, right: np.ndarray, units: Sequence[Any]) -> Row:
         "right": int(right.sum()),
         "mean": float(sure.mean()),
         "auc": auc(sure, right),
-        "auc_interval": interval(units, lambda i: auc(sure[i], right[i])),
+        "auc_interval": interval_of(units, lambda i: auc(sure[i], right[i])),
         "coverage_at_risk": coverage_at_risk(sure, right),
-        "coverage_interval": interval(units, lambda i: coverage_at_risk(sure[i], right[i])),
+        "coverage_interval": interval_of(units, lambda i: coverage_at_risk(sure[i], right[i])),
         "risk_at_coverage": {
             f"{c:g}": [round(float(risk[k - 1]) * k), k] for c in COVERAGES if (k := max(1, round(c * len(sure))))
         },
@@ -290,7 +276,7 @@ def shares(rows: Sequence[Row]) -> dict[str, Row]:
                     "answer within 5 degrees": [r["errors"][0] < 5.0 for r in some],
                     "among the hypotheses": [min(r["errors"]) < RIGHT for r in some],
                 }
-                out[f"{form} {pose}"] = {"n": len(some)} | {k: list(mean_of(v, units)) for k, v in found.items()}
+                out[f"{form} {pose}"] = {"n": len(some)} | {k: list(interval(v, units)) for k, v in found.items()}
     return out
 
 

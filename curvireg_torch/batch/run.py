@@ -56,9 +56,9 @@ def register_list(
     """Register the photographs of a list; ``out`` gets ``results.jsonl``, ``results.csv`` and ``index.html``.
 
     Photographs of one mesh follow each other, so that only its bank is in memory; as many as torch has threads are
-    registered side by side. What ``results.jsonl`` holds of
-    the same photograph, mesh, box, camera and settings is not done again. A row that cannot be registered (photograph
-    or mesh missing or broken, box or camera that is none) ends ``failed``, with the reason.
+    registered side by side. What ``results.jsonl`` holds of the same photograph, mesh, box, camera and settings is not
+    done again. A row that cannot be registered (photograph or mesh missing or broken, box or camera that is none) ends
+    ``failed``, with the reason.
 
     Args:
         listing: the photographs.
@@ -167,18 +167,16 @@ class _Run:
         """Photographs of the same meshes, side by side; each is on disk as soon as it is done."""
         start = time.perf_counter()
         registrar = self._opened(meshes)
-        seconds = [time.perf_counter() - start]  # the first photograph's
+        seconds = time.perf_counter() - start
         lock = threading.Lock()
 
-        def one(pair: tuple[str, Entry]) -> None:
-            with lock:
-                bank_seconds = seconds.pop() if seconds else 0.0
-            record = self._record(*pair, registrar, bank_seconds)
+        def one(k: int) -> None:
+            record = self._record(*some[k], registrar, 0.0 if k else seconds)  # the bank was opened for the first
             with lock:
                 self.records.append(record)
                 bar.update()
 
-        map_on_threads(one, some)
+        map_on_threads(one, range(len(some)))
 
     def _request(self, entry: Entry) -> str:
         """Names all that the result depends on but the photograph's content, which is read only where it must be."""

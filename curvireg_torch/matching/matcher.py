@@ -36,8 +36,8 @@ __all__ = ["Ranking", "ViewMatcher"]
 KEPT = 2048
 """Views that late terms described when a photograph asked for them and that stay in memory, 35 kB each at 128 px."""
 
-SOME = 16
-"""Views that are described at a time."""
+DESCRIBED = 16
+"""Views that a late term describes at a time."""
 
 
 @dataclass(frozen=True)
@@ -263,8 +263,8 @@ class ViewMatcher(nn.Module):
             return module.described(self._shaded(torch.tensor(some, device=self.device)))
 
         # On one thread each, as the bank's own: which photograph asked first does not decide how features are rounded.
-        some = [missing[k : k + SOME] for k in range(0, len(missing), SOME)]
-        parts = map_on_threads(described, some) if self.device.type == "cpu" else [described(part) for part in some]
+        some = [missing[k : k + DESCRIBED] for k in range(0, len(missing), DESCRIBED)]
+        parts = map_on_threads(described, some, device=self.device)
         new = dict(zip(missing, (feature for part in parts for feature in part), strict=True))
         if len(kept) + len(new) > KEPT:
             kept.clear()

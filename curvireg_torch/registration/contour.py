@@ -159,10 +159,8 @@ def fit_contours(
     if N == 0:
         none = T0.new_zeros(0)
         return ContourFit(T0, T0.new_zeros(0, 6, 6), none, none, none.long(), none, none, none)
-    crops, A = _crops(images, boxes, margin)
-    K = A.double()[photograph] @ K
-    full = Views(renderer, EdgeField(crops), photograph, K, SIZE, centre, radius)
-    K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ K
+    crops, full = _full_size(renderer, images, boxes, K, photograph, centre, radius, margin)
+    K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ full.K
     half = Views(renderer, EdgeField(F.avg_pool2d(crops, 2)), photograph, K, SIZE // 2, centre, radius)
     start = half.seen(T0)
     before = half.support(start)
@@ -216,17 +214,26 @@ def contour_support(
     images, boxes, K, photograph = _batch(images, boxes, camera_matrices, poses, photograph)
     if len(poses) == 0:
         return torch.zeros(0, dtype=torch.float64)
-    crops, A = _crops(images, boxes, margin)
-    views = Views(renderer, EdgeField(crops), photograph, A.double()[photograph] @ K, SIZE, centre.double(), radius)
+    centre = centre.detach().cpu().double()
+    _, views = _full_size(renderer, images, boxes, K, photograph, centre, radius, margin)
     return views.support(views.seen(poses.detach().cpu().double()))
 
 
-def _crops(images: Sequence[Tensor], boxes: Tensor, margin: float) -> tuple[Tensor, Tensor]:
-    """(B, C, S, S) crops without missing pixels, and (B, 3, 3) transforms."""
+def _full_size(
+    renderer: DepthRenderer,
+    images: Sequence[Tensor],
+    boxes: Tensor,
+    K: Tensor,
+    photograph: Tensor,
+    centre: Tensor,
+    radius: float,
+    margin: float,
+) -> tuple[Tensor, Views]:
+    """(B, C, S, S) crops without missing pixels, and the poses' views of them."""
     crops, A = crop_images(images, boxes, size=SIZE, margin=margin)
     crops = filled(crops)
     check_pixels(crops, "of the box")
-    return crops, A
+    return crops, Views(renderer, EdgeField(crops), photograph, A.double()[photograph] @ K, SIZE, centre, radius)
 
 
 def _around(half: Views, T0: Tensor, first: Seen, support: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -93,23 +94,10 @@ def follow_contours(
     describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor
 ) -> Poses:
     """What :func:`fit_contours` makes of poses of all models."""
-    parts, index, photograph = [], [], poses.found.photograph
+    parts, index = [], []
     for model, mine in _by_model(poses.found):
-        describe = describers[model]
-        parts.append(
-            fit_contours(
-                describe.renderer,
-                images,
-                boxes,
-                poses.cameras[mine],
-                poses.T[mine],
-                photograph=photograph[mine],
-                centre=describe.centre,
-                radius=describe.radius,
-                margin=describe.settings.margin,
-                finish=FINALISTS,
-            )
-        )
+        where, shape = _before_photographs(describers[model], images, poses, boxes, mine)
+        parts.append(fit_contours(*where, **shape, finish=FINALISTS))
         index.append(mine)
     place = torch.cat(index).argsort()
     fit = ContourFit(*(torch.cat([getattr(part, f.name) for part in parts])[place] for f in fields(ContourFit)))
@@ -120,19 +108,22 @@ def supports(describers: Sequence[ViewDescriber], images: Sequence[Tensor], pose
     """(H,) contour support of poses of all models as they are, see :func:`contour_support`."""
     out = torch.zeros(len(poses.found), dtype=torch.float64)
     for model, mine in _by_model(poses.found):
-        describe = describers[model]
-        out[mine] = contour_support(
-            describe.renderer,
-            images,
-            boxes,
-            poses.cameras[mine],
-            poses.T[mine],
-            photograph=poses.found.photograph[mine],
-            centre=describe.centre,
-            radius=describe.radius,
-            margin=describe.settings.margin,
-        )
+        where, shape = _before_photographs(describers[model], images, poses, boxes, mine)
+        out[mine] = contour_support(*where, **shape)
     return out
+
+
+def _before_photographs(
+    describe: ViewDescriber, images: Sequence[Tensor], poses: Poses, boxes: Tensor, mine: Tensor
+) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """Arguments of the contour stage for the poses ``mine``, all of one model."""
+    where = describe.renderer, images, boxes, poses.cameras[mine], poses.T[mine]
+    return where, {
+        "photograph": poses.found.photograph[mine],
+        "centre": describe.centre,
+        "radius": describe.radius,
+        "margin": describe.settings.margin,
+    }
 
 
 def _by_model(found: Hypotheses) -> list[tuple[int, Tensor]]:

@@ -192,8 +192,7 @@ class Registrar:
         def some(first: int) -> list[Any]:
             return answer(items[first : first + size], first)
 
-        firsts = range(0, len(items), size)
-        parts = map_on_threads(some, firsts) if size == 1 else [some(first) for first in firsts]
+        parts = map_on_threads(some, range(0, len(items), size), device=self.bank.device)
         return [each for part in parts for each in part]
 
     def _answers_to_boxes(

@@ -109,7 +109,7 @@ def test_what_confidences_are_worth(script):
 
 def test_intervals_are_over_units(script):
     right = np.repeat([True, False, True, True], 25)
-    low, high = script.interval(np.repeat(range(4), 25), lambda i: right[i].mean())
+    low, high = script.interval_of(np.repeat(range(4), 25), lambda i: right[i].mean())
     assert (low, high) == (0.25, 1.0)
 
 
