@@ -10,8 +10,8 @@ from torch import Tensor
 from .errors import InvalidInputError
 from .filters import gaussian_smooth
 from .geometry.cameras import rotation_towards, transform
-from .geometry.mesh import mesh_centre, mesh_radius
 from .geometry.viewpoint import rotation_from_viewpoint
+from .io.meshes.mesh import mesh_centre, mesh_radius
 from .rendering import render_depth
 
 __all__ = ["example_mesh", "procedural_background", "random_pose", "synthesize_photograph"]

@@ -22,7 +22,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from curvireg_torch import ViewBank, ViewMatcher, load_mesh
-from curvireg_torch.data import read_image
+from curvireg_torch.io import read_image
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.pipeline import preset_named
 

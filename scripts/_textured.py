@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from curvireg_torch.rendering.embree import RayScene
-from curvireg_torch.scenes.turns import any_turn
+from curvireg_torch.training.scenes.turns import any_turn
 
 LARGEST = 384
 """Side of textures in px: finer ones would only alias in pictures of this size."""

@@ -31,14 +31,14 @@ from torch import Tensor
 from tqdm import tqdm
 
 import curvireg_torch as cr
-from curvireg_torch.data import read_image
 from curvireg_torch.geometry import box_iou
-from curvireg_torch.location import representative_views
+from curvireg_torch.io import read_image
 from curvireg_torch.matching import cached_bank
 from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
 from curvireg_torch.registration.confidence import presence
-from curvireg_torch.registration.finding import Places
 from curvireg_torch.registration.inputs import Item
+from curvireg_torch.registration.localization import representative_views
+from curvireg_torch.registration.localization.localize import Places
 
 Row = dict[str, Any]
 Curves = dict[str, tuple[list[bool], list[float]]]

@@ -24,9 +24,11 @@ from _record import write_json
 
 import curvireg_torch as cr
 from curvireg_torch.errors import RenderingError
-from curvireg_torch.geometry import mesh_radius, opengl_from_opencv, uniform_views
-from curvireg_torch.matching import BankSettings, ViewDescriber
+from curvireg_torch.geometry import opengl_from_opencv, uniform_views
+from curvireg_torch.io.meshes import mesh_radius
+from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.rendering import make_renderer
+from curvireg_torch.settings import BankSettings
 
 FACES = {"1k": 3, "20k": 5, "300k": 7}  # subdivisions of an icosahedron: 1280, 20480, 327680 faces
 

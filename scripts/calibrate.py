@@ -33,13 +33,7 @@ from sklearn.linear_model import LogisticRegression
 from curvireg_torch.evaluation.store import PredictionStore
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_error, transform
 from curvireg_torch.metrics import symmetry_transforms
-from curvireg_torch.registration.confidence import (
-    FEATURES,
-    RANKING_EVIDENCE,
-    RELIABLE,
-    LogisticModel,
-    pose_features,
-)
+from curvireg_torch.registration.confidence import FEATURES, RANKING_EVIDENCE, RELIABLE, LogisticModel, pose_features
 from curvireg_torch.registration.verify import EVIDENCE, WEIGHTS, verdict
 
 CONSTANTS = REPOSITORY / "curvireg_torch" / "registration" / "calibration.json"

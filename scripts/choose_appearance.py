@@ -30,14 +30,14 @@ from _record import REPOSITORY, between, commit, today
 from torch import Tensor
 
 import curvireg_torch as cr
-from curvireg_torch.data import read_image
 from curvireg_torch.errors import CurviregError
 from curvireg_torch.geometry import rotation_towards
-from curvireg_torch.geometry.mesh import mesh_radius
-from curvireg_torch.learned.backbone import Backbone
+from curvireg_torch.io import read_image
+from curvireg_torch.io.meshes.mesh import mesh_radius
 from curvireg_torch.matching import ViewBank, ViewMatcher, cached_bank
 from curvireg_torch.matching.describe import ViewDescriber
 from curvireg_torch.metrics import symmetric_rotation_error
+from curvireg_torch.models.backbone import Backbone
 from curvireg_torch.pipeline import preset_named
 from curvireg_torch.rendering.shading import shade
 from curvireg_torch.terms import crop_regions, slack_boxes

@@ -21,12 +21,13 @@ from hypothesis import strategies as st
 from safetensors.torch import load, save
 
 import curvireg_torch as cr
-from curvireg_torch.data import BOPDataset, WebCollection, read_bop_csv, read_photo
-from curvireg_torch.data._matfile import read_mat
+from curvireg_torch.data import BOPDataset, WebCollection, read_bop_csv
 from curvireg_torch.errors import CurviregError
 from curvireg_torch.geometry import camera_matrix, crop_images, place_view, square_boxes, translation_from_box
 from curvireg_torch.geometry.crops import check_boxes
-from curvireg_torch.geometry.mesh import extreme_points
+from curvireg_torch.io import read_photo
+from curvireg_torch.io.mat_files import read_mat
+from curvireg_torch.io.meshes.mesh import extreme_points
 from curvireg_torch.matching.bank_file import _checksum
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.terms import crop_regions, slack_boxes

@@ -26,10 +26,10 @@ from tqdm import tqdm
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.cameras import rotation_towards
 from curvireg_torch.rendering.embree import RayScene
-from curvireg_torch.scenes.camera_noise import photographed
-from curvireg_torch.scenes.light import lit, random_light
-from curvireg_torch.scenes.materials import random_colour, random_picture
-from curvireg_torch.scenes.turns import any_turn
+from curvireg_torch.training.scenes.camera_noise import photographed
+from curvireg_torch.training.scenes.light import lit, random_light
+from curvireg_torch.training.scenes.materials import random_colour, random_picture
+from curvireg_torch.training.scenes.turns import any_turn
 
 FORMS = [(cad, pose) for cad in ("exact", "sibling") for pose in ("upright", "free")]
 SIZES = [(320, 320), (320, 400), (360, 480), (400, 320), (400, 400)]  # rows, columns

@@ -15,13 +15,16 @@ import torch
 from kornia.color import rgb_to_grayscale
 from torch import Tensor
 
-from curvireg_torch.data import Pascal3DPlus, read_image
+from curvireg_torch.data import Pascal3DPlus
 from curvireg_torch.filters import MultiScaleFocusCurves
-from curvireg_torch.geometry import crop_images, load_mesh
-from curvireg_torch.learned import LearnedCurvilinearSaliency
-from curvireg_torch.learned.lessons import SETTINGS
+from curvireg_torch.geometry import crop_images
+from curvireg_torch.io import read_image
+from curvireg_torch.io.meshes import load_mesh
 from curvireg_torch.matching import ViewDescriber
-from curvireg_torch.scenes import GeneratedScenes
+from curvireg_torch.matching.fields import depth_filter
+from curvireg_torch.models import LearnedCurvilinearSaliency
+from curvireg_torch.training.field_dataset import SETTINGS
+from curvireg_torch.training.scenes import GeneratedScenes
 
 COLUMNS = 12
 UNSEEN = 77_000_001
@@ -65,7 +68,7 @@ def main() -> None:
     pairs = generated() if arguments.pascal3d is None else photographs(arguments.pascal3d, arguments.pixel_origin)
     for image, depth in pairs:
         with torch.no_grad():
-            fields = [focus(rgb_to_grayscale(image[None])), learned(image[None]), SETTINGS.depth_filter()(depth[None])]
+            fields = [focus(rgb_to_grayscale(image[None])), learned(image[None]), depth_filter(SETTINGS)(depth[None])]
             lengths = [field[0].norm(dim=0).sqrt() for field in fields]
             lengths.insert(2, learned.mask(image[None])[0, 0])
         columns.append(torch.cat([image.permute(1, 2, 0), *map(as_grey, lengths)]))

@@ -22,7 +22,8 @@ from pathlib import Path
 
 from curvireg_torch.errors import CurviregError
 from curvireg_torch.evaluation import KINDS, paper
-from curvireg_torch.pipeline import BankSettings, Pipeline
+from curvireg_torch.pipeline import Pipeline
+from curvireg_torch.settings import BankSettings
 
 RANKINGS = ("precision", "angles", "ranks")
 TABLES = ("detectors", "repeatability", "curve", *RANKINGS)

@@ -26,7 +26,8 @@ from _record import REPOSITORY, commit, today
 from tqdm import tqdm
 
 from curvireg_torch import Registrar, camera_matrix, sample_views
-from curvireg_torch.matching import BankSettings, cached_bank
+from curvireg_torch.matching import cached_bank
+from curvireg_torch.settings import BankSettings
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
 CAMERA, SIZE = (260.0, 260.0, 119.5, 89.5), (180, 240)

@@ -22,14 +22,16 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
-from curvireg_torch._files import write_tensors
 from curvireg_torch.filters import MultiScaleFocusCurves
 from curvireg_torch.geometry import rotation_error, sample_views
-from curvireg_torch.learned import FieldNetwork, Lessons, Replay, altered, halved_angle, losses
-from curvireg_torch.learned.lessons import SETTINGS
-from curvireg_torch.learned.network import save_weights
 from curvireg_torch.matching import ViewDescriber, normalized_correlation
-from curvireg_torch.scenes import GeneratedScenes
+from curvireg_torch.matching.fields import depth_filter, hog_layer
+from curvireg_torch.models import FieldNetwork, halved_angle
+from curvireg_torch.models.learned_field import save_weights
+from curvireg_torch.training import Lessons, Replay, altered, losses
+from curvireg_torch.training.field_dataset import SETTINGS
+from curvireg_torch.training.scenes import GeneratedScenes
+from curvireg_torch.utils.files import write_tensors
 
 VALIDATION_SEED = 1_000_003
 
@@ -52,12 +54,12 @@ class Validation:
 
     @torch.no_grad()
     def __call__(self, field: torch.nn.Module) -> dict[str, float]:
-        descriptor = SETTINGS.descriptor()
+        descriptor = hog_layer(SETTINGS)
         errors, cosines = [], []
         for image, depth, error, bank in zip(self.images, self.depths, self.errors, self.banks, strict=True):
             query = descriptor(field(image[None]))
             errors.append(float(error[normalized_correlation(query, bank.float())[0].argmax()]))
-            right = descriptor(SETTINGS.depth_filter()(depth[None]))
+            right = descriptor(depth_filter(SETTINGS)(depth[None]))
             cosines.append(float(normalized_correlation(query, right)))
         e = np.array(errors)
         return {
@@ -73,7 +75,7 @@ class Validation:
         with torch.no_grad():
             output = F.interpolate(network(images), scale_factor=2.0, mode="bilinear")
         rows = [images.permute(0, 2, 3, 1).flip(3)]
-        for field in (halved_angle(output[:, :2]), SETTINGS.depth_filter()(depths)):
+        for field in (halved_angle(output[:, :2]), depth_filter(SETTINGS)(depths)):
             length = field.norm(dim=1).sqrt()
             rows.append(
                 (length / length.amax(dim=(1, 2), keepdim=True).clamp(min=1e-6))[..., None].expand(-1, -1, -1, 3)

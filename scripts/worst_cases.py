@@ -48,13 +48,13 @@ class Case:
 
 
 def photo(path: Path) -> Any:
-    from curvireg_torch.data import read_photo
+    from curvireg_torch.io import read_photo
 
     return read_photo(path)
 
 
 def floats(path: Path) -> Any:
-    from curvireg_torch.data import read_image
+    from curvireg_torch.io import read_image
 
     return read_image(path)
 
@@ -72,13 +72,13 @@ def table(path: Path) -> Any:
 
 
 def json_file(path: Path) -> Any:
-    from curvireg_torch.data._json import read_json
+    from curvireg_torch.io.json_files import read_json
 
     return read_json(path, dict, "docs/datasets.md")
 
 
 def mat(path: Path) -> Any:
-    from curvireg_torch.data._matfile import read_mat
+    from curvireg_torch.io.mat_files import read_mat
 
     return read_mat(path, "record")
 

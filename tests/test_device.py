@@ -12,7 +12,7 @@ import torch
 
 import curvireg_torch as cr
 from curvireg_torch.detectors import DETECTORS
-from curvireg_torch.learned import appearance
+from curvireg_torch.models import appearance
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import find
 from curvireg_torch.synthetic import example_mesh

@@ -11,8 +11,10 @@ from curvireg_torch import Pipeline, Registrar, ViewBank
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.filters import MultiScaleFocusCurves
 from curvireg_torch.geometry import sample_views
-from curvireg_torch.learned import LearnedCurvilinearSaliency
-from curvireg_torch.pipeline import DEFAULT, DEPTH_FIELDS, FIELDS, PRESETS, BankSettings, ViewPolicy, preset_named
+from curvireg_torch.matching.fields import depth_filter
+from curvireg_torch.models import LearnedCurvilinearSaliency
+from curvireg_torch.pipeline import DEFAULT, DEPTH_FIELDS, FIELDS, PRESETS, preset_named
+from curvireg_torch.settings import BankSettings, ViewPolicy
 from curvireg_torch.terms import TERMS, BoxShape, Correlation, Repeatability, Term
 
 
@@ -35,7 +37,7 @@ def test_every_field_keeps_the_contract(name):
 def test_every_depth_field_keeps_the_contract(name):
     depth = torch.zeros(1, 1, 48, 48)
     depth[..., 12:36, 8:40] = torch.linspace(2, 3, 32)
-    assert BankSettings(image_size=48, depth_field=name).depth_filter()(depth).shape == (1, 2, 48, 48)
+    assert depth_filter(BankSettings(image_size=48, depth_field=name))(depth).shape == (1, 2, 48, 48)
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))

@@ -17,8 +17,8 @@ from curvireg_torch import (
     rotation_error,
     sample_views,
 )
-from curvireg_torch.data import read_image
 from curvireg_torch.geometry import place_view
+from curvireg_torch.io import read_image
 from curvireg_torch.synthetic import random_pose, synthesize_photograph
 from tests._support.real_data import real_data
 

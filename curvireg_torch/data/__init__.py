@@ -4,10 +4,10 @@ A sample is a dict, one per object. Every dataset reports what it left out and w
 gives a sample without its photograph through ``annotation(index)``. Nothing is ever downloaded from here.
 """
 
+from ..io.images import Photo, read_image, read_photo
 from .bop import BOPDataset
 from .bop_csv import BOPRow, read_bop_csv, write_bop_csv
 from .collate import collate
-from .images import Photo, read_image, read_photo
 from .pascal3d import Pascal3DPlus
 from .transforms import CropBox
 from .web import WebCollection

@@ -10,7 +10,7 @@ import torch
 from torch.utils.data import Dataset
 
 from ..errors import MissingFileError
-from .images import read_image
+from ..io.images import read_image
 
 __all__ = ["IMAGE_SUFFIXES", "ObjectDataset", "Sample", "Transform", "existing_root", "is_plain_name"]
 

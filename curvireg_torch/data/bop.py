@@ -7,10 +7,10 @@ from typing import Any
 
 import torch
 
-from .._checks import check_camera_matrix, check_positive, check_rotation
 from ..errors import InvalidInputError, MissingFileError
+from ..io.json_files import finite_numbers, read_json
+from ..utils.checks import check_camera_matrix, check_positive, check_rotation
 from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name
-from ._json import finite_numbers, read_json
 
 __all__ = ["BOPDataset"]
 

@@ -11,10 +11,10 @@ from typing import Any, TypedDict
 import torch
 from torch import Tensor
 
-from .._checks import check_tensor
-from .._files import write_file
 from ..errors import InvalidInputError, MissingFileError
-from ._json import check_table_size, finite_numbers
+from ..io.json_files import check_table_size, finite_numbers
+from ..utils.checks import check_tensor
+from ..utils.files import write_file
 
 __all__ = ["BOPRow", "read_bop_csv", "write_bop_csv"]
 

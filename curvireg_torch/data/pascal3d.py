@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from .._checks import check_option, check_positive
 from ..errors import InvalidInputError, MissingFileError
 from ..geometry import rotation_from_viewpoint
+from ..io.mat_files import MatStruct, MatValue, read_mat
+from ..utils.checks import check_option, check_positive
 from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name
-from ._matfile import MatStruct, MatValue, read_mat
 
 __all__ = ["Pascal3DPlus"]
 

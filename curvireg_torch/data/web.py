@@ -9,8 +9,8 @@ import torch
 
 from ..errors import InvalidInputError, MissingFileError
 from ..geometry import rotation_from_viewpoint
+from ..io.json_files import check_table_size
 from ._base import ObjectDataset, Sample, Transform, existing_root, is_plain_name
-from ._json import check_table_size
 
 __all__ = ["WebCollection"]
 

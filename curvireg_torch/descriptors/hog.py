@@ -5,11 +5,11 @@ import math
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_field, check_option, check_positive, check_tensor
 from ..errors import InvalidInputError
 from ..filters.blocks import Planes, in_blocks
 from ..filters.inputs import finite_vectors
 from ..filters.numerics import at_least_float32, floor, full_precision, image_maximum, readable, safe_sqrt
+from ..utils.checks import check_field, check_option, check_positive, check_tensor
 
 __all__ = ["HOG", "hog", "hog_length", "orientation_cells"]
 

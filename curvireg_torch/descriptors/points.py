@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor
 
-from .._checks import check_field, check_share
 from ..errors import InvalidInputError
 from ..filters.inputs import finite_vectors
 from ..filters.numerics import at_least_float32, safe_sqrt
 from ..filters.suppression import is_ridge
+from ..utils.checks import check_field, check_share
 
 __all__ = ["field_points"]
 

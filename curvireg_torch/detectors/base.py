@@ -8,10 +8,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .._checks import check_colour_image
 from ..descriptors.points import field_points, strongest_points
 from ..filters.inputs import fill_missing, grey, may_lack_pixels, missing
 from ..filters.numerics import at_least_float32, safe_sqrt
+from ..utils.checks import check_colour_image
 
 Function = TypeVar("Function", bound=Callable[..., "Detection"])
 

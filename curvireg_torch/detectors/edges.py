@@ -5,10 +5,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._checks import check_positive, check_share
 from ..descriptors.points import strongest_points
 from ..filters.derivatives import central_derivatives, replicate_pad, smooth
 from ..filters.numerics import safe_sqrt
+from ..utils.checks import check_positive, check_share
 from .base import Detection, detector, from_field, grey_bytes
 
 

@@ -4,8 +4,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .._checks import check_positive
 from ..descriptors.points import strongest_points
+from ..utils.checks import check_positive
 from .base import Detection, detector
 
 OCTAVES = ((9, 15, 21, 27), (15, 27, 39, 51), (27, 51, 75, 99))

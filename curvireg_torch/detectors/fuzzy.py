@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from .._checks import check_positive
 from ..filters import image_gradient
 from ..filters.numerics import image_maximum
+from ..utils.checks import check_positive
 from .base import Detection, detector, from_field
 
 

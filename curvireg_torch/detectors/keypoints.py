@@ -4,7 +4,7 @@ import cv2
 import torch
 from torch import Tensor
 
-from .._checks import check_share
+from ..utils.checks import check_share
 from .base import Detection, detector, grey_bytes
 
 

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from ..data import BOPDataset, BOPRow, write_bop_csv
 from ..errors import InvalidInputError
-from ..geometry import load_mesh
 from ..geometry.cameras import transform
+from ..io.meshes import load_mesh
 from ..metrics import (
     add_error,
     add_recall,

@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from .. import __version__
-from .._checks import check_positive
 from ..pipeline import DEFAULT, PRESETS, Pipeline, preset_named
+from ..utils.checks import check_positive
+from ..version import __version__
 from .benchmark import Benchmark, Row
 from .localisation import localisation
 from .predict import predict

@@ -10,16 +10,16 @@ from pathlib import Path
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from .._files import file_digest
-from ..data import read_image
 from ..errors import ImageError, InvalidInputError, MeshError, MissingFileError
-from ..geometry import load_mesh
 from ..geometry.crops import whole_image_box
-from ..geometry.mesh_files import mesh_digest
+from ..io import read_image
+from ..io.meshes import load_mesh
+from ..io.meshes.files import mesh_digest
 from ..matching import ViewBank, ViewMatcher, cached_bank
 from ..pipeline import Pipeline
 from ..registration import Registrar
 from ..registration.inputs import Item as Photograph
+from ..utils.files import file_digest
 from .benchmark import Benchmark, Item, Row
 from .estimate import FusedMatcher, estimate_poses
 from .protocol import Protocol, perturbed_box

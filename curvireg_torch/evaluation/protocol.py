@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from .._checks import check_option
 from ..errors import InvalidInputError
+from ..utils.checks import check_option
 
 __all__ = ["Protocol", "perturbed_box"]
 

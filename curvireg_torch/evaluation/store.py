@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from .._files import write_file
 from ..errors import InvalidInputError, OutputError
+from ..utils.files import write_file
 
 __all__ = ["PredictionStore", "write_text"]
 

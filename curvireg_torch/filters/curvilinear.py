@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .._checks import check_image, check_mask, check_option, check_positive
+from ..utils.checks import check_image, check_mask, check_option, check_positive
 from .blocks import Planes, in_blocks
 from .derivatives import central_derivatives, central_gradient, smooth
 from .inputs import on_photograph

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_option, check_positive, check_tensor
 from ..errors import InvalidInputError
+from ..utils.checks import check_option, check_positive, check_tensor
 from .blocks import Planes, in_blocks
 from .derivatives import replicate_pad
 from .inputs import filled

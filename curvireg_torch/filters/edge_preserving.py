@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .._checks import check_positive, check_tensor
+from ..utils.checks import check_positive, check_tensor
 from .derivatives import replicate_pad
 from .inputs import filled
 from .learnable import check_width, inverse

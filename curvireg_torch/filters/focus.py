@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_option, check_positive
 from ..errors import InvalidInputError
+from ..utils.checks import check_option, check_positive
 from .blocks import Planes
 from .curvilinear import along
 from .derivatives import central_gradient, smooth

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .._checks import check_colour_image
+from ..utils.checks import check_colour_image
 from .blocks import Planes, in_blocks
 from .numerics import at_least_float32, readable
 

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_positive, check_tensor
+from ..utils.checks import check_positive, check_tensor
 from .numerics import readable
 
 __all__ = ["as_number", "check_width", "inverse", "keep_positive", "positive_option"]

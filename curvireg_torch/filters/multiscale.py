@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_option, check_positive
 from ..errors import InvalidInputError
+from ..utils.checks import check_option, check_positive
 from .blocks import Planes, channels
 from .curvilinear import along
 from .derivatives import central_gradient, smooth

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_option, check_positive
 from ..errors import InvalidInputError
+from ..utils.checks import check_option, check_positive
 from .blocks import Planes
 from .curvilinear import along, dominant_eigenvector, x_if_none
 from .derivatives import central_derivatives, smooth

@@ -7,8 +7,8 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_camera_matrix, check_same_device, check_tensor
 from ..errors import InvalidInputError
+from ..utils.checks import check_camera_matrix, check_same_device, check_tensor
 from .blocks import Planes, in_blocks
 from .curvilinear import (
     BACKGROUND,

@@ -1,4 +1,4 @@
-"""Viewpoints, cameras, view spheres, boxes and meshes.
+"""Viewpoints, cameras, view spheres and boxes, as tensors.
 
 Conventions of the whole library (pinned by ``tests/geometry``):
 
@@ -10,7 +10,6 @@ Conventions of the whole library (pinned by ``tests/geometry``):
 """
 
 from .cameras import camera_matrix, project_points, projected_boxes, rotation_towards, transform
-from .colours import SurfaceColours, has_colours, surface_colours
 from .conversions import (
     axis_angle_from_rotation,
     opencv_from_opengl,
@@ -23,27 +22,19 @@ from .conversions import (
     rotation_from_quaternion,
 )
 from .crops import box_iou, crop_images, crop_transforms, square_boxes, whole_image_box
-from .mesh import load_mesh, mesh_centre, mesh_radius, normalization_transform
 from .symmetry import symmetry_transforms, views_without_symmetric
 from .translation import place_view, translation_from_box
-from .up import mesh_up, up_rotation, with_z_up
+from .up import up_rotation
 from .viewpoint import rotation_error, rotation_from_viewpoint, viewpoint_from_rotation
 from .views import ViewSphere, paper_views, sample_views, uniform_views
 
 __all__ = [
-    "SurfaceColours",
     "ViewSphere",
     "axis_angle_from_rotation",
     "box_iou",
     "camera_matrix",
     "crop_images",
     "crop_transforms",
-    "has_colours",
-    "load_mesh",
-    "mesh_centre",
-    "mesh_radius",
-    "mesh_up",
-    "normalization_transform",
     "opencv_from_opengl",
     "opencv_from_pytorch3d",
     "opengl_from_opencv",
@@ -61,7 +52,6 @@ __all__ = [
     "rotation_towards",
     "sample_views",
     "square_boxes",
-    "surface_colours",
     "symmetry_transforms",
     "transform",
     "translation_from_box",
@@ -70,5 +60,4 @@ __all__ = [
     "viewpoint_from_rotation",
     "views_without_symmetric",
     "whole_image_box",
-    "with_z_up",
 ]

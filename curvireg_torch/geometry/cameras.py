@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from .._checks import check_camera_matrix, check_pose
 from ..errors import InvalidInputError
+from ..utils.checks import check_camera_matrix, check_pose
 
 __all__ = [
     "camera_matrix",

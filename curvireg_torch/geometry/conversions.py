@@ -13,8 +13,8 @@ import torch
 from kornia.geometry import conversions as kornia_conversions
 from torch import Tensor
 
-from .._checks import check_camera_matrix, check_pose, check_rotation, check_tensor
 from ..errors import InvalidInputError
+from ..utils.checks import check_camera_matrix, check_pose, check_rotation, check_tensor
 from .cameras import transform
 
 __all__ = [

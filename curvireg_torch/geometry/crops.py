@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._checks import as_boxes, check_positive, check_tensor
 from ..errors import InvalidInputError
+from ..utils.checks import as_boxes, check_positive, check_tensor
 
 __all__ = [
     "box_iou",

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._checks import check_positive, check_symmetries
 from ..errors import InvalidInputError
+from ..utils.checks import check_positive, check_symmetries
 from .views import ViewSphere
 
 __all__ = ["symmetry_transforms", "views_without_symmetric"]

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from .._checks import check_camera_matrix, check_finite, check_rotation
 from ..errors import InvalidInputError
+from ..utils.checks import check_camera_matrix, check_finite, check_rotation
 from .cameras import boxes_around, projected, rotation_towards, transform
 
 __all__ = ["place_view", "translation_from_box"]

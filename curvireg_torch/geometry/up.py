@@ -1,15 +1,12 @@
 """Which axis of a mesh points up when the object stands. Meshes and poses stay in the file's own frame."""
 
-from typing import Any
-
-import numpy as np
 import torch
 from torch import Tensor
 
-from .._checks import check_option
-from .._choices import UP_AXES
+from ..utils.checks import check_option
+from ..utils.choices import UP_AXES
 
-__all__ = ["UP_AXES", "format_up", "mesh_up", "up_rotation", "with_z_up"]
+__all__ = ["UP_AXES", "up_rotation"]
 
 
 def up_rotation(up: str) -> Tensor:
@@ -26,24 +23,3 @@ def up_rotation(up: str) -> Tensor:
     """
     check_option(up, UP_AXES, "up")
     return torch.tensor(UP_AXES[up], dtype=torch.float64)
-
-
-def format_up(suffix: str) -> str:
-    """The axis that points up in files of a format: y in glTF, by its specification; else z, as in CAD."""
-    return "y" if suffix.lower() in (".glb", ".gltf") else "z"
-
-
-def mesh_up(mesh: Any) -> str:
-    """The axis that points up in a mesh of :func:`load_mesh`, "z" in one from elsewhere."""
-    return str(mesh.metadata.get("up", "z"))
-
-
-def with_z_up(mesh: Any) -> Any:
-    """The mesh, turned where its z axis does not point up."""
-    if mesh_up(mesh) == "z":
-        return mesh
-    T = np.eye(4)
-    T[:3, :3] = up_rotation(mesh_up(mesh)).numpy()
-    turned = mesh.copy().apply_transform(T)
-    turned.metadata["up"] = "z"
-    return turned

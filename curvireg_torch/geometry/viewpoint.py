@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from .._checks import check_rotation
+from ..utils.checks import check_rotation
 
 __all__ = ["rotation_error", "rotation_from_viewpoint", "viewpoint_from_rotation"]
 

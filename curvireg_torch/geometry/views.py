@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .._checks import check_positive
 from ..errors import InvalidInputError
+from ..utils.checks import check_positive
 from .up import up_rotation
 from .viewpoint import rotation_from_viewpoint, viewpoint_from_rotation
 

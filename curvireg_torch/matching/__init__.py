@@ -1,6 +1,6 @@
 """Banks of described views, and the matcher that ranks them for photographs."""
 
-from ..pipeline import BankSettings
+from ..settings import BankSettings
 from ..terms import (
     DescriptorStatistics,
     Photographs,
@@ -16,16 +16,7 @@ from ..terms import (
     whole_box_shapes,
 )
 from .bank import ViewBank
-from .cache import (
-    CACHE_LIMIT,
-    CachedBank,
-    bank_key,
-    cache_folder,
-    cached_bank,
-    clear_cache,
-    list_cache,
-    trim_cache,
-)
+from .cache import CACHE_LIMIT, CachedBank, bank_key, cache_folder, cached_bank, clear_cache, list_cache, trim_cache
 from .describe import DescribedViews, ViewDescriber
 from .distinct import distinct_views
 from .matcher import Ranking, ViewMatcher

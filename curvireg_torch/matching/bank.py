@@ -12,13 +12,14 @@ import trimesh
 from torch import Tensor
 from tqdm import tqdm
 
-from .._threads import one_thread_each
 from ..errors import BankError, InvalidInputError
-from ..geometry.mesh import as_mesh, mesh_radius
-from ..geometry.up import mesh_up
 from ..geometry.views import ViewSphere
-from ..pipeline import BankSettings, Pipeline
+from ..io.meshes.mesh import as_mesh, mesh_radius
+from ..io.meshes.up import mesh_up
+from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
+from ..settings import BankSettings
+from ..utils.threads import one_thread_each
 from .describe import ViewDescriber
 
 __all__ = ["ViewBank"]

@@ -12,13 +12,14 @@ import trimesh
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from .._files import write_tensors
 from ..errors import BankError, CurviregError, MissingFileError
-from ..geometry.colours import SurfaceColours, surface_colours
-from ..geometry.mesh import mesh_unit
-from ..geometry.up import mesh_up
 from ..geometry.views import ViewSphere
+from ..io.meshes.colours import SurfaceColours, surface_colours
+from ..io.meshes.mesh import mesh_unit
+from ..io.meshes.up import mesh_up
 from ..pipeline import Pipeline
+from ..utils.files import write_tensors
+from .fields import hog_layer
 
 if TYPE_CHECKING:
     from .bank import ViewBank
@@ -121,7 +122,7 @@ def _check_contents(bank: "ViewBank") -> None:
     N, S = len(bank), bank.settings.image_size
     packed = (N, -(-(S**2) // 8))
     shapes = {
-        "descriptors": (N, bank.settings.descriptor().length),
+        "descriptors": (N, hog_layer(bank.settings).length),
         "boxes": (N, 4),
         "model": (N,),
         "points": packed,

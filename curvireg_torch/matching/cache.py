@@ -18,11 +18,12 @@ import torch
 import trimesh
 
 from ..errors import BankError
-from ..geometry.mesh import as_mesh, mesh_unit
-from ..geometry.up import mesh_up
 from ..geometry.views import ViewSphere
-from ..pipeline import BankSettings, Pipeline
+from ..io.meshes.mesh import as_mesh, mesh_unit
+from ..io.meshes.up import mesh_up
+from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
+from ..settings import BankSettings
 from .bank import ViewBank
 from .bank_file import FORMAT_VERSION, colour_arrays
 

@@ -8,12 +8,13 @@ from torch import Tensor
 
 from ..descriptors import field_points
 from ..geometry.cameras import projected_boxes, transform
-from ..geometry.colours import has_colours
 from ..geometry.crops import crop_transforms, image_transforms, square_boxes
-from ..geometry.mesh import extreme_points, mesh_centre, mesh_radius
-from ..pipeline import BankSettings
+from ..io.meshes.colours import has_colours
+from ..io.meshes.mesh import extreme_points, mesh_centre, mesh_radius
 from ..rendering import DepthRenderer, make_renderer, render_colour
 from ..rendering.shading import shade
+from ..settings import BankSettings
+from .fields import depth_filter, hog_layer
 
 __all__ = ["DescribedViews", "ViewDescriber"]
 
@@ -84,7 +85,7 @@ class ViewDescriber:
         self.hull = extreme_points(mesh)
         self._orthographic = settings.camera == "orthographic"
         self.radius = mesh_radius(mesh)
-        self._filter, self.descriptor = settings.depth_filter(), settings.descriptor()
+        self._filter, self.descriptor = depth_filter(settings), hog_layer(settings)
         self._device = device
 
     def cameras(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from .._checks import check_symmetries
+from ..utils.checks import check_symmetries
 
 __all__ = ["distinct_views"]
 

@@ -8,12 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from .._checks import as_boxes, check_photograph, check_pixels
-from .._threads import map_on_threads
 from ..descriptors import field_points
 from ..errors import InvalidInputError
-from ..geometry.colours import has_colours
 from ..geometry.crops import crop_images
+from ..io.meshes.colours import has_colours
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..terms import (
@@ -27,9 +25,12 @@ from ..terms import (
     whole_box_shapes,
 )
 from ..terms.correlation import Correlated
+from ..utils.checks import as_boxes, check_photograph, check_pixels
+from ..utils.threads import map_on_threads
 from .bank import ViewBank
 from .describe import ViewDescriber
 from .distinct import distinct_views
+from .fields import hog_layer
 
 __all__ = ["Ranking", "ViewMatcher"]
 
@@ -147,7 +148,7 @@ class ViewMatcher(nn.Module):
         self._kept: dict[str, dict[int, Tensor]] = {}
         self.pipeline = pipeline if field is None else pipeline.with_field(field)
         self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
-        self.descriptor = bank.settings.descriptor()
+        self.descriptor = hog_layer(bank.settings)
         self._comparisons = nn.ModuleDict({term.name: term.over(bank) for term in pipeline.terms}).to(bank.device)
         if whitening is not None:
             self._comparisons["hog"] = Correlated(bank.descriptors, whitening)

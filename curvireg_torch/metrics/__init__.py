@@ -5,13 +5,7 @@ strict: equal is not good enough, except for a radius in pixels and for the IoU,
 """
 
 from ..geometry.symmetry import symmetry_transforms
-from .detection import (
-    Detections,
-    Objects,
-    average_precision,
-    average_rotation_precision,
-    average_viewpoint_precision,
-)
+from .detection import Detections, Objects, average_precision, average_rotation_precision, average_viewpoint_precision
 from .points import hausdorff_distance, intersection_percentage, view_repeatability
 from .pose import add_error, add_recall, adds_error, mspd_error, mspd_recall, mssd_error, mssd_recall
 from .ranking import closest_view, pose_parameter_errors, rank_precision, viewpoint_differences

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from curvireg_torch._checks import check_same_device, check_tensor
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.utils.checks import check_same_device, check_tensor
 
 
 def check_errors(errors: Tensor, name: str = "errors") -> None:

@@ -22,9 +22,9 @@ from operator import itemgetter
 import torch
 from torch import Tensor
 
-from curvireg_torch._checks import check_finite, check_positive, check_rotation, check_same_device, check_tensor
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import box_iou, viewpoint_from_rotation
+from curvireg_torch.utils.checks import check_finite, check_positive, check_rotation, check_same_device, check_tensor
 
 from ._samples import shown
 from .viewpoint import same_bin, symmetric_rotation_error

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from curvireg_torch._checks import check_mask, check_positive
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.utils.checks import check_mask, check_positive
 
 from ._samples import shown
 

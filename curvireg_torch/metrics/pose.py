@@ -16,7 +16,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from curvireg_torch._checks import (
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.utils.checks import (
     check_camera_matrix,
     check_finite,
     check_pose,
@@ -24,7 +25,6 @@ from curvireg_torch._checks import (
     check_same_device,
     check_tensor,
 )
-from curvireg_torch.errors import InvalidInputError
 
 from ._samples import check_errors, or_inf, per_item, share
 

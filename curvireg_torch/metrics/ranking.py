@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from curvireg_torch._checks import check_finite, check_last_axes, check_positive, check_same_device, check_tensor
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint
+from curvireg_torch.utils.checks import check_finite, check_last_axes, check_positive, check_same_device, check_tensor
 
 from ._samples import or_inf, share, shown
 

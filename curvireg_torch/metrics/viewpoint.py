@@ -15,7 +15,9 @@ import math
 import torch
 from torch import Tensor
 
-from curvireg_torch._checks import (
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import rotation_error
+from curvireg_torch.utils.checks import (
     check_finite,
     check_last_axes,
     check_option,
@@ -24,8 +26,6 @@ from curvireg_torch._checks import (
     check_same_device,
     check_tensor,
 )
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import rotation_error
 
 from ._samples import check_errors, or_inf, share
 

@@ -3,8 +3,9 @@
 from ..matching import distinct_views
 from .confidence import RELIABLE, confidence, ranking_evidence
 from .contour import ContourFit, fit_contours
-from .finding import find
 from .hypotheses import Hypotheses, hypotheses
+from .localization import Located, Locator, locate, representative_views
+from .localization.localize import find
 from .pose import FailedRegistration, Found, Hypothesis, Registration
 from .registrar import Registrar
 from .search import coherent_views, search
@@ -17,6 +18,8 @@ __all__ = [
     "Found",
     "Hypotheses",
     "Hypothesis",
+    "Located",
+    "Locator",
     "Registrar",
     "Registration",
     "coherent_views",
@@ -25,7 +28,9 @@ __all__ = [
     "find",
     "fit_contours",
     "hypotheses",
+    "locate",
     "ranking_evidence",
+    "representative_views",
     "search",
     "verdict",
 ]

@@ -8,7 +8,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .._checks import (
+from ..errors import InvalidInputError
+from ..filters.inputs import filled
+from ..geometry import crop_images
+from ..rendering import DepthRenderer
+from ..utils.checks import (
     as_boxes,
     as_numbers,
     check_camera_matrix,
@@ -18,10 +22,6 @@ from .._checks import (
     check_positive,
     check_tensor,
 )
-from ..errors import InvalidInputError
-from ..filters.inputs import filled
-from ..geometry import crop_images
-from ..rendering import DepthRenderer
 from .contour_covariance import pose_covariance
 from .contour_descent import Seen, Views, moved
 from .contour_points import EdgeField

@@ -9,7 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._checks import (
+from ..errors import CurviregError, ImageError, InvalidInputError
+from ..geometry.crops import check_boxes, whole_image_box
+from ..io.images import read_photo
+from ..utils.checks import (
     as_boxes,
     as_camera_matrices,
     check_camera_matrix,
@@ -17,9 +20,6 @@ from .._checks import (
     check_pixels,
     check_square_pixels,
 )
-from ..data.images import read_photo
-from ..errors import CurviregError, ImageError, InvalidInputError
-from ..geometry.crops import check_boxes, whole_image_box
 
 __all__ = ["Item", "check_crop", "items_of", "named"]
 

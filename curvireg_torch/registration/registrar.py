@@ -8,19 +8,20 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_symmetries
-from .._threads import map_on_threads
 from ..errors import CurviregError, InvalidInputError
 from ..geometry.views import ViewSphere
-from ..location import Locator
 from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
-from ..pipeline import BankSettings, Pipeline
+from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
+from ..settings import BankSettings
+from ..utils.checks import check_symmetries
+from ..utils.threads import map_on_threads
 from .confidence import confidence_model, pose_features, ranking_evidence, ranking_features
 from .correction import corrected
-from .finding import find
 from .hypotheses import Hypotheses, hypotheses, own_peaks
 from .inputs import Item, check_crop, items_of, named
+from .localization import Locator
+from .localization.localize import find
 from .placing import Poses, follow_contours, placed, supports
 from .pose import FailedRegistration, Hypothesis, Registration
 from .search import search

@@ -10,10 +10,10 @@ import torch
 import trimesh
 from torch import Tensor
 
-from .._checks import check_camera_matrix, check_option, check_pose
-from .._choices import BACKENDS
 from ..errors import InvalidInputError, MissingDependencyError, RenderingError
-from ..geometry.mesh import as_mesh
+from ..io.meshes.mesh import as_mesh
+from ..utils.checks import check_camera_matrix, check_option, check_pose
+from ..utils.choices import BACKENDS
 
 __all__ = ["BACKENDS", "NEAREST", "DepthRenderer", "make_renderer", "render_depth"]
 

@@ -8,8 +8,8 @@ import torch.nn.functional as F
 import trimesh
 from torch import Tensor
 
-from ..geometry.colours import surface_colours
-from ..geometry.mesh import as_mesh
+from ..io.meshes.colours import surface_colours
+from ..io.meshes.mesh import as_mesh
 from .base import DepthRenderer, check_render_arguments, make_renderer
 from .shading import shade
 

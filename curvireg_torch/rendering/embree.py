@@ -8,8 +8,8 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from torch import Tensor
 
-from .._threads import for_each
-from ..geometry.mesh import box_corners, extreme_points, mesh_centre, mesh_radius
+from ..io.meshes.mesh import box_corners, extreme_points, mesh_centre, mesh_radius
+from ..utils.threads import for_each
 from .base import NEAREST, check_render_arguments
 
 __all__ = ["EmbreeRenderer", "RayScene"]

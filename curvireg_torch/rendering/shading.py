@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from .._checks import check_camera_matrix, check_image, check_tensor
+from ..utils.checks import check_camera_matrix, check_image, check_tensor
 
 __all__ = ["shade"]
 

@@ -5,8 +5,8 @@ import torch
 import trimesh
 from torch import Tensor
 
-from .._threads import available_threads, one_thread_each
-from ..geometry.mesh import mesh_centre, mesh_radius
+from ..io.meshes.mesh import mesh_centre, mesh_radius
+from ..utils.threads import available_threads, one_thread_each
 from .base import NEAREST, check_render_arguments
 
 __all__ = ["TorchRenderer"]

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..learned.appearance import describe, similarity
-from ..learned.backbone import SHA256, Backbone
+from ..models.appearance import describe, similarity
+from ..models.backbone import SHA256, Backbone
 from .base import LateModule, LateTerm, Views
 from .photographs import Photographs
 
@@ -21,7 +21,7 @@ class Appearance(LateTerm):
 
     A mesh with colours of its own is shown twice, shaded grey and in its colours, and what agrees better counts for
     each view: prints tell top from bottom, and where they mislead the grey picture is left. Raw scores are mean cosines
-    (:func:`curvireg_torch.learned.appearance.similarity`) in [-1, 1]; with the spread taken over the views that are
+    (:func:`curvireg_torch.models.appearance.similarity`) in [-1, 1]; with the spread taken over the views that are
     compared, log S_look = (raw - max raw) / spread.
 
     Attributes:

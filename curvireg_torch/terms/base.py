@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, ClassVar, Protocol
 
 from torch import Tensor, nn
 
-from .._checks import check_positive
 from ..errors import InvalidInputError
+from ..utils.checks import check_positive
 from .photographs import Photographs
 
 if TYPE_CHECKING:
-    from ..pipeline import BankSettings
+    from ..settings import BankSettings
 
 __all__ = ["LateModule", "LateTerm", "Term", "Views"]
 

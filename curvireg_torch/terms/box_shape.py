@@ -7,8 +7,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_positive, check_tensor
 from ..errors import InvalidInputError
+from ..utils.checks import check_positive, check_tensor
 from .base import Term, Views
 from .photographs import Photographs
 

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .._checks import check_option, check_tensor
+from ..utils.checks import check_option, check_tensor
 from .base import Term, Views
 from .photographs import Photographs
 from .whitening import DescriptorStatistics, Whitening

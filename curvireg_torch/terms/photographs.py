@@ -8,10 +8,10 @@ import torch
 from kornia.color import rgb_to_grayscale
 from torch import Tensor, nn
 
-from .._checks import as_numbers, check_photograph, check_tensor
 from ..errors import InvalidInputError
 from ..filters.inputs import fill_missing, may_lack_pixels, missing
 from ..geometry.crops import check_boxes, crop_images, square_boxes
+from ..utils.checks import as_numbers, check_photograph, check_tensor
 
 __all__ = ["Photographs", "crop_regions", "photograph_field", "slack_boxes"]
 

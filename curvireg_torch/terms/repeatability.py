@@ -9,8 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .._checks import check_masks, check_option, check_positive
 from ..errors import InvalidInputError
+from ..utils.checks import check_masks, check_option, check_positive
 from .base import Term, Views
 from .photographs import Photographs
 

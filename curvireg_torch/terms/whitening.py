@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from .._checks import check_option, check_tensor
 from ..errors import InvalidInputError
+from ..utils.checks import check_option, check_tensor
 from .base import Views
 
 __all__ = ["DescriptorStatistics", "Whitening"]

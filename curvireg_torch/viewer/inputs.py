@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from .._choices import PRESET_NAMES, UNITS, UP_AXES
 from ..limits import MAX_IMAGE_BYTES, MAX_MESH_BYTES
+from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from .drawing import BoxDrawing
 
 if TYPE_CHECKING:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from nicegui import ui
 
-from .._choices import UNITS
-from ..document import correction
 from ..geometry import rotation_error
-from ..geometry.mesh import mesh_unit
+from ..io.meshes.mesh import mesh_unit
 from ..limits import MAX_VIEWER_FACES
+from ..registration.document import correction
+from ..utils.choices import UNITS
 from ..visualization import contour_overlay, side_pictures
 from ..visualization.plots import view_sphere
 from ..visualization.sheet import thumbnail

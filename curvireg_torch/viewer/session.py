@@ -13,19 +13,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._checks import check_square_pixels
-from ..batch import Entry, register_entry
-from ..commands import open_registrar
-from ..data import read_photo
-from ..data.images import Photo
-from ..document import fitting_box, pose_document
+from ..cli.commands import open_registrar
 from ..errors import CurviregError, InvalidInputError
+from ..evaluation.lists import Entry, register_entry
 from ..evaluation.store import to_json
-from ..geometry import camera_matrix, has_colours, load_mesh, rotation_error, rotation_from_axis_angle
+from ..geometry import camera_matrix, rotation_error, rotation_from_axis_angle
 from ..geometry.cameras import camera_of_view
+from ..io import read_photo
+from ..io.images import Photo
+from ..io.meshes import has_colours, load_mesh
 from ..limits import MAX_VIEWER_SECONDS
 from ..matching import ViewBank
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
+from ..registration.document import fitting_box, pose_document
+from ..utils.checks import check_square_pixels
 from ..visualization import posed_glb
 from .pictures import at
 

@@ -8,12 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._checks import as_numbers, check_camera_matrix
 from ..errors import CurviregError, InvalidInputError
 from ..geometry import rotation_error
+from ..matching.fields import depth_filter
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import Item, items_of
 from ..rendering.base import DepthRenderer
+from ..utils.checks import as_numbers, check_camera_matrix
 
 __all__ = ["contour_overlay", "registration_sheet", "side_pictures"]
 
@@ -177,7 +178,7 @@ def side_pictures(
         "photograph": to_uint8(query.crops[0]),
         "photograph field": _field_picture(query.field[0]),
         "pose": depth_picture(depth[0, 0]),
-        "view field": _field_picture(registrar.bank.settings.depth_filter()(depth)[0]),
+        "view field": _field_picture(depth_filter(registrar.bank.settings)(depth)[0]),
     }
 
 

@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._checks import check_tensor
 from ..errors import InvalidInputError, MissingDependencyError
 from ..matching import Ranking, ViewBank
 from ..metrics import accuracy, azimuth_bin, median_error
 from ..registration import Hypothesis, Registrar, Registration
+from ..utils.checks import check_tensor
 from .overlay import side_pictures
 from .sphere import direction_scores, sphere_map
 

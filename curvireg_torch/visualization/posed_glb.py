@@ -11,11 +11,11 @@ import trimesh
 from PIL import Image
 from torch import Tensor
 
-from .._checks import check_camera_matrix, check_photograph, check_pose, check_tensor
-from .._choices import UNITS
 from ..errors import InvalidInputError
-from ..geometry.colours import surface_colours
-from ..geometry.mesh import mesh_centre, mesh_radius, mesh_unit
+from ..io.meshes.colours import surface_colours
+from ..io.meshes.mesh import mesh_centre, mesh_radius, mesh_unit
+from ..utils.checks import check_camera_matrix, check_photograph, check_pose, check_tensor
+from ..utils.choices import UNITS
 
 __all__ = ["posed_glb"]
 

@@ -10,8 +10,8 @@ import cv2
 import torch
 from torch import Tensor
 
-from .._files import write_file
 from ..rendering.base import DepthRenderer
+from ..utils.files import write_file
 from .overlay import draw_pose
 
 __all__ = ["Shown", "thumbnail", "write_sheet"]

@@ -12,7 +12,8 @@ import torch
 import trimesh
 
 import curvireg_torch as cr
-from curvireg_torch.geometry import mesh_centre, mesh_radius, transform
+from curvireg_torch.geometry import transform
+from curvireg_torch.io.meshes import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 

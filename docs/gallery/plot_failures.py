@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 import curvireg_torch as cr
-from curvireg_torch.scenes import random_shape
 from curvireg_torch.synthetic import example_mesh, procedural_background, random_pose, synthesize_photograph
+from curvireg_torch.training.scenes import random_shape
 from curvireg_torch.visualization import contour_overlay
 
 torch.set_grad_enabled(False)

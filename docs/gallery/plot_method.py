@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 import torch
 
 import curvireg_torch as cr
-from curvireg_torch.geometry import mesh_radius
+from curvireg_torch.io.meshes import mesh_radius
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from curvireg_torch.visualization import contour_overlay
 

@@ -1,7 +1,7 @@
 import pytest
 
 from curvireg_torch.data import BOPDataset, Pascal3DPlus, WebCollection
-from curvireg_torch.evaluation import DEFAULT, PRESETS
+from curvireg_torch.pipeline import DEFAULT, PRESETS
 from tests._support.miniature import write_bop, write_pascal3d, write_web
 
 from .small import SMALL

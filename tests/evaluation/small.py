@@ -7,9 +7,9 @@ import os
 import signal
 import sys
 
-from curvireg_torch.evaluation import DEFAULT, PRESETS, Pipeline
-from curvireg_torch.evaluation.__main__ import main
-from curvireg_torch.pipeline import BankSettings, ViewPolicy
+from curvireg_torch.cli import main
+from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline
+from curvireg_torch.settings import BankSettings, ViewPolicy
 
 SMALL = Pipeline(
     views=ViewPolicy(directions=18, turn=360.0, azimuth_step=60.0, elevations=(10.0,)),
@@ -38,4 +38,4 @@ if __name__ == "__main__":
     PRESETS[DEFAULT] = SMALL
     if "CURVIREG_TEST_KILL" in os.environ:
         die_at(int(os.environ["CURVIREG_TEST_KILL"]))
-    sys.exit(main())
+    sys.exit(main(["evaluate", *sys.argv[1:]]))

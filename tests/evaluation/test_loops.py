@@ -8,12 +8,14 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch.data import BOPDataset, read_bop_csv, read_image
+from curvireg_torch.data import BOPDataset, read_bop_csv
 from curvireg_torch.errors import InvalidInputError, RenderingError
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, estimate, evaluate, predict, score
 from curvireg_torch.evaluation.store import PredictionStore
 from curvireg_torch.filters import ImageGradient
-from curvireg_torch.geometry import load_mesh, rotation_error
+from curvireg_torch.geometry import rotation_error
+from curvireg_torch.io import read_image
+from curvireg_torch.io.meshes import load_mesh
 from curvireg_torch.matching import ViewBank, ViewMatcher
 from curvireg_torch.registration import Registrar
 from curvireg_torch.registration.inputs import Item

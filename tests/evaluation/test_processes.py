@@ -12,7 +12,6 @@ import pytest
 
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.evaluation import Benchmark, BOPBenchmark, Pascal3DBenchmark, Protocol, evaluate
-from curvireg_torch.evaluation.__main__ import main
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -66,12 +65,3 @@ def test_two_processes_do_the_same_as_one(request, tmp_path, kind):
     assert two.returncode == 0, two.stderr
     assert results(tmp_path / "two") == results(tmp_path / "one")
     assert two.stdout.count("protocol:") == 1, "one process reports"
-
-
-def test_errors_are_one_line(tmp_path, capsys, monkeypatch):
-    words = ["pascal3d", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"), "--quiet"]
-    monkeypatch.setattr(sys, "argv", ["curvireg_torch.evaluation", *words])
-    assert main() == 2
-    said = capsys.readouterr().err
-    assert said.startswith("curvireg_torch.evaluation: error: ")
-    assert said.count("\n") == 1

@@ -9,7 +9,7 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import KINDS, Protocol, WebBenchmark
 from tests._support.miniature import write_bop, write_pascal3d, write_web
 
-from .test_command import evaluate
+from ..cli.test_evaluate import evaluate
 
 
 def test_a_collection_is_evaluated(web, tmp_path, capsys):

@@ -7,8 +7,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from curvireg_torch import geometry as g
-from curvireg_torch._checks import check_camera_matrix
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.utils.checks import check_camera_matrix
 
 K = torch.tensor([[240.0, 0.0, 70.3], [0, 260.0, 51.8], [0, 0, 1]], dtype=torch.float64)
 

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from curvireg_torch import geometry as g
-from curvireg_torch._checks import check_camera_matrix
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry.crops import check_boxes, image_transforms
+from curvireg_torch.utils.checks import check_camera_matrix
 
 
 def ramp(height: int, width: int) -> torch.Tensor:

@@ -5,7 +5,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from curvireg_torch import geometry as g
-from curvireg_torch.geometry.mesh import extreme_points
+from curvireg_torch.io.meshes.mesh import extreme_points
 from curvireg_torch.synthetic import example_mesh
 
 K = g.camera_matrix(800.0, 820.0, 310.0, 255.0, dtype=torch.float64)

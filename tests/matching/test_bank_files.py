@@ -13,10 +13,11 @@ from safetensors.torch import load_file, save_file
 
 from curvireg_torch.errors import BankError, InvalidInputError, MissingFileError
 from curvireg_torch.geometry import sample_views, uniform_views
-from curvireg_torch.geometry.up import mesh_up
-from curvireg_torch.matching import BankSettings, ViewBank, ViewMatcher, normalized_correlation
-from curvireg_torch.pipeline import Pipeline, ViewPolicy
+from curvireg_torch.io.meshes.up import mesh_up
+from curvireg_torch.matching import ViewBank, ViewMatcher, normalized_correlation
+from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import Registrar
+from curvireg_torch.settings import BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 
 SETTINGS = BankSettings(image_size=64)

@@ -17,19 +17,11 @@ import trimesh
 from PIL import Image
 
 from curvireg_torch.geometry import sample_views
-from curvireg_torch.geometry.colours import SurfaceColours
-from curvireg_torch.geometry.mesh import as_mesh
-from curvireg_torch.matching import (
-    BankSettings,
-    ViewBank,
-    bank_key,
-    cache_folder,
-    cached_bank,
-    clear_cache,
-    list_cache,
-    trim_cache,
-)
+from curvireg_torch.io.meshes.colours import SurfaceColours
+from curvireg_torch.io.meshes.mesh import as_mesh
+from curvireg_torch.matching import ViewBank, bank_key, cache_folder, cached_bank, clear_cache, list_cache, trim_cache
 from curvireg_torch.rendering import make_renderer
+from curvireg_torch.settings import BankSettings
 
 SETTINGS = BankSettings(image_size=64)
 VIEWS = sample_views(azimuth_step=90, elevations=[20])

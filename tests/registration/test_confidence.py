@@ -8,7 +8,7 @@ import trimesh
 
 from curvireg_torch import Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
 from curvireg_torch.geometry import symmetry_transforms, views_without_symmetric
-from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
+from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import confidence, distinct_views, ranking_evidence, verdict

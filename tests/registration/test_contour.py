@@ -11,7 +11,7 @@ from curvireg_torch import Registrar, camera_matrix, rotation_error
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_towards
 from curvireg_torch.geometry.cameras import project_points, transform
-from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
+from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import contour, contour_descent, fit_contours
 from curvireg_torch.registration.contour_points import EdgeField, contour_points
 from curvireg_torch.rendering import make_renderer

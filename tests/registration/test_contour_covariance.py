@@ -8,7 +8,7 @@ import trimesh
 from curvireg_torch import camera_matrix
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import project_points, transform
-from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
+from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import contour_covariance, fit_contours
 from curvireg_torch.registration.calibration import COVARIANCE_SCALE as SCALE
 from curvireg_torch.registration.contour_covariance import pose_covariance

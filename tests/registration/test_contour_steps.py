@@ -10,8 +10,9 @@ import trimesh
 from torch import Tensor
 
 from curvireg_torch import camera_matrix
-from curvireg_torch.geometry import mesh_centre, mesh_radius, rotation_from_axis_angle
+from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
+from curvireg_torch.io.meshes import mesh_centre, mesh_radius
 from curvireg_torch.registration import fit_contours
 from curvireg_torch.registration.contour_descent import Seen, Views, moved, project
 from curvireg_torch.registration.contour_points import ContourPoints

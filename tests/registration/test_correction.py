@@ -6,10 +6,10 @@ import pytest
 import torch
 
 import curvireg_torch as cr
-from curvireg_torch.document import fitting_box, result_document
 from curvireg_torch.geometry import box_iou, rotation_error
 from curvireg_torch.registration import correction
 from curvireg_torch.registration.correction import posed_box
+from curvireg_torch.registration.document import fitting_box, result_document
 from tests._support.scenes import CAMERA, scene, truck_bank
 
 EDGES = torch.tensor([-0.18, 0.15, 0.02, 0.2])

@@ -12,7 +12,7 @@ from PIL import Image
 from curvireg_torch import Pipeline, Registrar, load_mesh, rotation_error, rotation_from_viewpoint, sample_views
 from curvireg_torch.geometry import transform, up_rotation
 from curvireg_torch.geometry.cameras import projected_boxes
-from curvireg_torch.geometry.mesh import extreme_points
+from curvireg_torch.io.meshes.mesh import extreme_points
 from curvireg_torch.rendering import render_colour
 from tests._support.scenes import CAMERA, SIZE
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from curvireg_torch import Registrar, Registration, ViewBank, rotation_error, sample_views
-from curvireg_torch.geometry import mesh_centre, mesh_radius, rotation_from_viewpoint
+from curvireg_torch.geometry import rotation_from_viewpoint
+from curvireg_torch.io.meshes import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import Hypothesis, fit_contours
 from curvireg_torch.rendering import make_renderer

@@ -17,7 +17,7 @@ from curvireg_torch import (
 )
 from curvireg_torch.errors import CurviregError, InvalidInputError
 from curvireg_torch.geometry import rotation_from_viewpoint, symmetry_transforms
-from curvireg_torch.geometry.mesh import mesh_centre, mesh_radius
+from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import RELIABLE, FailedRegistration, distinct_views, fit_contours
 from curvireg_torch.registration import pose as pose_module

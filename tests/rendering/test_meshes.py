@@ -7,7 +7,7 @@ import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, MeshError, RenderingError
-from curvireg_torch.geometry.mesh import as_mesh
+from curvireg_torch.io.meshes.mesh import as_mesh
 from curvireg_torch.rendering import make_renderer
 
 from .scenes import BACKENDS, camera, interior, require

@@ -15,7 +15,8 @@ import curvireg_torch
 from curvireg_torch.cli import _parsed, main
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, MeshError
 from curvireg_torch.geometry import rotation_error
-from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
+from curvireg_torch.pipeline import PRESETS
+from curvireg_torch.settings import BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer.session import Session
 from tests._support.exif import exif, with_exif
@@ -84,7 +85,7 @@ def test_the_command_gives_the_same_answer_to_the_digit(answered):
 
 def test_the_document_is_of_the_schema(answered):
     jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
-    schema = json.loads((Path(curvireg_torch.__file__).parent / "result.schema.json").read_text())
+    schema = json.loads((Path(curvireg_torch.__file__).parent / "registration" / "result.schema.json").read_text())
     jsonschema.validate(json.loads(answered[0].json()), schema)
 
 

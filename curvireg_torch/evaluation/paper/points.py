@@ -9,8 +9,10 @@ from kornia.color import rgb_to_grayscale
 from torch import Tensor
 
 from ...descriptors import field_points
-from ...matching import BankSettings, ViewDescriber
+from ...matching import ViewDescriber
+from ...matching.fields import depth_filter
 from ...metrics import hausdorff_distance, intersection_percentage, view_repeatability
+from ...settings import BankSettings
 from .cases import Case, grouped
 from .fields import PHOTO_FIELDS, photo_detectors
 from .tables import Table
@@ -138,7 +140,7 @@ def _depth(describe: ViewDescriber, R: Tensor, distance: float) -> Tensor:
 
 def _points(depth: Tensor, settings: BankSettings, name: str = "CS") -> Tensor:
     with torch.no_grad():
-        field = replace(settings, depth_field=name).depth_filter()(depth)
+        field = depth_filter(replace(settings, depth_field=name))(depth)
     return field_points(field, share=settings.point_share)[:, 0]
 
 

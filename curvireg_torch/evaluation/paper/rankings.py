@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from ...geometry import ViewSphere, rotation_error, viewpoint_from_rotation
-from ...matching import BankSettings, ViewBank, ViewMatcher
+from ...matching import ViewBank, ViewMatcher
 from ...metrics import accuracy, pose_parameter_errors, rank_precision
+from ...settings import BankSettings
 from .cases import Case, grouped
 from .fields import PHOTO_FIELDS
 from .tables import Table

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..._files import write_file
 from ...errors import MissingDependencyError
+from ...utils.files import write_file
 from ...visualization import plots
 from ..store import write_text
 

@@ -1,0 +1,20 @@
+from .benchmark import Benchmark
+from .bop import BOPBenchmark
+from .loops import evaluate, score
+from .pascal3d import Pascal3DBenchmark
+from .protocol import Protocol
+from .registry import KINDS
+from .sheet import contact_sheet
+from .web import WebBenchmark
+
+__all__ = [
+    "KINDS",
+    "BOPBenchmark",
+    "Benchmark",
+    "Pascal3DBenchmark",
+    "Protocol",
+    "WebBenchmark",
+    "contact_sheet",
+    "evaluate",
+    "score",
+]

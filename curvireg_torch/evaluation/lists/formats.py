@@ -1,0 +1,150 @@
+"""Lists of photographs in the formats that people have: CSV, JSON, COCO, a scene of a BOP set."""
+
+import csv
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ...data.bop import bop_box, entry_at
+from ...errors import InvalidInputError, MissingFileError
+from ...io.json_files import check_table_size, finite_numbers
+from .listing import BOX, CAMERA, Listing, listing
+
+__all__ = ["read_list"]
+
+Row = dict[str, Any]
+
+
+def read_list(path: Path, meshes: Sequence[Path] = ()) -> Listing:
+    """The photographs of a list on disk.
+
+    - ``.csv``: a header and the columns of :func:`listing`; blank lines are no rows.
+    - ``.json``: a list of objects ``{"photo": "a.jpg", "box": [x0, y0, x1, y1], "camera": [fx, fy, cx, cy], "mesh":
+      "part.stl"}``, all but ``photo`` if wanted; other keys are passed through. Or COCO annotations: one row each, with
+      ``image_id``, ``annotation_id`` and ``category``; COCO counts pixels from the picture's corner, so half a pixel is
+      taken off.
+    - a folder: a scene of a BOP set, with the boxes of whole objects, and the models where they lie in the set's
+      ``models``.
+
+    Args:
+        path: the file or folder, from which its paths count.
+        meshes: of rows that name none; several: which of them is it?
+
+    Raises:
+        MissingFileError: no such file.
+        InvalidInputError: not such a list, or one without rows.
+
+    Example:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp(), "list.json")
+        >>> _ = file.write_text('[{"photo": "a.jpg", "box": [1, 2, 30, 40.5], "mesh": "part.stl"}]')
+        >>> read_list(file).entries[0].box
+        (1.0, 2.0, 30.0, 40.5)
+    """
+    if path.is_dir():
+        return _listed(path, _bop_rows(path), path, meshes)
+    if not path.is_file():
+        raise MissingFileError(f"{path}: no such file; check the path of the list")
+    check_table_size(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        if path.suffix.lower() != ".json":
+            table = csv.reader(io.StringIO(text, newline=""), strict=True)
+            lines = [cells for cells in table if any(map(str.strip, cells))]
+            return listing(str(path), lines[0] if lines else [], lines[1:], path.parent, meshes)
+        content = json.loads(text)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InvalidInputError(f"{path}: not a table in UTF-8 ({error}); save it as CSV in UTF-8") from error
+    except (ValueError, RecursionError) as error:
+        raise InvalidInputError(f"{path}: not JSON ({error})") from error
+    if isinstance(content, dict) and {"images", "annotations"} <= set(content):
+        return _listed(path, _coco_rows(path, content), path.parent, meshes)
+    if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
+        raise InvalidInputError(f"{path}: expected a list of objects with photo, box, camera, mesh; or COCO's images")
+    return _listed(path, [_row(entry) for entry in content], path.parent, meshes)
+
+
+def _listed(path: Path, rows: Sequence[Row], folder: Path, meshes: Sequence[Path]) -> Listing:
+    """A table of all keys that rows have."""
+    columns = list(dict.fromkeys(["photo", *BOX, *(key for row in rows for key in row)]))
+    return listing(str(path), columns, [[_text(row.get(name)) for name in columns] for row in rows], folder, meshes)
+
+
+def _text(value: Any) -> str:
+    return "" if value is None else value if isinstance(value, str) else json.dumps(value)
+
+
+def _row(entry: Mapping[str, Any]) -> Row:
+    """``box`` and ``camera`` as columns; what are no four numbers stand there as they are, to be refused."""
+    row: Row = {"photo": entry.get("photo")}
+    for key, names in (("box", BOX), ("camera", CAMERA)):
+        values = entry.get(key)
+        if values is not None:
+            four = values if isinstance(values, list) and len(values) == 4 else [values] * 4
+            row |= dict(zip(names, four, strict=True))
+    return row | {key: value for key, value in entry.items() if key not in ("photo", "box", "camera")}
+
+
+def _coco_rows(path: Path, content: Mapping[str, Any]) -> list[Row]:
+    try:
+        files = {image["id"]: image["file_name"] for image in content["images"]}
+        kinds = {kind["id"]: kind["name"] for kind in content.get("categories", [])}
+        rows = []
+        for annotation in content["annotations"]:
+            box = finite_numbers(annotation.get("bbox"), 4)
+            corners: list[float | str] = ["no bbox"] * 4
+            if box is not None:
+                corners = [box[0] - 0.5, box[1] - 0.5, box[0] + box[2] - 0.5, box[1] + box[3] - 0.5]
+            rows.append(
+                {
+                    "photo": files[annotation["image_id"]],
+                    **dict(zip(BOX, corners, strict=True)),
+                    "image_id": annotation["image_id"],
+                    "annotation_id": annotation.get("id"),
+                    "category": kinds.get(annotation.get("category_id")),
+                }
+            )
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InvalidInputError(f"{path}: not COCO annotations ({type(error).__name__}: {error})") from error
+    return rows
+
+
+def _bop_rows(folder: Path) -> list[Row]:
+    contents = []
+    for name in ("scene_camera.json", "scene_gt.json", "scene_gt_info.json"):
+        if not (folder / name).is_file():
+            raise MissingFileError(f"{folder / name}: no such file; --list takes a scene's folder of a BOP set")
+        check_table_size(folder / name)
+        try:
+            contents.append(json.loads((folder / name).read_text(encoding="utf-8")))
+        except (ValueError, RecursionError) as error:
+            raise InvalidInputError(f"{folder / name}: not JSON ({error})") from error
+    try:
+        return list(_bop_objects(folder, *contents))
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+        raise InvalidInputError(f"{folder}: not a scene of a BOP set ({type(error).__name__}: {error})") from error
+
+
+def _bop_objects(folder: Path, cameras: Any, truths: Any, infos: Any) -> Iterator[Row]:
+    """What is missing or broken of an object stands in its row as a text, to be refused there."""
+    for key, objects in truths.items():
+        kinds, suffixes = ("rgb", "gray"), (".png", ".jpg", ".tif")
+        pictures = [f"{kind}/{key.zfill(6)}{suffix}" for kind in kinds for suffix in suffixes]
+        photo = next((name for name in pictures if (folder / name).is_file()), pictures[0])
+        camera = cameras.get(key)
+        K = finite_numbers(camera.get("cam_K") if isinstance(camera, dict) else None, 9) or ["no cam_K"] * 9
+        for index, truth in enumerate(objects):
+            number = truth.get("obj_id") if isinstance(truth, dict) else None
+            model = f"../../models/obj_{number:06d}.ply" if isinstance(number, int) else None
+            box = bop_box(entry_at(infos.get(key), index).get("bbox_obj")) or ["no bbox_obj"] * 4
+            yield {
+                "photo": photo,
+                **dict(zip(BOX, box, strict=True)),
+                **dict(zip(CAMERA, (K[0], K[4], K[2], K[5]), strict=True)),
+                "mesh": model if model and (folder / model).is_file() else None,
+                "scene_id": int(folder.resolve().name),
+                "im_id": int(key) if key.isdecimal() else key,
+                "obj_id": number,
+            }

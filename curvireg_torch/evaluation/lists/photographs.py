@@ -1,0 +1,84 @@
+"""Photographs named one by one, as folders, patterns or videos."""
+
+import glob
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+
+from ...errors import ImageError, InvalidInputError, MissingFileError
+from ...io.input_paths import is_one_photograph, is_pattern
+from ...limits import MAX_IMAGE_PIXELS
+from ...utils.choices import IMAGES, VIDEOS
+from ...utils.files import write_file
+from .listing import Listing, listing
+
+__all__ = ["is_one_photograph", "list_photographs"]
+
+_COLUMNS = ["photo", "x0", "y0", "x1", "y1", "fx", "fy", "cx", "cy"]
+
+
+def list_photographs(
+    paths: Sequence[Path],
+    meshes: Sequence[Path],
+    *,
+    box: Sequence[float] | None = None,
+    camera: Sequence[float] | None = None,
+    every: int = 1,
+    frames: Path,
+) -> Listing:
+    """A list of photographs, all with the same box and camera.
+
+    Args:
+        paths: photographs, folders of them, patterns such as ``shots/*.jpg``, videos.
+        meshes: of all of them; several: which of them is it?
+        box: x0, y0, x1, y1 in px of every photograph; default: the object is looked for.
+        camera: fx, fy, cx, cy in px of every photograph.
+        every: of a video, every how many frames.
+        frames: folder for frames of videos, as PNG.
+
+    Raises:
+        MissingFileError: a pattern or folder without photographs.
+        ImageError: a video that cannot be read.
+    """
+    if every < 1:
+        raise InvalidInputError(f"--every: expected >= 1, got {every}")
+    numbers = [*([""] * 4 if box is None else map(str, box)), *([""] * 4 if camera is None else map(str, camera))]
+    rows = [[str(photo), *numbers] for path in paths for photo in _found(path, every, frames)]
+    return listing("photographs", _COLUMNS, rows, Path(), meshes)
+
+
+def _found(path: Path, every: int, frames: Path) -> Iterator[Path]:
+    if path.suffix.lower() in VIDEOS and path.is_file():
+        yield from _frames(path, every, frames)
+    elif path.is_dir() or is_pattern(path):
+        inside = path.iterdir() if path.is_dir() else map(Path, glob.glob(str(path), recursive=True))
+        photographs = sorted(found for found in inside if found.suffix.lower() in IMAGES and found.is_file())
+        if not photographs:
+            raise MissingFileError(f"{path}: no photographs ({', '.join(IMAGES)}); check the path")
+        yield from photographs
+    else:
+        yield path
+
+
+def _frames(path: Path, every: int, folder: Path) -> Iterator[Path]:
+    """Frames 0, every, 2 every, ... as files, without loss."""
+    video = cv2.VideoCapture(str(path))
+    try:
+        width, height = (int(video.get(k)) for k in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if not video.isOpened() or not 0 < width * height <= MAX_IMAGE_PIXELS:
+            raise ImageError(f"{path}: not a video that can be read; save it as MP4 (H.264), or give its frames")
+        number = 0
+        while video.grab():
+            if number % every == 0:
+                frame = folder / f"{path.stem}-{number:06d}.png"
+                known, pixels = video.retrieve()
+                if not known:
+                    raise ImageError(f"{path}: frame {number} cannot be read; save the video again")
+                write_file(frame, cv2.imencode(".png", pixels)[1].tobytes())
+                yield frame
+            number += 1
+        if number == 0:
+            raise ImageError(f"{path}: a video without frames; save it again")
+    finally:
+        video.release()

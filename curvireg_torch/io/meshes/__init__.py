@@ -1,0 +1,19 @@
+"""Meshes: files of several formats become one trimesh with metadata for unit, up axis and colours."""
+
+from .colours import SurfaceColours, has_colours, surface_colours
+from .mesh import as_mesh, load_mesh, mesh_centre, mesh_radius, mesh_unit, normalization_transform
+from .up import mesh_up, with_z_up
+
+__all__ = [
+    "SurfaceColours",
+    "as_mesh",
+    "has_colours",
+    "load_mesh",
+    "mesh_centre",
+    "mesh_radius",
+    "mesh_unit",
+    "mesh_up",
+    "normalization_transform",
+    "surface_colours",
+    "with_z_up",
+]

@@ -1,0 +1,235 @@
+"""Mesh files to one cleaned ``trimesh.Trimesh``, and a normalised model frame."""
+
+import math
+import warnings
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from ...errors import MeshError, MissingFileError
+from ...limits import MAX_MESH_COORDINATE, MAX_MESH_FACES
+from ...utils.checks import check_option
+from ...utils.choices import MESHES, UNITS, UP_AXES
+from .colours import SurfaceColours, surface_colours
+from .files import read_mesh
+from .up import format_up, mesh_up
+
+__all__ = [
+    "UNITS",
+    "as_mesh",
+    "box_corners",
+    "extreme_points",
+    "load_mesh",
+    "mesh_centre",
+    "mesh_radius",
+    "mesh_unit",
+    "normalization_transform",
+]
+
+
+def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = None) -> trimesh.Trimesh:
+    """Read a mesh file; scenes become one mesh, polygons become triangles, normals are ignored.
+
+    Nothing is rescaled: vertices, and every pose computed from them, stay in the file's own frame and unit.
+
+    Args:
+        path: .obj, .ply, .stl, .off, .glb or .gltf.
+        unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. An object that
+            would be smaller than 5 mm or larger than 100 m gets a warning.
+        up: the axis that points up when the object stands ("x", "y", "z", "-x", "-y", "-z"), kept in
+            ``mesh.metadata["up"]`` for views of standing objects, see :meth:`ViewSphere.for_up`; None: y for glTF,
+            else z.
+
+    Returns:
+        ``trimesh.Trimesh`` with (V, 3) float64 vertices and (F, 3) faces, degenerate faces removed. Textures and other
+        colours are kept as one :class:`SurfaceColours` in ``mesh.metadata["colours"]``.
+
+    Raises:
+        MissingFileError: no such file.
+        MeshError: unreadable, empty, without faces, with NaN or infinite vertices, or beyond
+            :mod:`curvireg_torch.limits`.
+    """
+    check_option(unit, UNITS, "unit")
+    path = Path(path)
+    up = format_up(path.suffix) if up is None else up
+    check_option(up, UP_AXES, "up")
+    if not path.is_file():
+        raise MissingFileError(f"{path}: no such file; check the path of the mesh")
+    if path.suffix.lower() not in MESHES:
+        raise MeshError(f"{path}: expected a mesh file ({', '.join(MESHES)}); convert it first")
+    mesh = as_mesh(read_mesh(path), name=str(path))
+    mesh.units = unit
+    mesh.metadata.update(file_name=path.name, up=up)
+    size = float(np.linalg.norm(mesh.extents)) * UNITS[unit]
+    if not 0.005 <= size <= 100.0:
+        warnings.warn(
+            f"{path}: in unit {unit!r} the object is {size:g} m across; if that is wrong, give the unit (mm?)",
+            stacklevel=2,
+        )
+    return mesh
+
+
+def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
+    """One clean mesh from a path, a ``trimesh.Trimesh`` or a ``trimesh.Scene``; errors as :func:`load_mesh`."""
+    if isinstance(source, str | PathLike):
+        return load_mesh(source)
+    if isinstance(source, trimesh.Scene):
+        try:
+            parts = _placed(source)
+            source = _joined(parts) if parts else None
+        except Exception as error:  # transforms that are none, parts that hang on nothing, vertices of one number
+            raise MeshError(f"{name}: its parts cannot be put together ({error}); re-export the file") from error
+    if not isinstance(source, trimesh.Trimesh) or len(source.faces) == 0:
+        raise MeshError(f"{name}: expected a mesh with faces, got none; point clouds and curves cannot be rendered")
+    if len(source.faces) > MAX_MESH_FACES:
+        raise MeshError(f"{name}: {len(source.faces):,} faces, more than {MAX_MESH_FACES:,}; simplify it")
+    vertices, faces = np.asarray(source.vertices, dtype=np.float64), np.asarray(source.faces, dtype=np.int64)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise MeshError(f"{name}: expected vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshError(f"{name}: faces name vertices that do not exist; the file is damaged, re-export it")
+    used = vertices[faces]
+    if not np.isfinite(used).all():
+        broken = int((~np.isfinite(used).all(axis=(1, 2))).sum())
+        raise MeshError(f"{name}: {broken} faces have NaN or infinite vertices; repair the mesh")
+    if float(np.abs(used).max()) > MAX_MESH_COORDINATE:
+        raise MeshError(f"{name}: vertices farther than {MAX_MESH_COORDINATE:g} from the origin; repair the mesh")
+    area = np.linalg.norm(np.cross(used[:, 1] - used[:, 0], used[:, 2] - used[:, 0]), axis=1)
+    if not (area > 0).any():
+        raise MeshError(f"{name}: every face is degenerate (area 0); repair the mesh")
+    colours = _colours(source)
+    mesh = trimesh.Trimesh(vertices=vertices, faces=faces[area > 0], process=False)
+    mesh.remove_unreferenced_vertices()
+    unit = mesh_unit(source)
+    if unit is not None:  # trimesh keeps None as the word "none"
+        mesh.units = unit
+    mesh.metadata["up"] = mesh_up(source)
+    if colours is not None:
+        mesh.metadata["colours"] = colours[area > 0]
+    return mesh
+
+
+def mesh_unit(mesh: trimesh.Trimesh) -> str | None:
+    """The unit that ``mesh.units`` names, as a key of ``UNITS``; None where it names none of them.
+
+    Example:
+        >>> mesh = trimesh.creation.box()
+        >>> mesh_unit(mesh) is None
+        True
+        >>> mesh.units = "millimeters"
+        >>> mesh_unit(mesh)
+        'mm'
+    """
+    if mesh.units in UNITS:
+        return str(mesh.units)
+    try:
+        metres = trimesh.units.unit_conversion(mesh.units, "meters")
+    except (AttributeError, ValueError):
+        return None
+    return next((unit for unit, length in UNITS.items() if math.isclose(metres, length, rel_tol=1e-6)), None)
+
+
+def _placed(scene: trimesh.Scene) -> list[trimesh.Trimesh]:
+    """The meshes of a scene where they stand: its own ``dump``, which takes time with the cube of a part's depth."""
+    forest = scene.graph.transforms
+    world = {scene.graph.base_frame: np.eye(4)}
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        path = [node]
+        while path[-1] not in world and path[-1] in forest.parents:
+            path.append(forest.parents[path[-1]])
+        if path[-1] not in world:  # does not hang on the base: trimesh finds another way
+            world[path[-1]] = scene.graph.get(path[-1])[0]
+        for child, parent in zip(path[-2::-1], path[:0:-1], strict=True):
+            world[child] = world[parent] @ forest.edge_data[parent, child].get("matrix", np.eye(4))
+        part = scene.geometry[forest.node_data[node]["geometry"]]
+        if isinstance(part, trimesh.Trimesh):
+            parts.append(part.copy().apply_transform(world[node]))
+    return parts
+
+
+def _colours(mesh: trimesh.Trimesh) -> SurfaceColours | None:
+    try:
+        colours = surface_colours(mesh)
+        if colours is not None and len(colours) != len(mesh.faces):
+            raise ValueError(f"{len(colours)} for {len(mesh.faces)} faces")
+        return colours
+    except Exception as error:  # of whatever a file says about them
+        warnings.warn(f"the mesh's colours cannot be used ({error}); it is seen in grey", stacklevel=2)
+        return None
+
+
+def _joined(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """One mesh of several; trimesh would pack their textures into one, which repeats no more."""
+    colours = [_colours(part) for part in parts]
+    for part in parts:
+        part.visual = trimesh.visual.ColorVisuals()
+    mesh = trimesh.util.concatenate(parts)
+    if any(c is not None for c in colours):
+        known = [c or SurfaceColours.plain(len(part.faces)) for c, part in zip(colours, parts, strict=True)]
+        mesh.metadata["colours"] = SurfaceColours.joined(known)
+    return mesh
+
+
+def extreme_points(mesh: trimesh.Trimesh) -> Tensor:
+    """(P, 3) float64 vertices of the convex hull, which alone decide projected boxes and outlines."""
+    try:
+        points = mesh.convex_hull.vertices
+    except Exception:  # qhull refuses flat objects
+        points = mesh.vertices
+    return torch.from_numpy(np.array(points, dtype=np.float64))
+
+
+def box_corners(mesh: trimesh.Trimesh) -> Tensor:
+    """(8, 3) float64 corners of the axis-aligned box, in model units."""
+    return torch.cartesian_prod(*torch.from_numpy(np.array(mesh.bounds, dtype=np.float64)).T)
+
+
+def mesh_centre(mesh: trimesh.Trimesh) -> Tensor:
+    """(3,) float64 centre of the axis-aligned box, in model units."""
+    return torch.from_numpy(np.asarray(mesh.bounds, dtype=np.float64).mean(axis=0))
+
+
+def mesh_radius(mesh: trimesh.Trimesh) -> float:
+    """Half the diagonal of the axis-aligned box, in model units."""
+    return 0.5 * float(np.linalg.norm(mesh.extents))
+
+
+def normalization_transform(mesh: trimesh.Trimesh, *, align_axes: bool = False) -> Tensor:
+    """Similarity that brings a mesh into a normalised frame; its inverse brings poses back.
+
+    The area-weighted centroid goes to the origin and the farthest vertex to distance 1. With ``align_axes`` (the
+    paper's normalisation) the principal axes of the surface go to x, y, z in decreasing order of variance. An axis's
+    sign is such that the surface's third moment along it is positive for x and y; z completes a right-handed frame.
+
+    Returns:
+        (4, 4) float64 ``T_normalized_from_model``; ``torch.linalg.inv`` of it is the way back.
+
+    Example:
+        >>> T = normalization_transform(trimesh.creation.box((2.0, 4.0, 4.0)))
+        >>> round(1 / float(T[0, 0]), 6)                                        # half the diagonal
+        3.0
+    """
+    corners = np.asarray(mesh.triangles, dtype=np.float64)
+    area = np.asarray(mesh.area_faces, dtype=np.float64)
+    centroid = np.average(corners.mean(axis=1), axis=0, weights=area)
+    R = np.eye(3)
+    if align_axes:
+        # Midpoints of the edges integrate second moments of a triangle exactly.
+        points = (0.5 * (corners + np.roll(corners, 1, axis=1)) - centroid).reshape(-1, 3)
+        weights = np.repeat(area / area.sum() / 3.0, 3)
+        _, axes = np.linalg.eigh((points * weights[:, None]).T @ points)
+        R = axes.T[::-1].copy()
+        third = ((points @ R.T) ** 3 * weights[:, None]).sum(axis=0)
+        R[:2] *= np.where(third[:2] < 0, -1.0, 1.0)[:, None]
+        R[2] = np.cross(R[0], R[1])
+    scale = 1.0 / np.linalg.norm(mesh.vertices - centroid, axis=1).max()
+    T = np.eye(4)
+    T[:3, :3] = scale * R
+    T[:3, 3] = -scale * (R @ centroid)
+    return torch.from_numpy(T)

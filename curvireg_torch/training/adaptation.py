@@ -1,0 +1,68 @@
+"""The network, fine-tuned on renders of the user's own mesh."""
+
+from typing import Any
+
+import torch
+from torch.utils.data import DataLoader
+from tqdm import tqdm
+
+from ..io.meshes.mesh import as_mesh
+from ..io.meshes.up import with_z_up
+from ..models.learned_field import LearnedCurvilinearSaliency
+from ..utils.checks import check_positive
+from .field_dataset import Lessons, altered, losses
+from .scenes import GeneratedScenes
+
+__all__ = ["adapt"]
+
+BATCH = 16
+RATE = 5e-4
+
+
+def adapt(
+    mesh: Any,
+    *,
+    scenes: int = 3000,
+    upright: float = 0.0,
+    field: LearnedCurvilinearSaliency | None = None,
+    seed: int = 0,
+    workers: int = 0,
+    progress: bool = True,
+) -> LearnedCurvilinearSaliency:
+    """Fine-tune on generated photographs of one mesh, some minutes on a CPU.
+
+    No photograph of the object is needed: scenes are lit, textured and cluttered at random, see
+    :class:`curvireg_torch.training.scenes.GeneratedScenes`. Batch statistics stay those of the general training.
+
+    Args:
+        mesh: a mesh or the path of one.
+        scenes: how many photographs to generate; each is seen once.
+        upright: share of them where the object stands; the mesh's ``up`` axis points up then.
+        field: start from this one, which is changed; default the packaged one.
+        seed: of the scenes.
+        workers: processes that generate them; 0 is this one. They are spawned, so that a script that asks for them
+            needs ``if __name__ == "__main__":``.
+        progress: show a bar.
+
+    Returns:
+        The adapted field; keep it with :meth:`LearnedCurvilinearSaliency.save`.
+    """
+    check_positive(scenes, "scenes")
+    field = LearnedCurvilinearSaliency() if field is None else field
+    lessons = Lessons(GeneratedScenes(scenes, seed=seed, upright=upright, meshes=[with_z_up(as_mesh(mesh))]))
+    loader = DataLoader(lessons, BATCH, num_workers=workers, multiprocessing_context="spawn" if workers else None)
+    network = field.network
+    network.eval().requires_grad_(True)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=RATE)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=len(loader), pct_start=0.1)
+    generator = torch.Generator().manual_seed(seed)
+    for batch in tqdm(loader, desc="adapting", unit="batch", disable=not progress):
+        batch = {name: values.float() for name, values in batch.items()}
+        batch = altered({**batch, "image": batch["image"] / 255.0}, generator)
+        loss = torch.stack(list(losses(network(batch["image"]), batch).values())).sum()
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    network.requires_grad_(False)
+    return field

@@ -1,0 +1,165 @@
+"""What is to be photographed: drawn at random, before anything is rendered."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ...geometry.crops import crop_transforms, square_boxes
+from ...geometry.viewpoint import rotation_from_viewpoint
+from .light import Light, random_light
+from .materials import Material, random_picture
+from .shapes import Shape
+from .surfaces import Array
+from .turns import any_turn
+
+__all__ = ["Arrangement", "Thing", "arrange"]
+
+
+class Thing(NamedTuple):
+    """A shape in the camera's frame: vertices (V, 3) in radii of the object, faces (F, 3), materials (F,)."""
+
+    vertices: Array
+    faces: Array
+    materials: Array
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """A scene before it is rendered.
+
+    Attributes:
+        rotation: (3, 3) model -> camera of the object, the camera looking straight at it.
+        distance: of the object's centre, in radii.
+        things: the object, then what is around it.
+        looks: for each thing, a look for each of its materials.
+        light: of the scene.
+        camera_matrix: (3, 3) of the crop around the object's box.
+        size: side of the crop in px.
+        cut: x0, y0, x1, y1 in px: the part of the crop that the photograph covers.
+        background: (B, B, 3) linear picture behind everything, B = 3 size // 2.
+        defocus: blur in px of what is farther off; 0 = none.
+    """
+
+    rotation: Array
+    distance: float
+    things: tuple[Thing, ...]
+    looks: tuple[dict[int, Material], ...]
+    light: Light
+    camera_matrix: Array
+    size: int
+    cut: tuple[int, int, int, int]
+    background: Array
+    defocus: float
+
+    @property
+    def centre(self) -> Array:
+        """(3,) the object's, in the camera's frame."""
+        return np.array([0.0, 0.0, self.distance])
+
+
+def arrange(
+    shape: Shape,
+    clutter: list[Shape],
+    rng: np.random.Generator,
+    *,
+    size: int = 128,
+    margin: float = 0.1,
+    upright: float = 0.6,
+) -> Arrangement:
+    """Draw everything; arguments as of :func:`make_scene`.
+
+    Example:
+        >>> from curvireg_torch.training.scenes import random_shape
+        >>> rng = np.random.default_rng(0)
+        >>> arrange(random_shape(rng), [], rng, size=64).camera_matrix.shape
+        (3, 3)
+    """
+    standing = bool(rng.random() < upright)
+    if standing:
+        azimuth, elevation = rng.uniform(0, 360), rng.uniform(-12, 60) * rng.choice([0.35, 1.0])
+        R = rotation_from_viewpoint(azimuth, elevation, rng.normal(0, 5)).numpy()
+    else:
+        R = any_turn(rng)
+    distance = float(np.exp(rng.uniform(np.log(2.2), np.log(14.0))))
+    centre = np.array([0.0, 0.0, distance])
+    placed = shape.vertices @ R.T + centre
+    K, cut = _crop_camera(placed, rng, size, margin)
+    things = [Thing(placed, shape.faces, shape.materials)]
+    floor = float((shape.vertices[:, 2]).min())
+    above = float(-(R.T @ centre)[2]) > floor + 0.1  # seen from below, the ground would hide everything
+    ground = standing and rng.random() < 0.6 and above
+    things += [_beside(other, R, centre, floor if ground else None, K, size, rng) for other in clutter]
+    if ground:
+        things.append(_ground(R, centre, floor, rng))
+    if rng.random() < 0.3:
+        things.append(_wall(distance, rng))
+    plain = rng.uniform(0.2, 0.8)
+    looks = tuple({int(k): Material(rng, plain=plain) for k in np.unique(thing.materials)} for thing in things)
+    light = random_light(R[:, 2], rng)
+    background = random_picture(rng, 3 * size // 2)
+    defocus = float(rng.uniform(0.7, 4.0)) if rng.random() < 0.35 else 0.0
+    return Arrangement(R, distance, tuple(things), looks, light, K, size, cut, background, defocus)
+
+
+def _crop_camera(
+    placed: Array, rng: np.random.Generator, size: int, margin: float
+) -> tuple[Array, tuple[int, int, int, int]]:
+    """Camera matrix of the crop around a jittered box, and the part of the crop that the photograph covers."""
+    flat = placed[:, :2] / np.maximum(placed[:, 2:], 0.1)
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    side = high - low
+    jitter = rng.normal(0, rng.choice([0.01, 0.05]), 4)
+    box = np.concatenate([low + jitter[:2] * side, high + jitter[2:] * side])
+    border = np.array([-np.inf, -np.inf, np.inf, np.inf])
+    if rng.random() < 0.2:  # the photograph's border cuts the object
+        k = int(rng.integers(4))
+        box[k] += (0.5 - k // 2) * 2 * rng.uniform(0.1, 0.45) * side[k % 2]
+        border[k] = box[k]
+    A = crop_transforms(square_boxes(torch.from_numpy(box), margin), size).numpy()
+    corners = np.where(np.isfinite(border), border, 0).reshape(2, 2) @ A[:2, :2] + A[:2, 2]
+    whole = np.array([0, 0, size, size])
+    cut = np.where(np.isfinite(border), np.round(corners.reshape(-1) + 0.5), whole)
+    x0, y0, x1, y1 = np.clip(cut, 0, size).astype(int).tolist()
+    return A, (x0, y0, x1, y1)
+
+
+def _beside(
+    other: Shape, R: Array, centre: Array, floor: float | None, K: Array, size: int, rng: np.random.Generator
+) -> Thing:
+    """Another shape somewhere in the picture: mostly behind the object, at times before it."""
+    scale = np.exp(rng.uniform(-1.0, 0.8))
+    upright = R @ rotation_from_viewpoint(rng.uniform(0, 360), 90.0, 0.0).numpy()  # about the vertical
+    if floor is not None:
+        towards = rng.uniform(0, 2 * np.pi)
+        reach = rng.uniform(0.8, 3.5)
+        where = np.array([reach * np.cos(towards), reach * np.sin(towards), floor - scale * other.vertices[:, 2].min()])
+        points = scale * other.vertices @ upright.T + R @ where + centre
+        if points[:, 2].min() > 0.3:
+            return Thing(points, other.faces, other.materials)
+    front = rng.random() < 0.25
+    z = centre[2] + (-1.3 if front else rng.uniform(0.5, 4.0))
+    scale = scale * (0.3 if front else 1.0)
+    pixel = rng.uniform(-0.1, 1.1, 2) * size
+    if front:  # at the rim, so that it covers a part only
+        pixel[rng.integers(2)] = size * rng.choice([0.1, 0.9])
+    ray = np.array([(pixel[0] - K[0, 2]) / K[0, 0], (pixel[1] - K[1, 2]) / K[1, 1], 1.0])
+    points = scale * other.vertices @ (upright if rng.random() < 0.5 else any_turn(rng)).T + ray * max(z, 0.4 + scale)
+    return Thing(points, other.faces, other.materials)
+
+
+def _ground(R: Array, centre: Array, floor: float, rng: np.random.Generator) -> Thing:
+    reach = rng.choice([1.6, 4.0, 60.0])
+    corners = reach * np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0.0)]) + (0, 0, floor - 0.002)
+    return Thing(corners @ R.T + centre, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(2, int))
+
+
+def _wall(distance: float, rng: np.random.Generator) -> Thing:
+    far = distance + rng.uniform(1.2, 5.0)
+    slope = rng.normal(0, 0.4)
+    x = 3 * far
+    corners = np.array(
+        [(-x, -x, far - slope * 3), (x, -x, far + slope * 3), (x, x, far + slope * 3), (-x, x, far - slope * 3)]
+    )
+    return Thing(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(2, int))

@@ -1,0 +1,124 @@
+"""Scenes with one object in the middle: rays through a random arrangement of shapes."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ...rendering.embree import RayScene
+from .arrangement import Arrangement, Thing, arrange
+from .camera_noise import photographed
+from .light import lit
+from .shapes import Shape
+from .surfaces import Array
+
+__all__ = ["Scene", "make_scene", "photograph"]
+
+FINE = 1.5
+"""Rays per pixel and axis, averaged: edges as soft as a sensor's."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One photograph-like crop of an object, with its truth.
+
+    Attributes:
+        image: (S, S, 3) uint8 RGB.
+        depth: (S, S) float32 of the object alone, as a bank's view of it has: unoccluded, 0 = background, in radii.
+        visible: (S, S) bool, where the object is seen in the image.
+        rotation: (3, 3) model -> camera, the camera looking straight at the object.
+        distance: of the object's centre, in radii.
+    """
+
+    image: Array
+    depth: Array
+    visible: Array
+    rotation: Array
+    distance: float
+
+
+def make_scene(
+    shape: Shape,
+    clutter: list[Shape],
+    rng: np.random.Generator,
+    *,
+    size: int = 128,
+    margin: float = 0.1,
+    upright: float = 0.6,
+) -> Scene:
+    """Arrange, light and photograph.
+
+    Args:
+        shape: the object.
+        clutter: other shapes to stand behind, beside and before it.
+        rng: decides everything.
+        size: side of the crop in px.
+        margin: room around the object's box, see :class:`BankSettings`.
+        upright: probability that the object stands upright; otherwise it has any orientation.
+    """
+    return photograph(arrange(shape, clutter, rng, size=size, margin=margin, upright=upright), rng)
+
+
+def photograph(arrangement: Arrangement, rng: np.random.Generator) -> Scene:
+    """Render an arrangement, and take its picture with a camera whose faults ``rng`` decides."""
+    size, K = arrangement.size, arrangement.camera_matrix
+    body = arrangement.things[0]
+    alone = RayScene(body.vertices, body.faces).distance(*_rays(K, size)).reshape(size, size)
+    depth = np.where(np.isfinite(alone), alone, 0.0).astype(np.float32)
+    picture, seen = _render(arrangement, arrangement.things)
+    if seen.mean() < 0.1 * (depth > 0).mean():  # hidden: nothing could be learnt
+        picture, seen = _render(arrangement, arrangement.things[:1])
+    picture = cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA)
+    visible = cv2.resize(seen.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA) > 0.5
+    x0, y0, x1, y1 = arrangement.cut
+    picture = picture[y0:y1, x0:x1]
+    picture = cv2.copyMakeBorder(picture, y0, size - y1, x0, size - x1, cv2.BORDER_REPLICATE)  # as crop_images does
+    inside = np.zeros_like(visible)
+    inside[y0:y1, x0:x1] = True
+    return Scene(photographed(picture, rng), depth, visible & inside, arrangement.rotation, arrangement.distance)
+
+
+def _rays(K: Array, size: int) -> tuple[Array, Array]:
+    v, u = np.mgrid[0:size, 0:size].reshape(2, -1)
+    directions = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(len(u))], -1).astype(np.float32)
+    return np.zeros_like(directions), directions
+
+
+def _render(arrangement: Arrangement, things: tuple[Thing, ...]) -> tuple[Array, Array]:
+    """(F, F, 3) float32 linear picture of those things, F = FINE size, and where the first of them is seen."""
+    size = len(arrangement.background)
+    K = np.diag([FINE, FINE, 1.0]) @ arrangement.camera_matrix
+    K[:2, 2] += 0.5 * (FINE - 1.0)  # pixel centres are whole numbers
+    rays = _rays(K, size)
+    first = np.cumsum([0] + [len(thing.vertices) for thing in things[:-1]])
+    vertices = np.concatenate([thing.vertices for thing in things])
+    faces = np.concatenate([thing.faces + k for thing, k in zip(things, first, strict=True)])
+    owner = np.concatenate([np.full(len(thing.faces), k) for k, thing in enumerate(things)])
+    material = np.concatenate([thing.materials for thing in things])
+    scene = RayScene(vertices, faces)
+    depth, triangle, normal = scene.hits(*rays)
+    hit = np.flatnonzero(np.isfinite(depth))
+    points = rays[1][hit] * depth[hit, None]
+    normal = normal[hit] / (np.linalg.norm(normal[hit], axis=1, keepdims=True) + 1e-12)
+    normal *= -np.sign((normal * points).sum(axis=1, keepdims=True) - 1e-12)
+    owner, material = owner[triangle[hit]], material[triangle[hit]]
+    local = (points - arrangement.centre) @ arrangement.rotation
+    colour = np.empty_like(points)
+    gloss, shininess = np.zeros(len(hit)), np.ones(len(hit))
+    for k in range(len(things)):
+        for number, look in arrangement.looks[k].items():
+            here = (owner == k) & (material == number)
+            colour[here] = look.colours(local[here])
+            gloss[here], shininess[here] = look.gloss, look.shininess
+    picture = arrangement.background.copy()
+    row, column = np.divmod(hit, size)
+    picture[row, column] = lit(scene, points, normal, colour, gloss, shininess, arrangement.light)
+    seen = np.zeros((size, size), bool)
+    seen[row, column] = owner == 0
+    if arrangement.defocus > 0:  # depth of field: what is farther off is blurred
+        near = (depth < arrangement.distance + 1.0).astype(np.float32).reshape(size, size)
+        share = cv2.GaussianBlur(near, (0, 0), 0.6)[..., None]
+        blurred = cv2.GaussianBlur(picture * (1.0 - near[..., None]), (0, 0), arrangement.defocus)
+        weight = cv2.GaussianBlur(1.0 - near, (0, 0), arrangement.defocus)[..., None]
+        picture = share * picture + (1 - share) * blurred / np.maximum(weight, 1e-3)
+    return picture.astype(np.float32), seen

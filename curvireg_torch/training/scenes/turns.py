@@ -1,0 +1,30 @@
+"""Rotations that scenes and shapes are made with."""
+
+import numpy as np
+import torch
+
+from ...geometry.conversions import rotation_from_quaternion
+from .surfaces import Array
+
+__all__ = ["any_turn", "turn"]
+
+
+def any_turn(rng: np.random.Generator) -> Array:
+    """(3, 3) rotation, all of them equally likely: a quaternion of normal numbers has no preferred direction.
+
+    Example:
+        >>> R = any_turn(np.random.default_rng(0))
+        >>> bool(np.allclose(R @ R.T, np.eye(3))), round(float(np.linalg.det(R)), 6)
+        (True, 1.0)
+    """
+    rotation: Array = rotation_from_quaternion(torch.from_numpy(rng.normal(size=4))).numpy()
+    return rotation
+
+
+def turn(axis: int, angle: float) -> Array:
+    """(3, 3) rotation by ``angle`` radians about coordinate axis 0, 1 or 2."""
+    c, s = np.cos(angle), np.sin(angle)
+    i, j = [(1, 2), (2, 0), (0, 1)][axis]
+    R = np.eye(3)
+    R[i, i], R[i, j], R[j, i], R[j, j] = c, -s, s, c
+    return R

@@ -1,0 +1,1 @@
+"""Checks of arguments, atomic writes, threads: what every room uses."""

@@ -1,0 +1,245 @@
+"""The boundary of the library: one check per contract, through which every public entry takes what callers give.
+
+Each raises :class:`InvalidInputError` (pixels: :class:`ImageError`) with what was expected and what came. Photographs,
+boxes, cameras, poses and masks are all checked here, so that layers cannot differ in what they accept.
+"""
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import ImageError, InvalidInputError
+
+RIGID = 1e-2
+"""Deviation from a rotation that passes: poses in files are rounded, and half precision rounds to 5e-4."""
+
+ANISOTROPY = 1.1
+"""Largest ratio of the focal lengths with which pixels still count as square."""
+
+
+def check_tensor(x: Tensor, name: str, shape: tuple[int | None, ...]) -> None:
+    """``x`` is a floating tensor of ``shape``; ``None`` stands for any length."""
+    if not isinstance(x, Tensor):
+        raise InvalidInputError(f"{name}: expected a torch.Tensor, got {type(x).__name__}")
+    if x.ndim != len(shape) or any(want is not None and want != got for want, got in zip(shape, x.shape, strict=True)):
+        wanted = "(" + ", ".join("*" if n is None else str(n) for n in shape) + ")"
+        raise InvalidInputError(f"{name}: expected shape {wanted}, got {tuple(x.shape)}")
+    if not x.is_floating_point():
+        raise InvalidInputError(
+            f"{name}: expected a floating dtype, got {x.dtype}; convert with x.float() (images: divide by 255)"
+        )
+
+
+def check_last_axes(x: Tensor, name: str, shape: tuple[int | None, ...]) -> None:
+    """``x`` is a floating tensor of shape (..., *shape)."""
+    check_tensor(x, name, (None,) * (getattr(x, "ndim", 0) - len(shape)) + shape)
+
+
+def check_image(x: Tensor, name: str = "image") -> None:
+    """``x`` is a floating (B, 1, H, W) tensor with H, W >= 1."""
+    check_tensor(x, name, (None, 1, None, None))
+    if x.shape[-1] < 1 or x.shape[-2] < 1:
+        raise InvalidInputError(f"{name}: expected at least one pixel, got {tuple(x.shape)}")
+
+
+def check_colour_image(x: Tensor, name: str = "image") -> None:
+    """``x`` is a floating (B, 1, H, W) or (B, 3, H, W) tensor with H, W >= 1."""
+    check_tensor(x, name, (None, None, None, None))
+    if x.shape[1] not in (1, 3):
+        raise InvalidInputError(f"{name}: expected 1 (grey) or 3 (RGB) channels, got {x.shape[1]}")
+    check_image(x[:, :1], name)
+
+
+def check_field(x: Tensor, name: str = "field") -> None:
+    """``x`` is a floating (B, 2, H, W) tensor: channel 0 = x, channel 1 = y."""
+    check_tensor(x, name, (None, 2, None, None))
+
+
+def check_photograph(x: Any, name: str = "images") -> None:
+    """``x`` is a (C, H, W) tensor, C = 1 (grey) or 3 (RGB), with at least one pixel, floating or uint8."""
+    if not isinstance(x, Tensor):
+        raise InvalidInputError(f"{name}: expected tensors (C, H, W), got {type(x).__name__}")
+    if x.ndim != 3 or x.shape[0] not in (1, 3) or 0 in x.shape:
+        raise InvalidInputError(
+            f"{name}: expected 1 (grey) or 3 (RGB) channels in shape (C, H, W), arrays (H, W, C), got {tuple(x.shape)}"
+        )
+    if x.dtype != torch.uint8 and not x.is_floating_point():
+        raise InvalidInputError(f"{name}: expected uint8, or floating in [0, 1], got {x.dtype}")
+
+
+def check_pixels(x: Tensor, where: str) -> None:
+    """The pixels of floating ``x`` are finite and in [0, 1], or a thousandth beyond.
+
+    Args:
+        where: which pixels the message names, "of the box" for instance.
+
+    Raises:
+        ImageError: they are not.
+    """
+    if x.numel() == 0:
+        return
+    low, high = (float(value) for value in x.aminmax())
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise ImageError(f"NaN or inf in the pixels {where}; repair the image, or give another")
+    if high > 1.0 + 1e-3 or low < -1e-3:
+        raise ImageError(f"pixels outside [0, 1] {where}; divide floating images by 255, or give them as uint8")
+
+
+def check_mask(mask: Tensor, like: Tensor, name: str = "mask") -> None:
+    """``mask`` is boolean, of the shape and on the device of ``like``."""
+    if mask.dtype != torch.bool or mask.shape != like.shape:
+        raise InvalidInputError(
+            f"{name}: expected bool of shape {tuple(like.shape)}, got {mask.dtype} of shape {tuple(mask.shape)}"
+        )
+    check_same_device(mask, like, name)
+
+
+def check_masks(masks: Tensor, name: str) -> None:
+    """``masks`` is boolean (N, H, W): one mask without its batch axis would be taken for N rows."""
+    if not isinstance(masks, Tensor) or masks.dtype != torch.bool or masks.ndim != 3:
+        came = f"{masks.dtype} of shape {tuple(masks.shape)}" if isinstance(masks, Tensor) else type(masks).__name__
+        raise InvalidInputError(f"{name}: expected bool (N, H, W), got {came}; one mask is mask[None]")
+
+
+def check_same_device(x: Tensor, like: Tensor, name: str) -> None:
+    if x.device != like.device:
+        raise InvalidInputError(f"{name}: expected device {like.device}, got {x.device}")
+
+
+def check_option(value: str, options: Iterable[str], name: str) -> None:
+    """``value`` is one of ``options``."""
+    if value not in options:
+        raise InvalidInputError(f"{name}: expected one of {', '.join(map(repr, options))}, got {value!r}")
+
+
+def check_positive(value: float, name: str, *, zero_ok: bool = False) -> float:
+    """``value``, a finite number > 0 (or >= 0). In a compiled graph it is a constant: one graph per value."""
+    # torch.compile makes a float symbolic at its second value, and no kernel can be built of symbols. Taking the number
+    # apart makes it look.
+    value = math.ldexp(*math.frexp(value))
+    if not math.isfinite(value) or value < 0 or (value == 0 and not zero_ok):
+        raise InvalidInputError(f"{name}: expected a finite number {'>=' if zero_ok else '>'} 0, got {value}")
+    return value
+
+
+def check_share(value: float, name: str) -> None:
+    """``value`` is a share in (0, 1]."""
+    if not (isinstance(value, int | float) and 0 < value <= 1):
+        raise InvalidInputError(f"{name}: expected 0 < {name} <= 1, got {value!r}")
+
+
+def check_finite(x: Tensor, name: str) -> None:
+    """``x`` has no NaN and no inf."""
+    if not bool(x.isfinite().all()):
+        raise InvalidInputError(f"{name}: expected finite entries, got NaN or inf")
+
+
+def check_rotation(R: Tensor, name: str) -> None:
+    """``R`` is floating (..., 3, 3) and each matrix a rotation: orthonormal, determinant +1, within ``RIGID``.
+
+    A matrix with NaN or inf in it stands for an estimate that is missing and passes; :func:`check_finite` refuses it.
+    """
+    check_last_axes(R, name, (3, 3))
+    bad = int(_deviates(R).sum())
+    if bad:
+        raise InvalidInputError(f"{name}: expected rotations (orthonormal, determinant +1), got {bad} that are not")
+
+
+def check_pose(T: Tensor, name: str) -> None:
+    """``T`` is floating (..., 4, 4), finite, and each a rigid transform [[R, t], [0, 0, 0, 1]] within ``RIGID``."""
+    check_last_axes(T, name, (4, 4))
+    check_finite(T, name)
+    last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=T.dtype, device=T.device)
+    off = (T[..., 3, :] - last).abs().amax(-1) > 1e-6  # what inverting a pose may leave
+    bad = int((off | _deviates(T[..., :3, :3])).sum())
+    if bad:
+        raise InvalidInputError(
+            f"{name}: expected rigid transforms [[R, t], [0, 0, 0, 1]], R orthonormal with determinant +1, "
+            f"got {bad} that are not; take scale and reflection out"
+        )
+
+
+def check_symmetries(symmetries: Tensor) -> None:
+    """``symmetries`` is floating (S, 3, 3) or (S, 4, 4), S >= 1, of finite rotations or rigid transforms."""
+    if getattr(symmetries, "ndim", 0) != 3 or symmetries.shape[1:] not in ((3, 3), (4, 4)) or not len(symmetries):
+        came = tuple(symmetries.shape) if isinstance(symmetries, Tensor) else type(symmetries).__name__
+        raise InvalidInputError(f"symmetries: expected shape (S, 4, 4) or (S, 3, 3) with S >= 1, got {came}")
+    if symmetries.shape[1] == 4:
+        check_pose(symmetries, "symmetries")
+    else:
+        check_rotation(symmetries, "symmetries")
+        check_finite(symmetries, "symmetries")
+
+
+def _deviates(R: Tensor) -> Tensor:
+    """(...) bool: which finite ones of (..., 3, 3) matrices deviate from a rotation by more than ``RIGID``."""
+    R = R.detach().to(torch.promote_types(R.dtype, torch.float32))
+    a, b, c = R.unbind(-2)
+    # Rows a and b of unit length at right angles and c = a x b: orthonormal with determinant +1.
+    products = torch.stack([(a * a).sum(-1) - 1.0, (b * b).sum(-1) - 1.0, (a * b).sum(-1)], -1)
+    off = torch.cat([products, c - torch.linalg.cross(a, b)], -1).abs().amax(-1) > RIGID
+    return off & R.isfinite().all(-1).all(-1)
+
+
+def check_camera_matrix(K: Tensor, name: str = "camera matrix") -> None:
+    """``K`` is floating (..., 3, 3): finite [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px with fx, fy > 0."""
+    if not isinstance(K, Tensor) or tuple(K.shape[-2:]) != (3, 3) or not K.is_floating_point():
+        came = f"{K.dtype} of shape {tuple(K.shape)}" if isinstance(K, Tensor) else type(K).__name__
+        raise InvalidInputError(f"{name}: expected floating (..., 3, 3), got {came}")
+    check_finite(K, name)
+    if not bool((K[..., 0, 0] > 0).all() and (K[..., 1, 1] > 0).all()):
+        raise InvalidInputError(f"{name}: expected focal lengths FX, FY > 0 (in pixels); check their order FX FY CX CY")
+    last = torch.tensor([0.0, 0.0, 1.0], dtype=K.dtype, device=K.device)
+    if not bool((K[..., 2, :] == last).all() and (K[..., 1, 0] == 0).all()):
+        raise InvalidInputError(f"{name}: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    if not bool((K[..., 0, 1].abs() <= 1e-6 * K[..., 0, 0]).all()):  # what rounding leaves of none
+        raise InvalidInputError(f"{name}: expected no skew, K[0, 1] = 0; rectify the image")
+
+
+def check_square_pixels(K: Tensor, name: str = "camera matrix") -> None:
+    """Focal lengths of checked (..., 3, 3) cameras are at most 10 % apart: views are rendered with square pixels."""
+    ratio = K[..., 0, 0] / K[..., 1, 1]
+    if not bool(((ratio <= ANISOTROPY) & (ratio >= 1.0 / ANISOTROPY)).all()):
+        raise InvalidInputError(
+            f"{name}: expected square pixels, FX and FY at most 10 % apart; resize the image's width by FY / FX, "
+            "and FX, CX and the box with it"
+        )
+
+
+def as_numbers(values: Any, name: str, *, least: torch.dtype = torch.float32) -> Tensor:
+    """A floating tensor, of dtype ``least`` or a wider one, of a tensor, an array, or nested lists of any of them."""
+    try:
+        if isinstance(values, list | tuple):
+            plain = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+            parts = [] if plain else [as_numbers(value, name, least=least) for value in values]
+            x = torch.tensor(values, dtype=least) if plain else torch.stack(parts)
+        else:
+            x = torch.as_tensor(values)
+    except (TypeError, ValueError, RuntimeError) as error:
+        reason = str(error).partition("\n")[0]
+        raise InvalidInputError(f"{name}: expected numbers, got {type(values).__name__} ({reason})") from error
+    if x.is_complex() or x.dtype == torch.bool:
+        raise InvalidInputError(f"{name}: expected numbers, got {x.dtype}")
+    return x.to(torch.promote_types(x.dtype, least) if x.is_floating_point() else least)
+
+
+def as_boxes(boxes: Any, count: int) -> Tensor:
+    """(count, 4) boxes, at least float32, of a tensor, an array or lists; what they hold is checked with the images."""
+    x = as_numbers(boxes, "boxes")
+    x = x.view(0, 4) if count == 0 and x.numel() == 0 else x
+    if tuple(x.shape) != (count, 4):
+        raise InvalidInputError(f"boxes: expected shape ({count}, 4), one for each image, got {tuple(x.shape)}")
+    return x
+
+
+def as_camera_matrices(matrices: Any, count: int) -> Tensor:
+    """(count, 3, 3) float64 of one matrix for all or one for each, a tensor, an array or lists; values unchecked."""
+    K = as_numbers(matrices, "camera_matrices", least=torch.float64)
+    if tuple(K.shape[-2:]) != (3, 3) or K.ndim not in (2, 3):
+        raise InvalidInputError(f"camera_matrices: expected (3, 3) or ({count}, 3, 3), got {tuple(K.shape)}")
+    if K.ndim == 3 and len(K) not in (1, count):
+        raise InvalidInputError(f"camera_matrices: expected one or {count} matrices, got {len(K)}")
+    return K.expand(count, 3, 3)

@@ -1,0 +1,69 @@
+"""Normalised frames follow the object."""
+
+import pytest
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from curvireg_torch import geometry as g
+from curvireg_torch.matching import ViewBank
+from curvireg_torch.settings import BankSettings
+from curvireg_torch.synthetic import example_mesh
+
+
+def moved(mesh: trimesh.Trimesh, rotation: torch.Tensor, scale: float, shift: list[float]) -> trimesh.Trimesh:
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, :3], T[:3, 3] = scale * rotation, torch.tensor(shift, dtype=torch.float64)
+    return mesh.copy().apply_transform(T.numpy())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_principal_axes_and_their_signs_follow_any_motion(seed: int) -> None:
+    mesh = example_mesh()
+    R = torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
+    copy = moved(mesh, R, 7.0, [3.0, -2.0, 5.0])
+    normalised = [
+        m.copy().apply_transform(g.normalization_transform(m, align_axes=True).numpy()).vertices for m in (mesh, copy)
+    ]
+    torch.testing.assert_close(*map(torch.tensor, normalised), rtol=0, atol=1e-9)
+    spread = torch.tensor(normalised[0]).square().mean(dim=0)
+    assert spread[0] > spread[1] > spread[2]
+    assert float(torch.tensor(normalised[0]).norm(dim=1).max()) == pytest.approx(1.0)
+
+
+def test_a_mirrored_object_is_not_turned_into_its_twin() -> None:
+    mesh = example_mesh()
+    T = g.normalization_transform(mesh, align_axes=True)
+    assert float(torch.linalg.det(T[:3, :3])) > 0
+
+
+def test_bank_of_a_moved_copy_is_the_same_bank() -> None:
+    # A quarter turn about z maps the box, and a grid of azimuths, onto themselves.
+    mesh, settings = example_mesh(), BankSettings(image_size=64)
+    quarter = torch.from_numpy(Rotation.from_euler("z", 90, degrees=True).as_matrix())
+    copy = moved(mesh, quarter, 12.0, [30.0, -7.0, 2.0])
+    views = g.sample_views(azimuth_step=30, elevations=[-20, 40])
+    first, second = (ViewBank.build(m, views, settings=settings, progress=False) for m in (mesh, copy))
+    turned = (first.rotations.double() @ quarter.T).flatten(1) @ second.rotations.double().flatten(1).T
+    assert float(turned.amax(dim=1).min()) > 3.0 - 1e-5  # traces: every view is there
+    order = turned.argmax(dim=1)
+    assert order.tolist() != list(range(len(views)))
+    similarity = torch.cosine_similarity(first.descriptors, second.descriptors[order])
+    assert float(similarity.min()) > 0.999
+    torch.testing.assert_close(second.boxes[order], first.boxes, rtol=0, atol=1e-6)
+    differ = (first.silhouettes != second.silhouettes[order]).flatten(1).sum(dim=1)
+    assert int(differ.max()) <= 4  # pixels on rims
+
+
+def test_views_along_principal_axes_keep_poses_in_the_files_frame() -> None:
+    mesh = example_mesh()
+    copy = moved(mesh, torch.from_numpy(Rotation.random(random_state=1).as_matrix()), 3.0, [1.0, 2.0, 3.0])
+    views = g.uniform_views(12)
+    directions = []
+    for m in (mesh, copy):
+        T = g.normalization_transform(m, align_axes=True)
+        R = views.in_model_frame(T).rotations.double()
+        scale = torch.linalg.det(T[:3, :3]) ** (1 / 3)
+        directions.append(R @ T[:3, :3].T / scale)  # what the views see of the normalised object
+    torch.testing.assert_close(*directions, rtol=0, atol=1e-5)
+    torch.testing.assert_close(directions[0], views.rotations.double(), rtol=0, atol=1e-5)

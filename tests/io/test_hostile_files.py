@@ -1,0 +1,168 @@
+"""Photographs and annotations made to harm end in one line of ours, soon and in little memory."""
+
+import contextlib
+import struct
+import time
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import curvireg_torch as cr
+from curvireg_torch.data import BOPDataset, read_bop_csv
+from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError
+from curvireg_torch.io import images, read_photo
+from curvireg_torch.io import json_files as _json
+from curvireg_torch.io.mat_files import read_mat
+from tests._support.miniature import write_bop, write_image
+
+
+def chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def png_bomb(width: int, height: int) -> bytes:
+    """A valid PNG of one colour that packs a thousandfold."""
+    packer = zlib.compressobj(9)
+    row = bytes(1 + -(-width // 8))
+    body = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
+    header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+
+
+def jpeg(width: int, height: int, scans: int = 1) -> bytes:
+    frame = b"\xff\xc0" + struct.pack(">HBHHB", 11, 8, height, width, 1) + b"\x01\x11\0"
+    return b"\xff\xd8" + frame + (b"\xff\xda\0\x08\x01\x01\0\0\x3f\0" + b"\0" * 4) * scans + b"\xff\xd9"
+
+
+def tiff(width: int, height: int) -> bytes:
+    entries = [(256, 4, 1, width), (257, 4, 1, height), (258, 3, 1, 8), (262, 3, 1, 1)]
+    return b"II*\0\x08\0\0\0" + struct.pack("<H", 4) + b"".join(struct.pack("<HHII", *e) for e in entries) + bytes(4)
+
+
+def bmp(width: int, height: int) -> bytes:
+    return b"BM" + bytes(12) + struct.pack("<IiiHH", 40, width, height, 1, 24) + bytes(24)
+
+
+BOMBS = {
+    "a.png": png_bomb(20_000, 20_000),
+    "a.jpg": jpeg(65_000, 65_000),
+    "a.tif": tiff(100_000, 100_000),
+    "a.bmp": bmp(100_000, -100_000),
+    "a.ppm": b"P5 # x\n100000 100000 255\n",
+    "a.webp": b"RIFF" + struct.pack("<I", 22) + b"WEBPVP8X" + struct.pack("<I", 10) + bytes(4) + b"\xff" * 6,
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_pixels_are_counted_before_they_are_decoded(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(BOMBS[name])
+    tracemalloc.start()
+    start = time.perf_counter()
+    with pytest.raises(ImageError, match=r"px, more than 134,217,728 pixels; scale it down"):
+        read_photo(tmp_path / name)
+    assert tracemalloc.get_traced_memory()[1] < 20e6
+    tracemalloc.stop()
+    assert time.perf_counter() - start < 2
+
+
+def test_scans_and_bytes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.jpg").write_bytes(jpeg(1000, 1000, scans=1000))
+    with pytest.raises(ImageError, match="1000 scans"):
+        read_photo(tmp_path / "a.jpg")
+    monkeypatch.setattr(images, "MAX_IMAGE_BYTES", 100)
+    with pytest.raises(ImageError, match="larger than 100 bytes"):
+        read_photo(tmp_path / "a.jpg")
+
+
+def test_markers_alone_are_read_in_linear_time(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(b"\xff\xd8" + b"\xff" * 20_000_000)
+    start = time.perf_counter()
+    with pytest.raises(ImageError, match="truncated"):
+        read_photo(tmp_path / "a.jpg")
+    assert time.perf_counter() - start < 5
+
+
+def test_a_motion_photo_is_its_picture(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.jpg")
+    data = (tmp_path / "a.jpg").read_bytes()
+    film = b"\0\0\0\x18ftypmp42" + np.random.default_rng(0).bytes(100_000) + b"\xff\xda no end"
+    (tmp_path / "b.jpg").write_bytes(data + film)
+    assert torch.equal(read_photo(tmp_path / "a.jpg").image, read_photo(tmp_path / "b.jpg").image)
+    (tmp_path / "b.jpg").write_bytes(data[:-200] + film)  # the picture's own end is missing
+    with pytest.raises(ImageError, match=r"truncated|decoded"):
+        read_photo(tmp_path / "b.jpg")
+
+
+@pytest.mark.parametrize("shape", [(2, 600), (600, 2), (1, 1), (1, 5000)])
+def test_slivers_are_no_larger_than_pictures_to_the_learned_field(shape: tuple[int, int]) -> None:
+    field, seen = cr.LearnedCurvilinearSaliency(), []
+
+    def answer(image: torch.Tensor) -> torch.Tensor:
+        seen.append(image.shape)
+        return image.new_zeros(len(image), 3, image.shape[2] // 2, image.shape[3] // 2)
+
+    field.network.forward = answer
+    assert field(torch.rand(1, 3, *shape)).shape == (1, 2, *shape)
+    assert seen[0][2] * seen[0][3] <= 8 * 128 * 128
+
+
+def mat(body: bytes) -> bytes:
+    return b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + body
+
+
+def element(kind: int, content: bytes) -> bytes:
+    return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
+
+
+def test_deep_mat(tmp_path: Path) -> None:
+    inner = b""
+    for _ in range(3000):
+        fields = element(5, struct.pack("<i", 8)) + element(1, b"a".ljust(8, b"\0"))
+        dims = element(6, struct.pack("<II", 2, 0)) + element(5, struct.pack("<ii", 1, 1))
+        inner = dims + element(1, b"record") + fields + element(14, inner)
+    (tmp_path / "a.mat").write_bytes(mat(element(14, inner)))
+    with pytest.raises(InvalidInputError, match="16 deep"):
+        read_mat(tmp_path / "a.mat", "record")
+
+
+def test_many_bombs_in_a_mat_share_one_limit(tmp_path: Path) -> None:
+    bomb = zlib.compress(element(14, bytes(20_000_000)), 9)
+    (tmp_path / "a.mat").write_bytes(mat((struct.pack("<II", 15, len(bomb)) + bomb) * 200))
+    start = time.perf_counter()
+    with pytest.raises(InvalidInputError):
+        read_mat(tmp_path / "a.mat", "record")
+    assert time.perf_counter() - start < 5
+
+
+@pytest.mark.parametrize("content", [b"[" * 2_000_000, b'{"0": ' + b"1" * 100_000 + b"}", b'{"0": NaN}', b"\xff"])
+def test_json_made_to_harm(tmp_path: Path, content: bytes) -> None:
+    write_bop(tmp_path)
+    (tmp_path / "models" / "models_info.json").write_bytes(content)
+    if content.endswith(b"NaN}"):  # an entry that is none is left out
+        assert BOPDataset(tmp_path).skipped["missing_model_info"] > 0
+        return
+    with pytest.raises(CurviregError, match="models_info") as caught:
+        BOPDataset(tmp_path)
+    assert len(str(caught.value).splitlines()) == 1
+    assert len(str(caught.value)) < 1000
+
+
+def test_tables_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_bop(tmp_path)
+    for path, read in (
+        (tmp_path / "camera.json", lambda: BOPDataset(tmp_path)),
+        (tmp_path / "a.csv", lambda: read_bop_csv(tmp_path / "a.csv")),
+    ):
+        with open(path, "wb") as file:
+            file.truncate(1 << 27)  # a hole: takes no disk
+        with pytest.raises(InvalidInputError, match="33,554,432 bytes"):
+            read()
+    (tmp_path / "some").write_bytes(bytes(100))
+    for limit in (99, 100):
+        monkeypatch.setattr(_json, "MAX_TABLE_BYTES", limit)
+        with contextlib.nullcontext() if limit == 100 else pytest.raises(InvalidInputError, match="99 bytes"):
+            _json.check_table_size(tmp_path / "some")

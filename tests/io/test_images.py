@@ -1,0 +1,207 @@
+import struct
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from curvireg_torch.errors import ImageError, InvalidInputError, MissingFileError
+from curvireg_torch.io import read_image, read_photo
+from curvireg_torch.io.image_headers import read_header
+from tests._support.exif import exif, with_exif
+from tests._support.miniature import write_image
+
+
+def test_rgb_order_range_and_dtype(tmp_path):
+    bgr = np.zeros((4, 6, 3), np.uint8)
+    bgr[..., 0], bgr[1, 2, 2] = 51, 255  # blue everywhere, red at x = 2, y = 1
+    cv2.imwrite(str(tmp_path / "a.png"), bgr)
+    image = read_image(tmp_path / "a.png")
+    assert image.shape == (3, 4, 6)
+    assert image.dtype == torch.float32
+    assert image.is_contiguous()
+    assert image[0, 1, 2] == 1
+    torch.testing.assert_close(image[2], torch.full((4, 6), 0.2))
+
+
+@pytest.mark.parametrize(("dtype", "top"), [(np.uint8, 255), (np.uint16, 65535)])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_grey_alpha_and_16_bit(tmp_path, dtype, top, channels):
+    pixels = np.full((5, 7, channels), top // 5, dtype)
+    pixels[0, 0] = top
+    cv2.imwrite(str(tmp_path / "a.png"), pixels)
+    image = read_image(str(tmp_path / "a.png"))
+    assert image.shape == (3, 5, 7)
+    assert image.max() == 1
+    torch.testing.assert_close(image[:, 1:], torch.full((3, 4, 7), 0.2))
+
+
+def test_16_bit_keeps_its_precision(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.arange(256, dtype=np.uint16).reshape(16, 16))
+    assert len(read_image(tmp_path / "a.png").unique()) == 256
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_exif_orientation_is_applied_to_photographs_and_not_to_datasets(tmp_path, suffix, orientation):
+    path = tmp_path / f"a{suffix}"
+    write_image(path, (20, 30))
+    stored = read_image(path)
+    with_exif(path, exif(orientation, order="><"[orientation % 2]))
+    shown = torch.from_numpy(cv2.imread(str(path))[..., ::-1].copy()).permute(2, 0, 1)  # OpenCV honours the tag
+    photo = read_photo(path)
+    assert torch.equal(photo.image, shown)
+    assert photo.orientation == orientation
+    assert photo.notes == ((f"EXIF orientation {orientation} applied",) if orientation > 1 else ())
+    assert torch.equal(read_image(path), stored)
+    assert torch.equal(read_image(path, orientation="viewed"), shown.float() / 255)
+    assert photo.facts()["width"] == shown.shape[2]
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_orientation_of_tiff(tmp_path, dtype):
+    pixels = np.random.default_rng(0).integers(0, 256, (20, 30, 3)).astype(dtype) * (np.iinfo(dtype).max // 255)
+    assert cv2.imwrite(str(tmp_path / "a.tiff"), pixels)
+    stored = read_image(tmp_path / "a.tiff")
+    data = bytearray((tmp_path / "a.tiff").read_bytes())
+    (begin,) = struct.unpack_from("<I", data, 4)
+    (count,) = struct.unpack_from("<H", data, begin)
+    entries = [bytes(data[begin + 2 + 12 * i :][:12]) for i in range(count)]
+    entries = [e for e in entries if e[:2] != struct.pack("<H", 274)]
+    entries = sorted([*entries, struct.pack("<HHIHH", 274, 3, 1, 6, 0)], key=lambda e: struct.unpack_from("<H", e))
+    data[4:8] = struct.pack("<I", len(data))
+    data += struct.pack("<H", len(entries)) + b"".join(entries) + b"\0\0\0\0"
+    (tmp_path / "a.tiff").write_bytes(data)
+    assert torch.equal(read_image(tmp_path / "a.tiff"), stored)
+    assert torch.equal(read_image(tmp_path / "a.tiff", orientation="viewed"), stored.flip(1).transpose(1, 2))
+
+
+def test_focal_length_is_a_stated_guess(tmp_path):
+    path = tmp_path / "a.jpg"
+    write_image(path, (30, 40))
+    assert read_photo(path).guessed_camera_matrix() is None
+    with_exif(path, exif(6, focal=27))
+    photo = read_photo(path)
+    assert photo.focal_35mm == photo.facts()["focal_35mm"] == 27
+    K = photo.guessed_camera_matrix()
+    # The diagonal of 50 px subtends what the 43.27 mm of a 36 x 24 mm film do; the turned picture is 30 wide.
+    assert float(K[0, 0]) == float(K[1, 1]) == pytest.approx(27 * 50 / 43.2666, rel=1e-5)
+    assert K[:2, 2].tolist() == [14.5, 19.5]
+
+
+def test_a_damaged_exif_block_says_nothing(tmp_path):
+    path = tmp_path / "a.jpg"
+    write_image(path)
+    whole = exif(6, focal=27)
+    plain = path.read_bytes()
+    for block in [whole[:n] for n in range(len(whole))] + [exif(0), exif(9), b"XX" + whole[2:]]:
+        path.write_bytes(plain)
+        with_exif(path, block)
+        assert read_photo(path).image.shape in ((3, 60, 80), (3, 80, 60))
+    assert read_photo(path).orientation == 1
+
+
+def test_uint8_is_the_same_picture(tmp_path):
+    write_image(tmp_path / "a.png")
+    assert torch.equal(read_image(tmp_path / "a.png", dtype=torch.uint8).float() / 255, read_image(tmp_path / "a.png"))
+    cv2.imwrite(str(tmp_path / "b.png"), np.array([[0, 128, 129, 65535]], np.uint16))
+    assert read_image(tmp_path / "b.png", dtype=torch.uint8)[0].tolist() == [[0, 0, 1, 255]]
+    with pytest.raises(InvalidInputError, match="float16"):
+        read_image(tmp_path / "a.png", dtype=torch.float16)
+
+
+def test_what_was_done_to_the_channels_is_said(tmp_path):
+    for name, pixels, notes in (
+        ("grey.png", np.full((4, 4), 9, np.uint8), ("grey: three equal channels",)),
+        ("alpha.png", np.full((4, 4, 4), 9, np.uint8), ("alpha channel dropped",)),
+        ("deep.png", np.full((4, 4, 3), 9, np.uint16), ("16 bits rounded to 8",)),
+        ("plain.webp", np.full((4, 4, 3), 9, np.uint8), ()),
+        ("alpha.webp", np.full((4, 4, 4), 9, np.uint8), ("alpha channel dropped",)),
+        ("grey.tiff", np.full((4, 4), 9, np.uint8), ("grey: three equal channels",)),
+        ("plain.bmp", np.full((4, 4, 3), 9, np.uint8), ()),
+        ("grey.pgm", np.full((4, 4), 9, np.uint8), ("grey: three equal channels",)),
+    ):
+        assert cv2.imwrite(str(tmp_path / name), pixels)
+        assert read_photo(tmp_path / name).notes == notes, name
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.tif"])
+def test_cmyk(tmp_path, name):
+    image = pytest.importorskip("PIL.Image", reason="Pillow writes the CMYK picture")
+    image.new("RGB", (8, 8), (250, 10, 30)).convert("CMYK").save(tmp_path / name, quality=95)
+    photo = read_photo(tmp_path / name)
+    assert photo.notes == ("CMYK converted to RGB without a colour profile",)
+    assert (photo.image[:, 4, 4].int() - torch.tensor([250, 10, 30])).abs().max() <= 4
+
+
+def test_cielab_is_refused(tmp_path):
+    image = pytest.importorskip("PIL.Image", reason="Pillow writes the CIELAB picture")
+    image.new("LAB", (8, 8), (120, 10, 30)).save(tmp_path / "a.tif")
+    with pytest.raises(ImageError, match="CIELAB"):
+        read_photo(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(
+    ("content", "name"),
+    [
+        (b"\0\0\0\x18ftypheic\0\0\0\0", "HEIC"),
+        (b"\0\0\0\x18ftypmif1\0\0\0\0", "HEIC"),
+        (b"\0\0\0\x18ftypavif\0\0\0\0", "AVIF"),
+        (b"\0\0\0\x18ftypisom\0\0\0\0", "video"),
+        (b"GIF89a", "GIF"),
+        (b"%PDF-1.4", "PDF"),
+    ],
+)
+def test_other_formats_are_named(tmp_path, content, name):
+    (tmp_path / "a.jpg").write_bytes(content + bytes(100))
+    with pytest.raises(ImageError, match=rf"a\.jpg: .*{name}.*convert it"):
+        read_photo(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+@pytest.mark.parametrize("kept", [0.02, 0.5, 0.9])
+def test_truncated(tmp_path, suffix, kept):
+    path = tmp_path / f"a{suffix}"
+    write_image(path, (64, 64))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * kept)])
+    with pytest.raises(ImageError, match=r"truncated|not an image"):
+        read_image(path)
+
+
+def test_bytes_after_the_end_are_allowed(tmp_path):
+    for suffix in (".jpg", ".png"):
+        write_image(tmp_path / f"a{suffix}")
+        with open(tmp_path / f"a{suffix}", "ab") as file:
+            file.write(b"\n\n" + bytes(range(256)) * 8 + b"\xff\xda")  # a motion photo's film may hold any marker
+        photo = read_photo(tmp_path / f"a{suffix}")
+        assert photo.image.shape == (3, 60, 80)
+        assert photo.notes == ("2,052 bytes behind the picture's end ignored",)
+
+
+def test_what_stands_before_a_jpegs_frame_is_passed_over(tmp_path):
+    write_image(tmp_path / "a.jpg")
+    data = (tmp_path / "a.jpg").read_bytes()
+    arithmetic = b"\xff\xcc\0\x09\x08\0\x07\0\x09\x03\0"  # its conditioning; as a frame it would be 9 x 7 px
+    for more in (b"\xff\x01", b"\xff\xd8", arithmetic):
+        header = read_header(data[:2] + more + data[2:])
+        assert (header.width, header.height, header.scans) == (80, 60, 1)
+
+
+@pytest.mark.parametrize("content", [b"", b"no image at all", b"\xff\xd8\xff\xd9", b"\x89PNG\r\n\x1a\nIEND"])
+def test_not_an_image(tmp_path, content):
+    (tmp_path / "a.jpg").write_bytes(content)
+    with pytest.raises(ImageError, match=r"a\.jpg"):
+        read_image(tmp_path / "a.jpg")
+
+
+def test_floating_pixels_are_refused(tmp_path):
+    assert cv2.imwrite(str(tmp_path / "a.tiff"), np.ones((4, 4, 3), np.float32))
+    with pytest.raises(ImageError, match="float32"):
+        read_image(tmp_path / "a.tiff")
+
+
+def test_missing_file_and_folder(tmp_path):
+    for path in (tmp_path / "nothing.jpg", tmp_path):
+        with pytest.raises(MissingFileError, match="no such file"):
+            read_image(path)

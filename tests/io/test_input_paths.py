@@ -1,0 +1,116 @@
+"""Files named on the command line: looked at at once, and known from each other."""
+
+from argparse import Namespace
+from pathlib import Path
+
+import pytest
+
+from curvireg_torch import cli
+from curvireg_torch.cli import _parsed, main
+from curvireg_torch.errors import CurviregError
+from tests.utils.test_lazy import HEAVY, imported_by
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Names alone: nothing of these files is read."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("photo.jpg", "part.stl", "bank.safetensors", "list.csv", "odd.part"):
+        Path(name).touch()
+    Path("shots").mkdir()
+
+
+MISTAKEN = "where a photograph is expected"
+SWAPPED = "seem to be swapped: the photograph comes first, the mesh last"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["register", "part.stl", "photo.jpg"], f"part.stl: a mesh {MISTAKEN}; it and photo.jpg {SWAPPED}"),
+        (["register", "bank.safetensors", "photo.jpg"], f"it and photo.jpg {SWAPPED}"),
+        (["register", "part.stl", "shots"], f"it and shots {SWAPPED}"),
+        (["register", "part.stl", "shots/*.jpg"], f"it and shots/*.jpg {SWAPPED}"),
+        (["register", "part.stl", "none.JPG"], f"it and none.JPG {SWAPPED}"),
+        (["register", "--list", "part.stl", "list.csv"], f"a mesh where a list is expected; it and list.csv {SWAPPED}"),
+        (["view", "part.stl", "photo.jpg"], f"it and photo.jpg {SWAPPED}"),
+        (["view", "part.stl"], "part.stl: a mesh where a photograph is expected"),
+        (["plot", "sphere", "part.stl", "photo.jpg"], f"it and photo.jpg {SWAPPED}"),
+        (["register", "photo.jpg", "part.stl", "bank.safetensors"], "several by --mesh"),
+        (["register", "photo.jpg", "photo.jpg"], "photo.jpg: a photograph where a mesh is expected"),
+        (["register", "photo.jpg", "shots"], "shots: a folder where a mesh is expected"),
+        (["register", "list.csv", "part.stl"], "give it as --list list.csv"),
+        (["register", "photo.jpg", "none.stl"], "none.stl: no such file; check the path of the mesh"),
+        (["register", "none.jpg", "part.stl"], "none.jpg: no such file; check the path of the photograph"),
+        (["register", "--list", "none.csv", "part.stl"], "none.csv: no such file; check the path of the list"),
+        (["register", "photo.jpg", "--mesh", "part.stl", "--mesh", "none.stl"], "none.stl: no such file"),
+        (["view", "none.jpg", "part.stl"], "none.jpg: no such file"),
+        (["plot", "sphere", "photo.jpg", "none.stl"], "none.stl: no such file"),
+        (["bank", "none.stl"], "none.stl: no such file"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)  # fmt: skip
+@pytest.mark.usefixtures("here")
+def test_what_is_missing_or_swapped_is_said_in_one_line(words, said, capsys):
+    out = [] if words[0] == "view" else ["--out", "out"]
+    assert main([*words, *out]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("words", [["none.jpg", "part.stl"], ["photo.jpg", "none.stl"], ["part.stl", "photo.jpg"]])
+@pytest.mark.usefixtures("here")
+def test_it_is_said_before_anything_heavy_is_imported(words):
+    code = f"from curvireg_torch.cli import main; assert main({['register', *words, '--json']}) == 2"
+    assert not imported_by(code) & HEAVY
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--box", "10,20,30.5,40"],
+        ["--box=10,20,30.5,40"],
+        ["--box", "10,", "20,", "30.5,", "40"],
+        ["--box", "10, 20, 30.5, 40"],
+        ["--box", "10", "20", "30.5", "40"],
+    ],
+)
+def test_numbers_may_be_divided_by_commas(words):
+    arguments = _parsed(["register", "a,1.jpg", *words, "5,6", "--out", "out"])
+    assert arguments.box == [10.0, 20.0, 30.5, 40.0]
+    assert arguments.paths == [Path("a,1.jpg"), Path("5,6")]
+    assert _parsed(["view", *words]).box == arguments.box
+
+
+def test_cameras_and_distances_may_be_divided_by_commas_too():
+    words = ["register", "a.jpg", "b.stl", "--camera=1e3,1000,-.5,2", "--distance", ".5,1", "--json"]
+    arguments = _parsed(words)
+    assert arguments.camera == [1000.0, 1000.0, -0.5, 2.0]
+    assert arguments.distance == [0.5, 1.0]
+    assert _parsed(["register", "a.jpg", "b.stl", "--camera=exif", "--json"]).exif
+
+
+@pytest.mark.parametrize("numbers", ["1,2,3", "1,2,3,4,5", "1,2,three,4"])
+def test_other_numbers_are_refused(numbers, capsys):
+    with pytest.raises(SystemExit):
+        _parsed(["register", "a.jpg", "b.stl", "--box", numbers, "--json"])
+    assert "argument --box: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "said"),
+    [
+        (KeyboardInterrupt(), 130, "curvireg: interrupted\n"),
+        (PermissionError(13, "denied", "x.ply"), 2, "curvireg: error: [Errno 13] denied: 'x.ply'; check that it is "),
+        (CurviregError("no good"), 2, "curvireg: error: no good\n"),
+    ],
+)
+def test_what_stops_a_command_is_one_line_and_a_code(raised, code, said, monkeypatch, capsys):
+    def stop(_):
+        raise raised
+
+    monkeypatch.setattr(cli, "check_given", lambda *_: None)
+    monkeypatch.setattr(cli, "_parsed", lambda _: Namespace(run=stop, debug=False, photo=None, mesh=None))
+    assert main(["cache"]) == code
+    assert capsys.readouterr().err.startswith(said)

@@ -1,0 +1,88 @@
+"""Photographs and shaded views compared by the features of a network."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import crop_images, sample_views
+from curvireg_torch.io.meshes.mesh import mesh_radius
+from curvireg_torch.matching.describe import BankSettings, ViewDescriber
+from curvireg_torch.models.appearance import describe, similarity
+from curvireg_torch.models.backbone import Backbone
+from curvireg_torch.rendering.shading import shade
+from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
+
+
+@pytest.fixture(scope="module")
+def backbone():
+    return Backbone()
+
+
+def images(n, size=64, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.stack([procedural_background((size, size), generator) for _ in range(n)])
+
+
+def test_is_the_mean_cosine_of_the_cells(backbone):
+    pictures = images(3)
+    expected = torch.zeros(3, 3)
+    for features, spread in zip(backbone(pictures), backbone.spreads, strict=True):
+        cells = features - features.mean(dim=(2, 3), keepdim=True)
+        cells = F.normalize(cells / spread.view(1, -1, 1, 1), dim=1)
+        expected += torch.einsum("achw,bchw->abhw", cells, cells).mean(dim=(2, 3)) / 2
+    d = describe(pictures, backbone)
+    assert d.dtype == torch.float16
+    assert d.shape == (3, 40 * 8 * 8 + 112 * 4 * 4)
+    torch.testing.assert_close(similarity(d[:, None], d), expected, atol=2e-3, rtol=0)
+    torch.testing.assert_close(similarity(d[:, None], d).diagonal(), torch.ones(3), atol=2e-3, rtol=0)
+
+
+def test_the_best_crop_counts(backbone):
+    d = describe(images(4), backbone)
+    both = similarity(d[:2][None], d[2:])
+    assert torch.equal(both[0], similarity(d[:2, None], d[2:]).amax(dim=0))
+
+
+def test_many_images_are_described_as_one_by_one_and_none_at_all(backbone):
+    pictures = images(18, size=32)
+    together = describe(pictures, backbone)
+    torch.testing.assert_close(together[17:], describe(pictures[17:], backbone), atol=2e-3, rtol=0)
+    assert describe(pictures[:0], backbone).shape == (0, together.shape[1])
+    assert similarity(together[:0, None], together).shape == (0, 18)
+
+
+def test_a_blank_image_is_like_nothing(backbone):
+    d = describe(torch.cat([torch.full((1, 3, 64, 64), 0.5), images(1)]), backbone)
+    assert d.isfinite().all()
+
+
+@pytest.mark.parametrize("shapes", [((2, 8), (3, 8)), ((2, 1, 8), (3, 9))])
+def test_refuses_what_does_not_fit(shapes):
+    with pytest.raises(InvalidInputError):
+        similarity(torch.ones(shapes[0]), torch.ones(shapes[1]))
+
+
+def test_ranks_the_right_view_of_a_photograph_first(backbone):
+    mesh = example_mesh()
+    views = sample_views(azimuth_step=45, elevations=[20])
+    describer = ViewDescriber(mesh, BankSettings(image_size=128))
+    T, K, _ = describer.cameras(views.rotations, views.distance * mesh_radius(mesh))
+    shaded = describe(shade(describer.renderer.render(T, K, (128, 128)), K), backbone)
+    camera = torch.tensor([[400.0, 0, 99.5], [0, 400.0, 99.5], [0, 0, 1]], dtype=torch.float64)
+    crops = []
+    for k in range(len(views)):
+        photograph, box = synthesize_photograph(mesh, T[k], camera, (200, 200), torch.Generator().manual_seed(k))
+        crops.append(crop_images(photograph[None], box[None], size=128)[0])
+    found = similarity(describe(torch.cat(crops), backbone)[:, None], shaded).argmax(dim=1)
+    assert (found == torch.arange(len(views))).float().mean() >= 0.75
+
+
+def test_an_image_is_described_alike_in_any_batch_to_the_bit():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    images, network = torch.rand(18, 1, 64, 64, generator=torch.Generator().manual_seed(0)), Backbone()
+    whole = describe(images, network)
+    parts = [describe(images[:n], network) for n in (1, 3, 17)]
+    torch.set_num_threads(before)
+    assert all(torch.equal(part, whole[: len(part)]) for part in parts)

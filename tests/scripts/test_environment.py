@@ -1,0 +1,77 @@
+"""What the scripts of a clean machine install, and what they say where they cannot: with a pretended Python."""
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+def source(tmp_path: Path, python: str, *, venv: bool = True, gpu: bool = False) -> tuple[int, str, list[str]]:
+    """Exit code, output and the calls of pip of ``_environment.sh`` with ``python``, the body of a shell script."""
+    made = tmp_path / "venv" / "bin" / "python" if venv else tmp_path / "python"
+    for path, body in ((made, python), (tmp_path / "bin" / "nvidia-smi", f"exit {int(not gpu)}")):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f'#!/bin/sh\necho "$*" >> {tmp_path}/calls\n{body}\n')
+        path.chmod(0o755)
+    environment = {
+        "PATH": f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}",
+        "CURVIREG_VENV": str(tmp_path / "venv"),
+        "PYTHON": str(tmp_path / "python"),
+    }
+    script = f"set -euo pipefail; . '{REPOSITORY}/scripts/_environment.sh' '[dev]'"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, env=environment, timeout=60)
+    calls = (tmp_path / "calls").read_text().splitlines()
+    return done.returncode, done.stdout + done.stderr, [call.split("check ")[-1] for call in calls if "-m pip" in call]
+
+
+NO_TORCH = 'case "$*" in *"import torch"*) exit 1;; *versions*) echo "{versions}";; esac'
+
+
+@pytest.mark.parametrize(
+    ("versions", "gpu", "installed"),
+    [
+        ("2.15.0, 2.14.1+cpu, 2.14.1, 2.13.0+cpu, 2.13.0", False, "==2.14.1+cpu"),
+        ("2.15.0, 2.14.1", False, ""),
+        ("2.15.0, 2.14.1+cpu", True, ""),
+    ],
+)
+def test_the_cpu_build_is_taken_where_there_is_one_and_no_gpu(
+    tmp_path: Path, versions: str, gpu: bool, installed: str
+) -> None:
+    listing = f"torch (2.15.0)\nAvailable versions: {versions}"
+    code, output, calls = source(tmp_path, NO_TORCH.format(versions=listing), gpu=gpu)
+    assert code == 0
+    assert output.startswith(f"installing torch{installed} (")
+    assert len(output.splitlines()) == 1
+    torch, library = [call for call in calls if call.startswith("install")]
+    assert torch.split()[-1] == f"torch{installed}"
+    assert library == "install -e .[dev]"
+
+
+def test_torch_that_is_there_stays(tmp_path: Path) -> None:
+    assert source(tmp_path, "exit 0") == (0, "", ["--version", "install -e .[dev]"])
+
+
+@pytest.mark.parametrize(
+    ("python", "message"),
+    [
+        ('case "$*" in --version) echo Python 3.9.1;; *) exit 1;; esac', "needs Python 3.11 or newer, found Python 3"),
+        ('case "$*" in *ensurepip*) exit 1;; esac', "apt-get install python3-venv"),
+        ('case "$*" in "-m venv"*) exit 1;; esac', "set CURVIREG_VENV to a folder that can be written"),
+    ],
+)
+def test_pythons_that_will_not_do(tmp_path: Path, python: str, message: str) -> None:
+    code, output, _ = source(tmp_path, python, venv=False)
+    assert code == 1
+    assert message in output
+    assert len(output.splitlines()) == 1
+    assert not (tmp_path / "venv").exists()
+
+
+def test_half_made_environments(tmp_path: Path) -> None:
+    code, output, _ = source(tmp_path, 'case "$*" in *pip*) exit 1;; esac')
+    assert code == 1
+    assert "remove it" in output

@@ -1,0 +1,188 @@
+"""Result documents, their schema and their page; what is printed with ``--json``; examples in the help."""
+
+import argparse
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import torch
+import trimesh
+
+import curvireg_torch as cr
+from curvireg_torch.cli import _parsed, _parser, main
+from curvireg_torch.registration.document import result_document
+from tests._support.lists import CAMERA, box_of, write_files, written
+
+ROOT = Path(__file__).parents[2]
+SCHEMA = json.loads((ROOT / "curvireg_torch" / "result.schema.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_files(tmp_path_factory.mktemp("results"))
+
+
+@pytest.fixture(scope="module")
+def check():
+    """Raise for a document that is not of the schema."""
+    jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+    return jsonschema.Draft202012Validator(SCHEMA).validate
+
+
+def register(*words):
+    return main(["register", *map(str, words), "--quiet"])
+
+
+def printed(capsys):
+    return capsys.readouterr().out
+
+
+def test_json_is_all_that_is_printed(folder, capsys, check):
+    files = [folder / "photos" / "0.png", folder / "truck.safetensors"]
+    words = [*files, "--box", *box_of(0), "--camera", *CAMERA, "--json"]
+    assert register(*words) == 0
+    document = json.loads(printed(capsys))
+    check(document)
+    assert register(*words, "--out", folder / "one") == 0
+    again = json.loads(printed(capsys))
+    check(again)
+    assert json.loads((folder / "one" / "result.json").read_text()) == again
+    assert {**again, "seconds": 0} == {**document, "seconds": 0}
+    assert register(folder / "none.png", files[1], "--json") == 2
+    assert printed(capsys) == ""
+
+
+@pytest.mark.parametrize(
+    ("named", "unit"), [(None, None), ("none", None), ("yards", None), ("mm", "mm"), ("ft", "ft"), ("meters", "m")]
+)
+def test_a_mesh_without_a_unit_of_ours_has_none_also_from_a_file(tmp_path, check, named, unit):
+    """trimesh writes "none" for None, and "meters" where we say "m"."""
+    mesh = trimesh.creation.box((1.0, 2.0, 3.0))
+    if named is not None:
+        mesh.units = named
+    views = cr.sample_views(azimuth_step=90, elevations=[20])
+    bank = cr.ViewBank.build(mesh, views, image_size=32, progress=False)
+    bank.save(tmp_path / "box.safetensors")
+    for one in (bank, cr.ViewBank.load(tmp_path / "box.safetensors")):
+        assert one.mesh.units == unit
+        registrar = cr.Registrar(one, refine=False)
+        result = registrar([torch.rand(3, 64, 64)], torch.tensor([[10.0, 10, 50, 50]]))[0]
+        document = result_document(result, registrar, {"bank": 0.0, "register": 0.0})
+        assert document["unit"] == unit
+        check({**json.loads(json.dumps(document)), "inputs": {"box": [10, 10, 50, 50]}})
+
+
+def test_without_a_box_it_says_what_was_found_where(folder, capsys, check):
+    words = [folder / "photos" / "0.png", folder / "truck.safetensors", "--camera", *CAMERA, "--no-refine"]
+    assert register(*words, "--json", "--instances", "2") == 0
+    document = json.loads(printed(capsys))
+    check(document)
+    found = document["found"]
+    assert document["inputs"]["box"] == found["instances"][0]["box"] == found["proposals"][0]["box"]
+    assert document["rotation"] == found["instances"][0]["rotation"]
+    assert found["presence"] == found["instances"][0]["presence"] >= found["instances"][-1]["presence"]
+    assert document["confidence"] <= found["presence"]
+    assert register(*words, "--out", folder / "found") == 0
+    assert re.search(r"found in box [-\d ]+: there with probability 0\.\d\d", printed(capsys))
+    given = [*words, "--box", *box_of(0), "--json"]
+    assert register(*given) == 0
+    assert "found" not in json.loads(printed(capsys))
+    for more in (["--instances", "2"], ["--distance", "1", "2"]):
+        with pytest.raises(SystemExit):
+            register(*given, *more)
+        assert "are for objects that are looked for" in capsys.readouterr().err
+
+
+def test_json_of_a_list_is_one_line_each(folder, capsys, check):
+    rows = [["photos/0.png", *box_of(0)], ["none.png", "", "", "", ""], ["photos/1.png", "1", "", "", ""]]
+    path = written(folder / "list.csv", "photo,x0,y0,x1,y1", *rows)
+    before = sorted(found.name for found in folder.iterdir())
+    assert register("--list", path, folder / "truck.safetensors", "--no-refine", "--json") == 0
+    found = capsys.readouterr()
+    documents = [json.loads(line) for line in found.out.splitlines()]
+    assert [document["status"] for document in documents] == ["ok", "failed", "failed"]
+    for document in documents:
+        check(document)
+    assert re.fullmatch("3 photographs: 1 ok, 2 failed, [01] reliable", found.err.strip())
+    assert sorted(found.name for found in folder.iterdir()) == before
+
+
+def test_the_schema_refuses_what_is_no_result(folder, capsys, check):
+    import jsonschema
+
+    files = [folder / "photos" / "0.png", folder / "truck.safetensors"]
+    assert register(*files, "--no-refine", "--json") == 0
+    good = json.loads(printed(capsys))
+    check(good)
+    for change in (
+        {"rotation": good["rotation"][:2]},
+        {"confidence": 1.5},
+        {"new": 1},
+        {"status": "failed"},
+        {"top": []},
+        {"translation": [1, 2, None]},
+        {"inputs": {**good["inputs"], "box": None}},
+    ):
+        with pytest.raises(jsonschema.ValidationError):
+            check({**good, **change})
+    assert "corrected_box" in good
+    for missing in set(good) - {"found", "mesh"}:
+        with pytest.raises(jsonschema.ValidationError, match=f"'{missing}' is a required property"):
+            check({key: value for key, value in good.items() if key != missing})
+
+
+def test_the_demos_document_is_of_the_schema(tmp_path, monkeypatch, check):
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+    assert main(["demo", "--out", str(tmp_path / "demo"), "--preset", "fast", "--quiet"]) == 0
+    check(json.loads((tmp_path / "demo" / "result.json").read_text()))
+
+
+def test_the_schema_is_printed(capsys):
+    assert main(["schema"]) == 0
+    assert json.loads(printed(capsys)) == SCHEMA
+
+
+def keys(schema):
+    """Names of all properties, however deep."""
+    for name, inside in schema.get("properties", {}).items():
+        yield name
+        if isinstance(inside, dict):
+            yield from keys(inside)
+    for inside in [*schema.get("$defs", {}).values(), *schema.get("anyOf", [])]:
+        yield from keys(inside)
+
+
+def test_the_page_explains_every_key():
+    text = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    explained = set(re.findall(r"`(\w+)`", text))
+    assert set(keys(SCHEMA)) - explained == set()
+
+
+def commands(parser, words=()):
+    yield words, parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, below in action.choices.items():
+                yield from commands(below, (*words, name))
+
+
+@pytest.mark.parametrize(("words", "parser"), [pytest.param(w, p, id=" ".join(w)) for w, p in commands(_parser()) if w])
+def test_every_command_shows_examples_that_parse(words, parser):
+    text = parser.format_help()
+    assert "\nexamples:\n" in text
+    lines = [line.strip() for line in text.split("\nexamples:\n")[1].splitlines()]
+    assert lines
+    for line in lines:
+        name, *said = shlex.split(line.partition(">")[0])
+        assert name == "curvireg"
+        assert tuple(said[: len(words)]) == words
+        _parsed(said)
+
+
+def test_neither_out_nor_json(capsys):
+    with pytest.raises(SystemExit):
+        main(["register", "a.jpg", "b.stl"])
+    assert "expected --out DIR, or --json" in capsys.readouterr().err

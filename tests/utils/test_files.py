@@ -1,0 +1,136 @@
+"""Files that appear whole or not at all, whatever happens, and folders that cannot be written to."""
+
+import errno
+import os
+import resource
+import signal
+from pathlib import Path
+
+import pytest
+
+from curvireg_torch.cli import main
+from curvireg_torch.errors import CurviregError, OutputError
+from curvireg_torch.utils.files import probe_folder, write_file
+
+OLD, NEW = b"a" * 1000, b"b" * 5_000_000
+
+
+def test_whole_files(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "folder" / "file"
+    write_file(path, OLD)
+    write_file(path, NEW)
+    assert path.read_bytes() == NEW
+    assert list(path.parent.iterdir()) == [path]
+    link = tmp_path / "link"
+    link.symlink_to(path)
+    write_file(link, OLD)
+    assert link.is_symlink()
+    assert path.read_bytes() == OLD
+
+
+def test_a_disk_that_fills_up_midway(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    write_file(path, OLD)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(OutputError, match=r"file: cannot be written \(File too large\); choose another place"):
+            write_file(path, NEW)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == OLD
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_asks_for_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OutputError, match=r"\(No space left on device\); make room, or choose another place"):
+        write_file(tmp_path / "file", OLD)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["file/x", "folder", "null"])
+def test_what_is_no_place_for_a_file(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").write_bytes(OLD)
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "null").symlink_to(os.devnull)
+    with pytest.raises(CurviregError, match=f"{name}: cannot be written") as error:
+        write_file(tmp_path / name, NEW)
+    assert isinstance(error.value, OSError)
+    assert len(str(error.value).splitlines()) == 1
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "folder", "null"]
+    assert not Path(os.devnull).is_file()
+
+
+def test_probes(tmp_path: Path) -> None:
+    probe_folder(tmp_path / "a" / "b", "--out")
+    assert not list((tmp_path / "a" / "b").iterdir())
+    (tmp_path / "file").write_bytes(OLD)
+    with pytest.raises(OutputError, match=r"^--out .*file: cannot be written to \(.*\); choose another --out$"):
+        probe_folder(tmp_path / "file", "--out")
+
+
+@pytest.mark.parametrize("command", ["demo", "bank", "bank --adapt"])
+def test_the_place_is_probed_before_the_work(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def work(*_: object, **__: object) -> None:
+        raise AssertionError("began to work")
+
+    for name in ("cached_bank", "load_mesh"):
+        monkeypatch.setattr(f"curvireg_torch.cli.commands.{name}", work)
+    blocked = tmp_path / "file"
+    blocked.write_bytes(OLD)
+    (tmp_path / "mesh.ply").write_bytes(OLD)
+    mesh = str(tmp_path / "mesh.ply")
+    arguments = {
+        "demo": ["demo", "--out", str(blocked / "out")],
+        "bank": ["bank", mesh, "--out", str(blocked / "a.safetensors")],
+        "bank --adapt": ["bank", mesh, "--out", str(tmp_path / "a"), "--adapt", str(blocked / "b")],
+    }[command]
+    option = "--adapt" if "--adapt" in arguments else "--out"
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"curvireg: error: {option} {blocked}")
+    assert len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interrupted_in_the_middle_of_a_file(
+    number: signal.Signals, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "file"
+    write_file(path, OLD)
+    monkeypatch.setattr(os, "fsync", lambda _: signal.raise_signal(number))
+    monkeypatch.setattr("curvireg_torch.cli.commands.list_cache", lambda: write_file(path, NEW))
+    before = signal.getsignal(signal.SIGTERM)
+    ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # of a suite that a shell runs in the background
+    try:
+        ended = main(["cache"])
+    except SystemExit as stop:
+        ended = stop.code
+    finally:
+        signal.signal(signal.SIGINT, ignored)
+    assert ended == code
+    assert path.read_bytes() == OLD
+    assert list(tmp_path.iterdir()) == [path]
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 warns of fork beside threads
+def test_killed_in_the_middle_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "file"
+    write_file(path, OLD)
+    child = os.fork()
+    if child == 0:
+        monkeypatch.setattr(os, "fsync", lambda _: os.kill(os.getpid(), signal.SIGKILL))
+        write_file(path, NEW)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+    assert path.read_bytes() == OLD
+    left = [found.name for found in tmp_path.iterdir() if found != path]
+    assert len(left) == 1
+    assert left[0].endswith(".tmp")

@@ -1,0 +1,61 @@
+"""What is imported when: help at once, names when they are asked for."""
+
+import subprocess
+import sys
+from importlib import import_module
+
+import pytest
+
+import curvireg_torch
+from curvireg_torch import evaluation
+from curvireg_torch.pipeline import PRESETS
+from curvireg_torch.utils import choices
+
+HEAVY = {"torch", "numpy", "scipy", "kornia", "trimesh", "cv2", "sklearn", "matplotlib", "safetensors", "tqdm"}
+UNUSED = {"sklearn", "matplotlib", "skimage", "pyrender", "OpenGL", "timm", "torchvision", "pandas", "IPython"}
+
+
+def imported_by(code: str) -> set[str]:
+    """Top-level modules that are there after ``code`` has run in a fresh process."""
+    script = (
+        f"import sys\ntry:\n    {code}\nexcept SystemExit:\n    pass\nprint('\\n'.join(sys.modules), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=120)
+    return {name.split(".")[0] for name in done.stderr.split()}
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--help"], ["--version"], ["register", "--help"], ["evaluate", "bop", "--help"], ["register", "--unit", "mile"]],
+    ids=" ".join,
+)
+def test_help_imports_nothing_heavy(words):
+    assert not imported_by(f"from curvireg_torch.cli import main; main({words!r})") & HEAVY
+
+
+def test_the_package_alone_imports_nothing_heavy():
+    assert not imported_by("import curvireg_torch; curvireg_torch.CurviregError") & HEAVY
+
+
+def test_commands_import_no_more_than_they_use():
+    loaded = imported_by("import curvireg_torch.cli.commands")
+    assert {"torch", "trimesh"} <= loaded
+    assert not loaded & UNUSED
+
+
+@pytest.mark.parametrize("package", [curvireg_torch, evaluation], ids=lambda p: p.__name__)
+def test_every_lazy_name_can_be_imported(package):
+    for name in package.__all__:
+        assert getattr(package, name) is not None
+    assert set(package.__all__) <= set(dir(package))
+
+
+def test_unknown_names_are_attribute_errors():
+    with pytest.raises(AttributeError, match="registrar_of"):
+        curvireg_torch.registrar_of  # noqa: B018
+    assert curvireg_torch.filters is import_module("curvireg_torch.filters")
+
+
+def test_names_on_the_command_line_are_those_of_the_library():
+    assert list(PRESETS) == list(choices.PRESET_NAMES)
+    assert choices.DEFAULT in PRESETS
