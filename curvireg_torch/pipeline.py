@@ -19,7 +19,7 @@ from .filters import (
     MultiScaleFocusCurves,
 )
 from .settings import BankSettings, LocateSettings, ViewPolicy
-from .terms import TERMS, Appearance, BoxShape, Correlation, LateTerm, Repeatability, Term, slack_boxes
+from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, RerankingTerm, Term, jittered_boxes
 from .utils.checks import check_option
 from .utils.choices import DEFAULT
 
@@ -49,7 +49,7 @@ class Pipeline:
         field: what makes the photograph's field: one of :data:`FIELDS`, or "own:NAME" for a module given with the call.
         weights: digest of the field's weights; "" where there are none, and filled in for packaged ones.
         terms: ranking terms, one of a kind.
-        slack: how wrong boxes may be, as a share of their longer side (:func:`slack_boxes`); 0 takes them as they are.
+        box_jitter: how wrong boxes may be, as a fraction of their longer side (:func:`jittered_boxes`); 0: exact boxes.
         hypotheses: distinct views that are carried through search and contours.
         search: search around them in small steps.
         contours: pull the mesh's contours onto the photograph's edges.
@@ -61,7 +61,7 @@ class Pipeline:
     Example:
         >>> Pipeline() == Pipeline.from_json(Pipeline().to_json())
         True
-        >>> replace(Pipeline(), slack=0.0).posed("upright").views.pose
+        >>> replace(Pipeline(), box_jitter=0.0).with_pose_prior("upright").views.pose
         'upright'
     """
 
@@ -70,7 +70,7 @@ class Pipeline:
     field: str = "learned"
     weights: str = ""
     terms: tuple[Term, ...] = dataclass_field(default=(Correlation(), Repeatability(), BoxShape(), Appearance()))
-    slack: float = 0.1
+    box_jitter: float = 0.1
     hypotheses: int = 5
     search: bool = True
     contours: bool = True
@@ -84,13 +84,13 @@ class Pipeline:
 
             object.__setattr__(self, "weights", SHA256[:16])
         names = [term.name for term in self.terms]
-        if len(set(names)) < len(names) or all(isinstance(term, LateTerm) for term in self.terms):
+        if len(set(names)) < len(names) or all(isinstance(term, RerankingTerm) for term in self.terms):
             raise InvalidInputError(f"terms: expected one or more that compare all views, each once, got {names}")
         if self.hypotheses < 1:
             raise InvalidInputError(f"hypotheses: expected >= 1, got {self.hypotheses}")
-        slack_boxes(torch.ones(0, 4), self.slack)  # says what is wrong with it
+        jittered_boxes(torch.ones(0, 4), self.box_jitter)  # says what is wrong with it
 
-    def posed(self, pose: str) -> "Pipeline":
+    def with_pose_prior(self, pose: str) -> "Pipeline":
         """The same for another ``pose`` of the view policy."""
         return replace(self, views=replace(self.views, pose=pose))
 
@@ -128,13 +128,13 @@ class Pipeline:
         """The same with a module of one's own as the photograph's field: its name and digest are noted."""
         return replace(self, field=f"own:{type(field).__name__}", weights=field_digest(field))
 
-    def late_terms(self, count: int) -> list[LateTerm]:
+    def reranking_terms(self, count: int) -> list[RerankingTerm]:
         """The late terms by which all views of a bank of ``count`` are described."""
-        return [term for term in self.terms if isinstance(term, LateTerm) and count <= term.coarse]
+        return [term for term in self.terms if isinstance(term, RerankingTerm) and count <= term.coarse]
 
-    def made(self, count: int) -> dict[str, Any]:
+    def bank_key_fields(self, count: int) -> dict[str, Any]:
         """What decides the contents of a bank of ``count`` views, besides mesh and viewpoints."""
-        return {**asdict(self.bank), "late": [term.name for term in self.late_terms(count)]}
+        return {**asdict(self.bank), "late": [term.name for term in self.reranking_terms(count)]}
 
     def describe(self) -> dict[str, Any]:
         """Plain numbers and texts, as JSON holds them."""
@@ -225,12 +225,12 @@ _PAPER = BankSettings(image_size=256, sigma=1.0, formula="paper", camera="orthog
 PRESETS: dict[str, Pipeline] = {
     "learned": Pipeline(),
     "classical": Pipeline(field="focus", terms=_OWN),
-    "fast": Pipeline(terms=_OWN, slack=0.0, search=False, contours=False),
+    "fast": Pipeline(terms=_OWN, box_jitter=0.0, search=False, contours=False),
     "paper": Pipeline(
         bank=_PAPER,
         field="focus",
         terms=(Correlation(whitening="bank"), Repeatability(mode="paper"), BoxShape(weight=0.0)),
-        slack=0.0,
+        box_jitter=0.0,
     ),
 }
 """``learned``: the photograph's field by :class:`LearnedCurvilinearSaliency`, and the appearance term; ``classical``:

@@ -96,7 +96,7 @@ class BankSettings:
     bins: int = 9
     block: int = 2
     clip: float = 0.2
-    point_share: float = 0.04
+    point_fraction: float = 0.04
 
     def __post_init__(self) -> None:
         check_option(self.camera, CAMERAS, "camera")

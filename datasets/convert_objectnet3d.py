@@ -41,7 +41,7 @@ def classes_of(annotation: Path) -> set[str]:
 
 
 def convert_split(root: Path, out: Path, split: str) -> Counter[str]:
-    """Counts ``placed`` images and what was missing."""
+    """Counts ``lift_to_poses`` images and what was missing."""
     counts: Counter[str] = Counter()
     lists: dict[str, list[str]] = {}
     for image_id in (root / "Image_sets" / f"{split}.txt").read_text(encoding="utf-8").split():

@@ -81,7 +81,11 @@ def fetch(url: str, part: Path, validator: str | None, timeout: float) -> int | 
         with open(part, "ab" if resumed else "wb") as file:
             while chunk := response.read(CHUNK):
                 file.write(chunk)
-                print(f"\r{part.stem}: {file.tell() / 1e6:.1f} MB of {(total or 0) / 1e6:.1f}", end="", file=sys.stderr)
+                print(
+                    f"\r{part.stem}: {file.tell() / 1e6:.1f} MB of {(total or 0) / 1e6:.1f}",
+                    end="",
+                    file=sys.stderr,
+                )
         print(file=sys.stderr)
     return total
 

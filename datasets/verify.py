@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 
 from curvireg_torch.data import read_image
 from curvireg_torch.errors import CurviregError
-from curvireg_torch.evaluation.registry import KINDS, Kind
+from curvireg_torch.evaluation.registry import DATASETS, DatasetSpec
 
 DEFECTS = ("missing_", "corrupt_", "bad_")
 
@@ -31,7 +31,7 @@ def unreadable(dataset: Dataset) -> list[str]:
     return problems
 
 
-def report(dataset: Dataset, kind: Kind, images: bool, show: int) -> int:
+def report(dataset: Dataset, kind: DatasetSpec, images: bool, show: int) -> int:
     samples = [dataset.annotation(i) for i in range(len(dataset))]
     counts = Counter(kind.category.format_map(s) for s in samples)
     print(f"{len(samples)} objects in {len({s['image_path'] for s in samples})} photographs")
@@ -52,8 +52,8 @@ def report(dataset: Dataset, kind: Kind, images: bool, show: int) -> int:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    kinds = parser.add_subparsers(required=True, metavar=f"{{{','.join(KINDS)}}}")
-    for name, kind in KINDS.items():
+    kinds = parser.add_subparsers(required=True, metavar=f"{{{','.join(DATASETS)}}}")
+    for name, kind in DATASETS.items():
         command = kinds.add_parser(name)
         kind.add_arguments(command)
         command.add_argument("--images", action="store_true", help="also decode every photograph (slow)")

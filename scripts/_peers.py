@@ -97,7 +97,7 @@ def compare(folder: Path, photographs: int) -> list[dict[str, Any]]:
         truth, symmetries = allocentric(item), torch.tensor(item["symmetries"], dtype=torch.float64)
         answers: dict[str, Callable[[], int]] = {}
         for name in OURS:
-            pipeline = preset_named(name).posed("upright")
+            pipeline = preset_named(name).with_pose_prior("upright")
             start = time.perf_counter()
             matcher = ViewMatcher(ViewBank.build(mesh, pipeline=pipeline, progress=False), pipeline=pipeline)
             rows[name]["prepare"].append(time.perf_counter() - start)

@@ -20,10 +20,10 @@ WRITTEN = ("scripts/results", "docs", "README.md")
 
 def benchmark(data: Path, name: str) -> "Benchmark":
     """One of the real sets: pascal3d_* in ``data``, pixels counted from 0; others in its folder bop."""
-    from curvireg_torch.evaluation import KINDS, Protocol
+    from curvireg_torch.evaluation import DATASETS, Protocol
 
     mini = name.startswith("pascal")
-    kind = KINDS["pascal3d" if mini else "bop"]
+    kind = DATASETS["pascal3d" if mini else "bop"]
     dataset = kind.open(data / name, pixel_origin=0) if mini else kind.open(data / "bop" / name)
     return kind.scored(dataset, Protocol(pose=SETS[name]))
 

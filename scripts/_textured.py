@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from curvireg_torch.rendering.embree import RayScene
-from curvireg_torch.training.scenes.turns import any_turn
+from curvireg_torch.training.scenes.rotations import random_rotation
 
 LARGEST = 384
 """Side of textures in px: finer ones would only alias in pictures of this size."""
@@ -118,7 +118,7 @@ class Textured:
     def shifted(self, shift) -> "Textured":
         return replace(self, triangles=self.triangles + np.asarray(shift))
 
-    def posed(self, R: np.ndarray, t: np.ndarray) -> "Textured":
+    def with_pose_prior(self, R: np.ndarray, t: np.ndarray) -> "Textured":
         return replace(self, triangles=self.triangles @ R.T + t, normals=self.normals @ R.T)
 
     def surface(self, number: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -178,7 +178,7 @@ def look_symmetries(model: Textured, candidates: list[int], turns: np.ndarray, *
     grid = np.linspace(-1, 1, side)
     x, y = (g.ravel() for g in np.meshgrid(grid, grid))
     scene = model.rays()
-    views = [any_turn(np.random.default_rng(k)) for k in range(4)]
+    views = [random_rotation(np.random.default_rng(k)) for k in range(4)]
 
     def seen(R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         pictures = []

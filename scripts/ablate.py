@@ -52,7 +52,7 @@ ROWS: dict[str, Pipeline] = {
     "ranking, without S_look": _ranked(_without(_learned, "appearance")),
     "ranking, without S_rep": _ranked(_without(_learned, "repeatability")),
     "ranking, without S_box": _ranked(_without(_learned, "box")),
-    "ranking, without slack": _ranked(replace(_learned, slack=0.0)),
+    "ranking, without slack": _ranked(replace(_learned, box_jitter=0.0)),
     "classical": _classical,
     "classical ranking": _ranked(_classical),
     "gradient instead of MFC": _ranked(replace(_classical, field="gradient")),

@@ -36,9 +36,9 @@ from curvireg_torch.io import read_image
 from curvireg_torch.matching import cached_bank
 from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
 from curvireg_torch.registration.confidence import presence
-from curvireg_torch.registration.inputs import Item
+from curvireg_torch.registration.inputs import ImageItem
 from curvireg_torch.registration.localization import representative_views
-from curvireg_torch.registration.localization.localize import Places
+from curvireg_torch.registration.localization.localize import ScoredCandidates
 
 Row = dict[str, Any]
 Curves = dict[str, tuple[list[bool], list[float]]]
@@ -117,9 +117,9 @@ def linemod_boxes(registrar: cr.Registrar, image: Tensor, count: int) -> tuple[T
 
 
 def rows_of(folder: Path, item: Row, items: list[Row], half: Path, preset: str) -> Row:
-    pipeline = preset_named(preset).posed("upright" if item["pose"] == "upright" else "any")
-    looks = any(term.name == "appearance" for term in pipeline.terms)
-    if looks:
+    pipeline = preset_named(preset).with_pose_prior("upright" if item["pose"] == "upright" else "any")
+    appearance_scores = any(term.name == "appearance" for term in pipeline.terms)
+    if appearance_scores:
         pipeline = pipeline.with_term("appearance", coarse=0)
     bank = cached_bank(cr.load_mesh(folder / item["mesh"]), pipeline=pipeline, progress=False)
     registrar = cr.Registrar(bank, pipeline=pipeline)
@@ -139,10 +139,12 @@ def rows_of(folder: Path, item: Row, items: list[Row], half: Path, preset: str) 
         seconds = time.perf_counter() - start
         count = registrar.pipeline.locate.followed
         with torch.no_grad():
-            places = Places.judged(registrar, Item(image, box, None), located.boxes[:count], located.scores[:count])
+            places = ScoredCandidates.score_boxes(
+                registrar, ImageItem(image, box, None), located.boxes[:count], located.scores[:count]
+            )
         overlaps = [0.0] * len(located.boxes) if box is None else box_iou(located.boxes, box[None])[:, 0].tolist()
         row[name] = {"overlaps": overlaps, "evidence": places.evidence, "seconds": seconds}
-        if hasattr(cv2, "linemod") and looks and box is not None:
+        if hasattr(cv2, "linemod") and appearance_scores and box is not None:
             boxes, spent = linemod_boxes(registrar, image, len(located.boxes))
             row["linemod"] = {"overlaps": box_iou(boxes, box[None])[:, 0].tolist(), "seconds": spent}
     return row
@@ -160,7 +162,7 @@ class Place(NamedTuple):
     sure: float
 
 
-def judged(rows: list[Row], *, fit: bool) -> tuple[Row, list[Place]]:
+def score_boxes(rows: list[Row], *, fit: bool) -> tuple[Row, list[Place]]:
     """Presence of each place: fitted, meshes left out in turn, and what was fitted; or as the library says it."""
     every = [
         ((n, name), evidence, overlap >= 0.5, row["mesh"])
@@ -207,7 +209,7 @@ def record_of(rows: list[Row]) -> tuple[Row, dict[str, Curves]]:
         some = [row for row in rows if row["preset"] == preset]
         if not some:
             continue
-        told, places = judged(some, fit=preset in FITTED)
+        told, places = score_boxes(some, fit=preset in FITTED)
         if preset in FITTED:
             record["presence"][preset] = {**told, "forms": {}}
             for form in FORMS:

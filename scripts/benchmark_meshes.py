@@ -38,7 +38,7 @@ LICENCES = {
     "Scopia": "CC-BY-3.0",
 }
 
-KINDS = {
+DATASETS = {
     "chair": r"((oak|osaka|ryokan|cafe|folding|plastic|teck|child|children) )?chair|chair with cushion|class seat",
     "armchair": r"(modern |rattan |winchester )?armchair",
     "sofa": r"(burlap |clear |rattan |winchester )?(sofa|couch)( [23] seats)?|futon couch|convertible sofa bz",
@@ -121,7 +121,7 @@ def catalogue(unpacked: Path) -> list[dict]:
 
 
 def kind_of(name: str) -> str | None:
-    return next((kind for kind, pattern in KINDS.items() if re.fullmatch(pattern, name.lower())), None)
+    return next((kind for kind, pattern in DATASETS.items() if re.fullmatch(pattern, name.lower())), None)
 
 
 def convert(row: dict, unpacked: Path, folder: Path) -> str | None:

@@ -33,8 +33,8 @@ from sklearn.linear_model import LogisticRegression
 from curvireg_torch.evaluation.store import PredictionStore
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_error, transform
 from curvireg_torch.metrics import symmetry_transforms
-from curvireg_torch.registration.confidence import FEATURES, RANKING_EVIDENCE, RELIABLE, LogisticModel, pose_features
-from curvireg_torch.registration.verify import EVIDENCE, WEIGHTS, verdict
+from curvireg_torch.registration.confidence import FEATURES, RANKING_FEATURES, RELIABLE, LogisticModel, pose_features
+from curvireg_torch.registration.rescoring import POSE_FEATURES, WEIGHTS, rescore
 
 CONSTANTS = REPOSITORY / "curvireg_torch" / "registration" / "calibration.json"
 RECORD = REPOSITORY / "scripts" / "results" / "calibration.json"
@@ -63,11 +63,11 @@ Row = dict[str, Any]
 
 def features_of(row: Row, *, with_appearance: bool = True) -> tuple[dict[str, float | None], float]:
     """Features of the best hypothesis of a row, and its error in degrees; also as if the pipeline had no appearance."""
-    evidence = torch.tensor([[one[name] for name in EVIDENCE] for one in row["evidence"]], dtype=torch.float64)
+    evidence = torch.tensor([[one[name] for name in POSE_FEATURES] for one in row["evidence"]], dtype=torch.float64)
     if not with_appearance:
-        evidence[:, EVIDENCE.index("appearance")] = 0.0
-    concentration = row["ranking"][RANKING_EVIDENCE.index("concentration")]
-    features = pose_features(evidence, verdict(evidence, with_camera=row["form"] == "exact"), concentration)
+        evidence[:, POSE_FEATURES.index("appearance")] = 0.0
+    concentration = row["ranking"][RANKING_FEATURES.index("concentration")]
+    features = pose_features(evidence, rescore(evidence, with_camera=row["form"] == "exact"), concentration)
     return features, row["errors"][0]
 
 
@@ -75,7 +75,7 @@ def ranking_case(row: Row, *, with_appearance: bool = True) -> tuple[dict[str, f
     """Features of a row's ranking, and the error of its best view."""
     known = row["ranking"] if with_appearance else row["fast"]["ranking"]
     error = row["view_errors"][0] if with_appearance else row["fast"]["error"]
-    return dict(zip(RANKING_EVIDENCE, known, strict=True)), error
+    return dict(zip(RANKING_FEATURES, known, strict=True)), error
 
 
 Case = Callable[..., tuple[dict[str, float | None], float]]
@@ -84,7 +84,7 @@ MODELS: dict[str, tuple[Case, bool, str | None, tuple[str, ...]]] = {
     for stage, case, form, names in (
         ("contours, camera", features_of, "exact", FEATURES),
         ("contours, no camera", features_of, "sibling", FEATURES),
-        ("ranking", ranking_case, None, RANKING_EVIDENCE),
+        ("ranking", ranking_case, None, RANKING_FEATURES),
     )
     for appearance in ("appearance", "no appearance")
 }
@@ -240,7 +240,7 @@ def fit_covariance(rows: Sequence[Row], sure: np.ndarray) -> tuple[Row, Row]:
 def fit_verdict(rows: Sequence[Row]) -> list[float]:
     """Weights of the verdict by which right hypotheses have most of a softmax, drawn towards those in use."""
     cases = [
-        (np.array([[one[name] for name in EVIDENCE] for one in row["evidence"]]), np.array(row["errors"]) < RIGHT)
+        (np.array([[one[name] for name in POSE_FEATURES] for one in row["evidence"]]), np.array(row["errors"]) < RIGHT)
         for row in rows
         if row["form"] == "exact" and not row["wrong"]
     ]

@@ -40,7 +40,7 @@ from curvireg_torch.metrics import symmetric_rotation_error
 from curvireg_torch.models.backbone import Backbone
 from curvireg_torch.pipeline import preset_named
 from curvireg_torch.rendering.shading import shade
-from curvireg_torch.terms import crop_regions, slack_boxes
+from curvireg_torch.terms import crop_regions, jittered_boxes
 
 KEPT = REPOSITORY / "scripts" / "results" / "appearance.json"
 PAGE = REPOSITORY / "docs" / "accuracy.md"
@@ -124,7 +124,7 @@ def measure(mesh: Path, items: list[dict[str, Any]], bench: Path, backbone: Back
     """Raw scores of the photographs that are to be registered to one CAD."""
     upright = items[0]["pose"] == "upright"
     # The classical bank: this script describes appearance by itself.
-    pipeline = preset_named("classical").posed("upright" if upright else "any")
+    pipeline = preset_named("classical").with_pose_prior("upright" if upright else "any")
     bank = cached_bank(cr.load_mesh(mesh, unit="m"), pipeline=pipeline, progress=False)
     R = bank.rotations.double()
     images = [read_image(bench / item["image"]) for item in items]
@@ -143,7 +143,7 @@ def measure(mesh: Path, items: list[dict[str, Any]], bench: Path, backbone: Back
     raw: dict[str, np.ndarray] = {}
     for i, item in enumerate(items):
         columns, place = place[: len(judged[i])], place[len(judged[i]) :]
-        regions = slack_boxes(boxes[i : i + 1], 0.1)
+        regions = jittered_boxes(boxes[i : i + 1], 0.1)
         crops = crop_regions([images[i]], regions, size=bank.settings.image_size, margin=bank.settings.margin)[0]
         for name, similarity in shaded.similarities(crops, backbone).items():
             raw[f"{i} {name}"] = similarity[:, columns].astype(np.float16)

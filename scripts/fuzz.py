@@ -36,13 +36,13 @@ MEGABYTES = 3000  # for a process, libraries included
 def worker(kind: str, start: int, count: int, folder: Path) -> None:
     """Inputs ``start`` to ``start + count``; prints a line of JSON for each that is done and one for the batch."""
     warnings.simplefilter("ignore")
-    from fuzz_inputs import KINDS, attack
+    from fuzz_inputs import DATASETS, attack
 
     if kind in ("boxes", "cameras"):
         print(json.dumps({"at": start}), flush=True)
         begin, failure = time.perf_counter(), None
         try:
-            count = KINDS[kind](start, count)
+            count = DATASETS[kind](start, count)
         except Exception:
             failure = traceback.format_exc(limit=-3)
         say = {

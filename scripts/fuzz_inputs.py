@@ -30,9 +30,9 @@ from curvireg_torch.io.mat_files import read_mat
 from curvireg_torch.io.meshes.mesh import extreme_points
 from curvireg_torch.matching.bank_file import _checksum
 from curvireg_torch.synthetic import example_mesh
-from curvireg_torch.terms import crop_regions, slack_boxes
+from curvireg_torch.terms import crop_regions, jittered_boxes
 
-__all__ = ["KINDS", "attack"]
+__all__ = ["DATASETS", "attack"]
 
 NUMBERS = [0, 1, -1, 2, 255, 65535, 2**31 - 1, -(2**31), 2**32 - 1, 10**9, 10**18, 0.5, 1e308, math.nan, math.inf]
 WORDS = b" -1 0 1 nan inf 1e999 99999999999 4294967295 1000000000 x -0 3.5".split(b" ")
@@ -319,7 +319,7 @@ def _box(values: list[float], sides: tuple[int, int], margin: float) -> None:
     assert bool(crops.isfinite().all())
     assert bool(A.isfinite().all())
     assert bool((crops >= -1e-3).all() and (crops <= 1.001).all())
-    regions = crop_regions([image], slack_boxes(box, 0.1), size=16, margin=0.1)
+    regions = crop_regions([image], jittered_boxes(box, 0.1), size=16, margin=0.1)
     assert bool(regions.isfinite().all())
     square_boxes(box, 0.1)
 
@@ -363,7 +363,7 @@ def _by_hypothesis(check: Callable[..., None], *strategies: Any) -> Callable[[in
 _four = st.lists(_VALUES, min_size=4, max_size=4)
 _plain = st.tuples(st.floats(-5, 60), st.floats(-5, 45), st.floats(0.01, 200), st.floats(0.01, 200))
 _boxes = _four | _plain.map(lambda b: [b[0], b[1], b[0] + b[2], b[1] + b[3]])
-KINDS: dict[str, Any] = {
+DATASETS: dict[str, Any] = {
     "images": image,
     "meshes": mesh,
     "mat": mat,
@@ -378,7 +378,7 @@ KINDS: dict[str, Any] = {
 def attack(kind: str, number: int, folder: Path) -> str:
     """Input ``number`` of ``kind``: the name of what came of it; anything but a result or our error is raised."""
     try:
-        KINDS[kind](np.random.default_rng([number, list(KINDS).index(kind)]), folder)
+        DATASETS[kind](np.random.default_rng([number, list(DATASETS).index(kind)]), folder)
     except CurviregError as error:
         text = str(error)
         assert text, "an error without a message"

@@ -29,7 +29,7 @@ from curvireg_torch.rendering.embree import RayScene
 from curvireg_torch.training.scenes.camera_noise import photographed
 from curvireg_torch.training.scenes.light import lit, random_light
 from curvireg_torch.training.scenes.materials import random_colour, random_picture
-from curvireg_torch.training.scenes.turns import any_turn
+from curvireg_torch.training.scenes.rotations import random_rotation
 
 FORMS = [(cad, pose) for cad in ("exact", "sibling") for pose in ("upright", "free")]
 SIZES = [(320, 320), (320, 400), (360, 480), (400, 320), (400, 400)]  # rows, columns
@@ -172,7 +172,7 @@ def clutter_around(meshes: Meshes, reach: float, eye: np.ndarray, count: int, oc
         except Exception:  # a file that its reader refuses is no clutter; the object's own would stop the script
             continue
         scale = float(np.exp(rng.uniform(-0.9, 0.4))) * (0.6 if k >= count else 1.0)
-        turn = any_turn(rng) if rng.random() < 0.15 else None
+        turn = random_rotation(rng) if rng.random() < 0.15 else None
         other = other.standing(turn, scale, rng.uniform(0, 2 * np.pi))
         own = 0.5 * float(np.linalg.norm(np.ptp(other.points(), axis=0)[:2]))
         if k >= count:
@@ -191,7 +191,7 @@ def clutter_around(meshes: Meshes, reach: float, eye: np.ndarray, count: int, oc
     return made
 
 
-def draw(things: list[Textured], R, t, K, size, rng) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def draw(household: list[Textured], R, t, K, size, rng) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Linear picture (H, W, 3); where the first thing is seen; where it would be seen alone."""
     H, W = size
     fine = 1.25
@@ -201,7 +201,7 @@ def draw(things: list[Textured], R, t, K, size, rng) -> tuple[np.ndarray, np.nda
     v, u = np.mgrid[0:h, 0:w].reshape(2, -1)
     rays = (np.stack([u, v, np.ones(len(u))], -1) @ M.T).astype(np.float32)
     start = np.zeros_like(rays)
-    placed = [thing.posed(R, t) for thing in things]
+    placed = [thing.with_pose_prior(R, t) for thing in household]
     first = np.cumsum([0, *(len(p.triangles) for p in placed)])
     triangles = np.concatenate([p.triangles for p in placed])
     scene = RayScene(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
@@ -252,7 +252,7 @@ def make(meshes: Meshes, seed: int, index: int) -> tuple[np.ndarray, dict]:
     bare = bool(rng.random() < 0.2)
     size = SIZES[rng.integers(len(SIZES))]
     model = meshes.load(shown["path"])
-    turn = np.eye(3) if upright else any_turn(rng)
+    turn = np.eye(3) if upright else random_rotation(rng)
     radius, centre = model.radius_and_centre()
     obj = model.standing(turn, 1.0, 0.0)
     if bare:
@@ -263,11 +263,11 @@ def make(meshes: Meshes, seed: int, index: int) -> tuple[np.ndarray, dict]:
         points = obj.points()
         reach = float(np.linalg.norm(points[:, :2], axis=1).max())
         crowd, covered = int(rng.choice([0, 1, 3, 5])), bool(rng.random() < 0.3 and attempt < 12)
-        things = [obj]
+        household = [obj]
         if eye[2] > 0.05 and rng.random() < 0.9:
-            things += ground_and_walls(meshes, eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9), rng)
-        things += clutter_around(meshes, 0.8 * reach, eye, crowd, covered, rng)
-        picture, seen, whole = draw(things, R, t, K, size, rng)
+            household += ground_and_walls(meshes, eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9), rng)
+        household += clutter_around(meshes, 0.8 * reach, eye, crowd, covered, rng)
+        picture, seen, whole = draw(household, R, t, K, size, rng)
         if whole.sum() < 400:
             continue
         visible = float(seen.sum() / whole.sum())
@@ -303,7 +303,7 @@ def make(meshes: Meshes, seed: int, index: int) -> tuple[np.ndarray, dict]:
         "t": translation.round(6).tolist(),
         "symmetries": meshes.turns[alike].astype(float).round(9).tolist(),
         "visible": round(visible, 3),
-        "clutter": len(things) - 1,
+        "clutter": len(household) - 1,
         "occluded": visible < 0.9,
         "bare": bare,
         "seed": seed,

@@ -135,7 +135,7 @@ def main() -> None:
     for name in arguments.meshes:
         mesh = MESHES[name]()
         mesh.units = "m"
-        bank = cached_bank(mesh, pipeline=preset.posed("upright"), progress=False)
+        bank = cached_bank(mesh, pipeline=preset.with_pose_prior("upright"), progress=False)
         registrars = {
             "view": Registrar(bank, refine=False),
             "search": Registrar(bank, contours=False),

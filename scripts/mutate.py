@@ -245,7 +245,10 @@ def table() -> str:
             lines.append(f"- {path}, `{before}` to `{after}`: {s['reason'] or 'no test yet'}")
     by_hand = json.loads(BY_HAND.read_text())
     lines += ["", f"Placed by hand where gaps were suspected (`scripts/results/{BY_HAND.name}`): the tests notice"]
-    lines += [f"{by_hand['killed']} of {by_hand['placed']}. This is no sample, and says nothing of the others.", ""]
+    lines += [
+        f"{by_hand['killed']} of {by_hand['placed']}. This is no sample, and says nothing of the others.",
+        "",
+    ]
     lines += [f"- {s['file']}, `{s['before']}` to `{s['after']}`: {s['reason']}" for s in by_hand["survivors"]]
     return "\n".join([*lines, ""])
 

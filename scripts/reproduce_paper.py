@@ -21,7 +21,7 @@ import sys
 from pathlib import Path
 
 from curvireg_torch.errors import CurviregError
-from curvireg_torch.evaluation import KINDS, paper
+from curvireg_torch.evaluation import DATASETS, paper
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.settings import BankSettings
 
@@ -42,7 +42,7 @@ def main() -> int:
 def parser() -> argparse.ArgumentParser:
     result = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     result.add_argument("table", choices=(*TABLES, "all"), metavar="TABLE")
-    result.add_argument("kind", choices=KINDS)
+    result.add_argument("kind", choices=DATASETS)
     result.add_argument("root", type=Path, metavar="ROOT")
     result.add_argument("--out", type=Path, required=True, metavar="DIR")
     result.add_argument("--limit", type=int, metavar="N", help="only N photographs, spread evenly over the set")
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> None:
     if "curve" in wanted:
         tables.append(paper.curve_table(cases, settings, arguments.eps, progress))
     if any(name in wanted for name in RANKINGS):
-        views = Pipeline().posed(arguments.pose or KINDS[arguments.kind].pose).views.sphere()
+        views = Pipeline().with_pose_prior(arguments.pose or DATASETS[arguments.kind].pose).views.sphere()
         rankings = paper.rank_views(cases, views, settings, progress)
         made = {
             "precision": lambda: [paper.precision_table(rankings)],

@@ -60,7 +60,7 @@ def rows_of(task: dict[str, Any]) -> list[Any]:
     bank = cr.ViewBank.build(mesh, pipeline=pipeline, progress=False)
     registrar = cr.Registrar(bank, pipeline=pipeline)
     # The preset "fast" of the same views: its ranking alone.
-    fast = cr.ViewMatcher(bank, pipeline=PRESETS["fast"].posed(pipeline.views.pose))
+    fast = cr.ViewMatcher(bank, pipeline=PRESETS["fast"].with_pose_prior(pipeline.views.pose))
     rows = []
     for item in task["items"]:
         image = read_image(folder / half / item["image"])
@@ -139,7 +139,7 @@ def register_benchmark(
             "which": wrong,
             "like": like,
             "box": box,
-            "pipeline": pipeline.posed("upright" if stands == "upright" else "any"),
+            "pipeline": pipeline.with_pose_prior("upright" if stands == "upright" else "any"),
         }
         for (mesh, stands), group in groupby(todo, key=lambda i: (i["mesh"], i["pose"]))
     ]

@@ -28,7 +28,7 @@ from curvireg_torch.matching import ViewDescriber, normalized_correlation
 from curvireg_torch.matching.fields import depth_filter, hog_layer
 from curvireg_torch.models import FieldNetwork, halved_angle
 from curvireg_torch.models.learned_field import save_weights
-from curvireg_torch.training import Lessons, Replay, altered, losses
+from curvireg_torch.training import FieldDataset, ReplayBuffer, augment, losses
 from curvireg_torch.training.field_dataset import SETTINGS
 from curvireg_torch.training.scenes import GeneratedScenes
 from curvireg_torch.utils.files import write_tensors
@@ -160,11 +160,11 @@ def main() -> None:
 
     generated = GeneratedScenes(10**9, seed=options.seed)
     fresh = range(scenes, len(generated))
-    lessons = Lessons(generated)
+    lessons = FieldDataset(generated)
     loader = iter(
         DataLoader(lessons, options.fresh, sampler=fresh, num_workers=options.workers, multiprocessing_context="spawn")
     )
-    replay = Replay(options.replay)
+    replay = ReplayBuffer(options.replay)
     generator = torch.Generator().manual_seed(options.seed + step)
     totals: dict[str, float] = {}
     start = marked = time.monotonic()
@@ -173,7 +173,7 @@ def main() -> None:
     while spent < options.minutes:
         replay.add(next(loader))
         scenes += options.fresh
-        batch = altered(replay.draw(options.fresh, options.batch, generator), generator)
+        batch = augment(replay.draw(options.fresh, options.batch, generator), generator)
         batch = {name: values.to(options.device) for name, values in batch.items()}
         share = spent / options.minutes
         for group in optimizer.param_groups:

@@ -14,7 +14,7 @@ import curvireg_torch as cr
 from curvireg_torch.detectors import DETECTORS
 from curvireg_torch.models import appearance
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration import find
+from curvireg_torch.registration import localize
 from curvireg_torch.synthetic import example_mesh
 from tests._support.pretended import PRETENDING, Pretended, pretended_gpu
 from tests._support.scenes import CAMERA, scene, truck_bank
@@ -143,9 +143,9 @@ def test_photographs_are_registered_there(preset):
 
 def test_objects_are_found_there(bank):
     image, _, _ = scene(0)
-    expected = find(cr.Registrar(bank), [image], CAMERA)[0]
+    expected = localize(cr.Registrar(bank), [image], CAMERA)[0]
     with pretended_gpu() as device:
-        found = find(cr.Registrar(bank, device=device), [image.to(device)], CAMERA)[0]
+        found = localize(cr.Registrar(bank, device=device), [image.to(device)], CAMERA)[0]
         same(found[0], expected[0])
         assert torch.equal(found[0].found.box.cpu(), expected[0].found.box)
         assert found[0].found.presence == expected[0].found.presence

@@ -51,7 +51,7 @@ def test_every_preset_registers_and_goes_through_json(name):
     assert result.rotation.isfinite().all()
     assert set(result.ranking.terms) == {term.name for term in pipeline.terms}
     assert (registrar.pipeline.search, registrar.pipeline.contours) == (False, False)
-    assert Registrar(bank).pipeline == pipeline.posed("given")
+    assert Registrar(bank).pipeline == pipeline.with_pose_prior("given")
 
 
 def test_classical_and_paper_learn_nothing():
@@ -76,9 +76,13 @@ def other(value):
 def test_a_description_says_all_that_decides():
     """Whatever is changed in a pipeline is seen in its JSON, and nothing can be changed in place."""
     base = Pipeline()
-    changed = [replace(base, field="focus", weights=""), base.posed("upright"), replace(base, terms=base.terms[:2])]
+    changed = [
+        replace(base, field="focus", weights=""),
+        base.with_pose_prior("upright"),
+        replace(base, terms=base.terms[:2]),
+    ]
     changed += [replace(base, **{n: other(getattr(base, n))}) for n in ("hypotheses", "search", "contours")]
-    changed += [replace(base, slack=0.2), replace(base, weights="0123")]
+    changed += [replace(base, box_jitter=0.2), replace(base, weights="0123")]
     changed += [replace(base, views=replace(base.views, **{n: 7})) for n in ("directions", "turn", "azimuth_step")]
     changed += [replace(base, bank=replace(base.bank, **{n: 40})) for n in ("image_size", "sigma", "margin", "bins")]
     for term in base.terms:
@@ -92,13 +96,13 @@ def test_a_description_says_all_that_decides():
     for pipeline in changed:
         assert Pipeline.from_json(pipeline.to_json()) == pipeline
     with pytest.raises(FrozenInstanceError):
-        base.slack = 0.0  # type: ignore[misc]
+        base.box_jitter = 0.0  # type: ignore[misc]
 
 
 def test_part_of_a_json_text_keeps_the_other_defaults(tmp_path):
     path = tmp_path / "own.json"
-    path.write_text(json.dumps({"slack": 0.0, "terms": {"hog": {"weight": 2.0}}}))
-    assert Pipeline.read(path) == Pipeline(slack=0.0, terms=(Correlation(weight=2.0),))
+    path.write_text(json.dumps({"box_jitter": 0.0, "terms": {"hog": {"weight": 2.0}}}))
+    assert Pipeline.read(path) == Pipeline(box_jitter=0.0, terms=(Correlation(weight=2.0),))
 
 
 @pytest.mark.parametrize(
@@ -118,7 +122,7 @@ def test_part_of_a_json_text_keeps_the_other_defaults(tmp_path):
         ('{"terms": {}}', "terms"),
         ('{"terms": {"hog": {"weight": -1}}}', "weight"),
         ('{"terms": {"box": {"sigma": 0}}}', "sigma"),
-        ('{"slack": 0.6}', "slack"),
+        ('{"box_jitter": 0.6}', "box_jitter"),
         ('{"hypotheses": 0}', "hypotheses"),
         ('{"terms": {"appearance": {}}}', "compare all views"),
         ('{"terms": {"hog": {}, "appearance": {"top": 0}}}', "top"),

@@ -85,7 +85,7 @@ def chosen_pipeline(arguments: argparse.Namespace) -> Pipeline:
     chosen = preset_named(arguments.preset or DEFAULT)
     if arguments.pipeline is not None:
         chosen = Pipeline.read(arguments.pipeline)
-    return chosen if arguments.pose is None else chosen.posed(arguments.pose)
+    return chosen if arguments.pose is None else chosen.with_pose_prior(arguments.pose)
 
 
 def open_registrar(
@@ -262,7 +262,7 @@ def demo(arguments: argparse.Namespace) -> None:
 
 
 def _write(out: Path, document: dict[str, Any], registrar: Registrar, result: Registration, *scene: Any) -> None:
-    from ..visualization import posed_glb, registration_sheet
+    from ..visualization import pose_glb, registration_sheet
 
     sheet = registration_sheet(registrar, result, *scene)
     mesh = registrar.bank.meshes[result.model]
@@ -270,7 +270,7 @@ def _write(out: Path, document: dict[str, Any], registrar: Registrar, result: Re
         (out / older).unlink(missing_ok=True)  # never stands beside this picture
     _write_picture(out / "overlay.png", sheet)
     if len(mesh.faces) <= MAX_GLB_FACES:
-        write_file(out / "pose.glb", posed_glb(mesh, *result.seen_by, scene[0]))
+        write_file(out / "pose.glb", pose_glb(mesh, *result.projection, scene[0]))
     write_file(out / "result.json", to_json(document).encode())
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidInputError
-from ..evaluation.registry import KINDS, Kind
+from ..evaluation.registry import DATASETS, DatasetSpec
 from ..utils.choices import DEFAULT, PRESET_NAMES
 from .examples import examples
 
@@ -38,7 +38,7 @@ def add_parser(commands: Any, parents: Sequence[argparse.ArgumentParser]) -> Non
 def add_datasets(datasets: Any, parents: Sequence[argparse.ArgumentParser]) -> None:
     """Add the kinds of datasets to the subparsers ``datasets``; ``parents`` as for :func:`add_parser`."""
     description = "Writes DIR/summary.json, DIR/predictions.csv and, as it goes, DIR/predictions; run again to go on."
-    for name, kind in KINDS.items():
+    for name, kind in DATASETS.items():
         shown = examples(
             f"curvireg evaluate {name} {kind.example} --out out/{name}",
             f"curvireg evaluate {name} {kind.example} --jobs 2 --limit 100 --preset fast --out out/{name}-fast",
@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..evaluation.protocol import Protocol
     from ..pipeline import Pipeline
 
-    kind: Kind = arguments.kind
+    kind: DatasetSpec = arguments.kind
     dataset = kind.open(arguments.root, **kind.chosen(arguments))
     summary = evaluate(
         kind.scored(dataset, Protocol.parse(arguments.protocol, pose=kind.pose)),

@@ -3,12 +3,12 @@ from .bop import BOPBenchmark
 from .loops import evaluate, score
 from .pascal3d import Pascal3DBenchmark
 from .protocol import Protocol
-from .registry import KINDS
+from .registry import DATASETS
 from .sheet import contact_sheet
 from .web import WebBenchmark
 
 __all__ = [
-    "KINDS",
+    "DATASETS",
     "BOPBenchmark",
     "Benchmark",
     "Pascal3DBenchmark",

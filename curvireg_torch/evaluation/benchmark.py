@@ -10,14 +10,14 @@ from torch import Tensor
 from ..data import BOPDataset, Pascal3DPlus, WebCollection
 from .protocol import Protocol
 
-__all__ = ["Benchmark", "Item", "Row"]
+__all__ = ["Benchmark", "BenchmarkItem", "Row"]
 
 Row = dict[str, Any]
 """A prediction: ``rotation``, ``translation``, ``score``, ...; or ``failed``, or ``skipped`` with the reason."""
 
 
 @dataclass(frozen=True)
-class Item:
+class BenchmarkItem:
     """One object to register.
 
     Attributes:
@@ -52,7 +52,7 @@ class Benchmark(ABC):
         self.dataset, self.protocol = dataset, protocol
         self.items = [self.item(i) for i in range(len(dataset))]
 
-    def selection(self, limit: int | None) -> list[Item]:
+    def selection(self, limit: int | None) -> list[BenchmarkItem]:
         """``limit`` items spread evenly over the dataset, or all."""
         n = len(self.items)
         return self.items if limit is None or limit >= n else [self.items[i * n // limit] for i in range(limit)]
@@ -63,21 +63,21 @@ class Benchmark(ABC):
         return {"dataset": self.name, "root": str(self.dataset.root.resolve()), "split": split}
 
     @abstractmethod
-    def item(self, index: int) -> Item:
+    def item(self, index: int) -> BenchmarkItem:
         """Object ``index`` of the dataset."""
 
     @abstractmethod
-    def rotation_errors(self, items: list[Item], rows: list[Row]) -> Tensor:
+    def rotation_errors(self, items: list[BenchmarkItem], rows: list[Row]) -> Tensor:
         """(N,) float64 errors in degrees up to the objects' symmetries, ``inf`` for a miss."""
 
     @abstractmethod
-    def easy(self, item: Item) -> bool:
+    def easy(self, item: BenchmarkItem) -> bool:
         """Whether the object is seen whole."""
 
     @abstractmethod
-    def summary(self, items: list[Item], rows: list[Row]) -> Row:
+    def summary(self, items: list[BenchmarkItem], rows: list[Row]) -> Row:
         """Scores of the predictions ``rows`` of ``items``, none of them skipped."""
 
     @abstractmethod
-    def write_predictions(self, path: Path, items: list[Item], rows: list[Row]) -> None:
+    def write_predictions(self, path: Path, items: list[BenchmarkItem], rows: list[Row]) -> None:
         """The predictions as one table; ``path`` appears when it is complete."""

@@ -21,7 +21,7 @@ from ..metrics import (
     symmetric_rotation_error,
     symmetry_transforms,
 )
-from .benchmark import Benchmark, Item, Row
+from .benchmark import Benchmark, BenchmarkItem, Row
 from .protocol import Protocol
 from .scores import estimated_rotations, or_inf, viewpoint_scores
 
@@ -50,9 +50,9 @@ class BOPBenchmark(Benchmark):
             raise InvalidInputError(f"protocol: BOP names the object, so cad=annotated; got cad={protocol.cad}")
         super().__init__(dataset, protocol)
 
-    def item(self, index: int) -> Item:
+    def item(self, index: int) -> BenchmarkItem:
         s = self.dataset.annotation(index)
-        return Item(
+        return BenchmarkItem(
             key=f"{s['scene_id']}/{s['image_id']}/{s['instance_index']}",
             index=index,
             meshes=(Path(s["model_path"]),),
@@ -60,13 +60,13 @@ class BOPBenchmark(Benchmark):
             camera_matrix=s["camera_matrix"],
         )
 
-    def rotation_errors(self, items: list[Item], rows: list[Row]) -> Tensor:
+    def rotation_errors(self, items: list[BenchmarkItem], rows: list[Row]) -> Tensor:
         return self._judged(items, rows)[0][0]
 
-    def easy(self, item: Item) -> bool:
+    def easy(self, item: BenchmarkItem) -> bool:
         return float(self.dataset.annotation(item.index)["visib_fract"]) > UNOCCLUDED
 
-    def summary(self, items: list[Item], rows: list[Row]) -> Row:
+    def summary(self, items: list[BenchmarkItem], rows: list[Row]) -> Row:
         """Rotation errors up to the objects' symmetries, ADD(-S) recall, AR of MSSD and MSPD."""
         errors, objects = self._judged(items, rows)
         easy = torch.tensor([self.easy(item) for item in items], dtype=torch.bool)
@@ -76,7 +76,7 @@ class BOPBenchmark(Benchmark):
             "per_object": {str(o): _scores(errors[:, objects == o]) for o in objects.unique().tolist()},
         }
 
-    def write_predictions(self, path: Path, items: list[Item], rows: list[Row]) -> None:
+    def write_predictions(self, path: Path, items: list[BenchmarkItem], rows: list[Row]) -> None:
         """The results file of the BOP challenge; objects without an estimate are not in it."""
         samples = [self.dataset.annotation(item.index) for item in items]
         ids = [(s["scene_id"], s["image_id"]) for s in samples]
@@ -100,7 +100,7 @@ class BOPBenchmark(Benchmark):
             ],
         )
 
-    def _judged(self, items: list[Item], rows: list[Row]) -> tuple[Tensor, Tensor]:
+    def _judged(self, items: list[BenchmarkItem], rows: list[Row]) -> tuple[Tensor, Tensor]:
         """(4, N) errors in degrees, diameters, diameters and image widths, see :meth:`_errors`; (N,) object ids."""
         samples = [self.dataset.annotation(item.index) for item in items]
         objects = torch.tensor([s["obj_id"] for s in samples], dtype=torch.long)

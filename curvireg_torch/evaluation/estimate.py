@@ -4,15 +4,15 @@ from collections.abc import Sequence
 
 import torch
 
-from ..matching import Photographs, Ranking, ViewMatcher
-from ..registration import FailedRegistration, Found, Registrar, Registration
-from ..registration.inputs import Item
+from ..matching import QueryFeatures, Ranking, ViewMatcher
+from ..registration import FailedRegistration, Localization, Registrar, Registration
+from ..registration.inputs import ImageItem
 from .benchmark import Row
 
 __all__ = ["FusedMatcher", "estimate_poses"]
 
 
-def estimate_poses(registrar: Registrar, items: Sequence[Item], *, boxes: bool = True) -> list[Row]:
+def estimate_poses(registrar: Registrar, items: Sequence[ImageItem], *, boxes: bool = True) -> list[Row]:
     """Register photographs to one mesh, or to the best of several.
 
     Args:
@@ -22,7 +22,7 @@ def estimate_poses(registrar: Registrar, items: Sequence[Item], *, boxes: bool =
 
     Returns:
         For each ``rotation`` (3 x 3 numbers), ``translation`` (3 numbers, unit of the mesh, or None), ``score``,
-        ``confidence``, ``reliable``, ``confidence_features``, ``support``, ``covariance`` and ``seen_by`` (see
+        ``confidence``, ``reliable``, ``confidence_features``, ``edge_support``, ``covariance`` and ``projection`` (see
         :class:`Registration`), ``mesh``: the place of the chosen mesh in the bank, and ``rivals``: rotation, score and
         evidence of the other hypotheses; of objects that were looked for, ``found``: the presence and the proposed
         boxes; or ``failed`` with the reason.
@@ -47,11 +47,11 @@ def _row(result: Registration | FailedRegistration) -> Row:
         "confidence": result.confidence,
         "reliable": result.reliable,
         "confidence_features": dict(result.confidence_features),
-        "support": best.support,
+        "edge_support": best.edge_support,
         "evidence": dict(best.evidence),
         "covariance": None if result.covariance is None else result.covariance.tolist(),
         "mesh": best.model,
-        "seen_by": [matrix.tolist() for matrix in best.seen_by],
+        "seen_by": [matrix.tolist() for matrix in best.projection],
         **({} if result.found is None else {"found": _found(result.found)}),
         "rivals": [
             {"rotation": r.rotation.tolist(), "score": r.score, "mesh": r.model, "evidence": dict(r.evidence)}
@@ -60,7 +60,7 @@ def _row(result: Registration | FailedRegistration) -> Row:
     }
 
 
-def _found(found: Found) -> Row:
+def _found(found: Localization) -> Row:
     return {"presence": found.presence, "boxes": found.boxes.tolist(), "scores": found.scores.tolist()}
 
 
@@ -70,7 +70,7 @@ class FusedMatcher(ViewMatcher):
     The mean stands at the model that scores best from that view; at the others 0.
     """
 
-    def rank(self, query: Photographs) -> Ranking:
+    def rank(self, query: QueryFeatures) -> Ranking:
         ranking = super().rank(query)
         scores = ranking.scores.unflatten(1, (len(self.bank.meshes), -1))
         best = scores == scores.amax(dim=1, keepdim=True)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ..geometry.crops import box_iou
-from .benchmark import Item, Row
+from .benchmark import BenchmarkItem, Row
 
 __all__ = ["localisation"]
 
@@ -16,7 +16,7 @@ OVERLAP = 0.5
 COUNTS = (1, 5, 20)
 
 
-def localisation(items: Sequence[Item], rows: Sequence[Row]) -> Row:
+def localisation(items: Sequence[BenchmarkItem], rows: Sequence[Row]) -> Row:
     """Recall of annotated boxes by the best 1, 5 and 20 proposals, at an intersection over union of 0.5.
 
     Boxes are cut to the picture on both sides: some sets annotate what is seen, some the whole object.

@@ -140,7 +140,7 @@ def _settings(benchmark: Benchmark, name: str, pipeline: Pipeline, renderer: str
         **benchmark.settings(),
         "protocol": str(benchmark.protocol),
         "preset": name,
-        "pipeline": pipeline.posed(benchmark.protocol.pose).describe(),
+        "pipeline": pipeline.with_pose_prior(benchmark.protocol.pose).describe(),
         "renderer": renderer,
         "version": __version__,
         "code": code_digest(),

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..data import Pascal3DPlus
 from ..geometry import rotation_error, viewpoint_from_rotation
 from ..metrics import AVP_BINS, accuracy, axis_rotation_error, binned_accuracy, median_error, symmetric_rotation_error
-from .benchmark import Benchmark, Item, Row
+from .benchmark import Benchmark, BenchmarkItem, Row
 from .protocol import Protocol
 from .scores import estimated_rotations, or_inf, viewpoint_scores, write_viewpoints
 
@@ -55,10 +55,10 @@ class Pascal3DBenchmark(Benchmark):
         self._meshes = cache(lambda category: tuple(sorted((dataset.root / "CAD" / category).glob("*.off"))))
         super().__init__(dataset, protocol)
 
-    def item(self, index: int) -> Item:
+    def item(self, index: int) -> BenchmarkItem:
         sample = self.dataset.annotation(index)
         annotated = (Path(sample["cad_path"]),)
-        return Item(
+        return BenchmarkItem(
             key=f"{sample['category']}/{sample['image_id']}/{sample['object_index']}",
             index=index,
             meshes=annotated if self.protocol.cad == "annotated" else self._meshes(sample["category"]),
@@ -69,13 +69,13 @@ class Pascal3DBenchmark(Benchmark):
     def settings(self) -> Row:
         return {**super().settings(), "part": self.dataset.part, "pixel_origin": self.dataset._pixel_origin}
 
-    def rotation_errors(self, items: list[Item], rows: list[Row]) -> Tensor:
+    def rotation_errors(self, items: list[BenchmarkItem], rows: list[Row]) -> Tensor:
         return self._judged(items, rows)[4]
 
-    def easy(self, item: Item) -> bool:
+    def easy(self, item: BenchmarkItem) -> bool:
         return not any(self.dataset.annotation(item.index)[flag] for flag in FLAGS)
 
-    def summary(self, items: list[Item], rows: list[Row]) -> Row:
+    def summary(self, items: list[BenchmarkItem], rows: list[Row]) -> Row:
         """Acc(pi/6), Acc(pi/18), MedErr: of all, of subsets, of each class, and up to the symmetries of the classes."""
         samples, R, truth, plain, symmetric = self._judged(items, rows)
 
@@ -102,12 +102,12 @@ class Pascal3DBenchmark(Benchmark):
             },
         }
 
-    def write_predictions(self, path: Path, items: list[Item], rows: list[Row]) -> None:
+    def write_predictions(self, path: Path, items: list[BenchmarkItem], rows: list[Row]) -> None:
         """One line per object: what was estimated, what is true, and the error."""
         samples, _, _, plain, symmetric = self._judged(items, rows)
         write_viewpoints(path, COLUMNS, samples, rows, {"error_deg": plain, "symmetric_error_deg": symmetric})
 
-    def _judged(self, items: list[Item], rows: list[Row]) -> tuple[list[Row], Tensor, Tensor, Tensor, Tensor]:
+    def _judged(self, items: list[BenchmarkItem], rows: list[Row]) -> tuple[list[Row], Tensor, Tensor, Tensor, Tensor]:
         """Annotations, estimated and true rotations (N, 3, 3), and their errors (N,) without and with symmetries."""
         samples = [self.dataset.annotation(item.index) for item in items]
         R = estimated_rotations(rows)

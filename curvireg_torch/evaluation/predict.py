@@ -18,9 +18,9 @@ from ..io.meshes.files import mesh_digest
 from ..matching import ViewBank, ViewMatcher, cached_bank
 from ..pipeline import Pipeline
 from ..registration import Registrar
-from ..registration.inputs import Item as Photograph
+from ..registration.inputs import ImageItem as Photograph
 from ..utils.files import file_digest
-from .benchmark import Benchmark, Item, Row
+from .benchmark import Benchmark, BenchmarkItem, Row
 from .estimate import FusedMatcher, estimate_poses
 from .protocol import Protocol, perturbed_box
 from .store import PredictionStore
@@ -33,7 +33,7 @@ BATCH = 8
 
 def predict(
     benchmark: Benchmark,
-    items: Sequence[Item],
+    items: Sequence[BenchmarkItem],
     store: PredictionStore,
     pipeline: Pipeline,
     *,
@@ -64,7 +64,7 @@ def predict(
                     bar.update()
 
 
-def input_digests(benchmark: Benchmark, items: Sequence[Item]) -> dict[str, dict[str, str]]:
+def input_digests(benchmark: Benchmark, items: Sequence[BenchmarkItem]) -> dict[str, dict[str, str]]:
     """By the items' keys: what each prediction rests on, in short texts that differ where it does.
 
     Photographs and meshes, with all the files that a mesh consists of, are told by digests of their content; box and
@@ -86,7 +86,7 @@ def _digits(numbers: Tensor) -> str:
     return " ".join(map(repr, numbers.flatten().tolist()))
 
 
-def _is_done(store: PredictionStore, item: Item, digests: dict[str, str]) -> bool:
+def _is_done(store: PredictionStore, item: BenchmarkItem, digests: dict[str, str]) -> bool:
     if item.key not in store:
         return False
     row = store.read(item.key)
@@ -104,7 +104,7 @@ class _Workshop:
     meshes: tuple[Path, ...] = ()
     registrar: Registrar | None = None
 
-    def rows(self, items: Sequence[Item]) -> list[Row]:
+    def rows(self, items: Sequence[BenchmarkItem]) -> list[Row]:
         """Rows of items of the same meshes."""
         protocol = self.benchmark.protocol
         rows: dict[str, Row] = {}
@@ -146,7 +146,7 @@ class _Workshop:
     def _registrar(self, meshes: tuple[Path, ...], protocol: Protocol) -> Registrar:
         if self.registrar is None or meshes != self.meshes:
             self.meshes, self.registrar = (), None  # the memory goes before more is asked for
-            pipeline = self.pipeline.posed(protocol.pose)
+            pipeline = self.pipeline.with_pose_prior(protocol.pose)
             banks = [
                 cached_bank(
                     load_mesh(path, unit=self.benchmark.unit), pipeline=pipeline, renderer=self.renderer, progress=False

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .benchmark import Benchmark
 
-__all__ = ["KINDS", "Kind"]
+__all__ = ["DATASETS", "DatasetSpec"]
 
 
 @dataclass(frozen=True)
-class Kind:
+class DatasetSpec:
     """A kind of dataset.
 
     Attributes:
@@ -64,8 +64,8 @@ class Kind:
         return found
 
 
-KINDS = {
-    "pascal3d": Kind(
+DATASETS = {
+    "pascal3d": DatasetSpec(
         dataset="Pascal3DPlus",
         benchmark="Pascal3DBenchmark",
         help="viewpoints on PASCAL3D+",
@@ -86,7 +86,7 @@ KINDS = {
         },
         whole={"occluded": False, "truncated": False},
     ),
-    "bop": Kind(
+    "bop": DatasetSpec(
         dataset="BOPDataset",
         benchmark="BOPBenchmark",
         help="6D poses on a BOP set",
@@ -96,7 +96,7 @@ KINDS = {
         mesh="model_path",
         options={"split": {"default": "test", "help": "folder of the scenes (default: test)"}},
     ),
-    "web": Kind(
+    "web": DatasetSpec(
         dataset="WebCollection",
         benchmark="WebBenchmark",
         help="viewpoints on a collection of your own",

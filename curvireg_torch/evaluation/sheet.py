@@ -12,9 +12,9 @@ from ..io import read_image
 from ..io.meshes import load_mesh
 from ..rendering import make_renderer
 from ..visualization.sheet import Shown, thumbnail, write_sheet
-from .benchmark import Benchmark, Item, Row
+from .benchmark import Benchmark, BenchmarkItem, Row
 from .protocol import Protocol, perturbed_box
-from .registry import KINDS
+from .registry import DATASETS
 from .store import PredictionStore
 
 __all__ = ["contact_sheet"]
@@ -76,7 +76,7 @@ def _opened(store: PredictionStore) -> Benchmark:
     """The benchmark that an evaluation's settings name."""
     settings = store.read("settings")
     try:
-        kind = KINDS[settings["dataset"]]
+        kind = DATASETS[settings["dataset"]]
         options = {name: settings[name] for name in kind.options if name in settings}
         dataset = kind.open(settings["root"], **options)
         return kind.scored(dataset, Protocol.parse(settings["protocol"].split(), pose=kind.pose))
@@ -105,8 +105,8 @@ def _kind(row: Row, error: float, within_deg: float) -> str:
     return "right" if error < within_deg else "wrong"
 
 
-def _picture(benchmark: Benchmark, item: Item, row: Row) -> bytes | None:
-    """The thumbnail; None of what failed, has no picture any more, or was evaluated before ``seen_by`` was kept."""
+def _picture(benchmark: Benchmark, item: BenchmarkItem, row: Row) -> bytes | None:
+    """The thumbnail; None of what failed, has no picture any more, or was evaluated before ``projection`` was kept."""
     if "seen_by" not in row:
         return None
     T, K = (torch.tensor(matrix, dtype=torch.float64) for matrix in row["seen_by"])

@@ -8,7 +8,7 @@ from torch import Tensor
 from ..data import WebCollection
 from ..errors import InvalidInputError
 from ..geometry import rotation_error
-from .benchmark import Benchmark, Item, Row
+from .benchmark import Benchmark, BenchmarkItem, Row
 from .protocol import Protocol
 from .scores import estimated_rotations, or_inf, viewpoint_scores, write_viewpoints
 
@@ -43,9 +43,9 @@ class WebBenchmark(Benchmark):
             raise InvalidInputError(f"protocol: every object has its mesh, so cad=annotated; got cad={protocol.cad}")
         super().__init__(dataset, protocol)
 
-    def item(self, index: int) -> Item:
+    def item(self, index: int) -> BenchmarkItem:
         s = self.dataset.annotation(index)
-        return Item(
+        return BenchmarkItem(
             key=f"{s['category']}/{s['object_index']}",
             index=index,
             meshes=(Path(s["mesh_path"]),),
@@ -53,7 +53,7 @@ class WebBenchmark(Benchmark):
             camera_matrix=None,
         )
 
-    def rotation_errors(self, items: list[Item], rows: list[Row]) -> Tensor:
+    def rotation_errors(self, items: list[BenchmarkItem], rows: list[Row]) -> Tensor:
         """(N,) float64 degrees, ``inf`` for a miss, NaN where the truth is unknown; symmetries are not known."""
         R = estimated_rotations(rows)
         truth = torch.cat([torch.empty(0, 3, 3), *(self.dataset.annotation(i.index)["rotation"][None] for i in items)])
@@ -63,11 +63,11 @@ class WebBenchmark(Benchmark):
         errors[known] = or_inf(rotation_error(R[known], truth[known]), R[known])
         return errors
 
-    def easy(self, item: Item) -> bool:
+    def easy(self, item: BenchmarkItem) -> bool:
         """True: a collection does not say what is hidden."""
         return True
 
-    def summary(self, items: list[Item], rows: list[Row]) -> Row:
+    def summary(self, items: list[BenchmarkItem], rows: list[Row]) -> Row:
         """Shares within 15 and 30 degrees and the median error of what has a known pose; the rest by its confidence."""
         errors = self.rotation_errors(items, rows)
         groups = [str(self.dataset.annotation(item.index)["category"]) for item in items]
@@ -90,7 +90,7 @@ class WebBenchmark(Benchmark):
             "per_object": {name: scores_of([g == name for g in groups]) for name in sorted(set(groups))},
         }
 
-    def write_predictions(self, path: Path, items: list[Item], rows: list[Row]) -> None:
+    def write_predictions(self, path: Path, items: list[BenchmarkItem], rows: list[Row]) -> None:
         """One line per object: what was estimated and, where it is known, what is true."""
         samples = [self.dataset.annotation(item.index) for item in items]
         write_viewpoints(path, COLUMNS, samples, rows, {"error_deg": self.rotation_errors(items, rows)})

@@ -40,8 +40,8 @@ class ViewBank:
         points, silhouettes: (N, S, S) bool, unpacked on demand; :meth:`points_at` and :meth:`silhouettes_at` unpack a
             few views at a time, which a large bank asks for.
         boxes: (N, 4) float64 boxes of the object in normalised image coordinates, centre of the object on the axis.
-        late: features of the views by the name of their :class:`LateTerm`, (N, D) float16; none in a large bank. Of
-            meshes with colours grey and coloured features one after the other.
+        late: features of the views by the name of their :class:`RerankingTerm`, (N, D) float16; none in a large bank.
+            Meshes with colours have grey and coloured features one after the other.
     """
 
     def __init__(
@@ -171,14 +171,14 @@ class ViewBank:
         if views is None:
             views = pipeline.views.sphere(mesh_up(mesh))
         elif len(views) != 0:
-            pipeline = pipeline.posed("given")
+            pipeline = pipeline.with_pose_prior("given")
         if len(views) == 0:
             raise InvalidInputError("views: expected at least one viewpoint")
         if chunk_size < 1:
             raise InvalidInputError(f"chunk_size: expected >= 1, got {chunk_size}")
         describe = ViewDescriber(mesh, settings, renderer=renderer, device=device)
         rotations, distances = views.rotations, views.distance * mesh_radius(mesh)
-        late = {t.name: t.over(None).to(device) for t in pipeline.late_terms(len(views))}
+        late = {t.name: t.build(None).to(device) for t in pipeline.reranking_terms(len(views))}
 
         def chunk(start: int) -> dict[str, Tensor]:
             some = rotations[start : start + chunk_size], distances[start : start + chunk_size]

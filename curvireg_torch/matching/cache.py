@@ -93,7 +93,7 @@ def bank_key(
     renderer: str = "auto",
 ) -> str:
     """Digest in hexadecimal: mesh (colours, unit and up too), views, settings, renderer, code that describes views."""
-    made = _settled(pipeline, settings).made(len(views))
+    made = _settled(pipeline, settings).bank_key_fields(len(views))
     facts = [FORMAT_VERSION, made, mesh_unit(mesh), mesh_up(mesh), renderer]
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     digest.update(_code_digest())
@@ -149,7 +149,7 @@ def cached_bank(
     folder = folder or cache_folder()
     pipeline = pipeline or Pipeline()
     if views is not None:
-        pipeline = pipeline.posed("given")
+        pipeline = pipeline.with_pose_prior("given")
     views = pipeline.views.sphere(mesh_up(mesh)) if views is None else views
     pipeline = _settled(pipeline, settings)
     build_options |= {"views": views, "pipeline": pipeline, "renderer": renderer, "device": device}

@@ -15,13 +15,13 @@ from ..io.meshes.colours import has_colours
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..terms import (
-    LateModule,
-    LateTerm,
-    Photographs,
+    QueryFeatures,
+    RerankingModule,
+    RerankingTerm,
     Whitening,
     crop_regions,
+    jittered_boxes,
     photograph_field,
-    slack_boxes,
     whole_box_shapes,
 )
 from ..terms.correlation import Correlated
@@ -107,9 +107,9 @@ class ViewMatcher(nn.Module):
             be those of the bank, whose views may also have come with the call.
         field: photograph filter (B, 1, S, S) -> (B, 2, S, S) of one's own. One with an attribute ``colour = True`` gets
             colour photographs as (B, 3, S, S).
-        slack: instead of the pipeline's.
+        box_jitter: instead of the pipeline's.
         whitening: compare whitened descriptors (:class:`DescriptorStatistics`), whatever the term "hog" says.
-        renderer: of views that a :class:`LateTerm` asks for.
+        renderer: of views that a :class:`RerankingTerm` asks for.
         chunk_size: photographs in memory at a time.
 
     Raises:
@@ -131,7 +131,7 @@ class ViewMatcher(nn.Module):
         *,
         pipeline: Pipeline | None = None,
         field: nn.Module | None = None,
-        slack: float | None = None,
+        box_jitter: float | None = None,
         whitening: Whitening | None = None,
         renderer: str | DepthRenderer = "auto",
         chunk_size: int = 16,
@@ -140,8 +140,8 @@ class ViewMatcher(nn.Module):
         pipeline = bank.pipeline if pipeline is None else pipeline
         bank.check_made_for(pipeline)
         pipeline = replace(pipeline, views=bank.pipeline.views)  # "given" where they came with the call
-        if slack is not None:
-            pipeline = replace(pipeline, slack=slack)
+        if box_jitter is not None:
+            pipeline = replace(pipeline, box_jitter=box_jitter)
         if chunk_size < 1:
             raise InvalidInputError(f"chunk_size: expected >= 1, got {chunk_size}")
         self.bank, self.chunk_size, self._renderer = bank, chunk_size, renderer
@@ -149,7 +149,7 @@ class ViewMatcher(nn.Module):
         self.pipeline = pipeline if field is None else pipeline.with_field(field)
         self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
         self.descriptor = hog_layer(bank.settings)
-        self._comparisons = nn.ModuleDict({term.name: term.over(bank) for term in pipeline.terms}).to(bank.device)
+        self._comparisons = nn.ModuleDict({term.name: term.build(bank) for term in pipeline.terms}).to(bank.device)
         if whitening is not None:
             self._comparisons["hog"] = Correlated(bank.descriptors, whitening)
 
@@ -182,27 +182,27 @@ class ViewMatcher(nn.Module):
         ]
         return Ranking.cat(parts)
 
-    def query(self, images: Tensor | Sequence[Tensor], boxes: Any) -> Photographs:
+    def query(self, images: Tensor | Sequence[Tensor], boxes: Any) -> QueryFeatures:
         """Crop and describe photographs, see :meth:`forward`; missing pixels are refused by :meth:`rank`."""
         settings = self.bank.settings
         boxes = as_boxes(boxes, len(images)).to(self.device, torch.float32)
         for image in images:
             check_photograph(image)
         images = [image.to(self.device) for image in images]
-        several = slack_boxes(boxes, self.pipeline.slack)
+        several = jittered_boxes(boxes, self.pipeline.box_jitter)
         regions = crop_regions(images, several, size=settings.image_size, margin=settings.margin)
         return self.describe(regions, whole_box_shapes(boxes, [(int(i.shape[-2]), int(i.shape[-1])) for i in images]))
 
-    def features(self, crops: Tensor) -> Photographs:
+    def features(self, crops: Tensor) -> QueryFeatures:
         """Describe (B, 1 or 3, S, S) crops that :meth:`crop` cut: boxes taken as they are, their shapes unknown."""
         return self.describe(crops[:, None], torch.full_like(crops[:, 0, 0, 0], torch.nan))
 
-    def describe(self, regions: Tensor, shapes: Tensor) -> Photographs:
+    def describe(self, regions: Tensor, shapes: Tensor) -> QueryFeatures:
         """Field, descriptors and points of (B, K, C, S, S) crops; ``shapes`` (B,) of the boxes."""
         B, K = regions.shape[:2]
         field = photograph_field(self.field, regions.flatten(0, 1))
-        points = field_points(field, share=self.bank.settings.point_share)[:, 0]
-        return Photographs(
+        points = field_points(field, share=self.bank.settings.point_fraction)[:, 0]
+        return QueryFeatures(
             regions=regions,
             field=field.unflatten(0, (B, K))[:, 0],
             descriptors=self.descriptor(field).unflatten(0, (B, K)),
@@ -210,23 +210,23 @@ class ViewMatcher(nn.Module):
             shapes=shapes.to(regions),
         )
 
-    def rank(self, query: Photographs) -> Ranking:
+    def rank(self, query: QueryFeatures) -> Ranking:
         """Compare described photographs with all views.
 
         Raises:
             ImageError: missing pixels in the crop of a box, or pixels outside [0, 1].
         """
         check_pixels(query.crops, "of the box")
-        early = [t for t in self.pipeline.terms if not isinstance(t, LateTerm)]
+        early = [t for t in self.pipeline.terms if not isinstance(t, RerankingTerm)]
         terms = {t.name: self._comparisons[t.name](query) for t in early}
         log = torch.stack([t.weight * t.log_score(terms[t.name]) for t in early]).sum(dim=0)
-        for late in (t for t in self.pipeline.terms if isinstance(t, LateTerm)):
+        for late in (t for t in self.pipeline.terms if isinstance(t, RerankingTerm)):
             terms[late.name], score = self._asked_late(late, query, log)
             log = log + late.weight * score
         scores = log.exp()
         return Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), terms)
 
-    def _asked_late(self, term: LateTerm, query: Photographs, log: Tensor) -> tuple[Tensor, Tensor]:
+    def _asked_late(self, term: RerankingTerm, query: QueryFeatures, log: Tensor) -> tuple[Tensor, Tensor]:
         """(B, N) raw scores, NaN for views that were not compared; and log scores of all views."""
         raw, score = torch.full_like(log, torch.nan), torch.zeros_like(log)
         if len(log) == 0:
@@ -246,9 +246,9 @@ class ViewMatcher(nn.Module):
             score[b] = term.log_score(raw[b : b + 1, index])[0, alike.argmax(dim=1)]
         return raw, score
 
-    def _late(self, name: str) -> LateModule:
+    def _late(self, name: str) -> RerankingModule:
         module = self._comparisons[name]
-        assert isinstance(module, LateModule)
+        assert isinstance(module, RerankingModule)
         return module
 
     def _features(self, name: str, views: Tensor) -> Tensor:
@@ -273,10 +273,10 @@ class ViewMatcher(nn.Module):
         found.update(new)
         return torch.stack([found[view] for view in views.tolist()])
 
-    def late_score(
-        self, name: str, query: Photographs, ranking: Ranking, pictures: Tensor, photograph: Tensor
+    def reranking_score(
+        self, name: str, query: QueryFeatures, ranking: Ranking, pictures: Tensor, photograph: Tensor
     ) -> Tensor:
-        """(H,) float64 log scores by a :class:`LateTerm` of pictures of poses, as if they were views of the ranking.
+        """(H,) float64 log scores of pictures of poses by a :class:`RerankingTerm`, as if they were ranked views.
 
         Args:
             name: of the term.

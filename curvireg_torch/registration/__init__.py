@@ -5,19 +5,19 @@ from .confidence import RELIABLE, confidence, ranking_evidence
 from .contour import ContourFit, fit_contours
 from .hypotheses import Hypotheses, hypotheses
 from .localization import Located, Locator, locate, representative_views
-from .localization.localize import find
-from .pose import FailedRegistration, Found, Hypothesis, Registration
+from .localization.localize import localize
+from .pose import FailedRegistration, Hypothesis, Localization, Registration
 from .registrar import Registrar
+from .rescoring import rescore
 from .search import coherent_views, search
-from .verify import verdict
 
 __all__ = [
     "RELIABLE",
     "ContourFit",
     "FailedRegistration",
-    "Found",
     "Hypotheses",
     "Hypothesis",
+    "Localization",
     "Located",
     "Locator",
     "Registrar",
@@ -25,12 +25,12 @@ __all__ = [
     "coherent_views",
     "confidence",
     "distinct_views",
-    "find",
     "fit_contours",
     "hypotheses",
+    "localize",
     "locate",
     "ranking_evidence",
     "representative_views",
+    "rescore",
     "search",
-    "verdict",
 ]

@@ -13,18 +13,18 @@ from torch import Tensor
 
 from ..matching import Ranking
 from .calibration import CALIBRATION
-from .verify import EVIDENCE
+from .rescoring import POSE_FEATURES
 
 __all__ = [
     "FEATURES",
-    "PRESENCE_EVIDENCE",
+    "PRESENCE_FEATURES",
     "RELIABLE",
     "LogisticModel",
     "confidence",
     "confidence_model",
     "pose_features",
     "presence",
-    "presence_evidence",
+    "presence_features",
     "ranking_evidence",
     "ranking_features",
 ]
@@ -32,14 +32,14 @@ __all__ = [
 RELIABLE = 0.9
 """Confidence below which a registration says "no reliable match"."""
 
-RANKING_EVIDENCE = ("similarity", "margin", "concentration")
+RANKING_FEATURES = ("similarity", "margin", "concentration")
 """What :func:`ranking_evidence` measures, in its order."""
 
-FEATURES = ("similarity", "lead", "support", "appearance_lead", "concentration")
+FEATURES = ("similarity", "lead", "edge_support", "appearance_lead", "concentration")
 """What the confidence in a pose that was followed to its end rests on, see :func:`pose_features`."""
 
-PRESENCE_EVIDENCE = ("place", "similarity")
-"""What :func:`presence_evidence` measures, in its order; similarity alone where nothing was learnt."""
+PRESENCE_FEATURES = ("place", "similarity")
+"""What :func:`presence_features` measures, in its order; similarity alone where nothing was learnt."""
 
 _PRESENCE = {2: ((1.128, 7.819), -16.897), 1: ((16.756,), -14.856)}
 """Logistic regressions on mosaics of photographs of textured meshes, by scripts/bench_location.py: weights and bias for
@@ -98,7 +98,7 @@ def confidence_model(stage: str, *, with_camera: bool, with_appearance: bool) ->
 def ranking_evidence(
     ranking: Ranking, rotations: Tensor, *, answer: Tensor | None = None, symmetries: Tensor | None = None
 ) -> Tensor:
-    """(B, 3) numbers that tell right answers from wrong ones, by the names in ``RANKING_EVIDENCE``.
+    """(B, 3) numbers that tell right answers from wrong ones, by the names in ``RANKING_FEATURES``.
 
     similarity: normalised correlation of the answer's view, in [0, 1]. margin: how far its score leads the best view
     more than 30 degrees away, log S - log S', within +-5. concentration: of the sum of S^4 over all views, the share
@@ -129,7 +129,7 @@ def ranking_evidence(
 
 def ranking_features(evidence: Tensor) -> dict[str, float | None]:
     """Features of one ranking, from (3,) :func:`ranking_evidence`; None for what could not be compared."""
-    known = zip(RANKING_EVIDENCE, evidence.tolist(), strict=True)
+    known = zip(RANKING_FEATURES, evidence.tolist(), strict=True)
     return {name: None if math.isnan(value) else value for name, value in known}
 
 
@@ -159,22 +159,22 @@ def confidence(ranking: Ranking, rotations: Tensor, *, symmetries: Tensor | None
 def pose_features(evidence: Tensor, verdicts: Tensor, concentration: float | None) -> dict[str, float | None]:
     """Features of the best of the hypotheses that were followed for one photograph, by the names in ``FEATURES``.
 
-    similarity and support: of the best one. lead: how far it leads its best rival in :func:`verdict`;
+    similarity and support: of the best one. lead: how far it leads its best rival in :func:`rescore`;
     appearance_lead: how much more it looks like the photograph than any rival. Leads are at most 5, and None where
     there is no rival. concentration: of the ranking, see :func:`ranking_evidence`.
 
     Args:
-        evidence: (H, 4) of the hypotheses, see :data:`EVIDENCE`, the best first.
+        evidence: (H, 4) of the hypotheses, see :data:`POSE_FEATURES`, the best first.
         verdicts: (H,) of the same.
         concentration: of the ranking.
     """
-    best = dict(zip(EVIDENCE, evidence[0].tolist(), strict=True))
-    looks = evidence[:, EVIDENCE.index("appearance")]
+    best = dict(zip(POSE_FEATURES, evidence[0].tolist(), strict=True))
+    appearance_scores = evidence[:, POSE_FEATURES.index("appearance")]
     return {
         "similarity": best["similarity"],
         "lead": _lead(verdicts),
-        "support": best["support"],
-        "appearance_lead": _lead(looks),
+        "edge_support": best["edge_support"],
+        "appearance_lead": _lead(appearance_scores),
         "concentration": concentration,
     }
 
@@ -184,8 +184,8 @@ def _lead(values: Tensor) -> float | None:
     return float((values[0] - values[1:].max()).clamp(-MARGIN, MARGIN)) if len(values) > 1 else None
 
 
-def presence_evidence(score: float, ranking: Ranking, *, pictures: bool) -> list[float]:
-    """Numbers that tell whether the object is there at all (``PRESENCE_EVIDENCE``).
+def presence_features(score: float, ranking: Ranking, *, pictures: bool) -> list[float]:
+    """Numbers that tell whether the object is there at all (``PRESENCE_FEATURES``).
 
     Args:
         score: of the locator for the box.
@@ -197,7 +197,7 @@ def presence_evidence(score: float, ranking: Ranking, *, pictures: bool) -> list
 
 
 def presence(evidence: Sequence[float]) -> float:
-    """Probability that the photograph shows the object where its pose was found, from :func:`presence_evidence`.
+    """Probability that the photograph shows the object where its pose was found, from :func:`presence_features`.
 
     Example:
         >>> presence([8.0, 0.9]) > presence([4.0, 0.6])
@@ -206,6 +206,6 @@ def presence(evidence: Sequence[float]) -> float:
         True
     """
     weights, bias = _PRESENCE[len(evidence)]
-    names = PRESENCE_EVIDENCE[-len(evidence) :]
+    names = PRESENCE_FEATURES[-len(evidence) :]
     model = LogisticModel(dict(zip(names, weights, strict=True)), bias)
     return model(dict(zip(names, evidence, strict=True)))

@@ -65,7 +65,7 @@ class ContourFit:
 
     transform: Tensor
     covariance: Tensor
-    support: Tensor
+    edge_support: Tensor
     start_support: Tensor
     observable: Tensor
     matched: Tensor
@@ -79,7 +79,7 @@ class ContourFit:
         Support of at least 0.5, or at least 0.2 more than the start had. Contours of *another* object of the kind gain
         less: there the start's rotation is as good as the fit's.
         """
-        return (self.support >= SUPPORTED) | (self.support - self.start_support >= GAINED)
+        return (self.edge_support >= SUPPORTED) | (self.edge_support - self.start_support >= GAINED)
 
 
 @torch.no_grad()
@@ -163,21 +163,23 @@ def fit_contours(
     K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ full.K
     half = Views(renderer, EdgeField(F.avg_pool2d(crops, 2)), photograph, K, SIZE // 2, centre, radius)
     start = half.seen(T0)
-    before = half.support(start)
+    before = half.edge_support(start)
     first = half.descend(start, FIRST)
-    support = half.support(first)
-    tried = torch.ones(N, dtype=torch.bool) if finish is None else _among_best(support, photograph, finish)
+    edge_support = half.edge_support(first)
+    tried = torch.ones(N, dtype=torch.bool) if finish is None else _among_best(edge_support, photograph, finish)
     index, others = tried.nonzero()[:, 0], (~tried).nonzero()[:, 0]
-    of, T = _around(half.of(index), T0[index], first[index], support[index])
+    of, T = _around(half.of(index), T0[index], first[index], edge_support[index])
     # The starts, and what was only begun with, as they are. Of equals the first wins.
     owner = torch.cat([index, others, index[of]])
-    still = torch.cat([T0[index], torch.where((support > before)[others, None, None], first.T[others], T0[others])])
+    still = torch.cat(
+        [T0[index], torch.where((edge_support > before)[others, None, None], first.T[others], T0[others])]
+    )
     as_they_are, two = full.of(owner[: len(still)]), full.of(index[of])
     seen = Seen.cat([as_they_are.seen(still), two.descend(two.seen(T), FINE)])
-    support = full.of(owner).support(seen)
-    before[index] = support[: len(index)]
-    best = torch.where(owner == torch.arange(N)[:, None], support, -1.0).argmax(dim=1)
-    seen, support = seen[best], support[best]
+    edge_support = full.of(owner).edge_support(seen)
+    before[index] = edge_support[: len(index)]
+    best = torch.where(owner == torch.arange(N)[:, None], edge_support, -1.0).argmax(dim=1)
+    seen, edge_support = seen[best], edge_support[best]
     found = full.matches(seen, FINE[-1])
     covariance, observable = pose_covariance(found, seen.points, seen.T, full.K, centre, radius=radius)
     weight = found.weight[..., 0]
@@ -185,7 +187,7 @@ def fit_contours(
     return ContourFit(
         transform=seen.T,
         covariance=covariance,
-        support=support,
+        edge_support=edge_support,
         start_support=before,
         observable=observable,
         matched=(weight > 0).sum(dim=1) / seen.points.valid.sum(dim=1).clamp(min=1),
@@ -216,7 +218,7 @@ def contour_support(
         return torch.zeros(0, dtype=torch.float64)
     centre = centre.detach().cpu().double()
     _, views = _full_size(renderer, images, boxes, K, photograph, centre, radius, margin)
-    return views.support(views.seen(poses.detach().cpu().double()))
+    return views.edge_support(views.seen(poses.detach().cpu().double()))
 
 
 def _full_size(
@@ -236,7 +238,7 @@ def _full_size(
     return crops, Views(renderer, EdgeField(crops), photograph, A.double()[photograph] @ K, SIZE, centre, radius)
 
 
-def _around(half: Views, T0: Tensor, first: Seen, support: Tensor) -> tuple[Tensor, Tensor]:
+def _around(half: Views, T0: Tensor, first: Seen, edge_support: Tensor) -> tuple[Tensor, Tensor]:
     """Poses at half size from what the first rounds made of starts ``T0``, (N, 4, 4), and make of four turns of each:
     the best of five, and the next best that is another pose. Returns which start each belongs to, and the poses."""
     N, every = len(T0), torch.arange(len(T0))
@@ -244,7 +246,7 @@ def _around(half: Views, T0: Tensor, first: Seen, support: Tensor) -> tuple[Tens
     turns[:, :2] = torch.deg2rad(TURN * torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]))
     views = half.of(every.repeat_interleave(4))
     turned = views.descend(views.seen(moved(T0.repeat_interleave(4, 0), turns.repeat(N, 1), half.centre)), FIRST)
-    supports = torch.cat([support[:, None], views.support(turned).view(-1, 4)], dim=1)
+    supports = torch.cat([edge_support[:, None], views.edge_support(turned).view(-1, 4)], dim=1)
     five = torch.cat([every[:, None], N + torch.arange(4 * N).view(-1, 4)], dim=1)
     seen, best = Seen.cat([first, turned]), supports.argmax(dim=1)
     other, reference = seen[five.flatten()], seen[five[every, best].repeat_interleave(5)]
@@ -255,10 +257,12 @@ def _around(half: Views, T0: Tensor, first: Seen, support: Tensor) -> tuple[Tens
     return owner, half.of(owner).descend(seen[chosen], SECOND).T
 
 
-def _among_best(support: Tensor, photograph: Tensor, count: int) -> Tensor:
+def _among_best(edge_support: Tensor, photograph: Tensor, count: int) -> Tensor:
     """(N,) whether fewer than ``count`` other starts of the same photograph have more support."""
-    order = torch.arange(len(support))
-    ahead = (support > support[:, None]) | ((support == support[:, None]) & (order < order[:, None]))
+    order = torch.arange(len(edge_support))
+    ahead = (edge_support > edge_support[:, None]) | (
+        (edge_support == edge_support[:, None]) & (order < order[:, None])
+    )
     return (ahead & (photograph == photograph[:, None])).sum(dim=1) < count
 
 

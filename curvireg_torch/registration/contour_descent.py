@@ -145,7 +145,7 @@ class Views:
         share = torch.minimum(MAX_TURN / turn, MAX_SHIFT * z / shift).clamp(max=1.0)
         return step * share[:, None]
 
-    def support(self, seen: Seen) -> Tensor:
+    def edge_support(self, seen: Seen) -> Tensor:
         """(N,) mean strength of the edges within about 1 px of the contour points."""
         points = seen.points
         uv = pixels(points.model, seen.T, self.K, self.centre)

@@ -10,13 +10,13 @@ from torch import Tensor
 from ..errors import CurviregError
 from ..geometry.cameras import projected_boxes
 from ..geometry.crops import box_iou
-from .inputs import Item
+from .inputs import ImageItem
 from .pose import FailedRegistration, Registration
 
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-__all__ = ["AGREE", "corrected", "posed_box"]
+__all__ = ["AGREE", "corrected", "projected_box"]
 
 AGREE = 0.85
 """Overlap (IoU) from which a box and the one around its pose are taken for the same: boxes drawn by hand had 0.86 or
@@ -25,7 +25,7 @@ more on 60 generated photographs, see docs/method.md."""
 Results = Sequence[Registration | FailedRegistration]
 
 
-def corrected(registrar: "Registrar", items: Sequence[Item | CurviregError], results: Results) -> Results:
+def corrected(registrar: "Registrar", items: Sequence[ImageItem | CurviregError], results: Results) -> Results:
     """The better of each answer and of what the box around its pose leads to, where that is another than its own.
 
     The better is the one whose view is more like the photograph. Without a camera matrix poses keep to their boxes, and
@@ -36,20 +36,20 @@ def corrected(registrar: "Registrar", items: Sequence[Item | CurviregError], res
         items: B photographs with their boxes.
         results: of the same.
     """
-    moved: dict[int, Item] = {}
+    moved: dict[int, ImageItem] = {}
     for k, (item, result) in enumerate(zip(items, results, strict=True)):
-        if isinstance(item, Item) and isinstance(result, Registration) and item.camera_matrix is not None:
-            box = posed_box(registrar, result)
+        if isinstance(item, ImageItem) and isinstance(result, Registration) and item.camera_matrix is not None:
+            box = projected_box(registrar, result)
             if _is_another(box, item):
                 moved[k] = replace(item, box=box.float())
     better = list(results)
-    for (k, item), result in zip(moved.items(), registrar.answers([*moved.values()]), strict=True):
+    for (k, item), result in zip(moved.items(), registrar.register_items([*moved.values()]), strict=True):
         if isinstance(result, Registration) and result.score > results[k].score:
             better[k] = replace(result, corrected_box=item.box.double())
     return better
 
 
-def _is_another(box: Tensor, item: Item) -> bool:
+def _is_another(box: Tensor, item: ImageItem) -> bool:
     """Whether a box shows another part of a photograph than the box given with it, and some of it."""
     H, W = item.image.shape[-2:]
     pair = torch.stack([box, item.box.to(box)]).clamp(min=-0.5)
@@ -58,7 +58,7 @@ def _is_another(box: Tensor, item: Item) -> bool:
     return inside and float(box_iou(pair[:1], pair[1:])) < AGREE
 
 
-def posed_box(registrar: "Registrar", result: Registration) -> Tensor:
+def projected_box(registrar: "Registrar", result: Registration) -> Tensor:
     """(4,) float64 box around the pose that was found, px of the photograph."""
-    T, K = result.seen_by
+    T, K = result.projection
     return projected_boxes(registrar.describers[result.model].hull, T[None], K)[0]

@@ -41,7 +41,7 @@ CONVENTIONS = {
     "reliable": f"confidence of at least {RELIABLE:g}; false = no reliable match, the pose is a guess",
     "confidence_features": "what the confidence rests on; lead: how far the best pose leads its best rival, null where "
     "the bank has no rival view, and then little confidence is given",
-    "support": "how strongly edges of the photograph lie under the mesh's contours, 0 to 1",
+    "edge_support": "how strongly edges of the photograph lie under the mesh's contours, 0 to 1",
     "covariance": "of turn (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
     "t_true = t + e; null without a camera, with a guessed one, whose error nobody knows, and where not reliable",
     "squared_radius": "with e = (w, e) the error, e^T covariance^-1 e is below it for that share of reliable answers, "
@@ -77,7 +77,7 @@ def result_document(result: Registration, registrar: Registrar, seconds: Mapping
         "confidence": result.confidence,
         "reliable": result.reliable,
         "confidence_features": dict(result.confidence_features),
-        "support": result.support,
+        "edge_support": result.edge_support,
         "standard_deviations": None
         if deviations is None
         else {"rotation_deg": _known(deviations[0]), "translation": _known(deviations[1])},
@@ -120,10 +120,10 @@ def found_document(results: Sequence[Registration]) -> dict[str, Any]:
     """What is known of objects that were looked for, the surest first.
 
     Args:
-        results: of one photograph, see :func:`curvireg_torch.registration.find`.
+        results: of one photograph, see :func:`curvireg_torch.registration.localize`.
     """
-    placed = [(result, result.found) for result in results if result.found is not None]
-    places = placed[0][1]
+    lift_to_poses = [(result, result.found) for result in results if result.found is not None]
+    places = lift_to_poses[0][1]
     return {
         "presence": places.presence,
         "proposals": [
@@ -137,7 +137,7 @@ def found_document(results: Sequence[Registration]) -> dict[str, Any]:
                 "confidence": result.confidence,
                 **pose_document(result),
             }
-            for result, found in placed
+            for result, found in lift_to_poses
         ],
     }
 

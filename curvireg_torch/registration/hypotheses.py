@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..matching import Ranking, ViewBank, distinct_views
 
-__all__ = ["Hypotheses", "hypotheses", "own_peaks"]
+__all__ = ["Hypotheses", "distinct_mask", "hypotheses"]
 
 SAME = 15.0
 """Degrees within which two hypotheses have become one."""
@@ -62,7 +62,7 @@ def hypotheses(ranking: Ranking, bank: ViewBank, *, count: int, symmetries: Tens
     )
 
 
-def own_peaks(found: Hypotheses, score: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
+def distinct_mask(found: Hypotheses, score: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
     """(H,) bool: False where a hypothesis ended within ``SAME`` degrees of a better one of its photograph.
 
     Args:

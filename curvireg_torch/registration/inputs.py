@@ -21,11 +21,11 @@ from ..utils.checks import (
     check_square_pixels,
 )
 
-__all__ = ["Item", "check_crop", "items_of", "named"]
+__all__ = ["ImageItem", "check_crop", "image_items", "named"]
 
 
 @dataclass(frozen=True)
-class Item:
+class ImageItem:
     """One photograph to register: ``image`` (1 or 3, H, W) float or uint8, ``box`` (4,), ``camera_matrix`` (3, 3).
 
     Raises:
@@ -44,7 +44,9 @@ class Item:
             check_square_pixels(self.camera_matrix)
 
 
-def items_of(images: Tensor | Sequence[Any], boxes: Any, camera_matrices: Any | None) -> list[Item | CurviregError]:
+def image_items(
+    images: Tensor | Sequence[Any], boxes: Any, camera_matrices: Any | None
+) -> list[ImageItem | CurviregError]:
     """Every photograph with its box and camera, or what is wrong with it.
 
     Args:
@@ -63,7 +65,7 @@ def items_of(images: Tensor | Sequence[Any], boxes: Any, camera_matrices: Any | 
     cameras: Sequence[Tensor | None] = [None] * n
     if camera_matrices is not None:
         cameras = list(as_camera_matrices(camera_matrices, n).detach().cpu())
-    out: list[Item | CurviregError] = []
+    out: list[ImageItem | CurviregError] = []
     for i in range(n):
         try:
             out.append(_item(images[i], None if whole else boxes[i].detach().cpu().float(), cameras[i]))
@@ -72,9 +74,9 @@ def items_of(images: Tensor | Sequence[Any], boxes: Any, camera_matrices: Any | 
     return out
 
 
-def _item(image: Any, box: Tensor | None, K: Tensor | None) -> Item:
+def _item(image: Any, box: Tensor | None, K: Tensor | None) -> ImageItem:
     pixels = _pixels(image)
-    return Item(pixels, whole_image_box(pixels).cpu() if box is None else box, K)
+    return ImageItem(pixels, whole_image_box(pixels).cpu() if box is None else box, K)
 
 
 def _pixels(image: Any) -> Tensor:

@@ -13,7 +13,7 @@ from ..geometry.viewpoint import viewpoint_from_rotation
 from ..matching import Ranking
 from .confidence import RELIABLE
 
-__all__ = ["FailedRegistration", "Found", "Hypothesis", "Registration"]
+__all__ = ["FailedRegistration", "Hypothesis", "Localization", "Registration"]
 
 UNKNOWN_TURN = 1.0
 """Radians of standard deviation from which a turn is not known at all."""
@@ -28,7 +28,7 @@ class Hypothesis:
         translation: (3,) float64 in model units, None without a camera matrix.
         score: normalised correlation of the pose's view with the photograph, in [0, 1], on the grid of the search
             (twice as fine as the bank's) or, without search, of the bank.
-        evidence: what the order of hypotheses rests on, by name, see :mod:`curvireg_torch.registration.verify`.
+        evidence: what the order of hypotheses rests on, by name, see :mod:`curvireg_torch.registration.rescoring`.
         allocentric_rotation: (3, 3) float64 of the same view by a camera that looks straight at the object; equal to
             ``rotation`` without a camera matrix.
         distance: of the object's centre in that view, in model units.
@@ -51,10 +51,10 @@ class Hypothesis:
     evidence: Mapping[str, float]
     allocentric_rotation: Tensor
     distance: float
-    seen_by: tuple[Tensor, Tensor]
+    projection: tuple[Tensor, Tensor]
     view: int
     model: int = 0
-    support: float | None = None
+    edge_support: float | None = None
     covariance: Tensor | None = None
 
     @property
@@ -82,7 +82,7 @@ class Hypothesis:
 
 
 @dataclass(frozen=True)
-class Found:
+class Localization:
     """Where an object was found that came without a box.
 
     Attributes:
@@ -124,7 +124,7 @@ class Registration:
     confidence: float
     ranking: Ranking
     confidence_features: Mapping[str, float | None] = field(default_factory=dict)
-    found: Found | None = None
+    found: Localization | None = None
     corrected_box: Tensor | None = None
 
     ok = True
@@ -161,16 +161,16 @@ class Registration:
         return self.hypotheses[0].distance
 
     @property
-    def seen_by(self) -> tuple[Tensor, Tensor]:
-        return self.hypotheses[0].seen_by
+    def projection(self) -> tuple[Tensor, Tensor]:
+        return self.hypotheses[0].projection
 
     @property
     def model(self) -> int:
         return self.hypotheses[0].model
 
     @property
-    def support(self) -> float | None:
-        return self.hypotheses[0].support
+    def edge_support(self) -> float | None:
+        return self.hypotheses[0].edge_support
 
     @property
     def covariance(self) -> Tensor | None:

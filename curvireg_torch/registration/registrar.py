@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ..errors import CurviregError, InvalidInputError
 from ..geometry.views import ViewSphere
-from ..matching import Photographs, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
+from ..matching import QueryFeatures, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..settings import BankSettings
@@ -18,14 +18,14 @@ from ..utils.checks import check_symmetries
 from ..utils.threads import map_on_threads
 from .confidence import confidence_model, pose_features, ranking_evidence, ranking_features
 from .correction import corrected
-from .hypotheses import Hypotheses, hypotheses, own_peaks
-from .inputs import Item, check_crop, items_of, named
+from .hypotheses import Hypotheses, distinct_mask, hypotheses
+from .inputs import ImageItem, check_crop, image_items, named
 from .localization import Locator
-from .localization.localize import find
-from .placing import Poses, follow_contours, placed, supports
+from .localization.localize import localize
 from .pose import FailedRegistration, Hypothesis, Registration
+from .poses import Poses, follow_contours, lift_to_poses, supports
+from .rescoring import POSE_FEATURES, gather_pose_features, rescore, similarities
 from .search import search
-from .verify import EVIDENCE, gathered_evidence, similarities, verdict
 
 __all__ = ["Registrar"]
 
@@ -155,7 +155,7 @@ class Registrar:
         Args:
             images: (B, C, H, W) or a list of (C, H, W) tensors, (H, W, C) arrays or paths, C = 1 or 3, floating in
                 [0, 1] or uint8.
-            boxes: (B, 4) x0, y0, x1, y1 in px; None: the object is looked for, see :func:`find`.
+            boxes: (B, 4) x0, y0, x1, y1 in px; None: the object is looked for, see :func:`localize`.
             camera_matrices: (B, 3, 3) or (3, 3) in px; without them translations are None and rotations are relative to
                 a camera that looks straight at the box.
             distance: without boxes, nearest and farthest that the object's centre may be, in the mesh's unit.
@@ -169,16 +169,16 @@ class Registrar:
             InvalidInputError: not as many boxes or cameras as images, or a ``distance`` beside boxes.
         """
         if boxes is None:
-            return [each[0] for each in find(self, images, camera_matrices, distance=distance)]
+            return [each[0] for each in localize(self, images, camera_matrices, distance=distance)]
         if distance is not None:
             raise InvalidInputError("distance: for objects that are looked for; leave the boxes out, or the distance")
-        items = items_of(images, boxes, camera_matrices)
+        items = image_items(images, boxes, camera_matrices)
         return self.each(items, self._answers_to_boxes)
 
     def each(
         self,
-        items: Sequence[Item | CurviregError],
-        answer: Callable[[Sequence[Item | CurviregError], int], list[Any]],
+        items: Sequence[ImageItem | CurviregError],
+        answer: Callable[[Sequence[ImageItem | CurviregError], int], list[Any]],
     ) -> list[Any]:
         """``answer(some items, number of the first)`` for all items, joined in their order.
 
@@ -197,19 +197,19 @@ class Registrar:
         return [each for part in parts for each in part]
 
     def _answers_to_boxes(
-        self, items: Sequence[Item | CurviregError], first: int
+        self, items: Sequence[ImageItem | CurviregError], first: int
     ) -> list[Registration | FailedRegistration]:
-        answers = self.answers(items, first=first)
-        return list(corrected(self, items, answers)) if self.pipeline.slack and self.pipeline.search else answers
+        answers = self.register_items(items, first=first)
+        return list(corrected(self, items, answers)) if self.pipeline.box_jitter and self.pipeline.search else answers
 
-    def answers(
-        self, items: Sequence[Item | CurviregError], *, first: int = 0
+    def register_items(
+        self, items: Sequence[ImageItem | CurviregError], *, first: int = 0
     ) -> list[Registration | FailedRegistration]:
         """:meth:`register` for photographs that may be unfit, their boxes taken as they are; ``first``: its number."""
         out: list[Registration | FailedRegistration | None] = [
-            None if isinstance(item, Item) else FailedRegistration(item) for item in items
+            None if isinstance(item, ImageItem) else FailedRegistration(item) for item in items
         ]
-        usable = [(i, item) for i, item in enumerate(items) if isinstance(item, Item)]
+        usable = [(i, item) for i, item in enumerate(items) if isinstance(item, ImageItem)]
         if usable:
             query = self.matcher.query(
                 [item.image for _, item in usable], torch.stack([item.box for _, item in usable])
@@ -228,7 +228,9 @@ class Registrar:
         return [result for result in out if result is not None]
 
     @torch.no_grad()
-    def register(self, items: Sequence[Item], query: Photographs, ranking: Ranking | None = None) -> list[Registration]:
+    def register(
+        self, items: Sequence[ImageItem], query: QueryFeatures, ranking: Ranking | None = None
+    ) -> list[Registration]:
         """All stages behind the cropping.
 
         Args:
@@ -236,7 +238,7 @@ class Registrar:
             query: the same, cropped and described by the matcher.
             ranking: of the same; default :meth:`ViewMatcher.rank`.
         """
-        self.tell("ranking")
+        self.report_progress("ranking")
         ranking = self.matcher.rank(query) if ranking is None else ranking
         images = [item.image for item in items]
         boxes = torch.stack([item.box for item in items]).double()
@@ -247,7 +249,7 @@ class Registrar:
         descriptors = self.describers[0].descriptor(query.field)
         found = starts
         if self.pipeline.search:
-            self.tell("search")
+            self.report_progress("search")
             found = search(
                 self.describers,
                 descriptors,
@@ -258,20 +260,20 @@ class Registrar:
                 camera_matrices=K,
                 brief=self.pipeline.contours,
             )
-        poses = placed(self.describers, found, boxes, K)
+        poses = lift_to_poses(self.describers, found, boxes, K)
         if self.pipeline.contours:
-            self.tell("contours")
+            self.report_progress("contours")
             poses = follow_contours(self.describers, images, poses, boxes)
 
         def measured(poses: Poses) -> tuple[Tensor, Tensor]:
             similarity = similarities(self.describers, descriptors, poses.found)
-            return similarity, self._looks(poses.found, query, ranking)
+            return similarity, self._appearance_scores(poses.found, query, ranking)
 
         fit, with_camera = poses.fit, K is not None
-        similarity, looks = measured(poses)
-        support = torch.zeros_like(similarity) if fit is None else fit.support.clone()
-        evidence = gathered_evidence(starts, similarity, support, looks)
-        own = own_peaks(poses.found, verdict(evidence, with_camera=with_camera), symmetries=self.symmetries)
+        similarity, appearance_scores = measured(poses)
+        edge_support = torch.zeros_like(similarity) if fit is None else fit.edge_support.clone()
+        evidence = gather_pose_features(starts, similarity, edge_support, appearance_scores)
+        own = distinct_mask(poses.found, rescore(evidence, with_camera=with_camera), symmetries=self.symmetries)
         kept = own
         if fit is not None and not with_camera:
             # The mesh is often another object of the kind: where its contours do not fit, the view itself errs less.
@@ -279,14 +281,14 @@ class Registrar:
         if not bool(kept.all()):
             # A hypothesis that became another one is still a rival: it returns to the view that it started from, and
             # is measured there.
-            views = placed(self.describers, starts, boxes, K)
+            views = lift_to_poses(self.describers, starts, boxes, K)
             poses, back = poses.where(kept, views), ~kept
-            similarity[back], looks[back] = measured(views[back])
+            similarity[back], appearance_scores[back] = measured(views[back])
             if fit is not None:
-                support[back] = supports(self.describers, images, views[back], boxes)
-            evidence = gathered_evidence(starts, similarity, support, looks)
+                edge_support[back] = supports(self.describers, images, views[back], boxes)
+            evidence = gather_pose_features(starts, similarity, edge_support, appearance_scores)
         poses = replace(poses, found=replace(poses.found, score=similarity))
-        verdicts = verdict(evidence, with_camera=with_camera)
+        verdicts = rescore(evidence, with_camera=with_camera)
         order = (verdicts + torch.where(own, 0.0, -1e6)).argsort(descending=True, stable=True)
         ordered = [order[starts.photograph[order] == b] for b in range(len(items))]
         # Of a pose the calibration knows the ranking's own best view; without contours the answer is a view itself.
@@ -303,37 +305,38 @@ class Registrar:
             if fit is not None:
                 features = pose_features(evidence[mine], verdicts[mine], features["concentration"])
             answers = tuple(
-                _hypothesis(h, poses, support, evidence, with_camera) for h in mine[: self.pipeline.hypotheses].tolist()
+                _hypothesis(h, poses, edge_support, evidence, with_camera)
+                for h in mine[: self.pipeline.hypotheses].tolist()
             )
             results.append(Registration(answers, model(features), ranking[b : b + 1], features))
         return results
 
-    def tell(self, stage: str) -> None:
+    def report_progress(self, stage: str) -> None:
         """Call ``progress`` at the beginning of a stage, where it is a function."""
         if callable(self.progress):
             self.progress(stage, 0, 1)
 
-    def _looks(self, found: Hypotheses, query: Photographs, ranking: Ranking) -> Tensor:
+    def _appearance_scores(self, found: Hypotheses, query: QueryFeatures, ranking: Ranking) -> Tensor:
         """(H,) float64 how much poses look like their photographs; 0 without that term."""
         if "appearance" not in ranking.terms:
             return torch.zeros(len(found), dtype=torch.float64)
         pictures = self.matcher.pictures(found.model, found.rotation, found.distance)
-        return self.matcher.late_score("appearance", query, ranking, pictures, found.photograph)
+        return self.matcher.reranking_score("appearance", query, ranking, pictures, found.photograph)
 
 
-def _hypothesis(h: int, poses: Poses, support: Tensor, evidence: Tensor, with_camera: bool) -> Hypothesis:
+def _hypothesis(h: int, poses: Poses, edge_support: Tensor, evidence: Tensor, with_camera: bool) -> Hypothesis:
     found, T, fit = poses.found, poses.T[h], poses.fit
     known = fit is not None and with_camera and bool(fit.covariance[h].isfinite().all())
     return Hypothesis(
         rotation=T[:3, :3].clone() if with_camera else found.rotation[h].clone(),
         translation=T[:3, 3].clone() if with_camera else None,
         score=float(found.score[h]),
-        evidence=dict(zip(EVIDENCE, evidence[h].tolist(), strict=True)),
+        evidence=dict(zip(POSE_FEATURES, evidence[h].tolist(), strict=True)),
         allocentric_rotation=found.rotation[h].clone(),
         distance=float(found.distance[h]),
-        seen_by=(T.clone(), poses.cameras[h].clone()),
+        projection=(T.clone(), poses.cameras[h].clone()),
         view=int(found.view[h]),
         model=int(found.model[h]),
-        support=None if fit is None else float(support[h]),
+        edge_support=None if fit is None else float(edge_support[h]),
         covariance=fit.covariance[h].clone() if fit is not None and known else None,
     )

@@ -11,7 +11,7 @@ from ..geometry import rotation_error, rotation_from_axis_angle
 from ..geometry.translation import place_view
 from ..matching import Ranking, ViewBank, ViewDescriber
 from .hypotheses import Hypotheses
-from .verify import similarities
+from .rescoring import similarities
 
 __all__ = ["coherent_views", "search"]
 

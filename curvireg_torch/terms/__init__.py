@@ -1,10 +1,10 @@
 """Ranking terms: each compares photographs with views, one file each; the ranking multiplies them."""
 
 from .appearance import Appearance
-from .base import LateModule, LateTerm, Term, Views
+from .base import RerankingModule, RerankingTerm, Term, Views
 from .box_shape import BoxShape, box_shape_score, box_shapes, whole_box_shapes
 from .correlation import Correlation, normalized_correlation, unit_score
-from .photographs import Photographs, crop_regions, photograph_field, slack_boxes
+from .query import QueryFeatures, crop_regions, jittered_boxes, photograph_field
 from .repeatability import Repeatability, dilate_points, repeatability, repeatability_score
 from .whitening import DescriptorStatistics, Whitening
 
@@ -14,10 +14,10 @@ __all__ = [
     "BoxShape",
     "Correlation",
     "DescriptorStatistics",
-    "LateModule",
-    "LateTerm",
-    "Photographs",
+    "QueryFeatures",
     "Repeatability",
+    "RerankingModule",
+    "RerankingTerm",
     "Term",
     "Views",
     "Whitening",
@@ -25,11 +25,11 @@ __all__ = [
     "box_shapes",
     "crop_regions",
     "dilate_points",
+    "jittered_boxes",
     "normalized_correlation",
     "photograph_field",
     "repeatability",
     "repeatability_score",
-    "slack_boxes",
     "unit_score",
     "whole_box_shapes",
 ]

@@ -9,14 +9,14 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..models.appearance import describe, similarity
 from ..models.backbone import SHA256, Backbone
-from .base import LateModule, LateTerm, Views
-from .photographs import Photographs
+from .base import RerankingModule, RerankingTerm, Views
+from .query import QueryFeatures
 
 __all__ = ["Appearance"]
 
 
 @dataclass(frozen=True)
-class Appearance(LateTerm):
+class Appearance(RerankingTerm):
     """S_look: features of an ImageNet network agree, cell by cell, between the photograph's crop and the shaded view.
 
     A mesh with colours of its own is shown twice, shaded grey and in its colours, and what agrees better counts for
@@ -37,8 +37,8 @@ class Appearance(LateTerm):
         if self.weights != SHA256[:16]:
             raise InvalidInputError(f"appearance: made with weights {self.weights}, installed are {SHA256[:16]}")
 
-    def over(self, views: Views | None) -> LateModule:
-        return _Looks()
+    def build(self, views: Views | None) -> RerankingModule:
+        return _AppearanceModule()
 
     def log_score(self, raw: Tensor) -> Tensor:
         spread = raw.std(dim=1, keepdim=True, correction=0)
@@ -46,7 +46,7 @@ class Appearance(LateTerm):
         return (raw - raw.amax(dim=1, keepdim=True)) / spread
 
 
-class _Looks(LateModule):
+class _AppearanceModule(RerankingModule):
     def __init__(self) -> None:
         super().__init__()
         self.backbone = Backbone()
@@ -56,9 +56,9 @@ class _Looks(LateModule):
         ways = [describe(picture, self.backbone) for picture in (grey, colour) if picture.shape[1]]
         return torch.cat(ways, dim=1)
 
-    def compare(self, photographs: Photographs, views: Tensor) -> Tensor:
+    def compare(self, photographs: QueryFeatures, views: Tensor) -> Tensor:
         if Appearance.name not in photographs.late:  # ranking and verdict ask about the same
             photographs.late[Appearance.name] = describe(photographs.crops, self.backbone)
-        looks = photographs.late[Appearance.name]
-        each = similarity(looks[:, None], views.reshape(-1, looks.shape[1]))
-        return each.view(len(looks), len(views), -1).amax(dim=2)
+        appearance_scores = photographs.late[Appearance.name]
+        each = similarity(appearance_scores[:, None], views.reshape(-1, appearance_scores.shape[1]))
+        return each.view(len(appearance_scores), len(views), -1).amax(dim=2)

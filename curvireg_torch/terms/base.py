@@ -9,12 +9,12 @@ from torch import Tensor, nn
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_positive
-from .photographs import Photographs
+from .query import QueryFeatures
 
 if TYPE_CHECKING:
     from ..settings import BankSettings
 
-__all__ = ["LateModule", "LateTerm", "Term", "Views"]
+__all__ = ["RerankingModule", "RerankingTerm", "Term", "Views"]
 
 
 class Views(Protocol):
@@ -63,8 +63,8 @@ class Term(ABC):
             raise InvalidInputError(f"{self.name}: weight: expected a number >= 0, got {self.weight}")
 
     @abstractmethod
-    def over(self, views: Views) -> nn.Module:
-        """A module that compares photographs with these N views: :class:`Photographs` -> (B, N) raw scores."""
+    def build(self, views: Views) -> nn.Module:
+        """A module that compares photographs with these N views: :class:`QueryFeatures` -> (B, N) raw scores."""
 
     @abstractmethod
     def log_score(self, raw: Tensor) -> Tensor:
@@ -72,7 +72,7 @@ class Term(ABC):
 
 
 @dataclass(frozen=True)
-class LateTerm(Term):
+class RerankingTerm(Term):
     """A term that costs a picture of every view.
 
     In banks of up to ``coarse`` views all are described when the bank is built, and compared. In larger ones only the
@@ -95,11 +95,11 @@ class LateTerm(Term):
             raise InvalidInputError(f"{self.name}: expected top >= 1 and coarse >= 0, got {self.top} and {self.coarse}")
 
     @abstractmethod
-    def over(self, views: Views | None) -> "LateModule":
+    def build(self, views: Views | None) -> "RerankingModule":
         """What describes and compares; the same for all views."""
 
 
-class LateModule(nn.Module, ABC):
+class RerankingModule(nn.Module, ABC):
     """Describes pictures of views, and compares photographs with them."""
 
     @abstractmethod
@@ -107,5 +107,5 @@ class LateModule(nn.Module, ABC):
         """(N, D) features of pictures of views: (N, 1, S, S) grey, or (N, 4, S, S) grey and in the mesh's colours."""
 
     @abstractmethod
-    def compare(self, photographs: Photographs, views: Tensor) -> Tensor:
+    def compare(self, photographs: QueryFeatures, views: Tensor) -> Tensor:
         """(B, N) raw scores of (N, D) features."""

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from ..errors import InvalidInputError
 from ..utils.checks import check_positive, check_tensor
 from .base import Term, Views
-from .photographs import Photographs
+from .query import QueryFeatures
 
 __all__ = ["BoxShape", "box_shape_score", "box_shapes", "whole_box_shapes"]
 
@@ -43,8 +43,8 @@ def whole_box_shapes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
         [0.0, nan]
     """
     far = torch.tensor([[W, H] for H, W in sizes], dtype=boxes.dtype, device=boxes.device).view(-1, 2) - 0.5
-    slack = 1.0 + _BORDER * (boxes[:, 2:] - boxes[:, :2]).amax(dim=1, keepdim=True)
-    inside = (boxes[:, :2] > -0.5 + slack).all(dim=1) & (boxes[:, 2:] < far - slack).all(dim=1)
+    box_jitter = 1.0 + _BORDER * (boxes[:, 2:] - boxes[:, :2]).amax(dim=1, keepdim=True)
+    inside = (boxes[:, :2] > -0.5 + box_jitter).all(dim=1) & (boxes[:, 2:] < far - box_jitter).all(dim=1)
     return torch.where(inside, box_shapes(boxes), torch.nan)
 
 
@@ -106,7 +106,7 @@ class BoxShape(Term):
         super().__post_init__()
         check_positive(self.sigma, "sigma")
 
-    def over(self, views: Views) -> nn.Module:
+    def build(self, views: Views) -> nn.Module:
         return _Shapes(box_shapes(views.boxes).float(), self.sigma)
 
     def log_score(self, raw: Tensor) -> Tensor:
@@ -121,5 +121,5 @@ class _Shapes(nn.Module):
         self.shapes: Tensor
         self.register_buffer("shapes", shapes, persistent=False)
 
-    def forward(self, photographs: Photographs) -> Tensor:
+    def forward(self, photographs: QueryFeatures) -> Tensor:
         return _score(photographs.shapes.float(), self.shapes, self.sigma)

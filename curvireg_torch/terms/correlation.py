@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from ..utils.checks import check_option, check_tensor
 from .base import Term, Views
-from .photographs import Photographs
+from .query import QueryFeatures
 from .whitening import DescriptorStatistics, Whitening
 
 __all__ = ["Correlation", "normalized_correlation", "unit_score"]
@@ -74,7 +74,7 @@ class Correlation(Term):
         super().__post_init__()
         check_option(self.whitening, WHITENINGS, "whitening")
 
-    def over(self, views: Views) -> nn.Module:
+    def build(self, views: Views) -> nn.Module:
         if self.whitening == "none":
             return Correlated(views.descriptors)
         statistics = DescriptorStatistics.from_descriptors(views.descriptors)
@@ -96,7 +96,7 @@ class Correlated(nn.Module):
     def _comparable(self, descriptors: Tensor) -> Tensor:
         return F.normalize(descriptors if self.whitening is None else self.whitening(descriptors), dim=1)
 
-    def forward(self, photographs: Photographs) -> Tensor:
+    def forward(self, photographs: QueryFeatures) -> Tensor:
         B, K = photographs.descriptors.shape[:2]
         queries = self._comparable(photographs.descriptors.flatten(0, 1)).to(self.views.dtype)
         return (queries @ self.views.T).float().view(B, K, len(self.views)).amax(dim=1)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ..errors import InvalidInputError
 from ..utils.checks import check_masks, check_option, check_positive
 from .base import Term, Views
-from .photographs import Photographs
+from .query import QueryFeatures
 
 __all__ = ["Repeatability", "dilate_points", "repeatability", "repeatability_score"]
 
@@ -116,7 +116,7 @@ class Repeatability(Term):
         check_option(self.mode, MODES, "mode")
         check_positive(self.eps, "eps", zero_ok=True)
 
-    def over(self, views: Views) -> nn.Module:
+    def build(self, views: Views) -> nn.Module:
         return _Points(views, self.eps)
 
     def log_score(self, raw: Tensor) -> Tensor:
@@ -135,7 +135,7 @@ def cell_counts(points: Tensor, cell: int) -> Tensor:
     return count.float()
 
 
-def cell_shares(points: Tensor, cell: int) -> Tensor:
+def cell_fractions(points: Tensor, cell: int) -> Tensor:
     """(N, C, C) float32 share of the pixels of each cell that are set.
 
     ``avg_pool2d`` with ``ceil_mode``, to the bit, several times as fast: whole numbers are added.
@@ -153,13 +153,13 @@ class _Points(nn.Module):
         # Points are counted in cells of eps px or less, so that the product stays small.
         self.cell = max(1, min(int(eps * S), S // 64))
         near = [
-            cell_shares(dilate_points(views.points_at(slice(i, i + 64)), eps * S), self.cell).flatten(1)
+            cell_fractions(dilate_points(views.points_at(slice(i, i + 64)), eps * S), self.cell).flatten(1)
             for i in range(0, len(views), 64)
         ]
         self.near: Tensor
         self.register_buffer("near", torch.cat(near), persistent=False)
 
-    def forward(self, photographs: Photographs) -> Tensor:
+    def forward(self, photographs: QueryFeatures) -> Tensor:
         B, K = photographs.points.shape[:2]
         # Counts, not shares: a point in a cut cell weighs as much as any other.
         points = cell_counts(photographs.points.flatten(0, 1), self.cell).flatten(1)

@@ -1,6 +1,6 @@
 """Training of the learned field: generated scenes, datasets and losses, and adaptation to one mesh."""
 
 from .adaptation import adapt
-from .field_dataset import Lessons, Replay, altered, losses
+from .field_dataset import FieldDataset, ReplayBuffer, augment, losses
 
-__all__ = ["Lessons", "Replay", "adapt", "altered", "losses"]
+__all__ = ["FieldDataset", "ReplayBuffer", "adapt", "augment", "losses"]

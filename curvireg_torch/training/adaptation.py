@@ -10,7 +10,7 @@ from ..io.meshes.mesh import as_mesh
 from ..io.meshes.up import with_z_up
 from ..models.learned_field import LearnedCurvilinearSaliency
 from ..utils.checks import check_positive
-from .field_dataset import Lessons, altered, losses
+from .field_dataset import FieldDataset, augment, losses
 from .scenes import GeneratedScenes
 
 __all__ = ["adapt"]
@@ -49,7 +49,7 @@ def adapt(
     """
     check_positive(scenes, "scenes")
     field = LearnedCurvilinearSaliency() if field is None else field
-    lessons = Lessons(GeneratedScenes(scenes, seed=seed, upright=upright, meshes=[with_z_up(as_mesh(mesh))]))
+    lessons = FieldDataset(GeneratedScenes(scenes, seed=seed, upright=upright, meshes=[with_z_up(as_mesh(mesh))]))
     loader = DataLoader(lessons, BATCH, num_workers=workers, multiprocessing_context="spawn" if workers else None)
     network = field.network
     network.eval().requires_grad_(True)
@@ -58,7 +58,7 @@ def adapt(
     generator = torch.Generator().manual_seed(seed)
     for batch in tqdm(loader, desc="adapting", unit="batch", disable=not progress):
         batch = {name: values.float() for name, values in batch.items()}
-        batch = altered({**batch, "image": batch["image"] / 255.0}, generator)
+        batch = augment({**batch, "image": batch["image"] / 255.0}, generator)
         loss = torch.stack(list(losses(network(batch["image"]), batch).values())).sum()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()

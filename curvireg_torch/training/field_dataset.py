@@ -12,7 +12,7 @@ from ..models.learned_field import WORK_SIZE, doubled_angle, halved_angle
 from ..settings import BankSettings
 from .scenes import GeneratedScenes
 
-__all__ = ["SETTINGS", "Lessons", "Replay", "altered", "losses", "mirrored_descriptors"]
+__all__ = ["SETTINGS", "FieldDataset", "ReplayBuffer", "augment", "losses", "mirrored_descriptors"]
 
 SETTINGS = BankSettings(image_size=WORK_SIZE, sigma=0.8)
 """Of the depth views that the network is to imitate."""
@@ -24,7 +24,7 @@ RIVALS = 5
 """Other views of the same object in a lesson."""
 
 
-class Lessons(Dataset[dict[str, Tensor]]):
+class FieldDataset(Dataset[dict[str, Tensor]]):
     """Generated scenes with the right answers.
 
     Args:
@@ -85,7 +85,7 @@ def _rival_turns(generator: torch.Generator) -> Tensor:
     return rotation_from_axis_angle(torch.cat([about_z, others]))
 
 
-class Replay:
+class ReplayBuffer:
     """The latest ``capacity`` lessons, so that the network need not wait for the generator."""
 
     def __init__(self, capacity: int) -> None:
@@ -110,7 +110,7 @@ class Replay:
         return {**batch, "image": batch["image"] / 255.0}
 
 
-def altered(batch: dict[str, Tensor], generator: torch.Generator) -> dict[str, Tensor]:
+def augment(batch: dict[str, Tensor], generator: torch.Generator) -> dict[str, Tensor]:
     """The same lessons mirrored, with other colours, contrast and noise, each at random."""
     images = batch["image"]
     B = len(images)
@@ -148,7 +148,7 @@ def losses(
 
     Args:
         answer: (B, 3, S/2, S/2) of :class:`FieldNetwork`.
-        batch: of :class:`Lessons`, float32.
+        batch: of :class:`FieldDataset`, float32.
         descriptor_weight, ranking_weight, rivals_weight: factors of the last three.
     """
     code, wanted = answer[:, :2], batch["code"]

@@ -154,11 +154,11 @@ class Panels:
             for number, pose in enumerate(result.hypotheses, start=1):
                 away = float(rotation_error(pose.rotation, best.rotation))
                 told = f"{number}: score {pose.score:.2f}" + (f", {away:.0f} degrees from 1" if number > 1 else "")
-                support = "" if pose.support is None else f"support {pose.support:.2f}\n"
+                edge_support = "" if pose.edge_support is None else f"support {pose.edge_support:.2f}\n"
                 evidence = ", ".join(f"{name} {value:.2f}" for name, value in pose.evidence.items())
                 renderer = registrar.describers[pose.model].renderer
-                picture = thumbnail(renderer, pose.seen_by, answer.image, answer.box.tolist())
-                cards.append((picture, f"{told}\n{support}{evidence}"))
+                picture = thumbnail(renderer, pose.projection, answer.image, answer.box.tolist())
+                cards.append((picture, f"{told}\n{edge_support}{evidence}"))
             return cards
 
         cards = await self.page.do(make)
@@ -223,10 +223,10 @@ class Panels:
             return
         url = self.page.put("scene.glb", content, "model/gltf-binary")
         describe = registrar.describers[shown.pose.model]
-        T = shown.pose.seen_by[0]
+        T = shown.pose.projection[0]
         unit = UNITS[mesh_unit(mesh) or "m"]
         x, y, z = ((T[:3, :3] @ describe.centre + T[:3, 3]) / describe.radius).tolist()
-        fov = 2 * math.degrees(math.atan(answer.image.shape[-2] / (1.7 * float(shown.pose.seen_by[1][1, 1]))))
+        fov = 2 * math.degrees(math.atan(answer.image.shape[-2] / (1.7 * float(shown.pose.projection[1][1, 1]))))
         camera = ui.scene.perspective_camera(fov=min(fov, 120.0), near=0.05, far=1000.0)
         with self.place["3D"]:
             scene = ui.scene(width=760, height=480, grid=False, camera=camera, background_color="#222")

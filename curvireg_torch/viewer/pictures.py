@@ -53,8 +53,8 @@ def at(centre: Tensor, pose: Hypothesis, T: Tensor) -> Hypothesis:
         evidence={},
         allocentric_rotation=straight,
         distance=float(torch.linalg.vector_norm(position)),
-        seen_by=(T, pose.seen_by[1]),
-        support=None,
+        projection=(T, pose.projection[1]),
+        edge_support=None,
         covariance=None,
     )
 
@@ -79,7 +79,7 @@ def pose_layers(registrar: Registrar, pose: Hypothesis, size: tuple[int, int], s
 
 def _seen(registrar: Registrar, pose: Hypothesis, size: tuple[int, int], scale: float) -> tuple[Tensor, Tensor]:
     """(H, W) depth at a pose in the photograph as shown, and the camera matrix of that."""
-    T, K = pose.seen_by
+    T, K = pose.projection
     half = 0.5 * scale - 0.5
     smaller = torch.tensor([[scale, 0.0, half], [0.0, scale, half], [0.0, 0.0, 1.0]], dtype=torch.float64)
     K = smaller @ K

@@ -27,7 +27,7 @@ from ..matching import ViewBank
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
 from ..registration.document import fitting_box, pose_document
 from ..utils.checks import check_square_pixels
-from ..visualization import posed_glb
+from ..visualization import pose_glb
 from .pictures import at
 
 __all__ = ["Answer", "Session", "Shown"]
@@ -167,10 +167,10 @@ class Session:
             check_square_pixels(camera_matrix(*camera))  # refused before the bank is made
         if isinstance(self.guess, float):
             camera_of_view(self.guess, (1, 1))
-        self.stopped, tell = False, self._teller(start)
+        self.stopped, report_progress = False, self._teller(start)
         with self._named():
-            registrar = self._made(self.mesh, tell)
-            registrar.progress = tell
+            registrar = self._made(self.mesh, report_progress)
+            registrar.progress = report_progress
             name, meshes = self._name(self.photo, ""), (Path(self._name(self.mesh, "")),)
             entry = Entry(name=name, cells=(), meshes=meshes, box=self.box, camera=camera, guess=self.guess)
             ready = time.perf_counter() - start
@@ -209,7 +209,7 @@ class Session:
         """
         answer, shown = self.seen()
         describe = answer.registrar.describers[shown.pose.model]
-        T = shown.pose.seen_by[0].clone()
+        T = shown.pose.projection[0].clone()
         vector = torch.deg2rad(torch.tensor([float(v) for v in turn], dtype=torch.float64))
         centre = T[:3, :3] @ describe.centre + T[:3, 3]
         centre = centre + describe.radius * torch.tensor([float(v) for v in shift], dtype=torch.float64)
@@ -225,7 +225,7 @@ class Session:
         """Let the mesh's contours pull the pose shown onto the photograph's edges; says how far that went."""
         answer, shown = self.seen()
         describe = answer.registrar.describers[shown.pose.model]
-        T, K = shown.pose.seen_by
+        T, K = shown.pose.projection
         fit = fit_contours(
             describe.renderer,
             answer.image,
@@ -237,8 +237,8 @@ class Session:
             margin=answer.registrar.bank.settings.margin,
         )
         turned = float(rotation_error(fit.transform[0, :3, :3], T[:3, :3]))
-        support = f"support {float(fit.start_support[0]):.2f} to {float(fit.support[0]):.2f}"
-        told = f"pulled in by contours: {turned:.1f} degrees, {support}"
+        edge_support = f"support {float(fit.start_support[0]):.2f} to {float(fit.edge_support[0]):.2f}"
+        told = f"pulled in by contours: {turned:.1f} degrees, {edge_support}"
         moved = at(describe.centre, shown.pose, fit.transform[0])
         self.shown = Shown(moved, shown.number, (*shown.by_hand, told))
         return told
@@ -259,9 +259,9 @@ class Session:
         return to_json(self.document()).encode()
 
     def glb(self) -> bytes:
-        """The pose shown as a GLB file, see :func:`curvireg_torch.visualization.posed_glb`."""
+        """The pose shown as a GLB file, see :func:`curvireg_torch.visualization.pose_glb`."""
         answer, shown = self.seen()
-        return posed_glb(answer.registrar.bank.mesh, *shown.pose.seen_by, answer.image)
+        return pose_glb(answer.registrar.bank.mesh, *shown.pose.projection, answer.image)
 
     def stop(self) -> None:
         """End a registration at its next step."""
@@ -271,7 +271,7 @@ class Session:
         self.answer, self.shown = None, None
 
     def _teller(self, start: float) -> Callable[[str, int, int], None]:
-        def tell(stage: str, done: int, of: int) -> None:
+        def report_progress(stage: str, done: int, of: int) -> None:
             self.progress = (stage, done, of)
             if self.stopped:
                 raise CurviregError("stopped")
@@ -281,13 +281,13 @@ class Session:
                     "take a simpler mesh, a pose that stands upright, or the command line, which has no limit"
                 )
 
-        return tell
+        return report_progress
 
-    def _made(self, path: Path, tell: Callable[[str, int, int], None]) -> Registrar:
+    def _made(self, path: Path, report_progress: Callable[[str, int, int], None]) -> Registrar:
         """For the mesh and the options; the last one where nothing has changed."""
         key = (path, *(getattr(self.options, name) for name in OPTIONS))
         if self._registrar is None or self._registrar[0] != key:
-            self._registrar = key, open_registrar(self.options, [path], None, progress=tell)
+            self._registrar = key, open_registrar(self.options, [path], None, progress=report_progress)
         return self._registrar[1]
 
     def _name(self, path: Path | None, other: str) -> str:

@@ -12,7 +12,7 @@ from ..errors import CurviregError, InvalidInputError
 from ..geometry import rotation_error
 from ..matching.fields import depth_filter
 from ..registration import Hypothesis, Registrar, Registration
-from ..registration.inputs import Item, items_of
+from ..registration.inputs import ImageItem, image_items
 from ..rendering.base import DepthRenderer
 from ..utils.checks import as_numbers, check_camera_matrix
 
@@ -31,7 +31,7 @@ def contour_overlay(
 ) -> np.ndarray:
     """The photograph with the mesh's outer (green) and inner (orange) contours at the pose, and the box (white).
 
-    What is drawn is what was found (``result.seen_by``), not what would fill the box.
+    What is drawn is what was found (``result.projection``), not what would fill the box.
 
     Args:
         registrar: what made ``result``.
@@ -55,7 +55,7 @@ def contour_overlay(
 def _overlay(
     registrar: Registrar,
     result: Registration | Hypothesis,
-    item: Item,
+    item: ImageItem,
     camera_matrix: Any | None,
     part: tuple[int, int, int, int],
 ) -> np.ndarray:
@@ -63,7 +63,7 @@ def _overlay(
     if camera_matrix is not None and result.translation is None:
         raise InvalidInputError("camera_matrix: the pose was found without one; leave it out")
     x0, y0, x1, y1 = part
-    T, K = result.seen_by
+    T, K = result.projection
     if camera_matrix is not None:
         K = as_numbers(camera_matrix, "camera_matrix", least=torch.float64)
         check_camera_matrix(K)
@@ -75,7 +75,7 @@ def _overlay(
     return picture
 
 
-def _around(item: Item) -> tuple[int, int, int, int]:
+def _around(item: ImageItem) -> tuple[int, int, int, int]:
     """The part of a photograph that holds the box and half of its longer side on every side."""
     H, W = item.image.shape[-2:]
     x0, y0, x1, y1 = item.box.tolist()
@@ -84,10 +84,10 @@ def _around(item: Item) -> tuple[int, int, int, int]:
 
 
 def draw_pose(
-    picture: np.ndarray, renderer: DepthRenderer, seen_by: tuple[Tensor, Tensor], box: Sequence[float]
+    picture: np.ndarray, renderer: DepthRenderer, projection: tuple[Tensor, Tensor], box: Sequence[float]
 ) -> None:
     """Draw a mesh's contours, seen by (4, 4) ``T_cam_from_model`` and (3, 3) camera, and a box into (H, W, 3) uint8."""
-    T, K = seen_by
+    T, K = projection
     H, W = picture.shape[:2]
     width = draw_contours(picture, renderer.render(T[None], K, (H, W))[0, 0].cpu().numpy())
     x0, y0, x1, y1 = (round(v) for v in box)
@@ -106,8 +106,8 @@ def draw_contours(picture: np.ndarray, depth: np.ndarray) -> int:
     return width
 
 
-def _item(image: Any, box: Any) -> Item:
-    item = items_of([image], as_numbers(box, "box")[None], None)[0]
+def _item(image: Any, box: Any) -> ImageItem:
+    item = image_items([image], as_numbers(box, "box")[None], None)[0]
     if isinstance(item, CurviregError):
         raise item
     return item

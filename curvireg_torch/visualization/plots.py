@@ -87,10 +87,10 @@ def fields(registrar: Registrar, result: Registration | Hypothesis, image: Any, 
     return figure
 
 
-Cells = Sequence[str | float]
+DenseFeatures = Sequence[str | float]
 
 
-def curves(columns: Sequence[str], rows: Sequence[Cells], *, title: str = "", ylabel: str = "share") -> Any:
+def curves(columns: Sequence[str], rows: Sequence[DenseFeatures], *, title: str = "", ylabel: str = "share") -> Any:
     """Curves over the first column: repeatability around the right view, precision at rank k.
 
     Args:
@@ -118,7 +118,7 @@ def curves(columns: Sequence[str], rows: Sequence[Cells], *, title: str = "", yl
     return figure
 
 
-def bars(columns: Sequence[str], rows: Sequence[Cells], *, title: str = "", ylabel: str = "share") -> Any:
+def bars(columns: Sequence[str], rows: Sequence[DenseFeatures], *, title: str = "", ylabel: str = "share") -> Any:
     """A group of bars for each row: precision by class, errors by filter.
 
     Args:
@@ -147,7 +147,7 @@ def bars(columns: Sequence[str], rows: Sequence[Cells], *, title: str = "", ylab
     return figure
 
 
-def _columns(columns: Sequence[str], rows: Sequence[Cells]) -> dict[str, list[float]]:
+def _columns(columns: Sequence[str], rows: Sequence[DenseFeatures]) -> dict[str, list[float]]:
     """The numbers of each column but the first."""
     if len(columns) < 2 or not rows or any(len(row) != len(columns) for row in rows):
         raise InvalidInputError(

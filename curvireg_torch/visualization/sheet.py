@@ -57,7 +57,7 @@ class Shown:
     picture: Callable[[], bytes | None]
 
 
-def thumbnail(renderer: DepthRenderer, seen_by: tuple[Tensor, Tensor], image: Tensor, box: Sequence[float]) -> bytes:
+def thumbnail(renderer: DepthRenderer, projection: tuple[Tensor, Tensor], image: Tensor, box: Sequence[float]) -> bytes:
     """JPEG of the photograph around the box, with the mesh's contours at the pose.
 
     Args:
@@ -82,7 +82,7 @@ def thumbnail(renderer: DepthRenderer, seen_by: tuple[Tensor, Tensor], image: Te
     )
     corners = torch.tensor([[box[0], box[2]], [box[1], box[3]], [1.0, 1.0]], dtype=torch.float64)
     (x0, x1), (y0, y1), _ = (to_small @ corners).tolist()
-    T, K = seen_by
+    T, K = projection
     draw_pose(small, renderer, (T, to_small @ K), (x0, y0, x1, y1))
     return bytes(cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes())
 

@@ -26,7 +26,7 @@ objects = {
     "box": trimesh.creation.box((0.1, 0.2, 0.06)),
     "bottle": trimesh.creation.revolve(profile),
 }
-pipeline = PRESETS["classical"].posed("upright")  # the paper's terms alone
+pipeline = PRESETS["classical"].with_pose_prior("upright")  # the paper's terms alone
 
 fig, axes = plt.subplots(3, 2, figsize=(9, 7), layout="constrained", width_ratios=(1, 3))
 for row, (name, mesh) in zip(axes, objects.items(), strict=True):

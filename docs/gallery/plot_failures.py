@@ -23,7 +23,7 @@ from curvireg_torch.visualization import contour_overlay
 torch.set_grad_enabled(False)
 mesh, size = example_mesh(), (360, 480)
 K = cr.camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
-upright = cr.Pipeline().posed("upright")
+upright = cr.Pipeline().with_pose_prior("upright")
 truck = cr.Registrar(mesh, pipeline=upright, progress=False)
 
 
@@ -37,7 +37,7 @@ def photograph(seed):
 def show(picture, box, truth, title, registrar=truck):
     result = registrar([picture], box[None], K)[0]
     error = float(cr.rotation_error(result.rotation, truth))
-    told = f"confidence {result.confidence:.2f}, support {result.support:.2f}"
+    told = f"confidence {result.confidence:.2f}, support {result.edge_support:.2f}"
     _, ax = plt.subplots(figsize=(5, 4.1), layout="constrained")
     ax.imshow(contour_overlay(registrar, result, picture, box))
     ax.set(title=f"{title}\n{error:.0f}° from the truth; {told}", xticks=[], yticks=[])

@@ -65,7 +65,7 @@ plt.show()
 # The mesh is rendered from many viewpoints, as depth. The curvilinear saliency of a depth image is the difference of
 # the principal curvatures of its graph: large at occluding contours and creases, zero on planes and spheres.
 
-registrar = cr.Registrar(mesh, pipeline=cr.Pipeline().posed("upright"), progress=False)
+registrar = cr.Registrar(mesh, pipeline=cr.Pipeline().with_pose_prior("upright"), progress=False)
 bank, describer = registrar.bank, registrar.matcher.describers[0]
 distances = bank.views.distance * mesh_radius(mesh)
 some = torch.arange(20, len(bank), len(bank) // 6)[:6]

@@ -92,7 +92,7 @@ def test_nothing_scored_is_an_error(pascal, tmp_path):
 
 
 def test_a_pipeline_of_ones_own(pascal, tmp_path):
-    (tmp_path / "own.json").write_text(replace(SMALL, slack=0.0).to_json())
+    (tmp_path / "own.json").write_text(replace(SMALL, box_jitter=0.0).to_json())
     evaluate("pascal3d", pascal.root, "--out", tmp_path / "out", "--pipeline", tmp_path / "own.json")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert (summary["settings"]["preset"], summary["settings"]["pipeline"]["slack"]) == ("own", 0.0)
+    assert (summary["settings"]["preset"], summary["settings"]["pipeline"]["box_jitter"]) == ("own", 0.0)

@@ -83,12 +83,12 @@ def test_contours_of_a_thumbnail_lie_on_the_object(scale):
     registrar = Registrar(truck_bank(), refine=False)
     result = registrar([photograph], [edges])[0]
     grey = torch.full_like(photograph, 100)
-    jpeg = sheet.thumbnail(registrar.describers[0].renderer, result.seen_by, grey, edges)
+    jpeg = sheet.thumbnail(registrar.describers[0].renderer, result.projection, grey, edges)
     pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), 1)
     y, x = np.nonzero(pixels[..., 1].astype(int) - pixels[..., 2] > 60)  # the outline's green
     assert len(x) > 50
     # The same corners, from the photograph's pixels to the thumbnail's.
-    T, K = result.seen_by
+    T, K = result.projection
     uv = project_points(torch.as_tensor(registrar.bank.mesh.vertices, dtype=torch.float64), T[None], K)[0]
     room = 0.25 * max(edges[2] - edges[0], edges[3] - edges[1])
     left, top = int(edges[0] - room), int(edges[1] - room)

@@ -61,7 +61,7 @@ def test_register_writes_result_and_overlay(files, capsys):
         "score",
         "confidence",
         "reliable",
-        "support",
+        "edge_support",
         "covariance",
         "top",
         "seconds",
@@ -363,7 +363,7 @@ def test_what_to_check_where_nothing_is_reliable(pose, more, told, untold, tmp_p
     document = {
         "viewpoint": {"azimuth": 1.0}, "score": 0.2, "confidence": 0.1, "reliable": False, "translation": None,
         "standard_deviations": None, "seconds": {"bank": 1.0, "register": 2.0}, "corrected_box": None,
-        "pipeline": Pipeline().posed(pose).describe(), **more,
+        "pipeline": Pipeline().with_pose_prior(pose).describe(), **more,
     }  # fmt: skip
     _print_result(document, tmp_path)
     printed = capsys.readouterr().out

@@ -2,12 +2,12 @@
 
 import torch
 
-from curvireg_torch.evaluation.benchmark import Item
+from curvireg_torch.evaluation.benchmark import BenchmarkItem
 from curvireg_torch.evaluation.localisation import localisation
 
 
 def item(*box):
-    return Item(key="", index=0, meshes=(), box=torch.tensor(box), camera_matrix=None)
+    return BenchmarkItem(key="", index=0, meshes=(), box=torch.tensor(box), camera_matrix=None)
 
 
 def row(*boxes):

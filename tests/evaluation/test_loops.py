@@ -18,7 +18,7 @@ from curvireg_torch.io import read_image
 from curvireg_torch.io.meshes import load_mesh
 from curvireg_torch.matching import ViewBank, ViewMatcher
 from curvireg_torch.registration import Registrar
-from curvireg_torch.registration.inputs import Item
+from curvireg_torch.registration.inputs import BenchmarkItem
 
 from .small import SMALL
 
@@ -174,7 +174,7 @@ def test_any_cad_takes_the_one_that_ranks_first(pascal, tmp_path):
     trimesh.creation.box((0.2, 0.9, 0.2)).export(folder / "02.off")
     benchmark = Pascal3DBenchmark(pascal, Protocol(cad="any"))
     run(benchmark, tmp_path / "any")
-    pipeline = SMALL.posed("upright")
+    pipeline = SMALL.with_pose_prior("upright")
     bank = ViewBank.join(
         [ViewBank.build(load_mesh(p), pipeline=pipeline, progress=False) for p in sorted(folder.iterdir())]
     )
@@ -194,7 +194,7 @@ def test_any_cad_takes_the_one_that_ranks_first(pascal, tmp_path):
 
 
 def test_fused_takes_the_view_that_is_best_on_average():
-    views = SMALL.posed("upright").views.sphere()
+    views = SMALL.with_pose_prior("upright").views.sphere()
     bank = ViewBank.join(
         [
             ViewBank.build(trimesh.creation.box(extents), views, pipeline=SMALL, progress=False)
@@ -211,7 +211,7 @@ def test_fused_takes_the_view_that_is_best_on_average():
     assert int(ranking.order[0, 0]) == model * len(views) + best
     assert float(ranking.scores.max()) == pytest.approx(float(scores.mean(0).max()))
     assert int((ranking.scores > 0).sum()) == len(views), "each view stands once"
-    row = estimate.estimate_poses(Registrar(matcher), [Item(image, box, None)])[0]
+    row = estimate.estimate_poses(Registrar(matcher), [BenchmarkItem(image, box, None)])[0]
     assert row["mesh"] == model
 
 
@@ -219,8 +219,8 @@ def test_the_pipelines_options_reach_the_matcher(pascal, tmp_path, monkeypatch):
     seen = []
     made = predict.ViewMatcher
     monkeypatch.setattr(predict, "ViewMatcher", lambda *a, **k: seen.append(made(*a, **k)) or seen[-1])
-    evaluate(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out", preset=replace(SMALL, slack=0.05), limit=1)
-    assert seen[0].pipeline.slack == 0.05
+    evaluate(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out", preset=replace(SMALL, box_jitter=0.05), limit=1)
+    assert seen[0].pipeline.box_jitter == 0.05
     assert seen[0].pipeline.views.pose == "upright"
 
 
@@ -334,7 +334,7 @@ def test_seconds_of_a_batch_are_shared_by_its_objects(pascal, tmp_path, monkeypa
 
 def test_fused_models_that_agree_share_nothing():
     """Two models that are the same score alike from everywhere: each view stands once all the same, at the first."""
-    views = SMALL.posed("upright").views.sphere()
+    views = SMALL.with_pose_prior("upright").views.sphere()
     bank = ViewBank.build(trimesh.creation.box((1, 2, 1)), views, pipeline=SMALL, progress=False)
     image, box = torch.rand(3, 60, 80, generator=torch.Generator().manual_seed(0)), torch.tensor([[10.0, 5, 70, 55]])
     with torch.no_grad():

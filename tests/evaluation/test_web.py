@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evaluation import KINDS, Protocol, WebBenchmark
+from curvireg_torch.evaluation import DATASETS, Protocol, WebBenchmark
 from tests._support.miniature import write_bop, write_pascal3d, write_web
 
 from ..cli.test_evaluate import evaluate
@@ -63,10 +63,10 @@ def test_another_cad_is_refused(web, tmp_path):
         evaluate("web", web.root, "--out", tmp_path / "out", "--protocol", "cad=any")
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", DATASETS)
 def test_every_kind_opens_and_names_its_groups(kind, tmp_path):
     {"pascal3d": write_pascal3d, "bop": write_bop, "web": write_web}[kind](tmp_path)
-    row = KINDS[kind]
+    row = DATASETS[kind]
     dataset = row.open(tmp_path, **row.whole)
     sample = dataset.annotation(0)
     assert row.category.format_map(sample) in ("car", "object 1", "cup")

@@ -167,7 +167,7 @@ def test_a_bank_of_another_pose_is_refused(change: dict[str, object], told: str)
 
 def test_views_that_came_with_the_call_go_with_every_policy(bank: ViewBank) -> None:
     for pose in ("any", "upright", "given"):
-        assert ViewMatcher(bank, pipeline=Pipeline(bank=SETTINGS).posed(pose)).pipeline.views.pose == "given"
+        assert ViewMatcher(bank, pipeline=Pipeline(bank=SETTINGS).with_pose_prior(pose)).pipeline.views.pose == "given"
 
 
 def test_banks_of_different_poses_are_not_joined(bank: ViewBank) -> None:

@@ -33,7 +33,7 @@ def bank() -> ViewBank:
 def numbers(result: Registration) -> list[torch.Tensor]:
     """Everything that a result says, as tensors."""
     poses = [t for h in result.hypotheses for t in (h.rotation, h.translation, torch.tensor(list(h.evidence.values())))]
-    known = torch.tensor([result.confidence, result.score, result.support], dtype=torch.float64)
+    known = torch.tensor([result.confidence, result.score, result.edge_support], dtype=torch.float64)
     features = torch.tensor(list(result.confidence_features.values()), dtype=torch.float64)
     return [*poses, known, features, result.ranking.scores, result.ranking.order]
 

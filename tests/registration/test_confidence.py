@@ -11,12 +11,12 @@ from curvireg_torch.geometry import symmetry_transforms, views_without_symmetric
 from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration import confidence, distinct_views, ranking_evidence, verdict
+from curvireg_torch.registration import confidence, distinct_views, ranking_evidence, rescore
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration.confidence import (
     CALIBRATION,
     FEATURES,
-    RANKING_EVIDENCE,
+    RANKING_FEATURES,
     RELIABLE,
     UNCOMPARED,
     LogisticModel,
@@ -40,7 +40,7 @@ def test_evidence_in_closed_form():
     R = sample_views(azimuth_step=12, elevations=[0]).rotations
     scores = torch.full((1, 30), 0.1)
     scores[0, 3], scores[0, 4], scores[0, 20] = 1.0, 0.9, 0.5
-    got = dict(zip(RANKING_EVIDENCE, ranking_evidence(ranking(scores), R)[0].tolist(), strict=True))
+    got = dict(zip(RANKING_FEATURES, ranking_evidence(ranking(scores), R)[0].tolist(), strict=True))
     near = 1 + 0.9**4 + 3 * 0.1**4  # views 1 to 5 lie within 30 degrees
     assert got["similarity"] == pytest.approx(0.8)
     assert got["margin"] == pytest.approx(0.6931, abs=1e-3)  # log(1 / 0.5)
@@ -96,7 +96,7 @@ def test_constants_are_those_that_the_script_found():
     for name, model in CALIBRATION["confidence"].items():
         assert record["confidence"][name]["weights"] == model["weights"]
         assert record["confidence"][name]["bias"] == model["bias"]
-        assert list(model["weights"]) == list(RANKING_EVIDENCE if name.startswith("ranking") else FEATURES)
+        assert list(model["weights"]) == list(RANKING_FEATURES if name.startswith("ranking") else FEATURES)
 
 
 def test_confidence_of_a_pose_is_the_logistic_function():
@@ -111,7 +111,7 @@ def test_confidence_of_a_pose_is_the_logistic_function():
 @pytest.mark.parametrize("with_appearance", [True, False])
 def test_more_evidence_is_more_confidence(with_appearance):
     model = confidence_model("contours", with_camera=True, with_appearance=with_appearance)
-    tied = {"similarity": 0.7, "lead": 0.0, "support": 0.5, "appearance_lead": 0.0, "concentration": 0.3}
+    tied = {"similarity": 0.7, "lead": 0.0, "edge_support": 0.5, "appearance_lead": 0.0, "concentration": 0.3}
     clear = {**tied, "lead": 5.0, "appearance_lead": 3.0, "concentration": 0.9}
     assert model(tied) < RELIABLE < model(clear)
 
@@ -120,7 +120,7 @@ def test_features_of_a_pose():
     evidence = torch.tensor([[0.0, 0.7, 0.4, 1.0], [-1.0, 0.6, 0.5, 0.4], [-2.0, 0.5, 0.1, 0.8]], dtype=torch.float64)
     verdicts = torch.tensor([9.0, 2.0, 3.0], dtype=torch.float64)
     assert pose_features(evidence, verdicts, 0.3) == pytest.approx(
-        {"similarity": 0.7, "lead": 5.0, "support": 0.4, "appearance_lead": 0.2, "concentration": 0.3}
+        {"similarity": 0.7, "lead": 5.0, "edge_support": 0.4, "appearance_lead": 0.2, "concentration": 0.3}
     ), "the lead is over the best rival, and 5 at most"
     behind = pose_features(evidence, verdicts.flip(0) - torch.tensor([9.0, 0.0, 0.0]), 0.3)
     assert behind["lead"] == -5.0, "nor less than -5"
@@ -131,8 +131,8 @@ def test_features_of_a_pose():
 
 def test_verdict_counts_what_was_found_only_where_the_camera_is_known():
     evidence = torch.tensor([[0.0, 0.5, 0.3, 0.0], [-0.5, 0.6, 0.6, 0.1]], dtype=torch.float64)
-    assert verdict(evidence, with_camera=True).tolist() == pytest.approx([2.5 + 3.0, -0.5 + 3.0 + 6.0 + 0.1])
-    assert verdict(evidence, with_camera=False).tolist() == [0.0, -0.5]
+    assert rescore(evidence, with_camera=True).tolist() == pytest.approx([2.5 + 3.0, -0.5 + 3.0 + 6.0 + 0.1])
+    assert rescore(evidence, with_camera=False).tolist() == [0.0, -0.5]
 
 
 def test_the_right_object_is_trusted_more_than_clutter():
@@ -185,7 +185,7 @@ def test_confidence_rests_on_what_the_hypotheses_say():
         image, box, _ = scene(seed)
         result = Registrar(truck_bank())([image], box[None], K)[0]
         evidence = torch.tensor([list(h.evidence.values()) for h in result.hypotheses], dtype=torch.float64)
-        verdicts = verdict(evidence, with_camera=K is not None)
+        verdicts = rescore(evidence, with_camera=K is not None)
         concentration = float(ranking_evidence(result.ranking, truck_bank().rotations)[0, 2])
         features = pose_features(evidence, verdicts, concentration)
         assert result.confidence_features == pytest.approx(features)
@@ -197,7 +197,7 @@ def test_without_contours_the_confidence_is_that_of_the_answers_view(monkeypatch
     image, box, _ = scene(0)
     registrar = Registrar(truck_bank(), refine=False)
     result = registrar([image], box[None], CAMERA)[0]
-    assert list(result.confidence_features) == list(RANKING_EVIDENCE)
+    assert list(result.confidence_features) == list(RANKING_FEATURES)
     assert result.confidence == pytest.approx(float(confidence(result.ranking, truck_bank().rotations)))
     # Where the order of the hypotheses is not that of the ranking, the answer is judged, not the best view.
     monkeypatch.setattr(registrar_module, "verdict", lambda evidence, **_: evidence[:, 0].neg())
@@ -262,8 +262,8 @@ def test_what_is_said_of_a_pose_is_measured_of_that_pose() -> None:
                 cosine = torch.nn.functional.cosine_similarity(pose, descriptors)
                 assert h.score == pytest.approx(float(cosine), abs=1e-5)
                 assert h.evidence["similarity"] == h.score
-                T, camera = h.seen_by
-                support = contour_support(
+                T, camera = h.projection
+                edge_support = contour_support(
                     registrar.describers[0].renderer,
                     image,
                     box,
@@ -273,5 +273,5 @@ def test_what_is_said_of_a_pose_is_measured_of_that_pose() -> None:
                     radius=mesh_radius(truck_bank().mesh),
                     margin=truck_bank().settings.margin,
                 )
-                assert h.support == pytest.approx(float(support), abs=0.02)
-                assert h.evidence["support"] == h.support
+                assert h.edge_support == pytest.approx(float(edge_support), abs=0.02)
+                assert h.evidence["edge_support"] == h.edge_support

@@ -123,13 +123,13 @@ def test_a_pose_three_degrees_and_three_per_cent_off_is_recovered(seed):
     assert float(torch.linalg.eigvalsh(C).min()) > 0
     assert 0.001 < float(torch.rad2deg(C.diagonal()[:3].sqrt()).max()) < 5.0
     assert int(fit.observable) == 6
-    assert float(fit.start_support) < float(fit.support)
+    assert float(fit.start_support) < float(fit.edge_support)
     assert 0.5 < float(fit.matched) <= 1.0
     assert 0 < float(fit.residual) < 2.0
     assert 1 < float(fit.moved) < 40
     both = fitted(torch.cat([start, T[None]]))
     torch.testing.assert_close(both.transform[:1], fit.transform)
-    torch.testing.assert_close(both.support[:1], fit.support)
+    torch.testing.assert_close(both.edge_support[:1], fit.edge_support)
 
 
 def cube_fit(
@@ -148,14 +148,14 @@ def test_nothing_to_hold_on_to_leaves_the_pose_as_it_is():
     start = pose([0.4, 0.5, 0.1], [0.0, 0.0, 8.0])[None]
     blank = cube_fit(torch.full((3, 128, 128), 0.4), start)
     assert blank.transform.equal(start)
-    assert float(blank.support) == 0
+    assert float(blank.edge_support) == 0
     assert bool(blank.covariance.isnan().all())
     noise = torch.rand(3, 128, 128, generator=torch.Generator().manual_seed(0))
     for away in ([9.0, 0.0, 8.0], [0.0, 0.0, -8.0]):  # beside the crop; behind the camera
         start = pose([0.4, 0.5, 0.1], away)[None]
         outside = cube_fit(noise, start)
         assert outside.transform.equal(start)
-        assert float(outside.support) == 0
+        assert float(outside.edge_support) == 0
         assert bool(outside.covariance.isnan().all())
 
 
@@ -201,7 +201,11 @@ def test_many_photographs_and_hypotheses_are_fitted_as_each_alone():
         # Crops are float32: how a batch is shared among threads or vectors moves their last bit, a fit of many steps by
         # some 1e-7, and a point across the border of a cell of the covariance, worth 0.3 % of it. A round shared where
         # it must not be moves poses by 1e-2 and support by 1e-3.
-        for name, allowed in (("transform", 1e-4), ("support", 1e-4), ("covariance", 0.02 * alone.covariance.max())):
+        for name, allowed in (
+            ("transform", 1e-4),
+            ("edge_support", 1e-4),
+            ("covariance", 0.02 * alone.covariance.max()),
+        ):
             torch.testing.assert_close(getattr(fit, name)[i], getattr(alone, name)[0], rtol=0, atol=float(allowed))
     stacked = [F.pad(image, (0, 128 - image.shape[2], 0, 128 - image.shape[1])) for image in images]
     inside = fit_contours(renderer, torch.stack(stacked), boxes, cameras, starts, photograph=photograph, **rest)
@@ -221,7 +225,7 @@ def test_only_the_best_starts_of_a_photograph_are_finished():
     same = (some.transform - everything.transform).abs().amax(dim=(1, 2)) < 1e-9
     assert torch.bincount(of[same], minlength=3).tolist() == [1, 1, 1]  # one of each photograph
     for b in range(3):
-        assert int(some.support[of == b].argmax()) == int(everything.support[of == b].argmax())
+        assert int(some.edge_support[of == b].argmax()) == int(everything.edge_support[of == b].argmax())
 
 
 def test_a_fit_is_trusted_for_what_it_supports_or_gains():
@@ -261,7 +265,7 @@ def test_bad_input_is_named():
     none = cube_fit(image, start[:0])
     assert none.transform.shape == (0, 4, 4)
     assert none.covariance.shape == (0, 6, 6)
-    assert none.support.shape == (0,)
+    assert none.edge_support.shape == (0,)
 
 
 @pytest.mark.parametrize("camera", [CAMERA, None])
@@ -279,11 +283,11 @@ def test_the_registrar_ends_with_the_contours(camera):
             truth = rotation_towards(ray).T @ truth  # the view of a camera that looks straight at it
         for c, result in results.items():
             errors[c].append(float(rotation_error(result.rotation, truth)))
-        assert results[False].support is None
+        assert results[False].edge_support is None
         assert results[False].covariance is None
         with_contours = results[True]
-        assert with_contours.support is not None
-        assert 0 < with_contours.support < 1
+        assert with_contours.edge_support is not None
+        assert 0 < with_contours.edge_support < 1
         assert (with_contours.covariance is None) == (with_contours.translation is None) == (camera is None)
         assert (with_contours.standard_deviations is None) == (camera is None)
         assert 0 <= with_contours.score <= 1

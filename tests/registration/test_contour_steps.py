@@ -67,12 +67,14 @@ def test_the_nearer_of_two_edges_is_matched_to_a_fraction_of_a_pixel(side):
 
 def test_support_is_the_mean_strength_near_points_that_count():
     some = points(8, valid=4)
-    assert float(views(at(8, 0.0), [0.7]).support(there(some))) == pytest.approx(0.7)
-    assert float(views(at(8, 1.0), [0.7]).support(there(some))) == pytest.approx(0.7 * math.exp(-0.5))
-    assert float(views(at(8, -3.0), [0.7]).support(there(some))) == pytest.approx(0.7 * (1 - 1 / 2.25) * math.exp(-2.0))
+    assert float(views(at(8, 0.0), [0.7]).edge_support(there(some))) == pytest.approx(0.7)
+    assert float(views(at(8, 1.0), [0.7]).edge_support(there(some))) == pytest.approx(0.7 * math.exp(-0.5))
+    assert float(views(at(8, -3.0), [0.7]).edge_support(there(some))) == pytest.approx(
+        0.7 * (1 - 1 / 2.25) * math.exp(-2.0)
+    )
     half = torch.where(torch.arange(8) % 2 == 0, 0.0, 50.0)[None].double()
-    assert float(views(half, [0.7]).support(there(some))) == pytest.approx(0.35)
-    assert float(views(half, [0.7]).support(there(points(8, valid=0)))) == 0.0
+    assert float(views(half, [0.7]).edge_support(there(some))) == pytest.approx(0.35)
+    assert float(views(half, [0.7]).edge_support(there(points(8, valid=0)))) == 0.0
 
 
 def test_a_step_undoes_a_motion_though_stronger_edges_lie_elsewhere():

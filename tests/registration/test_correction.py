@@ -8,7 +8,7 @@ import torch
 import curvireg_torch as cr
 from curvireg_torch.geometry import box_iou, rotation_error
 from curvireg_torch.registration import correction
-from curvireg_torch.registration.correction import posed_box
+from curvireg_torch.registration.correction import projected_box
 from curvireg_torch.registration.document import fitting_box, result_document
 from tests._support.scenes import CAMERA, scene, truck_bank
 
@@ -27,18 +27,20 @@ def registrar():
 
 def as_it_is(registrar, image, box, camera=CAMERA):
     """The answer with the box as it is given."""
-    return cr.Registrar(registrar.bank, pipeline=replace(registrar.pipeline, slack=0.0))([image], box[None], camera)[0]
+    return cr.Registrar(registrar.bank, pipeline=replace(registrar.pipeline, box_jitter=0.0))(
+        [image], box[None], camera
+    )[0]
 
 
 def test_the_box_around_the_pose_takes_the_place_of_one_that_is_wrong(registrar):
     image, box, truth = scene(0)
     wrong = roughly(box)
     result = registrar([image], wrong[None], CAMERA)[0]
-    (before,) = registrar.answers([correction.Item(image, wrong, CAMERA)])
+    (before,) = registrar.register_items([correction.ImageItem(image, wrong, CAMERA)])
     assert rotation_error(before.rotation, truth[:3, :3]) > 5
     assert rotation_error(result.rotation, truth[:3, :3]) < 2
     assert result.score > before.score
-    assert torch.equal(result.corrected_box, posed_box(registrar, before).float().double())
+    assert torch.equal(result.corrected_box, projected_box(registrar, before).float().double())
     right = box[None].double()
     assert box_iou(result.corrected_box[None], right) > box_iou(wrong[None].double(), right) + 0.1
     document = {**result_document(result, registrar, {}), "inputs": {"box": [1.0, 2.0, 3.0, 4.0]}}
@@ -61,7 +63,7 @@ def test_one_answer_of_a_batch_may_be_corrected(registrar):
 def test_boxes_that_fit_stay(registrar, monkeypatch):
     """They cost nothing: nothing is registered again."""
     image, box, _ = scene(0)
-    (expected,) = registrar.answers([correction.Item(image, box, CAMERA)])
+    (expected,) = registrar.register_items([correction.ImageItem(image, box, CAMERA)])
     asked = []
     monkeypatch.setattr(registrar, "register", lambda items, _: asked.append(len(items)) or [expected] * len(items))
     assert registrar([image], box[None], CAMERA)[0] is expected
@@ -71,7 +73,7 @@ def test_boxes_that_fit_stay(registrar, monkeypatch):
 @pytest.mark.parametrize("better", [True, False])
 def test_the_view_that_is_more_like_the_photograph_stays(registrar, monkeypatch, better):
     image, box, _ = scene(0)
-    (first,) = registrar.answers([correction.Item(image, box, CAMERA)])
+    (first,) = registrar.register_items([correction.ImageItem(image, box, CAMERA)])
     other = replace(first, hypotheses=(replace(first.hypotheses[0], score=first.score + (0.01 if better else -0.01)),))
     answers = iter([[first], [other]])
     monkeypatch.setattr(registrar, "answers", lambda *_, **__: next(answers))
@@ -98,11 +100,11 @@ def test_a_pose_that_left_the_photograph_corrects_nothing(registrar, monkeypatch
 
 def test_boxes_are_compared_where_they_show_the_photograph():
     """An object cut off by the border has a box that ends there, its pose one that does not."""
-    item = correction.Item(torch.zeros(3, 100, 200), torch.tensor([150.0, 20.0, 199.5, 80.0]), CAMERA)
+    item = correction.ImageItem(torch.zeros(3, 100, 200), torch.tensor([150.0, 20.0, 199.5, 80.0]), CAMERA)
     same = torch.tensor([150.0, 20.0, 260.0, 80.0], dtype=torch.float64)
     assert not correction._is_another(same, item)
     assert correction._is_another(same - torch.tensor([20.0, 0.0, 20.0, 0.0]), item)
-    low = correction.Item(torch.zeros(3, 100, 200), torch.tensor([20.0, 50.0, 80.0, 99.5]), CAMERA)
+    low = correction.ImageItem(torch.zeros(3, 100, 200), torch.tensor([20.0, 50.0, 80.0, 99.5]), CAMERA)
     assert not correction._is_another(torch.tensor([20.0, 50.0, 80.0, 300.0], dtype=torch.float64), low)
     assert correction._is_another(torch.tensor([20.0, 30.0, 80.0, 300.0], dtype=torch.float64), low)
 
@@ -110,13 +112,13 @@ def test_boxes_are_compared_where_they_show_the_photograph():
 @pytest.mark.parametrize(("box", "another"), [((4, 10, 104, 60), False), ((12, 10, 112, 60), True)])
 def test_boxes_that_overlap_by_85_per_cent_are_the_same(box, another):
     """Moved by 4 of 100 px they overlap by 0.92, moved by 12 by 0.79."""
-    item = correction.Item(torch.zeros(3, 80, 120), torch.tensor([0.0, 10.0, 100.0, 60.0]), CAMERA)
+    item = correction.ImageItem(torch.zeros(3, 80, 120), torch.tensor([0.0, 10.0, 100.0, 60.0]), CAMERA)
     assert correction._is_another(torch.tensor(box, dtype=torch.float64), item) == another
 
 
 def test_what_lies_outside_of_the_photograph_does_not_tell_boxes_apart():
     """A pose may reach far beyond the border that cut its box."""
-    item = correction.Item(torch.zeros(3, 80, 120), torch.tensor([-0.5, 10.0, 60.0, 79.5]), CAMERA)
+    item = correction.ImageItem(torch.zeros(3, 80, 120), torch.tensor([-0.5, 10.0, 60.0, 79.5]), CAMERA)
     for beyond in ((-300.0, 10.0, 60.0, 79.5), (-0.5, 10.0, 60.0, 400.0)):
         assert not correction._is_another(torch.tensor(beyond, dtype=torch.float64), item)
     assert correction._is_another(torch.tensor([-300.0, 10.0, 20.0, 79.5], dtype=torch.float64), item)

@@ -10,7 +10,7 @@ from curvireg_torch import Registration
 from curvireg_torch.matching import Ranking
 from curvireg_torch.registration import Hypothesis
 from curvireg_torch.registration.document import correction, found_document, result_document
-from curvireg_torch.registration.pose import Found
+from curvireg_torch.registration.pose import Localization
 
 
 def registration(covariance=None, confidence=0.9, found=None, distance=2.0):
@@ -26,9 +26,9 @@ def registration(covariance=None, confidence=0.9, found=None, distance=2.0):
             evidence={"rank": 0.0},
             allocentric_rotation=eye,
             distance=distance,
-            seen_by=(torch.eye(4, dtype=torch.float64), eye),
+            projection=(torch.eye(4, dtype=torch.float64), eye),
             view=view,
-            support=0.5,
+            edge_support=0.5,
             covariance=covariance,
         )
         for view in (0, 1)
@@ -65,7 +65,7 @@ def test_terms_that_did_not_compare_a_view_are_left_out():
 def test_presence_is_that_of_the_surest_instance():
     boxes, scores = torch.tensor([[1.0, 2, 30, 40], [50, 2, 80, 40]]).double(), torch.tensor([7.0, 6.5])
     results = [
-        registration(found=Found(box, presence, score, boxes, scores), confidence=0.5 * presence)
+        registration(found=Localization(box, presence, score, boxes, scores), confidence=0.5 * presence)
         for box, presence, score in zip(boxes, (0.9, 0.4), (7.0, 6.5), strict=True)
     ]
     document = found_document(results)

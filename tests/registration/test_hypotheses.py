@@ -3,8 +3,8 @@
 import torch
 
 from curvireg_torch.geometry import rotation_from_axis_angle
-from curvireg_torch.registration.hypotheses import Hypotheses, own_peaks
-from curvireg_torch.registration.verify import gathered_evidence
+from curvireg_torch.registration.hypotheses import Hypotheses, distinct_mask
+from curvireg_torch.registration.rescoring import gather_pose_features
 
 
 def found(photograph: list[int], degrees: list[float], score: list[float], model: list[int] | None = None):
@@ -22,20 +22,23 @@ def found(photograph: list[int], degrees: list[float], score: list[float], model
 def test_a_hypothesis_within_15_degrees_of_a_better_one_is_no_peak_of_its_own():
     score = [0.9, 0.8, 0.7, 0.6]
     some = found([0, 0, 0, 0], [0.0, 14.0, 16.0, 180.0], score)
-    assert own_peaks(some, some.score).tolist() == [True, False, True, True]
+    assert distinct_mask(some, some.score).tolist() == [True, False, True, True]
     other_photograph = found([0, 1, 1, 1], [0.0, 1.0, 14.0, 180.0], score)
-    assert own_peaks(other_photograph, other_photograph.score).tolist() == [True, True, False, True]
+    assert distinct_mask(other_photograph, other_photograph.score).tolist() == [True, True, False, True]
     other_model = found([0, 0, 0, 0], [0.0, 1.0, 2.0, 3.0], score, [0, 1, 0, 1])
-    assert own_peaks(other_model, other_model.score).tolist() == [True, True, False, False]
+    assert distinct_mask(other_model, other_model.score).tolist() == [True, True, False, False]
     worse_first = found([0, 0], [0.0, 10.0], [0.1, 0.2])
-    assert own_peaks(worse_first, worse_first.score).tolist() == [False, True]
+    assert distinct_mask(worse_first, worse_first.score).tolist() == [False, True]
 
 
 def test_ranks_are_told_beside_the_best_of_the_same_photograph():
     """Logarithms of scores, whatever those of other photographs are."""
     starts = found([0, 0, 1, 1], [0.0, 90.0, 0.0, 90.0], [1.0, 0.5, 0.01, 0.04])
     similarity = torch.tensor([0.6, 0.7, 0.8, 0.9]).double()
-    support, looks = torch.tensor([0.1, 0.2, 0.3, 0.4]).double(), torch.tensor([-1.0, -2.0, -3.0, -4.0]).double()
-    evidence = gathered_evidence(starts, similarity, support, looks)
+    edge_support, appearance_scores = (
+        torch.tensor([0.1, 0.2, 0.3, 0.4]).double(),
+        torch.tensor([-1.0, -2.0, -3.0, -4.0]).double(),
+    )
+    evidence = gather_pose_features(starts, similarity, edge_support, appearance_scores)
     rank = torch.tensor([1.0, 0.5, 0.25, 1.0], dtype=torch.float64).log()
-    torch.testing.assert_close(evidence, torch.stack([rank, similarity, support, looks], dim=1))
+    torch.testing.assert_close(evidence, torch.stack([rank, similarity, edge_support, appearance_scores], dim=1))

@@ -17,7 +17,7 @@ from curvireg_torch.rendering import render_colour
 from tests._support.scenes import CAMERA, SIZE
 
 VIEWS = sample_views(azimuth_step=30, elevations=[-25, 25], thetas=[0, 180]).for_up("y")
-PIPELINE = replace(Pipeline(field="focus", slack=0.0, hypotheses=4), bank=replace(Pipeline().bank, image_size=64))
+PIPELINE = replace(Pipeline(field="focus", box_jitter=0.0, hypotheses=4), bank=replace(Pipeline().bank, image_size=64))
 
 
 @pytest.fixture(scope="module")

@@ -72,12 +72,12 @@ def test_the_support_of_a_view_is_not_that_of_the_fit_it_led_to(results):
     for result, image, box in zip(results, images, boxes, strict=True):
         assert put_back(result)
         for h in put_back(result):
-            assert h.evidence["support"] == h.support
-            if h.support != 0:
-                T, K = h.seen_by
+            assert h.evidence["edge_support"] == h.edge_support
+            if h.edge_support != 0:
+                T, K = h.projection
                 places = {"centre": mesh_centre(mesh), "radius": mesh_radius(mesh)}
                 own = fit_contours(renderer, image, box, K, T[None], **places).start_support
-                assert h.support == pytest.approx(float(own), abs=0.02)
+                assert h.edge_support == pytest.approx(float(own), abs=0.02)
 
 
 def test_a_view_that_was_put_back_has_no_covariance(results):

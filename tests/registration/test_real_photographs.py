@@ -57,7 +57,7 @@ def registered(benchmark, case):
     chosen = [items[key] for key in case.keys]
     assert len({item.meshes for item in chosen}) == 1
     mesh = cr.load_mesh(chosen[0].meshes[0], unit=benchmark.unit)
-    pipeline = cr.Pipeline().posed(benchmark.protocol.pose)
+    pipeline = cr.Pipeline().with_pose_prior(benchmark.protocol.pose)
     registrar = cr.Registrar(cr.ViewBank.build(mesh, pipeline=pipeline, progress=False))
     for item in chosen:
         known = benchmark.dataset.annotation(item.index)

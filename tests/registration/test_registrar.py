@@ -100,7 +100,7 @@ def test_a_rival_is_a_whole_pose(registered):
         seen = torch.cat([uv.amin(dim=0), uv.amax(dim=0)])
         side = float((box[2:] - box[:2]).max())
         assert float((seen - box).abs().max()) < 0.35 * side
-        assert set(rival.evidence) == {"rank", "similarity", "support", "appearance"}
+        assert set(rival.evidence) == {"rank", "similarity", "edge_support", "appearance"}
 
 
 def test_a_mesh_instead_of_a_bank_uses_the_cache(tmp_path, monkeypatch):

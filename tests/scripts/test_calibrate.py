@@ -21,7 +21,7 @@ def script():
 
 def row(number, *, right=True, form="exact", kind=None, wrong=None, lead=3.0, similarity=0.7, **more):
     """A photograph of two hypotheses, the better of which leads by ``lead`` in the verdict."""
-    names = ("rank", "similarity", "support", "appearance")
+    names = ("rank", "similarity", "edge_support", "appearance")
     evidence = [(lead, similarity, 0.4, lead / 2), (0.0, similarity, 0.4, 0.0)]
     return {
         "id": number,
@@ -72,14 +72,14 @@ def test_a_model_finds_how_sure_answers_are(script):
 
 
 def test_another_objects_mesh_keeps_the_weights_and_learns_what_they_are_worth(script):
-    own = script.LogisticModel({"lead": 2.0, "support": -1.0}, 0.5)
+    own = script.LogisticModel({"lead": 2.0, "edge_support": -1.0}, 0.5)
     rng = np.random.default_rng(1)
     X = rng.uniform(-2, 2, (4000, 2))
     logit = 0.25 * (2.0 * X[:, 0] - X[:, 1]) - 0.8
     y = rng.random(4000) < 1 / (1 + np.exp(-logit))
     found = script.transferred(own, X, y)
     assert found.weights["lead"] == pytest.approx(0.5, abs=0.06)
-    assert found.weights["support"] == pytest.approx(-0.25, abs=0.03)
+    assert found.weights["edge_support"] == pytest.approx(-0.25, abs=0.03)
     assert found.bias == pytest.approx(-0.8, abs=0.1)
     assert set(script.transferred(own, X, ~y).weights.values()) <= {0.0, -0.0}, "never the other way round"
 
@@ -167,7 +167,7 @@ def test_weights_of_the_verdict_follow_what_is_right(script):
         for k in range(50)
     ]
     found = dict(zip(names, script.fit_verdict(rows), strict=True))
-    assert found["support"] > 10.0
+    assert found["edge_support"] > 10.0
     assert found["rank"] < 1.0
 
 

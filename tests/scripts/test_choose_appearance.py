@@ -12,11 +12,11 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 import choose_appearance as script
 
 
-def shot(ranked, looks, errors, mesh="car-0"):
+def shot(ranked, appearance_scores, errors, mesh="car-0"):
     """Raw scores of one photograph of three views, 0, 40 and 80 degrees from the first, registered to ``mesh``."""
     angles = np.radians([0.0, 40.0, 80.0])
     turns = [[[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]] for a in angles]
-    both = {f"{s} {m}": np.tile(np.float16(looks), (7, 1)) for s in (8, 16) for m in ("all", "mask")}
+    both = {f"{s} {m}": np.tile(np.float16(appearance_scores), (7, 1)) for s in (8, 16) for m in ("all", "mask")}
     scores = {name: np.float32(ranked) for name in script.PRESETS}
     return {**both, **scores, "error": np.float32(errors), "rotation": np.float32(turns), "form": "exact", "mesh": mesh}
 

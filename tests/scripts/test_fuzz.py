@@ -21,7 +21,7 @@ def fuzz():
 @pytest.mark.parametrize("kind", COUNTS)
 def test_no_input_escapes(fuzz, tmp_path, capsys, kind):
     script, inputs = fuzz
-    assert set(COUNTS) == set(inputs.KINDS) == set(script.SHARES)
+    assert set(COUNTS) == set(inputs.DATASETS) == set(script.SHARES)
     script.worker(kind, 10_000_000, COUNTS[kind], tmp_path)  # not those of the long run
     report = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert report["failures"] == []
@@ -38,7 +38,7 @@ def test_a_foreign_error_and_a_message_of_two_lines_are_failures(fuzz, tmp_path,
     def attack(*_):
         raise raised.pop()
 
-    monkeypatch.setitem(inputs.KINDS, "mat", attack)
+    monkeypatch.setitem(inputs.DATASETS, "mat", attack)
     script.worker("mat", 0, 3, tmp_path)
     report = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert report["outcomes"] == {"failure": 2, "ImageError": 1}

@@ -18,7 +18,7 @@ from curvireg_torch.terms import Appearance
 from tests._support.scenes import CAMERA, scene
 
 VIEWS = sample_views(azimuth_step=30, elevations=[0, 30])
-PIPELINE = replace(Pipeline(field="focus", slack=0.0), bank=replace(Pipeline().bank, image_size=64))
+PIPELINE = replace(Pipeline(field="focus", box_jitter=0.0), bank=replace(Pipeline().bank, image_size=64))
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,9 @@ def test_poses_are_judged_on_the_scale_of_the_views(bank):
     query = matcher.query([image], box[None])
     ranking = matcher.rank(query)
     views = torch.tensor([3, 11, 3])
-    scores = matcher.late_score("appearance", query, ranking, matcher._shaded(views), torch.zeros(3, dtype=torch.long))
+    scores = matcher.reranking_score(
+        "appearance", query, ranking, matcher._shaded(views), torch.zeros(3, dtype=torch.long)
+    )
     raw = ranking.terms["appearance"].double()
     expected = Appearance().log_score(raw)[0, views]
     torch.testing.assert_close(scores, expected, atol=0.1, rtol=0.1)
@@ -105,9 +107,9 @@ def test_hypotheses_tell_how_they_look():
     bank = ViewBank.build(example_mesh(), VIEWS, pipeline=PIPELINE, progress=False)
     result = Registrar(bank)([image], box[None], CAMERA)[0]
     assert float(rotation_error(result.rotation, T[:3, :3])) < 5
-    looks = [h.evidence["appearance"] for h in result.hypotheses]
-    assert looks[0] == max(looks)
-    assert looks[0] != 0
+    appearance_scores = [h.evidence["appearance"] for h in result.hypotheses]
+    assert appearance_scores[0] == max(appearance_scores)
+    assert appearance_scores[0] != 0
 
 
 def painted() -> trimesh.Trimesh:

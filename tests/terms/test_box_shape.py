@@ -75,4 +75,4 @@ def test_shapes_of_boxes_without_area_are_refused(shape):
 def test_a_bank_with_a_view_without_box_makes_no_matcher():
     views = SimpleNamespace(boxes=torch.tensor([[0.0, 0, 20, 10], [math.nan] * 4]))
     with pytest.raises(InvalidInputError, match="views: expected finite shapes, got 1 of 2"):
-        BoxShape().over(views)
+        BoxShape().build(views)

@@ -6,7 +6,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from curvireg_torch.terms.repeatability import Repeatability, cell_shares
+from curvireg_torch.terms.repeatability import Repeatability, cell_fractions
 
 
 @pytest.mark.parametrize(("size", "cell"), [(128, 2), (64, 1), (65, 2), (100, 3), (1030, 16)])
@@ -14,7 +14,7 @@ def test_shares_are_those_of_average_pooling(size, cell):
     points = torch.rand(3, size, size, generator=torch.Generator().manual_seed(0)) < 0.3
     points[1] = True
     expected = F.avg_pool2d(points[:, None].float(), cell, ceil_mode=True)[:, 0]
-    assert torch.equal(cell_shares(points, cell), expected)
+    assert torch.equal(cell_fractions(points, cell), expected)
 
 
 class OneView:
@@ -39,7 +39,7 @@ def test_a_point_in_a_cut_cell_counts_once(size, cell):
     points = torch.zeros(1, 1, size, size, dtype=torch.bool)
     for y, x in ((size - 1, size - 1), (0, size - 1), (0, 0), (2 * cell, cell)):
         points[..., y, x] = True
-    term = Repeatability().over(OneView(size))
+    term = Repeatability().build(OneView(size))
     assert term.cell == cell
     assert term(SimpleNamespace(points=points)).item() == 0.5
 
@@ -65,7 +65,7 @@ def test_points_are_counted_in_64_cells_a_side_however_far_they_may_be_apart(sid
     eps = 0.1
     away = int(eps * side)
     views = OnePoint(side, [side // 2 + away - 3, side // 2 + away + 4])
-    term = Repeatability(eps=eps).over(views)
+    term = Repeatability(eps=eps).build(views)
     assert term.near.shape == (2, cells**2)
     query = OnePoint(side, [side // 2]).points[None]
     assert term(SimpleNamespace(points=query)).tolist() == [[1.0, 0.0]]
@@ -73,5 +73,5 @@ def test_points_are_counted_in_64_cells_a_side_however_far_they_may_be_apart(sid
 
 def test_cells_are_never_larger_than_eps():
     """2 px at 128 px allow cells of 2 px, 1 px allows pixels alone."""
-    sides = [Repeatability(eps=eps).over(OnePoint(128, [64])).near.shape[1] ** 0.5 for eps in (0.016, 0.008)]
+    sides = [Repeatability(eps=eps).build(OnePoint(128, [64])).near.shape[1] ** 0.5 for eps in (0.016, 0.008)]
     assert sides == [64, 128]

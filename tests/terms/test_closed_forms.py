@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.matching import slack_boxes
+from curvireg_torch.matching import jittered_boxes
 from curvireg_torch.terms import (
     BoxShape,
     Correlation,
@@ -35,8 +35,8 @@ def test_correlation_is_the_cosine_of_each_query_with_each_view():
 def test_whitening_is_asked_for_by_name_and_shrinks_by_half():
     descriptors = torch.rand(40, 6, generator=torch.Generator().manual_seed(0))
     views = SimpleNamespace(descriptors=descriptors)
-    assert Correlation().over(views).whitening is None
-    assert Correlation(whitening="bank").over(views).whitening is not None
+    assert Correlation().build(views).whitening is None
+    assert Correlation(whitening="bank").build(views).whitening is not None
     statistics = DescriptorStatistics.from_descriptors(descriptors)
     x = descriptors[:3]
     assert torch.equal(statistics.whitening()(x), statistics.whitening(shrinkage=0.5)(x))
@@ -78,9 +78,9 @@ def test_weights_are_checked_in_every_term(term):
 
 def test_slack_is_at_most_nearly_half():
     box = torch.tensor([[0.0, 0.0, 100.0, 50.0]])
-    assert slack_boxes(box, 0.45).shape == (1, 7, 4)
-    with pytest.raises(InvalidInputError, match="slack"):
-        slack_boxes(box, 0.46)
+    assert jittered_boxes(box, 0.45).shape == (1, 7, 4)
+    with pytest.raises(InvalidInputError, match="box_jitter"):
+        jittered_boxes(box, 0.46)
 
 
 def test_the_score_of_a_correlation_is_an_exponential_of_standard_deviations():

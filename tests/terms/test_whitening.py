@@ -55,7 +55,7 @@ def test_the_matcher_ranks_by_whitened_correlation():
     bank = truck_bank()
     whitening = DescriptorStatistics.from_bank(bank).whitening()
     image, box, _ = scene(0)
-    matcher = ViewMatcher(bank, slack=0.0, whitening=whitening)
+    matcher = ViewMatcher(bank, box_jitter=0.0, whitening=whitening)
     query = matcher.query([image], box[None]).descriptors[:, 0]
     a, b = (torch.linalg.solve(torch.linalg.inv(whitening.matrix), (x - whitening.mean).T).T for x in
             (query, bank.descriptors))  # fmt: skip

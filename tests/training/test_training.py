@@ -12,14 +12,14 @@ import trimesh
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.matching.fields import depth_filter, hog_layer
 from curvireg_torch.models import FieldNetwork, LearnedCurvilinearSaliency, doubled_angle
-from curvireg_torch.training import Lessons, Replay, adapt, altered, losses
+from curvireg_torch.training import FieldDataset, ReplayBuffer, adapt, augment, losses
 from curvireg_torch.training.field_dataset import SETTINGS
 from curvireg_torch.training.scenes import GeneratedScenes
 
 
 @pytest.fixture(scope="module")
 def batch():
-    lessons = Lessons(GeneratedScenes(4, seed=1))
+    lessons = FieldDataset(GeneratedScenes(4, seed=1))
     items = [lessons[i] for i in range(4)]
     stacked = {k: torch.stack([item[k] for item in items]).float() for k in items[0]}
     return {**stacked, "image": stacked["image"] / 255}
@@ -50,7 +50,7 @@ def test_mirroring_keeps_answers_right(batch):
     found = set()
     for seed in range(6):
         one = {k: v[:1] for k, v in batch.items()}
-        other = altered(one, torch.Generator().manual_seed(seed))
+        other = augment(one, torch.Generator().manual_seed(seed))
         mirrored = not torch.equal(other["mask"], one["mask"])
         found.add(mirrored)
         expected = one["code"].flip(3) * torch.tensor([1.0, -1.0])[:, None, None] if mirrored else one["code"]
@@ -61,7 +61,7 @@ def test_mirroring_keeps_answers_right(batch):
 
 
 def test_replay_keeps_the_latest(batch):
-    replay = Replay(6)
+    replay = ReplayBuffer(6)
     for k in range(4):
         replay.add({name: values[:2] * 0 + k for name, values in batch.items()})
     drawn = replay.draw(2, 40, torch.Generator().manual_seed(0))
@@ -134,7 +134,7 @@ def test_pictures_are_mirrored_with_their_answers():
     mask[..., :4] = 1.0
     width = hog_layer(SETTINGS)(torch.zeros(1, 2, 128, 128)).shape[1]
     batch = {"image": image, "mask": mask, "code": torch.zeros(B, 2, 8, 8), "descriptors": torch.zeros(B, 7, width)}
-    found = altered(batch, torch.Generator().manual_seed(0))
+    found = augment(batch, torch.Generator().manual_seed(0))
     left, right = (half.std(dim=2).mean(dim=(1, 2)) for half in found["image"].split(8, dim=3))
     mirrored = found["mask"][:, 0, 0, 0] == 0
     assert 5 < int(mirrored.sum()) < B - 5

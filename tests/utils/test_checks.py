@@ -16,12 +16,12 @@ from curvireg_torch import filters, geometry, metrics
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError
 from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.matching import dilate_points, distinct_views
-from curvireg_torch.registration import find, fit_contours
+from curvireg_torch.registration import fit_contours, localize
 from curvireg_torch.rendering import make_renderer, render_colour
 from curvireg_torch.rendering.shading import shade
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from curvireg_torch.utils.checks import check_pose, check_rotation, check_square_pixels
-from curvireg_torch.visualization import contour_overlay, posed_glb, registration_sheet
+from curvireg_torch.visualization import contour_overlay, pose_glb, registration_sheet
 
 SIZE = (96, 128)
 BACKENDS = ("torch", "embree")
@@ -53,7 +53,7 @@ def thorough(mesh: trimesh.Trimesh) -> cr.Registrar:
 
 @pytest.fixture(scope="module")
 def registrar(thorough: cr.Registrar) -> cr.Registrar:
-    return cr.Registrar(cr.ViewMatcher(thorough.bank, slack=0.0), refine=False)
+    return cr.Registrar(cr.ViewMatcher(thorough.bank, box_jitter=0.0), refine=False)
 
 
 class Entries:
@@ -80,7 +80,7 @@ class Entries:
         self.cameras: dict[str, Callable[[Tensor], object]] = {
             "Registrar": lambda K: one(registrar([image], box[None], K[None])),
             "Registrar, no box": lambda K: one(registrar([image], None, K)),
-            "find": lambda K: one(find(registrar, [image], K)[0]),
+            "localize": lambda K: one(localize(registrar, [image], K)[0]),
             "Locator": lambda K: registrar.locator([image], camera_matrices=[K]),
             "locate": lambda K: cr.locate(registrar.pipeline, bank, [image], camera_matrices=[K]),
             "fit_contours": lambda K: fit(camera_matrices=K),
@@ -94,7 +94,7 @@ class Entries:
             "place_view": lambda K: geometry.place_view(points, R, box, K),
             "opengl_projection": lambda K: geometry.opengl_projection(K, size, near=1.0, far=9.0),
             "mspd_error": lambda K: metrics.mspd_error(pose[None], pose[None], points, K),
-            "posed_glb": lambda K: posed_glb(mesh, pose, K, image),
+            "posed_glb": lambda K: pose_glb(mesh, pose, K, image),
             "contour_overlay": lambda K: contour_overlay(registrar, result, image, box, K),
             "registration_sheet": lambda K: registration_sheet(registrar, result, image, box, K),
             "average_shading_gradient": lambda K: cr.average_shading_gradient(depth, camera_matrix=K.float()),
@@ -102,7 +102,7 @@ class Entries:
             "apparent_ridges": lambda K: cr.apparent_ridges(depth, camera_matrix=K.float()),
             "ApparentRidges": lambda K: cr.ApparentRidges(camera_matrix=K.float()),
         }
-        self.needs_square_pixels = ("Registrar", "Registrar, no box", "find", "Locator", "locate")
+        self.needs_square_pixels = ("Registrar", "Registrar, no box", "localize", "Locator", "locate")
         self.poses: dict[str, Callable[[Tensor], object]] = {
             "fit_contours": lambda T: fit(starts=T[None]),
             "render_depth": lambda T: cr.render_depth(mesh, T, CAMERA, size),
@@ -113,7 +113,7 @@ class Entries:
             "opengl_from_opencv": geometry.opengl_from_opencv,
             "opencv_from_opengl": geometry.opencv_from_opengl,
             "pytorch3d_from_opencv": geometry.pytorch3d_from_opencv,
-            "posed_glb": lambda T: posed_glb(mesh, T, CAMERA, image),
+            "posed_glb": lambda T: pose_glb(mesh, T, CAMERA, image),
             "add_error": lambda T: metrics.add_error(pose[None], T[None], points),
             "adds_error": lambda T: metrics.adds_error(pose[None], T[None], points),
             "mssd_error": lambda T: metrics.mssd_error(pose[None], T[None], points),
@@ -139,12 +139,12 @@ class Entries:
         }
         self.photographs: dict[str, Callable[[Any], object]] = {
             "Registrar": lambda x: one(registrar([x], box[None])),
-            "find": lambda x: one(find(registrar, [x])[0]),
+            "localize": lambda x: one(localize(registrar, [x])[0]),
             "ViewMatcher": lambda x: registrar.matcher([x], box[None]),
             "Locator": lambda x: registrar.locator([x]),
             "locate": lambda x: cr.locate(registrar.pipeline, bank, [x]),
             "fit_contours": lambda x: fit(images=[x]),
-            "posed_glb": lambda x: posed_glb(mesh, pose, CAMERA, x),
+            "posed_glb": lambda x: pose_glb(mesh, pose, CAMERA, x),
             "contour_overlay": lambda x: contour_overlay(registrar, result, x, box),
         }
         self.boxes: dict[str, Callable[[Any], object]] = {
@@ -173,7 +173,7 @@ def refused(name: str, call: Callable[[Any], object], given: Any, match: str = "
     return error
 
 
-def altered(matrix: Tensor, *changes: tuple[int, int, float]) -> Tensor:
+def augment(matrix: Tensor, *changes: tuple[int, int, float]) -> Tensor:
     matrix = matrix.clone()
     for i, j, value in changes:
         matrix[i, j] = value
@@ -181,14 +181,14 @@ def altered(matrix: Tensor, *changes: tuple[int, int, float]) -> Tensor:
 
 
 BAD_CAMERAS = {
-    "NaN": altered(CAMERA, (0, 2, math.nan)),
-    "infinite": altered(CAMERA, (1, 1, math.inf)),
-    "fx = 0": altered(CAMERA, (0, 0, 0.0)),
-    "fy = 0": altered(CAMERA, (1, 1, 0.0)),
-    "fx < 0": altered(CAMERA, (0, 0, -220.1)),
-    "both < 0": altered(CAMERA, (0, 0, -220.1), (1, 1, -220.1)),
-    "skew": altered(CAMERA, (0, 1, 0.5)),
-    "last row": altered(CAMERA, (2, 0, 0.01)),
+    "NaN": augment(CAMERA, (0, 2, math.nan)),
+    "infinite": augment(CAMERA, (1, 1, math.inf)),
+    "fx = 0": augment(CAMERA, (0, 0, 0.0)),
+    "fy = 0": augment(CAMERA, (1, 1, 0.0)),
+    "fx < 0": augment(CAMERA, (0, 0, -220.1)),
+    "both < 0": augment(CAMERA, (0, 0, -220.1), (1, 1, -220.1)),
+    "skew": augment(CAMERA, (0, 1, 0.5)),
+    "last row": augment(CAMERA, (2, 0, 0.01)),
     "not scaled": 2.0 * CAMERA,
     "transposed": CAMERA.T.contiguous(),
 }
@@ -204,12 +204,12 @@ def test_no_entry_takes_a_bad_camera(entries: Entries, bad: str) -> None:
 def test_every_entry_takes_a_good_camera(entries: Entries) -> None:
     for call in entries.cameras.values():
         call(CAMERA)
-        call(altered(CAMERA, (1, 1, 238.0)))  # 8 % apart
+        call(augment(CAMERA, (1, 1, 238.0)))  # 8 % apart
 
 
 @pytest.mark.parametrize("fx", [195.0, 245.0])
 def test_only_what_compares_views_asks_for_square_pixels(entries: Entries, fx: float) -> None:
-    oblong = altered(CAMERA, (0, 0, fx))  # 11 % apart
+    oblong = augment(CAMERA, (0, 0, fx))  # 11 % apart
     for name, call in entries.cameras.items():
         if name in entries.needs_square_pixels:
             refused(name, call, oblong, "square pixels.*resize")
@@ -219,10 +219,10 @@ def test_only_what_compares_views_asks_for_square_pixels(entries: Entries, fx: f
 
 def test_square_pixels_are_within_ten_per_cent_either_way() -> None:
     for ratio in (1.0 / 1.099, 1.0, 1.099):
-        check_square_pixels(altered(CAMERA, (0, 0, 220.1 * ratio)))
+        check_square_pixels(augment(CAMERA, (0, 0, 220.1 * ratio)))
     for ratio in (1.0 / 1.101, 1.101):
         with pytest.raises(InvalidInputError, match="square"):
-            check_square_pixels(torch.stack([CAMERA, altered(CAMERA, (0, 0, 220.1 * ratio))]))
+            check_square_pixels(torch.stack([CAMERA, augment(CAMERA, (0, 0, 220.1 * ratio))]))
 
 
 def bad_poses(T: Tensor) -> dict[str, Tensor]:
@@ -239,13 +239,13 @@ def bad_poses(T: Tensor) -> dict[str, Tensor]:
         "inverted": turned(-T[:3, :3]),
         "sheared": turned(T[:3, :3] @ shear),
         "zero": turned(torch.zeros_like(T[:3, :3])),
-        "NaN": altered(T, (1, 1, math.nan)),
-        "infinite": altered(T, (0, 2, math.inf)),
+        "NaN": augment(T, (1, 1, math.nan)),
+        "infinite": augment(T, (0, 2, math.inf)),
     }
 
 
 def test_no_entry_takes_a_pose_that_is_not_rigid(entries: Entries, pose: Tensor) -> None:
-    others = altered(pose, (3, 0, 0.1)), altered(pose, (3, 3, 2.0)), altered(pose, (2, 3, math.inf))
+    others = augment(pose, (3, 0, 0.1)), augment(pose, (3, 3, 2.0)), augment(pose, (2, 3, math.inf))
     for T in (*bad_poses(pose).values(), *others):
         for name, call in entries.poses.items():
             refused(name, call, T, "expected (rigid|finite)")
@@ -298,14 +298,14 @@ def test_missing_pixels_in_the_box_are_refused(
     image, box = photograph
     x, y = (int(v) for v in 0.5 * (box[:2] + box[2:]))
     for lost in (holes(image, (slice(y, y + 1), slice(x, x + 1)), value), torch.full_like(image, value)):
-        for name in ("Registrar", "find", "ViewMatcher", "Locator", "locate"):
+        for name in ("Registrar", "localize", "ViewMatcher", "Locator", "locate"):
             assert isinstance(refused(name, entries.photographs[name], lost, "NaN or inf in the pixels"), ImageError)
         fit: Any = entries.photographs["fit_contours"](lost)  # fills them
         assert bool(fit.transform.isfinite().all())
 
 
 def test_pixels_beyond_one_are_refused(entries: Entries, photograph: tuple[Tensor, Tensor]) -> None:
-    for name in ("Registrar", "find", "ViewMatcher", "Locator", "locate"):
+    for name in ("Registrar", "localize", "ViewMatcher", "Locator", "locate"):
         refused(name, entries.photographs[name], 255.0 * photograph[0], r"outside \[0, 1\].*255")
         refused(name, entries.photographs[name], photograph[0] - 0.6, r"outside \[0, 1\].*255")
 
@@ -366,9 +366,9 @@ def test_fields_fill_missing_pixels() -> None:
     from curvireg_torch.models.appearance import describe
     from curvireg_torch.models.backbone import Backbone
 
-    looks = describe(torch.cat([image, lost]), Backbone())
-    assert bool(looks.isfinite().all())
-    assert 0.5 < float((looks[0].float() * looks[1].float()).sum()) < 0.9999
+    appearance_scores = describe(torch.cat([image, lost]), Backbone())
+    assert bool(appearance_scores.isfinite().all())
+    assert 0.5 < float((appearance_scores[0].float() * appearance_scores[1].float()).sum()) < 0.9999
 
 
 def test_a_field_of_ones_own_sees_no_missing_pixels(registrar: cr.Registrar, photograph: tuple[Tensor, Tensor]) -> None:

@@ -132,9 +132,9 @@ def test_without_a_camera_the_rotation_is_that_of_the_view(answered):
         assert pose.translation is None
         assert float(rotation_error(pose.rotation, before.rotation)) == pytest.approx(5, abs=1e-3)
         # A shift moves the object in the picture, not its rotation as a camera sees it that looks straight at it.
-        T = pose.seen_by[0]
+        T = pose.projection[0]
         session.nudge(shift=(0.1, 0, 0))
-        assert torch.equal(session.shown.pose.seen_by[0][:3, :3], T[:3, :3])
+        assert torch.equal(session.shown.pose.projection[0][:3, :3], T[:3, :3])
         assert 0.1 < float(rotation_error(session.shown.pose.rotation, pose.rotation)) < 5
         assert session.document()["viewer"]["translation"] is None
     finally:
@@ -231,11 +231,11 @@ def test_it_is_stopped_and_has_a_limit(folder):
     session.limit, told = 600.0, session._teller
 
     def stopping(start):
-        def tell(*told_of):
+        def report_progress(*told_of):
             session.stop()
             told(start)(*told_of)
 
-        return tell
+        return report_progress
 
     session._teller = stopping
     with pytest.raises(CurviregError, match=r"^stopped$"):

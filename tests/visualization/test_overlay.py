@@ -67,7 +67,7 @@ def test_contours_lie_where_the_object_is_seen_though_the_box_is_wrong(found):
 
 def test_the_true_pose_is_drawn_on_the_true_contour(found):
     registrar, result, image, box, T = found
-    best = replace(result.hypotheses[0], seen_by=(T, CAMERA))
+    best = replace(result.hypotheses[0], projection=(T, CAMERA))
     assert near(drawn(contour_overlay(registrar, best, image, box)), silhouette(T), 1) == 1.0
 
 
@@ -79,7 +79,7 @@ def check_assumed_camera(registrar, result, image, box, truth):
     # A view of the same rotation that fills the box lies beside it.
     angle, distance = result.allocentric_rotation[None], torch.tensor([result.distance])
     refitted = registrar.describers[0].cameras_of_boxes(angle, distance, box[None])
-    old = replace(result.hypotheses[0], seen_by=(refitted[0][0], refitted[1][0]))
+    old = replace(result.hypotheses[0], projection=(refitted[0][0], refitted[1][0]))
     assert near(drawn(contour_overlay(registrar, old, image, box)), truth, 2) < 0.5
 
 
@@ -104,11 +104,11 @@ def test_orthographic_pipelines_are_drawn_by_a_camera_from_far_away():
 
 def test_every_hypothesis_is_seen_where_its_pose_says(found, blind):
     for hypothesis in found[1].hypotheses:
-        torch.testing.assert_close(hypothesis.seen_by[0], hypothesis.transform)
-        assert hypothesis.seen_by[1].equal(CAMERA)
+        torch.testing.assert_close(hypothesis.projection[0], hypothesis.transform)
+        assert hypothesis.projection[1].equal(CAMERA)
     registrar, result, _, box, _ = blind
     for hypothesis in result.hypotheses:
-        T, K = hypothesis.seen_by
+        T, K = hypothesis.projection
         centre = T[:3, :3] @ registrar.describers[0].centre + T[:3, 3]
         assert float(centre.norm()) == pytest.approx(hypothesis.distance, rel=1e-6)
         mask = silhouette(T, K)
@@ -124,7 +124,7 @@ def test_a_hypothesis_that_was_sent_back_is_seen_by_the_camera_of_its_start(blin
     back = [h for h in result.hypotheses if torch.equal(h.rotation, begun[h.view].rotation)]
     assert back
     for hypothesis in back:
-        torch.testing.assert_close(hypothesis.seen_by, begun[hypothesis.view].seen_by)
+        torch.testing.assert_close(hypothesis.projection, begun[hypothesis.view].projection)
 
 
 def test_the_registrars_own_renderer_draws():
@@ -159,7 +159,7 @@ def test_several_meshes_each_with_its_own():
     image, box, T = scene(0)
     result = registrar([image], box[None], CAMERA)[0]
     truck = next(h for h in result.hypotheses if h.model == 1)
-    seen = replace(truck, seen_by=(T, CAMERA))
+    seen = replace(truck, projection=(T, CAMERA))
     assert near(drawn(contour_overlay(registrar, seen, image, box)), silhouette(T), 1) == 1.0
     seen = replace(seen, model=0)
     assert near(drawn(contour_overlay(registrar, seen, image, box)), silhouette(T, mesh=pole), 1) == 1.0
@@ -195,10 +195,10 @@ def test_a_small_object_is_drawn_large(found):
     room = torch.zeros(3, 4 * H, 4 * W)
     room[:, H : 2 * H, W : 2 * W] = image
     shift = torch.tensor([W, H], dtype=torch.float64)
-    T, K = result.seen_by
+    T, K = result.projection
     K = K.clone()
     K[:2, 2] += shift
-    moved = replace(result, hypotheses=(replace(result.hypotheses[0], seen_by=(T, K)), *result.hypotheses[1:]))
+    moved = replace(result, hypotheses=(replace(result.hypotheses[0], projection=(T, K)), *result.hypotheses[1:]))
     other = registration_sheet(registrar, moved, room, box + shift.repeat(2))
     wide = sheet.shape[1] - 2 * 192
     assert other.shape == sheet.shape

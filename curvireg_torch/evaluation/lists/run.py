@@ -18,7 +18,7 @@ from ...geometry import camera_matrix
 from ...geometry.cameras import camera_of_view
 from ...io import Photo, read_photo
 from ...io.meshes.files import mesh_digest
-from ...registration import FailedRegistration, Registrar, Registration, find
+from ...registration import FailedRegistration, Registrar, Registration, localize
 from ...registration.document import SCHEMA, fitting_box, found_document, result_document
 from ...utils.files import file_digest, write_file
 from ...utils.threads import map_on_threads
@@ -90,7 +90,7 @@ def register_entry(
     start = time.perf_counter()
     K, source = _camera(entry, photo)
     if entry.box is None:
-        results = find(registrar, [photo.image], K, instances=entry.instances, distance=entry.distance)[0]
+        results = localize(registrar, [photo.image], K, instances=entry.instances, distance=entry.distance)[0]
     else:
         results = registrar([photo.image], torch.tensor(entry.box)[None], K)
     result = results[0]
@@ -209,7 +209,7 @@ class _Run:
         except (ImageError, InvalidInputError) as error:
             return _failed(str(error), digests)
         renderer = registrar.describers[result.model].renderer
-        picture = thumbnail(renderer, result.seen_by, photo.image, fitting_box(document))
+        picture = thumbnail(renderer, result.projection, photo.image, fitting_box(document))
         write_file(self._picture(request), picture)  # before the line that says that all is done
         return {"status": "ok", "message": "", **document, "digests": digests}
 

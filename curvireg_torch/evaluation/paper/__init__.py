@@ -1,13 +1,13 @@
 """The measurements of the paper, on any of the datasets; ``scripts/reproduce_paper.py`` runs them."""
 
-from .cases import KINDS, Case, find_cases
+from .cases import DATASETS, Case, find_cases
 from .fields import PHOTO_FIELDS, photo_detectors
 from .points import curve_table, detector_tables, repeatability_table
 from .rankings import Rankings, angle_table, precision_table, rank_tables, rank_views
 from .tables import Table, write_table
 
 __all__ = [
-    "KINDS",
+    "DATASETS",
     "PHOTO_FIELDS",
     "Case",
     "Rankings",

@@ -18,9 +18,9 @@ from ...io import read_image
 from ...io.meshes import load_mesh, mesh_centre, mesh_radius
 from ...settings import BankSettings
 from ..bop import UNOCCLUDED
-from ..registry import KINDS, Kind
+from ..registry import DATASETS, DatasetSpec
 
-__all__ = ["KINDS", "Case", "find_cases", "grouped"]
+__all__ = ["DATASETS", "Case", "find_cases", "grouped"]
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,9 @@ def find_cases(kind: str, root: Path, *, pixel_origin: int = 1, limit: int | Non
         InvalidInputError: nothing is left, or an unknown kind.
         MissingFileError: the dataset is not there.
     """
-    if kind not in KINDS:
-        raise InvalidInputError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
-    row = KINDS[kind]
+    if kind not in DATASETS:
+        raise InvalidInputError(f"kind: expected one of {', '.join(DATASETS)}, got {kind!r}")
+    row = DATASETS[kind]
     origin = {"pixel_origin": pixel_origin} if "pixel_origin" in row.options else {}
     dataset = row.open(root, **row.whole, **origin)
     cases = [case for i in range(len(dataset)) if (case := _case(row, dataset.annotation(i))) is not None]
@@ -87,7 +87,7 @@ def find_cases(kind: str, root: Path, *, pixel_origin: int = 1, limit: int | Non
     return sorted(cases, key=lambda case: case.mesh_path)
 
 
-def _case(kind: Kind, s: dict[str, Any]) -> Case | None:
+def _case(kind: DatasetSpec, s: dict[str, Any]) -> Case | None:
     translation = s.get("translation", torch.full((3,), math.nan))
     pose = torch.cat([s["rotation"], translation[:, None]], dim=1).double()
     known = bool(pose[:, :3].isfinite().all() and s["box"].isfinite().all())

@@ -20,7 +20,7 @@ PHOTO_FIELDS: dict[str, Callable[[], nn.Module]] = {
 """Photographs (B, 1, H, W) to fields."""
 
 
-def photo_detectors(point_share: float) -> dict[str, Callable[[Tensor], Tensor]]:
+def photo_detectors(point_fraction: float) -> dict[str, Callable[[Tensor], Tensor]]:
     """Feature points of photographs: (B, 1, H, W) to bool (B, H, W).
 
     The paper's three filters, thinned to points as views are, and the classical detectors of
@@ -29,10 +29,10 @@ def photo_detectors(point_share: float) -> dict[str, Callable[[Tensor], Tensor]]
 
     def of_field(make: Callable[[], nn.Module]) -> Callable[[Tensor], Tensor]:
         field = make()
-        return lambda image: field_points(field(image), share=point_share)[:, 0]
+        return lambda image: field_points(field(image), share=point_fraction)[:, 0]
 
     def of_detector(detect: Callable[..., Any]) -> Callable[[Tensor], Tensor]:
-        return lambda image: detect(image, share=point_share).points[:, 0]
+        return lambda image: detect(image, share=point_fraction).points[:, 0]
 
     found = {name: of_field(make) for name, make in PHOTO_FIELDS.items()}
     known = {name.lower() for name in found}

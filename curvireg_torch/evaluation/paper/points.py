@@ -27,7 +27,7 @@ CURVE_DETECTORS = ("mfc", "mcs", "ig", "sift", "sobel")
 
 def detector_tables(cases: list[Case], settings: BankSettings, eps_px: float, progress: bool = True) -> list[Table]:
     """IP and Hausdorff distances of every detector against the curvilinear saliency of the right view, per category."""
-    detectors = photo_detectors(settings.point_share)
+    detectors = photo_detectors(settings.point_fraction)
     scores: dict[str, dict[str, dict[str, list[float]]]] = {
         name: defaultdict(lambda: defaultdict(list)) for name in ("ip", "hausdorff", "hausdorff_95", "points")
     }
@@ -69,7 +69,7 @@ def detector_tables(cases: list[Case], settings: BankSettings, eps_px: float, pr
 
 def repeatability_table(cases: list[Case], settings: BankSettings, eps_px: float, progress: bool = True) -> Table:
     """Repeatability of each depth filter's points in each photograph filter's points."""
-    detectors = {n: d for n, d in photo_detectors(settings.point_share).items() if n in PHOTO_FIELDS}
+    detectors = {n: d for n, d in photo_detectors(settings.point_fraction).items() if n in PHOTO_FIELDS}
     depths = ("CS", "ASG", "HFN")
     columns = [f"{d}/{p}" for d in depths for p in detectors]
     scores: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
@@ -87,7 +87,7 @@ def repeatability_table(cases: list[Case], settings: BankSettings, eps_px: float
                         scores[case.category][f"{name}/{photo_name}"].append(value)
     text = (
         f"Repeatability: share of the points of the right view with a point of the photograph within {eps_px:g} px. "
-        f"Crops of {settings.image_size} px, {settings.point_share:.0%} of the pixels at most, N = {len(cases)}."
+        f"Crops of {settings.image_size} px, {settings.point_fraction:.0%} of the pixels at most, N = {len(cases)}."
     )
     return Table(
         "repeatability",
@@ -100,7 +100,7 @@ def repeatability_table(cases: list[Case], settings: BankSettings, eps_px: float
 
 def curve_table(cases: list[Case], settings: BankSettings, eps_px: float, progress: bool = True) -> Table:
     """Repeatability in 40 views around the right one."""
-    detectors = {n: d for n, d in photo_detectors(settings.point_share).items() if n.lower() in CURVE_DETECTORS}
+    detectors = {n: d for n, d in photo_detectors(settings.point_fraction).items() if n.lower() in CURVE_DETECTORS}
     angles = torch.deg2rad(torch.tensor(CURVE_OFFSETS, dtype=torch.float64))
     turns = torch.zeros(len(angles), 3, 3, dtype=torch.float64)
     turns[:, 0, 0] = turns[:, 1, 1] = angles.cos()
@@ -141,7 +141,7 @@ def _depth(describe: ViewDescriber, R: Tensor, distance: float) -> Tensor:
 def _points(depth: Tensor, settings: BankSettings, name: str = "CS") -> Tensor:
     with torch.no_grad():
         field = depth_filter(replace(settings, depth_field=name))(depth)
-    return field_points(field, share=settings.point_share)[:, 0]
+    return field_points(field, share=settings.point_fraction)[:, 0]
 
 
 def _view_points(describe: ViewDescriber, settings: BankSettings, R: Tensor, distance: float) -> Tensor:

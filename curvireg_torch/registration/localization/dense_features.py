@@ -10,14 +10,14 @@ from ...matching import ViewDescriber, ViewMatcher
 from ...models.backbone import STRIDES, Backbone
 from ...terms import photograph_field
 
-__all__ = ["Cells", "FieldCells", "LookCells", "cells_for"]
+__all__ = ["BackboneFeatures", "DenseFeatures", "FieldFeatures", "dense_features_for"]
 
 
 FLAT = 0.01
 """Share of the strongest edges' energy that counts as none."""
 
 
-class Cells(nn.Module, ABC):
+class DenseFeatures(nn.Module, ABC):
     """Feature maps at one stride, or at two, the second twice as coarse.
 
     Attributes:
@@ -46,7 +46,7 @@ class Cells(nn.Module, ABC):
         """(K, C, side / stride, side / stride) for each stride, for each way to show K views of a mesh."""
 
 
-class LookCells(Cells):
+class BackboneFeatures(DenseFeatures):
     """Features of the appearance term's network. Views are shaded grey, and in colours where the mesh has some."""
 
     strides = STRIDES
@@ -65,7 +65,7 @@ class LookCells(Cells):
         return [self.of_photograph(way) for way in (small[:, :1], small[:, 1:]) if way.shape[1]]
 
 
-class FieldCells(Cells):
+class FieldFeatures(DenseFeatures):
     """Orientations of the photograph's field and of depth fields, for pipelines in which nothing was learnt."""
 
     strides = (8,)
@@ -90,10 +90,10 @@ class FieldCells(Cells):
         return [[orientation_cells(describer.fields(rotations, distances), grid=(side // cell, side // cell))]]
 
 
-def cells_for(matcher: ViewMatcher) -> Cells:
+def dense_features_for(matcher: ViewMatcher) -> DenseFeatures:
     """Pictures, as the appearance term's network sees them; fields for pipelines in which nothing was learnt."""
     pipeline = matcher.pipeline
     if pipeline.field == "learned" or any(term.name == "appearance" for term in pipeline.terms):
         networks = (module for module in matcher.modules() if isinstance(module, Backbone))
-        return LookCells(next(networks, None) or Backbone()).to(matcher.device)
-    return FieldCells(matcher.field).to(matcher.device)
+        return BackboneFeatures(next(networks, None) or Backbone()).to(matcher.device)
+    return FieldFeatures(matcher.field).to(matcher.device)

@@ -10,22 +10,22 @@ from torch import Tensor
 
 from ...errors import CurviregError, InvalidInputError
 from ...geometry.crops import box_iou
-from ...matching import Photographs, Ranking
-from ..confidence import presence, presence_evidence
-from ..correction import posed_box
-from ..inputs import Item, check_crop, items_of, named
-from ..pose import FailedRegistration, Found, Registration
+from ...matching import QueryFeatures, Ranking
+from ..confidence import presence, presence_features
+from ..correction import projected_box
+from ..inputs import ImageItem, check_crop, image_items, named
+from ..pose import FailedRegistration, Localization, Registration
 from . import Located
 from .locator import OVERLAP, check_distance
 
 if TYPE_CHECKING:
     from ..registrar import Registrar
 
-__all__ = ["Places", "find"]
+__all__ = ["ScoredCandidates", "localize"]
 
 
 @torch.no_grad()
-def find(
+def localize(
     registrar: "Registrar",
     images: Tensor | Sequence[Any],
     camera_matrices: Any | None = None,
@@ -56,24 +56,26 @@ def find(
     check_distance(distance, with_cameras=camera_matrices is not None)
     _ = registrar.locator  # made once, before threads ask for it
 
-    def looked_for(some: Sequence[Item | CurviregError], first: int) -> list[list[Registration | FailedRegistration]]:
+    def looked_for(
+        some: Sequence[ImageItem | CurviregError], first: int
+    ) -> list[list[Registration | FailedRegistration]]:
         numbered = enumerate(some, start=first)
         return [_found_objects(registrar, item, f"image {i}", instances, distance) for i, item in numbered]
 
-    return registrar.each(items_of(images, None, camera_matrices), looked_for)
+    return registrar.each(image_items(images, None, camera_matrices), looked_for)
 
 
 def _found_objects(
     registrar: "Registrar",
-    item: Item | CurviregError,
+    item: ImageItem | CurviregError,
     name: str,
     instances: int,
     distance: tuple[float, float] | None,
 ) -> list[Registration | FailedRegistration]:
-    """:func:`find` for one photograph."""
-    if not isinstance(item, Item):
+    """:func:`localize` for one photograph."""
+    if not isinstance(item, ImageItem):
         return [FailedRegistration(item)]
-    registrar.tell("looking")
+    registrar.report_progress("looking")
     try:
         check_crop(_extremes(item.image))
         cameras = None if item.camera_matrix is None else [item.camera_matrix]
@@ -83,12 +85,12 @@ def _found_objects(
         return [FailedRegistration(named(error, name))]
 
 
-def _followed(registrar: "Registrar", item: Item, located: Located, instances: int) -> list[Registration]:
+def _followed(registrar: "Registrar", item: ImageItem, located: Located, instances: int) -> list[Registration]:
     """The best ``instances`` objects among the places of one photograph."""
     if not len(located.boxes):
         raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
     count = max(registrar.pipeline.locate.followed, instances + 1)
-    places = Places.judged(registrar, item, located.boxes[:count], located.scores[:count])
+    places = ScoredCandidates.score_boxes(registrar, item, located.boxes[:count], located.scores[:count])
     answers: list[Registration] = []
     for k in nms(places.boxes, places.presence, OVERLAP).tolist():
         if len(answers) < instances:
@@ -112,32 +114,32 @@ def _add(answers: list[Registration], new: Registration) -> None:
 
 
 @dataclass(frozen=True)
-class Places:
+class ScoredCandidates:
     """P boxes of one photograph, described and ranked, and how surely each shows the object."""
 
     boxes: Tensor
     scores: Tensor
-    query: Photographs
+    query: QueryFeatures
     ranking: Ranking
     evidence: list[list[float]]
     presence: Tensor
 
     @classmethod
-    def judged(cls, registrar: "Registrar", item: Item, boxes: Tensor, scores: Tensor) -> "Places":
+    def score_boxes(cls, registrar: "Registrar", item: ImageItem, boxes: Tensor, scores: Tensor) -> "ScoredCandidates":
         query = registrar.matcher.query([item.image] * len(boxes), boxes)
         ranking = registrar.matcher.rank(query)
         pictures = registrar.locator.cells.pictures
         ones = (ranking[k : k + 1] for k in range(len(boxes)))
-        evidence = [presence_evidence(s, one, pictures=pictures) for s, one in zip(scores.tolist(), ones, strict=True)]
+        evidence = [presence_features(s, one, pictures=pictures) for s, one in zip(scores.tolist(), ones, strict=True)]
         sure = torch.tensor([presence(known) for known in evidence], dtype=torch.float64)
         return cls(boxes, scores, query, ranking, evidence, sure)
 
-    def registered(self, registrar: "Registrar", item: Item, k: int) -> Registration:
+    def registered(self, registrar: "Registrar", item: ImageItem, k: int) -> Registration:
         """Box ``k`` as a registration, the box around its pose in the place of the one it began with."""
         one = slice(k, k + 1)
         result = registrar.register([replace(item, box=self.boxes[k])], self.query[one], self.ranking[one])[0]
-        found = Found(
-            box=posed_box(registrar, result),
+        found = Localization(
+            box=projected_box(registrar, result),
             presence=float(self.presence[k]),
             score=float(self.scores[k]),
             boxes=self.boxes[:0].double(),
@@ -146,11 +148,11 @@ class Places:
         return replace(result, found=found)
 
 
-def _corrected(registrar: "Registrar", item: Item, answer: Registration) -> Registration:
+def _corrected(registrar: "Registrar", item: ImageItem, answer: Registration) -> Registration:
     """The better of an answer and of what the box around its pose leads to."""
     found = found_in(answer)
     try:
-        places = Places.judged(registrar, item, found.box[None].float(), torch.tensor([found.score]))
+        places = ScoredCandidates.score_boxes(registrar, item, found.box[None].float(), torch.tensor([found.score]))
     except InvalidInputError:  # the pose has left the photograph: it is of nothing that is there
         return replace(answer, found=replace(found, presence=0.0))
     if float(places.presence[0]) <= found.presence:
@@ -164,7 +166,7 @@ def _extremes(image: Tensor) -> Tensor:
     return pair.float() / 255.0 if image.dtype == torch.uint8 else pair
 
 
-def found_in(result: Registration) -> Found:
+def found_in(result: Registration) -> Localization:
     """``found`` of a result that has it."""
     assert result.found is not None
     return result.found

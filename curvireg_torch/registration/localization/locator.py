@@ -13,7 +13,7 @@ from ...geometry.crops import crop_transforms, square_boxes
 from ...matching import ViewBank, ViewDescriber, ViewMatcher
 from ...pipeline import Pipeline
 from ...utils.checks import as_numbers, check_camera_matrix, check_photograph, check_pixels, check_square_pixels
-from .dense_features import Cells, cells_for
+from .dense_features import DenseFeatures, dense_features_for
 from .representatives import representative_views
 
 __all__ = ["OVERLAP", "Located", "Locator", "check_distance", "locate"]
@@ -86,7 +86,7 @@ class Locator(nn.Module):
     def __init__(self, matcher: ViewMatcher) -> None:
         super().__init__()
         self.matcher, self.settings = matcher, matcher.pipeline.locate
-        self.cells = cells_for(matcher)
+        self.cells = dense_features_for(matcher)
         self._templates = _templates(self.cells, matcher, self.settings.views)
 
     @torch.no_grad()
@@ -210,7 +210,7 @@ def check_distance(distance: tuple[float, float] | None, *, with_cameras: bool) 
         raise InvalidInputError("distance: needs the camera matrix of every photograph")
 
 
-def _templates(cells: Cells, matcher: ViewMatcher, count: int) -> _Templates:
+def _templates(cells: DenseFeatures, matcher: ViewMatcher, count: int) -> _Templates:
     bank = matcher.bank
     views = representative_views(bank, count)
     R, z, boxes = bank.rotations[views], bank.distances[views], bank.boxes[views].double()

@@ -10,14 +10,14 @@ from ...geometry.crops import crop_transforms, square_boxes
 from ...geometry.viewpoint import rotation_from_viewpoint
 from .light import Light, random_light
 from .materials import Material, random_picture
+from .rotations import random_rotation
 from .shapes import Shape
 from .surfaces import Array
-from .turns import any_turn
 
-__all__ = ["Arrangement", "Thing", "arrange"]
+__all__ = ["Arrangement", "PlacedShape", "arrange"]
 
 
-class Thing(NamedTuple):
+class PlacedShape(NamedTuple):
     """A shape in the camera's frame: vertices (V, 3) in radii of the object, faces (F, 3), materials (F,)."""
 
     vertices: Array
@@ -44,8 +44,8 @@ class Arrangement:
 
     rotation: Array
     distance: float
-    things: tuple[Thing, ...]
-    looks: tuple[dict[int, Material], ...]
+    household: tuple[PlacedShape, ...]
+    appearance_scores: tuple[dict[int, Material], ...]
     light: Light
     camera_matrix: Array
     size: int
@@ -81,33 +81,35 @@ def arrange(
         azimuth, elevation = rng.uniform(0, 360), rng.uniform(-12, 60) * rng.choice([0.35, 1.0])
         R = rotation_from_viewpoint(azimuth, elevation, rng.normal(0, 5)).numpy()
     else:
-        R = any_turn(rng)
+        R = random_rotation(rng)
     distance = float(np.exp(rng.uniform(np.log(2.2), np.log(14.0))))
     centre = np.array([0.0, 0.0, distance])
-    placed = shape.vertices @ R.T + centre
-    K, cut = _crop_camera(placed, rng, size, margin)
-    things = [Thing(placed, shape.faces, shape.materials)]
+    lift_to_poses = shape.vertices @ R.T + centre
+    K, cut = _crop_camera(lift_to_poses, rng, size, margin)
+    household = [PlacedShape(lift_to_poses, shape.faces, shape.materials)]
     floor = float((shape.vertices[:, 2]).min())
     above = float(-(R.T @ centre)[2]) > floor + 0.1  # seen from below, the ground would hide everything
     ground = standing and rng.random() < 0.6 and above
-    things += [_beside(other, R, centre, floor if ground else None, K, size, rng) for other in clutter]
+    household += [_beside(other, R, centre, floor if ground else None, K, size, rng) for other in clutter]
     if ground:
-        things.append(_ground(R, centre, floor, rng))
+        household.append(_ground(R, centre, floor, rng))
     if rng.random() < 0.3:
-        things.append(_wall(distance, rng))
+        household.append(_wall(distance, rng))
     plain = rng.uniform(0.2, 0.8)
-    looks = tuple({int(k): Material(rng, plain=plain) for k in np.unique(thing.materials)} for thing in things)
+    appearance_scores = tuple(
+        {int(k): Material(rng, plain=plain) for k in np.unique(thing.materials)} for thing in household
+    )
     light = random_light(R[:, 2], rng)
     background = random_picture(rng, 3 * size // 2)
     defocus = float(rng.uniform(0.7, 4.0)) if rng.random() < 0.35 else 0.0
-    return Arrangement(R, distance, tuple(things), looks, light, K, size, cut, background, defocus)
+    return Arrangement(R, distance, tuple(household), appearance_scores, light, K, size, cut, background, defocus)
 
 
 def _crop_camera(
-    placed: Array, rng: np.random.Generator, size: int, margin: float
+    lift_to_poses: Array, rng: np.random.Generator, size: int, margin: float
 ) -> tuple[Array, tuple[int, int, int, int]]:
     """Camera matrix of the crop around a jittered box, and the part of the crop that the photograph covers."""
-    flat = placed[:, :2] / np.maximum(placed[:, 2:], 0.1)
+    flat = lift_to_poses[:, :2] / np.maximum(lift_to_poses[:, 2:], 0.1)
     low, high = flat.min(axis=0), flat.max(axis=0)
     side = high - low
     jitter = rng.normal(0, rng.choice([0.01, 0.05]), 4)
@@ -127,7 +129,7 @@ def _crop_camera(
 
 def _beside(
     other: Shape, R: Array, centre: Array, floor: float | None, K: Array, size: int, rng: np.random.Generator
-) -> Thing:
+) -> PlacedShape:
     """Another shape somewhere in the picture: mostly behind the object, at times before it."""
     scale = np.exp(rng.uniform(-1.0, 0.8))
     upright = R @ rotation_from_viewpoint(rng.uniform(0, 360), 90.0, 0.0).numpy()  # about the vertical
@@ -137,7 +139,7 @@ def _beside(
         where = np.array([reach * np.cos(towards), reach * np.sin(towards), floor - scale * other.vertices[:, 2].min()])
         points = scale * other.vertices @ upright.T + R @ where + centre
         if points[:, 2].min() > 0.3:
-            return Thing(points, other.faces, other.materials)
+            return PlacedShape(points, other.faces, other.materials)
     front = rng.random() < 0.25
     z = centre[2] + (-1.3 if front else rng.uniform(0.5, 4.0))
     scale = scale * (0.3 if front else 1.0)
@@ -145,21 +147,23 @@ def _beside(
     if front:  # at the rim, so that it covers a part only
         pixel[rng.integers(2)] = size * rng.choice([0.1, 0.9])
     ray = np.array([(pixel[0] - K[0, 2]) / K[0, 0], (pixel[1] - K[1, 2]) / K[1, 1], 1.0])
-    points = scale * other.vertices @ (upright if rng.random() < 0.5 else any_turn(rng)).T + ray * max(z, 0.4 + scale)
-    return Thing(points, other.faces, other.materials)
+    points = scale * other.vertices @ (upright if rng.random() < 0.5 else random_rotation(rng)).T + ray * max(
+        z, 0.4 + scale
+    )
+    return PlacedShape(points, other.faces, other.materials)
 
 
-def _ground(R: Array, centre: Array, floor: float, rng: np.random.Generator) -> Thing:
+def _ground(R: Array, centre: Array, floor: float, rng: np.random.Generator) -> PlacedShape:
     reach = rng.choice([1.6, 4.0, 60.0])
     corners = reach * np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0.0)]) + (0, 0, floor - 0.002)
-    return Thing(corners @ R.T + centre, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(2, int))
+    return PlacedShape(corners @ R.T + centre, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(2, int))
 
 
-def _wall(distance: float, rng: np.random.Generator) -> Thing:
+def _wall(distance: float, rng: np.random.Generator) -> PlacedShape:
     far = distance + rng.uniform(1.2, 5.0)
     slope = rng.normal(0, 0.4)
     x = 3 * far
     corners = np.array(
         [(-x, -x, far - slope * 3), (x, -x, far + slope * 3), (x, x, far + slope * 3), (-x, x, far - slope * 3)]
     )
-    return Thing(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(2, int))
+    return PlacedShape(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(2, int))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from ...rendering.embree import RayScene
-from .arrangement import Arrangement, Thing, arrange
+from .arrangement import Arrangement, PlacedShape, arrange
 from .camera_noise import photographed
 from .light import lit
 from .shapes import Shape
@@ -62,12 +62,12 @@ def make_scene(
 def photograph(arrangement: Arrangement, rng: np.random.Generator) -> Scene:
     """Render an arrangement, and take its picture with a camera whose faults ``rng`` decides."""
     size, K = arrangement.size, arrangement.camera_matrix
-    body = arrangement.things[0]
+    body = arrangement.household[0]
     alone = RayScene(body.vertices, body.faces).distance(*_rays(K, size)).reshape(size, size)
     depth = np.where(np.isfinite(alone), alone, 0.0).astype(np.float32)
-    picture, seen = _render(arrangement, arrangement.things)
+    picture, seen = _render(arrangement, arrangement.household)
     if seen.mean() < 0.1 * (depth > 0).mean():  # hidden: nothing could be learnt
-        picture, seen = _render(arrangement, arrangement.things[:1])
+        picture, seen = _render(arrangement, arrangement.household[:1])
     picture = cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA)
     visible = cv2.resize(seen.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA) > 0.5
     x0, y0, x1, y1 = arrangement.cut
@@ -84,17 +84,17 @@ def _rays(K: Array, size: int) -> tuple[Array, Array]:
     return np.zeros_like(directions), directions
 
 
-def _render(arrangement: Arrangement, things: tuple[Thing, ...]) -> tuple[Array, Array]:
+def _render(arrangement: Arrangement, household: tuple[PlacedShape, ...]) -> tuple[Array, Array]:
     """(F, F, 3) float32 linear picture of those things, F = FINE size, and where the first of them is seen."""
     size = len(arrangement.background)
     K = np.diag([FINE, FINE, 1.0]) @ arrangement.camera_matrix
     K[:2, 2] += 0.5 * (FINE - 1.0)  # pixel centres are whole numbers
     rays = _rays(K, size)
-    first = np.cumsum([0] + [len(thing.vertices) for thing in things[:-1]])
-    vertices = np.concatenate([thing.vertices for thing in things])
-    faces = np.concatenate([thing.faces + k for thing, k in zip(things, first, strict=True)])
-    owner = np.concatenate([np.full(len(thing.faces), k) for k, thing in enumerate(things)])
-    material = np.concatenate([thing.materials for thing in things])
+    first = np.cumsum([0] + [len(thing.vertices) for thing in household[:-1]])
+    vertices = np.concatenate([thing.vertices for thing in household])
+    faces = np.concatenate([thing.faces + k for thing, k in zip(household, first, strict=True)])
+    owner = np.concatenate([np.full(len(thing.faces), k) for k, thing in enumerate(household)])
+    material = np.concatenate([thing.materials for thing in household])
     scene = RayScene(vertices, faces)
     depth, triangle, normal = scene.hits(*rays)
     hit = np.flatnonzero(np.isfinite(depth))
@@ -105,8 +105,8 @@ def _render(arrangement: Arrangement, things: tuple[Thing, ...]) -> tuple[Array,
     local = (points - arrangement.centre) @ arrangement.rotation
     colour = np.empty_like(points)
     gloss, shininess = np.zeros(len(hit)), np.ones(len(hit))
-    for k in range(len(things)):
-        for number, look in arrangement.looks[k].items():
+    for k in range(len(household)):
+        for number, look in arrangement.appearance_scores[k].items():
             here = (owner == k) & (material == number)
             colour[here] = look.colours(local[here])
             gloss[here], shininess[here] = look.gloss, look.shininess

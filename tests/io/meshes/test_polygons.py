@@ -127,7 +127,7 @@ def write(path, kind: str) -> None:
         path.write_bytes(header.encode() + body)
 
 
-KINDS = [
+DATASETS = [
     "off", "off with colours", "obj", "obj counted back", "obj continued", "obj with texture",
     "ply", "ply big", "ply little", "ply with texture",
 ]  # fmt: skip
@@ -140,7 +140,7 @@ def silhouette(mesh: trimesh.Trimesh) -> int:
     return int((cr.render_depth(mesh, T, K, (64, 64), renderer="embree") > 0).sum())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", DATASETS)
 def test_a_u_is_no_block(tmp_path, kind: str) -> None:
     vertices, faces = prism()
     whole = trimesh.creation.box((3, 3, 1), transform=trimesh.transformations.translation_matrix((1.5, 1.5, 0.5)))

@@ -10,17 +10,17 @@ import pytest
 import torch
 
 import curvireg_torch as cr
+import curvireg_torch.registration.localization.localize as finding
 from curvireg_torch.errors import ImageError, InvalidInputError
 from curvireg_torch.geometry import box_iou, rotation_error
-from curvireg_torch.registration import RELIABLE, find
+from curvireg_torch.registration import RELIABLE
 from curvireg_torch.registration.confidence import presence
-from curvireg_torch.registration.inputs import Item
+from curvireg_torch.registration.inputs import ImageItem
 from curvireg_torch.registration.localization import Located
-from curvireg_torch.registration.localization import localize as finding
-from curvireg_torch.registration.localization.localize import Places
+from curvireg_torch.registration.localization.localize import ScoredCandidates, localize
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, scene
-from tests.registration.localization.test_locator import SIZE, bank, placed
+from tests.registration.localization.test_locator import SIZE, bank, placed_scene
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def registrar():
 
 def test_an_object_is_found_and_posed(registrar):
     """The box around the pose lies where the object was put; its pose is near that with the box given."""
-    image, box = placed(5, (90, 40), 0.9)
+    image, box = placed_scene(5, (90, 40), 0.9)
     result = registrar([image])[0]
     place = result.found
     assert box_iou(place.box[None], box[None].double()) > 0.6
@@ -49,7 +49,7 @@ def test_an_object_is_found_and_posed(registrar):
 def test_an_object_is_found_to_a_tenth_of_its_size(seed, corner, scale):
     """Rendered, put into clutter elsewhere and at another scale, followed to its end: each edge of the box and the pose
     are those that it was rendered with, seen by the camera of the scene, which went along."""
-    image, box = placed(seed, corner, scale)
+    image, box = placed_scene(seed, corner, scale)
     K, truth = CAMERA.clone(), scene(seed)[2]
     K[:2, :2] *= scale
     K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5 + torch.tensor(corner)
@@ -84,27 +84,27 @@ def test_a_place_that_is_not_sure_has_no_covariance(registrar):
 
 def test_a_pose_that_left_the_photograph_is_of_nothing(registrar, monkeypatch):
     """It stays an answer, which nobody is to believe; the photograph does not fail."""
-    image, _ = placed(5, (90, 40), 0.9)
+    image, _ = placed_scene(5, (90, 40), 0.9)
     outside = torch.tensor([-300.0, -200.0, -100.0, -50.0], dtype=torch.float64)
-    monkeypatch.setattr(finding, "posed_box", lambda *_: outside)
+    monkeypatch.setattr(finding, "projected_box", lambda *_: outside)
     result = registrar([image])[0]
     assert result.ok
     assert (result.found.presence, result.confidence) == (0.0, 0.0)
 
 
 def test_photographs_without_the_object_are_less_sure(registrar):
-    there = [registrar([placed(seed, (40, 30), 0.9)[0]])[0].found.presence for seed in (0, 1, 5)]
+    there = [registrar([placed_scene(seed, (40, 30), 0.9)[0]])[0].found.presence for seed in (0, 1, 5)]
     absent = [procedural_background(SIZE, torch.Generator().manual_seed(20 + k)) for k in range(3)]
     assert min(there) > max(result.found.presence for result in registrar(absent))
 
 
 def test_several_objects_of_one_photograph(registrar):
     """Two trucks, one and the other: both are found, each once, and no third is needed."""
-    first, box = placed(5, (0, 0), 0.7)
-    second, other = placed(5, (150, 70), 0.7)
+    first, box = placed_scene(5, (0, 0), 0.7)
+    second, other = placed_scene(5, (150, 70), 0.7)
     image = first.clone()
     image[:, 70:, 150:] = second[:, 70:, 150:]
-    results = find(registrar, [image], instances=2)[0]
+    results = localize(registrar, [image], instances=2)[0]
     overlap = box_iou(torch.stack([r.found.box for r in results]), torch.stack([box, other]).double())
     assert len(results) == 2
     assert sorted(overlap.argmax(dim=1).tolist()) == [0, 1]
@@ -112,25 +112,25 @@ def test_several_objects_of_one_photograph(registrar):
     assert results[0].found.presence >= results[1].found.presence
     assert torch.equal(results[0].found.boxes[:2], torch.stack([r.found.box for r in results]))
     with pytest.raises(InvalidInputError, match="instances: expected >= 1, got 0"):
-        find(registrar, [image], instances=0)
+        localize(registrar, [image], instances=0)
 
 
 def test_places_that_lead_to_one_object_give_one_answer(registrar, monkeypatch):
     """Two places beside each other are followed to the same truck, and two objects are asked for."""
-    image, box = placed(5, (60, 40), 0.9)
+    image, box = placed_scene(5, (60, 40), 0.9)
     side = float((box[2:] - box[:2]).max())
     beside = torch.stack([box - 0.36 * side, box + 0.36 * side]).float()
     assert box_iou(beside[:1], beside[1:]) < 0.5, "places that the locator takes for two"
     located = Located(beside, torch.tensor([9.0, 8.0]), torch.zeros(2, dtype=torch.long))
     monkeypatch.setattr(registrar, "locator", _Proposing(located, registrar.locator.cells))
-    monkeypatch.setattr(finding, "posed_box", lambda *_: box.double())
-    results = find(registrar, [image], instances=2)[0]
+    monkeypatch.setattr(finding, "projected_box", lambda *_: box.double())
+    results = localize(registrar, [image], instances=2)[0]
     assert len(results) == 1
     assert torch.equal(results[0].found.box, box.double())
 
 
 def test_of_answers_that_overlap_the_surest_stays(registrar):
-    image, _ = placed(5, (90, 40), 0.9)
+    image, _ = placed_scene(5, (90, 40), 0.9)
     sure = registrar([image])[0]
     beside = replace(sure, found=replace(sure.found, box=sure.found.box + 500.0, presence=0.1))
     less = replace(sure, found=replace(sure.found, presence=0.5 * sure.found.presence))
@@ -153,7 +153,7 @@ class _Proposing:
 
 
 def test_what_cannot_be_searched_takes_nothing_else_down(registrar):
-    image = placed(5, (90, 40), 0.9)[0]
+    image = placed_scene(5, (90, 40), 0.9)[0]
     nan = image.clone()
     nan[0, 3, 3] = torch.nan
     results = registrar([torch.full((3, 80, 100), 0.5), image, nan, torch.rand(2, 9, 9)])
@@ -199,9 +199,10 @@ def test_presence_rises_with_each_piece_of_evidence(base):
 def test_presence_is_judged_by_what_it_was_fitted_on(preset, pieces):
     """Scores of places count where the locator looks at pictures; those of fields mean nothing to what was fitted."""
     registrar = cr.Registrar(bank(preset))
-    image, box = placed(5, (90, 40), 0.9)
+    image, box = placed_scene(5, (90, 40), 0.9)
     places = [
-        Places.judged(registrar, Item(image, box, None), box[None], torch.tensor([score])) for score in (4.0, 9.0)
+        ScoredCandidates.score_boxes(registrar, ImageItem(image, box, None), box[None], torch.tensor([score]))
+        for score in (4.0, 9.0)
     ]
     low, high = (float(place.presence[0]) for place in places)
     assert [len(place.evidence[0]) for place in places] == [pieces] * 2
@@ -225,8 +226,8 @@ def test_one_place_more_than_objects_is_looked_at():
     also where only one place is to be followed."""
     pipeline = replace(bank().pipeline, locate=replace(bank().pipeline.locate, followed=1))
     registrar = cr.Registrar(bank(), pipeline=pipeline, refine=False)
-    image, box = placed(5, (90, 40), 0.9)
+    image, box = placed_scene(5, (90, 40), 0.9)
     elsewhere = torch.tensor([2.0, 2.0, 60.0, 40.0])
     registrar.__dict__["locator"] = Proposed([elsewhere, box], [6.2, 6.0])
-    result = find(registrar, [image], instances=1)[0][0]
+    result = localize(registrar, [image], instances=1)[0][0]
     assert box_iou(result.found.box[None], box[None].double()) > 0.5

@@ -12,7 +12,7 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import box_iou, projected_boxes
 from curvireg_torch.matching import ViewDescriber, ViewMatcher
 from curvireg_torch.registration.localization import Locator
-from curvireg_torch.registration.localization.dense_features import LookCells, cells_for
+from curvireg_torch.registration.localization.dense_features import BackboneFeatures, dense_features_for
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from tests._support.scenes import CAMERA, scene, truck_bank
 
@@ -33,8 +33,8 @@ def locator(preset="learned"):
 
 def test_the_network_of_the_appearance_term_is_not_loaded_again():
     matcher = ViewMatcher(bank())
-    cells = cells_for(matcher)
-    assert isinstance(cells, LookCells)
+    cells = dense_features_for(matcher)
+    assert isinstance(cells, BackboneFeatures)
     assert any(cells.backbone is module for module in matcher.modules())
 
 
@@ -42,13 +42,13 @@ def test_pictures_are_looked_at_wherever_something_was_learnt():
     """A preset without the appearance term, but with the learnt field, finds as the default does: 0 of 14 without."""
     assert locator("fast").cells.pictures
     assert not locator("classical").cells.pictures
-    image, box = placed(1, (100, 30), 0.8)
+    image, box = placed_scene(1, (100, 30), 0.8)
     fast, default = locator("fast")([image])[0], locator()([image])[0]
     assert torch.equal(fast.boxes, default.boxes)
     assert box_iou(fast.boxes[:1], box[None]) > 0.6
 
 
-def placed(seed, corner, scale, size=SIZE):
+def placed_scene(seed, corner, scale, size=SIZE):
     """The scene's truck, its background and all, pasted into other clutter: image (3, H, W) and box (4,)."""
     image, box, _ = scene(seed)
     small = F.interpolate(image[None], scale_factor=scale, mode="bilinear", antialias=True)[0]
@@ -62,7 +62,7 @@ def placed(seed, corner, scale, size=SIZE):
 @pytest.mark.parametrize("preset", ["learned", "classical"])
 @pytest.mark.parametrize(("seed", "corner", "scale"), [(0, (10, 20), 0.8), (1, (100, 30), 0.8), (3, (40, 10), 1.1)])
 def test_an_object_is_found_where_it_was_put(preset, seed, corner, scale):
-    image, box = placed(seed, corner, scale)
+    image, box = placed_scene(seed, corner, scale)
     found = locator(preset)([image])[0]
     overlap = box_iou(found.boxes, box[None])[:, 0]
     told = overlap[:6].tolist(), found.scores[:6].tolist()
@@ -79,7 +79,7 @@ def test_what_is_found_moves_with_the_picture():
     """Pasted elsewhere, the best box goes along: places are not mirrored, swapped or shifted."""
     middles = []
     for corner in ((10, 40), (100, 40), (100, 10)):
-        image, box = placed(5, corner, 0.8)
+        image, box = placed_scene(5, corner, 0.8)
         best = locator()([image])[0].boxes[0]
         assert box_iou(best[None], box[None]) > 0.6
         middles.append(0.5 * (best[:2] + best[2:]))
@@ -88,7 +88,7 @@ def test_what_is_found_moves_with_the_picture():
 
 
 def test_pictures_without_the_object_score_lower():
-    with_it = [locator()([placed(seed, (40, 30), 0.9)[0]])[0].scores[0] for seed in (0, 1, 3)]
+    with_it = [locator()([placed_scene(seed, (40, 30), 0.9)[0]])[0].scores[0] for seed in (0, 1, 3)]
     without = [
         locator()([procedural_background(SIZE, torch.Generator().manual_seed(7 + k))])[0].scores[0] for k in range(3)
     ]
@@ -112,7 +112,7 @@ def test_a_view_that_agrees_with_everything_tells_nothing():
 
 
 def test_a_photograph_is_answered_the_same_alone_grey_or_as_bytes():
-    images = [placed(0, (10, 20), 0.8)[0], placed(1, (60, 30), 0.8)[0]]
+    images = [placed_scene(0, (10, 20), 0.8)[0], placed_scene(1, (60, 30), 0.8)[0]]
     both, alone = locator()(images), locator()(images[1:])
     assert torch.equal(both[1].boxes, alone[0].boxes)
     assert torch.equal(both[1].scores, alone[0].scores)
@@ -158,7 +158,7 @@ def test_what_cannot_be_asked():
 
 def test_locate_pads_what_differs_in_number():
     one_colour = torch.full((3, 120, 160), 0.5)
-    boxes, scores = cr.locate(truck_bank().pipeline, truck_bank(), [placed(0, (10, 20), 0.8)[0], one_colour])
+    boxes, scores = cr.locate(truck_bank().pipeline, truck_bank(), [placed_scene(0, (10, 20), 0.8)[0], one_colour])
     assert boxes.shape[:2] == scores.shape
     assert len(scores) == 2
     assert torch.equal(boxes.isnan().all(dim=2), scores == -torch.inf)
@@ -167,7 +167,7 @@ def test_locate_pads_what_differs_in_number():
 
 def test_size_of_the_picture_does_not_matter():
     """Cost and answer are those of the picture's proportions: sizes are shares of it."""
-    image, box = placed(3, (40, 10), 1.1)
+    image, box = placed_scene(3, (40, 10), 1.1)
     large = F.interpolate(image[None], scale_factor=3, mode="bilinear")[0]
     found = [locator()([picture])[0].boxes[0] for picture in (image, large)]
     assert box_iou(found[0][None], (found[1][None] + 0.5) / 3 - 0.5) > 0.7

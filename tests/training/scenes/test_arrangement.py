@@ -39,7 +39,7 @@ def test_parts_of_an_arrangement_can_be_exchanged(drawn):
     assert not np.array_equal(before.image, after.image)
     assert np.array_equal(before.depth, after.depth)
     assert np.array_equal(before.visible, after.visible)
-    alone = photograph(dataclasses.replace(drawn, things=drawn.things[:1]), np.random.default_rng(3))
+    alone = photograph(dataclasses.replace(drawn, household=drawn.household[:1]), np.random.default_rng(3))
     assert (alone.visible | ~before.visible).all()
 
 

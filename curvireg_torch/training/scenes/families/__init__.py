@@ -3,14 +3,14 @@
 from collections.abc import Callable
 
 from ..parts import Part, Rng
-from . import furniture, solids, things, vehicles
+from . import furniture, household, solids, vehicles
 
 __all__ = ["FAMILIES"]
 
 FAMILIES: dict[str, Callable[[Rng], list[Part]]] = {
     "compound": solids.compound,
     "stack": solids.stack,
-    "vessel": things.vessel,
+    "vessel": household.vessel,
     "chair": furniture.chair,
     "table": furniture.table,
     "sofa": furniture.sofa,
@@ -20,10 +20,10 @@ FAMILIES: dict[str, Callable[[Rng], list[Part]]] = {
     "boat": vehicles.boat,
     "screen": furniture.screen,
     "train": vehicles.train,
-    "creature": things.creature,
+    "creature": household.creature,
     "bracket": solids.bracket,
     "frame": furniture.frame,
     "lump": solids.lump,
-    "package": things.package,
+    "package": household.package,
 }
 """Families of shapes by name."""

@@ -3,8 +3,8 @@
 import numpy as np
 
 from ..parts import Part, Rng, rounded_box
+from ..rotations import turn
 from ..surfaces import bar, box, lathe, superquadric, tube
-from ..turns import turn
 
 __all__ = ["chair", "frame", "screen", "sofa", "table"]
 

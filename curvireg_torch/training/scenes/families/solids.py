@@ -3,8 +3,8 @@
 import numpy as np
 
 from ..parts import Part, Rng, rounded_box
+from ..rotations import random_rotation, turn
 from ..surfaces import Surface, bar, box, extrude, lathe, superquadric, torus
-from ..turns import any_turn, turn
 
 __all__ = ["bracket", "compound", "lump", "stack"]
 
@@ -37,7 +37,7 @@ def compound(rng: Rng) -> list[Part]:
     centre = np.zeros(3)
     mirrored = rng.random() < 0.5
     for k in range(int(rng.integers(2, 8))):
-        pose = any_turn(rng) if rng.random() < 0.3 else turn(int(rng.integers(3)), 0.5 * np.pi * rng.integers(4))
+        pose = random_rotation(rng) if rng.random() < 0.3 else turn(int(rng.integers(3)), 0.5 * np.pi * rng.integers(4))
         piece = _piece(rng).moved(centre, pose, rng.uniform(0.3, 1.0))
         parts.append((piece, k))
         if mirrored:

@@ -3,8 +3,8 @@
 import numpy as np
 
 from ..parts import Part, Rng, rounded_box
+from ..rotations import turn
 from ..surfaces import Array, Surface, bar, box, lathe, loft, superquadric, torus, tube
-from ..turns import turn
 
 __all__ = ["aircraft", "bicycle", "boat", "car", "train"]
 

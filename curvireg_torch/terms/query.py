@@ -13,14 +13,14 @@ from ..filters.inputs import fill_missing, may_lack_pixels, missing
 from ..geometry.crops import check_boxes, crop_images, square_boxes
 from ..utils.checks import as_numbers, check_photograph, check_tensor
 
-__all__ = ["Photographs", "crop_regions", "photograph_field", "slack_boxes"]
+__all__ = ["QueryFeatures", "crop_regions", "jittered_boxes", "photograph_field"]
 
 _MOVES = ((0, 0, 0), (-0.75, 0, 0), (0.75, 0, 0), (0, -0.75, 0), (0, 0.75, 0), (0, 0, -1), (0, 0, 1))
 """Shifts in x and y and the exponent of the scale, in units of the slack."""
 
 
 @dataclass(frozen=True)
-class Photographs:
+class QueryFeatures:
     """B photographs, each described in K crops: of its box first, then of the box moved and scaled a little.
 
     Attributes:
@@ -42,8 +42,8 @@ class Photographs:
     def __len__(self) -> int:
         return self.regions.shape[0]
 
-    def __getitem__(self, index: slice | Tensor) -> "Photographs":
-        return Photographs(*(getattr(self, f.name)[index] for f in fields(self) if f.name != "late"))
+    def __getitem__(self, index: slice | Tensor) -> "QueryFeatures":
+        return QueryFeatures(*(getattr(self, f.name)[index] for f in fields(self) if f.name != "late"))
 
     @property
     def crops(self) -> Tensor:
@@ -65,26 +65,26 @@ def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
     return out if holes is None else out.masked_fill(holes.any(dim=1, keepdim=True), 0.0)
 
 
-def slack_boxes(boxes: Tensor, slack: float) -> Tensor:
-    """(B, K, 4): each box, then it moved four ways by 3/4 ``slack`` of its longer side, shrunk and grown by ``slack``.
+def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:
+    """(B, K, 4) each box, four copies shifted by 3/4 ``box_jitter`` of its longer side, and two scaled ones.
 
     Args:
         boxes: (B, 4) x0, y0, x1, y1 in px.
-        slack: share in [0, 0.45]; K = 7, or 1 for ``slack`` = 0.
+        box_jitter: fraction in [0, 0.45]; K = 7, or 1 for ``box_jitter`` = 0.
 
     Example:
-        >>> slack_boxes(torch.tensor([[0.0, 0.0, 100.0, 50.0]]), 0.1)[0, 1].tolist()
+        >>> jittered_boxes(torch.tensor([[0.0, 0.0, 100.0, 50.0]]), 0.1)[0, 1].tolist()
         [-7.5, 0.0, 92.5, 50.0]
     """
     boxes = as_numbers(boxes, "boxes")
     check_tensor(boxes, "boxes", (None, 4))
-    if not 0.0 <= slack <= 0.45:
-        raise InvalidInputError(f"slack: expected a share in [0, 0.45], got {slack}")
-    moves = torch.tensor(_MOVES if slack else _MOVES[:1], dtype=boxes.dtype, device=boxes.device)
+    if not 0.0 <= box_jitter <= 0.45:
+        raise InvalidInputError(f"box_jitter: expected a fraction in [0, 0.45], got {box_jitter}")
+    moves = torch.tensor(_MOVES if box_jitter else _MOVES[:1], dtype=boxes.dtype, device=boxes.device)
     sides = boxes[:, 2:] - boxes[:, :2]
-    shift = slack * moves[None, :, :2] * sides.amax(dim=1)[:, None, None]
+    shift = box_jitter * moves[None, :, :2] * sides.amax(dim=1)[:, None, None]
     centre = 0.5 * (boxes[:, None, :2] + boxes[:, None, 2:]) + shift
-    half = 0.5 * sides[:, None] * (1.0 + slack) ** moves[None, :, 2:]
+    half = 0.5 * sides[:, None] * (1.0 + box_jitter) ** moves[None, :, 2:]
     return torch.cat([centre - half, centre + half], dim=2)
 
 
@@ -94,8 +94,8 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
     Args:
         images: (B, C, H, W), or a list of (C, H, W), floating in [0, 1] or uint8; of several channel counts, grey ones
             get three channels.
-        boxes: (B, K, 4) x0, y0, x1, y1 in px, from :func:`slack_boxes`; a moved box wholly outside its image gives way
-            to the first.
+        boxes: (B, K, 4) x0, y0, x1, y1 in px, from :func:`jittered_boxes`; the first box replaces one that lies
+            wholly outside its image.
         size, margin: see :func:`crop_images`.
 
     Returns:

@@ -6,14 +6,14 @@ import torch
 from ...geometry.conversions import rotation_from_quaternion
 from .surfaces import Array
 
-__all__ = ["any_turn", "turn"]
+__all__ = ["random_rotation", "turn"]
 
 
-def any_turn(rng: np.random.Generator) -> Array:
+def random_rotation(rng: np.random.Generator) -> Array:
     """(3, 3) rotation, all of them equally likely: a quaternion of normal numbers has no preferred direction.
 
     Example:
-        >>> R = any_turn(np.random.default_rng(0))
+        >>> R = random_rotation(np.random.default_rng(0))
         >>> bool(np.allclose(R @ R.T, np.eye(3))), round(float(np.linalg.det(R)), 6)
         (True, 1.0)
     """

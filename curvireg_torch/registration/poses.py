@@ -14,7 +14,7 @@ from .contour import ContourFit, contour_support, fit_contours
 from .hypotheses import Hypotheses
 from .search import FINALISTS
 
-__all__ = ["Poses", "follow_contours", "placed", "seen_straight", "supports"]
+__all__ = ["Poses", "follow_contours", "lift_to_poses", "supports", "to_allocentric"]
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Poses:
         return Poses(self.found[index], self.T[index], self.cameras[index])
 
 
-def placed(describers: Sequence[ViewDescriber], found: Hypotheses, boxes: Tensor, K: Tensor | None) -> Poses:
+def lift_to_poses(describers: Sequence[ViewDescriber], found: Hypotheses, boxes: Tensor, K: Tensor | None) -> Poses:
     """Hypotheses as poses that fill their boxes.
 
     Args:
@@ -79,7 +79,7 @@ def placed(describers: Sequence[ViewDescriber], found: Hypotheses, boxes: Tensor
     return Poses(found, T, cameras)
 
 
-def seen_straight(describers: Sequence[ViewDescriber], found: Hypotheses, T: Tensor) -> Hypotheses:
+def to_allocentric(describers: Sequence[ViewDescriber], found: Hypotheses, T: Tensor) -> Hypotheses:
     """The hypotheses with the allocentric rotations and distances of poses (H, 4, 4)."""
     rotation, distance = found.rotation.clone(), found.distance.clone()
     for model, mine in _by_model(found):
@@ -101,7 +101,7 @@ def follow_contours(
         index.append(mine)
     place = torch.cat(index).argsort()
     fit = ContourFit(*(torch.cat([getattr(part, f.name) for part in parts])[place] for f in fields(ContourFit)))
-    return Poses(seen_straight(describers, poses.found, fit.transform), fit.transform, poses.cameras, fit)
+    return Poses(to_allocentric(describers, poses.found, fit.transform), fit.transform, poses.cameras, fit)
 
 
 def supports(describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ import torch
 
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.training.scenes import GeneratedScenes
-from curvireg_torch.training.scenes.turns import any_turn
+from curvireg_torch.training.scenes.rotations import random_rotation
 
 
 def haar(count, rng):
@@ -20,7 +20,7 @@ def haar(count, rng):
 def test_all_rotations_are_equally_likely():
     """The mean vanishes, an angle from any rotation has the density (1 - cos t) / pi, and no probe is left out."""
     rng = np.random.default_rng(0)
-    turns = np.stack([any_turn(rng) for _ in range(8000)])
+    turns = np.stack([random_rotation(rng) for _ in range(8000)])
     assert np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3))
     assert np.allclose(np.linalg.det(turns), 1.0)
     assert np.abs(turns.mean(axis=0)).max() < 0.03  # five standard errors of sqrt(1 / 3 / 8000)

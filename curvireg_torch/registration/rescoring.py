@@ -9,9 +9,9 @@ from torch import Tensor
 from ..matching import ViewDescriber
 from .hypotheses import Hypotheses
 
-__all__ = ["EVIDENCE", "WEIGHTS", "gathered_evidence", "similarities", "verdict"]
+__all__ = ["POSE_FEATURES", "WEIGHTS", "gather_pose_features", "rescore", "similarities"]
 
-EVIDENCE = ("rank", "similarity", "support", "appearance")
+POSE_FEATURES = ("rank", "similarity", "edge_support", "appearance")
 """Of a hypothesis: log S of the view it comes from, less that of the best view; normalised correlation of the pose that
 was found; strength of the photograph's edges under its contours (0 without the contour stage); how much the pose that
 was found looks like the photograph, as log S_look (0 without that term)."""
@@ -20,8 +20,10 @@ WEIGHTS, RANK_ALONE = (1.0, 5.0, 10.0, 1.0), (1.0, 0.0, 0.0, 0.0)
 """See docs/accuracy.md."""
 
 
-def gathered_evidence(starts: Hypotheses, similarity: Tensor, support: Tensor, looks: Tensor) -> Tensor:
-    """(H, 4) float64, see :data:`EVIDENCE`.
+def gather_pose_features(
+    starts: Hypotheses, similarity: Tensor, edge_support: Tensor, appearance_scores: Tensor
+) -> Tensor:
+    """(H, 4) float64, see :data:`POSE_FEATURES`.
 
     Args:
         starts: as they were ranked, their score being S.
@@ -33,10 +35,10 @@ def gathered_evidence(starts: Hypotheses, similarity: Tensor, support: Tensor, l
     count = int(starts.photograph.max()) + 1 if len(starts) else 0
     best = log.new_full((count,), -torch.inf).scatter_reduce(0, starts.photograph, log, "amax")
     rank = log - best[starts.photograph]
-    return torch.stack([rank, similarity, support, looks], dim=1)
+    return torch.stack([rank, similarity, edge_support, appearance_scores], dim=1)
 
 
-def verdict(evidence: Tensor, *, with_camera: bool) -> Tensor:
+def rescore(evidence: Tensor, *, with_camera: bool) -> Tensor:
     """(H,) scores of hypotheses from (H, 4) evidence: the higher, the sooner believed.
 
     Where the camera is known the mesh is taken to be the object's own, and what was found of it counts

@@ -12,7 +12,7 @@ import trimesh
 from curvireg_torch import camera_matrix
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import project_points
-from curvireg_torch.visualization import posed_glb
+from curvireg_torch.visualization import pose_glb
 from tests._support.scenes import CAMERA, SIZE, scene
 
 
@@ -35,7 +35,7 @@ def test_the_files_camera_sees_the_mesh_where_it_was_found(unit, metres):
     image, _, T = scene(0)
     mesh = trimesh.creation.box((0.1, 0.2, 0.05))
     mesh.units = unit
-    data = posed_glb(mesh, T, CAMERA, image)
+    data = pose_glb(mesh, T, CAMERA, image)
     tree, back = tree_of(data), trimesh.load(BytesIO(data), file_type="glb")
     parts = {back.graph[name][1]: back.graph[name][0] for name in back.graph.nodes_geometry}
     boxes = [n for n in parts if len(back.geometry[n].faces) == 12]
@@ -62,7 +62,7 @@ def test_the_files_camera_sees_the_mesh_where_it_was_found(unit, metres):
 def test_extras_hold_the_exact_pose_and_camera():
     image, _, T = scene(0)
     K = camera_matrix(260.0, 255.0, 100.0, 95.0, dtype=torch.float64)
-    tree = tree_of(posed_glb(trimesh.creation.box(), T, K, image, photograph=False))
+    tree = tree_of(pose_glb(trimesh.creation.box(), T, K, image, photograph=False))
     node = next(n for n in tree["nodes"] if "camera" in n)
     assert node["extras"]["T_cam_from_model"] == T.tolist()
     assert node["extras"]["camera_matrix"] == K.tolist()
@@ -73,7 +73,7 @@ def test_colours_of_corners_are_kept():
     image, _, T = scene(0)
     mesh = trimesh.creation.box()
     mesh.visual.face_colors = [[200, 20, 20, 255]] * 6 + [[20, 20, 200, 255]] * 6
-    data = posed_glb(mesh, T, CAMERA, image, photograph=False)
+    data = pose_glb(mesh, T, CAMERA, image, photograph=False)
     tree = tree_of(data)
     part = tree["meshes"][0]["primitives"][0]
     accessor = tree["accessors"][part["attributes"]["COLOR_0"]]
@@ -89,6 +89,6 @@ def test_a_pose_behind_the_camera_is_refused():
     T = torch.eye(4, dtype=torch.float64)
     T[2, 3] = -2.0
     with pytest.raises(InvalidInputError, match="behind the camera"):
-        posed_glb(trimesh.creation.box(), T, CAMERA, torch.rand(3, *SIZE))
+        pose_glb(trimesh.creation.box(), T, CAMERA, torch.rand(3, *SIZE))
     with pytest.raises(InvalidInputError, match="finite"):
-        posed_glb(trimesh.creation.box(), T * torch.nan, CAMERA, torch.rand(3, *SIZE))
+        pose_glb(trimesh.creation.box(), T * torch.nan, CAMERA, torch.rand(3, *SIZE))

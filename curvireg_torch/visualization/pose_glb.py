@@ -17,14 +17,14 @@ from ..io.meshes.mesh import mesh_centre, mesh_radius, mesh_unit
 from ..utils.checks import check_camera_matrix, check_photograph, check_pose, check_tensor
 from ..utils.choices import UNITS
 
-__all__ = ["posed_glb"]
+__all__ = ["pose_glb"]
 
 _PHOTO_SIDE = 1024
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's camera to glTF's: y up, looking along -z
 _MATT = {"name": "matt", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}, "doubleSided": True}
 
 
-def posed_glb(
+def pose_glb(
     mesh: trimesh.Trimesh, T_cam_from_model: Tensor, camera_matrix: Tensor, image: Tensor, *, photograph: bool = True
 ) -> bytes:
     """A GLB file: the mesh where it was found, a camera at the origin, the photograph on a plane behind the mesh.
@@ -47,7 +47,7 @@ def posed_glb(
     Example:
         >>> K = torch.tensor([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]], dtype=torch.float64)
         >>> T = torch.eye(4, dtype=torch.float64); T[2, 3] = 4.0
-        >>> posed_glb(trimesh.creation.box(), T, K, torch.rand(3, 64, 64))[:4]
+        >>> pose_glb(trimesh.creation.box(), T, K, torch.rand(3, 64, 64))[:4]
         b'glTF'
     """
     check_camera_matrix(camera_matrix)

@@ -3,8 +3,8 @@
 import numpy as np
 
 from ..parts import Part, Rng
+from ..rotations import turn
 from ..surfaces import bar, box, lathe, superquadric, torus, tube
-from ..turns import turn
 
 __all__ = ["creature", "package", "vessel"]
 
