@@ -206,7 +206,7 @@ def test_many_photographs_and_hypotheses_are_fitted_as_each_alone():
             ("edge_support", 1e-4),
             ("covariance", 0.02 * alone.covariance.max()),
         ):
-            torch.testing.assert_close(getattr(fit, name)[i], getattr(alone, name)[0], rtol=0, atol=float(allowed))
+            torch.testing.assert_close(getattr(fit, name)[i], getattr(alone, name)[0], rtol=0, atol=allowed)
     stacked = [F.pad(image, (0, 128 - image.shape[2], 0, 128 - image.shape[1])) for image in images]
     inside = fit_contours(renderer, torch.stack(stacked), boxes, cameras, starts, photograph=photograph, **rest)
     torch.testing.assert_close(inside.transform, fit.transform, rtol=0, atol=0.05)  # crops may see the padding
