@@ -57,7 +57,7 @@ class ViewPolicy:
         """The viewpoints.
 
         Args:
-            up: the mesh's axis that points up when it stands, for "upright" (:func:`curvireg_torch.geometry.mesh_up`).
+            up: the mesh's axis that points up when it stands, for "upright" (:func:`curvireg_torch.io.meshes.mesh_up`).
 
         Raises:
             InvalidInputError: they were given with the call and cannot be made again.

@@ -3,7 +3,7 @@
     python scripts/train_learned_field.py --out runs/field --minutes 90
 
 Every step draws a batch, partly fresh scenes, partly scenes seen before, recoloured and mirrored. Losses: see
-curvireg_torch.learned.losses; one goes straight through HOG, since our layers are differentiable. A second start
+curvireg_torch.training.losses; one goes straight through HOG, since our layers are differentiable. A second start
 with the same --out goes on where the first one stopped.
 """
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import CurviregError
-from ..io.input_paths import check_given
 from ..utils.choices import BACKENDS, DEFAULT, PRESET_NAMES, UNITS, UP_AXES
 from ..utils.files import terminable
+from ..utils.input_paths import check_given
 from ..version import __version__
 from .completion import SHELLS, script
 from .evaluate import add_parser as add_evaluate

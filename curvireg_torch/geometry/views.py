@@ -87,7 +87,7 @@ class ViewSphere:
         """These views of an object that stands on z, as views of one whose axis ``up`` points up, in its own frame.
 
         Args:
-            up: "x", "y", "z", "-x", "-y" or "-z"; :func:`curvireg_torch.geometry.mesh_up` says it of a mesh.
+            up: "x", "y", "z", "-x", "-y" or "-z"; :func:`curvireg_torch.io.meshes.mesh_up` says it of a mesh.
 
         Example:
             >>> y_up = sample_views(azimuths=[0.0], elevations=[90.0]).for_up("y")          # from above
@@ -109,7 +109,7 @@ class ViewSphere:
 
         Example:
             >>> import trimesh
-            >>> from curvireg_torch.geometry import normalization_transform
+            >>> from curvireg_torch.io.meshes import normalization_transform
             >>> T = normalization_transform(trimesh.creation.box((1, 2, 3)), align_axes=True)
             >>> len(uniform_views(100).in_model_frame(T))
             100

@@ -16,7 +16,7 @@ def depth_filter(settings: BankSettings) -> nn.Module:
 
     Example:
         >>> depth_filter(BankSettings(depth_field="HFN"))
-        HessianFrobeniusNorm()
+        HessianFrobeniusNorm(sigma=1.0, depth_scale=None)
     """
     if settings.depth_field == "CS":
         return DepthCurvilinearSaliency(sigma=settings.sigma, formula=settings.formula)

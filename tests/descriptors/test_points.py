@@ -9,7 +9,7 @@ from curvireg_torch.descriptors import field_points
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.filters import image_gradient
 
-from ..filters.edge_support import photos
+from ..filters.support import photos
 
 
 def _line(angle: float) -> torch.Tensor:

@@ -11,7 +11,7 @@ from curvireg_torch.detectors.base import Detection, from_peaks, grey_bytes
 from curvireg_torch.detectors.fast_hessian import _determinant
 from curvireg_torch.errors import InvalidInputError
 
-from ..filters.edge_support import photos
+from ..filters.support import photos
 
 
 def test_the_defaults_of_the_comparison() -> None:

@@ -17,7 +17,7 @@ from curvireg_torch.detectors import DETECTORS
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.filters import gaussian_smooth
 
-from ..filters.edge_support import photos
+from ..filters.support import photos
 
 every_detector = pytest.mark.parametrize("name", list(DETECTORS))
 

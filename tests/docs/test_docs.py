@@ -105,7 +105,7 @@ def test_the_reference_lists_every_name_of_the_package() -> None:
 LAYERS = sorted(
     {
         thing
-        for package in ("filters", "descriptors", "detectors", "learned")
+        for package in ("filters", "descriptors", "detectors", "models")
         for name in import_module(f"curvireg_torch.{package}").__all__
         if inspect.isclass(thing := getattr(import_module(f"curvireg_torch.{package}"), name))
         and issubclass(thing, nn.Module)

@@ -18,7 +18,7 @@ from curvireg_torch.io import read_image
 from curvireg_torch.io.meshes import load_mesh
 from curvireg_torch.matching import ViewBank, ViewMatcher
 from curvireg_torch.registration import Registrar
-from curvireg_torch.registration.inputs import BenchmarkItem
+from curvireg_torch.registration.inputs import ImageItem
 
 from .small import SMALL
 
@@ -211,7 +211,7 @@ def test_fused_takes_the_view_that_is_best_on_average():
     assert int(ranking.order[0, 0]) == model * len(views) + best
     assert float(ranking.scores.max()) == pytest.approx(float(scores.mean(0).max()))
     assert int((ranking.scores > 0).sum()) == len(views), "each view stands once"
-    row = estimate.estimate_poses(Registrar(matcher), [BenchmarkItem(image, box, None)])[0]
+    row = estimate.estimate_poses(Registrar(matcher), [ImageItem(image, box, None)])[0]
     assert row["mesh"] == model
 
 

@@ -5,7 +5,7 @@ import torch
 
 from curvireg_torch import filters
 
-from .edge_support import LAYERS, Layer
+from .support import LAYERS, Layer
 
 SOME = ("cs", "asg-perspective", "ig", "blur", "hog")
 

@@ -9,7 +9,7 @@ import torch
 from curvireg_torch import filters
 from curvireg_torch.descriptors import hog
 
-from .edge_support import LAYERS, NAMES, Layer, depths, fields, photos
+from .support import LAYERS, NAMES, Layer, depths, fields, photos
 
 pytestmark = pytest.mark.slow
 every_layer = pytest.mark.parametrize("layer", LAYERS, ids=NAMES)

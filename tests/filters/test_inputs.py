@@ -10,7 +10,7 @@ from curvireg_torch import filters
 from curvireg_torch.descriptors import field_points, hog
 from curvireg_torch.filters.inputs import fill_missing, grey
 
-from .edge_support import LAYERS, Layer, photos
+from .support import LAYERS, Layer, photos
 
 PHOTO_LAYERS = [x for x in LAYERS if x.inputs is photos]
 SMOOTHINGS = ("diffusion", "diffusion-exponential")

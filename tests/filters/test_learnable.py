@@ -11,7 +11,7 @@ from torch import nn
 from curvireg_torch import filters
 from curvireg_torch.errors import InvalidInputError
 
-from .edge_support import depths, photos
+from .support import depths, photos
 
 # At sigma 1 the kernel is about to grow by a tap, 4e-6 of its sum: enough to disturb a difference quotient.
 MODULES = {

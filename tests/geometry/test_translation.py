@@ -5,6 +5,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from curvireg_torch import geometry as g
+from curvireg_torch.io.meshes import mesh_centre, mesh_radius
 from curvireg_torch.io.meshes.mesh import extreme_points
 from curvireg_torch.synthetic import example_mesh
 
@@ -15,7 +16,7 @@ def truths(spread: float, count: int = 25) -> list[tuple[torch.Tensor, ...]]:
     """(hull, centre, view R, R, t, box) of objects 3 to 12 radii away, ``spread`` (tangent) off the axis."""
     mesh = example_mesh()
     mesh.apply_translation([3.0, -2.0, 1.0])  # the centre is far from the origin
-    centre, radius, hull = g.mesh_centre(mesh), g.mesh_radius(mesh), extreme_points(mesh)
+    centre, radius, hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
     generator = torch.Generator().manual_seed(0)
     found = []
     for i in range(count):

@@ -76,7 +76,7 @@ def test_the_view_that_is_more_like_the_photograph_stays(registrar, monkeypatch,
     (first,) = registrar.register_items([correction.ImageItem(image, box, CAMERA)])
     other = replace(first, hypotheses=(replace(first.hypotheses[0], score=first.score + (0.01 if better else -0.01)),))
     answers = iter([[first], [other]])
-    monkeypatch.setattr(registrar, "answers", lambda *_, **__: next(answers))
+    monkeypatch.setattr(registrar, "register_items", lambda *_, **__: next(answers))
     result = registrar([image], roughly(box)[None], CAMERA)[0]
     assert (result is first) != better
     assert (result.corrected_box is None) != better
@@ -94,7 +94,7 @@ def test_boxes_are_taken_as_they_are_where_that_is_asked_for(registrar):
 @pytest.mark.parametrize("box", [[-300.0, -200.0, -100.0, -50.0], [torch.nan] * 4, [240.0, 10.0, 300.0, 90.0]])
 def test_a_pose_that_left_the_photograph_corrects_nothing(registrar, monkeypatch, box):
     image, given, _ = scene(0)
-    monkeypatch.setattr(correction, "posed_box", lambda *_: torch.tensor(box, dtype=torch.float64))
+    monkeypatch.setattr(correction, "projected_box", lambda *_: torch.tensor(box, dtype=torch.float64))
     assert registrar([image], given[None], CAMERA)[0].corrected_box is None
 
 

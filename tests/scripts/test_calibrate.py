@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from curvireg_torch import Registrar
-from curvireg_torch.registration import ranking_evidence, verify
+from curvireg_torch.registration import ranking_evidence, rescoring
 from tests._support.scenes import CAMERA, scene, truck_bank
 from tests._support.scripts import imported
 
@@ -160,7 +160,7 @@ def test_the_page_has_a_line_for_each_model_and_set(script):
 
 def test_weights_of_the_verdict_follow_what_is_right(script):
     """Support alone is right here: its weight grows from the one in use."""
-    names = script.EVIDENCE
+    names = script.POSE_FEATURES
     wrong_first = [(0.0, 0.6, 0.1, 0.0), (-1.0, 0.5, 0.4, 0.0)]
     rows = [
         {**row(k), "errors": [90.0, 5.0], "evidence": [dict(zip(names, e, strict=True)) for e in wrong_first]}
@@ -175,8 +175,8 @@ def test_weights_of_the_verdict_follow_what_is_right(script):
 def test_features_of_a_row_are_those_of_the_registration(script, camera, monkeypatch):
     """Also where the answer comes from another view than the ranking's best."""
     weights = (-1.0, 5.0, 10.0, 1.0)  # the view that ranks last is preferred
-    monkeypatch.setattr(verify, "WEIGHTS", weights)
-    monkeypatch.setattr(verify, "RANK_ALONE", (-1.0, 0.0, 0.0, 0.0))
+    monkeypatch.setattr(rescoring, "WEIGHTS", weights)
+    monkeypatch.setattr(rescoring, "RANK_ALONE", (-1.0, 0.0, 0.0, 0.0))
     image, box, _ = scene(0)
     result = Registrar(truck_bank())([image], box[None], camera)[0]
     assert int(result.candidates[0]) != int(result.ranking.order[0, 0])

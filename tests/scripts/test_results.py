@@ -16,7 +16,7 @@ from curvireg_torch.registration.document import result_document
 from tests._support.lists import CAMERA, box_of, write_files, written
 
 ROOT = Path(__file__).parents[2]
-SCHEMA = json.loads((ROOT / "curvireg_torch" / "result.schema.json").read_text())
+SCHEMA = json.loads((ROOT / "curvireg_torch" / "registration" / "result.schema.json").read_text())
 
 
 @pytest.fixture(scope="module")

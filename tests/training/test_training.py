@@ -104,7 +104,7 @@ def test_adapting_works_from_a_plain_script(tmp_path):
     script = tmp_path / "plain.py"
     script.write_text(
         "import trimesh\n"
-        "from curvireg_torch.learned import adapt\n"
+        "from curvireg_torch.training import adapt\n"
         "adapt(trimesh.creation.box(), scenes=1, progress=False).save('adapted.safetensors')\n"
         "print('done')\n"
     )

@@ -15,6 +15,7 @@ import curvireg_torch as cr
 from curvireg_torch import filters, geometry, metrics
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError
 from curvireg_torch.geometry.cameras import transform
+from curvireg_torch.io.meshes import mesh_centre, mesh_radius
 from curvireg_torch.matching import dilate_points, distinct_views
 from curvireg_torch.registration import fit_contours, localize
 from curvireg_torch.rendering import make_renderer, render_colour
@@ -36,8 +37,8 @@ def mesh() -> trimesh.Trimesh:
 @pytest.fixture(scope="module")
 def pose(mesh: trimesh.Trimesh) -> Tensor:
     R = cr.rotation_from_viewpoint(30.0, 20.0).double()
-    centre = geometry.mesh_centre(mesh)
-    return transform(R, torch.tensor([0.0, 0.0, 6.0 * geometry.mesh_radius(mesh)], dtype=torch.float64) - R @ centre)
+    centre = mesh_centre(mesh)
+    return transform(R, torch.tensor([0.0, 0.0, 6.0 * mesh_radius(mesh)], dtype=torch.float64) - R @ centre)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ class Entries:
         (image, box), R = photograph, pose[:3, :3]
         points = torch.from_numpy(np.array(mesh.vertices))
         renderers = {name: make_renderer(mesh, name) for name in BACKENDS}
-        size, radius, centre = (24, 32), geometry.mesh_radius(mesh), geometry.mesh_centre(mesh)
+        size, radius, centre = (24, 32), mesh_radius(mesh), mesh_centre(mesh)
         depth = torch.rand(1, 1, 16, 16) + 1.0
         result = registrar([image], box[None], CAMERA)[0]
         symmetries = torch.eye(4, dtype=torch.float64)[None]
@@ -94,7 +95,7 @@ class Entries:
             "place_view": lambda K: geometry.place_view(points, R, box, K),
             "opengl_projection": lambda K: geometry.opengl_projection(K, size, near=1.0, far=9.0),
             "mspd_error": lambda K: metrics.mspd_error(pose[None], pose[None], points, K),
-            "posed_glb": lambda K: pose_glb(mesh, pose, K, image),
+            "pose_glb": lambda K: pose_glb(mesh, pose, K, image),
             "contour_overlay": lambda K: contour_overlay(registrar, result, image, box, K),
             "registration_sheet": lambda K: registration_sheet(registrar, result, image, box, K),
             "average_shading_gradient": lambda K: cr.average_shading_gradient(depth, camera_matrix=K.float()),
@@ -113,7 +114,7 @@ class Entries:
             "opengl_from_opencv": geometry.opengl_from_opencv,
             "opencv_from_opengl": geometry.opencv_from_opengl,
             "pytorch3d_from_opencv": geometry.pytorch3d_from_opencv,
-            "posed_glb": lambda T: pose_glb(mesh, T, CAMERA, image),
+            "pose_glb": lambda T: pose_glb(mesh, T, CAMERA, image),
             "add_error": lambda T: metrics.add_error(pose[None], T[None], points),
             "adds_error": lambda T: metrics.adds_error(pose[None], T[None], points),
             "mssd_error": lambda T: metrics.mssd_error(pose[None], T[None], points),
@@ -144,7 +145,7 @@ class Entries:
             "Locator": lambda x: registrar.locator([x]),
             "locate": lambda x: cr.locate(registrar.pipeline, bank, [x]),
             "fit_contours": lambda x: fit(images=[x]),
-            "posed_glb": lambda x: pose_glb(mesh, pose, CAMERA, x),
+            "pose_glb": lambda x: pose_glb(mesh, pose, CAMERA, x),
             "contour_overlay": lambda x: contour_overlay(registrar, result, x, box),
         }
         self.boxes: dict[str, Callable[[Any], object]] = {

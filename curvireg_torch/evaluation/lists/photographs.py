@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 
 from ...errors import ImageError, InvalidInputError, MissingFileError
-from ...io.input_paths import is_one_photograph, is_pattern
 from ...limits import MAX_IMAGE_PIXELS
 from ...utils.choices import IMAGES, VIDEOS
 from ...utils.files import write_file
+from ...utils.input_paths import is_one_photograph, is_pattern
 from .listing import Listing, listing
 
 __all__ = ["is_one_photograph", "list_photographs"]

@@ -6,6 +6,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from curvireg_torch import geometry as g
+from curvireg_torch.io.meshes import normalization_transform
 from curvireg_torch.matching import ViewBank
 from curvireg_torch.settings import BankSettings
 from curvireg_torch.synthetic import example_mesh
@@ -23,7 +24,7 @@ def test_principal_axes_and_their_signs_follow_any_motion(seed: int) -> None:
     R = torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
     copy = moved(mesh, R, 7.0, [3.0, -2.0, 5.0])
     normalised = [
-        m.copy().apply_transform(g.normalization_transform(m, align_axes=True).numpy()).vertices for m in (mesh, copy)
+        m.copy().apply_transform(normalization_transform(m, align_axes=True).numpy()).vertices for m in (mesh, copy)
     ]
     torch.testing.assert_close(*map(torch.tensor, normalised), rtol=0, atol=1e-9)
     spread = torch.tensor(normalised[0]).square().mean(dim=0)
@@ -33,7 +34,7 @@ def test_principal_axes_and_their_signs_follow_any_motion(seed: int) -> None:
 
 def test_a_mirrored_object_is_not_turned_into_its_twin() -> None:
     mesh = example_mesh()
-    T = g.normalization_transform(mesh, align_axes=True)
+    T = normalization_transform(mesh, align_axes=True)
     assert float(torch.linalg.det(T[:3, :3])) > 0
 
 
@@ -61,7 +62,7 @@ def test_views_along_principal_axes_keep_poses_in_the_files_frame() -> None:
     views = g.uniform_views(12)
     directions = []
     for m in (mesh, copy):
-        T = g.normalization_transform(m, align_axes=True)
+        T = normalization_transform(m, align_axes=True)
         R = views.in_model_frame(T).rotations.double()
         scale = torch.linalg.det(T[:3, :3]) ** (1 / 3)
         directions.append(R @ T[:3, :3].T / scale)  # what the views see of the normalised object

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import InvalidInputError, MissingFileError
-from ..utils.choices import IMAGES, MESHES, VIDEOS
+from .choices import IMAGES, MESHES, VIDEOS
 
 __all__ = ["check_given", "is_one_photograph", "is_pattern"]
 
