@@ -1,9 +1,10 @@
-"""Every error that this library raises on purpose.
+"""The errors that this library raises.
 
-All derive from :class:`CurviregError`, so ``except CurviregError`` catches them together; each is also the built-in
-error that a caller would expect, so ``except ValueError`` keeps working. A message is one line that names what was
-wrong and what to do.
+All derive from :class:`CurviregError`, so ``except CurviregError`` catches them together. Each also derives from the
+built-in error that fits, so ``except ValueError`` works too. A message is one line: what is wrong and what to do.
 """
+
+from typing import Self
 
 __all__ = [
     "BankError",
@@ -19,7 +20,29 @@ __all__ = [
 
 
 class CurviregError(Exception):
-    """Base class of the library's errors."""
+    """Base class of the library's errors.
+
+    Attributes:
+        message: what is wrong and what to do.
+        subject: the file, photograph or option that the error is about, "" if the message names it. ``str(error)`` is
+            ``"subject: message"``.
+
+    Example:
+        >>> error = ImageError("truncated; download it again", subject="photo.jpg")
+        >>> str(error), str(error.with_subject("image 3"))
+        ('photo.jpg: truncated; download it again', 'image 3: truncated; download it again')
+    """
+
+    def __init__(self, message: str = "", *, subject: object = "") -> None:
+        super().__init__(message)
+        self.message, self.subject = message, str(subject)
+
+    def __str__(self) -> str:
+        return f"{self.subject}: {self.message}" if self.subject else self.message
+
+    def with_subject(self, subject: object) -> Self:
+        """A copy of this error about ``subject``, in place of its present subject."""
+        return type(self)(self.message, subject=subject)
 
 
 class InvalidInputError(CurviregError, ValueError):
@@ -27,7 +50,7 @@ class InvalidInputError(CurviregError, ValueError):
 
 
 class ImageError(CurviregError, ValueError):
-    """A photograph cannot be read or carries no information."""
+    """A photograph cannot be read, or shows nothing to register."""
 
 
 class MeshError(CurviregError, ValueError):
@@ -35,14 +58,11 @@ class MeshError(CurviregError, ValueError):
 
 
 class BankError(CurviregError, ValueError):
-    """A view bank file is truncated, of another version, or does not match what is asked of it."""
+    """A bank file is truncated, of another version, or does not fit the request."""
 
 
 class MissingFileError(CurviregError, FileNotFoundError):
-    """A file or folder that was named does not exist."""
-
-    def __str__(self) -> str:  # FileNotFoundError would print its errno form
-        return str(self.args[0]) if self.args else ""
+    """A file or folder does not exist."""
 
 
 class OutputError(InvalidInputError, OSError):
@@ -50,8 +70,8 @@ class OutputError(InvalidInputError, OSError):
 
 
 class MissingDependencyError(CurviregError, ImportError):
-    """An optional package is needed for this call."""
+    """An optional package is required for this call."""
 
 
 class RenderingError(CurviregError, RuntimeError):
-    """No renderer works on this machine, or the one asked for failed."""
+    """No renderer works on this machine, or the selected one failed."""

@@ -1,6 +1,5 @@
 """Everything that decides a result, in one frozen value: the only source of defaults."""
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
@@ -22,6 +21,7 @@ from .settings import BankSettings, LocateSettings, ViewPolicy
 from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, RerankingTerm, Term, jittered_boxes
 from .utils.checks import check_option
 from .utils.choices import DEFAULT
+from .utils.digests import tensor_digest
 
 __all__ = [
     "DEFAULT",
@@ -203,13 +203,7 @@ class Pipeline:
 def field_digest(field: nn.Module) -> str:
     """16 hexadecimal digits of a module's parameters and buffers; "" of one that has none."""
     state = field.state_dict()
-    if not state:
-        return ""
-    digest = hashlib.sha256()
-    for name, tensor in sorted(state.items()):
-        digest.update(f"{name} {tuple(tensor.shape)}".encode())
-        digest.update(tensor.detach().cpu().double().numpy().tobytes())
-    return digest.hexdigest()[:16]
+    return tensor_digest(state) if state else ""
 
 
 def _term(name: str, options: Mapping[str, Any]) -> Term:

@@ -24,7 +24,7 @@ from ..evaluation.lists import (
     register_entry,
     register_list,
 )
-from ..evaluation.loops import code_digest
+from ..evaluation.loops import POSE_SOURCES
 from ..evaluation.store import to_json
 from ..geometry import camera_matrix, rotation_error
 from ..geometry.cameras import camera_of_view
@@ -38,6 +38,7 @@ from ..registration.document import corners, correction, fitting_box, result_doc
 from ..training import adapt
 from ..utils.checks import check_square_pixels
 from ..utils.choices import DEFAULT
+from ..utils.digests import code_digest
 from ..utils.files import probe_folder, write_file
 
 __all__ = ["bank", "cache", "chosen_pipeline", "demo", "open_registrar", "register"]
@@ -175,7 +176,7 @@ def _register_several(arguments: argparse.Namespace, out: Path, field: nn.Module
         "bank_decides": arguments.preset is None and arguments.pipeline is None,
         "field": None if field is None else field_digest(field),
         "device": str(arguments.device),
-        "code": code_digest(),
+        "code": code_digest(*POSE_SOURCES),
         **{name: getattr(arguments, name) for name in ("pose", "unit", "up", "top", "no_refine", "renderer")},
     }
     counts = register_list(

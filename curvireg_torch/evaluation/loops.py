@@ -1,9 +1,7 @@
 """The two loops in a row: predictions to disk, then scores from disk."""
 
-import hashlib
 import platform
 from collections import Counter
-from functools import cache
 from pathlib import Path
 
 import torch
@@ -11,6 +9,7 @@ from torch import nn
 
 from ..pipeline import DEFAULT, PRESETS, Pipeline, preset_named
 from ..utils.checks import check_positive
+from ..utils.digests import code_digest
 from ..version import __version__
 from .benchmark import Benchmark, Row
 from .localisation import localisation
@@ -20,21 +19,11 @@ from .workers import workers
 
 __all__ = ["evaluate", "score"]
 
-BESIDE_THE_POINT = (
-    "_completion.py",
-    "_examples.py",
-    "batch",
-    "cli.py",
-    "commands.py",
-    "detectors",
-    "document.py",
-    "evaluation",
-    "metrics",
-    "scenes",
-    "synthetic.py",
-    "visualization",
+POSE_SOURCES = (
+    *("data", "descriptors", "filters", "geometry", "io", "matching", "models", "registration", "rendering", "terms"),
+    *("utils", "errors.py", "limits.py", "pipeline.py", "settings.py"),
 )
-"""Parts of the package that no pose depends on."""
+"""Parts of the package that poses depend on."""
 
 NOT_ASKED_FOR = ("other_class", "no_target")
 """What datasets leave out because it is none of the objects to be evaluated, not because something is wrong with it."""
@@ -143,16 +132,5 @@ def _settings(benchmark: Benchmark, name: str, pipeline: Pipeline, renderer: str
         "pipeline": pipeline.with_pose_prior(benchmark.protocol.pose).describe(),
         "renderer": renderer,
         "version": __version__,
-        "code": code_digest(),
+        "code": code_digest(*POSE_SOURCES),
     }
-
-
-@cache
-def code_digest() -> str:
-    """16 hexadecimal digits of the sources that poses come from."""
-    package = Path(__file__).parents[1]
-    digest = hashlib.blake2b(digest_size=8)
-    for source in sorted(package.rglob("*.py")):
-        if source.relative_to(package).parts[0] not in BESIDE_THE_POINT:
-            digest.update(source.read_bytes())
-    return digest.hexdigest()

@@ -19,7 +19,7 @@ from ..matching import ViewBank, ViewMatcher, cached_bank
 from ..pipeline import Pipeline
 from ..registration import Registrar
 from ..registration.inputs import ImageItem as Photograph
-from ..utils.files import file_digest
+from ..utils.digests import file_digest
 from .benchmark import Benchmark, BenchmarkItem, Row
 from .estimate import FusedMatcher, estimate_poses
 from .protocol import Protocol, perturbed_box

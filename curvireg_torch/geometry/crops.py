@@ -36,7 +36,8 @@ def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
     check_tensor(boxes, "boxes", (len(sizes), 4))
     for i, (box, (H, W)) in enumerate(zip(boxes.tolist(), sizes, strict=True)):
         x0, y0, x1, y1 = box
-        shown = f"box {i} ({x0:g}, {y0:g}, {x1:g}, {y1:g})"
+        number = f" {i}" if len(sizes) > 1 else ""
+        shown = f"box{number} ({x0:g}, {y0:g}, {x1:g}, {y1:g})"
         if not all(abs(v) < 1e9 for v in box):
             raise InvalidInputError(f"{shown}: expected finite coordinates in px")
         if x1 <= x0 or y1 <= y0:

@@ -1,6 +1,5 @@
 """Banks on disk: safetensors with the pipeline and a checksum of the contents in the header."""
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -18,6 +17,7 @@ from ..io.meshes.colours import SurfaceColours, surface_colours
 from ..io.meshes.mesh import mesh_unit
 from ..io.meshes.up import mesh_up
 from ..pipeline import Pipeline
+from ..utils.digests import tensor_digest
 from ..utils.files import write_tensors
 from .fields import hog_layer
 
@@ -45,7 +45,7 @@ def write_bank(bank: "ViewBank", path: Path) -> None:
         "pipeline": bank.pipeline.to_json(),
         "units": " ".join(mesh_unit(mesh) or _NO_UNIT for mesh in bank.meshes),
         "up": " ".join(mesh_up(mesh) for mesh in bank.meshes),
-        "checksum": _checksum(tensors),
+        "checksum": tensor_digest(tensors, size=16),
     }
     write_tensors(path, tensors, metadata)
 
@@ -70,7 +70,7 @@ def read_bank(path: Path) -> "ViewBank":
     except (SafetensorError, OSError) as error:
         raise BankError(f"{path}: truncated or not a safetensors file ({error}); {again}") from error
     try:
-        if metadata["checksum"] != _checksum(tensors):
+        if metadata["checksum"] != tensor_digest(tensors, size=16):
             raise BankError(f"{path}: changed since it was written (its checksum differs); {again}")
         pipeline = Pipeline.from_json(metadata["pipeline"])
         views = ViewSphere(**{f.name: tensors[f"views.{f.name}"] for f in fields(ViewSphere)})
@@ -143,11 +143,3 @@ def _check_contents(bank: "ViewBank") -> None:
         raise ValueError("boxes that are empty or not finite")
     if int(bank.model.min()) < 0 or int(bank.model.max()) >= len(bank.meshes):
         raise ValueError("views of meshes that are not there")
-
-
-def _checksum(tensors: Mapping[str, Tensor]) -> str:
-    digest = hashlib.blake2b(digest_size=16)
-    for name, tensor in sorted(tensors.items()):
-        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
-        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()

@@ -1,6 +1,5 @@
 """Banks cached on disk by the content of what made them."""
 
-import functools
 import hashlib
 import json
 import os
@@ -24,6 +23,7 @@ from ..io.meshes.up import mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..settings import BankSettings
+from ..utils.digests import code_digest
 from .bank import ViewBank
 from .bank_file import FORMAT_VERSION, colour_arrays
 
@@ -43,6 +43,8 @@ CACHE_LIMIT = 2_000_000_000
 
 _ABANDONED = 3600.0  # seconds after which a half-written file belongs to no builder any more
 _HEADER_LIMIT = 1_000_000  # bytes; a bank's header takes about 2000
+_VIEW_SOURCES = ("descriptors", "filters", "geometry", "models", "rendering", "terms", "matching/describe.py")
+"""Sources that turn a mesh into descriptors: banks of another version of them are not found."""
 _BANK = re.compile(r"bank-[0-9a-f]{32}\.safetensors")
 _HALF_WRITTEN = re.compile(_BANK.pattern + r"\.[0-9a-f]{8}\.tmp")
 
@@ -72,18 +74,6 @@ def cache_folder() -> Path:
         return Path(tempfile.gettempdir()) / "curvireg_torch"
 
 
-@functools.cache
-def _code_digest() -> bytes:
-    """Digest of the sources that turn a mesh into descriptors: banks of another version of them are not found."""
-    package = Path(__file__).parents[1]
-    digest = hashlib.sha256()
-    for folder in ("descriptors", "filters", "geometry", "learned", "rendering", "terms"):
-        for source in sorted((package / folder).glob("*.py")):
-            digest.update(source.read_bytes())
-    digest.update((package / "matching" / "describe.py").read_bytes())
-    return digest.digest()
-
-
 def bank_key(
     mesh: trimesh.Trimesh,
     views: ViewSphere,
@@ -96,7 +86,7 @@ def bank_key(
     made = _settled(pipeline, settings).bank_key_fields(len(views))
     facts = [FORMAT_VERSION, made, mesh_unit(mesh), mesh_up(mesh), renderer]
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
-    digest.update(_code_digest())
+    digest.update(code_digest(*_VIEW_SOURCES).encode())
     digest.update(np.ascontiguousarray(mesh.vertices, np.float64).tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, np.int64).tobytes())
     for name, part in colour_arrays(mesh).items():

@@ -21,7 +21,7 @@ from ..utils.checks import (
     check_square_pixels,
 )
 
-__all__ = ["ImageItem", "check_crop", "image_items", "named"]
+__all__ = ["ImageItem", "check_crop", "image_items"]
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def image_items(
         try:
             out.append(_item(images[i], None if whole else boxes[i].detach().cpu().float(), cameras[i]))
         except CurviregError as error:
-            out.append(named(error, f"image {i}"))
+            out.append(error.with_subject(f"image {i}"))
     return out
 
 
@@ -96,8 +96,3 @@ def check_crop(crop: Tensor) -> None:
     check_pixels(crop, "of the box")
     if float(crop.amax() - crop.amin()) < 1.0 / 255.0:
         raise ImageError("the box shows one colour, nothing to register; check image and box")
-
-
-def named(error: CurviregError, name: str) -> CurviregError:
-    """The same error, saying which photograph it is about."""
-    return type(error)(f"{name}: {error}")

@@ -19,7 +19,7 @@ from ..utils.threads import map_on_threads
 from .confidence import confidence_model, pose_features, ranking_evidence, ranking_features
 from .correction import corrected
 from .hypotheses import Hypotheses, distinct_mask, hypotheses
-from .inputs import ImageItem, check_crop, image_items, named
+from .inputs import ImageItem, check_crop, image_items
 from .localization import Locator
 from .localization.localize import localize
 from .pose import FailedRegistration, Hypothesis, Registration
@@ -220,7 +220,7 @@ class Registrar:
                     check_crop(query.crops[k])
                     kept.append(k)
                 except CurviregError as error:
-                    out[i] = FailedRegistration(named(error, f"image {first + i}"))
+                    out[i] = FailedRegistration(error.with_subject(f"image {first + i}"))
             if kept:
                 results = self.register([usable[k][1] for k in kept], query[torch.tensor(kept)])
                 for k, result in zip(kept, results, strict=True):

@@ -1,7 +1,6 @@
 """Files that appear whole or not at all."""
 
 import errno
-import hashlib
 import os
 import secrets
 import signal
@@ -41,17 +40,6 @@ def write_file(path: Path, content: bytes) -> None:
     except OSError as error:
         cure = "make room, or choose" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "choose"
         raise OutputError(f"{path}: cannot be written ({error.strerror}); {cure} another place") from error
-
-
-def file_digest(path: Path) -> str:
-    """16 hexadecimal digits of a file's content; "" of one that cannot be read, and of what is no regular file."""
-    try:
-        if not path.is_file():
-            return ""
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=8)).hexdigest()
-    except OSError:
-        return ""
 
 
 def probe_folder(folder: Path, name: str) -> None:

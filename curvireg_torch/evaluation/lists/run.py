@@ -1,6 +1,5 @@
 """The loop over a list: each photograph's result is on disk as soon as it is known."""
 
-import hashlib
 import json
 import threading
 import time
@@ -20,7 +19,8 @@ from ...io import Photo, read_photo
 from ...io.meshes.files import mesh_digest
 from ...registration import FailedRegistration, Registrar, Registration, localize
 from ...registration.document import SCHEMA, fitting_box, found_document, result_document
-from ...utils.files import file_digest, write_file
+from ...utils.digests import file_digest, text_digest
+from ...utils.files import write_file
 from ...utils.threads import map_on_threads
 from ...visualization.sheet import Shown, thumbnail, write_sheet
 from .bop import write_bop_results
@@ -95,9 +95,7 @@ def register_entry(
         results = registrar([photo.image], torch.tensor(entry.box)[None], K)
     result = results[0]
     if isinstance(result, FailedRegistration):
-        raise type(result.error)(
-            str(result.error).replace("image 0: box 0", "image 0: box").replace("image 0", entry.name)
-        )
+        raise result.error.with_subject(entry.name)
     box = torch.tensor(entry.box) if result.found is None else result.found.box
     document = result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start})
     document["mesh"] = str(entry.meshes[result.model])
@@ -188,7 +186,7 @@ class _Run:
             *(entry.name, entry.box, entry.camera, entry.guess, entry.instances, entry.distance),
             *(meshes, self.settings),
         ]
-        return hashlib.blake2b(json.dumps(asked).encode(), digest_size=8).hexdigest()
+        return text_digest(json.dumps(asked))
 
     def _is_done(self, request: str, entry: Entry) -> bool:
         before = self.records.photo_digest(request)

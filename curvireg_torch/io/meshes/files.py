@@ -1,7 +1,6 @@
 """The files that a mesh consists of: read, listed and digested through one resolver."""
 
 import contextlib
-import hashlib
 import logging
 import urllib.parse
 import warnings
@@ -13,7 +12,7 @@ import trimesh
 
 from ...errors import MeshError
 from ...limits import MAX_MESH_BYTES
-from ...utils.files import file_digest
+from ...utils.digests import file_digest, text_digest
 from .gltf import check_gltf
 from .polygon_files import with_triangles
 
@@ -45,8 +44,7 @@ def mesh_digest(path: Path) -> str:
 
     A file that is missing or cannot be read counts too, so that the digest changes once it is put right.
     """
-    contents = " ".join(map(file_digest, mesh_files(path)))
-    return hashlib.blake2b(contents.encode(), digest_size=8).hexdigest()
+    return text_digest(" ".join(map(file_digest, mesh_files(path))))
 
 
 def read_mesh(path: Path) -> Any:

@@ -13,7 +13,7 @@ from ...geometry.crops import box_iou
 from ...matching import QueryFeatures, Ranking
 from ..confidence import presence, presence_features
 from ..correction import projected_box
-from ..inputs import ImageItem, check_crop, image_items, named
+from ..inputs import ImageItem, check_crop, image_items
 from ..pose import FailedRegistration, Localization, Registration
 from . import Located
 from .locator import OVERLAP, check_distance
@@ -82,7 +82,7 @@ def _found_objects(
         located = registrar.locator([item.image], camera_matrices=cameras, distance=distance)[0]
         return [*_followed(registrar, item, located, instances)]
     except CurviregError as error:
-        return [FailedRegistration(named(error, name))]
+        return [FailedRegistration(error.with_subject(name))]
 
 
 def _followed(registrar: "Registrar", item: ImageItem, located: Located, instances: int) -> list[Registration]:
