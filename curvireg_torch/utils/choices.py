@@ -1,10 +1,10 @@
-"""Names that a user may choose from, apart from what they stand for: the command line shows them without torch."""
+"""Names that a user may choose from. The command line lists them without importing torch."""
 
 BACKENDS = ("auto", "embree", "pyrender", "torch")
 """Renderers."""
 
 DEFAULT = "learned"
-"""The preset that is taken where none is named."""
+"""The default preset."""
 
 PRESET_NAMES = ("learned", "classical", "fast", "paper")
 """Of :data:`curvireg_torch.pipeline.PRESETS`."""
@@ -15,7 +15,8 @@ UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.304
 IMAGES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp")
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm")
 MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
-"""How names of files end, in small letters."""
+MESHES_AND_BANKS = (*MESHES, ".safetensors")
+"""Suffixes of file names, in lower case."""
 
 UP_AXES = {
     "x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
@@ -25,4 +26,4 @@ UP_AXES = {
     "-y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
     "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
 }
-"""Axis that points up: the quarter turns that bring it to z."""
+"""Axis that points up, and the rotation by quarter turns that brings it to z."""

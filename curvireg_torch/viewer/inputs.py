@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING, Any
 from nicegui import ui
 
 from ..limits import MAX_IMAGE_BYTES, MAX_MESH_BYTES
-from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
+from ..utils.choices import MESHES_AND_BANKS, PRESET_NAMES, UNITS, UP_AXES
 from .drawing import BoxDrawing
 
 if TYPE_CHECKING:
     from .page import Page
 
 __all__ = ["Inputs"]
-
-MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".safetensors")
 
 
 class Inputs:
@@ -30,7 +28,7 @@ class Inputs:
         options = self.session.options
         self._upload("photograph", MAX_IMAGE_BYTES, "image/*", self._photo_came)
         self.photo_facts = self._told("photo-facts")
-        self._upload("mesh", MAX_MESH_BYTES, ",".join(MESHES), self._mesh_came)
+        self._upload("mesh", MAX_MESH_BYTES, ",".join(MESHES_AND_BANKS), self._mesh_came)
         self.mesh_facts = self._told("mesh-facts")
         with ui.row().classes("w-full no-wrap gap-2"):
             self._choice("unit", list(UNITS), options.unit)
@@ -85,9 +83,9 @@ class Inputs:
 
     async def _mesh_came(self, event: Any) -> None:
         suffix = Path(event.file.name).suffix.lower()
-        if suffix not in MESHES:
+        if suffix not in MESHES_AND_BANKS:
             self.page.say(
-                f"{event.file.name}: expected a mesh file ({', '.join(MESHES)}); convert it first", wrong=True
+                f"{event.file.name}: expected a mesh file ({', '.join(MESHES_AND_BANKS)}); convert it first", wrong=True
             )
             return
         await self._take_mesh(await self._saved(event.file, "mesh", suffix), event.file.name)
