@@ -38,7 +38,7 @@ from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
 from curvireg_torch.registration.confidence import presence
 from curvireg_torch.registration.inputs import ImageItem
 from curvireg_torch.registration.localization import representative_views
-from curvireg_torch.registration.localization.localize import ScoredCandidates
+from curvireg_torch.registration.localization.objects import ScoredCandidates
 
 Row = dict[str, Any]
 Curves = dict[str, tuple[list[bool], list[float]]]

@@ -75,7 +75,10 @@ def pipeline_times(mesh: trimesh.Trimesh, pipeline: Pipeline, photographs: int, 
         bank.save(path)
         times["megabytes"] = path.stat().st_size / 1e6
         times["open"] = seconds(lambda: registrar_of(ViewBank.load(path)))
-    ranked, single, whole = registrar_of(bank, refine=False), registrar_of(bank, hypotheses=1), registrar_of(bank)
+    ranked, single, whole = (
+        registrar_of(bank, pipeline=replace(bank.pipeline, **changes))
+        for changes in ({"search": False, "contours": False}, {"hypotheses": 1}, {})
+    )
     one = images[:1], boxes[:1], K
     for name, registrar in (("rank", ranked), ("register_1_hypothesis", single), ("register", whole)):
         registrar(*one)  # makes what is made once

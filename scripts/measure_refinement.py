@@ -15,6 +15,7 @@ import json
 import math
 import platform
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -137,8 +138,8 @@ def main() -> None:
         mesh.units = "m"
         bank = cached_bank(mesh, pipeline=preset.with_pose_prior("upright"), progress=False)
         registrars = {
-            "view": Registrar(bank, refine=False),
-            "search": Registrar(bank, contours=False),
+            "view": Registrar(bank, pipeline=replace(bank.pipeline, search=False, contours=False)),
+            "search": Registrar(bank, pipeline=replace(bank.pipeline, contours=False)),
             "contours": Registrar(bank),
         }
         for jitter in arguments.jitter:

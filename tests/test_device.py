@@ -147,8 +147,8 @@ def test_objects_are_found_there(bank):
     with pretended_gpu() as device:
         found = localize(cr.Registrar(bank, device=device), [image.to(device)], CAMERA)[0]
         same(found[0], expected[0])
-        assert torch.equal(found[0].found.box.cpu(), expected[0].found.box)
-        assert found[0].found.presence == expected[0].found.presence
+        assert torch.equal(found[0].localization.box.cpu(), expected[0].localization.box)
+        assert found[0].localization.presence == expected[0].localization.presence
 
 
 def test_another_default_dtype_changes_nothing():

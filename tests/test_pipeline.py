@@ -16,6 +16,7 @@ from curvireg_torch.models import LearnedCurvilinearSaliency
 from curvireg_torch.pipeline import DEFAULT, FIELDS, PRESETS, preset_named
 from curvireg_torch.settings import DEPTH_FIELDS, BankSettings, ViewPolicy
 from curvireg_torch.terms import TERMS, BoxShape, Correlation, Repeatability, Term
+from tests._support.scenes import unrefined
 
 
 def test_the_default_pipeline_is_the_default_preset():
@@ -46,7 +47,7 @@ def test_every_preset_registers_and_goes_through_json(name):
     assert Pipeline.from_json(pipeline.to_json()) == pipeline
     views = sample_views(azimuth_step=60, elevations=[20])
     bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), views, pipeline=pipeline, progress=False)
-    registrar = Registrar(bank, refine=False)
+    registrar = Registrar(bank, pipeline=unrefined(bank))
     result = registrar([torch.rand(3, 80, 100)], torch.tensor([[20.0, 10, 80, 70]]))[0]
     assert result.rotation.isfinite().all()
     assert set(result.ranking.terms) == {term.name for term in pipeline.terms}

@@ -34,7 +34,7 @@ from ..matching import ViewBank, cache_folder, cached_bank, clear_cache, list_ca
 from ..models import LearnedCurvilinearSaliency
 from ..pipeline import Pipeline, field_digest, preset_named
 from ..registration import Registrar, Registration
-from ..registration.document import corners, correction, fitting_box, result_document
+from ..registration.document import corners, correction, result_document, used_box
 from ..training import adapt
 from ..utils.checks import check_square_pixels
 from ..utils.choices import DEFAULT
@@ -103,14 +103,13 @@ def open_registrar(
     bank = ViewBank.join(banks).to(arguments.device)
     if own and arguments.pose is None and arguments.pipeline is None:  # presets say nothing of the views
         pipeline = replace(pipeline, views=bank.pipeline.views)
-    return Registrar(
-        bank,
-        pipeline=None if own and arguments.preset is None and arguments.pipeline is None else pipeline,
-        field=field,
-        refine=not arguments.no_refine,
-        hypotheses=arguments.top,
-        renderer=arguments.renderer,
-    )
+    if own and arguments.preset is None and arguments.pipeline is None:
+        pipeline = bank.pipeline
+    if arguments.no_refine:
+        pipeline = replace(pipeline, search=False, contours=False)
+    if arguments.top is not None:
+        pipeline = replace(pipeline, hypotheses=arguments.top)
+    return Registrar(bank, pipeline=pipeline, field=field, renderer=arguments.renderer)
 
 
 def _open_bank(
@@ -156,7 +155,7 @@ def _register_one(arguments: argparse.Namespace, field: nn.Module | None) -> Non
         print(f"{path}: looking for the object; --box X0 Y0 X1 Y1 is faster and surer", file=sys.stderr)
     result, document = register_entry(entry, photo, registrar, bank_seconds=ready)
     if arguments.out is not None:
-        _write(arguments.out, document, registrar, result, photo.image, fitting_box(document))
+        _write(arguments.out, document, registrar, result, photo.image, used_box(document))
     if document["inputs"]["camera_source"] in ("exif", "fov"):
         focal = document["inputs"]["camera"][0]
         print(
@@ -287,14 +286,14 @@ def _print_result(document: dict[str, Any], out: Path) -> None:
         upright = document["pipeline"]["views"]["pose"] == "upright"
         stands = ", and that it stands as in its file (--pose upright, --up)" if upright else ""
         looked_for = "the object was looked for: give its --box, and check that"
-        checks = looked_for if "found" in document else "check that the box is tight and"
+        checks = looked_for if "localization" in document else "check that the box is tight and"
         print(f"no reliable match: take the pose as a guess; {checks} the mesh is the object's{stands}")
     if ", " in document.get("inputs", {}).get("mesh", ""):
         print(f"mesh: {document['mesh']}")
     for line in correction(document):
         print(line)
-    if "found" in document:
-        for found in document["found"]["instances"]:
+    if "localization" in document:
+        for found in document["localization"]["instances"]:
             print(f"found in box {corners(found['box'])}: there with probability {found['presence']:.2f}")
     if document["translation"] is not None:
         print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")

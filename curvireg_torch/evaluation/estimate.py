@@ -52,7 +52,7 @@ def _row(result: Registration | FailedRegistration) -> Row:
         "covariance": None if result.covariance is None else result.covariance.tolist(),
         "mesh": best.model,
         "seen_by": [matrix.tolist() for matrix in best.projection],
-        **({} if result.found is None else {"found": _found(result.found)}),
+        **({} if result.localization is None else {"localization": _found(result.localization)}),
         "rivals": [
             {"rotation": r.rotation.tolist(), "score": r.score, "mesh": r.model, "evidence": dict(r.evidence)}
             for r in rivals

@@ -35,9 +35,9 @@ def localisation(items: Sequence[BenchmarkItem], rows: Sequence[Row]) -> Row:
 
 def _rank(box: Tensor, row: Row) -> float:
     """Place of the first proposal that is right, from 1; infinite if none is."""
-    if "found" not in row:
+    if "localization" not in row:
         return float("inf")
-    proposals = torch.tensor(row["found"]["boxes"], dtype=torch.float64).view(-1, 4)
+    proposals = torch.tensor(row["localization"]["boxes"], dtype=torch.float64).view(-1, 4)
     H, W = row["image_size"]
     end = torch.tensor([W, H, W, H], dtype=torch.float64) - 0.5
     cut = [torch.minimum(boxes.clamp(min=-0.5), end) for boxes in (proposals, box.double()[None])]

@@ -117,7 +117,7 @@ def _picture(benchmark: Benchmark, item: BenchmarkItem, row: Row) -> bytes | Non
     except CurviregError:
         return None
     given = perturbed_box(item.box, benchmark.protocol, item.key).tolist()
-    box = row["found"]["boxes"][0] if "found" in row else given
+    box = row["localization"]["boxes"][0] if "localization" in row else given
     return None if renderer is None else thumbnail(renderer, (T, K), image, box)
 
 

@@ -5,10 +5,10 @@ from .confidence import RELIABLE, confidence, ranking_evidence
 from .contour import ContourFit, fit_contours
 from .hypotheses import Hypotheses, hypotheses
 from .localization import Located, Locator, locate, representative_views
-from .localization.localize import localize
-from .pose import FailedRegistration, Hypothesis, Localization, Registration
+from .localization.objects import localize
 from .registrar import Registrar
 from .rescoring import rescore
+from .results import FailedRegistration, Hypothesis, Localization, Registration
 from .search import coherent_views, search
 
 __all__ = [

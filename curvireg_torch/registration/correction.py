@@ -11,7 +11,7 @@ from ..errors import CurviregError
 from ..geometry.cameras import projected_boxes
 from ..geometry.crops import box_iou
 from .inputs import ImageItem
-from .pose import FailedRegistration, Registration
+from .results import FailedRegistration, Registration
 
 if TYPE_CHECKING:
     from .registrar import Registrar

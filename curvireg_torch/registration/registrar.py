@@ -21,10 +21,10 @@ from .correction import corrected
 from .hypotheses import Hypotheses, distinct_mask, hypotheses
 from .inputs import ImageItem, check_crop, image_items
 from .localization import Locator
-from .localization.localize import localize
-from .pose import FailedRegistration, Hypothesis, Registration
+from .localization.objects import localize
 from .poses import Poses, follow_contours, lift_to_poses, supports
 from .rescoring import POSE_FEATURES, gather_pose_features, rescore, similarities
+from .results import FailedRegistration, Hypothesis, Registration
 from .search import search
 
 __all__ = ["Registrar"]
@@ -48,8 +48,6 @@ class Registrar:
         pipeline: all settings; default that of a bank, else ``Pipeline()``.
         views, settings: viewpoints and bank settings of one's own, for a mesh.
         field: photograph filter of one's own, see :class:`ViewMatcher`.
-        refine, contours: False leaves out the search and all behind it, or the contour stage.
-        hypotheses: distinct hypotheses to carry and to report, instead of the pipeline's.
         renderer: of the views rendered in search and contours, and of a bank that is built; one of your own is of one
             mesh.
         symmetries: (S, 4, 4) of the mesh, from :func:`curvireg_torch.geometry.symmetry_transforms`; hypotheses that
@@ -65,7 +63,7 @@ class Registrar:
         >>> from curvireg_torch.geometry import sample_views
         >>> bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), sample_views(azimuth_step=45, elevations=[20]),
         ...                       image_size=64, progress=False)
-        >>> result = Registrar(bank, refine=False)(torch.rand(1, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30]]))[0]
+        >>> result = Registrar(bank)(torch.rand(1, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30]]))[0]
         >>> result.rotation.shape, result.translation
         (torch.Size([3, 3]), None)
     """
@@ -78,9 +76,6 @@ class Registrar:
         views: ViewSphere | None = None,
         settings: BankSettings | None = None,
         field: nn.Module | None = None,
-        refine: bool = True,
-        contours: bool = True,
-        hypotheses: int | None = None,
         renderer: str | DepthRenderer = "auto",
         symmetries: Tensor | None = None,
         device: torch.device | str | None = None,
@@ -112,12 +107,7 @@ class Registrar:
             pipeline = matcher.pipeline
         if isinstance(bank_or_mesh, ViewBank | ViewMatcher) and (views is not None or settings is not None):
             raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
-        self.pipeline = replace(
-            pipeline,
-            search=pipeline.search and refine,
-            contours=pipeline.contours and refine and contours,
-            hypotheses=pipeline.hypotheses if hypotheses is None else hypotheses,
-        )
+        self.pipeline = pipeline
         self.matcher, self.bank = matcher, matcher.bank
         if not isinstance(renderer, str) and len(self.bank.meshes) != 1:
             raise InvalidInputError(f"renderer: yours is of one mesh, the bank has {len(self.bank.meshes)}; name one")

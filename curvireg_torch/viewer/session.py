@@ -25,7 +25,7 @@ from ..io.meshes import has_colours, load_mesh
 from ..limits import MAX_VIEWER_SECONDS
 from ..matching import ViewBank
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
-from ..registration.document import fitting_box, pose_document
+from ..registration.document import used_box
 from ..utils.checks import check_square_pixels
 from ..visualization import pose_glb
 from .pictures import at
@@ -175,7 +175,7 @@ class Session:
             entry = Entry(name=name, cells=(), meshes=meshes, box=self.box, camera=camera, guess=self.guess)
             ready = time.perf_counter() - start
             result, document = register_entry(entry, picture, registrar, bank_seconds=ready)
-        box = torch.tensor(fitting_box(document))
+        box = torch.tensor(used_box(document))
         self.answer = Answer(registrar, result, document, picture.image, box, command)
         self.choose(0)
         return result
@@ -192,7 +192,7 @@ class Session:
 
     def proposals(self) -> list[list[float]]:
         """The best boxes in which the object was looked for, the answer's first; none where the box was given."""
-        found = {} if self.answer is None else self.answer.document.get("found", {})
+        found = {} if self.answer is None else self.answer.document.get("localization", {})
         return [proposal["box"] for proposal in found.get("proposals", [])[:SHOWN]]
 
     def choose(self, number: int) -> None:
@@ -250,7 +250,7 @@ class Session:
             "command": answer.command,
             "hypothesis": shown.number,
             "by_hand": list(shown.by_hand),
-            **pose_document(shown.pose),
+            **shown.pose.pose_dict(),
         }
         return {**answer.document, "viewer": on_page}
 

@@ -13,6 +13,8 @@ comes out.
 # A photograph, a box around the object, the camera matrix if it is known, and a mesh. Here all of it is made in code,
 # so that the truth is known.
 
+from dataclasses import replace
+
 import matplotlib.pyplot as plt
 import torch
 
@@ -136,7 +138,7 @@ plt.show()
 # Around the best distinct views the pose is searched in small steps, then the mesh's contours are pulled onto the
 # photograph's edges. Left: the best view of the bank, placed into the box. Right: what is found.
 
-coarse = cr.Registrar(bank, refine=False)
+coarse = cr.Registrar(bank, pipeline=replace(bank.pipeline, search=False, contours=False))
 before = coarse([photograph], box[None], K)[0]
 after = registrar([photograph], box[None], K)[0]
 

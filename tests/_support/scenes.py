@@ -1,15 +1,17 @@
 """Small scenes shared by tests."""
 
+from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from curvireg_torch import ViewBank, camera_matrix, sample_views
-from curvireg_torch.pipeline import PRESETS
+from curvireg_torch import Registrar, ViewBank, camera_matrix, sample_views
+from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
-__all__ = ["CAMERA", "SIZE", "scene", "truck_bank"]
+__all__ = ["CAMERA", "SIZE", "scene", "truck_bank", "truck_registrar", "unrefined"]
 
 SIZE = (180, 240)
 CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
@@ -28,3 +30,13 @@ def scene(seed: int) -> tuple[Tensor, Tensor, Tensor]:
     T = random_pose(example_mesh(), CAMERA, SIZE, generator, elevations=(5.0, 50.0))
     image, box = synthesize_photograph(example_mesh(), T, CAMERA, SIZE, generator)
     return image, box, T
+
+
+def unrefined(bank: ViewBank, **changes: Any) -> Pipeline:
+    """The bank's pipeline without search and contour fit: results are views of the bank."""
+    return replace(bank.pipeline, search=False, contours=False, **changes)
+
+
+def truck_registrar(**changes: Any) -> Registrar:
+    """A registrar of the truck, with changed fields of its pipeline."""
+    return Registrar(truck_bank(), pipeline=replace(truck_bank().pipeline, **changes))

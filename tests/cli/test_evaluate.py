@@ -55,11 +55,11 @@ def test_without_boxes(pascal, tmp_path, capsys, monkeypatch):
     assert summary["localisation"]["n"] == 2
     assert f"recall_1 {summary['localisation']['recall_1']:.3f}   recall_5" in capsys.readouterr().out
     contact_sheet(tmp_path / "out", tmp_path / "sheet.html")
-    row = next(row for row in rows_of(tmp_path / "out") if "found" in row)
+    row = next(row for row in rows_of(tmp_path / "out") if "localization" in row)
     seen = []
     monkeypatch.setattr("curvireg_torch.evaluation.sheet.thumbnail", lambda *a: seen.append(a[3]) or b"")
     contact_sheet(tmp_path / "out", tmp_path / "sheet.html")
-    assert row["found"]["boxes"][0] in seen, "the page shows the box that was found"
+    assert row["localization"]["boxes"][0] in seen, "the page shows the box that was found"
     summary["localisation"] = localisation([], [])
     monkeypatch.setattr("curvireg_torch.evaluation.loops.evaluate", lambda *_, **__: summary)
     evaluate("pascal3d", pascal.root, "--limit", "2", "--out", tmp_path / "out", "--protocol", "box=none")

@@ -23,7 +23,7 @@ from curvireg_torch.geometry import project_points
 from curvireg_torch.io.meshes import load_mesh
 from curvireg_torch.visualization import sheet
 from tests._support.lists import CAMERA, box_of, lines, table, write_files, written
-from tests._support.scenes import scene, truck_bank
+from tests._support.scenes import scene, truck_bank, unrefined
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_contours_of_a_thumbnail_lie_on_the_object(scale):
     large = torch.nn.functional.interpolate(image[None], scale_factor=scale, mode="bilinear")[0]
     photograph = (large * 255).round().byte()
     edges = ((box + 0.5) * scale - 0.5).tolist()
-    registrar = Registrar(truck_bank(), refine=False)
+    registrar = Registrar(truck_bank(), pipeline=unrefined(truck_bank()))
     result = registrar([photograph], [edges])[0]
     grey = torch.full_like(photograph, 100)
     jpeg = sheet.thumbnail(registrar.describers[0].renderer, result.projection, grey, edges)

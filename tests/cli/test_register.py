@@ -21,7 +21,7 @@ from curvireg_torch.settings import BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.training import adapt
 from tests._support.exif import exif, with_exif
-from tests._support.scenes import scene, truck_bank
+from tests._support.scenes import scene, truck_bank, unrefined
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,8 @@ def test_a_sideways_photograph_is_registered_as_viewers_show_it(files, capsys):
     assert upright["inputs"]["picture"]["orientation"] == 1
     assert "sideways.png: EXIF orientation 6 applied" in capsys.readouterr().out
     # A path given in Python is the same photograph.
-    registrar = Registrar(ViewBank.load(folder / "truck.safetensors"), refine=False)
+    bank = ViewBank.load(folder / "truck.safetensors")
+    registrar = Registrar(bank, pipeline=unrefined(bank))
     assert registrar([folder / "sideways.png"], [[float(v) for v in box]])[0].rotation.tolist() == result["rotation"]
 
 
@@ -355,7 +356,7 @@ def test_adapted_field_from_bank_to_register(files, monkeypatch, capsys):
     [
         ("any", {}, "the box is tight and the mesh is the object's\n", "looked for"),
         ("upright", {}, "(--pose upright, --up)\n", "looked for"),
-        ("any", {"found": {"instances": []}}, "the object was looked for: give its --box", "tight"),
+        ("any", {"localization": {"instances": []}}, "the object was looked for: give its --box", "tight"),
         ("any", {"corrected_box": [1.2, 2.0, 30.6, 40.0]}, "did not fit the pose; one that does: 1 2 31 40\n", "found"),
     ],
 )

@@ -11,7 +11,7 @@ def item(*box):
 
 
 def row(*boxes):
-    return {"found": {"boxes": [list(map(float, box)) for box in boxes]}, "image_size": [100, 200]}
+    return {"localization": {"boxes": [list(map(float, box)) for box in boxes]}, "image_size": [100, 200]}
 
 
 AWAY = (150, 50, 160, 60)

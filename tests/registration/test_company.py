@@ -57,6 +57,6 @@ def test_looked_for_alone_or_beside_others_to_the_bit(bank: ViewBank) -> None:
     alone = Registrar(bank)(images[1:])[0]
     torch.set_num_threads(2)
     together = Registrar(bank)(images)[1]
-    assert torch.equal(alone.found.boxes, together.found.boxes)
+    assert torch.equal(alone.localization.boxes, together.localization.boxes)
     assert torch.equal(alone.rotation, together.rotation)
     assert alone.confidence == together.confidence

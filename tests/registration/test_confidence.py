@@ -25,7 +25,7 @@ from curvireg_torch.registration.confidence import (
 )
 from curvireg_torch.registration.contour import contour_support
 from curvireg_torch.synthetic import procedural_background
-from tests._support.scenes import CAMERA, SIZE, scene, truck_bank
+from tests._support.scenes import CAMERA, SIZE, scene, truck_bank, truck_registrar, unrefined
 
 RECORD = Path(__file__).parents[2] / "scripts" / "results" / "calibration.json"
 
@@ -148,7 +148,7 @@ def test_the_right_object_is_trusted_more_than_clutter():
 
 def test_no_reliable_match_is_an_answer():
     empty = procedural_background(SIZE, torch.Generator().manual_seed(0))
-    result = Registrar(truck_bank(), refine=False)([empty], torch.tensor([[60.0, 40, 180, 140]]), CAMERA)[0]
+    result = truck_registrar(search=False, contours=False)([empty], torch.tensor([[60.0, 40, 180, 140]]), CAMERA)[0]
     assert not result.reliable
 
 
@@ -161,7 +161,7 @@ def test_symmetric_duplicates_are_reported_once():
     assert plain.tolist() == list(range(12))
     assert merged.tolist() == list(range(6))
     image, box, _ = scene(0)
-    result = Registrar(truck_bank(), refine=False, symmetries=symmetries)([image], box[None])[0]
+    result = Registrar(truck_bank(), pipeline=unrefined(truck_bank()), symmetries=symmetries)([image], box[None])[0]
     found = truck_bank().rotations[result.candidates].double()
     turned = found @ symmetries[1, :3, :3]
     apart = rotation_error(found[:, None], turned[None]) + 1000 * torch.eye(len(found))
@@ -195,7 +195,7 @@ def test_confidence_rests_on_what_the_hypotheses_say():
 
 def test_without_contours_the_confidence_is_that_of_the_answers_view(monkeypatch):
     image, box, _ = scene(0)
-    registrar = Registrar(truck_bank(), refine=False)
+    registrar = truck_registrar(search=False, contours=False)
     result = registrar([image], box[None], CAMERA)[0]
     assert list(result.confidence_features) == list(RANKING_FEATURES)
     assert result.confidence == pytest.approx(float(confidence(result.ranking, truck_bank().rotations)))
@@ -213,7 +213,7 @@ def test_one_hypothesis_is_not_believed_for_want_of_a_rival() -> None:
     """Its rivals are followed all the same: the confidence is that of two hypotheses, of which one is reported."""
     for seed in range(3):
         image, box, _ = scene(seed)
-        one, two = (Registrar(truck_bank(), hypotheses=n)([image], box[None], CAMERA)[0] for n in (1, 2))
+        one, two = (truck_registrar(hypotheses=n)([image], box[None], CAMERA)[0] for n in (1, 2))
         assert (len(one.hypotheses), len(two.hypotheses)) == (1, 2)
         assert torch.equal(one.rotation, two.rotation)
         assert one.confidence_features == two.confidence_features
@@ -229,7 +229,7 @@ def test_a_bank_without_a_rival_view_has_no_lead() -> None:
     assert result.confidence_features["lead"] is None
     assert result.confidence_features["concentration"] is None
     assert result.confidence <= UNCOMPARED
-    ranked = Registrar(bank, refine=False)([image], box[None], CAMERA)[0]
+    ranked = Registrar(bank, pipeline=unrefined(bank))([image], box[None], CAMERA)[0]
     assert ranked.confidence_features["margin"] is None
     assert ranked.confidence <= UNCOMPARED
 

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 import trimesh
 
-from curvireg_torch import Registrar, camera_matrix, rotation_error
+from curvireg_torch import camera_matrix, rotation_error
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_towards
 from curvireg_torch.geometry.cameras import project_points, transform
@@ -16,7 +16,7 @@ from curvireg_torch.registration import contour, contour_descent, fit_contours
 from curvireg_torch.registration.contour_points import EdgeField, contour_points
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
-from tests._support.scenes import CAMERA, scene, truck_bank
+from tests._support.scenes import CAMERA, scene, truck_bank, truck_registrar
 
 K = camera_matrix(300.0, 310.0, 63.5, 60.0, dtype=torch.float64)
 FIRST = torch.tensor([0])
@@ -274,7 +274,7 @@ def test_the_registrar_ends_with_the_contours(camera):
     for seed in (0, 1, 2):
         image, box, T = scene(seed)
         results = {
-            contours: Registrar(truck_bank(), contours=contours, hypotheses=2)(image[None], box[None], camera)[0]
+            contours: truck_registrar(contours=contours, hypotheses=2)(image[None], box[None], camera)[0]
             for contours in (True, False)
         }
         truth = T[:3, :3]

@@ -9,8 +9,8 @@ import curvireg_torch as cr
 from curvireg_torch.geometry import box_iou, rotation_error
 from curvireg_torch.registration import correction
 from curvireg_torch.registration.correction import projected_box
-from curvireg_torch.registration.document import fitting_box, result_document
-from tests._support.scenes import CAMERA, scene, truck_bank
+from curvireg_torch.registration.document import result_document, used_box
+from tests._support.scenes import CAMERA, scene, truck_bank, unrefined
 
 EDGES = torch.tensor([-0.18, 0.15, 0.02, 0.2])
 """Shares of a box's sides by which its edges are wrong."""
@@ -44,8 +44,8 @@ def test_the_box_around_the_pose_takes_the_place_of_one_that_is_wrong(registrar)
     right = box[None].double()
     assert box_iou(result.corrected_box[None], right) > box_iou(wrong[None].double(), right) + 0.1
     document = {**result_document(result, registrar, {}), "inputs": {"box": [1.0, 2.0, 3.0, 4.0]}}
-    assert fitting_box(document) == document["corrected_box"] == result.corrected_box.tolist()
-    assert fitting_box({**document, "corrected_box": None}) == [1.0, 2.0, 3.0, 4.0]
+    assert used_box(document) == document["corrected_box"] == result.corrected_box.tolist()
+    assert used_box({**document, "corrected_box": None}) == [1.0, 2.0, 3.0, 4.0]
 
 
 def test_one_answer_of_a_batch_may_be_corrected(registrar):
@@ -87,7 +87,7 @@ def test_boxes_are_taken_as_they_are_where_that_is_asked_for(registrar):
     wrong = roughly(box)
     assert as_it_is(registrar, image, wrong).corrected_box is None
     assert registrar([image], wrong[None])[0].corrected_box is None, "without a camera a pose keeps to its box"
-    ranked = cr.Registrar(registrar.bank, refine=False)
+    ranked = cr.Registrar(registrar.bank, pipeline=unrefined(registrar.bank))
     assert ranked([image], wrong[None], CAMERA)[0].corrected_box is None
 
 

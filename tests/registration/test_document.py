@@ -9,11 +9,11 @@ import torch
 from curvireg_torch import Registration
 from curvireg_torch.matching import Ranking
 from curvireg_torch.registration import Hypothesis
-from curvireg_torch.registration.document import correction, found_document, result_document
-from curvireg_torch.registration.pose import Localization
+from curvireg_torch.registration.document import correction, localization_document, result_document
+from curvireg_torch.registration.results import Localization
 
 
-def registration(covariance=None, confidence=0.9, found=None, distance=2.0):
+def registration(covariance=None, confidence=0.9, localization=None, distance=2.0):
     """Of a bank of two views, the second of which one term did not compare."""
     terms = {"hog": torch.tensor([[0.5, 0.4]]), "appearance": torch.tensor([[0.3, torch.nan]])}
     ranking = Ranking(torch.tensor([[0.9, 0.8]]), torch.tensor([[0, 1]]), terms)
@@ -33,7 +33,7 @@ def registration(covariance=None, confidence=0.9, found=None, distance=2.0):
         )
         for view in (0, 1)
     )
-    return Registration(poses, confidence, ranking, found=found)
+    return Registration(poses, confidence, ranking, localization=localization)
 
 
 class Bank(list):
@@ -65,10 +65,10 @@ def test_terms_that_did_not_compare_a_view_are_left_out():
 def test_presence_is_that_of_the_surest_instance():
     boxes, scores = torch.tensor([[1.0, 2, 30, 40], [50, 2, 80, 40]]).double(), torch.tensor([7.0, 6.5])
     results = [
-        registration(found=Localization(box, presence, score, boxes, scores), confidence=0.5 * presence)
+        registration(localization=Localization(box, presence, score, boxes, scores), confidence=0.5 * presence)
         for box, presence, score in zip(boxes, (0.9, 0.4), (7.0, 6.5), strict=True)
     ]
-    document = found_document(results)
+    document = localization_document(results)
     assert document["presence"] == 0.9
     assert [one["presence"] for one in document["instances"]] == [0.9, 0.4]
     assert [one["confidence"] for one in document["instances"]] == [0.45, 0.2]

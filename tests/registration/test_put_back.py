@@ -1,5 +1,6 @@
 """Hypotheses whose search or fit ended in another one, or in nothing that is trusted: they stand at their own view."""
 
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -40,7 +41,7 @@ def photographs() -> tuple[list[torch.Tensor], torch.Tensor]:
 @pytest.fixture(scope="module")
 def results() -> list[Registration]:
     images, boxes = photographs()
-    return Registrar(coarse_bank(), hypotheses=5)(images, boxes, CAMERA)
+    return Registrar(coarse_bank(), pipeline=replace(coarse_bank().pipeline, hypotheses=5))(images, boxes, CAMERA)
 
 
 def moved(hypothesis: Hypothesis) -> float:
@@ -92,7 +93,7 @@ def test_a_view_that_was_put_back_has_no_covariance(results):
 def test_without_a_camera_a_fit_is_taken_where_it_is_trusted(results):
     """Contours of rivals hardly fit: there the view stays. With a camera, the mesh counts as the object's own."""
     images, boxes = photographs()
-    blind = Registrar(coarse_bank(), hypotheses=3)(images[::2], boxes[::2])
+    blind = Registrar(coarse_bank(), pipeline=replace(coarse_bank().pipeline, hypotheses=3))(images[::2], boxes[::2])
     for without, with_camera in zip(blind, results[::2], strict=True):
         rivals = {h.view for h in without.hypotheses[1:]}
         assert all(moved(h) < 0.01 for h in without.hypotheses[1:])

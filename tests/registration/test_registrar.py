@@ -20,10 +20,10 @@ from curvireg_torch.geometry import rotation_from_viewpoint, symmetry_transforms
 from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import RELIABLE, FailedRegistration, distinct_views, fit_contours
-from curvireg_torch.registration import pose as pose_module
+from curvireg_torch.registration import results as results_module
 from curvireg_torch.rendering import make_renderer, render_depth
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import CAMERA, SIZE, scene, truck_bank
+from tests._support.scenes import CAMERA, SIZE, scene, truck_bank, truck_registrar, unrefined
 
 SEEDS = range(6)
 
@@ -32,7 +32,7 @@ SEEDS = range(6)
 def registered() -> tuple[list, list]:
     """Six scenes of known truth, before and after refinement."""
     images, boxes = [scene(s)[0] for s in SEEDS], torch.stack([scene(s)[1] for s in SEEDS])
-    coarse = Registrar(truck_bank(), refine=False)(images, boxes, CAMERA)
+    coarse = truck_registrar(search=False, contours=False)(images, boxes, CAMERA)
     return coarse, Registrar(truck_bank())(images, boxes, CAMERA)
 
 
@@ -68,7 +68,7 @@ def test_results_are_proper_poses(registered):
 
 def test_without_a_camera_there_is_no_translation():
     image, box, _ = scene(0)
-    result = Registrar(truck_bank(), refine=False)(image[None], box[None])[0]
+    result = truck_registrar(search=False, contours=False)(image[None], box[None])[0]
     assert result.translation is None
     assert result.transform is None
     assert result.rotation.equal(result.allocentric_rotation)
@@ -114,7 +114,7 @@ def test_a_mesh_instead_of_a_bank_uses_the_cache(tmp_path, monkeypatch):
 
 
 def test_what_is_wrong_with_one_photograph_is_its_own_failure(tmp_path):
-    registrar = Registrar(truck_bank(), refine=False)
+    registrar = truck_registrar(search=False, contours=False)
     image, box, _ = scene(0)
     nan = image.clone()
     nan[1, int(box[1]) + 9, int(box[0]) + 9] = torch.nan
@@ -137,13 +137,13 @@ def test_photographs_as_people_have_them(tmp_path):
     array = pixels.permute(1, 2, 0).numpy()
     cv2.imwrite(str(tmp_path / "photo.png"), array[..., ::-1])
     images = [pixels, array, array.astype("float32") / 255, tmp_path / "photo.png", str(tmp_path / "photo.png")]
-    results = Registrar(truck_bank(), refine=False)(images, [box.tolist()] * 5)
+    results = truck_registrar(search=False, contours=False)(images, [box.tolist()] * 5)
     for result in results[1:]:
         torch.testing.assert_close(result.ranking.scores, results[0].ranking.scores, atol=1e-5, rtol=1e-4)
 
 
 def test_bad_calls_are_named():
-    registrar = Registrar(truck_bank(), refine=False)
+    registrar = truck_registrar(search=False, contours=False)
     image, box, _ = scene(0)
     bad = CAMERA.clone()
     bad[0, 0] = 0
@@ -163,7 +163,7 @@ def test_bad_calls_are_named():
 
 
 def test_a_field_of_ones_own_is_used_and_noted():
-    registrar = Registrar(truck_bank(), field=ImageGradient(), refine=False)
+    registrar = Registrar(truck_bank(), field=ImageGradient(), pipeline=unrefined(truck_bank()))
     assert registrar.pipeline.field == "own:ImageGradient"
     image, box, _ = scene(0)
     gradient = ViewMatcher(truck_bank(), field=ImageGradient())([image], box[None])
@@ -172,9 +172,9 @@ def test_a_field_of_ones_own_is_used_and_noted():
 
 def test_a_pickle_of_one_result_is_small():
     images, boxes = [scene(s)[0] for s in range(4)], torch.stack([scene(s)[1] for s in range(4)])
-    results = Registrar(truck_bank(), refine=False)(images, boxes)
+    results = truck_registrar(search=False, contours=False)(images, boxes)
     one = len(pickle.dumps(results[:1]))
-    assert one < 1.2 * len(pickle.dumps(Registrar(truck_bank(), refine=False)(images[:1], boxes[:1])))
+    assert one < 1.2 * len(pickle.dumps(truck_registrar(search=False, contours=False)(images[:1], boxes[:1])))
 
 
 def test_several_meshes_one_answer(tmp_path, monkeypatch):
@@ -215,11 +215,11 @@ def test_a_turn_that_nothing_shows_has_no_standard_deviation():
 
 @pytest.mark.parametrize("limit", [0.0, 1.01])
 def test_what_is_not_reliable_has_no_covariance(monkeypatch, limit):
-    monkeypatch.setattr(pose_module, "RELIABLE", limit)
+    monkeypatch.setattr(results_module, "RELIABLE", limit)
     image, box, _ = scene(0)
-    result = Registrar(truck_bank(), hypotheses=2)([image], box[None], CAMERA)[0]
+    result = truck_registrar(hypotheses=2)([image], box[None], CAMERA)[0]
     assert (result.covariance is not None) == (limit == 0.0)
-    assert Registrar(truck_bank(), hypotheses=2)([image], box[None])[0].covariance is None, "no camera"
+    assert truck_registrar(hypotheses=2)([image], box[None])[0].covariance is None, "no camera"
 
 
 def fitted_covariance(bank, image, box, pose):

@@ -14,6 +14,7 @@ import curvireg_torch as cr
 from curvireg_torch.cli import _parsed, _parser, main
 from curvireg_torch.registration.document import result_document
 from tests._support.lists import CAMERA, box_of, write_files, written
+from tests._support.scenes import unrefined
 
 ROOT = Path(__file__).parents[2]
 SCHEMA = json.loads((ROOT / "curvireg_torch" / "registration" / "result.schema.json").read_text())
@@ -68,7 +69,7 @@ def test_a_mesh_without_a_unit_of_ours_has_none_also_from_a_file(tmp_path, check
     bank.save(tmp_path / "box.safetensors")
     for one in (bank, cr.ViewBank.load(tmp_path / "box.safetensors")):
         assert one.mesh.units == unit
-        registrar = cr.Registrar(one, refine=False)
+        registrar = cr.Registrar(one, pipeline=unrefined(one))
         result = registrar([torch.rand(3, 64, 64)], torch.tensor([[10.0, 10, 50, 50]]))[0]
         document = result_document(result, registrar, {"bank": 0.0, "register": 0.0})
         assert document["unit"] == unit
@@ -80,7 +81,7 @@ def test_without_a_box_it_says_what_was_found_where(folder, capsys, check):
     assert register(*words, "--json", "--instances", "2") == 0
     document = json.loads(printed(capsys))
     check(document)
-    found = document["found"]
+    found = document["localization"]
     assert document["inputs"]["box"] == found["instances"][0]["box"] == found["proposals"][0]["box"]
     assert document["rotation"] == found["instances"][0]["rotation"]
     assert found["presence"] == found["instances"][0]["presence"] >= found["instances"][-1]["presence"]
@@ -89,7 +90,7 @@ def test_without_a_box_it_says_what_was_found_where(folder, capsys, check):
     assert re.search(r"found in box [-\d ]+: there with probability 0\.\d\d", printed(capsys))
     given = [*words, "--box", *box_of(0), "--json"]
     assert register(*given) == 0
-    assert "found" not in json.loads(printed(capsys))
+    assert "localization" not in json.loads(printed(capsys))
     for more in (["--instances", "2"], ["--distance", "1", "2"]):
         with pytest.raises(SystemExit):
             register(*given, *more)
@@ -129,7 +130,7 @@ def test_the_schema_refuses_what_is_no_result(folder, capsys, check):
         with pytest.raises(jsonschema.ValidationError):
             check({**good, **change})
     assert "corrected_box" in good
-    for missing in set(good) - {"found", "mesh"}:
+    for missing in set(good) - {"localization", "mesh"}:
         with pytest.raises(jsonschema.ValidationError, match=f"'{missing}' is a required property"):
             check({key: value for key, value in good.items() if key != missing})
 

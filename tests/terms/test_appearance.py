@@ -134,7 +134,7 @@ def test_colours_tell_the_front_from_the_back(tmp_path, coarse):
     assert pictures.shape == (2, 4, 64, 64)
     box = torch.tensor([[4.0, 4, 59, 59]])
     for view, picture in zip(views, pictures, strict=True):
-        registrar = Registrar(bank, pipeline=pipeline, refine=False, hypotheses=2)
+        registrar = Registrar(bank, pipeline=replace(pipeline, search=False, contours=False, hypotheses=2))
         best = registrar([picture[1:]], box)[0]
         assert rotation_error(best.rotation, bank.rotations[view].double()) < 20
         assert best.hypotheses[0].view != best.hypotheses[1].view

@@ -23,6 +23,7 @@ from curvireg_torch.rendering.shading import shade
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from curvireg_torch.utils.checks import check_pose, check_rotation, check_square_pixels
 from curvireg_torch.visualization import contour_overlay, pose_glb, registration_sheet
+from tests._support.scenes import unrefined
 
 SIZE = (96, 128)
 BACKENDS = ("torch", "embree")
@@ -54,7 +55,7 @@ def thorough(mesh: trimesh.Trimesh) -> cr.Registrar:
 
 @pytest.fixture(scope="module")
 def registrar(thorough: cr.Registrar) -> cr.Registrar:
-    return cr.Registrar(cr.ViewMatcher(thorough.bank, box_jitter=0.0), refine=False)
+    return cr.Registrar(thorough.bank, pipeline=unrefined(thorough.bank, box_jitter=0.0))
 
 
 class Entries:

@@ -306,7 +306,7 @@ def test_find_it_draws_what_it_thought_of_and_a_click_takes_it(browser, folder):
         patch.setenv("CURVIREG_CACHE", str(folder / "cache"))
         assert main([*shlex.split(command)[1:], "--quiet"]) == 0
     written = json.loads((folder / "result" / "result.json").read_text())
-    proposals = [place["box"] for place in written["found"]["proposals"]][:SHOWN]
+    proposals = [place["box"] for place in written["localization"]["proposals"]][:SHOWN]
     assert proposals[0] == written["inputs"]["box"]
     assert len(proposals) > 1
 

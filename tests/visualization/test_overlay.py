@@ -14,7 +14,7 @@ from curvireg_torch.rendering import make_renderer, render_depth
 from curvireg_torch.settings import BankSettings
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from curvireg_torch.visualization import contour_overlay, registration_sheet
-from tests._support.scenes import CAMERA, SIZE, scene, truck_bank
+from tests._support.scenes import CAMERA, SIZE, scene, truck_bank, unrefined
 
 GREEN = (0, 255, 80)
 HEIGHT = 2 * 192
@@ -119,7 +119,7 @@ def test_every_hypothesis_is_seen_where_its_pose_says(found, blind):
 
 def test_a_hypothesis_that_was_sent_back_is_seen_by_the_camera_of_its_start(blind):
     _, result, image, box, _ = blind
-    starts = Registrar(truck_bank(), refine=False)([image], box[None])[0].hypotheses
+    starts = Registrar(truck_bank(), pipeline=unrefined(truck_bank()))([image], box[None])[0].hypotheses
     begun = {start.view: start for start in starts}
     back = [h for h in result.hypotheses if torch.equal(h.rotation, begun[h.view].rotation)]
     assert back
@@ -141,7 +141,7 @@ def test_the_registrars_own_renderer_draws():
             self.sizes.append(size)
             return self.inner.render(T, K, size, orthographic=orthographic)
 
-    registrar = Registrar(truck_bank(), refine=False, renderer=Counting())
+    registrar = Registrar(truck_bank(), pipeline=unrefined(truck_bank()), renderer=Counting())
     result = registrar([image], box[None])[0]
     contour_overlay(registrar, result, image, box)
     assert registrar.describers[0].renderer.sizes[-1] == SIZE
@@ -155,7 +155,7 @@ def test_several_meshes_each_with_its_own():
     pole = trimesh.creation.box((0.02, 0.02, 0.3))
     pipeline = truck_bank().pipeline
     banks = [ViewBank.build(mesh, views, pipeline=pipeline, progress=False) for mesh in (pole, example_mesh())]
-    registrar = Registrar(ViewBank.join(banks), refine=False)
+    registrar = Registrar(ViewBank.join(banks), pipeline=unrefined(ViewBank.join(banks)))
     image, box, T = scene(0)
     result = registrar([image], box[None], CAMERA)[0]
     truck = next(h for h in result.hypotheses if h.model == 1)

@@ -7,7 +7,7 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.visualization.plots import view_sphere
 from curvireg_torch.visualization.sphere import direction_scores, sphere_map
-from tests._support.scenes import CAMERA, scene
+from tests._support.scenes import CAMERA, scene, unrefined
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_the_map_shows_the_nearest_direction():
 
 def test_the_picture_holds_the_map_and_the_hypotheses(bank):
     image, box, _ = scene(0)
-    registrar = Registrar(bank, refine=False, hypotheses=3)
+    registrar = Registrar(bank, pipeline=unrefined(bank, hypotheses=3))
     result = registrar([image], box[None], CAMERA)[0]
     figure = view_sphere(bank, result)
     axes = figure.axes[0]

@@ -18,7 +18,7 @@ from ...geometry.cameras import camera_of_view
 from ...io import Photo, read_photo
 from ...io.meshes.files import mesh_digest
 from ...registration import FailedRegistration, Registrar, Registration, localize
-from ...registration.document import SCHEMA, fitting_box, found_document, result_document
+from ...registration.document import SCHEMA, localization_document, result_document, used_box
 from ...utils.digests import file_digest, text_digest
 from ...utils.files import write_file
 from ...utils.threads import map_on_threads
@@ -96,7 +96,7 @@ def register_entry(
     result = results[0]
     if isinstance(result, FailedRegistration):
         raise result.error.with_subject(entry.name)
-    box = torch.tensor(entry.box) if result.found is None else result.found.box
+    box = torch.tensor(entry.box) if result.localization is None else result.localization.box
     document = result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start})
     document["mesh"] = str(entry.meshes[result.model])
     for pose, hypothesis in zip(document["top"], result.hypotheses, strict=True):
@@ -109,8 +109,8 @@ def register_entry(
         "camera_source": source,
         "picture": photo.facts(),
     }
-    if result.found is not None:
-        document["found"] = found_document([r for r in results if isinstance(r, Registration)])
+    if result.localization is not None:
+        document["localization"] = localization_document([r for r in results if isinstance(r, Registration)])
     if source in ("exif", "fov"):  # how far a guess is off, nobody knows
         document["covariance"] = document["standard_deviations"] = document["squared_radius"] = None
     return result, document
@@ -207,7 +207,7 @@ class _Run:
         except (ImageError, InvalidInputError) as error:
             return _failed(str(error), digests)
         renderer = registrar.describers[result.model].renderer
-        picture = thumbnail(renderer, result.projection, photo.image, fitting_box(document))
+        picture = thumbnail(renderer, result.projection, photo.image, used_box(document))
         write_file(self._picture(request), picture)  # before the line that says that all is done
         return {"status": "ok", "message": "", **document, "digests": digests}
 

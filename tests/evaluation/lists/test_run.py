@@ -16,7 +16,7 @@ from curvireg_torch.io import read_photo
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import Registration
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import SIZE, scene
+from tests._support.scenes import SIZE, scene, unrefined
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def registrar():
     """The example's mesh seen from eight sides, without a refinement."""
     views = sample_views(azimuth_step=45, elevations=[20])
     bank = ViewBank.build(example_mesh(), views, pipeline=PRESETS["classical"], image_size=64, progress=False)
-    return Registrar(bank, refine=False)
+    return Registrar(bank, pipeline=unrefined(bank))
 
 
 @pytest.fixture

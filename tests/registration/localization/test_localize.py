@@ -10,29 +10,29 @@ import pytest
 import torch
 
 import curvireg_torch as cr
-import curvireg_torch.registration.localization.localize as finding
+import curvireg_torch.registration.localization.objects as finding
 from curvireg_torch.errors import ImageError, InvalidInputError
 from curvireg_torch.geometry import box_iou, rotation_error
 from curvireg_torch.registration import RELIABLE
 from curvireg_torch.registration.confidence import presence
 from curvireg_torch.registration.inputs import ImageItem
 from curvireg_torch.registration.localization import Located
-from curvireg_torch.registration.localization.localize import ScoredCandidates, localize
+from curvireg_torch.registration.localization.objects import ScoredCandidates, localize
 from curvireg_torch.synthetic import procedural_background
-from tests._support.scenes import CAMERA, scene
+from tests._support.scenes import CAMERA, scene, unrefined
 from tests.registration.localization.test_locator import SIZE, bank, placed_scene
 
 
 @pytest.fixture(scope="module")
 def registrar():
-    return cr.Registrar(bank(), refine=False)
+    return cr.Registrar(bank(), pipeline=unrefined(bank()))
 
 
 def test_an_object_is_found_and_posed(registrar):
     """The box around the pose lies where the object was put; its pose is near that with the box given."""
     image, box = placed_scene(5, (90, 40), 0.9)
     result = registrar([image])[0]
-    place = result.found
+    place = result.localization
     assert box_iou(place.box[None], box[None].double()) > 0.6
     size = (box[2:] - box[:2]).max()
     middle = 0.5 * (place.box[:2] + place.box[2:]) - 0.5 * (box[:2] + box[2:])
@@ -40,7 +40,7 @@ def test_an_object_is_found_and_posed(registrar):
     assert torch.equal(place.boxes[0], place.box), "the answer is the first of the proposals"
     assert len(place.boxes) == len(place.scores)
     given = registrar([image], box[None])[0]
-    assert given.found is None
+    assert given.localization is None
     assert rotation_error(result.rotation, given.rotation) < 35, "one step of this bank"
     assert 0.0 <= result.confidence <= place.presence <= 1.0
 
@@ -54,7 +54,7 @@ def test_an_object_is_found_to_a_tenth_of_its_size(seed, corner, scale):
     K[:2, :2] *= scale
     K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5 + torch.tensor(corner)
     result = cr.Registrar(bank())([image], camera_matrices=K)[0]
-    assert (result.found.box - box).abs().max() < 0.1 * (box[2:] - box[:2]).max()
+    assert (result.localization.box - box).abs().max() < 0.1 * (box[2:] - box[:2]).max()
     assert rotation_error(result.rotation, truth[:3, :3]) < 5
     assert (result.translation - truth[:3, 3]).norm() < 0.05 * truth[:3, 3].norm()
 
@@ -89,13 +89,13 @@ def test_a_pose_that_left_the_photograph_is_of_nothing(registrar, monkeypatch):
     monkeypatch.setattr(finding, "projected_box", lambda *_: outside)
     result = registrar([image])[0]
     assert result.ok
-    assert (result.found.presence, result.confidence) == (0.0, 0.0)
+    assert (result.localization.presence, result.confidence) == (0.0, 0.0)
 
 
 def test_photographs_without_the_object_are_less_sure(registrar):
-    there = [registrar([placed_scene(seed, (40, 30), 0.9)[0]])[0].found.presence for seed in (0, 1, 5)]
+    there = [registrar([placed_scene(seed, (40, 30), 0.9)[0]])[0].localization.presence for seed in (0, 1, 5)]
     absent = [procedural_background(SIZE, torch.Generator().manual_seed(20 + k)) for k in range(3)]
-    assert min(there) > max(result.found.presence for result in registrar(absent))
+    assert min(there) > max(result.localization.presence for result in registrar(absent))
 
 
 def test_several_objects_of_one_photograph(registrar):
@@ -105,12 +105,12 @@ def test_several_objects_of_one_photograph(registrar):
     image = first.clone()
     image[:, 70:, 150:] = second[:, 70:, 150:]
     results = localize(registrar, [image], instances=2)[0]
-    overlap = box_iou(torch.stack([r.found.box for r in results]), torch.stack([box, other]).double())
+    overlap = box_iou(torch.stack([r.localization.box for r in results]), torch.stack([box, other]).double())
     assert len(results) == 2
     assert sorted(overlap.argmax(dim=1).tolist()) == [0, 1]
     assert overlap.amax(dim=1).min() > 0.5
-    assert results[0].found.presence >= results[1].found.presence
-    assert torch.equal(results[0].found.boxes[:2], torch.stack([r.found.box for r in results]))
+    assert results[0].localization.presence >= results[1].localization.presence
+    assert torch.equal(results[0].localization.boxes[:2], torch.stack([r.localization.box for r in results]))
     with pytest.raises(InvalidInputError, match="instances: expected >= 1, got 0"):
         localize(registrar, [image], instances=0)
 
@@ -126,14 +126,14 @@ def test_places_that_lead_to_one_object_give_one_answer(registrar, monkeypatch):
     monkeypatch.setattr(finding, "projected_box", lambda *_: box.double())
     results = localize(registrar, [image], instances=2)[0]
     assert len(results) == 1
-    assert torch.equal(results[0].found.box, box.double())
+    assert torch.equal(results[0].localization.box, box.double())
 
 
 def test_of_answers_that_overlap_the_surest_stays(registrar):
     image, _ = placed_scene(5, (90, 40), 0.9)
     sure = registrar([image])[0]
-    beside = replace(sure, found=replace(sure.found, box=sure.found.box + 500.0, presence=0.1))
-    less = replace(sure, found=replace(sure.found, presence=0.5 * sure.found.presence))
+    beside = replace(sure, localization=replace(sure.localization, box=sure.localization.box + 500.0, presence=0.1))
+    less = replace(sure, localization=replace(sure.localization, presence=0.5 * sure.localization.presence))
     for first, second in ((sure, less), (less, sure)):
         answers = [beside, first]
         finding._add(answers, second)
@@ -167,7 +167,7 @@ def test_what_cannot_be_searched_takes_nothing_else_down(registrar):
         with pytest.raises(error, match=word):
             _ = failed.rotation
     alone = registrar([image])[0]
-    assert torch.equal(alone.found.boxes, results[1].found.boxes)
+    assert torch.equal(alone.localization.boxes, results[1].localization.boxes)
     with pytest.raises(InvalidInputError, match="distance: needs the camera"):
         registrar([image], distance=(1.0, 2.0))
     with pytest.raises(InvalidInputError, match="distance: for objects that are looked for"):
@@ -224,10 +224,10 @@ class Proposed:
 def test_one_place_more_than_objects_is_looked_at():
     """The locator likes a place of the background a little better than the object's: the one that is surer is taken,
     also where only one place is to be followed."""
-    pipeline = replace(bank().pipeline, locate=replace(bank().pipeline.locate, followed=1))
-    registrar = cr.Registrar(bank(), pipeline=pipeline, refine=False)
+    pipeline = unrefined(bank(), locate=replace(bank().pipeline.locate, followed=1))
+    registrar = cr.Registrar(bank(), pipeline=pipeline)
     image, box = placed_scene(5, (90, 40), 0.9)
     elsewhere = torch.tensor([2.0, 2.0, 60.0, 40.0])
     registrar.__dict__["locator"] = Proposed([elsewhere, box], [6.2, 6.0])
     result = localize(registrar, [image], instances=1)[0][0]
-    assert box_iou(result.found.box[None], box[None].double()) > 0.5
+    assert box_iou(result.localization.box[None], box[None].double()) > 0.5

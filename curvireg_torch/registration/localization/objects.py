@@ -14,7 +14,7 @@ from ...matching import QueryFeatures, Ranking
 from ..confidence import presence, presence_features
 from ..correction import projected_box
 from ..inputs import ImageItem, check_crop, image_items
-from ..pose import FailedRegistration, Localization, Registration
+from ..results import FailedRegistration, Localization, Registration
 from . import Located
 from .locator import OVERLAP, check_distance
 
@@ -46,7 +46,7 @@ def localize(
         distance: nearest and farthest that an object's centre may be, in the mesh's unit; needs cameras.
 
     Returns:
-        For each photograph one to ``instances`` registrations, whose ``found`` is set; or one failed.
+        For each photograph one to ``instances`` registrations, whose ``localization`` is set; or one failed.
 
     Raises:
         InvalidInputError: not as many cameras as images, ``instances`` < 1, or a bad ``distance``.
@@ -99,7 +99,7 @@ def _followed(registrar: "Registrar", item: ImageItem, located: Located, instanc
     boxes = torch.cat([torch.stack([found_in(a).box for a in answers]), located.boxes.double()])
     scores = torch.cat([torch.tensor([found_in(a).score for a in answers]), located.scores])
     own = nms(boxes, -torch.arange(len(boxes)), OVERLAP)  # in the order that they have
-    answers = [replace(a, found=replace(found_in(a), boxes=boxes[own], scores=scores[own])) for a in answers]
+    answers = [replace(a, localization=replace(found_in(a), boxes=boxes[own], scores=scores[own])) for a in answers]
     return [replace(answer, confidence=answer.confidence * _surely(answer)) for answer in answers]
 
 
@@ -145,7 +145,7 @@ class ScoredCandidates:
             boxes=self.boxes[:0].double(),
             scores=self.scores[:0],
         )
-        return replace(result, found=found)
+        return replace(result, localization=found)
 
 
 def _corrected(registrar: "Registrar", item: ImageItem, answer: Registration) -> Registration:
@@ -154,7 +154,7 @@ def _corrected(registrar: "Registrar", item: ImageItem, answer: Registration) ->
     try:
         places = ScoredCandidates.score_boxes(registrar, item, found.box[None].float(), torch.tensor([found.score]))
     except InvalidInputError:  # the pose has left the photograph: it is of nothing that is there
-        return replace(answer, found=replace(found, presence=0.0))
+        return replace(answer, localization=replace(found, presence=0.0))
     if float(places.presence[0]) <= found.presence:
         return answer
     return places.registered(registrar, item, 0)
@@ -167,9 +167,9 @@ def _extremes(image: Tensor) -> Tensor:
 
 
 def found_in(result: Registration) -> Localization:
-    """``found`` of a result that has it."""
-    assert result.found is not None
-    return result.found
+    """``localization`` of a result that has it."""
+    assert result.localization is not None
+    return result.localization
 
 
 def _surely(result: Registration) -> float:
