@@ -1,7 +1,7 @@
 """Everything that decides a result, in one frozen value: the only source of defaults."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from dataclasses import field as dataclass_field
 from os import PathLike
@@ -12,16 +12,13 @@ import torch
 from torch import nn
 
 from .errors import InvalidInputError, MissingFileError
-from .filters import (
-    ImageGradient,
-    MultiScaleCurvilinearSaliency,
-    MultiScaleFocusCurves,
-)
+from .models.learned_field import SHA256
 from .settings import BankSettings, LocateSettings, ViewPolicy
 from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, RerankingTerm, Term, jittered_boxes
 from .utils.checks import check_option
 from .utils.choices import DEFAULT
 from .utils.digests import tensor_digest
+from .utils.registry import Registry
 
 __all__ = [
     "DEFAULT",
@@ -35,25 +32,38 @@ __all__ = [
 VERSION = 1
 """Of the JSON form."""
 
-FIELDS = ("learned", "focus", "saliency", "gradient")
-"""Photograph filters by name; "own:NAME" stands for a module that comes with the call."""
+FIELDS: Registry[Callable[[], nn.Module]] = Registry(
+    "field",
+    {
+        "learned": "curvireg_torch.models:LearnedCurvilinearSaliency",
+        "focus": "curvireg_torch.filters:MultiScaleFocusCurves",
+        "saliency": "curvireg_torch.filters:MultiScaleCurvilinearSaliency",
+        "gradient": "curvireg_torch.filters:ImageGradient",
+    },
+)
+"""Photograph filters by name: modules that are built without arguments."""
+
+CUSTOM = "custom:"
+"""Prefix of the name of a field that is passed with each call."""
 
 
 @dataclass(frozen=True)
 class Pipeline:
-    """From a photograph, a box and a mesh to a pose: all settings, as plain numbers and texts.
+    """From a photograph, a box and a mesh to a pose: all settings, as plain numbers and strings.
 
     Attributes:
         views: which viewpoints are rendered.
         bank: how views and photographs are described.
-        field: what makes the photograph's field: one of :data:`FIELDS`, or "own:NAME" for a module given with the call.
-        weights: digest of the field's weights; "" where there are none, and filled in for packaged ones.
-        terms: ranking terms, one of a kind.
-        box_jitter: how wrong boxes may be, as a fraction of their longer side (:func:`jittered_boxes`); 0: exact boxes.
-        hypotheses: distinct views that are carried through search and contours.
-        search: search around them in small steps.
-        contours: pull the mesh's contours onto the photograph's edges.
-        locate: how boxes are found that are not given.
+        field: filter of photographs: a name in :data:`FIELDS`, or "custom:NAME" for a module that is passed with each
+            call.
+        weights: digest of the field's weights; "" for a field without any. Filled in for packaged weights.
+        terms: ranking terms, each at most once.
+        box_jitter: error that boxes are allowed, as a fraction of their longer side (:func:`jittered_boxes`); 0: exact
+            boxes.
+        hypotheses: distinct views that are carried through search and contour fit.
+        search: search around hypotheses in small rotation steps.
+        contours: fit the mesh's contours to the photograph's edges.
+        locate: how boxes that are not given are found.
 
     Raises:
         InvalidInputError: an unknown name or a number out of range.
@@ -77,25 +87,23 @@ class Pipeline:
     locate: LocateSettings = LocateSettings()
 
     def __post_init__(self) -> None:
-        if not self.field.startswith("own:"):
-            check_option(self.field, FIELDS, "field")
+        if not self.field.startswith(CUSTOM):
+            FIELDS.check(self.field)
         if self.field == "learned" and not self.weights:
-            from .models.learned_field import SHA256
-
             object.__setattr__(self, "weights", SHA256[:16])
         names = [term.name for term in self.terms]
         if len(set(names)) < len(names) or all(isinstance(term, RerankingTerm) for term in self.terms):
             raise InvalidInputError(f"terms: expected one or more that compare all views, each once, got {names}")
         if self.hypotheses < 1:
             raise InvalidInputError(f"hypotheses: expected >= 1, got {self.hypotheses}")
-        jittered_boxes(torch.ones(0, 4), self.box_jitter)  # says what is wrong with it
+        jittered_boxes(torch.ones(0, 4), self.box_jitter)  # checks box_jitter
 
     def with_pose_prior(self, pose: str) -> "Pipeline":
-        """The same for another ``pose`` of the view policy."""
+        """A copy with another ``pose`` of the view policy."""
         return replace(self, views=replace(self.views, pose=pose))
 
     def with_term(self, name: str, **options: Any) -> "Pipeline":
-        """The same with other options of one term; ``weight=0`` takes it out of the product.
+        """A copy with other options of one term; ``weight=0`` removes the term from the product.
 
         Example:
             >>> Pipeline().with_term("box", weight=0).terms[2].weight
@@ -104,53 +112,42 @@ class Pipeline:
         check_option(name, [term.name for term in self.terms], "term")
         return replace(self, terms=tuple(replace(t, **options) if t.name == name else t for t in self.terms))
 
+    def with_field(self, field: nn.Module) -> "Pipeline":
+        """A copy that records a custom module as the photograph's field, by class name and digest."""
+        return replace(self, field=f"{CUSTOM}{type(field).__name__}", weights=field_digest(field))
+
     def photograph_field(self) -> nn.Module:
-        """What makes fields of photographs.
+        """The filter of photographs.
 
         Raises:
-            InvalidInputError: it came with the call, or the packaged weights are not those this pipeline was made with.
+            InvalidInputError: a custom field, or packaged weights with another digest than ``weights``.
         """
-        if self.field.startswith("own:"):
+        if self.field.startswith(CUSTOM):
             raise InvalidInputError(f"field: {self.field!r} came with the call; give the module again (field=...)")
-        if self.field == "learned":
-            from .models.learned_field import SHA256, LearnedCurvilinearSaliency
-
-            if self.weights != SHA256[:16]:
-                raise InvalidInputError(
-                    f"field: made with weights {self.weights}, packaged are {SHA256[:16]}; give the module (field=...)"
-                )
-            return LearnedCurvilinearSaliency()
-        plain = {"focus": MultiScaleFocusCurves, "saliency": MultiScaleCurvilinearSaliency, "gradient": ImageGradient}
-        made: nn.Module = plain[self.field]()
-        return made
-
-    def with_field(self, field: nn.Module) -> "Pipeline":
-        """The same with a module of one's own as the photograph's field: its name and digest are noted."""
-        return replace(self, field=f"own:{type(field).__name__}", weights=field_digest(field))
+        if self.field == "learned" and self.weights != SHA256[:16]:
+            raise InvalidInputError(
+                f"field: made with weights {self.weights}, packaged are {SHA256[:16]}; give the module (field=...)"
+            )
+        return FIELDS[self.field]()
 
     def reranking_terms(self, count: int) -> list[RerankingTerm]:
-        """The late terms by which all views of a bank of ``count`` are described."""
-        return [term for term in self.terms if isinstance(term, RerankingTerm) and count <= term.coarse]
+        """The reranking terms whose features a bank of ``count`` views holds for every view."""
+        return [term for term in self.terms if isinstance(term, RerankingTerm) and count <= term.exhaustive_limit]
 
     def bank_key_fields(self, count: int) -> dict[str, Any]:
         """What decides the contents of a bank of ``count`` views, besides mesh and viewpoints."""
-        return {**asdict(self.bank), "late": [term.name for term in self.reranking_terms(count)]}
+        return {**asdict(self.bank), "reranking": [term.name for term in self.reranking_terms(count)]}
 
     def describe(self) -> dict[str, Any]:
-        """Plain numbers and texts, as JSON holds them."""
-        terms = {term.name: {f.name: getattr(term, f.name) for f in fields(term)} for term in self.terms}
-        own = {
-            f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("views", "bank", "terms", "locate")
-        }
-        views = {**asdict(self.views), "elevations": list(self.views.elevations)}
-        return {
-            "version": VERSION,
-            "views": views,
+        """All settings as plain numbers, strings, lists and dictionaries for JSON."""
+        described = {f.name: getattr(self, f.name) for f in fields(self)}
+        nested = {
+            "views": {**asdict(self.views), "elevations": list(self.views.elevations)},
             "bank": asdict(self.bank),
-            "terms": terms,
-            **own,
+            "terms": {term.name: asdict(term) for term in self.terms},
             "locate": asdict(self.locate),
         }
+        return {"version": VERSION, **described, **nested}
 
     def to_json(self) -> str:
         """The pipeline as a JSON text, which :meth:`from_json` reads."""
@@ -158,7 +155,7 @@ class Pipeline:
 
     @classmethod
     def from_json(cls, text: str) -> "Pipeline":
-        """Read what :meth:`to_json` wrote, or part of it: what is not named keeps its default.
+        """Read what :meth:`to_json` wrote, or a part of it; what is missing keeps its default.
 
         Raises:
             InvalidInputError: not JSON, another version, an unknown name or a number out of range.
@@ -172,12 +169,9 @@ class Pipeline:
         if data.pop("version", VERSION) != VERSION:
             raise InvalidInputError(f"pipeline: this library reads version {VERSION}; write the file again")
         try:
-            if "views" in data:
-                data["views"] = ViewPolicy(**data["views"])
-            if "bank" in data:
-                data["bank"] = BankSettings(**data["bank"])
-            if "locate" in data:
-                data["locate"] = LocateSettings(**data["locate"])
+            for name, settings in (("views", ViewPolicy), ("bank", BankSettings), ("locate", LocateSettings)):
+                if name in data:
+                    data[name] = settings(**data[name])
             if "terms" in data:
                 data["terms"] = tuple(_term(name, options) for name, options in data["terms"].items())
             return cls(**data)
@@ -186,7 +180,7 @@ class Pipeline:
 
     @classmethod
     def read(cls, path: str | PathLike[str]) -> "Pipeline":
-        """From a JSON file.
+        """Read a JSON file.
 
         Raises:
             MissingFileError, InvalidInputError.
@@ -201,35 +195,31 @@ class Pipeline:
 
 
 def field_digest(field: nn.Module) -> str:
-    """16 hexadecimal digits of a module's parameters and buffers; "" of one that has none."""
+    """16 hexadecimal digits of a module's parameters and buffers; "" for a module without any."""
     state = field.state_dict()
     return tensor_digest(state) if state else ""
 
 
 def _term(name: str, options: Mapping[str, Any]) -> Term:
-    check_option(name, list(TERMS), "term")
     return TERMS[name](**options)
 
 
-_OWN: tuple[Term, ...] = (Correlation(), Repeatability(), BoxShape())
-"""The paper's terms and the box: nothing that was learnt compares."""
-
-_PAPER = BankSettings(image_size=256, sigma=1.0, formula="paper", camera="orthographic")
+_CLASSICAL_TERMS: tuple[Term, ...] = (Correlation(), Repeatability(), BoxShape())
 
 PRESETS: dict[str, Pipeline] = {
     "learned": Pipeline(),
-    "classical": Pipeline(field="focus", terms=_OWN),
-    "fast": Pipeline(terms=_OWN, box_jitter=0.0, search=False, contours=False),
+    "classical": Pipeline(field="focus", terms=_CLASSICAL_TERMS),
+    "fast": Pipeline(terms=_CLASSICAL_TERMS, box_jitter=0.0, search=False, contours=False),
     "paper": Pipeline(
-        bank=_PAPER,
+        bank=BankSettings(image_size=256, sigma=1.0, formula="paper", camera="orthographic"),
         field="focus",
         terms=(Correlation(whitening="bank"), Repeatability(mode="paper"), BoxShape(weight=0.0)),
         box_jitter=0.0,
     ),
 }
-"""``learned``: the photograph's field by :class:`LearnedCurvilinearSaliency`, and the appearance term; ``classical``:
-by focus curves, nothing learnt; ``fast``: the learnt field alone, without slack, search and contours; ``paper``: the
-paper's own, as far as it is stated."""
+"""``learned``: :class:`LearnedCurvilinearSaliency` as the photograph's field, and the appearance term; ``classical``:
+focus curves, nothing learned; ``fast``: the learned field alone, without box jitter, search and contour fit; ``paper``:
+the paper's own settings, as far as it states them."""
 
 
 def preset_named(name: str) -> Pipeline:

@@ -91,7 +91,7 @@ def linemod_boxes(registrar: cr.Registrar, image: Tensor, count: int) -> tuple[T
     pictures = registrar.matcher.describers[0].shaded(bank.rotations[views], bank.distances[views])[:, :1]
     start = time.perf_counter()
     longer, boxes, scores = max(SIZE), [], []
-    side = located.settings.smallest * longer
+    side = located.settings.min_size * longer
     while side <= longer:
         detector = cv2.linemod.getDefaultLINE()
         S = round(side / 0.83)  # with the margin around the object
@@ -120,7 +120,7 @@ def rows_of(folder: Path, item: Row, items: list[Row], half: Path, preset: str) 
     pipeline = preset_named(preset).with_pose_prior("upright" if item["pose"] == "upright" else "any")
     appearance_scores = any(term.name == "appearance" for term in pipeline.terms)
     if appearance_scores:
-        pipeline = pipeline.with_term("appearance", coarse=0)
+        pipeline = pipeline.with_term("appearance", exhaustive_limit=0)
     bank = cached_bank(cr.load_mesh(folder / item["mesh"]), pipeline=pipeline, progress=False)
     registrar = cr.Registrar(bank, pipeline=pipeline)
     others = [
@@ -137,7 +137,7 @@ def rows_of(folder: Path, item: Row, items: list[Row], half: Path, preset: str) 
         start = time.perf_counter()
         located = registrar.locator([image])[0]
         seconds = time.perf_counter() - start
-        count = registrar.pipeline.locate.followed
+        count = registrar.pipeline.locate.candidates
         with torch.no_grad():
             places = ScoredCandidates.score_boxes(
                 registrar, ImageItem(image, box, None), located.boxes[:count], located.scores[:count]

@@ -84,7 +84,9 @@ def test_a_description_says_all_that_decides():
     ]
     changed += [replace(base, **{n: other(getattr(base, n))}) for n in ("hypotheses", "search", "contours")]
     changed += [replace(base, box_jitter=0.2), replace(base, weights="0123")]
-    changed += [replace(base, views=replace(base.views, **{n: 7})) for n in ("directions", "turn", "azimuth_step")]
+    changed += [
+        replace(base, views=replace(base.views, **{n: 7})) for n in ("directions", "theta_step", "azimuth_step")
+    ]
     changed += [replace(base, bank=replace(base.bank, **{n: 40})) for n in ("image_size", "sigma", "margin", "bins")]
     for term in base.terms:
         for f in fields(term):
@@ -147,7 +149,7 @@ def test_weights_that_are_not_there_are_never_replaced_by_others():
     with pytest.raises(InvalidInputError, match="made with weights feed"):
         Pipeline(weights="feed").photograph_field()
     own = Pipeline().with_field(torch.nn.Conv2d(1, 2, 3, padding=1))
-    assert own.field == "own:Conv2d"
+    assert own.field == "custom:Conv2d"
     assert own.weights != Pipeline().with_field(torch.nn.Conv2d(1, 2, 3, padding=1)).weights
     with pytest.raises(InvalidInputError, match="came with the call"):
         own.photograph_field()
@@ -162,7 +164,7 @@ def test_terms_are_frozen_plain_values():
 
 
 def test_views_of_a_policy():
-    assert len(ViewPolicy(directions=50, turn=90).sphere()) == 200
+    assert len(ViewPolicy(directions=50, theta_step=90).sphere()) == 200
     upright = ViewPolicy(pose="upright", azimuth_step=90, elevations=(0.0,), distance=3.0).sphere()
     assert upright.distance.tolist() == [3.0] * 4
     with pytest.raises(InvalidInputError, match="came with the call"):

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import CurviregError
-from ..utils.choices import BACKENDS, DEFAULT, PRESET_NAMES, UNITS, UP_AXES
+from ..utils.choices import DEFAULT, PRESET_NAMES, RENDERER_NAMES, UNITS, UP_AXES
 from ..utils.files import terminable
 from ..utils.input_paths import check_given
 from ..version import __version__
@@ -137,7 +137,7 @@ def _parser() -> argparse.ArgumentParser:
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--debug", action="store_true", help="show tracebacks")
     common.add_argument("--quiet", action="store_true", help="no progress bars")
-    common.add_argument("--renderer", choices=BACKENDS, default="auto", help="default: auto")
+    common.add_argument("--renderer", choices=RENDERER_NAMES, default="auto", help="default: auto")
     parser = argparse.ArgumentParser(prog="curvireg", description="Pose of a known 3D object from one photograph.")
     parser.add_argument("--version", action="version", version=f"curvireg_torch {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")

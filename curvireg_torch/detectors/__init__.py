@@ -6,6 +6,7 @@
 
 from collections.abc import Callable
 
+from ..utils.registry import Registry
 from .base import Detection
 from .corners import harris, minimum_eigenvalue
 from .edges import canny, laplacian_of_gaussian, sobel
@@ -33,18 +34,21 @@ __all__ = [
     "sobel",
 ]
 
-DETECTORS: dict[str, Callable[..., Detection]] = {
-    "mfc": focus_curves,
-    "mcs": multiscale_saliency,
-    "ig": gradient,
-    "pci": principal_curvature,
-    "sobel": sobel,
-    "log": laplacian_of_gaussian,
-    "canny": canny,
-    "fuzzy": fuzzy_edges,
-    "harris": harris,
-    "mineig": minimum_eigenvalue,
-    "sift": sift,
-    "surf": fast_hessian,
-}
+DETECTORS: Registry[Callable[..., Detection]] = Registry(
+    "detector",
+    {
+        "mfc": focus_curves,
+        "mcs": multiscale_saliency,
+        "ig": gradient,
+        "pci": principal_curvature,
+        "sobel": sobel,
+        "log": laplacian_of_gaussian,
+        "canny": canny,
+        "fuzzy": fuzzy_edges,
+        "harris": harris,
+        "mineig": minimum_eigenvalue,
+        "sift": sift,
+        "surf": fast_hessian,
+    },
+)
 """Every detector of the comparison by its short name, the paper's own first."""

@@ -9,6 +9,8 @@ from importlib import import_module
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
+from ..utils.registry import Registry
+
 if TYPE_CHECKING:
     from .benchmark import Benchmark
 
@@ -64,44 +66,47 @@ class DatasetSpec:
         return found
 
 
-DATASETS = {
-    "pascal3d": DatasetSpec(
-        dataset="Pascal3DPlus",
-        benchmark="Pascal3DBenchmark",
-        help="viewpoints on PASCAL3D+",
-        root="folder with Annotations, Images and CAD",
-        example="data/PASCAL3D+_release1.1",
-        pose="upright",
-        mesh="cad_path",
-        options={
-            "split": {"default": "val", "help": "name of the image lists (default: val)"},
-            "categories": {"nargs": "+", "metavar": "CLASS", "help": "default: all"},
-            "part": {"choices": ("pascal", "imagenet"), "default": "pascal", "help": "default: pascal"},
-            "pixel_origin": {
-                "type": int,
-                "choices": (0, 1),
-                "default": 1,
-                "help": "number of the first pixel (default: 1, the release)",
+DATASETS: Registry[DatasetSpec] = Registry(
+    "dataset",
+    {
+        "pascal3d": DatasetSpec(
+            dataset="Pascal3DPlus",
+            benchmark="Pascal3DBenchmark",
+            help="viewpoints on PASCAL3D+",
+            root="folder with Annotations, Images and CAD",
+            example="data/PASCAL3D+_release1.1",
+            pose="upright",
+            mesh="cad_path",
+            options={
+                "split": {"default": "val", "help": "name of the image lists (default: val)"},
+                "categories": {"nargs": "+", "metavar": "CLASS", "help": "default: all"},
+                "part": {"choices": ("pascal", "imagenet"), "default": "pascal", "help": "default: pascal"},
+                "pixel_origin": {
+                    "type": int,
+                    "choices": (0, 1),
+                    "default": 1,
+                    "help": "number of the first pixel (default: 1, the release)",
+                },
             },
-        },
-        whole={"occluded": False, "truncated": False},
-    ),
-    "bop": DatasetSpec(
-        dataset="BOPDataset",
-        benchmark="BOPBenchmark",
-        help="6D poses on a BOP set",
-        root="folder with models and the split's folder",
-        example="data/bop/lm",
-        category="object {obj_id}",
-        mesh="model_path",
-        options={"split": {"default": "test", "help": "folder of the scenes (default: test)"}},
-    ),
-    "web": DatasetSpec(
-        dataset="WebCollection",
-        benchmark="WebBenchmark",
-        help="viewpoints on a collection of your own",
-        root="folder with one folder per object",
-        example="data/web",
-    ),
-}
-"""By the name that stands on the command line."""
+            whole={"occluded": False, "truncated": False},
+        ),
+        "bop": DatasetSpec(
+            dataset="BOPDataset",
+            benchmark="BOPBenchmark",
+            help="6D poses on a BOP set",
+            root="folder with models and the split's folder",
+            example="data/bop/lm",
+            category="object {obj_id}",
+            mesh="model_path",
+            options={"split": {"default": "test", "help": "folder of the scenes (default: test)"}},
+        ),
+        "web": DatasetSpec(
+            dataset="WebCollection",
+            benchmark="WebBenchmark",
+            help="viewpoints on a collection of your own",
+            root="folder with one folder per object",
+            example="data/web",
+        ),
+    },
+)
+"""Datasets by the name that the command line uses."""

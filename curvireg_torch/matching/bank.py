@@ -24,7 +24,7 @@ from .describe import ViewDescriber
 
 __all__ = ["ViewBank"]
 
-LATE = "late."
+RERANKING = "reranking."
 """Before the names of features of late terms."""
 
 
@@ -51,7 +51,9 @@ class ViewBank:
         self.descriptors = tensors["descriptors"].float()
         self.boxes, self.model = tensors["boxes"], tensors["model"]
         self._points, self._silhouettes = tensors["points"], tensors["silhouettes"]
-        self.late = {name.removeprefix(LATE): x for name, x in tensors.items() if name.startswith(LATE)}
+        self.reranking_features = {
+            name.removeprefix(RERANKING): x for name, x in tensors.items() if name.startswith(RERANKING)
+        }
 
     def __len__(self) -> int:
         return len(self.views)
@@ -116,8 +118,8 @@ class ViewBank:
         """
         made, asked = asdict(self.settings), asdict(pipeline.bank)
         if self.pipeline.views.pose != "given":
-            made |= self.pipeline.views.decisive()
-            asked |= pipeline.views.decisive()
+            made |= self.pipeline.views.key_fields()
+            asked |= pipeline.views.key_fields()
         differ = [name for name in {**made, **asked} if made.get(name) != asked.get(name)]
         if differ:
             told = ", ".join(f"{n} {made[n]}, asked for {asked[n]}" for n in differ if n in made and n in asked)
@@ -184,7 +186,7 @@ class ViewBank:
             some = rotations[start : start + chunk_size], distances[start : start + chunk_size]
             described = describe(*some)
             return {
-                **{LATE + name: module.described(describe.shaded(*some)).half() for name, module in late.items()},
+                **{RERANKING + name: module.describe(describe.shaded(*some)).half() for name, module in late.items()},
                 "descriptors": described.descriptors,
                 "points": _pack(described.points),
                 "silhouettes": _pack(described.silhouettes),
@@ -231,10 +233,10 @@ class ViewBank:
                 raise InvalidInputError(
                     f"banks: expected one set of settings, but bank {i} has {bank.settings} and bank 0 {first.settings}"
                 )
-            if bank.pipeline.views.decisive() != first.pipeline.views.decisive():
+            if bank.pipeline.views.key_fields() != first.pipeline.views.key_fields():
                 raise InvalidInputError(
-                    f"banks: expected one view policy, but bank {i} has {bank.pipeline.views.decisive()} and bank 0 "
-                    f"{first.pipeline.views.decisive()}"
+                    f"banks: expected one view policy, but bank {i} has {bank.pipeline.views.key_fields()} and bank 0 "
+                    f"{first.pipeline.views.key_fields()}"
                 )
             if bank.device != first.device:
                 raise InvalidInputError(
@@ -267,7 +269,7 @@ class ViewBank:
             "points": self._points,
             "silhouettes": self._silhouettes,
             "model": self.model,
-            **{LATE + name: features for name, features in self.late.items()},
+            **{RERANKING + name: features for name, features in self.reranking_features.items()},
         }
 
     def save(self, path: str | PathLike[str]) -> None:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["FORMAT", "FORMAT_VERSION", "read_bank", "write_bank"]
 
-FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 3
+FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 4
 _NO_UNIT = "none"
 
 
@@ -134,7 +134,7 @@ def _check_contents(bank: "ViewBank") -> None:
     boxes, angles = bank.boxes, torch.stack([bank.views.azimuth, bank.views.elevation, bank.views.theta])
     if not bool(angles.isfinite().all() and bank.views.distance.isfinite().all()):
         raise ValueError("viewpoints that are not finite")
-    for name, features in bank.late.items():
+    for name, features in bank.reranking_features.items():
         if features.ndim != 2 or len(features) != N or not bool(features.isfinite().all()):
             raise ValueError(f"features of {name} that do not fit the views, or are not finite")
     if not bool(bank.descriptors.isfinite().all()) or not bool(bank.descriptors.any()):

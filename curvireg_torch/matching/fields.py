@@ -3,12 +3,9 @@
 from torch import nn
 
 from ..descriptors import HOG
-from ..filters import ApparentRidges, AverageShadingGradient, DepthCurvilinearSaliency, HessianFrobeniusNorm
-from ..settings import BankSettings
+from ..settings import DEPTH_FIELDS, BankSettings
 
 __all__ = ["depth_filter", "hog_layer"]
-
-_OTHERS: dict[str, type[nn.Module]] = {"ASG": AverageShadingGradient, "HFN": HessianFrobeniusNorm, "AR": ApparentRidges}
 
 
 def depth_filter(settings: BankSettings) -> nn.Module:
@@ -18,9 +15,9 @@ def depth_filter(settings: BankSettings) -> nn.Module:
         >>> depth_filter(BankSettings(depth_field="HFN"))
         HessianFrobeniusNorm(sigma=1.0, depth_scale=None)
     """
-    if settings.depth_field == "CS":
-        return DepthCurvilinearSaliency(sigma=settings.sigma, formula=settings.formula)
-    return _OTHERS[settings.depth_field]()
+    options = {"sigma": settings.sigma, "formula": settings.formula} if settings.depth_field == "CS" else {}
+    layer: nn.Module = DEPTH_FIELDS[settings.depth_field](**options)
+    return layer
 
 
 def hog_layer(settings: BankSettings) -> HOG:

@@ -24,7 +24,7 @@ from ..terms import (
     photograph_field,
     whole_box_shapes,
 )
-from ..terms.correlation import Correlated
+from ..terms.correlation import CorrelationModule
 from ..utils.checks import as_boxes, check_photograph, check_pixels
 from ..utils.threads import map_on_threads
 from .bank import ViewBank
@@ -151,7 +151,7 @@ class ViewMatcher(nn.Module):
         self.descriptor = hog_layer(bank.settings)
         self._comparisons = nn.ModuleDict({term.name: term.build(bank) for term in pipeline.terms}).to(bank.device)
         if whitening is not None:
-            self._comparisons["hog"] = Correlated(bank.descriptors, whitening)
+            self._comparisons["hog"] = CorrelationModule(bank.descriptors, whitening)
 
     @property
     def device(self) -> torch.device:
@@ -232,12 +232,12 @@ class ViewMatcher(nn.Module):
         if len(log) == 0:
             return raw, score
         module = self._late(term.name)
-        if len(self.bank) <= term.coarse:
+        if len(self.bank) <= term.exhaustive_limit:
             raw = module.compare(query, self._features(term.name, torch.arange(len(self.bank)))).to(log)
             return raw, term.log_score(raw)
         R, model = self.bank.rotations, self.bank.model
         order = log.argsort(dim=1, descending=True, stable=True)
-        chosen = [distinct_views(o, R, count=term.top, angle=term.apart, model=model) for o in order]
+        chosen = [distinct_views(o, R, count=term.top, angle=term.min_angle, model=model) for o in order]
         wanted = torch.cat(chosen).unique()
         found = module.compare(query, self._features(term.name, wanted)).to(log)
         for b, index in enumerate(chosen):
@@ -253,15 +253,15 @@ class ViewMatcher(nn.Module):
 
     def _features(self, name: str, views: Tensor) -> Tensor:
         """(U, D) features of (U,) views of the bank: from the bank, or of pictures made now, which are kept."""
-        if name in self.bank.late:
-            return self.bank.late[name][views.to(self.device)]
+        if name in self.bank.reranking_features:
+            return self.bank.reranking_features[name][views.to(self.device)]
         kept = self._kept.setdefault(name, {})
         found = {view: known for view in views.tolist() if (known := kept.get(view)) is not None}
         missing = [view for view in views.tolist() if view not in found]
         module = self._late(name)
 
         def described(some: list[int]) -> Tensor:
-            return module.described(self._shaded(torch.tensor(some, device=self.device)))
+            return module.describe(self._shaded(torch.tensor(some, device=self.device)))
 
         # On one thread each, as the bank's own: which photograph asked first does not decide how features are rounded.
         some = [missing[k : k + DESCRIBED] for k in range(0, len(missing), DESCRIBED)]
@@ -286,7 +286,7 @@ class ViewMatcher(nn.Module):
             photograph: (H,) which of the photographs each is compared with.
         """
         module, term = self._late(name), next(t for t in self.pipeline.terms if t.name == name)
-        raw = module.compare(query, module.described(pictures)).cpu().double()
+        raw = module.compare(query, module.describe(pictures)).cpu().double()
         out = torch.zeros(len(pictures), dtype=torch.float64)
         for h, b in enumerate(photograph.tolist()):
             known = ranking.terms[name][b].cpu().double()

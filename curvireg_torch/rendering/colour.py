@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ..io.meshes.colours import surface_colours
 from ..io.meshes.mesh import as_mesh
-from .base import DepthRenderer, check_render_arguments, make_renderer
+from .factory import make_renderer
+from .protocol import DepthRenderer, check_render_arguments
 from .shading import shade
 
 __all__ = ["render_colour"]

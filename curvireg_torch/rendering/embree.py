@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..io.meshes.mesh import box_corners, extreme_points, mesh_centre, mesh_radius
 from ..utils.threads import for_each
-from .base import NEAREST, check_render_arguments
+from .protocol import NEAREST, check_render_arguments
 
 __all__ = ["EmbreeRenderer", "RayScene"]
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from ..errors import RenderingError
 from ..geometry.conversions import opencv_from_opengl, opengl_projection
 from ..io.meshes.mesh import box_corners, mesh_centre, mesh_radius
-from .base import NEAREST, check_render_arguments
+from .protocol import NEAREST, check_render_arguments
 
 __all__ = ["PyrenderRenderer"]
 

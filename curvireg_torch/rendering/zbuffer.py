@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..io.meshes.mesh import mesh_centre, mesh_radius
 from ..utils.threads import available_threads, one_thread_each
-from .base import NEAREST, check_render_arguments
+from .protocol import NEAREST, check_render_arguments
 
 __all__ = ["TorchRenderer"]
 

@@ -1,5 +1,6 @@
 """Ranking terms: each compares photographs with views, one file each; the ranking multiplies them."""
 
+from ..utils.registry import Registry
 from .appearance import Appearance
 from .base import RerankingModule, RerankingTerm, Term, Views
 from .box_shape import BoxShape, box_shape_score, box_shapes, whole_box_shapes
@@ -34,5 +35,5 @@ __all__ = [
     "whole_box_shapes",
 ]
 
-TERMS: dict[str, type[Term]] = {term.name: term for term in (Correlation, Repeatability, BoxShape, Appearance)}
-"""Terms by name, as JSON files of pipelines name them."""
+TERMS: Registry[type[Term]] = Registry("term", {t.name: t for t in (Correlation, Repeatability, BoxShape, Appearance)})
+"""Terms by the name that JSON files of pipelines use."""

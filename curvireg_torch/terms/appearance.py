@@ -1,4 +1,4 @@
-"""Does the photograph look as the shaded view does?"""
+"""Similarity of backbone features of the photograph and of shaded views."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -19,13 +19,13 @@ __all__ = ["Appearance"]
 class Appearance(RerankingTerm):
     """S_look: features of an ImageNet network agree, cell by cell, between the photograph's crop and the shaded view.
 
-    A mesh with colours of its own is shown twice, shaded grey and in its colours, and what agrees better counts for
-    each view: prints tell top from bottom, and where they mislead the grey picture is left. Raw scores are mean cosines
-    (:func:`curvireg_torch.models.appearance.similarity`) in [-1, 1]; with the spread taken over the views that are
-    compared, log S_look = (raw - max raw) / spread.
+    A mesh with colours is rendered twice, in grey and in its colours, and the better match counts for each view: a
+    print distinguishes top from bottom, and the grey picture remains where the print misleads. Raw scores are mean
+    cosines (:func:`curvireg_torch.models.appearance.similarity`) in [-1, 1]; log S_look = (raw - max raw) / std raw,
+    over the compared views.
 
     Attributes:
-        weights: digest of the network's.
+        weights: digest of the network's weights.
     """
 
     name: ClassVar[str] = "appearance"
@@ -51,14 +51,14 @@ class _AppearanceModule(RerankingModule):
         super().__init__()
         self.backbone = Backbone()
 
-    def described(self, pictures: Tensor) -> Tensor:
+    def describe(self, pictures: Tensor) -> Tensor:
         grey, colour = pictures[:, :1], pictures[:, 1:]
-        ways = [describe(picture, self.backbone) for picture in (grey, colour) if picture.shape[1]]
-        return torch.cat(ways, dim=1)
+        features = [describe(picture, self.backbone) for picture in (grey, colour) if picture.shape[1]]
+        return torch.cat(features, dim=1)
 
-    def compare(self, photographs: QueryFeatures, views: Tensor) -> Tensor:
-        if Appearance.name not in photographs.late:  # ranking and verdict ask about the same
-            photographs.late[Appearance.name] = describe(photographs.crops, self.backbone)
-        appearance_scores = photographs.late[Appearance.name]
-        each = similarity(appearance_scores[:, None], views.reshape(-1, appearance_scores.shape[1]))
-        return each.view(len(appearance_scores), len(views), -1).amax(dim=2)
+    def compare(self, query: QueryFeatures, features: Tensor) -> Tensor:
+        if Appearance.name not in query.reranking_features:  # shared by ranking and rescoring
+            query.reranking_features[Appearance.name] = describe(query.crops, self.backbone)
+        crops = query.reranking_features[Appearance.name]
+        similarities = similarity(crops[:, None], features.reshape(-1, crops.shape[1]))
+        return similarities.view(len(crops), len(features), -1).amax(dim=2)

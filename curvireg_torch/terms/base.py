@@ -1,27 +1,25 @@
-"""What a ranking term is: views and photographs are compared, and what comes out becomes a score."""
+"""What a ranking term is: it compares photographs with views and turns the result into a score."""
 
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError
+from ..settings import BankSettings
 from ..utils.checks import check_positive
 from .query import QueryFeatures
-
-if TYPE_CHECKING:
-    from ..settings import BankSettings
 
 __all__ = ["RerankingModule", "RerankingTerm", "Term", "Views"]
 
 
 class Views(Protocol):
-    """N views as terms see them: a bank, or views that were rendered a moment ago."""
+    """N described views: a bank, or views that were rendered for one call."""
 
     @property
-    def settings(self) -> "BankSettings": ...
+    def settings(self) -> BankSettings: ...
 
     @property
     def descriptors(self) -> Tensor:
@@ -36,7 +34,7 @@ class Views(Protocol):
     def __len__(self) -> int: ...
 
     def points_at(self, index: Tensor | slice) -> Tensor:
-        """(K, S, S) bool feature points of some of the views."""
+        """(K, S, S) bool feature points of the selected views."""
         ...
 
     def silhouettes_at(self, index: Tensor | slice) -> Tensor:
@@ -48,11 +46,11 @@ class Views(Protocol):
 class Term(ABC):
     """One factor of the score S = prod S_t^w_t of a view for a photograph.
 
-    A new term is a new file: a frozen dataclass of plain numbers with these three methods, and its name in
+    A new term is a frozen dataclass of plain numbers with a ``name`` and these two methods, registered in
     :data:`curvireg_torch.terms.TERMS`.
 
     Attributes:
-        weight: w >= 0; with 0 the term is computed and reported, and does not count.
+        weight: w >= 0; a term of weight 0 is computed and reported, but does not count.
     """
 
     name: ClassVar[str]
@@ -73,39 +71,41 @@ class Term(ABC):
 
 @dataclass(frozen=True)
 class RerankingTerm(Term):
-    """A term that costs a picture of every view.
+    """A term that needs a picture of every view that it compares.
 
-    In banks of up to ``coarse`` views all are described when the bank is built, and compared. In larger ones only the
-    best distinct views of the other terms are, when a photograph asks for them; every other view then has the score of
-    the one nearest to it, and NaN for a raw score.
+    A bank of up to ``exhaustive_limit`` views stores the features of all its views. In a larger bank the term compares
+    only the best distinct views of the other terms and computes their features on demand; every other view gets the
+    score of the nearest compared view, and NaN as raw score.
 
     Attributes:
-        coarse: views of a bank that is described as a whole.
-        top, apart: otherwise, how many views are compared, and degrees between them.
+        exhaustive_limit: largest number of views that are all compared.
+        top, min_angle: in a larger bank, number of compared views and minimal angle between them in degrees.
     """
 
-    coarse: int = 1000
+    exhaustive_limit: int = 1000
     top: int = 32
-    apart: float = 20.0
+    min_angle: float = 20.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive(self.apart, "apart", zero_ok=True)
-        if self.top < 1 or self.coarse < 0:
-            raise InvalidInputError(f"{self.name}: expected top >= 1 and coarse >= 0, got {self.top} and {self.coarse}")
+        check_positive(self.min_angle, "min_angle", zero_ok=True)
+        if self.top < 1 or self.exhaustive_limit < 0:
+            raise InvalidInputError(
+                f"{self.name}: expected top >= 1 and exhaustive_limit >= 0, got {self.top} and {self.exhaustive_limit}"
+            )
 
     @abstractmethod
     def build(self, views: Views | None) -> "RerankingModule":
-        """What describes and compares; the same for all views."""
+        """The module that describes and compares. It does not depend on the views."""
 
 
 class RerankingModule(nn.Module, ABC):
     """Describes pictures of views, and compares photographs with them."""
 
     @abstractmethod
-    def described(self, pictures: Tensor) -> Tensor:
+    def describe(self, pictures: Tensor) -> Tensor:
         """(N, D) features of pictures of views: (N, 1, S, S) grey, or (N, 4, S, S) grey and in the mesh's colours."""
 
     @abstractmethod
-    def compare(self, photographs: QueryFeatures, views: Tensor) -> Tensor:
-        """(B, N) raw scores of (N, D) features."""
+    def compare(self, query: QueryFeatures, features: Tensor) -> Tensor:
+        """(B, N) raw scores of B photographs and the (N, D) features of N views."""

@@ -1,4 +1,4 @@
-"""Does the photograph's box have the proportions of the view's?"""
+"""Aspect ratio of the photograph's box against those of the views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from .query import QueryFeatures
 __all__ = ["BoxShape", "box_shape_score", "box_shapes", "whole_box_shapes"]
 
 _BORDER = 0.01
-"""Share of the box's longer side within which an edge counts as cut off by the image's border, besides 1 px."""
+"""A box edge this close to the image's border, as a fraction of the box's longer side plus 1 px, counts as cut off."""
 
 
 def box_shapes(boxes: Tensor) -> Tensor:
@@ -30,9 +30,7 @@ def box_shapes(boxes: Tensor) -> Tensor:
 
 
 def whole_box_shapes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
-    """(B,) shapes of boxes that show a whole object; NaN for those that reach their image's border.
-
-    A box that ends at the border may be that of an object cut off there, or of nothing but the image.
+    """(B,) shapes of boxes; NaN for boxes that reach their image's border, where the object may be cut off.
 
     Args:
         boxes: (B, 4) x0, y0, x1, y1 in px.
@@ -42,9 +40,9 @@ def whole_box_shapes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
         >>> whole_box_shapes(torch.tensor([[9.0, 9, 19, 19], [-0.5, 9, 19, 19]]), [(48, 64)] * 2).tolist()
         [0.0, nan]
     """
-    far = torch.tensor([[W, H] for H, W in sizes], dtype=boxes.dtype, device=boxes.device).view(-1, 2) - 0.5
-    box_jitter = 1.0 + _BORDER * (boxes[:, 2:] - boxes[:, :2]).amax(dim=1, keepdim=True)
-    inside = (boxes[:, :2] > -0.5 + box_jitter).all(dim=1) & (boxes[:, 2:] < far - box_jitter).all(dim=1)
+    end = torch.tensor([[W, H] for H, W in sizes], dtype=boxes.dtype, device=boxes.device).view(-1, 2) - 0.5
+    border = 1.0 + _BORDER * (boxes[:, 2:] - boxes[:, :2]).amax(dim=1, keepdim=True)
+    inside = (boxes[:, :2] > -0.5 + border).all(dim=1) & (boxes[:, 2:] < end - border).all(dim=1)
     return torch.where(inside, box_shapes(boxes), torch.nan)
 
 
@@ -56,13 +54,13 @@ def box_shape_score(queries: Tensor, views: Tensor, *, sigma: float = 0.2) -> Te
     Args:
         queries: (B,) shapes of the photographs' boxes; NaN = unknown, every view then scores 1.
         views: (N,) shapes of the views' boxes, finite.
-        sigma: 0.2 = a box a fifth too wide.
+        sigma: 0.2 corresponds to a box that is a fifth too wide.
 
     Returns:
         (B, N).
 
     Raises:
-        InvalidInputError: wrong shape, dtype or sigma; a view's shape that is NaN or infinite, an infinite query.
+        InvalidInputError: wrong shape, dtype or sigma; a NaN or infinite view shape; an infinite query.
 
     Example:
         >>> box_shape_score(torch.tensor([0.0, float("nan")]), torch.tensor([0.0, 0.2])).round(decimals=2)
@@ -79,10 +77,10 @@ def box_shape_score(queries: Tensor, views: Tensor, *, sigma: float = 0.2) -> Te
 
 
 def _check_views(shapes: Tensor) -> None:
-    broken = int((~shapes.isfinite()).sum())
-    if broken:
+    bad = int((~shapes.isfinite()).sum())
+    if bad:
         raise InvalidInputError(
-            f"views: expected finite shapes, got {broken} of {len(shapes)} NaN or infinite; their boxes have no area"
+            f"views: expected finite shapes, got {bad} of {len(shapes)} NaN or infinite; their boxes have no area"
         )
 
 
@@ -93,7 +91,7 @@ def _score(queries: Tensor, views: Tensor, sigma: float) -> Tensor:
 
 @dataclass(frozen=True)
 class BoxShape(Term):
-    """S_box: the photograph's box has the proportions of the view's; 1 for a box that reaches the image's border.
+    """S_box: the box has the view's aspect ratio; 1 for all views if the box reaches the image's border.
 
     Attributes:
         sigma: of :func:`box_shape_score`.
@@ -107,13 +105,13 @@ class BoxShape(Term):
         check_positive(self.sigma, "sigma")
 
     def build(self, views: Views) -> nn.Module:
-        return _Shapes(box_shapes(views.boxes).float(), self.sigma)
+        return _BoxShapeModule(box_shapes(views.boxes).float(), self.sigma)
 
     def log_score(self, raw: Tensor) -> Tensor:
         return raw.clamp(min=torch.finfo(raw.dtype).tiny).log()
 
 
-class _Shapes(nn.Module):
+class _BoxShapeModule(nn.Module):
     def __init__(self, shapes: Tensor, sigma: float) -> None:
         super().__init__()
         _check_views(shapes)
@@ -121,5 +119,5 @@ class _Shapes(nn.Module):
         self.shapes: Tensor
         self.register_buffer("shapes", shapes, persistent=False)
 
-    def forward(self, photographs: QueryFeatures) -> Tensor:
-        return _score(photographs.shapes.float(), self.shapes, self.sigma)
+    def forward(self, query: QueryFeatures) -> Tensor:
+        return _score(query.shapes.float(), self.shapes, self.sigma)

@@ -14,8 +14,6 @@ from .whitening import DescriptorStatistics, Whitening
 
 __all__ = ["Correlation", "normalized_correlation", "unit_score"]
 
-WHITENINGS = ("none", "bank")
-
 
 def normalized_correlation(queries: Tensor, views: Tensor) -> Tensor:
     """Cosine of every query with every view.
@@ -33,7 +31,7 @@ def normalized_correlation(queries: Tensor, views: Tensor) -> Tensor:
     """
     check_tensor(queries, "queries", (None, None))
     check_tensor(views, "views", (None, queries.shape[1]))
-    return torch.nn.functional.normalize(queries, dim=1) @ torch.nn.functional.normalize(views, dim=1).T
+    return F.normalize(queries, dim=1) @ F.normalize(views, dim=1).T
 
 
 def unit_score(similarity: Tensor) -> Tensor:
@@ -58,13 +56,13 @@ def _log_score(similarity: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Correlation(Term):
-    """S_hog: normalised correlation of descriptors, the best over the slack crops, mapped by :func:`unit_score`.
+    """S_hog: normalised correlation of descriptors, the best over the jittered crops, mapped by :func:`unit_score`.
 
     Attributes:
-        whitening: "none", or "bank": the cosine is taken after both descriptors were whitened by the mean mu and the
-            covariance Sigma of the bank's views. The paper takes mu and Sigma of the views as well, but scores
-            (D_view - mu)^T Sigma^-1 D_query: here the photograph's descriptor is centred too, lengths are divided out,
-            and Sigma is shrunk (Ledoit-Wolf), since a bank has fewer views than a descriptor has entries.
+        whitening: "none", or "bank": both descriptors are whitened by the mean mu and the covariance Sigma of the
+            bank's views before the cosine. The paper scores (D_view - mu)^T Sigma^-1 D_query with the same mu and
+            Sigma. Here the photograph's descriptor is centred too, lengths are divided out, and Sigma is shrunk
+            (Ledoit-Wolf), because a bank has fewer views than a descriptor has entries.
     """
 
     name: ClassVar[str] = "hog"
@@ -72,31 +70,31 @@ class Correlation(Term):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_option(self.whitening, WHITENINGS, "whitening")
+        check_option(self.whitening, ("none", "bank"), "whitening")
 
     def build(self, views: Views) -> nn.Module:
         if self.whitening == "none":
-            return Correlated(views.descriptors)
+            return CorrelationModule(views.descriptors)
         statistics = DescriptorStatistics.from_descriptors(views.descriptors)
-        return Correlated(views.descriptors, statistics.whitening(shrinkage="ledoit-wolf"))
+        return CorrelationModule(views.descriptors, statistics.whitening(shrinkage="ledoit-wolf"))
 
     def log_score(self, raw: Tensor) -> Tensor:
         return _log_score(raw)
 
 
-class Correlated(nn.Module):
-    """Photographs against (N, D) descriptors of views, whitened or as they are."""
+class CorrelationModule(nn.Module):
+    """Compares photographs with (N, D) descriptors of views, whitened or not."""
 
     def __init__(self, descriptors: Tensor, whitening: Whitening | None = None) -> None:
         super().__init__()
         self.whitening = whitening
         self.views: Tensor
-        self.register_buffer("views", self._comparable(descriptors), persistent=False)
+        self.register_buffer("views", self._normalized(descriptors), persistent=False)
 
-    def _comparable(self, descriptors: Tensor) -> Tensor:
+    def _normalized(self, descriptors: Tensor) -> Tensor:
         return F.normalize(descriptors if self.whitening is None else self.whitening(descriptors), dim=1)
 
-    def forward(self, photographs: QueryFeatures) -> Tensor:
-        B, K = photographs.descriptors.shape[:2]
-        queries = self._comparable(photographs.descriptors.flatten(0, 1)).to(self.views.dtype)
+    def forward(self, query: QueryFeatures) -> Tensor:
+        B, K = query.descriptors.shape[:2]
+        queries = self._normalized(query.descriptors.flatten(0, 1)).to(self.views.dtype)
         return (queries @ self.views.T).float().view(B, K, len(self.views)).amax(dim=1)

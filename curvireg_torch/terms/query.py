@@ -1,7 +1,7 @@
-"""What is compared of a photograph: crops around a box that need not be exact, and their features."""
+"""Features of photographs: crops of a box and of jittered copies of it, their fields, descriptors and points."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 
 import torch
@@ -15,21 +15,24 @@ from ..utils.checks import as_numbers, check_photograph, check_tensor
 
 __all__ = ["QueryFeatures", "crop_regions", "jittered_boxes", "photograph_field"]
 
-_MOVES = ((0, 0, 0), (-0.75, 0, 0), (0.75, 0, 0), (0, -0.75, 0), (0, 0.75, 0), (0, 0, -1), (0, 0, 1))
-"""Shifts in x and y and the exponent of the scale, in units of the slack."""
+_JITTER = ((0, 0, 0), (-0.75, 0, 0), (0.75, 0, 0), (0, -0.75, 0), (0, 0.75, 0), (0, 0, -1), (0, 0, 1))
+"""Shifts in x and y in units of the box jitter, and the exponent of the scale."""
+
+
+_BATCHED = ("regions", "field", "descriptors", "points", "shapes")
 
 
 @dataclass(frozen=True)
 class QueryFeatures:
-    """B photographs, each described in K crops: of its box first, then of the box moved and scaled a little.
+    """B photographs, each described in K crops: of its box first, then of jittered copies of the box.
 
     Attributes:
         regions: (B, K, C, S, S) the crops, in [0, 1]; NaN where pixels of the photograph are missing.
-        field: (B, 2, S, S) of the first of them.
+        field: (B, 2, S, S) of the first crop.
         descriptors: (B, K, D).
         points: (B, K, S, S) bool feature points.
         shapes: (B,) log of width / height of the boxes, NaN where unknown.
-        late: features of the crops that late terms have computed, by the term's name.
+        reranking_features: features of the crops that reranking terms have computed, by the term's name.
     """
 
     regions: Tensor
@@ -37,13 +40,13 @@ class QueryFeatures:
     descriptors: Tensor
     points: Tensor
     shapes: Tensor
-    late: dict[str, Tensor] = dataclass_field(default_factory=dict, compare=False)
+    reranking_features: dict[str, Tensor] = dataclass_field(default_factory=dict, compare=False)
 
     def __len__(self) -> int:
         return self.regions.shape[0]
 
     def __getitem__(self, index: slice | Tensor) -> "QueryFeatures":
-        return QueryFeatures(*(getattr(self, f.name)[index] for f in fields(self) if f.name != "late"))
+        return replace(self, reranking_features={}, **{n: getattr(self, n)[index] for n in _BATCHED})
 
     @property
     def crops(self) -> Tensor:
@@ -52,9 +55,9 @@ class QueryFeatures:
 
 
 def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
-    """(B, 2, S, S) of (B, 1 or 3, S, S) crops: in grey, unless the filter has an attribute ``colour = True``.
+    """(B, 2, S, S) field of (B, 1 or 3, S, S) crops, in grey unless the filter has an attribute ``colour = True``.
 
-    Missing pixels (NaN or infinite) are filled from around them before the filter; its field is 0 there.
+    Missing pixels (NaN or infinite) are filled from their surroundings before the filter; the field is 0 there.
     """
     if crops.shape[1] not in (1, 3):
         raise InvalidInputError(f"images: expected 1 (grey) or 3 (RGB) channels, got {crops.shape[1]}")
@@ -80,26 +83,26 @@ def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:
     check_tensor(boxes, "boxes", (None, 4))
     if not 0.0 <= box_jitter <= 0.45:
         raise InvalidInputError(f"box_jitter: expected a fraction in [0, 0.45], got {box_jitter}")
-    moves = torch.tensor(_MOVES if box_jitter else _MOVES[:1], dtype=boxes.dtype, device=boxes.device)
+    jitter = torch.tensor(_JITTER if box_jitter else _JITTER[:1], dtype=boxes.dtype, device=boxes.device)
     sides = boxes[:, 2:] - boxes[:, :2]
-    shift = box_jitter * moves[None, :, :2] * sides.amax(dim=1)[:, None, None]
+    shift = box_jitter * jitter[None, :, :2] * sides.amax(dim=1)[:, None, None]
     centre = 0.5 * (boxes[:, None, :2] + boxes[:, None, 2:]) + shift
-    half = 0.5 * sides[:, None] * (1.0 + box_jitter) ** moves[None, :, 2:]
+    half = 0.5 * sides[:, None] * (1.0 + box_jitter) ** jitter[None, :, 2:]
     return torch.cat([centre - half, centre + half], dim=2)
 
 
 def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int, margin: float) -> Tensor:
-    """(B, K, C, S, S) crops, K boxes on each image, cut as :func:`crop_images` does; reads no more than it needs.
+    """(B, K, C, S, S) crops of K boxes per image, as :func:`crop_images` cuts them; converts only the pixels it needs.
 
     Args:
-        images: (B, C, H, W), or a list of (C, H, W), floating in [0, 1] or uint8; of several channel counts, grey ones
+        images: (B, C, H, W), or a list of (C, H, W), floating in [0, 1] or uint8; if channel counts differ, grey images
             get three channels.
-        boxes: (B, K, 4) x0, y0, x1, y1 in px, from :func:`jittered_boxes`; the first box replaces one that lies
-            wholly outside its image.
+        boxes: (B, K, 4) x0, y0, x1, y1 in px, from :func:`jittered_boxes`; a box wholly outside its image is replaced
+            by the first box.
         size, margin: see :func:`crop_images`.
 
     Returns:
-        Floating crops; of no images (0, K, 3, S, S).
+        Floating crops; (0, K, 3, S, S) for an empty batch.
 
     Raises:
         InvalidInputError: wrong shapes, or a first box that is empty or wholly outside its image.
@@ -118,18 +121,14 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
     low = (squares[..., :2].amin(dim=1) - reach[:, None]).floor().long().clamp(min=0).tolist()
     high = (squares[..., 2:].amax(dim=1) + reach[:, None]).ceil().long().tolist()
     crops = []
-    for image, some, (x0, y0), (x1, y1), (H, W) in zip(images, boxes, low, high, sizes, strict=True):
-        end = torch.tensor([W - 0.5, H - 0.5], dtype=some.dtype, device=some.device)
-        seen = (some[:, 2:] > -0.5).all(dim=1) & (some[:, :2] < end).all(dim=1)
-        some = torch.where(seen[:, None], some, some[:1])
+    for image, each, (x0, y0), (x1, y1), (H, W) in zip(images, boxes, low, high, sizes, strict=True):
+        end = torch.tensor([W - 0.5, H - 0.5], dtype=each.dtype, device=each.device)
+        visible = (each[:, 2:] > -0.5).all(dim=1) & (each[:, :2] < end).all(dim=1)
+        each = torch.where(visible[:, None], each, each[:1])
         x0, y0 = min(x0, W - 1), min(y0, H - 1)
         part = image[:, y0 : max(min(y1, H), y0 + 1), x0 : max(min(x1, W), x0 + 1)]
-        part = part.to(torch.float32) / 255.0 if _is_bytes(part) else part
+        part = part.to(torch.float32) / 255.0 if part.dtype == torch.uint8 else part
         part = part.expand(channels, -1, -1) if len(part) == 1 else part
-        origin = torch.tensor([x0, y0, x0, y0], dtype=some.dtype, device=some.device)
-        crops.append(crop_images(part.expand(len(some), *part.shape), some - origin, size=size, margin=margin)[0])
+        origin = torch.tensor([x0, y0, x0, y0], dtype=each.dtype, device=each.device)
+        crops.append(crop_images(part.expand(len(each), *part.shape), each - origin, size=size, margin=margin)[0])
     return torch.stack(crops)
-
-
-def _is_bytes(image: Tensor) -> bool:
-    return image.dtype == torch.uint8

@@ -30,7 +30,7 @@ def dilate_points(points: Tensor, eps: float) -> Tensor:
         (N, H, W) bool.
 
     Raises:
-        InvalidInputError: masks of another shape or dtype, one without the batch axis too, or a bad radius.
+        InvalidInputError: masks of another shape or dtype, or a bad radius.
     """
     check_masks(points, "points")
     check_positive(eps, "eps", zero_ok=True)
@@ -45,11 +45,11 @@ def dilate_points(points: Tensor, eps: float) -> Tensor:
 
 
 def repeatability(query_points: Tensor, dilated_view_points: Tensor) -> Tensor:
-    """Share of each query's points that have a view's point within eps (the paper's Rep, view -> query).
+    """Fraction of each query's points that have a view's point within eps (the paper's Rep, view -> query).
 
     Args:
-        query_points: (B, H, W) bool, or the number of points in cells of px.
-        dilated_view_points: (N, H, W) bool, from :func:`dilate_points`, or the share of cells within eps of a point.
+        query_points: (B, H, W) bool, or the number of points in each cell.
+        dilated_view_points: (N, H, W) bool, from :func:`dilate_points`, or the fraction of each cell within eps.
 
     Returns:
         (B, N) float32 in [0, 1]; 0 for a query without points.
@@ -66,8 +66,8 @@ def repeatability(query_points: Tensor, dilated_view_points: Tensor) -> Tensor:
             f"got {tuple(query_points.shape)}"
         )
     queries = query_points.flatten(1).float()
-    found = queries @ dilated_view_points.flatten(1).float().T
-    return found / queries.sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    matched = queries @ dilated_view_points.flatten(1).float().T
+    return matched / queries.sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
 
 
 def repeatability_score(rep: Tensor, *, mode: str = "monotone", sigma: float = 0.1) -> Tensor:
@@ -98,11 +98,11 @@ def _log_score(rep: Tensor, mode: str, sigma: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Repeatability(Term):
-    """S_rep: the photograph's feature points have points of the view nearby, the best over the slack crops.
+    """S_rep: the photograph's feature points have points of the view nearby, the best over the jittered crops.
 
     Attributes:
         sigma, mode: of :func:`repeatability_score`.
-        eps: how near, as a share of the crop's side.
+        eps: largest distance of matching points, as a fraction of the crop's side.
     """
 
     name: ClassVar[str] = "repeatability"
@@ -117,17 +117,17 @@ class Repeatability(Term):
         check_positive(self.eps, "eps", zero_ok=True)
 
     def build(self, views: Views) -> nn.Module:
-        return _Points(views, self.eps)
+        return _RepeatabilityModule(views, self.eps)
 
     def log_score(self, raw: Tensor) -> Tensor:
         return _log_score(raw, self.mode, self.sigma)
 
 
 def cell_counts(points: Tensor, cell: int) -> Tensor:
-    """(N, C, C) float32 number of set pixels in cells of ``cell`` px, the last ones cut, from (N, S, S) bool."""
+    """(N, C, C) float32 number of set pixels of (N, S, S) bool in cells of ``cell`` px; the last cells may be cut."""
     over = -points.shape[-1] % cell
     count = F.pad(points.view(torch.uint8), (0, over, 0, over))
-    for dim in (1, 2):  # rows first: they lie together in memory
+    for dim in (1, 2):  # rows first: they are contiguous
         parts = count.unfold(dim, cell, cell).unbind(dim=3)
         count = parts[0].short()
         for part in parts[1:]:
@@ -136,9 +136,9 @@ def cell_counts(points: Tensor, cell: int) -> Tensor:
 
 
 def cell_fractions(points: Tensor, cell: int) -> Tensor:
-    """(N, C, C) float32 share of the pixels of each cell that are set.
+    """(N, C, C) float32 fraction of the pixels of each cell that are set.
 
-    ``avg_pool2d`` with ``ceil_mode``, to the bit, several times as fast: whole numbers are added.
+    Bit-identical to ``avg_pool2d`` with ``ceil_mode`` and several times as fast, because it adds integers.
     """
     count = cell_counts(points, cell)
     side = torch.full((count.shape[-1],), cell, device=points.device)
@@ -146,11 +146,11 @@ def cell_fractions(points: Tensor, cell: int) -> Tensor:
     return count / (side[:, None] * side)
 
 
-class _Points(nn.Module):
+class _RepeatabilityModule(nn.Module):
     def __init__(self, views: Views, eps: float) -> None:
         super().__init__()
         S = views.settings.image_size
-        # Points are counted in cells of eps px or less, so that the product stays small.
+        # Cells of at most eps px keep the matrix product small.
         self.cell = max(1, min(int(eps * S), S // 64))
         near = [
             cell_fractions(dilate_points(views.points_at(slice(i, i + 64)), eps * S), self.cell).flatten(1)
@@ -159,8 +159,8 @@ class _Points(nn.Module):
         self.near: Tensor
         self.register_buffer("near", torch.cat(near), persistent=False)
 
-    def forward(self, photographs: QueryFeatures) -> Tensor:
-        B, K = photographs.points.shape[:2]
-        # Counts, not shares: a point in a cut cell weighs as much as any other.
-        points = cell_counts(photographs.points.flatten(0, 1), self.cell).flatten(1)
+    def forward(self, query: QueryFeatures) -> Tensor:
+        B, K = query.points.shape[:2]
+        # Counts, not fractions: a point in a cut cell must count as much as any other.
+        points = cell_counts(query.points.flatten(0, 1), self.cell).flatten(1)
         return repeatability(points, self.near).view(B, K, len(self.near)).amax(dim=1)

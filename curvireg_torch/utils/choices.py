@@ -1,6 +1,6 @@
 """Names that a user may choose from. The command line lists them without importing torch."""
 
-BACKENDS = ("auto", "embree", "pyrender", "torch")
+RENDERER_NAMES = ("auto", "embree", "pyrender", "torch")
 """Renderers."""
 
 DEFAULT = "learned"

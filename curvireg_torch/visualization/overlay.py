@@ -13,7 +13,7 @@ from ..geometry import rotation_error
 from ..matching.fields import depth_filter
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import ImageItem, image_items
-from ..rendering.base import DepthRenderer
+from ..rendering.protocol import DepthRenderer
 from ..utils.checks import as_numbers, check_camera_matrix
 
 __all__ = ["contour_overlay", "registration_sheet", "side_pictures"]

@@ -10,7 +10,7 @@ import cv2
 import torch
 from torch import Tensor
 
-from ..rendering.base import DepthRenderer
+from ..rendering.protocol import DepthRenderer
 from ..utils.files import write_file
 from .overlay import draw_pose
 

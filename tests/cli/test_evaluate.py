@@ -45,7 +45,7 @@ def test_bop_supposes_any_orientation(bop, tmp_path):
     assert summary["protocol"] == "cad=annotated pose=any box=0.1 seed=3"
     assert summary["settings"]["dataset"] == "bop"
     views = summary["settings"]["pipeline"]["views"]
-    assert (views["pose"], views["directions"], views["turn"]) == ("any", 18, 360.0)
+    assert (views["pose"], views["directions"], views["theta_step"]) == ("any", 18, 360.0)
 
 
 def test_without_boxes(pascal, tmp_path, capsys, monkeypatch):

@@ -296,7 +296,7 @@ def test_python_and_the_command_line_give_the_same_bits(files, monkeypatch, pres
     folder, box, _ = files
     monkeypatch.setenv("CURVIREG_CACHE", str(folder / "doors"))
     # The views of every preset, thinned out: 12 instead of 7200.
-    views = ViewPolicy(directions=12, turn=360.0)
+    views = ViewPolicy(directions=12, theta_step=360.0)
     (folder / "own.json").write_text(replace(PRESETS[preset], views=views).to_json())
     camera = ["--camera", "260", "260", "119.5", "89.5"]
     assert run(folder, "photo.png", "truck.ply", "--pipeline", str(folder / "own.json"), *camera, box=box) == 0

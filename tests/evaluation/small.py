@@ -12,7 +12,7 @@ from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline
 from curvireg_torch.settings import BankSettings, ViewPolicy
 
 SMALL = Pipeline(
-    views=ViewPolicy(directions=18, turn=360.0, azimuth_step=60.0, elevations=(10.0,)),
+    views=ViewPolicy(directions=18, theta_step=360.0, azimuth_step=60.0, elevations=(10.0,)),
     bank=BankSettings(image_size=32),
     terms=PRESETS["classical"].terms,
     search=False,

@@ -227,7 +227,7 @@ def test_the_pipelines_options_reach_the_matcher(pascal, tmp_path, monkeypatch):
 def test_a_field_of_ones_own_is_noted(pascal, tmp_path):
     evaluate(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out", field=ImageGradient(), limit=1)
     settings = PredictionStore(tmp_path / "out" / "predictions").read("settings")
-    assert settings["pipeline"]["field"] == "own:ImageGradient"
+    assert settings["pipeline"]["field"] == "custom:ImageGradient"
 
 
 def test_repaired_and_changed_files_are_registered_again(pascal, tmp_path):

@@ -161,7 +161,7 @@ def test_a_bank_of_another_pose_is_refused(change: dict[str, object], told: str)
     for make in (ViewMatcher, Registrar):
         with pytest.raises(BankError, match=told):
             make(bank, pipeline=other)
-    beside_the_point = replace(pipeline, views=replace(policy, directions=9, turn=9.0))  # of pose="any"
+    beside_the_point = replace(pipeline, views=replace(policy, directions=9, theta_step=9.0))  # of pose="any"
     assert ViewMatcher(bank, pipeline=beside_the_point).pipeline.views == policy
 
 

@@ -39,7 +39,7 @@ def test_one_photograph_among_several_models_scores_as_with_each_alone():
 def test_half_precision_moves_similarities_by_rounding_alone():
     image, box, _ = scene(0)
     bank = truck_bank()
-    for whitening in (None, DescriptorStatistics.from_bank(bank).whitening()):
+    for whitening in (None, DescriptorStatistics.from_descriptors(bank.descriptors).whitening()):
         single = ViewMatcher(bank, whitening=whitening)([image], box[None])
         half = ViewMatcher(bank, whitening=whitening).half()([image], box[None])
         assert half.scores.dtype == torch.float32

@@ -25,8 +25,8 @@ def threads() -> Iterator[None]:
 def bank() -> ViewBank:
     """The default pipeline; the appearance of views is described when a photograph asks for it, as in large banks."""
     views = sample_views(azimuth_step=30, elevations=[0, 30, 60])
-    pipeline = Pipeline().with_term("appearance", coarse=10, top=8)
-    pipeline = replace(pipeline, hypotheses=2, locate=replace(pipeline.locate, views=12, proposals=4, followed=2))
+    pipeline = Pipeline().with_term("appearance", exhaustive_limit=10, top=8)
+    pipeline = replace(pipeline, hypotheses=2, locate=replace(pipeline.locate, views=12, proposals=4, candidates=2))
     return ViewBank.build(example_mesh(), views, pipeline=pipeline, progress=False)
 
 

@@ -164,7 +164,7 @@ def test_bad_calls_are_named():
 
 def test_a_field_of_ones_own_is_used_and_noted():
     registrar = Registrar(truck_bank(), field=ImageGradient(), pipeline=unrefined(truck_bank()))
-    assert registrar.pipeline.field == "own:ImageGradient"
+    assert registrar.pipeline.field == "custom:ImageGradient"
     image, box, _ = scene(0)
     gradient = ViewMatcher(truck_bank(), field=ImageGradient())([image], box[None])
     assert registrar([image], box[None])[0].ranking.scores.equal(gradient.scores)

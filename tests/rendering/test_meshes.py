@@ -166,11 +166,11 @@ def test_arguments_are_checked() -> None:
 
 
 def test_auto_falls_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    from curvireg_torch.rendering import base, opengl
+    from curvireg_torch.rendering import factory, opengl
 
     box = trimesh.creation.box()
     assert make_renderer(box).name == "embree"
-    monkeypatch.setattr(base.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setattr(factory.importlib.util, "find_spec", lambda _: None)
 
     def no_driver(_: object) -> None:
         raise RenderingError("no EGL")

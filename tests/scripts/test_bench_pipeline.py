@@ -28,7 +28,7 @@ def test_ranking_is_compared_with_the_products_in_it(script):
 @pytest.mark.parametrize("on_gpu", [False, pytest.param(True, marks=[*PRETENDING, pytest.mark.slow])])
 def test_everything_is_timed_on_a_device(script, on_gpu, monkeypatch):
     few = replace(Pipeline(), search=False, contours=False)  # which tests/test_device.py has
-    few = replace(few, views=ViewPolicy(directions=4, turn=180.0), bank=BankSettings(image_size=64))
+    few = replace(few, views=ViewPolicy(directions=4, theta_step=180.0), bank=BankSettings(image_size=64))
     on = pretended_gpu() if on_gpu else nullcontext(torch.device("cpu"))
     used = []
     monkeypatch.setattr(script, "seconds", lambda call, *_: script.timed(call, 1)[0])

@@ -27,7 +27,7 @@ def bank() -> ViewBank:
 
 
 def late(**options) -> Pipeline:
-    return PIPELINE.with_term("appearance", coarse=0, **options)
+    return PIPELINE.with_term("appearance", exhaustive_limit=0, **options)
 
 
 def test_a_small_bank_describes_all_its_views(bank, tmp_path):
@@ -35,7 +35,7 @@ def test_a_small_bank_describes_all_its_views(bank, tmp_path):
     pictures = matcher._shaded(torch.arange(len(bank)))
     assert pictures.shape == (len(bank), 1, 64, 64)
     expected = describe(pictures, Backbone())
-    torch.testing.assert_close(bank.late["appearance"], expected, atol=2e-3, rtol=0)
+    torch.testing.assert_close(bank.reranking_features["appearance"], expected, atol=2e-3, rtol=0)
     image, box, _ = scene(0)
     query = matcher.query([image], box[None])
     ranking = matcher.rank(query)
@@ -59,8 +59,8 @@ def test_a_large_bank_is_asked_for_its_best_distinct_views(bank):
     image, box, _ = scene(2)
     before = ViewMatcher(bank, pipeline=replace(PIPELINE, terms=PIPELINE.terms[:3]))([image], box[None])
     large = ViewBank.build(example_mesh(), VIEWS, pipeline=late(), progress=False)
-    assert large.late == {}
-    matcher = ViewMatcher(large, pipeline=late(top=5, apart=40.0))
+    assert large.reranking_features == {}
+    matcher = ViewMatcher(large, pipeline=late(top=5, min_angle=40.0))
     ranking = matcher([image], box[None])
     chosen = distinct_views(before.order[0], bank.rotations, count=5, angle=40.0)
     raw = ranking.terms["appearance"][0]
@@ -124,7 +124,7 @@ def painted() -> trimesh.Trimesh:
 
 @pytest.mark.parametrize("coarse", [1000, 0])
 def test_colours_tell_the_front_from_the_back(tmp_path, coarse):
-    mesh, pipeline = painted(), PIPELINE.with_term("appearance", coarse=coarse)
+    mesh, pipeline = painted(), PIPELINE.with_term("appearance", exhaustive_limit=coarse)
     bank = ViewBank.build(mesh, VIEWS, pipeline=pipeline, progress=False)
     bank.save(tmp_path / "bank.safetensors")
     bank = ViewBank.load(tmp_path / "bank.safetensors")  # the colours travel with the mesh
@@ -144,9 +144,9 @@ def test_a_bank_of_coloured_and_grey_meshes_is_one_bank():
     meshes = painted(), example_mesh()
     banks = [ViewBank.build(m, VIEWS, pipeline=PIPELINE, progress=False) for m in meshes]
     both = ViewBank.join(banks)
-    coloured, grey = both.late["appearance"].split(len(VIEWS))
-    assert torch.equal(coloured, banks[0].late["appearance"])
-    assert torch.equal(grey, banks[1].late["appearance"].repeat(1, 2))
+    coloured, grey = both.reranking_features["appearance"].split(len(VIEWS))
+    assert torch.equal(coloured, banks[0].reranking_features["appearance"])
+    assert torch.equal(grey, banks[1].reranking_features["appearance"].repeat(1, 2))
     image, box, _ = scene(1)
     alone = ViewMatcher(banks[1])([image], box[None]).terms["appearance"]
     joined = ViewMatcher(both)([image], box[None]).terms["appearance"][:, len(VIEWS) :]
@@ -157,7 +157,7 @@ def test_features_that_are_made_anew_when_too_many_were_kept_are_the_same(monkey
     """A photograph that asks for views of which some were kept, and for more than may be kept, is ranked as by a
     matcher that kept none."""
     large = ViewBank.build(example_mesh(), VIEWS, pipeline=late(), progress=False)
-    pipeline = late(top=6, apart=20.0)
+    pipeline = late(top=6, min_angle=20.0)
     queries = [ViewMatcher(large, pipeline=pipeline).query([scene(k)[0]], scene(k)[1][None]) for k in range(3)]
     fresh = [ViewMatcher(large, pipeline=pipeline).rank(query).scores for query in queries]
     monkeypatch.setattr(matcher_module, "KEPT", 8)

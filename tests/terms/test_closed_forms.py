@@ -18,7 +18,7 @@ from curvireg_torch.terms import (
     repeatability_score,
     whole_box_shapes,
 )
-from curvireg_torch.terms.correlation import Correlated, unit_score
+from curvireg_torch.terms.correlation import CorrelationModule, unit_score
 from curvireg_torch.terms.whitening import DescriptorStatistics
 
 
@@ -27,9 +27,9 @@ def test_correlation_is_the_cosine_of_each_query_with_each_view():
     expected = torch.tensor([[24 / 25, 4 / 5, 63 / 65], [4 / 5, 0.0, 5 / 13]])
     torch.testing.assert_close(normalized_correlation(queries, views), expected)
     # Of the crops of a photograph the best counts, view by view: both are crops of one, then each of its own.
-    together = Correlated(views)(SimpleNamespace(descriptors=queries[None]))
+    together = CorrelationModule(views)(SimpleNamespace(descriptors=queries[None]))
     torch.testing.assert_close(together, expected.amax(dim=0, keepdim=True))
-    torch.testing.assert_close(Correlated(views)(SimpleNamespace(descriptors=queries[:, None])), expected)
+    torch.testing.assert_close(CorrelationModule(views)(SimpleNamespace(descriptors=queries[:, None])), expected)
 
 
 def test_whitening_is_asked_for_by_name_and_shrinks_by_half():

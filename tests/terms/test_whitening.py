@@ -53,7 +53,7 @@ def test_equal_descriptors_shrink_to_the_identity_and_too_little_shrinkage_is_na
 
 def test_the_matcher_ranks_by_whitened_correlation():
     bank = truck_bank()
-    whitening = DescriptorStatistics.from_bank(bank).whitening()
+    whitening = DescriptorStatistics.from_descriptors(bank.descriptors).whitening()
     image, box, _ = scene(0)
     matcher = ViewMatcher(bank, box_jitter=0.0, whitening=whitening)
     query = matcher.query([image], box[None]).descriptors[:, 0]
@@ -65,7 +65,7 @@ def test_the_matcher_ranks_by_whitened_correlation():
 
 def test_complete_whitening_by_the_identity_is_centred_correlation():
     bank = truck_bank()
-    statistics = DescriptorStatistics.from_bank(bank)
+    statistics = DescriptorStatistics.from_descriptors(bank.descriptors)
     centred = statistics.whitening(shrinkage=1.0)
     x = bank.descriptors[:3]
     scale = float(statistics.covariance.diagonal().mean()) ** 0.5

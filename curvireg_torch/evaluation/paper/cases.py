@@ -74,8 +74,6 @@ def find_cases(kind: str, root: Path, *, pixel_origin: int = 1, limit: int | Non
         InvalidInputError: nothing is left, or an unknown kind.
         MissingFileError: the dataset is not there.
     """
-    if kind not in DATASETS:
-        raise InvalidInputError(f"kind: expected one of {', '.join(DATASETS)}, got {kind!r}")
     row = DATASETS[kind]
     origin = {"pixel_origin": pixel_origin} if "pixel_origin" in row.options else {}
     dataset = row.open(root, **row.whole, **origin)

@@ -71,7 +71,7 @@ class Locator(nn.Module):
 
     Args:
         matcher: of the bank; its pipeline says how many views (``locate.views``), how small the object may be
-            (``locate.smallest``) and how many boxes are proposed (``locate.proposals``).
+            (``locate.min_size``) and how many boxes are proposed (``locate.proposals``).
 
     Example:
         >>> import trimesh
@@ -150,7 +150,7 @@ class Locator(nn.Module):
     ) -> list[float]:
         """Factors by which the photograph is resized, so that objects of all sizes become as large as the views."""
         longer = float(max(image.shape[-2:]))
-        small, large = min(max(self.settings.smallest * longer, LEAST), longer), longer
+        small, large = min(max(self.settings.min_size * longer, LEAST), longer), longer
         if focal is not None and distance is not None:
             extent = reach * focal * self._templates.unit  # px at distance 1
             small = max(small, float(extent.min()) / distance[1])

@@ -89,7 +89,7 @@ def _followed(registrar: "Registrar", item: ImageItem, located: Located, instanc
     """The best ``instances`` objects among the places of one photograph."""
     if not len(located.boxes):
         raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
-    count = max(registrar.pipeline.locate.followed, instances + 1)
+    count = max(registrar.pipeline.locate.candidates, instances + 1)
     places = ScoredCandidates.score_boxes(registrar, item, located.boxes[:count], located.scores[:count])
     answers: list[Registration] = []
     for k in nms(places.boxes, places.presence, OVERLAP).tolist():

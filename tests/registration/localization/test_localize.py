@@ -224,7 +224,7 @@ class Proposed:
 def test_one_place_more_than_objects_is_looked_at():
     """The locator likes a place of the background a little better than the object's: the one that is surer is taken,
     also where only one place is to be followed."""
-    pipeline = unrefined(bank(), locate=replace(bank().pipeline.locate, followed=1))
+    pipeline = unrefined(bank(), locate=replace(bank().pipeline.locate, candidates=1))
     registrar = cr.Registrar(bank(), pipeline=pipeline)
     image, box = placed_scene(5, (90, 40), 0.9)
     elsewhere = torch.tensor([2.0, 2.0, 60.0, 40.0])

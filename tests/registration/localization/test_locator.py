@@ -150,8 +150,8 @@ def test_what_cannot_be_asked():
     for wrong in (torch.rand(2, 60, 80), torch.rand(60, 80), torch.rand(3, 0, 80)):
         with pytest.raises(InvalidInputError, match="images: expected"):
             locator()([wrong])
-    with pytest.raises(InvalidInputError, match="smallest"):
-        cr.pipeline.LocateSettings(smallest=0.0)
+    with pytest.raises(InvalidInputError, match="min_size"):
+        cr.pipeline.LocateSettings(min_size=0.0)
     with pytest.raises(InvalidInputError, match="views, proposals"):
         cr.pipeline.LocateSettings(views=0)
 
@@ -214,4 +214,4 @@ def test_objects_of_less_than_32_px_are_not_looked_for():
         scales = locator()._scales(torch.zeros(3, *shape), None, None, reach)
         assert reach / max(scales) == pytest.approx(least)
     large = locator()._scales(torch.zeros(3, 900, 1200), None, None, reach)
-    assert reach / max(large) == pytest.approx(1200 * locator().settings.smallest)
+    assert reach / max(large) == pytest.approx(1200 * locator().settings.min_size)

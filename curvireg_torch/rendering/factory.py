@@ -1,0 +1,163 @@
+"""Renderers by name, and :func:`render_depth`."""
+
+import importlib.util
+import threading
+import warnings
+from collections.abc import Callable
+from os import PathLike
+from typing import Any
+
+import torch
+import trimesh
+from torch import Tensor
+
+from ..errors import InvalidInputError, MissingDependencyError, RenderingError
+from ..io.meshes.mesh import as_mesh
+from ..utils.registry import Registry
+from .protocol import DepthRenderer, check_render_arguments
+
+__all__ = ["BACKENDS", "make_renderer", "render_depth"]
+
+BACKENDS: Registry[Callable[..., DepthRenderer]] = Registry("renderer")
+"""Renderers by name: functions or classes that are called as ``(mesh, device=device)``."""
+
+AUTOMATIC = ("embree", "pyrender", "torch")
+"""What "auto" tries, in this order."""
+
+
+def make_renderer(
+    mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto", *, device: torch.device | str = "cpu"
+) -> DepthRenderer:
+    """A renderer of ``mesh``. All backends agree, see ``docs/conventions.md``; all may be shared by threads.
+
+    - ``"embree"`` casts rays on the CPU and needs only its wheel. Forked processes may share it.
+    - ``"pyrender"`` draws through OpenGL and needs a system with EGL. A process that is forked after its first use
+      cannot use it: start processes by "spawn".
+    - ``"torch"`` runs on any torch device. Forked processes must call ``torch.set_num_threads(1)`` first.
+    - ``"auto"``: embree where it is installed (it needs no driver and survives forks), else pyrender where EGL works,
+      else torch. If a backend fails later, the next one replaces it with a warning.
+
+    Args:
+        mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
+        backend: a name, or a renderer, which is returned unchanged.
+        device: where "torch" renders.
+
+    Raises:
+        InvalidInputError: unknown name.
+        RenderingError, MissingDependencyError: the backend does not work here.
+    """
+    if not isinstance(backend, str):
+        return backend
+    return BACKENDS[backend](mesh, device=device)
+
+
+@BACKENDS.register("auto")
+class _FirstThatWorks:
+    """Delegates to the first backend that works; after a failure, to the next."""
+
+    def __init__(self, mesh: trimesh.Trimesh, device: torch.device | str = "cpu") -> None:
+        self._mesh, self._device = mesh, device
+        self._untried = [b for b in AUTOMATIC if b != "embree" or importlib.util.find_spec("embreex")]
+        self._lock = threading.Lock()
+        self._renderer = self._next()
+        self.name = self._renderer.name
+
+    def _next(self) -> DepthRenderer:
+        while True:
+            try:
+                return make_renderer(self._mesh, self._untried.pop(0), device=self._device)
+            except (RenderingError, MissingDependencyError):
+                if not self._untried:
+                    raise
+
+    @property
+    def faces_at(self) -> Any:
+        """The backend's method of that name, or None if it has none; see :func:`render_colour`."""
+        return getattr(self._renderer, "faces_at", None)
+
+    def render(
+        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+    ) -> Tensor:
+        # Invalid arguments must not count as a failure of the backend.
+        check_render_arguments(T_cam_from_model, camera_matrix, size)
+        while True:
+            used = self._renderer
+            try:
+                return used.render(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
+            except Exception as error:  # drivers raise anything
+                with self._lock:  # if several threads saw the same failure, only one replaces the backend
+                    if used is self._renderer:
+                        if not self._untried:
+                            raise
+                        self._renderer = self._next()
+                        self.name = self._renderer.name
+                        warnings.warn(
+                            f"renderer {used.name!r} failed ({type(error).__name__}: {error}); "
+                            f"continuing with {self.name!r}",
+                            stacklevel=2,
+                        )
+
+
+@BACKENDS.register("embree")
+def _embree(mesh: trimesh.Trimesh, **_: Any) -> DepthRenderer:
+    try:
+        from .embree import EmbreeRenderer
+    except ImportError as error:
+        message = f"renderer 'embree' needs the package embreex ({error}): pip install embreex"
+        raise MissingDependencyError(message) from error
+    return EmbreeRenderer(mesh)
+
+
+@BACKENDS.register("pyrender")
+def _pyrender(mesh: trimesh.Trimesh, **_: Any) -> DepthRenderer:
+    from .opengl import PyrenderRenderer
+
+    return PyrenderRenderer(mesh)
+
+
+BACKENDS.register("torch", "curvireg_torch.rendering.zbuffer:TorchRenderer")
+
+
+def render_depth(
+    mesh: "trimesh.Trimesh | trimesh.Scene | str | PathLike[str]",
+    T_cam_from_model: Tensor,
+    camera_matrix: Tensor,
+    size: tuple[int, int],
+    *,
+    renderer: str | DepthRenderer = "auto",
+    orthographic: bool = False,
+) -> Tensor:
+    """Depth images of a mesh.
+
+    Args:
+        mesh: a mesh, a scene (all its parts, placed by their transforms) or the path of one.
+        T_cam_from_model: (N, 4, 4) or (4, 4), rigid, model to OpenCV camera.
+        camera_matrix: (N, 3, 3) or (3, 3) in px; pixel (0, 0) is the centre of the top-left pixel.
+        size: (H, W).
+        renderer: a name for :func:`make_renderer`, or a :class:`DepthRenderer` of this mesh.
+        orthographic: parallel projection; fx, fy are then px per model unit.
+
+    Returns:
+        (N, 1, H, W) float32 z-depth in model units, 0 = background.
+
+    Raises:
+        InvalidInputError, MeshError, MissingFileError, RenderingError.
+
+    Example:
+        >>> K = torch.tensor([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]])
+        >>> T = torch.eye(4); T[2, 3] = 4.0
+        >>> depth = render_depth(trimesh.creation.box((1.0, 1.0, 1.0)), T, K, (64, 64))
+        >>> depth.shape, round(float(depth[0, 0, 32, 32]), 4)
+        (torch.Size([1, 1, 64, 64]), 3.5)
+    """
+    if T_cam_from_model.ndim == 2:
+        T_cam_from_model = T_cam_from_model[None]
+    backend = make_renderer(as_mesh(mesh), renderer)
+    try:
+        return backend.render(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
+    except (InvalidInputError, RenderingError):
+        raise
+    except Exception as error:  # drivers raise anything
+        raise RenderingError(
+            f"renderer {backend.name!r} failed: {type(error).__name__}: {error}; try another renderer"
+        ) from error

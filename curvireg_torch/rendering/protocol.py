@@ -1,0 +1,55 @@
+"""What a renderer is, and the check of arguments that all renderers share."""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInputError
+from ..utils.checks import check_camera_matrix, check_pose
+
+__all__ = ["NEAREST", "DepthRenderer", "check_render_arguments"]
+
+NEAREST = 1e-3
+"""Near plane, in object radii: surface closer to the camera plane, or behind it, is not rendered."""
+
+
+class DepthRenderer(Protocol):
+    """Depth images of one mesh. Both sides of every face are visible; textures are ignored."""
+
+    name: str
+
+    def render(
+        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+    ) -> Tensor:
+        """Render N views.
+
+        Args:
+            T_cam_from_model: (N, 4, 4) rigid transforms into the OpenCV camera.
+            camera_matrix: (N, 3, 3) or (3, 3), without skew; see :func:`curvireg_torch.geometry.project_points`.
+            size: (H, W) in px.
+            orthographic: parallel projection along z; fx, fy are then px per model unit.
+
+        Returns:
+            (N, 1, H, W) float32 z-depth at pixel centres, in model units; 0 = background. On the renderer's device,
+            which is the CPU except for "torch".
+        """
+        ...
+
+
+def check_render_arguments(T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Rigid poses (N, 4, 4) and cameras (N, 3, 3) as float64 on the CPU.
+
+    Raises:
+        InvalidInputError: wrong shapes, a pose that is not rigid, an unusable camera matrix or size.
+    """
+    if T.ndim != 3 or T.shape[1:] != (4, 4):
+        raise InvalidInputError(f"T_cam_from_model: expected shape (N, 4, 4), got {tuple(T.shape)}")
+    if len(size) != 2 or min(size) < 1:
+        raise InvalidInputError(f"size: expected (H, W) >= 1, got {size}")
+    check_camera_matrix(K)
+    if K.ndim == 3 and K.shape[0] not in (1, T.shape[0]):
+        raise InvalidInputError(f"camera_matrix: expected one or {T.shape[0]} matrices, got {K.shape[0]}")
+    check_pose(T, "T_cam_from_model")
+    T = T.detach().to("cpu", torch.float64)
+    return T, K.detach().to("cpu", torch.float64).expand(T.shape[0], 3, 3)
