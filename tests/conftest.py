@@ -1,35 +1,41 @@
-"""Fixtures of all tests. One thread: nearly all that tests compute is too small to be shared among threads."""
+"""Fixtures that many tests share. Tests must not change them; a copy is cheap."""
 
 import os
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported, and for the processes that tests start
+# Nearly all that the tests compute is too small for several threads. Set before torch is imported, and for processes
+# that tests start.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
+import torch
+import trimesh
 
-from curvireg_torch.data import BOPDataset, Pascal3DPlus, WebCollection
-from tests._support.miniature import write_bop, write_pascal3d, write_web
-
-
-@pytest.fixture
-def pascal(tmp_path):
-    """Five objects, of which one has a damaged photograph and one a damaged CAD."""
-    root = tmp_path / "pascal"
-    write_pascal3d(root)
-    photograph = root / "Images" / "car_pascal" / "2008_000003.jpg"
-    photograph.write_bytes(photograph.read_bytes()[:300])
-    root.joinpath("CAD", "sofa", "01.off").write_text("OFF\n8 12 0\n1 2\n")
-    return Pascal3DPlus(root)
+from curvireg_torch import ViewBank, sample_views
+from curvireg_torch.synthetic import example_mesh
+from tests._support import scenes
 
 
-@pytest.fixture
-def bop(tmp_path):
-    """Four instances, one of them without a box."""
-    write_bop(tmp_path / "bop")
-    return BOPDataset(tmp_path / "bop", targets=False)
+@pytest.fixture(scope="session")
+def truck() -> trimesh.Trimesh:
+    """The example mesh, in metres."""
+    return example_mesh()
 
 
-@pytest.fixture
-def web(tmp_path):
-    """Four photographs of two objects, two of them with a pose."""
-    write_web(tmp_path / "web")
-    return WebCollection(tmp_path / "web")
+@pytest.fixture(scope="session")
+def bank() -> ViewBank:
+    """120 views of the truck at 96 px, preset "classical"."""
+    return scenes.truck_bank()
+
+
+@pytest.fixture(scope="session")
+def small_bank(truck: trimesh.Trimesh) -> ViewBank:
+    """24 views of the truck at 64 px, default pipeline."""
+    views = sample_views(azimuth_step=30, elevations=[0, 30])
+    return ViewBank.build(truck, views, image_size=64, progress=False)
+
+
+@pytest.fixture(scope="session")
+def photographs() -> tuple[list[torch.Tensor], torch.Tensor]:
+    """Three photographs (3, 180, 240) of the truck and their boxes (3, 4); camera ``scenes.CAMERA``."""
+    images, boxes, _ = zip(*(scenes.scene(seed) for seed in range(3)), strict=True)
+    return list(images), torch.stack(boxes)
