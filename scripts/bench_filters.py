@@ -22,11 +22,11 @@ from pathlib import Path
 
 import kornia
 import torch
-from _record import REPOSITORY, between, commit, today
-from make_detector_figure import scene, silhouette
 from torch import Tensor
 
 from curvireg_torch import descriptors, filters
+from scripts._shared import REPOSITORY, commit, replace_between, today
+from scripts.paper.figures import scene, silhouette
 
 
 def kornia_depth_saliency(depth: Tensor) -> Tensor:
@@ -135,7 +135,7 @@ def write_table() -> None:
         )
     body = "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n\n" + "\n".join(notes)
     text = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(between(text, BEGIN, END, body + "\n"), encoding="utf-8")
+    PAGE.write_text(replace_between(text, BEGIN, END, body + "\n"), encoding="utf-8")
 
 
 def main() -> None:
@@ -216,7 +216,7 @@ def main() -> None:
         "machine": platform.machine(),
         "environment": {k: v for k, v in os.environ.items() if k.startswith(("GLIBC_TUNABLES", "MALLOC_"))},
         "date": today(),
-        "commit": commit(REPOSITORY),
+        "commit": commit(),
         "load_average_at_end": os.getloadavg()[0],
         "layers": rows,
         "mcs_smoothing": smoothings(),

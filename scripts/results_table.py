@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from _record import REPOSITORY, between, commit, today, write_json
+from scripts._shared import REPOSITORY, commit, replace_between, today, write_json
 
 BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
 
@@ -62,7 +62,7 @@ def main() -> int:
     if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
         print(f"results_table: error: {readme}: expected {BEGIN} and then {END}, once each", file=sys.stderr)
         return 2
-    wanted = between(text, BEGIN, END, table(results))
+    wanted = replace_between(text, BEGIN, END, table(results))
     if arguments.check:
         if wanted != text:
             print(f"results_table: {readme} is not what {results} says; run scripts/results_table.py", file=sys.stderr)

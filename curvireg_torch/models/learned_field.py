@@ -186,7 +186,9 @@ def _without_values() -> FieldNetwork:
 
 def _read_weights(path: Path, *, packaged: bool) -> dict[str, Tensor]:
     if not path.is_file():
-        raise MissingFileError(f"weights: {path} is not there; train them with scripts/train_learned_field.py")
+        raise MissingFileError(
+            f"weights: {path} is not there; train them with scripts/calibration/train_learned_field.py"
+        )
     content = path.read_bytes()
     if packaged and hashlib.sha256(content).hexdigest() != SHA256:
         raise InvalidInputError(f"weights: {path} is damaged; install curvireg_torch again")

@@ -1,4 +1,4 @@
-"""Constants that scripts/calibrate.py found on registered photographs of the benchmark."""
+"""Constants that scripts/calibration/calibrate.py found on registered photographs of the benchmark."""
 
 import json
 from pathlib import Path

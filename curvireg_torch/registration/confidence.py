@@ -42,7 +42,7 @@ PRESENCE_FEATURES = ("place", "similarity")
 """What :func:`presence_features` measures, in its order; similarity alone where nothing was learnt."""
 
 _PRESENCE = {2: ((1.128, 7.819), -16.897), 1: ((16.756,), -14.856)}
-"""Logistic regressions on mosaics of photographs of textured meshes, by scripts/bench_location.py: weights and bias for
+"""Logistic regressions on mosaics of photographs of textured meshes, by scripts/speed/location.py: weights and bias for
 both pieces of evidence, and for the one."""
 
 MARGIN = 5.0

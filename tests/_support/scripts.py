@@ -20,10 +20,10 @@ def imported(name: str) -> Iterator[ModuleType]:
     """The module; afterwards neither it nor what it imported from beside it is known any more."""
     before = set(sys.modules)
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(SCRIPTS))
+        patch.syspath_prepend(str(ROOT))
         try:
             yield importlib.import_module(name)
         finally:
             for other in set(sys.modules) - before:
-                if Path(getattr(sys.modules[other], "__file__", None) or "").parent == SCRIPTS:
+                if other.startswith("scripts."):
                     del sys.modules[other]

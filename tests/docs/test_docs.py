@@ -178,7 +178,7 @@ def options() -> set[str]:
 
 @by_page
 def test_options_that_are_named_exist(page: Path) -> None:
-    scripts = "".join(p.read_text(encoding="utf-8") for d in ("scripts", "datasets") for p in (ROOT / d).glob("*.py"))
+    scripts = "".join(p.read_text(encoding="utf-8") for d in ("scripts", "datasets") for p in (ROOT / d).rglob("*.py"))
     known = options() | set(re.findall(r'"(--[\w-]+)"', scripts)) | {"--nproc-per-node", "--node-rank"}
     for option in re.findall(r"`(--[a-z][\w-]*)", page.read_text(encoding="utf-8")):
         assert option in known, option
@@ -190,7 +190,7 @@ def test_what_these_tests_find(tmp_path: Path) -> None:
     page.write_text(
         "# A `b` (c)\n[x](gone.md) [y](page.md#a-b-c) [z](#no)\n`[code](not.md)`\n\n```bash\ncurvireg bank\n"
         "torchrun --nproc-per-node 2 \\\n  -m curvireg_torch.evaluation web D --out R --jobs 2\n```\n"
-        "`python scripts/ablate.py DATA --out R --no`\n"
+        "`python scripts/results_table.py DATA --out R --no`\n"
     )
     assert links(page) == ["gone.md", "page.md#a-b-c", "#no"]
     assert anchors(page) == {"a-b-c"}

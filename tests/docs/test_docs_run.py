@@ -34,13 +34,13 @@ from .._support.miniature import (
 from .._support.pages import DOCS, PAGES, ROOT, steps, words_of
 
 NOT_HERE = {
-    r"git |pip |apt-get |python datasets/download|python -m zipfile|python scripts/benchmark_meshes": "download",
+    r"git |pip |apt-get |python datasets/download|python -m zipfile|python scripts/benchmark/meshes": "download",
     r"curvireg view": "browser",  # tests/viewer/test_browser.py opens it
-    r"scripts/test\.sh|python -m coverage|python scripts/(mutate|fuzz|soak)\.py": "suite",
-    r"python scripts/results_table|python scripts/make_detector_figure\.py$": "writes into the project",
+    r"scripts/test\.sh|python -m coverage|python scripts/robustness/(fuzz|soak)\.py|python -m mutmut": "suite",
+    r"python scripts/results_table|python scripts/paper/figures\.py detectors$": "writes into the project",
     r".*[ /=$][A-Z]+([ ./]|$)": "placeholder",
     r"curvireg bank .*--adapt|curvireg register .*--field": "3000 photographs",  # tests/cli/test_register.py uses fewer
-    r"python scripts/(?!reproduce_paper|make_detector_figure)": "measures for long",
+    r"python scripts/(?!paper/)": "measures for long",
 }
 """Commands that are not typed, and why; how many is counted below."""
 

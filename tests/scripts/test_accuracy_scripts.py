@@ -1,7 +1,6 @@
 """The scripts behind docs/accuracy.md."""
 
 import json
-import math
 import re
 from collections import Counter
 
@@ -18,7 +17,7 @@ STAGES = ("view", "search", "contours")
 
 @pytest.fixture
 def ablate():
-    with imported("ablate") as script:
+    with imported("scripts._shared") as script:
         yield script
 
 
@@ -45,22 +44,9 @@ def test_paired_differences_are_sharper_than_their_parts(ablate):
 
 def test_there_is_one_median():
     """``Tensor.median`` takes the lower of the middle two; ``median_error`` and ``quantile(0.5)`` take their mean."""
-    sources = [*(ROOT / "curvireg_torch").rglob("*.py"), *SCRIPTS.glob("*.py")]
+    sources = [*(ROOT / "curvireg_torch").rglob("*.py"), *SCRIPTS.rglob("*.py")]
     assert len(sources) > 200
     assert [path.name for path in sources if re.search(r"\.(nan)?median\(\)", path.read_text(encoding="utf-8"))] == []
-
-
-def test_medians_of_the_refinement_are_means_of_the_middle_two():
-    numbers = [1.0, 2.0, 4.0, 9.0]
-    names = [f"{what} {stage}" for what in ("rotation", "translation", "seconds") for stage in STAGES]
-    with imported("measure_refinement") as script:
-        found = script.summary([{**dict.fromkeys(names, x), "sigmas": x} for x in numbers[:-1]])
-        assert (found["search: rotation median"], found["sigmas"]) == (2.0, 2.0)
-        rows = [{**dict.fromkeys(names, x), "sigmas": math.nan if x == 4.0 else x} for x in numbers]
-        found = script.summary(rows)
-    medians = [found[f"contours: {name}"] for name in ("rotation median", "translation median %", "seconds")]
-    assert medians == [3.0, 3.0, 3.0]
-    assert found["sigmas"] == 1.5, "of 1 and 2; 4 is unknown and 9 too far off"
 
 
 def test_unequal_units_weigh_by_their_members(ablate):
@@ -72,7 +58,7 @@ def test_unequal_units_weigh_by_their_members(ablate):
 
 def test_independent_units(pascal, bop):
     """Objects of one CAD; an object of a scene in one pose, under whatever light."""
-    with imported("_intervals") as intervals:
+    with imported("scripts._shared") as intervals:
         benchmark = Pascal3DBenchmark(pascal, Protocol())
         meshes = [item.meshes for item in benchmark.items]
         units = intervals.independent_units(benchmark)
@@ -90,26 +76,14 @@ def test_independent_units(pascal, bop):
 
 def test_hope_is_sixteen_views_in_five_lightings():
     objects = BOPBenchmark(BOPDataset(real_data("bop/hope")), Protocol(pose="any"))
-    with imported("_intervals") as intervals:
+    with imported("scripts._shared") as intervals:
         assert set(Counter(intervals.independent_units(objects)).values()) == {5}
         assert len(set(intervals.independent_units(objects))) == 16
 
 
-def test_table_has_a_line_for_every_row_that_was_measured(ablate):
-    kept = {"errors": [5.0, 20.0, 50.0, 10.0], "whole": [True, True, False, False], "units": [0, 1, 2, 2]}
-    worse = {**kept, "errors": [5.0, 80.0, 50.0, 10.0]}
-    text = ablate.table({"learned": {"lm": kept}, "classical": {"lm": worse}})
-    lines = text.splitlines()
-    assert lines[0] == "**lm**"
-    assert lines[4].startswith("| learned | 4 (3) | 0.750 (")
-    assert "| 0.500 | 15.0° | 1.000 (2) |" in lines[4], "the mean of 10 and 20"
-    assert lines[5].startswith("| classical | 4 (3) | 0.500 (")
-    assert "-0.250 (" in lines[5]
-
-
 @pytest.fixture
 def runner():
-    with imported("run_benchmark") as script:
+    with imported("scripts.benchmark.run") as script:
         yield script
 
 

@@ -1,4 +1,4 @@
-"""``scripts/bench_location.py``: what it makes of its rows, and that its table stands in the guide."""
+"""``scripts/speed/location.py``: what it makes of its rows, and that its table stands in the guide."""
 
 import json
 
@@ -11,7 +11,7 @@ from tests._support.scripts import ROOT, imported
 def script():
     for name in ("sklearn", "matplotlib"):
         pytest.importorskip(name, reason=f"{name} is not installed")
-    with imported("bench_location") as script:
+    with imported("scripts.speed.location") as script:
         yield script
 
 

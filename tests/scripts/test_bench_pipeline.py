@@ -1,4 +1,4 @@
-"""``scripts/bench_pipeline.py``: it reads what the terms hold, and its table stands in docs/performance.md."""
+"""``scripts/speed/pipeline.py``: it reads what the terms hold, and its table stands in docs/performance.md."""
 
 import json
 from contextlib import nullcontext
@@ -16,7 +16,7 @@ from tests._support.scripts import ROOT, imported
 
 @pytest.fixture
 def script():
-    with imported("bench_pipeline") as script:
+    with imported("scripts.speed.pipeline") as script:
         yield script
 
 

@@ -1,4 +1,4 @@
-"""scripts/calibrate.py: what is fitted, on what, and what it is said to be worth."""
+"""scripts/calibration/calibrate.py: what is fitted, on what, and what it is said to be worth."""
 
 import math
 
@@ -15,7 +15,7 @@ from tests._support.scripts import imported
 @pytest.fixture(scope="module")
 def script():
     pytest.importorskip("sklearn", reason="scikit-learn is not installed")
-    with imported("calibrate") as module:
+    with imported("scripts.calibration.calibrate") as module:
         yield module
 
 

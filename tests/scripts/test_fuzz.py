@@ -1,4 +1,4 @@
-"""A short run of scripts/fuzz.py: every input ends in a result or in one of our errors."""
+"""A short run of scripts/robustness/fuzz.py: every input ends in a result or in one of our errors."""
 
 import json
 import sys
@@ -13,7 +13,7 @@ COUNTS = {"images": 150, "meshes": 100, "mat": 150, "tables": 20, "banks": 20, "
 
 @pytest.fixture
 def fuzz():
-    with imported("fuzz") as script, imported("fuzz_inputs") as inputs:
+    with imported("scripts.robustness.fuzz") as script, imported("scripts.robustness.fuzz_inputs") as inputs:
         yield script, inputs
 
 
@@ -54,7 +54,7 @@ def test_the_report_continues_and_names_what_killed_a_process(fuzz, tmp_path, mo
         returncode, stderr = -11, "Segmentation fault"
 
     def process(command, **_):
-        batches.append(command[3:6])
+        batches.append(command[command.index("--worker") + 1 :][:3])
         done = Done()
         done.stdout = '{"at": 3}\n{"at": 4}\n'
         if len(batches) > 1:
@@ -82,4 +82,4 @@ def test_the_long_run_found_nothing_and_stands_in_security(fuzz):
     assert set(report["kinds"]) == set(script.SHARES)
     assert report["failures"] == 0
     text = script.DOCUMENT.read_text()
-    assert script.between(text, script.BEGIN, script.END, script.table(report)) == text
+    assert script.replace_between(text, script.BEGIN, script.END, script.table(report)) == text

@@ -11,7 +11,7 @@ from tests._support.scripts import imported
 @pytest.fixture
 def run(monkeypatch):
     """The script's exit code for a repository and words."""
-    with imported("results_table") as script:
+    with imported("scripts.results_table") as script:
 
         def exit_code(root, *words):
             monkeypatch.setattr(sys, "argv", ["results_table.py", "--root", str(root), *map(str, words)])
@@ -53,7 +53,7 @@ def test_table_from_summaries(run, repository, pascal, bop, tmp_path):
 
 
 def test_objects_that_were_photographed_under_several_lightings_are_told():
-    with imported("results_table") as script:
+    with imported("scripts.results_table") as script:
         assert script.counted("hope", 80) == "80 (16 views x 5 lightings)"
         assert script.counted("hope", 12) == "12", "a limited run"
         assert script.counted("dino", 105) == "105"

@@ -1,4 +1,4 @@
-"""``scripts/soak.py``: what it calls flat, and a short run of it."""
+"""``scripts/robustness/soak.py``: what it calls flat, and a short run of it."""
 
 import json
 import subprocess
@@ -14,7 +14,7 @@ from tests._support.scripts import SCRIPTS, imported
 
 @pytest.fixture
 def soak() -> Iterator[ModuleType]:
-    with imported("soak") as script:
+    with imported("scripts.robustness.soak") as script:
         yield script
 
 
@@ -40,7 +40,7 @@ def test_a_short_soak_of_two_processes_with_one_cache(tmp_path: Path) -> None:
     allowed = ["--allow", "100"]  # MB: so few registrations only warm up
     words = ["--count", "40", "--processes", "2", "--reopen", "5", *allowed, "--out", str(out)]
     done = subprocess.run(
-        [sys.executable, str(SCRIPTS / "soak.py"), *words], capture_output=True, text=True, timeout=900
+        [sys.executable, str(SCRIPTS / "robustness" / "soak.py"), *words], capture_output=True, text=True, timeout=900
     )
     assert done.returncode == 0, done.stdout + done.stderr
     result = json.loads(out.read_text())

@@ -62,7 +62,7 @@ kids 0
 
 @pytest.fixture(scope="module")
 def scripts():
-    with imported("_ac3d") as ac3d, imported("vehicle_meshes") as vehicles:
+    with imported("scripts.benchmark.ac3d") as ac3d, imported("scripts.benchmark.vehicles") as vehicles:
         yield ac3d, vehicles
 
 

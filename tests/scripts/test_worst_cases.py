@@ -1,4 +1,4 @@
-"""``scripts/worst_cases.py``: it measures what it says, and its table stands in SECURITY.md."""
+"""``scripts/robustness/worst_cases.py``: it measures what it says, and its table stands in SECURITY.md."""
 
 import json
 
@@ -9,7 +9,7 @@ from tests._support.scripts import ROOT, imported
 
 @pytest.fixture
 def script():
-    with imported("worst_cases") as script:
+    with imported("scripts.robustness.worst_cases") as script:
         yield script
 
 
@@ -36,4 +36,4 @@ def test_what_was_measured_is_within_what_security_states(script):
     kept = json.loads(script.RESULT.read_text())
     assert all(script.within(name, found) for name, found in kept.items())
     text = (ROOT / "SECURITY.md").read_text()
-    assert script.between(text, script.BEGIN, script.END, script.table(kept)) == text
+    assert script.replace_between(text, script.BEGIN, script.END, script.table(kept)) == text

@@ -1,4 +1,4 @@
-"""The measurements of the paper, on any of the datasets; ``scripts/reproduce_paper.py`` runs them."""
+"""The measurements of the paper, on any of the datasets; ``scripts/paper/reproduce_paper.py`` runs them."""
 
 from .cases import DATASETS, Case, find_cases
 from .fields import PHOTO_FIELDS, photo_detectors

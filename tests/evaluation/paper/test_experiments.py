@@ -131,7 +131,7 @@ def test_view_of_a_camera_that_looks_aside():
 def test_command(collection, tmp_path):
     words = ["curve", "web", str(collection), "--out", str(tmp_path / "out"), "--image-size", "64", "--quiet"]
     done = subprocess.run(
-        [sys.executable, str(REPOSITORY / "scripts" / "reproduce_paper.py"), *words],
+        [sys.executable, str(REPOSITORY / "scripts" / "paper" / "reproduce_paper.py"), *words],
         capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

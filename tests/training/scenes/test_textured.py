@@ -1,8 +1,6 @@
 """The benchmark's renderer: what a ray meets has the colour that the file gives it, and the truth is the picture's."""
 
-import importlib.util
-import sys
-from pathlib import Path
+import importlib
 
 import cv2
 import numpy as np
@@ -11,14 +9,11 @@ import torch
 
 import curvireg_torch as cr
 
-SCRIPTS = Path(__file__).parents[3] / "scripts"
-
 
 @pytest.fixture(scope="module")
 def scripts():
-    sys.path.insert(0, str(SCRIPTS))
-    yield {name: importlib.import_module(name) for name in ("_textured", "benchmark_meshes", "make_benchmark")}
-    sys.path.remove(str(SCRIPTS))
+    names = {"_textured": "textured", "benchmark_meshes": "meshes", "make_benchmark": "make"}
+    return {name: importlib.import_module(f"scripts.benchmark.{module}") for name, module in names.items()}
 
 
 @pytest.fixture(scope="module")

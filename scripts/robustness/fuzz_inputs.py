@@ -1,4 +1,4 @@
-"""What scripts/fuzz.py throws at the readers: valid files, broken in ways that know their structure."""
+"""What scripts/robustness/fuzz.py throws at the readers: valid files, broken in ways that know their structure."""
 
 import json
 import math

@@ -1,6 +1,6 @@
 """Train the learned field on generated scenes: no photograph, no annotation, no foreign weights.
 
-    python scripts/train_learned_field.py --out runs/field --minutes 90
+    python scripts/calibration/train_learned_field.py --out runs/field --minutes 90
 
 Every step draws a batch, partly fresh scenes, partly scenes seen before, recoloured and mirrored. Losses: see
 curvireg_torch.training.losses; one goes straight through HOG, since our layers are differentiable. A second start

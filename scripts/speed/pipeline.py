@@ -1,11 +1,9 @@
 """Times the path from mesh to pose: build a bank, open it from disk, rank and register one photograph and many.
 
-    python scripts/bench_pipeline.py                    # scripts/results/bench_pipeline.json, docs/performance.md
-    python scripts/bench_pipeline.py --device cuda      # scripts/results/bench_pipeline_cuda.json, with the GPU's name
-    python scripts/bench_pipeline.py --peers BENCH      # scripts/results/bench_peers.json, docs/performance.md
+    python scripts/speed/pipeline.py                    # scripts/results/bench_pipeline.json, docs/performance.md
+    python scripts/speed/pipeline.py --device cuda      # scripts/results/bench_pipeline_cuda.json, with the GPU's name
 
 All with the default pipeline. The mesh is a sphere with dents, made in code, so that the number of faces can be chosen.
---peers compares with OpenCV's LINEMOD and other people's HOG instead, on photographs of scripts/make_benchmark.py.
 """
 
 import argparse
@@ -19,10 +17,10 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from _record import REPOSITORY, between, commit, timed, today, write_json
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, ViewMatcher, camera_matrix
 from curvireg_torch.synthetic import random_pose, synthesize_photograph
+from scripts._shared import REPOSITORY, commit, replace_between, timed, today, write_json
 
 
 def dented_sphere(faces: int) -> trimesh.Trimesh:
@@ -108,36 +106,18 @@ def pipeline_table(record: dict[str, Any]) -> str:
     return "\n".join([*lines, "", products, stamp, ""])
 
 
-def compare_peers(folder: Path, photographs: int) -> None:
-    from _peers import compare, table
-
-    rows = compare(folder, photographs)
-    record = {"date": today(), "commit": commit(REPOSITORY), "threads": torch.get_num_threads(), "rows": rows}
-    write_json(REPOSITORY / "scripts" / "results" / "bench_peers.json", record)
-    page = REPOSITORY / "docs" / "performance.md"
-    text = between(page.read_text(encoding="utf-8"), "<!-- peers:begin -->", "<!-- peers:end -->", table(rows))
-    page.write_text(text, encoding="utf-8")
-    print(table(rows))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faces", type=int, default=20_000)
     parser.add_argument(
         "--device", choices=("cpu", "cuda"), default="cpu", help="of modules, bank, search and the views' renderer"
     )
-    parser.add_argument(
-        "--peers", type=Path, metavar="BENCH", help="compare with others on the benchmark's photographs"
-    )
-    parser.add_argument("--photographs", type=int, help="default: 32; of --peers 100")
+    parser.add_argument("--photographs", type=int, default=32)
     arguments = parser.parse_args()
-    if arguments.peers is not None:
-        compare_peers(arguments.peers, arguments.photographs or 100)
-        return
-    mesh, photographs, device = dented_sphere(arguments.faces), arguments.photographs or 32, arguments.device
+    mesh, photographs, device = dented_sphere(arguments.faces), arguments.photographs, arguments.device
     record = {
         "date": today(),
-        "commit": commit(REPOSITORY),
+        "commit": commit(),
         "views": len(Pipeline().views.sphere("z")),
         "faces": len(mesh.faces),
         "photographs": photographs,
@@ -155,7 +135,7 @@ def main() -> None:
     page = REPOSITORY / "docs" / "performance.md"
     text = page.read_text(encoding="utf-8")
     marks = "<!-- pipeline:begin -->", "<!-- pipeline:end -->"
-    page.write_text(between(text, *marks, pipeline_table(record)), encoding="utf-8")
+    page.write_text(replace_between(text, *marks, pipeline_table(record)), encoding="utf-8")
 
 
 if __name__ == "__main__":

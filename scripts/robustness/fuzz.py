@@ -1,7 +1,7 @@
 """Throws broken files at every reader: each must end in a result or in one of our errors, in time and memory.
 
-    python scripts/fuzz.py                                  the 100,000 inputs of the record
-    python scripts/fuzz.py --inputs 1000 --out fuzz.json    some, beside it
+    python scripts/robustness/fuzz.py                                  the 100,000 inputs of the record
+    python scripts/robustness/fuzz.py --inputs 1000 --out fuzz.json    some, beside it
 
 Batches run in processes of their own, which a stuck or killed one takes along with nothing else; the report is written
 after each, and another run continues from it. ``scripts/results/fuzz.json`` is the record, and SECURITY.md has its
@@ -22,7 +22,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from _record import REPOSITORY, between, commit, today
+from scripts._shared import REPOSITORY, commit, replace_between, today
 
 RESULT = REPOSITORY / "scripts" / "results" / "fuzz.json"
 DOCUMENT = REPOSITORY / "SECURITY.md"
@@ -36,7 +36,7 @@ MEGABYTES = 3000  # for a process, libraries included
 def worker(kind: str, start: int, count: int, folder: Path) -> None:
     """Inputs ``start`` to ``start + count``; prints a line of JSON for each that is done and one for the batch."""
     warnings.simplefilter("ignore")
-    from fuzz_inputs import DATASETS, attack
+    from scripts.robustness.fuzz_inputs import DATASETS, attack
 
     if kind in ("boxes", "cameras"):
         print(json.dumps({"at": start}), flush=True)
@@ -73,11 +73,13 @@ def peak() -> float:
 
 def run(kind: str, start: int, count: int) -> dict[str, Any]:
     """One batch in a process of its own; where that dies, what it did before and which input it was."""
-    command = [sys.executable, __file__, "--worker", kind, str(start), str(count)]
+    command = [sys.executable, "-m", "scripts.robustness.fuzz", "--worker", kind, str(start), str(count)]
     limit = 60.0 + 0.1 * count + SECONDS
     with tempfile.TemporaryDirectory() as folder:
         try:
-            done = subprocess.run([*command, folder], capture_output=True, text=True, timeout=limit, errors="replace")
+            done = subprocess.run(
+                [*command, folder], capture_output=True, text=True, timeout=limit, errors="replace", cwd=REPOSITORY
+            )
             output, died = done.stdout, f"exit code {done.returncode}: {done.stderr[-800:]}"
         except subprocess.TimeoutExpired as error:
             output, died = (error.stdout or b"").decode(errors="replace"), f"not done in {limit:g} s"
@@ -107,7 +109,7 @@ def main() -> int:
         kind, start, count, folder = arguments.worker
         worker(kind, int(start), int(count), Path(folder))
         return 0
-    here = commit(REPOSITORY)
+    here = commit()
     report: dict[str, Any] = json.loads(arguments.out.read_text()) if arguments.out.is_file() else {"kinds": {}}
     for kind in arguments.kinds:
         fresh = {"tried": 0, "seconds": 0.0, "outcomes": {}, "slowest_s": 0.0, "peak_mb": 0.0, "failures": []}
@@ -131,7 +133,7 @@ def main() -> int:
               f"{own['peak_mb']} MB, {len(own['failures'])} failures; {own['outcomes']}")  # fmt: skip
     if arguments.out == RESULT:
         text = DOCUMENT.read_text(encoding="utf-8")
-        DOCUMENT.write_text(between(text, BEGIN, END, table(report)), encoding="utf-8")
+        DOCUMENT.write_text(replace_between(text, BEGIN, END, table(report)), encoding="utf-8")
     return 1 if report["failures"] else 0
 
 

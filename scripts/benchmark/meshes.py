@@ -7,7 +7,7 @@ to this project: they stay in OUT. In OUT/meshes every object stands on its own 
 metres. OUT/meshes.json lists name, kind, half (``held-out`` or ``train``: by a hash of the name; copies of held-out
 ones are left out), licence, and the turns under which shape and look stay what they are.
 
-    python scripts/benchmark_meshes.py --out /data/benchmark [--deb sweethome3d-furniture_1.8-1_all.deb]
+    python scripts/benchmark/meshes.py --out /data/benchmark [--deb sweethome3d-furniture_1.8-1_all.deb]
 """
 
 import argparse
@@ -23,9 +23,10 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from _textured import Textured, look_symmetries
 from scipy.spatial import cKDTree
 from tqdm import tqdm
+
+from scripts.benchmark.textured import Textured, look_symmetries
 
 PACKAGE = "sweethome3d-furniture"
 SHA256 = "3ccb90c63f9525e887a767b9cd5c8b6933b8b6b2973a615a5359ee68a2118668"

@@ -1,9 +1,9 @@
 """How well and how fast objects are found without a box, beside OpenCV's LINEMOD, and what ``presence`` is worth.
 
-    python scripts/bench_location.py BENCH --rows rows.jsonl [--preset learned] [--pose upright] [--form exact]
-    python scripts/bench_location.py --rows rows.jsonl --table          # fits presence, writes record, table, picture
+    python scripts/speed/location.py BENCH --rows rows.jsonl [--preset learned] [--pose upright] [--form exact]
+    python scripts/speed/location.py --rows rows.jsonl --table          # fits presence, writes record, table, picture
 
-BENCH is the folder of scripts/make_benchmark.py. Each photograph in which more than 0.7 of the object's silhouette is
+BENCH is the folder of scripts/benchmark/make.py. Each photograph in which more than 0.7 of the object's silhouette is
 seen becomes a quarter of a mosaic of 640 x 480 px, three others, of other kinds of objects, the rest; a second mosaic
 has none of it. Rows say where the proposals lie (overlap with the visible box) and what presence is judged by; run
 again, it goes on. LINEMOD gets the same representative views, shaded grey, at the same sizes; it needs
@@ -22,7 +22,6 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from _record import REPOSITORY, between, commit, today, write_json
 from matplotlib.figure import Figure
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score, roc_curve
@@ -39,6 +38,7 @@ from curvireg_torch.registration.confidence import presence
 from curvireg_torch.registration.inputs import ImageItem
 from curvireg_torch.registration.localization import representative_views
 from curvireg_torch.registration.localization.objects import ScoredCandidates
+from scripts._shared import REPOSITORY, commit, replace_between, today, write_json
 
 Row = dict[str, Any]
 Curves = dict[str, tuple[list[bool], list[float]]]
@@ -203,7 +203,7 @@ def curves(places: list[Place]) -> Curves:
 
 def record_of(rows: list[Row]) -> tuple[Row, dict[str, Curves]]:
     """The record, and the curves of the picture."""
-    record: Row = {"commit": commit(REPOSITORY), "date": today(), "presence": {}, "sets": []}
+    record: Row = {"commit": commit(), "date": today(), "presence": {}, "sets": []}
     drawn = {}
     for preset in PRESETS:
         some = [row for row in rows if row["preset"] == preset]
@@ -297,7 +297,7 @@ def main() -> None:
     if arguments.table:
         record, drawn = record_of(rows)
         write_json(RECORD, record)
-        PAGE.write_text(between(PAGE.read_text(encoding="utf-8"), *MARKERS, table(record)), encoding="utf-8")
+        PAGE.write_text(replace_between(PAGE.read_text(encoding="utf-8"), *MARKERS, table(record)), encoding="utf-8")
         draw(drawn).savefig(PICTURE, dpi=90)
         print(json.dumps(record["presence"], indent=2))
         return

@@ -1,8 +1,8 @@
-"""Links and pictures of a built site: what they lead to is there, anchors included, and pictures have a text.
+"""Check the links and pictures of a built site: targets and anchors exist, and pictures have a description.
 
-    python scripts/check_site.py docs/_build/html
+    python docs/check_site.py docs/_build/html
 
-Nothing is fetched: links to other hosts are counted, no more.
+Nothing is fetched. Links to other hosts are not checked.
 """
 
 import argparse
@@ -13,13 +13,13 @@ from urllib.parse import unquote, urlsplit
 
 
 class Page(HTMLParser):
-    """Anchors, links and pictures without a text of one page."""
+    """Anchors, links and undescribed pictures of one page."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
         self.anchors: set[str] = set()
         self.links: list[str] = []
-        self.untold: list[str] = []
+        self.undescribed: list[str] = []
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
@@ -27,16 +27,16 @@ class Page(HTMLParser):
         self.anchors |= {value for name in ("id", "name") if (value := found.get(name))}
         self.links += [value for name in ("href", "src") if (value := found.get(name))]
         if tag == "img" and not (found.get("alt") or "").strip() and "_thumb." not in (found.get("src") or ""):
-            self.untold.append(found.get("src") or "?")
+            self.undescribed.append(found.get("src") or "?")
 
 
-def faults(root: Path) -> Iterator[str]:
-    """One line for each link that leads nowhere and each picture without a text."""
+def find_faults(root: Path) -> Iterator[str]:
+    """One line for each broken link and each picture without alternative text."""
     pages = {path: Page(path) for path in sorted(root.resolve().rglob("*.html"))}
     if not pages:
         yield f"{root}: no pages"
     for path, page in pages.items():
-        for picture in page.untold:
+        for picture in page.undescribed:
             yield f"{path}: {picture} has no alternative text"
         for link in page.links:
             parts = urlsplit(link)
@@ -45,7 +45,7 @@ def faults(root: Path) -> Iterator[str]:
             target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
             target = target / "index.html" if target.is_dir() else target
             if not target.is_file():
-                yield f"{path}: {link} is not there"
+                yield f"{path}: {link} does not exist"
             elif parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].anchors:
                 yield f"{path}: {link} has no such anchor"
 
@@ -53,9 +53,9 @@ def faults(root: Path) -> Iterator[str]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("root", type=Path)
-    found = list(faults(parser.parse_args().root))
-    print("\n".join(found) or "all links lead somewhere")
-    return int(bool(found))
+    faults = list(find_faults(parser.parse_args().root))
+    print("\n".join(faults) or "all links are valid")
+    return int(bool(faults))
 
 
 if __name__ == "__main__":

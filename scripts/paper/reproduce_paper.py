@@ -1,6 +1,6 @@
 """The paper's tables and figures on a dataset of your own choice, as CSV, Markdown and pictures.
 
-    python scripts/reproduce_paper.py TABLE pascal3d|bop|web ROOT --out DIR
+    python scripts/paper/reproduce_paper.py TABLE pascal3d|bop|web ROOT --out DIR
 
 TABLE is one of
 

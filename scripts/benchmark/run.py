@@ -1,6 +1,6 @@
-"""Registers the benchmark of textured meshes (scripts/make_benchmark.py) and keeps what every hypothesis rests on.
+"""Registers the benchmark of textured meshes (scripts/benchmark/make.py) and keeps what every hypothesis rests on.
 
-    python scripts/run_benchmark.py FOLDER --out rows.jsonl [--pose upright] [--form sibling] [--limit N] [--jobs 2]
+    python scripts/benchmark/run.py FOLDER --out rows.jsonl [--pose upright] [--form sibling] [--limit N] [--jobs 2]
 
 One line for each photograph: the errors of the hypotheses in degrees up to the object's symmetries, their evidence,
 the evidence of the ranking (also of the preset "fast"), the errors of the best views, and how far the pose is off, with

@@ -6,7 +6,7 @@ The meshes are those of Debian's packages flightgear-data-ai and flightgear-data
 benchmark_meshes.py leaves furniture in BENCH, which lends clutter and the rooms' papers. make_benchmark.py --out OUT
 then photographs the vehicles.
 
-    python scripts/vehicle_meshes.py BENCH --out /data/vehicles
+    python scripts/benchmark/vehicles.py BENCH --out /data/vehicles
 """
 
 import argparse
@@ -17,13 +17,14 @@ import re
 import subprocess
 from pathlib import Path
 
-import _ac3d
 import numpy as np
-from _textured import Textured
-from benchmark_meshes import copy_of, fetched, half_of, measured, samples, turns, write_listing
 from PIL import Image
 from scipy.spatial import cKDTree
 from tqdm import tqdm
+
+from scripts.benchmark import ac3d as _ac3d
+from scripts.benchmark.meshes import copy_of, fetched, half_of, measured, samples, turns, write_listing
+from scripts.benchmark.textured import Textured
 
 PACKAGES = {
     "flightgear-data-ai": "a86b2acbf99ff2d49698abd2a2f4bc28ab0cf5a744218b4ca4d8aede8a67dc2f",

@@ -1,9 +1,9 @@
 """From registered photographs to the constants of confidence and covariance, and what these are worth.
 
-    python scripts/calibrate.py BENCHMARK --rows ROWS [--jobs 2] [--real DATA RUNS]
+    python scripts/calibration/calibrate.py BENCHMARK --rows ROWS [--jobs 2] [--real DATA RUNS]
 
-BENCHMARK is the folder of scripts/make_benchmark.py --count 2000. What is not in ROWS yet is registered first, as
-scripts/run_benchmark.py does (stop and go on at will): every photograph to its own mesh or, of siblings, to that of
+BENCHMARK is the folder of scripts/benchmark/make.py --count 2000. What is not in ROWS yet is registered first, as
+scripts/benchmark/run.py does (stop and go on at will): every photograph to its own mesh or, of siblings, to that of
 another object of the kind; and some to wrong meshes. Then the script writes
 
 - curvireg_torch/registration/calibration.json, the constants,
@@ -22,9 +22,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from _intervals import independent_units, interval, interval_of
-from _record import REPOSITORY, SETS, benchmark, between, commit, table_lines, today, write_json
-from run_benchmark import register_benchmark
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 from scipy.stats import chi2
@@ -35,6 +32,20 @@ from curvireg_torch.geometry import axis_angle_from_rotation, rotation_error, tr
 from curvireg_torch.metrics import symmetry_transforms
 from curvireg_torch.registration.confidence import FEATURES, RANKING_FEATURES, RELIABLE, LogisticModel, pose_features
 from curvireg_torch.registration.rescoring import POSE_FEATURES, WEIGHTS, rescore
+from scripts._shared import (
+    REAL_SETS,
+    REPOSITORY,
+    benchmark,
+    commit,
+    independent_units,
+    interval,
+    interval_of,
+    replace_between,
+    table_lines,
+    today,
+    write_json,
+)
+from scripts.benchmark.run import register_benchmark
 
 CONSTANTS = REPOSITORY / "curvireg_torch" / "registration" / "calibration.json"
 RECORD = REPOSITORY / "scripts" / "results" / "calibration.json"
@@ -42,7 +53,7 @@ PAGE = REPOSITORY / "docs" / "accuracy.md"
 BEGIN, END = "<!-- calibration:begin -->", "<!-- calibration:end -->"
 
 PARTS: dict[str, tuple[str | None, int | None]] = {"right": (None, None), "any": ("any", 60), "kind": ("kind", 60)}
-"""What is registered: --wrong and --limit of scripts/run_benchmark.py."""
+"""What is registered: --wrong and --limit of scripts/benchmark/run.py."""
 
 FOLDS = 5
 RIGHT = 30.0
@@ -334,7 +345,7 @@ def page(record: Row) -> str:
         [name, str(found["n"]), *(shown(found[m][0], found[m][1:]) for m in measures)]
         for name, found in record["shares"].items()
     ]
-    where = f"`python scripts/calibrate.py`, {record['date']}, commit {record['commit']}."
+    where = f"`python scripts/calibration/calibrate.py`, {record['date']}, commit {record['commit']}."
     tables = (table_lines(rows) for rows in (right, lines, ellipsoid))
     return "\n".join([*(line for table in tables for line in [*table, ""]), where, ""])
 
@@ -385,12 +396,12 @@ def main() -> None:
     rows = [row for row in rows if "errors" in row]
     constants, worthy = calibrate(rows)
     write_json(CONSTANTS, constants)
-    record = {"date": today(), "commit": commit(REPOSITORY), "n": len(rows), **constants, **worthy}
+    record = {"date": today(), "commit": commit(), "n": len(rows), **constants, **worthy}
     record |= {"shares": shares(rows), "verdict": {"used": list(WEIGHTS), "fitted": fit_verdict(rows)}}
     if arguments.real:
-        record["real"] = {name: real_set(*arguments.real, name, constants["covariance"]) for name in SETS}
+        record["real"] = {name: real_set(*arguments.real, name, constants["covariance"]) for name in REAL_SETS}
     write_json(RECORD, record)
-    PAGE.write_text(between(PAGE.read_text(encoding="utf-8"), BEGIN, END, page(record)), encoding="utf-8")
+    PAGE.write_text(replace_between(PAGE.read_text(encoding="utf-8"), BEGIN, END, page(record)), encoding="utf-8")
     print(page(record))
 
 

@@ -5,7 +5,7 @@ Picture i is a function of seed and i (and of the meshes). Four forms take turns
 another object of its kind, standing upright or thrown into any orientation. Rooms, light with shadows, clutter,
 occluders and a camera are drawn at random; a fifth of the objects are bare. A stopped run goes on where it was.
 
-    python scripts/make_benchmark.py --out /data/benchmark [--half held-out] [--count 1200] [--jobs 2]
+    python scripts/benchmark/make.py --out /data/benchmark [--half held-out] [--count 1200] [--jobs 2]
 
 OUT/<half>/items.jsonl has a line for each picture: OUT/README.md says what is in it.
 """
@@ -20,7 +20,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from _textured import Textured
 from tqdm import tqdm
 
 from curvireg_torch.geometry import rotation_from_viewpoint
@@ -30,6 +29,7 @@ from curvireg_torch.training.scenes.camera_noise import photographed
 from curvireg_torch.training.scenes.light import lit, random_light
 from curvireg_torch.training.scenes.materials import random_colour, random_picture
 from curvireg_torch.training.scenes.rotations import random_rotation
+from scripts.benchmark.textured import Textured
 
 FORMS = [(cad, pose) for cad in ("exact", "sibling") for pose in ("upright", "free")]
 SIZES = [(320, 320), (320, 400), (360, 480), (400, 320), (400, 400)]  # rows, columns

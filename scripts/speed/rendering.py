@@ -1,6 +1,6 @@
 """Views per second of every renderer, and the cost of a whole bank.
 
-    python scripts/bench_rendering.py [--views 16] [--out scripts/results/bench_rendering.json]
+    python scripts/speed/rendering.py [--views 16] [--out scripts/results/bench_rendering.json]
 
 All candidates render the same views of the same mesh in the same run, the object filling the image, interleaved; the
 best of three rounds counts. "trimesh" is trimesh's own ray caster over all pixels; "naive pyrender" opens a renderer,
@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
-from _record import write_json
 
 import curvireg_torch as cr
 from curvireg_torch.errors import RenderingError
@@ -29,6 +28,7 @@ from curvireg_torch.io.meshes import mesh_radius
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.settings import BankSettings
+from scripts._shared import RESULTS, write_json
 
 FACES = {"1k": 3, "20k": 5, "300k": 7}  # subdivisions of an icosahedron: 1280, 20480, 327680 faces
 
@@ -155,7 +155,7 @@ def in_a_process_of_its_own(function: Callable[[], dict[str, float]]) -> dict[st
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, default=16)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "bench_rendering.json")
+    parser.add_argument("--out", type=Path, default=RESULTS / "bench_rendering.json")
     arguments = parser.parse_args()
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     results: dict[str, object] = {

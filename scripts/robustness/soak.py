@@ -1,7 +1,7 @@
 """Many registrations in one process: do memory and open files stay where they are?
 
-    python scripts/soak.py                     2000 registrations in each of two processes that share a cache
-    python scripts/soak.py --count 100 --processes 1
+    python scripts/robustness/soak.py                     2000 registrations in each of two processes that share a cache
+    python scripts/robustness/soak.py --count 100 --processes 1
 
 Every process registers noisy copies of one photograph made in code, and opens its bank anew from the shared cache every
 ``--reopen`` registrations; the cache is trimmed to nothing by each, so that they also remove what the other one reads.
@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _record import REPOSITORY, commit, today
 from tqdm import tqdm
 
 from curvireg_torch import Registrar, camera_matrix, sample_views
 from curvireg_torch.matching import cached_bank
 from curvireg_torch.settings import BankSettings
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
+from scripts._shared import REPOSITORY, commit, today
 
 CAMERA, SIZE = (260.0, 260.0, 119.5, 89.5), (180, 240)
 Sample = dict[str, float]
@@ -53,7 +53,7 @@ def main() -> int:
     processes = [{"growth": growth(course), "course": course} for course in courses]
     flat = all(is_flat(process["growth"], arguments.allow) for process in processes) and set(left) <= {".safetensors"}
     head = {"registrations": arguments.count, "flat": flat, "allowed_mb": arguments.allow, "left_in_cache": left}
-    result = {**head, "processes": processes, "date": today(), "commit": commit(REPOSITORY)}
+    result = {**head, "processes": processes, "date": today(), "commit": commit()}
     arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     print(json.dumps({**head, "growth": [process["growth"] for process in processes]}))
     return int(not flat)

@@ -1,7 +1,7 @@
 """The largest and slowest input that each limit of SECURITY.md still lets in: how long it takes, and how much memory.
 
-    python scripts/worst_cases.py              all of them
-    python scripts/worst_cases.py obj off      some; the others stay as they were measured
+    python scripts/robustness/worst_cases.py              all of them
+    python scripts/robustness/worst_cases.py obj off      some; the others stay as they were measured
 
 Each input is made, then read in a process of its own on one thread: its seconds of CPU, and its memory, libraries
 included. ``scripts/results/worst_cases.json`` keeps them, and SECURITY.md has their table. Exit code 1 if one ends in
@@ -25,10 +25,10 @@ from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
-from _record import REPOSITORY, between, commit, today, write_json
 
 from curvireg_torch import limits
 from curvireg_torch.errors import CurviregError
+from scripts._shared import REPOSITORY, commit, replace_between, today, write_json
 
 RESULT = REPOSITORY / "scripts" / "results" / "worst_cases.json"
 DOCUMENT = REPOSITORY / "SECURITY.md"
@@ -282,8 +282,8 @@ def measured(name: str) -> dict[str, Any]:
         path = Path(folder, f"case{SUFFIX.get(name, '.' + name)}")
         CASES[name].make(path)
         done = subprocess.run(
-            [sys.executable, __file__, "--worker", name, str(path)],
-            capture_output=True, text=True, timeout=1800,
+            [sys.executable, "-m", "scripts.robustness.worst_cases", "--worker", name, str(path)],
+            capture_output=True, text=True, timeout=1800, cwd=REPOSITORY,
             env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPOSITORY)},
         )  # fmt: skip
         size = path.stat().st_size
@@ -302,7 +302,7 @@ def main() -> int:
         worker(options.worker[0], Path(options.worker[1]))
         return 0
     kept = json.loads(RESULT.read_text()) if RESULT.is_file() else {}
-    here = commit(REPOSITORY)
+    here = commit()
     bad = 0
     for name in options.names or CASES:
         found = measured(name)
@@ -312,7 +312,7 @@ def main() -> int:
         kept[name] = {**found, "date": today(), "commit": here}
         write_json(RESULT, kept)
     text = DOCUMENT.read_text(encoding="utf-8")
-    DOCUMENT.write_text(between(text, BEGIN, END, table(kept)), encoding="utf-8")
+    DOCUMENT.write_text(replace_between(text, BEGIN, END, table(kept)), encoding="utf-8")
     return int(bad > 0)
 
 
