@@ -1,7 +1,8 @@
-"""The files that a mesh consists of: read, listed and digested through one resolver."""
+"""The files of a mesh: read, listed and digested through one resolver."""
 
 import contextlib
 import logging
+import struct
 import urllib.parse
 import warnings
 from io import BytesIO
@@ -13,47 +14,60 @@ import trimesh
 from ...errors import MeshError
 from ...limits import MAX_MESH_BYTES
 from ...utils.digests import file_digest, text_digest
+from . import obj, off, ply
 from .gltf import check_gltf
-from .polygon_files import with_triangles
 
-__all__ = ["mesh_digest", "mesh_files", "read_mesh"]
+__all__ = ["mesh_digest", "mesh_files", "read_mesh", "with_triangles"]
 
-_NAME_OTHER_FILES = (".glb", ".gltf", ".obj", ".ply")
+_WITH_COMPANIONS = (".glb", ".gltf", ".obj", ".ply")
 """Formats whose files may name buffers, material files or textures beside them."""
+
+_POLYGON_FORMATS = {".obj": obj.with_triangles, ".off": off.with_triangles, ".ply": ply.with_triangles}
 
 
 def mesh_files(path: Path) -> list[Path]:
-    """The mesh file and every file that reading it asks for: buffers and images of glTF, MTL files, textures.
+    """The mesh file and every file that is read with it: buffers and images of glTF, MTL files, textures.
 
-    They are found by reading the mesh, so that this list and what is read cannot differ. Of a mesh that cannot be read
-    they are those asked for until it failed. Files that are named but missing are listed too: they change the mesh once
-    they are there.
+    They are found by reading the mesh. If that fails, those requested before the failure are listed. Files that are
+    named but missing are listed too, because the mesh changes when they appear.
 
     Args:
         path: a mesh; any other file is listed alone.
     """
     folder = _Folder(path)
-    if path.suffix.lower() in _NAME_OTHER_FILES and path.is_file():
+    if path.suffix.lower() in _WITH_COMPANIONS and path.is_file():
         with contextlib.suppress(MeshError):  # reported where the mesh is loaded
             _read(path, folder)
-    return [path, *sorted(folder.asked)]
+    return [path, *sorted(folder.requested)]
 
 
 def mesh_digest(path: Path) -> str:
-    """16 hexadecimal digits of the contents of :func:`mesh_files`, wherever they lie.
+    """16 hexadecimal digits of the contents of :func:`mesh_files`, whatever their folder.
 
-    A file that is missing or cannot be read counts too, so that the digest changes once it is put right.
+    Missing and unreadable files count too, so that the digest changes when they are repaired.
     """
     return text_digest(" ".join(map(file_digest, mesh_files(path))))
 
 
 def read_mesh(path: Path) -> Any:
-    """What trimesh makes of a mesh file and of the files that it names.
+    """Read a mesh file, and the files that it names, with trimesh.
 
     Raises:
-        MeshError: it cannot be read, or claims more than :mod:`curvireg_torch.limits` allow.
+        MeshError: the file cannot be read, or is beyond :mod:`curvireg_torch.limits`.
     """
     return _read(path, _Folder(path))
+
+
+def with_triangles(data: bytes, suffix: str) -> bytes:
+    """The content of an OBJ, OFF or PLY file with every face a triangle; the same bytes if all are.
+
+    Raises:
+        ValueError: the file is damaged, or beyond :mod:`curvireg_torch.limits`.
+    """
+    try:
+        return _POLYGON_FORMATS[suffix](data)
+    except (struct.error, IndexError) as error:
+        raise ValueError("the file ends too early") from error
 
 
 def _read(path: Path, folder: "_Folder") -> Any:
@@ -61,39 +75,39 @@ def _read(path: Path, folder: "_Folder") -> Any:
     logger = logging.getLogger("trimesh")
     level = logger.level
     try:
-        logger.setLevel(logging.CRITICAL)  # its tracebacks of files that it cannot read
+        logger.setLevel(logging.CRITICAL)  # trimesh logs tracebacks of files that it cannot read
         if path.stat().st_size > MAX_MESH_BYTES:
             raise ValueError(f"larger than {MAX_MESH_BYTES:,} bytes")
         data = path.read_bytes()
-        if suffix in (".obj", ".off", ".ply"):
+        if suffix in _POLYGON_FORMATS:
             data = with_triangles(data, suffix)
         elif suffix in (".glb", ".gltf"):
             check_gltf(data, suffix, folder.size)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy's, of numbers that the checks in as_mesh find
+            warnings.simplefilter("ignore")  # numpy warns of values that as_mesh reports
             return trimesh.load(BytesIO(data), file_type=suffix[1:], resolver=folder, process=False)
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".removeprefix("ValueError: ").split())[:300]
-        raise MeshError(f"{path}: cannot be read as a mesh ({reason}); re-export the file") from error
+        raise MeshError(f"cannot be read as a mesh ({reason}); re-export the file", subject=path) from error
     finally:
         logger.setLevel(level)
 
 
 class _Folder(trimesh.resolvers.Resolver):  # type: ignore[misc]
-    """Files beside a mesh, which it may name; no others, and nothing from the network.
+    """Access to the files beside a mesh and in folders below; to no others, and not to the network.
 
     Attributes:
-        asked: the files in this folder that were asked for, whether they exist or not.
+        requested: the files that were requested, existing or not.
     """
 
     def __init__(self, path: Path) -> None:
         self.folder, self.file_name = path.parent.resolve(), path.name
-        self.asked: set[Path] = set()
+        self.requested: set[Path] = set()
 
     def _path(self, name: str) -> Path:
         path = (self.folder / urllib.parse.unquote(name)).resolve()
         if "://" not in name and path.is_relative_to(self.folder):
-            self.asked.add(path)
+            self.requested.add(path)
             if path.is_file():
                 return path
         raise ValueError(f"it names {name[:100]!r}, which is no file of its folder")

@@ -1,61 +1,116 @@
-"""Faces of more than three corners, divided into triangles."""
+"""Division of faces with more than three corners into triangles.
 
+Readers, trimesh's too, divide such faces into fans, which is wrong for concave faces. Here those go to earcut.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator
+
+import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 
-from ...limits import MAX_POLYGON_CORNERS
+from ...limits import MAX_MESH_FACES, MAX_MESH_LINES, MAX_POLYGON_CORNERS, MAX_POLYGON_WORK
 
-__all__ = ["ear_work", "triangulate"]
+__all__ = ["check_face_count", "check_line_count", "divide_faces", "triangulate"]
 
 Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
-def triangulate(polygons: Floats) -> Indices:
-    """Triangles that cover N planar polygons of n corners each, concave ones too.
+def check_face_count(count: int) -> None:
+    """Raise ValueError for more faces than a mesh may have."""
+    if count > MAX_MESH_FACES:
+        raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
 
-    Convex polygons become fans; of the others ears are cut off. Corners may repeat (a hole joined to the rim by a
-    bridge). A polygon that crosses itself gives some triangles.
+
+def check_line_count(data: bytes) -> None:
+    """Raise ValueError for a text of more lines than a mesh file may have."""
+    if max(data.count(b"\n"), data.count(b"\r")) > MAX_MESH_LINES:
+        raise ValueError(f"more than {MAX_MESH_LINES:,} lines; simplify it")
+
+
+def divide_faces(vertices: Floats, faces: list[list[int]]) -> Iterator[tuple[int, list[list[int]]]]:
+    """Yield the index of each face and its triangles, as indices of its corners.
+
+    Faces of fewer than three corners yield nothing.
+
+    Args:
+        vertices: (V, 3).
+        faces: vertex indices of each face.
+
+    Raises:
+        ValueError: a vertex does not exist, or the faces are beyond :mod:`curvireg_torch.limits`.
+    """
+    check_face_count(sum(max(len(face) - 2, 0) for face in faces))
+    by_length, work = defaultdict(list), 0
+    for index, face in enumerate(faces):
+        by_length[len(face)].append(index)
+        if face and not 0 <= min(face) <= max(face) < len(vertices):
+            raise ValueError(f"face {index} names vertices that do not exist")
+    for corners, indices in by_length.items():
+        if corners >= 3:
+            polygons = vertices[np.array([faces[index] for index in indices])]
+            work += corners**2 * int(_is_concave(_project(polygons)).sum())
+            if work > MAX_POLYGON_WORK:
+                raise ValueError("faces that are not convex have too many corners; triangulate the mesh")
+            yield from zip(indices, triangulate(polygons), strict=True)
+
+
+def triangulate(polygons: Floats) -> list[list[list[int]]]:
+    """Triangles that cover each of N planar polygons of n corners, in the polygon's orientation.
+
+    Convex polygons become fans. Corners may repeat, as where a bridge joins a hole to the outline. A polygon that
+    crosses itself or is not finite gives some triangles.
 
     Args:
         polygons: (N, n, 3) corners in order, n >= 3.
 
     Returns:
-        (N, n - 2, 3) numbers of corners, in the polygon's sense of rotation.
+        For each polygon its triangles, three indices of corners each; n - 2 if it does not cross itself.
 
     Raises:
         ValueError: a concave polygon has more than ``MAX_POLYGON_CORNERS`` corners.
 
     Example:
         >>> dart = np.array([[[0.0, 0, 0], [1, 2, 0], [0, 1, 0], [-1, 2, 0]]])
-        >>> sorted(map(sorted, triangulate(dart)[0].tolist()))
+        >>> sorted(map(sorted, triangulate(dart)[0]))
         [[0, 1, 2], [0, 2, 3]]
     """
     N, n, _ = polygons.shape
-    ones = np.arange(1, n - 1)
-    triangles = np.tile(np.stack([0 * ones, ones, ones + 1], axis=-1), (N, 1, 1))
-    flat = _flattened(polygons)
-    concave = ~_convex(flat)
-    if n > 3 and concave.any():
-        if n > MAX_POLYGON_CORNERS:
-            raise ValueError(f"a concave face of {n} corners, more than {MAX_POLYGON_CORNERS}; triangulate the mesh")
-        triangles[concave] = _cut_ears(flat[concave])
+    triangles = [[[0, i, i + 1] for i in range(1, n - 1)]] * N
+    flat = _project(polygons)
+    concave = _is_concave(flat) & np.isfinite(flat).all(axis=(1, 2))  # as_mesh refuses the others, corner by corner
+    if concave.any() and n > MAX_POLYGON_CORNERS:
+        raise ValueError(f"a concave face of {n} corners, more than {MAX_POLYGON_CORNERS}; triangulate the mesh")
+    for i in concave.nonzero()[0]:
+        indices = mapbox_earcut.triangulate_float64(flat[i], np.array([n], dtype=np.uint32))
+        if len(indices):
+            triangles[i] = _with_all_corners(indices.reshape(-1, 3).tolist(), n)
     return triangles
 
 
-def ear_work(polygons: Floats) -> int:
-    """Squared corners of those of N polygons that are not convex: what :func:`triangulate` takes time with.
+def _with_all_corners(triangles: list[list[int]], n: int) -> list[list[int]]:
+    """Put back the corners on straight edges, which earcut drops, so that faces still share edges with neighbours."""
+    if len(triangles) >= n - 2:
+        return triangles
+    used = sorted({corner for triangle in triangles for corner in triangle})
+    following = dict(zip(used, [*used[1:], used[0]], strict=True))
+    ahead, complete = triangles, []
+    while ahead:
+        a, b, c = ahead.pop()
+        for start, end, tip in ((a, b, c), (b, c, a), (c, a, b)):
+            if following[start] == end and (end - start) % n > 1:
+                middle = (start + 1) % n
+                following[start], following[middle] = middle, end
+                ahead += [[start, middle, tip], [middle, end, tip]]
+                break
+        else:
+            complete.append([a, b, c])
+    return complete
 
-    Example:
-        >>> ear_work(np.array([[[0.0, 0, 0], [1, 2, 0], [0, 1, 0], [-1, 2, 0]]] * 3))
-        48
-    """
-    n = polygons.shape[1]
-    return n * n * int((~_convex(_flattened(polygons))).sum()) if n > 3 else 0
 
-
-def _flattened(polygons: Floats) -> Floats:
-    """(N, n, 2) corners without the coordinate that the plane is steepest in, anticlockwise."""
+def _project(polygons: Floats) -> Floats:
+    """(N, n, 2) corners without the coordinate along which the plane is steepest, anticlockwise."""
     points = polygons - polygons[:, :1]
     normal = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)
     axis = np.abs(normal).argmax(axis=1)[:, None]
@@ -64,54 +119,12 @@ def _flattened(polygons: Floats) -> Floats:
     return flat
 
 
-def _cross(a: Floats, b: Floats) -> Floats:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
-def _convex(flat: Floats) -> NDArray[np.bool_]:
+def _is_concave(flat: Floats) -> NDArray[np.bool_]:
+    """(N,): whether some corner of an anticlockwise polygon turns clockwise; True for polygons with NaN."""
+    if flat.shape[1] <= 3:
+        return np.zeros(len(flat), dtype=bool)
     edges = np.roll(flat, -1, axis=1) - flat
+    ahead = np.roll(edges, -1, axis=1)
     size = np.square(np.ptp(flat, axis=1)).sum(axis=1)
-    bend: Floats = _cross(edges, np.roll(edges, -1, axis=1)).min(axis=1)
-    flag: NDArray[np.bool_] = bend >= -1e-9 * size
-    return flag
-
-
-def _cut_ears(flat: Floats) -> Indices:
-    """Triangles of polygons that wind anticlockwise, all of them one corner at a time."""
-    N, n, _ = flat.shape
-    size = np.square(np.ptp(flat, axis=1)).sum(axis=1)
-    after = np.tile((np.arange(n) + 1) % n, (N, 1))
-    before = np.tile((np.arange(n) - 1) % n, (N, 1))
-    alive, waiting = np.ones((N, n), dtype=bool), np.ones((N, n), dtype=bool)  # a corner waits until it is looked at
-    blocker = np.full((N, n), -1)  # what lies in a refused corner's triangle; when it goes, the corner waits again
-    corner, cut = np.zeros(N, dtype=np.int64), np.zeros(N, dtype=np.int64)
-    triangles = np.empty((N, n - 2, 3), dtype=np.int64)
-    rows = np.arange(N)
-    while len(rows):
-        candidates = waiting[rows]
-        crosses_itself = ~candidates.any(axis=1)
-        candidates[crosses_itself] = alive[rows[crosses_itself]]
-        ahead = (np.arange(n) - corner[rows, None]) % n  # the next one from where we are
-        b = np.where(candidates, ahead, n).argmin(axis=1)
-        a, c = before[rows, b], after[rows, b]
-        A, B, C = (flat[rows, i][:, None] for i in (a, b, c))
-        points, inside = flat[rows], alive[rows]
-        for start, stop in ((A, B), (B, C), (C, A)):
-            inside &= (_cross(stop - start, points - start) >= 0) & (points != start).any(axis=-1)
-        bend = _cross(B - A, C - B)[:, 0] / size[rows]
-        bent = bend > 1e-12
-        ear = crosses_itself | (np.abs(bend) <= 1e-12) | (bent & ~inside.any(axis=1))
-        waiting[rows, b] = False
-        blocker[rows, b] = np.where(bent, inside.argmax(axis=1), -1)
-        corner[rows] = b
-        done, a, b, c = rows[ear], a[ear], b[ear], c[ear]
-        triangles[done, cut[done]] = np.stack([a, b, c], axis=-1)
-        after[done, a], before[done, c] = c, a
-        alive[done, b] = False
-        waiting[done] |= blocker[done] == b[:, None]
-        waiting[done, a] = waiting[done, c] = True
-        waiting[done] &= alive[done]
-        corner[done] = after[done, c]  # leaving one out makes fewer slivers
-        cut[done] += 1
-        rows = rows[cut[rows] < n - 2]
-    return triangles
+    least_turn = (edges[..., 0] * ahead[..., 1] - edges[..., 1] * ahead[..., 0]).min(axis=1)
+    return np.asarray(~(least_turn >= -1e-9 * size), dtype=bool)

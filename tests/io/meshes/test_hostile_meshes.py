@@ -1,4 +1,4 @@
-"""Mesh files made to harm end in one line of ours, soon and in little memory."""
+"""Malicious mesh files end in a one-line error, soon and in little memory."""
 
 import base64
 import json
@@ -17,7 +17,7 @@ import curvireg_torch as cr
 from curvireg_torch import limits
 from curvireg_torch.errors import MeshError
 from curvireg_torch.io.meshes import files as mesh_files
-from curvireg_torch.io.meshes import gltf, polygon_files
+from curvireg_torch.io.meshes import gltf, polygons
 from curvireg_torch.io.meshes import mesh as mesh_module
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
@@ -59,7 +59,7 @@ def refused(path: Path, content: bytes, match: str, *, seconds: float = 5.0, meg
     assert path.name in str(caught.value)
 
 
-def test_the_triangle_itself_is_read(tmp_path: Path) -> None:
+def test_load_mesh_reads_the_valid_gltf_and_glb(tmp_path: Path) -> None:
     (tmp_path / "a.gltf").write_text(json.dumps(tree()))
     (tmp_path / "a.glb").write_bytes(glb(tree()))
     assert cr.load_mesh(tmp_path / "a.gltf").area == cr.load_mesh(tmp_path / "a.glb").area == 0.5
@@ -88,7 +88,7 @@ CHAIN = [{"children": [i + 1]} for i in range(1000)] + [{"mesh": 0}]
         ({"meshes": 5}, "valid glTF"),
     ],
 )
-def test_gltf_that_claims_or_asks_too_much(tmp_path: Path, changes: dict[str, Any], match: str) -> None:
+def test_check_gltf_refuses_false_claims(tmp_path: Path, changes: dict[str, Any], match: str) -> None:
     refused(tmp_path / "a.gltf", json.dumps(tree(**changes)).encode(), match)
     if "buffers" not in changes:
         refused(tmp_path / "a.glb", glb(tree(**changes)), match)
@@ -109,7 +109,7 @@ BINARY = struct.pack("<4sII", b"glTF", 2, 100)
         (BINARY + struct.pack("<I4s", 2, b"JSON") + b"[]", "JSON is no object"),
     ],
 )
-def test_glb_files_that_are_none(tmp_path: Path, data: bytes, match: str) -> None:
+def test_check_gltf_refuses_damaged_glb(tmp_path: Path, data: bytes, match: str) -> None:
     refused(tmp_path / "a.glb", data, match)
 
 
@@ -121,32 +121,24 @@ def test_glb_files_that_are_none(tmp_path: Path, data: bytes, match: str) -> Non
         ({"byteLength": 36, "uri": "data:;base64,AAAA"}, "a buffer claims 36 bytes, 3 are there"),
     ],
 )
-def test_gltf_whose_buffers_are_none(tmp_path: Path, buffer: dict[str, Any], match: str) -> None:
+def test_check_gltf_refuses_damaged_buffers(tmp_path: Path, buffer: dict[str, Any], match: str) -> None:
     refused(tmp_path / "a.gltf", json.dumps(tree(buffers=[buffer])).encode(), match)
 
 
-def test_copies_of_a_part_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_check_gltf_counts_every_copy_of_a_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gltf, "MAX_MESH_FACES", 100)
     refused(tmp_path / "a.gltf", json.dumps(tree(nodes=[{"mesh": 0}] * 200)).encode(), "more than 100 faces")
 
 
-def test_deep_json(tmp_path: Path) -> None:
+def test_check_gltf_refuses_deep_json(tmp_path: Path) -> None:
     refused(tmp_path / "a.gltf", b'{"asset": ' + b"[" * 1_000_000, "JSON is damaged")
 
 
-FOREIGN = [
-    "../b.bin",
-    "/etc/passwd",
-    "file:///etc/passwd",
-    "http://127.0.0.1:9/b.bin",
-    "%2e%2e/b.bin",
-    "link.bin",
-    "no.bin",
-]
-
-
-@pytest.mark.parametrize("uri", FOREIGN)
-def test_files_outside_the_folder_are_not_opened(tmp_path: Path, uri: str) -> None:
+@pytest.mark.parametrize(
+    "uri",
+    ["../b.bin", "/etc/passwd", "file:///etc/passwd", "http://127.0.0.1:9/b.bin", "%2e%2e/b.bin", "link.bin", "no.bin"],
+)
+def test_load_mesh_opens_no_file_outside_the_folder(tmp_path: Path, uri: str) -> None:
     folder = tmp_path / "inside"
     folder.mkdir()
     (tmp_path / "b.bin").write_bytes(POINTS)
@@ -155,13 +147,13 @@ def test_files_outside_the_folder_are_not_opened(tmp_path: Path, uri: str) -> No
     refused(folder / "a.gltf", json.dumps(content).encode(), "no file of its folder")
 
 
-def test_files_of_the_folder_are(tmp_path: Path) -> None:
+def test_load_mesh_opens_files_of_the_folder(tmp_path: Path) -> None:
     (tmp_path / "b c.bin").write_bytes(POINTS)
     (tmp_path / "a.gltf").write_text(json.dumps(tree(buffers=[{"byteLength": 36, "uri": "b%20c.bin"}])))
     assert cr.load_mesh(tmp_path / "a.gltf").area == 0.5
 
 
-def test_an_obj_names_materials_that_are_not_opened(tmp_path: Path) -> None:
+def test_load_mesh_ignores_materials_outside_the_folder(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_text("mtllib ../../secret.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl x\nf 1 2 3\n")
     assert cr.load_mesh(tmp_path / "a.obj").area == 0.5
 
@@ -187,11 +179,11 @@ PLY += b"property list uchar int vertex_indices\nend_header\n"
         ("a.obj", b"v 0 0 0\n" * 9 + b"f " + b"1 2 3 " * 2_000 + b"\n", "degenerate"),
     ],
 )
-def test_false_claims_of_other_formats(tmp_path: Path, name: str, content: bytes, match: str) -> None:
+def test_load_mesh_refuses_false_claims(tmp_path: Path, name: str, content: bytes, match: str) -> None:
     refused(tmp_path / name, content, match)
 
 
-def test_size_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_load_mesh_bounds_faces_and_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trimesh.creation.icosphere(3).export(tmp_path / "a.stl")
     content = (tmp_path / "a.stl").read_bytes()
     monkeypatch.setattr(mesh_module, "MAX_MESH_FACES", 1000)
@@ -201,10 +193,10 @@ def test_size_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert limits.MAX_MESH_FACES > 1_000_000
 
 
-def test_parts_stand_where_a_deep_tree_puts_them_and_soon(tmp_path: Path) -> None:
-    """trimesh alone multiplies the whole chain anew for each part, in an order that takes the cube of its length."""
-    turn = {"rotation": [0.0, 0.0, math.sin(math.radians(0.25)), math.cos(math.radians(0.25))]}  # half a degree
-    chain = [{"children": [i + 1], "translation": [0.01, 0, 0], **turn} for i in range(179)]
+def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path: Path) -> None:
+    """trimesh alone multiplies the whole chain again for each part."""
+    half_degree = {"rotation": [0.0, 0.0, math.sin(math.radians(0.25)), math.cos(math.radians(0.25))]}
+    chain = [{"children": [i + 1], "translation": [0.01, 0, 0], **half_degree} for i in range(179)]
     leaves = [{"mesh": 0, "translation": [0, 0, 0.1 * i]} for i in range(500)]
     nodes = [*chain, {"children": list(range(180, 680))}, *leaves]
     (tmp_path / "a.gltf").write_text(json.dumps(tree(nodes=nodes)))
@@ -215,11 +207,11 @@ def test_parts_stand_where_a_deep_tree_puts_them_and_soon(tmp_path: Path) -> Non
     at = 0.01 * np.exp(1j * np.radians(0.5 * np.arange(179))).sum()  # the chain's end, in the complex plane
     far = at + np.exp(1j * np.radians(0.5 * 179))  # the corner at x = 1 of a part
     vertices = mesh.vertices[np.isclose(mesh.vertices[:, 2], 0.7)]
-    for place in (at, far):
-        assert np.abs(vertices - [place.real, place.imag, 0.7]).max(axis=1).min() < 1e-6
+    for point in (at, far):
+        assert np.abs(vertices - [point.real, point.imag, 0.7]).max(axis=1).min() < 1e-6
 
 
-def test_parts_that_do_not_hang_on_the_base_are_placed_all_the_same() -> None:
+def test_as_mesh_places_parts_above_the_base_frame() -> None:
     scene = trimesh.Scene()
     scene.add_geometry(
         trimesh.creation.box(), node_name="a", transform=trimesh.transformations.translation_matrix([2, 0, 0])
@@ -231,7 +223,7 @@ def test_parts_that_do_not_hang_on_the_base_are_placed_all_the_same() -> None:
     assert np.allclose(np.sort(found.vertices, axis=0), np.sort(expected.vertices, axis=0))
 
 
-def test_polygons_are_counted_before_they_are_divided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_divide_faces_counts_before_it_divides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dart = b"OFF\n4 %d 0\n0 0 0\n1 2 0\n0 1 0\n-1 2 0\n" + b"4 0 1 2 3\n" * 10
     ply = PLY.replace(b"9000000", b"10") % (b"ascii", 4) + dart.split(b"\n", 2)[2]
     obj = b"v 0 0 0\nv 1 2 0\nv 0 1 0\nv -1 2 0\n" + b"f 1 2 3 4\n" * 10
@@ -239,18 +231,18 @@ def test_polygons_are_counted_before_they_are_divided(tmp_path: Path, monkeypatc
         monkeypatch.undo()
         (tmp_path / name).write_bytes(content)
         assert len(cr.load_mesh(tmp_path / name).faces) == 20
-        monkeypatch.setattr(polygon_files, "MAX_POLYGON_WORK", 159)
+        monkeypatch.setattr(polygons, "MAX_POLYGON_WORK", 159)
         refused(tmp_path / name, content, "not convex have too many corners")
-        monkeypatch.setattr(polygon_files, "MAX_MESH_FACES", 19)
+        monkeypatch.setattr(polygons, "MAX_MESH_FACES", 19)
         refused(tmp_path / name, content, "more than 19 faces")
-        monkeypatch.setattr(polygon_files, "MAX_MESH_LINES", 9)
+        monkeypatch.setattr(polygons, "MAX_MESH_LINES", 9)
         refused(tmp_path / name, content, "more than 9 lines")
     monkeypatch.undo()
-    monkeypatch.setattr(polygon_files, "MAX_POLYGON_WORK", 160)
+    monkeypatch.setattr(polygons, "MAX_POLYGON_WORK", 160)
     assert len(cr.load_mesh(tmp_path / "a.off").faces) == 20
 
 
-def test_a_part_whose_vertices_are_no_points_is_named():
+def test_as_mesh_refuses_a_part_with_malformed_vertices():
     odd = trimesh.Trimesh(np.zeros((3, 1)), [[0, 1, 2]], process=False)
     with pytest.raises(MeshError, match="put together"):
         mesh_module.as_mesh(trimesh.Scene([trimesh.creation.box(), odd]))
