@@ -97,7 +97,7 @@ def smoothings() -> dict[str, dict[str, float]]:
         def layer(name: str = name) -> Tensor:
             return filters.multiscale_curvilinear_saliency(photo, smoothing=name)
 
-        points = descriptors.field_points(layer(), share=0.013)
+        points = descriptors.field_points(layer(), fraction=0.013)
         rows[name] = {
             "seconds": smallest(layer, 5),
             "near_contour": round(float(grown(contour)[points].float().mean()), 3),

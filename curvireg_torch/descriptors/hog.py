@@ -4,11 +4,20 @@ import math
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import parametrize
 
 from ..errors import InvalidInputError
-from ..filters.blocks import Planes, in_blocks
-from ..filters.inputs import finite_vectors
-from ..filters.numerics import at_least_float32, floor, full_precision, image_maximum, readable, safe_sqrt
+from ..filters.blocks import Planes, apply_in_blocks
+from ..filters.inputs import zero_nonfinite_vectors
+from ..filters.learnable import OptionsModule, Positive
+from ..filters.numerics import (
+    at_least_float32,
+    full_precision,
+    image_maximum,
+    is_host_readable,
+    safe_eps,
+    safe_sqrt,
+)
 from ..utils.checks import check_field, check_option, check_positive, check_tensor
 
 __all__ = ["HOG", "hog", "hog_length", "orientation_cells"]
@@ -16,7 +25,7 @@ __all__ = ["HOG", "hog", "hog_length", "orientation_cells"]
 VOTINGS = ("linear", "hard")
 
 _EPSILON = 1e-5
-"""Length of a block, in units of the image's longest one, below which it is nothing rather than a direction."""
+"""Length of a block, relative to the longest block of the image, below which normalisation suppresses it."""
 
 
 def hog_length(*, grid: int = 8, bins: int = 9, block: int = 2) -> int:
@@ -39,24 +48,24 @@ def hog(
     voting: str = "linear",
     bin_weights: Tensor | None = None,
 ) -> Tensor:
-    """HOG (Dalal and Triggs 2005) of a vector field; the whole image is one grid of cells.
+    """HOG (Dalal and Triggs 2005) of a vector field; one grid of cells covers the whole image.
 
-    A pixel votes with the vector's length for the vector's orientation modulo 180 degrees. ``"linear"`` shares a vote
-    between the two nearest bins and the four nearest cells; ``"hard"`` gives it to one bin and one cell, as
-    ``skimage.feature.hog`` does. Cell histograms are means over the cell's area; blocks of ``block`` x ``block`` cells
-    are normalised by L2-Hys: to unit length, clipped, to unit length again. What counts as nothing is relative to the
-    image's strongest block, so the descriptor does not change with the field's unit or the photograph's contrast.
+    Each pixel votes with the length of its vector for the orientation of the vector modulo 180 degrees. ``"linear"``
+    voting interpolates between the two nearest bins and the four nearest cells; ``"hard"`` voting uses one bin and one
+    cell, as ``skimage.feature.hog`` does. Cell histograms are means over the cell area. Blocks of ``block`` x ``block``
+    cells are normalised by L2-Hys: to unit length, clipped, and to unit length again. The regularisation is relative to
+    the strongest block of the image, so the descriptor is invariant to the unit of the field and to contrast.
 
     Args:
         field: (B, 2, H, W), channel 0 = x, 1 = y, H and W >= grid. Vectors with a NaN or infinite component have no
             vote.
         grid: cells along each side.
         bins: orientations over 180 degrees.
-        block: cells along a block's side, <= grid.
-        clip: upper limit of L2-Hys in (0, 1]; 1 switches it off.
+        block: cells along the side of a block, <= grid.
+        clip: upper limit of L2-Hys in (0, 1]; 1 disables clipping.
         voting: ``"linear"`` or ``"hard"``.
-        bin_weights: (bins,) factor on every vote for a bin, >= 0; differentiated through. In a graph (compiled,
-            exported, under vmap) and on another device than the CPU the sign is not checked.
+        bin_weights: (bins,) factor >= 0 on every vote for a bin; differentiable. The sign is not checked while tracing
+            (compile, export, vmap) and on devices other than the CPU.
 
     Returns:
         (B, D), D = (grid - block + 1)^2 block^2 bins = 1764 by default, ordered block row, block column, cell row, cell
@@ -70,37 +79,37 @@ def hog(
         torch.Size([4, 1764])
     """
     check_field(field)
-    limit = _check_options(grid, bins, block, clip, voting)
+    clip = _check_options(grid, bins, block, clip, voting)
     H, W = field.shape[-2:]
     if min(H, W) < grid:
         raise InvalidInputError(f"field: expected at least {grid} x {grid} px for grid={grid}, got {H} x {W}")
     if bin_weights is not None:
         check_tensor(bin_weights, "bin_weights", (bins,))
-        if readable(bin_weights) and not bool((bin_weights >= 0).all()):
+        if is_host_readable(bin_weights) and not bool((bin_weights >= 0).all()):
             raise InvalidInputError(f"bin_weights: expected factors >= 0, got {bin_weights.tolist()}")
 
     def layer(field: Tensor) -> Planes:
-        votes = _orientation_votes(finite_vectors(field), bins, voting)
+        votes = _orientation_votes(zero_nonfinite_vectors(field), bins, voting)
         rows, columns = _cell_weights(H, grid, voting, votes), _cell_weights(W, grid, voting, votes)
         with full_precision(votes):
             cells = rows @ (votes @ columns.T)  # (B, bins, grid, grid)
         if bin_weights is not None:
             cells = cells * bin_weights.to(cells.dtype).view(1, -1, 1, 1)
-        return (_normalised_blocks(cells, block, limit),)
+        return (_normalised_blocks(cells, block, clip),)
 
-    return in_blocks(layer, at_least_float32(field)).to(field.dtype)
+    return apply_in_blocks(layer, at_least_float32(field)).to(field.dtype)
 
 
 def orientation_cells(field: Tensor, *, grid: tuple[int, int], bins: int = 9) -> Tensor:
-    """The histograms of :func:`hog` before blocks are made of them, on a grid that need not be square.
+    """Cell histograms of :func:`hog` before block normalisation, on a grid that may be rectangular.
 
     Args:
-        field: (B, 2, H, W), channel 0 = x, 1 = y; vectors that are not finite have no vote.
+        field: (B, 2, H, W), channel 0 = x, 1 = y; vectors with a NaN or infinite component have no vote.
         grid: rows and columns of cells, at most H and W.
         bins: orientations over 180 degrees.
 
     Returns:
-        (B, bins, rows, columns) mean length of the vectors of each orientation, in the field's unit.
+        (B, bins, rows, columns) mean vector length per orientation in the unit of the field.
 
     Raises:
         InvalidInputError: wrong shape, dtype or option, or fewer pixels than cells.
@@ -114,14 +123,14 @@ def orientation_cells(field: Tensor, *, grid: tuple[int, int], bins: int = 9) ->
     H, W = field.shape[-2:]
     if grid[0] > H or grid[1] > W:
         raise InvalidInputError(f"field: expected at least {grid[0]} x {grid[1]} px for {grid=}, got {H} x {W}")
-    votes = _orientation_votes(finite_vectors(at_least_float32(field)), bins, "linear")
+    votes = _orientation_votes(zero_nonfinite_vectors(at_least_float32(field)), bins, "linear")
     rows, columns = (_cell_weights(n, cells, "linear", votes) for n, cells in zip((H, W), grid, strict=True))
     with full_precision(votes):
         return (rows @ (votes @ columns.T)).to(field.dtype)
 
 
 def _check_options(grid: int, bins: int, block: int, clip: float, voting: str) -> float:
-    """clip."""
+    """Check the options; return clip."""
     check_option(voting, VOTINGS, "voting")
     if not 0 < clip <= 1:
         raise InvalidInputError(f"clip: expected 0 < clip <= 1, got {clip}")
@@ -131,26 +140,26 @@ def _check_options(grid: int, bins: int, block: int, clip: float, voting: str) -
 
 
 def _orientation_votes(field: Tensor, bins: int, voting: str) -> Tensor:
-    """(B, bins, H, W): each pixel's length, shared among the bins of its orientation."""
+    """(B, bins, H, W) vector length of each pixel, distributed over the bins of its orientation."""
     x, y = field[:, :1], field[:, 1:]
     length = safe_sqrt(x * x + y * y)
-    # atan2 has no derivative at the origin: give it (1, 0) there; by arithmetic, torch.where takes ten times as long.
+    # atan2 has no derivative at the origin: use (1, 0) there, by arithmetic, since torch.where takes ten times as long.
     angle = torch.atan2(y, x + (length == 0).to(x.dtype))
     position = torch.remainder(angle * (bins / math.pi), bins)  # bin i covers [i, i + 1)
     index = torch.arange(bins, device=field.device, dtype=field.dtype).view(1, -1, 1, 1)
     if voting == "hard":
-        # remainder may round up to ``bins`` itself.
+        # The remainder may round up to ``bins``.
         return length * (torch.floor(position).clamp(max=bins - 1) == index)
     if bins == 1:
         return length
-    # 1 - min(d, bins - d), written so that every step but the first can happen in place.
+    # 1 - min(d, bins - d), written so that all steps but the first are in place.
     half = 0.5 * bins
     distance = (position - (index + 0.5)).abs_().sub_(half).abs_()
     return distance.add_(1.0 - half).clamp_(min=0.0).mul_(length)
 
 
 def _cell_weights(length: int, grid: int, voting: str, like: Tensor) -> Tensor:
-    """(grid, length) share of each pixel in each cell along one axis, times the pixels-per-cell normalisation."""
+    """(grid, length) weight of each pixel in each cell along one axis, divided by the pixels per cell."""
     position = (torch.arange(length, device=like.device, dtype=like.dtype) + 0.5) * (grid / length)
     cell = torch.arange(grid, device=like.device, dtype=like.dtype)[:, None]
     if voting == "hard":
@@ -164,22 +173,22 @@ def _normalised_blocks(cells: Tensor, block: int, clip: float) -> Tensor:
     blocks = cells.unfold(2, block, 1).unfold(3, block, 1)  # (B, bins, n, n, block, block)
     blocks = blocks.permute(0, 2, 3, 4, 5, 1).flatten(3)  # (B, n, n, block * block * bins)
     squared = blocks.square().sum(-1, keepdim=True)
-    blocks = blocks / (squared + (_EPSILON**2 * image_maximum(squared) + floor(squared))).sqrt()
+    blocks = blocks / (squared + (_EPSILON**2 * image_maximum(squared) + safe_eps(squared))).sqrt()
     blocks = blocks.clamp(max=clip)
     blocks = blocks / (blocks.square().sum(-1, keepdim=True) + _EPSILON**2).sqrt()
     return blocks.flatten(1)
 
 
-class HOG(nn.Module):
-    """HOG of a vector field, as a layer; module twin of :func:`hog`.
+class HOG(OptionsModule):
+    """Module twin of :func:`hog`.
 
     Args:
         grid: cells along each side.
         bins: orientations over 180 degrees.
-        block: cells along a block's side, <= grid.
+        block: cells along the side of a block, <= grid.
         clip: upper limit of L2-Hys in (0, 1].
         voting: ``"linear"`` or ``"hard"``.
-        learnable: make the logarithms of the weights of the bins, 0 at first, a parameter, ``log_bin_weights``.
+        learnable: make ``bin_weights`` (bins,), initially 1, a positive parameter; otherwise it is None.
 
     Shape:
         Input (B, 2, H, W); output (B, D), D = :func:`hog_length` of grid, bins and block.
@@ -191,7 +200,10 @@ class HOG(nn.Module):
         (torch.Size([2, 324]), 324)
     """
 
-    log_bin_weights: nn.Parameter | None
+    bin_weights: Tensor | None
+    grid: int
+    bins: int
+    block: int
 
     def __init__(
         self,
@@ -203,15 +215,11 @@ class HOG(nn.Module):
         voting: str = "linear",
         learnable: bool = False,
     ) -> None:
-        super().__init__()
         _check_options(grid, bins, block, clip, voting)
-        self.grid, self.bins, self.block, self.clip, self.voting = grid, bins, block, clip, voting
-        self.log_bin_weights = nn.Parameter(torch.zeros(bins)) if learnable else None
-
-    @property
-    def bin_weights(self) -> Tensor | None:
-        """(bins,) learnt factors on the votes, positive after any step; None if not learnable."""
-        return None if self.log_bin_weights is None else self.log_bin_weights.exp()
+        super().__init__(grid=grid, bins=bins, block=block, clip=clip, voting=voting)
+        self.bin_weights = nn.Parameter(torch.ones(bins)) if learnable else None
+        if learnable:
+            parametrize.register_parametrization(self, "bin_weights", Positive())
 
     @property
     def length(self) -> int:
@@ -219,7 +227,7 @@ class HOG(nn.Module):
         return hog_length(grid=self.grid, bins=self.bins, block=self.block)
 
     def half_turned(self, descriptors: Tensor) -> Tensor:
-        """(B, D) of fields turned by 180 degrees, of the (B, D) of the fields: cells change places, orientations stay.
+        """Descriptors (B, D) of the fields rotated by 180 degrees: cells are permuted, orientations are unchanged.
 
         Example:
             >>> field, layer = torch.randn(1, 2, 64, 64), HOG()
@@ -231,15 +239,4 @@ class HOG(nn.Module):
         return cells.flip(1, 2, 3, 4).flatten(1)
 
     def forward(self, field: Tensor) -> Tensor:
-        return hog(
-            field,
-            grid=self.grid,
-            bins=self.bins,
-            block=self.block,
-            clip=self.clip,
-            voting=self.voting,
-            bin_weights=self.bin_weights,
-        )
-
-    def extra_repr(self) -> str:
-        return f"grid={self.grid}, bins={self.bins}, block={self.block}, clip={self.clip}, voting={self.voting!r}"
+        return hog(field, bin_weights=self.bin_weights, **self.options)

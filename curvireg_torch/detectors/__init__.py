@@ -1,7 +1,7 @@
-"""The 2D detectors that the paper compares, behind one call: photograph in, response map and feature points out.
+"""The 2D detectors that the paper compares, with one interface: photograph in, response map and feature points out.
 
-``DETECTORS[name](image, share=0.04)`` takes (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB, and returns a
-:class:`Detection`. Nothing is detected on NaN pixels, which are filled from around them.
+``DETECTORS[name](image, fraction=0.04)`` takes (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB, and returns a
+:class:`Detection`. NaN pixels are filled from their surroundings and have no detections.
 """
 
 from collections.abc import Callable
@@ -9,10 +9,9 @@ from collections.abc import Callable
 from ..utils.registry import Registry
 from .base import Detection
 from .corners import harris, minimum_eigenvalue
-from .edges import canny, laplacian_of_gaussian, sobel
+from .edges import canny, fuzzy_edges, laplacian_of_gaussian, sobel
 from .fast_hessian import fast_hessian
 from .fields import focus_curves, gradient, multiscale_saliency, principal_curvature
-from .fuzzy import fuzzy_edges
 from .keypoints import sift
 from .response import Response
 
@@ -51,4 +50,4 @@ DETECTORS: Registry[Callable[..., Detection]] = Registry(
         "surf": fast_hessian,
     },
 )
-"""Every detector of the comparison by its short name, the paper's own first."""
+"""Every detector of the comparison by its short name, the detectors of the paper first."""

@@ -1,4 +1,4 @@
-"""What every detector returns, and the steps that several of them share."""
+"""The result of a detector, and the steps that several detectors share."""
 
 import functools
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..descriptors.points import field_points, strongest_points
-from ..filters.inputs import fill_missing, grey, may_lack_pixels, missing
+from ..filters.inputs import fill_missing, may_have_missing, missing_mask, to_grey
 from ..filters.numerics import at_least_float32, safe_sqrt
 from ..utils.checks import check_colour_image
 
@@ -17,16 +17,16 @@ Function = TypeVar("Function", bound=Callable[..., "Detection"])
 
 
 class Detection(NamedTuple):
-    """A detector's answer."""
+    """Response map and feature points of a detector."""
 
     response: Tensor
-    """(B, 1, H, W) float32 or float64 >= 0, in the detector's own unit."""
+    """(B, 1, H, W) float32 or float64 >= 0, in a unit that depends on the detector."""
 
     points: Tensor
-    """(B, 1, H, W) bool feature points, at most the share of the pixels that was asked for (ties aside)."""
+    """(B, 1, H, W) bool feature points, at most the requested fraction of the pixels except for ties."""
 
     def coordinates(self) -> list[Tensor]:
-        """Per image the (N, 2) pixel coordinates x, y of its points, strongest first.
+        """Pixel coordinates x, y of the points of each image, (N, 2), strongest first.
 
         Example:
             >>> response = torch.tensor([[0.0, 1.0], [2.0, 0.0]])[None, None]
@@ -42,38 +42,38 @@ class Detection(NamedTuple):
 
 
 def detector(function: Function) -> Function:
-    """A detector on photographs by the rule of :mod:`curvireg_torch.filters.inputs`: it sees grey levels, all finite.
+    """Decorator that lets a detector on finite grey levels accept any photograph.
 
-    (B, 3, H, W) is RGB and becomes grey; half types compute in float32; NaN and infinite pixels are filled from around
-    them, and nothing is detected there.
+    (B, 3, H, W) is RGB and becomes grey; half types compute in float32. NaN and infinite pixels are filled from their
+    surroundings and have no detections.
     """
 
     @functools.wraps(function)
     def on_photograph(image: Tensor, **options: float) -> Detection:
         check_colour_image(image)
-        x = grey(at_least_float32(image))
-        if not may_lack_pixels(x):
+        x = to_grey(at_least_float32(image))
+        if not may_have_missing(x):
             return function(x, **options)
-        holes = missing(x)
-        response, points = function(fill_missing(x, holes), **options)
-        return Detection(torch.where(holes, 0.0, response), points & ~holes)
+        mask = missing_mask(x)
+        response, points = function(fill_missing(x, mask), **options)
+        return Detection(torch.where(mask, 0.0, response), points & ~mask)
 
     return cast(Function, on_photograph)
 
 
-def from_field(field: Tensor, share: float) -> Detection:
-    """Length of a vector field, and its maxima across the field's direction."""
+def detection_from_field(field: Tensor, fraction: float) -> Detection:
+    """Length of a vector field, and its maxima across the direction of the field."""
     response = safe_sqrt(field.square().sum(dim=1, keepdim=True))
-    return Detection(response, field_points(field, share=share))
+    return Detection(response, field_points(field, fraction=fraction))
 
 
-def from_peaks(response: Tensor, share: float) -> Detection:
-    """A response map, and those of its pixels that no pixel of their 3 x 3 neighbourhood exceeds."""
+def detection_from_peaks(response: Tensor, fraction: float) -> Detection:
+    """The positive part of a response map, and its maxima over 3 x 3 px."""
     response = response.clamp(min=0.0)
     peaks = response == F.max_pool2d(response, 3, stride=1, padding=1)
-    return Detection(response, strongest_points(response, peaks & (response > 0), share))
+    return Detection(response, strongest_points(response, peaks & (response > 0), fraction))
 
 
-def grey_bytes(image: Tensor) -> list[Tensor]:
-    """Each image as (H, W) uint8 in memory that OpenCV can read."""
+def to_uint8_images(image: Tensor) -> list[Tensor]:
+    """Each image as (H, W) uint8 in CPU memory, as OpenCV needs it."""
     return list((image.detach().float().clamp(0.0, 1.0) * 255.0).round().byte().cpu()[:, 0])

@@ -9,25 +9,25 @@ from ..utils.checks import check_positive
 from .base import Detection, detector
 
 OCTAVES = ((9, 15, 21, 27), (15, 27, 39, 51), (27, 51, 75, 99))
-"""Sides in px of the box filters, as in Bay et al.; a side of 9 stands for a Gaussian of sigma 1.2 px."""
+"""Sides in px of the box filters, as in Bay et al.; a side of 9 corresponds to a Gaussian of sigma 1.2 px."""
 
 
 @detector
-def fast_hessian(image: Tensor, *, threshold: float = 1e-4, share: float = 0.04) -> Detection:
+def fast_hessian(image: Tensor, *, threshold: float = 1e-4, fraction: float = 0.04) -> Detection:
     r"""Fast-Hessian (Bay et al. 2008): determinant of a Hessian of box filters, the detector of SURF.
 
-    Own code, since the wheels of OpenCV come without SURF: the second derivatives are sums over boxes, by an integral
-    image, divided by the filter's area; :math:`D_{xx} D_{yy} - (0.9 D_{xy})^2`. Points are maxima over 3 x 3 px and
-    three neighbouring sides of an octave. Every octave is sampled at every pixel, and positions are not refined below a
-    pixel. Filters that do not fit into the image are left out; borders are replicated. Sums run in float64 on the CPU.
+    Own code, because OpenCV packages come without SURF. The second derivatives are box sums, computed from an integral
+    image and divided by the filter area; the response is :math:`D_{xx} D_{yy} - (0.9 D_{xy})^2`. Points are maxima over
+    3 x 3 px and three neighbouring filter sides of an octave. Every octave is sampled at every pixel, without sub-pixel
+    refinement. Filters larger than the image are skipped; borders are replicated. Computed in float64 on the CPU.
 
     Args:
         image: (B, 1, H, W) grey levels in [0, 1].
         threshold: on the determinant, > 0.
-        share: largest share of the pixels that become points.
+        fraction: largest fraction of the pixels that become points.
 
     Returns:
-        response: the largest determinant over all sides, where positive.
+        The response is the largest determinant over all sides, where positive.
     """
     check_positive(threshold, "threshold")
     H, W = image.shape[-2:]
@@ -44,7 +44,7 @@ def fast_hessian(image: Tensor, *, threshold: float = 1e-4, share: float = 0.04)
         inner = volume[:, 0, 1:-1]
         strength = torch.where((inner == peaks) & (inner > threshold), inner, 0.0)
         best = torch.maximum(best, strength.amax(dim=1, keepdim=True))
-    points = strongest_points(best, best > 0, share)
+    points = strongest_points(best, best > 0, fraction)
     return Detection(response.float().to(image.device), points.to(image.device))
 
 
@@ -55,7 +55,7 @@ def _determinant(x: Tensor, side: int) -> Tensor:
     integral = F.pad(F.pad(x, (radius,) * 4, mode="replicate").cumsum(-1).cumsum(-2), (1, 0, 1, 0))
 
     def box(y0: int, x0: int, height: int, width: int) -> Tensor:
-        """Sum over the box whose top left pixel lies at (y0, x0) from the filter's centre."""
+        """Sum over the box whose top-left pixel is at (y0, x0) relative to the filter centre."""
         top, left = y0 + radius, x0 + radius
 
         def corner(dy: int, dx: int) -> Tensor:

@@ -4,21 +4,21 @@ import cv2
 import torch
 from torch import Tensor
 
-from ..utils.checks import check_share
-from .base import Detection, detector, grey_bytes
+from ..utils.checks import check_fraction
+from .base import Detection, detector, to_uint8_images
 
 
 @detector
-def sift(image: Tensor, *, share: float = 0.04) -> Detection:
-    """SIFT keypoints (Lowe 2004) by OpenCV with its defaults, each at the pixel nearest to it. Runs on the CPU.
+def sift(image: Tensor, *, fraction: float = 0.04) -> Detection:
+    """SIFT keypoints (Lowe 2004) by OpenCV with its defaults on the CPU, each rounded to the nearest pixel.
 
-    The response is OpenCV's contrast of the keypoint at its pixel (the largest where several meet), 0 elsewhere.
+    The response is the contrast of the strongest keypoint at each pixel, as OpenCV computes it, and 0 elsewhere.
     """
-    check_share(share, "share")
-    greys = grey_bytes(image)
+    check_fraction(fraction, "fraction")
+    greys = to_uint8_images(image)
     response = torch.zeros(image.shape, dtype=torch.float32)
     H, W = image.shape[-2:]
-    detector = cv2.SIFT.create(nfeatures=max(1, int(share * H * W)))
+    detector = cv2.SIFT.create(nfeatures=max(1, int(fraction * H * W)))
     for i, grey in enumerate(greys):
         for keypoint in detector.detect(grey.numpy(), None):
             x, y = (min(max(round(c), 0), n - 1) for c, n in zip(keypoint.pt, (W, H), strict=True))

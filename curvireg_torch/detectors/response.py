@@ -1,4 +1,4 @@
-"""Saliencies and detectors as kornia's response functions."""
+"""Filters and detectors as response functions of kornia."""
 
 from collections.abc import Callable
 
@@ -11,17 +11,17 @@ __all__ = ["Response"]
 
 
 class Response(nn.Module):
-    """How strong a layer or detector finds each pixel: the ``resp_module`` of ``kornia.feature.ScaleSpaceDetector``.
+    """Response map of a filter or detector, as ``resp_module`` of ``kornia.feature.ScaleSpaceDetector``.
 
     Args:
-        layer: from photographs (B, 1 or 3, H, W) to a vector field (B, 2, H, W), whose length is the response, to a
-            :class:`Detection`, whose response it is, or to a map (B, 1, H, W).
-        power: p of the factor sigma^p on the response of a level of scale sigma px, without which no level is a maximum
-            over scales: the number of derivatives that the response multiplies, 1 for a gradient, 2 for its square or a
-            curvature, 4 for the product of two curvatures.
+        layer: maps photographs (B, 1 or 3, H, W) to a vector field (B, 2, H, W), whose length is the response, to a
+            :class:`Detection`, whose response is used, or to a response map (B, 1, H, W).
+        power: p of the scale normalisation sigma^p, without which no level is a maximum over scales. Use the number of
+            derivatives in the response: 1 for a gradient, 2 for its square or a curvature, 4 for a product of two
+            curvatures.
 
     Shape:
-        Input (B, 1 or 3, H, W), and (B,) sigmas of the levels, as kornia passes them; output (B, 1, H, W).
+        Input (B, 1 or 3, H, W), and (B,) the sigma of each level, as kornia passes it; output (B, 1, H, W).
 
     Example:
         >>> import torch
@@ -35,9 +35,8 @@ class Response(nn.Module):
         self.layer, self.power = layer, power
 
     def forward(self, image: Tensor, sigmas: Tensor | None = None) -> Tensor:
-        answer = self.layer(image)
-        if isinstance(answer, Detection):
-            answer = answer.response
-        if answer.shape[1] > 1:
-            answer = safe_sqrt(answer.square().sum(dim=1, keepdim=True))
-        return answer if sigmas is None else answer * sigmas.to(answer).view(-1, 1, 1, 1) ** self.power
+        output = self.layer(image)
+        response = output.response if isinstance(output, Detection) else output
+        if response.shape[1] > 1:
+            response = safe_sqrt(response.square().sum(dim=1, keepdim=True))
+        return response if sigmas is None else response * sigmas.to(response).view(-1, 1, 1, 1) ** self.power

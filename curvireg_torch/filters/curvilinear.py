@@ -4,14 +4,14 @@ import math
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..utils.checks import check_image, check_mask, check_option, check_positive
-from .blocks import Planes, in_blocks
+from .blocks import Planes, apply_in_blocks
 from .derivatives import central_derivatives, central_gradient, smooth
-from .inputs import on_photograph
-from .learnable import as_number, check_width, keep_positive, positive_option
-from .numerics import at_least_float32, floor, owned, safe_sqrt, squared_length
+from .inputs import apply_to_photograph
+from .learnable import OptionsModule, check_scalar
+from .numerics import at_least_float32, clone_if_grad, safe_eps, safe_sqrt, squared_length
 
 __all__ = [
     "DepthCurvilinearSaliency",
@@ -21,39 +21,39 @@ __all__ = [
 ]
 
 BACKGROUND = 1.25
-"""Depth given to missing pixels, in units of the visible depth range behind the nearest visible point."""
+"""Depth of missing pixels behind the nearest visible point, in units of the visible depth range."""
 
-FLATTEST = 1e-6
-"""Visible range, as a share of the largest depth, below which depths differ by rounding only: 8 ulp of float32."""
+_MIN_RELATIVE_RANGE = 1e-6
+"""Visible depth range, relative to the largest depth, below which depths differ by rounding only: 8 ulp of float32."""
 
 FORMULAS = ("geometric", "paper")
 
 
 def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth with missing pixels at the largest number, and each image's nearest depth and range, (B, 1, 1, 1).
+    """Depth with missing pixels at the largest number; nearest depth and depth range of each image, (B, 1, 1, 1).
 
-    Missing is 0 or negative, inf, NaN, or outside ``mask``. A range of at most ``FLATTEST`` of the largest depth is a
-    renderer's rounding on a surface parallel to the image and must not be stretched: the largest depth is returned
-    instead, so that the unit of depth does not matter. An empty image has the range 1.
+    Missing pixels are 0, negative, inf, NaN or outside ``mask``. A range of at most 1e-6 of the largest depth is
+    rounding on a surface parallel to the image and must not be stretched: the largest depth is returned instead, so
+    that the unit of depth does not matter. The range of an empty image is 1.
     """
-    # The same twice: eager, torch.where takes seven times as long; compiled, nan_to_num is not vectorised.
+    # Two equivalent forms: eager, torch.where takes seven times as long; compiled, nan_to_num is not vectorised.
     compiling = torch.compiler.is_compiling()
     clean = torch.where(depth < math.inf, depth, 0.0) if compiling else depth.nan_to_num(0.0, 0.0, 0.0)
     if mask is not None:
         clean = torch.where(mask, clean, 0.0)
     far = clean.amax(dim=(1, 2, 3), keepdim=True)
-    seen = far > 0
+    visible = far > 0
     surface = F.threshold(clean, 0.0, torch.finfo(depth.dtype).max)
-    near = torch.where(seen, surface.amin(dim=(1, 2, 3), keepdim=True), 1.0)
+    near = torch.where(visible, surface.amin(dim=(1, 2, 3), keepdim=True), 1.0)
     span = far - near
-    return surface, near, torch.where(span > FLATTEST * far, span, torch.where(seen, far, 1.0))
+    return surface, near, torch.where(span > _MIN_RELATIVE_RANGE * far, span, torch.where(visible, far, 1.0))
 
 
 def fill_depth(depth: Tensor, mask: Tensor | None, depth_scale: float | None) -> Tensor:
-    """Depth as a graph surface over the image: nearest visible point at 0, missing pixels at ``BACKGROUND`` ranges.
+    """Depth as a graph surface: nearest visible point at 0, missing pixels at ``BACKGROUND`` depth ranges.
 
-    With ``depth_scale=None`` the visible range becomes 1; a number multiplies the depth instead. An image with no
-    visible pixel becomes a constant.
+    With ``depth_scale=None`` the visible range is scaled to 1; a number multiplies the depth instead. An image without
+    visible pixels becomes constant.
     """
     surface, near, span = visible_range(depth, mask)
     scale = 1.0 / span if depth_scale is None else depth_scale
@@ -76,16 +76,16 @@ def depth_curvilinear_saliency(
       prints :math:`I^{-1}II = M/\alpha`, it is :math:`\alpha^3 M`);
     - ``"paper"``: :math:`|\nabla Z| \sqrt{\mathrm{tr}(M)^2 - 4\det M}` (``lambdasD``).
 
-    The vector's direction is the eigenvector of M whose eigenvalue is largest in absolute value, sign free.
+    The vector is parallel to the eigenvector of M whose eigenvalue is largest in absolute value; its sign is arbitrary.
 
     Args:
         depth: (B, 1, H, W) z-depth in any unit. 0, negative, inf and NaN are background.
-        mask: bool, False = background; optional. (B, 1, H, W) or what broadcasts to it.
+        mask: bool, False = background; (B, 1, H, W) or broadcastable to it.
         sigma: smoothing in px before differentiation, >= 0.
         formula: ``"geometric"`` or ``"paper"``.
-        depth_scale: None rescales each image's visible depth range to 1, so that the vector points across occluding
-            contours (a range of at most 1e-6 of the largest depth is rounding and counts as none); a number multiplies
-            the depth (1 with depth in px gives curvature in 1/px).
+        depth_scale: None rescales each image's visible depth range to 1, so that vectors point across occluding
+            contours (a range of at most 1e-6 of the largest depth counts as rounding); a number multiplies the depth
+            (1 with depth in px gives curvature in 1/px).
 
     Returns:
         (B, 2, H, W) vector field, finite everywhere; its length is CS >= 0. dtype kept (half types compute in float32).
@@ -100,20 +100,20 @@ def depth_curvilinear_saliency(
         >>> round(float(field[0, :, 32, 32].norm()) * 40, 2)                          # 1 / radius
         1.0
     """
-    mask, scale = check_depth(depth, mask), check_scale(depth_scale)
-    width = check_width(sigma, "sigma", zero_ok=True)
+    mask, scale = check_depth(depth, mask), check_depth_scale(depth_scale)
+    sigma = check_scalar(sigma, "sigma", zero_ok=True)
     check_option(formula, FORMULAS, "formula")
 
     def layer(depth: Tensor, mask: Tensor | None) -> Planes:
-        factor, *m = _shape_operator(smooth(fill_depth(depth, mask, scale), width, linear=True), formula)
+        factor, *m = _shape_operator(smooth(fill_depth(depth, mask, scale), sigma, linear=True), formula)
         vx, vy, half_gap = dominant_eigenvector(*m)
-        return along(factor.mul_(half_gap), vx, vy)
+        return scaled_direction(factor.mul_(half_gap), vx, vy)
 
-    return in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
+    return apply_in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
 
 
 def check_depth(depth: Tensor, mask: Tensor | None) -> Tensor | None:
-    """The mask in the depth's shape."""
+    """Check both; return the mask expanded to the shape of the depth."""
     check_image(depth, "depth")
     if mask is None:
         return None
@@ -124,63 +124,65 @@ def check_depth(depth: Tensor, mask: Tensor | None) -> Tensor | None:
     return mask
 
 
-def check_scale(depth_scale: float | None) -> float | None:
+def check_depth_scale(depth_scale: float | None) -> float | None:
     return None if depth_scale is None else check_positive(depth_scale, "depth_scale")
 
 
 def _shape_operator(z: Tensor, formula: str) -> Planes:
-    """What CS is of half the difference of M's eigenvalues, and M row by row; z has a margin of 1 px."""
+    """Ratio of CS to half the eigenvalue difference of M, and M row by row, from z with a margin of 1 px."""
     zx, zy, zxx, zyy, zxy = central_derivatives(z)
     # M = adj(I_P) H_Z = H_Z + (z_y, -z_x)^T (u, -v).
     u, v = (zy * zxx).addcmul_(zx, zxy, value=-1), (zx * zyy).addcmul_(zy, zxy, value=-1)
-    m11, m12 = owned(zxx).addcmul_(zy, u), torch.addcmul(zxy, zy, v, value=-1)
-    m21, m22 = owned(zxy).addcmul_(zx, u, value=-1), owned(zyy).addcmul_(zx, v)
+    m11, m12 = clone_if_grad(zxx).addcmul_(zy, u), torch.addcmul(zxy, zy, v, value=-1)
+    m21, m22 = clone_if_grad(zxy).addcmul_(zx, u, value=-1), clone_if_grad(zyy).addcmul_(zx, v)
     if formula == "paper":
         return safe_sqrt(squared_length(zx, zy)).mul_(2.0), m11, m12, m21, m22
     # 2 alpha^3 = (c + c |grad Z|^2)^(-3/2)
     c = 2.0 ** (-2.0 / 3.0)
-    stretch = torch.addcmul(z.new_full((), c), zx, zx, value=c).addcmul_(zy, zy, value=c)
-    return stretch.rsqrt_().pow(3), m11, m12, m21, m22
+    metric = torch.addcmul(z.new_full((), c), zx, zx, value=c).addcmul_(zy, zy, value=c)
+    return metric.rsqrt_().pow(3), m11, m12, m21, m22
 
 
 def dominant_eigenvector(
     m11: Tensor, m12: Tensor, m21: Tensor, m22: Tensor, sign: float | Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Of M = [[m11, m12], [m21, m22]] with real eigenvalues: (vx, vy, half the eigenvalues' difference >= 0).
+    """Dominant eigenvector of [[m11, m12], [m21, m22]] with real eigenvalues, and half the eigenvalue difference.
 
-    (vx, vy) is an eigenvector, of any length, to the eigenvalue largest in absolute value (with ``sign`` 1 simply to
-    the largest); 0 if M is a multiple of 1.
+    Returns:
+        (vx, vy, half_gap): (vx, vy), of any length, belongs to the eigenvalue largest in absolute value, or with
+        ``sign=1`` to the largest one. It is 0 for a multiple of the identity.
     """
     gap = m11 - m22
-    # tr^2 / 4 - det, in the form that does not cancel.
+    # tr^2 / 4 - det in a form without cancellation.
     half_gap = safe_sqrt((m12 * m21).addcmul_(gap, gap, value=0.25))
-    # With s the sign, (s half_gap + gap / 2, m21) and (m12, s half_gap - gap / 2) are both eigenvectors. Take the one
-    # that does not cancel; by arithmetic, as torch.where by an unpredictable mask costs a CPU 27 additions.
+    # (s half_gap + gap / 2, m21) and (m12, s half_gap - gap / 2), where s is the sign, are both eigenvectors. Take the
+    # one without cancellation, by arithmetic: torch.where with an unpredictable mask costs a CPU as much as 27
+    # additions.
     sign = (m11 + m22).ge_(0.0).mul_(2.0).sub_(1.0) if sign is None else sign
     diagonal = gap.abs().mul_(0.5).add_(half_gap).mul_(sign)
     first = (gap * sign).ge_(0.0)
     return torch.lerp(m12, diagonal, first), torch.lerp(diagonal, m21, first), half_gap
 
 
-def along(length: Tensor, vx: Tensor, vy: Tensor) -> Planes:
-    """The vectors of the given length along (vx, vy), as planes; the zero vector stays zero."""
+def scaled_direction(length: Tensor, vx: Tensor, vy: Tensor) -> Planes:
+    """Vectors parallel to (vx, vy) with the given length, as planes; 0 where (vx, vy) is 0."""
     squared = squared_length(vx, vy)
-    scale = squared.clamp_(min=floor(squared)).rsqrt_() * length
+    scale = squared.clamp_(min=safe_eps(squared)).rsqrt_() * length
     return vx * scale, vy * scale
 
 
-def x_if_none(vx: Tensor, vy: Tensor) -> Tensor:
-    """vx, and 1 where (vx, vy) is next to 0: where every direction is as good as any other, take x."""
+def default_to_x(vx: Tensor, vy: Tensor) -> Tensor:
+    """vx, replaced by 1 where (vx, vy) is numerically 0 and the direction is arbitrary."""
     squared = squared_length(vx, vy)
-    return torch.where(squared <= floor(squared), 1.0, vx)
+    return torch.where(squared <= safe_eps(squared), 1.0, vx)
 
 
 def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
     r"""Curvilinear saliency of a photograph, :math:`\mu_1-\mu_2 = |\nabla I|^2` (the paper's ``equ:PG:004``).
 
     Args:
-        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB; NaN pixels are missing (0 in the
-            result).
+        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB. NaN pixels are missing: 0 in the
+            result.
         sigma: smoothing in px before differentiation, >= 0.
 
     Returns:
@@ -194,27 +196,27 @@ def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) ->
         >>> image_curvilinear_saliency(ramp, sigma=0.0)[0, :, 4, 4].tolist()
         [9.0, 0.0]
     """
-    width = check_width(sigma, "sigma", zero_ok=True)
+    checked_sigma = check_scalar(sigma, "sigma", zero_ok=True)
 
     def layer(x: Tensor) -> Planes:
-        gx, gy = central_gradient(smooth(x, width))
+        gx, gy = central_gradient(smooth(x, checked_sigma))
         length = safe_sqrt(squared_length(gx, gy))
         return gx * length, gy * length
 
-    return on_photograph(layer, image)
+    return apply_to_photograph(layer, image)
 
 
-class DepthCurvilinearSaliency(nn.Module):
-    """Curvilinear saliency of depth images, as a layer; module twin of :func:`depth_curvilinear_saliency`.
+class DepthCurvilinearSaliency(OptionsModule):
+    """Module twin of :func:`depth_curvilinear_saliency`.
 
     Args:
         sigma: smoothing in px before differentiation, >= 0.
         formula: ``"geometric"`` or ``"paper"``.
         depth_scale: None rescales each image's visible depth range to 1; a number multiplies the depth.
-        learnable: make the logarithm of sigma a parameter, ``log_sigma``; then sigma > 0.
+        learnable: make sigma a positive parameter.
 
     Shape:
-        Input (B, 1, H, W) depth and, optionally, a mask that broadcasts to it; output (B, 2, H, W).
+        Input (B, 1, H, W) depth and optionally a mask that broadcasts to it; output (B, 2, H, W).
 
     Example:
         >>> import torch
@@ -222,8 +224,6 @@ class DepthCurvilinearSaliency(nn.Module):
         >>> round(float(DepthCurvilinearSaliency()(plane).norm()), 3)
         0.0
     """
-
-    sigma = positive_option("sigma")
 
     def __init__(
         self,
@@ -233,28 +233,23 @@ class DepthCurvilinearSaliency(nn.Module):
         depth_scale: float | None = None,
         learnable: bool = False,
     ) -> None:
-        super().__init__()
         check_option(formula, FORMULAS, "formula")
-        check_width(sigma, "sigma", zero_ok=True)
-        check_scale(depth_scale)
-        keep_positive(self, learnable, sigma=sigma)
-        self.formula, self.depth_scale = formula, depth_scale
-
-    def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
-        return depth_curvilinear_saliency(
-            depth, mask, sigma=self.sigma, formula=self.formula, depth_scale=self.depth_scale
+        check_scalar(sigma, "sigma", zero_ok=True)
+        check_depth_scale(depth_scale)
+        super().__init__(
+            sigma=sigma, formula=formula, depth_scale=depth_scale, learnable=("sigma",) if learnable else ()
         )
 
-    def extra_repr(self) -> str:
-        return f"sigma={as_number(self.sigma)}, formula={self.formula!r}, depth_scale={self.depth_scale}"
+    def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
+        return depth_curvilinear_saliency(depth, mask, **self.options)
 
 
-class ImageCurvilinearSaliency(nn.Module):
-    """Curvilinear saliency of photographs, as a layer; module twin of :func:`image_curvilinear_saliency`.
+class ImageCurvilinearSaliency(OptionsModule):
+    """Module twin of :func:`image_curvilinear_saliency`.
 
     Args:
         sigma: smoothing in px before differentiation, >= 0.
-        learnable: make its logarithm a parameter, ``log_sigma``; then > 0.
+        learnable: make sigma a positive parameter.
 
     Shape:
         Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
@@ -262,19 +257,13 @@ class ImageCurvilinearSaliency(nn.Module):
     Example:
         >>> import torch
         >>> layer = ImageCurvilinearSaliency(learnable=True)
-        >>> layer(torch.rand(2, 3, 32, 32)).shape, [name for name, _ in layer.named_parameters()]
-        (torch.Size([2, 2, 32, 32]), ['log_sigma'])
+        >>> layer(torch.rand(2, 3, 32, 32)).shape, len(list(layer.parameters()))
+        (torch.Size([2, 2, 32, 32]), 1)
     """
 
-    sigma = positive_option("sigma")
-
     def __init__(self, *, sigma: float = 1.0, learnable: bool = False) -> None:
-        super().__init__()
-        check_width(sigma, "sigma", zero_ok=True)
-        keep_positive(self, learnable, sigma=sigma)
+        check_scalar(sigma, "sigma", zero_ok=True)
+        super().__init__(sigma=sigma, learnable=("sigma",) if learnable else ())
 
     def forward(self, image: Tensor) -> Tensor:
-        return image_curvilinear_saliency(image, sigma=self.sigma)
-
-    def extra_repr(self) -> str:
-        return f"sigma={as_number(self.sigma)}"
+        return image_curvilinear_saliency(image, **self.options)

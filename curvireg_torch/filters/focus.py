@@ -5,30 +5,29 @@ import math
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_option, check_positive
 from .blocks import Planes
-from .curvilinear import along
+from .curvilinear import scaled_direction
 from .derivatives import central_gradient, smooth
-from .inputs import on_photograph
-from .learnable import as_number, check_width, keep_positive, positive_option
-from .numerics import floor, image_maximum, safe_sqrt, squared_length
+from .inputs import apply_to_photograph
+from .learnable import OptionsModule, check_scalar
+from .numerics import image_maximum, safe_eps, safe_sqrt, squared_length
 
 __all__ = ["EdgeBlur", "MultiScaleFocusCurves", "edge_blur", "multiscale_focus_curves"]
 
 MODES = ("reblur-image", "reblur-saliency")
 MAX_BLUR = 1000.0
-"""Blur in px reported where re-blurring changes nothing (no edge, or infinitely smooth)."""
+"""Blur in px reported where re-blurring does not lower the saliency."""
 
 _DIFFERENCE_VARIANCE = 0.36
-"""Variance in px^2 that the 3-tap central difference itself adds to an edge: its second moment is 1/3, but it is not a
-Gaussian, and 0.36 lowers the largest error at blurs of 1 to 4 px from 3.1 to 1.8 %."""
+"""Variance in px^2 that the central difference adds to an edge. Its second moment is 1/3, but it is not a Gaussian;
+0.36 lowers the largest error at blurs of 1 to 4 px from 3.1 to 1.8 %."""
 
-_EDGE_FLOOR = 1e-3
-"""CS below this share of the image's largest CS is not an edge (noise is infinitely sharp); about 3 % of the
-contrast."""
+_MIN_RELATIVE_SALIENCY = 1e-3
+"""CS relative to the largest CS of the image below which a pixel is noise, not an edge; about 3 % of the contrast."""
 
 
 def edge_blur(
@@ -37,20 +36,20 @@ def edge_blur(
     reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0),
     mode: str = "reblur-image",
 ) -> Tensor:
-    r"""Blur (standard deviation, px) of the step edge through each pixel, one estimate per re-blurring.
+    r"""Blur (standard deviation in px) of the step edge through each pixel, one estimate per re-blurring.
 
     With :math:`R_i = CS / CS_i` at the edge, where CS is :math:`|\nabla I|^2`:
 
     - ``"reblur-image"``: :math:`CS_i = |\nabla(I * g_i)|^2`, :math:`R_i = 1 + \sigma_i^2/\sigma^2`, so
       :math:`s_i = \sigma_i/\sqrt{R_i-1}`;
-    - ``"reblur-saliency"`` (the letter of the paper's ``CSmultiscale``): :math:`CS_i = CS * g_i`,
+    - ``"reblur-saliency"`` (the paper's ``CSmultiscale`` as printed): :math:`CS_i = CS * g_i`,
       :math:`R_i = \sqrt{1+2\sigma_i^2/\sigma^2}`, so :math:`s_i = \sqrt 2\,\sigma_i/\sqrt{R_i^2-1}`.
 
-    (The paper writes :math:`R_i = CS_i/CS`, which is below 1 on an edge.) The blur of the derivative kernel is
-    subtracted. The estimate is right on the edge's centre line; beside it :math:`R_i` falls and the blur grows.
+    (The paper prints :math:`R_i = CS_i/CS`, which is below 1 on an edge.) The blur of the derivative kernel is
+    subtracted. The estimate is accurate on the centre line of the edge and grows beside it.
 
     Args:
-        image: (B, 1, H, W) grey levels, or (B, 3, H, W) RGB; NaN pixels are missing (1000 in the result).
+        image: (B, 1, H, W) grey levels, or (B, 3, H, W) RGB. NaN pixels are missing: 1000 in the result.
         reblur_sigmas: S re-blurring sigmas in px, > 0.
         mode: ``"reblur-image"`` or ``"reblur-saliency"``.
 
@@ -67,13 +66,13 @@ def edge_blur(
         >>> abs(float(edge_blur(edge)[0, 0, 32, 32]) - 2.0) < 0.06
         True
     """
-    widths = _check_reblurring(reblur_sigmas, mode)
+    sigmas = _check_reblurring(reblur_sigmas, mode)
 
     def layer(x: Tensor) -> Planes:
         gx, gy = central_gradient(smooth(x, 0.0))
-        return tuple(_edge_blur(x, squared_length(gx, gy), widths, mode))
+        return tuple(_edge_blur(x, squared_length(gx, gy), sigmas, mode))
 
-    return on_photograph(layer, image, where_missing=MAX_BLUR)
+    return apply_to_photograph(layer, image, missing_value=MAX_BLUR)
 
 
 def _check_reblurring(reblur_sigmas: Sequence[float], mode: str) -> list[float]:
@@ -94,7 +93,7 @@ def _edge_blur(x: Tensor, saliency: Tensor, reblur_sigmas: Sequence[float], mode
         else:
             reblurred = smooth(saliency, sigma, margin=0)
             numerator, denominator = 2.0 * sigma**2 * reblurred.square(), saliency.square() - reblurred.square()
-        numerator = numerator + floor(numerator)
+        numerator = numerator + safe_eps(numerator)
         quotient = numerator / torch.maximum(denominator, numerator / (MAX_BLUR**2 + _DIFFERENCE_VARIANCE))
         blurs.append(safe_sqrt(quotient - _DIFFERENCE_VARIANCE))
     return blurs
@@ -109,20 +108,20 @@ def multiscale_focus_curves(
     saliency_weight: float = 1.0,
     threshold: float | None = None,
 ) -> Tensor:
-    r"""MFC: edges in focus (the paper's section "Multi Focus Curves"), with the sharpest edges longest.
+    r"""MFC (the paper's section "Multi Focus Curves"): edges in focus, the sharpest with the largest length.
 
-    The image is re-blurred by 1, 2, ..., n-1 px. A pixel is kept where its focus :math:`1/s_i` exceeds T at all n-1
-    scales and its saliency exceeds 0.1 % of the image's largest (flat noise is infinitely sharp). Its value is
-    :math:`1/\max_i s_i` (the paper's ``ratiogradientMerge``, whose arg is a slip). The measured blur of a step edge
-    includes the pre-smoothing ``sigma``, so that its value is at most 1/sigma. Noise, thin lines and corners are not
-    step edges: their value is limited at every sigma by the derivative kernel alone, to 1/0.6 = 1.67 per px.
+    The image is re-blurred by 1, 2, ..., n-1 px. A pixel is retained where its focus :math:`1/s_i` exceeds T at all n-1
+    scales and its saliency exceeds 0.1 % of the largest in the image, which rejects noise in flat regions. Its value is
+    :math:`1/\max_i s_i` (the paper's ``ratiogradientMerge``, where arg is a misprint). The measured blur of a step edge
+    includes the pre-smoothing ``sigma``, so its value is at most 1/sigma. Noise, thin lines and corners are not step
+    edges; only the derivative kernel limits their value, to 1/0.6 = 1.67 per px at every sigma.
 
     Args:
-        image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB; NaN pixels are missing (0 in the result).
+        image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB. NaN pixels are missing: 0 in the result.
         scales: n >= 2.
-        sigma: smoothing in px before everything else.
+        sigma: smoothing in px before all other steps, >= 0.
         mode: of :func:`edge_blur`.
-        saliency_weight: p >= 0: the focus is multiplied by :math:`CS^p`. 0 is the focus alone, 0.5 multiplies by
+        saliency_weight: p >= 0; the focus is multiplied by :math:`CS^p`. 0 is the focus alone, 0.5 multiplies by
             :math:`|\nabla I|`; 1 ranks the views of real photographs best.
         threshold: T >= 0 in 1/px; None is the paper's :math:`e^{-n}`.
 
@@ -137,25 +136,25 @@ def multiscale_focus_curves(
         torch.Size([2, 2, 32, 32])
     """
     power, limit = _check_focus(scales, mode, saliency_weight, threshold)
-    width = check_width(sigma, "sigma", zero_ok=True)
+    checked_sigma = check_scalar(sigma, "sigma", zero_ok=True)
 
     def layer(image: Tensor) -> Planes:
-        x = smooth(image, width)
+        x = smooth(image, checked_sigma)
         gx, gy = central_gradient(x)
         x = x[..., 1:-1, 1:-1]
         saliency = squared_length(gx, gy)
         blur = functools.reduce(torch.maximum, _edge_blur(x, saliency, [float(i) for i in range(1, scales)], mode))
-        # Sub-pixel blur is not measurable: it counts as the derivative kernel's own.
+        # Blur below that of the derivative kernel cannot be measured.
         focus = blur.clamp(min=_DIFFERENCE_VARIANCE**0.5).reciprocal()
-        kept = (focus > limit) & (saliency > _EDGE_FLOOR * image_maximum(saliency))
-        weight = saliency.clamp(min=floor(saliency)) ** power
-        return along(focus * weight * kept, gx, gy)
+        retained = (focus > limit) & (saliency > _MIN_RELATIVE_SALIENCY * image_maximum(saliency))
+        weight = saliency.clamp(min=safe_eps(saliency)) ** power
+        return scaled_direction(focus * weight * retained, gx, gy)
 
-    return on_photograph(layer, image)
+    return apply_to_photograph(layer, image)
 
 
 def _check_focus(scales: int, mode: str, saliency_weight: float, threshold: float | None) -> tuple[float, float]:
-    """p and T."""
+    """Check the options; return p and T."""
     check_option(mode, MODES, "mode")
     if scales < 2:
         raise InvalidInputError(f"scales: expected >= 2, got {scales}")
@@ -163,8 +162,8 @@ def _check_focus(scales: int, mode: str, saliency_weight: float, threshold: floa
     return check_positive(saliency_weight, "saliency_weight", zero_ok=True), limit
 
 
-class EdgeBlur(nn.Module):
-    """Blur of the step edge through each pixel, as a layer; module twin of :func:`edge_blur`.
+class EdgeBlur(OptionsModule):
+    """Module twin of :func:`edge_blur`.
 
     Args:
         reblur_sigmas: S re-blurring sigmas in px, > 0.
@@ -180,27 +179,23 @@ class EdgeBlur(nn.Module):
     """
 
     def __init__(self, *, reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0), mode: str = "reblur-image") -> None:
-        super().__init__()
         _check_reblurring(reblur_sigmas, mode)
-        self.reblur_sigmas, self.mode = tuple(reblur_sigmas), mode
+        super().__init__(reblur_sigmas=tuple(reblur_sigmas), mode=mode)
 
     def forward(self, image: Tensor) -> Tensor:
-        return edge_blur(image, reblur_sigmas=self.reblur_sigmas, mode=self.mode)
-
-    def extra_repr(self) -> str:
-        return f"reblur_sigmas={self.reblur_sigmas}, mode={self.mode!r}"
+        return edge_blur(image, **self.options)
 
 
-class MultiScaleFocusCurves(nn.Module):
-    """MFC, as a layer; module twin of :func:`multiscale_focus_curves`.
+class MultiScaleFocusCurves(OptionsModule):
+    """Module twin of :func:`multiscale_focus_curves`.
 
     Args:
         scales: n >= 2; the image is re-blurred by 1, 2, ..., n-1 px.
-        sigma: smoothing in px before everything else, >= 0.
+        sigma: smoothing in px before all other steps, >= 0.
         mode: of :func:`edge_blur`.
-        saliency_weight: p >= 0: the focus is multiplied by CS^p.
+        saliency_weight: p >= 0; the focus is multiplied by CS^p.
         threshold: T >= 0 in 1/px; None is e^-n.
-        learnable: make the logarithm of sigma a parameter, ``log_sigma``; then sigma > 0.
+        learnable: make sigma a positive parameter.
 
     Shape:
         Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
@@ -212,8 +207,6 @@ class MultiScaleFocusCurves(nn.Module):
         torch.Size([2, 1764])
     """
 
-    sigma = positive_option("sigma")
-
     def __init__(
         self,
         *,
@@ -224,25 +217,16 @@ class MultiScaleFocusCurves(nn.Module):
         threshold: float | None = None,
         learnable: bool = False,
     ) -> None:
-        super().__init__()
         _check_focus(scales, mode, saliency_weight, threshold)
-        check_width(sigma, "sigma", zero_ok=True)
-        keep_positive(self, learnable, sigma=sigma)
-        self.scales, self.mode = scales, mode
-        self.saliency_weight, self.threshold = saliency_weight, threshold
+        check_scalar(sigma, "sigma", zero_ok=True)
+        super().__init__(
+            scales=scales,
+            sigma=sigma,
+            mode=mode,
+            saliency_weight=saliency_weight,
+            threshold=threshold,
+            learnable=("sigma",) if learnable else (),
+        )
 
     def forward(self, image: Tensor) -> Tensor:
-        return multiscale_focus_curves(
-            image,
-            scales=self.scales,
-            sigma=self.sigma,
-            mode=self.mode,
-            saliency_weight=self.saliency_weight,
-            threshold=self.threshold,
-        )
-
-    def extra_repr(self) -> str:
-        return (
-            f"scales={self.scales}, sigma={as_number(self.sigma)}, mode={self.mode!r}, "
-            f"saliency_weight={self.saliency_weight}, threshold={self.threshold}"
-        )
+        return multiscale_focus_curves(image, **self.options)

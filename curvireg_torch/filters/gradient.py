@@ -1,10 +1,10 @@
 """The gradient of photographs, the paper's IG."""
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from .derivatives import central_gradient, smooth
-from .inputs import on_photograph
-from .learnable import as_number, check_width, keep_positive, positive_option
+from .inputs import apply_to_photograph
+from .learnable import OptionsModule, check_scalar
 
 __all__ = ["ImageGradient", "image_gradient"]
 
@@ -13,8 +13,8 @@ def image_gradient(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
     """Gradient of the Gaussian-smoothed image, the paper's IG.
 
     Args:
-        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB; NaN pixels are missing (0 in the
-            result).
+        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB. NaN pixels are missing: 0 in the
+            result.
         sigma: smoothing in px before differentiation, >= 0.
 
     Returns:
@@ -29,16 +29,16 @@ def image_gradient(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
         >>> image_gradient(ramp, sigma=0.0)[0, :, 4, 4].tolist()
         [1.0, 0.0]
     """
-    width = check_width(sigma, "sigma", zero_ok=True)
-    return on_photograph(lambda x: central_gradient(smooth(x, width)), image)
+    checked_sigma = check_scalar(sigma, "sigma", zero_ok=True)
+    return apply_to_photograph(lambda x: central_gradient(smooth(x, checked_sigma)), image)
 
 
-class ImageGradient(nn.Module):
-    """Gradient of the Gaussian-smoothed image, as a layer; module twin of :func:`image_gradient`.
+class ImageGradient(OptionsModule):
+    """Module twin of :func:`image_gradient`.
 
     Args:
         sigma: smoothing in px before differentiation, >= 0.
-        learnable: make its logarithm a parameter, ``log_sigma``; then > 0.
+        learnable: make sigma a positive parameter.
 
     Shape:
         Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
@@ -50,15 +50,9 @@ class ImageGradient(nn.Module):
         [1.0, 0.0]
     """
 
-    sigma = positive_option("sigma")
-
     def __init__(self, *, sigma: float = 1.0, learnable: bool = False) -> None:
-        super().__init__()
-        check_width(sigma, "sigma", zero_ok=True)
-        keep_positive(self, learnable, sigma=sigma)
+        check_scalar(sigma, "sigma", zero_ok=True)
+        super().__init__(sigma=sigma, learnable=("sigma",) if learnable else ())
 
     def forward(self, image: Tensor) -> Tensor:
-        return image_gradient(image, sigma=self.sigma)
-
-    def extra_repr(self) -> str:
-        return f"sigma={as_number(self.sigma)}"
+        return image_gradient(image, **self.options)

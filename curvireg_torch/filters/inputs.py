@@ -1,4 +1,4 @@
-"""What comes in as a photograph, for every layer and detector: colour, missing pixels, half types."""
+"""Photographs as input of every layer and detector: colour, missing pixels, half precision."""
 
 import math
 from collections.abc import Callable
@@ -8,80 +8,90 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..utils.checks import check_colour_image
-from .blocks import Planes, in_blocks
-from .numerics import at_least_float32, readable
+from .blocks import Planes, apply_in_blocks
+from .numerics import at_least_float32, is_host_readable
 
-__all__ = ["fill_missing", "filled", "finite_vectors", "grey", "may_lack_pixels", "missing", "on_photograph"]
+__all__ = [
+    "apply_to_photograph",
+    "fill_missing",
+    "may_have_missing",
+    "missing_mask",
+    "to_grey",
+    "zero_nonfinite_vectors",
+]
 
-LUMA = (0.299, 0.587, 0.114)
-"""Weights of red, green and blue in a grey level, kornia's ``rgb_to_grayscale``."""
-
-_HALVINGS = 5
-"""Holes of up to 2^5 px are filled from around them, larger ones in their middle with the mean of the image."""
+_PYRAMID_LEVELS = 5
+"""Holes of up to 2^5 px are filled from their surroundings, the middle of larger ones with the mean of the image."""
 
 
-def on_photograph(layer: Callable[[Tensor], Planes], image: Tensor, *, where_missing: float = 0.0) -> Tensor:
-    """``layer`` on photographs by the one rule for what comes in.
+def apply_to_photograph(layer: Callable[[Tensor], Planes], image: Tensor, *, missing_value: float = 0.0) -> Tensor:
+    """Apply ``layer`` to photographs with the same input conventions for every layer.
 
-    (B, 3, H, W) is RGB and becomes grey as :func:`grey` says. NaN and infinite pixels are missing: they are filled from
-    around them before the layer, and its result there is ``where_missing``. Half types compute in float32; the result
-    has the image's dtype.
+    (B, 3, H, W) is RGB and converted by :func:`to_grey`. NaN and infinite pixels are missing: they are filled from
+    their surroundings before the layer runs, and its result there is ``missing_value``. Half types compute in float32;
+    the result has the dtype of the image.
     """
     check_colour_image(image)
 
     def on_filled(x: Tensor) -> Planes:
-        if not may_lack_pixels(x):
+        if not may_have_missing(x):
             return layer(x)
-        holes = missing(x)
-        return tuple(torch.where(holes, where_missing, plane) for plane in layer(fill_missing(x, holes)))
+        mask = missing_mask(x)
+        return tuple(torch.where(mask, missing_value, plane) for plane in layer(fill_missing(x, mask)))
 
-    return in_blocks(on_filled, grey(at_least_float32(image))).to(image.dtype)
+    return apply_in_blocks(on_filled, to_grey(at_least_float32(image))).to(image.dtype)
 
 
-def grey(image: Tensor) -> Tensor:
-    """(B, 1, H, W) of (B, 1, H, W), as it is, or of (B, 3, H, W) RGB: 0.299 R + 0.587 G + 0.114 B."""
+def to_grey(image: Tensor) -> Tensor:
+    """(B, 1, H, W) grey levels of (B, 3, H, W) RGB, 0.299 R + 0.587 G + 0.114 B; a grey image is returned unchanged."""
     if image.shape[1] == 1:
         return image
+    # kornia's rgb_to_grayscale has the same weights and rounds differently, which would change results.
     r, g, b = image.split(1, dim=1)
-    level: Tensor = LUMA[0] * r + LUMA[1] * g + LUMA[2] * b
-    return level
+    grey: Tensor = 0.299 * r + 0.587 * g + 0.114 * b
+    return grey
 
 
-def may_lack_pixels(x: Tensor) -> bool:
-    """False where a look at x, at the price of one sum, shows that it is all finite. A graph cannot look: True."""
-    return not readable(x) or not math.isfinite(float(x.detach().sum()))
+def may_have_missing(x: Tensor) -> bool:
+    """False if all of x is known to be finite, at the cost of one sum; always True while tracing."""
+    return not is_host_readable(x) or not math.isfinite(float(x.detach().sum()))
 
 
-def missing(x: Tensor) -> Tensor:
-    """Pixels that are NaN or infinite."""
+def missing_mask(x: Tensor) -> Tensor:
+    """True where x is NaN or infinite."""
     return ~(x.abs() < math.inf)
 
 
-def fill_missing(x: Tensor, holes: Tensor) -> Tensor:
-    """(B, C, H, W) with its holes filled: each with the mean of the smallest square of 2, 4, ... px that has any pixel.
+def fill_missing(x: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Fill each missing pixel with the mean of the smallest pyramid cell of 2, 4, ... px that has any valid pixel.
 
-    The squares are those of a pyramid. An image without any pixel becomes 0.
+    Args:
+        x: (B, C, H, W).
+        mask: True where a pixel is missing; None: where x is not finite.
+
+    Returns:
+        (B, C, H, W); an image without any valid pixel becomes 0.
     """
-    values = [torch.where(holes, 0.0, x)]
-    shares = [(~holes).to(x.dtype)]
-    for _ in range(_HALVINGS):
-        values.append(F.avg_pool2d(values[-1], 2, ceil_mode=True))
-        shares.append(F.avg_pool2d(shares[-1], 2, ceil_mode=True))
+    if mask is None:
+        if not may_have_missing(x):
+            return x
+        mask = missing_mask(x)
+    sums = [torch.where(mask, 0.0, x)]
+    weights = [(~mask).to(x.dtype)]
+    for _ in range(_PYRAMID_LEVELS):
+        sums.append(F.avg_pool2d(sums[-1], 2, ceil_mode=True))
+        weights.append(F.avg_pool2d(weights[-1], 2, ceil_mode=True))
     tiny = torch.finfo(x.dtype).tiny
-    fill = values[-1].sum(dim=(2, 3), keepdim=True) / shares[-1].sum(dim=(2, 3), keepdim=True).clamp(min=tiny)
-    for value, share in zip(values[:0:-1], shares[:0:-1], strict=True):
-        fill = torch.where(share > 0, value / share.clamp(min=tiny), fill[..., : share.shape[-2], : share.shape[-1]])
+    fill = sums[-1].sum(dim=(2, 3), keepdim=True) / weights[-1].sum(dim=(2, 3), keepdim=True).clamp(min=tiny)
+    for total, weight in zip(sums[:0:-1], weights[:0:-1], strict=True):
+        coarser = fill[..., : weight.shape[-2], : weight.shape[-1]]
+        fill = torch.where(weight > 0, total / weight.clamp(min=tiny), coarser)
         fill = F.interpolate(fill, scale_factor=2.0, mode="nearest")
-    return torch.where(holes, fill[..., : x.shape[-2], : x.shape[-1]], x)
+    return torch.where(mask, fill[..., : x.shape[-2], : x.shape[-1]], x)
 
 
-def filled(x: Tensor) -> Tensor:
-    """(B, C, H, W) with its missing pixels, if any, filled."""
-    return fill_missing(x, missing(x)) if may_lack_pixels(x) else x
-
-
-def finite_vectors(field: Tensor) -> Tensor:
-    """(B, 2, H, W) with zero vectors in place of those that have a NaN or infinite component."""
-    if not may_lack_pixels(field):
+def zero_nonfinite_vectors(field: Tensor) -> Tensor:
+    """(B, 2, H, W) with vectors that have a NaN or infinite component replaced by zero."""
+    if not may_have_missing(field):
         return field
-    return torch.where(missing(field).any(dim=1, keepdim=True), 0.0, field)
+    return torch.where(missing_mask(field).any(dim=1, keepdim=True), 0.0, field)

@@ -3,24 +3,24 @@
 import math
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_option, check_positive
-from .blocks import Planes, channels
-from .curvilinear import along
+from .blocks import Planes, stack_channels
+from .curvilinear import scaled_direction
 from .derivatives import central_gradient, smooth
 from .diffusion import CONDUCTANCES, diffuse
 from .edge_preserving import bilateral_smooth, guided_smooth
-from .inputs import on_photograph
-from .learnable import as_number, check_width, keep_positive, positive_option
+from .inputs import apply_to_photograph
+from .learnable import OptionsModule, check_scalar
 from .numerics import image_maximum, squared_length
 
 __all__ = ["MultiScaleCurvilinearSaliency", "multiscale_curvilinear_saliency"]
 
 SMOOTHINGS = ("perona-malik", "bilateral", "guided")
 
-STEP = 0.2
+_STEP = 0.2
 """Time step of the diffusion."""
 
 
@@ -37,23 +37,23 @@ def multiscale_curvilinear_saliency(
 ) -> Tensor:
     r"""MCS (the paper's section "Multi-Curvilinear Saliency"): edges that survive edge-preserving smoothing.
 
-    The image curvilinear saliency :math:`|\nabla I|^2` of every level, divided by its own maximum over the image, is
-    compared with T. Where *every* level exceeds T the largest level is kept, elsewhere the field is 0.
+    The image curvilinear saliency :math:`|\nabla I|^2` of every level is divided by its maximum over the image. The
+    result is the largest of these where *every* level exceeds T, and 0 elsewhere.
 
     Args:
-        image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB; NaN pixels are missing (0 in the result).
-        scales: number n of levels, the image itself included. Each smoothed level has twice the time t of the one
-            before.
-        sigma: smoothing in px before differentiation.
+        image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB. NaN pixels are missing: 0 in the result.
+        scales: number n of levels, the image itself included. Each smoothed level has twice the diffusion time t of the
+            previous one.
+        sigma: smoothing in px before differentiation, >= 0.
         smoothing: ``"perona-malik"`` (:func:`anisotropic_diffusion` to time t), or ``"bilateral"`` or ``"guided"``
             with the width of linear diffusion to time t, sqrt(2 t) px.
-        kappa: contrast in grey levels above which an edge is kept, for all smoothings.
+        kappa: contrast in grey levels above which an edge is preserved, > 0, for all smoothings.
         conductance: of :func:`anisotropic_diffusion`.
-        diffusion_time: t of the last level, in px^2; None is 2^(n-2), that is 0, 5, 10, 20, ... steps of 0.2.
+        diffusion_time: t of the last level in px^2; None is 2^(n-2), that is 0, 5, 10, 20, ... steps of 0.2.
         threshold: T in [0, 1); None is the paper's :math:`e^{-n}`.
 
     Returns:
-        (B, 2, H, W): length in [0, 1], direction of the gradient at the level that was kept. dtype kept.
+        (B, 2, H, W): length in [0, 1], direction of the gradient at the level with the largest value. dtype kept.
 
     Raises:
         InvalidInputError: wrong shape, dtype or option.
@@ -65,33 +65,33 @@ def multiscale_curvilinear_saliency(
         1.0
     """
     times, limit = _check_scales(scales, smoothing, conductance, diffusion_time, threshold)
-    width, edge = check_width(sigma, "sigma", zero_ok=True), check_width(kappa, "kappa")
+    checked_sigma, contrast = check_scalar(sigma, "sigma", zero_ok=True), check_scalar(kappa, "kappa")
 
     def layer(image: Tensor) -> Planes:
-        level, done = image, 0
-        field, saliency = _normalised_saliency(level, width)
+        level, steps_done = image, 0
+        field, saliency = _normalised_saliency(level, checked_sigma)
         lowest = saliency
         for time in times:
             if smoothing == "perona-malik":
-                steps = max(round(time / STEP), 1)
-                level = diffuse(level, max(steps - done, 0), edge, STEP, conductance)
-                done = max(steps, done)
+                steps = max(round(time / _STEP), 1)
+                level = diffuse(level, max(steps - steps_done, 0), contrast, _STEP, conductance)
+                steps_done = max(steps, steps_done)
             else:
                 edge_preserving = bilateral_smooth if smoothing == "bilateral" else guided_smooth
-                level = edge_preserving(image, sigma=math.sqrt(2.0 * time), kappa=edge)
-            level_field, level_saliency = _normalised_saliency(level, width)
-            # A selection by arithmetic: on a CPU far faster than argmax and gather.
+                level = edge_preserving(image, sigma=math.sqrt(2.0 * time), kappa=contrast)
+            level_field, level_saliency = _normalised_saliency(level, checked_sigma)
+            # On a CPU, selection by arithmetic is much faster than argmax and gather.
             field = torch.lerp(field, level_field, (level_saliency > saliency).to(field.dtype))
             saliency, lowest = torch.maximum(saliency, level_saliency), torch.minimum(lowest, level_saliency)
         return (field * (lowest > limit),)
 
-    return on_photograph(layer, image)
+    return apply_to_photograph(layer, image)
 
 
 def _check_scales(
     scales: int, smoothing: str, conductance: str, diffusion_time: float | None, threshold: float | None
 ) -> tuple[list[float], float]:
-    """The smoothed levels' times, and T."""
+    """Check the options; return the diffusion times of the smoothed levels, and T."""
     check_option(smoothing, SMOOTHINGS, "smoothing")
     check_option(conductance, CONDUCTANCES, "conductance")
     if scales < 1:
@@ -104,26 +104,26 @@ def _check_scales(
 
 
 def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> tuple[Tensor, Tensor]:
-    """CS of a level as vectors and their lengths, 1 at the image's largest."""
+    """Vectors of the image CS of one level, and their lengths, with maximum 1 over the image."""
     gx, gy = central_gradient(smooth(level, sigma))
     saliency = squared_length(gx, gy)
     peak = image_maximum(saliency)
     saliency = saliency / torch.where(peak > 0, peak, 1.0)
-    return channels(*along(saliency, gx, gy)), saliency
+    return stack_channels(*scaled_direction(saliency, gx, gy)), saliency
 
 
-class MultiScaleCurvilinearSaliency(nn.Module):
-    """MCS, as a layer; module twin of :func:`multiscale_curvilinear_saliency`.
+class MultiScaleCurvilinearSaliency(OptionsModule):
+    """Module twin of :func:`multiscale_curvilinear_saliency`.
 
     Args:
         scales: number n of levels, >= 1, the image itself included.
         sigma: smoothing in px before differentiation, >= 0.
         smoothing: ``"perona-malik"``, ``"bilateral"`` or ``"guided"``.
-        kappa: contrast in grey levels above which an edge is kept, > 0.
+        kappa: contrast in grey levels above which an edge is preserved, > 0.
         conductance: of :func:`anisotropic_diffusion`.
         diffusion_time: of the last level in px^2; None is 2^(n-2).
         threshold: T in [0, 1); None is e^-n.
-        learnable: make the logarithms of sigma and kappa parameters, ``log_sigma`` and ``log_kappa``; then sigma > 0.
+        learnable: make sigma and kappa positive parameters.
 
     Shape:
         Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
@@ -133,8 +133,6 @@ class MultiScaleCurvilinearSaliency(nn.Module):
         >>> MultiScaleCurvilinearSaliency(scales=3)(torch.rand(2, 3, 32, 32)).norm(dim=1).amax() <= 1.0001
         tensor(True)
     """
-
-    sigma, kappa = positive_option("sigma"), positive_option("kappa")
 
     def __init__(
         self,
@@ -148,28 +146,18 @@ class MultiScaleCurvilinearSaliency(nn.Module):
         threshold: float | None = None,
         learnable: bool = False,
     ) -> None:
-        super().__init__()
         _check_scales(scales, smoothing, conductance, diffusion_time, threshold)
-        check_width(sigma, "sigma", zero_ok=True), check_width(kappa, "kappa")
-        keep_positive(self, learnable, sigma=sigma, kappa=kappa)
-        self.scales, self.smoothing, self.conductance = scales, smoothing, conductance
-        self.diffusion_time, self.threshold = diffusion_time, threshold
+        check_scalar(sigma, "sigma", zero_ok=True), check_scalar(kappa, "kappa")
+        super().__init__(
+            scales=scales,
+            sigma=sigma,
+            smoothing=smoothing,
+            kappa=kappa,
+            conductance=conductance,
+            diffusion_time=diffusion_time,
+            threshold=threshold,
+            learnable=("sigma", "kappa") if learnable else (),
+        )
 
     def forward(self, image: Tensor) -> Tensor:
-        return multiscale_curvilinear_saliency(
-            image,
-            scales=self.scales,
-            sigma=self.sigma,
-            smoothing=self.smoothing,
-            kappa=self.kappa,
-            conductance=self.conductance,
-            diffusion_time=self.diffusion_time,
-            threshold=self.threshold,
-        )
-
-    def extra_repr(self) -> str:
-        return (
-            f"scales={self.scales}, sigma={as_number(self.sigma)}, smoothing={self.smoothing!r}, "
-            f"kappa={as_number(self.kappa)}, conductance={self.conductance!r}, diffusion_time={self.diffusion_time}, "
-            f"threshold={self.threshold}"
-        )
+        return multiscale_curvilinear_saliency(image, **self.options)

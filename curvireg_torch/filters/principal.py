@@ -3,14 +3,15 @@
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_option, check_positive
 from .blocks import Planes
-from .curvilinear import along, dominant_eigenvector, x_if_none
+from .curvilinear import default_to_x, dominant_eigenvector, scaled_direction
 from .derivatives import central_derivatives, smooth
-from .inputs import on_photograph
+from .inputs import apply_to_photograph
+from .learnable import OptionsModule
 
 __all__ = ["PrincipalCurvatureImage", "principal_curvature_image"]
 
@@ -23,19 +24,19 @@ def principal_curvature_image(
     r"""Principal curvature image (Deng et al. 2007): lines and the sides of edges, over scales.
 
     :math:`\max_\sigma \sigma^2 \max(\lambda, 0)` with :math:`\lambda` an eigenvalue of the Hessian of the image
-    smoothed by :math:`\sigma`: the largest one (``"largest"``, dark lines and the dark side of edges) or the smallest
-    one, negated (``"smallest"``, bright lines and the bright side). Deng et al. take maxima over three neighbouring
-    scales at a time and sum them up in a watershed; this is the maximum over all scales, which the paper compares with.
+    smoothed by :math:`\sigma`: the largest one (``"largest"``: dark lines and the dark side of edges) or the negated
+    smallest one (``"smallest"``: bright lines and the bright side). Deng et al. combine maxima over three neighbouring
+    scales in a watershed; like the paper, this function takes the maximum over all scales.
 
     Args:
-        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB; NaN pixels are missing (0 in the
-            result).
+        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB. NaN pixels are missing: 0 in the
+            result.
         sigmas: scales in px, > 0.
         eigenvalue: ``"largest"`` or ``"smallest"``.
 
     Returns:
-        (B, 2, H, W): length the curvature >= 0 in grey levels, direction across the line at the scale that won, sign
-        free. dtype kept (half types compute in float32).
+        (B, 2, H, W): the length is the curvature >= 0 in grey levels, the direction is across the line at the scale of
+        the maximum, with arbitrary sign. dtype kept (half types compute in float32).
 
     Raises:
         InvalidInputError: wrong shape, dtype or option.
@@ -47,20 +48,20 @@ def principal_curvature_image(
         >>> int(field[0, 0, 16].abs().argmax())
         16
     """
-    widths = _check_scales(sigmas, eigenvalue)
+    scales = _check_scales(sigmas, eigenvalue)
     sign = 1.0 if eigenvalue == "largest" else -1.0
 
     def layer(image: Tensor) -> Planes:
         best, vx, vy = torch.zeros_like(image), torch.zeros_like(image), torch.zeros_like(image)
-        for sigma in widths:
+        for sigma in scales:
             xx, yy, xy = (sign * sigma**2 * h for h in central_derivatives(smooth(image, sigma))[2:])
             x, y, half_gap = dominant_eigenvector(xx, xy, xy, yy, sign=1.0)
             curvature = 0.5 * (xx + yy) + half_gap
             better = (curvature > best).to(best.dtype)
             best, vx, vy = torch.maximum(best, curvature), torch.lerp(vx, x, better), torch.lerp(vy, y, better)
-        return along(best, x_if_none(vx, vy), vy)  # a blob has no direction of its own
+        return scaled_direction(best, default_to_x(vx, vy), vy)  # a round blob has no unique direction
 
-    return on_photograph(layer, image)
+    return apply_to_photograph(layer, image)
 
 
 def _check_scales(sigmas: Sequence[float], eigenvalue: str) -> list[float]:
@@ -70,12 +71,12 @@ def _check_scales(sigmas: Sequence[float], eigenvalue: str) -> list[float]:
     return [check_positive(sigma, "sigmas") for sigma in sigmas]
 
 
-class PrincipalCurvatureImage(nn.Module):
-    """Principal curvature image, as a layer; module twin of :func:`principal_curvature_image`.
+class PrincipalCurvatureImage(OptionsModule):
+    """Module twin of :func:`principal_curvature_image`.
 
     Args:
         sigmas: scales in px, > 0.
-        eigenvalue: ``"largest"``, dark lines, or ``"smallest"``, bright ones.
+        eigenvalue: ``"largest"`` for dark lines or ``"smallest"`` for bright lines.
 
     Shape:
         Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
@@ -89,12 +90,8 @@ class PrincipalCurvatureImage(nn.Module):
     """
 
     def __init__(self, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0), eigenvalue: str = "largest") -> None:
-        super().__init__()
         _check_scales(sigmas, eigenvalue)
-        self.sigmas, self.eigenvalue = tuple(sigmas), eigenvalue
+        super().__init__(sigmas=tuple(sigmas), eigenvalue=eigenvalue)
 
     def forward(self, image: Tensor) -> Tensor:
-        return principal_curvature_image(image, sigmas=self.sigmas, eigenvalue=self.eigenvalue)
-
-    def extra_repr(self) -> str:
-        return f"sigmas={self.sigmas}, eigenvalue={self.eigenvalue!r}"
+        return principal_curvature_image(image, **self.options)

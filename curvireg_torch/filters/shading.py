@@ -2,27 +2,27 @@
 
 import math
 from collections.abc import Callable
-from typing import Self
+from typing import Any, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_camera_matrix, check_same_device, check_tensor
-from .blocks import Planes, in_blocks
+from .blocks import Planes, apply_in_blocks
 from .curvilinear import (
     BACKGROUND,
-    along,
     check_depth,
-    check_scale,
+    check_depth_scale,
+    default_to_x,
     dominant_eigenvector,
     fill_depth,
+    scaled_direction,
     visible_range,
-    x_if_none,
 )
 from .derivatives import central_derivatives, smooth
-from .learnable import check_width
-from .numerics import at_least_float32, readable, safe_sqrt
+from .learnable import OptionsModule, check_scalar
+from .numerics import at_least_float32, is_host_readable, safe_sqrt
 
 __all__ = ["AverageShadingGradient", "HessianFrobeniusNorm", "average_shading_gradient", "hessian_frobenius_norm"]
 
@@ -37,21 +37,21 @@ def average_shading_gradient(
 ) -> Tensor:
     r"""Average shading gradient (Plötz and Roth 2017; the paper's ``equ:PG:103``).
 
-    :math:`\gamma\sqrt{|N_x|^2 + |N_y|^2}`, :math:`\gamma = \sqrt{\pi/3}`, N the unit normal of the observed surface: a
-    bound on the gradient of a Lambertian image, averaged over all directions of the light.
+    :math:`\gamma\sqrt{|N_x|^2 + |N_y|^2}`, :math:`\gamma = \sqrt{\pi/3}`, where N is the unit normal of the observed
+    surface: a bound on the gradient of a Lambertian image averaged over all light directions.
 
     Args:
         depth: (B, 1, H, W) z-depth. 0, negative, inf and NaN are background.
-        mask: bool, False = background; optional. (B, 1, H, W) or what broadcasts to it.
-        camera_matrix: (3, 3), (1, 3, 3) or (B, 3, 3), px, without skew: N is the normal of the surface that this
-            perspective camera sees (``equ:PG:300``), whatever the depth's unit. None (orthographic): N is the normal of
-            the graph of Z.
+        mask: bool, False = background; (B, 1, H, W) or broadcastable to it.
+        camera_matrix: (3, 3), (1, 3, 3) or (B, 3, 3) in px without skew: N is the normal of the surface seen by this
+            perspective camera (``equ:PG:300``), for any unit of depth. None (orthographic): N is the normal of the
+            graph of Z.
         sigma: smoothing in px before differentiation, >= 0.
         depth_scale: of :func:`depth_curvilinear_saliency`; orthographic only.
 
     Returns:
-        (B, 2, H, W): length ASG in 1/px, direction in which the normal turns fastest, sign free. dtype kept (half
-        types compute in float32).
+        (B, 2, H, W): length ASG in 1/px, direction in which the normal changes fastest, with arbitrary sign. dtype kept
+        (half types compute in float32).
 
     Raises:
         InvalidInputError: wrong shape, dtype, mask or option, or ``depth_scale`` together with ``camera_matrix``.
@@ -63,28 +63,28 @@ def average_shading_gradient(
         >>> round(float(field[0, :, 32, 32].norm()) * 60 / (2 * torch.pi / 3) ** 0.5, 2)     # gamma sqrt(2) / radius
         1.0
     """
-    width, scale = check_shading(sigma, depth_scale, camera_matrix)
+    sigma, scale = check_shading(sigma, depth_scale, camera_matrix)
     mask, camera = check_depth(depth, mask), batched_camera(camera_matrix, depth)
 
     def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Planes:
-        a, b, c = normal_variation(depth, mask, camera, width, scale)
+        a, b, c = normal_structure_tensor(depth, mask, camera, sigma, scale)
         vx, vy, _ = dominant_eigenvector(a, b, b, c)
-        return along(math.sqrt(math.pi / 3.0) * safe_sqrt(a + c), x_if_none(vx, vy), vy)
+        return scaled_direction(math.sqrt(math.pi / 3.0) * safe_sqrt(a + c), default_to_x(vx, vy), vy)
 
-    return in_blocks(layer, at_least_float32(depth), mask, camera).to(depth.dtype)
+    return apply_in_blocks(layer, at_least_float32(depth), mask, camera).to(depth.dtype)
 
 
 def check_shading(
     sigma: float | Tensor, depth_scale: float | None, camera_matrix: Tensor | None
 ) -> tuple[float | Tensor, float | None]:
-    """sigma and depth_scale."""
+    """Check all options; return sigma and depth_scale."""
     if camera_matrix is not None:
         check_tensor(camera_matrix, "camera_matrix", (None,) * (camera_matrix.ndim == 3) + (3, 3))
-        if readable(camera_matrix):
+        if is_host_readable(camera_matrix):
             check_camera_matrix(camera_matrix)
         if depth_scale is not None:
             raise InvalidInputError("depth_scale: has no meaning with a camera_matrix; leave one of them out")
-    return check_width(sigma, "sigma", zero_ok=True), check_scale(depth_scale)
+    return check_scalar(sigma, "sigma", zero_ok=True), check_depth_scale(depth_scale)
 
 
 def batched_camera(camera_matrix: Tensor | None, depth: Tensor) -> Tensor | None:
@@ -98,7 +98,7 @@ def batched_camera(camera_matrix: Tensor | None, depth: Tensor) -> Tensor | None
     return camera_matrix.to(at_least_float32(depth).dtype)
 
 
-def normal_variation(
+def normal_structure_tensor(
     depth: Tensor, mask: Tensor | None, camera: Tensor | None, sigma: float | Tensor, depth_scale: float | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """N_x . N_x, N_x . N_y, N_y . N_y per px^2, each (B, 1, H, W), from the Hessian in closed form."""
@@ -106,9 +106,7 @@ def normal_variation(
         z = smooth(fill_depth(depth, mask, depth_scale), sigma, linear=True)
         zx, zy, zxx, zyy, zxy = central_derivatives(z)
         one, zero = torch.ones_like(zx), torch.zeros_like(zx)
-        normal = (-zx, -zy, one)
-        along_x, along_y = (-zxx, -zxy, zero), (-zxy, -zyy, zero)
-        return _gram(normal, along_x, along_y)
+        return _unit_vector_products((-zx, -zy, one), (-zxx, -zxy, zero), (-zxy, -zyy, zero))
     surface, near, span = visible_range(depth, mask)
     z = smooth(torch.minimum(surface, near + BACKGROUND * span) / span, sigma, linear=True)
     zx, zy, zxx, zyy, zxy = central_derivatives(z)
@@ -117,18 +115,18 @@ def normal_variation(
     fx, fy, cx, cy = (camera[:, i, j].view(-1, 1, 1, 1) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     x = torch.arange(W, device=z.device, dtype=z.dtype).view(1, 1, 1, W) - cx
     y = torch.arange(H, device=z.device, dtype=z.dtype).view(1, 1, H, 1) - cy
-    # equ:PG:300 without its factor Z, per px: with (x, y) in px from the principal point, x Z_x needs no focal length.
+    # equ:PG:300 without its factor Z, per px. With (x, y) in px from the principal point, x Z_x has no focal length.
     normal = (-fx * zx, -fy * zy, x * zx + y * zy + z)
-    along_x = (-fx * zxx, -fy * zxy, x * zxx + y * zxy + 2.0 * zx)
-    along_y = (-fx * zxy, -fy * zyy, x * zxy + y * zyy + 2.0 * zy)
-    return _gram(normal, along_x, along_y)
+    normal_x = (-fx * zxx, -fy * zxy, x * zxx + y * zxy + 2.0 * zx)
+    normal_y = (-fx * zxy, -fy * zyy, x * zxy + y * zyy + 2.0 * zy)
+    return _unit_vector_products(normal, normal_x, normal_y)
 
 
 Vector = tuple[Tensor, Tensor, Tensor]
 
 
-def _gram(normal: Vector, along_x: Vector, along_y: Vector) -> Vector:
-    """Inner products of the derivatives of normal / |normal|, from those of ``normal``."""
+def _unit_vector_products(normal: Vector, normal_x: Vector, normal_y: Vector) -> Vector:
+    """Inner products of the derivatives of normal / |normal|, given the derivatives of ``normal``."""
 
     def dot(a: Vector, b: Vector) -> Tensor:
         return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -136,9 +134,10 @@ def _gram(normal: Vector, along_x: Vector, along_y: Vector) -> Vector:
     def cross(a: Vector, b: Vector) -> Vector:
         return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
-    # The part of a derivative across N is |N|^-2 N x (derivative x N): cross products do not cancel as projections do.
+    # The component of a derivative orthogonal to N has the length |N x derivative| / |N|; cross products cancel less
+    # than projections.
     inverse = 1.0 / dot(normal, normal)
-    tx, ty = cross(normal, along_x), cross(normal, along_y)
+    tx, ty = cross(normal, normal_x), cross(normal, normal_y)
     factor = inverse * inverse
     return dot(tx, tx) * factor, dot(tx, ty) * factor, dot(ty, ty) * factor
 
@@ -152,8 +151,8 @@ def hessian_frobenius_norm(
         depth, mask, sigma, depth_scale: as in :func:`depth_curvilinear_saliency`.
 
     Returns:
-        (B, 2, H, W): length HFN; direction of the strongest second derivative, sign free. dtype kept (half types
-        compute in float32).
+        (B, 2, H, W): length HFN, direction of the largest second derivative, with arbitrary sign. dtype kept (half
+        types compute in float32).
 
     Raises:
         InvalidInputError: wrong shape, dtype, mask or option.
@@ -165,23 +164,23 @@ def hessian_frobenius_norm(
         [1.0, 0.0]
     """
     mask = check_depth(depth, mask)
-    width, scale = check_shading(sigma, depth_scale, None)
+    sigma, scale = check_shading(sigma, depth_scale, None)
 
     def layer(depth: Tensor, mask: Tensor | None) -> Planes:
-        _, _, zxx, zyy, zxy = central_derivatives(smooth(fill_depth(depth, mask, scale), width, linear=True))
+        _, _, zxx, zyy, zxy = central_derivatives(smooth(fill_depth(depth, mask, scale), sigma, linear=True))
         vx, vy, _ = dominant_eigenvector(zxx, zxy, zxy, zyy)
-        return along(safe_sqrt(zxx * zxx + 2.0 * zxy * zxy + zyy * zyy), x_if_none(vx, vy), vy)
+        return scaled_direction(safe_sqrt(zxx * zxx + 2.0 * zxy * zxy + zyy * zyy), default_to_x(vx, vy), vy)
 
-    return in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
+    return apply_in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
 
 
-class WithCamera(nn.Module):
-    """A module whose camera matrix moves with its device and keeps its dtype: ``.half()`` would round focal lengths."""
+class CameraModule(OptionsModule):
+    """A module with a camera matrix that moves between devices and keeps its dtype: ``.half()`` would round it."""
 
     camera_matrix: Tensor | None
 
-    def __init__(self, camera_matrix: Tensor | None) -> None:
-        super().__init__()
+    def __init__(self, camera_matrix: Tensor | None, **options: Any) -> None:
+        super().__init__(**options)
         self.register_buffer("camera_matrix", camera_matrix, persistent=False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -191,18 +190,21 @@ class WithCamera(nn.Module):
             self.camera_matrix = camera.to(self.camera_matrix.device)
         return self
 
+    def extra_repr(self) -> str:
+        return f"{'orthographic' if self.camera_matrix is None else 'perspective'}, {super().extra_repr()}"
 
-class AverageShadingGradient(WithCamera):
-    """Average shading gradient, as a layer; module twin of :func:`average_shading_gradient`.
+
+class AverageShadingGradient(CameraModule):
+    """Module twin of :func:`average_shading_gradient`.
 
     Args:
-        camera_matrix: (3, 3), (1, 3, 3) or (B, 3, 3), px; it moves with the module and keeps its dtype. None:
+        camera_matrix: (3, 3), (1, 3, 3) or (B, 3, 3) in px; it moves with the module and keeps its dtype. None:
             orthographic.
         sigma: smoothing in px before differentiation, >= 0.
         depth_scale: of :func:`depth_curvilinear_saliency`; orthographic only.
 
     Shape:
-        Input (B, 1, H, W) depth and, optionally, a mask that broadcasts to it; output (B, 2, H, W).
+        Input (B, 1, H, W) depth and optionally a mask that broadcasts to it; output (B, 2, H, W).
 
     Example:
         >>> import torch
@@ -215,29 +217,22 @@ class AverageShadingGradient(WithCamera):
     def __init__(
         self, *, camera_matrix: Tensor | None = None, sigma: float = 1.0, depth_scale: float | None = None
     ) -> None:
-        super().__init__(camera_matrix)
         check_shading(sigma, depth_scale, camera_matrix)
-        self.sigma, self.depth_scale = sigma, depth_scale
+        super().__init__(camera_matrix, sigma=sigma, depth_scale=depth_scale)
 
     def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
-        return average_shading_gradient(
-            depth, mask, camera_matrix=self.camera_matrix, sigma=self.sigma, depth_scale=self.depth_scale
-        )
-
-    def extra_repr(self) -> str:
-        camera = "orthographic" if self.camera_matrix is None else "perspective"
-        return f"{camera}, sigma={self.sigma}, depth_scale={self.depth_scale}"
+        return average_shading_gradient(depth, mask, camera_matrix=self.camera_matrix, **self.options)
 
 
-class HessianFrobeniusNorm(nn.Module):
-    """Hessian Frobenius norm, as a layer; module twin of :func:`hessian_frobenius_norm`.
+class HessianFrobeniusNorm(OptionsModule):
+    """Module twin of :func:`hessian_frobenius_norm`.
 
     Args:
         sigma: smoothing in px before differentiation, >= 0.
         depth_scale: None rescales each image's visible depth range to 1; a number multiplies the depth.
 
     Shape:
-        Input (B, 1, H, W) depth and, optionally, a mask that broadcasts to it; output (B, 2, H, W).
+        Input (B, 1, H, W) depth and optionally a mask that broadcasts to it; output (B, 2, H, W).
 
     Example:
         >>> import torch
@@ -248,12 +243,8 @@ class HessianFrobeniusNorm(nn.Module):
     """
 
     def __init__(self, *, sigma: float = 1.0, depth_scale: float | None = None) -> None:
-        super().__init__()
         check_shading(sigma, depth_scale, None)
-        self.sigma, self.depth_scale = sigma, depth_scale
+        super().__init__(sigma=sigma, depth_scale=depth_scale)
 
     def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
-        return hessian_frobenius_norm(depth, mask, sigma=self.sigma, depth_scale=self.depth_scale)
-
-    def extra_repr(self) -> str:
-        return f"sigma={self.sigma}, depth_scale={self.depth_scale}"
+        return hessian_frobenius_norm(depth, mask, **self.options)

@@ -3,14 +3,14 @@
 import torch
 from torch import Tensor
 
-__all__ = ["is_ridge"]
+__all__ = ["is_directional_maximum"]
 
 
-def is_ridge(length: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Pixels whose length is a maximum along (x, y), rounded to 45 degrees as Canny does; all (B, 1, H, W)."""
+def is_directional_maximum(length: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """True where ``length`` is a maximum along (x, y), rounded to 45 degrees as in Canny; all (B, 1, H, W)."""
     H, W = length.shape[-2:]
     p = length
-    for dim in (-1, -2):  # not F.pad: compiled, everything before it would be computed again for every neighbour
+    for dim in (-1, -2):  # F.pad would make a compiled graph recompute its input for every neighbour
         margin = torch.zeros_like(p.narrow(dim, 0, 1))
         p = torch.cat([margin, p, margin], dim=dim)
 
@@ -22,7 +22,7 @@ def is_ridge(length: Tensor, x: Tensor, y: Tensor) -> Tensor:
     diagonal = ~(horizontal | vertical)
     falling = diagonal & (x * y > 0)  # y points down: equal signs run from top left to bottom right
     result = torch.zeros_like(horizontal)
-    for where, dx, dy in ((horizontal, 1, 0), (vertical, 0, 1), (falling, 1, 1), (diagonal & ~falling, 1, -1)):
-        # Strict on one side, so that a plateau two pixels wide gives one point, not two or none.
-        result = result | (where & (length > shifted(dx, dy)) & (length >= shifted(-dx, -dy)))
+    for selected, dx, dy in ((horizontal, 1, 0), (vertical, 0, 1), (falling, 1, 1), (diagonal & ~falling, 1, -1)):
+        # Strict on one side only, so that a plateau two pixels wide yields exactly one point.
+        result = result | (selected & (length > shifted(dx, dy)) & (length >= shifted(-dx, -dy)))
     return result

@@ -172,7 +172,7 @@ class ViewDescriber:
         own = first == torch.arange(len(first))
         depth, boxes = self.depth(rotations[own], distances[own])
         field = self._filter(depth)
-        points, silhouettes = field_points(field, share=self.settings.point_fraction)[:, 0], depth[:, 0] > 0
+        points, silhouettes = field_points(field, fraction=self.settings.point_fraction)[:, 0], depth[:, 0] > 0
         descriptors = self.descriptor(field)
         if not bool(own.all()):
             chosen = turns.to(self._device), (own.cumsum(0) - 1)[first].to(self._device)

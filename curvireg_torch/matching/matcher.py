@@ -201,7 +201,7 @@ class ViewMatcher(nn.Module):
         """Field, descriptors and points of (B, K, C, S, S) crops; ``shapes`` (B,) of the boxes."""
         B, K = regions.shape[:2]
         field = photograph_field(self.field, regions.flatten(0, 1))
-        points = field_points(field, share=self.bank.settings.point_fraction)[:, 0]
+        points = field_points(field, fraction=self.bank.settings.point_fraction)[:, 0]
         return QueryFeatures(
             regions=regions,
             field=field.unflatten(0, (B, K))[:, 0],

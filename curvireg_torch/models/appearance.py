@@ -1,4 +1,4 @@
-"""How much a photograph looks like a shaded view: local features compared cell by cell."""
+"""Appearance scores: photographs and shaded views compared by local backbone features, cell by cell."""
 
 import torch
 import torch.nn.functional as F
@@ -10,25 +10,25 @@ from .backbone import Backbone
 __all__ = ["describe", "similarity"]
 
 CHUNK = 16
-"""Images in the network at a time on a GPU. On a CPU it is one: more are no faster there, and convolutions of a batch
-round each image in a way that depends on how many there are."""
+"""Images per network call on a GPU. It is 1 on a CPU, where larger batches are no faster and the rounding of
+convolutions depends on the batch size."""
 
 
 @torch.no_grad()
 def describe(images: Tensor, backbone: Backbone) -> Tensor:
-    """Descriptors of photographs' crops and of shaded views, whose inner product is the appearance score.
+    """Appearance descriptors of photograph crops and of shaded views; their inner product is the appearance score.
 
-    Of the backbone's features at both strides, each channel loses its mean over the image (what the whole image has in
-    common: light, style, "this is a rendering") and is divided by its spread on ImageNet; every cell is then scaled to
-    unit length, so that each counts the same. Both strides together weigh one.
+    At both strides of the backbone, each channel loses its mean over the image, which contains light and style, and is
+    divided by its standard deviation on ImageNet. Every cell is then scaled to unit length, so that all cells have
+    equal weight, and the two strides have equal weight too.
 
     Args:
         images: (N, 1 or 3, S, S) in [0, 1]; photographs in colour, views from :func:`curvireg_torch.rendering.shade`.
-            Missing pixels (NaN or infinite) are filled from around them.
-        backbone: where they are described.
+            Missing pixels (NaN or infinite) are filled from their surroundings.
+        backbone: the feature network.
 
     Returns:
-        (N, D) float16 of length 1; D = 17 408 at S = 128.
+        (N, D) float16 of unit length; D = 17 408 at S = 128.
 
     Raises:
         InvalidInputError: wrong shape or dtype.
@@ -38,11 +38,10 @@ def describe(images: Tensor, backbone: Backbone) -> Tensor:
         torch.Size([2, 4352])
     """
     chunks = images.split(1 if images.device.type == "cpu" else CHUNK)
-    parts = [_described(chunk, backbone) for chunk in chunks] or [_described(images, backbone)]
-    return torch.cat(parts)
+    return torch.cat([_describe_chunk(chunk, backbone) for chunk in chunks or [images]])
 
 
-def _described(images: Tensor, backbone: Backbone) -> Tensor:
+def _describe_chunk(images: Tensor, backbone: Backbone) -> Tensor:
     levels = []
     for features, spread in zip(backbone(images), backbone.spreads, strict=True):
         centred = features - features.mean(dim=(2, 3), keepdim=True)
@@ -52,7 +51,7 @@ def _described(images: Tensor, backbone: Backbone) -> Tensor:
 
 
 def similarity(photographs: Tensor, views: Tensor) -> Tensor:
-    """Mean cosine of the cells, the best over the crops of each photograph.
+    """Mean cosine similarity of the cells, maximum over the crops of each photograph.
 
     Args:
         photographs: (B, K, D) descriptors of K crops each, from :func:`describe`.
@@ -72,5 +71,5 @@ def similarity(photographs: Tensor, views: Tensor) -> Tensor:
     """
     check_tensor(photographs, "photographs", (None, None, None))
     check_tensor(views, "views", (None, photographs.shape[-1]))
-    found = photographs.flatten(0, 1).float() @ views.float().T
-    return found.view(*photographs.shape[:2], len(views)).amax(dim=1)
+    scores = photographs.flatten(0, 1).float() @ views.float().T
+    return scores.view(*photographs.shape[:2], len(views)).amax(dim=1)

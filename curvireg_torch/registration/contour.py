@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..filters.inputs import filled
+from ..filters.inputs import fill_missing
 from ..geometry import crop_images
 from ..rendering import DepthRenderer
 from ..utils.checks import (
@@ -233,7 +233,7 @@ def _full_size(
 ) -> tuple[Tensor, Views]:
     """(B, C, S, S) crops without missing pixels, and the poses' views of them."""
     crops, A = crop_images(images, boxes, size=SIZE, margin=margin)
-    crops = filled(crops)
+    crops = fill_missing(crops)
     check_pixels(crops, "of the box")
     return crops, Views(renderer, EdgeField(crops), photograph, A.double()[photograph] @ K, SIZE, centre, radius)
 

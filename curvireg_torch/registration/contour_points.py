@@ -93,7 +93,7 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
     # Depth in px: saliency is then a curvature in 1 / px, and a threshold has a meaning.
     scale = K[:, 0, 0].view(-1, 1, 1, 1) / z.amax(dim=(1, 2, 3), keepdim=True)
     field = depth_curvilinear_saliency(depth * scale.float(), depth_scale=1.0)
-    creases = field_points(field * ~(_widened(beside) | ~seen), share=CREASE_SHARE, threshold=CREASE)
+    creases = field_points(field * ~(_widened(beside) | ~seen), fraction=CREASE_SHARE, threshold=CREASE)
     pixel = torch.arange(H * W).view(H, W)
     neighbours = [torch.stack([x.flatten() for x in _ends(pixel, dim)]) for dim in (-1, -2)]
     samples = [

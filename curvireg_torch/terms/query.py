@@ -9,7 +9,7 @@ from kornia.color import rgb_to_grayscale
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError
-from ..filters.inputs import fill_missing, may_lack_pixels, missing
+from ..filters.inputs import fill_missing, may_have_missing, missing_mask
 from ..geometry.crops import check_boxes, crop_images, square_boxes
 from ..utils.checks import as_numbers, check_photograph, check_tensor
 
@@ -62,7 +62,7 @@ def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
     if crops.shape[1] not in (1, 3):
         raise InvalidInputError(f"images: expected 1 (grey) or 3 (RGB) channels, got {crops.shape[1]}")
     grey = crops.shape[1] == 3 and not getattr(field, "colour", False)
-    holes = missing(crops) if may_lack_pixels(crops) else None
+    holes = missing_mask(crops) if may_have_missing(crops) else None
     crops = crops if holes is None else fill_missing(crops, holes)
     out: Tensor = field(rgb_to_grayscale(crops) if grey else crops)
     return out if holes is None else out.masked_fill(holes.any(dim=1, keepdim=True), 0.0)

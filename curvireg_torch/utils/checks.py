@@ -125,8 +125,8 @@ def check_positive(value: float, name: str, *, zero_ok: bool = False) -> float:
     return value
 
 
-def check_share(value: float, name: str) -> None:
-    """``value`` is a share in (0, 1]."""
+def check_fraction(value: float, name: str) -> None:
+    """``value`` is a fraction in (0, 1]."""
     if not (isinstance(value, int | float) and 0 < value <= 1):
         raise InvalidInputError(f"{name}: expected 0 < {name} <= 1, got {value!r}")
 

@@ -9,7 +9,7 @@ from curvireg_torch.descriptors import field_points
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.filters import image_gradient
 
-from ..filters.support import photos
+from ..filters.layer_cases import photos
 
 
 def _line(angle: float) -> torch.Tensor:
@@ -24,7 +24,7 @@ def _line(angle: float) -> torch.Tensor:
 @pytest.mark.parametrize("angle", [0.0, 20.0, 45.0, 70.0, 90.0, 135.0, 160.0])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_ridge_becomes_a_thin_line(angle: float, sign: float) -> None:
-    points = field_points(sign * _line(angle)[None], share=1.0, threshold=0.5)[0, 0]
+    points = field_points(sign * _line(angle)[None], fraction=1.0, threshold=0.5)[0, 0]
     y, x = (points.nonzero().T - 20).float()
     a = torch.tensor(angle).deg2rad()
     assert float((x * torch.cos(a) + y * torch.sin(a)).abs().max()) <= 0.75
@@ -33,15 +33,15 @@ def test_a_ridge_becomes_a_thin_line(angle: float, sign: float) -> None:
 
 
 @settings(max_examples=10, deadline=None, derandomize=True)
-@given(seed=st.integers(0, 1000), share=st.floats(0.01, 0.3))
-def test_share_limits_each_image_by_itself_and_keeps_the_longest(seed: int, share: float) -> None:
+@given(seed=st.integers(0, 1000), fraction=st.floats(0.01, 0.3))
+def test_share_limits_each_image_by_itself_and_keeps_the_longest(seed: int, fraction: float) -> None:
     field = image_gradient(photos(3, 24, seed=seed, dtype=torch.float64))
     field = field * torch.tensor([1.0, 0.01, 5.0]).view(3, 1, 1, 1)
-    points = field_points(field, share=share)
-    every = field_points(field, share=1.0)
+    points = field_points(field, fraction=fraction)
+    every = field_points(field, fraction=1.0)
     length = field.norm(dim=1, keepdim=True)
     for p, e, v in zip(points, every, length, strict=True):
-        assert int(p.sum()) == min(max(1, int(share * 576)), int(e.sum()))
+        assert int(p.sum()) == min(max(1, int(fraction * 576)), int(e.sum()))
         assert bool((p <= e).all())
         if bool((e & ~p).any()):
             assert float(v[p].min()) >= float(v[e & ~p].max())
@@ -50,15 +50,15 @@ def test_share_limits_each_image_by_itself_and_keeps_the_longest(seed: int, shar
 def test_threshold_and_no_suppression() -> None:
     field = torch.zeros(1, 2, 1, 6)
     field[0, 1, 0] = torch.tensor([0.0, 1.0, 2.0, 3.0, 2.0, 1.0])
-    assert field_points(field, share=1.0, suppress=False)[0, 0, 0].tolist() == [False, True, True, True, True, True]
-    assert field_points(field, share=1.0, suppress=False, threshold=1.5).sum() == 3
+    assert field_points(field, fraction=1.0, suppress=False)[0, 0, 0].tolist() == [False, True, True, True, True, True]
+    assert field_points(field, fraction=1.0, suppress=False, threshold=1.5).sum() == 3
 
 
 def test_nothing_has_no_points_and_bad_input_is_refused() -> None:
     assert not field_points(torch.zeros(2, 2, 8, 8)).any()
     assert field_points(torch.zeros(0, 2, 8, 8)).shape == (0, 1, 8, 8)
-    with pytest.raises(InvalidInputError, match="share"):
-        field_points(torch.zeros(1, 2, 8, 8), share=0.0)
+    with pytest.raises(InvalidInputError, match="fraction"):
+        field_points(torch.zeros(1, 2, 8, 8), fraction=0.0)
     with pytest.raises(InvalidInputError, match="threshold"):
         field_points(torch.zeros(1, 2, 8, 8), threshold=-1.0)
 
@@ -66,5 +66,5 @@ def test_nothing_has_no_points_and_bad_input_is_refused() -> None:
 def test_a_share_of_less_than_a_pixel_keeps_the_strongest() -> None:
     field = torch.zeros(1, 2, 1, 9)
     field[0, 0, 0, [1, 4, 7]] = torch.tensor([1.0, 3.0, 2.0])
-    assert field_points(field, share=1e-3, suppress=False)[0, 0, 0].nonzero().flatten().tolist() == [4]
-    assert int(field_points(field, share=2 / 9, suppress=False).sum()) == 2
+    assert field_points(field, fraction=1e-3, suppress=False)[0, 0, 0].nonzero().flatten().tolist() == [4]
+    assert int(field_points(field, fraction=2 / 9, suppress=False).sum()) == 2

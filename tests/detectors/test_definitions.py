@@ -7,31 +7,31 @@ import torch
 from kornia.feature import gftt_response, harris_response
 
 from curvireg_torch import detectors
-from curvireg_torch.detectors.base import Detection, from_peaks, grey_bytes
+from curvireg_torch.detectors.base import Detection, detection_from_peaks, to_uint8_images
 from curvireg_torch.detectors.fast_hessian import _determinant
 from curvireg_torch.errors import InvalidInputError
 
-from ..filters.support import photos
+from ..filters.layer_cases import photos
 
 
 def test_the_defaults_of_the_comparison() -> None:
     # Noise has more peaks than any default's share.
     image = torch.cat([photos(1, 48, seed=9), torch.rand(1, 1, 48, 48, generator=torch.Generator().manual_seed(0))])
     for name, options in (
-        ("harris", {"k": 0.04, "share": 0.04}),
-        ("laplacian_of_gaussian", {"sigma": 2.0, "share": 0.04}),
-        ("canny", {"sigma": 1.4, "edges": 0.3, "share": 0.04}),
-        ("fast_hessian", {"threshold": 1e-4, "share": 0.04}),
-        ("fuzzy_edges", {"width": 0.1, "share": 0.04}),
-        *((n, {"share": 0.04}) for n in ("minimum_eigenvalue", "sobel", "sift", "focus_curves", "gradient")),
-        *((n, {"share": 0.04}) for n in ("multiscale_saliency", "principal_curvature")),
+        ("harris", {"k": 0.04, "fraction": 0.04}),
+        ("laplacian_of_gaussian", {"sigma": 2.0, "fraction": 0.04}),
+        ("canny", {"sigma": 1.4, "edges": 0.3, "fraction": 0.04}),
+        ("fast_hessian", {"threshold": 1e-4, "fraction": 0.04}),
+        ("fuzzy_edges", {"width": 0.1, "fraction": 0.04}),
+        *((n, {"fraction": 0.04}) for n in ("minimum_eigenvalue", "sobel", "sift", "focus_curves", "gradient")),
+        *((n, {"fraction": 0.04}) for n in ("multiscale_saliency", "principal_curvature")),
     ):
         detect = getattr(detectors, name)
         default, told = detect(image), detect(image, **options)
         assert torch.equal(default.response, told.response), name
         assert torch.equal(default.points, told.points), name
-        for option in set(options) - {"share"}:
-            all_points = {**options, "share": 1.0}
+        for option in set(options) - {"fraction"}:
+            all_points = {**options, "fraction": 1.0}
             same, other = detect(image, **all_points), detect(image, **{**all_points, option: 2.0 * options[option]})
             assert not (torch.equal(same.response, other.response) and torch.equal(same.points, other.points)), option
 
@@ -39,8 +39,8 @@ def test_the_defaults_of_the_comparison() -> None:
 def test_corners_are_kornias_peaks() -> None:
     image = photos(1, 40, seed=4)
     for ours, theirs in (
-        (detectors.harris(image, k=0.06, share=1.0), harris_response(image, k=0.06)),
-        (detectors.minimum_eigenvalue(image, share=1.0), gftt_response(image)),
+        (detectors.harris(image, k=0.06, fraction=1.0), harris_response(image, k=0.06)),
+        (detectors.minimum_eigenvalue(image, fraction=1.0), gftt_response(image)),
     ):
         torch.testing.assert_close(ours.response, theirs.clamp(min=0.0))
         r = ours.response[0, 0]
@@ -53,8 +53,10 @@ def test_peaks_below_zero_are_none_and_a_share_keeps_the_strongest() -> None:
     response = torch.zeros(1, 1, 20, 20)
     response[0, 0, 2::6, 2::6] = torch.tensor([[3.0, 2.0, 1.0], [9.0, 8.0, 7.0], [6.0, 5.0, 4.0]])
     response[0, 0, 17, 17] = -5.0
-    assert [response[0, 0, y, x].item() for x, y in from_peaks(response, 1.0).coordinates()[0]] == list(range(9, 0, -1))
-    few = from_peaks(response, 0.01)  # of 400
+    assert [response[0, 0, y, x].item() for x, y in detection_from_peaks(response, 1.0).coordinates()[0]] == list(
+        range(9, 0, -1)
+    )
+    few = detection_from_peaks(response, 0.01)  # of 400
     assert [response[0, 0, y, x].item() for x, y in few.coordinates()[0]] == [9.0, 8.0, 7.0, 6.0]
     assert float(few.response.min()) == 0.0
 
@@ -69,7 +71,7 @@ def test_coordinates_are_x_then_y() -> None:
 
 def test_bytes_are_rounded_and_clamped() -> None:
     image = torch.tensor([-1.0, 0.0, 0.5 / 255 + 1e-4, 0.5, 1.0, 2.0]).view(1, 1, 2, 3)
-    assert grey_bytes(image)[0].tolist() == [[0, 0, 1], [128, 255, 255]]
+    assert to_uint8_images(image)[0].tolist() == [[0, 0, 1], [128, 255, 255]]
 
 
 @pytest.mark.parametrize("sigma", [2.0, 3.0])
@@ -78,7 +80,7 @@ def test_zero_crossings_of_a_step_have_the_height_of_the_closed_form(sigma: floa
     image = torch.zeros(1, 1, 41, 60)
     image[..., 30:] = 0.8
     for picture in (image, image.mT):
-        answer = detectors.laplacian_of_gaussian(picture, sigma=sigma, share=1.0)
+        answer = detectors.laplacian_of_gaussian(picture, sigma=sigma, fraction=1.0)
         # The response belongs to the left or upper pixel of the two.
         line = answer.response[0, 0, 20] if picture is image else answer.response[0, 0, :, 20]
         expected = 0.8 * np.exp(-0.125 / sigma**2) / (np.sqrt(2 * np.pi) * sigma**3)
@@ -88,7 +90,7 @@ def test_zero_crossings_of_a_step_have_the_height_of_the_closed_form(sigma: floa
 
 def test_canny_is_opencvs_with_these_thresholds() -> None:
     image = photos(1, 64, seed=5)
-    answer = detectors.canny(image, sigma=1.8, edges=0.2, share=1.0)
+    answer = detectors.canny(image, sigma=1.8, edges=0.2, fraction=1.0)
     grey = (image[0, 0] * 255).round().numpy().astype(np.float32)
     blurred = cv2.GaussianBlur(grey, (0, 0), 1.8, borderType=cv2.BORDER_REPLICATE)
     dx, dy = (cv2.Sobel(blurred, cv2.CV_32F, *o, ksize=3, borderType=cv2.BORDER_REPLICATE) for o in ((1, 0), (0, 1)))
@@ -107,7 +109,7 @@ def test_canny_is_opencvs_with_these_thresholds() -> None:
 def test_sift_keeps_the_strongest_and_its_contrast() -> None:
     image = photos(1, 96, seed=7)
     grey = (image[0, 0] * 255).round().byte().numpy()
-    answer = detectors.sift(image, share=0.002)
+    answer = detectors.sift(image, fraction=0.002)
     keypoints = cv2.SIFT.create(nfeatures=int(0.002 * 96 * 96)).detect(grey, None)
     contrast: dict[tuple[int, int], float] = {}
     for k in keypoints:
@@ -152,7 +154,7 @@ def test_fast_hessian_is_the_maxima_over_place_and_side_of_bays_octaves() -> Non
             cube = padded[level - 1 : level + 2]
             around = torch.stack([cube[:, dy : dy + 104, dx : dx + 104] for dy in range(3) for dx in range(3)])
             expected |= (stack[level] == around.flatten(0, 1).amax(0)) & (stack[level] > 5e-5)
-    answer = detectors.fast_hessian(image, threshold=5e-5, share=1.0)
+    answer = detectors.fast_hessian(image, threshold=5e-5, fraction=1.0)
     assert int(expected.sum()) > 3
     assert torch.equal(answer.points[0, 0], expected)
     torch.testing.assert_close(answer.response[0, 0].double(), torch.stack([*det.values()]).amax(0).clamp(min=0))
@@ -173,10 +175,10 @@ def test_bad_options_are_refused() -> None:
 
 
 @pytest.mark.parametrize("name", detectors.DETECTORS)
-@pytest.mark.parametrize("share", [-1.0, 0.0, 1.5, float("nan")])
-def test_shares_that_are_none_are_refused(name: str, share: float) -> None:
-    with pytest.raises(InvalidInputError, match="share: expected 0 < share <= 1"):
-        detectors.DETECTORS[name](torch.rand(1, 1, 32, 32), share=share)
+@pytest.mark.parametrize("fraction", [-1.0, 0.0, 1.5, float("nan")])
+def test_shares_that_are_none_are_refused(name: str, fraction: float) -> None:
+    with pytest.raises(InvalidInputError, match="fraction: expected 0 < fraction <= 1"):
+        detectors.DETECTORS[name](torch.rand(1, 1, 32, 32), fraction=fraction)
 
 
 @pytest.mark.parametrize("edges", [-0.5, 0.0, 1.5, float("nan")])
@@ -188,7 +190,7 @@ def test_canny_refuses_a_share_of_edges_that_is_none(edges: float) -> None:
 def test_canny_of_more_than_16_million_pixels() -> None:
     image = torch.zeros(1, 1, 4001, 4000)
     image[..., 2000:] = 1.0
-    points = detectors.canny(image, edges=0.002, share=1e-3).points[0, 0]
+    points = detectors.canny(image, edges=0.002, fraction=1e-3).points[0, 0]
     assert points[:, 1990:2010].sum() >= 4001
     assert not points[:, :1990].any()
     assert not points[:, 2010:].any()

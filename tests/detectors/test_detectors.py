@@ -17,7 +17,7 @@ from curvireg_torch.detectors import DETECTORS
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.filters import gaussian_smooth
 
-from ..filters.support import photos
+from ..filters.layer_cases import photos
 
 every_detector = pytest.mark.parametrize("name", list(DETECTORS))
 
@@ -33,7 +33,7 @@ def _box(contrast: float = 0.6) -> torch.Tensor:
 def test_uniform_answer(name: str) -> None:
     image = torch.cat([photos(1, 48), _box()[..., :48, :48]])
     before = image.clone()
-    answer = DETECTORS[name](image, share=0.02)
+    answer = DETECTORS[name](image, fraction=0.02)
     assert answer.response.shape == answer.points.shape == image.shape
     assert answer.response.dtype == torch.float32
     assert answer.points.dtype == torch.bool
@@ -101,13 +101,13 @@ def test_edge_detectors_find_the_outline_of_a_box_and_little_else(name: str) -> 
     outline = np.zeros((72, 96), dtype=bool)
     outline[20:44, 24:72] = True
     outline[21:43, 25:71] = False
-    points = DETECTORS[name](_box(), share=0.05).points[0, 0].numpy()
+    points = DETECTORS[name](_box(), fraction=0.05).points[0, 0].numpy()
     assert _near(points, outline, 2) > 0.95
     assert _near(outline, points, 2) > 0.9
 
 
 def test_all_detectors_keep_the_same_share_of_the_pixels() -> None:
-    assert {inspect.signature(detector).parameters["share"].default for detector in DETECTORS.values()} == {0.04}
+    assert {inspect.signature(detector).parameters["fraction"].default for detector in DETECTORS.values()} == {0.04}
 
 
 @pytest.mark.parametrize("name", ["harris", "mineig"])
@@ -125,7 +125,7 @@ def _on_bytes(image: torch.Tensor) -> np.ndarray:
 def test_canny_against_scikit_image() -> None:
     """The same method in another library, its thresholds as quantiles: nearly all edges meet within 1 px."""
     image = gaussian_smooth(photos(1, 64, seed=5), 2.0)
-    ours = detectors.canny(image, share=1.0).points[0, 0].numpy()
+    ours = detectors.canny(image, fraction=1.0).points[0, 0].numpy()
     theirs = skimage_canny(image[0, 0].numpy(), sigma=1.4, low_threshold=0.5, high_threshold=0.7, use_quantiles=True)
     assert _near(ours, theirs, 1) > 0.85
     assert _near(theirs, ours, 1) > 0.8
@@ -163,7 +163,7 @@ def test_zero_crossings_lie_on_a_disc_where_the_laplacian_changes_sign() -> None
     axis = torch.arange(65.0) - 32
     r = (axis[:, None] ** 2 + axis**2).sqrt()
     disc = torch.sigmoid((20 - r) / 0.5)[None, None]
-    answer = detectors.laplacian_of_gaussian(disc, share=0.04)
+    answer = detectors.laplacian_of_gaussian(disc, fraction=0.04)
     # Rounding crosses zero too where the image is flat, a thousand times more weakly.
     strong = answer.points[0, 0] & (answer.response[0, 0] > 1e-3 * answer.response.max())
     assert int(strong.sum()) > 100
@@ -181,7 +181,7 @@ def test_zero_crossings_find_a_step_whose_edge_is_a_pixel(contrast: float, trans
     image = image.mT if transposed else image
 
     def response_of(sigma: float) -> torch.Tensor:
-        found = detectors.laplacian_of_gaussian(image, sigma=sigma, share=1.0).response
+        found = detectors.laplacian_of_gaussian(image, sigma=sigma, fraction=1.0).response
         return (found.mT if transposed else found)[0, 0]
 
     # Smoothed by next to nothing the Laplacian is exact: contrast / 2, 0, -contrast / 2, one crossing.

@@ -15,7 +15,7 @@ from curvireg_torch import detectors, filters
 from curvireg_torch.descriptors import HOG
 from curvireg_torch.detectors import Response
 
-from ..filters.support import photos
+from ..filters.layer_cases import photos
 
 
 def _discs() -> tuple[Tensor, Tensor]:

@@ -5,7 +5,7 @@ import torch
 
 from curvireg_torch import filters
 
-from .support import LAYERS, Layer
+from .layer_cases import LAYERS, Layer
 
 SOME = ("cs", "asg-perspective", "ig", "blur", "hog")
 

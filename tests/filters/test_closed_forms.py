@@ -9,7 +9,7 @@ from torch import Tensor
 
 from curvireg_torch import filters
 
-from .support import cylinder, grid, plane, sphere
+from .layer_cases import cylinder, grid, plane, sphere
 
 SIZES = (33, 65, 129)
 

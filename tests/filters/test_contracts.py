@@ -8,7 +8,7 @@ import torch
 from curvireg_torch import filters
 from curvireg_torch.errors import InvalidInputError
 
-from .support import LAYERS, NAMES, Layer, depths, equal_up_to_sign, photos
+from .layer_cases import LAYERS, NAMES, Layer, depths, equal_up_to_sign, photos
 
 every_layer = pytest.mark.parametrize("layer", LAYERS, ids=NAMES)
 every_filter = pytest.mark.parametrize("layer", [x for x in LAYERS if "hog" not in x.name], ids=lambda x: x.name)

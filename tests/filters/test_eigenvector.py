@@ -2,7 +2,7 @@
 
 import torch
 
-from curvireg_torch.filters.curvilinear import along, dominant_eigenvector
+from curvireg_torch.filters.curvilinear import dominant_eigenvector, scaled_direction
 
 
 def matrices() -> torch.Tensor:
@@ -30,7 +30,7 @@ def test_eigenvector_and_gap_are_those_of_lapack() -> None:
     m = matrices()
     planes = [m[:, i, j].view(-1, 1, 1, 1) for i in range(2) for j in range(2)]
     vx, vy, half_gap = dominant_eigenvector(*planes)
-    v = torch.cat(along(torch.ones_like(vx), vx, vy), dim=1)[:, :, 0, 0]
+    v = torch.cat(scaled_direction(torch.ones_like(vx), vx, vy), dim=1)[:, :, 0, 0]
     values = torch.linalg.eigvals(m).real
     torch.testing.assert_close(2 * half_gap.flatten(), values.amax(dim=1) - values.amin(dim=1))
     torch.testing.assert_close(v.norm(dim=1), torch.ones(len(m), dtype=torch.float64))
@@ -43,4 +43,4 @@ def test_eigenvector_and_gap_are_those_of_lapack() -> None:
 def test_no_direction_where_the_eigenvalues_agree() -> None:
     planes = [torch.full((1, 1, 1, 1), x) for x in (3.0, 0.0, 0.0, 3.0)]
     assert [float(x) for x in dominant_eigenvector(*planes)] == [0.0, 0.0, 0.0]
-    assert [float(x) for x in along(torch.ones(1), torch.zeros(1), torch.zeros(1))] == [0.0, 0.0]
+    assert [float(x) for x in scaled_direction(torch.ones(1), torch.zeros(1), torch.zeros(1))] == [0.0, 0.0]

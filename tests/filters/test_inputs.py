@@ -8,9 +8,10 @@ from kornia.color import rgb_to_grayscale
 
 from curvireg_torch import filters
 from curvireg_torch.descriptors import field_points, hog
-from curvireg_torch.filters.inputs import fill_missing, grey
+from curvireg_torch.filters.inputs import fill_missing
+from curvireg_torch.filters.inputs import to_grey as grey
 
-from .support import LAYERS, Layer, photos
+from .layer_cases import LAYERS, Layer, photos
 
 PHOTO_LAYERS = [x for x in LAYERS if x.inputs is photos]
 SMOOTHINGS = ("diffusion", "diffusion-exponential")

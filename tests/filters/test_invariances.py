@@ -9,7 +9,7 @@ from torch import Tensor
 from curvireg_torch import filters
 from curvireg_torch.descriptors import hog
 
-from .support import LAYERS, Layer, photos
+from .layer_cases import LAYERS, Layer, photos
 
 NOT_FIELDS = ("hog", "hog-hard", "diffusion", "diffusion-exponential", "blur", "blur-saliency")
 FIELDS = [x for x in LAYERS if x.name not in NOT_FIELDS]

@@ -11,7 +11,7 @@ from curvireg_torch import filters
 from curvireg_torch.descriptors import HOG, hog
 from curvireg_torch.errors import InvalidInputError
 
-from .support import CAMERA, depths, fields, photos
+from .layer_cases import CAMERA, depths, fields, photos
 
 CS = (filters.depth_curvilinear_saliency, filters.DepthCurvilinearSaliency, depths)
 ASG = (filters.average_shading_gradient, filters.AverageShadingGradient, depths)

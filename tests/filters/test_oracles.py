@@ -13,7 +13,7 @@ from skimage.feature import hessian_matrix_eigvals
 from curvireg_torch import filters
 from curvireg_torch.filters.derivatives import central_derivatives, smooth
 
-from .support import photos
+from .layer_cases import photos
 
 
 def _smooth(x: np.ndarray, sigma: float) -> np.ndarray:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from curvireg_torch.filters.suppression import is_ridge
+from curvireg_torch.filters.suppression import is_directional_maximum
 
 
 @pytest.mark.parametrize("across", [0.0, 22.0, 23.0, 45.0, 67.0, 68.0, 90.0, 112.0, 113.0, 135.0, 157.0, 158.0])
@@ -15,7 +15,7 @@ def test_directions_are_rounded_to_the_nearest_45_degrees(across: float, sign: f
     length[..., 1, 1] = 1.0
     angle = torch.deg2rad(torch.tensor(across))
     x, y = (sign * f(angle).expand(1, 1, 3, 3) for f in (torch.cos, torch.sin))
-    assert not bool(is_ridge(length, x, y)[0, 0, 1, 1])
+    assert not bool(is_directional_maximum(length, x, y)[0, 0, 1, 1])
     for side in (1, -1):
         length[..., 1 + side * axis[1], 1 + side * axis[0]] = 0.5
-    assert bool(is_ridge(length, x, y)[0, 0, 1, 1])
+    assert bool(is_directional_maximum(length, x, y)[0, 0, 1, 1])

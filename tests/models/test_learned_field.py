@@ -128,7 +128,7 @@ def test_errors(field, tmp_path):
         field(torch.rand(1, 2, 32, 32))
     with pytest.raises(InvalidInputError, match="floating"):
         field(torch.zeros(1, 3, 32, 32, dtype=torch.uint8))
-    with pytest.raises(MissingFileError, match="not there"):
+    with pytest.raises(MissingFileError, match="does not exist"):
         LearnedCurvilinearSaliency(weights=tmp_path / "none.safetensors")
     (tmp_path / "bad.safetensors").write_bytes(b"not weights")
     with pytest.raises(InvalidInputError, match="not a safetensors file"):

@@ -358,7 +358,7 @@ def test_fields_fill_missing_pixels() -> None:
     image = torch.rand(1, 3, 64, 64, generator=generator)
     lost = image.clone()
     lost[0, :, 30:34, 30:34], lost[0, 2, 5, 5] = math.nan, math.inf
-    where = filters.inputs.missing(lost).any(dim=1, keepdim=True)
+    where = filters.inputs.missing_mask(lost).any(dim=1, keepdim=True)
     learned = cr.LearnedCurvilinearSaliency()
     field = learned(lost)
     assert bool(field.isfinite().all())

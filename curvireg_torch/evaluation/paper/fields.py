@@ -29,10 +29,10 @@ def photo_detectors(point_fraction: float) -> dict[str, Callable[[Tensor], Tenso
 
     def of_field(make: Callable[[], nn.Module]) -> Callable[[Tensor], Tensor]:
         field = make()
-        return lambda image: field_points(field(image), share=point_fraction)[:, 0]
+        return lambda image: field_points(field(image), fraction=point_fraction)[:, 0]
 
     def of_detector(detect: Callable[..., Any]) -> Callable[[Tensor], Tensor]:
-        return lambda image: detect(image, share=point_fraction).points[:, 0]
+        return lambda image: detect(image, fraction=point_fraction).points[:, 0]
 
     found = {name: of_field(make) for name, make in PHOTO_FIELDS.items()}
     known = {name.lower() for name in found}

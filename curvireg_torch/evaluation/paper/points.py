@@ -141,7 +141,7 @@ def _depth(describe: ViewDescriber, R: Tensor, distance: float) -> Tensor:
 def _points(depth: Tensor, settings: BankSettings, name: str = "CS") -> Tensor:
     with torch.no_grad():
         field = depth_filter(replace(settings, depth_field=name))(depth)
-    return field_points(field, share=settings.point_fraction)[:, 0]
+    return field_points(field, fraction=settings.point_fraction)[:, 0]
 
 
 def _view_points(describe: ViewDescriber, settings: BankSettings, R: Tensor, distance: float) -> Tensor:
