@@ -1,4 +1,4 @@
-"""All the files that a mesh consists of are known, and changing any of them changes its digest."""
+"""The files of a mesh are listed, and changing any of them changes its digest."""
 
 import json
 from pathlib import Path
@@ -28,7 +28,7 @@ def picture(path: Path, shade: int = 0) -> None:
 
 
 def write(folder: Path, suffix: str) -> Path:
-    """A mesh of one format whose companions have names of their own."""
+    """A mesh of one format with companion files."""
     folder.mkdir(parents=True, exist_ok=True)
     picture(folder / "picture.png")
     (folder / "beside.png").write_bytes(b"no part of the mesh")
@@ -72,12 +72,12 @@ def write(folder: Path, suffix: str) -> Path:
 
 
 @pytest.mark.parametrize("suffix", EXPECTED)
-def test_every_file_that_is_read_is_listed_and_digested(tmp_path: Path, suffix: str) -> None:
+def test_mesh_files_and_mesh_digest_cover_every_file_that_is_read(tmp_path: Path, suffix: str) -> None:
     path = write(tmp_path, suffix)
     load_mesh(path)
     assert {file.name for file in mesh_files(path)} == EXPECTED[suffix]
     before = mesh_digest(path)
-    assert mesh_digest(write(tmp_path / "copy", suffix)) == before, "of the content, wherever it lies"
+    assert mesh_digest(write(tmp_path / "copy", suffix)) == before, "the digest is of the content, not of the folder"
     (tmp_path / "beside.png").write_bytes(b"something else")
     assert mesh_digest(path) == before
     for name in EXPECTED[suffix]:
@@ -88,8 +88,7 @@ def test_every_file_that_is_read_is_listed_and_digested(tmp_path: Path, suffix: 
     assert mesh_digest(path) == before
 
 
-def test_other_names_for_the_same_pictures_are_another_mesh(tmp_path: Path) -> None:
-    """Two textures that changed places."""
+def test_mesh_digest_changes_when_textures_swap_places(tmp_path: Path) -> None:
     write(tmp_path, "obj")
     picture(tmp_path / "other.png", shade=50)
     (tmp_path / "part.mtl").write_text("newmtl skin\nmap_Kd picture.png\nnewmtl cloth\nmap_Kd other.png\n")
@@ -102,7 +101,7 @@ def test_other_names_for_the_same_pictures_are_another_mesh(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(("suffix", "name"), [("gltf", "points.bin"), ("obj", "part.mtl"), ("obj", "picture.png")])
-def test_a_file_that_was_missing_changes_the_digest_once_it_is_there(tmp_path: Path, suffix: str, name: str) -> None:
+def test_mesh_digest_changes_when_a_missing_file_appears(tmp_path: Path, suffix: str, name: str) -> None:
     path = write(tmp_path, suffix)
     whole = mesh_digest(path)
     content = (tmp_path / name).read_bytes()
@@ -113,7 +112,7 @@ def test_a_file_that_was_missing_changes_the_digest_once_it_is_there(tmp_path: P
     assert mesh_digest(path) == whole
 
 
-def test_damaged_meshes_and_files_outside_are_digested_without_an_error(tmp_path: Path) -> None:
+def test_mesh_digest_accepts_damaged_meshes_and_banks(tmp_path: Path) -> None:
     path = write(tmp_path / "inside", "gltf")
     path.write_text("{")
     with pytest.raises(MeshError):

@@ -134,10 +134,10 @@ def test_check_gltf_refuses_deep_json(tmp_path: Path) -> None:
     refused(tmp_path / "a.gltf", b'{"asset": ' + b"[" * 1_000_000, "JSON is damaged")
 
 
-@pytest.mark.parametrize(
-    "uri",
-    ["../b.bin", "/etc/passwd", "file:///etc/passwd", "http://127.0.0.1:9/b.bin", "%2e%2e/b.bin", "link.bin", "no.bin"],
-)
+OUTSIDE = ["../b.bin", "/etc/passwd", "file:///etc/passwd", "http://127.0.0.1:9/b.bin", "%2e%2e/b.bin"]
+
+
+@pytest.mark.parametrize("uri", [*OUTSIDE, "link.bin", "no.bin"])
 def test_load_mesh_opens_no_file_outside_the_folder(tmp_path: Path, uri: str) -> None:
     folder = tmp_path / "inside"
     folder.mkdir()

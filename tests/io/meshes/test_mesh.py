@@ -1,4 +1,4 @@
-"""Normalised frames follow the object."""
+"""The normalised frame of a mesh."""
 
 import pytest
 import torch
@@ -12,14 +12,14 @@ from curvireg_torch.settings import BankSettings
 from curvireg_torch.synthetic import example_mesh
 
 
-def moved(mesh: trimesh.Trimesh, rotation: torch.Tensor, scale: float, shift: list[float]) -> trimesh.Trimesh:
+def moved(mesh: trimesh.Trimesh, rotation: torch.Tensor, scale: float, offset: list[float]) -> trimesh.Trimesh:
     T = torch.eye(4, dtype=torch.float64)
-    T[:3, :3], T[:3, 3] = scale * rotation, torch.tensor(shift, dtype=torch.float64)
+    T[:3, :3], T[:3, 3] = scale * rotation, torch.tensor(offset, dtype=torch.float64)
     return mesh.copy().apply_transform(T.numpy())
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_principal_axes_and_their_signs_follow_any_motion(seed: int) -> None:
+def test_normalization_transform_is_invariant_to_similarities(seed: int) -> None:
     mesh = example_mesh()
     R = torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
     copy = moved(mesh, R, 7.0, [3.0, -2.0, 5.0])
@@ -32,14 +32,14 @@ def test_principal_axes_and_their_signs_follow_any_motion(seed: int) -> None:
     assert float(torch.tensor(normalised[0]).norm(dim=1).max()) == pytest.approx(1.0)
 
 
-def test_a_mirrored_object_is_not_turned_into_its_twin() -> None:
+def test_normalization_transform_does_not_mirror() -> None:
     mesh = example_mesh()
     T = normalization_transform(mesh, align_axes=True)
     assert float(torch.linalg.det(T[:3, :3])) > 0
 
 
-def test_bank_of_a_moved_copy_is_the_same_bank() -> None:
-    # A quarter turn about z maps the box, and a grid of azimuths, onto themselves.
+def test_bank_of_a_moved_copy_holds_the_same_views() -> None:
+    # A quarter rotation about z maps the box, and a grid of azimuths, onto themselves.
     mesh, settings = example_mesh(), BankSettings(image_size=64)
     quarter = torch.from_numpy(Rotation.from_euler("z", 90, degrees=True).as_matrix())
     copy = moved(mesh, quarter, 12.0, [30.0, -7.0, 2.0])
@@ -56,7 +56,7 @@ def test_bank_of_a_moved_copy_is_the_same_bank() -> None:
     assert int(differ.max()) <= 4  # pixels on rims
 
 
-def test_views_along_principal_axes_keep_poses_in_the_files_frame() -> None:
+def test_in_model_frame_keeps_poses_in_the_frame_of_the_file() -> None:
     mesh = example_mesh()
     copy = moved(mesh, torch.from_numpy(Rotation.random(random_state=1).as_matrix()), 3.0, [1.0, 2.0, 3.0])
     views = g.uniform_views(12)

@@ -71,7 +71,7 @@ def test_triangulate_is_batch_independent() -> None:
 
 def test_triangulate_divides_convex_and_broken_polygons_into_fans() -> None:
     square = np.array([[[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]])
-    for polygon in (square, square * np.nan, square * np.inf, square * 0):
+    for polygon in (square, square * np.nan, square * 0):
         assert triangulate(polygon)[0] == [[0, 1, 2], [0, 2, 3]]
 
 
