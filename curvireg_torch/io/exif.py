@@ -1,4 +1,7 @@
-"""The two EXIF facts that matter here: how the picture is turned, and the focal length."""
+"""The EXIF orientation and focal length of a photograph.
+
+This reader replaces Pillow's because :mod:`.image_headers` needs the offsets of TIFF entries, which Pillow hides.
+"""
 
 import struct
 from dataclasses import dataclass
@@ -10,13 +13,14 @@ _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
 
 
 class Directory:
-    """The whole-number entries of one directory of a TIFF or EXIF block.
+    """The integer entries of one directory of a TIFF or EXIF block.
 
     Attributes:
-        next: offset of the directory behind it, 0 if it is the last.
+        next: offset of the following directory, 0 after the last.
+        offsets: tag -> offset of the entry's value field.
 
     Raises:
-        ValueError: not a TIFF block, or it ends inside the directory.
+        ValueError: not a TIFF block, or the block ends inside the directory.
     """
 
     def __init__(self, block: bytes, offset: int | None = None) -> None:
@@ -29,22 +33,22 @@ class Directory:
                 (offset,) = struct.unpack_from(self.order + "I", block, 4)
             (count,) = struct.unpack_from(self.order + "H", block, offset)
             layout = self.order + "HHII"
-            found = [struct.unpack_from(layout, block, offset + 2 + 12 * i) for i in range(count)]
+            entries = [struct.unpack_from(layout, block, offset + 2 + 12 * i) for i in range(count)]
             (self.next,) = struct.unpack_from(self.order + "I", block, offset + 2 + 12 * count)
         except struct.error as error:
             raise ValueError("ends inside a directory") from error
-        self.places = {tag: offset + 10 + 12 * i for i, (tag, *_) in enumerate(found)}
-        self._entries = {tag: (kind, count, value) for tag, kind, count, value in found}
+        self.offsets = {tag: offset + 10 + 12 * i for i, (tag, *_) in enumerate(entries)}
+        self._entries = {tag: (kind, count, value) for tag, kind, count, value in entries}
 
     def get(self, tag: int, default: int) -> int:
-        """The first number of an entry; ``default`` where it is absent or no whole number."""
+        """The first number of an entry; ``default`` if it is absent or not an integer."""
         kind, count, offset = self._entries.get(tag, (0, 0, 0))
         if kind not in _FORMATS or count < 1:
             return default
         layout = self.order + _FORMATS[kind]
-        place = self.places[tag] if struct.calcsize(layout) * count <= 4 else offset
+        offset = self.offsets[tag] if struct.calcsize(layout) * count <= 4 else offset
         try:
-            return int(struct.unpack_from(layout, self._block, place)[0])
+            return int(struct.unpack_from(layout, self._block, offset)[0])
         except struct.error:
             return default
 
@@ -58,12 +62,12 @@ class Exif:
 
 
 def read_exif(block: bytes) -> Exif:
-    """What a TIFF block (the part behind ``Exif\\0\\0``) says; a damaged block says nothing."""
+    """Read a TIFF block (the part after ``Exif\\0\\0``); a damaged block gives the defaults."""
     try:
         main = Directory(block)
         orientation = main.get(_ORIENTATION, 1)
-        place = main.get(_EXIF_DIRECTORY, 0)
-        focal = Directory(block, place).get(_FOCAL_35MM, 0) if place else 0
+        offset = main.get(_EXIF_DIRECTORY, 0)
+        focal = Directory(block, offset).get(_FOCAL_35MM, 0) if offset else 0
     except ValueError:
         return Exif()
     return Exif(orientation if 1 <= orientation <= 8 else 1, float(focal) if focal > 0 else None)

@@ -1,4 +1,8 @@
-"""What a photograph's file says of itself, read before anything is decoded."""
+"""Headers of image files, read before anything is decoded.
+
+Pillow's headers do not suffice: they neither count the scans of a progressive JPEG, which may take hours to decode, nor
+find where the picture ends before other data, nor say where a TIFF stores its orientation.
+"""
 
 import re
 import struct
@@ -12,19 +16,18 @@ __all__ = ["ImageHeader", "read_header"]
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Size and make of a picture.
+    """Size and format of a picture.
 
     Attributes:
         width, height: px, as stored.
+        data: the bytes to decode, without what follows the picture. A TIFF's orientation is set to 1, because OpenCV
+            always applies it.
         colour: "RGB", "grey", "palette" or "CMYK".
-        bits: of a channel.
-        alpha: whether it has an alpha channel.
-        exif: orientation and focal length.
-        data: the bytes to decode: without what follows the picture's end, and with orientation 1 where the decoder
-            would otherwise turn the picture.
-        surplus: bytes behind the picture's end.
+        bits: per channel.
+        alpha: whether the picture has an alpha channel.
+        surplus: number of bytes after the picture.
         scans: passes over the picture.
-        pages: whether more than one picture is inside.
+        has_more_pages: whether the file holds several pictures.
     """
 
     width: int
@@ -36,7 +39,7 @@ class ImageHeader:
     exif: Exif = field(default_factory=Exif)
     surplus: int = 0
     scans: int = 1
-    pages: bool = False
+    has_more_pages: bool = False
 
 
 _TRUNCATED = "the image is truncated; fetch the file again"
@@ -48,7 +51,7 @@ def read_header(data: bytes) -> ImageHeader:
     """The header of a JPEG, PNG, TIFF, WebP, BMP, PGM or PPM file.
 
     Raises:
-        ValueError: another format, or damaged; the message is for the user.
+        ValueError: another format, or a damaged file; the message is for the user.
     """
     try:
         for start, reader in _READERS.items():
@@ -56,8 +59,8 @@ def read_header(data: bytes) -> ImageHeader:
                 return reader(data)
     except (struct.error, IndexError):
         raise ValueError(_TRUNCATED) from None
-    for start, offset, name in _OTHERS:
-        if data[offset:].startswith(start):
+    for start, name in _OTHERS.items():
+        if data.startswith(start) or (start.startswith(b"ftyp") and data[4:].startswith(start)):
             raise ValueError(f"{name} is not read; convert it to JPEG or PNG")
     raise ValueError("not an image; expected JPEG, PNG, TIFF, WebP, BMP, PGM or PPM")
 
@@ -65,10 +68,10 @@ def read_header(data: bytes) -> ImageHeader:
 def _jpeg(data: bytes) -> ImageHeader:
     position, scans, frame, exif = 2, 0, None, Exif()
     while True:
-        found = _STARTS_SEGMENT.search(data, position)
-        if found is None:
+        segment = _STARTS_SEGMENT.search(data, position)
+        if segment is None:
             raise ValueError(_TRUNCATED)
-        marker, position = data[found.end() - 1], found.end()
+        marker, position = data[segment.end() - 1], segment.end()
         if marker == 0xD9:
             break
         if marker in (0x01, 0xD8):  # no content
@@ -87,31 +90,29 @@ def _jpeg(data: bytes) -> ImageHeader:
         raise ValueError("not an image: a JPEG without a picture in it")
     bits, height, width, channels = frame
     colour = {1: "grey", 4: "CMYK"}.get(channels, "RGB")
-    return ImageHeader(
-        width, height, data[:position], colour, bits, exif=exif, surplus=len(data) - position, scans=scans
-    )
+    surplus = len(data) - position
+    return ImageHeader(width, height, data[:position], colour, bits, exif=exif, surplus=surplus, scans=scans)
 
 
 def _png(data: bytes) -> ImageHeader:
-    position, exif, alpha, pages = 8, Exif(), False, False
-    while True:
+    position, exif, alpha, animated, kind = 8, Exif(), False, False, b""
+    while kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", data, position)
-        begin, position = position + 8, position + 12 + length
+        start, position = position + 8, position + 12 + length
         if position > len(data):
             raise ValueError(_TRUNCATED)
         if kind == b"eXIf":
-            exif = read_exif(data[begin : begin + length])
+            exif = read_exif(data[start : start + length])
         alpha |= kind == b"tRNS"
-        pages |= kind == b"acTL"
-        if kind == b"IEND":
-            break
-    size, kind, width, height, bits, colour = struct.unpack_from(">I4sIIBB", data, 8)
+        animated |= kind == b"acTL"
+    size, kind, width, height, bits, colour_type = struct.unpack_from(">I4sIIBB", data, 8)
     if kind != b"IHDR" or size != 13:
         raise ValueError("not an image: a PNG without a header")
-    name = {0: "grey", 3: "palette", 4: "grey"}.get(colour, "RGB")
-    alpha |= colour in (4, 6)
+    colour = {0: "grey", 3: "palette", 4: "grey"}.get(colour_type, "RGB")
+    alpha |= colour_type in (4, 6)
+    surplus = len(data) - position
     return ImageHeader(
-        width, height, data[:position], name, bits, alpha, exif, surplus=len(data) - position, pages=pages
+        width, height, data[:position], colour, bits, alpha, exif, surplus=surplus, has_more_pages=animated
     )
 
 
@@ -120,56 +121,53 @@ def _tiff(data: bytes) -> ImageHeader:
         directory = Directory(data)
     except ValueError:
         raise ValueError(_TRUNCATED) from None
-    width, height, bits, kind, samples = (
-        directory.get(tag, default) for tag, default in ((256, 0), (257, 0), (258, 1), (262, 1), (277, 1))
-    )
-    if kind in (8, 9, 10):  # decoded with other colours
+    defaults = {256: 0, 257: 0, 258: 1, 262: 1, 277: 1}
+    width, height, bits, interpretation, samples = (directory.get(tag, default) for tag, default in defaults.items())
+    if interpretation in (8, 9, 10):  # OpenCV decodes these with wrong colours
         raise ValueError("a TIFF in CIELAB is not read; convert it to RGB")
-    colour = {0: "grey", 1: "grey", 3: "palette", 5: "CMYK"}.get(kind, "RGB")
+    colour = {0: "grey", 1: "grey", 3: "palette", 5: "CMYK"}.get(interpretation, "RGB")
     exif = read_exif(data)
-    if exif.orientation != 1:  # OpenCV turns a TIFF whatever it is told
-        place = directory.places[274]
-        data = data[:place] + struct.pack(directory.order + "HH", 1, 0) + data[place + 4 :]
+    if exif.orientation != 1:
+        offset = directory.offsets[274]
+        data = data[:offset] + struct.pack(directory.order + "HH", 1, 0) + data[offset + 4 :]
     alpha = samples > {"grey": 1, "palette": 1, "CMYK": 4}.get(colour, 3)
-    return ImageHeader(width, height, data, colour, bits, alpha, exif, pages=directory.next != 0)
+    return ImageHeader(width, height, data, colour, bits, alpha, exif, has_more_pages=directory.next != 0)
 
 
 def _webp(data: bytes) -> ImageHeader:
     (size,) = struct.unpack_from("<I", data, 4)
     if data[8:12] != b"WEBP":
-        raise ValueError("not an image: a RIFF file that is no WebP")
-    end, position, exif, alpha, pages = 8 + size, 12, Exif(), False, False
+        raise ValueError("not an image: a RIFF file other than WebP")
+    end, position, exif, alpha, animated = 8 + size, 12, Exif(), False, False
     if end > len(data):
         raise ValueError(_TRUNCATED)
     sizes = []
     while position + 8 <= end:
         kind, length = struct.unpack_from("<4sI", data, position)
-        begin, position = position + 8, position + 8 + length + length % 2
+        start, position = position + 8, position + 8 + length + length % 2
         if kind == b"VP8X":
-            flags, wide, high = data[begin], data[begin + 4 : begin + 7], data[begin + 7 : begin + 10]
+            flags, wide, high = data[start], data[start + 4 : start + 7], data[start + 7 : start + 10]
             sizes.append((int.from_bytes(wide, "little") + 1, int.from_bytes(high, "little") + 1))
-            alpha, pages = bool(flags & 16), bool(flags & 2)
+            alpha, animated = bool(flags & 16), bool(flags & 2)
         elif kind == b"VP8 ":
-            wide, high = struct.unpack_from("<HH", data, begin + 6)
+            wide, high = struct.unpack_from("<HH", data, start + 6)
             sizes.append((wide & 0x3FFF, high & 0x3FFF))
         elif kind == b"VP8L":
-            (word,) = struct.unpack_from("<I", data, begin + 1)
+            (word,) = struct.unpack_from("<I", data, start + 1)
             sizes.append(((word & 0x3FFF) + 1, (word >> 14 & 0x3FFF) + 1))
             alpha |= bool(word >> 28 & 1)
         elif kind == b"EXIF":
-            exif = read_exif(data[begin : begin + length].removeprefix(b"Exif\0\0"))
+            exif = read_exif(data[start : start + length].removeprefix(b"Exif\0\0"))
     if not sizes:
         raise ValueError("not an image: a WebP without a picture in it")
     width, height = max(sizes)
-    return ImageHeader(width, height, data[:end], "RGB", 8, alpha, exif, surplus=len(data) - end, pages=pages)
+    surplus = len(data) - end
+    return ImageHeader(width, height, data[:end], alpha=alpha, exif=exif, surplus=surplus, has_more_pages=animated)
 
 
 def _bmp(data: bytes) -> ImageHeader:
     (size,) = struct.unpack_from("<I", data, 14)
-    if size == 12:
-        width, height, _, bits = struct.unpack_from("<HHHH", data, 18)
-    else:
-        width, height, _, bits = struct.unpack_from("<iiHH", data, 18)
+    width, height, _, bits = struct.unpack_from("<HHHH" if size == 12 else "<iiHH", data, 18)
     return ImageHeader(abs(width), abs(height), data, "palette" if bits <= 8 else "RGB", 8, bits == 32)
 
 
@@ -179,37 +177,30 @@ def _pnm(data: bytes) -> ImageHeader:
         words += line.split(b"#")[0].split()
     if len(words) < 3 or not all(word.isdigit() for word in words[:3]):
         raise ValueError(_TRUNCATED)
-    width, height, top = (int(word) for word in words[:3])
-    return ImageHeader(width, height, data, "grey" if data[1:2] in b"25" else "RGB", 8 if top < 256 else 16)
+    width, height, maximum = (int(word) for word in words[:3])
+    return ImageHeader(width, height, data, "grey" if data[1:2] in b"25" else "RGB", 8 if maximum < 256 else 16)
 
 
 _READERS: dict[bytes, Callable[[bytes], ImageHeader]] = {
     b"\xff\xd8": _jpeg,
     b"\x89PNG\r\n\x1a\n": _png,
-    b"II*\0": _tiff,
-    b"MM\0*": _tiff,
+    **dict.fromkeys((b"II*\0", b"MM\0*"), _tiff),
     b"RIFF": _webp,
     b"BM": _bmp,
-    b"P2": _pnm,
-    b"P3": _pnm,
-    b"P5": _pnm,
-    b"P6": _pnm,
+    **dict.fromkeys((b"P2", b"P3", b"P5", b"P6"), _pnm),
 }
-_OTHERS = [
-    (b"ftyphe", 4, "HEIC"),
-    (b"ftypmif1", 4, "HEIC"),
-    (b"ftypmsf1", 4, "HEIC"),
-    (b"ftypavi", 4, "AVIF"),
-    (b"ftyp", 4, "a video"),
-    (b"\0\0\0\x0cjP", 0, "JPEG 2000"),
-    (b"\xff\x0a", 0, "JPEG XL"),
-    (b"\0\0\0\x0cJXL", 0, "JPEG XL"),
-    (b"GIF8", 0, "GIF"),
-    (b"II+\0", 0, "BigTIFF"),
-    (b"MM\0+", 0, "BigTIFF"),
-    (b"\x76\x2f\x31\x01", 0, "OpenEXR"),
-    (b"#?R", 0, "Radiance HDR"),
-    (b"8BPS", 0, "Photoshop"),
-    (b"%PDF", 0, "PDF"),
-    (b"<svg", 0, "SVG"),
-]
+_OTHERS = {
+    **dict.fromkeys((b"ftyphe", b"ftypmif1", b"ftypmsf1"), "HEIC"),
+    b"ftypavi": "AVIF",
+    b"ftyp": "a video",
+    b"\0\0\0\x0cjP": "JPEG 2000",
+    **dict.fromkeys((b"\xff\x0a", b"\0\0\0\x0cJXL"), "JPEG XL"),
+    b"GIF8": "GIF",
+    **dict.fromkeys((b"II+\0", b"MM\0+"), "BigTIFF"),
+    b"\x76\x2f\x31\x01": "OpenEXR",
+    b"#?R": "Radiance HDR",
+    b"8BPS": "Photoshop",
+    b"%PDF": "PDF",
+    b"<svg": "SVG",
+}
+"""Starts of formats that are not read; those with ``ftyp`` follow the four bytes of a length."""

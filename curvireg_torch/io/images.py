@@ -21,7 +21,7 @@ from .image_headers import ImageHeader, read_header
 __all__ = ["Photo", "read_image", "read_photo"]
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
-_SHOWN = {  # how viewers turn the stored (H, W, C) pixels for an EXIF orientation
+_APPLY_ORIENTATION = {  # stored (H, W, C) pixels to viewed ones, for each EXIF orientation
     1: lambda x: x,
     2: lambda x: x[:, ::-1],
     3: lambda x: x[::-1, ::-1],
@@ -35,13 +35,13 @@ _SHOWN = {  # how viewers turn the stored (H, W, C) pixels for an EXIF orientati
 
 @dataclass(frozen=True)
 class Photo:
-    """A photograph as viewers show it, and what its file says.
+    """A photograph as viewers show it, and the metadata of its file.
 
     Attributes:
         image: (3, H, W) RGB.
-        orientation: EXIF orientation that was applied, 1 to 8; 1 = none.
+        orientation: the EXIF orientation that was applied, 1 to 8; 1 = none.
         focal_35mm: EXIF focal length in mm of a 36 x 24 mm camera of the same view, or None.
-        notes: what was done to the pixels, in words.
+        notes: changes to the pixels, in words.
     """
 
     image: Tensor
@@ -50,9 +50,10 @@ class Photo:
     notes: tuple[str, ...]
 
     def guessed_camera_matrix(self) -> Tensor | None:
-        """(3, 3) float64 camera of the EXIF focal length, or None; a guess: right for the whole, undistorted picture.
+        """(3, 3) float64 camera matrix from the EXIF focal length, or None without one.
 
-        The focal length is taken over the diagonal, the principal point as the middle.
+        The focal length is taken relative to the diagonal, and the principal point is the centre. That is right for a
+        picture that was neither cropped nor undistorted.
         """
         if self.focal_35mm is None:
             return None
@@ -62,22 +63,25 @@ class Photo:
 
     def facts(self) -> dict[str, Any]:
         """All but the pixels, as plain JSON."""
-        size = {"width": self.image.shape[-1], "height": self.image.shape[-2]}
-        turned = {"orientation": self.orientation, "focal_35mm": self.focal_35mm}
-        return {**size, **turned, "notes": list(self.notes)}
+        return {
+            "width": self.image.shape[-1],
+            "height": self.image.shape[-2],
+            "orientation": self.orientation,
+            "focal_35mm": self.focal_35mm,
+            "notes": list(self.notes),
+        }
 
 
 def read_photo(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.uint8) -> Photo:
-    """Read a photograph as viewers show it: an EXIF orientation is applied, and boxes count in the turned picture.
+    """Read a photograph as viewers show it: the EXIF orientation is applied, and boxes refer to the result.
 
     Args:
         path: JPEG, PNG, TIFF, WebP, BMP, PGM or PPM with 8 or 16 bits per channel.
         dtype: ``torch.uint8``, 0 to 255, or ``torch.float32``, 0 to 1.
 
     Raises:
-        MissingFileError: no such file.
-        ImageError: not such an image, truncated, of another bit depth, or beyond
-            :mod:`curvireg_torch.limits`.
+        MissingFileError: the file does not exist.
+        ImageError: another format or bit depth, a truncated file, or one beyond :mod:`curvireg_torch.limits`.
 
     Example:
         >>> import tempfile
@@ -91,7 +95,7 @@ def read_photo(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.uint8
     header, pixels = _decode(Path(path))
     orientation = header.exif.orientation
     notes = _notes(header, pixels.dtype, dtype)
-    return Photo(_tensor(_SHOWN[orientation](pixels), dtype), orientation, header.exif.focal_35mm, notes)
+    return Photo(_to_tensor(_APPLY_ORIENTATION[orientation](pixels), dtype), orientation, header.exif.focal_35mm, notes)
 
 
 def read_image(
@@ -102,18 +106,15 @@ def read_image(
     Grey images get three equal channels, an alpha channel is dropped, 16-bit images keep their precision in float32.
 
     Args:
-        path: JPEG, PNG, TIFF, WebP, BMP, PGM or PPM with 8 or 16 bits per channel.
-        orientation: ``"stored"``: pixels as they are stored, in which datasets count their labelled boxes;
-            ``"viewed"``: as viewers show them, turned by the EXIF orientation.
-        dtype: ``torch.float32``, 0 to 1, or ``torch.uint8``, 0 to 255.
+        path, dtype: see :func:`read_photo`.
+        orientation: ``"stored"`` for pixels as stored, to which the boxes of datasets refer; ``"viewed"`` to apply the
+            EXIF orientation.
 
     Returns:
         (3, H, W).
 
     Raises:
-        MissingFileError: no such file.
-        ImageError: not such an image, truncated, of another bit depth, or beyond
-            :mod:`curvireg_torch.limits`.
+        MissingFileError, ImageError: see :func:`read_photo`.
 
     Example:
         >>> read_image("missing.jpg")
@@ -123,45 +124,52 @@ def read_image(
     """
     check_option(orientation, ("stored", "viewed"), "orientation")
     header, pixels = _decode(Path(path))
-    return _tensor(_SHOWN[header.exif.orientation](pixels) if orientation == "viewed" else pixels, dtype)
+    return _to_tensor(_APPLY_ORIENTATION[header.exif.orientation](pixels) if orientation == "viewed" else pixels, dtype)
 
 
 def _decode(path: Path) -> tuple[ImageHeader, NDArray[Any]]:
     """Header and (H, W, 3) BGR pixels, uint8 or uint16, as stored."""
     if not path.is_file():
-        raise MissingFileError(f"{path}: no such file; check the path of the photograph")
+        raise MissingFileError("no such file; check the path of the photograph", subject=path)
     if path.stat().st_size > MAX_IMAGE_BYTES:
-        raise ImageError(f"{path}: larger than {MAX_IMAGE_BYTES:,} bytes; save it smaller")
+        raise ImageError(f"larger than {MAX_IMAGE_BYTES:,} bytes; save it smaller", subject=path)
     try:
         header = read_header(path.read_bytes())
     except ValueError as error:
-        raise ImageError(f"{path}: {error}") from None
+        raise ImageError(str(error), subject=path) from None
     size = f"{header.width} x {header.height} px"
     if header.width * header.height > MAX_IMAGE_PIXELS:
-        raise ImageError(f"{path}: {size}, more than {MAX_IMAGE_PIXELS:,} pixels; scale it down")
+        raise ImageError(f"{size}, more than {MAX_IMAGE_PIXELS:,} pixels; scale it down", subject=path)
     if header.scans > MAX_IMAGE_SCANS:
-        raise ImageError(f"{path}: a JPEG of {header.scans} scans, more than {MAX_IMAGE_SCANS}; save it again")
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    log = getattr(cv2.utils, "logging", cv2)  # OpenCV 5, and 4
-    level = log.getLogLevel()
-    try:
-        log.setLogLevel(0)  # silent: the error below says it, in one line
-        pixels = cv2.imdecode(np.frombuffer(header.data, np.uint8), flags)
-    except cv2.error:
-        pixels = None
-    finally:
-        log.setLogLevel(level)
+        raise ImageError(f"a JPEG of {header.scans} scans, more than {MAX_IMAGE_SCANS}; save it again", subject=path)
+    pixels = _decode_silently(header.data)
     if pixels is None or pixels.shape != (header.height, header.width, 3):
         raise ImageError(
-            f"{path}: not an image that can be decoded ({size}, {header.colour}, {header.bits} bits); "
-            "save it as JPEG or PNG with 8 or 16 bits per channel"
+            f"not an image that can be decoded ({size}, {header.colour}, {header.bits} bits); "
+            "save it as JPEG or PNG with 8 or 16 bits per channel",
+            subject=path,
         )
     if pixels.dtype not in (np.uint8, np.uint16):
-        raise ImageError(f"{path}: expected 8 or 16 bits per channel, got {pixels.dtype}")
+        raise ImageError(f"expected 8 or 16 bits per channel, got {pixels.dtype}", subject=path)
     return header, pixels
 
 
-def _tensor(bgr: NDArray[Any], dtype: torch.dtype) -> Tensor:
+def _decode_silently(data: bytes) -> NDArray[Any] | None:
+    """OpenCV's pixels, or None; its log is off, because the caller reports the failure."""
+    log = getattr(cv2.utils, "logging", cv2)  # OpenCV 5, and 4
+    level = log.getLogLevel()
+    try:
+        log.setLogLevel(0)
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+        pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        return pixels
+    except cv2.error:
+        return None
+    finally:
+        log.setLogLevel(level)
+
+
+def _to_tensor(bgr: NDArray[Any], dtype: torch.dtype) -> Tensor:
     rgb = bgr[..., ::-1].transpose(2, 0, 1)
     if dtype == torch.uint8:
         if bgr.dtype == np.uint16:
@@ -173,13 +181,13 @@ def _tensor(bgr: NDArray[Any], dtype: torch.dtype) -> Tensor:
 
 
 def _notes(header: ImageHeader, stored: np.dtype[Any], dtype: torch.dtype) -> tuple[str, ...]:
-    said = {
+    notes = {
         f"EXIF orientation {header.exif.orientation} applied": header.exif.orientation != 1,
         "grey: three equal channels": header.colour == "grey",
         "CMYK converted to RGB without a colour profile": header.colour == "CMYK",
         "alpha channel dropped": header.alpha,
         "16 bits rounded to 8": stored == np.uint16 and dtype == torch.uint8,
-        "first of several pictures": header.pages,
-        f"{header.surplus:,} bytes behind the picture's end ignored": header.surplus > 0,
+        "first of several pictures": header.has_more_pages,
+        f"{header.surplus:,} bytes after the picture ignored": header.surplus > 0,
     }
-    return tuple(text for text, true in said.items() if true)
+    return tuple(text for text, applies in notes.items() if applies)

@@ -1,4 +1,4 @@
-"""JSON files of others."""
+"""JSON files, read within limits."""
 
 import json
 import math
@@ -13,27 +13,27 @@ __all__ = ["check_table_size", "finite_numbers", "read_json"]
 
 
 def read_json(path: Path, kind: type[Any], readme: str) -> Any:
-    """The content of ``path``, which must be a ``kind`` (dict or list) at the top."""
+    """The content of a JSON file whose top level must be a ``kind`` (dict or list)."""
     if not path.is_file():
-        raise MissingFileError(f"{path}: no such file; {readme} shows the layout")
+        raise MissingFileError(f"no such file; {readme} shows the layout", subject=path)
     check_table_size(path)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise InvalidInputError(f"{path}: damaged ({error})") from error
+        raise InvalidInputError(f"damaged ({error})", subject=path) from error
     if not isinstance(content, kind):
-        raise InvalidInputError(f"{path}: expected a {kind.__name__}, got a {type(content).__name__}")
+        raise InvalidInputError(f"expected a {kind.__name__}, got a {type(content).__name__}", subject=path)
     return content
 
 
 def check_table_size(path: Path) -> None:
-    """``path`` is not larger than a table that is read whole may be."""
+    """Refuse a table that is too large to be read as a whole."""
     if path.stat().st_size > MAX_TABLE_BYTES:
-        raise InvalidInputError(f"{path}: larger than {MAX_TABLE_BYTES:,} bytes; split the set")
+        raise InvalidInputError(f"larger than {MAX_TABLE_BYTES:,} bytes; split the set", subject=path)
 
 
 def finite_numbers(values: object, count: int) -> tuple[float, ...] | None:
-    """``values`` as floats if it is a list of ``count`` finite numbers, else None."""
+    """``values`` as floats if they are ``count`` finite numbers, else None."""
     if not isinstance(values, Iterable) or isinstance(values, str | dict):
         return None
     numbers = list(values)

@@ -1,8 +1,8 @@
 """A bounded reader for MATLAB 5 annotation files.
 
-``scipy.io.loadmat`` overflows the C stack, and so kills the process, on a file of deeply nested cells; it also
-allocates what a header claims. Annotations are downloaded files, so they are read here: structs, text and real numbers
-only, with bounds on depth and size. Everything else (cells, objects, function handles, sparse) becomes None.
+It replaces ``scipy.io.loadmat``, which overflows the C stack on a file of deeply nested cells, and so kills the
+process, and which allocates whatever size a header claims. Annotations are downloaded files. This reader takes structs,
+text and real numbers, with bounds on depth and size; all else (cells, objects, function handles, sparse) becomes None.
 """
 
 import math
@@ -20,7 +20,7 @@ __all__ = ["MatStruct", "MatValue", "read_mat"]
 
 MatStruct = dict[str, "MatValue"]
 MatValue = list[MatStruct] | str | NDArray[np.float64] | None
-"""A struct array, a text, real numbers in MATLAB's column order, or None for what is not read."""
+"""A struct array, a text, real numbers in MATLAB's column order, or None for any other type."""
 
 _MATRIX, _COMPRESSED, _INT32, _UINT32 = 14, 15, 5, 6
 _STRUCT, _CHAR, _NUMERIC = 2, 4, range(6, 16)
@@ -36,31 +36,31 @@ def read_mat(path: Path, variable: str) -> MatValue:
     """
     try:
         if path.stat().st_size > MAX_MAT_BYTES:
-            raise InvalidInputError(f"{path}: larger than {MAX_MAT_BYTES} bytes, no annotation")
+            raise InvalidInputError(f"larger than {MAX_MAT_BYTES} bytes, not an annotation")
         data = path.read_bytes()
         order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
         if order is None or data[124:126] not in (b"\x00\x01", b"\x01\x00"):
-            raise InvalidInputError(f"{path}: expected a MATLAB 5 file, version 0x0100")
+            raise InvalidInputError("expected a MATLAB 5 file, version 0x0100")
         return _find(data[128:], variable, order)
     except (OSError, struct.error, zlib.error, UnicodeError) as error:
-        raise InvalidInputError(f"{path}: damaged ({error})") from error
+        raise InvalidInputError(f"damaged ({error})", subject=path) from error
     except InvalidInputError as error:
-        raise InvalidInputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
+        raise error.with_subject(path) from None
 
 
 def _find(data: bytes, variable: str, order: str) -> MatValue:
-    position, left = 0, MAX_MAT_UNPACKED_BYTES
+    position, remaining = 0, MAX_MAT_UNPACKED_BYTES
     while position + 8 <= len(data):
         kind, body, position = _element(data, position, order, padded=False)
         if kind == _COMPRESSED:
             stream = zlib.decompressobj()
-            unpacked = stream.decompress(body, left)
-            left -= len(unpacked)
-            if not stream.eof or left <= 0:
+            unpacked = stream.decompress(body, remaining)
+            remaining -= len(unpacked)
+            if not stream.eof or remaining <= 0:
                 raise InvalidInputError(f"truncated, or unpacks to more than {MAX_MAT_UNPACKED_BYTES} bytes")
             kind, body, _ = _element(unpacked, 0, order)
         if kind == _MATRIX:
-            name, value = _matrix(body, order, MAX_MAT_DEPTH, wanted=variable)
+            name, value = _array(body, order, MAX_MAT_DEPTH, variable=variable)
             if name == variable:
                 return value
     raise InvalidInputError(f"holds no variable {variable!r}")
@@ -70,20 +70,20 @@ def _element(data: bytes, position: int, order: str, *, padded: bool = True) -> 
     """Type, content and end of the tagged element at ``position``."""
     (word,) = struct.unpack_from(order + "I", data, position)
     if word >> 16:  # small form: size and type share a word, content in the next four bytes
-        kind, size, begin, end = word & 0xFFFF, word >> 16, position + 4, position + 8
+        kind, size, start, end = word & 0xFFFF, word >> 16, position + 4, position + 8
         if size > 4:
             raise InvalidInputError(f"small element of {size} bytes")
     else:
-        kind, begin = word, position + 8
+        kind, start = word, position + 8
         (size,) = struct.unpack_from(order + "I", data, position + 4)
-        end = begin + size + (-size % 8 if padded else 0)
-    if begin + size > len(data):
+        end = start + size + (-size % 8 if padded else 0)
+    if start + size > len(data):
         raise InvalidInputError("ends inside an element")
-    return kind, data[begin : begin + size], end
+    return kind, data[start : start + size], end
 
 
-def _matrix(body: bytes, order: str, depth: int, wanted: str | None = None) -> tuple[str, MatValue]:
-    """Name and value of an array; the value is not read where another name is wanted."""
+def _array(body: bytes, order: str, depth: int, variable: str | None = None) -> tuple[str, MatValue]:
+    """Name and value of an array; the value of any but ``variable`` is not read."""
     if not body:
         return "", np.empty(0)
     if depth == 0:
@@ -101,7 +101,7 @@ def _matrix(body: bytes, order: str, depth: int, wanted: str | None = None) -> t
     array_class = flag & 0xFF
     if count < 0:
         raise InvalidInputError("array of negative size")
-    if wanted is not None and name != wanted:
+    if variable is not None and name != variable:
         return name, None
     if array_class == _STRUCT:
         return name, _struct(body, position, order, depth, count)
@@ -132,7 +132,7 @@ def _struct(body: bytes, position: int, order: str, depth: int, count: int) -> l
             kind, content, position = _element(body, position, order)
             if kind != _MATRIX:
                 raise InvalidInputError(f"field {field!r} is no array")
-            value[field] = _matrix(content, order, depth - 1)[1]
+            value[field] = _array(content, order, depth - 1)[1]
         values.append(value)
     return values
 

@@ -1,4 +1,4 @@
-"""Photographs and annotations made to harm end in one line of ours, soon and in little memory."""
+"""Malicious photographs and annotations end in a one-line error, soon and in little memory."""
 
 import contextlib
 import struct
@@ -14,9 +14,9 @@ import torch
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset, read_bop_csv
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError
-from curvireg_torch.io import images, read_photo
-from curvireg_torch.io import json_files as _json
+from curvireg_torch.io import images, json_files, read_photo
 from curvireg_torch.io.mat_files import read_mat
+from tests._support.matlab import element, file
 from tests._support.miniature import write_bop, write_image
 
 
@@ -58,7 +58,7 @@ BOMBS = {
 
 
 @pytest.mark.parametrize("name", BOMBS)
-def test_pixels_are_counted_before_they_are_decoded(tmp_path: Path, name: str) -> None:
+def test_read_photo_counts_pixels_before_it_decodes(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(BOMBS[name])
     tracemalloc.start()
     start = time.perf_counter()
@@ -69,7 +69,7 @@ def test_pixels_are_counted_before_they_are_decoded(tmp_path: Path, name: str) -
     assert time.perf_counter() - start < 2
 
 
-def test_scans_and_bytes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_photo_bounds_scans_and_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.jpg").write_bytes(jpeg(1000, 1000, scans=1000))
     with pytest.raises(ImageError, match="1000 scans"):
         read_photo(tmp_path / "a.jpg")
@@ -78,7 +78,7 @@ def test_scans_and_bytes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyP
         read_photo(tmp_path / "a.jpg")
 
 
-def test_markers_alone_are_read_in_linear_time(tmp_path: Path) -> None:
+def test_read_header_takes_linear_time(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_bytes(b"\xff\xd8" + b"\xff" * 20_000_000)
     start = time.perf_counter()
     with pytest.raises(ImageError, match="truncated"):
@@ -86,19 +86,19 @@ def test_markers_alone_are_read_in_linear_time(tmp_path: Path) -> None:
     assert time.perf_counter() - start < 5
 
 
-def test_a_motion_photo_is_its_picture(tmp_path: Path) -> None:
+def test_read_photo_ignores_the_film_of_a_motion_photo(tmp_path: Path) -> None:
     write_image(tmp_path / "a.jpg")
     data = (tmp_path / "a.jpg").read_bytes()
     film = b"\0\0\0\x18ftypmp42" + np.random.default_rng(0).bytes(100_000) + b"\xff\xda no end"
     (tmp_path / "b.jpg").write_bytes(data + film)
     assert torch.equal(read_photo(tmp_path / "a.jpg").image, read_photo(tmp_path / "b.jpg").image)
-    (tmp_path / "b.jpg").write_bytes(data[:-200] + film)  # the picture's own end is missing
+    (tmp_path / "b.jpg").write_bytes(data[:-200] + film)  # the end of the picture is missing
     with pytest.raises(ImageError, match=r"truncated|decoded"):
         read_photo(tmp_path / "b.jpg")
 
 
 @pytest.mark.parametrize("shape", [(2, 600), (600, 2), (1, 1), (1, 5000)])
-def test_slivers_are_no_larger_than_pictures_to_the_learned_field(shape: tuple[int, int]) -> None:
+def test_learned_field_does_not_enlarge_slivers(shape: tuple[int, int]) -> None:
     field, seen = cr.LearnedCurvilinearSaliency(), []
 
     def answer(image: torch.Tensor) -> torch.Tensor:
@@ -110,39 +110,20 @@ def test_slivers_are_no_larger_than_pictures_to_the_learned_field(shape: tuple[i
     assert seen[0][2] * seen[0][3] <= 8 * 128 * 128
 
 
-def mat(body: bytes) -> bytes:
-    return b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + body
-
-
-def element(kind: int, content: bytes) -> bytes:
-    return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
-
-
-def test_deep_mat(tmp_path: Path) -> None:
-    inner = b""
-    for _ in range(3000):
-        fields = element(5, struct.pack("<i", 8)) + element(1, b"a".ljust(8, b"\0"))
-        dims = element(6, struct.pack("<II", 2, 0)) + element(5, struct.pack("<ii", 1, 1))
-        inner = dims + element(1, b"record") + fields + element(14, inner)
-    (tmp_path / "a.mat").write_bytes(mat(element(14, inner)))
-    with pytest.raises(InvalidInputError, match="16 deep"):
-        read_mat(tmp_path / "a.mat", "record")
-
-
-def test_many_bombs_in_a_mat_share_one_limit(tmp_path: Path) -> None:
+def test_read_mat_bounds_all_compressed_variables_together(tmp_path: Path) -> None:
     bomb = zlib.compress(element(14, bytes(20_000_000)), 9)
-    (tmp_path / "a.mat").write_bytes(mat((struct.pack("<II", 15, len(bomb)) + bomb) * 200))
+    (tmp_path / "a.mat").write_bytes(file((struct.pack("<II", 15, len(bomb)) + bomb) * 200))
     start = time.perf_counter()
-    with pytest.raises(InvalidInputError):
+    with pytest.raises(InvalidInputError, match="unpacks to more"):
         read_mat(tmp_path / "a.mat", "record")
     assert time.perf_counter() - start < 5
 
 
 @pytest.mark.parametrize("content", [b"[" * 2_000_000, b'{"0": ' + b"1" * 100_000 + b"}", b'{"0": NaN}', b"\xff"])
-def test_json_made_to_harm(tmp_path: Path, content: bytes) -> None:
+def test_read_json_refuses_malicious_files(tmp_path: Path, content: bytes) -> None:
     write_bop(tmp_path)
     (tmp_path / "models" / "models_info.json").write_bytes(content)
-    if content.endswith(b"NaN}"):  # an entry that is none is left out
+    if content.endswith(b"NaN}"):  # this entry is skipped
         assert BOPDataset(tmp_path).skipped["missing_model_info"] > 0
         return
     with pytest.raises(CurviregError, match="models_info") as caught:
@@ -151,18 +132,18 @@ def test_json_made_to_harm(tmp_path: Path, content: bytes) -> None:
     assert len(str(caught.value)) < 1000
 
 
-def test_tables_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_check_table_size_bounds_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_bop(tmp_path)
     for path, read in (
         (tmp_path / "camera.json", lambda: BOPDataset(tmp_path)),
         (tmp_path / "a.csv", lambda: read_bop_csv(tmp_path / "a.csv")),
     ):
         with open(path, "wb") as file:
-            file.truncate(1 << 27)  # a hole: takes no disk
+            file.truncate(1 << 27)  # a sparse file
         with pytest.raises(InvalidInputError, match="33,554,432 bytes"):
             read()
     (tmp_path / "some").write_bytes(bytes(100))
     for limit in (99, 100):
-        monkeypatch.setattr(_json, "MAX_TABLE_BYTES", limit)
+        monkeypatch.setattr(json_files, "MAX_TABLE_BYTES", limit)
         with contextlib.nullcontext() if limit == 100 else pytest.raises(InvalidInputError, match="99 bytes"):
-            _json.check_table_size(tmp_path / "some")
+            json_files.check_table_size(tmp_path / "some")

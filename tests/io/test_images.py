@@ -12,7 +12,7 @@ from tests._support.exif import exif, with_exif
 from tests._support.miniature import write_image
 
 
-def test_rgb_order_range_and_dtype(tmp_path):
+def test_read_image_returns_rgb_floats_in_0_to_1(tmp_path):
     bgr = np.zeros((4, 6, 3), np.uint8)
     bgr[..., 0], bgr[1, 2, 2] = 51, 255  # blue everywhere, red at x = 2, y = 1
     cv2.imwrite(str(tmp_path / "a.png"), bgr)
@@ -26,7 +26,7 @@ def test_rgb_order_range_and_dtype(tmp_path):
 
 @pytest.mark.parametrize(("dtype", "top"), [(np.uint8, 255), (np.uint16, 65535)])
 @pytest.mark.parametrize("channels", [1, 3, 4])
-def test_grey_alpha_and_16_bit(tmp_path, dtype, top, channels):
+def test_read_image_reads_grey_alpha_and_16_bits(tmp_path, dtype, top, channels):
     pixels = np.full((5, 7, channels), top // 5, dtype)
     pixels[0, 0] = top
     cv2.imwrite(str(tmp_path / "a.png"), pixels)
@@ -34,16 +34,13 @@ def test_grey_alpha_and_16_bit(tmp_path, dtype, top, channels):
     assert image.shape == (3, 5, 7)
     assert image.max() == 1
     torch.testing.assert_close(image[:, 1:], torch.full((3, 4, 7), 0.2))
-
-
-def test_16_bit_keeps_its_precision(tmp_path):
-    cv2.imwrite(str(tmp_path / "a.png"), np.arange(256, dtype=np.uint16).reshape(16, 16))
-    assert len(read_image(tmp_path / "a.png").unique()) == 256
+    cv2.imwrite(str(tmp_path / "b.png"), np.arange(256, dtype=np.uint16).reshape(16, 16))
+    assert len(read_image(tmp_path / "b.png").unique()) == 256
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_exif_orientation_is_applied_to_photographs_and_not_to_datasets(tmp_path, suffix, orientation):
+def test_read_photo_applies_the_exif_orientation(tmp_path, suffix, orientation):
     path = tmp_path / f"a{suffix}"
     write_image(path, (20, 30))
     stored = read_image(path)
@@ -59,7 +56,7 @@ def test_exif_orientation_is_applied_to_photographs_and_not_to_datasets(tmp_path
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_orientation_of_tiff(tmp_path, dtype):
+def test_read_image_applies_the_orientation_of_tiff_on_request(tmp_path, dtype):
     pixels = np.random.default_rng(0).integers(0, 256, (20, 30, 3)).astype(dtype) * (np.iinfo(dtype).max // 255)
     assert cv2.imwrite(str(tmp_path / "a.tiff"), pixels)
     stored = read_image(tmp_path / "a.tiff")
@@ -76,7 +73,7 @@ def test_orientation_of_tiff(tmp_path, dtype):
     assert torch.equal(read_image(tmp_path / "a.tiff", orientation="viewed"), stored.flip(1).transpose(1, 2))
 
 
-def test_focal_length_is_a_stated_guess(tmp_path):
+def test_guessed_camera_matrix_uses_the_exif_focal_length(tmp_path):
     path = tmp_path / "a.jpg"
     write_image(path, (30, 40))
     assert read_photo(path).guessed_camera_matrix() is None
@@ -89,7 +86,7 @@ def test_focal_length_is_a_stated_guess(tmp_path):
     assert K[:2, 2].tolist() == [14.5, 19.5]
 
 
-def test_a_damaged_exif_block_says_nothing(tmp_path):
+def test_read_photo_ignores_damaged_exif(tmp_path):
     path = tmp_path / "a.jpg"
     write_image(path)
     whole = exif(6, focal=27)
@@ -101,7 +98,7 @@ def test_a_damaged_exif_block_says_nothing(tmp_path):
     assert read_photo(path).orientation == 1
 
 
-def test_uint8_is_the_same_picture(tmp_path):
+def test_read_image_returns_uint8_on_request(tmp_path):
     write_image(tmp_path / "a.png")
     assert torch.equal(read_image(tmp_path / "a.png", dtype=torch.uint8).float() / 255, read_image(tmp_path / "a.png"))
     cv2.imwrite(str(tmp_path / "b.png"), np.array([[0, 128, 129, 65535]], np.uint16))
@@ -110,7 +107,7 @@ def test_uint8_is_the_same_picture(tmp_path):
         read_image(tmp_path / "a.png", dtype=torch.float16)
 
 
-def test_what_was_done_to_the_channels_is_said(tmp_path):
+def test_read_photo_notes_changes_of_channels(tmp_path):
     for name, pixels, notes in (
         ("grey.png", np.full((4, 4), 9, np.uint8), ("grey: three equal channels",)),
         ("alpha.png", np.full((4, 4, 4), 9, np.uint8), ("alpha channel dropped",)),
@@ -126,7 +123,7 @@ def test_what_was_done_to_the_channels_is_said(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.tif"])
-def test_cmyk(tmp_path, name):
+def test_read_photo_converts_cmyk(tmp_path, name):
     image = pytest.importorskip("PIL.Image", reason="Pillow writes the CMYK picture")
     image.new("RGB", (8, 8), (250, 10, 30)).convert("CMYK").save(tmp_path / name, quality=95)
     photo = read_photo(tmp_path / name)
@@ -134,7 +131,7 @@ def test_cmyk(tmp_path, name):
     assert (photo.image[:, 4, 4].int() - torch.tensor([250, 10, 30])).abs().max() <= 4
 
 
-def test_cielab_is_refused(tmp_path):
+def test_read_photo_refuses_cielab(tmp_path):
     image = pytest.importorskip("PIL.Image", reason="Pillow writes the CIELAB picture")
     image.new("LAB", (8, 8), (120, 10, 30)).save(tmp_path / "a.tif")
     with pytest.raises(ImageError, match="CIELAB"):
@@ -152,7 +149,7 @@ def test_cielab_is_refused(tmp_path):
         (b"%PDF-1.4", "PDF"),
     ],
 )
-def test_other_formats_are_named(tmp_path, content, name):
+def test_read_photo_names_other_formats(tmp_path, content, name):
     (tmp_path / "a.jpg").write_bytes(content + bytes(100))
     with pytest.raises(ImageError, match=rf"a\.jpg: .*{name}.*convert it"):
         read_photo(tmp_path / "a.jpg")
@@ -160,7 +157,7 @@ def test_other_formats_are_named(tmp_path, content, name):
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
 @pytest.mark.parametrize("kept", [0.02, 0.5, 0.9])
-def test_truncated(tmp_path, suffix, kept):
+def test_read_image_refuses_truncated_files(tmp_path, suffix, kept):
     path = tmp_path / f"a{suffix}"
     write_image(path, (64, 64))
     data = path.read_bytes()
@@ -169,39 +166,39 @@ def test_truncated(tmp_path, suffix, kept):
         read_image(path)
 
 
-def test_bytes_after_the_end_are_allowed(tmp_path):
+def test_read_photo_ignores_bytes_after_the_picture(tmp_path):
     for suffix in (".jpg", ".png"):
         write_image(tmp_path / f"a{suffix}")
         with open(tmp_path / f"a{suffix}", "ab") as file:
-            file.write(b"\n\n" + bytes(range(256)) * 8 + b"\xff\xda")  # a motion photo's film may hold any marker
+            file.write(b"\n\n" + bytes(range(256)) * 8 + b"\xff\xda")  # as a motion photo, which may hold any marker
         photo = read_photo(tmp_path / f"a{suffix}")
         assert photo.image.shape == (3, 60, 80)
-        assert photo.notes == ("2,052 bytes behind the picture's end ignored",)
+        assert photo.notes == ("2,052 bytes after the picture ignored",)
 
 
-def test_what_stands_before_a_jpegs_frame_is_passed_over(tmp_path):
+def test_read_header_skips_segments_before_the_frame_of_a_jpeg(tmp_path):
     write_image(tmp_path / "a.jpg")
     data = (tmp_path / "a.jpg").read_bytes()
-    arithmetic = b"\xff\xcc\0\x09\x08\0\x07\0\x09\x03\0"  # its conditioning; as a frame it would be 9 x 7 px
+    arithmetic = b"\xff\xcc\0\x09\x08\0\x07\0\x09\x03\0"  # as a frame it would be 9 x 7 px
     for more in (b"\xff\x01", b"\xff\xd8", arithmetic):
         header = read_header(data[:2] + more + data[2:])
         assert (header.width, header.height, header.scans) == (80, 60, 1)
 
 
 @pytest.mark.parametrize("content", [b"", b"no image at all", b"\xff\xd8\xff\xd9", b"\x89PNG\r\n\x1a\nIEND"])
-def test_not_an_image(tmp_path, content):
+def test_read_image_refuses_other_content(tmp_path, content):
     (tmp_path / "a.jpg").write_bytes(content)
     with pytest.raises(ImageError, match=r"a\.jpg"):
         read_image(tmp_path / "a.jpg")
 
 
-def test_floating_pixels_are_refused(tmp_path):
+def test_read_image_refuses_floating_pixels(tmp_path):
     assert cv2.imwrite(str(tmp_path / "a.tiff"), np.ones((4, 4, 3), np.float32))
     with pytest.raises(ImageError, match="float32"):
         read_image(tmp_path / "a.tiff")
 
 
-def test_missing_file_and_folder(tmp_path):
+def test_read_image_reports_missing_files(tmp_path):
     for path in (tmp_path / "nothing.jpg", tmp_path):
         with pytest.raises(MissingFileError, match="no such file"):
             read_image(path)

@@ -1,4 +1,4 @@
-"""The reader of annotation files: equal to scipy's on sound files, an error and nothing worse on others."""
+"""The reader of annotation files: equal to scipy's on valid files, an error on others."""
 
 import contextlib
 import struct
@@ -10,22 +10,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.io import mat_files as _matfile
+from curvireg_torch.io import mat_files
 from curvireg_torch.io.mat_files import read_mat
+from tests._support.matlab import element, file
 from tests._support.miniature import pascal_object, write_record
-
-
-def element(kind: int, content: bytes) -> bytes:
-    return struct.pack("<II", kind, len(content)) + content + b"\0" * (-len(content) % 8)
 
 
 def array(array_class: int, dims: tuple[int, ...], rest: bytes, name: bytes = b"") -> bytes:
     head = element(6, struct.pack("<II", array_class, 0)) + element(5, struct.pack(f"<{len(dims)}i", *dims))
     return element(14, head + element(1, name) + rest)
-
-
-def file(content: bytes) -> bytes:
-    return b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x0100) + b"IM" + content
 
 
 FIELD_A = element(5, struct.pack("<i", 8)) + element(1, b"a".ljust(8, b"\0"))  # one field, named a
@@ -39,7 +32,7 @@ def nested_struct(depth: int) -> bytes:
 
 
 @pytest.mark.parametrize("compress", [False, True])
-def test_agrees_with_scipy(tmp_path, compress):
+def test_read_mat_agrees_with_scipy(tmp_path, compress):
     numbers = {
         t: np.array([[1, 2, 3], [4, 5, 100]], t) for t in ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
     }
@@ -49,22 +42,22 @@ def test_agrees_with_scipy(tmp_path, compress):
     record |= {"complex": np.array([1j]), "cell": np.array([1, "a"], dtype=object)}
     path = tmp_path / "a.mat"
     scipy.io.savemat(path, {"other": 1.0, "record": record}, do_compression=compress)
-    (mine,) = read_mat(path, "record")
+    (ours,) = read_mat(path, "record")
     theirs = scipy.io.loadmat(path)["record"][0, 0]
     for kind in numbers:
-        np.testing.assert_array_equal(mine[f"n_{kind}"], theirs[f"n_{kind}"].ravel("F"))
-        assert type(mine[f"n_{kind}"]) is np.ndarray
-    assert mine["text"] == theirs["text"][0]
-    assert mine["flag"] == [1.0]
-    assert [s["a"] for s in mine["structs"]] == ["x", ""]
-    np.testing.assert_array_equal(mine["structs"][0]["b"], [1, 0, 0, 1])
-    assert mine["structs"][1]["b"].size == 0
-    assert mine["complex"] is None
-    assert mine["cell"] is None
+        np.testing.assert_array_equal(ours[f"n_{kind}"], theirs[f"n_{kind}"].ravel("F"))
+        assert type(ours[f"n_{kind}"]) is np.ndarray
+    assert ours["text"] == theirs["text"][0]
+    assert ours["flag"] == [1.0]
+    assert [s["a"] for s in ours["structs"]] == ["x", ""]
+    np.testing.assert_array_equal(ours["structs"][0]["b"], [1, 0, 0, 1])
+    assert ours["structs"][1]["b"].size == 0
+    assert ours["complex"] is None
+    assert ours["cell"] is None
     assert read_mat(path, "other") == [1.0]
 
 
-def test_big_endian(tmp_path):
+def test_read_mat_reads_big_endian_files(tmp_path):
     def swapped(kind, content):
         return struct.pack(">II", kind, len(content)) + content + b"\0" * (-len(content) % 8)
 
@@ -77,11 +70,11 @@ def test_big_endian(tmp_path):
     np.testing.assert_array_equal(scipy.io.loadmat(tmp_path / "a.mat")["abc"], [[1.5, -2.0]])
 
 
-def test_deep_nesting_is_an_error(tmp_path):
+def test_read_mat_bounds_depth(tmp_path):
     (tmp_path / "a.mat").write_bytes(file(nested_struct(10)))
     assert isinstance(read_mat(tmp_path / "a.mat", "record"), list)
-    (tmp_path / "a.mat").write_bytes(file(nested_struct(2000)))
-    with pytest.raises(InvalidInputError, match="deep"):
+    (tmp_path / "a.mat").write_bytes(file(nested_struct(3000)))
+    with pytest.raises(InvalidInputError, match="16 deep"):
         read_mat(tmp_path / "a.mat", "record")
 
 
@@ -101,44 +94,42 @@ def test_deep_nesting_is_an_error(tmp_path):
         (b"", "holds no variable"),
     ],
 )
-def test_false_claims_are_errors(tmp_path, content, message):
+def test_read_mat_refuses_false_claims(tmp_path, content, message):
     (tmp_path / "a.mat").write_bytes(file(content))
     with pytest.raises(InvalidInputError, match=rf"a\.mat.*{message}"):
         read_mat(tmp_path / "a.mat", "record")
 
 
-def test_unpacking_is_bounded(tmp_path, monkeypatch):
+def test_read_mat_bounds_size(tmp_path, monkeypatch):
     scipy.io.savemat(tmp_path / "a.mat", {"record": np.zeros((1000, 100))}, do_compression=True)
     assert read_mat(tmp_path / "a.mat", "record").size == 100000
-    monkeypatch.setattr(_matfile, "MAX_MAT_UNPACKED_BYTES", 100000)
+    monkeypatch.setattr(mat_files, "MAX_MAT_UNPACKED_BYTES", 100000)
     with pytest.raises(InvalidInputError, match="unpacks to more"):
         read_mat(tmp_path / "a.mat", "record")
-    monkeypatch.setattr(_matfile, "MAX_MAT_BYTES", 100)
+    monkeypatch.setattr(mat_files, "MAX_MAT_BYTES", 100)
     with pytest.raises(InvalidInputError, match="larger"):
         read_mat(tmp_path / "a.mat", "record")
 
 
-def test_other_formats_and_missing_file(tmp_path):
-    (tmp_path / "a.mat").write_bytes(b"short")
-    with pytest.raises(InvalidInputError, match="MATLAB 5"):
-        read_mat(tmp_path / "a.mat", "record")
-    (tmp_path / "a.mat").write_bytes(b"MATLAB 7.3".ljust(124) + b"\x00\x02IM" + b"\x89HDF")
-    with pytest.raises(InvalidInputError, match="MATLAB 5"):
-        read_mat(tmp_path / "a.mat", "record")
+def test_read_mat_refuses_other_formats_and_missing_files(tmp_path):
+    for content in (b"short", b"MATLAB 7.3".ljust(124) + b"\x00\x02IM" + b"\x89HDF"):
+        (tmp_path / "a.mat").write_bytes(content)
+        with pytest.raises(InvalidInputError, match="MATLAB 5"):
+            read_mat(tmp_path / "a.mat", "record")
     with pytest.raises(InvalidInputError, match="damaged"):
         read_mat(tmp_path / "nothing.mat", "record")
 
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.tuples(st.integers(0, 5000), st.integers(0, 255)), min_size=1, max_size=8), st.integers(0, 5000))
-def test_no_damage_does_worse_than_an_error(tmp_path, changes, cut):
+def test_read_mat_survives_random_damage(tmp_path, changes, cut):
     path = tmp_path / "a.mat"
     if not path.exists():
-        write_record(tmp_path / "sound.mat", [pascal_object("car"), pascal_object("sofa")])
-        record = scipy.io.loadmat(tmp_path / "sound.mat")["record"]
-        scipy.io.savemat(tmp_path / "sound.mat", {"record": record})  # without compression damage reaches further
+        write_record(tmp_path / "valid.mat", [pascal_object("car"), pascal_object("sofa")])
+        record = scipy.io.loadmat(tmp_path / "valid.mat")["record"]
+        scipy.io.savemat(tmp_path / "valid.mat", {"record": record})  # without compression damage reaches further
         path.touch()
-    data = bytearray((tmp_path / "sound.mat").read_bytes())
+    data = bytearray((tmp_path / "valid.mat").read_bytes())
     for position, value in changes:
         data[position % len(data)] = value
     path.write_bytes(data[: max(cut, 200)] if cut % 3 == 0 else data)
