@@ -18,7 +18,7 @@ DEFAULT_DISTANCE = 5.0
 """Distance of a view in units of the object's radius.
 
 Measured on photographs at 5 to 14 radii: descriptors of views at 5 radii come within 0.005 of the cosine of views at
-the true distance (``docs/conventions.md``); nearer views lose more.
+the true distance (``docs/experiments.md``); nearer views lose more.
 """
 
 

@@ -20,7 +20,7 @@ __all__ = ["AGREE", "corrected", "projected_box"]
 
 AGREE = 0.85
 """Overlap (IoU) from which a box and the one around its pose are taken for the same: boxes drawn by hand had 0.86 or
-more on 60 generated photographs, see docs/method.md."""
+more on 60 generated photographs, see docs/experiments.md."""
 
 Results = Sequence[Registration | FailedRegistration]
 

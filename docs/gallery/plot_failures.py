@@ -67,8 +67,8 @@ middle = int((x0 + x1) / 2)
 show(picture[:, :, :middle], torch.tensor([x0, y0, middle - 0.5, y1]), truth, "cut off")
 
 # %%
-# Upside down, told to be upright
-# -------------------------------
+# Upside down, declared upright
+# ------------------------------
 #
 # ``--pose upright`` compares upright views alone: the right one is not among them.
 

@@ -1,5 +1,4 @@
-"""What the documentation's pages tell to type is typed: commands and Python, in order, page by page, with the settings
-that everyone gets, in a folder with the files that the pages name."""
+"""The commands and Python blocks of each page run in order, in a folder with the files that the pages name."""
 
 import json
 import re
@@ -31,34 +30,34 @@ from .._support.miniature import (
     write_record,
     write_web,
 )
-from .._support.pages import DOCS, PAGES, ROOT, steps, words_of
+from .._support.pages import DOCS, PAGES, ROOT, python_blocks, split_command, steps
 
-NOT_HERE = {
-    r"git |pip |apt-get |python datasets/download|python -m zipfile|python scripts/benchmark/meshes": "download",
+SKIPPED = {
+    r"git |pip |apt-get |python datasets/download|python -m zipfile|python scripts/(\w+/)?benchmark_meshes": "download",
     r"curvireg view": "browser",  # tests/viewer/test_browser.py opens it
-    r"scripts/test\.sh|python -m coverage|python scripts/robustness/(fuzz|soak)\.py|python -m mutmut": "suite",
-    r"python scripts/results_table|python scripts/paper/figures\.py detectors$": "writes into the project",
+    r"scripts/test\.sh|python -m coverage|python scripts/(\w+/)?(mutate|fuzz|soak)\.py": "test suite",
+    r"python scripts/(\w+/)?results_table|python scripts/(\w+/)?make_detector_figure\.py$": "writes into the project",
     r".*[ /=$][A-Z]+([ ./]|$)": "placeholder",
     r"curvireg bank .*--adapt|curvireg register .*--field": "3000 photographs",  # tests/cli/test_register.py uses fewer
-    r"python scripts/(?!paper/)": "measures for long",
+    r"python scripts/(?!(\w+/)?(reproduce_paper|make_detector_figure))": "long measurement",
 }
-"""Commands that are not typed, and why; how many is counted below."""
+"""Commands that are not run here, and the reason."""
 
 DEFECTIVE = ("data/PASCAL3D+_release1.1", "data/bop/lm", "data/web")
-"""Trees with every defect that a tree may have, of which ``datasets/verify.py`` must tell."""
+"""Trees with every defect that ``datasets/verify.py`` must report."""
 
-PHOTOGRAPHS = {"photo.jpg": 30.0, "front.jpg": 210.0, "left.jpg": 300.0, "above.jpg": 120.0}
-"""And the azimuths from which they were taken."""
+AZIMUTHS = {"photo.jpg": 30.0, "front.jpg": 210.0, "left.jpg": 300.0, "above.jpg": 120.0}
+
+SLOW = {DOCS / "evaluation.md", DOCS / "guides" / "several.md"}  # 30 s and more on one core
 
 
-def reason(command: str) -> str | None:
-    """Why a command is not typed; None where it is."""
+def skip_reason(command: str) -> str | None:
     command = re.sub(r"\s+#.*", "", command)
-    return next((why for start, why in NOT_HERE.items() if re.match(start, command)), None)
+    return next((reason for start, reason in SKIPPED.items() if re.match(start, command)), None)
 
 
 def pose(azimuth: float) -> torch.Tensor:
-    """(4, 4) of the truck in m: its box is about 410 220 890 700."""
+    """(4, 4) pose of the truck in m, whose box is about 410 220 890 700."""
     points, box = torch.from_numpy(example_mesh().vertices.copy()), torch.tensor([410.0, 220.0, 890.0, 700.0])
     view = cr.rotation_from_viewpoint(torch.tensor(azimuth, dtype=torch.float64), 30.0, 0.0)
     return transform(*place_view(points, view, box, cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0)))
@@ -66,12 +65,12 @@ def pose(azimuth: float) -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the pages name: a part in mm, photographs of it, and datasets."""
+    """A folder with a part in mm, photographs of it, and datasets."""
     folder = tmp_path_factory.mktemp("newcomer")
     mesh, size = example_mesh(), (1080, 1920)
-    small = torch.diag(torch.tensor([0.25, 0.25, 1.0], dtype=torch.float64))
-    K = small @ cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0, dtype=torch.float64)
-    for seed, (name, azimuth) in enumerate(PHOTOGRAPHS.items()):
+    quarter = torch.diag(torch.tensor([0.25, 0.25, 1.0], dtype=torch.float64))
+    K = quarter @ cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0, dtype=torch.float64)
+    for seed, (name, azimuth) in enumerate(AZIMUTHS.items()):
         generator = torch.Generator().manual_seed(seed)
         picture, _ = synthesize_photograph(mesh, pose(azimuth), K, (size[0] // 4, size[1] // 4), generator)
         pixels = (255 * picture.permute(1, 2, 0)).round().byte().numpy()[..., ::-1]
@@ -81,17 +80,17 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     kettle.mkdir(parents=True)
     for name in ("1.jpg", "2.jpg"):
         shutil.copy(folder / "photo.jpg", kettle / name)
-    (text,) = re.findall(r"```\n(image,.*?)```", (DOCS / "guides" / "own-data.md").read_text("utf-8"), flags=re.DOTALL)
-    kettle.joinpath("views.csv").write_text(text)
+    (table,) = re.findall(r"```\n(image,.*?)```", (DOCS / "datasets.md").read_text("utf-8"), flags=re.DOTALL)
+    kettle.joinpath("views.csv").write_text(table)
     mesh.export(kettle / "mesh.stl")
     mesh.apply_scale(1000.0).export(folder / "part.stl")
     mesh.apply_scale([1.0, 1.0, 2.0]).export(folder / "tall.stl")
     folder.joinpath("photos.csv").write_text("photo,x0,y0,x1,y1\nphoto.jpg,410,220,890,700\nleft.jpg,380,240,900,690\n")
     write_image(folder / "photo.png", (128, 128))
     cv2.imwrite(str(folder / "depth.png"), cv2.imread(str(folder / "photo.png"), cv2.IMREAD_GRAYSCALE))
-    write_pascal3d(folder / "data" / "PASCAL3D+_release1.1")
-    write_bop(folder / "data" / "bop" / "lm")
-    write_web(folder / "data" / "web")
+    write_pascal3d(folder / DEFECTIVE[0])
+    write_bop(folder / DEFECTIVE[1])
+    write_web(folder / DEFECTIVE[2])
     net = folder / "data" / "ObjectNet3D"
     for split in ("train", "val"):
         write_record(net / "Annotations" / f"{split}.mat", [pascal_object("ashtray")])
@@ -103,7 +102,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def here(files: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def in_folder(files: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
     monkeypatch.chdir(files)
     threads = torch.get_num_threads()
@@ -113,74 +112,87 @@ def here(files: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pyt
     torch.set_num_threads(threads)
 
 
-def typed(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int | str:
-    """The exit code of a command, or what it says instead; run in this process."""
+def run_command(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int | str:
+    """Run a command in this process; its exit code or message."""
     program = Path(words[0]).name
     if "--jobs" in words:  # tests/evaluation/test_processes.py starts several
         words[words.index("--jobs") + 1] = "1"
     if program == "demo.sh":
         last = (ROOT / words[0]).read_text("utf-8").splitlines()[-1]
-        program, *words = words_of(last.replace('"$venv/bin/curvireg"', "curvireg").replace('"$@"', ""))
-        words = [program, *words]
-    if program == "curvireg":
-        monkeypatch.setattr(sys, "argv", words)
-        return cli.main()
+        words = split_command(last.replace('"$venv/bin/curvireg"', "curvireg").replace('"$@"', ""))
     if program == "torchrun":
-        module = words.index("-m") + 1
-        assert words[module] == "curvireg_torch.evaluation"
-        monkeypatch.setattr(sys, "argv", words[module:])
-        run, name = runpy.run_module, words[module]
-    else:
-        assert program == "python", words
+        words = words[words.index("-m") + 1 :]
+    if program == "python":
         monkeypatch.setattr(sys, "argv", words[1:])
-        run, name = runpy.run_path, str(ROOT / words[1])  # type: ignore[assignment]
-    try:
-        run(name, run_name="__main__")
-    except SystemExit as stop:
-        return stop.code or 0
-    return 0
+        try:
+            runpy.run_path(str(ROOT / words[1]), run_name="__main__")
+        except SystemExit as stop:
+            return stop.code or 0
+        return 0
+    assert words[0].endswith(("curvireg", "curvireg_torch")), words
+    monkeypatch.setattr(sys, "argv", words)
+    return cli.main()
 
 
-LONG = {DOCS / "evaluation.md", DOCS / "guides" / "several.md"}
-"""Half a minute and more on one core: run with the slow tests."""
+def run_blocks(page: Path, blocks: list[str], names: dict[str, Any]) -> dict[str, Any]:
+    for text in blocks:
+        exec(compile(text, page.name, "exec"), names)
+    return names
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("in_folder")
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(p, marks=[pytest.mark.slow] if p in LONG else []) for p in PAGES if steps(p)],
+    [pytest.param(p, marks=[pytest.mark.slow] if p in SLOW else []) for p in PAGES if steps(p)],
     ids=lambda p: str(p.relative_to(ROOT)),
 )
-def test_a_page_works_as_it_stands(
-    page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_page_runs(page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     names: dict[str, Any] = {"__name__": "page"}
     for kind, text in steps(page):
         if kind == "python":
-            exec(compile(text, page.name, "exec"), names)
-        elif reason(text) is None:
-            words = words_of(text)
+            run_blocks(page, [text], names)
+        elif skip_reason(text) is None:
+            words = split_command(text)
             expected = int("datasets/verify.py" in words and not set(words).isdisjoint(DEFECTIVE))
-            assert typed(words, monkeypatch) == expected, (text, capsys.readouterr().err)
+            assert run_command(words, monkeypatch) == expected, (text, capsys.readouterr().err)
             if "register" in words and "photo.jpg" in words and not any(word.startswith("--up=") for word in words):
                 result = json.loads(Path("out/part/result.json").read_text("utf-8"))
                 R = torch.tensor(result["rotation"], dtype=torch.float64)
-                # Without a camera the rotation is that of one that looks straight at the object.
-                assert float(rotation_error(R, pose(30.0)[:3, :3])) < (20 if result["translation"] is None else 5)
+                allowed = 20 if result["translation"] is None else 5  # without a camera R is allocentric
+                assert float(rotation_error(R, pose(30.0)[:3, :3])) < allowed
     for name in re.findall(r"`((?:out|results)/[\w/.]+\.\w+)`", page.read_text(encoding="utf-8")):
-        assert Path(name).is_file(), f"{name} is promised and was not written"
+        assert Path(name).is_file(), f"the page promises {name}"
 
 
-def test_what_is_not_typed_is_counted() -> None:
+def test_page_runs_skips_few_commands() -> None:
     commands = [text for page in PAGES for kind, text in steps(page) if kind == "command"]
-    counts = Counter(map(reason, commands))
-    assert counts.pop(None) >= 35
+    counts = Counter(map(skip_reason, commands))
+    assert counts.pop(None) >= 30
     assert counts == {
         "download": 10,
-        "measures for long": 11,
-        "placeholder": 7,
-        "suite": 5,
-        "writes into the project": 4,
+        "long measurement": 10,
+        "placeholder": 5,
+        "test suite": 5,
+        "writes into the project": 3,
         "3000 photographs": 2,
         "browser": 1,
     }
+
+
+def test_architecture_page_adds_a_term_that_counts() -> None:
+    page = DOCS / "architecture.md"
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        names = run_blocks(page, python_blocks(page), {"__name__": "page"})
+    assert names["result"].hypotheses[0].rotation.shape == (3, 3)
+    ranking, term = names["ranking"], names["Middle"]()
+    assert set(ranking.terms) == {term.name for term in cr.Pipeline().terms} | {"middle"}
+    log = term.log_score(ranking.terms["middle"])
+    assert float(log.max()) == 0.0
+    plain = names["bank"].pipeline.with_term("middle", weight=0.0)
+    matcher = names["cr"].ViewMatcher(names["bank"], pipeline=plain)
+    without = matcher([names["photograph"]], torch.tensor([names["box"]]))
+    torch.testing.assert_close(ranking.scores, without.scores * (0.5 * log).exp())
+    one_pixel = torch.zeros(1, 5, 5, dtype=torch.bool)
+    one_pixel[0, 1, 4] = True
+    assert names["middles"](one_pixel).tolist() == [[1.0, 0.25]]

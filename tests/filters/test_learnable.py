@@ -114,11 +114,11 @@ def test_image_gradient_under_vmap_over_sigma() -> None:
 
 
 def test_training_page_lowers_its_loss() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "training.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    page = (Path(__file__).parents[2] / "docs" / "guides" / "layers.md").read_text(encoding="utf-8")
+    code = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)[-1]
     with torch.random.fork_rng(devices=[]):
         names: dict[str, object] = {}
-        exec(compile(code, "docs/training.md", "exec"), names)
+        exec(compile(code, "docs/guides/layers.md", "exec"), names)
     losses = names["losses"]
     assert isinstance(losses, list)
     assert losses[-1] < losses[0]
