@@ -1,4 +1,4 @@
-"""Statistics of descriptors, and the linear map after which their entries are uncorrelated (LDA, Aubry et al. 2014)."""
+"""Statistics of descriptors, and the linear map that decorrelates their entries (LDA, Aubry et al. 2014)."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,6 @@ from torch import Tensor, nn
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_option, check_tensor
-from .base import Views
 
 __all__ = ["DescriptorStatistics", "Whitening"]
 
@@ -43,7 +42,7 @@ class Whitening(nn.Module):
         self.register_buffer("matrix", torch.linalg.solve_triangular(factor, identity, upper=False).float())
 
     def forward(self, descriptors: Tensor) -> Tensor:
-        """(N, D) to (N, D), one matrix product."""
+        """(N, D) -> (N, D)."""
         check_tensor(descriptors, "descriptors", (None, len(self.mean)))
         return (descriptors.to(self.mean) - self.mean) @ self.matrix.T
 
@@ -55,8 +54,8 @@ class DescriptorStatistics:
     Attributes:
         mean: (D,) float32.
         covariance: (D, D) float32, of the sample, not shrunk.
-        count: descriptors that were counted.
-        fourth: mean of ``|x - mean|^4``, which Ledoit and Wolf's shrinkage asks for.
+        count: number of descriptors.
+        fourth: mean of ``|x - mean|^4``, which Ledoit and Wolf's shrinkage needs.
 
     Example:
         >>> statistics = DescriptorStatistics.from_descriptors(torch.rand(50, 8))
@@ -71,7 +70,7 @@ class DescriptorStatistics:
 
     @classmethod
     def from_descriptors(cls, descriptors: Tensor) -> "DescriptorStatistics":
-        """Of (N, D) descriptors, N >= 2."""
+        """Statistics of (N, D) descriptors, N >= 2, for example ``bank.descriptors`` as in the paper."""
         check_tensor(descriptors, "descriptors", (None, None))
         if len(descriptors) < 2:
             raise InvalidInputError(f"descriptors: expected at least 2, got {len(descriptors)}")
@@ -81,17 +80,12 @@ class DescriptorStatistics:
         fourth = float(x.square().sum(dim=1).double().square().mean())
         return cls(mean, x.T @ x / len(x), len(x), fourth)
 
-    @classmethod
-    def from_bank(cls, bank: Views) -> "DescriptorStatistics":
-        """Of the views of a bank: whitening by them brings out what tells views from each other (the paper)."""
-        return cls.from_descriptors(bank.descriptors)
-
     def shrinkage(self, rule: str | float) -> float:
-        """The share a in [0, 1] of the identity in (1 - a) Sigma + a tr(Sigma)/D Id.
+        """The weight a in [0, 1] of the identity in (1 - a) Sigma + a tr(Sigma)/D Id.
 
         Args:
-            rule: a number, or ``"ledoit-wolf"``, the closed form of Ledoit and Wolf (2004) for the share that estimates
-                the population's covariance best.
+            rule: a number, or ``"ledoit-wolf"``, the closed form of Ledoit and Wolf (2004) for the weight that
+                estimates the population's covariance best.
 
         Raises:
             InvalidInputError: another rule, or a number outside [0, 1].
@@ -109,11 +103,11 @@ class DescriptorStatistics:
         return min(1.0, max(0.0, (self.fourth - square) / self.count / spread))
 
     def whitening(self, *, shrinkage: str | float = 0.5) -> Whitening:
-        """The map that a :class:`ViewMatcher` takes.
+        """The whitening by these statistics, for example for :class:`ViewMatcher`.
 
         Args:
-            shrinkage: see :meth:`shrinkage`. Descriptors of photographs and of renderings are not of one population,
-                and more than the closed form gives (nearly 0) matches better: ``docs/experiments.md``.
+            shrinkage: see :meth:`shrinkage`. Descriptors of photographs and of renderings are different populations,
+                so more shrinkage than the closed form gives (nearly 0) matches better: ``docs/experiments.md``.
         """
         a = self.shrinkage(shrinkage)
         S = self.covariance

@@ -195,7 +195,7 @@ def test_helpers_find_broken_pages(tmp_path: Path) -> None:
     page.write_text(
         "# A `b` (c)\n[x](gone.md) [y](page.md#a-b-c) [z](#no)\n`[code](not.md)`\n\n```bash\ncurvireg bank\n"
         "torchrun --nproc-per-node 2 \\\n  -m curvireg_torch evaluate web D --out R --jobs 2\n```\n"
-        "`python datasets/verify.py DATA --out R --no`\n"
+        "`python scripts/results_table.py DATA --out R --no`\n"
     )
     assert links(page) == ["gone.md", "page.md#a-b-c", "#no"]
     assert anchors(page) == {"a-b-c"}
