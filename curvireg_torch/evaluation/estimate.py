@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import torch
 
-from ..matching import QueryFeatures, Ranking, ViewMatcher
+from ..matching import Ranking, ViewMatcher
 from ..registration import FailedRegistration, Localization, Registrar, Registration
 from ..registration.inputs import ImageItem
+from ..terms import QueryFeatures
 from .benchmark import Row
 
 __all__ = ["FusedMatcher", "estimate_poses"]

@@ -20,28 +20,26 @@ from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..settings import BankSettings
 from ..utils.threads import one_thread_each
+from .bank_file import RERANKING, read_bank, write_bank
 from .describe import ViewDescriber
 
 __all__ = ["ViewBank"]
 
-RERANKING = "reranking."
-"""Before the names of features of late terms."""
-
 
 class ViewBank:
-    """N views of one mesh, or of several: descriptors, feature points, silhouettes and the cameras that saw them.
+    """N views of one mesh, or of several: descriptors, feature points, silhouettes and cameras.
 
     Attributes:
         meshes: the meshes, in their files' own frames and units.
         model: (N,) int64: which of the meshes each view shows.
         views: the N viewpoints.
-        pipeline: what the views were made for.
+        pipeline: the pipeline that the bank was built for.
         descriptors: (N, D) float32.
-        points, silhouettes: (N, S, S) bool, unpacked on demand; :meth:`points_at` and :meth:`silhouettes_at` unpack a
-            few views at a time, which a large bank asks for.
+        points, silhouettes: (N, S, S) bool, unpacked on demand. For a large bank use :meth:`points_at` and
+            :meth:`silhouettes_at`, which unpack a few views at a time.
         boxes: (N, 4) float64 boxes of the object in normalised image coordinates, centre of the object on the axis.
-        late: features of the views by the name of their :class:`RerankingTerm`, (N, D) float16; none in a large bank.
-            Meshes with colours have grey and coloured features one after the other.
+        reranking_features: features of the views by the name of their :class:`RerankingTerm`, (N, D) float16; none in a
+            large bank. Meshes with colours have grey features followed by coloured ones.
     """
 
     def __init__(
@@ -51,9 +49,8 @@ class ViewBank:
         self.descriptors = tensors["descriptors"].float()
         self.boxes, self.model = tensors["boxes"], tensors["model"]
         self._points, self._silhouettes = tensors["points"], tensors["silhouettes"]
-        self.reranking_features = {
-            name.removeprefix(RERANKING): x for name, x in tensors.items() if name.startswith(RERANKING)
-        }
+        reranking = (name for name in tensors if name.startswith(RERANKING))
+        self.reranking_features = {name.removeprefix(RERANKING): tensors[name] for name in reranking}
 
     def __len__(self) -> int:
         return len(self.views)
@@ -64,7 +61,7 @@ class ViewBank:
 
     @property
     def mesh(self) -> trimesh.Trimesh:
-        """The one mesh.
+        """The mesh of a bank of one mesh.
 
         Raises:
             InvalidInputError: there are several; see ``meshes``.
@@ -111,19 +108,22 @@ class ViewBank:
         """(K, S, S) bool silhouettes of some views."""
         return _unpack(self._silhouettes[index], self.settings.image_size)
 
-    def check_made_for(self, pipeline: Pipeline) -> None:
-        """Raise :class:`BankError` if the views were made in another way than ``pipeline`` asks for.
+    def check_compatible(self, pipeline: Pipeline) -> None:
+        """Raise :class:`BankError` unless the bank's settings and view policy are those of ``pipeline``.
 
-        Views that came with the call (``pose="given"``) were chosen by the caller and go with every ``pipeline.views``.
+        Views that were passed by the caller (``pose="given"``) fit every view policy.
         """
-        made, asked = asdict(self.settings), asdict(pipeline.bank)
+        mine, theirs = asdict(self.settings), asdict(pipeline.bank)
         if self.pipeline.views.pose != "given":
-            made |= self.pipeline.views.key_fields()
-            asked |= pipeline.views.key_fields()
-        differ = [name for name in {**made, **asked} if made.get(name) != asked.get(name)]
-        if differ:
-            told = ", ".join(f"{n} {made[n]}, asked for {asked[n]}" for n in differ if n in made and n in asked)
-            raise BankError(f"bank: made with other settings ({told}); build it again, or use bank.pipeline")
+            mine |= self.pipeline.views.key_fields()
+            theirs |= pipeline.views.key_fields()
+        if mine != theirs:
+            differences = [
+                f"{n} {mine[n]}, asked for {theirs[n]}" for n in mine if n in theirs and mine[n] != theirs[n]
+            ]
+            raise BankError(
+                f"bank: made with other settings ({', '.join(differences)}); build it again, or use bank.pipeline"
+            )
 
     @classmethod
     def build(
@@ -140,19 +140,18 @@ class ViewBank:
         chunk_size: int = 24,
         device: torch.device | str = "cpu",
     ) -> "ViewBank":
-        """Render, filter and describe every view, chunks of them in parallel on as many threads as torch may use.
+        """Render, filter and describe every view, in chunks on as many threads as torch may use.
 
         Args:
             mesh: a mesh or the path of one.
-            views: viewpoints of one's own; default those of the pipeline.
+            views: custom viewpoints; default those of the pipeline.
             image_size, camera: instead of the pipeline's.
             renderer: "auto", "embree", "pyrender", "torch" or a :class:`DepthRenderer` of this mesh.
             settings: instead of the pipeline's ``bank``.
-            pipeline: what the bank is made for; default ``Pipeline()``.
-            progress: show a bar; or a function that is told "bank", views done and views in all, and may raise to stop.
-            chunk_size: views that a thread has in memory at a time (about 60 bytes x image_size^2 each). Those that are
-                quarter turns of each other are rendered once where they fall into one chunk.
-            device: where views are filtered and described, and where the bank stays.
+            pipeline: default ``Pipeline()``.
+            progress: show a bar; or a callback (stage "bank", views done, views in all) that may raise to cancel.
+            chunk_size: views that a thread holds in memory, about 60 bytes x image_size^2 each.
+            device: where views are filtered and described, and where the bank is stored.
 
         Raises:
             MeshError, MissingFileError, InvalidInputError, RenderingError.
@@ -172,21 +171,21 @@ class ViewBank:
         pipeline = replace(pipeline, bank=settings)
         if views is None:
             views = pipeline.views.sphere(mesh_up(mesh))
-        elif len(views) != 0:
-            pipeline = pipeline.with_pose_prior("given")
-        if len(views) == 0:
+        elif len(views) == 0:
             raise InvalidInputError("views: expected at least one viewpoint")
+        else:
+            pipeline = pipeline.with_pose_prior("given")
         if chunk_size < 1:
             raise InvalidInputError(f"chunk_size: expected >= 1, got {chunk_size}")
         describe = ViewDescriber(mesh, settings, renderer=renderer, device=device)
         rotations, distances = views.rotations, views.distance * mesh_radius(mesh)
-        late = {t.name: t.build(None).to(device) for t in pipeline.reranking_terms(len(views))}
+        reranking = {t.name: t.build(None).to(device) for t in pipeline.reranking_terms(len(views))}
 
-        def chunk(start: int) -> dict[str, Tensor]:
-            some = rotations[start : start + chunk_size], distances[start : start + chunk_size]
-            described = describe(*some)
+        def describe_chunk(start: int) -> dict[str, Tensor]:
+            chunk = rotations[start : start + chunk_size], distances[start : start + chunk_size]
+            described = describe(*chunk)
             return {
-                **{RERANKING + name: module.describe(describe.shaded(*some)).half() for name, module in late.items()},
+                **{RERANKING + n: module.describe(describe.shaded(*chunk)).half() for n, module in reranking.items()},
                 "descriptors": described.descriptors,
                 "points": _pack(described.points),
                 "silhouettes": _pack(described.silhouettes),
@@ -198,7 +197,7 @@ class ViewBank:
             tqdm(total=len(views), desc="views", unit="view", disable=progress is not True) as bar,
             one_thread_each() as pool,
         ):
-            for part in pool.map(chunk, range(0, len(views), chunk_size)):
+            for part in pool.map(describe_chunk, range(0, len(views), chunk_size)):
                 parts.append(part)
                 bar.update(len(part["boxes"]))
                 if callable(progress):
@@ -209,13 +208,13 @@ class ViewBank:
 
     @classmethod
     def join(cls, banks: "Sequence[ViewBank]") -> "ViewBank":
-        """The views of several banks, one after the other: which model fits a photograph best?
+        """Concatenate banks, so that photographs are compared with the views of several models.
 
         Args:
-            banks: at least one, all made for the same pipeline and on one device.
+            banks: at least one, with equal settings and view policies, on one device.
 
         Raises:
-            InvalidInputError: no bank, or banks that do not go together.
+            InvalidInputError: no bank, or banks that differ.
 
         Example:
             >>> from curvireg_torch.geometry import sample_views
@@ -228,29 +227,25 @@ class ViewBank:
         if not banks:
             raise InvalidInputError("banks: expected at least one bank, got none")
         first = banks[0]
-        for i, bank in enumerate(banks):
-            if bank.settings != first.settings:
-                raise InvalidInputError(
-                    f"banks: expected one set of settings, but bank {i} has {bank.settings} and bank 0 {first.settings}"
-                )
-            if bank.pipeline.views.key_fields() != first.pipeline.views.key_fields():
-                raise InvalidInputError(
-                    f"banks: expected one view policy, but bank {i} has {bank.pipeline.views.key_fields()} and bank 0 "
-                    f"{first.pipeline.views.key_fields()}"
-                )
-            if bank.device != first.device:
-                raise InvalidInputError(
-                    f"banks: expected one device, but bank {i} is on {bank.device}, not {first.device}"
-                )
+        properties: dict[str, Callable[[ViewBank], object]] = {
+            "set of settings": lambda bank: bank.settings,
+            "view policy": lambda bank: bank.pipeline.views.key_fields(),
+            "device": lambda bank: bank.device,
+        }
+        for what, value in properties.items():
+            for i, bank in enumerate(banks):
+                mine, theirs = value(bank), value(first)
+                if mine != theirs:
+                    raise InvalidInputError(f"banks: expected one {what}, but bank {i} has {mine} and bank 0 {theirs}")
         names = [name for name in first.tensors if all(name in bank.tensors for bank in banks)]
-        tensors = {name: _joined([bank.tensors[name] for bank in banks]) for name in names}
+        tensors = {name: _concatenate([bank.tensors[name] for bank in banks]) for name in names}
         shift = torch.tensor([0, *(len(bank.meshes) for bank in banks)]).cumsum(0)[:-1].tolist()
         tensors["model"] = torch.cat([bank.model + n for bank, n in zip(banks, shift, strict=True)])
         views = ViewSphere(*(torch.cat([getattr(b.views, f.name) for b in banks]) for f in fields(ViewSphere)))
         return cls([mesh for bank in banks for mesh in bank.meshes], views, first.pipeline, tensors)
 
     def locate(self, index: int) -> tuple[int, int]:
-        """Number of the model, and of the view among its views, of one of the N views."""
+        """Index of the model that view ``index`` shows, and of the view among that model's views."""
         if not 0 <= index < len(self):
             raise InvalidInputError(f"index: expected 0 <= index < {len(self)}, got {index}")
         model = int(self.model[index])
@@ -262,7 +257,7 @@ class ViewBank:
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """All that was computed of the views; masks packed eight pixels to a byte."""
+        """All tensors of the views; masks packed eight pixels to a byte."""
         return {
             "descriptors": self.descriptors,
             "boxes": self.boxes,
@@ -273,14 +268,8 @@ class ViewBank:
         }
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write a safetensors file; it appears whole or not at all, whoever else writes it at the same time.
-
-        Descriptors are stored in float16: they move by at most 5e-4 of themselves, cosines by less than 1e-4
-        (``tests/matching/test_bank_files.py``).
-        """
-        from .bank_file import write_bank
-
-        write_bank(self, Path(path))
+        """Write a safetensors file atomically. Descriptors in float16 change cosines by less than 1e-4."""
+        write_bank(Path(path), self.meshes, self.views, self.pipeline, self.tensors)
 
     @classmethod
     def load(cls, path: str | PathLike[str], *, device: torch.device | str = "cpu") -> "ViewBank":
@@ -290,13 +279,11 @@ class ViewBank:
             MissingFileError: no such file.
             BankError: truncated, changed, not a bank, or written by another version of the format.
         """
-        from .bank_file import read_bank
-
-        return read_bank(Path(path)).to(device)
+        return cls(*read_bank(Path(path))).to(device)
 
 
-def _joined(parts: list[Tensor]) -> Tensor:
-    """One after the other; those of meshes without colours hold their grey features twice beside others."""
+def _concatenate(parts: list[Tensor]) -> Tensor:
+    """Concatenate; beside coloured meshes, the grey features of meshes without colours are repeated."""
     widest = max(part.shape[1:].numel() for part in parts)
     return torch.cat([p.repeat(1, widest // p.shape[1]) if p.ndim == 2 else p for p in parts])
 

@@ -1,4 +1,4 @@
-"""Banks cached on disk by the content of what made them."""
+"""A cache of banks on disk, found again by a digest of everything they depend on."""
 
 import hashlib
 import json
@@ -8,7 +8,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from ..io.meshes.mesh import as_mesh, mesh_unit
 from ..io.meshes.up import mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
-from ..settings import BankSettings
 from ..utils.digests import code_digest
 from .bank import ViewBank
 from .bank_file import FORMAT_VERSION, colour_arrays
@@ -39,19 +38,31 @@ __all__ = [
 ]
 
 CACHE_LIMIT = 2_000_000_000
-"""Bytes that the cache may take; the banks used longest ago go first. ``$CURVIREG_CACHE_LIMIT`` overrides it."""
+"""Size limit of the cache in bytes; least recently used banks are removed. ``$CURVIREG_CACHE_LIMIT`` overrides it."""
 
-_ABANDONED = 3600.0  # seconds after which a half-written file belongs to no builder any more
+_ABANDONED = 3600.0  # seconds after which an incomplete file is taken for the remains of a killed process
 _HEADER_LIMIT = 1_000_000  # bytes; a bank's header takes about 2000
-_VIEW_SOURCES = ("descriptors", "filters", "geometry", "models", "rendering", "terms", "matching/describe.py")
-"""Sources that turn a mesh into descriptors: banks of another version of them are not found."""
 _BANK = re.compile(r"bank-[0-9a-f]{32}\.safetensors")
-_HALF_WRITTEN = re.compile(_BANK.pattern + r"\.[0-9a-f]{8}\.tmp")
+_INCOMPLETE = re.compile(_BANK.pattern + r"\.[0-9a-f]{8}\.tmp")
+
+_SOURCES = (
+    "descriptors",
+    "filters",
+    "geometry",
+    "io/meshes",
+    "models",
+    "rendering",
+    "terms",
+    "settings.py",
+    "matching/describe.py",
+    "matching/fields.py",
+)
+"""Code that turns a mesh into described views: a bank that another version of it built is not found."""
 
 
 @dataclass(frozen=True)
 class CachedBank:
-    """A file of the cache: ``path``, ``size`` in bytes, ``used``: seconds since the epoch of its last use."""
+    """A file of the cache: ``path``, ``size`` in bytes, and ``used``, the time of its last use in seconds."""
 
     path: Path
     size: int
@@ -61,8 +72,8 @@ class CachedBank:
 def cache_folder() -> Path:
     """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else ``~/.cache/curvireg_torch``.
 
-    Banks lie in its folder ``banks``, as ``bank-<key>.safetensors``. Nothing else is ever listed, overwritten or
-    removed: a file must lie there, bear such a name, and say in its own header that it is a bank.
+    Banks are stored in its folder ``banks`` as ``bank-<key>.safetensors``. Only files in that folder that have such a
+    name and the header of a bank are ever listed, overwritten or removed.
     """
     if folder := os.environ.get("CURVIREG_CACHE"):
         return Path(folder)
@@ -75,18 +86,12 @@ def cache_folder() -> Path:
 
 
 def bank_key(
-    mesh: trimesh.Trimesh,
-    views: ViewSphere,
-    settings: BankSettings | None = None,
-    *,
-    pipeline: Pipeline | None = None,
-    renderer: str = "auto",
+    mesh: trimesh.Trimesh, views: ViewSphere, *, pipeline: Pipeline | None = None, renderer: str = "auto"
 ) -> str:
-    """Digest in hexadecimal: mesh (colours, unit and up too), views, settings, renderer, code that describes views."""
-    made = _settled(pipeline, settings).bank_key_fields(len(views))
-    facts = [FORMAT_VERSION, made, mesh_unit(mesh), mesh_up(mesh), renderer]
+    """32 hexadecimal digits: digest of mesh (with colours, unit and up axis), views, settings, renderer and code."""
+    settings = (pipeline or Pipeline()).bank_key_fields(len(views))
+    facts = [FORMAT_VERSION, settings, mesh_unit(mesh), mesh_up(mesh), renderer, code_digest(*_SOURCES)]
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
-    digest.update(code_digest(*_VIEW_SOURCES).encode())
     digest.update(np.ascontiguousarray(mesh.vertices, np.float64).tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, np.int64).tobytes())
     for name, part in colour_arrays(mesh).items():
@@ -97,71 +102,67 @@ def bank_key(
     return digest.hexdigest()[:32]
 
 
-def _settled(pipeline: Pipeline | None, settings: BankSettings | None) -> Pipeline:
-    pipeline = pipeline or Pipeline()
-    return pipeline if settings is None else replace(pipeline, bank=settings)
-
-
 def cached_bank(
     mesh: Any,
     views: ViewSphere | None = None,
-    settings: BankSettings | None = None,
     *,
     pipeline: Pipeline | None = None,
     renderer: str | DepthRenderer = "auto",
     folder: Path | None = None,
     device: torch.device | str = "cpu",
     progress: bool | Callable[[str, int, int], object] = True,
-    **build_options: Any,
 ) -> ViewBank:
-    """The bank from the cache, or built and put there; a damaged file is built again, an unwritable folder a warning.
+    """The bank from the cache, or a new one that is stored there. Concurrent processes are safe.
 
-    Afterwards the cache is trimmed to its limit. Any number of processes may do this at the same time.
+    A damaged file is built again. A folder that cannot be written causes a warning. Afterwards the cache is trimmed to
+    its limit.
 
     Args:
         mesh: a mesh or the path of one.
-        views, settings: of the bank; default those of the pipeline.
-        pipeline: what the bank is made for; default ``Pipeline()``.
-        renderer: of a bank that is built; its name is part of the key, and a bank of one's own renderer is not kept.
+        views: custom viewpoints; default those of the pipeline.
+        pipeline: default ``Pipeline()``.
+        renderer: for a new bank; its name is part of the key. With a custom renderer the cache is not used.
         folder: default :func:`cache_folder`.
-        device, progress, build_options: of :meth:`ViewBank.build`.
+        device, progress: of :meth:`ViewBank.build`.
 
     Example:
         >>> import tempfile
         >>> from curvireg_torch.geometry import sample_views
         >>> folder, views = Path(tempfile.mkdtemp()), sample_views(azimuth_step=90, elevations=[20])
-        >>> settings = BankSettings(image_size=64)
-        >>> bank = cached_bank(trimesh.creation.box(), views, settings, folder=folder, progress=False)
+        >>> bank = cached_bank(trimesh.creation.box(), views, folder=folder, progress=False)
         >>> len(list_cache(folder)), clear_cache(folder)
         (1, 1)
     """
     mesh = as_mesh(mesh)
     folder = folder or cache_folder()
     pipeline = pipeline or Pipeline()
-    if views is not None:
+    if views is None:
+        views = pipeline.views.sphere(mesh_up(mesh))
+    else:
         pipeline = pipeline.with_pose_prior("given")
-    views = pipeline.views.sphere(mesh_up(mesh)) if views is None else views
-    pipeline = _settled(pipeline, settings)
-    build_options |= {"views": views, "pipeline": pipeline, "renderer": renderer, "device": device}
+
+    def build() -> ViewBank:
+        return ViewBank.build(mesh, views, pipeline=pipeline, renderer=renderer, device=device, progress=progress)
+
     if not isinstance(renderer, str):
-        return ViewBank.build(mesh, progress=progress, **build_options)
+        return build()
     key = bank_key(mesh, views, pipeline=pipeline, renderer=renderer)
     path = folder / "banks" / f"bank-{key}.safetensors"
-    if _is_ours(path):
+    if _is_bank(path):
         try:
             bank = ViewBank.load(path, device=device)
             if bank_key(bank.mesh, bank.views, pipeline=bank.pipeline, renderer=renderer) != key:
                 raise BankError(f"{path}: holds another bank than its name says")
-        except BankError:  # built again, and replaced
+        except BankError:  # build it again and replace the file
             pass
         else:
-            _touch(path)
-            bank.pipeline = pipeline  # of all that share these views
+            _mark_used(path)
+            bank.pipeline = pipeline  # pipelines that differ in ranking or search share a bank
             return bank
-    bank = ViewBank.build(mesh, progress=progress, **build_options)
+    bank = build()
     bank.pipeline = pipeline
-    bank.descriptors = bank.descriptors.half().float()  # as the file will hold them: now and later rank alike
-    if os.path.lexists(path) and not _is_ours(path):
+    bank.descriptors = bank.descriptors.half().float()  # as the file stores them, so that both rank alike
+    if os.path.lexists(path) and not _is_bank(path):
         warnings.warn(f"{path}: not a view bank, so it stays and the bank is not cached; move it away", stacklevel=2)
         return bank
     try:
@@ -173,7 +174,7 @@ def cached_bank(
         return bank
     try:
         trim_cache(folder, keep=path)
-    except OSError as error:  # its files may be added to, but not removed
+    except OSError as error:  # files may be added to the folder, but not removed
         warnings.warn(
             f"the cache exceeds its limit: {error.filename} cannot be removed ({error.strerror})", stacklevel=2
         )
@@ -181,28 +182,28 @@ def cached_bank(
 
 
 def list_cache(folder: Path | None = None) -> list[CachedBank]:
-    """The banks of the cache, last used first."""
+    """The banks of the cache, most recently used first."""
     banks = []
-    for path in _our_files(folder or cache_folder(), _BANK):
+    for path in _files(folder or cache_folder(), _BANK):
         try:
             status = path.stat()
-        except FileNotFoundError:  # another process removed it
+        except FileNotFoundError:  # removed by another process
             continue
         banks.append(CachedBank(path, status.st_size, status.st_mtime))
     return sorted(banks, key=lambda bank: bank.used, reverse=True)
 
 
 def clear_cache(folder: Path | None = None) -> int:
-    """Remove every bank of the cache, and what killed builders left; returns how many banks there were."""
+    """Remove every bank of the cache and incomplete files of killed processes; returns the number of banks."""
     folder = folder or cache_folder()
     banks = list_cache(folder)
-    for path in [*(bank.path for bank in banks), *_our_files(folder, _HALF_WRITTEN)]:
+    for path in [*(bank.path for bank in banks), *_files(folder, _INCOMPLETE)]:
         path.unlink(missing_ok=True)
     return len(banks)
 
 
 def trim_cache(folder: Path | None = None, *, limit: int | None = None, keep: Path | None = None) -> int:
-    """Remove the banks used longest ago until the cache fits its limit; returns how many went.
+    """Remove the least recently used banks until the cache fits its limit; returns how many were removed.
 
     Args:
         folder: default :func:`cache_folder`.
@@ -213,7 +214,7 @@ def trim_cache(folder: Path | None = None, *, limit: int | None = None, keep: Pa
     if limit is None:
         given = os.environ.get("CURVIREG_CACHE_LIMIT", "")
         limit = int(given) if given.isdecimal() else CACHE_LIMIT
-    for path in _our_files(folder, _HALF_WRITTEN):
+    for path in _files(folder, _INCOMPLETE):
         try:
             if time.time() - path.stat().st_mtime > _ABANDONED:
                 path.unlink(missing_ok=True)
@@ -229,17 +230,20 @@ def trim_cache(folder: Path | None = None, *, limit: int | None = None, keep: Pa
     return removed
 
 
-def _our_files(folder: Path, name: re.Pattern[str]) -> Iterator[Path]:
+def _files(folder: Path, name: re.Pattern[str]) -> Iterator[Path]:
     banks = folder / "banks"
     try:
         names = os.listdir(banks)
-    except OSError:  # not there yet, or not for us
+    except OSError:  # the folder does not exist yet, or cannot be read
         names = []
-    return (banks / found for found in names if name.fullmatch(found) and _is_ours(banks / found))
+    return (banks / found for found in names if name.fullmatch(found) and _is_bank(banks / found))
 
 
-def _is_ours(path: Path) -> bool:
-    """The header of this safetensors file, whole or cut short behind it, names this library; or the file is empty."""
+def _is_bank(path: Path) -> bool:
+    """Whether the header of this safetensors file, complete or truncated behind it, names this library.
+
+    An empty file, which a killed process may leave, counts too.
+    """
     try:
         with path.open("rb") as file:
             size = file.read(8)
@@ -249,8 +253,8 @@ def _is_ours(path: Path) -> bool:
         return False
 
 
-def _touch(path: Path) -> None:
+def _mark_used(path: Path) -> None:
     try:
         os.utime(path)
-    except OSError:  # a cache that may only be read
+    except OSError:  # a read-only cache
         return

@@ -1,4 +1,4 @@
-"""Views of one mesh, framed as a photograph's crop is, rendered, filtered and described."""
+"""Views of one mesh: framed as a photograph's crop is, rendered, filtered and described."""
 
 from dataclasses import dataclass
 
@@ -22,10 +22,10 @@ CHUNK = 64
 """Views in memory at a time."""
 
 SAME = 1e-6
-"""Difference of rotations' entries, and share of distances, that count as none: 1e-4 px in a view."""
+"""Tolerance of equal rotations (entries) and distances (relative): 1e-4 px in a view."""
 
 FAR = 20.0
-"""Distances farther away than usual: parallel projection but for a few per mille."""
+"""Distances to step back so that a perspective view approximates parallel projection to a few per mille."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class DescribedViews:
     """N described views.
 
     Attributes:
-        settings: what they were made with.
+        settings: how they were rendered and described.
         descriptors: (N, D) float32.
         points, silhouettes: (N, S, S) bool.
         boxes: (N, 4) float64 boxes of the object in normalised image coordinates (focal length 1), the object's centre
@@ -59,13 +59,13 @@ class DescribedViews:
 
 
 class ViewDescriber:
-    """Renders, filters and describes any views of one mesh.
+    """Renders, filters and describes arbitrary views of one mesh.
 
     Args:
         mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
-        settings: what views are made with.
+        settings: how views are rendered and described.
         renderer: "auto", "embree", "pyrender" or a :class:`DepthRenderer` of this mesh.
-        coloured: whether :meth:`shaded` shows the mesh's own colours too; default: where it has some.
+        coloured: whether :meth:`shaded` adds the mesh's colours; default: if it has any.
         device: where views are filtered and described.
     """
 
@@ -89,7 +89,7 @@ class ViewDescriber:
         self._device = device
 
     def cameras(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Cameras that look at the object's centre and are cropped to its box, as a photograph is.
+        """Cameras that look at the object's centre, cropped to its box as a photograph is.
 
         Args:
             rotations: (N, 3, 3) model -> camera.
@@ -106,9 +106,9 @@ class ViewDescriber:
         return T, crop_transforms(square_boxes(boxes, self.settings.margin), self.settings.image_size), boxes
 
     def cameras_of_boxes(self, rotations: Tensor, distances: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
-        """Perspective cameras that would see the object, straight ahead, where photographs' boxes have it.
+        """Perspective cameras that look straight at the object and project it into the photographs' boxes.
 
-        For photographs of unknown cameras. An orthographic describer's camera is one from far away.
+        They replace unknown cameras of photographs. For orthographic views the camera is far away.
 
         Args:
             rotations: (N, 3, 3).
@@ -136,14 +136,16 @@ class ViewDescriber:
 
     @torch.no_grad()
     def shaded(self, rotations: Tensor, distances: Tensor) -> Tensor:
-        """(N, 1, S, S) grey pictures of the framed views, see :func:`curvireg_torch.rendering.shade`; with the mesh's
-        colours (N, 4, S, S): grey, then red, green and blue of :func:`curvireg_torch.rendering.render_colour`."""
-        S, parallel = self.settings.image_size, {"orthographic": self._orthographic}
+        """(N, 1, S, S) grey pictures of the framed views, see :func:`curvireg_torch.rendering.shading.shade`.
+
+        With the mesh's colours (N, 4, S, S): grey, then RGB of :func:`curvireg_torch.rendering.render_colour`.
+        """
+        S, projection = self.settings.image_size, {"orthographic": self._orthographic}
         T, K, _ = self.cameras(rotations, distances)
-        grey = shade(self.renderer.render(T, K, (S, S), **parallel), K, **parallel).to(self._device)
+        grey = shade(self.renderer.render(T, K, (S, S), **projection), K, **projection).to(self._device)
         if not self._coloured:
             return grey
-        colour = render_colour(self._mesh, T, K, (S, S), renderer=self.renderer, **parallel)
+        colour = render_colour(self._mesh, T, K, (S, S), renderer=self.renderer, **projection)
         return torch.cat([grey, colour.to(grey)], dim=1)
 
     @torch.no_grad()
@@ -155,45 +157,46 @@ class ViewDescriber:
     @torch.no_grad()
     def descriptors(self, rotations: Tensor, distances: Tensor) -> Tensor:
         """(N, D) of (N, 3, 3) rotations at (N,) distances of the object's centre, in model units."""
-        parts = [
-            self.descriptor(self.fields(R, z))
-            for R, z in zip(rotations.split(CHUNK), distances.split(CHUNK), strict=True)
-        ]
-        return torch.cat(parts)
+        chunks = zip(rotations.split(CHUNK), distances.split(CHUNK), strict=True)
+        return torch.cat([self.descriptor(self.fields(R, z)) for R, z in chunks])
 
     @torch.no_grad()
     def __call__(self, rotations: Tensor, distances: Tensor) -> DescribedViews:
         """Describe (N, 3, 3) rotations at (N,) distances of the object's centre, in model units.
 
-        Views that differ by quarter turns about the optical axis, as every sixth does in steps of 15 degrees, are
-        pictures turned by 90 degrees: they are rendered and filtered once.
+        Views that differ by a multiple of 90 degrees about the optical axis are rendered and filtered once.
         """
-        first, turns = quarter_turns(rotations, distances)
-        own = first == torch.arange(len(first))
-        depth, boxes = self.depth(rotations[own], distances[own])
+        source, quarters = quarter_turns(rotations, distances)
+        rendered = source == torch.arange(len(source))
+        depth, boxes = self.depth(rotations[rendered], distances[rendered])
         field = self._filter(depth)
         points, silhouettes = field_points(field, fraction=self.settings.point_fraction)[:, 0], depth[:, 0] > 0
         descriptors = self.descriptor(field)
-        if not bool(own.all()):
-            chosen = turns.to(self._device), (own.cumsum(0) - 1)[first].to(self._device)
+        if not bool(rendered.all()):
+            selected = quarters.to(self._device), (rendered.cumsum(0) - 1)[source].to(self._device)
             sideways = self.descriptor(torch.stack([-field[:, 1], field[:, 0]], dim=1).rot90(-1, (2, 3)))
             halves = (self.descriptor.half_turned(x) for x in (descriptors, sideways))
-            descriptors = torch.stack([descriptors, sideways, *halves])[chosen]
+            descriptors = torch.stack([descriptors, sideways, *halves])[selected]
             points, silhouettes = (
-                torch.stack([x.rot90(-k, (1, 2)) for k in range(4)])[chosen] for x in (points, silhouettes)
+                torch.stack([x.rot90(-k, (1, 2)) for k in range(4)])[selected] for x in (points, silhouettes)
             )
             x0, y0, x1, y1 = boxes.T
             clockwise = [x0, y0, x1, y1, -y1, x0, -y0, x1, -x1, -y1, -x0, -y0, y0, -x1, y1, -x0]
-            boxes = torch.stack(clockwise, dim=1).view(-1, 4, 4).transpose(0, 1)[chosen]
+            boxes = torch.stack(clockwise, dim=1).view(-1, 4, 4).transpose(0, 1)[selected]
         return DescribedViews(self.settings, descriptors, points, silhouettes, boxes)
 
 
 def quarter_turns(rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
-    """Of (N, 3, 3) views the first that each is a picture of, turned clockwise by (N,) quarters, 0 to 3, on the CPU."""
+    """Group views that are the same picture rotated in the plane by a multiple of 90 degrees.
+
+    Returns:
+        For each of the (N, 3, 3) views the index (N,) of the first view of its group, and the number (N,) of clockwise
+        90 degree rotations, 0 to 3, from that view to this one; on the CPU.
+    """
     x, y, z = rotations[:, 0].double().cpu(), rotations[:, 1].double().cpu(), distances.double().cpu()
     frames = [torch.cat(pair, dim=1) for pair in ((x, y), (-y, x), (-x, -y), (y, -x))]
     apart = torch.cdist(torch.stack(frames), frames[0], compute_mode="donot_use_mm_for_euclid_dist")
     close = (apart < SAME) & ((z[:, None] - z).abs() <= SAME * z)
-    turned = close.any(dim=0)
-    first = (turned * torch.arange(len(x), 0, -1)[:, None]).argmax(dim=0)
+    grouped = close.any(dim=0)
+    first = (grouped * torch.arange(len(x), 0, -1)[:, None]).argmax(dim=0)
     return first, close.int().argmax(dim=0).gather(0, first[None])[0]

@@ -10,10 +10,11 @@ from torch import Tensor, nn
 
 from ..errors import CurviregError, InvalidInputError
 from ..geometry.views import ViewSphere
-from ..matching import QueryFeatures, Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
+from ..matching import Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..settings import BankSettings
+from ..terms import QueryFeatures
 from ..utils.checks import check_symmetries
 from ..utils.threads import map_on_threads
 from .confidence import confidence_model, pose_features, ranking_evidence, ranking_features

@@ -6,10 +6,11 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from ..geometry import rotation_from_axis_angle
-from ..matching import ViewDescriber, normalized_correlation
+from ..matching import ViewDescriber
 from ..matching.fields import depth_filter, hog_layer
 from ..models.learned_field import WORK_SIZE, doubled_angle, halved_angle
 from ..settings import BankSettings
+from ..terms import normalized_correlation
 from .scenes import GeneratedScenes
 
 __all__ = ["SETTINGS", "FieldDataset", "ReplayBuffer", "augment", "losses", "mirrored_descriptors"]

@@ -24,7 +24,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from curvireg_torch import Registrar, camera_matrix, sample_views
+from curvireg_torch import Pipeline, Registrar, camera_matrix, sample_views
 from curvireg_torch.matching import cached_bank
 from curvireg_torch.settings import BankSettings
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
@@ -71,7 +71,7 @@ def soak(count: int, reopen: int, seed: int) -> list[Sample]:
     for i in tqdm(range(count), unit="registration", position=seed):
         if i % reopen == 0:
             settings = BankSettings(image_size=64 if i // reopen % 2 else 96)  # each removes the other's bank
-            registrar = Registrar(cached_bank(mesh, views, settings, progress=False))
+            registrar = Registrar(cached_bank(mesh, views, pipeline=Pipeline(bank=settings), progress=False))
         noisy = (image + 0.02 * torch.randn(image.shape, generator=generator)).clamp(0, 1)
         result = registrar([noisy], box[None], K)[0]
         if not bool(torch.isfinite(result.rotation).all()):

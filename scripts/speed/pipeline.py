@@ -39,7 +39,7 @@ def seconds(call, repeats: int = 3) -> float:
 
 def over_products(matcher: ViewMatcher, images: list[torch.Tensor], boxes: torch.Tensor) -> float:
     """Ranking of described photographs by S_hog S_rep S_box over the bare matrix products in it, turn about; minima."""
-    hog, points = matcher.get_submodule("_comparisons.hog"), matcher.get_submodule("_comparisons.repeatability")
+    hog, points = matcher.get_submodule("_terms.hog"), matcher.get_submodule("_terms.repeatability")
     with torch.no_grad():
         query = matcher.query(images, boxes)
         descriptors = query.descriptors.flatten(0, 1).contiguous()

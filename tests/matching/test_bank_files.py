@@ -14,11 +14,12 @@ from safetensors.torch import load_file, save_file
 from curvireg_torch.errors import BankError, InvalidInputError, MissingFileError
 from curvireg_torch.geometry import sample_views, uniform_views
 from curvireg_torch.io.meshes.up import mesh_up
-from curvireg_torch.matching import ViewBank, ViewMatcher, normalized_correlation
+from curvireg_torch.matching import ViewBank, ViewMatcher
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import Registrar
 from curvireg_torch.settings import BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
+from curvireg_torch.terms import normalized_correlation
 
 SETTINGS = BankSettings(image_size=64)
 VIEWS = sample_views(azimuth_step=30, elevations=[0, 40])
@@ -198,7 +199,7 @@ def test_files_that_do_not_fit_are_refused(bank: ViewBank, tmp_path: Path) -> No
         (written(bank, tmp_path / "i", descriptors=infinite), "not finite"),
         (written(bank, tmp_path / "j", descriptors=torch.zeros_like(bank.descriptors)), "all zero"),
         (written(bank, tmp_path / "k", boxes=bank.boxes[:, [2, 1, 0, 3]]), "empty"),
-        (written(bank, tmp_path / "l", model=bank.model + 1), "meshes that are not there"),
+        (written(bank, tmp_path / "l", model=bank.model + 1), "meshes that do not exist"),
     ]
     for path, match in cases:
         with pytest.raises(BankError, match=match):

@@ -4,7 +4,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from curvireg_torch import ViewBank, ViewMatcher, sample_views
-from curvireg_torch.matching import DescriptorStatistics, Ranking
+from curvireg_torch.matching import Ranking
+from curvireg_torch.terms import DescriptorStatistics
 from tests._support.scenes import scene, truck_bank
 
 

@@ -20,16 +20,18 @@ from curvireg_torch.geometry import sample_views
 from curvireg_torch.io.meshes.colours import SurfaceColours
 from curvireg_torch.io.meshes.mesh import as_mesh
 from curvireg_torch.matching import ViewBank, bank_key, cache_folder, cached_bank, clear_cache, list_cache, trim_cache
+from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.settings import BankSettings
 
 SETTINGS = BankSettings(image_size=64)
+PIPELINE = Pipeline(bank=SETTINGS)
 VIEWS = sample_views(azimuth_step=90, elevations=[20])
 
 
 def build(folder: Path, edge: float = 1.0, **options: object) -> ViewBank:
     mesh = trimesh.creation.box((edge, 1.0, 1.0))
-    return cached_bank(mesh, VIEWS, SETTINGS, folder=folder, progress=False, **options)
+    return cached_bank(mesh, VIEWS, pipeline=PIPELINE, folder=folder, progress=False, **options)
 
 
 def test_second_time_from_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -49,11 +51,12 @@ def test_key_depends_on_everything(monkeypatch: pytest.MonkeyPatch) -> None:
     flipped.faces = flipped.faces[::-1]
     standing = mesh.copy()
     standing.metadata["up"] = "y"
-    keys = [bank_key(m, VIEWS, SETTINGS) for m in (mesh, millimetres, metres, moved, flipped, standing)]
-    keys += [bank_key(mesh, VIEWS[:3], SETTINGS), bank_key(mesh, VIEWS, replace(SETTINGS, sigma=1.5))]
-    keys.append(bank_key(mesh, VIEWS, SETTINGS, renderer="torch"))
+    keys = [bank_key(m, VIEWS, pipeline=PIPELINE) for m in (mesh, millimetres, metres, moved, flipped, standing)]
+    keys += [bank_key(mesh, VIEWS[:3], pipeline=PIPELINE)]
+    keys += [bank_key(mesh, VIEWS, pipeline=Pipeline(bank=replace(SETTINGS, sigma=1.5)))]
+    keys.append(bank_key(mesh, VIEWS, pipeline=PIPELINE, renderer="torch"))
     monkeypatch.setattr(cache, "code_digest", lambda *_: "another version")
-    keys.append(bank_key(mesh, VIEWS, SETTINGS))
+    keys.append(bank_key(mesh, VIEWS, pipeline=PIPELINE))
     assert len(set(keys)) == 10
 
 
@@ -71,7 +74,7 @@ def test_key_depends_on_colours() -> None:
     painted.visual.vertex_colors[0] = (9, 8, 7, 255)
     meshes = [trimesh.creation.box(), painted]
     meshes += [textured(), textured(uv=1e-4), textured(shade=1), textured(side=8), textured(side=2)]
-    assert len({bank_key(mesh, VIEWS, SETTINGS) for mesh in meshes}) == len(meshes)
+    assert len({bank_key(mesh, VIEWS, pipeline=PIPELINE) for mesh in meshes}) == len(meshes)
 
 
 def test_the_cached_bank_of_a_mesh_shows_that_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,10 +84,10 @@ def test_the_cached_bank_of_a_mesh_shows_that_mesh(tmp_path: Path, monkeypatch: 
     meshes = [trimesh.creation.box(), standing, textured(uv=100.0), textured(uv=100.0, shade=1)]
     options = {"folder": tmp_path, "progress": False}
     for mesh in meshes:
-        cached_bank(mesh, VIEWS, SETTINGS, **options)
+        cached_bank(mesh, VIEWS, pipeline=PIPELINE, **options)
     monkeypatch.setattr(ViewBank, "build", None)  # would fail
     for mesh in meshes:
-        found, given = cached_bank(mesh, VIEWS, SETTINGS, **options).mesh, as_mesh(mesh)
+        found, given = cached_bank(mesh, VIEWS, pipeline=PIPELINE, **options).mesh, as_mesh(mesh)
         assert found.metadata["up"] == given.metadata["up"]
         assert ("colours" in found.metadata) == ("colours" in given.metadata)
         if "colours" in given.metadata:
@@ -146,7 +149,7 @@ def test_list_and_clear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
     assert cache_folder() == tmp_path / "cache"
     assert (list_cache(), clear_cache(), trim_cache()) == ([], 0, 0)  # not even a folder
-    cached_bank(trimesh.creation.box(), VIEWS, SETTINGS, progress=False)
+    cached_bank(trimesh.creation.box(), VIEWS, pipeline=PIPELINE, progress=False)
     (file,) = list_cache()
     left = file.path.with_name(f"{file.path.name}.{uuid.uuid4().hex[:8]}.tmp")
     left.write_bytes(file.path.read_bytes()[:9000])  # of a killed process
@@ -288,5 +291,5 @@ def test_key_depends_on_each_texture() -> None:
         F = len(one.faces)
         corners, uv = np.full((F, 3, 3), 255, np.uint8), np.zeros((F, 3, 2), np.float32)
         one.metadata["colours"] = SurfaceColours(corners, uv, (np.arange(F) % 2).astype(np.int32), textures)
-    assert bank_key(mesh, VIEWS, SETTINGS) != bank_key(other, VIEWS, SETTINGS)
-    assert bank_key(mesh, VIEWS, SETTINGS) == bank_key(mesh.copy(), VIEWS, SETTINGS)
+    assert bank_key(mesh, VIEWS, pipeline=PIPELINE) != bank_key(other, VIEWS, pipeline=PIPELINE)
+    assert bank_key(mesh, VIEWS, pipeline=PIPELINE) == bank_key(mesh.copy(), VIEWS, pipeline=PIPELINE)

@@ -5,14 +5,14 @@ import torch
 
 from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.matching import (
+from curvireg_torch.terms import (
+    Correlation,
     dilate_points,
     normalized_correlation,
     repeatability,
     repeatability_score,
     unit_score,
 )
-from curvireg_torch.terms import Correlation
 from tests._support.scenes import scene, truck_bank
 
 

@@ -160,13 +160,13 @@ def test_features_that_are_made_anew_when_too_many_were_kept_are_the_same(monkey
     pipeline = late(top=6, min_angle=20.0)
     queries = [ViewMatcher(large, pipeline=pipeline).query([scene(k)[0]], scene(k)[1][None]) for k in range(3)]
     fresh = [ViewMatcher(large, pipeline=pipeline).rank(query).scores for query in queries]
-    monkeypatch.setattr(matcher_module, "KEPT", 8)
+    monkeypatch.setattr(matcher_module, "CACHED", 8)
     matcher, asked = ViewMatcher(large, pipeline=pipeline), []
     for query, expected in zip(queries, fresh, strict=True):
-        known = set(matcher._kept.get("appearance", {}))
+        known = set(matcher._feature_cache.get("appearance", {}))
         ranking = matcher.rank(query)
         wanted = set(ranking.terms["appearance"][0].isfinite().nonzero()[:, 0].tolist())
         asked.append(bool(known & wanted) and len(known | wanted) > 8)
         torch.testing.assert_close(ranking.scores, expected, rtol=1e-4, atol=1e-7)
-        assert len(matcher._kept["appearance"]) <= 8
+        assert len(matcher._feature_cache["appearance"]) <= 8
     assert any(asked), "views kept and wanted again, and too many in all"

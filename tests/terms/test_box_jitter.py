@@ -5,8 +5,7 @@ from torch import nn
 from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import crop_images
-from curvireg_torch.matching import jittered_boxes
-from curvireg_torch.terms import crop_regions
+from curvireg_torch.terms import crop_regions, jittered_boxes
 from tests._support.scenes import scene, truck_bank
 
 

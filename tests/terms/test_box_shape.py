@@ -6,8 +6,7 @@ import torch
 
 from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.matching import box_shape_score, box_shapes, whole_box_shapes
-from curvireg_torch.terms import BoxShape
+from curvireg_torch.terms import BoxShape, box_shape_score, box_shapes, whole_box_shapes
 from tests._support.scenes import scene, truck_bank
 
 

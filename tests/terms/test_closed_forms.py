@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.matching import jittered_boxes
 from curvireg_torch.terms import (
     BoxShape,
     Correlation,
     Repeatability,
     dilate_points,
+    jittered_boxes,
     normalized_correlation,
     repeatability,
     repeatability_score,

@@ -5,7 +5,7 @@ from sklearn.covariance import ledoit_wolf, ledoit_wolf_shrinkage
 
 from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.matching import DescriptorStatistics, Whitening
+from curvireg_torch.terms import DescriptorStatistics, Whitening
 from tests._support.scenes import scene, truck_bank
 
 

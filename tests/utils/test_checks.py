@@ -16,11 +16,12 @@ from curvireg_torch import filters, geometry, metrics
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError
 from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.io.meshes import mesh_centre, mesh_radius
-from curvireg_torch.matching import dilate_points, distinct_views
+from curvireg_torch.matching import distinct_views
 from curvireg_torch.registration import fit_contours, localize
 from curvireg_torch.rendering import make_renderer, render_colour
 from curvireg_torch.rendering.shading import shade
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
+from curvireg_torch.terms import dilate_points
 from curvireg_torch.utils.checks import check_pose, check_rotation, check_square_pixels
 from curvireg_torch.visualization import contour_overlay, pose_glb, registration_sheet
 from tests._support.scenes import unrefined

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ...errors import CurviregError, InvalidInputError
 from ...geometry.crops import box_iou
-from ...matching import QueryFeatures, Ranking
+from ...matching import Ranking
+from ...terms import QueryFeatures
 from ..confidence import presence, presence_features
 from ..correction import projected_box
 from ..inputs import ImageItem, check_crop, image_items
