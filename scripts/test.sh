@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
-# Installs everything, then lints, type-checks and tests. Arguments go to pytest, for instance -m "not slow".
+# Installs everything, then checks style, spelling and types, and tests. Arguments go to pytest, for instance -m "not slow".
 set -euo pipefail
 . "$(dirname "$0")/_environment.sh" "[dev]"
 "$venv/bin/ruff" check .
 "$venv/bin/ruff" format --check .
+"$venv/bin/codespell"
 "$venv/bin/mypy"
 "$venv/bin/python" -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile "$@"
