@@ -1,4 +1,4 @@
-"""Training of the learned field: generated scenes, datasets and losses, and adaptation to one mesh."""
+"""Training of the learned field: generated scenes, targets, losses, and adaptation to one mesh."""
 
 from .adaptation import adapt
 from .field_dataset import FieldDataset, ReplayBuffer, augment, losses

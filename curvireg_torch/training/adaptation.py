@@ -1,4 +1,4 @@
-"""The network, fine-tuned on renders of the user's own mesh."""
+"""Fine-tuning of the learned field on renders of one mesh."""
 
 from typing import Any
 
@@ -29,28 +29,31 @@ def adapt(
     workers: int = 0,
     progress: bool = True,
 ) -> LearnedCurvilinearSaliency:
-    """Fine-tune on generated photographs of one mesh, some minutes on a CPU.
+    """Fine-tune the learned field on generated photographs of one mesh. This takes some minutes on a CPU.
 
-    No photograph of the object is needed: scenes are lit, textured and cluttered at random, see
-    :class:`curvireg_torch.training.scenes.GeneratedScenes`. Batch statistics stay those of the general training.
+    No photograph of the object is needed: light, textures and clutter are random, see
+    :class:`curvireg_torch.training.scenes.GeneratedScenes`. Batch statistics are not updated.
 
     Args:
         mesh: a mesh or the path of one.
-        scenes: how many photographs to generate; each is seen once.
-        upright: share of them where the object stands; the mesh's ``up`` axis points up then.
-        field: start from this one, which is changed; default the packaged one.
+        scenes: number of photographs to generate; each is used once.
+        upright: fraction of them in which the object stands upright, with the mesh's ``up`` axis pointing up.
+        field: starting point, modified in place; default: the packaged weights.
         seed: of the scenes.
-        workers: processes that generate them; 0 is this one. They are spawned, so that a script that asks for them
+        workers: processes that generate scenes; 0 uses this one. Processes are spawned, so a script that uses them
             needs ``if __name__ == "__main__":``.
-        progress: show a bar.
+        progress: show a progress bar.
 
     Returns:
-        The adapted field; keep it with :meth:`LearnedCurvilinearSaliency.save`.
+        The adapted field. Save it with :meth:`LearnedCurvilinearSaliency.save`.
+
+    Raises:
+        InvalidInputError: ``scenes`` is not positive.
     """
     check_positive(scenes, "scenes")
     field = LearnedCurvilinearSaliency() if field is None else field
-    lessons = FieldDataset(GeneratedScenes(scenes, seed=seed, upright=upright, meshes=[with_z_up(as_mesh(mesh))]))
-    loader = DataLoader(lessons, BATCH, num_workers=workers, multiprocessing_context="spawn" if workers else None)
+    dataset = FieldDataset(GeneratedScenes(scenes, seed=seed, upright=upright, meshes=[with_z_up(as_mesh(mesh))]))
+    loader = DataLoader(dataset, BATCH, num_workers=workers, multiprocessing_context="spawn" if workers else None)
     network = field.network
     network.eval().requires_grad_(True)
     optimizer = torch.optim.AdamW(network.parameters(), lr=RATE)

@@ -1,4 +1,4 @@
-"""What the network is shown and what it is asked for."""
+"""Training data and losses of the learned field."""
 
 import torch
 import torch.nn.functional as F
@@ -16,25 +16,26 @@ from .scenes import GeneratedScenes
 __all__ = ["SETTINGS", "FieldDataset", "ReplayBuffer", "augment", "losses", "mirrored_descriptors"]
 
 SETTINGS = BankSettings(image_size=WORK_SIZE, sigma=0.8)
-"""Of the depth views that the network is to imitate."""
+"""Settings of the depth views that the network learns to imitate."""
 
 TEMPERATURE = 0.05
-"""Of the ranking loss: correlations of right and wrong views lie about so far apart."""
+"""Of the ranking losses: about the difference between the correlations of right and wrong views."""
 
-RIVALS = 5
-"""Other views of the same object in a lesson."""
+OTHER_VIEWS = 5
+"""Number of other views of the same object in a sample."""
 
 
 class FieldDataset(Dataset[dict[str, Tensor]]):
-    """Generated scenes with the right answers.
+    """Generated scenes with the targets of the learned field.
 
     Args:
-        scenes: of ``WORK_SIZE`` px.
+        scenes: scenes of ``WORK_SIZE`` px.
 
-    Items: ``image`` (3, S, S) uint8; in half precision ``code`` (2, S/2, S/2), the clean depth's field by
-    :func:`doubled_angle`, of length about 1 on its edges; ``mask`` (1, S/2, S/2), hidden parts included;
-    ``descriptors`` (2 + RIVALS, D) of that field, and of views of the object as a bank would hold them, the right one
-    first.
+    Items (a dict): ``image`` (3, S, S) uint8, and in half precision
+
+    - ``code`` (2, S/2, S/2), the field of the clean depth encoded by :func:`doubled_angle`, of length about 1 on edges;
+    - ``mask`` (1, S/2, S/2), the object's silhouette, occluded parts included;
+    - ``descriptors`` (2 + OTHER_VIEWS, D): of that field, of the true view as a bank describes it, and of other views.
     """
 
     def __init__(self, scenes: GeneratedScenes) -> None:
@@ -51,8 +52,8 @@ class FieldDataset(Dataset[dict[str, Tensor]]):
         code = F.avg_pool2d(doubled_angle(field), 2)
         length = code.norm(dim=1)
         describe = ViewDescriber(self.scenes.shape(index).mesh(), SETTINGS)
-        turns = _rival_turns(torch.Generator().manual_seed(index))
-        views = self._filter(describe.depth(sample["rotation"] @ turns, sample["distance"].expand(len(turns)))[0])
+        rotations = sample["rotation"] @ _view_rotations(torch.Generator().manual_seed(index))
+        views = self._filter(describe.depth(rotations, sample["distance"].expand(len(rotations)))[0])
         return {
             "image": (255 * sample["image"]).round().to(torch.uint8),
             "code": (code * length.sum() / (length.square().sum() + 1e-6))[0].half(),
@@ -62,7 +63,7 @@ class FieldDataset(Dataset[dict[str, Tensor]]):
 
 
 def mirrored_descriptors(descriptors: Tensor) -> Tensor:
-    """(..., D) descriptors of the mirror images: blocks, cells and bins change sides.
+    """Descriptors (..., D) of the mirror images of the fields of ``descriptors`` (..., D).
 
     Example:
         >>> field = torch.randn(1, 2, 128, 128)
@@ -77,42 +78,42 @@ def mirrored_descriptors(descriptors: Tensor) -> Tensor:
     return mirrored
 
 
-def _rival_turns(generator: torch.Generator) -> Tensor:
-    """(1 + RIVALS, 3, 3) turns of the model: none, half a turn and a quarter about z, others at random."""
+def _view_rotations(generator: torch.Generator) -> Tensor:
+    """(1 + OTHER_VIEWS, 3, 3) model rotations: identity, half and quarter turns about z, then random ones."""
     z = torch.tensor([0.0, torch.pi, 0.5 * torch.pi, -0.5 * torch.pi])
     about_z = torch.stack([torch.zeros(4), torch.zeros(4), z], dim=1)
-    angles = torch.deg2rad(20.0 + 60.0 * torch.rand(RIVALS - 3, 1, generator=generator))
-    others = angles * F.normalize(torch.randn(RIVALS - 3, 3, generator=generator), dim=1)
+    angles = torch.deg2rad(20.0 + 60.0 * torch.rand(OTHER_VIEWS - 3, 1, generator=generator))
+    others = angles * F.normalize(torch.randn(OTHER_VIEWS - 3, 3, generator=generator), dim=1)
     return rotation_from_axis_angle(torch.cat([about_z, others]))
 
 
 class ReplayBuffer:
-    """The latest ``capacity`` lessons, so that the network need not wait for the generator."""
+    """The latest ``capacity`` samples, reused so that training does not wait for the scene generator."""
 
     def __init__(self, capacity: int) -> None:
-        self.capacity, self.seen = capacity, 0
+        self.capacity, self.added = capacity, 0
         self._store: dict[str, Tensor] = {}
 
     def add(self, batch: dict[str, Tensor]) -> None:
-        """Keep a batch, in place of the oldest where there is no room."""
+        """Store a batch. It replaces the oldest samples when the buffer is full."""
         if not self._store:
             self._store = {k: v.new_zeros(self.capacity, *v.shape[1:]) for k, v in batch.items()}
-        at = torch.arange(self.seen, self.seen + len(batch["image"])) % self.capacity
+        index = torch.arange(self.added, self.added + len(batch["image"])) % self.capacity
         for name, values in batch.items():
-            self._store[name][at] = values
-        self.seen += len(at)
+            self._store[name][index] = values
+        self.added += len(index)
 
     def draw(self, fresh: int, count: int, generator: torch.Generator) -> dict[str, Tensor]:
-        """The ``fresh`` latest lessons and others at random, ``count`` in all; float32, images in [0, 1]."""
-        held = min(self.seen, self.capacity)
-        latest = torch.arange(self.seen - fresh, self.seen) % self.capacity
-        at = torch.cat([latest, torch.randint(held, (count - fresh,), generator=generator)])
-        batch = {name: values[at].float() for name, values in self._store.items()}
+        """The ``fresh`` latest samples and random others, ``count`` in all, as float32 with images in [0, 1]."""
+        stored = min(self.added, self.capacity)
+        latest = torch.arange(self.added - fresh, self.added) % self.capacity
+        index = torch.cat([latest, torch.randint(stored, (count - fresh,), generator=generator)])
+        batch = {name: values[index].float() for name, values in self._store.items()}
         return {**batch, "image": batch["image"] / 255.0}
 
 
 def augment(batch: dict[str, Tensor], generator: torch.Generator) -> dict[str, Tensor]:
-    """The same lessons mirrored, with other colours, contrast and noise, each at random."""
+    """Mirror the samples and change colours, contrast and noise, each at random. Targets are mirrored with images."""
     images = batch["image"]
     B = len(images)
 
@@ -134,35 +135,35 @@ def augment(batch: dict[str, Tensor], generator: torch.Generator) -> dict[str, T
 
 
 def losses(
-    answer: Tensor,
+    output: Tensor,
     batch: dict[str, Tensor],
     *,
     descriptor_weight: float = 1.0,
     ranking_weight: float = 0.1,
-    rivals_weight: float = 0.2,
+    other_views_weight: float = 0.2,
 ) -> dict[str, Tensor]:
-    """What is to be small, to be added up.
+    """Terms of the training loss, to be added up.
 
-    ``field``: squared error of the code, 1 for no field at all; ``mask``: cross entropy; ``descriptor``: one minus the
-    correlation with the right view's; ``ranking``: cross entropy of picking the right view among those of the batch and
-    their mirror images; ``rivals``: of picking it among other views of the same object.
+    ``field``: squared error of the code, relative to predicting no field. ``mask``: cross entropy. ``descriptor``: one
+    minus the correlation with the true view. ``ranking``: cross entropy of picking the true view among those of the
+    batch and their mirror images. ``other_views``: of picking it among other views of the same object.
 
     Args:
-        answer: (B, 3, S/2, S/2) of :class:`FieldNetwork`.
-        batch: of :class:`FieldDataset`, float32.
-        descriptor_weight, ranking_weight, rivals_weight: factors of the last three.
+        output: (B, 3, S/2, S/2) of :class:`FieldNetwork`.
+        batch: samples of :class:`FieldDataset` as float32.
+        descriptor_weight, ranking_weight, other_views_weight: factors of the last three terms.
     """
-    code, wanted = answer[:, :2], batch["code"]
-    ours = hog_layer(SETTINGS)(halved_angle(code))
-    own = batch["descriptors"][:, 0]
-    similar = normalized_correlation(ours, torch.cat([own, mirrored_descriptors(own)]))
-    right = torch.arange(len(ours), device=ours.device)
+    code, target = output[:, :2], batch["code"]
+    predicted = hog_layer(SETTINGS)(halved_angle(code))
+    true = batch["descriptors"][:, 0]
+    correlation = normalized_correlation(predicted, torch.cat([true, mirrored_descriptors(true)]))
+    labels = torch.arange(len(predicted), device=predicted.device)
     views = F.normalize(batch["descriptors"][:, 1:], dim=2)
-    among_views = (views @ F.normalize(ours, dim=1)[..., None])[..., 0]
+    among_views = (views @ F.normalize(predicted, dim=1)[..., None])[..., 0]
     return {
-        "field": (code - wanted).square().sum(dim=1).mean() / wanted.square().sum(dim=1).mean(),
-        "mask": F.binary_cross_entropy_with_logits(answer[:, 2:], batch["mask"]),
-        "descriptor": descriptor_weight * (1.0 - similar.diagonal()).mean(),
-        "ranking": ranking_weight * F.cross_entropy(similar / TEMPERATURE, right),
-        "rivals": rivals_weight * F.cross_entropy(among_views / TEMPERATURE, torch.zeros_like(right)),
+        "field": (code - target).square().sum(dim=1).mean() / target.square().sum(dim=1).mean(),
+        "mask": F.binary_cross_entropy_with_logits(output[:, 2:], batch["mask"]),
+        "descriptor": descriptor_weight * (1.0 - correlation.diagonal()).mean(),
+        "ranking": ranking_weight * F.cross_entropy(correlation / TEMPERATURE, labels),
+        "other_views": other_views_weight * F.cross_entropy(among_views / TEMPERATURE, torch.zeros_like(labels)),
     }

@@ -25,8 +25,8 @@ from tqdm import tqdm
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.cameras import rotation_towards
 from curvireg_torch.rendering.embree import RayScene
-from curvireg_torch.training.scenes.camera_noise import photographed
-from curvireg_torch.training.scenes.light import lit, random_light
+from curvireg_torch.training.scenes.camera_noise import simulate_camera
+from curvireg_torch.training.scenes.light import random_light, shade_points
 from curvireg_torch.training.scenes.materials import random_colour, random_picture
 from curvireg_torch.training.scenes.rotations import random_rotation
 from scripts.benchmark.textured import Textured
@@ -219,7 +219,7 @@ def draw(household: list[Textured], R, t, K, size, rng) -> tuple[np.ndarray, np.
         gloss[here] *= rng.uniform(0, 1.5)
     view = -points / np.linalg.norm(points, axis=1, keepdims=True)
     normal *= np.sign((normal * view).sum(axis=1, keepdims=True) + 1e-12)
-    light = lit(scene, points, normal, colour, np.clip(gloss, 0, 1), shine, random_light(R[:, 2], rng))
+    light = shade_points(scene, points, normal, colour, np.clip(gloss, 0, 1), shine, random_light(R[:, 2], rng))
     side = max(h, w)
     picture = random_picture(rng, side)[:h, :w].reshape(-1, 3).astype(np.float32)
     picture[hit] = light
@@ -275,7 +275,7 @@ def make(meshes: Meshes, seed: int, index: int) -> tuple[np.ndarray, dict]:
             break
     else:
         raise RuntimeError(f"{index}: {shown['id']} stays hidden")
-    image = photographed(picture, rng)
+    image = simulate_camera(picture, rng)
     exact = np.array(outline(whole))
     side = np.tile(exact[2:] - exact[:2], 2)
     box = np.clip(exact + rng.normal(0, 0.012, 4) * side, -0.5, [size[1] - 0.5, size[0] - 0.5] * 2)

@@ -51,9 +51,9 @@ def test_mirroring_keeps_answers_right(batch):
     for seed in range(6):
         one = {k: v[:1] for k, v in batch.items()}
         other = augment(one, torch.Generator().manual_seed(seed))
-        mirrored = not torch.equal(other["mask"], one["mask"])
-        found.add(mirrored)
-        expected = one["code"].flip(3) * torch.tensor([1.0, -1.0])[:, None, None] if mirrored else one["code"]
+        reflection = not torch.equal(other["mask"], one["mask"])
+        found.add(reflection)
+        expected = one["code"].flip(3) * torch.tensor([1.0, -1.0])[:, None, None] if reflection else one["code"]
         assert torch.equal(other["code"], expected)
         answer = torch.cat([other["code"], torch.zeros_like(other["mask"])], dim=1)
         assert losses(answer, other)["descriptor"] < 0.1
@@ -136,6 +136,6 @@ def test_pictures_are_mirrored_with_their_answers():
     batch = {"image": image, "mask": mask, "code": torch.zeros(B, 2, 8, 8), "descriptors": torch.zeros(B, 7, width)}
     found = augment(batch, torch.Generator().manual_seed(0))
     left, right = (half.std(dim=2).mean(dim=(1, 2)) for half in found["image"].split(8, dim=3))
-    mirrored = found["mask"][:, 0, 0, 0] == 0
-    assert 5 < int(mirrored.sum()) < B - 5
-    assert torch.equal(right > left, mirrored)
+    reflection = found["mask"][:, 0, 0, 0] == 0
+    assert 5 < int(reflection.sum()) < B - 5
+    assert torch.equal(right > left, reflection)

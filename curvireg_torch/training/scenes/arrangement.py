@@ -1,4 +1,4 @@
-"""What is to be photographed: drawn at random, before anything is rendered."""
+"""Random arrangement of a scene before it is rendered: shapes, materials, light and camera."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -30,32 +30,32 @@ class Arrangement:
     """A scene before it is rendered.
 
     Attributes:
-        rotation: (3, 3) model -> camera of the object, the camera looking straight at it.
-        distance: of the object's centre, in radii.
-        things: the object, then what is around it.
-        looks: for each thing, a look for each of its materials.
-        light: of the scene.
+        rotation: (3, 3) model -> camera of the object; the camera looks straight at it.
+        distance: distance of the object's centre in radii.
+        shapes: the object first, then its surroundings.
+        materials: one dictionary per shape, from material number to material.
+        light: light of the scene.
         camera_matrix: (3, 3) of the crop around the object's box.
         size: side of the crop in px.
-        cut: x0, y0, x1, y1 in px: the part of the crop that the photograph covers.
+        photo_area: x0, y0, x1, y1 in px, the part of the crop that lies within the photograph.
         background: (B, B, 3) linear picture behind everything, B = 3 size // 2.
-        defocus: blur in px of what is farther off; 0 = none.
+        defocus: blur of the distant background in px; 0 = none.
     """
 
     rotation: Array
     distance: float
-    household: tuple[PlacedShape, ...]
-    appearance_scores: tuple[dict[int, Material], ...]
+    shapes: tuple[PlacedShape, ...]
+    materials: tuple[dict[int, Material], ...]
     light: Light
     camera_matrix: Array
     size: int
-    cut: tuple[int, int, int, int]
+    photo_area: tuple[int, int, int, int]
     background: Array
     defocus: float
 
     @property
     def centre(self) -> Array:
-        """(3,) the object's, in the camera's frame."""
+        """(3,) centre of the object in the camera's frame."""
         return np.array([0.0, 0.0, self.distance])
 
 
@@ -68,7 +68,7 @@ def arrange(
     margin: float = 0.1,
     upright: float = 0.6,
 ) -> Arrangement:
-    """Draw everything; arguments as of :func:`make_scene`.
+    """Draw a random arrangement. See :func:`make_scene` for the arguments.
 
     Example:
         >>> from curvireg_torch.training.scenes import random_shape
@@ -84,32 +84,30 @@ def arrange(
         R = random_rotation(rng)
     distance = float(np.exp(rng.uniform(np.log(2.2), np.log(14.0))))
     centre = np.array([0.0, 0.0, distance])
-    lift_to_poses = shape.vertices @ R.T + centre
-    K, cut = _crop_camera(lift_to_poses, rng, size, margin)
-    household = [PlacedShape(lift_to_poses, shape.faces, shape.materials)]
+    placed = shape.vertices @ R.T + centre
+    K, photo_area = _crop_camera(placed, rng, size, margin)
+    shapes = [PlacedShape(placed, shape.faces, shape.materials)]
     floor = float((shape.vertices[:, 2]).min())
-    above = float(-(R.T @ centre)[2]) > floor + 0.1  # seen from below, the ground would hide everything
+    above = float(-(R.T @ centre)[2]) > floor + 0.1  # the ground would hide everything from a camera below it
     ground = standing and rng.random() < 0.6 and above
-    household += [_beside(other, R, centre, floor if ground else None, K, size, rng) for other in clutter]
+    shapes += [_beside(other, R, centre, floor if ground else None, K, size, rng) for other in clutter]
     if ground:
-        household.append(_ground(R, centre, floor, rng))
+        shapes.append(_ground(R, centre, floor, rng))
     if rng.random() < 0.3:
-        household.append(_wall(distance, rng))
+        shapes.append(_wall(distance, rng))
     plain = rng.uniform(0.2, 0.8)
-    appearance_scores = tuple(
-        {int(k): Material(rng, plain=plain) for k in np.unique(thing.materials)} for thing in household
-    )
+    materials = tuple({int(k): Material(rng, plain=plain) for k in np.unique(one.materials)} for one in shapes)
     light = random_light(R[:, 2], rng)
     background = random_picture(rng, 3 * size // 2)
     defocus = float(rng.uniform(0.7, 4.0)) if rng.random() < 0.35 else 0.0
-    return Arrangement(R, distance, tuple(household), appearance_scores, light, K, size, cut, background, defocus)
+    return Arrangement(R, distance, tuple(shapes), materials, light, K, size, photo_area, background, defocus)
 
 
 def _crop_camera(
-    lift_to_poses: Array, rng: np.random.Generator, size: int, margin: float
+    placed: Array, rng: np.random.Generator, size: int, margin: float
 ) -> tuple[Array, tuple[int, int, int, int]]:
-    """Camera matrix of the crop around a jittered box, and the part of the crop that the photograph covers."""
-    flat = lift_to_poses[:, :2] / np.maximum(lift_to_poses[:, 2:], 0.1)
+    """Camera matrix of the crop around a jittered box, and the part of the crop that lies within the photograph."""
+    flat = placed[:, :2] / np.maximum(placed[:, 2:], 0.1)
     low, high = flat.min(axis=0), flat.max(axis=0)
     side = high - low
     jitter = rng.normal(0, rng.choice([0.01, 0.05]), 4)
@@ -122,15 +120,15 @@ def _crop_camera(
     A = crop_transforms(square_boxes(torch.from_numpy(box), margin), size).numpy()
     corners = np.where(np.isfinite(border), border, 0).reshape(2, 2) @ A[:2, :2] + A[:2, 2]
     whole = np.array([0, 0, size, size])
-    cut = np.where(np.isfinite(border), np.round(corners.reshape(-1) + 0.5), whole)
-    x0, y0, x1, y1 = np.clip(cut, 0, size).astype(int).tolist()
+    area = np.where(np.isfinite(border), np.round(corners.reshape(-1) + 0.5), whole)
+    x0, y0, x1, y1 = np.clip(area, 0, size).astype(int).tolist()
     return A, (x0, y0, x1, y1)
 
 
 def _beside(
     other: Shape, R: Array, centre: Array, floor: float | None, K: Array, size: int, rng: np.random.Generator
 ) -> PlacedShape:
-    """Another shape somewhere in the picture: mostly behind the object, at times before it."""
+    """Place another shape in the picture: mostly behind the object, sometimes in front of it."""
     scale = np.exp(rng.uniform(-1.0, 0.8))
     upright = R @ rotation_from_viewpoint(rng.uniform(0, 360), 90.0, 0.0).numpy()  # about the vertical
     if floor is not None:
@@ -144,7 +142,7 @@ def _beside(
     z = centre[2] + (-1.3 if front else rng.uniform(0.5, 4.0))
     scale = scale * (0.3 if front else 1.0)
     pixel = rng.uniform(-0.1, 1.1, 2) * size
-    if front:  # at the rim, so that it covers a part only
+    if front:  # near the border, so that it hides only a part of the object
         pixel[rng.integers(2)] = size * rng.choice([0.1, 0.9])
     ray = np.array([(pixel[0] - K[0, 2]) / K[0, 0], (pixel[1] - K[1, 2]) / K[1, 1], 1.0])
     points = scale * other.vertices @ (upright if rng.random() < 0.5 else random_rotation(rng)).T + ray * max(

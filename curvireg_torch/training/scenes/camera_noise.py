@@ -1,19 +1,19 @@
-"""What a camera does to a clean picture."""
+"""Simulation of a camera's imperfections."""
 
 import cv2
 import numpy as np
 
 from .surfaces import Array
 
-__all__ = ["photographed"]
+__all__ = ["simulate_camera"]
 
 
-def photographed(picture: Array, rng: np.random.Generator) -> Array:
-    """A clean (H, W, 3) picture as a camera would give it: exposure, white balance, blur, few pixels, noise, JPEG.
+def simulate_camera(picture: Array, rng: np.random.Generator) -> Array:
+    """Apply random exposure, white balance, blur, downsampling, noise and JPEG compression to a rendered picture.
 
     Args:
-        picture: float32 in [0, 1], linear light.
-        rng: decides everything.
+        picture: (H, W, 3) float32 in [0, 1], linear light.
+        rng: random generator.
 
     Returns:
         (H, W, 3) uint8.
@@ -33,9 +33,9 @@ def photographed(picture: Array, rng: np.random.Generator) -> Array:
         end = rng.integers(0, length, 2).tolist()
         cv2.line(kernel, (length // 2, length // 2), end, 1.0)
         picture = cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
-    if rng.random() < 0.35:  # an object of few pixels, enlarged
-        share = rng.uniform(0.35, 0.9)
-        few = cv2.resize(picture, (int(width * share), int(height * share)), interpolation=cv2.INTER_AREA)
+    if rng.random() < 0.35:  # low resolution
+        scale = rng.uniform(0.35, 0.9)
+        few = cv2.resize(picture, (int(width * scale), int(height * scale)), interpolation=cv2.INTER_AREA)
         picture = cv2.resize(few, (width, height))
     picture = picture + rng.normal(0, np.exp(rng.uniform(-6.5, -3.0)), picture.shape)
     coded: Array = (255 * np.clip(picture, 0, 1) + 0.5).astype(np.uint8)

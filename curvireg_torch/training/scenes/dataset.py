@@ -17,23 +17,26 @@ from .shapes import Shape, random_shape, shape_from_mesh
 __all__ = ["GeneratedScenes"]
 
 CLUTTER = 500
-"""Shapes that clutter is drawn from: made once in each process."""
+"""Number of shapes that clutter is drawn from. Each process builds them once."""
 
 
 class GeneratedScenes(Dataset[dict[str, Tensor]]):
     """Photograph-like crops of procedural objects among clutter, with the depth of the object alone.
 
-    Sample i depends on ``seed`` and i only: it is the same in every process, on every day, in any order.
+    Sample i depends only on ``seed`` and i, in whatever process or order it is generated.
 
     Args:
         length: number of samples.
-        seed: of all of them; other seeds give other objects.
-        image_size, margin: side of the crops in px and room around the object's box, as in :class:`BankSettings`.
-        upright: share of the objects that stand upright.
-        meshes: photograph these instead of procedural objects.
+        seed: another seed gives other objects.
+        image_size, margin: side of the crops in px and margin around the object's box, as in :class:`BankSettings`.
+        upright: fraction of the objects that stand upright.
+        meshes: use these instead of procedural objects.
 
     Items (a dict): ``image`` (3, S, S) float32 in [0, 1], ``depth`` (1, S, S) float32 in radii of the object, 0 =
     background, ``visible`` (1, S, S) bool, ``rotation`` (3, 3) float32, ``distance`` () float32 in radii.
+
+    Raises:
+        InvalidInputError: ``length`` is below 1.
 
     Example:
         >>> sample = GeneratedScenes(1000, seed=1, image_size=64)[7]

@@ -8,20 +8,20 @@ from ...rendering.embree import RayScene
 from .materials import random_colour
 from .surfaces import Array
 
-__all__ = ["Lamp", "Light", "lit", "random_light"]
+__all__ = ["Lamp", "Light", "random_light", "shade_points"]
 
 SHADOW = 0.1
-"""Share of a lamp's light that reaches what it cannot see: rooms are not black."""
+"""Fraction of a lamp's light that reaches shadowed points, as indirect light would."""
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """Far away.
+    """A distant lamp.
 
     Attributes:
         towards: (3,) unit vector from the scene to the lamp, in the camera's frame.
         power: (3,) linear light.
-        shadows: whether it casts them.
+        shadows: whether the lamp casts shadows.
     """
 
     towards: Array
@@ -31,25 +31,25 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Light:
-    """Everything that lights a scene.
+    """All light of a scene.
 
     Attributes:
         up: (3,) unit vector to the zenith, in the camera's frame.
-        sky: light from everywhere, and how much more comes from above.
-        tint: (3,) of the sky.
-        lamps: any number.
-        mirrored: height of the horizon and (3,) colour above it that glossy things mirror; None for nothing.
+        sky: ambient light, and the additional light from above.
+        tint: (3,) colour of the sky.
+        lamps: any number of lamps.
+        reflection: height of the horizon and (3,) colour above it, mirrored by glossy surfaces; None for none.
     """
 
     up: Array
     sky: tuple[float, float]
     tint: Array
     lamps: tuple[Lamp, ...]
-    mirrored: tuple[float, Array] | None
+    reflection: tuple[float, Array] | None
 
 
 def random_light(up: Array, rng: np.random.Generator) -> Light:
-    """Some light for a scene whose z axis is ``up`` (3,) in the camera's frame.
+    """Random light for a scene whose z axis is ``up`` (3,) in the camera's frame.
 
     Example:
         >>> light = random_light(np.array([0.0, -1.0, 0.0]), np.random.default_rng(0))
@@ -64,11 +64,11 @@ def random_light(up: Array, rng: np.random.Generator) -> Light:
         towards = rng.normal(size=3) + up * rng.uniform(0, 2) + np.array([0, 0, -1.0]) * rng.uniform(0, 1.5)
         power = rng.uniform(0.2, 1.0) * (1 + rng.normal(0, 0.08, 3))
         lamps.append(Lamp(towards / np.linalg.norm(towards), power, bool(rng.random() < 0.6)))
-    mirrored = (float(rng.uniform(-0.2, 0.5)), random_colour(rng)) if rng.random() < 0.4 else None
-    return Light(up, sky, tint, tuple(lamps), mirrored)
+    reflection = (float(rng.uniform(-0.2, 0.5)), random_colour(rng)) if rng.random() < 0.4 else None
+    return Light(up, sky, tint, tuple(lamps), reflection)
 
 
-def lit(
+def shade_points(
     scene: RayScene,
     points: Array,
     normal: Array,
@@ -77,18 +77,18 @@ def lit(
     shininess: Array,
     light: Light,
 ) -> Array:
-    """(N, 3) linear light that N points of a scene send to a camera at the origin.
+    """(N, 3) linear light that N surface points send to a camera at the origin.
 
     Args:
-        scene: what casts shadows.
-        points, normal: (N, 3), normals of unit length on the camera's side.
-        colour: (N, 3) share of the light that is sent back.
-        gloss, shininess: (N,) strength of the highlights and their exponent.
-        light: see :func:`random_light`.
+        scene: geometry that casts shadows.
+        points, normal: (N, 3); normals have unit length and face the camera.
+        colour: (N, 3) albedo.
+        gloss, shininess: (N,) strength and exponent of the highlights.
+        light: for instance of :func:`random_light`.
     """
     view = -points / np.linalg.norm(points, axis=1, keepdims=True)
     level, more = light.sky
-    answer = colour * (level + more * (normal @ light.up))[:, None] * light.tint
+    radiance = colour * (level + more * (normal @ light.up))[:, None] * light.tint
     for lamp in light.lamps:
         facing = np.maximum(normal @ lamp.towards, 0)
         if lamp.shadows:
@@ -98,11 +98,11 @@ def lit(
         half = view + lamp.towards
         half /= np.linalg.norm(half, axis=1, keepdims=True) + 1e-9
         shine = gloss * np.maximum((normal * half).sum(axis=1), 0) ** shininess * (facing > 0)
-        answer = answer + (colour * facing[:, None] + shine[:, None]) * lamp.power
-    if light.mirrored is not None:  # glossy things mirror a bright or dark surrounding
-        horizon, above = light.mirrored
-        mirrored = 2 * (normal * view).sum(axis=1, keepdims=True) * normal - view
-        bright = np.clip(0.5 + 2.0 * (mirrored @ light.up - horizon), 0, 1)[:, None] * above
-        share = (0.6 * gloss)[:, None]
-        answer = (1 - share) * answer + share * bright
-    return np.maximum(answer, 0)
+        radiance = radiance + (colour * facing[:, None] + shine[:, None]) * lamp.power
+    if light.reflection is not None:
+        horizon, above = light.reflection
+        reflection = 2 * (normal * view).sum(axis=1, keepdims=True) * normal - view
+        bright = np.clip(0.5 + 2.0 * (reflection @ light.up - horizon), 0, 1)[:, None] * above
+        weight = (0.6 * gloss)[:, None]
+        radiance = (1 - weight) * radiance + weight * bright
+    return np.maximum(radiance, 0)

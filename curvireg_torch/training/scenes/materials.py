@@ -1,4 +1,4 @@
-"""Random looks: what colour a surface has at each of its points."""
+"""Random materials, colours and pictures."""
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ __all__ = ["Material", "random_colour", "random_picture"]
 
 
 def random_colour(rng: np.random.Generator) -> Array:
-    """(3,) colour in [0, 1]; half of them nearly grey, as most things are."""
+    """(3,) colour in [0, 1]; half of the colours are nearly grey."""
     grey = rng.uniform(0.03, 0.97)
     tint = rng.normal(0, rng.choice([0.03, 0.25]), 3)
     colour: Array = np.clip(grey + tint, 0.01, 1.0)
@@ -17,11 +17,11 @@ def random_colour(rng: np.random.Generator) -> Array:
 
 
 class Material:
-    """A colour pattern in space with a gloss, drawn at random.
+    """A random pattern of colours in space, with gloss.
 
     Args:
-        rng: decides everything.
-        plain: probability of one flat colour.
+        rng: random generator.
+        plain: probability of a uniform colour.
     """
 
     def __init__(self, rng: np.random.Generator, *, plain: float = 0.5) -> None:
@@ -46,18 +46,18 @@ class Material:
             mixed: Array = np.clip(self._first + self._strength * (self._palette[nearest] - self._first), 0, 1)
             return mixed
         if self._kind == "waves":
-            share = 0.5 + 0.5 * np.sin(along).mean(axis=1)
+            weight = 0.5 + 0.5 * np.sin(along).mean(axis=1)
         elif self._kind == "stripes":
-            share = (np.sin(along[:, 0]) > np.sin(self._phases[0])).astype(float)
+            weight = (np.sin(along[:, 0]) > np.sin(self._phases[0])).astype(float)
         elif self._kind == "checks":
-            share = (np.sin(along[:, 0]) * np.sin(along[:, 1]) * np.sin(along[:, 2]) > 0).astype(float)
-        elif self._kind == "print":  # lines of letter-like dashes
+            weight = (np.sin(along[:, 0]) * np.sin(along[:, 1]) * np.sin(along[:, 2]) > 0).astype(float)
+        elif self._kind == "print":  # lines of dashes, like text
             row, place = np.floor(along[:, 0]), np.floor(3 * along[:, 1])
             letters = np.sin(12.9898 * row + 78.233 * place) * 43758.5453
-            share = (letters - np.floor(letters) > 0.5) & (along[:, 0] - row > 0.4) & (np.sin(7.1 * row) > -0.3)
+            weight = (letters - np.floor(letters) > 0.5) & (along[:, 0] - row > 0.4) & (np.sin(7.1 * row) > -0.3)
         else:
-            share = np.sin(17.0 * along).mean(axis=1) * np.sin(31.0 * along[:, ::-1]).mean(axis=1) + 0.5
-        blend: Array = self._strength * np.asarray(share, dtype=float)[:, None] * (self._second - self._first)
+            weight = np.sin(17.0 * along).mean(axis=1) * np.sin(31.0 * along[:, ::-1]).mean(axis=1) + 0.5
+        blend: Array = self._strength * np.asarray(weight, dtype=float)[:, None] * (self._second - self._first)
         return self._first + blend
 
 

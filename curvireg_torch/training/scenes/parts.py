@@ -1,4 +1,4 @@
-"""What shapes are put together from: surfaces with the number of their material."""
+"""Parts of a shape: surfaces with a material number."""
 
 from typing import TypeAlias
 
@@ -10,11 +10,11 @@ __all__ = ["Part", "Rng", "rounded_box"]
 
 Rng: TypeAlias = np.random.Generator
 Part: TypeAlias = tuple[Surface, int]
-"""A surface and the number of its material: parts of one number look alike."""
+"""A surface and its material number; parts with the same number have the same material."""
 
 
 def rounded_box(rng: Rng, size: object) -> Surface:
-    """A box, sharp or with soft edges, with the full side lengths ``size``."""
+    """A box of side lengths ``size``, with sharp or rounded edges."""
     if rng.random() < 0.5:
         return box(size, top=rng.choice([1.0, rng.uniform(0.7, 1.0)]))
     e = rng.uniform(0.1, 0.5)

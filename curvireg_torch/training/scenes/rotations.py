@@ -1,4 +1,4 @@
-"""Rotations that scenes and shapes are made with."""
+"""Rotations of shapes and scenes."""
 
 import numpy as np
 import torch
@@ -6,11 +6,11 @@ import torch
 from ...geometry.conversions import rotation_from_quaternion
 from .surfaces import Array
 
-__all__ = ["random_rotation", "turn"]
+__all__ = ["random_rotation", "rotation"]
 
 
 def random_rotation(rng: np.random.Generator) -> Array:
-    """(3, 3) rotation, all of them equally likely: a quaternion of normal numbers has no preferred direction.
+    """(3, 3) rotation, uniformly distributed because a quaternion of normal numbers has no preferred direction.
 
     Example:
         >>> R = random_rotation(np.random.default_rng(0))
@@ -21,7 +21,7 @@ def random_rotation(rng: np.random.Generator) -> Array:
     return rotation
 
 
-def turn(axis: int, angle: float) -> Array:
+def rotation(axis: int, angle: float) -> Array:
     """(3, 3) rotation by ``angle`` radians about coordinate axis 0, 1 or 2."""
     c, s = np.cos(angle), np.sin(angle)
     i, j = [(1, 2), (2, 0), (0, 1)][axis]

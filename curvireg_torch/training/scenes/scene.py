@@ -1,4 +1,4 @@
-"""Scenes with one object in the middle: rays through a random arrangement of shapes."""
+"""Ray-traced scenes with one object in the centre."""
 
 from dataclasses import dataclass
 
@@ -7,27 +7,27 @@ import numpy as np
 
 from ...rendering.embree import RayScene
 from .arrangement import Arrangement, PlacedShape, arrange
-from .camera_noise import photographed
-from .light import lit
+from .camera_noise import simulate_camera
+from .light import shade_points
 from .shapes import Shape
 from .surfaces import Array
 
-__all__ = ["Scene", "make_scene", "photograph"]
+__all__ = ["Scene", "make_scene", "render_scene"]
 
 FINE = 1.5
-"""Rays per pixel and axis, averaged: edges as soft as a sensor's."""
+"""Rays per pixel and axis. Their average gives antialiased edges."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One photograph-like crop of an object, with its truth.
+    """One photograph-like crop of an object with its ground truth.
 
     Attributes:
         image: (S, S, 3) uint8 RGB.
-        depth: (S, S) float32 of the object alone, as a bank's view of it has: unoccluded, 0 = background, in radii.
-        visible: (S, S) bool, where the object is seen in the image.
-        rotation: (3, 3) model -> camera, the camera looking straight at the object.
-        distance: of the object's centre, in radii.
+        depth: (S, S) float32 depth of the object in radii, without occlusion, 0 = background, as in a bank's view.
+        visible: (S, S) bool, pixels in which the object is visible.
+        rotation: (3, 3) model -> camera; the camera looks straight at the object.
+        distance: distance of the object's centre in radii.
     """
 
     image: Array
@@ -46,36 +46,36 @@ def make_scene(
     margin: float = 0.1,
     upright: float = 0.6,
 ) -> Scene:
-    """Arrange, light and photograph.
+    """Arrange and render a random scene.
 
     Args:
         shape: the object.
-        clutter: other shapes to stand behind, beside and before it.
-        rng: decides everything.
+        clutter: other shapes to place around it.
+        rng: random generator.
         size: side of the crop in px.
-        margin: room around the object's box, see :class:`BankSettings`.
+        margin: margin around the object's box, see :class:`BankSettings`.
         upright: probability that the object stands upright; otherwise it has any orientation.
     """
-    return photograph(arrange(shape, clutter, rng, size=size, margin=margin, upright=upright), rng)
+    return render_scene(arrange(shape, clutter, rng, size=size, margin=margin, upright=upright), rng)
 
 
-def photograph(arrangement: Arrangement, rng: np.random.Generator) -> Scene:
-    """Render an arrangement, and take its picture with a camera whose faults ``rng`` decides."""
+def render_scene(arrangement: Arrangement, rng: np.random.Generator) -> Scene:
+    """Render an arrangement and simulate a camera, whose random imperfections are drawn from ``rng``."""
     size, K = arrangement.size, arrangement.camera_matrix
-    body = arrangement.household[0]
+    body = arrangement.shapes[0]
     alone = RayScene(body.vertices, body.faces).distance(*_rays(K, size)).reshape(size, size)
     depth = np.where(np.isfinite(alone), alone, 0.0).astype(np.float32)
-    picture, seen = _render(arrangement, arrangement.household)
-    if seen.mean() < 0.1 * (depth > 0).mean():  # hidden: nothing could be learnt
-        picture, seen = _render(arrangement, arrangement.household[:1])
+    picture, seen = _render(arrangement, arrangement.shapes)
+    if seen.mean() < 0.1 * (depth > 0).mean():  # fully hidden objects are of no use for training
+        picture, seen = _render(arrangement, arrangement.shapes[:1])
     picture = cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA)
     visible = cv2.resize(seen.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA) > 0.5
-    x0, y0, x1, y1 = arrangement.cut
+    x0, y0, x1, y1 = arrangement.photo_area
     picture = picture[y0:y1, x0:x1]
     picture = cv2.copyMakeBorder(picture, y0, size - y1, x0, size - x1, cv2.BORDER_REPLICATE)  # as crop_images does
     inside = np.zeros_like(visible)
     inside[y0:y1, x0:x1] = True
-    return Scene(photographed(picture, rng), depth, visible & inside, arrangement.rotation, arrangement.distance)
+    return Scene(simulate_camera(picture, rng), depth, visible & inside, arrangement.rotation, arrangement.distance)
 
 
 def _rays(K: Array, size: int) -> tuple[Array, Array]:
@@ -84,17 +84,17 @@ def _rays(K: Array, size: int) -> tuple[Array, Array]:
     return np.zeros_like(directions), directions
 
 
-def _render(arrangement: Arrangement, household: tuple[PlacedShape, ...]) -> tuple[Array, Array]:
-    """(F, F, 3) float32 linear picture of those things, F = FINE size, and where the first of them is seen."""
+def _render(arrangement: Arrangement, shapes: tuple[PlacedShape, ...]) -> tuple[Array, Array]:
+    """(F, F, 3) float32 linear picture of the shapes, F = FINE size, and the pixels in which the first is visible."""
     size = len(arrangement.background)
     K = np.diag([FINE, FINE, 1.0]) @ arrangement.camera_matrix
     K[:2, 2] += 0.5 * (FINE - 1.0)  # pixel centres are whole numbers
     rays = _rays(K, size)
-    first = np.cumsum([0] + [len(thing.vertices) for thing in household[:-1]])
-    vertices = np.concatenate([thing.vertices for thing in household])
-    faces = np.concatenate([thing.faces + k for thing, k in zip(household, first, strict=True)])
-    owner = np.concatenate([np.full(len(thing.faces), k) for k, thing in enumerate(household)])
-    material = np.concatenate([thing.materials for thing in household])
+    first = np.cumsum([0] + [len(thing.vertices) for thing in shapes[:-1]])
+    vertices = np.concatenate([thing.vertices for thing in shapes])
+    faces = np.concatenate([thing.faces + k for thing, k in zip(shapes, first, strict=True)])
+    owner = np.concatenate([np.full(len(thing.faces), k) for k, thing in enumerate(shapes)])
+    material = np.concatenate([thing.materials for thing in shapes])
     scene = RayScene(vertices, faces)
     depth, triangle, normal = scene.hits(*rays)
     hit = np.flatnonzero(np.isfinite(depth))
@@ -105,20 +105,20 @@ def _render(arrangement: Arrangement, household: tuple[PlacedShape, ...]) -> tup
     local = (points - arrangement.centre) @ arrangement.rotation
     colour = np.empty_like(points)
     gloss, shininess = np.zeros(len(hit)), np.ones(len(hit))
-    for k in range(len(household)):
-        for number, look in arrangement.appearance_scores[k].items():
+    for k in range(len(shapes)):
+        for number, material_of in arrangement.materials[k].items():
             here = (owner == k) & (material == number)
-            colour[here] = look.colours(local[here])
-            gloss[here], shininess[here] = look.gloss, look.shininess
+            colour[here] = material_of.colours(local[here])
+            gloss[here], shininess[here] = material_of.gloss, material_of.shininess
     picture = arrangement.background.copy()
     row, column = np.divmod(hit, size)
-    picture[row, column] = lit(scene, points, normal, colour, gloss, shininess, arrangement.light)
+    picture[row, column] = shade_points(scene, points, normal, colour, gloss, shininess, arrangement.light)
     seen = np.zeros((size, size), bool)
     seen[row, column] = owner == 0
-    if arrangement.defocus > 0:  # depth of field: what is farther off is blurred
+    if arrangement.defocus > 0:  # depth of field: the distant background is blurred
         near = (depth < arrangement.distance + 1.0).astype(np.float32).reshape(size, size)
-        share = cv2.GaussianBlur(near, (0, 0), 0.6)[..., None]
+        sharp = cv2.GaussianBlur(near, (0, 0), 0.6)[..., None]
         blurred = cv2.GaussianBlur(picture * (1.0 - near[..., None]), (0, 0), arrangement.defocus)
         weight = cv2.GaussianBlur(1.0 - near, (0, 0), arrangement.defocus)[..., None]
-        picture = share * picture + (1 - share) * blurred / np.maximum(weight, 1e-3)
+        picture = sharp * picture + (1 - sharp) * blurred / np.maximum(weight, 1e-3)
     return picture.astype(np.float32), seen

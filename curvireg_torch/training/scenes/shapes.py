@@ -1,4 +1,4 @@
-"""Procedural objects of great variety: every shape is made in code from a seed."""
+"""Procedural objects, each generated from a random seed."""
 
 from typing import NamedTuple
 
@@ -25,25 +25,25 @@ class Shape(NamedTuple):
     materials: Array
 
     def mesh(self) -> trimesh.Trimesh:
-        """The same as a mesh, without materials."""
+        """The shape as a mesh without materials."""
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
 def shape_from_mesh(mesh: trimesh.Trimesh) -> Shape:
-    """A user's mesh, centred and scaled to radius 1; its connected parts get materials of their own.
+    """A mesh, centred and scaled to radius 1, with one material per connected part.
 
-    Triangles are connected where they share an edge in space: an STL file lists every corner anew, and other formats
-    do so along seams of texture.
+    Triangles are connected if they share an edge in space, not vertex numbers: STL files repeat every corner, and
+    other formats repeat those along texture seams.
     """
     vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces)
-    places = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)
-    adjacent = trimesh.graph.face_adjacency(faces=places[faces])
+    points = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)
+    adjacent = trimesh.graph.face_adjacency(faces=points[faces])
     labels = trimesh.graph.connected_component_labels(adjacent, node_count=len(faces))
     return _normalised(vertices, faces, np.asarray(labels) % 12)
 
 
 def random_shape(rng: Rng, family: str | None = None) -> Shape:
-    """A shape of the family of that name, or of a random one: see ``FAMILIES``.
+    """A random shape of the named family of ``FAMILIES``, or of a random family.
 
     Example:
         >>> shape = random_shape(np.random.default_rng(0), "chair")

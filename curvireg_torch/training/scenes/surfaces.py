@@ -1,4 +1,4 @@
-"""Surfaces that shapes are put together from: each a (vertices, faces) pair of arrays."""
+"""Elementary surfaces that shapes are built from."""
 
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeAlias
@@ -8,10 +8,10 @@ import numpy as np
 __all__ = ["Array", "Surface", "bar", "box", "extrude", "lathe", "loft", "superquadric", "torus", "tube"]
 
 Array: TypeAlias = np.ndarray[Any, Any]
-"""Float arrays; shapes are stated where they matter."""
+"""Array of any shape."""
 
 AROUND = 36
-"""Vertices around a round surface: its facets stay below what a picture of 128 px shows."""
+"""Number of vertices around a round surface; enough for pictures of 128 px."""
 
 
 class Surface(NamedTuple):
@@ -20,15 +20,17 @@ class Surface(NamedTuple):
     vertices: Array
     faces: Array
 
-    def moved(self, shift: object = (0.0, 0.0, 0.0), rotation: Array | None = None, scale: object = 1.0) -> "Surface":
-        """Scaled, turned, then shifted."""
+    def moved(
+        self, translation: object = (0.0, 0.0, 0.0), rotation: Array | None = None, scale: object = 1.0
+    ) -> "Surface":
+        """The surface after scaling, rotation and translation, in this order."""
         points = self.vertices * np.asarray(scale, dtype=float)
         points = points if rotation is None else points @ rotation.T
-        return Surface(points + np.asarray(shift, dtype=float), self.faces)
+        return Surface(points + np.asarray(translation, dtype=float), self.faces)
 
 
 def _grid(points: Array, *, close: bool = True, caps: bool = True) -> Surface:
-    """Triangles between the rows of (M, N, 3) points; rows close on themselves, first and last row get a lid."""
+    """Triangles between the rows of (M, N, 3) points; ``close`` closes each row, ``caps`` the ends."""
     m, n = points.shape[:2]
     i, j = np.meshgrid(np.arange(m - 1), np.arange(n if close else n - 1), indexing="ij")
     a, b = i * n + j, i * n + (j + 1) % n
@@ -57,14 +59,14 @@ def loft(outlines: Array, heights: Array) -> Surface:
 
 
 def box(size: object, *, top: float = 1.0) -> Surface:
-    """Box of (3,) ``size`` around the origin; its upper end shrunk by ``top``."""
+    """Box of (3,) ``size`` around the origin; the upper end is scaled by ``top``."""
     x, y, z = (0.5 * float(s) for s in np.broadcast_to(np.asarray(size, dtype=float), 3))
     square = np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
     return loft(np.stack([square, top * square]), np.array([-z, z]))
 
 
 def extrude(outline: Array, height: float) -> Surface:
-    """An outline (N, 2), star-shaped about its mean, drawn out by ``height`` around z = 0."""
+    """Extrusion of an outline (N, 2), star-shaped about its mean, by ``height`` around z = 0."""
     return loft(np.stack([outline, outline]), np.array([-0.5 * height, 0.5 * height]))
 
 
@@ -101,9 +103,9 @@ def bar(start: object, end: object, radius: float, *, sides: int = 10) -> Surfac
     axis = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
     side = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
     side /= np.linalg.norm(side)
-    turn = np.stack([side, np.cross(axis, side)])
+    frame = np.stack([side, np.cross(axis, side)])
     t = 2 * np.pi * (np.arange(sides) + 0.5) / sides
-    ring = radius * np.stack([np.cos(t), np.sin(t)], -1) @ turn
+    ring = radius * np.stack([np.cos(t), np.sin(t)], -1) @ frame
     return _grid(np.stack([a + ring, b + ring]))
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from curvireg_torch.training.scenes import random_shape
 from curvireg_torch.training.scenes.arrangement import _crop_camera, arrange
-from curvireg_torch.training.scenes.scene import make_scene, photograph
+from curvireg_torch.training.scenes.scene import make_scene, render_scene
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,7 @@ def drawn():
 def test_a_scene_is_its_arrangement_photographed():
     shape = random_shape(np.random.default_rng(1), "table")
     rng = np.random.default_rng(5)
-    apart = photograph(arrange(shape, [], rng, size=32), rng)
+    apart = render_scene(arrange(shape, [], rng, size=32), rng)
     whole = make_scene(shape, [], np.random.default_rng(5), size=32)
     assert np.array_equal(apart.image, whole.image)
     assert np.array_equal(apart.depth, whole.depth)
@@ -27,19 +27,19 @@ def test_a_scene_is_its_arrangement_photographed():
 
 def test_rendering_draws_nothing(drawn):
     """The camera's faults apart, an arrangement has one picture."""
-    one, same = (photograph(drawn, np.random.default_rng(3)) for _ in range(2))
+    one, same = (render_scene(drawn, np.random.default_rng(3)) for _ in range(2))
     assert np.array_equal(one.image, same.image)
 
 
 def test_parts_of_an_arrangement_can_be_exchanged(drawn):
     """Another light changes the picture and leaves the truth; without clutter more of the object is seen, not less."""
-    before = photograph(drawn, np.random.default_rng(3))
-    dark = dataclasses.replace(drawn.light, lamps=(), sky=(0.5, 0.0), mirrored=None)
-    after = photograph(dataclasses.replace(drawn, light=dark), np.random.default_rng(3))
+    before = render_scene(drawn, np.random.default_rng(3))
+    dark = dataclasses.replace(drawn.light, lamps=(), sky=(0.5, 0.0), reflection=None)
+    after = render_scene(dataclasses.replace(drawn, light=dark), np.random.default_rng(3))
     assert not np.array_equal(before.image, after.image)
     assert np.array_equal(before.depth, after.depth)
     assert np.array_equal(before.visible, after.visible)
-    alone = photograph(dataclasses.replace(drawn, household=drawn.household[:1]), np.random.default_rng(3))
+    alone = render_scene(dataclasses.replace(drawn, shapes=drawn.shapes[:1]), np.random.default_rng(3))
     assert (alone.visible | ~before.visible).all()
 
 
@@ -48,12 +48,12 @@ def test_a_border_that_cuts_the_object_leaves_part_of_it_outside():
     corners = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.7, 0.7) for z in (4.7, 5.3)])
     size, sides = 200, set()
     for seed in range(60):
-        K, cut = _crop_camera(corners, np.random.default_rng(seed), size, 0.1)
+        K, area = _crop_camera(corners, np.random.default_rng(seed), size, 0.1)
         seen = corners @ K.T
         seen = seen[:, :2] / seen[:, 2:]
         low, high = seen.min(axis=0) + 0.5, seen.max(axis=0) + 0.5
-        beyond = np.concatenate([(cut[:2] - low) / (high - low), (high - cut[2:]) / (high - low)])
-        for side in np.flatnonzero(np.array(cut) != (0, 0, size, size)):
+        beyond = np.concatenate([(area[:2] - low) / (high - low), (high - area[2:]) / (high - low)])
+        for side in np.flatnonzero(np.array(area) != (0, 0, size, size)):
             assert -0.1 < beyond[side] < 0.65
             sides.add(int(side))
             if beyond[side] < 0.02:
@@ -64,8 +64,8 @@ def test_a_border_that_cuts_the_object_leaves_part_of_it_outside():
 
 def test_nothing_is_visible_beyond_the_border(drawn):
     """Where the photograph ends in the middle of the object, its other half is not seen; its depth is still known."""
-    whole = photograph(drawn, np.random.default_rng(3))
-    half = photograph(dataclasses.replace(drawn, cut=(24, 0, 48, 48)), np.random.default_rng(3))
+    whole = render_scene(drawn, np.random.default_rng(3))
+    half = render_scene(dataclasses.replace(drawn, photo_area=(24, 0, 48, 48)), np.random.default_rng(3))
     assert whole.visible[:, :24].any()
     assert whole.visible[:, 24:].any()
     assert not half.visible[:, :24].any()

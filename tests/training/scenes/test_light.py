@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from curvireg_torch.rendering.embree import RayScene
-from curvireg_torch.training.scenes.light import SHADOW, Lamp, Light, lit, random_light
+from curvireg_torch.training.scenes.light import SHADOW, Lamp, Light, random_light, shade_points
 
 UP = np.array([0.0, -1.0, 0.0])
 
@@ -21,7 +21,7 @@ def room():
 def shine(room, light, points, *, gloss=0.0):
     n = len(points)
     normal = np.tile((0, 0, -1.0), (n, 1))
-    return lit(room, points, normal, np.full((n, 3), 0.5), np.full(n, gloss), np.full(n, 50.0), light)
+    return shade_points(room, points, normal, np.full((n, 3), 0.5), np.full(n, gloss), np.full(n, 50.0), light)
 
 
 def lamp(*, shadows, towards=(0, 0, -1.0)):
@@ -54,7 +54,7 @@ def test_the_sky_is_brighter_above(room):
     light = Light(UP, (0.4, 0.2), np.array([1.0, 0.9, 0.8]), (), None)
     points, colour = np.array([[0, 0, 4.0]] * 2), np.ones((2, 3))
     normal = np.stack([UP, -UP])
-    answer = lit(room, points, normal, colour, np.zeros(2), np.ones(2), light)
+    answer = shade_points(room, points, normal, colour, np.zeros(2), np.ones(2), light)
     assert answer == pytest.approx(np.array([[0.6], [0.2]]) * [1.0, 0.9, 0.8])
 
 

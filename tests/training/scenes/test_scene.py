@@ -10,7 +10,7 @@ from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.settings import BankSettings
 from curvireg_torch.training.scenes import GeneratedScenes
-from curvireg_torch.training.scenes.camera_noise import photographed
+from curvireg_torch.training.scenes.camera_noise import simulate_camera
 from curvireg_torch.training.scenes.materials import random_picture
 
 
@@ -103,7 +103,7 @@ def test_a_camera_keeps_the_picture_recognisable():
     clean = np.zeros((64, 64, 3), np.float32)
     clean[16:48, 16:48] = 0.8
     for _ in range(10):
-        picture = photographed(clean, rng)
+        picture = simulate_camera(clean, rng)
         assert picture.dtype == np.uint8
         assert picture.shape == clean.shape
         assert picture[24:40, 24:40].mean() > picture[:8].mean() + 40

@@ -1,4 +1,4 @@
-"""Families of procedural objects, by kind: a family is a function from a generator to parts."""
+"""Families of procedural objects. A family is a function from a random generator to parts."""
 
 from collections.abc import Callable
 
@@ -26,4 +26,3 @@ FAMILIES: dict[str, Callable[[Rng], list[Part]]] = {
     "lump": solids.lump,
     "package": household.package,
 }
-"""Families of shapes by name."""

@@ -1,9 +1,9 @@
-"""Furniture made in code: one function for each family, from a generator to parts."""
+"""Procedural furniture, one function per family."""
 
 import numpy as np
 
 from ..parts import Part, Rng, rounded_box
-from ..rotations import turn
+from ..rotations import rotation
 from ..surfaces import bar, box, lathe, superquadric, tube
 
 __all__ = ["chair", "frame", "screen", "sofa", "table"]
@@ -30,7 +30,7 @@ def chair(rng: Rng) -> list[Part]:
     ]
     if rng.random() < 0.5:
         panel = rounded_box(rng, (w, thick * 0.7, back)).moved(
-            (0, 0.5 * d + 0.5 * lean, h + 0.5 * back), turn(0, -lean / back)
+            (0, 0.5 * d + 0.5 * lean, h + 0.5 * back), rotation(0, -lean / back)
         )
         parts.append((panel, 0))
     else:
@@ -98,7 +98,7 @@ def sofa(rng: Rng) -> list[Part]:
     parts.append(
         (
             rounded_box(rng, (w, deep, h + back)).moved(
-                (0, 0.5 * d, 0.5 * (h + back) + 0.05), turn(0, -rng.uniform(0, 0.2))
+                (0, 0.5 * d, 0.5 * (h + back) + 0.05), rotation(0, -rng.uniform(0, 0.2))
             ),
             0,
         )
@@ -132,7 +132,7 @@ def sofa(rng: Rng) -> list[Part]:
 def screen(rng: Rng) -> list[Part]:
     w, h, deep, rim = rng.uniform((0.6, 0.4, 0.03, 0.02), (1.2, 0.8, 0.12, 0.06))
     up = rng.uniform(0.05, 0.3) + 0.5 * h
-    tilt = turn(0, rng.uniform(-0.15, 0.15))
+    tilt = rotation(0, rng.uniform(-0.15, 0.15))
     parts: list[Part] = [(rounded_box(rng, (w, deep, h)).moved((0, 0, up), tilt), 0)]
     parts.append((box((w - 2 * rim, 0.01, h - 2 * rim)).moved((0, 0, up) + tilt @ (0, -0.5 * deep, 0), tilt), 1))
     if rng.random() < 0.35:

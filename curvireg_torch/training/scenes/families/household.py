@@ -1,9 +1,9 @@
-"""What stands on tables and in meadows: vessels, packages, creatures."""
+"""Procedural vessels, packages and creatures."""
 
 import numpy as np
 
 from ..parts import Part, Rng
-from ..rotations import turn
+from ..rotations import rotation
 from ..surfaces import bar, box, lathe, superquadric, torus, tube
 
 __all__ = ["creature", "package", "vessel"]
@@ -24,7 +24,7 @@ def vessel(rng: Rng) -> list[Part]:
         low, high = 0.3 * heights[2], heights[2]
         parts.append((lathe(np.full(2, radii[:3].max() * 1.01), np.array([low, high])), 2))
     if rng.random() < 0.3:
-        ring = torus(0.15, 0.02).moved((radii.max(), 0, 0.5), turn(0, np.pi / 2))
+        ring = torus(0.15, 0.02).moved((radii.max(), 0, 0.5), rotation(0, np.pi / 2))
         parts.append((ring, 3))
     return parts
 
@@ -34,7 +34,7 @@ def creature(rng: Rng) -> list[Part]:
     body = np.array([rng.uniform(0.15, 0.3), rng.uniform(0.3, 0.5), rng.uniform(0.15, 0.35)])
     high = rng.uniform(0.2, 0.6) + body[2]
     ball = (1.0, 1.0)
-    parts: list[Part] = [(superquadric(body, ball).moved((0, 0, high), turn(0, rng.uniform(-0.6, 0.6))), 0)]
+    parts: list[Part] = [(superquadric(body, ball).moved((0, 0, high), rotation(0, rng.uniform(-0.6, 0.6))), 0)]
     head = np.array([0, -body[1] - rng.uniform(0, 0.2), high + rng.uniform(0, 0.5)])
     parts.append((bar((0, -0.7 * body[1], high), head, rng.uniform(0.05, 0.12)), 0))
     size = rng.uniform((0.1, 0.1, 0.1), (0.2, 0.28, 0.2))
@@ -42,7 +42,7 @@ def creature(rng: Rng) -> list[Part]:
     for s in (-1, 1):
         ear = superquadric((0.03, 0.05, rng.uniform(0.05, 0.2)), ball)
         parts.append(
-            (ear.moved(head + np.array((s * 0.7 * size[0], 0.03, size[2])), turn(1, s * rng.uniform(0, 0.5))), 1)
+            (ear.moved(head + np.array((s * 0.7 * size[0], 0.03, size[2])), rotation(1, s * rng.uniform(0, 0.5))), 1)
         )
         for y in (-0.6, 0.6):
             foot = (s * rng.uniform(0.8, 1.1) * body[0], y * body[1] + rng.normal(0, 0.05), 0)
@@ -56,7 +56,7 @@ def creature(rng: Rng) -> list[Part]:
 
 
 def package(rng: Rng) -> list[Part]:
-    """Cartons, tins, tubs and bottles with a print: plain bodies whose look is all texture."""
+    """Cartons, tins, tubs and bottles with a print: simple bodies that differ mainly in texture."""
     w, d, h = rng.uniform((0.3, 0.15, 0.3), (0.8, 0.5, 1.0))
     kind = rng.integers(4)
     if kind == 0:

@@ -1,9 +1,9 @@
-"""Bodies without a use: compounds, stacks, machine parts, lumps."""
+"""Procedural compounds, stacks, machine parts and lumps."""
 
 import numpy as np
 
 from ..parts import Part, Rng, rounded_box
-from ..rotations import random_rotation, turn
+from ..rotations import random_rotation, rotation
 from ..surfaces import Surface, bar, box, extrude, lathe, superquadric, torus
 
 __all__ = ["bracket", "compound", "lump", "stack"]
@@ -32,12 +32,16 @@ def _piece(rng: Rng) -> Surface:
 
 
 def compound(rng: Rng) -> list[Part]:
-    """Pieces stuck together, often mirrored in x."""
+    """Overlapping pieces, often mirrored in x."""
     parts: list[Part] = []
     centre = np.zeros(3)
     mirrored = rng.random() < 0.5
     for k in range(int(rng.integers(2, 8))):
-        pose = random_rotation(rng) if rng.random() < 0.3 else turn(int(rng.integers(3)), 0.5 * np.pi * rng.integers(4))
+        pose = (
+            random_rotation(rng)
+            if rng.random() < 0.3
+            else rotation(int(rng.integers(3)), 0.5 * np.pi * rng.integers(4))
+        )
         piece = _piece(rng).moved(centre, pose, rng.uniform(0.3, 1.0))
         parts.append((piece, k))
         if mirrored:
@@ -47,7 +51,7 @@ def compound(rng: Rng) -> list[Part]:
 
 
 def stack(rng: Rng) -> list[Part]:
-    """Boxes side by side and on top of each other, as furniture, houses and machines are."""
+    """Boxes side by side and on top of each other, like furniture, houses and machines."""
     parts: list[Part] = []
     top = 0.0
     for k in range(int(rng.integers(1, 5))):
@@ -58,7 +62,7 @@ def stack(rng: Rng) -> list[Part]:
 
 
 def bracket(rng: Rng) -> list[Part]:
-    """Plates, ribs, holes' rims, bolts and gears: machine parts."""
+    """Machine parts: plates, ribs, rims of holes, bolts and gears."""
     w, d, t = rng.uniform((0.6, 0.3, 0.05), (1.2, 0.8, 0.15))
     parts: list[Part] = [(box((w, d, t)), 0)]
     parts.append((box((t, d, rng.uniform(0.3, 0.9))).moved((0.5 * w * rng.choice([-1, 0, 1]), 0, 0.25)), 0))

@@ -1,16 +1,16 @@
-"""Vehicles made in code: one function for each family, from a generator to parts; fronts along -y."""
+"""Procedural vehicles, one function per family; the front points along -y."""
 
 import numpy as np
 
 from ..parts import Part, Rng, rounded_box
-from ..rotations import turn
+from ..rotations import rotation
 from ..surfaces import Array, Surface, bar, box, lathe, loft, superquadric, torus, tube
 
 __all__ = ["aircraft", "bicycle", "boat", "car", "train"]
 
 
 def _wheels(rng: Rng, length: float, width: float, radius: float) -> list[Part]:
-    across = turn(1, np.pi / 2)
+    across = rotation(1, np.pi / 2)
     tyre = lathe(
         radius * np.array([0.55, 0.6, 0.95, 1, 1, 0.95]), np.array([0.0, -0.35, -0.5, -0.3, 0.3, 0.5]) * radius * 0.5
     )
@@ -24,7 +24,7 @@ def _wheels(rng: Rng, length: float, width: float, radius: float) -> list[Part]:
 
 
 def car(rng: Rng) -> list[Part]:
-    """Side outlines of cars, vans, buses and pick-ups, drawn out across and narrowed towards the roof."""
+    """Side outlines of cars, vans, buses and pick-ups, extruded across and narrowed towards the roof."""
     length, width, height = rng.uniform((1.5, 0.65, 0.5), (2.2, 0.85, 0.75))
     radius = rng.uniform(0.14, 0.19)
     bonnet, roof_front, roof_back, boot = rng.uniform((0.12, 0.3, 0.6, 0.82), (0.3, 0.45, 0.85, 1.0))
@@ -34,7 +34,7 @@ def car(rng: Rng) -> list[Part]:
         height *= rng.uniform(1.0, 1.5)
     low = 0.7 * radius
     pickup = boot < 1.0 and rng.random() < 0.25
-    if pickup:  # a short cabin, and the body ends behind it
+    if pickup:  # a short cabin at the end of the body
         roof_front, roof_back, tail = rng.uniform((0.3, 0.5, 0.9 * belt), (0.4, 0.58, belt))
         boot = roof_back + 0.04
     end = [(boot, low)] if pickup else [(1, tail * height), (1, low)]
@@ -57,7 +57,7 @@ def car(rng: Rng) -> list[Part]:
     parts: list[Part] = [(across(body, width), 0)]
     centre = cabin.mean(axis=0)
     parts.append((across(cabin, width), 0))
-    if rng.random() < 0.85:  # windows, a little proud of the cabin
+    if rng.random() < 0.85:  # windows, slightly outside the cabin
         glass = centre + (cabin - centre) * np.array([0.86, 0.75])
         parts.append((across(glass, width * 1.02), 1))
         wide = 0.66 * width
@@ -78,9 +78,9 @@ def car(rng: Rng) -> list[Part]:
 
 
 def _bed(length: float, width: float, start: float, heights: tuple[float, float, float]) -> list[Part]:
-    """Open to the sky: a floor, two sides and a tailgate, from ``start`` of the length on.
+    """Open bed of a pick-up: a floor, two sides and a tailgate.
 
-    ``heights``: of the underside, the floor and the rim.
+    ``start``: fraction of the length at which it begins. ``heights``: of the underside, the floor and the rim.
     """
     low, floor, rim = heights
     thick, long = 0.05 * width, (1 - start) * length
@@ -98,7 +98,7 @@ def _bed(length: float, width: float, start: float, heights: tuple[float, float,
 def bicycle(rng: Rng) -> list[Part]:
     radius, base = rng.uniform(0.28, 0.36), rng.uniform(0.9, 1.1)
     rod, tyre = rng.uniform(0.012, 0.03), rng.uniform(0.015, 0.04)
-    across = turn(1, np.pi / 2)
+    across = rotation(1, np.pi / 2)
     back, front = np.array([0, base / 2, radius]), np.array([0, -base / 2, radius])
     crank, seat, head = np.array([0, 0.08, 0.28]), np.array([0, 0.2, 0.78]), np.array([0, -0.32, 0.78])
     low_head = 0.75 * head + 0.25 * front
@@ -129,7 +129,7 @@ def aircraft(rng: Rng) -> list[Part]:
     r, span = rng.uniform(0.07, 0.13), rng.uniform(0.6, 1.1)
     y = np.array([-1, -0.97, -0.85, -0.5, 0.4, 0.8, 1.0])
     parts: list[Part] = [
-        (lathe(r * np.array([0.05, 0.4, 0.85, 1, 1, 0.6, 0.15]), y).moved(rotation=turn(0, np.pi / 2)), 0)
+        (lathe(r * np.array([0.05, 0.4, 0.85, 1, 1, 0.6, 0.15]), y).moved(rotation=rotation(0, np.pi / 2)), 0)
     ]
     parts[0] = (parts[0][0].moved(scale=(1, -1, 1)), 0)
 
@@ -156,7 +156,7 @@ def aircraft(rng: Rng) -> list[Part]:
         (s, 1) for s in wing(0.2, 0.1, 0.35 * span, 0.6 * sweep, (0, 0.85, rng.choice([0.3, 2.0]) * r), 0.15, 0.02)
     ]
     fin = wing(0.25, 0.12, rng.uniform(0.2, 0.35), 0.15, (0, 0.85, 0), 0.15, 0.0)[1]
-    parts.append((fin.moved((0, 0, 0.5 * r), turn(1, -np.pi / 2)), 2))
+    parts.append((fin.moved((0, 0, 0.5 * r), rotation(1, -np.pi / 2)), 2))
     n = int(rng.integers(0, 3))
     for k in range(n):
         for s in (-1, 1):
@@ -165,13 +165,13 @@ def aircraft(rng: Rng) -> list[Part]:
                 (
                     pod.moved(
                         (s * span * (k + 1) / (n + 1.5), 0.5 * sweep * (k + 1) / n - 0.2, height - 0.5 * r),
-                        turn(0, np.pi / 2),
+                        rotation(0, np.pi / 2),
                     ),
                     3,
                 )
             )
     if n == 0 and rng.random() < 0.6:
-        parts.append((box((0.5, 0.02, 0.05)).moved((0, -1.0, 0), turn(1, rng.uniform(0, np.pi))), 3))
+        parts.append((box((0.5, 0.02, 0.05)).moved((0, -1.0, 0), rotation(1, rng.uniform(0, np.pi))), 3))
     return parts
 
 
