@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ..data import BOPDataset, BOPRow, write_bop_csv
 from ..errors import InvalidInputError
+from ..geometry import symmetry_transforms
 from ..geometry.cameras import transform
 from ..io.meshes import load_mesh
 from ..metrics import (
@@ -19,7 +20,6 @@ from ..metrics import (
     mssd_error,
     mssd_recall,
     symmetric_rotation_error,
-    symmetry_transforms,
 )
 from .benchmark import Benchmark, BenchmarkItem, Row
 from .protocol import Protocol

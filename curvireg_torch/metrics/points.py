@@ -1,4 +1,4 @@
-"""How well two sets of feature points, given as boolean masks, fall on each other."""
+"""Agreement of two sets of feature points given as boolean masks."""
 
 from collections.abc import Callable
 
@@ -8,24 +8,22 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.utils.checks import check_mask, check_positive
-
-from ._samples import shown
+from ..errors import InvalidInputError
+from ..utils.checks import check_mask, check_positive
+from .checks import type_and_shape
 
 __all__ = ["hausdorff_distance", "intersection_percentage", "view_repeatability"]
 
 
 def intersection_percentage(photo: Tensor, view: Tensor, *, eps_px: float = 2.0) -> Tensor:
-    """IP of the paper: share of the photograph's feature points with a point of the rendered view within ``eps_px``.
+    """IP of the paper: fraction of the photograph's points within ``eps_px`` of a point of the view.
 
     Args:
         photo, view: (..., H, W) bool, one mask of feature points per image.
-        eps_px: radius >= 0 in pixels, Euclidean, inclusive.
+        eps_px: Euclidean radius >= 0 in px, inclusive.
 
     Returns:
-        (...) shares in [0, 1] (times 100 for the printed percentage); NaN where the photograph has no point, 0 where
-        only the view has none.
+        (...) in [0, 1]; NaN where the photograph has no points, 0 where only the view has none.
 
     Raises:
         InvalidInputError: masks that are not boolean or differ in shape or device; a bad radius.
@@ -36,26 +34,16 @@ def intersection_percentage(photo: Tensor, view: Tensor, *, eps_px: float = 2.0)
         >>> float(intersection_percentage(photo, view, eps_px=1.0))
         0.5
     """
-    check_positive(eps_px, "eps_px", zero_ok=True)
-    return _per_image(_share_near(eps_px), photo, view, ("photo", "view"))
+    return _per_image(_fraction_within(eps_px), photo, view, ("photo", "view"))
 
 
 def view_repeatability(view: Tensor, photo: Tensor, *, eps_px: float = 2.0) -> Tensor:
-    """Share of the rendered view's feature points that are found again within ``eps_px`` in the photograph.
+    """Repeatability of a detector: fraction of the view's points within ``eps_px`` of a point of the photograph.
 
-    What the paper's introduction calls the repeatability of a detector. The other direction of
-    :func:`intersection_percentage` and of the paper's Rep, which ranks views
-    (:func:`curvireg_torch.matching.repeatability`): a photograph full of texture repeats any view: print both.
+    This is :func:`intersection_percentage` with the roles exchanged. The paper's Rep, which ranks views
+    (:func:`curvireg_torch.matching.repeatability`), has the other direction.
 
-    Args:
-        view, photo: (..., H, W) bool, one mask of feature points per image.
-        eps_px: radius >= 0 in pixels, Euclidean, inclusive.
-
-    Returns:
-        (...) shares in [0, 1]; NaN where the view has no point, 0 where only the photograph has none.
-
-    Raises:
-        InvalidInputError: masks that are not boolean or differ in shape or device; a bad radius.
+    Args, returns and errors are those of :func:`intersection_percentage`.
 
     Example:
         >>> photo = torch.tensor([[True, False, False, True]])
@@ -63,15 +51,14 @@ def view_repeatability(view: Tensor, photo: Tensor, *, eps_px: float = 2.0) -> T
         >>> float(view_repeatability(view, photo, eps_px=1.0))
         1.0
     """
-    check_positive(eps_px, "eps_px", zero_ok=True)
-    return _per_image(_share_near(eps_px), view, photo, ("view", "photo"))
+    return _per_image(_fraction_within(eps_px), view, photo, ("view", "photo"))
 
 
 def hausdorff_distance(a: Tensor, b: Tensor, *, percentile: float = 100.0, directed: bool = False) -> Tensor:
     """Hausdorff distance of two point sets in pixels, or a percentile of it.
 
-    ``h(A, B)`` is the percentile over a in A of the distance of a to its nearest point of B; the result is
-    ``max(h(A, B), h(B, A))``. The classical distance (percentile 100) hangs on a single point; 95 is the robust one.
+    ``h(A, B)`` is the percentile over a in A of the distance from a to the nearest point of B; the result is
+    ``max(h(A, B), h(B, A))``. The classical distance (percentile 100) depends on a single point; 95 is robust.
 
     Args:
         a, b: (..., H, W) bool.
@@ -79,7 +66,7 @@ def hausdorff_distance(a: Tensor, b: Tensor, *, percentile: float = 100.0, direc
         directed: only ``h(A, B)``.
 
     Returns:
-        (...) pixels >= 0; ``inf`` where one of the masks is empty, NaN where both are.
+        (...) px >= 0; ``inf`` where one mask is empty, NaN where both are.
 
     Raises:
         InvalidInputError: masks that are not boolean or differ in shape or device; a bad percentile.
@@ -96,18 +83,19 @@ def hausdorff_distance(a: Tensor, b: Tensor, *, percentile: float = 100.0, direc
     def of_pair(x: NDArray[np.bool_], y: NDArray[np.bool_]) -> float:
         if not (x.any() and y.any()):
             return np.inf if x.any() or y.any() else np.nan
-        there = float(np.percentile(_distances(x, y), percentile))
-        return there if directed else max(there, float(np.percentile(_distances(y, x), percentile)))
+        forward = float(np.percentile(_distances(x, y), percentile))
+        return forward if directed else max(forward, float(np.percentile(_distances(y, x), percentile)))
 
     return _per_image(of_pair, a, b, ("a", "b"))
 
 
-def _share_near(eps_px: float) -> Callable[[NDArray[np.bool_], NDArray[np.bool_]], float]:
+def _fraction_within(eps_px: float) -> Callable[[NDArray[np.bool_], NDArray[np.bool_]], float]:
+    check_positive(eps_px, "eps_px", zero_ok=True)
     return lambda a, b: float((_distances(a, b) <= eps_px).mean()) if a.any() else np.nan
 
 
 def _distances(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Distance of each point of ``a`` to its nearest point of ``b``, ``inf`` if ``b`` is empty."""
+    """Distance from each point of ``a`` to the nearest point of ``b``; ``inf`` if ``b`` is empty."""
     if not b.any():
         return np.full(int(a.sum()), np.inf)
     to_b: NDArray[np.float64] = distance_transform_edt(~b)
@@ -120,7 +108,7 @@ def _per_image(
     """``score`` of each pair of (..., H, W) masks, as a (...) tensor of the default dtype on their device."""
     for name, mask in zip(names, (a, b), strict=True):
         if not isinstance(mask, Tensor) or mask.ndim < 2 or mask.dtype != torch.bool:
-            raise InvalidInputError(f"{name}: expected bool (..., H, W), got {shown(mask)}")
+            raise InvalidInputError(f"{name}: expected bool (..., H, W), got {type_and_shape(mask)}")
     check_mask(b, a, names[1])
     height, width = a.shape[-2:]
     n = a.shape[:-2].numel()

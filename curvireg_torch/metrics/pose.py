@@ -1,8 +1,8 @@
-"""Errors of 6D poses: ADD, ADD-S, MSSD and MSPD, and the shares of good poses that BOP prints.
+"""Errors of 6D poses (ADD, ADD-S, MSSD, MSPD) and the recalls of BOP.
 
-All take the estimated and the true pose ``T_cam_from_model`` and points of the model's surface in one unit. An estimate
-that is missing is a pose full of NaN; its error is ``inf``, so that it counts as a miss in every share. Any other pose
-that is not rigid is refused.
+All functions take the estimated and the true pose ``T_cam_from_model`` and points on the surface of the model in one
+unit. A missing estimate is a pose of NaN; its error is ``inf``, so that it counts as a miss. Any other pose that is not
+rigid is refused.
 
 - ADD (Hinterstoisser et al. 2012): mean over the points x of ``|T_est x - T_gt x|``;
 - ADD-S: mean over x of the distance of ``T_gt x`` to the nearest ``T_est y``;
@@ -16,8 +16,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.utils.checks import (
+from ..errors import InvalidInputError
+from ..utils.checks import (
     check_camera_matrix,
     check_finite,
     check_pose,
@@ -25,20 +25,19 @@ from curvireg_torch.utils.checks import (
     check_same_device,
     check_tensor,
 )
-
-from ._samples import check_errors, or_inf, per_item, share
+from .checks import check_errors, fraction_true, inf_unless, per_item
 
 __all__ = ["add_error", "add_recall", "adds_error", "mspd_error", "mspd_recall", "mssd_error", "mssd_recall"]
 
 _CHUNK = 1 << 22
-"""Points transformed at a time: 50 MB of float32 for their coordinates."""
+"""Points transformed at once: 50 MB of float32 coordinates."""
 
 _MSSD_THRESHOLDS = tuple(step / 20.0 for step in range(1, 11))
 _MSPD_THRESHOLDS = tuple(5.0 * step for step in range(1, 11))
 
 
 def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
-    """ADD: mean distance of the model's points under the two poses.
+    """ADD: mean distance of the model points under the two poses.
 
     Args:
         T_est, T_gt: (B, 4, 4) rigid model -> camera; NaN in ``T_est`` for a missing estimate.
@@ -56,25 +55,24 @@ def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
         >>> add_error(moved, T, torch.rand(10, 3)).tolist()
         [0.5]
     """
-    T_est, T_gt, points, found = _checked(T_est, T_gt, points)
+    T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
     means = [_transform(d, points).norm(dim=1).mean(1) for d in _chunks(T_est - T_gt, points)]
-    return or_inf(torch.cat(means), found)
+    return inf_unless(valid, torch.cat(means))
 
 
 def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     """ADD-S: mean distance of each point under the true pose to the nearest point under the estimate.
 
-    Computed in float64 on the CPU, with one k-d tree in the model frame: rigid poses keep distances.
+    Computed in float64 on the CPU with one k-d tree in the model frame, since rigid poses preserve distances.
 
     Args:
-        T_est, T_gt: (B, 4, 4) rigid model -> camera; NaN in ``T_est`` for a missing estimate.
-        points: (P, 3) on the model's surface, P >= 1.
+        T_est, T_gt, points: as in :func:`add_error`.
 
     Returns:
         (B,) in the unit of the points, on the device and in the dtype of ``T_est``.
 
     Raises:
-        InvalidInputError: wrong shape, dtype or device, no points, a pose that is not rigid, NaN in ``T_gt``.
+        InvalidInputError: as :func:`add_error`.
 
     Example:
         >>> T = torch.eye(4)[None]
@@ -82,22 +80,21 @@ def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
         >>> adds_error(half_turn, T, torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])).tolist()
         [0.0]
     """
-    T_est, T_gt, points, found = _checked(T_est, T_gt, points)
+    T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
     model = points.detach().cpu().double()
     tree = cKDTree(model.numpy())
     back = torch.linalg.solve(T_est.detach().cpu().double(), T_gt.detach().cpu().double())
     means = [float(tree.query((model @ T[:3, :3].T + T[:3, 3]).numpy())[0].mean()) for T in back]
-    return or_inf(torch.tensor(means, dtype=T_est.dtype, device=T_est.device), found)
+    return inf_unless(valid, torch.tensor(means, dtype=T_est.dtype, device=T_est.device))
 
 
 def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
-    """MSSD: maximum distance of the model's points in space, the true pose taken up to the object's symmetries.
+    """MSSD: maximum distance of the model points in space, minimum over the symmetries of the object.
 
     Args:
-        T_est, T_gt: (B, 4, 4) rigid model -> camera; NaN in ``T_est`` for a missing estimate.
-        points: (P, 3) on the model's surface, P >= 1.
-        symmetries: (S, 4, 4) of the model, S >= 1, the identity among them, as from :func:`symmetry_transforms`; None
-            for the identity alone.
+        T_est, T_gt, points: as in :func:`add_error`.
+        symmetries: (S, 4, 4) of the model, S >= 1, including the identity, for example from
+            :func:`curvireg_torch.geometry.symmetry_transforms`; None: only the identity.
 
     Returns:
         (B,) in the unit of the points.
@@ -114,26 +111,24 @@ def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tenso
         >>> mssd_error(half_turn, T, points, symmetries=torch.cat([T, half_turn])).tolist()
         [0.0]
     """
-    T_est, T_gt, points, found = _checked(T_est, T_gt, points)
+    T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
     difference = T_est.unsqueeze(1) - T_gt.unsqueeze(1) @ _checked_symmetries(symmetries, T_gt)
     largest = [_transform(d, points).norm(dim=1).amax(1) for d in _chunks(difference.flatten(0, 1), points)]
-    return or_inf(torch.cat(largest).view(difference.shape[:2]).amin(1), found)
+    return inf_unless(valid, torch.cat(largest).view(difference.shape[:2]).amin(1))
 
 
 def mspd_error(
     T_est: Tensor, T_gt: Tensor, points: Tensor, camera_matrix: Tensor, *, symmetries: Tensor | None = None
 ) -> Tensor:
-    """MSPD: maximum distance of the model's points in the image, the true pose taken up to the object's symmetries.
+    """MSPD: maximum distance of the model points in the image, minimum over the symmetries of the object.
 
     Args:
-        T_est, T_gt: (B, 4, 4) rigid model -> camera; NaN in ``T_est`` for a missing estimate.
-        points: (P, 3) on the model's surface, P >= 1.
-        camera_matrix: (B, 3, 3) or (3, 3), pixels.
-        symmetries: (S, 4, 4) of the model, S >= 1, the identity among them, as from :func:`symmetry_transforms`; None
-            for the identity alone.
+        T_est, T_gt, points: as in :func:`add_error`.
+        camera_matrix: (B, 3, 3) or (3, 3) in px.
+        symmetries: as in :func:`mssd_error`.
 
     Returns:
-        (B,) pixels; ``inf`` where a point lies in or behind the camera's plane.
+        (B,) px; ``inf`` where a point is not in front of the camera.
 
     Raises:
         InvalidInputError: as :func:`mssd_error`, or no camera matrix.
@@ -145,7 +140,7 @@ def mspd_error(
         >>> round(float(mspd_error(moved, T, torch.zeros(1, 3), K)), 3)       # 100 px * 0.1 / 2
         5.0
     """
-    T_est, T_gt, points, found = _checked(T_est, T_gt, points)
+    T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
     check_tensor(
         camera_matrix, "camera_matrix", (3, 3) if getattr(camera_matrix, "ndim", 0) == 2 else (len(T_est), 3, 3)
     )
@@ -155,16 +150,16 @@ def mspd_error(
     if K.ndim == 3:
         K = K.unsqueeze(1)
     true = K @ (T_gt.unsqueeze(1) @ _checked_symmetries(symmetries, T_gt))[:, :, :3]
-    ours = (K @ T_est.unsqueeze(1)[:, :, :3]).expand_as(true)
+    estimated = (K @ T_est.unsqueeze(1)[:, :, :3]).expand_as(true)
     largest = []
-    for a, b in zip(*(_chunks(projections.flatten(0, 1), points) for projections in (ours, true)), strict=True):
+    for a, b in zip(*(_chunks(projections.flatten(0, 1), points) for projections in (estimated, true)), strict=True):
         (xy_a, front_a), (xy_b, front_b) = _project(a, points), _project(b, points)
-        largest.append(or_inf((xy_a - xy_b).norm(dim=1), front_a & front_b).amax(1))
-    return or_inf(torch.cat(largest).view(true.shape[:2]).amin(1), found)
+        largest.append(inf_unless(front_a & front_b, (xy_a - xy_b).norm(dim=1)).amax(1))
+    return inf_unless(valid, torch.cat(largest).view(true.shape[:2]).amin(1))
 
 
 def add_recall(errors: Tensor, diameter: Tensor | float, *, fraction: float = 0.1) -> float:
-    """Share of the poses with ADD (or ADD-S) below a fraction of the object's diameter.
+    """Fraction of the poses with ADD (or ADD-S) below a fraction of the object diameter.
 
     Args:
         errors: (N,) from :func:`add_error` or :func:`adds_error`.
@@ -172,7 +167,7 @@ def add_recall(errors: Tensor, diameter: Tensor | float, *, fraction: float = 0.
         fraction: of the diameter, > 0.
 
     Returns:
-        Share in [0, 1], NaN for N = 0.
+        [0, 1], NaN for N = 0.
 
     Raises:
         InvalidInputError: errors that are negative or NaN, wrong shapes, a diameter or fraction that is not > 0.
@@ -187,7 +182,7 @@ def add_recall(errors: Tensor, diameter: Tensor | float, *, fraction: float = 0.
 
 
 def mssd_recall(errors: Tensor, diameter: Tensor | float) -> float:
-    """BOP's AR_MSSD: mean share of the poses with MSSD below 0.05, 0.10, ..., 0.50 diameters.
+    """AR_MSSD of BOP: fraction of the poses with MSSD below 0.05, 0.10, ..., 0.50 diameters, averaged.
 
     Args:
         errors: (N,) from :func:`mssd_error`.
@@ -208,7 +203,7 @@ def mssd_recall(errors: Tensor, diameter: Tensor | float) -> float:
 
 
 def mspd_recall(errors: Tensor, image_width: Tensor | float) -> float:
-    """BOP's AR_MSPD: mean share of the poses with MSPD below 5, 10, ..., 50 px, these scaled by image width / 640.
+    """AR_MSPD of BOP: fraction of the poses with MSPD below 5, 10, ..., 50 px times image width / 640, averaged.
 
     Args:
         errors: (N,) px from :func:`mspd_error`.
@@ -229,11 +224,11 @@ def mspd_recall(errors: Tensor, image_width: Tensor | float) -> float:
 
 
 def _average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
-    return sum(share(errors < threshold) for threshold in thresholds) / len(thresholds)
+    return sum(fraction_true(errors < threshold) for threshold in thresholds) / len(thresholds)
 
 
 def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Everything in the dtype of ``T_est``, missing estimates replaced by the truth, and a mask of the others."""
+    """Arguments in the dtype of ``T_est``, missing estimates replaced by the truth, and a mask of valid estimates."""
     check_tensor(T_est, "T_est", (None, 4, 4))
     check_tensor(T_gt, "T_gt", (len(T_est), 4, 4))
     check_tensor(points, "points", (None, 3))
@@ -244,10 +239,10 @@ def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tenso
     check_finite(points, "points")
     check_pose(T_gt, "T_gt")
     T_gt = T_gt.to(T_est.dtype)
-    found = T_est.isfinite().flatten(1).all(1)
-    T_est = torch.where(found.view(-1, 1, 1), T_est, T_gt)
+    valid = T_est.isfinite().flatten(1).all(1)
+    T_est = torch.where(valid.view(-1, 1, 1), T_est, T_gt)
     check_pose(T_est, "T_est")
-    return T_est, T_gt, points.to(T_est.dtype), found
+    return T_est, T_gt, points.to(T_est.dtype), valid
 
 
 def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:
@@ -261,7 +256,7 @@ def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:
 
 
 def _chunks(transforms: Tensor, points: Tensor) -> list[Tensor]:
-    """(N, ...) cut into runs, at least one, of as many transforms as may meet all the points at a time."""
+    """Split (N, ...) so that at most ``_CHUNK`` points are transformed at once; at least one chunk."""
     step = max(1, _CHUNK // len(points))
     return [transforms[start : start + step] for start in range(0, max(1, len(transforms)), step)]
 
@@ -272,7 +267,7 @@ def _transform(T: Tensor, points: Tensor) -> Tensor:
 
 
 def _project(projections: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """(N, 3, 4) projections -> pixels (N, 2, P) and which points (N, P) lie in front of the camera."""
+    """(N, 3, 4) projections -> pixels (N, 2, P), and which points (N, P) are in front of the camera."""
     image = _transform(projections, points)
     front = image[:, 2] > 0
     return image[:, :2] / torch.where(front, image[:, 2], torch.ones_like(image[:, 2])).unsqueeze(1), front

@@ -1,10 +1,9 @@
-"""How good a ranking of the bank's views is, and how good it could have been.
+"""Quality of a ranking of the views of a bank, and the best quality that the bank allows.
 
-"Precision at rank k" is not defined where it is printed, so both readings are here. With e(v) the rotation error of
-view v of the bank, a query counts at rank k if
+"Precision at rank k" has two definitions in use. With e(v) the rotation error of view v, a query counts at rank k if
 
-- *nearest* (``threshold_deg=None``): a view as near as the bank's nearest is among the first k;
-- *threshold*: a view with e < threshold is among the first k.
+- *nearest* (``threshold_deg=None``): one of the first k views is as near as the nearest view of the bank;
+- *threshold*: one of the first k views has e < threshold.
 """
 
 from collections.abc import Sequence
@@ -12,35 +11,34 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint
-from curvireg_torch.utils.checks import check_finite, check_last_axes, check_positive, check_same_device, check_tensor
-
-from ._samples import or_inf, share, shown
+from ..errors import InvalidInputError
+from ..geometry import rotation_error, rotation_from_viewpoint
+from ..utils.checks import check_finite, check_last_axes, check_positive, check_same_device, check_tensor
+from .checks import fraction_true, inf_unless, type_and_shape
 
 __all__ = ["closest_view", "pose_parameter_errors", "rank_precision", "viewpoint_differences"]
 
 _SAME_DEG = 1e-2
-"""Views nearer to each other than this have one rotation: float32 rotations are exact to about 1e-4 degrees."""
+"""Rotation errors closer than this count as equal; float32 rotations are exact to about 1e-4 degrees."""
 
 
 def rank_precision(
     order: Tensor, errors: Tensor, *, ks: Sequence[int] = (1, 3, 5, 10, 20), threshold_deg: float | None = None
 ) -> dict[int, float]:
-    """Share of the queries that count at rank k, for each k.
+    """Fraction of the queries that count at rank k, for each k.
 
     Args:
-        order: (B, M) integers, the bank's views from best to worst; all N of them, or the first M >= min(max(ks), N).
-        errors: (B, N) degrees, the rotation error of each view of the bank against the query's truth.
-        ks: ranks >= 1; a rank beyond the bank looks at all of it.
+        order: (B, M) integers, the views from best to worst: all N, or the first M >= min(max(ks), N).
+        errors: (B, N) degrees, the rotation error of each view of the bank.
+        ks: ranks >= 1; a rank above N counts as N.
         threshold_deg: None for the *nearest* definition (views of one rotation at several distances are all nearest),
-            degrees > 0 for the *threshold* definition; an error equal to it does not count.
+            degrees > 0 for the *threshold* definition.
 
     Returns:
-        ``{k: share in [0, 1]}``, NaN for B = 0.
+        ``{k: fraction in [0, 1]}``, NaN for B = 0.
 
     Raises:
-        InvalidInputError: wrong shapes or dtypes, indices outside of the bank, negative, NaN or inf errors, bad ranks.
+        InvalidInputError: wrong shapes or dtypes, indices outside the bank, negative, NaN or inf errors, bad ranks.
 
     Example:
         >>> order = torch.tensor([[2, 0, 1]])
@@ -58,24 +56,24 @@ def rank_precision(
     integers = isinstance(order, Tensor) and not order.is_floating_point() and order.dtype != torch.bool
     if not integers or order.ndim != 2 or len(order) != len(errors) or not needed <= order.shape[1] <= n:
         raise InvalidInputError(
-            f"order: expected integers of shape ({len(errors)}, {needed} to {n}), got {shown(order)}"
+            f"order: expected integers of shape ({len(errors)}, {needed} to {n}), got {type_and_shape(order)}"
         )
     check_same_device(order, errors, "order")
     if n == 0:
         raise InvalidInputError("errors: expected a bank of at least one view, got none")
-    if not bool(((errors >= 0) & errors.isfinite()).all()):  # all inf would be all nearest
+    if not bool(((errors >= 0) & errors.isfinite()).all()):  # if all were inf, all views would be nearest
         raise InvalidInputError("errors: expected degrees >= 0, got negative ones, inf or NaN")
     if not bool(((order >= 0) & (order < n)).all()):
         raise InvalidInputError(f"order: expected indices in [0, {n}), got some outside")
     best = errors.gather(1, order.long()).cummin(1).values
     smallest = {k: best[:, min(k, n) - 1] for k in ks}
     if threshold_deg is None:
-        return {k: share(e <= errors.amin(1) + _SAME_DEG) for k, e in smallest.items()}
-    return {k: share(e < threshold_deg) for k, e in smallest.items()}
+        return {k: fraction_true(e <= errors.amin(1) + _SAME_DEG) for k, e in smallest.items()}
+    return {k: fraction_true(e < threshold_deg) for k, e in smallest.items()}
 
 
 def viewpoint_differences(a: Tensor, b: Tensor) -> Tensor:
-    """Absolute differences of viewpoint parameters, angles taken the short way round the circle.
+    """Absolute differences of viewpoint parameters; azimuth and theta are circular.
 
     Args:
         a, b: (..., 4) azimuth, elevation, theta (in-plane) in degrees and distance, broadcast against each other.
@@ -84,7 +82,7 @@ def viewpoint_differences(a: Tensor, b: Tensor) -> Tensor:
         (..., 4) in the same order; azimuth and theta in [0, 180].
 
     Raises:
-        InvalidInputError: a last axis that is not 4 long.
+        InvalidInputError: the last axis does not have length 4.
 
     Example:
         >>> a, b = torch.tensor([350.0, 10.0, -170.0, 2.0]), torch.tensor([20.0, 30.0, 175.0, 1.5])
@@ -94,17 +92,17 @@ def viewpoint_differences(a: Tensor, b: Tensor) -> Tensor:
     for name, x in (("a", a), ("b", b)):
         check_last_axes(x, name, (4,))
     difference = (a - b).abs()
-    turn = difference % 360.0
+    remainder = difference % 360.0
     circular = torch.tensor([True, False, True, False], device=difference.device)
-    return torch.where(circular, torch.minimum(turn, 360.0 - turn), difference)
+    return torch.where(circular, torch.minimum(remainder, 360.0 - remainder), difference)
 
 
 def closest_view(views: Tensor, truth: Tensor) -> Tensor:
-    """The view of the bank that the matcher ought to find: least rotation error, then nearest in distance.
+    """The best view of the bank: the smallest rotation error, and among equal ones the nearest distance.
 
     Args:
-        views: (N, 4), N >= 1, azimuth, elevation, theta in degrees and distance of the bank's views.
-        truth: (B, 4), the same of the queries.
+        views: (N, 4), N >= 1, azimuth, elevation, theta in degrees and distance of the views of the bank.
+        truth: (B, 4), the same for the queries.
 
     Returns:
         (B,) int64 indices into ``views``.
@@ -132,16 +130,16 @@ def closest_view(views: Tensor, truth: Tensor) -> Tensor:
 
 
 def pose_parameter_errors(estimate: Tensor, truth: Tensor, views: Tensor) -> dict[str, dict[str, float]]:
-    """Mean absolute errors of the estimate (Est.) beside those of the bank's closest view (Clo.), as the paper's table.
+    """Mean absolute errors of the estimate (Est.) and of the closest view of the bank (Clo.), as in the paper.
 
     Args:
         estimate, truth: (B, 4) azimuth, elevation, theta in degrees and distance; NaN in ``estimate`` for a missing
-            one, which makes the means of Est. infinite.
-        views: (N, 4), the same of the bank's views.
+            estimate, which makes the means of Est. infinite.
+        views: (N, 4), the same for the views of the bank.
 
     Returns:
         ``{"est": {...}, "clo": {...}}``, each with ``azimuth``, ``elevation`` and ``theta`` in degrees and ``distance``
-        in the unit that came in; NaN for B = 0.
+        in the input unit; NaN for B = 0.
 
     Raises:
         InvalidInputError: wrong shapes, an empty bank, NaN or inf in ``truth`` or ``views``.
@@ -158,7 +156,7 @@ def pose_parameter_errors(estimate: Tensor, truth: Tensor, views: Tensor) -> dic
     names = ("azimuth", "elevation", "theta", "distance")
     table = {}
     for key, view in (("est", estimate), ("clo", views[closest_view(views, truth)])):
-        found = view.isfinite().all(1, keepdim=True)
-        means = or_inf(viewpoint_differences(view, truth), found).double().mean(0)
+        valid = view.isfinite().all(1, keepdim=True)
+        means = inf_unless(valid, viewpoint_differences(view, truth)).double().mean(0)
         table[key] = dict(zip(names, means.tolist(), strict=True))
     return table

@@ -1,13 +1,12 @@
-"""How far estimated rotations are from the true ones, and the two numbers PASCAL3D+ tables print about it.
+"""Rotation errors of symmetric objects, and the averages that PASCAL3D+ tables report.
 
-The angle itself is :func:`curvireg_torch.geometry.rotation_error`; here are its variants for symmetric objects and the
-averages over a set. Rotations map model points into the camera, so a symmetry ``S`` of the model acts from the right:
-``R`` and ``R S`` show the same image. An estimate with NaN or inf in it is missing: its error is ``inf``, its azimuth
-in no bin.
+:func:`curvireg_torch.geometry.rotation_error` computes the plain angle. Rotations map model points into the camera, so
+a symmetry ``S`` of the model multiplies from the right: ``R`` and ``R S`` show the same image. An estimate with NaN or
+inf is missing: its error is ``inf`` and its azimuth is in no bin.
 
-RenderForCNN's evaluation takes ``norm(logm(R1' R2)) / sqrt(2)`` with the spectral norm, where only the Frobenius norm
-gives the angle, so its errors are sqrt(2) too small; later papers inherited them. ``legacy_sqrt2=True`` reproduces
-those numbers, to be printed beside the right ones and never instead of them.
+The evaluation code of RenderForCNN computes ``norm(logm(R1' R2)) / sqrt(2)`` with the spectral norm, although only the
+Frobenius norm gives the angle. Its errors, and those of later papers, are too small by sqrt(2). ``legacy_sqrt2=True``
+reproduces them for comparison; report them only beside the correct numbers.
 """
 
 import math
@@ -15,9 +14,9 @@ import math
 import torch
 from torch import Tensor
 
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import rotation_error
-from curvireg_torch.utils.checks import (
+from ..errors import InvalidInputError
+from ..geometry import rotation_error
+from ..utils.checks import (
     check_finite,
     check_last_axes,
     check_option,
@@ -26,8 +25,7 @@ from curvireg_torch.utils.checks import (
     check_same_device,
     check_tensor,
 )
-
-from ._samples import check_errors, or_inf, share
+from .checks import check_errors, fraction_true, inf_unless
 
 __all__ = [
     "AVP_BINS",
@@ -40,19 +38,19 @@ __all__ = [
 ]
 
 AVP_BINS = (4, 8, 16, 24)
-"""Numbers of azimuth bins that PASCAL3D+ tables print."""
+"""Numbers of azimuth bins in PASCAL3D+ tables."""
 
 
 def accuracy(errors: Tensor, threshold_deg: float, *, legacy_sqrt2: bool = False) -> float:
-    """Share of the errors below a threshold: Acc(pi/6) with 30, Acc(pi/18) with 10.
+    """Fraction of the errors below a threshold: Acc(pi/6) with 30, Acc(pi/18) with 10.
 
     Args:
         errors: (N,) degrees >= 0; ``inf`` for an object without an estimate (a miss).
         threshold_deg: degrees > 0; an error equal to it is a miss.
-        legacy_sqrt2: divide the errors by sqrt(2) first: the literature's flawed number (see module).
+        legacy_sqrt2: divide the errors by sqrt(2) first, as flawed evaluation code does (see module).
 
     Returns:
-        Share in [0, 1], NaN for N = 0.
+        [0, 1], NaN for N = 0.
 
     Raises:
         InvalidInputError: errors that are not (N,), floating, >= 0; a threshold that is not > 0.
@@ -64,18 +62,18 @@ def accuracy(errors: Tensor, threshold_deg: float, *, legacy_sqrt2: bool = False
     """
     check_errors(errors)
     check_positive(threshold_deg, "threshold_deg")
-    return share((errors / math.sqrt(2.0) if legacy_sqrt2 else errors) < threshold_deg)
+    return fraction_true((errors / math.sqrt(2.0) if legacy_sqrt2 else errors) < threshold_deg)
 
 
 def median_error(errors: Tensor, *, legacy_sqrt2: bool = False) -> float:
-    """Median of the errors (MedErr), the mean of the middle two for an even number.
+    """Median of the errors (MedErr); the mean of the middle two for an even number.
 
     Args:
         errors: (N,) degrees >= 0; ``inf`` for an object without an estimate.
-        legacy_sqrt2: divide by sqrt(2): the literature's flawed number (see module).
+        legacy_sqrt2: as in :func:`accuracy`.
 
     Returns:
-        Degrees >= 0, ``inf`` where half of the estimates are missing, NaN for N = 0.
+        Degrees >= 0; ``inf`` if half of the estimates are missing, NaN for N = 0.
 
     Raises:
         InvalidInputError: errors that are not (N,), floating, >= 0.
@@ -97,8 +95,8 @@ def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) ->
 
     Args:
         R_est, R_gt: (..., 3, 3), broadcast against each other; NaN in ``R_est`` for a missing estimate.
-        symmetries: (S, 3, 3) rotations of the model onto itself, S >= 0. The identity is always one of them, listed
-            or not; list the rest of the group in full, since products are not formed.
+        symmetries: (S, 3, 3) rotations of the model onto itself, S >= 0: the whole group, since products are not
+            formed. The identity is always included.
 
     Returns:
         (...) degrees in [0, 180]; ``inf`` for a missing estimate.
@@ -111,26 +109,26 @@ def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) ->
         >>> float(symmetric_rotation_error(half_turn, torch.eye(3), half_turn[None]))
         0.0
     """
-    found = _found(R_est, R_gt)
+    valid = _check_rotations(R_est, R_gt)
     check_tensor(symmetries, "symmetries", (None, 3, 3))
     check_same_device(symmetries, R_gt, "symmetries")
     check_finite(symmetries, "symmetries")
     check_rotation(symmetries, "symmetries")
     plain = rotation_error(R_est, R_gt)
-    turned = rotation_error(R_est.unsqueeze(-3), R_gt.unsqueeze(-3) @ symmetries.to(R_gt.dtype))
-    return or_inf(torch.cat([plain.unsqueeze(-1), turned], -1).amin(-1), found)
+    symmetric = rotation_error(R_est.unsqueeze(-3), R_gt.unsqueeze(-3) @ symmetries.to(R_gt.dtype))
+    return inf_unless(valid, torch.cat([plain.unsqueeze(-1), symmetric], -1).amin(-1))
 
 
 def axis_rotation_error(R_est: Tensor, R_gt: Tensor, axis: Tensor) -> Tensor:
     """Rotation error of a solid of revolution: ``min_phi angle(R_est, R_gt Rot(axis, phi))``.
 
-    Free turns about the axis leave the angle between the two images of the axis, ``angle(R_est axis, R_gt axis)``,
-    which is the minimum in closed form. It is computed from the chord, without the loss of digits of ``acos`` near 0.
+    The minimum is the angle between ``R_est axis`` and ``R_gt axis``, computed from the chord, since ``acos`` loses
+    digits near 0.
 
     Args:
         R_est, R_gt: (..., 3, 3), broadcast against each other; NaN in ``R_est`` for a missing estimate.
-        axis: (3,) direction of the axis in the model frame, of any length > 0. The two ends of the axis differ; for a
-            solid that looks the same upside down take the minimum with the flipped rotation as well.
+        axis: (3,) direction of the axis in the model frame, of any length > 0. Its two ends differ; for a solid that
+            looks the same upside down, take the minimum with the flipped rotation too.
 
     Returns:
         (...) degrees in [0, 180]; ``inf`` for a missing estimate.
@@ -144,7 +142,7 @@ def axis_rotation_error(R_est: Tensor, R_gt: Tensor, axis: Tensor) -> Tensor:
         >>> round(float(axis_rotation_error(a, b, torch.tensor([0.0, 0.0, 1.0]))), 3)   # the azimuth of a vase is free
         20.0
     """
-    found = _found(R_est, R_gt)
+    valid = _check_rotations(R_est, R_gt)
     check_tensor(axis, "axis", (3,))
     check_same_device(axis, R_gt, "axis")
     length = torch.linalg.vector_norm(axis)
@@ -152,11 +150,11 @@ def axis_rotation_error(R_est: Tensor, R_gt: Tensor, axis: Tensor) -> Tensor:
         raise InvalidInputError(f"axis: expected a direction of finite length > 0, got {axis.tolist()}")
     axis = (axis / length).to(R_gt.dtype)
     half_chord = torch.linalg.vector_norm(R_est @ axis - R_gt @ axis, dim=-1) / 2.0
-    return or_inf(torch.rad2deg(2.0 * torch.asin(half_chord.clamp(max=1.0))), found)
+    return inf_unless(valid, torch.rad2deg(2.0 * torch.asin(half_chord.clamp(max=1.0))))
 
 
-def _found(R_est: Tensor, R_gt: Tensor) -> Tensor:
-    """(...) bool: which estimates are not missing; the rotations are checked."""
+def _check_rotations(R_est: Tensor, R_gt: Tensor) -> Tensor:
+    """Check both; return (...) bool, which estimates are not missing."""
     for name, R in (("R_est", R_est), ("R_gt", R_gt)):
         check_last_axes(R, name, (3, 3))
     check_same_device(R_est, R_gt, "R_est")
@@ -167,17 +165,17 @@ def _found(R_est: Tensor, R_gt: Tensor) -> Tensor:
 
 
 def azimuth_bin(azimuth: Tensor, bins: int) -> Tensor:
-    """Bin of an azimuth as PASCAL3D+ cuts the circle: bin 0 is centred on azimuth 0.
+    """Azimuth bin of PASCAL3D+; bin 0 is centred on azimuth 0.
 
     Args:
-        azimuth: (...) degrees, any turn, finite.
+        azimuth: (...) degrees, finite, not restricted to [0, 360).
         bins: 4, 8, 16 or 24.
 
     Returns:
-        (...) int64 in [0, bins); bin i holds [(i - 1/2) 360/bins, (i + 1/2) 360/bins).
+        (...) int64 in [0, bins); bin i is [(i - 1/2) 360/bins, (i + 1/2) 360/bins).
 
     Raises:
-        InvalidInputError: another number of bins, an azimuth that is not a floating tensor or is NaN or inf.
+        InvalidInputError: another number of bins, or an azimuth that is not a finite floating tensor.
 
     Example:
         >>> azimuth_bin(torch.tensor([0.0, 44.0, 45.0, 350.0]), 4).tolist()
@@ -189,21 +187,15 @@ def azimuth_bin(azimuth: Tensor, bins: int) -> Tensor:
     return torch.floor(azimuth % 360.0 * (bins / 360.0) + 0.5).long() % bins
 
 
-def same_bin(azimuth_est: Tensor, azimuth_gt: Tensor, bins: int) -> Tensor:
-    """Whether azimuths of one shape share a bin; an estimate with NaN or inf, which is missing, shares none."""
-    found = azimuth_est.isfinite()
-    return found & (azimuth_bin(azimuth_est.where(found, 0.0), bins) == azimuth_bin(azimuth_gt, bins))
-
-
 def binned_accuracy(azimuth_est: Tensor, azimuth_gt: Tensor, bins: int) -> float:
-    """Share of the objects whose azimuth falls into the right bin: AVP with ground-truth boxes.
+    """Fraction of the objects whose azimuth is in the correct bin: AVP with ground-truth boxes.
 
     Args:
-        azimuth_est, azimuth_gt: (N,) degrees; NaN in ``azimuth_est`` for a missing estimate, which is a miss.
+        azimuth_est, azimuth_gt: (N,) degrees; NaN or inf in ``azimuth_est`` for a missing estimate.
         bins: 4, 8, 16 or 24.
 
     Returns:
-        Share in [0, 1], NaN for N = 0.
+        [0, 1], NaN for N = 0.
 
     Raises:
         InvalidInputError: different shapes, not (N,), NaN or inf in ``azimuth_gt``, or another number of bins.
@@ -214,4 +206,6 @@ def binned_accuracy(azimuth_est: Tensor, azimuth_gt: Tensor, bins: int) -> float
     """
     check_tensor(azimuth_gt, "azimuth_gt", (None,))
     check_tensor(azimuth_est, "azimuth_est", tuple(azimuth_gt.shape))
-    return share(same_bin(azimuth_est, azimuth_gt, bins))
+    valid = azimuth_est.isfinite()
+    same = azimuth_bin(azimuth_est.where(valid, 0.0), bins) == azimuth_bin(azimuth_gt, bins)
+    return fraction_true(valid & same)

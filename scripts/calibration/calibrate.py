@@ -28,8 +28,7 @@ from scipy.stats import chi2
 from sklearn.linear_model import LogisticRegression
 
 from curvireg_torch.evaluation.store import PredictionStore
-from curvireg_torch.geometry import axis_angle_from_rotation, rotation_error, transform
-from curvireg_torch.metrics import symmetry_transforms
+from curvireg_torch.geometry import axis_angle_from_rotation, rotation_error, symmetry_transforms, transform
 from curvireg_torch.registration.confidence import FEATURES, RANKING_FEATURES, RELIABLE, LogisticModel, pose_features
 from curvireg_torch.registration.rescoring import POSE_FEATURES, WEIGHTS, rescore
 from scripts._shared import (

@@ -1,3 +1,5 @@
+"""Agreement of feature points against distance matrices and scikit-image."""
+
 import math
 
 import numpy as np
@@ -20,7 +22,7 @@ def _slow_distances(a: torch.Tensor, b: torch.Tensor) -> np.ndarray:
 
 
 @pytest.mark.parametrize("eps", [0.0, 1.0, math.sqrt(2.0), 3.5])
-def test_shares_against_a_distance_matrix(eps: float) -> None:
+def test_intersection_percentage_and_view_repeatability_against_a_distance_matrix(eps: float) -> None:
     photo, view = _masks(0, density=0.1), _masks(1)
     ip = [np.mean(_slow_distances(p, v) <= eps) for p, v in zip(photo, view, strict=True)]
     rep = [np.mean(_slow_distances(v, p) <= eps) for p, v in zip(photo, view, strict=True)]
@@ -29,8 +31,7 @@ def test_shares_against_a_distance_matrix(eps: float) -> None:
     assert not np.allclose(ip, rep)
 
 
-def test_matching_ranks_by_the_papers_rep_which_is_ip_and_not_view_repeatability() -> None:
-    # Rep(view -> query): the photograph's points with a point of the view near them.
+def test_matching_repeatability_equals_intersection_percentage() -> None:
     photo, view = _masks(0, density=0.1), _masks(1)
     rep = matching.repeatability(photo, matching.dilate_points(view, 1.5)).diagonal()
     torch.testing.assert_close(rep, metrics.intersection_percentage(photo, view, eps_px=1.5))
@@ -38,7 +39,7 @@ def test_matching_ranks_by_the_papers_rep_which_is_ip_and_not_view_repeatability
     assert not np.allclose(ours, rep)
 
 
-def test_hausdorff_against_scikit_image() -> None:
+def test_hausdorff_distance_against_scikit_image() -> None:
     a, b = _masks(2), _masks(3)
     slow = [skimage_hausdorff(x.numpy(), y.numpy()) for x, y in zip(a, b, strict=True)]
     np.testing.assert_allclose(metrics.hausdorff_distance(a, b), slow, rtol=1e-6)
@@ -46,17 +47,17 @@ def test_hausdorff_against_scikit_image() -> None:
 
 
 @pytest.mark.parametrize("percentile", [50.0, 95.0, 100.0])
-def test_percentile_and_direction_against_a_distance_matrix(percentile: float) -> None:
+def test_hausdorff_distance_percentile_and_direction(percentile: float) -> None:
     a, b = _masks(4, density=0.1), _masks(5)
-    there = [np.percentile(_slow_distances(x, y), percentile) for x, y in zip(a, b, strict=True)]
-    back = [np.percentile(_slow_distances(y, x), percentile) for x, y in zip(a, b, strict=True)]
+    forward = [np.percentile(_slow_distances(x, y), percentile) for x, y in zip(a, b, strict=True)]
+    backward = [np.percentile(_slow_distances(y, x), percentile) for x, y in zip(a, b, strict=True)]
     one_way = metrics.hausdorff_distance(a, b, percentile=percentile, directed=True)
-    np.testing.assert_allclose(one_way, there, rtol=1e-6)
+    np.testing.assert_allclose(one_way, forward, rtol=1e-6)
     both = metrics.hausdorff_distance(a, b, percentile=percentile)
-    np.testing.assert_allclose(both, np.maximum(there, back), rtol=1e-6)
+    np.testing.assert_allclose(both, np.maximum(forward, backward), rtol=1e-6)
 
 
-def test_one_stray_point_moves_the_distance_but_not_its_95th_percentile() -> None:
+def test_hausdorff_distance_at_95_percent_ignores_one_outlier() -> None:
     a = torch.zeros(50, 50, dtype=torch.bool)
     a[10, 5:45] = True
     b = a.clone()
@@ -65,7 +66,7 @@ def test_one_stray_point_moves_the_distance_but_not_its_95th_percentile() -> Non
     assert float(metrics.hausdorff_distance(a, b, percentile=95.0)) == 0.0
 
 
-def test_empty_masks() -> None:
+def test_point_metrics_of_empty_masks() -> None:
     some, none = _masks(6, n=1)[0], torch.zeros(24, 31, dtype=torch.bool)
     assert float(metrics.intersection_percentage(some, none)) == 0.0
     assert math.isnan(float(metrics.intersection_percentage(none, some)))
@@ -74,7 +75,7 @@ def test_empty_masks() -> None:
     assert math.isnan(float(metrics.hausdorff_distance(none, none)))
 
 
-def test_leading_axes_are_kept() -> None:
+def test_point_metrics_keep_leading_axes() -> None:
     a, b = _masks(7, n=6).view(3, 2, 24, 31), _masks(8, n=6).view(3, 2, 24, 31)
     together = metrics.hausdorff_distance(a, b)
     assert together.shape == (3, 2)
@@ -82,13 +83,13 @@ def test_leading_axes_are_kept() -> None:
     assert metrics.intersection_percentage(a[:0], b[:0]).shape == (0, 2)
 
 
-def test_bad_input_is_refused() -> None:
+def test_point_metrics_reject_bad_input() -> None:
     a = _masks(9)
-    with pytest.raises(InvalidInputError, match="photo: expected bool"):
-        metrics.intersection_percentage(a.float(), a)
-    with pytest.raises(InvalidInputError, match=r"view: expected bool of shape \(4, 24, 31\)"):
-        metrics.intersection_percentage(a, a[:1])
-    with pytest.raises(InvalidInputError, match="eps_px"):
-        metrics.view_repeatability(a, a, eps_px=-1.0)
-    with pytest.raises(InvalidInputError, match="percentile"):
-        metrics.hausdorff_distance(a, a, percentile=0.0)
+    for call, match in (
+        (lambda: metrics.intersection_percentage(a.float(), a), "photo: expected bool"),
+        (lambda: metrics.intersection_percentage(a, a[:1]), r"view: expected bool of shape \(4, 24, 31\)"),
+        (lambda: metrics.view_repeatability(a, a, eps_px=-1.0), "eps_px"),
+        (lambda: metrics.hausdorff_distance(a, a, percentile=0.0), "percentile"),
+    ):
+        with pytest.raises(InvalidInputError, match=match):
+            call()

@@ -1,3 +1,5 @@
+"""Pose errors and recalls against loops and worked examples."""
+
 import math
 from collections.abc import Callable
 
@@ -36,14 +38,14 @@ def test_add_and_adds_against_loops() -> None:
     assert np.all(np.array(adds) < add)
 
 
-def test_adds_starts_from_the_points_of_the_true_pose() -> None:
-    # The model is lopsided, so the other direction of nearest neighbours gives another number.
+def test_adds_error_queries_the_points_of_the_true_pose() -> None:
+    # The model is asymmetric, so the opposite direction of nearest neighbours gives another result.
     points = torch.cat([POINTS * 0.01, torch.tensor([[3.0, 0.0, 0.0]], dtype=torch.float64)])
     est, gt = poses(1, 3), poses(1, 4)
-    forth = cdist(_move(gt[0], points), _move(est[0], points)).min(1).mean()
-    back = cdist(_move(est[0], points), _move(gt[0], points)).min(1).mean()
-    assert abs(forth - back) > 0.01
-    assert float(metrics.adds_error(est, gt, points)) == pytest.approx(forth)
+    forward = cdist(_move(gt[0], points), _move(est[0], points)).min(1).mean()
+    backward = cdist(_move(est[0], points), _move(gt[0], points)).min(1).mean()
+    assert abs(forward - backward) > 0.01
+    assert float(metrics.adds_error(est, gt, points)) == pytest.approx(forward)
 
 
 def test_mssd_and_mspd_against_loops(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,16 +68,16 @@ def test_mssd_and_mspd_against_loops(monkeypatch: pytest.MonkeyPatch) -> None:
         np.testing.assert_allclose(metrics.mspd_error(EST, GT, POINTS, cameras, symmetries=symmetries), mspd)
 
 
-def test_symmetry_forgives_only_the_turn_of_the_model() -> None:
-    turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
-    symmetries = torch.stack([torch.eye(4, dtype=torch.float64), turn])
-    assert float(metrics.mssd_error(GT @ turn, GT, POINTS, symmetries=symmetries).max()) < 1e-12
-    assert float(metrics.mspd_error(GT @ turn, GT, POINTS, K, symmetries=symmetries).max()) < 1e-9
-    assert float(metrics.mssd_error(GT @ turn, GT, POINTS).min()) > 0.5
-    assert float(metrics.mssd_error(turn @ GT, GT, POINTS, symmetries=symmetries).min()) > 0.5
+def test_mssd_and_mspd_apply_symmetries_in_the_model_frame() -> None:
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
+    symmetries = torch.stack([torch.eye(4, dtype=torch.float64), half_turn])
+    assert float(metrics.mssd_error(GT @ half_turn, GT, POINTS, symmetries=symmetries).max()) < 1e-12
+    assert float(metrics.mspd_error(GT @ half_turn, GT, POINTS, K, symmetries=symmetries).max()) < 1e-9
+    assert float(metrics.mssd_error(GT @ half_turn, GT, POINTS).min()) > 0.5
+    assert float(metrics.mssd_error(half_turn @ GT, GT, POINTS, symmetries=symmetries).min()) > 0.5
 
 
-def test_point_behind_the_camera_is_infinitely_wrong_in_the_image_only() -> None:
+def test_mspd_error_is_infinite_for_points_behind_the_camera() -> None:
     behind = EST.clone()
     behind[2, 2, 3] = 0.1
     mspd = metrics.mspd_error(behind, GT, POINTS, K)
@@ -92,13 +94,13 @@ ERRORS: list[Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]]
 
 
 @pytest.mark.parametrize("error", ERRORS)
-def test_contract_of_every_error(error: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]) -> None:
+def test_pose_errors_contract(error: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]) -> None:
     whole = error(EST, GT, POINTS)
     missing = EST.clone()
     missing[1, 0, 0] = math.nan
-    with_gap = error(missing, GT, POINTS)
-    assert float(with_gap[1]) == math.inf
-    torch.testing.assert_close(with_gap[[0, 2, 3, 4]], whole[[0, 2, 3, 4]])
+    with_missing = error(missing, GT, POINTS)
+    assert float(with_missing[1]) == math.inf
+    torch.testing.assert_close(with_missing[[0, 2, 3, 4]], whole[[0, 2, 3, 4]])
     one_by_one = [error(e[None], g[None], POINTS) for e, g in zip(EST, GT, strict=True)]
     torch.testing.assert_close(torch.cat(one_by_one), whole)
     assert error(EST[:0], GT[:0], POINTS).shape == (0,)
@@ -113,37 +115,35 @@ def test_contract_of_every_error(error: Callable[[torch.Tensor, torch.Tensor, to
         error(EST, GT * math.nan, POINTS)
 
 
-def test_empty_symmetries_are_refused() -> None:
-    with pytest.raises(InvalidInputError, match="at least the identity"):
-        metrics.mssd_error(EST, GT, POINTS, symmetries=torch.empty(0, 4, 4))
-
-
-def test_recalls_by_hand() -> None:
+def test_recalls_worked_example() -> None:
     errors = torch.tensor([0.0, 7.0, 26.0, 50.0, torch.inf])
-    # Diameter 100, thresholds 5, 10, ..., 50: passed by 10, 9, 5, 0 (50 is not below 50) and 0 of the ten.
+    # Diameter 100, thresholds 5, 10, ..., 50: the errors pass 10, 9, 5, 0 (50 is not below 50) and 0 of the ten.
     assert metrics.mssd_recall(errors, 100.0) == pytest.approx(24 / 50)
     assert metrics.mspd_recall(errors, 640) == pytest.approx(24 / 50)
-    assert metrics.mspd_recall(errors, 320) == pytest.approx((10 + 8) / 50)  # as 0, 14, 52 and 100 px
+    assert metrics.mspd_recall(errors, 320) == pytest.approx((10 + 8) / 50)  # equivalent to 0, 14, 52 and 100 px
     assert metrics.add_recall(errors, 100.0) == pytest.approx(2 / 5)
     assert metrics.add_recall(errors, 100.0, fraction=0.3) == pytest.approx(3 / 5)
 
 
-def test_recalls_of_objects_of_several_sizes() -> None:
+def test_recalls_of_objects_of_different_sizes() -> None:
     errors, diameters = torch.tensor([7.0, 7.0]), torch.tensor([100.0, 20.0])
     assert metrics.add_recall(errors, diameters) == 0.5
-    assert metrics.mssd_recall(errors, diameters) == pytest.approx((9 + 3) / 20)  # 0.07 and 0.35, of which 0.40 and up
+    assert metrics.mssd_recall(errors, diameters) == pytest.approx(
+        (9 + 3) / 20
+    )  # 0.07, and 0.35, which passes from 0.40 on
     assert metrics.mspd_recall(errors, torch.tensor([640.0, 128.0])) == pytest.approx((9 + 3) / 20)
 
 
-def test_recall_of_nothing_is_nan_and_bad_input_is_refused() -> None:
-    assert math.isnan(metrics.mssd_recall(torch.empty(0), 1.0))
+def test_pose_metrics_reject_bad_input() -> None:
+    with pytest.raises(InvalidInputError, match="at least the identity"):
+        metrics.mssd_error(EST, GT, POINTS, symmetries=torch.empty(0, 4, 4))
     with pytest.raises(InvalidInputError, match="diameter: expected finite numbers > 0"):
         metrics.mssd_recall(torch.ones(2), 0.0)
     with pytest.raises(InvalidInputError, match="diameter: expected a number or shape"):
         metrics.add_recall(torch.ones(2), torch.ones(3))
+    with pytest.raises(InvalidInputError, match="fraction"):
+        metrics.add_recall(torch.ones(2), 1.0, fraction=0.0)
     for recall in (metrics.mspd_recall, metrics.mssd_recall, metrics.add_recall):
         for bad in (math.nan, -1.0):
             with pytest.raises(InvalidInputError, match="errors: expected numbers >= 0"):
                 recall(torch.tensor([bad]), 640)
-    with pytest.raises(InvalidInputError, match="fraction"):
-        metrics.add_recall(torch.ones(2), 1.0, fraction=0.0)

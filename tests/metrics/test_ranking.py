@@ -1,3 +1,5 @@
+"""Precision at rank k and errors of viewpoint parameters."""
+
 import math
 
 import numpy as np
@@ -15,7 +17,7 @@ def _case(seed: int = 0, queries: int = 40, views: int = 30) -> tuple[torch.Tens
     return (errors + 60.0 * torch.randn(queries, views, generator=g)).argsort(1), errors
 
 
-def test_both_definitions_against_a_slow_loop() -> None:
+def test_rank_precision_against_a_loop() -> None:
     order, errors = _case()
     nearest = metrics.rank_precision(order, errors)
     within = metrics.rank_precision(order, errors, threshold_deg=20.0)
@@ -28,13 +30,13 @@ def test_both_definitions_against_a_slow_loop() -> None:
     assert nearest != within
 
 
-def test_views_of_one_rotation_at_several_distances_are_all_nearest() -> None:
+def test_rank_precision_counts_all_views_of_the_nearest_rotation() -> None:
     errors = torch.tensor([[10.0, 10.00001, 50.0]])
     assert metrics.rank_precision(torch.tensor([[1, 2, 0]]), errors, ks=(1,)) == {1: 1.0}
     assert metrics.rank_precision(torch.tensor([[2, 1, 0]]), errors, ks=(1,)) == {1: 0.0}
 
 
-def test_ranks_beyond_the_bank_look_at_all_of_it_and_a_short_order_is_enough() -> None:
+def test_rank_precision_of_large_ranks_and_partial_orders() -> None:
     order, errors = _case(views=4)
     assert metrics.rank_precision(order, errors, ks=(20,)) == {20: 1.0}
     assert metrics.rank_precision(order[:, :2], errors, ks=(1, 2)) == metrics.rank_precision(order, errors, ks=(1, 2))
@@ -42,23 +44,23 @@ def test_ranks_beyond_the_bank_look_at_all_of_it_and_a_short_order_is_enough() -
         metrics.rank_precision(order[:, :2], errors, ks=(3,))
 
 
-def test_no_queries_give_nan_and_bad_input_is_refused() -> None:
+def test_rank_precision_of_no_queries_and_of_bad_input() -> None:
     order, errors = _case(queries=2, views=3)
     assert math.isnan(metrics.rank_precision(order[:0], errors[:0], ks=(1,))[1])
-    for kwargs, match in (({"ks": ()}, "ks"), ({"ks": (0,)}, "ks"), ({"threshold_deg": 0.0}, "threshold_deg")):
+    for wrong, options, match in (
+        ((order, errors), {"ks": ()}, "ks"),
+        ((order, errors), {"ks": (0,)}, "ks"),
+        ((order, errors), {"threshold_deg": 0.0}, "threshold_deg"),
+        ((order + 1, errors), {"ks": (3,)}, "order: expected indices"),
+        ((order.float(), errors), {"ks": (3,)}, "order: expected integers"),
+        ((order, errors * math.nan), {"ks": (3,)}, "NaN"),
+        ((order[:, :0], errors[:, :0]), {"ks": (1,)}, "at least one view"),
+    ):
         with pytest.raises(InvalidInputError, match=match):
-            metrics.rank_precision(order, errors, **kwargs)
-    with pytest.raises(InvalidInputError, match="order: expected indices"):
-        metrics.rank_precision(order + 1, errors, ks=(3,))
-    with pytest.raises(InvalidInputError, match="order: expected integers"):
-        metrics.rank_precision(order.float(), errors, ks=(3,))
-    with pytest.raises(InvalidInputError, match="NaN"):
-        metrics.rank_precision(order, errors * math.nan, ks=(3,))
-    with pytest.raises(InvalidInputError, match="at least one view"):
-        metrics.rank_precision(order[:, :0], errors[:, :0], ks=(1,))
+            metrics.rank_precision(*wrong, **options)
 
 
-def test_differences_take_the_short_way_round_for_azimuth_and_theta_only() -> None:
+def test_viewpoint_differences_are_circular_in_azimuth_and_theta() -> None:
     a = torch.tensor([[359.0, 80.0, -179.0, 1.0], [10.0, -80.0, 10.0, 3.0], [0.0, 0.0, 0.0, 400.0]])
     b = torch.tensor([[1.0, -80.0, 179.0, 2.5], [725.0, -70.0, -20.0, 3.0], [180.0, 0.0, 0.0, 10.0]])
     expected = [[2.0, 160.0, 2.0, 1.5], [5.0, 10.0, 30.0, 0.0], [180.0, 0.0, 0.0, 390.0]]
@@ -79,14 +81,14 @@ def test_closest_view_against_scipy() -> None:
         return Rotation.from_euler("ZXZ", np.stack([v[:, 2], v[:, 1] - 90.0, -v[:, 0]], 1), degrees=True)
 
     bank = rotation(views.numpy())
-    found = metrics.closest_view(views, truth)
+    closest = metrics.closest_view(views, truth)
     for i, t in enumerate(truth.numpy()):
         angles = np.degrees((bank.inv() * rotation(t[None])).magnitude())
         best = np.flatnonzero(angles < angles.min() + 1e-2)
-        assert int(found[i]) == best[np.argmin(np.abs(views.numpy()[best, 3] - t[3]))]
+        assert int(closest[i]) == best[np.argmin(np.abs(views.numpy()[best, 3] - t[3]))]
 
 
-def test_estimate_and_closest_errors_by_hand() -> None:
+def test_pose_parameter_errors_worked_example() -> None:
     views = torch.tensor([[0.0, 0.0, 0.0, 1.0], [90.0, 20.0, 0.0, 1.0], [350.0, 10.0, 10.0, 2.0]])
     truth = torch.tensor([[5.0, 2.0, 1.0, 1.25], [80.0, 20.0, -4.0, 1.0]])
     estimate = torch.stack([views[2], views[1]])
@@ -95,7 +97,7 @@ def test_estimate_and_closest_errors_by_hand() -> None:
     assert table["clo"] == pytest.approx({"azimuth": 7.5, "elevation": 1.0, "theta": 2.5, "distance": 0.125})
 
 
-def test_empty_bank_is_refused_and_no_queries_give_nan() -> None:
+def test_pose_parameter_errors_of_empty_sets() -> None:
     views = _view_grid()
     table = metrics.pose_parameter_errors(views[:0], views[:0], views)
     assert all(math.isnan(x) for row in table.values() for x in row.values())

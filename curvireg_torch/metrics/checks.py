@@ -1,14 +1,14 @@
-"""What every average over objects asks of its errors, written once."""
+"""Checks and reductions that the metrics share."""
 
 import torch
 from torch import Tensor
 
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.utils.checks import check_same_device, check_tensor
+from ..errors import InvalidInputError
+from ..utils.checks import check_same_device, check_tensor
 
 
 def check_errors(errors: Tensor, name: str = "errors") -> None:
-    """``errors`` is a floating (N,) tensor of numbers >= 0; ``inf`` (a missing estimate) is one of them, NaN is not."""
+    """``errors`` is a floating (N,) tensor of numbers >= 0, ``inf`` included, NaN excluded."""
     check_tensor(errors, name, (None,))
     bad = int((~(errors >= 0)).sum())
     if bad:
@@ -17,18 +17,18 @@ def check_errors(errors: Tensor, name: str = "errors") -> None:
         )
 
 
-def shown(x: object) -> str:
-    """What came in place of the tensor that was expected."""
+def type_and_shape(x: object) -> str:
+    """What was passed instead of the expected tensor, for an error message."""
     return f"{x.dtype} of shape {tuple(x.shape)}" if isinstance(x, Tensor) else type(x).__name__
 
 
-def or_inf(errors: Tensor, valid: Tensor) -> Tensor:
-    """``errors``, ``inf`` where they are not valid."""
+def inf_unless(valid: Tensor, errors: Tensor) -> Tensor:
+    """``errors``, replaced by ``inf`` where ``valid`` is False."""
     return torch.where(valid, errors, torch.full_like(errors, torch.inf))
 
 
-def share(hits: Tensor) -> float:
-    """Share of True in a boolean tensor, NaN of an empty one."""
+def fraction_true(hits: Tensor) -> float:
+    """Fraction of True in a boolean tensor; NaN if it is empty."""
     return float(hits.double().mean())
 
 
