@@ -9,6 +9,7 @@ from typing import Self
 __all__ = [
     "BankError",
     "CurviregError",
+    "CurviregWarning",
     "ImageError",
     "InvalidInputError",
     "MeshError",
@@ -19,7 +20,22 @@ __all__ = [
 ]
 
 
-class CurviregError(Exception):
+class _WithSubject(Exception):
+    """What errors and warnings have in common."""
+
+    def __init__(self, message: str = "", *, subject: object = "") -> None:
+        super().__init__(message)
+        self.message, self.subject = message, str(subject)
+
+    def __str__(self) -> str:
+        return f"{self.subject}: {self.message}" if self.subject else self.message
+
+    def with_subject(self, subject: object) -> Self:
+        """A copy of it about ``subject``, in place of its present subject."""
+        return type(self)(self.message, subject=subject)
+
+
+class CurviregError(_WithSubject):
     """Base class of the library's errors.
 
     Attributes:
@@ -33,16 +49,9 @@ class CurviregError(Exception):
         ('photo.jpg: truncated; download it again', 'image 3: truncated; download it again')
     """
 
-    def __init__(self, message: str = "", *, subject: object = "") -> None:
-        super().__init__(message)
-        self.message, self.subject = message, str(subject)
 
-    def __str__(self) -> str:
-        return f"{self.subject}: {self.message}" if self.subject else self.message
-
-    def with_subject(self, subject: object) -> Self:
-        """A copy of this error about ``subject``, in place of its present subject."""
-        return type(self)(self.message, subject=subject)
+class CurviregWarning(_WithSubject, UserWarning):
+    """A file can be used, but is perhaps not what the user means; ``message`` and ``subject`` as of an error."""
 
 
 class InvalidInputError(CurviregError, ValueError):

@@ -4,80 +4,76 @@ import argparse
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidInputError
-from ..evaluation.registry import DATASETS, DatasetSpec
+from ..evaluation.registry import DATASETS
 from ..utils.choices import DEFAULT, PRESET_NAMES
-from .examples import examples
+from .options import common_options, examples
 
-__all__ = ["add_datasets", "add_parser", "run"]
+__all__ = ["add_parser", "run"]
 
 PROTOCOL = (
-    "cad=annotated|any|fused: the annotated CAD, the best of the class, or one vote of all of the class; "
+    "cad=annotated|any|fused: the annotated CAD model, the best of the class, or one vote of all of the class; "
     "pose=upright|any: whether objects are known to stand upright; "
-    "box=annotated|none|SHARE: as annotated; looked for; or each edge moved by up to SHARE of the side (seed=N)"
+    "box=annotated|none|FRACTION: as annotated; localized; or each edge moved by up to FRACTION of the side (seed=N)"
 )
 
 
-def add_parser(commands: Any, parents: Sequence[argparse.ArgumentParser]) -> None:
-    """Add ``evaluate`` to the subparsers ``commands``; parsed arguments get ``run``, to be called with them.
-
-    Args:
-        commands: what ``ArgumentParser.add_subparsers`` returned.
-        parents: parsers with at least ``--quiet`` and ``--renderer``.
-    """
+def add_parser(commands: Any) -> None:
+    """Add ``evaluate`` and its datasets to the subparsers."""
     parser = commands.add_parser(
         "evaluate", help="register and score a dataset", **examples("curvireg evaluate bop data/bop/lm --out out/lm")
     )
-    add_datasets(parser.add_subparsers(required=True, metavar="DATASET"), parents)
-
-
-def add_datasets(datasets: Any, parents: Sequence[argparse.ArgumentParser]) -> None:
-    """Add the kinds of datasets to the subparsers ``datasets``; ``parents`` as for :func:`add_parser`."""
-    description = "Writes DIR/summary.json, DIR/predictions.csv and, as it goes, DIR/predictions; run again to go on."
+    datasets = parser.add_subparsers(required=True, metavar="DATASET")
     for name, kind in DATASETS.items():
-        shown = examples(
-            f"curvireg evaluate {name} {kind.example} --out out/{name}",
-            f"curvireg evaluate {name} {kind.example} --jobs 2 --limit 100 --preset fast --out out/{name}-fast",
+        dataset = datasets.add_parser(
+            name,
+            parents=[common_options()],
+            help=kind.help,
+            description="Writes DIR/summary.json, DIR/predictions.csv and, while it runs, DIR/predictions; the same "
+            "command resumes.",
+            **examples(
+                f"curvireg evaluate {name} {kind.example} --out out/{name}",
+                f"curvireg evaluate {name} {kind.example} --jobs 2 --limit 100 --preset fast --out out/{name}-fast",
+            ),
         )
-        parser = datasets.add_parser(name, parents=parents, description=description, help=kind.help, **shown)
-        kind.add_arguments(parser)
-        parser.add_argument(
+        kind.add_arguments(dataset)
+        dataset.add_argument(
             "--protocol",
             nargs="+",
             default=[],
             metavar="KEY=VALUE",
             help=f"{PROTOCOL} (default: cad=annotated pose={kind.pose} box=annotated)",
         )
-        parser.add_argument("--preset", choices=sorted(PRESET_NAMES), default=DEFAULT, help=f"default: {DEFAULT}")
-        parser.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
-        parser.add_argument(
-            "--jobs", type=int, default=1, metavar="N", help="processes that share the objects (default: 1)"
+        dataset.add_argument("--preset", choices=sorted(PRESET_NAMES), default=DEFAULT, help=f"default: {DEFAULT}")
+        dataset.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
+        dataset.add_argument(
+            "--jobs", type=int, default=1, metavar="N", help="processes that divide the objects (default: 1)"
         )
-        parser.add_argument("--limit", type=int, metavar="N", help="only N objects, spread evenly over the set")
-        parser.add_argument("--overwrite", action="store_true", help="start anew in a folder with other predictions")
-        parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-        parser.set_defaults(run=run, kind=kind)
+        dataset.add_argument("--limit", type=int, metavar="N", help="only N objects, spread evenly over the set")
+        dataset.add_argument("--overwrite", action="store_true", help="replace the predictions of other settings")
+        dataset.add_argument("--out", type=Path, required=True, metavar="DIR")
+        dataset.set_defaults(run=run, dataset=name)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Evaluate what ``curvireg evaluate`` was asked to, and print the headline.
+    """Evaluate a dataset and print the headline.
 
     Raises:
-        CurviregError: the dataset is not there, an option is out of range, or the folder holds other results.
+        CurviregError: the dataset is missing, an option is out of range, or the folder holds other results.
     """
     if arguments.jobs > 1 and "TORCHELASTIC_RUN_ID" not in os.environ:
-        _run_jobs(arguments.jobs)
+        _run_processes(arguments.jobs, arguments.argv)
         return
     from ..evaluation.loops import evaluate
     from ..evaluation.protocol import Protocol
     from ..pipeline import Pipeline
 
-    kind: DatasetSpec = arguments.kind
-    dataset = kind.open(arguments.root, **kind.chosen(arguments))
+    kind = DATASETS[arguments.dataset]
+    dataset = kind.open(arguments.root, **{name: getattr(arguments, name) for name in kind.options})
     summary = evaluate(
         kind.scored(dataset, Protocol.parse(arguments.protocol, pose=kind.pose)),
         arguments.out,
@@ -85,35 +81,36 @@ def run(arguments: argparse.Namespace) -> None:
         limit=arguments.limit,
         renderer=arguments.renderer,
         overwrite=arguments.overwrite,
-        progress=not arguments.quiet,
+        progress=arguments.progress,
     )
-    if summary is None:
+    if summary is None:  # not the first of several processes
         return
     if summary["n"] == 0:
-        told = ", ".join(f"{count} {reason}" for reason, count in summary["skipped"].items()) or "it is empty"
-        raise InvalidInputError(f"{arguments.root}: nothing was scored ({told}); see {arguments.out}/summary.json")
-    shares = [name for name in summary if name.startswith(("acc_", "add_", "mssd_", "mspd_"))]
-    print(f"{summary['n']} objects, {summary['failed']} failed, {sum(summary['skipped'].values())} skipped")
-    if "n_posed" in summary:
-        print(f"{summary['reliable']} reliable, mean confidence {summary['mean_confidence']:.2f}")
-        print(
-            f"the pose of {summary['n_posed']} is known: "
-            + ("of these" if summary["n_posed"] else "nothing to compare")
-        )
-    if summary["med_err_deg"] is not None:
-        print("   ".join([*(f"{n} {summary[n]:.3f}" for n in shares), f"med_err_deg {summary['med_err_deg']:.1f}"]))
-    if "localisation" in summary:
-        n, *shares = summary["localisation"].items()
-        print("   ".join(f"{name} {value:.3f}" for name, value in shares if n[1]) or "no box is annotated")
+        reasons = ", ".join(f"{count} {reason}" for reason, count in summary["skipped"].items()) or "it is empty"
+        raise InvalidInputError(f"{arguments.root}: nothing was scored ({reasons}); see {arguments.out}/summary.json")
+    _print_summary(summary)
     print(f"protocol: {summary['protocol']}; see {arguments.out}/summary.json")
 
 
-def _run_jobs(count: int) -> None:
-    """This same command again, in processes that ``torchrun`` starts."""
-    words = sys.argv[1:]
-    words = words[words.index("evaluate") + 1 :] if "evaluate" in words else words
+def _print_summary(summary: Mapping[str, Any]) -> None:
+    print(f"{summary['n']} objects, {summary['failed']} failed, {sum(summary['skipped'].values())} skipped")
+    if "n_posed" in summary:
+        print(f"{summary['reliable']} reliable, mean confidence {summary['mean_confidence']:.2f}")
+        posed = summary["n_posed"]
+        print(f"the true pose of {posed} is known: " + ("their scores are" if posed else "nothing to compare"))
+    if summary["med_err_deg"] is not None:
+        names = [name for name in summary if name.startswith(("acc_", "add_", "mssd_", "mspd_"))]
+        numbers = [f"{name} {summary[name]:.3f}" for name in names]
+        print("   ".join([*numbers, f"med_err_deg {summary['med_err_deg']:.1f}"]))
+    if "localisation" in summary:
+        (_, n), *recalls = summary["localisation"].items()
+        print("   ".join(f"{name} {value:.3f}" for name, value in recalls) if n else "no box is annotated")
+
+
+def _run_processes(count: int, argv: list[str]) -> None:
+    """Run the same command in processes that ``torchrun`` starts."""
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
     environment = {"OMP_NUM_THREADS": "1", **os.environ}
-    done = subprocess.run([*torchrun, "-m", "curvireg_torch.evaluation", *words], env=environment, check=False)
+    done = subprocess.run([*torchrun, "-m", "curvireg_torch", *argv], env=environment, check=False)
     if done.returncode:
-        raise InvalidInputError(f"evaluate: a process ended with {done.returncode}; what it says stands above")
+        raise InvalidInputError(f"evaluate: a process ended with code {done.returncode}; its message is above")

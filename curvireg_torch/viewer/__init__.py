@@ -1,6 +1,5 @@
-"""A local page that shows a registration and lets it be corrected: ``curvireg view``.
+"""A local page that registers a photograph and lets the user correct the pose: ``curvireg view``.
 
-``server`` starts the page, ``page`` and ``panels`` lay it out, ``session`` computes (no
-page needed), ``pictures`` and ``drawing`` are what its name says. NiceGUI is imported by ``server``, ``page`` and
-``panels`` alone, when a page is started.
+:mod:`.session` computes and :mod:`.editing` moves poses, without NiceGUI. :mod:`.server` starts the page, :mod:`.page`
+lays it out from :mod:`.inputs` and :mod:`.panels`, which know only the protocol in :mod:`.host`.
 """

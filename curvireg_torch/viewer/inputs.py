@@ -1,160 +1,154 @@
-"""The left side of the page: photograph, mesh, what is known of them, box and camera."""
+"""The left side of the page: photograph, mesh, options, box and camera."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from nicegui import ui
 
 from ..limits import MAX_IMAGE_BYTES, MAX_MESH_BYTES
 from ..utils.choices import MESHES_AND_BANKS, PRESET_NAMES, UNITS, UP_AXES
 from .drawing import BoxDrawing
-
-if TYPE_CHECKING:
-    from .page import Page
+from .host import Host
 
 __all__ = ["Inputs"]
 
 
 class Inputs:
-    """Fields of a page; what is typed, chosen or dropped goes into its session.
+    """Input fields; what is typed, chosen or dropped goes into the session.
 
-    Attributes:
-        drawing: the box, as the mouse draws it.
+    Args:
+        host: the page.
     """
 
-    def __init__(self, page: "Page") -> None:
-        self.page, self.session, self.drawing = page, page.session, BoxDrawing()
+    def __init__(self, host: Host) -> None:
+        self.host, self.session, self.drawing = host, host.session, BoxDrawing()
         options = self.session.options
-        self._upload("photograph", MAX_IMAGE_BYTES, "image/*", self._photo_came)
-        self.photo_facts = self._told("photo-facts")
-        self._upload("mesh", MAX_MESH_BYTES, ",".join(MESHES_AND_BANKS), self._mesh_came)
-        self.mesh_facts = self._told("mesh-facts")
+        self._upload("photograph", MAX_IMAGE_BYTES, "image/*", self._photo_uploaded)
+        self.photo_facts = self._caption("photo-facts")
+        self._upload("mesh", MAX_MESH_BYTES, ",".join(MESHES_AND_BANKS), self._mesh_uploaded)
+        self.mesh_facts = self._caption("mesh-facts")
         with ui.row().classes("w-full no-wrap gap-2"):
-            self._choice("unit", list(UNITS), options.unit)
-            self._choice("up", {None: "as the format says", **{a: a for a in UP_AXES}}, options.up)
+            self._select("unit", list(UNITS), options.unit)
+            self._select("up", {None: "of the format", **{axis: axis for axis in UP_AXES}}, options.up)
         with ui.row().classes("w-full no-wrap gap-2"):
-            self._choice("pose", {None: "default", "any": "any", "upright": "upright"}, options.pose)
-            self._choice("preset", {None: "default", **{p: p for p in PRESET_NAMES}}, options.preset)
-        self._told().text = (
-            "box, px: draw it on the photograph; drag edges, corners or the box to correct it; none: it is looked for, "
-            "and a click on a dashed box takes that"
+            self._select("pose", {None: "default", "any": "any", "upright": "upright"}, options.pose)
+            self._select("preset", {None: "default", **{name: name for name in PRESET_NAMES}}, options.preset)
+        self._caption().text = (
+            "box, px: draw it on the photograph; drag edges, corners or the box to correct it. Without a box the "
+            "object is localized; click a dashed box to choose it"
         )
         self.box = self._numbers("box", ("x0", "y0", "x1", "y1"), self._box_typed)
-        self._told().text = "camera, px: gives the translation"
+        self._caption().text = "camera, px: gives the translation"
         self.camera = self._numbers("camera", ("fx", "fy", "cx", "cy"), self._camera_typed)
-        self.fov = ui.number("or its field of view, degrees across", on_change=self._fov_typed)
+        self.fov = ui.number("or its horizontal field of view, degrees", on_change=self._fov_typed)
         self.fov.classes("w-full").props("dense data-testid=fov")
-        self.camera_facts = self._told("camera-facts")
+        self.camera_facts = self._caption("camera-facts")
         with ui.row().classes("gap-2"):
             ui.button("no box", on_click=lambda: self.set_box(None)).props("flat dense no-caps")
             ui.button("no camera", on_click=lambda: self.set_camera(None)).props("flat dense no-caps")
-            self.exif = ui.button("guess by EXIF", on_click=lambda: self.set_camera(self.session.guessed_camera()))
+            self.exif = ui.button("guess from EXIF", on_click=lambda: self.set_camera(self.session.exif_camera()))
             self.exif.props("flat dense no-caps data-testid=exif").set_visibility(False)
 
-    def _told(self, test: str = "") -> Any:
-        return ui.label().classes("text-caption leading-tight").props(f"data-testid={test}" if test else "")
+    def _caption(self, test_id: str = "") -> Any:
+        return ui.label().classes("text-caption leading-tight").props(f"data-testid={test_id}" if test_id else "")
 
-    def _upload(self, what: str, limit: int, kinds: str, came: Callable[..., Any]) -> None:
-        box = ui.upload(label=f"{what}: drop it here", auto_upload=True, max_file_size=limit, on_upload=came)
-        box.on_rejected(lambda: self.page.say(f"{what}: larger than {limit:,} bytes, or not {kinds}", wrong=True))
-        box.classes("w-full curvireg-drop").props(f'accept="{kinds}" flat bordered data-testid=upload-{what}')
+    def _upload(self, what: str, limit: int, accept: str, on_upload: Callable[..., Any]) -> None:
+        field = ui.upload(label=f"{what}: drop it here", auto_upload=True, max_file_size=limit, on_upload=on_upload)
+        refused = f"{what}: larger than {limit:,} bytes, or not {accept}"
+        field.on_rejected(lambda: self.host.show_message(refused, error=True))
+        field.classes("w-full curvireg-drop").props(f'accept="{accept}" flat bordered data-testid=upload-{what}')
 
-    def _choice(self, name: str, choices: Any, value: Any) -> None:
-        async def chosen(event: Any) -> None:
-            setattr(self.session.options, name, event.value)
-            if name in ("unit", "up") and self.session.mesh is not None:
-                await self._take_mesh(self.session.mesh, self.session.names[self.session.mesh])
+    def _select(self, name: str, choices: Any, value: Any) -> None:
+        async def changed(event: Any) -> None:
+            self.session.options = replace(self.session.options, **{name: event.value})
+            if name in ("unit", "up") and self.session.mesh_path is not None:
+                await self._open_mesh(self.session.mesh_path, self.session.names[self.session.mesh_path])
 
-        select = ui.select(choices, value=value, label=name, on_change=chosen).classes("grow")
+        select = ui.select(choices, value=value, label=name, on_change=changed).classes("grow")
         select.props(f"dense options-dense data-testid={name}")
 
-    def _numbers(self, name: str, labels: tuple[str, ...], typed: Callable[[], None]) -> list[Any]:
+    def _numbers(self, name: str, labels: tuple[str, ...], on_change: Callable[[], None]) -> list[Any]:
         with ui.row().classes("w-full no-wrap gap-1"):
-            fields = [ui.number(label, on_change=typed).classes("w-20").props("dense") for label in labels]
+            fields = [ui.number(label, on_change=on_change).classes("w-20").props("dense") for label in labels]
         for label, number in zip(labels, fields, strict=True):
             number.props(f"data-testid={name}-{label}")
         return fields
 
-    async def _photo_came(self, event: Any) -> None:
-        path = await self._saved(event.file, "photo", "")
-        if await self.page.do(lambda: self.session.take_photo(path, event.file.name)):
-            await self.page.show_photograph()
+    async def _photo_uploaded(self, event: Any) -> None:
+        path = self.host.upload_path("photo", "")
+        await event.file.save(path)
+        if await self.host.run(lambda: self.session.open_photo(path, event.file.name)):
+            await self.host.show_photograph()
 
-    async def _mesh_came(self, event: Any) -> None:
+    async def _mesh_uploaded(self, event: Any) -> None:
         suffix = Path(event.file.name).suffix.lower()
         if suffix not in MESHES_AND_BANKS:
-            self.page.say(
-                f"{event.file.name}: expected a mesh file ({', '.join(MESHES_AND_BANKS)}); convert it first", wrong=True
-            )
+            expected = f"expected a mesh file ({', '.join(MESHES_AND_BANKS)}); convert it first"
+            self.host.show_message(f"{event.file.name}: {expected}", error=True)
             return
-        await self._take_mesh(await self._saved(event.file, "mesh", suffix), event.file.name)
+        path = self.host.upload_path("mesh", suffix)
+        await event.file.save(path)
+        await self._open_mesh(path, event.file.name)
 
-    async def _take_mesh(self, path: Path, name: str) -> None:
-        told = await self.page.do(lambda: self.session.take_mesh(path, name))
-        if told:
-            self.mesh_facts.text = f"{name}: {told}"
-        self.page.arrange_layers()
+    async def _open_mesh(self, path: Path, name: str) -> None:
+        facts = await self.host.run(lambda: self.session.open_mesh(path, name))
+        if facts:
+            self.mesh_facts.text = f"{name}: {facts}"
+        self.host.update_layers()
 
-    async def _saved(self, file: Any, what: str, suffix: str) -> Path:
-        path = self.page.folder / f"{what}-{self.page.counted()}{suffix}"
-        await file.save(path)
-        return path
-
-    def mouse(self, event: Any) -> None:
-        """The mouse on the photograph."""
-        if self.session.picture is None or self.page.busy:
+    def handle_mouse(self, event: Any) -> None:
+        """Draw or correct the box with the mouse on the photograph."""
+        if self.session.photo is None or self.host.busy:
             return
-        scale = self.page.scale
+        scale = self.host.scale
         x, y = event.image_x / scale - 0.5, event.image_y / scale - 0.5
         if event.type == "mousedown":
             self.drawing.press(x, y, reach=10 / scale)
         elif self.drawing.active and event.type == "mousemove" and event.buttons:
             self.drawing.move(x, y)
-            self._draw()
-        elif self.drawing.active:  # also where the button came up beside the photograph
+            self.draw_boxes()
+        elif self.drawing.active:  # also if the button was released outside the photograph
             self.drawing.release()
-            self.set_box(self.drawing.box or self._proposed(x, y))
+            self.set_box(self.drawing.box or self._proposal_at(x, y))
 
-    def _proposed(self, x: float, y: float) -> Any:
-        """The first of the dashed boxes in which a click lies, to 0.1 px; None where there is none."""
+    def _proposal_at(self, x: float, y: float) -> Any:
+        """The first dashed box that contains a point, to 0.1 px, or None."""
         for x0, y0, x1, y1 in self.session.proposals():
             if x0 <= x <= x1 and y0 <= y <= y1:
                 return tuple(round(v, 1) for v in (x0, y0, x1, y1))
         return None
 
     def set_box(self, box: Any) -> None:
-        """Take a box, or None: the object is looked for."""
+        """Set the box; None: the object is localized."""
         self.session.box = self.drawing.box = box
         for number, value in zip(self.box, box or (None,) * 4, strict=True):
             number.value = value
-        self._draw()
+        self.draw_boxes()
 
     def _box_typed(self) -> None:
         x0, y0, x1, y1 = (number.value for number in self.box)
         if None not in (x0, y0, x1, y1) and not self.drawing.active:
             self.session.box = self.drawing.box = (float(x0), float(y0), float(x1), float(y1))
-            self._draw()
+            self.draw_boxes()
 
-    def _draw(self) -> None:
-        given = self.drawing.box
-        boxes = [(given, "")] if given is not None else [(b, "4 6") for b in self.session.proposals()]
-        self.page.image.content = "".join(self._outline(box, dashes) for box, dashes in boxes)
+    def draw_boxes(self) -> None:
+        """Draw the box, or dashed the proposals of the localization."""
+        box = self.drawing.box
+        boxes = [(box, "")] if box is not None else [(proposal, "4 6") for proposal in self.session.proposals()]
+        self.host.draw("".join(self._outline(box, dashes) for box, dashes in boxes))
 
     def _outline(self, box: Sequence[float], dashes: str) -> str:
-        x0, y0, x1, y1 = ((v + 0.5) * self.page.scale for v in box)
-        place = f"x='{x0}' y='{y0}' width='{x1 - x0}' height='{y1 - y0}' stroke-dasharray='{dashes}'"
+        x0, y0, x1, y1 = ((v + 0.5) * self.host.scale for v in box)
+        shape = f"x='{x0}' y='{y0}' width='{x1 - x0}' height='{y1 - y0}' stroke-dasharray='{dashes}'"
         return "".join(
-            f"<rect {place} fill='none' vector-effect='non-scaling-stroke' stroke='{colour}' stroke-width='{width}'/>"
+            f"<rect {shape} fill='none' vector-effect='non-scaling-stroke' stroke='{colour}' stroke-width='{width}'/>"
             for colour, width in (("black", 4), ("white", 2))
         )
 
-    def proposals_changed(self) -> None:
-        """Draw where the object was looked for."""
-        self._draw()
-
     def set_camera(self, camera: Any) -> None:
-        """Take a camera, or None for an unknown one."""
+        """Set the camera; None: unknown."""
         self.fov.value = None
         for number, value in zip(self.camera, camera or (None,) * 4, strict=True):
             number.value = value
@@ -165,24 +159,23 @@ class Inputs:
         self.session.camera = None if None in (fx, fy, cx, cy) else (float(fx), float(fy), float(cx), float(cy))
         if self.session.camera is not None:
             self.fov.value = None
-        self._tell_camera()
+        self._describe_camera()
 
     def _fov_typed(self) -> None:
         fov = self.session.fov = None if self.fov.value is None else float(self.fov.value)
         if fov is not None:
             for number in self.camera:
                 number.value = None
-        self._tell_camera()
+        self._describe_camera()
 
-    def _tell_camera(self) -> None:
-        """Say where the camera is from."""
+    def _describe_camera(self) -> None:
         session = self.session
-        self.exif.set_visibility(session.guessed_camera() is not None)
-        if session.guessed and session.picture is not None:
-            focal = session.picture.focal_35mm
-            self.camera_facts.text = f"a guess by the photograph's EXIF, {focal:g} mm of a 35 mm camera: no covariance"
+        self.exif.set_visibility(session.exif_camera() is not None)
+        if session.guess == "exif" and session.photo is not None:
+            focal = session.photo.focal_35mm
+            text = f"guessed from the photograph's EXIF, {focal:g} mm of a 35 mm camera: no covariance"
         elif session.guess is not None:
-            self.camera_facts.text = "a guess by the field of view: no covariance"
+            text = "guessed from the field of view: no covariance"
         else:
-            unknown = "unknown: the answer is a rotation without translation"
-            self.camera_facts.text = "" if session.camera is not None else unknown
+            text = "" if session.camera is not None else "unknown: the result is a rotation without translation"
+        self.camera_facts.text = text

@@ -4,7 +4,6 @@ import math
 from io import BytesIO
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 import trimesh
@@ -16,6 +15,8 @@ from ..io.meshes.colours import surface_colours
 from ..io.meshes.mesh import mesh_centre, mesh_radius, mesh_unit
 from ..utils.checks import check_camera_matrix, check_photograph, check_pose, check_tensor
 from ..utils.choices import UNITS
+from .encoding import jpeg, shrink
+from .overlay import to_uint8
 
 __all__ = ["pose_glb"]
 
@@ -124,12 +125,4 @@ def _photograph_plane(image: Tensor, K: Tensor, depth: float) -> trimesh.Trimesh
 
 def _jpeg(image: Tensor) -> Any:
     """A small copy of the photograph that exporters write as JPEG."""
-    from .overlay import to_uint8
-
-    pixels = to_uint8(image)
-    shrink = _PHOTO_SIDE / max(pixels.shape[:2])
-    if shrink < 1:
-        size = max(1, round(pixels.shape[1] * shrink)), max(1, round(pixels.shape[0] * shrink))
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
-    data = cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
-    return Image.open(BytesIO(data))
+    return Image.open(BytesIO(jpeg(shrink(to_uint8(image), _PHOTO_SIDE), 85)))

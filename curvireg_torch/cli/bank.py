@@ -1,0 +1,67 @@
+"""``curvireg bank MESH --out FILE``."""
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+from ..utils.files import probe_folder
+from ..utils.input_paths import check_given
+from .options import common_options, examples, mesh_options, pipeline_options, register_options
+
+__all__ = ["add_parser", "run"]
+
+
+def add_parser(commands: Any) -> None:
+    """Add ``bank`` to the subparsers."""
+    parser = commands.add_parser(
+        "bank",
+        parents=[common_options(), pipeline_options(), mesh_options()],
+        help="render and describe the views of MESH",
+        **examples(
+            "curvireg bank part.stl --unit mm --out part.safetensors",
+            "curvireg bank chair.glb --pose upright --out chair.safetensors --adapt chair_field.safetensors",
+        ),
+    )
+    parser.add_argument("mesh", type=Path, metavar="MESH")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE")
+    parser.add_argument(
+        "--adapt",
+        type=Path,
+        metavar="FILE",
+        help="also fine-tune the learned field on generated photographs of MESH (minutes) and write its weights to "
+        "FILE, for register --field",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Build and save a bank.
+
+    Raises:
+        CurviregError: the mesh or an option cannot be used, or a file cannot be written.
+    """
+    check_given([], [arguments.mesh])
+    probe_folder(arguments.out.parent, "--out")
+    if arguments.adapt is not None:
+        probe_folder(arguments.adapt.parent, "--adapt")
+    from ..io.meshes import load_mesh
+    from ..matching import ViewBank
+
+    start = time.perf_counter()
+    options = register_options(arguments)
+    pipeline = options.open_pipeline()
+    mesh = load_mesh(arguments.mesh, unit=options.unit, up=options.up)
+    bank = ViewBank.build(
+        mesh, pipeline=pipeline, renderer=options.renderer, progress=options.progress, device=options.device
+    )
+    bank.save(arguments.out)
+    size = arguments.out.stat().st_size / 1e6
+    print(f"{arguments.out}: {len(bank)} views, {size:.1f} MB, {time.perf_counter() - start:.1f} s")
+    if arguments.adapt is not None:
+        from ..training import adapt
+
+        start = time.perf_counter()
+        upright = 1.0 if options.pose == "upright" else 0.0
+        adapt(mesh, upright=upright, workers=1, progress=options.progress).save(arguments.adapt)
+        print(f"{arguments.adapt}: adapted field, {time.perf_counter() - start:.1f} s")

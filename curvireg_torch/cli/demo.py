@@ -1,0 +1,73 @@
+"""``curvireg demo --out DIR``."""
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+from ..utils.files import probe_folder, write_file
+from .options import common_options, examples, pipeline_options, register_options
+
+__all__ = ["add_parser", "run"]
+
+
+def add_parser(commands: Any) -> None:
+    """Add ``demo`` to the subparsers."""
+    parser = commands.add_parser(
+        "demo",
+        parents=[common_options(), pipeline_options()],
+        help="register a generated scene, whose true pose is known",
+        **examples("curvireg demo --out out/demo", "curvireg demo --seed 7 --preset fast --out out/demo"),
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.set_defaults(run=run, pose="upright")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Generate a photograph of the example mesh, register it and print the error.
+
+    Raises:
+        CurviregError: an option cannot be used, or a file cannot be written.
+    """
+    probe_folder(arguments.out, "--out")
+    import torch
+
+    from ..evaluation.result_files import write_result
+    from ..geometry import camera_matrix, rotation_error
+    from ..matching import cached_bank
+    from ..registration import Registrar, Registration
+    from ..registration.document import result_document
+    from ..synthetic import example_mesh, random_pose, synthesize_photograph
+    from ..visualization.encoding import png
+    from ..visualization.overlay import to_uint8
+    from .report import print_result
+
+    start = time.perf_counter()
+    generator = torch.Generator().manual_seed(arguments.seed)
+    mesh, size = example_mesh(), (360, 480)
+    K = camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
+    truth = random_pose(mesh, K, size, generator)
+    image, box = synthesize_photograph(mesh, truth, K, size, generator)
+    options = register_options(arguments)
+    pipeline = options.open_pipeline()
+    bank = cached_bank(mesh, pipeline=pipeline, renderer=options.renderer, progress=options.progress)
+    ready = time.perf_counter()
+    registrar = Registrar(bank, pipeline=pipeline, renderer=options.renderer, device=options.device)
+    result = registrar([image], box[None], K)[0]
+    assert isinstance(result, Registration)
+    assert result.translation is not None
+    seconds = {"bank": ready - start, "register": time.perf_counter() - ready}
+    document = result_document(result, registrar, seconds)
+    document["rotation_error_deg"] = float(rotation_error(result.rotation, truth[:3, :3]))
+    document["translation_error"] = float((result.translation - truth[:3, 3]).norm() / truth[:3, 3].norm())
+    document["truth"] = {"rotation": truth[:3, :3].tolist(), "translation": truth[:3, 3].tolist()}
+    document["inputs"] = {"seed": arguments.seed, "box": box.tolist()}
+    write_result(arguments.out, document, registrar, result, image, box)
+    write_file(arguments.out / "mesh.ply", mesh.export(file_type="ply"))
+    write_file(arguments.out / "photo.png", png(to_uint8(image)))
+    print_result(document, arguments.out)
+    print(
+        f"error against the truth: rotation {document['rotation_error_deg']:.1f} degrees, "
+        f"translation {100 * document['translation_error']:.1f} % of the distance"
+    )

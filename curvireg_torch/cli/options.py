@@ -1,0 +1,139 @@
+"""Options that several commands share, and what is read from them."""
+
+import argparse
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypedDict
+
+from ..utils.choices import DEFAULT, PRESET_NAMES, RENDERER_NAMES, UNITS, UP_AXES
+
+if TYPE_CHECKING:
+    from ..evaluation.opening import RegisterOptions
+
+__all__ = [
+    "add_box_and_camera",
+    "add_fov",
+    "common_options",
+    "examples",
+    "mesh_options",
+    "pipeline_options",
+    "register_options",
+    "split_numbers",
+]
+
+_COUNTS = {"--box": 4, "--camera": 4, "--distance": 2}
+_NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
+
+
+class _Help(TypedDict):
+    epilog: str
+    formatter_class: type[argparse.HelpFormatter]
+
+
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    """Keeps the lines of the examples and wraps everything else."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        keep = text.startswith("examples:")
+        return (
+            super()._fill_text(text, width, indent)
+            if keep
+            else argparse.HelpFormatter._fill_text(self, text, width, indent)
+        )
+
+
+def examples(*lines: str) -> _Help:
+    """Arguments for ``add_parser`` that show these command lines below the help."""
+    return {"epilog": "\n  ".join(["examples:", *lines]), "formatter_class": _Formatter}
+
+
+def common_options() -> argparse.ArgumentParser:
+    """Parent parser: ``--debug --quiet --renderer``."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--debug", action="store_true", help="show tracebacks")
+    parser.add_argument("--quiet", dest="progress", action="store_false", help="no progress bars")
+    parser.add_argument("--renderer", choices=RENDERER_NAMES, default="auto", help="default: auto")
+    return parser
+
+
+def pipeline_options() -> argparse.ArgumentParser:
+    """Parent parser: ``--preset --pipeline --device``."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument(
+        "--preset", choices=sorted(PRESET_NAMES), help=f"default: the pipeline of a bank, else {DEFAULT}"
+    )
+    parser.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
+    parser.add_argument("--device", default="cpu", help="device of modules, bank and search (default: cpu)")
+    return parser
+
+
+def mesh_options() -> argparse.ArgumentParser:
+    """Parent parser: ``--unit --pose --up``."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--unit", choices=sorted(UNITS), help="unit of the mesh file (default: m; for a BOP scene mm)")
+    parser.add_argument(
+        "--pose",
+        choices=("any", "upright"),
+        help="any: no assumption. upright: the mesh's up axis points up in the photograph and the object is seen "
+        "from 10 degrees below to 60 above; faster, and right more often where it is true (default: any)",
+    )
+    parser.add_argument(
+        "--up", choices=UP_AXES, help="axis of the mesh file that points up, as --up=-y; default: y for glTF, else z"
+    )
+    return parser
+
+
+def add_box_and_camera(parser: argparse.ArgumentParser, *, box: str = "px", camera: str = "px") -> None:
+    """Add ``--box`` and ``--camera`` with these help texts."""
+    parser.add_argument("--box", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help=box)
+    parser.add_argument("--camera", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help=camera)
+
+
+def add_fov(parser: argparse.ArgumentParser) -> None:
+    """Add ``--fov``."""
+    parser.add_argument("--fov", type=float, metavar="DEG", help="horizontal field of view in degrees")
+
+
+def register_options(
+    arguments: argparse.Namespace, photos: Sequence[Path] = (), meshes: Sequence[Path] = ()
+) -> "RegisterOptions":
+    """The options of ``register``, ``plot`` and ``view``; an option that a command lacks has its default."""
+    from dataclasses import fields
+
+    from ..evaluation.opening import RegisterOptions
+
+    names = {option.name for option in fields(RegisterOptions)} - {"photos", "meshes"}
+    values: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in vars(arguments).items()
+        if name in names and value is not None
+    }
+    guess = "exif" if getattr(arguments, "exif", False) else getattr(arguments, "fov", None)
+    return RegisterOptions(photos=tuple(photos), meshes=tuple(meshes), guess=guess, **values)
+
+
+def split_numbers(words: Sequence[str]) -> list[str]:
+    """The command line with one word per number.
+
+    The numbers of ``--box``, ``--camera`` and ``--distance`` may also be separated by commas or blanks.
+    ``--camera exif`` becomes ``--exif``, as argparse cannot take either four numbers or one word.
+    """
+    out: list[str] = []
+    expected = 0
+    for word in words:
+        option, equals, value = word.partition("=")
+        if option in _COUNTS:
+            expected, word = _COUNTS[option], value
+            out.append(option)
+            if not equals:
+                continue
+        parts = re.split(r"[,\s]+", word.strip(", "))
+        are_numbers = len(parts) <= expected and all(re.fullmatch(_NUMBER, part) for part in parts)
+        expected = expected - len(parts) if are_numbers else 0
+        out += parts if are_numbers else [word]
+    if ("--camera", "exif") in pairwise(out):
+        place = out.index("--camera")
+        out[place : place + 2] = ["--exif"]
+    return out

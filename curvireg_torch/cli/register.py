@@ -1,0 +1,238 @@
+"""``curvireg register PHOTO... MESH``."""
+
+import argparse
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import InvalidInputError
+from ..utils.files import probe_folder
+from ..utils.input_paths import check_given, is_one_photograph
+from .options import (
+    add_box_and_camera,
+    add_fov,
+    common_options,
+    examples,
+    mesh_options,
+    pipeline_options,
+    register_options,
+)
+
+if TYPE_CHECKING:
+    from ..evaluation.lists import Listing
+    from ..evaluation.opening import RegisterOptions
+
+__all__ = ["add_parser", "complete", "run"]
+
+
+def add_parser(commands: Any) -> None:
+    """Add ``register`` to the subparsers."""
+    parser = commands.add_parser(
+        "register",
+        parents=[common_options(), pipeline_options(), mesh_options()],
+        help="find the pose of MESH in PHOTO",
+        usage="curvireg register PHOTO... MESH --out DIR [options]\n       "
+        "curvireg register --list LIST [MESH] --out DIR [options]",
+        description="One photograph: writes DIR/result.json, DIR/overlay.png and DIR/pose.glb. Several, or a list: "
+        "DIR/results.csv, DIR/results.jsonl and DIR/index.html; after an interruption the same command resumes.",
+        **examples(
+            "curvireg register photo.jpg part.stl --unit mm --box 410 220 890 700 --out out/part",
+            "curvireg register photo.jpg part.stl --camera 1450 1450 960 540 --json",
+            "curvireg register photo.jpg part.stl --camera exif --out out/part",
+            "curvireg register shelf.jpg part.stl --instances 4 --out out/shelf",
+            "curvireg register --list photos.csv part.stl --out out/parts",
+            "curvireg register shots/ turn.mp4 part.stl --every 10 --out out/shots",
+            "curvireg register photo.jpg --mesh mug.obj --mesh bowl.obj --out out/which",
+        ),
+    )
+    parser.add_argument(
+        "paths",
+        type=Path,
+        nargs="*",
+        metavar="PHOTO... MESH",
+        help="photographs, folders of them, patterns ('shots/*.jpg') or videos; last a mesh (.obj .ply .stl .off .glb "
+        ".gltf) or a bank. Textures and colours of .glb .obj .ply are compared too; a mesh without colours is grey",
+    )
+    parser.add_argument(
+        "--mesh",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="MESH",
+        help="a candidate mesh; repeat the option, and the best of them is reported",
+    )
+    parser.add_argument(
+        "--list",
+        type=Path,
+        metavar="LIST",
+        help="CSV with columns photo,x0,y0,x1,y1 and optionally fx,fy,cx,cy,mesh. Paths are relative to the list's "
+        "folder. Empty cells mean: localize the object, no camera, MESH. Or the same as JSON, COCO annotations, or the "
+        "folder of a BOP scene",
+    )
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th frame of videos (default: 1)")
+    add_box_and_camera(
+        parser,
+        box="px; default: the object is localized",
+        camera="px; gives the translation. For an unknown camera give --camera exif (focal length in the photograph's "
+        "file) or --fov; the result then has no covariance",
+    )
+    parser.add_argument("--exif", action="store_true", help=argparse.SUPPRESS)
+    add_fov(parser)
+    parser.add_argument(
+        "--instances", type=int, default=1, metavar="N", help="without a box: up to N objects (default: 1)"
+    )
+    parser.add_argument(
+        "--distance",
+        type=float,
+        nargs=2,
+        metavar=("MIN", "MAX"),
+        help="without a box: range of the object's distance in the mesh's unit; needs --camera",
+    )
+    parser.add_argument("--field", type=Path, metavar="FILE", help="weights from curvireg bank --adapt")
+    parser.add_argument("--top", type=int, metavar="K", help="hypotheses to carry and report (default: 5)")
+    parser.add_argument("--no-refine", dest="refine", action="store_false", help="stop at the best view of the bank")
+    parser.add_argument("--json", action="store_true", help="print only the results as JSON; --out is optional")
+    parser.add_argument("--out", type=Path, metavar="DIR")
+    parser.set_defaults(run=run)
+
+
+def complete(arguments: argparse.Namespace) -> str | None:
+    """Divide ``paths`` into ``photos`` and ``meshes``, and set the default of ``unit``.
+
+    Returns:
+        What is wrong with the combination of options, or None.
+    """
+    arguments.photos = [] if arguments.list else arguments.paths if arguments.mesh else arguments.paths[:-1]
+    arguments.meshes = [*arguments.paths[len(arguments.photos) :], *arguments.mesh]
+    if arguments.unit is None and arguments.list is not None and arguments.list.is_dir():
+        arguments.unit = "mm"  # of the models in a BOP set
+    if arguments.list is None and not (arguments.photos and arguments.meshes):
+        return "expected PHOTO MESH, PHOTO ... --mesh MESH, or --list FILE MESH"
+    if arguments.out is None and not arguments.json:
+        return "expected --out DIR, or --json"
+    if arguments.list is not None and len(arguments.paths) > 1:
+        return f"with --list, expected at most one MESH, got {len(arguments.paths)}; give several by --mesh"
+    if sum(map(bool, (arguments.camera, arguments.exif, arguments.fov))) > 1:
+        return "expected one of --camera FX FY CX CY, --camera exif, --fov DEG"
+    if arguments.box and (arguments.instances != 1 or arguments.distance):
+        return "--instances and --distance apply only without a box; leave --box out"
+    if arguments.list is not None and (arguments.box or arguments.camera):
+        return "the list holds boxes and cameras; leave --box and --camera out"
+    return None
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Register one photograph, or several.
+
+    Raises:
+        CurviregError: a file or an option cannot be used, or no photograph could be registered.
+    """
+    check_given(arguments.photos, arguments.meshes, arguments.list)
+    from ..evaluation.opening import check_camera
+
+    options = register_options(arguments, arguments.photos, arguments.meshes)
+    options.open_pipeline()  # errors in options come before any photograph is read
+    field = options.open_field()
+    check_camera(options.camera, options.guess)
+    if arguments.list is None and is_one_photograph(options.photos):
+        _register_one(options, field, arguments.out, as_json=arguments.json)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) if arguments.out is None else arguments.out
+        listing = _listing(options, arguments.list, out, every=arguments.every)
+        counts = _register_several(options, field, listing, out)
+        if arguments.json:
+            print((out / "results.jsonl").read_text(encoding="utf-8"), end="")
+    table = "" if arguments.out is None else f"; see {out}/results.csv"
+    print(f"{counts}{table}", file=_notes(arguments.json))
+    if not counts.ok:
+        raise InvalidInputError("no photograph could be registered; the message of each gives the reason")
+
+
+def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, as_json: bool) -> None:
+    import torch
+
+    from ..evaluation.lists import register_entry
+    from ..evaluation.opening import open_registrar
+    from ..evaluation.result_files import write_result
+    from ..evaluation.store import to_json
+    from ..io import read_photo
+    from ..registration.document import used_box
+    from .report import print_result
+
+    start = time.perf_counter()
+    path = options.photos[0]
+    photo = read_photo(path, dtype=torch.uint8)
+    if out is not None:
+        probe_folder(out, "--out")
+    registrar = open_registrar(options, options.meshes, field)
+    ready = time.perf_counter() - start
+    if options.box is None and options.progress:
+        print(f"{path}: localizing the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
+    result, document = register_entry(options.entry(path), photo, registrar, bank_seconds=ready)
+    if out is not None:
+        write_result(out, document, registrar, result, photo.image, used_box(document))
+    if document["inputs"]["camera_source"] in ("exif", "fov"):
+        focal = document["inputs"]["camera"][0]
+        note = f"camera guessed, focal length {focal:.0f} px; distances are off by the same factor"
+        print(f"{path}: {note}", file=_notes(as_json))
+    if photo.notes:
+        print(f"{path}: {'; '.join(photo.notes)}", file=_notes(as_json))
+    if as_json:
+        print(to_json(document), end="")
+    else:
+        assert out is not None
+        print_result(document, out)
+
+
+def _register_several(options: "RegisterOptions", field: Any, listing: "Listing", out: Path) -> Any:
+    from ..evaluation.lists import register_list
+    from ..evaluation.loops import POSE_SOURCES
+    from ..evaluation.opening import open_registrar
+    from ..pipeline import field_digest
+    from ..utils.digests import code_digest
+
+    settings = {
+        "pipeline": options.open_pipeline().describe(),
+        "field": None if field is None else field_digest(field),
+        "code": code_digest(*POSE_SOURCES),
+        **{
+            n: getattr(options, n)
+            for n in ("bank_decides", "pose", "unit", "up", "top", "refine", "renderer", "device")
+        },
+    }
+    return register_list(
+        listing,
+        out,
+        lambda meshes: open_registrar(options, meshes, field),
+        settings=settings,
+        progress=options.progress,
+    )
+
+
+def _listing(options: "RegisterOptions", path: Path | None, out: Path, *, every: int) -> "Listing":
+    """The photographs that are named one by one or by the list at ``path``."""
+    from ..evaluation.lists import list_photographs, read_list
+
+    if path is not None:
+        listing = read_list(path, options.meshes)
+        probe_folder(out, "--out")
+    else:
+        probe_folder(out, "--out")
+        listing = list_photographs(
+            options.photos, options.meshes, box=options.box, camera=options.camera, every=every, frames=out / "frames"
+        )
+        given = [f"--{name}" for name in ("box", "camera") if getattr(options, name) is not None]
+        if given:
+            print(f"{' and '.join(given)}: used for all {len(listing.entries)} photographs", file=sys.stderr)
+    if options.guess is not None:
+        print("unknown cameras are guessed; distances are off by the same factor as the guesses", file=sys.stderr)
+    return replace(listing, entries=tuple(map(options.complete, listing.entries)))
+
+
+def _notes(as_json: bool) -> Any:
+    """The stream for messages: with ``--json``, standard output holds only results."""
+    return sys.stderr if as_json else sys.stdout

@@ -1,0 +1,51 @@
+"""The lines that ``register`` and ``demo`` print about a result."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..registration.document import corners, correction
+
+__all__ = ["print_result"]
+
+
+def print_result(document: Mapping[str, Any], out: Path) -> None:
+    """Print a result.
+
+    Args:
+        document: of :func:`curvireg_torch.registration.document.result_document`.
+        out: the folder of its files.
+    """
+    angles = ", ".join(f"{name} {value:.1f}" for name, value in document["viewpoint"].items())
+    print(f"viewpoint: {angles} degrees   score {document['score']:.3f}   confidence {document['confidence']:.2f}")
+    if not document["reliable"]:
+        print(f"no reliable match: take the pose as a guess; {_advice(document)}")
+    if ", " in document.get("inputs", {}).get("mesh", ""):
+        print(f"mesh: {document['mesh']}")
+    for line in correction(document):
+        print(line)
+    for instance in document.get("localization", {}).get("instances", []):
+        print(f"found in box {corners(instance['box'])}: there with probability {instance['presence']:.2f}")
+    if document["translation"] is not None:
+        print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")
+    deviations = document["standard_deviations"]
+    if deviations is not None:
+        rotation, translation = (
+            ", ".join("unknown" if v is None else f"{v:.2g}" for v in deviations[name])
+            for name in ("rotation_deg", "translation")
+        )
+        print(
+            f"standard deviations: {rotation} degrees; {translation} {document['unit']}   "
+            "(about and along the camera's axes)"
+        )
+    seconds = document["seconds"]
+    print(f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see {out}/overlay.png")
+
+
+def _advice(document: Mapping[str, Any]) -> str:
+    """What to check after a registration that is not reliable."""
+    upright = document["pipeline"]["views"]["pose"] == "upright"
+    orientation = ", and that it stands as in its file (--pose upright, --up)" if upright else ""
+    if "localization" in document:
+        return f"no box was given: add --box, and check that the mesh is the object's{orientation}"
+    return f"check that the box is tight and the mesh is the object's{orientation}"

@@ -1,0 +1,152 @@
+"""Options of a registration, and the registrar that they ask for: shared by the command line and the viewer."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ..errors import BankError
+from ..geometry import camera_matrix
+from ..geometry.cameras import camera_of_view
+from ..io.meshes import load_mesh
+from ..matching import ViewBank, cached_bank
+from ..models import LearnedCurvilinearSaliency
+from ..pipeline import Pipeline, preset_named
+from ..registration import Registrar
+from ..utils.checks import check_square_pixels
+from ..utils.choices import DEFAULT
+from .lists import Entry
+
+__all__ = ["RegisterOptions", "check_camera", "open_registrar"]
+
+
+@dataclass(frozen=True)
+class RegisterOptions:
+    """What to register, and how; the names and defaults are those of ``curvireg register``.
+
+    Attributes:
+        photos: photographs, folders, patterns or videos.
+        meshes: mesh files or banks; of several, each photograph is registered to the best.
+        box: x0, y0, x1, y1 in px; None: the object is localized.
+        camera: fx, fy, cx, cy in px; None: unknown.
+        guess: replaces an unknown camera: "exif" takes the focal length in the photograph's file, a number is the
+            horizontal field of view in degrees.
+        instances, distance: without a box, see :func:`curvireg_torch.registration.localize`.
+        preset, pipeline: name of a pipeline, or its JSON file; None: the pipeline of a bank, or the default.
+        pose: the pose prior, "any" or "upright"; None: that of the pipeline.
+        field: weights of an adapted field.
+        top: number of hypotheses; None: that of the pipeline.
+        refine: False stops at the best view of the bank.
+        unit, up: of mesh files, see :func:`curvireg_torch.load_mesh`.
+        renderer, device: where views are rendered, and where the search runs.
+        progress: show progress bars.
+    """
+
+    photos: tuple[Path, ...] = ()
+    meshes: tuple[Path, ...] = ()
+    box: tuple[float, float, float, float] | None = None
+    camera: tuple[float, float, float, float] | None = None
+    guess: str | float | None = None
+    instances: int = 1
+    distance: tuple[float, float] | None = None
+    preset: str | None = None
+    pipeline: Path | None = None
+    pose: str | None = None
+    field: Path | None = None
+    top: int | None = None
+    refine: bool = True
+    unit: str = "m"
+    up: str | None = None
+    renderer: str = "auto"
+    device: str = "cpu"
+    progress: bool = True
+
+    @property
+    def bank_decides(self) -> bool:
+        """Whether the pipeline of a bank file applies, as none was chosen."""
+        return self.preset is None and self.pipeline is None
+
+    def open_pipeline(self) -> Pipeline:
+        """The pipeline that ``preset``, ``pipeline`` and ``pose`` choose.
+
+        Raises:
+            CurviregError: the file is missing or does not hold a pipeline.
+        """
+        chosen = preset_named(self.preset or DEFAULT) if self.pipeline is None else Pipeline.read(self.pipeline)
+        return chosen if self.pose is None else chosen.with_pose_prior(self.pose)
+
+    def open_field(self) -> LearnedCurvilinearSaliency | None:
+        """The network of ``field``, or None.
+
+        Raises:
+            CurviregError: the file is missing or does not hold weights.
+        """
+        return None if self.field is None else LearnedCurvilinearSaliency(weights=self.field)
+
+    def entry(self, photo: Path) -> Entry:
+        """A photograph with the box, camera and meshes of these options."""
+        entry = Entry(cells=(), name=str(photo), photo=photo, meshes=self.meshes, box=self.box, camera=self.camera)
+        return self.complete(entry)
+
+    def complete(self, entry: Entry) -> Entry:
+        """A photograph of a list with the options that a list does not hold."""
+        return replace(entry, guess=self.guess, instances=self.instances, distance=self.distance)
+
+
+def check_camera(camera: Sequence[float] | None, guess: str | float | None) -> None:
+    """Refuse a camera (fx, fy, cx, cy) or field of view that cannot be used, before any file is read.
+
+    Raises:
+        InvalidInputError: not finite or positive, pixels that are not square, or an angle outside (0, 180).
+    """
+    if camera is not None:
+        check_square_pixels(camera_matrix(*camera), "--camera")
+    if isinstance(guess, float):
+        camera_of_view(guess, (1, 1))
+
+
+def open_registrar(
+    options: RegisterOptions,
+    meshes: Sequence[Path],
+    field: LearnedCurvilinearSaliency | None = None,
+    *,
+    progress: Callable[[str, int, int], object] | None = None,
+) -> Registrar:
+    """The registrar of mesh files or banks.
+
+    Args:
+        options: its settings; ``photos``, ``meshes`` and what belongs to a photograph are not used.
+        meshes: files; of several, each photograph is registered to the best.
+        field: from :meth:`RegisterOptions.open_field`.
+        progress: called while banks are built, instead of showing a bar.
+
+    Raises:
+        CurviregError: a file is missing or damaged, or a bank was built with other settings.
+    """
+    pipeline = options.open_pipeline()
+    banks = [_open_bank(options, mesh, pipeline, progress or options.progress) for mesh in meshes]
+    bank = ViewBank.join(banks).to(options.device)
+    if all(mesh.suffix == ".safetensors" for mesh in meshes):
+        if options.preset is None and options.pipeline is None:
+            pipeline = bank.pipeline
+        elif options.pose is None and options.pipeline is None:  # a preset does not fix the views
+            pipeline = replace(pipeline, views=bank.pipeline.views)
+    if not options.refine:
+        pipeline = replace(pipeline, search=False, contours=False)
+    if options.top is not None:
+        pipeline = replace(pipeline, hypotheses=options.top)
+    return Registrar(bank, pipeline=pipeline, field=field, renderer=options.renderer)
+
+
+def _open_bank(
+    options: RegisterOptions, mesh: Path, pipeline: Pipeline, progress: bool | Callable[[str, int, int], object]
+) -> ViewBank:
+    if mesh.suffix != ".safetensors":
+        loaded = load_mesh(mesh, unit=options.unit, up=options.up)
+        return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
+    bank = ViewBank.load(mesh)
+    if options.pose not in (None, bank.pipeline.views.pose):
+        raise BankError(
+            f"{mesh}: built for --pose {bank.pipeline.views.pose}, expected --pose {options.pose}; "
+            "leave --pose out, or build it again with 'curvireg bank'"
+        )
+    return bank

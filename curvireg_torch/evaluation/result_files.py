@@ -1,0 +1,38 @@
+"""The files of one result: ``result.json``, ``overlay.png`` and ``pose.glb``."""
+
+from pathlib import Path
+from typing import Any
+
+from ..registration import Registrar, Registration
+from ..utils.files import write_file
+from ..visualization import pose_glb, registration_sheet
+from ..visualization.encoding import png
+from .store import to_json
+
+__all__ = ["write_result"]
+
+MAX_GLB_FACES = 300_000
+"""Faces of the largest mesh that is written to ``pose.glb``: viewers are slow with files above 30 MB."""
+
+
+def write_result(
+    out: Path, document: dict[str, Any], registrar: Registrar, result: Registration, image: Any, box: Any
+) -> None:
+    """Write the files of a result into the folder ``out``; ``pose.glb`` only for meshes of up to 300,000 faces.
+
+    Args:
+        out: the folder.
+        document: the content of ``result.json``.
+        registrar, result, image, box: as for :func:`curvireg_torch.visualization.registration_sheet`.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    sheet = registration_sheet(registrar, result, image, box)
+    mesh = registrar.bank.meshes[result.model]
+    for name in ("result.json", "pose.glb"):
+        (out / name).unlink(missing_ok=True)  # an older one must not stay beside the new overlay
+    write_file(out / "overlay.png", png(sheet))
+    if len(mesh.faces) <= MAX_GLB_FACES:
+        write_file(out / "pose.glb", pose_glb(mesh, *result.projection, image))
+    write_file(out / "result.json", to_json(document).encode())

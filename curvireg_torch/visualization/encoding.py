@@ -1,0 +1,26 @@
+"""Pictures as files in memory."""
+
+import cv2
+import numpy as np
+
+__all__ = ["jpeg", "png", "shrink"]
+
+
+def png(picture: np.ndarray) -> bytes:
+    """A PNG file of (H, W, 3 or 4) uint8 RGB or RGBA."""
+    order = cv2.COLOR_RGB2BGR if picture.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
+    return bytes(cv2.imencode(".png", cv2.cvtColor(picture, order))[1].tobytes())
+
+
+def jpeg(picture: np.ndarray, quality: int) -> bytes:
+    """A JPEG file of (H, W, 3) uint8 RGB; ``quality`` is 0 to 100."""
+    return bytes(cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes())
+
+
+def shrink(picture: np.ndarray, side: int) -> np.ndarray:
+    """An (H, W, 3) uint8 picture, resized so that its longer side is at most ``side`` px."""
+    scale = side / max(picture.shape[:2])
+    if scale >= 1:
+        return picture
+    size = max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
