@@ -20,7 +20,7 @@ __all__ = [
 ]
 
 
-class _WithSubject(Exception):
+class _SubjectError(Exception):
     """What errors and warnings have in common."""
 
     def __init__(self, message: str = "", *, subject: object = "") -> None:
@@ -35,7 +35,7 @@ class _WithSubject(Exception):
         return type(self)(self.message, subject=subject)
 
 
-class CurviregError(_WithSubject):
+class CurviregError(_SubjectError):
     """Base class of the library's errors.
 
     Attributes:
@@ -50,7 +50,7 @@ class CurviregError(_WithSubject):
     """
 
 
-class CurviregWarning(_WithSubject, UserWarning):
+class CurviregWarning(_SubjectError, UserWarning):  # noqa: N818
     """A file can be used, but is perhaps not what the user means; ``message`` and ``subject`` as of an error."""
 
 

@@ -17,7 +17,7 @@ def add_parser(commands: Any) -> None:
         help="print a script that completes this command line",
         **examples(
             "curvireg completion bash > ~/.local/share/bash-completion/completions/curvireg",
-            "curvireg completion zsh >> ~/.zshrc",
+            "curvireg completion zsh > ~/.zfunc/_curvireg",
             "curvireg completion fish > ~/.config/fish/completions/curvireg.fish",
         ),
     )

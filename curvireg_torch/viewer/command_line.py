@@ -22,7 +22,8 @@ def command_line(options: RegisterOptions, names: Mapping[Path, str]) -> str:
         names: what the user calls the files.
 
     Example:
-        >>> command_line(RegisterOptions(photos=(Path("upload-1"),), guess=60.0, unit="mm"), {Path("upload-1"): "a.jpg"})
+        >>> photo = Path("upload-1")
+        >>> command_line(RegisterOptions(photos=(photo,), guess=60.0, unit="mm"), {photo: "a.jpg"})
         'curvireg register a.jpg MESH --fov 60 --unit mm --out result'
     """
     words = ["curvireg", "register"]

@@ -85,7 +85,7 @@ def fit_displayed(registrar: Registrar, displayed: DisplayedPose, image: Tensor,
 
 
 def _edited(displayed: DisplayedPose, centre: Tensor, T: Tensor, *edits: str) -> DisplayedPose:
-    """The pose at (4, 4) ``T_cam_from_model``, without the measurements of the hypothesis; ``centre`` (3,) of the mesh."""
+    """The pose at (4, 4) ``T_cam_from_model``, without the hypothesis's measurements; ``centre`` (3,) of the mesh."""
     position = T[:3, :3] @ centre + T[:3, 3]
     allocentric = rotation_towards(position).mT @ T[:3, :3]
     has_translation = displayed.pose.translation is not None

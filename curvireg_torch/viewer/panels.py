@@ -71,7 +71,7 @@ class Panels:
         self.tools.set_visibility(False)
 
     def _build_pair(self, name: str, kind: str, axis: tuple[int, int, int], unit: float) -> None:
-        """Buttons that move the pose along an axis in both directions, in steps of degrees or of fractions of the radius."""
+        """Two buttons that rotate about an axis or move along it, in steps of ``unit`` degrees or radii."""
 
         async def move(sign: int) -> None:
             step = {kind: [sign * v * float(self.step.value) * unit for v in axis]}
@@ -158,14 +158,12 @@ class Panels:
             cards = []
             for number, pose in enumerate(hypotheses, start=1):
                 degrees = float(rotation_error(pose.rotation, hypotheses[0].rotation))
-                caption = f"{number}: score {pose.score:.2f}" + (
-                    f", {degrees:.0f} degrees from 1" if number > 1 else ""
-                )
+                away = f", {degrees:.0f} degrees from 1" if number > 1 else ""
                 support = "" if pose.edge_support is None else f"edge support {pose.edge_support:.2f}\n"
                 evidence = ", ".join(f"{name} {value:.2f}" for name, value in pose.evidence.items())
                 renderer = registrar.describers[pose.model].renderer
                 picture = thumbnail(renderer, pose.projection, result.image, result.box.tolist())
-                cards.append((picture, f"{caption}\n{support}{evidence}"))
+                cards.append((picture, f"{number}: score {pose.score:.2f}{away}\n{support}{evidence}"))
             return cards
 
         cards = await self.host.run(make)

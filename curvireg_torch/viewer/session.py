@@ -20,7 +20,7 @@ from ..io.meshes import has_colours, load_mesh
 from ..limits import MAX_VIEWER_SECONDS
 from ..matching import ViewBank
 from ..registration import Registrar, Registration
-from ..registration.document import pose_document, used_box
+from ..registration.document import used_box
 from ..visualization import pose_glb
 from .command_line import command_line
 from .editing import DisplayedPose, fit_displayed, move_displayed
@@ -233,7 +233,7 @@ class Session:
             "command": result.command,
             "hypothesis": displayed.number,
             "by_hand": list(displayed.edits),
-            **pose_document(displayed.pose),
+            **displayed.pose.pose_dict(),
         }
         return {**result.document, "viewer": viewer}
 

@@ -1,26 +1,26 @@
 """``curvireg evaluate`` as the command line holds it."""
 
-import argparse
 import json
 from dataclasses import replace
 
 import pytest
 
-from curvireg_torch.cli.evaluate import add_parser
+from curvireg_torch.cli import parse
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.evaluation import contact_sheet
 from curvireg_torch.evaluation.localisation import localisation
+from curvireg_torch.pipeline import DEFAULT, PRESETS
+from tests.evaluation.small import SMALL
 
-from ..evaluation.small import SMALL
+
+@pytest.fixture(autouse=True)
+def _small_pipeline(monkeypatch, tmp_path):
+    monkeypatch.setitem(PRESETS, DEFAULT, SMALL)
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
 
 
 def evaluate(*words):
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--quiet", action="store_true")
-    common.add_argument("--renderer", default="auto")
-    parser = argparse.ArgumentParser()
-    add_parser(parser.add_subparsers(), [common])
-    arguments = parser.parse_args(["evaluate", *map(str, words), "--quiet"])
+    arguments = parse(["evaluate", *map(str, words), "--quiet"])
     arguments.run(arguments)
 
 

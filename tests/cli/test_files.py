@@ -125,7 +125,7 @@ def test_the_posed_mesh_is_written_beside_the_overlay(folder, monkeypatch):
     seen = trimesh.transform_points(posed.geometry[name].vertices, place)
     np.testing.assert_allclose([seen.min(0), seen.max(0)], [wanted.min(0), wanted.max(0)], atol=1e-5)
     # A mesh that is too large for viewers leaves none, nor an older one.
-    monkeypatch.setattr("curvireg_torch.cli.commands.MAX_GLB_FACES", 10)
+    monkeypatch.setattr("curvireg_torch.evaluation.result_files.MAX_GLB_FACES", 10)
     assert register(folder, *words, out="one") == 0
     assert not (folder / "one" / "pose.glb").exists()
 

@@ -56,7 +56,7 @@ def test_a_box_is_of_all_and_that_is_said(folder, capsys):
     words = ["--box", *box_of(0), "--camera", *CAMERA]
     photos = [folder / "photos" / "0.png", folder / "photos" / "1.png"]
     assert register(folder, *photos, folder / "truck.safetensors", *words, out="c") == 0
-    assert "--box and --camera: of all 2 photographs" in capsys.readouterr().err
+    assert "--box and --camera: used for all 2 photographs" in capsys.readouterr().err
     for line in lines(folder / "c"):
         assert line["inputs"]["box"] == [float(v) for v in box_of(0)]
         assert len(line["translation"]) == 3

@@ -11,9 +11,11 @@ import torch
 import trimesh
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix
-from curvireg_torch.cli import commands, main
-from curvireg_torch.cli.commands import _print_result
+from curvireg_torch.cli import main, parse
+from curvireg_torch.cli.options import register_options
+from curvireg_torch.cli.report import print_result
 from curvireg_torch.errors import BankError
+from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.geometry import rotation_error, up_rotation
 from curvireg_torch.models import LearnedCurvilinearSaliency
 from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline, preset_named
@@ -92,9 +94,9 @@ def test_without_box_and_camera(files, capsys):
     folder, box, _ = files
     words = ["register", str(folder / "photo.png"), str(folder / "truck.safetensors"), "--no-refine", "--json"]
     assert main([*words, "--box", *box]) == 0
-    assert "looking for the object" not in capsys.readouterr().err
+    assert "localizing the object" not in capsys.readouterr().err
     assert main(words) == 0
-    assert "photo.png: looking for the object" in capsys.readouterr().err
+    assert "photo.png: localizing the object" in capsys.readouterr().err
     assert run(folder, "photo.png", "truck.safetensors", "--no-refine") == 0
     assert capsys.readouterr().err == ""
     result = json.loads((folder / "out" / "result.json").read_text())
@@ -231,8 +233,10 @@ def test_demo_runs_as_a_module_and_is_right(tmp_path, monkeypatch):
 def test_the_demo_shows_what_it_says(tmp_path, monkeypatch, capsys):
     """Its truth projects into its box, its photograph shows the object there, its error is that of its answer."""
     asked = {}
-    monkeypatch.setattr(commands, "cached_bank", lambda _, **options: asked.update(options) or truck_bank())
-    monkeypatch.setattr(commands, "chosen_pipeline", lambda _: truck_bank().pipeline)
+    monkeypatch.setattr(
+        "curvireg_torch.matching.cached_bank", lambda _, **options: asked.update(options) or truck_bank()
+    )
+    monkeypatch.setattr(RegisterOptions, "open_pipeline", lambda _: truck_bank().pipeline)
     assert main(["demo", "--out", str(tmp_path), "--quiet"]) == 0
     assert asked["progress"] is False
     result = json.loads((tmp_path / "result.json").read_text())
@@ -255,7 +259,7 @@ def test_the_demo_shows_what_it_says(tmp_path, monkeypatch, capsys):
 
 
 def test_a_camera_that_is_none_is_refused_before_anything_is_read(files, monkeypatch, capsys):
-    monkeypatch.setattr(commands, "read_photo", lambda *_, **__: pytest.fail("it was read"))
+    monkeypatch.setattr("curvireg_torch.io.read_photo", lambda *_, **__: pytest.fail("it was read"))
     assert run(files[0], "photo.png", "truck.safetensors", "--camera", "0", "260", "119", "89") == 2
     assert "focal" in capsys.readouterr().err
 
@@ -312,14 +316,12 @@ def test_python_and_the_command_line_give_the_same_bits(files, monkeypatch, pres
 
 
 def test_no_option_is_the_default_pipeline_at_every_door(monkeypatch):
-    from curvireg_torch import cli
-    from curvireg_torch.cli import commands
     from curvireg_torch.evaluation import evaluate
     from curvireg_torch.registration import registrar
 
     assert preset_named(DEFAULT) == Pipeline()
-    parsed = cli._parser().parse_args(["register", "a.jpg", "b.stl", "--out", "c"])
-    assert commands.chosen_pipeline(parsed) == Pipeline()
+    parsed = parse(["register", "a.jpg", "b.stl", "--out", "c"])
+    assert register_options(parsed).open_pipeline() == Pipeline()
     assert inspect.signature(evaluate).parameters["preset"].default == DEFAULT
     asked = []
     monkeypatch.setattr(registrar, "cached_bank", lambda *_, pipeline, **__: asked.append(pipeline) or truck_bank())
@@ -337,7 +339,7 @@ def test_adapted_field_from_bank_to_register(files, monkeypatch, capsys):
         assert workers == 1
         return adapt(mesh, scenes=16, upright=upright, progress=progress)
 
-    monkeypatch.setattr("curvireg_torch.cli.commands.adapt", quick)
+    monkeypatch.setattr("curvireg_torch.training.adapt", quick)
     small = Pipeline(views=ViewPolicy(azimuth_step=90, elevations=(20,)), bank=BankSettings(image_size=64))
     monkeypatch.setitem(PRESETS, DEFAULT, small)
     out, field = folder / "own.safetensors", folder / "own_field.safetensors"
@@ -354,9 +356,9 @@ def test_adapted_field_from_bank_to_register(files, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("pose", "more", "told", "untold"),
     [
-        ("any", {}, "the box is tight and the mesh is the object's\n", "looked for"),
-        ("upright", {}, "(--pose upright, --up)\n", "looked for"),
-        ("any", {"localization": {"instances": []}}, "the object was looked for: give its --box", "tight"),
+        ("any", {}, "the box is tight and the mesh is the object's\n", "no box"),
+        ("upright", {}, "(--pose upright, --up)\n", "no box"),
+        ("any", {"localization": {"instances": []}}, "no box was given: add --box, and check that the mesh", "tight"),
         ("any", {"corrected_box": [1.2, 2.0, 30.6, 40.0]}, "did not fit the pose; one that does: 1 2 31 40\n", "found"),
     ],
 )
@@ -366,7 +368,7 @@ def test_what_to_check_where_nothing_is_reliable(pose, more, told, untold, tmp_p
         "standard_deviations": None, "seconds": {"bank": 1.0, "register": 2.0}, "corrected_box": None,
         "pipeline": Pipeline().with_pose_prior(pose).describe(), **more,
     }  # fmt: skip
-    _print_result(document, tmp_path)
+    print_result(document, tmp_path)
     printed = capsys.readouterr().out
     assert told in printed
     assert untold not in printed

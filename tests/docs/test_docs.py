@@ -152,9 +152,9 @@ def parse(words: list[str]) -> None:
         SystemExit: the program would refuse it.
     """
     if Path(words[0]).name == "curvireg":
-        cli._parser().parse_args(words[1:])
+        cli.build_parser().parse_args(words[1:])
     elif "curvireg_torch" in words:
-        cli._parser().parse_args(words[words.index("curvireg_torch") + 1 :])
+        cli.build_parser().parse_args(words[words.index("curvireg_torch") + 1 :])
     elif words[1].endswith(".py"):
         text = (ROOT / words[1]).read_text(encoding="utf-8")
         for option in (word for word in words if word.startswith("--")):
@@ -174,7 +174,7 @@ def test_commands_parse(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def options() -> set[str]:
     """Every option of the command line."""
     found: set[str] = set()
-    waiting = [cli._parser()]
+    waiting = [cli.build_parser()]
     while waiting:
         for action in waiting.pop()._actions:
             found |= set(action.option_strings)

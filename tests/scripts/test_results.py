@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 import curvireg_torch as cr
-from curvireg_torch.cli import _parsed, _parser, main
+from curvireg_torch.cli import build_parser, main, parse
 from curvireg_torch.registration.document import result_document
 from tests._support.lists import CAMERA, box_of, write_files, written
 from tests._support.scenes import unrefined
@@ -94,7 +94,7 @@ def test_without_a_box_it_says_what_was_found_where(folder, capsys, check):
     for more in (["--instances", "2"], ["--distance", "1", "2"]):
         with pytest.raises(SystemExit):
             register(*given, *more)
-        assert "are for objects that are looked for" in capsys.readouterr().err
+        assert "apply only without a box" in capsys.readouterr().err
 
 
 def test_json_of_a_list_is_one_line_each(folder, capsys, check):
@@ -170,7 +170,9 @@ def commands(parser, words=()):
                 yield from commands(below, (*words, name))
 
 
-@pytest.mark.parametrize(("words", "parser"), [pytest.param(w, p, id=" ".join(w)) for w, p in commands(_parser()) if w])
+@pytest.mark.parametrize(
+    ("words", "parser"), [pytest.param(w, p, id=" ".join(w)) for w, p in commands(build_parser()) if w]
+)
 def test_every_command_shows_examples_that_parse(words, parser):
     text = parser.format_help()
     assert "\nexamples:\n" in text
@@ -180,7 +182,7 @@ def test_every_command_shows_examples_that_parse(words, parser):
         name, *said = shlex.split(line.partition(">")[0])
         assert name == "curvireg"
         assert tuple(said[: len(words)]) == words
-        _parsed(said)
+        parse(said)
 
 
 def test_neither_out_nor_json(capsys):

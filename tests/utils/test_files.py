@@ -80,8 +80,8 @@ def test_the_place_is_probed_before_the_work(
     def work(*_: object, **__: object) -> None:
         raise AssertionError("began to work")
 
-    for name in ("cached_bank", "load_mesh"):
-        monkeypatch.setattr(f"curvireg_torch.cli.commands.{name}", work)
+    for name in ("matching.cached_bank", "io.meshes.load_mesh"):
+        monkeypatch.setattr(f"curvireg_torch.{name}", work)
     blocked = tmp_path / "file"
     blocked.write_bytes(OLD)
     (tmp_path / "mesh.ply").write_bytes(OLD)
@@ -105,7 +105,7 @@ def test_interrupted_in_the_middle_of_a_file(
     path = tmp_path / "file"
     write_file(path, OLD)
     monkeypatch.setattr(os, "fsync", lambda _: signal.raise_signal(number))
-    monkeypatch.setattr("curvireg_torch.cli.commands.list_cache", lambda: write_file(path, NEW))
+    monkeypatch.setattr("curvireg_torch.matching.list_cache", lambda: write_file(path, NEW))
     before = signal.getsignal(signal.SIGTERM)
     ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # of a suite that a shell runs in the background
     try:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from curvireg_torch import cli
-from curvireg_torch.cli import _parsed, main
+from curvireg_torch.cli import main, parse
 from curvireg_torch.errors import CurviregError
 from tests.utils.test_lazy import HEAVY, imported_by
 
@@ -77,24 +77,24 @@ def test_it_is_said_before_anything_heavy_is_imported(words):
     ],
 )
 def test_numbers_may_be_divided_by_commas(words):
-    arguments = _parsed(["register", "a,1.jpg", *words, "5,6", "--out", "out"])
+    arguments = parse(["register", "a,1.jpg", *words, "5,6", "--out", "out"])
     assert arguments.box == [10.0, 20.0, 30.5, 40.0]
     assert arguments.paths == [Path("a,1.jpg"), Path("5,6")]
-    assert _parsed(["view", *words]).box == arguments.box
+    assert parse(["view", *words]).box == arguments.box
 
 
 def test_cameras_and_distances_may_be_divided_by_commas_too():
     words = ["register", "a.jpg", "b.stl", "--camera=1e3,1000,-.5,2", "--distance", ".5,1", "--json"]
-    arguments = _parsed(words)
+    arguments = parse(words)
     assert arguments.camera == [1000.0, 1000.0, -0.5, 2.0]
     assert arguments.distance == [0.5, 1.0]
-    assert _parsed(["register", "a.jpg", "b.stl", "--camera=exif", "--json"]).exif
+    assert parse(["register", "a.jpg", "b.stl", "--camera=exif", "--json"]).exif
 
 
 @pytest.mark.parametrize("numbers", ["1,2,3", "1,2,3,4,5", "1,2,three,4"])
 def test_other_numbers_are_refused(numbers, capsys):
     with pytest.raises(SystemExit):
-        _parsed(["register", "a.jpg", "b.stl", "--box", numbers, "--json"])
+        parse(["register", "a.jpg", "b.stl", "--box", numbers, "--json"])
     assert "argument --box: " in capsys.readouterr().err
 
 
@@ -102,7 +102,11 @@ def test_other_numbers_are_refused(numbers, capsys):
     ("raised", "code", "said"),
     [
         (KeyboardInterrupt(), 130, "curvireg: interrupted\n"),
-        (PermissionError(13, "denied", "x.ply"), 2, "curvireg: error: [Errno 13] denied: 'x.ply'; check that it is "),
+        (
+            PermissionError(13, "denied", "x.ply"),
+            2,
+            "curvireg: error: [Errno 13] denied: 'x.ply'; check that it exists",
+        ),
         (CurviregError("no good"), 2, "curvireg: error: no good\n"),
     ],
 )
@@ -110,7 +114,6 @@ def test_what_stops_a_command_is_one_line_and_a_code(raised, code, said, monkeyp
     def stop(_):
         raise raised
 
-    monkeypatch.setattr(cli, "check_given", lambda *_: None)
-    monkeypatch.setattr(cli, "_parsed", lambda _: Namespace(run=stop, debug=False, photo=None, mesh=None))
+    monkeypatch.setattr(cli, "parse", lambda _: Namespace(run=stop, debug=False))
     assert main(["cache"]) == code
     assert capsys.readouterr().err.startswith(said)

@@ -38,7 +38,7 @@ def test_the_package_alone_imports_nothing_heavy():
 
 
 def test_commands_import_no_more_than_they_use():
-    loaded = imported_by("import curvireg_torch.cli.commands")
+    loaded = imported_by("import curvireg_torch.evaluation.opening")
     assert {"torch", "trimesh"} <= loaded
     assert not loaded & UNUSED
 

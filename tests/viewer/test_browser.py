@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from curvireg_torch.cli import main
-from curvireg_torch.viewer.session import SHOWN
+from curvireg_torch.viewer.session import MAX_PROPOSALS
 from tests._support.exif import exif, with_exif
 from tests.viewer.test_session import write_scene
 
@@ -184,11 +184,11 @@ def test_from_upload_to_download(browser, folder):
     browser.until(lambda: browser.text("photo-facts") == "240 x 180 px", "photograph")
     assert browser.text("camera-facts").startswith("unknown")
     browser.part("fov").send_keys("65")
-    browser.until(lambda: browser.text("camera-facts").startswith("a guess by the field of view"), "field of view")
+    browser.until(lambda: browser.text("camera-facts").startswith("guessed from the field of view"), "field of view")
     browser.until(lambda: "--fov 65" in browser.text("command"), "command")
     browser.click("exif")
     browser.until(lambda: browser.text("fov") == "", "the camera goes before it")
-    told = "a guess by the photograph's EXIF, 37 mm of a 35 mm camera: no covariance"
+    told = "guessed from the photograph's EXIF, 37 mm of a 35 mm camera: no covariance"
     browser.until(lambda: browser.text("camera-facts") == told, "EXIF")
     browser.upload("mesh", folder / "truck.ply")
     browser.until(lambda: "968 faces" in browser.text("mesh-facts"), "mesh")
@@ -260,10 +260,10 @@ def test_by_hand_and_pulled_in(browser):
     before = browser.text("facts")
     browser.click("tab-answer")
     browser.click("+roll")
-    browser.until(lambda: "turned 4 degrees about z" in browser.text("facts"), "nudge")
+    browser.until(lambda: "rotated 4 degrees about z" in browser.text("facts"), "nudge")
     assert browser.text("facts").splitlines()[0] != before.splitlines()[0]
-    browser.click("pull-in")
-    browser.until(lambda: "pulled in by contours" in browser.text("facts"), "contours")
+    browser.click("fit")
+    browser.until(lambda: "contours fitted" in browser.text("facts"), "contours")
     browser.click("show-2")
     browser.until(lambda: "by hand" not in browser.text("facts") and browser.text("facts") != before, "second")
     for name, start in (("GLB", b"glTF"), ("PNG", b"\x89PNG")):
@@ -297,7 +297,7 @@ def test_find_it_draws_what_it_thought_of_and_a_click_takes_it(browser, folder):
     assert browser.box() == pytest.approx(json.loads((folder / "box.json").read_text()), abs=0.7)
     browser.until(lambda: "starting" in stages() or browser.click("find"), "pressed")
     browser.until(lambda: stages()[-1] == "done", "answer without a box")
-    assert "looking for the object" in stages()
+    assert "localizing the object" in stages()
     assert browser.text("message") == browser.text("box-x0") == ""
     command = browser.text("command")
     assert "--box" not in command
@@ -306,7 +306,7 @@ def test_find_it_draws_what_it_thought_of_and_a_click_takes_it(browser, folder):
         patch.setenv("CURVIREG_CACHE", str(folder / "cache"))
         assert main([*shlex.split(command)[1:], "--quiet"]) == 0
     written = json.loads((folder / "result" / "result.json").read_text())
-    proposals = [place["box"] for place in written["localization"]["proposals"]][:SHOWN]
+    proposals = [place["box"] for place in written["localization"]["proposals"]][:MAX_PROPOSALS]
     assert proposals[0] == written["inputs"]["box"]
     assert len(proposals) > 1
 
@@ -329,4 +329,4 @@ def test_find_it_draws_what_it_thought_of_and_a_click_takes_it(browser, folder):
     browser.until(lambda: browser.box() == [round(v, 1) for v in proposals[0]], "the box that was clicked on")
     assert not dashed()
     browser.until(lambda: "--box" in browser.text("command"), "the command has it")
-    assert browser.text("stage") == "the inputs have changed since this answer"
+    assert browser.text("stage") == "the inputs have changed since this result"
