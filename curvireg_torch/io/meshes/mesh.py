@@ -11,7 +11,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from ...errors import CurviregWarning, MeshError, MissingFileError
+from ...errors import MeshError, MissingFileError
 from ...limits import MAX_MESH_COORDINATE, MAX_MESH_FACES
 from ...utils.checks import check_option
 from ...utils.choices import MESHES, UNITS, UP_AXES
@@ -67,8 +67,10 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
     mesh.metadata.update(file_name=path.name, up=up)
     size = float(np.linalg.norm(mesh.extents)) * UNITS[unit]
     if not 0.005 <= size <= 100.0:
-        message = f"in unit {unit!r} the object is {size:g} m across; if that is wrong, give the unit (mm?)"
-        warnings.warn(CurviregWarning(message, subject=path), stacklevel=2)
+        warnings.warn(
+            f"{path}: in unit {unit!r} the object is {size:g} m across; if that is wrong, give the unit (mm?)",
+            stacklevel=2,
+        )
     return mesh
 
 
