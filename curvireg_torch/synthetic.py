@@ -1,4 +1,4 @@
-"""Photograph-like pictures with known truth, made entirely in code: for the demo and for tests."""
+"""Synthetic photographs with known pose, for the demo and for tests."""
 
 import math
 
@@ -18,7 +18,7 @@ __all__ = ["example_mesh", "procedural_background", "random_pose", "synthesize_p
 
 
 def example_mesh() -> trimesh.Trimesh:
-    """A toy truck, 0.25 m long, that looks different from every side; z up, front along -y. In metres."""
+    """A toy truck, 0.25 m long, without symmetries; z up, front along -y, in metres."""
     box, cylinder = trimesh.creation.box, trimesh.creation.cylinder
     shift = trimesh.transformations.translation_matrix
     across = trimesh.transformations.rotation_matrix(math.pi / 2, [0, 1, 0])
@@ -70,9 +70,9 @@ def random_pose(
     u = torch.rand(6, generator=generator, dtype=torch.float64)
     elevation = elevations[0] + (elevations[1] - elevations[0]) * u[1]
     R = rotation_from_viewpoint(360.0 * u[0], elevation, 10.0 * u[2] - 5.0)
-    share = fill[0] + (fill[1] - fill[0]) * float(u[3])
+    fraction = fill[0] + (fill[1] - fill[0]) * float(u[3])
     focal = float(camera_matrix[0, 0])
-    distance = 2.0 * mesh_radius(mesh) * focal / (share * min(size))
+    distance = 2.0 * mesh_radius(mesh) * focal / (fraction * min(size))
     pixel = torch.stack([size[1] * (0.4 + 0.2 * u[4]), size[0] * (0.4 + 0.2 * u[5]), torch.ones_like(u[0])])
     ray = torch.linalg.inv(camera_matrix.double()) @ pixel
     R = rotation_towards(ray) @ R
@@ -90,26 +90,28 @@ def synthesize_photograph(
     texture: float = 0.35,
     defocus: float = 1.5,
 ) -> tuple[Tensor, Tensor]:
-    """A photograph-like picture of the mesh: random light, a random solid texture, defocused background, sensor noise.
+    """A synthetic photograph of the mesh: random light, a random solid texture, defocused background, sensor noise.
 
     Args:
         mesh, T_cam_from_model (4, 4), camera_matrix (3, 3), size (H, W): the scene.
         background: (3, H, W) in [0, 1]; default :func:`procedural_background`.
-        texture: contrast of the texture, 0 = plain.
-        defocus: blur of the background in px, as behind an object in focus.
+        texture: contrast of the texture, 0 = none.
+        defocus: blur of the background in px.
 
     Returns:
         image (3, H, W) in [0, 1] and the object's box (4,) in px.
     """
     H, W = size
-    zoom = torch.tensor([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]], dtype=torch.float64)  # twice as fine
+    zoom = torch.tensor(
+        [[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]], dtype=torch.float64
+    )  # supersampling by two
     K = zoom @ camera_matrix.double()
     depth = render_depth(mesh, T_cam_from_model, K, (2 * H, 2 * W))[0, 0].double()
     mask = depth > 0
     v, u = torch.meshgrid(torch.arange(2.0 * H), torch.arange(2.0 * W), indexing="ij")
     pixels = torch.stack([u, v, torch.ones_like(u)], dim=-1).double()
     points = depth[..., None] * (pixels @ torch.linalg.inv(K).T)
-    # Normals from neighbouring points; the border of the silhouette borrows the camera's direction.
+    # Normals come from neighbouring points; at occluding contours they point to the camera.
     du = torch.gradient(points, dim=1)[0]
     dv = torch.gradient(points, dim=0)[0]
     normal = F.normalize(torch.linalg.cross(dv, du), dim=-1)
@@ -131,7 +133,7 @@ def synthesize_photograph(
     image = image + 0.01 * torch.randn(3, H, W, generator=generator)
     rows, columns = mask.any(dim=1).nonzero(), mask.any(dim=0).nonzero()
     if len(rows) == 0:
-        raise InvalidInputError("T_cam_from_model: the object is not in the picture")
-    # Outer borders of the outermost pixels, from the fine grid to the picture's.
-    fine = torch.tensor([int(columns[0]) - 0.5, int(rows[0]) - 0.5, int(columns[-1]) + 0.5, int(rows[-1]) + 0.5])
-    return image.clamp(0, 1), (fine - 0.5) / 2.0
+        raise InvalidInputError("T_cam_from_model: expected a pose that shows the object, but no pixel does")
+    # Outer borders of the outermost pixels, converted from the fine grid to the picture's.
+    border = torch.tensor([int(columns[0]) - 0.5, int(rows[0]) - 0.5, int(columns[-1]) + 0.5, int(rows[-1]) + 0.5])
+    return image.clamp(0, 1), (border - 0.5) / 2.0

@@ -1,4 +1,4 @@
-"""Views in the mesh's own colours, under the light that grey views are shaded with."""
+"""Views in the mesh's colours, shaded like grey views."""
 
 from os import PathLike
 
@@ -16,8 +16,8 @@ from .shading import shade
 
 __all__ = ["render_colour"]
 
-FINENESS = 2
-"""Samples per pixel and axis: textures are finer than views."""
+SUPERSAMPLING = 2
+"""Samples per pixel and axis, because textures are finer than views."""
 
 
 @torch.no_grad()
@@ -30,17 +30,17 @@ def render_colour(
     renderer: str | DepthRenderer = "auto",
     orthographic: bool = False,
 ) -> Tensor:
-    """Pictures of a mesh in its own colours before white: the colour times :func:`shade`, four samples a pixel.
+    """Pictures of a mesh in its colours before white: the colour times :func:`shade`, four samples per pixel.
 
-    A mesh without colours (:func:`has_colours`) is white, which is what :func:`shade` shows. So is every mesh where
-    the renderer cannot tell which face a pixel sees: only "embree" can.
+    A mesh without colours (:func:`has_colours`) is white. So is every mesh with a renderer that does not report which
+    face a pixel shows; only "embree" does.
 
     Args:
         mesh: a mesh, a scene or the path of one.
         T_cam_from_model: (N, 4, 4) or (4, 4), model to OpenCV camera.
         camera_matrix: (N, 3, 3) or (3, 3) in px, without skew.
         size: (H, W).
-        renderer: a name, or a renderer of this very mesh, which saves building one in every call.
+        renderer: a name, or a renderer of this mesh, which is then not built in every call.
         orthographic: parallel projection; fx, fy are then px per model unit.
 
     Returns:
@@ -60,9 +60,11 @@ def render_colour(
     """
     mesh = as_mesh(mesh)
     T, K = check_render_arguments(T_cam_from_model.view(-1, 4, 4), camera_matrix, size)
-    zoom = torch.tensor([[1.0, 0, 0.5 - 0.5 / FINENESS], [0, 1, 0.5 - 0.5 / FINENESS], [0, 0, 1 / FINENESS]])
-    K = FINENESS * zoom.double() @ K
-    fine = FINENESS * size[0], FINENESS * size[1]
+    zoom = torch.tensor(
+        [[1.0, 0, 0.5 - 0.5 / SUPERSAMPLING], [0, 1, 0.5 - 0.5 / SUPERSAMPLING], [0, 0, 1 / SUPERSAMPLING]]
+    )
+    K = SUPERSAMPLING * zoom.double() @ K
+    fine = SUPERSAMPLING * size[0], SUPERSAMPLING * size[1]
     backend = make_renderer(mesh, renderer)
     colours, faces_at = surface_colours(mesh), getattr(backend, "faces_at", None)
     if colours is None or faces_at is None:
@@ -71,7 +73,7 @@ def render_colour(
     else:
         face, u, v, depth = faces_at(T, K, fine, orthographic=orthographic)
         albedo = np.ones((*face.shape, 3), np.float32)
-        seen = face >= 0
-        albedo[seen] = colours.at(face[seen], u[seen], v[seen])
+        visible = face >= 0
+        albedo[visible] = colours.at(face[visible], u[visible], v[visible])
         picture = shade(depth, K, orthographic=orthographic) * torch.from_numpy(albedo).permute(0, 3, 1, 2)
-    return F.avg_pool2d(picture.contiguous(), FINENESS)
+    return F.avg_pool2d(picture.contiguous(), SUPERSAMPLING)

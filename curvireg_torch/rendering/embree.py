@@ -15,13 +15,13 @@ from .protocol import NEAREST, check_render_arguments
 __all__ = ["EmbreeRenderer", "RayScene"]
 
 _MISS = 1e30  # embreex returns 1e37 where a ray hits nothing
-_HULL = 200_000  # vertices up to which a convex hull takes less time than it saves
-_OUTLINE = 4096  # points of a convex hull that are worth projecting in every view
-_DRAWABLE = 16000  # px, as far as OpenCV draws polygons
+_MAX_HULL_VERTICES = 200_000  # above, a convex hull takes more time than it saves
+_MAX_OUTLINE = 4096  # above, projecting the hull in every view costs more than it saves
+_MAX_COORDINATE = 16000  # px; OpenCV draws no polygons beyond
 
 
 class RayScene:
-    """Triangles that rays are cast at.
+    """Triangles for ray casting.
 
     Args:
         vertices: (V, 3).
@@ -31,33 +31,32 @@ class RayScene:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self._scene = EmbreeScene()
         TriangleMesh(scene=self._scene, vertices=vertices.astype(np.float32), indices=np.asarray(faces, np.int32))
-        self.distance(np.zeros((1, 3)), np.ones((1, 3)))  # builds embree's tree, which threads may not do at a time
+        self.distance(np.zeros((1, 3)), np.ones((1, 3)))  # builds embree's tree, which is not thread-safe
 
     def distance(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(N,) float32 lengths along rays to what they hit first, in units of the directions; inf for nothing.
+        """(N,) float32 distances along rays to the first hit, in units of the directions; inf without a hit.
 
         Args:
             origins: (N, 3).
-            directions: (N, 3), or (1, 3) for all of them.
+            directions: (N, 3), or (1, 3) for all rays.
         """
-        along: np.ndarray = self._scene.run(_float32(origins), _float32(directions), query="DISTANCE")
-        along[along >= _MISS] = np.inf
-        return along
+        distance: np.ndarray = self._scene.run(_float32(origins), _float32(directions), query="DISTANCE")
+        distance[distance >= _MISS] = np.inf
+        return distance
 
     def hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """:meth:`distance`, the triangle hit (N,), and its normal (N, 3), neither of unit length nor of known sign."""
+        """:meth:`distance`, the triangle hit (N,), and its normal (N, 3) of arbitrary length and sign."""
         found = self._scene.run(_float32(origins), _float32(directions), query="INTERSECT", output=True)
         return np.where(found["tfar"] < _MISS, found["tfar"], np.inf), found["primID"], found["Ng"]
 
-    def places(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
-        """The triangle hit first (N,), -1 for none, the shares u, v (N,) of its second and third corner there, and
-        :meth:`distance`."""
+    def barycentric_hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The first triangle hit (N,), -1 for none; barycentric u, v (N,) of its corners 2 and 3; the distance."""
         found = self._scene.run(_float32(origins), _float32(directions), query="INTERSECT", output=True)
         hit = found["tfar"] < _MISS
         return np.where(hit, found["primID"], -1), found["u"], found["v"], np.where(hit, found["tfar"], np.inf)
 
     def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(N,) bool: whether rays hit anything."""
+        """(N,) bool: rays that hit anything."""
         return np.asarray(self._scene.run(_float32(origins), _float32(directions), query="OCCLUDED") >= 0)
 
 
@@ -66,20 +65,20 @@ def _float32(x: np.ndarray) -> np.ndarray:
 
 
 class EmbreeRenderer:
-    """One ray through each pixel's centre inside the outline of the object's hull; threads share a call's views.
+    """Casts one ray through each pixel's centre inside the outline of the object's hull, views in parallel on threads.
 
-    Thread-safe, since rays only read the scene, and fork-safe. Cannot be pickled: a spawned process makes its own.
+    Thread-safe, because rays only read the scene, and fork-safe. Cannot be pickled: a spawned process builds its own.
     """
 
     name = "embree"
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
-        # Embree computes in float32: centre the object and scale it to radius 1.
+        # Embree computes in float32, so the object is centred and scaled to radius 1.
         self._centre = mesh_centre(mesh).numpy()
         self._radius = mesh_radius(mesh)
         vertices = (np.asarray(mesh.vertices) - self._centre) / self._radius
-        outline = extreme_points(mesh) if len(vertices) <= _HULL else box_corners(mesh)
-        outline = outline if len(outline) <= _OUTLINE else box_corners(mesh)
+        outline = extreme_points(mesh) if len(vertices) <= _MAX_HULL_VERTICES else box_corners(mesh)
+        outline = outline if len(outline) <= _MAX_OUTLINE else box_corners(mesh)
         self._outline = (outline.numpy() - self._centre) / self._radius
         self._scene = RayScene(vertices, mesh.faces)
 
@@ -94,24 +93,24 @@ class EmbreeRenderer:
     def faces_at(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tensor]:
-        """The face that each pixel of :meth:`render` sees, where on it, and what :meth:`render` returns.
+        """The face that each pixel shows, the point on that face, and the depth of :meth:`render`.
 
         Returns:
-            (N, H, W) int32 numbers of faces, -1 for none; (N, H, W) float32 u and v: the point is
+            (N, H, W) int32 face indices, -1 for none; (N, H, W) float32 u and v: the point is
             (1 - u - v) a + u b + v c, with the face's corners a, b, c; (N, 1, H, W) depth.
         """
         T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
         face = np.full((len(T), *size), -1, dtype=np.int32)
         u, v, depth = (np.zeros(face.shape, np.float32) for _ in range(3))
 
-        def one(i: int) -> None:
+        def cast(i: int) -> None:
             rays = self._rays(T[i], K[i], size, orthographic)
             if rays is not None:
                 mask, starts, directions, near = rays
-                face[i][mask], u[i][mask], v[i][mask], along = self._scene.places(starts, directions)
+                face[i][mask], u[i][mask], v[i][mask], along = self._scene.barycentric_hits(starts, directions)
                 depth[i][mask] = self._depth(along, near)
 
-        for_each(len(T), one)
+        for_each(len(T), cast)
         return face, u, v, torch.from_numpy(depth)[:, None]
 
     def _render_view(self, T: np.ndarray, K: np.ndarray, out: np.ndarray, orthographic: bool) -> None:
@@ -128,15 +127,15 @@ class EmbreeRenderer:
     def _rays(
         self, T: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
-        """Pixels (H, W) that may see the object, origins and directions of their rays, and the depth they start at."""
+        """Pixels (H, W) that may show the object, origins and directions of their rays, and their start depth."""
         R = T[:3, :3]
         t = (T[:3, 3] + R @ self._centre) / self._radius  # centre of the object in the camera, in radii
         outline = self._outline @ R.T + t
         nearest = outline[:, 2].min()
         if outline[:, 2].max() <= NEAREST:
-            return None  # wholly behind the camera
+            return None  # entirely behind the camera
         mask = self._mask(outline, K, size, orthographic)
-        # Rays start at the plane z = near, relative to the object: no digits are spent on the way to a distant one.
+        # Rays start at the plane z = near close to the object, which keeps float32 precise for distant objects.
         # Rows and columns are computed in float64, pixels in float32.
         near = max(nearest - 1e-3, NEAREST)
         reach = 1.0 / self._radius if orthographic else near
@@ -147,17 +146,17 @@ class EmbreeRenderer:
         return mask, starts, _float32(R[2:]) if orthographic else _combined(pixels, x, y, 1.0, R), near
 
     def _mask(self, outline: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool) -> np.ndarray:
-        """(H, W) bool: the pixels inside the outline's projection, with a rim of a pixel."""
-        everywhere = np.ones(size, dtype=bool)
+        """(H, W) bool: pixels inside the outline's projection, dilated by one pixel."""
+        full = np.ones(size, dtype=bool)
         if orthographic:
             xy = outline[:, :2] * self._radius
         elif outline[:, 2].min() > NEAREST:
             xy = outline[:, :2] / outline[:, 2:]
         else:
-            return everywhere  # it passes the camera's plane: no finite projection
+            return full  # the outline crosses the camera plane: no finite projection
         uv = xy @ K[:2, :2].T + K[:2, 2]
-        if np.abs(uv).max() >= _DRAWABLE:
-            return everywhere
+        if np.abs(uv).max() >= _MAX_COORDINATE:
+            return full
         mask = np.zeros(size, dtype=np.uint8)
         cv2.fillConvexPoly(mask, cv2.convexHull(np.round(uv).astype(np.int32)), 1)
         return np.asarray(cv2.dilate(mask, np.ones((3, 3), np.uint8))).view(bool)

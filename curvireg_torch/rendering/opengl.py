@@ -24,7 +24,7 @@ _context: tuple[int, Any] | None = None
 
 
 def _offscreen() -> Any:
-    """The process's one OffscreenRenderer: a second one fails under EGL, and none survives a fork."""
+    """The only OffscreenRenderer of this process: a second one fails under EGL, and none survives a fork."""
     global _context
     if _context is not None and _context[0] != os.getpid():
         raise RenderingError(
@@ -34,14 +34,14 @@ def _offscreen() -> Any:
     if _context is None:
         os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
         with suppress(ImportError):
-            # Mesa and triton (torch.compile) each bring an LLVM: where that of Mesa comes first, the process dies.
+            # Mesa and triton (torch.compile) each load an LLVM: if Mesa's is loaded first, the process crashes.
             import_module("triton")
         try:
             import pyrender
 
             _context = (os.getpid(), pyrender.OffscreenRenderer(64, 64))
             atexit.register(_release)
-        except Exception as error:  # PyOpenGL raises whatever its loader met
+        except Exception as error:  # PyOpenGL raises anything
             raise RenderingError(
                 f"renderer 'pyrender' needs OpenGL through EGL ({type(error).__name__}: {error}); "
                 "install the system's libegl1, or use renderer='embree'"
@@ -49,8 +49,8 @@ def _offscreen() -> Any:
     return _context[1]
 
 
-def _let_go(offscreen: Any) -> None:
-    """Unbind the context from this thread, so that another may take it; pyrender's own make_uncurrent does nothing."""
+def _unbind(offscreen: Any) -> None:
+    """Unbind the context from this thread, so that others can bind it; pyrender's make_uncurrent does nothing."""
     from OpenGL import EGL
 
     display = getattr(offscreen._platform, "_egl_display", None)
@@ -59,7 +59,7 @@ def _let_go(offscreen: Any) -> None:
 
 
 def _release() -> None:
-    """Give the context back at the end of the process that made it."""
+    """Delete the context at the end of the process that created it."""
     global _context
     if _context is not None and _context[0] == os.getpid():
         _context[1].delete()
@@ -79,15 +79,15 @@ def _camera(P: np.ndarray, near: float, far: float) -> Any:
 
 
 class PyrenderRenderer:
-    """Draws into the process's one EGL context, one view at a time, behind a lock: thread-safe.
+    """Draws into the process's only EGL context, one view at a time; a lock makes it thread-safe.
 
-    Defects of pyrender 0.1.45 are worked around. Its framebuffer takes four samples a pixel and resolves depth to one
-    of them, off the centre: segmentation mode switches that off. That mode culls faces seen from behind, whatever its
-    flags say: faces are drawn both ways round. Orthographic depth comes back through the perspective formula: it is
-    inverted here. Its EGL context stays bound to the thread that used it last: it is unbound here.
+    It works around defects of pyrender 0.1.45. The framebuffer takes four samples per pixel and resolves depth to one
+    that is off the centre; segmentation mode avoids that, but always culls back faces, so faces are drawn in both
+    orientations. Orthographic depth is returned through the perspective formula, which is inverted here. The EGL
+    context stays bound to the last thread that used it, so it is unbound here.
 
-    Depth has 24 bits, spread over the object as perspective does: a camera inside the object's box sees its far end
-    less exactly than the other backends do.
+    Depth has 24 bits, distributed by perspective: for a camera inside the object's box, the far end is less exact than
+    with the other backends.
     """
 
     name = "pyrender"
@@ -97,7 +97,7 @@ class PyrenderRenderer:
         self._radius = mesh_radius(mesh)
         self._corners = (box_corners(mesh) - self._centre) / self._radius
         with _lock:
-            _let_go(_offscreen())
+            _unbind(_offscreen())
             import pyrender
 
             positions = ((np.asarray(mesh.vertices) - self._centre.numpy()) / self._radius).astype(np.float32)
@@ -120,22 +120,22 @@ class PyrenderRenderer:
                 for i in range(len(T)):
                     self._render_view(offscreen, T[i], K[i], out[i, 0], orthographic)
             finally:
-                _let_go(offscreen)
+                _unbind(offscreen)
         return torch.from_numpy(out)
 
     def _render_view(self, offscreen: Any, T: Tensor, K: Tensor, out: np.ndarray, orthographic: bool) -> None:
-        cam_from_model = T.clone()  # in radii, the object's centre at its origin
+        cam_from_model = T.clone()  # in radii, with the origin at the object's centre
         cam_from_model[:3, 3] = (T[:3, 3] + T[:3, :3] @ self._centre) / self._radius
-        # The clip range hugs the object: 24 bits of depth are spent on it alone.
+        # A tight clip range spends all 24 bits of depth on the object.
         z = self._corners @ cam_from_model[2, :3] + cam_from_model[2, 3]
         near, far = max(float(z.min()) - 1e-3, NEAREST), float(z.max()) + 1e-3
         if far - 1e-3 <= near:
-            return  # wholly behind the camera
+            return  # entirely behind the camera
         K = K.clone()
         shift = 0.0
         if orthographic:
-            # Pyrender takes depth for perspective's, 2 f n / (f + n - ndc (f - n)): bring the object to where the
-            # inverse of that loses no digits.
+            # Pyrender treats depth as perspective, 2 f n / (f + n - ndc (f - n)). Move the object to where the inverse
+            # of that formula is precise.
             shift = 2.0 - near
             cam_from_model[2, 3] += shift
             near, far = near + shift, far + shift
@@ -147,8 +147,8 @@ class PyrenderRenderer:
             depth = offscreen.render(self._scene, flags=self._flags, seg_node_map={self._node: (255, 255, 255)})
         finally:
             self._scene.remove_node(camera)
-        seen = depth > 0
+        visible = depth > 0
         if orthographic:
-            ndc = (far + near - 2 * near * far / np.where(seen, depth, 1.0)) / (far - near)
+            ndc = (far + near - 2 * near * far / np.where(visible, depth, 1.0)) / (far - near)
             depth = np.asarray(0.5 * (ndc * (far - near) + far + near) - shift)
-        out[:] = np.where(seen, depth * self._radius, 0.0)
+        out[:] = np.where(visible, depth * self._radius, 0.0)

@@ -1,4 +1,4 @@
-"""Depth views as grey pictures, lit as a plain object before a white wall would be."""
+"""Grey pictures of depth views: Lambertian shading before a white background."""
 
 import torch
 from torch import Tensor
@@ -8,14 +8,14 @@ from ..utils.checks import check_camera_matrix, check_image, check_tensor
 __all__ = ["shade"]
 
 AMBIENT, LIT = 0.3, 0.9
-"""Grey of a surface seen edge on and face on; what is behind is 1."""
+"""Grey levels of a surface seen edge on and face on; the background is 1."""
 
 
 def shade(depth: Tensor, camera_matrix: Tensor, *, orthographic: bool = False) -> Tensor:
-    """Lambert's law under a lamp beside the camera: grey 0.3 edge on to 0.9 face on, before white.
+    """Lambertian shading with a light at the camera: grey 0.3 edge on to 0.9 face on, background 1.
 
-    Normals come from neighbouring pixels of the surface, exactly for planes; of the two neighbours of an axis the one
-    nearer in depth counts, so that creases and contours stay sharp.
+    Normals come from neighbouring pixels and are exact for planes. Of the two neighbours along an axis, the one nearer
+    in depth is used, so that creases and contours stay sharp.
 
     Args:
         depth: (N, 1, H, W) z-depth, 0 = background.
@@ -40,10 +40,10 @@ def shade(depth: Tensor, camera_matrix: Tensor, *, orthographic: bool = False) -
     check_tensor(camera_matrix, "camera_matrix", (depth.shape[0], 3, 3))
     check_camera_matrix(camera_matrix)
     z = depth.float()
-    seen = z > 0
+    visible = z > 0
     fx, fy, cx, cy = (camera_matrix.to(z)[:, i, j].view(-1, 1, 1, 1) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    # What is linear in the pixels of a plane: the inverse depth, or under parallel projection the depth.
-    s = torch.where(seen, z if orthographic else 1.0 / z, torch.inf)
+    # Across a plane, inverse depth is linear in pixel coordinates; under parallel projection, depth is.
+    s = torch.where(visible, z if orthographic else 1.0 / z, torch.inf)
     su, sv = _slope(s, -1), _slope(s, -2)
     if orthographic:
         x, y, n = fx * su, fy * sv, torch.ones_like(s)
@@ -56,15 +56,15 @@ def shade(depth: Tensor, camera_matrix: Tensor, *, orthographic: bool = False) -
         )
         u, v = u - cx, v - cy
         x, y, n = fx * su, fy * sv, s - u * su - v * sv
-        # Its product with the pixel's ray (u / fx, v / fy, 1) is s itself.
+        # The product of the normal (x, y, n) with the pixel's ray (u / fx, v / fy, 1) is s.
         ray = ((u / fx).square() + (v / fy).square() + 1.0).sqrt()
         cosine = s / (ray * (x * x + y * y + n * n).sqrt())
-    return torch.where(seen, AMBIENT + (LIT - AMBIENT) * cosine, 1.0).to(depth.dtype)
+    return torch.where(visible, AMBIENT + (LIT - AMBIENT) * cosine, 1.0).to(depth.dtype)
 
 
 def _slope(s: Tensor, dim: int) -> Tensor:
-    """Difference per px along ``dim`` to the nearer of both neighbours; 0 where neither is on the surface."""
-    step = s.diff(dim=dim).nan_to_num(torch.inf, torch.inf, torch.inf)  # inf: the background on one side
+    """Difference per px along ``dim`` to the neighbour nearer in depth; 0 if neither neighbour is on the surface."""
+    step = s.diff(dim=dim).nan_to_num(torch.inf, torch.inf, torch.inf)  # inf beside the background
     edge = torch.full_like(s.narrow(dim, 0, 1), torch.inf)
     before, after = torch.cat([edge, step], dim), torch.cat([step, edge], dim)
     slope = torch.where(before.abs() < after.abs(), before, after)

@@ -1,4 +1,4 @@
-"""Depth by a z-buffer written in torch: any device, no compiled extension; the reference for the other backends."""
+"""A z-buffer written in torch: runs on any device and is the reference for the other backends."""
 
 import numpy as np
 import torch
@@ -11,24 +11,24 @@ from .protocol import NEAREST, check_render_arguments
 
 __all__ = ["TorchRenderer"]
 
-# Of a CPU, whose threads take a view each and whose caches are small, and of other devices:
+# On a CPU, where threads take a view each and caches are small, and on other devices:
 _PAIRS = 2**20, 2**24  # (triangle, pixel) pairs in memory at a time, about 60 bytes each
 _TRIANGLES = 2**18, 2**21  # triangles x views set up at a time, about 400 bytes each
-_SLACK = 1e-5  # barycentric share outside a triangle that still counts: closes the seams that rounding opens
+_TOLERANCE = 1e-5  # barycentric tolerance outside a triangle, which closes seams that rounding opens
 
 
 class TorchRenderer:
-    """Every pixel's centre is tested against every triangle whose box holds it, in chunks; the nearest wins.
+    """Tests every pixel's centre against every triangle whose box contains it, in chunks; the nearest one wins.
 
     Edge functions are formed from homogeneous points, so that no triangle needs clipping. They are set up in float64
-    (float32 where a device has none) at a pixel beside the triangle, and evaluated in float32.
+    (float32 on devices without it) at a pixel next to the triangle, and evaluated in float32.
 
-    Thread-safe. In a forked process torch itself hangs on more than one thread: call ``torch.set_num_threads(1)`` there
+    Thread-safe. In a forked process torch hangs with more than one thread: call ``torch.set_num_threads(1)`` there
     first, as the workers of a ``DataLoader`` do.
 
     Args:
         mesh: a clean mesh.
-        device: where views are rendered and depth stays.
+        device: where views are rendered and depth is returned.
     """
 
     name = "torch"
@@ -40,9 +40,9 @@ class TorchRenderer:
         vertices = (np.asarray(mesh.vertices) - self._centre.numpy()) / self._radius
         self._vertices = torch.from_numpy(vertices).to(self.device, self._setup_dtype)
         self._faces = torch.from_numpy(np.array(mesh.faces, dtype=np.int64)).to(self.device)
-        away = self.device.type != "cpu"
-        self._pairs, self._triangles = _PAIRS[away], _TRIANGLES[away]
-        self._views = max(1, self._triangles // len(self._faces)) if away else 1
+        on_accelerator = self.device.type != "cpu"
+        self._pairs, self._triangles = _PAIRS[on_accelerator], _TRIANGLES[on_accelerator]
+        self._views = max(1, self._triangles // len(self._faces)) if on_accelerator else 1
 
     @torch.no_grad()
     def render(
@@ -59,7 +59,7 @@ class TorchRenderer:
         depth = torch.full((len(T), H * W), torch.inf, device=self.device)
         views = self._views
 
-        @torch.no_grad()  # a thread does not inherit it
+        @torch.no_grad()  # threads do not inherit it
         def draw(i: int) -> None:
             for j in range(0, len(self._faces), self._triangles):
                 faces = self._faces[j : j + self._triangles]
@@ -85,10 +85,10 @@ class TorchRenderer:
         size: tuple[int, int],
         orthographic: bool,
     ) -> None:
-        """Lower (n * H * W,) depths, relative to t's z, by the faces as n views see them."""
+        """Draw faces as n views see them: lower (n * H * W,) depths, which are relative to the z of t."""
         H, W = size
-        turned = self._vertices @ R.mT  # (n, V, 3) relative to the object's centre
-        camera = turned + t[:, None]
+        rotated = self._vertices @ R.mT  # (n, V, 3) relative to the object's centre
+        camera = rotated + t[:, None]
         # Homogeneous pixels: K (x, y, z) or, orthographic, K (x, y, 1).
         ray = torch.cat([camera[..., :2], torch.ones_like(camera[..., :1])], -1) if orthographic else camera
         q = (ray @ K.mT)[:, faces]  # (n, F, 3 corners, 3)
@@ -100,10 +100,10 @@ class TorchRenderer:
             return
         count, low, extent = count[used], low.view(-1, 2)[used], extent.view(-1, 2)[used]
         first = (used // len(faces)) * (H * W) + low[:, 1] * W + low[:, 0]
-        z = turned[..., 2][:, faces].view(-1, 3)[used]
+        z = rotated[..., 2][:, faces].view(-1, 3)[used]
         edges = self._edges(q.view(-1, 3, 3)[used], low)
-        # The triangle's values side by side: three edge functions as (value at the window's corner, per column, per
-        # row), three relative depths.
+        # One row per triangle: three edge functions as (value at the window's corner, step per column, step per row)
+        # and three relative depths.
         table = torch.cat([edges.flatten(1), z], 1).float()
         near = NEAREST - t[:, 2].float()
         view = used // len(faces)
@@ -119,10 +119,10 @@ class TorchRenderer:
         border = torch.tensor([W, H], dtype=q.dtype, device=q.device)
         uv = q[..., :2] / q[..., 2:]
         low, high = uv.amin(dim=2), uv.amax(dim=2)
-        # Rounding must not lose a pixel whose centre lies on the triangle's rim.
+        # Rounding must not lose a pixel whose centre is on the triangle's edge.
         low = torch.minimum((low - 1e-3).ceil().clamp(min=0), border).long()
         high = torch.minimum(((high + 1e-3).floor() + 1).clamp(min=0), border).long()
-        crossing = (q[..., 2] <= 0).any(dim=2, keepdim=True)  # no finite projection: anywhere
+        crossing = (q[..., 2] <= 0).any(dim=2, keepdim=True)  # no finite projection: the whole image
         low = torch.where(crossing, 0, low)
         high = torch.where(crossing, border.long(), high)
         behind = (z < NEAREST).all(dim=2, keepdim=True)
@@ -131,12 +131,12 @@ class TorchRenderer:
     def _edges(self, q: Tensor, corner: Tensor) -> Tensor:
         """(T, 3 edges, 3) value at the window's corner pixel, step per column, step per row; inside all are >= 0."""
         pixel = torch.cat([corner.to(q), torch.ones_like(q[:, 0, :1])], 1)
-        # Corners relative to that pixel: small numbers, no cancellation.
+        # Corners relative to that pixel are small numbers, which avoids cancellation.
         local = q - pixel[:, None] * q[..., 2:]
         local[..., 2] = q[..., 2]
         normal = torch.linalg.cross(local[:, [1, 2, 0]], local[:, [2, 0, 1]])  # (T, 3, 3): columns are x, y, 1
         scale = normal.flatten(1).abs().amax(dim=1).clamp(min=torch.finfo(q.dtype).tiny)
-        # Either side may face the camera: the sign is that of the volume between triangle and camera.
+        # Either side may face the camera; the sign of the volume between triangle and camera decides.
         facing = (local[:, 0] * normal[:, 0]).sum(dim=1).sign()
         normal = normal * (facing / scale)[:, None, None]
         edges: Tensor = normal[..., [2, 0, 1]]
@@ -155,7 +155,7 @@ class TorchRenderer:
         start: int,
         stop: int,
     ) -> None:
-        """The pairs number ``start`` to ``stop``, counted through all triangles."""
+        """Draw the (triangle, pixel) pairs ``start`` to ``stop`` of all pairs."""
         a = int(torch.searchsorted(ends, start, right=True))
         b = int(torch.searchsorted(ends, stop, right=False)) + 1
         begins = (ends[a:b] - count[a:b]).clamp(min=start)
@@ -167,11 +167,11 @@ class TorchRenderer:
         x, y = column.float(), row.float()
         e = [values[:, 3 * i] + values[:, 3 * i + 1] * x + values[:, 3 * i + 2] * y for i in range(3)]
         total = e[0] + e[1] + e[2]
-        inside = (torch.minimum(torch.minimum(e[0], e[1]), e[2]) >= -_SLACK * total) & (total > 0)
-        kept = inside.nonzero()[:, 0]
-        triangle = triangle[kept]
-        z = sum((e[i][kept] * values[kept, 9 + i] for i in range(3)), start=torch.zeros_like(total[kept]))
-        z = z / total[kept]
-        seen = z >= near[triangle]
-        pixel = first[triangle] + row[kept] * W + column[kept]
-        depth.scatter_reduce_(0, pixel[seen], z[seen], "amin")
+        inside = (torch.minimum(torch.minimum(e[0], e[1]), e[2]) >= -_TOLERANCE * total) & (total > 0)
+        hit = inside.nonzero()[:, 0]
+        triangle = triangle[hit]
+        z = sum((e[i][hit] * values[hit, 9 + i] for i in range(3)), start=torch.zeros_like(total[hit]))
+        z = z / total[hit]
+        visible = z >= near[triangle]
+        pixel = first[triangle] + row[hit] * W + column[hit]
+        depth.scatter_reduce_(0, pixel[visible], z[visible], "amin")
