@@ -1,4 +1,4 @@
-"""Sphinx: ``scripts/docs.sh`` builds the site from these pages, the docstrings and the scripts of ``gallery``."""
+"""Sphinx configuration: ``scripts/docs.sh`` builds the site from the pages, the docstrings and ``gallery``."""
 
 import re
 from pathlib import Path
@@ -28,14 +28,14 @@ html_theme = "furo"
 html_title = "curvireg_torch"
 html_copy_source = False
 
-myst_heading_anchors = 4  # named as GitHub names them
+myst_heading_anchors = 4  # the same anchors as on GitHub
 
 autodoc_member_order = "bysource"
-autodoc_inherit_docstrings = False  # torch says the same of every forward()
+autodoc_inherit_docstrings = False  # torch repeats one docstring for every forward()
 autodoc_typehints_format = "short"
 autodoc_default_options = {"members": True, "imported-members": True}
 napoleon_custom_sections = ["Shape"]
-# A colon in the first line of an attribute's docstring is a colon, and does not follow a type.
+# In the docstring of an attribute, text before a colon is not its type.
 GoogleDocstring._consume_inline_attribute = lambda self: ("", self._dedent(self._consume_to_end()))  # type: ignore[method-assign]
 
 sphinx_gallery_conf = {
@@ -47,7 +47,7 @@ sphinx_gallery_conf = {
     "min_reported_time": 1,
 }
 
-PAGES = {
+COPIED_PAGES = {
     "CHANGELOG.md": "project/changelog.md",
     "CONTRIBUTING.md": "project/contributing.md",
     "SECURITY.md": "project/security.md",
@@ -56,55 +56,57 @@ PAGES = {
     "datasets/bop/README.md": "project/bop.md",
     "datasets/web/README.md": "project/web.md",
 }
-"""Pages of the site that are files elsewhere in the repository."""
+"""Files outside ``docs`` and the pages of the site that show them."""
+
+SHAPES = {"B", "C", "D", "F", "H", "K", "Module", "N", "S", "T", "V", "W", "size"}
+"""Words in docstrings that napoleon mistakes for types, and torch's Module."""
 
 
-def links_of_the_site(text: str, file: Path) -> str:
-    """The text of ``file`` with its links to files, by which it can be read as a file, led to the site's pages."""
+def site_links(text: str, file: Path) -> str:
+    """Rewrite the links of ``file`` between files of the repository as links between pages of the site."""
 
-    def led(match: re.Match[str]) -> str:
-        place = (file.parent / match[1]).resolve().relative_to(ROOT).as_posix()
-        place = re.sub(r"^docs/gallery/(\w+)\.py$", r"docs/auto_gallery/\1.rst", place)
-        place = "docs/index.md" if place == "README.md" else f"docs/{PAGES.get(place, '')}" if place in PAGES else place
-        return f"](/{place.removeprefix('docs/')}" if place.startswith("docs/") else match[0]
+    def site_link(match: re.Match[str]) -> str:
+        path = (file.parent / match[1]).resolve().relative_to(ROOT).as_posix()
+        path = re.sub(r"^docs/gallery/(\w+)\.py$", r"docs/auto_gallery/\1.rst", path)
+        if path == "README.md":
+            path = "docs/index.md"
+        elif path in COPIED_PAGES:
+            path = f"docs/{COPIED_PAGES[path]}"
+        return f"](/{path.removeprefix('docs/')}" if path.startswith("docs/") else match[0]
 
-    return re.sub(r"\]\(([\w./+-]+\.(?:md|py))(?=[#)])", led, text)
+    return re.sub(r"\]\(([\w./+-]+\.(?:md|py))(?=[#)])", site_link, text)
 
 
 def copy_pages(app: Any, *_: Any) -> None:
-    for place, page in PAGES.items():
-        text = links_of_the_site((ROOT / place).read_text(encoding="utf-8"), ROOT / place)
+    for path, page in COPIED_PAGES.items():
+        text = site_links((ROOT / path).read_text(encoding="utf-8"), ROOT / path)
         copy = Path(app.srcdir) / page
         if not copy.is_file() or copy.read_text(encoding="utf-8") != text:
             copy.parent.mkdir(exist_ok=True)
             copy.write_text(text, encoding="utf-8")
 
 
-def lead_links(app: Any, page: str, source: list[str]) -> None:
+def rewrite_links(app: Any, page: str, source: list[str]) -> None:
     file = Path(app.env.doc2path(page))
     if file.suffix == ".md" and file.parent.name != "project":
-        source[0] = links_of_the_site(source[0], file)
+        source[0] = site_links(source[0], file)
 
 
-def short_names(app: Any, env: Any, node: Any, text: Any) -> Any:
-    """A name in a docstring is that of the one documented object that ends so; of other libraries it is no link."""
+def resolve_short_names(app: Any, env: Any, node: Any, text: Any) -> Any:
+    """Link a name in a docstring to the one documented object that ends with it; names of other libraries stay text."""
     target = node.get("reftarget", "").strip(".")
     if node.get("refdomain") != "py":
         return None
     objects = env.get_domain("py").objects
     found = [target] if target in objects else sorted(n for n in objects if n.endswith("." + target.rsplit(".", 1)[-1]))
     if found:
-        place = app.builder.get_relative_uri(node["refdoc"], objects[found[0]].docname)
-        return nodes.reference("", "", text, internal=True, refuri=f"{place}#{objects[found[0]].node_id}")
+        page = app.builder.get_relative_uri(node["refdoc"], objects[found[0]].docname)
+        return nodes.reference("", "", text, internal=True, refuri=f"{page}#{objects[found[0]].node_id}")
     ours = target.startswith("curvireg_torch") or ("." not in target and target.isidentifier() and target not in SHAPES)
     return None if ours else text
 
 
-SHAPES = {"B", "C", "D", "F", "H", "K", "Module", "N", "S", "T", "V", "W", "size"}
-"""What napoleon takes for the names of types in our docstrings, and torch's Module, which it calls by this name."""
-
-
 def setup(app: Any) -> None:
     app.connect("config-inited", copy_pages)
-    app.connect("source-read", lead_links)
-    app.connect("missing-reference", short_names)
+    app.connect("source-read", rewrite_links)
+    app.connect("missing-reference", resolve_short_names)

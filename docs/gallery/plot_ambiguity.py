@@ -2,9 +2,9 @@
 Ambiguity, on the view sphere
 =============================
 
-The score of every view says what a photograph leaves open. Three objects, photographed from the same side: a truck that
-looks different from everywhere, a box that looks the same after half a turn, and a bottle that looks the same from all
-sides. The cross is the truth.
+The scores of all views show which poses a photograph cannot distinguish. Three objects are photographed from the same
+side: a truck without symmetry, a box that looks the same after a half turn, and a bottle that looks the same from all
+sides. The cross marks the true viewpoint.
 """
 
 import matplotlib.pyplot as plt
@@ -47,5 +47,5 @@ for row, (name, mesh) in zip(axes, objects.items(), strict=True):
 plt.show()
 
 # %%
-# One peak: the photograph decides. Two peaks: the pose is one of two, and both come back as hypotheses. A ridge: the
-# turn about the axis cannot be known, and need not be. How to tell the library of a symmetry: :doc:`/guides/symmetric`.
+# One peak: the photograph determines the pose. Two peaks: both poses are reported as hypotheses. A ridge: the rotation
+# about the axis is undetermined. :doc:`/guides/symmetric` shows how to declare a symmetry.

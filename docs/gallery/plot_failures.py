@@ -2,13 +2,12 @@
 A gallery of failures
 =====================
 
-A toy truck, drawn and registered with its own mesh and camera. The first picture is as it should be; each of the others
-breaks one of the library's conditions, and the answer is wrong. Contours are drawn at the pose that was found.
+A generated photograph of a toy truck is registered with its own mesh and camera. The first picture shows a correct
+pose. Each of the others violates one condition of the method, and the estimated pose, whose contours are drawn, is wrong.
 
-**Look at the confidence.** It was fitted on generated photographs that keep most of these conditions, some of them with
-a wrong mesh. Where they are broken it drops, and so does the support, how strongly edges lie under the contours: none
-of the wrong answers below is called reliable (from 0.9 on). That is no promise, so look at the overlay before you
-believe a number.
+**Check the confidence.** It was fitted on generated photographs that meet most of these conditions. Where they are
+violated, confidence and edge support drop: none of the wrong poses below is called reliable (0.9 or more). This is no
+guarantee, so check the overlay first.
 """
 
 import matplotlib.pyplot as plt
@@ -37,10 +36,10 @@ def photograph(seed):
 def show(picture, box, truth, title, registrar=truck):
     result = registrar([picture], box[None], K)[0]
     error = float(cr.rotation_error(result.rotation, truth))
-    told = f"confidence {result.confidence:.2f}, support {result.edge_support:.2f}"
+    numbers = f"confidence {result.confidence:.2f}, support {result.edge_support:.2f}"
     _, ax = plt.subplots(figsize=(5, 4.1), layout="constrained")
     ax.imshow(contour_overlay(registrar, result, picture, box))
-    ax.set(title=f"{title}\n{error:.0f}° from the truth; {told}", xticks=[], yticks=[])
+    ax.set(title=f"{title}\n{error:.0f}° from the truth; {numbers}", xticks=[], yticks=[])
     (x0, y0, x1, y1), room = box.tolist(), 50
     height, width = picture.shape[1:]
     ax.set(xlim=(max(x0 - room, 0), min(x1 + room, width)), ylim=(min(y1 + room, height), max(y0 - room, 0)))
@@ -48,19 +47,19 @@ def show(picture, box, truth, title, registrar=truck):
 
 
 # %%
-# As it should be
-# ---------------
+# All conditions met
+# ------------------
 #
-# The object whole, the box tight, the mesh the object's own.
+# The object is fully visible, the box is tight, and the mesh is exact.
 
 picture, box, truth = photograph(3)
-show(picture, box, truth, "all conditions kept")
+show(picture, box, truth, "all conditions met")
 
 # %%
 # Cut off by the border of the photograph
 # ---------------------------------------
 #
-# The box holds what is left of the object. The crop shows half of it where the views show all.
+# The box contains the visible half of the object, but views show the whole object.
 
 x0, y0, x1, y1 = box.tolist()
 middle = int((x0 + x1) / 2)
@@ -70,7 +69,7 @@ show(picture[:, :, :middle], torch.tensor([x0, y0, middle - 0.5, y1]), truth, "c
 # Upside down, declared upright
 # ------------------------------
 #
-# ``--pose upright`` compares upright views alone: the right one is not among them.
+# ``--pose upright`` compares upright views only, and the right view is not among them.
 
 show(
     picture.rot90(2, (1, 2)),
@@ -83,8 +82,8 @@ show(
 # The mesh of another object
 # --------------------------
 #
-# A car's mesh for a truck's photograph, both with their front along -y. At times a similar mesh does, here it turns
-# back to front.
+# The mesh is a car's, with its front along -y like the truck's. A similar mesh works sometimes; here front and back are
+# confused.
 
 car = random_shape(np.random.default_rng(3), "car").mesh()
 show(picture, box, truth, "another object's mesh", cr.Registrar(car, pipeline=upright, progress=False))
@@ -93,7 +92,7 @@ show(picture, box, truth, "another object's mesh", cr.Registrar(car, pipeline=up
 # A box that is far too large
 # ---------------------------
 #
-# By 30 and 40 % of the object to the left and below. Boxes that are 10 % wrong are allowed for.
+# It is 30 and 40 % too large on the left and at the bottom. About 10 % is tolerated.
 
 picture, box, truth = photograph(1)
 x0, y0, x1, y1 = box.tolist()
@@ -104,7 +103,7 @@ show(picture, torch.tensor([x0 - 0.3 * wide, y0 - 0.1 * high, x1 + 0.1 * wide, y
 # The whole image as the box
 # --------------------------
 #
-# A box that is given is believed: the object is taken to fill it. Without one it would have been looked for.
+# A given box is trusted: the object is assumed to fill it. Without a box, the object would be localized.
 
 picture, box, truth = photograph(5)
 show(picture, torch.tensor([-0.5, -0.5, 479.5, 359.5]), truth, "the whole image")
@@ -113,8 +112,8 @@ show(picture, torch.tensor([-0.5, -0.5, 479.5, 359.5]), truth, "the whole image"
 # Four fifths hidden
 # ------------------
 #
-# Something stands before the object. The box is that of the whole object. With six tenths hidden, this truck is still
-# found.
+# An occluder covers the object; the box is that of the whole object. With six tenths hidden, this truck is still
+# registered.
 
 picture, box, truth = photograph(2)
 x0, y0, x1, y1 = box.tolist()
@@ -124,4 +123,4 @@ picture[:, :, seen : int(x1 + 10)] = screen[:, :, seen : int(x1 + 10)]
 show(picture, box, truth, "hidden")
 
 # %%
-# What follows from it for use: :doc:`/limits`.
+# :doc:`/limits` lists the conditions.

@@ -2,16 +2,15 @@
 The method in pictures
 ======================
 
-A photograph and a mesh go in on two sides, both become vector fields and then descriptors, they meet once, and a pose
-comes out.
+Photograph and mesh are both converted to vector fields and then to descriptors; matching them gives a pose.
 """
 
 # %%
-# What is given
-# -------------
+# Input
+# -----
 #
-# A photograph, a box around the object, the camera matrix if it is known, and a mesh. Here all of it is made in code,
-# so that the truth is known.
+# A photograph, a box around the object, the camera matrix if known, and a mesh. Here all are generated, so that the
+# true pose is known.
 
 from dataclasses import replace
 
@@ -46,9 +45,9 @@ plt.show()
 # The photograph's side: a field
 # ------------------------------
 #
-# The square crop around the box becomes a vector field: its length says how much of an edge there is, its direction
-# points across the edge. Focus curves see every edge that is in focus; the small network that the default uses answers
-# with the edges of the object's shape alone. It has learnt that from scenes made in code.
+# The square crop around the box becomes a vector field: its length is the edge strength, its direction points across
+# the edge. Focus curves respond to every edge in focus; the default, a small network trained on generated scenes, responds
+# to the edges of the object's shape only.
 
 crop = cr.crop_images([photograph], box[None], size=128)[0]
 focus = cr.MultiScaleFocusCurves()(crop)
@@ -64,7 +63,7 @@ plt.show()
 # The mesh's side: depth views and their curvilinear saliency
 # -----------------------------------------------------------
 #
-# The mesh is rendered from many viewpoints, as depth. The curvilinear saliency of a depth image is the difference of
+# The depth of the mesh is rendered from many viewpoints. The curvilinear saliency of a depth image is the difference of
 # the principal curvatures of its graph: large at occluding contours and creases, zero on planes and spheres.
 
 registrar = cr.Registrar(mesh, pipeline=cr.Pipeline().with_pose_prior("upright"), progress=False)
@@ -86,8 +85,8 @@ plt.show()
 # Both become HOG descriptors
 # ---------------------------
 #
-# Orientations in 8 x 8 cells, modulo half a turn: a field and its negative are described alike. Drawn here: for each
-# cell, the directions *along* the edges, of the photograph and of the view that is right.
+# HOG accumulates orientations modulo 180 degrees in 8 x 8 cells, so a field and its negative have equal descriptors. The
+# drawing shows the directions *along* the edges in each cell, for the photograph and for the right view.
 
 query = registrar.matcher.query([photograph], box[None])
 ranking = registrar.matcher.rank(query)
@@ -113,11 +112,11 @@ draw_cells(axes[1], view_field, "the right view")
 plt.show()
 
 # %%
-# They meet: a score for every view
-# ---------------------------------
+# A score for every view
+# ----------------------
 #
-# The product of the ranking terms, for all azimuths and elevations of the bank. The cross is the truth. Other views
-# that score high are rivals, which are followed as well.
+# The product of the ranking terms for all azimuths and elevations of the bank. The cross marks the true viewpoint. Other
+# high scores become hypotheses, too.
 
 azimuths, elevations = bank.views.azimuth.unique(), bank.views.elevation.unique()
 order = (bank.views.elevation * 1000 + bank.views.azimuth).argsort()
@@ -135,8 +134,8 @@ plt.show()
 # From the best views to a pose
 # -----------------------------
 #
-# Around the best distinct views the pose is searched in small steps, then the mesh's contours are pulled onto the
-# photograph's edges. Left: the best view of the bank, placed into the box. Right: what is found.
+# A local search starts at the best distinct views; then the contour fit moves the mesh's contours onto the photograph's
+# edges. Left: the best view of the bank, placed into the box. Right: the final pose.
 
 coarse = cr.Registrar(bank, pipeline=replace(bank.pipeline, search=False, contours=False))
 before = coarse([photograph], box[None], K)[0]
@@ -151,4 +150,4 @@ for ax, which, result in ((axes[0], coarse, before), (axes[1], registrar, after)
 plt.show()
 
 # %%
-# What each step is exactly, and why: :doc:`/method`.
+# :doc:`/method` gives the equations of each step.
