@@ -3,7 +3,7 @@ A gallery of failures
 =====================
 
 A generated photograph of a toy truck is registered with its own mesh and camera. The first picture shows a correct
-pose. Each of the others violates one condition of the method, and the estimated pose, whose contours are drawn, is wrong.
+pose. Each of the others violates one condition of the method, and the estimated pose, drawn by its contours, is wrong.
 
 **Check the confidence.** It was fitted on generated photographs that meet most of these conditions. Where they are
 violated, confidence and edge support drop: none of the wrong poses below is called reliable (0.9 or more). This is no

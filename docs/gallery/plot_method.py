@@ -46,8 +46,8 @@ plt.show()
 # ------------------------------
 #
 # The square crop around the box becomes a vector field: its length is the edge strength, its direction points across
-# the edge. Focus curves respond to every edge in focus; the default, a small network trained on generated scenes, responds
-# to the edges of the object's shape only.
+# the edge. Focus curves respond to every edge in focus; the default, a small network trained on generated scenes,
+# responds to the edges of the object's shape only.
 
 crop = cr.crop_images([photograph], box[None], size=128)[0]
 focus = cr.MultiScaleFocusCurves()(crop)
@@ -85,8 +85,8 @@ plt.show()
 # Both become HOG descriptors
 # ---------------------------
 #
-# HOG accumulates orientations modulo 180 degrees in 8 x 8 cells, so a field and its negative have equal descriptors. The
-# drawing shows the directions *along* the edges in each cell, for the photograph and for the right view.
+# HOG accumulates orientations modulo 180 degrees in 8 x 8 cells, so a field and its negative have equal descriptors.
+# The drawing shows the directions *along* the edges in each cell, for the photograph and for the right view.
 
 query = registrar.matcher.query([photograph], box[None])
 ranking = registrar.matcher.rank(query)
@@ -115,8 +115,8 @@ plt.show()
 # A score for every view
 # ----------------------
 #
-# The product of the ranking terms for all azimuths and elevations of the bank. The cross marks the true viewpoint. Other
-# high scores become hypotheses, too.
+# The product of the ranking terms for all azimuths and elevations of the bank. The cross marks the true viewpoint.
+# Other high scores become hypotheses, too.
 
 azimuths, elevations = bank.views.azimuth.unique(), bank.views.elevation.unique()
 order = (bank.views.elevation * 1000 + bank.views.azimuth).argsort()
