@@ -5,5 +5,6 @@ set -euo pipefail
 "$venv/bin/ruff" check .
 "$venv/bin/ruff" format --check .
 "$venv/bin/codespell"
+"$venv/bin/lint-imports"
 "$venv/bin/mypy"
 "$venv/bin/python" -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile "$@"
