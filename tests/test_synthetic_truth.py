@@ -17,7 +17,7 @@ from curvireg_torch import (
     rotation_error,
     sample_views,
 )
-from curvireg_torch.geometry import place_view
+from curvireg_torch.geometry import pose_from_box
 from curvireg_torch.io import read_image
 from curvireg_torch.synthetic import random_pose, synthesize_photograph
 from tests._support.real_data import real_data
@@ -32,7 +32,7 @@ def share_within_30_degrees(field: torch.nn.Module, bank: ViewBank, scenes: list
     images, boxes = [image for image, _, _ in scenes], torch.stack([box for _, box, _ in scenes])
     best = bank.rotations[matcher(images, boxes).order[:, 0]]
     points = torch.from_numpy(bank.mesh.convex_hull.vertices.copy())
-    found = [place_view(points, R, box, CAMERA)[0] for R, (_, box, _) in zip(best, scenes, strict=True)]
+    found = [pose_from_box(points, R, box, CAMERA)[0] for R, (_, box, _) in zip(best, scenes, strict=True)]
     errors = [rotation_error(R, T[:3, :3]) for R, (_, _, T) in zip(found, scenes, strict=True)]
     return float((torch.stack(errors) < 30).float().mean())
 

@@ -1,4 +1,4 @@
-"""Viewpoints, cameras, view spheres and boxes, as tensors.
+"""Viewpoints, cameras, view spheres and boxes as tensors.
 
 Conventions of the whole library (pinned by ``tests/geometry``):
 
@@ -6,7 +6,7 @@ Conventions of the whole library (pinned by ``tests/geometry``):
 - Pixel (0, 0) is the centre of the top-left pixel; the image covers [-0.5, W - 0.5] x [-0.5, H - 0.5].
 - Boxes are ``x0, y0, x1, y1`` in pixels; depth is z along the optical axis in model units, background 0.
 - Angles are degrees at the API, radians inside. Images are RGB, floating, in [0, 1].
-- Poses are reported in the mesh file's own frame and unit; ``up`` says which of its axes points up, and turns nothing.
+- Poses refer to the frame and unit of the mesh file; ``up`` names the axis that points up and rotates nothing.
 """
 
 from .cameras import camera_matrix, project_points, projected_boxes, rotation_towards, transform
@@ -23,7 +23,7 @@ from .conversions import (
 )
 from .crops import box_iou, crop_images, crop_transforms, square_boxes, whole_image_box
 from .symmetry import symmetry_transforms, views_without_symmetric
-from .translation import place_view, translation_from_box
+from .translation import pose_from_box, translation_from_box
 from .up import up_rotation
 from .viewpoint import rotation_error, rotation_from_viewpoint, viewpoint_from_rotation
 from .views import ViewSphere, paper_views, sample_views, uniform_views
@@ -40,7 +40,7 @@ __all__ = [
     "opengl_from_opencv",
     "opengl_projection",
     "paper_views",
-    "place_view",
+    "pose_from_box",
     "project_points",
     "projected_boxes",
     "pytorch3d_from_opencv",

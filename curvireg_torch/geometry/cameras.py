@@ -1,4 +1,4 @@
-"""OpenCV pinhole cameras, projection, and translations from boxes."""
+"""OpenCV pinhole cameras and projection."""
 
 import math
 
@@ -31,23 +31,21 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dt
 
 
 def camera_of_view(fov: float, size: tuple[int, int]) -> Tensor:
-    """(3, 3) float64 camera matrix of a picture that shows ``fov`` degrees from its left to its right border.
-
-    Pixels are square, the principal point is the middle.
+    """(3, 3) float64 camera matrix of a horizontal field of view; square pixels, the principal point in the centre.
 
     Args:
         fov: degrees, 0 < fov < 180.
-        size: (H, W) of the picture in px.
+        size: (H, W) of the image in px.
 
     Raises:
-        InvalidInputError: another angle.
+        InvalidInputError: ``fov`` is out of range.
 
     Example:
         >>> camera_of_view(90.0, (480, 640))[0].round(decimals=6).tolist()
         [320.0, 0.0, 319.5]
     """
     if not 0.0 < fov < 180.0:
-        raise InvalidInputError(f"fov: expected 0 < degrees < 180 across the picture's width, got {fov:g}")
+        raise InvalidInputError(f"fov: expected 0 < degrees < 180 across the image's width, got {fov:g}")
     H, W = size
     focal = W / 2 / math.tan(math.radians(fov) / 2)
     return camera_matrix(focal, focal, (W - 1) / 2, (H - 1) / 2, dtype=torch.float64)
@@ -61,7 +59,7 @@ def transform(R: Tensor, t: Tensor) -> Tensor:
 
 
 def project_points(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False) -> Tensor:
-    """Pixel coordinates of model points, as ``cv2.projectPoints`` without distortion.
+    """Pixel coordinates of model points, as ``cv2.projectPoints`` gives without distortion.
 
     Args:
         points: (P, 3) or (N, P, 3) in model units.
@@ -74,7 +72,7 @@ def project_points(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, ortho
         (..., P, 2) pixel coordinates; pixel (0, 0) is the centre of the top-left pixel.
 
     Raises:
-        InvalidInputError: a pose that is not rigid and finite, or an unusable camera matrix.
+        InvalidInputError: a pose is not rigid and finite, or the camera matrix is unusable.
 
     Example:
         >>> K = camera_matrix(100.0, 100.0, 50.0, 50.0)
@@ -88,36 +86,30 @@ def project_points(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, ortho
 
 
 def projected(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False) -> Tensor:
-    """:func:`project_points` without its checks, for loops over poses that the library has made."""
+    """:func:`project_points` without its checks, for loops over poses that the library has computed."""
     cam = points @ T_cam_from_model[..., :3, :3].mT + T_cam_from_model[..., None, :3, 3]
     xy = cam[..., :2] if orthographic else cam[..., :2] / cam[..., 2:]
     return xy @ K[..., :2, :2].mT + K[..., None, :2, 2]
 
 
 def projected_boxes(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False) -> Tensor:
-    """(..., 4) boxes x0, y0, x1, y1 around the projections of model points; the exact silhouette box for vertices.
-
-    Points must lie in front of a perspective camera.
-    """
+    """(..., 4) boxes x0, y0, x1, y1 around projected model points, which must be in front of a perspective camera."""
     return boxes_around(project_points(points, T_cam_from_model, K, orthographic=orthographic))
 
 
 def boxes_around(pixels: Tensor) -> Tensor:
-    """(..., 4) smallest boxes x0, y0, x1, y1 that hold (..., P, 2) pixel coordinates."""
+    """(..., 4) smallest boxes x0, y0, x1, y1 around (..., P, 2) pixel coordinates."""
     return torch.cat([pixels.amin(dim=-2), pixels.amax(dim=-2)], dim=-1)
 
 
 def rotation_towards(rays: Tensor) -> Tensor:
-    """Smallest rotations that take the optical axis (0, 0, 1) onto rays.
-
-    A box away from the principal point is seen along a ray, not along the axis: a view rendered on the axis has to be
-    turned by this rotation to be the pose in the whole camera.
+    """Smallest rotations that take the optical axis (0, 0, 1) onto rays; they turn allocentric rotations into poses.
 
     Args:
         rays: (..., 3), z > 0, any length.
 
     Returns:
-        (..., 3, 3) rotations, R (0, 0, 1) = the ray, unit length.
+        (..., 3, 3) rotations with R (0, 0, 1) = ray / |ray|.
     """
     x, y, z = (rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)).unbind(-1)
     # Rodrigues with axis (0, 0, 1) x ray = (-y, x, 0): R = I + [v] + [v]^2 / (1 + z).

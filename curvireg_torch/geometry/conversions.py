@@ -1,8 +1,8 @@
-"""From the OpenCV camera to the conventions of others, and back.
+"""Conversions between the OpenCV camera and other conventions.
 
 | convention | camera axes | transform | principal point of pixel (i, j)'s centre |
 |---|---|---|---|
-| here, OpenCV | x right, y down, z forward | ``x_cam = R x + t`` | (i, j) |
+| OpenCV, used here | x right, y down, z forward | ``x_cam = R x + t`` | (i, j) |
 | OpenGL | x right, y up, z backward | ``x_cam = R x + t`` | (i + 0.5, j + 0.5) |
 | PyTorch3D | x left, y up, z forward | ``x_cam = x R + T`` (rows) | (i + 0.5, j + 0.5) |
 
@@ -35,17 +35,17 @@ def _flip(matrix: Tensor, signs: tuple[float, ...]) -> Tensor:
 
 
 def opengl_from_opencv(T_cam_from_model: Tensor) -> Tensor:
-    """Transform into the OpenGL camera (a view matrix, as ``gluLookAt`` makes it).
+    """Transform into the OpenGL camera: a view matrix, as of ``gluLookAt``.
 
     Args:
         T_cam_from_model: (..., 4, 4) into the OpenCV camera.
 
     Returns:
         (..., 4, 4) into the camera with x right, y up, z backward. Its inverse is the camera's pose in the model frame,
-        which trimesh, pyrender and Blender ask for.
+        which trimesh, pyrender and Blender expect.
 
     Raises:
-        InvalidInputError: not rigid, finite and floating (..., 4, 4).
+        InvalidInputError: not a finite, rigid, floating (..., 4, 4) transform.
 
     Example:
         >>> opengl_from_opencv(torch.eye(4)).diagonal().tolist()
@@ -56,7 +56,7 @@ def opengl_from_opencv(T_cam_from_model: Tensor) -> Tensor:
 
 
 def opencv_from_opengl(T_cam_from_model: Tensor) -> Tensor:
-    """Inverse of :func:`opengl_from_opencv`; the flip of two axes is its own inverse."""
+    """Inverse of :func:`opengl_from_opencv`: flipping two axes is its own inverse."""
     return opengl_from_opencv(T_cam_from_model)
 
 
@@ -72,10 +72,10 @@ def opengl_projection(
         orthographic: parallel projection.
 
     Returns:
-        (..., 4, 4) from the OpenGL camera to clip coordinates; OpenGL's row 0 is the image's last.
+        (..., 4, 4) from the OpenGL camera to clip coordinates; row 0 of OpenGL is the last row of the image.
 
     Raises:
-        InvalidInputError: bad K, size or clip distances.
+        InvalidInputError: K, size or clip distances are invalid.
 
     Example:
         >>> K = torch.tensor([[64.0, 0, 31.5], [0, 64.0, 31.5], [0, 0, 1]])
@@ -89,7 +89,7 @@ def opengl_projection(
     if not near < far or (near <= 0 and not orthographic):
         raise InvalidInputError(f"near, far: expected 0 < near < far, got {near}, {far}")
     fx, fy = K[..., 0, 0], K[..., 1, 1]
-    # The pixel's centre lies half a pixel from the corner that OpenGL counts from.
+    # OpenGL counts from the corner of a pixel, half a pixel from its centre.
     x0, y0 = 2.0 * (K[..., 0, 2] + 0.5) / W - 1.0, 1.0 - 2.0 * (K[..., 1, 2] + 0.5) / H
     P = torch.zeros(*K.shape[:-2], 4, 4, dtype=K.dtype, device=K.device)
     P[..., 0, 0], P[..., 1, 1] = 2.0 * fx / W, 2.0 * fy / H
@@ -116,7 +116,7 @@ def pytorch3d_from_opencv(T_cam_from_model: Tensor) -> tuple[Tensor, Tensor]:
         R (..., 3, 3), T (..., 3) with ``x_cam = x R + T`` for row vectors x; x left, y up, z forward.
 
     Raises:
-        InvalidInputError: not rigid, finite and floating (..., 4, 4).
+        InvalidInputError: not a finite, rigid, floating (..., 4, 4) transform.
 
     Example:
         >>> R, T = pytorch3d_from_opencv(transform(torch.eye(3), torch.tensor([1.0, 2.0, 3.0])))

@@ -1,4 +1,4 @@
-"""Boxes of photographs to square crops of fixed size, with the matching change of the camera matrix."""
+"""Boxes, and square crops of fixed size with their camera matrices."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,13 +21,13 @@ __all__ = [
 
 
 def whole_image_box(image: Tensor) -> Tensor:
-    """(4,) box that covers all of a (..., H, W) image."""
+    """(4,) box of a whole (..., H, W) image."""
     H, W = image.shape[-2:]
     return torch.tensor([-0.5, -0.5, W - 0.5, H - 0.5], dtype=torch.float32, device=image.device)
 
 
 def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
-    """Raise :class:`InvalidInputError` for boxes that are not (B, 4), empty, not finite or wholly outside their image.
+    """Raise :class:`InvalidInputError` for boxes that are empty, not finite or wholly outside their image.
 
     Args:
         boxes: (B, 4) x0, y0, x1, y1 in px.
@@ -37,15 +37,13 @@ def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
     for i, (box, (H, W)) in enumerate(zip(boxes.tolist(), sizes, strict=True)):
         x0, y0, x1, y1 = box
         number = f" {i}" if len(sizes) > 1 else ""
-        shown = f"box{number} ({x0:g}, {y0:g}, {x1:g}, {y1:g})"
+        name = f"box{number} ({x0:g}, {y0:g}, {x1:g}, {y1:g})"
         if not all(abs(v) < 1e9 for v in box):
-            raise InvalidInputError(f"{shown}: expected finite coordinates in px")
+            raise InvalidInputError(f"{name}: expected finite coordinates in px")
         if x1 <= x0 or y1 <= y0:
-            raise InvalidInputError(f"{shown}: expected X0 < X1 and Y0 < Y1; give corners, not width and height")
+            raise InvalidInputError(f"{name}: expected X0 < X1 and Y0 < Y1; give corners, not width and height")
         if x1 <= -0.5 or y1 <= -0.5 or x0 >= W - 0.5 or y0 >= H - 0.5:
-            raise InvalidInputError(
-                f"{shown}: wholly outside the {W} x {H} image; give pixel coordinates of this image"
-            )
+            raise InvalidInputError(f"{name}: wholly outside the {W} x {H} image; give pixel coordinates of this image")
 
 
 def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
@@ -76,52 +74,46 @@ def square_boxes(boxes: Tensor, margin: float) -> Tensor:
 
 
 def crop_transforms(squares: Tensor, size: int) -> Tensor:
-    """(..., 3, 3) maps from image pixels to pixels of the crop; ``A @ K`` is the crop's camera matrix.
+    """(..., 3, 3) maps from image pixels to crop pixels; ``A @ K`` is the crop's camera matrix.
 
-    The crop's outer border [-0.5, size - 0.5] falls on the square's.
+    The outer border of the crop, [-0.5, size - 0.5], falls on that of the square.
     """
     scale = size / (squares[..., 2] - squares[..., 0])
-    zero, one = torch.zeros_like(scale), torch.ones_like(scale)
-    rows = [
-        torch.stack([scale, zero, -squares[..., 0] * scale - 0.5], -1),
-        torch.stack([zero, scale, -squares[..., 1] * scale - 0.5], -1),
-        torch.stack([zero, zero, one], -1),
-    ]
-    return torch.stack(rows, -2)
+    return _scale_and_shift(scale, -squares[..., 0] * scale - 0.5, -squares[..., 1] * scale - 0.5)
 
 
 def image_transforms(squares: Tensor, size: int) -> Tensor:
-    """The inverse of :func:`crop_transforms`, exact zeros and ones in their places."""
-    side = (squares[..., 2] - squares[..., 0]) / size
-    zero, one = torch.zeros_like(side), torch.ones_like(side)
-    rows = [
-        torch.stack([side, zero, squares[..., 0] + 0.5 * side], -1),
-        torch.stack([zero, side, squares[..., 1] + 0.5 * side], -1),
-        torch.stack([zero, zero, one], -1),
-    ]
+    """The inverse of :func:`crop_transforms`, with exact zeros and ones, which LAPACK does not guarantee."""
+    scale = (squares[..., 2] - squares[..., 0]) / size
+    return _scale_and_shift(scale, squares[..., 0] + 0.5 * scale, squares[..., 1] + 0.5 * scale)
+
+
+def _scale_and_shift(scale: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    zero, one = torch.zeros_like(scale), torch.ones_like(scale)
+    rows = [torch.stack(row, -1) for row in ([scale, zero, x], [zero, scale, y], [zero, zero, one])]
     return torch.stack(rows, -2)
 
 
 def crop_images(
     images: Tensor | Sequence[Tensor], boxes: Any, *, size: int = 256, margin: float = 0.1
 ) -> tuple[Tensor, Tensor]:
-    """Square crops around boxes, resampled bilinearly, with a widened triangle (no aliasing) when shrinking.
+    """Square crops around boxes, resampled bilinearly, with a wider triangle filter (no aliasing) when shrinking.
 
-    A pixel of an image that is NaN or infinite is missing: pixels of the crop that it has a share in are NaN, no
-    others are. Half types are resampled in float32.
+    Pixels that are NaN or infinite are missing: exactly those pixels of the crop are NaN that depend on one. Half types
+    are resampled in float32.
 
     Args:
         images: (B, C, H, W), or a list of (C, H, W) of different sizes. Pixels outside an image repeat its border.
-        boxes: (B, 4) x0, y0, x1, y1 in px, a tensor, an array or lists; may stick out of the image.
+        boxes: (B, 4) x0, y0, x1, y1 in px, a tensor, an array or lists; may extend beyond the image.
         size: side of the crops in px.
-        margin: room around the box on each side, as a share of its longer side.
+        margin: added on each side of the box, as a fraction of its longer side.
 
     Returns:
-        crops (B, C, size, size) in the dtype of the images, and (B, 3, 3) transforms A, at least float32, ``A @ K``
-        being the crops' camera matrices.
+        crops (B, C, size, size) in the dtype of the images, and their (B, 3, 3) :func:`crop_transforms` A, at least
+        float32.
 
     Raises:
-        InvalidInputError: wrong shapes, or a box that is empty or wholly outside its image.
+        InvalidInputError: wrong shapes, or a box is empty or wholly outside its image.
 
     Example:
         >>> crops, A = crop_images(torch.rand(2, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30], [10, 5, 60, 47]]), size=32)
@@ -146,18 +138,18 @@ def crop_images(
 
 
 def _resample(images: Tensor, squares: Tensor, size: int) -> Tensor:
-    """(B, C, size, size) of (B, C, H, W) images, in their dtype; NaN where a missing pixel has a share."""
+    """(B, C, size, size) crops of (B, C, H, W) images, in their dtype."""
     H, W = images.shape[-2:]
-    # Half types cannot name the pixels of a photograph: bfloat16 has eight bits.
+    # Half types cannot represent pixel coordinates: bfloat16 has eight bits.
     x = images.to(torch.promote_types(images.dtype, torch.float32))
     squares = squares.to(x)
     rows = _triangle_weights(squares[:, 1], squares[:, 3], size, H)[:, None]
     columns = _triangle_weights(squares[:, 0], squares[:, 2], size, W)[:, None]
     crops = rows @ (x @ columns.mT)
-    if not bool(crops.isfinite().all()):  # 0 times NaN is NaN: one missing pixel spoils its row and column
-        lost = ~x.isfinite()
-        share = rows @ (lost.to(x) @ columns.mT)
-        crops = torch.where(share > 0, torch.nan, rows @ (torch.where(lost, 0.0, x) @ columns.mT))
+    if not bool(crops.isfinite().all()):  # 0 times NaN is NaN: one missing pixel would spread along its row and column
+        missing = ~x.isfinite()
+        weight = rows @ (missing.to(x) @ columns.mT)
+        crops = torch.where(weight > 0, torch.nan, rows @ (torch.where(missing, 0.0, x) @ columns.mT))
     return crops.to(images.dtype)
 
 

@@ -1,10 +1,11 @@
-"""The symmetries of a BOP object, and view sets that hold each appearance once."""
+"""Symmetries of BOP objects, and view sets without symmetric duplicates."""
 
 import math
 from collections.abc import Mapping
 from typing import Any
 
 import torch
+from kornia.geometry import vector_to_skew_symmetric_matrix
 from torch import Tensor
 
 from ..errors import InvalidInputError
@@ -17,21 +18,21 @@ __all__ = ["symmetry_transforms", "views_without_symmetric"]
 def symmetry_transforms(info: Mapping[str, Any], *, max_step_fraction: float = 0.01) -> Tensor:
     """All symmetries of an object as 4x4 transforms, from its entry in BOP's ``models_info.json``.
 
-    Each discrete symmetry is followed by each turn about each continuous axis. A vertex is at most half a diameter
-    away from an axis, so ``ceil(pi / max_step_fraction)`` turns move it by at most ``max_step_fraction`` diameters
-    between one and the next; BOP prescribes 0.01 (315 turns).
+    Each discrete symmetry is followed by each rotation about each continuous axis, in ``ceil(pi / max_step_fraction)``
+    steps: a vertex is at most half a diameter from an axis, so that a step moves it by at most ``max_step_fraction``
+    diameters. BOP prescribes 0.01 (315 steps).
 
     Args:
-        info: with ``symmetries_discrete`` (list of 16 numbers, a row-major 4x4 matrix) and ``symmetries_continuous``
-            (list of ``{"axis": [x, y, z], "offset": [x, y, z]}``, the offset a point of the axis); both may be absent,
-            other keys are ignored.
-        max_step_fraction: in (0, 1], the largest step of a vertex as a share of the object's diameter.
+        info: optional ``symmetries_discrete`` (lists of 16 numbers, row-major 4x4 matrices) and
+            ``symmetries_continuous`` (``{"axis": [x, y, z], "offset": [x, y, z]}``, the offset a point of the axis).
+        max_step_fraction: in (0, 1], the largest step of a vertex as a fraction of the object's diameter.
 
     Returns:
         (S, 4, 4) float64 on the CPU, S >= 1, in the unit of ``info`` (BOP: mm); the identity comes first.
 
     Raises:
-        InvalidInputError: a matrix without 16 numbers, an axis or offset without 3, an axis of length 0, a bad step.
+        InvalidInputError: a matrix does not have 16 numbers, an axis or offset 3, an axis has length 0, or the step is
+            out of range.
 
     Example:
         >>> symmetry_transforms({"diameter": 100.0}).shape
@@ -46,32 +47,31 @@ def symmetry_transforms(info: Mapping[str, Any], *, max_step_fraction: float = 0
     discrete = [identity]
     for matrix in info.get("symmetries_discrete", ()):
         discrete.append(_numbers(matrix, 16, "symmetries_discrete").view(4, 4))
-    turns = [identity[None]]
+    rotations = [identity[None]]
     for symmetry in info.get("symmetries_continuous", ()):
         axis = _numbers(symmetry["axis"], 3, "axis")
         offset = _numbers(symmetry.get("offset", (0.0, 0.0, 0.0)), 3, "offset")
-        turns.append(_turns(axis, offset, math.ceil(math.pi / max_step_fraction)))
+        rotations.append(_axis_rotations(axis, offset, math.ceil(math.pi / max_step_fraction)))
     # (C, 1, 4, 4) @ (D, 4, 4): the discrete symmetry acts first.
-    return (torch.cat(turns).unsqueeze(1) @ torch.stack(discrete)).flatten(0, 1)
+    return (torch.cat(rotations).unsqueeze(1) @ torch.stack(discrete)).flatten(0, 1)
 
 
 def views_without_symmetric(views: ViewSphere, symmetries: Tensor, *, tolerance: float = 1.0) -> ViewSphere:
-    """Views of a symmetric object that look different: the first of every group that symmetries map on each other.
+    """The views of a symmetric object that look different.
 
-    A view is dropped if an earlier one that is kept, at the same distance, shows the object turned by a symmetry.
+    A view is dropped if an earlier one at the same distance shows the same, up to a symmetry.
 
     Args:
         views: N views.
         symmetries: (S, 4, 4) or (S, 3, 3) of the model, from :func:`symmetry_transforms`.
-        tolerance: degrees within which two views count as the same. A regular grid needs no more than half a step of
-            the symmetries (0.6 degrees for BOP's 315 turns); views of a scattered sampling never coincide: give its
-            covering radius.
+        tolerance: degrees within which two views count as the same. For a regular grid half a step of the symmetries
+            suffices (0.6 degrees for BOP's 315 steps); for a scattered sampling use its covering radius.
 
     Returns:
         K <= N views, in their order.
 
     Raises:
-        InvalidInputError: symmetries of another shape or that are not rigid, or a bad tolerance.
+        InvalidInputError: symmetries of another shape or not rigid, or a negative tolerance.
 
     Example:
         >>> from curvireg_torch.geometry import sample_views
@@ -83,19 +83,19 @@ def views_without_symmetric(views: ViewSphere, symmetries: Tensor, *, tolerance:
     check_positive(tolerance, "tolerance", zero_ok=True)
     check_symmetries(symmetries)
     R = views.rotations.double()
-    turns = symmetries[:, :3, :3].to(R)
+    S = symmetries[:, :3, :3].to(R)
     # |A - B|_F = 2 sqrt(2) sin(angle / 2); float32 angles carry about 1e-5 degrees.
     limit = 3.0 - 4.0 * math.sin(math.radians(tolerance + 1e-3) / 2.0) ** 2
     kept: list[int] = []
-    open_views = torch.ones(len(views), dtype=torch.bool)
+    remaining = torch.ones(len(views), dtype=torch.bool)
     for i in range(len(views)):
-        if not open_views[i]:
+        if not remaining[i]:
             continue
         kept.append(i)
-        later = open_views.nonzero()[:, 0]
-        traces = (R[i] @ turns).flatten(1) @ R[later].flatten(1).T  # (S, L) traces of (R_i S)^T R_j
+        later = remaining.nonzero()[:, 0]
+        traces = (R[i] @ S).flatten(1) @ R[later].flatten(1).T  # (S, L) traces of (R_i S)^T R_j
         same = (traces.amax(dim=0) >= limit) & (views.distance[later] == views.distance[i]).cpu()
-        open_views[later[same]] = False
+        remaining[later[same]] = False
     return views[torch.tensor(kept)]
 
 
@@ -106,13 +106,12 @@ def _numbers(values: Any, count: int, name: str) -> Tensor:
     return numbers
 
 
-def _turns(axis: Tensor, offset: Tensor, count: int) -> Tensor:
-    """(count - 1, 4, 4) turns by multiples of 360 / count degrees about the axis through ``offset``."""
+def _axis_rotations(axis: Tensor, offset: Tensor, count: int) -> Tensor:
+    """(count - 1, 4, 4) rotations by multiples of 360 / count degrees about the axis through ``offset``."""
     length = torch.linalg.vector_norm(axis)
     if not bool(length > 0):
         raise InvalidInputError(f"axis: expected a direction of length > 0, got {axis.tolist()}")
-    x, y, z = (axis / length).tolist()
-    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+    cross: Tensor = vector_to_skew_symmetric_matrix(axis / length)
     angles = (torch.arange(1, count, dtype=torch.float64) * (2.0 * math.pi / count)).view(-1, 1, 1)
     transforms = torch.eye(4, dtype=torch.float64).repeat(count - 1, 1, 1)
     transforms[:, :3, :3] += angles.sin() * cross + (1.0 - angles.cos()) * (cross @ cross)

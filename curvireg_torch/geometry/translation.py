@@ -1,23 +1,24 @@
-"""Full poses of views, from the box that the object fills."""
+"""Poses from the box that an object fills."""
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_camera_matrix, check_finite, check_rotation
 from .cameras import boxes_around, projected, rotation_towards, transform
 
-__all__ = ["place_view", "translation_from_box"]
+__all__ = ["pose_from_box", "translation_from_box"]
 
 _ITERATIONS = 20
 
 
 def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor) -> Tensor:
-    """Translation that makes the projected points fill a box.
+    """Translation with which the projected points fill a box.
 
-    Fixed point of two closed-form steps: the sizes of projected and given box give the distance, their centres the
-    offset. With the true rotation and box it converges to the true translation; with others, to the best scale (in the
-    least-squares sense over width and height) with the centres equal.
+    Fixed point of two closed-form steps: the sizes of the projected and the given box determine the distance, their
+    centres the offset. With the true rotation and box it converges to the true translation; with others, to the best
+    scale (least squares over width and height) with equal centres.
 
     Args:
         points: (P, 3) of the model, for instance the vertices of its convex hull.
@@ -26,10 +27,10 @@ def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tenso
         K: (..., 3, 3).
 
     Returns:
-        (..., 3) float64 translation in model units, the object in front of the camera.
+        (..., 3) float64 translation in model units, with the object in front of the camera.
 
     Raises:
-        InvalidInputError: a matrix that is no rotation, an empty box, or an unusable camera matrix.
+        InvalidInputError: a matrix is not a rotation, the box is empty, or the camera matrix is unusable.
 
     Example:
         >>> cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
@@ -38,29 +39,27 @@ def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tenso
         >>> [round(v, 3) for v in t.tolist()]
         [0.0, 0.0, 5.0]
     """
-    return _filled(points, rotation, box, K, towards=False)[1]
+    return _fill_box(points, rotation, box, K, allocentric=False)[1]
 
 
-def place_view(points: Tensor, view_rotation: Tensor, box: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    """Pose of an object that a camera looking straight at its centre would see with ``view_rotation``.
+def pose_from_box(points: Tensor, view_rotation: Tensor, box: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    """Pose of an object from its allocentric rotation and its box.
 
     An object away from the principal point is seen along a ray, not along the optical axis: every step of
-    :func:`translation_from_box` turns the view towards the ray of the object's centre as it is known by then. With the
-    true view and box the pose is the true one.
+    :func:`translation_from_box` also rotates the view towards the ray of the object's current centre. With the true
+    view and box the pose is the true one.
 
     Args:
-        points, box, K: of :func:`translation_from_box`.
-        view_rotation: (..., 3, 3).
+        points, box, K: see :func:`translation_from_box`.
+        view_rotation: (..., 3, 3) as seen by a camera that looks straight at the object's centre.
 
     Returns:
         rotation (..., 3, 3) and translation (..., 3) in the photograph's camera, float64.
     """
-    return _filled(points, view_rotation, box, K, towards=True)
+    return _fill_box(points, view_rotation, box, K, allocentric=True)
 
 
-def _filled(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor, *, towards: bool) -> tuple[Tensor, Tensor]:
-    """Rotation and translation of :func:`translation_from_box`; of :func:`place_view` where the view turns ``towards``
-    the ray."""
+def _fill_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor, *, allocentric: bool) -> tuple[Tensor, Tensor]:
     check_finite(rotation, "rotation")
     check_rotation(rotation, "rotation")
     check_camera_matrix(K)
@@ -73,13 +72,13 @@ def _filled(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor, *, towards
     inverse = torch.linalg.inv(K)
     # Start far enough away for every point to be in front of the camera.
     z = torch.maximum(2.0 * extent * K[..., 0, 0] / size.amax(dim=-1), 2.0 * extent)
-    position = (inverse @ torch.nn.functional.pad(middle, (0, 1), value=1.0)[..., None])[..., 0] * z[..., None]
+    position = (inverse @ F.pad(middle, (0, 1), value=1.0)[..., None])[..., 0] * z[..., None]
     for _ in range(_ITERATIONS):
-        R = rotation_towards(position) @ view if towards else view
+        R = rotation_towards(position) @ view if allocentric else view
         low, high = boxes_around(projected(points - centre, transform(R, position), K)).split(2, dim=-1)
         zoom = ((high - low) * size).sum(dim=-1, keepdim=True) / (size * size).sum(dim=-1, keepdim=True)
-        shift = torch.nn.functional.pad(middle - 0.5 * (low + high), (0, 1))
+        offset = F.pad(middle - 0.5 * (low + high), (0, 1))
         # Move sideways at the object's depth, then along its ray; never closer than its own extent.
-        position = position + (inverse @ shift[..., None])[..., 0] * position[..., 2:]
+        position = position + (inverse @ offset[..., None])[..., 0] * position[..., 2:]
         position = position * torch.maximum(zoom, 1.05 * extent / position[..., 2:])
     return R, position - R @ centre

@@ -1,4 +1,4 @@
-"""Which axis of a mesh points up when the object stands. Meshes and poses stay in the file's own frame."""
+"""The axis that points up when an object stands. Meshes and poses stay in the frame of the file."""
 
 import torch
 from torch import Tensor
@@ -6,11 +6,11 @@ from torch import Tensor
 from ..utils.checks import check_option
 from ..utils.choices import UP_AXES
 
-__all__ = ["UP_AXES", "up_rotation"]
+__all__ = ["up_rotation"]
 
 
 def up_rotation(up: str) -> Tensor:
-    """(3, 3) float64 rotation that takes points of a frame whose axis ``up`` points up to one where z does.
+    """(3, 3) float64 rotation from a frame whose axis ``up`` points up to one whose z axis does.
 
     glTF's front, +z under y up, becomes -y, the front of PASCAL3D+ at azimuth 0.
 

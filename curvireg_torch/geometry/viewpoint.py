@@ -1,7 +1,7 @@
-"""PASCAL3D+ viewpoint angles, rotations and the angle between two rotations.
+"""PASCAL3D+ viewpoint angles, rotations, and the angle between two rotations.
 
-The PASCAL3D+ camera looks from ``C = d (cos e sin a, -cos e cos a, sin e)`` at the model's origin, +z of the model up
-in the image, turned by ``theta`` about the optical axis. With the image's y flipped to OpenCV's that is
+The PASCAL3D+ camera looks from ``C = d (cos e sin a, -cos e cos a, sin e)`` at the model's origin, with the model's +z
+up in the image, rotated by ``theta`` about the optical axis. With the image's y flipped to OpenCV's that is
 
     R = diag(1, -1, -1) Rz(theta) Rx(e - 90 deg) Rz(-a),    x_cam = R x_model + t,    t = (0, 0, d).
 """
@@ -17,7 +17,7 @@ __all__ = ["rotation_error", "rotation_from_viewpoint", "viewpoint_from_rotation
 
 
 def _as_floating(*values: Tensor | float) -> list[Tensor]:
-    device = next((v.device for v in values if isinstance(v, Tensor)), None)  # numbers go where tensors are
+    device = next((v.device for v in values if isinstance(v, Tensor)), None)  # of the tensors, for plain numbers
     tensors = [v if isinstance(v, Tensor) else torch.tensor(float(v), device=device) for v in values]
     tensors = [t if t.is_floating_point() else t.to(torch.get_default_dtype()) for t in tensors]
     dtype = tensors[0].dtype
@@ -27,7 +27,7 @@ def _as_floating(*values: Tensor | float) -> list[Tensor]:
 
 
 def rotation_from_viewpoint(azimuth: Tensor | float, elevation: Tensor | float, theta: Tensor | float = 0.0) -> Tensor:
-    """Rotation model -> OpenCV camera of a PASCAL3D+ viewpoint (METHOD of the PASCAL3D+ camera, see module).
+    """Rotation model -> OpenCV camera of a PASCAL3D+ viewpoint; the module states the equation.
 
     Args:
         azimuth, elevation, theta: degrees, numbers or tensors of broadcastable shapes (...).
@@ -60,13 +60,13 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         R: (..., 3, 3) rotations into the OpenCV camera.
 
     Returns:
-        azimuth in [0, 360), elevation in [-90, 90], theta in [-180, 180), degrees, each of shape (...). Looking
-        straight down or up (elevation +-90) azimuth and theta are not separable: theta is 0, azimuth carries the turn.
-        Where R is so near a pole that only rounding separates them, the azimuth is arbitrary and theta fits it. The
-        three angles give R back everywhere, within 5e-5 rad in float32.
+        azimuth in [0, 360), elevation in [-90, 90], theta in [-180, 180), degrees, each of shape (...). At the poles
+        (elevation +-90) azimuth and theta rotate about the same axis, and theta is 0. Close to a pole, where rounding
+        decides, the azimuth is arbitrary and theta matches it. :func:`rotation_from_viewpoint` gives R back everywhere,
+        within 5e-5 rad in float32.
 
     Raises:
-        InvalidInputError: another shape or dtype, or a matrix that is no rotation.
+        InvalidInputError: another shape or dtype, or a matrix is not a rotation.
 
     Example:
         >>> a, e, t = viewpoint_from_rotation(rotation_from_viewpoint(30.0, 20.0, -10.0))
@@ -81,8 +81,8 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     pole = planar < 4 * torch.finfo(R.dtype).eps
     # At the pole R[0] = (cos(a -+ theta), sin(a -+ theta), 0).
     a = torch.atan2(torch.where(pole, R[..., 0, 1], cx), torch.where(pole, R[..., 0, 0], -cy))
-    # Near the pole rounding decides the azimuth. The first column of R Rz(a) is (cos theta, -sin theta, 0): it gives
-    # the theta that belongs to this azimuth, so that the rotation comes back all the same.
+    # Near the pole rounding decides the azimuth. The first column of R Rz(a), (cos theta, -sin theta, 0), gives the
+    # theta that belongs to it.
     ca, sa = a.cos(), a.sin()
     theta = torch.atan2(-(R[..., 1, 0] * ca + R[..., 1, 1] * sa), R[..., 0, 0] * ca + R[..., 0, 1] * sa)
     theta = torch.where(pole, torch.zeros_like(theta), theta)
@@ -95,7 +95,7 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def rotation_error(R1: Tensor, R2: Tensor) -> Tensor:
     """Geodesic distance of rotations, ``acos((tr(R1^T R2) - 1) / 2)`` in degrees.
 
-    Computed as ``2 asin(|R1 - R2|_F / (2 sqrt 2))``, the same angle without the loss of digits of ``acos`` near 0.
+    Computed as ``2 asin(|R1 - R2|_F / (2 sqrt 2))``, which is accurate near 0, unlike ``acos``.
 
     Args:
         R1, R2: (..., 3, 3), broadcast against each other; NaN for a missing estimate.
@@ -104,7 +104,7 @@ def rotation_error(R1: Tensor, R2: Tensor) -> Tensor:
         (...) degrees in [0, 180]; NaN for a missing estimate.
 
     Raises:
-        InvalidInputError: another shape or dtype, or a matrix that is no rotation.
+        InvalidInputError: another shape or dtype, or a matrix is not a rotation.
 
     Example:
         >>> round(float(rotation_error(rotation_from_viewpoint(0.0, 0.0), rotation_from_viewpoint(30.0, 0.0))), 3)

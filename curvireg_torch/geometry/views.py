@@ -15,11 +15,7 @@ from .viewpoint import rotation_from_viewpoint, viewpoint_from_rotation
 __all__ = ["DEFAULT_DISTANCE", "ViewSphere", "paper_views", "sample_views", "uniform_views"]
 
 DEFAULT_DISTANCE = 5.0
-"""Distance of a view in units of the object's radius.
-
-Measured on photographs at 5 to 14 radii: descriptors of views at 5 radii come within 0.005 of the cosine of views at
-the true distance (``docs/experiments.md``); nearer views lose more.
-"""
+"""Distance of a view in units of the object's radius: ``docs/experiments.md`` compares others."""
 
 
 @dataclass(frozen=True)
@@ -61,20 +57,20 @@ class ViewSphere:
         elevation: tuple[float, float] = (-90.0, 90.0),
         theta: tuple[float, float] = (-180.0, 180.0),
     ) -> "ViewSphere":
-        """The views inside a range of poses, borders included.
+        """The views inside a range of viewpoints, borders included.
 
         Args:
-            azimuth, theta: (from, to) in degrees, turning upwards, so (350, 10) are the 20 degrees around 0.
+            azimuth, theta: (from, to) in degrees, upwards modulo 360: (350, 10) are the 20 degrees around 0.
             elevation: (low, high) in degrees.
 
         Raises:
-            InvalidInputError: no view lies in the range.
+            InvalidInputError: no view is inside the range.
 
         Example:
-            >>> len(uniform_views(100).within(elevation=(0, 90)))            # a car stands on its wheels
+            >>> len(uniform_views(100).within(elevation=(0, 90)))
             50
         """
-        inside = _in_turn(self.azimuth, *azimuth) & _in_turn(self.theta, *theta)
+        inside = _in_arc(self.azimuth, *azimuth) & _in_arc(self.theta, *theta)
         inside &= (self.elevation >= elevation[0]) & (self.elevation <= elevation[1])
         if not bool(inside.any()):
             raise InvalidInputError(
@@ -84,10 +80,10 @@ class ViewSphere:
         return self[inside]
 
     def for_up(self, up: str) -> "ViewSphere":
-        """These views of an object that stands on z, as views of one whose axis ``up`` points up, in its own frame.
+        """The same views of an object whose axis ``up`` points up instead of z, in the frame of that object.
 
         Args:
-            up: "x", "y", "z", "-x", "-y" or "-z"; :func:`curvireg_torch.io.meshes.mesh_up` says it of a mesh.
+            up: "x", "y", "z", "-x", "-y" or "-z"; see :func:`curvireg_torch.io.meshes.mesh_up`.
 
         Example:
             >>> y_up = sample_views(azimuths=[0.0], elevations=[90.0]).for_up("y")          # from above
@@ -99,19 +95,19 @@ class ViewSphere:
         return self if up == "z" else self.in_model_frame(T)
 
     def in_model_frame(self, T_views_from_model: Tensor) -> "ViewSphere":
-        """Views that were chosen in another frame of the model, as views of the model's own frame.
+        """Views of another frame of the model, expressed in the model's frame.
 
-        With :func:`normalization_transform` views are laid out along an object's principal axes while poses stay in
-        the file's frame.
+        With :func:`curvireg_torch.io.meshes.normalization_transform` views follow the principal axes of an object
+        while poses stay in the frame of the file.
 
         Args:
-            T_views_from_model: (4, 4) similarity from the model's own frame to that of these views.
+            T_views_from_model: (4, 4) similarity from the model's frame to that of these views.
+
+        Raises:
+            InvalidInputError: not a similarity.
 
         Example:
-            >>> import trimesh
-            >>> from curvireg_torch.io.meshes import normalization_transform
-            >>> T = normalization_transform(trimesh.creation.box((1, 2, 3)), align_axes=True)
-            >>> len(uniform_views(100).in_model_frame(T))
+            >>> len(uniform_views(100).in_model_frame(torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0]))))
             100
         """
         if T_views_from_model.shape != (4, 4) or not T_views_from_model.is_floating_point():
@@ -121,19 +117,19 @@ class ViewSphere:
             )
         linear = T_views_from_model[:3, :3].double()
         scale = torch.linalg.det(linear)
-        turn = linear / scale.abs() ** (1 / 3)
-        if not (scale > 0 and torch.allclose(turn @ turn.T, torch.eye(3, dtype=torch.float64), atol=1e-5)):
-            raise InvalidInputError("T_views_from_model: expected a rotation, a scale > 0 and a shift")
+        R = linear / scale.abs() ** (1 / 3)
+        if not (scale > 0 and torch.allclose(R @ R.T, torch.eye(3, dtype=torch.float64), atol=1e-5)):
+            raise InvalidInputError("T_views_from_model: expected a rotation, a scale > 0 and a translation")
         exact = rotation_from_viewpoint(self.azimuth.double(), self.elevation.double(), self.theta.double())
-        azimuth, elevation, theta = viewpoint_from_rotation(exact @ turn.to(exact.device))
+        azimuth, elevation, theta = viewpoint_from_rotation(exact @ R.to(exact.device))
         return ViewSphere(azimuth.to(self.azimuth), elevation.to(self.azimuth), theta.to(self.azimuth), self.distance)
 
 
-def _in_turn(angle: Tensor, start: float, stop: float) -> Tensor:
-    """Whether angles lie on the way up from ``start`` to ``stop``, degrees modulo 360."""
+def _in_arc(angle: Tensor, start: float, stop: float) -> Tensor:
+    """Whether angles are between ``start`` and ``stop``, upwards modulo 360 degrees."""
     if stop - start >= 360.0:
         return torch.ones_like(angle, dtype=torch.bool)
-    # A hair of slack, so that rounding never drops a border.
+    # A tolerance keeps rounding from dropping the borders.
     return (angle - start + 1e-3) % 360.0 <= (stop - start) % 360.0 + 2e-3
 
 
@@ -150,17 +146,16 @@ def sample_views(
     distances: Sequence[float] = (DEFAULT_DISTANCE,),
     azimuths: Sequence[float] | None = None,
 ) -> ViewSphere:
-    """Grid of viewpoints; the default suits an object that stands upright, seen from the side or from above.
+    """Grid of viewpoints; by default of an upright object, seen from the side or from above.
 
     Args:
-        azimuth_step: degrees; the circle is divided into round(360 / step) equal parts.
+        azimuth_step: degrees; the circle is divided into ``round(360 / azimuth_step)`` equal parts.
         elevations, thetas: degrees.
         distances: in units of the object's radius, > 1.
         azimuths: degrees, instead of the full circle in steps.
 
     Returns:
-        All combinations, distance fastest, then theta, azimuth, elevation. At the poles, where azimuth and theta
-        turn about the same axis, nothing is left out.
+        All combinations, distance fastest, then theta, azimuth, elevation. Duplicates at the poles stay.
 
     Raises:
         InvalidInputError: an empty range, a step that is not positive, or a distance <= 1.
@@ -173,15 +168,11 @@ def sample_views(
     if azimuths is None:
         count = max(1, round(360.0 / azimuth_step))
         azimuths = [360.0 * i / count for i in range(count)]
-    for name, values in (
-        ("azimuths", azimuths),
-        ("elevations", elevations),
-        ("thetas", thetas),
-        ("distances", distances),
-    ):
+    ranges = {"elevations": elevations, "azimuths": azimuths, "thetas": thetas, "distances": distances}
+    for name, values in ranges.items():
         if len(values) == 0:
             raise InvalidInputError(f"{name}: expected at least one value, got none")
-    axes = [torch.tensor([float(v) for v in values]) for values in (elevations, azimuths, thetas, distances)]
+    axes = [torch.tensor([float(v) for v in values]) for values in ranges.values()]
     _check_elevations(elevations, "elevations")
     elevation, azimuth, theta, distance = (v.flatten() for v in torch.meshgrid(*axes, indexing="ij"))
     return ViewSphere(azimuth, elevation, theta, distance)
@@ -190,13 +181,12 @@ def sample_views(
 def paper_views(*, object_radius: float = 0.2) -> ViewSphere:
     """The paper's grid: azimuth in steps of 20 degrees, elevation of 50 degrees, distance of 0.3 m up to 2 m.
 
-    The paper says "around 700" views. Its steps give that number where elevation runs on over the poles, around the
-    whole circle (0, 50, ..., 300 degrees): 18 x 7 x 6 = 756. Past a pole the camera is upside down. An orthographic
-    camera, as the paper's, does not see the distance: there, 126 of these views differ.
+    The paper states "around 700" views. Its steps give 18 x 7 x 6 = 756 if elevation covers the whole circle (0, 50,
+    ..., 300 degrees); past a pole the camera is upside down. For the paper's orthographic camera the distance does not
+    matter, and 126 of the views differ.
 
     Args:
-        object_radius: of the object, in m: the paper's distances are metric. Below 0.3, so that the nearest camera
-            stays outside.
+        object_radius: in m, because the paper's distances are metric; below 0.3, the distance of the nearest camera.
 
     Example:
         >>> len(paper_views())
@@ -207,13 +197,12 @@ def paper_views(*, object_radius: float = 0.2) -> ViewSphere:
         raise InvalidInputError(f"object_radius: expected < 0.3 m, the paper's nearest camera, got {object_radius}")
     distances = [0.3 * i / object_radius for i in range(1, 7)]
     grids = []
-    for turn in range(0, 350, 50):
-        # Over the pole: the same camera stands on the other side, upside down.
-        over = 90 < turn < 270
-        elevation = math.degrees(math.asin(math.sin(math.radians(turn))))
+    for angle in range(0, 350, 50):
+        elevation = math.degrees(math.asin(math.sin(math.radians(angle))))
         grid = sample_views(azimuth_step=20.0, elevations=[elevation], distances=distances)
-        shift = 180.0 if over else 0.0
-        grids.append(ViewSphere((grid.azimuth + shift) % 360.0, grid.elevation, grid.theta - shift, grid.distance))
+        # Past the pole the camera is on the other side, upside down.
+        half = 180.0 if 90 < angle < 270 else 0.0
+        grids.append(ViewSphere((grid.azimuth + half) % 360.0, grid.elevation, grid.theta - half, grid.distance))
     return ViewSphere(
         *(torch.cat([getattr(g, name) for g in grids]) for name in ("azimuth", "elevation", "theta", "distance"))
     )
@@ -228,18 +217,18 @@ def uniform_views(
 ) -> ViewSphere:
     """Near-uniform view directions on (a band of) the sphere, by the Fibonacci spiral.
 
-    Covering radius: on the full sphere no direction is farther than ``157 / sqrt(count)`` degrees from its nearest
-    (measured for 2 to 3000 directions; 5.9 degrees for 700). Every theta and distance repeats the same directions; with
-    thetas all around in steps of ``s`` degrees no rotation is farther than the covering radius + ``s / 2``.
+    Covering radius: on the full sphere no direction is farther than ``157 / sqrt(count)`` degrees from the nearest view
+    (measured for 2 to 3000 directions; 5.9 degrees for 700). With thetas in steps of ``s`` degrees around the circle no
+    rotation is farther than that + ``s / 2``.
 
     Args:
-        count: view directions; each comes with every theta and distance.
+        count: number of view directions; each is combined with every theta and distance.
         elevation_range: (low, high) in degrees, within [-90, 90].
-        thetas: degrees in the image plane.
+        thetas: in-plane rotations in degrees.
         distances: in units of the object's radius, > 1.
 
     Raises:
-        InvalidInputError: count < 1, a range that is empty or leaves [-90, 90], an empty option, or a distance <= 1.
+        InvalidInputError: count < 1, an empty range or one beyond [-90, 90], an empty option, or a distance <= 1.
 
     Example:
         >>> len(uniform_views(100, thetas=[0, 90, 180, 270]))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..geometry.cameras import rotation_towards
-from ..geometry.translation import place_view
+from ..geometry.translation import pose_from_box
 from ..matching import ViewDescriber
 from .contour import ContourFit, contour_support, fit_contours
 from .hypotheses import Hypotheses
@@ -73,7 +73,7 @@ def lift_to_poses(describers: Sequence[ViewDescriber], found: Hypotheses, boxes:
             )
         else:
             cameras[mine] = K[photograph]
-            T[mine, :3, :3], T[mine, :3, 3] = place_view(
+            T[mine, :3, :3], T[mine, :3, 3] = pose_from_box(
                 describe.hull, found.rotation[mine], boxes[photograph], K[photograph]
             )
     return Poses(found, T, cameras)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..geometry import rotation_error, rotation_from_axis_angle
-from ..geometry.translation import place_view
+from ..geometry.translation import pose_from_box
 from ..matching import Ranking, ViewBank, ViewDescriber
 from .hypotheses import Hypotheses
 from .rescoring import similarities
@@ -176,7 +176,7 @@ def _placed(describers: Sequence[ViewDescriber], state: Hypotheses, boxes: Tenso
     for model in state.model.unique().tolist():
         mine = state.model == model
         describe, photograph = describers[model], state.photograph[mine]
-        R, t = place_view(describe.hull, state.rotation[mine], boxes[photograph], cameras[photograph])
+        R, t = pose_from_box(describe.hull, state.rotation[mine], boxes[photograph], cameras[photograph])
         distance[mine] = torch.linalg.vector_norm(R @ describe.centre + t, dim=1)
     return distance
 

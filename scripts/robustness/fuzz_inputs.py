@@ -23,7 +23,7 @@ from safetensors.torch import load, save
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset, WebCollection, read_bop_csv
 from curvireg_torch.errors import CurviregError
-from curvireg_torch.geometry import camera_matrix, crop_images, place_view, square_boxes, translation_from_box
+from curvireg_torch.geometry import camera_matrix, crop_images, pose_from_box, square_boxes, translation_from_box
 from curvireg_torch.geometry.crops import check_boxes
 from curvireg_torch.io import read_photo
 from curvireg_torch.io.mat_files import read_mat
@@ -329,7 +329,7 @@ def _camera(values: list[float], box: list[float]) -> None:
     corners = extreme_points(trimesh.creation.box((0.1, 0.2, 0.3)))
     boxes = torch.tensor(box, dtype=torch.float64)
     check_boxes(boxes[None], [(48, 64)])
-    R, t = place_view(corners, torch.eye(3, dtype=torch.float64), boxes, K)
+    R, t = pose_from_box(corners, torch.eye(3, dtype=torch.float64), boxes, K)
     assert bool(R.isfinite().all() and t.isfinite().all())
     assert bool(translation_from_box(corners, torch.eye(3, dtype=torch.float64), boxes, K).isfinite().all())
 

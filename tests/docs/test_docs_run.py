@@ -17,7 +17,7 @@ import torch
 import curvireg_torch as cr
 from curvireg_torch import cli
 from curvireg_torch.geometry import rotation_error, transform
-from curvireg_torch.geometry.translation import place_view
+from curvireg_torch.geometry.translation import pose_from_box
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 
 from .._support.exif import exif, with_exif
@@ -60,7 +60,7 @@ def pose(azimuth: float) -> torch.Tensor:
     """(4, 4) pose of the truck in m, whose box is about 410 220 890 700."""
     points, box = torch.from_numpy(example_mesh().vertices.copy()), torch.tensor([410.0, 220.0, 890.0, 700.0])
     view = cr.rotation_from_viewpoint(torch.tensor(azimuth, dtype=torch.float64), 30.0, 0.0)
-    return transform(*place_view(points, view, box, cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0)))
+    return transform(*pose_from_box(points, view, box, cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0)))
 
 
 @pytest.fixture(scope="module")

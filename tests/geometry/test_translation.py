@@ -40,7 +40,7 @@ def test_true_rotation_and_box_give_the_true_translation(spread: float) -> None:
 @pytest.mark.parametrize("spread", [0.0, 0.3])
 def test_true_view_and_box_give_the_true_pose(spread: float) -> None:
     for hull, centre, view, R, t, box in truths(spread):
-        found_R, found_t = g.place_view(hull, view, box, K)
+        found_R, found_t = g.pose_from_box(hull, view, box, K)
         distance = (R @ centre + t).norm()
         assert float(g.rotation_error(found_R, R)) < 0.01
         assert float((found_R @ centre + found_t - R @ centre - t).norm() / distance) < 1e-4
@@ -48,8 +48,8 @@ def test_true_view_and_box_give_the_true_pose(spread: float) -> None:
 
 def test_scale_of_the_model_scales_the_translation() -> None:
     hull, _, view, _, _, box = truths(0.3, 1)[0]
-    R1, t1 = g.place_view(hull, view, box, K)
-    R2, t2 = g.place_view(1000.0 * hull, view, box, K)
+    R1, t1 = g.pose_from_box(hull, view, box, K)
+    R2, t2 = g.pose_from_box(1000.0 * hull, view, box, K)
     torch.testing.assert_close(R2, R1, rtol=0, atol=1e-12)
     torch.testing.assert_close(t2, 1000.0 * t1, rtol=1e-12, atol=0)
 

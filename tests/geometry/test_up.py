@@ -8,11 +8,11 @@ import trimesh
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import up_rotation
-from curvireg_torch.geometry.up import UP_AXES
 from curvireg_torch.io.meshes import mesh_up, with_z_up
 from curvireg_torch.io.meshes.mesh import as_mesh
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.settings import ViewPolicy
+from curvireg_torch.utils.choices import UP_AXES
 
 AXES = {s + a: (-1 if s else 1) * np.eye(3)[i] for i, a in enumerate("xyz") for s in ("", "-")}
 

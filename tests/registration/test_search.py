@@ -11,7 +11,7 @@ from torch import Tensor
 from curvireg_torch import Registrar, camera_matrix, project_points, rotation_error
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_axis_angle
-from curvireg_torch.geometry.translation import place_view
+from curvireg_torch.geometry.translation import pose_from_box
 from curvireg_torch.registration import coherent_views
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration.hypotheses import Hypotheses
@@ -133,7 +133,7 @@ def test_a_round_that_finds_nothing_better_leaves_the_distance():
     K = camera_matrix(500.0, 500.0, 320.0, 240.0, dtype=torch.float64)
     start, truth = turn(0.0, 40.0, 0.0), turn(5.0, 0.0, 0.0) @ turn(0.0, 40.0, 0.0)
     box = torch.tensor([[260.0, 150.0, 380.0, 330.0]], dtype=torch.float64)
-    filled = {name: place_view(CORNERS, R, box[0], K) for name, R in (("start", start), ("truth", truth))}
+    filled = {name: pose_from_box(CORNERS, R, box[0], K) for name, R in (("start", start), ("truth", truth))}
     away = {name: float(t.norm()) for name, (_, t) in filled.items()}
     assert abs(away["start"] / away["truth"] - 1.0) > 0.001
     found = around(truth, start, boxes=box, camera_matrices=K[None])

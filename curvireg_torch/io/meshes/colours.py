@@ -1,4 +1,4 @@
-"""The colours that a mesh brings along: of its textures, materials, faces or vertices."""
+"""Surface colours of a mesh, from its textures, materials, faces or vertices."""
 
 import warnings
 from collections.abc import Sequence
@@ -14,22 +14,22 @@ from ...limits import MAX_IMAGE_PIXELS
 __all__ = ["SurfaceColours", "has_colours", "surface_colours"]
 
 TEXTURE_SIDE = 512
-"""Textures are shrunk to so many px on their longer side: a view shows an object smaller than that."""
+"""Textures are reduced to this longer side in px; views are smaller."""
 
-_UNSET = (102, 102, 102)  # what trimesh gives a material of which the file says nothing
+_UNSET = (102, 102, 102)  # trimesh's colour for a material without one
 _PLAIN = 255
 
 
 @dataclass(frozen=True)
 class SurfaceColours:
-    """Colour of every point of F faces: the corners' colours, interpolated, times the texture's.
+    """Colours of F faces: interpolated between the corners and multiplied by a texture.
 
-    Everything belongs to corners of faces, not to vertices, so that vertices may be merged and renumbered.
+    All values belong to corners of faces, so that vertices may be merged and renumbered.
 
     Attributes:
         corners: (F, 3, 3) uint8 RGB.
         uv: (F, 3, 2) float32 texture coordinates; (0, 0) is the bottom left, and textures repeat.
-        texture: (F,) int32 number of the texture, -1 for none.
+        texture: (F,) int32 index of the texture, -1 for none.
         textures: (h, w, 3) uint8 RGB each.
     """
 
@@ -45,27 +45,27 @@ class SurfaceColours:
         return SurfaceColours(self.corners[faces], self.uv[faces], self.texture[faces], self.textures)
 
     def check(self, faces: int) -> None:
-        """Raise ValueError unless these are colours of so many faces."""
+        """Raise ValueError unless these are valid colours of ``faces`` faces."""
         parts = (self.corners, (faces, 3, 3), np.uint8), (self.uv, (faces, 3, 2), np.float32)
-        fits = all(x.shape == shape and x.dtype == kind for x, shape, kind in parts)
-        fits = fits and self.texture.shape == (faces,) and self.texture.dtype == np.int32
-        fits = fits and all(t.ndim == 3 and t.shape[2] == 3 and t.size and t.dtype == np.uint8 for t in self.textures)
+        valid = all(x.shape == shape and x.dtype == dtype for x, shape, dtype in parts)
+        valid = valid and self.texture.shape == (faces,) and self.texture.dtype == np.int32
+        valid = valid and all(t.ndim == 3 and t.shape[2] == 3 and t.size and t.dtype == np.uint8 for t in self.textures)
         if (
-            not fits
+            not valid
             or not np.isfinite(self.uv).all()
             or not -1 <= self.texture.min() <= self.texture.max() < len(self.textures)
         ):
-            raise ValueError("colours that do not fit the mesh")
+            raise ValueError("colours that do not match the mesh")
 
     @classmethod
     def plain(cls, faces: int, colour: Sequence[int] = (_PLAIN,) * 3) -> "SurfaceColours":
-        """One colour everywhere, white unless told otherwise."""
+        """One colour everywhere, white by default."""
         corners = np.broadcast_to(np.array(colour, np.uint8), (faces, 3, 3))
         return cls(corners, np.zeros((faces, 3, 2), np.float32), np.full(faces, -1, np.int32))
 
     @classmethod
-    def joined(cls, parts: Sequence["SurfaceColours"]) -> "SurfaceColours":
-        """The colours of meshes one after the other."""
+    def concatenate(cls, parts: Sequence["SurfaceColours"]) -> "SurfaceColours":
+        """The colours of a mesh that is made of several."""
         first = np.cumsum([0] + [len(part.textures) for part in parts])
         texture = [np.where(part.texture < 0, -1, part.texture + k) for part, k in zip(parts, first, strict=False)]
         return cls(
@@ -77,18 +77,18 @@ class SurfaceColours:
 
     def at(self, face: NDArray[np.int32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
         """(N, 3) RGB in [0, 1] at the points (1 - u - v) a + u b + v c of faces with corners a, b, c."""
-        share = np.stack([1.0 - u - v, u, v], axis=1)[..., None].astype(np.float32)
-        colour: NDArray[np.float32] = (self.corners[face] * share).sum(axis=1) / np.float32(255)
-        place = (self.uv[face] * share).sum(axis=1)
-        number = self.texture[face]
-        for k in np.unique(number[number >= 0]):
-            here = number == k
-            colour[here] *= _sampled(self.textures[k], place[here])
+        weights = np.stack([1.0 - u - v, u, v], axis=1)[..., None].astype(np.float32)
+        colour: NDArray[np.float32] = (self.corners[face] * weights).sum(axis=1) / np.float32(255)
+        uv = (self.uv[face] * weights).sum(axis=1)
+        texture = self.texture[face]
+        for k in np.unique(texture[texture >= 0]):
+            mask = texture == k
+            colour[mask] *= _sample(self.textures[k], uv[mask])
         return colour
 
 
 def has_colours(mesh: Any) -> bool:
-    """Whether a mesh brings colours along, as :func:`load_mesh` keeps them.
+    """Whether a mesh has colours.
 
     Example:
         >>> import trimesh
@@ -101,42 +101,42 @@ def has_colours(mesh: Any) -> bool:
 def surface_colours(mesh: Any) -> SurfaceColours | None:
     """The colours of a ``trimesh.Trimesh``, or None where it has none.
 
-    They are those that :func:`load_mesh` kept in ``mesh.metadata["colours"]``, else those of ``mesh.visual``: texture,
-    face colours, vertex colours or the material's colour. Transparent places of a texture are white.
+    They come from ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else from ``mesh.visual``: texture,
+    face colours, vertex colours or the material's colour. Transparent texels are white.
     """
-    kept = mesh.metadata.get("colours")
-    if isinstance(kept, SurfaceColours) and len(kept) == len(mesh.faces):
-        return kept
+    colours = mesh.metadata.get("colours")
+    if isinstance(colours, SurfaceColours) and len(colours) == len(mesh.faces):
+        return colours
     visual, faces = mesh.visual, np.asarray(mesh.faces)
-    bare = SurfaceColours.plain(len(faces))
+    plain = SurfaceColours.plain(len(faces))
     if visual.kind == "face":
         corners = np.repeat(np.asarray(visual.face_colors, np.uint8)[:, None, :3], 3, axis=1)
-        return SurfaceColours(corners, bare.uv, bare.texture)
+        return SurfaceColours(corners, plain.uv, plain.texture)
     if visual.kind == "vertex":
-        return SurfaceColours(np.asarray(visual.vertex_colors, np.uint8)[faces][..., :3], bare.uv, bare.texture)
+        return SurfaceColours(np.asarray(visual.vertex_colors, np.uint8)[faces][..., :3], plain.uv, plain.texture)
     if visual.kind != "texture":
         return None
     material = visual.material
     factor = getattr(material, "baseColorFactor", None)
-    image = getattr(material, "image", None)  # with one, exporters of OBJ write any colour, so that it says nothing
+    image = getattr(material, "image", None)  # beside an image, exporters of OBJ write any colour
     image = getattr(material, "baseColorTexture", None) if image is None else image
-    picture = None if image is None or visual.uv is None else _picture(image)
-    if picture is not None:
+    texture = None if image is None or visual.uv is None else _texture(image)
+    if texture is not None:
         tint = SurfaceColours.plain(len(faces), (_PLAIN,) * 3 if factor is None else factor[:3])
         uv = np.nan_to_num(np.asarray(visual.uv, np.float32), posinf=0.0, neginf=0.0)[faces][..., :2]
-        return SurfaceColours(tint.corners, uv, np.zeros(len(faces), np.int32), (picture,))
+        return SurfaceColours(tint.corners, uv, np.zeros(len(faces), np.int32), (texture,))
     colour = tuple(int(c) for c in np.asarray(material.main_color)[:3])
     return None if colour == _UNSET else SurfaceColours.plain(len(faces), colour)
 
 
-def _picture(image: Any) -> NDArray[np.uint8] | None:
-    """(h, w, 3) uint8 of a PIL image, transparent places white; None, with a warning, where it cannot be used."""
+def _texture(image: Any) -> NDArray[np.uint8] | None:
+    """(h, w, 3) uint8 of a PIL image, transparent texels white; None, with a warning, if it cannot be used."""
     try:
         if image.width * image.height > MAX_IMAGE_PIXELS:
             raise ValueError(f"{image.width} x {image.height} px are too many")
         rgba = np.asarray(image.convert("RGBA"), np.uint8)
-    except Exception as error:  # of any decoder
-        warnings.warn(f"a texture cannot be read ({error}); its faces are seen in their plain colour", stacklevel=2)
+    except Exception as error:  # decoders raise anything
+        warnings.warn(f"a texture cannot be read ({error}); its faces are drawn in their plain colour", stacklevel=2)
         return None
     shrink = TEXTURE_SIDE / max(rgba.shape[:2])
     if shrink < 1:
@@ -146,7 +146,7 @@ def _picture(image: Any) -> NDArray[np.uint8] | None:
     return np.asarray((rgba[..., :3] * alpha + 255 * (1 - alpha)).round(), np.uint8)
 
 
-def _sampled(texture: NDArray[np.uint8], uv: NDArray[np.float32]) -> NDArray[np.float32]:
+def _sample(texture: NDArray[np.uint8], uv: NDArray[np.float32]) -> NDArray[np.float32]:
     """(N, 3) in [0, 1]: bilinear, repeating."""
     h, w = texture.shape[:2]
     x, y = (uv[:, 0] % 1.0) * w - 0.5, (-uv[:, 1] % 1.0) * h - 0.5

@@ -1,4 +1,4 @@
-"""glTF files are checked before they are read: what they claim and ask for, and whether their nodes are a tree."""
+"""Checks of glTF files before trimesh reads them: their claims, the files they name, and the tree of their nodes."""
 
 import json
 import struct
@@ -9,22 +9,21 @@ from ...limits import MAX_MESH_BYTES, MAX_MESH_DEPTH, MAX_MESH_FACES, MAX_MESH_P
 
 __all__ = ["check_gltf"]
 
-_HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_", "KHR_animation_")
+_OPTIONAL_EXTENSIONS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_", "KHR_animation_")
 _COMPONENTS = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_PER_TRIANGLE = {4: 3, 5: 1, 6: 1}  # indices that each triangle of a list, strip or fan takes
+_PER_TRIANGLE = {4: 3, 5: 1, 6: 1}  # indices for each triangle of a list, strip or fan
 
 
 def check_gltf(data: bytes, suffix: str, size_of: Callable[[str], int]) -> None:
-    """Refuse what would read foreign files, take too much, or not be understood.
+    """Refuse files that name others outside their folder, take too much memory, or need unknown extensions.
 
     Args:
         data: a .glb or .gltf file.
-        suffix: which of them.
         size_of: bytes of a file beside the mesh; raises ValueError for any other.
 
     Raises:
-        ValueError: why; the message is for the user.
+        ValueError: the message is for the user.
     """
     chunk = None
     if suffix == ".glb":
@@ -47,7 +46,7 @@ def check_gltf(data: bytes, suffix: str, size_of: Callable[[str], int]) -> None:
 
 
 def _chunks(data: bytes) -> tuple[bytes, int | None]:
-    """The JSON and the length of the binary chunk."""
+    """The JSON, and the length of the binary chunk."""
     try:
         magic, version, _, length, kind = struct.unpack_from("<4sIII4s", data)
     except struct.error:
@@ -65,11 +64,11 @@ def _chunks(data: bytes) -> tuple[bytes, int | None]:
     return data[20:end], binary
 
 
-def _whole(value: Any, default: int | None = None) -> int:
-    """A whole number >= 0, as sizes and places must be."""
+def _index(value: Any, default: int | None = None) -> int:
+    """``value`` if it is an integer >= 0, as sizes and indices must be."""
     value = default if value is None else value
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise TypeError(f"expected a whole number >= 0, got {value!r}")
+        raise TypeError(f"expected an integer >= 0, got {value!r}")
     return value
 
 
@@ -77,7 +76,7 @@ def _check_extensions(tree: dict[str, Any]) -> None:
     if str(tree.get("asset", {}).get("version", "2.0")).split(".")[0] != "2":
         raise ValueError("only glTF version 2 is read; export version 2")
     for name in tree.get("extensionsRequired", []):
-        if not str(name).startswith(_HARMLESS):
+        if not str(name).startswith(_OPTIONAL_EXTENSIONS):
             raise ValueError(f"it requires the glTF extension {str(name)[:60]}, which is not read; export without it")
 
 
@@ -96,16 +95,16 @@ def _check_buffers(tree: dict[str, Any], chunk: int | None, size_of: Callable[[s
             length = (len(uri) - uri.index(",")) * 3 // 4
         else:
             length = size_of(str(uri))
-        if _whole(buffer["byteLength"]) > length:
+        if _index(buffer["byteLength"]) > length:
             raise ValueError(f"a buffer claims {buffer['byteLength']} bytes, {length} are there")
-        buffers.append(_whole(buffer["byteLength"]))
+        buffers.append(_index(buffer["byteLength"]))
         total += length
     if total > MAX_MESH_BYTES:
         raise ValueError(f"its buffers hold more than {MAX_MESH_BYTES:,} bytes")
     views = []
     for view in tree.get("bufferViews", []):
-        length, begin = _whole(view["byteLength"]), _whole(view.get("byteOffset"), 0)
-        if begin + length > buffers[_whole(view["buffer"])]:
+        length, start = _index(view["byteLength"]), _index(view.get("byteOffset"), 0)
+        if start + length > buffers[_index(view["buffer"])]:
             raise ValueError("a buffer view reaches beyond its buffer")
         views.append(length)
     return views
@@ -115,15 +114,15 @@ def _check_accessors(tree: dict[str, Any], views: list[int]) -> list[int]:
     """The length of every accessor."""
     counts = []
     for accessor in tree.get("accessors", []):
-        count = _whole(accessor["count"])
+        count = _index(accessor["count"])
         size = _COMPONENTS[accessor["componentType"]] * _WIDTHS[accessor["type"]]
         if count > 3 * MAX_MESH_FACES:
             raise ValueError(f"an accessor claims {count} values, more than {3 * MAX_MESH_FACES:,}")
         if "bufferView" in accessor:
-            place = _whole(accessor["bufferView"])
-            stride = max(size, _whole(tree["bufferViews"][place].get("byteStride"), 0))
-            needed = _whole(accessor.get("byteOffset"), 0) + stride * max(count - 1, 0) + size * min(count, 1)
-            if needed > views[place]:
+            view = _index(accessor["bufferView"])
+            stride = max(size, _index(tree["bufferViews"][view].get("byteStride"), 0))
+            needed = _index(accessor.get("byteOffset"), 0) + stride * max(count - 1, 0) + size * min(count, 1)
+            if needed > views[view]:
                 raise ValueError(f"an accessor claims {count} values, more than its buffer view holds")
         counts.append(count)
     return counts
@@ -132,37 +131,37 @@ def _check_accessors(tree: dict[str, Any], views: list[int]) -> list[int]:
 def _triangles(mesh: dict[str, Any], counts: list[int]) -> int:
     total = 0
     for part in mesh["primitives"]:
-        mode = _whole(part.get("mode"), 4)
+        mode = _index(part.get("mode"), 4)
         values = part["indices"] if "indices" in part else part.get("attributes", {}).get("POSITION")
         if mode in _PER_TRIANGLE and values is not None:
-            total += counts[_whole(values)] // _PER_TRIANGLE[mode] + 1
+            total += counts[_index(values)] // _PER_TRIANGLE[mode] + 1
     return total
 
 
 def _check_nodes(tree: dict[str, Any], triangles: list[int]) -> None:
     nodes = tree.get("nodes", [])
-    parts = [0 if "mesh" not in node else triangles[_whole(node["mesh"])] for node in nodes]
+    parts = [0 if "mesh" not in node else triangles[_index(node["mesh"])] for node in nodes]
     if sum(map(bool, parts)) > MAX_MESH_PARTS:
         raise ValueError(f"more than {MAX_MESH_PARTS:,} parts; join them")
     if sum(parts) > MAX_MESH_FACES:
         raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
     parents: dict[int, int] = {}
-    for place, node in enumerate(nodes):
+    for index, node in enumerate(nodes):
         for child in node.get("children", []):
-            if _whole(child) >= len(nodes) or child in parents:
+            if _index(child) >= len(nodes) or child in parents:
                 raise ValueError(f"node {child} is missing, or the child of several")
-            parents[child] = place
-    depth = {place: 0 for place in range(len(nodes)) if place not in parents}
+            parents[child] = index
+    depth = {index: 0 for index in range(len(nodes)) if index not in parents}
     ahead = list(depth)
     while ahead:
-        place = ahead.pop()
-        for child in nodes[place].get("children", []):
-            depth[child] = depth[place] + 1
+        index = ahead.pop()
+        for child in nodes[index].get("children", []):
+            depth[child] = depth[index] + 1
             ahead.append(child)
-        if depth[place] > MAX_MESH_DEPTH:
+        if depth[index] > MAX_MESH_DEPTH:
             raise ValueError(f"nodes more than {MAX_MESH_DEPTH} deep")
     if len(depth) < len(nodes):
-        raise ValueError("its nodes go round in a circle")
+        raise ValueError("its nodes form a circle")
     for scene in tree.get("scenes", []):
-        if any(_whole(root) >= len(nodes) for root in scene.get("nodes", [])):
+        if any(_index(root) >= len(nodes) for root in scene.get("nodes", [])):
             raise ValueError("a scene names nodes that do not exist")

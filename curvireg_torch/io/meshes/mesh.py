@@ -1,4 +1,4 @@
-"""Mesh files to one cleaned ``trimesh.Trimesh``, and a normalised model frame."""
+"""Mesh files to one cleaned ``trimesh.Trimesh``, its measures, and a normalised model frame."""
 
 import math
 import warnings
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ...errors import MeshError, MissingFileError
@@ -20,7 +21,6 @@ from .files import read_mesh
 from .up import format_up, mesh_up
 
 __all__ = [
-    "UNITS",
     "as_mesh",
     "box_corners",
     "extreme_points",
@@ -42,16 +42,15 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
         unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. An object that
             would be smaller than 5 mm or larger than 100 m gets a warning.
         up: the axis that points up when the object stands ("x", "y", "z", "-x", "-y", "-z"), kept in
-            ``mesh.metadata["up"]`` for views of standing objects, see :meth:`ViewSphere.for_up`; None: y for glTF,
-            else z.
+            ``mesh.metadata["up"]`` for :meth:`ViewSphere.for_up`; None: y for glTF, else z.
 
     Returns:
         ``trimesh.Trimesh`` with (V, 3) float64 vertices and (F, 3) faces, degenerate faces removed. Textures and other
         colours are kept as one :class:`SurfaceColours` in ``mesh.metadata["colours"]``.
 
     Raises:
-        MissingFileError: no such file.
-        MeshError: unreadable, empty, without faces, with NaN or infinite vertices, or beyond
+        MissingFileError: the file does not exist.
+        MeshError: the file is unreadable, empty, without faces, with NaN or infinite vertices, or beyond
             :mod:`curvireg_torch.limits`.
     """
     check_option(unit, UNITS, "unit")
@@ -59,9 +58,9 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
     up = format_up(path.suffix) if up is None else up
     check_option(up, UP_AXES, "up")
     if not path.is_file():
-        raise MissingFileError(f"{path}: no such file; check the path of the mesh")
+        raise MissingFileError("no such file; check the path of the mesh", subject=path)
     if path.suffix.lower() not in MESHES:
-        raise MeshError(f"{path}: expected a mesh file ({', '.join(MESHES)}); convert it first")
+        raise MeshError(f"expected a mesh file ({', '.join(MESHES)}); convert it first", subject=path)
     mesh = as_mesh(read_mesh(path), name=str(path))
     mesh.units = unit
     mesh.metadata.update(file_name=path.name, up=up)
@@ -80,38 +79,52 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
         return load_mesh(source)
     if isinstance(source, trimesh.Scene):
         try:
-            parts = _placed(source)
-            source = _joined(parts) if parts else None
-        except Exception as error:  # transforms that are none, parts that hang on nothing, vertices of one number
-            raise MeshError(f"{name}: its parts cannot be put together ({error}); re-export the file") from error
-    if not isinstance(source, trimesh.Trimesh) or len(source.faces) == 0:
-        raise MeshError(f"{name}: expected a mesh with faces, got none; point clouds and curves cannot be rendered")
-    if len(source.faces) > MAX_MESH_FACES:
-        raise MeshError(f"{name}: {len(source.faces):,} faces, more than {MAX_MESH_FACES:,}; simplify it")
-    vertices, faces = np.asarray(source.vertices, dtype=np.float64), np.asarray(source.faces, dtype=np.int64)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise MeshError(f"{name}: expected vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshError(f"{name}: faces name vertices that do not exist; the file is damaged, re-export it")
-    used = vertices[faces]
-    if not np.isfinite(used).all():
-        broken = int((~np.isfinite(used).all(axis=(1, 2))).sum())
-        raise MeshError(f"{name}: {broken} faces have NaN or infinite vertices; repair the mesh")
-    if float(np.abs(used).max()) > MAX_MESH_COORDINATE:
-        raise MeshError(f"{name}: vertices farther than {MAX_MESH_COORDINATE:g} from the origin; repair the mesh")
-    area = np.linalg.norm(np.cross(used[:, 1] - used[:, 0], used[:, 2] - used[:, 0]), axis=1)
-    if not (area > 0).any():
-        raise MeshError(f"{name}: every face is degenerate (area 0); repair the mesh")
+            parts = _placed_parts(source)
+            source = _concatenate(parts) if parts else None
+        except Exception as error:  # singular transforms, unconnected parts, malformed vertices
+            raise MeshError(f"its parts cannot be put together ({error}); re-export the file", subject=name) from error
+    if not isinstance(source, trimesh.Trimesh):
+        raise MeshError(_NO_FACES, subject=name)
+    triangles, is_degenerate = _checked_triangles(source, name)
     colours = _colours(source)
-    mesh = trimesh.Trimesh(vertices=vertices, faces=faces[area > 0], process=False)
+    vertices, faces = np.asarray(source.vertices, dtype=np.float64), triangles[~is_degenerate]
+    mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
     mesh.remove_unreferenced_vertices()
     unit = mesh_unit(source)
     if unit is not None:  # trimesh keeps None as the word "none"
         mesh.units = unit
     mesh.metadata["up"] = mesh_up(source)
     if colours is not None:
-        mesh.metadata["colours"] = colours[area > 0]
+        mesh.metadata["colours"] = colours[~is_degenerate]
     return mesh
+
+
+_NO_FACES = "expected a mesh with faces, got none; point clouds and curves cannot be rendered"
+
+
+def _checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """(F, 3) faces, and (F,) whether a face has no area."""
+    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+    if len(faces) == 0:
+        raise MeshError(_NO_FACES, subject=name)
+    if len(faces) > MAX_MESH_FACES:
+        raise MeshError(f"{len(faces):,} faces, more than {MAX_MESH_FACES:,}; simplify it", subject=name)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise MeshError(
+            f"expected vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}", subject=name
+        )
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshError("faces name vertices that do not exist; the file is damaged, re-export it", subject=name)
+    corners = vertices[faces]
+    if not np.isfinite(corners).all():
+        count = int((~np.isfinite(corners).all(axis=(1, 2))).sum())
+        raise MeshError(f"{count} faces have NaN or infinite vertices; repair the mesh", subject=name)
+    if float(np.abs(corners).max()) > MAX_MESH_COORDINATE:
+        raise MeshError(f"vertices farther than {MAX_MESH_COORDINATE:g} from the origin; repair the mesh", subject=name)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    if not (area > 0).any():
+        raise MeshError("every face is degenerate (area 0); repair the mesh", subject=name)
+    return faces, ~(area > 0)
 
 
 def mesh_unit(mesh: trimesh.Trimesh) -> str | None:
@@ -134,8 +147,8 @@ def mesh_unit(mesh: trimesh.Trimesh) -> str | None:
     return next((unit for unit, length in UNITS.items() if math.isclose(metres, length, rel_tol=1e-6)), None)
 
 
-def _placed(scene: trimesh.Scene) -> list[trimesh.Trimesh]:
-    """The meshes of a scene where they stand: its own ``dump``, which takes time with the cube of a part's depth."""
+def _placed_parts(scene: trimesh.Scene) -> list[trimesh.Trimesh]:
+    """The transformed meshes of a scene: ``scene.dump()`` takes time with the cube of a part's depth."""
     forest = scene.graph.transforms
     world = {scene.graph.base_frame: np.eye(4)}
     parts = []
@@ -143,7 +156,7 @@ def _placed(scene: trimesh.Scene) -> list[trimesh.Trimesh]:
         path = [node]
         while path[-1] not in world and path[-1] in forest.parents:
             path.append(forest.parents[path[-1]])
-        if path[-1] not in world:  # does not hang on the base: trimesh finds another way
+        if path[-1] not in world:  # not below the base frame: trimesh searches the graph
             world[path[-1]] = scene.graph.get(path[-1])[0]
         for child, parent in zip(path[-2::-1], path[:0:-1], strict=True):
             world[child] = world[parent] @ forest.edge_data[parent, child].get("matrix", np.eye(4))
@@ -159,25 +172,25 @@ def _colours(mesh: trimesh.Trimesh) -> SurfaceColours | None:
         if colours is not None and len(colours) != len(mesh.faces):
             raise ValueError(f"{len(colours)} for {len(mesh.faces)} faces")
         return colours
-    except Exception as error:  # of whatever a file says about them
-        warnings.warn(f"the mesh's colours cannot be used ({error}); it is seen in grey", stacklevel=2)
+    except Exception as error:  # files may hold anything
+        warnings.warn(f"the mesh's colours cannot be used ({error}); it is drawn in grey", stacklevel=2)
         return None
 
 
-def _joined(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """One mesh of several; trimesh would pack their textures into one, which repeats no more."""
+def _concatenate(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """One mesh of several. Their textures stay apart: trimesh would pack them into one that cannot repeat."""
     colours = [_colours(part) for part in parts]
     for part in parts:
         part.visual = trimesh.visual.ColorVisuals()
     mesh = trimesh.util.concatenate(parts)
     if any(c is not None for c in colours):
         known = [c or SurfaceColours.plain(len(part.faces)) for c, part in zip(colours, parts, strict=True)]
-        mesh.metadata["colours"] = SurfaceColours.joined(known)
+        mesh.metadata["colours"] = SurfaceColours.concatenate(known)
     return mesh
 
 
 def extreme_points(mesh: trimesh.Trimesh) -> Tensor:
-    """(P, 3) float64 vertices of the convex hull, which alone decide projected boxes and outlines."""
+    """(P, 3) float64 vertices of the convex hull, which determine projected boxes."""
     try:
         points = mesh.convex_hull.vertices
     except Exception:  # qhull refuses flat objects
@@ -201,14 +214,14 @@ def mesh_radius(mesh: trimesh.Trimesh) -> float:
 
 
 def normalization_transform(mesh: trimesh.Trimesh, *, align_axes: bool = False) -> Tensor:
-    """Similarity that brings a mesh into a normalised frame; its inverse brings poses back.
+    """Similarity from the model's frame to a normalised frame.
 
     The area-weighted centroid goes to the origin and the farthest vertex to distance 1. With ``align_axes`` (the
-    paper's normalisation) the principal axes of the surface go to x, y, z in decreasing order of variance. An axis's
-    sign is such that the surface's third moment along it is positive for x and y; z completes a right-handed frame.
+    paper's normalisation) the principal axes of the surface go to x, y, z in decreasing order of variance. The third
+    moments of the surface along x and y are positive; z completes a right-handed frame.
 
     Returns:
-        (4, 4) float64 ``T_normalized_from_model``; ``torch.linalg.inv`` of it is the way back.
+        (4, 4) float64 ``T_normalized_from_model``.
 
     Example:
         >>> T = normalization_transform(trimesh.creation.box((2.0, 4.0, 4.0)))
@@ -220,7 +233,7 @@ def normalization_transform(mesh: trimesh.Trimesh, *, align_axes: bool = False) 
     centroid = np.average(corners.mean(axis=1), axis=0, weights=area)
     R = np.eye(3)
     if align_axes:
-        # Midpoints of the edges integrate second moments of a triangle exactly.
+        # Edge midpoints integrate the second moments of a triangle exactly.
         points = (0.5 * (corners + np.roll(corners, 1, axis=1)) - centroid).reshape(-1, 3)
         weights = np.repeat(area / area.sum() / 3.0, 3)
         _, axes = np.linalg.eigh((points * weights[:, None]).T @ points)

@@ -1,4 +1,4 @@
-"""Which axis of a mesh points up when the object stands. Meshes and poses stay in the file's own frame."""
+"""The axis of a mesh that points up when the object stands. Meshes and poses stay in the frame of the file."""
 
 from typing import Any
 
@@ -15,16 +15,16 @@ def format_up(suffix: str) -> str:
 
 
 def mesh_up(mesh: Any) -> str:
-    """The axis that points up in a mesh of :func:`load_mesh`, "z" in one from elsewhere."""
+    """The up axis that :func:`load_mesh` noted, "z" for meshes from elsewhere."""
     return str(mesh.metadata.get("up", "z"))
 
 
 def with_z_up(mesh: Any) -> Any:
-    """The mesh, turned where its z axis does not point up."""
+    """The mesh, or a rotated copy whose z axis points up."""
     if mesh_up(mesh) == "z":
         return mesh
     T = np.eye(4)
     T[:3, :3] = up_rotation(mesh_up(mesh)).numpy()
-    turned = mesh.copy().apply_transform(T)
-    turned.metadata["up"] = "z"
-    return turned
+    rotated = mesh.copy().apply_transform(T)
+    rotated.metadata["up"] = "z"
+    return rotated
