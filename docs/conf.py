@@ -59,7 +59,7 @@ COPIED_PAGES = {
 """Files outside ``docs`` and the pages of the site that show them."""
 
 SHAPES = {"B", "C", "D", "F", "H", "K", "Module", "N", "S", "T", "V", "W", "size"}
-"""Words in docstrings that napoleon mistakes for types, and torch's Module."""
+"""Words in docstrings that napoleon mistakes for types, type variables, and torch's Module."""
 
 
 def site_links(text: str, file: Path) -> str:
@@ -102,8 +102,8 @@ def resolve_short_names(app: Any, env: Any, node: Any, text: Any) -> Any:
     if found:
         page = app.builder.get_relative_uri(node["refdoc"], objects[found[0]].docname)
         return nodes.reference("", "", text, internal=True, refuri=f"{page}#{objects[found[0]].node_id}")
-    ours = target.startswith("curvireg_torch") or ("." not in target and target.isidentifier() and target not in SHAPES)
-    return None if ours else text
+    ours = target.startswith("curvireg_torch") or target.isidentifier()
+    return None if ours and target.rsplit(".", 1)[-1] not in SHAPES else text
 
 
 def setup(app: Any) -> None:
