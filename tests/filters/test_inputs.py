@@ -1,4 +1,4 @@
-"""The one rule for photographs: colour becomes grey, missing pixels are filled and give nothing."""
+"""Photographs as input: colour becomes grey; missing pixels are filled and give zero."""
 
 import math
 
@@ -8,19 +8,23 @@ from kornia.color import rgb_to_grayscale
 
 from curvireg_torch import filters
 from curvireg_torch.descriptors import field_points, hog
-from curvireg_torch.filters.inputs import fill_missing
-from curvireg_torch.filters.inputs import to_grey as grey
+from curvireg_torch.filters.inputs import fill_missing, to_grey
 
-from .layer_cases import LAYERS, Layer, photos
+from .._support.layer_contract import LayerCase
+from .layer_cases import LAYERS, colour_photos, photos
 
-PHOTO_LAYERS = [x for x in LAYERS if x.inputs is photos]
-SMOOTHINGS = ("diffusion", "diffusion-exponential")
-every_photo_layer = pytest.mark.parametrize("layer", PHOTO_LAYERS, ids=lambda x: x.name)
+every_photo_layer = pytest.mark.parametrize(
+    "layer", [x for x in LAYERS.values() if x.inputs is photos], ids=lambda x: x.name
+)
+
+
+def missing_value(layer: LayerCase) -> float:
+    return 1000.0 if layer.name.startswith("blur") else 0.0
 
 
 @every_photo_layer
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_missing_pixel_is_filled_and_gives_nothing(layer: Layer, value: float) -> None:
+def test_photo_layers_fill_missing_pixels(layer: LayerCase, value: float) -> None:
     x = photos(2, 48, dtype=torch.float64)
     clean = layer(x)
     broken = x.clone()
@@ -29,43 +33,49 @@ def test_a_missing_pixel_is_filled_and_gives_nothing(layer: Layer, value: float)
     y = layer(broken)
     assert torch.isfinite(y).all()
     torch.testing.assert_close(y[1], clean[1], rtol=0.0, atol=0.0)
-    nothing = {"blur": 1000.0, "blur-saliency": 1000.0}.get(layer.name, 0.0)
-    if layer.name not in SMOOTHINGS:
-        assert bool((y[0, :, 5, 7] == nothing).all())
-    # Beyond the kernels' reach nothing changed but what the image's largest saliency is the unit of.
+    if not layer.name.startswith("diffusion"):
+        assert bool((y[0, :, 5, 7] == missing_value(layer)).all())
+    # Beyond the reach of the kernels only normalisations by the maximum of the image can change.
     far = (y - clean)[0, :, 30:, 30:].abs()
     assert float((far > 1e-6 * clean.abs().max()).float().mean()) < 0.02
     y.square().sum().backward()
     assert broken.grad is not None
     assert torch.isfinite(broken.grad).all()
     assert float(broken.grad[0, 0, 5, 7]) == 0.0
+    empty = layer(torch.full((1, 1, 12, 12), value))
+    assert float(empty.min()) == float(empty.max()) == missing_value(layer)
 
 
-@every_photo_layer
-def test_nothing_but_missing_pixels(layer: Layer) -> None:
-    y = layer(torch.full((1, 1, 12, 12), math.nan))
-    assert torch.isfinite(y).all()
-    assert float(y.min()) == float(y.max()) == {"blur": 1000.0, "blur-saliency": 1000.0}.get(layer.name, 0.0)
-
-
-def test_holes_are_filled_from_around_them() -> None:
-    """On a ramp of 1 per px the fill is as wrong as its square is wide, and the gradient sees no edge at its rim."""
+def test_fill_missing_uses_the_surroundings() -> None:
+    """On a ramp of 1 per px the error of the fill is at most the size of its pyramid cell."""
     ramp = torch.arange(64.0, dtype=torch.float64).expand(1, 1, 50, 64).contiguous()
     for size in (1, 3, 8):
         holes = torch.zeros_like(ramp, dtype=torch.bool)
         holes[..., 20 : 20 + size, 30 : 30 + size] = True
-        filled = fill_missing(ramp.masked_fill(holes, math.nan), holes)
+        filled = fill_missing(ramp.masked_fill(holes, math.nan))
         assert torch.equal(filled[~holes], ramp[~holes])
         assert float((filled - ramp)[holes].abs().max()) <= 2 * size
         gradient = filters.image_gradient(ramp.masked_fill(holes, math.nan))[..., 5:-5, 5:-5].norm(dim=1)
         assert float(gradient.max()) < 2.5
     large = torch.zeros_like(ramp, dtype=torch.bool)
-    large[..., :, 2:] = True  # farther than the pyramid reaches: the mean of what is left
+    large[..., :, 2:] = True  # beyond the reach of the pyramid: the mean of the valid pixels
     filled = fill_missing(ramp.masked_fill(large, math.nan), large)
     assert float(filled[..., -1].max()) == pytest.approx(0.5)
 
 
-def test_smoothings_come_out_filled() -> None:
+def test_fill_missing_reaches_holes_of_32_px() -> None:
+    """A hole of 31 px is filled from its surroundings, which are 0; the middle of one of 63 px with the image mean."""
+    for side, expected in ((31, 0.0), (63, None)):
+        image = torch.zeros(1, 1, 256, 256, dtype=torch.float64)
+        image[..., 192:, :] = 1.0
+        holes = torch.zeros_like(image, dtype=torch.bool)
+        holes[..., 64 : 64 + side, 64 : 64 + side] = True
+        mean = float(image[~holes].mean())
+        filled = fill_missing(image.masked_fill(holes, math.nan), holes)
+        assert float(filled[0, 0, 70, 70]) == pytest.approx(mean if expected is None else expected, abs=1e-3)
+
+
+def test_smoothing_filters_fill_missing_pixels() -> None:
     x = photos(1, 32, dtype=torch.float64)
     broken = x.clone()
     broken[0, 0, 16, 10:13] = math.nan
@@ -80,7 +90,7 @@ def test_smoothings_come_out_filled() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:There is a performance drop")
-def test_missing_pixels_under_vmap() -> None:
+def test_image_gradient_fills_missing_pixels_under_vmap() -> None:
     x = photos(3, 24, dtype=torch.float64)
     x[1, 0, 4, 5] = math.nan
     want = filters.image_gradient(x)
@@ -88,19 +98,18 @@ def test_missing_pixels_under_vmap() -> None:
 
 
 @every_photo_layer
-def test_colour_becomes_kornias_grey(layer: Layer) -> None:
-    colour = torch.stack([photos(2, 24, seed=i, dtype=torch.float64)[:, 0] for i in range(3)], dim=1)
-    assert colour.shape == (2, 3, 24, 24)
-    torch.testing.assert_close(grey(colour), rgb_to_grayscale(colour))
-    if layer.name in SMOOTHINGS:
-        assert layer(colour).shape == colour.shape  # channels by themselves
+def test_photo_layers_convert_colour_to_grey(layer: LayerCase) -> None:
+    colour = colour_photos(2, dtype=torch.float64)
+    torch.testing.assert_close(to_grey(colour), rgb_to_grayscale(colour))
+    if layer.name.startswith("diffusion"):
+        assert layer(colour).shape == colour.shape  # channels are independent
         torch.testing.assert_close(layer(colour)[:, 1:2], layer(colour[:, 1:2]))
     else:
-        torch.testing.assert_close(layer(colour), layer(grey(colour)), rtol=0.0, atol=0.0)
+        torch.testing.assert_close(layer(colour), layer(to_grey(colour)), rtol=0.0, atol=0.0)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_vectors_that_are_not_finite_count_as_zero(value: float) -> None:
+def test_hog_and_field_points_ignore_vectors_that_are_not_finite(value: float) -> None:
     field = filters.image_gradient(photos(2, 32))
     zero, broken = field.clone(), field.clone()
     zero[0, :, 9, 12:15] = 0.0
@@ -108,16 +117,3 @@ def test_vectors_that_are_not_finite_count_as_zero(value: float) -> None:
     broken[0, 1, 9, 12:15] = value
     torch.testing.assert_close(hog(broken), hog(zero), rtol=0.0, atol=0.0)
     assert torch.equal(field_points(broken), field_points(zero))
-
-
-def test_holes_of_up_to_32_px_are_filled_from_around_them() -> None:
-    """A hole that leaves one row and column of its 32 px square free is filled from that row and column, 0 like all
-    that is near; a hole that leaves one row and column of a 64 px square free is filled with the mean in its middle."""
-    for side, expected in ((31, 0.0), (63, None)):
-        image = torch.zeros(1, 1, 256, 256, dtype=torch.float64)
-        image[..., 192:, :] = 1.0
-        holes = torch.zeros_like(image, dtype=torch.bool)
-        holes[..., 64 : 64 + side, 64 : 64 + side] = True
-        mean = float(image[~holes].mean())
-        filled = fill_missing(image.masked_fill(holes, math.nan), holes)
-        assert float(filled[0, 0, 70, 70]) == pytest.approx(mean if expected is None else expected, abs=1e-3)

@@ -1,4 +1,4 @@
-"""Options are checked where they are given; masks and cameras broadcast; half types leave cameras alone."""
+"""Options: functions and constructors check them alike; masks and cameras broadcast; cameras keep their dtype."""
 
 import math
 from collections.abc import Callable
@@ -8,87 +8,81 @@ import torch
 from torch import Tensor, nn
 
 from curvireg_torch import filters
-from curvireg_torch.descriptors import HOG, hog
 from curvireg_torch.errors import InvalidInputError
 
-from .layer_cases import CAMERA, depths, fields, photos
+from .layer_cases import CAMERA, PAIRS, depths
 
-CS = (filters.depth_curvilinear_saliency, filters.DepthCurvilinearSaliency, depths)
-ASG = (filters.average_shading_gradient, filters.AverageShadingGradient, depths)
-AR = (filters.apparent_ridges, filters.ApparentRidges, depths)
-HFN = (filters.hessian_frobenius_norm, filters.HessianFrobeniusNorm, depths)
-IG = (filters.image_gradient, filters.ImageGradient, photos)
-ICS = (filters.image_curvilinear_saliency, filters.ImageCurvilinearSaliency, photos)
-DIFFUSION = (filters.anisotropic_diffusion, filters.AnisotropicDiffusion, photos)
-MCS = (filters.multiscale_curvilinear_saliency, filters.MultiScaleCurvilinearSaliency, photos)
-MFC = (filters.multiscale_focus_curves, filters.MultiScaleFocusCurves, photos)
-BLUR = (filters.edge_blur, filters.EdgeBlur, photos)
-PCI = (filters.principal_curvature_image, filters.PrincipalCurvatureImage, photos)
-DESCRIPTOR = (hog, HOG, fields)
-WRONG: list[tuple[tuple[Callable[..., Tensor], Callable[..., nn.Module], Callable[..., Tensor]], dict[str, object]]] = [
-    (CS, {"sigma": -1.0}),
-    (CS, {"formula": "x"}),
-    (CS, {"depth_scale": 0.0}),
-    (ASG, {"sigma": math.nan}),
-    (ASG, {"camera_matrix": torch.eye(4)}),
-    (ASG, {"camera_matrix": torch.eye(3), "depth_scale": 1.0}),
-    (AR, {"depth_scale": -1.0}),
-    (HFN, {"depth_scale": math.inf}),
-    (IG, {"sigma": -1.0}),
-    (ICS, {"sigma": math.inf}),
-    (DIFFUSION, {"iterations": -1}),
-    (DIFFUSION, {"iterations": 1, "step": 0.3}),
-    (DIFFUSION, {"iterations": 1, "step": 0.0}),
-    (DIFFUSION, {"iterations": 1, "kappa": 0.0}),
-    (MCS, {"scales": 0}),
-    (MCS, {"kappa": -1.0}),
-    (MCS, {"threshold": 1.0}),
-    (MCS, {"diffusion_time": 0.0}),
-    (MFC, {"scales": 1}),
-    (MFC, {"saliency_weight": -1.0}),
-    (MFC, {"threshold": -1.0}),
-    (BLUR, {"reblur_sigmas": ()}),
-    (BLUR, {"reblur_sigmas": (1.0, 0.0)}),
-    (PCI, {"sigmas": (1.0, -1.0)}),
-    (DESCRIPTOR, {"clip": 1.5}),
-    (DESCRIPTOR, {"clip": 0.0}),
-    (DESCRIPTOR, {"bins": 0}),
+WRONG: list[tuple[str, dict[str, object], str]] = [
+    ("cs", {"sigma": -1.0}, "sigma: expected a finite number >= 0, got -1"),
+    ("cs", {"formula": "x"}, "formula: expected one of 'geometric', 'paper', got 'x'"),
+    ("cs", {"depth_scale": 0.0}, "depth_scale"),
+    ("asg", {"sigma": math.nan}, "sigma"),
+    ("asg", {"camera_matrix": torch.eye(4)}, "camera_matrix: expected shape"),
+    (
+        "asg",
+        {"camera_matrix": torch.eye(3), "depth_scale": 1.0},
+        "depth_scale: has no meaning with a camera_matrix",
+    ),
+    ("ar", {"camera_matrix": torch.eye(3), "depth_scale": 1.0}, "depth_scale: has no meaning with a camera_matrix"),
+    ("ar", {"depth_scale": -1.0}, "depth_scale"),
+    ("hfn", {"depth_scale": math.inf}, "depth_scale"),
+    ("ig", {"sigma": -1.0}, "sigma: expected a finite number >= 0, got -1"),
+    ("ics", {"sigma": math.inf}, "sigma"),
+    ("diffusion", {"iterations": -1}, "iterations"),
+    ("diffusion", {"iterations": 1, "step": 0.3}, "step: expected 0 < step <= 0.25"),
+    ("diffusion", {"iterations": 1, "step": 0.0}, "step"),
+    ("diffusion", {"iterations": 1, "kappa": 0.0}, "kappa"),
+    ("mcs", {"scales": 0}, "scales"),
+    ("mcs", {"kappa": -1.0}, "kappa"),
+    ("mcs", {"threshold": 1.0}, "threshold"),
+    ("mcs", {"diffusion_time": 0.0}, "diffusion_time"),
+    ("mcs", {"smoothing": "median"}, "smoothing: expected one of"),
+    ("mfc", {"scales": 1}, "scales"),
+    ("mfc", {"saliency_weight": -1.0}, "saliency_weight"),
+    ("mfc", {"threshold": -1.0}, "threshold"),
+    ("blur", {"reblur_sigmas": ()}, "reblur_sigmas"),
+    ("blur", {"reblur_sigmas": (1.0, 0.0)}, "reblur_sigmas"),
+    ("pci", {"sigmas": (1.0, -1.0)}, "sigmas"),
+    ("pci", {"sigmas": ()}, "sigmas"),
+    ("hog", {"clip": 1.5}, "clip"),
+    ("hog", {"clip": 0.0}, "clip"),
+    ("hog", {"bins": 0}, "bins"),
+    ("hog", {"voting": "soft"}, "voting"),
+    ("hog", {"grid": 2, "block": 3}, "block <= grid"),
 ]
 
 
-@pytest.mark.parametrize(("layer", "options"), WRONG, ids=[f"{x[0].__name__}-{','.join(o)}" for x, o in WRONG])
-def test_constructors_check_what_functions_check(
-    layer: tuple[Callable[..., Tensor], Callable[..., nn.Module], Callable[..., Tensor]], options: dict[str, object]
-) -> None:
-    function, module, inputs = layer
-    with pytest.raises(InvalidInputError) as by_function:
+@pytest.mark.parametrize(("name", "options", "message"), WRONG, ids=[f"{x[0]}-{','.join(x[1])}" for x in WRONG])
+def test_functions_and_constructors_reject_wrong_options(name: str, options: dict[str, object], message: str) -> None:
+    function, inputs, module = PAIRS[name]
+    with pytest.raises(InvalidInputError, match=message) as by_function:
         function(inputs(), **options)
     with pytest.raises(InvalidInputError) as by_module:
         module(**options)
     assert str(by_function.value) == str(by_module.value)
 
 
-@pytest.mark.parametrize("layer", [CS, ASG, HFN, IG, ICS, MFC], ids=lambda layer: layer[0].__name__)
-def test_no_smoothing_is_allowed(layer: tuple[Callable[..., Tensor], object, Callable[..., Tensor]]) -> None:
-    function, _, inputs = layer
+@pytest.mark.parametrize("name", ["cs", "asg", "hfn", "ig", "ics", "mfc"])
+def test_layers_accept_sigma_zero(name: str) -> None:
+    function, inputs, _ = PAIRS[name]
     assert torch.isfinite(function(inputs(), sigma=0.0)).all()
 
 
-def test_masks_broadcast() -> None:
+def test_depth_layers_broadcast_masks() -> None:
     depth = depths(3)
     mask = torch.rand(24, 24, generator=torch.Generator().manual_seed(0)) < 0.7
     want = filters.depth_curvilinear_saliency(depth, mask.expand(3, 1, 24, 24))
-    for some in (mask, mask[None], mask[None, None]):
-        assert torch.equal(filters.depth_curvilinear_saliency(depth, some), want)
+    for broadcastable in (mask, mask[None], mask[None, None]):
+        assert torch.equal(filters.depth_curvilinear_saliency(depth, broadcastable), want)
     each = torch.ones(3, 1, 1, 1, dtype=torch.bool)
     assert torch.equal(filters.hessian_frobenius_norm(depth, each), filters.hessian_frobenius_norm(depth))
-    for wrong in (mask[:23], mask.expand(2, 1, 24, 24), mask[None, None, None]):
+    for wrong in (mask[:23], mask.expand(2, 1, 24, 24), mask[None, None, None], depth):
         with pytest.raises(InvalidInputError, match=r"mask: expected bool of shape \(3, 1, 24, 24\)"):
             filters.average_shading_gradient(depth, wrong)
 
 
 @pytest.mark.parametrize("layer", [filters.average_shading_gradient, filters.apparent_ridges])
-def test_cameras_broadcast(layer: Callable[..., Tensor]) -> None:
+def test_perspective_layers_broadcast_cameras(layer: Callable[..., Tensor]) -> None:
     depth = depths(3)
     want = layer(depth, camera_matrix=CAMERA.expand(3, 3, 3))
     assert torch.equal(layer(depth, camera_matrix=CAMERA), want)
@@ -98,9 +92,9 @@ def test_cameras_broadcast(layer: Callable[..., Tensor]) -> None:
 
 
 @pytest.mark.parametrize("module", [filters.AverageShadingGradient, filters.ApparentRidges])
-def test_half_modules_keep_their_camera(module: Callable[..., nn.Module]) -> None:
+def test_perspective_modules_keep_the_dtype_of_their_camera(module: Callable[..., nn.Module]) -> None:
     camera = CAMERA.clone()
-    camera[:2, 2] += 1 / 3  # no half type has it
+    camera[:2, 2] += 1 / 3  # not representable in half precision
     depth = depths().half()
     want = module(camera_matrix=camera)(depth)
     for half in (module(camera_matrix=camera).half(), module(camera_matrix=camera).to(torch.bfloat16)):

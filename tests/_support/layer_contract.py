@@ -1,0 +1,259 @@
+"""The contract of every layer, as one base class of tests.
+
+A test module defines its layers and inherits the tests::
+
+    class TestFilters(LayerContract):
+        cases = [LayerCase("ig", image_gradient, photos, ImageGradient), ...]
+
+A subclass disables a test that does not apply with ``test_gradcheck = None``.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from curvireg_torch.errors import InvalidInputError
+
+SIZE = 24
+
+
+@dataclass(frozen=True)
+class LayerCase:
+    """A function with its options, its module twin if it has one, and a generator of inputs."""
+
+    name: str
+    function: Callable[..., Any]
+    inputs: Callable[..., Tensor]
+    """inputs(n, size, seed=, dtype=) -> (n, C, size, size)."""
+    module: Callable[..., nn.Module] | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+    gradcheck_options: Mapping[str, Any] = field(default_factory=dict)
+    constant_gives_zero: bool = True
+    min_size: int = 1
+    accepts_colour: bool = True
+
+    def __call__(self, x: Tensor) -> Any:
+        return self.function(x, **self.options)
+
+    def twin(self) -> nn.Module:
+        """The module with the same options; without one, a module that calls the function."""
+        if self.module is not None:
+            return self.module(**self.options)
+        return self.function if isinstance(self.function, nn.Module) else _Wrapper(self)
+
+
+class _Wrapper(nn.Module):
+    def __init__(self, case: LayerCase) -> None:
+        super().__init__()
+        self.case = case
+
+    def forward(self, x: Tensor) -> Any:
+        return self.case(x)
+
+
+def tensors(output: Any) -> tuple[Tensor, ...]:
+    """The tensors of an output: itself, or those of a tuple."""
+    return (output,) if isinstance(output, Tensor) else tuple(output)
+
+
+def degenerate_images() -> dict[str, Tensor]:
+    x = torch.arange(16.0)
+    bright = torch.zeros(1, 1, 16, 16)
+    bright[..., 8, 8] = 1.0
+    return {
+        "zeros": torch.zeros(1, 1, 16, 16),
+        "constant": torch.full((1, 1, 16, 16), 0.7),
+        "one pixel": torch.full((1, 1, 1, 1), 0.5),
+        "one bright pixel": bright,
+        "checkerboard": ((x[:, None] + x) % 2)[None, None],
+        "saturated": torch.rand(1, 1, 16, 16, generator=torch.Generator().manual_seed(1)).mul(3.0).clamp(max=1.0),
+        "two levels": (x >= 8).float().expand(1, 1, 16, 16).contiguous(),
+        "row": torch.rand(1, 1, 1, 16, generator=torch.Generator().manual_seed(0)),
+    }
+
+
+class NoFloat64(TorchDispatchMode):
+    """Fails when an operation makes a float64 tensor, which MPS does not support."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        for t in out if isinstance(out, tuple | list) else (out,):
+            # Python numbers become 0-dim float64 tensors, which MPS accepts.
+            assert not (isinstance(t, Tensor) and t.dtype is torch.float64 and t.ndim > 0), func
+        return out
+
+
+class LayerContract:
+    """Tests that every layer has to pass; see the module for its use."""
+
+    cases: ClassVar[Sequence[LayerCase]] = ()
+    differentiable: ClassVar[bool] = True
+    batch_tolerance: ClassVar[Mapping[str, float]] = {"rtol": 1e-6, "atol": 1e-9}
+
+    def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
+        if "case" in metafunc.fixturenames:
+            metafunc.parametrize("case", self.cases, ids=[case.name for case in self.cases])
+
+    def agrees(self, got: Any, want: Any) -> bool:
+        """Equality of compiled results: another order of summation flips single pixels at a threshold or a sign."""
+        for a, b in zip(tensors(got), tensors(want), strict=True):
+            error = (a.float() - b.float()).abs()
+            if b.ndim == 4 and b.shape[1] == 2:
+                error = torch.minimum(error, (a + b).abs()).amax(dim=1)
+            if a.shape != b.shape or float((error > 1e-3 * float(b.abs().max())).float().mean()) >= 0.005:
+                return False
+        return True
+
+    def test_function_equals_module(self, case: LayerCase) -> None:
+        x = case.inputs(2, SIZE)
+        before = x.clone()
+        want, twin = case(x), case.twin()
+        torch.testing.assert_close(tensors(twin(x)), tensors(want), rtol=0.0, atol=0.0)
+        assert torch.equal(x, before)
+        assert type(twin).__name__ in repr(twin)
+        for y in tensors(want):
+            assert y.device == x.device
+            assert len(y) == len(x)
+            assert torch.isfinite(y).all()
+
+    def test_options_are_keyword_only(self, case: LayerCase) -> None:
+        for call in (case.function, case.module.__init__) if case.module is not None else (case.function,):
+            for name, parameter in inspect.signature(call).parameters.items():
+                if parameter.default is not inspect.Parameter.empty and name != "mask":
+                    assert parameter.kind is inspect.Parameter.KEYWORD_ONLY, name
+
+    def test_batched_equals_one_by_one(self, case: LayerCase) -> None:
+        """The images differ in contrast and depth range, so that a normalisation over the batch is detected."""
+        scale = torch.tensor([1.0, 0.1, 0.0], dtype=torch.float64).view(-1, 1, 1, 1)
+        x = case.inputs(3, SIZE, dtype=torch.float64) * scale
+        parts = [torch.cat(part) for part in zip(*(tensors(case(image[None])) for image in x), strict=True)]
+        torch.testing.assert_close(tensors(case(x)), tuple(parts), **self.batch_tolerance)
+
+    def test_empty_batch(self, case: LayerCase) -> None:
+        x = case.inputs(2, SIZE)
+        for empty, full in zip(tensors(case(x[:0])), tensors(case(x)), strict=True):
+            assert empty.shape == (0, *full.shape[1:])
+
+    @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+    def test_dtype_is_kept(self, case: LayerCase, dtype: torch.dtype) -> None:
+        x = case.inputs(2, SIZE).to(dtype)
+        y = case(x)
+        assert {t.dtype for t in tensors(y)} == {dtype}
+        if dtype is not torch.float64:  # half types compute in float32
+            want = tuple(t.to(dtype) for t in tensors(case(x.float())))
+            torch.testing.assert_close(tensors(y), want, rtol=0.0, atol=0.0)
+
+    def test_autocast_changes_nothing(self, case: LayerCase) -> None:
+        x = case.inputs(2, SIZE)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            y = case(x)
+        torch.testing.assert_close(tensors(y), tensors(case(x)), rtol=0.0, atol=0.0)
+
+    def test_no_float64_operations(self, case: LayerCase) -> None:
+        x = case.inputs(2, SIZE)
+        with NoFloat64():
+            case(x)
+
+    @pytest.mark.parametrize("image", list(degenerate_images()))
+    def test_finite_on_degenerate_input(self, case: LayerCase, image: str) -> None:
+        x = degenerate_images()[image]
+        if min(x.shape[-2:]) < case.min_size:
+            return
+        x = x.repeat(1, case.inputs(1, SIZE).shape[1], 1, 1).requires_grad_(self.differentiable)
+        y = tensors(case(x))
+        assert all(torch.isfinite(t).all() for t in y)
+        if self.differentiable:
+            sum(t.square().sum() + t.sum() for t in y).backward()
+            assert x.grad is not None
+            assert torch.isfinite(x.grad).all()
+        if case.constant_gives_zero and image in ("zeros", "constant") and x.shape[1] == 1:
+            assert all(float(t.detach().abs().max()) < 1e-6 for t in y)
+
+    def test_gradcheck(self, case: LayerCase) -> None:
+        """At generic points, where no maximum, threshold or suppression switches within the step."""
+        x = case.inputs(1, 9, seed=3, dtype=torch.float64)
+        generator = torch.Generator().manual_seed(0)
+        x = x + 0.05 * torch.rand(x.shape, generator=generator, dtype=torch.float64) * (x > 0)
+        # Pixels of 0 may be background of a depth image, which a step would make visible.
+        index = (x != 0).nonzero(as_tuple=True)
+        weights = self.gradcheck_weights(case, x)
+
+        def function(values: Tensor) -> Tensor:
+            return case.function(x.index_put(index, values), **case.options, **case.gradcheck_options) * weights
+
+        assert float(function(x[index]).abs().max()) > 0.0
+        values = x[index].requires_grad_()
+        assert torch.autograd.gradcheck(function, values, eps=1e-7, atol=1e-5, rtol=1e-4, fast_mode=True)
+
+    def gradcheck_weights(self, case: LayerCase, x: Tensor) -> float | Tensor:
+        """Factor on the output that excludes pixels where it is not differentiable."""
+        return 1.0
+
+    @pytest.mark.filterwarnings("ignore:There is a performance drop")
+    @pytest.mark.parametrize("block", [None, SIZE**2])
+    def test_function_transforms(self, case: LayerCase, block: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+        """vmap, reverse and forward derivatives; also of batches that are processed in blocks."""
+        x = case.inputs(2, SIZE, dtype=torch.float64)
+        halved = case(0.5 * x)
+
+        def loss(x: Tensor) -> Tensor:
+            return case(x).square().sum()
+
+        want, y = torch.autograd.grad(loss(x.requires_grad_()), x)[0], case(x).detach()
+        x = x.detach()
+        direction = torch.randn(x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(0))
+        if block is not None:
+            monkeypatch.setattr("curvireg_torch.filters.blocks.BLOCK", block)
+        torch.testing.assert_close(torch.func.vmap(case)(torch.stack([x, 0.5 * x])), torch.stack([y, halved]))
+        torch.testing.assert_close(torch.func.grad(loss)(x), want)
+        _, slope = torch.func.jvp(loss, (x,), (direction,))
+        torch.testing.assert_close(slope, (want * direction).sum())
+        with torch.autograd.forward_ad.dual_level():
+            dual = loss(torch.autograd.forward_ad.make_dual(x, direction))
+            torch.testing.assert_close(torch.autograd.forward_ad.unpack_dual(dual).tangent, slope)
+
+    def test_bad_input_is_rejected(self, case: LayerCase) -> None:
+        x = case.inputs(1, SIZE)
+        wrong = [(x[0], "expected shape"), (x.byte(), r"expected a floating dtype, got torch\.uint8")]
+        if case.accepts_colour:
+            wrong.append((x.repeat(1, 4, 1, 1), "got"))
+        for bad, message in wrong:
+            with pytest.raises(InvalidInputError, match=message):
+                case(bad)
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("dynamic", [False, True])
+    def test_compile_fullgraph(self, case: LayerCase, dynamic: bool) -> None:
+        """Compiled by inductor for one size, and traced as one graph for any size."""
+        torch._dynamo.reset()
+        options = {"dynamic": True, "backend": "eager"} if dynamic else {}
+        graph = torch.compile(case.twin(), fullgraph=True, **options)
+        for n, size in ((2, SIZE), (3, SIZE + 6)) if dynamic else ((2, SIZE),):
+            x = case.inputs(n, size)
+            assert self.agrees(graph(x), case(x))
+
+    @pytest.mark.slow
+    def test_export_with_any_batch(self, case: LayerCase) -> None:
+        batch = torch.export.Dim("batch", min=1, max=64)
+        program = torch.export.export(case.twin(), (case.inputs(3, SIZE),), dynamic_shapes=({0: batch},))
+        for n in (2, 5):
+            x = case.inputs(n, SIZE, seed=7)
+            assert self.agrees(program.module()(x), case(x))
+
+    @pytest.mark.slow
+    @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
+    def test_onnx_export(self, case: LayerCase, tmp_path: Path) -> None:
+        pytest.importorskip("onnxscript")
+        runtime = pytest.importorskip("onnxruntime")
+        path, x = tmp_path / "layer.onnx", case.inputs(2, SIZE)
+        torch.onnx.export(case.twin().eval(), (x,), path, dynamo=True, verbose=False)
+        session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        (got,) = session.run(None, {session.get_inputs()[0].name: x.numpy()})
+        assert self.agrees(torch.from_numpy(got), case(x))
