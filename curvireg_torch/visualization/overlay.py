@@ -1,4 +1,4 @@
-"""One picture that shows whether a registration can be believed."""
+"""One picture that shows whether a registration is right."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -31,40 +31,37 @@ def contour_overlay(
 ) -> np.ndarray:
     """The photograph with the mesh's outer (green) and inner (orange) contours at the pose, and the box (white).
 
-    What is drawn is what was found (``result.projection``), not what would fill the box.
-
     Args:
-        registrar: what made ``result``.
-        result: a registration, or one of its hypotheses.
+        registrar: the registrar that computed ``result``.
+        result: a registration, or one of its hypotheses; it is drawn with its ``projection``.
         image: the photograph, as the registrar takes it: a (1 or 3, H, W) tensor, an array or a path.
         box: (4,) px.
-        camera_matrix: (3, 3) of another camera in the same place, for instance of a smaller copy of the photograph;
-            default that of the photograph.
+        camera_matrix: (3, 3), if ``image`` is another one from the same position, such as a smaller copy.
 
     Returns:
         (H, W, 3) uint8 RGB.
 
     Raises:
-        InvalidInputError: a camera matrix for a pose that was found without one.
+        InvalidInputError: a camera matrix, but a pose without translation.
     """
     item = _item(image, box)
     H, W = item.image.shape[-2:]
-    return _overlay(registrar, result, item, camera_matrix, (0, 0, W, H))
+    return _overlay(registrar, result, item, (0, 0, W, H), camera_matrix)
 
 
 def _overlay(
     registrar: Registrar,
     result: Registration | Hypothesis,
     item: ImageItem,
+    window: tuple[int, int, int, int],
     camera_matrix: Any | None,
-    part: tuple[int, int, int, int],
 ) -> np.ndarray:
     """:func:`contour_overlay` of columns x0 to x1 - 1 and rows y0 to y1 - 1."""
-    if camera_matrix is not None and result.translation is None:
-        raise InvalidInputError("camera_matrix: the pose was found without one; leave it out")
-    x0, y0, x1, y1 = part
+    x0, y0, x1, y1 = window
     T, K = result.projection
     if camera_matrix is not None:
+        if result.translation is None:
+            raise InvalidInputError("camera_matrix: the pose was found without one; leave it out")
         K = as_numbers(camera_matrix, "camera_matrix", least=torch.float64)
         check_camera_matrix(K)
     K = K.clone()
@@ -75,18 +72,23 @@ def _overlay(
     return picture
 
 
-def _around(item: ImageItem) -> tuple[int, int, int, int]:
-    """The part of a photograph that holds the box and half of its longer side on every side."""
+def _window(item: ImageItem) -> tuple[int, int, int, int]:
+    """The box with a margin of half its longer side, inside the photograph."""
     H, W = item.image.shape[-2:]
     x0, y0, x1, y1 = item.box.tolist()
-    room = 0.5 * max(x1 - x0, y1 - y0)
-    return max(0, round(x0 - room)), max(0, round(y0 - room)), min(W, round(x1 + room)), min(H, round(y1 + room))
+    margin = 0.5 * max(x1 - x0, y1 - y0)
+    return (
+        max(0, round(x0 - margin)),
+        max(0, round(y0 - margin)),
+        min(W, round(x1 + margin)),
+        min(H, round(y1 + margin)),
+    )
 
 
 def draw_pose(
     picture: np.ndarray, renderer: DepthRenderer, projection: tuple[Tensor, Tensor], box: Sequence[float]
 ) -> None:
-    """Draw a mesh's contours, seen by (4, 4) ``T_cam_from_model`` and (3, 3) camera, and a box into (H, W, 3) uint8."""
+    """Draw a mesh's contours and a box into (H, W, 3) uint8; ``projection`` is pose and camera matrix."""
     T, K = projection
     H, W = picture.shape[:2]
     width = draw_contours(picture, renderer.render(T[None], K, (H, W))[0, 0].cpu().numpy())
@@ -95,7 +97,7 @@ def draw_pose(
 
 
 def draw_contours(picture: np.ndarray, depth: np.ndarray) -> int:
-    """Draw the outer and inner contours of a (H, W) depth image into an (H, W, 3 or 4) picture; returns their width."""
+    """Draw outer and inner contours of (H, W) depth into an (H, W, 3 or 4) picture; returns the line width in px."""
     width = max(1, round(max(int(n) for n in depth.shape) / 500))
     opaque = (255,) * (picture.shape[2] - 3)
     mask = (depth > 0).astype(np.uint8)
@@ -114,19 +116,19 @@ def _item(image: Any, box: Any) -> ImageItem:
 
 
 def _depth_edges(depth: np.ndarray) -> np.ndarray:
-    """Jumps of depth inside the silhouette: steps that exceed those beside them by 3 % of the object's depth range."""
-    seen = depth > 0
-    if not seen.any():
-        return seen
-    limit = 0.03 * float(np.ptp(depth[seen]))
-    edges = np.zeros_like(seen)
+    """Depth discontinuities inside the silhouette: steps larger than a neighbouring one by 3 % of the depth range."""
+    mask = depth > 0
+    if not mask.any():
+        return mask
+    limit = 0.03 * float(np.ptp(depth[mask]))
+    edges = np.zeros_like(mask)
     for axis in (0, 1):
         step = np.abs(np.diff(depth, axis=axis))
-        around = np.pad(step, [(1, 1), (0, 0)] if axis == 0 else [(0, 0), (1, 1)], mode="edge")
-        before, after = (np.take(around, range(k, k + step.shape[axis]), axis=axis) for k in (0, 2))
+        padded = np.pad(step, [(1, 1), (0, 0)] if axis == 0 else [(0, 0), (1, 1)], mode="edge")
+        before, after = (np.take(padded, range(k, k + step.shape[axis]), axis=axis) for k in (0, 2))
         jump = step - np.minimum(before, after) > limit
         edges |= np.pad(jump, [(0, 1), (0, 0)] if axis == 0 else [(0, 0), (0, 1)])
-    return np.asarray(edges & seen)
+    return np.asarray(edges & mask)
 
 
 def _thick(mask: np.ndarray, width: int) -> np.ndarray:
@@ -137,20 +139,19 @@ def _thick(mask: np.ndarray, width: int) -> np.ndarray:
 def registration_sheet(
     registrar: Registrar, result: Registration, image: Any, box: Any, camera_matrix: Any | None = None
 ) -> np.ndarray:
-    """Contour overlay; beside it the crop, its field, the pose and its field; below the hypotheses' poses, best first.
+    """Contour overlay; beside it crop, field, pose and its field; below the hypotheses, best first.
 
-    The overlay shows the box and half of its longer side on every side, so that contours of a small object are seen,
-    too. Over each hypothesis stand its score and how far it is turned from the best. Arguments as for
-    :func:`contour_overlay`.
+    The overlay shows the box with a margin of half its longer side. The caption of a hypothesis is its score and its
+    rotation from the best. Arguments as for :func:`contour_overlay`.
 
     Returns:
         (H', W', 3) uint8 RGB.
     """
     item = _item(image, box)
-    overlay = _overlay(registrar, result, item, camera_matrix, _around(item))
+    overlay = _overlay(registrar, result, item, _window(item), camera_matrix)
     side = [_caption(_tile(p), name) for name, p in side_pictures(registrar, result, item.image, item.box).items()]
     poses = [
-        _caption(_tile(depth_picture(_depth(registrar, h)[0, 0])), _told(registrar, result, i))
+        _caption(_tile(depth_picture(_depth(registrar, h)[0, 0])), _hypothesis_caption(registrar, result, i))
         for i, h in enumerate(result.hypotheses, start=1)
     ]
     panel = np.vstack([np.hstack(side[:2]), np.hstack(side[2:])])
@@ -167,7 +168,7 @@ def registration_sheet(
 def side_pictures(
     registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any
 ) -> dict[str, np.ndarray]:
-    """What the two sides compare, (S, S, 3) uint8 RGB each: "photograph", "photograph field", "pose", "view field".
+    """The compared pictures, (S, S, 3) uint8 RGB each: "photograph", "photograph field", "pose", "view field".
 
     Arguments as for :func:`contour_overlay`.
     """
@@ -183,12 +184,11 @@ def side_pictures(
 
 
 def _depth(registrar: Registrar, pose: Registration | Hypothesis) -> Tensor:
-    """(1, 1, S, S) of the view of a pose."""
+    """(1, 1, S, S) depth of a pose, as the bank's views are rendered."""
     return registrar.describers[pose.model].depth(pose.allocentric_rotation[None], torch.tensor([pose.distance]))[0]
 
 
-def _told(registrar: Registrar, result: Registration, number: int) -> str:
-    """What stands over the picture of a hypothesis."""
+def _hypothesis_caption(registrar: Registrar, result: Registration, number: int) -> str:
     best, this = result.hypotheses[0], result.hypotheses[number - 1]
     mesh = f"mesh {this.model}, " if len(registrar.bank.meshes) > 1 else ""
     if number == 1 or this.model != best.model:
@@ -197,7 +197,7 @@ def _told(registrar: Registrar, result: Registration, number: int) -> str:
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
-    """(H, W, 3) uint8 RGB of a (1 or 3, H, W) image, floating in [0, 1] or uint8; black where pixels are missing."""
+    """(H, W, 3) uint8 RGB of a (1 or 3, H, W) image, floating in [0, 1] or uint8; black for NaN."""
     pixels = image.detach().cpu()
     if pixels.is_floating_point():
         pixels = (pixels.float().nan_to_num(0.0, 0.0, 0.0).clamp(0, 1) * 255).round().byte()
@@ -206,12 +206,12 @@ def to_uint8(image: Tensor) -> np.ndarray:
 
 def depth_picture(depth: Tensor) -> np.ndarray:
     """(H, W, 3) uint8 of a (H, W) depth image: near is bright, background black."""
-    seen = depth > 0
-    if not bool(seen.any()):
+    mask = depth > 0
+    if not bool(mask.any()):
         return to_uint8(torch.zeros_like(depth)[None])
-    near, far = depth[seen].min(), depth[seen].max()
+    near, far = depth[mask].min(), depth[mask].max()
     shade = 1.0 - 0.75 * (depth - near) / (far - near).clamp(min=1e-9)
-    return to_uint8((shade * seen)[None])
+    return to_uint8((shade * mask)[None])
 
 
 def _field_picture(field: Tensor) -> np.ndarray:

@@ -28,22 +28,21 @@ _MATT = {"name": "matt", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughn
 def pose_glb(
     mesh: trimesh.Trimesh, T_cam_from_model: Tensor, camera_matrix: Tensor, image: Tensor, *, photograph: bool = True
 ) -> bytes:
-    """A GLB file: the mesh where it was found, a camera at the origin, the photograph on a plane behind the mesh.
+    """A GLB file: the mesh at its pose, a camera at the origin, and the photograph on a plane behind the mesh.
 
-    In metres and with y up, as glTF asks: from the camera "photograph" a viewer shows the mesh over the photograph.
-    glTF cameras look straight ahead: a principal point away from the picture's middle and the pose stand, exact and in
-    the mesh's own unit, in the camera node's ``extras``. Of the mesh's colours, those of its corners are kept.
+    Lengths are metres and y points up, as glTF requires. From the camera "photograph", a viewer shows the mesh over the
+    photograph. A glTF camera has no principal point, so the exact camera and the pose, in the mesh's unit, are in the
+    ``extras`` of the camera's node. Textures are reduced to colours of vertices.
 
     Args:
-        mesh: as :func:`curvireg_torch.load_mesh` gives it; ``mesh.units`` counts.
+        mesh: from :func:`curvireg_torch.load_mesh`, with its unit in ``mesh.units``.
         T_cam_from_model: (4, 4), OpenCV camera, in the mesh's unit.
         camera_matrix: (3, 3) px.
         image: (1 or 3, H, W) floating in [0, 1] or uint8.
         photograph: False leaves the plane out.
 
     Raises:
-        InvalidInputError: a pose that is not rigid, an unusable camera or image, or an object that is not before the
-            camera.
+        InvalidInputError: a pose that is not rigid, an unusable camera or image, or an object behind the camera.
 
     Example:
         >>> K = torch.tensor([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]], dtype=torch.float64)
@@ -58,7 +57,7 @@ def pose_glb(
     T, K = T_cam_from_model.detach().cpu().double(), camera_matrix.detach().cpu().double()
     depth = float((T[:3, :3] @ mesh_centre(mesh) + T[:3, 3])[2])
     if depth <= 0:
-        raise InvalidInputError("T_cam_from_model: the object lies behind the camera; check the pose")
+        raise InvalidInputError("T_cam_from_model: the object is behind the camera; check the pose")
     H, W = (int(n) for n in image.shape[-2:])
     unit = mesh_unit(mesh) or "m"  # glTF is in metres
     metres = UNITS[unit]
@@ -87,7 +86,7 @@ def pose_glb(
             for part in mesh["primitives"]:
                 part.setdefault("material", len(tree["materials"]) - 1)
         for material in tree["materials"]:
-            if material.get("name") == "picture":  # no light falls on it
+            if material.get("name") == "picture":  # keeps its brightness
                 material["extensions"] = {"KHR_materials_unlit": {}}
                 tree["extensionsUsed"] = ["KHR_materials_unlit"]
 
@@ -95,7 +94,7 @@ def pose_glb(
 
 
 def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh alone, with corners of their own so that edges stay sharp, in the colours of its corners."""
+    """The mesh with vertex colours; faces share no vertices, so that edges stay sharp."""
     faces = np.arange(3 * len(mesh.faces)).reshape(-1, 3)
     plain = trimesh.Trimesh(np.asarray(mesh.triangles).reshape(-1, 3), faces, process=False)
     rgb = np.full((len(faces), 3, 3), 190, np.uint8)
@@ -109,13 +108,13 @@ def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _photograph_plane(image: Tensor, K: Tensor, depth: float) -> trimesh.Trimesh:
-    """The photograph across the optical axis, in OpenCV's camera frame, at a depth where the mesh does not reach."""
+    """The photograph as a plane at a depth, in OpenCV's camera frame."""
     H, W = (int(n) for n in image.shape[-2:])
     edges = [(-0.5, -0.5), (W - 0.5, -0.5), (W - 0.5, H - 0.5), (-0.5, H - 0.5)]
     pixels = torch.tensor([[u, v, 1.0] for u, v in edges], dtype=torch.float64)
     corners = (depth * pixels @ torch.linalg.inv(K).T).numpy()
     uv = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
-    faces = np.array([[0, 3, 2], [0, 2, 1]])  # counterclockwise for the camera, once flipped
+    faces = np.array([[0, 3, 2], [0, 2, 1]])  # counterclockwise after the flip
     material = trimesh.visual.material.PBRMaterial(
         name="picture", baseColorTexture=_jpeg(image), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
     )

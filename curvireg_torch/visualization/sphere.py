@@ -1,4 +1,4 @@
-"""Scores of a ranking over the directions from which an object can be seen."""
+"""Scores of a ranking over the viewing directions."""
 
 import numpy as np
 import torch
@@ -12,21 +12,21 @@ __all__ = ["direction_scores", "sphere_map"]
 
 
 def direction_scores(
-    bank: ViewBank, ranking: Ranking, *, photograph: int = 0, model: int = 0
+    bank: ViewBank, ranking: Ranking, *, image_index: int = 0, model: int = 0
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Of every direction of a bank the best score over turns in the image plane and distances.
+    """Best score of every viewing direction of a bank, over in-plane rotations and distances.
 
     Args:
         bank: N views.
-        ranking: of them.
-        photograph: which of the ranking's.
-        model: which of the bank's meshes.
+        ranking: of these views.
+        image_index: photograph of the ranking.
+        model: mesh of the bank.
 
     Returns:
-        azimuth and elevation (M,) in degrees, [0, 360) and [-90, 90], and score (M,); all float64.
+        azimuth and elevation (M,) in degrees, [0, 360) and [-90, 90], and score (M,); float64.
 
     Raises:
-        InvalidInputError: a ranking of other views, or a photograph or model that is not there.
+        InvalidInputError: a ranking of other views, or no such photograph or model.
 
     Example:
         >>> import trimesh
@@ -37,41 +37,41 @@ def direction_scores(
         >>> len(bank), len(direction_scores(bank, ranking)[0])
         (16, 8)
     """
-    if ranking.scores.shape[1] != len(bank) or not 0 <= photograph < len(ranking):
+    if ranking.scores.shape[1] != len(bank) or not 0 <= image_index < len(ranking):
         raise InvalidInputError(
-            f"ranking: expected {len(bank)} views and photograph {photograph}, got {tuple(ranking.scores.shape)}"
+            f"ranking: expected {len(bank)} views and image {image_index}, got {tuple(ranking.scores.shape)}"
         )
-    mine = (bank.model == model).nonzero()[:, 0].cpu()
-    if len(mine) == 0:
+    views = (bank.model == model).nonzero()[:, 0].cpu()
+    if len(views) == 0:
         raise InvalidInputError(f"model: the bank has {len(bank.meshes)} meshes, got {model}")
-    azimuth = bank.views.azimuth.cpu().double()[mine] % 360.0
-    elevation = bank.views.elevation.cpu().double()[mine]
-    azimuth = torch.where(elevation.abs() > 89.999, 0.0, azimuth)  # at a pole it is a turn
+    azimuth = bank.views.azimuth.cpu().double()[views] % 360.0
+    elevation = bank.views.elevation.cpu().double()[views]
+    azimuth = torch.where(elevation.abs() > 89.999, 0.0, azimuth)  # at a pole azimuth is an in-plane rotation
     keys = torch.stack([azimuth, elevation], dim=1).mul(1000).round().long()
     _, group = keys.unique(dim=0, return_inverse=True)
     count = int(group.max()) + 1
     score = torch.full((count,), -torch.inf, dtype=torch.float64)
-    score = score.scatter_reduce(0, group, ranking.scores[photograph].cpu().double()[mine], "amax")
-    first = torch.full((count,), len(mine)).scatter_reduce(0, group, torch.arange(len(mine)), "amin")
+    score = score.scatter_reduce(0, group, ranking.scores[image_index].cpu().double()[views], "amax")
+    first = torch.full((count,), len(views)).scatter_reduce(0, group, torch.arange(len(views)), "amin")
     return azimuth[first], elevation[first], score
 
 
 def sphere_map(
     azimuth: Tensor, elevation: Tensor, score: Tensor, *, size: tuple[int, int] = (180, 360)
 ) -> NDArray[np.float64]:
-    """The scores on a map: rows from elevation 90 down to -90, columns from azimuth 0 to 360.
+    """Map of scores: rows from elevation 90 to -90, columns from azimuth 0 to 360.
 
     Args:
         azimuth, elevation, score: (M,) of directions.
         size: (rows, columns).
 
     Returns:
-        The score of the direction nearest to each cell's centre; NaN where none is as near as directions are to their
-        neighbours.
+        Score of the direction nearest to each cell's centre; NaN if it is farther away than any direction is from its
+        nearest neighbour.
 
     Example:
-        >>> sky = sphere_map(torch.tensor([0.0, 180.0]), torch.zeros(2), torch.tensor([1.0, 2.0]), size=(1, 4))
-        >>> sky.tolist()
+        >>> scores = sphere_map(torch.tensor([0.0, 180.0]), torch.zeros(2), torch.tensor([1.0, 2.0]), size=(1, 4))
+        >>> scores.tolist()
         [[1.0, 2.0, 2.0, 1.0]]
     """
     rows, columns = size
@@ -79,12 +79,11 @@ def sphere_map(
     a = (torch.arange(columns, dtype=torch.float64) + 0.5) * 360.0 / columns
     directions = _unit(azimuth.double(), elevation.double())
     cells = _unit(a[None].expand(rows, columns), e[:, None].expand(rows, columns)).reshape(-1, 3)
-    cosine, nearest = (cells @ directions.T).mul(1e9).round().div(1e9).max(dim=1)  # of equals the first
-    own = (directions @ directions.T).fill_diagonal_(-1.0).amax(dim=1).clamp(-1.0, 1.0)
-    reach = torch.acos(own).amax() if len(own) > 1 else torch.tensor(torch.pi)
-    near = torch.acos(cosine.clamp(-1.0, 1.0)) <= reach
-    found = torch.where(near, score.double()[nearest], torch.nan)
-    return np.asarray(found.view(rows, columns).numpy())
+    cosine, nearest = (cells @ directions.T).mul(1e9).round().div(1e9).max(dim=1)  # the first of equal ones
+    neighbour = (directions @ directions.T).fill_diagonal_(-1.0).amax(dim=1).clamp(-1.0, 1.0)
+    reach = torch.acos(neighbour).amax() if len(neighbour) > 1 else torch.tensor(torch.pi)
+    is_near = torch.acos(cosine.clamp(-1.0, 1.0)) <= reach
+    return np.asarray(torch.where(is_near, score.double()[nearest], torch.nan).view(rows, columns).numpy())
 
 
 def _unit(azimuth: Tensor, elevation: Tensor) -> Tensor:

@@ -39,7 +39,7 @@ def test_reliability_bins_by_confidence():
     np.testing.assert_allclose((sizes[1] - 20) / (sizes[0] - 20), 3, rtol=1e-5)
     with pytest.raises(InvalidInputError, match=r"\[0, 1\]"):
         plots.reliability(torch.tensor([1.2]), torch.tensor([True]))
-    with pytest.raises(InvalidInputError, match="right"):
+    with pytest.raises(InvalidInputError, match="correct"):
         plots.risk_coverage(torch.tensor([0.2]), torch.tensor([True, False]))
 
 
@@ -73,7 +73,7 @@ def test_curves_are_the_columns():
     assert [text.get_text() for text in axes.get_xticklabels()] == ["car", "sofa"]
     assert [round(bar.get_x(), 6) for bar in axes.containers[1]] == [0.0, 1.0], "beside the first, from the middle on"
     for draw in (plots.curves, plots.bars):
-        with pytest.raises(InvalidInputError, match="rows of 2"):
+        with pytest.raises(InvalidInputError, match="row of 2"):
             draw(["k", "a"], [[1, 2, 3]])
 
 

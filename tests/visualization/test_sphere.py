@@ -22,14 +22,14 @@ def ranked(scores):
 
 def test_each_direction_has_its_best_turn_and_distance(bank):
     scores = torch.rand(2, len(bank), generator=torch.Generator().manual_seed(0))
-    azimuth, elevation, best = direction_scores(bank, ranked(scores), photograph=1)
+    azimuth, elevation, best = direction_scores(bank, ranked(scores), image_index=1)
     assert len(best) == 8
     for a, e, s in zip(azimuth.tolist(), elevation.tolist(), best.tolist(), strict=True):
         mine = (bank.views.azimuth == a) & (bank.views.elevation == e)
         assert int(mine.sum()) == 4
         assert s == float(scores[1][mine].max())
-    with pytest.raises(InvalidInputError, match="photograph 2"):
-        direction_scores(bank, ranked(scores), photograph=2)
+    with pytest.raises(InvalidInputError, match="image 2"):
+        direction_scores(bank, ranked(scores), image_index=2)
     with pytest.raises(InvalidInputError, match="1 meshes"):
         direction_scores(bank, ranked(scores), model=1)
 
