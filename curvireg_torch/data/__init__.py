@@ -5,6 +5,7 @@ gives a sample without its photograph through ``annotation(index)``. Nothing is 
 """
 
 from ..io.images import Photo, read_image, read_photo
+from ._base import ObjectDataset
 from .bop import BOPDataset
 from .bop_csv import BOPRow, read_bop_csv, write_bop_csv
 from .collate import collate
@@ -16,6 +17,7 @@ __all__ = [
     "BOPDataset",
     "BOPRow",
     "CropBox",
+    "ObjectDataset",
     "Pascal3DPlus",
     "Photo",
     "WebCollection",

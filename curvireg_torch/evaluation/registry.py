@@ -1,37 +1,33 @@
-"""The kinds of datasets, one row each, for ``evaluate``, the paper's experiments and ``datasets/verify.py``.
+"""Datasets by name, for ``evaluate``, the paper's experiments and ``datasets/verify.py``.
 
-Nothing heavy is imported before a dataset is opened, so that the command line's help answers at once.
+Nothing heavy is imported before a dataset is opened, so that the command line's help is fast.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ..utils.registry import Registry
-
-if TYPE_CHECKING:
-    from .benchmark import Benchmark
+from ..utils.registry import Registry, resolve
 
 __all__ = ["DATASETS", "DatasetSpec"]
 
 
 @dataclass(frozen=True)
 class DatasetSpec:
-    """A kind of dataset.
+    """A dataset, its benchmark, and what the command line says about it.
 
     Attributes:
-        dataset, benchmark: names of the classes, in :mod:`curvireg_torch.data` and :mod:`curvireg_torch.evaluation`.
-        help, root, example: for the command line: what it is, what ROOT must hold, and a ROOT.
+        dataset, benchmark: subclasses of :class:`ObjectDataset` and :class:`Benchmark`, or "package.module:attribute".
+        help, root, example: for the command line: what the dataset is, what ROOT must contain, and an example of ROOT.
         pose: default of the protocol's ``pose``.
-        category, mesh: of a sample: a format of its group's name, and the key of its mesh.
-        options: of the dataset's class, each as ``ArgumentParser.add_argument`` takes it.
-        whole: options with which only whole objects are left, as far as the class has such options.
+        category, mesh: of a sample: format string of its group's name, and the key of its mesh.
+        options: keyword arguments of the dataset's class, each with the options of ``ArgumentParser.add_argument``.
+        whole: options that select objects that are neither occluded nor truncated.
     """
 
-    dataset: str
-    benchmark: str
+    dataset: Callable[..., Any] | str
+    benchmark: Callable[..., Any] | str
     help: str
     root: str
     example: str
@@ -42,36 +38,35 @@ class DatasetSpec:
     whole: Mapping[str, Any] = field(default_factory=dict)
 
     def add_arguments(self, parser: Any) -> None:
-        """ROOT and the options."""
+        """Add ROOT and the options to a parser."""
         parser.add_argument("root", metavar="ROOT", help=self.root)
         for name, how in self.options.items():
             parser.add_argument(f"--{name.replace('_', '-')}", **how)
 
     def chosen(self, arguments: Any) -> dict[str, Any]:
-        """Those of the parsed ``arguments`` that are options of the dataset."""
+        """The parsed ``arguments`` that are options of the dataset."""
         return {name: getattr(arguments, name) for name in self.options}
 
     def open(self, root: str | PathLike[str], **options: Any) -> Any:
-        """The dataset.
+        """Open the dataset.
 
         Raises:
-            CurviregError: it is not there, or an option is out of range.
+            CurviregError: it does not exist, or an option is out of range.
         """
-        return getattr(import_module("curvireg_torch.data"), self.dataset)(root, **options)
+        return resolve(self.dataset)(root, **options)
 
     @property
-    def scored(self) -> "type[Benchmark]":
+    def scored(self) -> Any:
         """The benchmark's class."""
-        found: type[Benchmark] = getattr(import_module("curvireg_torch.evaluation"), self.benchmark)
-        return found
+        return resolve(self.benchmark)
 
 
 DATASETS: Registry[DatasetSpec] = Registry(
     "dataset",
     {
         "pascal3d": DatasetSpec(
-            dataset="Pascal3DPlus",
-            benchmark="Pascal3DBenchmark",
+            dataset="curvireg_torch.data:Pascal3DPlus",
+            benchmark="curvireg_torch.evaluation:Pascal3DBenchmark",
             help="viewpoints on PASCAL3D+",
             root="folder with Annotations, Images and CAD",
             example="data/PASCAL3D+_release1.1",
@@ -91,8 +86,8 @@ DATASETS: Registry[DatasetSpec] = Registry(
             whole={"occluded": False, "truncated": False},
         ),
         "bop": DatasetSpec(
-            dataset="BOPDataset",
-            benchmark="BOPBenchmark",
+            dataset="curvireg_torch.data:BOPDataset",
+            benchmark="curvireg_torch.evaluation:BOPBenchmark",
             help="6D poses on a BOP set",
             root="folder with models and the split's folder",
             example="data/bop/lm",
@@ -101,8 +96,8 @@ DATASETS: Registry[DatasetSpec] = Registry(
             options={"split": {"default": "test", "help": "folder of the scenes (default: test)"}},
         ),
         "web": DatasetSpec(
-            dataset="WebCollection",
-            benchmark="WebBenchmark",
+            dataset="curvireg_torch.data:WebCollection",
+            benchmark="curvireg_torch.evaluation:WebBenchmark",
             help="viewpoints on a collection of your own",
             root="folder with one folder per object",
             example="data/web",

@@ -79,7 +79,8 @@ def _opened(store: PredictionStore) -> Benchmark:
         kind = DATASETS[settings["dataset"]]
         options = {name: settings[name] for name in kind.options if name in settings}
         dataset = kind.open(settings["root"], **options)
-        return kind.scored(dataset, Protocol.parse(settings["protocol"].split(), pose=kind.pose))
+        found: Benchmark = kind.scored(dataset, Protocol.parse(settings["protocol"].split(), pose=kind.pose))
+        return found
     except (KeyError, TypeError, AttributeError) as error:
         raise InvalidInputError(f"{store.folder}/settings.json: not an evaluation's ({error!r})") from error
 

@@ -6,10 +6,19 @@ from typing import Any, Generic, TypeVar, overload
 
 from ..errors import InvalidInputError
 
-__all__ = ["Registry"]
+__all__ = ["Registry", "resolve"]
 
 T = TypeVar("T")
 D = TypeVar("D")
+
+
+def resolve(target: T | str) -> T:
+    """Import a target that is given as "package.module:attribute"; any other object is returned unchanged."""
+    if not isinstance(target, str):
+        return target
+    module, _, attribute = target.partition(":")
+    found: T = getattr(import_module(module), attribute)
+    return found
 
 
 class Registry(Mapping[str, T], Generic[T]):
@@ -56,10 +65,7 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def __getitem__(self, name: str) -> T:
         self.check(name)
-        target = self._entries[name]
-        if isinstance(target, str):
-            module, _, attribute = target.partition(":")
-            target = self._entries[name] = getattr(import_module(module), attribute)
+        target = self._entries[name] = resolve(self._entries[name])
         return target
 
     def __contains__(self, name: object) -> bool:
