@@ -81,7 +81,7 @@ def _opened(store: PredictionStore) -> Benchmark:
         dataset = kind.open(settings["root"], **options)
         found: Benchmark = kind.scored(dataset, Protocol.parse(settings["protocol"].split(), pose=kind.pose))
         return found
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, InvalidInputError) as error:
         raise InvalidInputError(f"{store.folder}/settings.json: not an evaluation's ({error!r})") from error
 
 
