@@ -117,7 +117,7 @@ class BankSettings:
 
 @dataclass(frozen=True)
 class LocateSettings:
-    """How an object without a box is searched for, see :class:`curvireg_torch.registration.localization.Locator`.
+    """How an object without a box is searched for, see :class:`curvireg_torch.registration.locator.Locator`.
 
     Attributes:
         views: of each model, that represent all of its views.

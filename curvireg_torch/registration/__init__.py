@@ -2,10 +2,10 @@
 
 from ..matching import distinct_views
 from .confidence import RELIABLE, confidence, ranking_evidence
-from .contour import ContourFit, fit_contours
-from .hypotheses import Hypotheses, hypotheses
-from .localization import Located, Locator, locate, representative_views
-from .localization.objects import localize
+from .contours import ContourFit, fit_contours
+from .hypotheses import Hypotheses, start_hypotheses
+from .localization import localize
+from .locator import Located, Locator, locate, representative_views
 from .registrar import Registrar
 from .rescoring import rescore
 from .results import FailedRegistration, Hypothesis, Localization, Registration
@@ -26,11 +26,11 @@ __all__ = [
     "confidence",
     "distinct_views",
     "fit_contours",
-    "hypotheses",
     "localize",
     "locate",
     "ranking_evidence",
     "representative_views",
     "rescore",
     "search",
+    "start_hypotheses",
 ]

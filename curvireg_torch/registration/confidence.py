@@ -1,7 +1,7 @@
-"""How far a ranking, a pose or a place can be trusted: logistic models of what was measured.
+"""Probabilities that a ranking, a pose or a localization is right: logistic models of measured features.
 
-Their constants are those of :mod:`curvireg_torch.registration.calibration`. What they are worth on photographs that had
-no part in them is in docs/accuracy.md.
+Their constants come from :mod:`curvireg_torch.registration.calibration`; docs/accuracy.md has their accuracy on
+photographs that were not used for calibration.
 """
 
 import math
@@ -16,13 +16,13 @@ from .calibration import CALIBRATION
 from .rescoring import POSE_FEATURES
 
 __all__ = [
-    "FEATURES",
+    "CONFIDENCE_FEATURES",
     "PRESENCE_FEATURES",
     "RELIABLE",
     "LogisticModel",
     "confidence",
+    "confidence_features",
     "confidence_model",
-    "pose_features",
     "presence",
     "presence_features",
     "ranking_evidence",
@@ -30,31 +30,31 @@ __all__ = [
 ]
 
 RELIABLE = 0.9
-"""Confidence below which a registration says "no reliable match"."""
+"""Confidence from which a registration is called reliable."""
 
 RANKING_FEATURES = ("similarity", "margin", "concentration")
-"""What :func:`ranking_evidence` measures, in its order."""
+"""Columns of :func:`ranking_evidence`."""
 
-FEATURES = ("similarity", "lead", "edge_support", "appearance_lead", "concentration")
-"""What the confidence in a pose that was followed to its end rests on, see :func:`pose_features`."""
+CONFIDENCE_FEATURES = ("similarity", "lead", "edge_support", "appearance_lead", "concentration")
+"""Features of the confidence in a fitted pose, see :func:`confidence_features`."""
 
-PRESENCE_FEATURES = ("place", "similarity")
-"""What :func:`presence_features` measures, in its order; similarity alone where nothing was learnt."""
+PRESENCE_FEATURES = ("proposal", "similarity")
+"""Values of :func:`presence_features`; only the similarity for pipelines without anything learned."""
 
 _PRESENCE = {2: ((1.128, 7.819), -16.897), 1: ((16.756,), -14.856)}
-"""Logistic regressions on mosaics of photographs of textured meshes, by scripts/speed/location.py: weights and bias for
-both pieces of evidence, and for the one."""
+"""Weights and bias for two features and for one: logistic regressions on mosaics of photographs of textured meshes, by
+scripts/speed/location.py."""
 
 MARGIN = 5.0
-"""A lead that is larger says no more."""
+"""Leads are clamped to +- this value."""
 
 UNCOMPARED = 0.5
-"""Confidence in an answer that has no rival, at most."""
+"""Largest confidence in a result without rival views."""
 
-_APART = 30.0  # degrees beyond which two views are rival answers
+_APART = 30.0  # degrees beyond which two views are rivals
 
 Features = Mapping[str, float | None]
-"""By name; None where there is no rival view to compare with."""
+"""Features by name; None where there is no rival view to compare with."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class LogisticModel:
 
     Attributes:
         weights: of the features, by name.
-        bias: where all features are 0.
+        bias: logit where all features are 0.
     """
 
     weights: Mapping[str, float]
@@ -72,8 +72,8 @@ class LogisticModel:
     def __call__(self, features: Features) -> float:
         """Probability in (0, 1).
 
-        A feature that is None, for want of a rival to compare with, counts as 0, as that of a tie does, and the
-        probability is ``UNCOMPARED`` at most: nothing was seen that speaks against another pose.
+        A feature that is None, because there is no rival to compare with, counts as 0, as in a tie, and the probability
+        is at most ``UNCOMPARED``: there is no evidence against another pose.
         """
         logit = self.bias + sum(weight * (features[name] or 0.0) for name, weight in self.weights.items())
         probability = 0.5 * (1.0 + math.tanh(0.5 * logit))  # the logistic function, which overflows nowhere
@@ -81,12 +81,11 @@ class LogisticModel:
 
 
 def confidence_model(stage: str, *, with_camera: bool, with_appearance: bool) -> LogisticModel:
-    """The model of one way to register.
+    """The model for a kind of result.
 
     Args:
-        stage: "ranking" of answers that are views, "contours" of poses that were followed to their end.
-        with_camera: whether the camera matrix is known, and with it, as a rule, the object's own mesh. A ranking does
-            not depend on it.
+        stage: "ranking" for views, "contours" for fitted poses.
+        with_camera: whether the camera matrix is known; the model of a ranking does not depend on it.
         with_appearance: whether the pipeline has the appearance term.
     """
     camera = [] if stage == "ranking" else ["camera" if with_camera else "no camera"]
@@ -98,25 +97,25 @@ def confidence_model(stage: str, *, with_camera: bool, with_appearance: bool) ->
 def ranking_evidence(
     ranking: Ranking, rotations: Tensor, *, answer: Tensor | None = None, symmetries: Tensor | None = None
 ) -> Tensor:
-    """(B, 3) numbers that tell right answers from wrong ones, by the names in ``RANKING_FEATURES``.
+    """(B, 3) features that separate right from wrong results, in the order of ``RANKING_FEATURES``.
 
-    similarity: normalised correlation of the answer's view, in [0, 1]. margin: how far its score leads the best view
-    more than 30 degrees away, log S - log S', within +-5. concentration: of the sum of S^4 over all views, the share
-    within 30 degrees of it. Both are NaN where no view is that far away: then nothing was compared.
+    similarity: normalised correlation of the result's view, in [0, 1]. margin: log S - log S' to the best view more
+    than 30 degrees away, clamped to +-5. concentration: the fraction of the sum of S^4 over all views that lies within
+    30 degrees of the result. The last two are NaN where no view is that far away.
 
     Args:
         ranking: of N views for B photographs.
         rotations: (N, 3, 3) of the views.
-        answer: (B,) views that are the answers; default the best of each ranking.
-        symmetries: (K, 4, 4) or (K, 3, 3) of the mesh: views that differ by one of them are the same answer.
+        answer: (B,) views that are the results; default the best of each ranking.
+        symmetries: (K, 4, 4) or (K, 3, 3) of the mesh: views that differ by one of them count as the same.
     """
     scores = ranking.scores.double()
     best = ranking.order[:, :1] if answer is None else answer.to(ranking.order)[:, None]
-    turns = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
-    alike = rotations[best] @ turns.to(rotations)  # (B, K, 3, 3)
-    traces = (alike.flatten(2) @ rotations.flatten(1).T).amax(dim=1)
+    group = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
+    equivalent = rotations[best] @ group.to(rotations)  # (B, K, 3, 3)
+    traces = (equivalent.flatten(2) @ rotations.flatten(1).T).amax(dim=1)
     near = traces >= 1.0 + 2.0 * math.cos(math.radians(_APART)) - 1e-5
-    tiny = 1e-300  # of scores that are all 0
+    tiny = 1e-300  # all scores may be 0
     leader = scores.gather(1, best).clamp(min=tiny)
     rival = scores.masked_fill(near, 0.0).amax(dim=1, keepdim=True)
     margin = (leader / rival.clamp(min=tiny)).log().clamp(-MARGIN, MARGIN)
@@ -128,7 +127,7 @@ def ranking_evidence(
 
 
 def ranking_features(evidence: Tensor) -> dict[str, float | None]:
-    """Features of one ranking, from (3,) :func:`ranking_evidence`; None for what could not be compared."""
+    """Features by name of one ranking, from (3,) :func:`ranking_evidence`; None instead of NaN."""
     known = zip(RANKING_FEATURES, evidence.tolist(), strict=True)
     return {name: None if math.isnan(value) else value for name, value in known}
 
@@ -156,48 +155,46 @@ def confidence(ranking: Ranking, rotations: Tensor, *, symmetries: Tensor | None
     return torch.tensor([model(ranking_features(one)) for one in evidence])
 
 
-def pose_features(evidence: Tensor, verdicts: Tensor, concentration: float | None) -> dict[str, float | None]:
-    """Features of the best of the hypotheses that were followed for one photograph, by the names in ``FEATURES``.
+def confidence_features(evidence: Tensor, scores: Tensor, concentration: float | None) -> dict[str, float | None]:
+    """``CONFIDENCE_FEATURES`` of the best hypothesis of one photograph.
 
-    similarity and support: of the best one. lead: how far it leads its best rival in :func:`rescore`;
-    appearance_lead: how much more it looks like the photograph than any rival. Leads are at most 5, and None where
-    there is no rival. concentration: of the ranking, see :func:`ranking_evidence`.
+    similarity, edge_support: of the best hypothesis. lead, appearance_lead: its score, and its appearance score, minus
+    the largest of its rivals, clamped to +-5; None without rivals. concentration: see :func:`ranking_evidence`.
 
     Args:
-        evidence: (H, 4) of the hypotheses, see :data:`POSE_FEATURES`, the best first.
-        verdicts: (H,) of the same.
+        evidence: (H, 4) :data:`POSE_FEATURES` of the hypotheses, the best first.
+        scores: (H,) of the same, see :func:`rescore`.
         concentration: of the ranking.
     """
     best = dict(zip(POSE_FEATURES, evidence[0].tolist(), strict=True))
-    appearance_scores = evidence[:, POSE_FEATURES.index("appearance")]
     return {
         "similarity": best["similarity"],
-        "lead": _lead(verdicts),
+        "lead": _lead(scores),
         "edge_support": best["edge_support"],
-        "appearance_lead": _lead(appearance_scores),
+        "appearance_lead": _lead(evidence[:, POSE_FEATURES.index("appearance")]),
         "concentration": concentration,
     }
 
 
 def _lead(values: Tensor) -> float | None:
-    """How far the first is above the largest of the others, within +-``MARGIN``."""
+    """The first value minus the largest of the others, clamped to +-``MARGIN``."""
     return float((values[0] - values[1:].max()).clamp(-MARGIN, MARGIN)) if len(values) > 1 else None
 
 
-def presence_features(score: float, ranking: Ranking, *, pictures: bool) -> list[float]:
-    """Numbers that tell whether the object is there at all (``PRESENCE_FEATURES``).
+def presence_features(score: float, ranking: Ranking, *, learned: bool) -> list[float]:
+    """Features of the probability that the photograph shows the object at all (``PRESENCE_FEATURES``).
 
     Args:
         score: of the locator for the box.
-        ranking: of the one box; its best raw correlation counts.
-        pictures: whether the locator looked at pictures; where it compared fields its score tells nothing.
+        ranking: of that box (B = 1); its best correlation is the similarity.
+        learned: whether the locator compares learned features; its score of classical fields is not informative.
     """
     similarity = float(ranking.hog.detach().max())
-    return [score, similarity] if pictures else [similarity]
+    return [score, similarity] if learned else [similarity]
 
 
 def presence(evidence: Sequence[float]) -> float:
-    """Probability that the photograph shows the object where its pose was found, from :func:`presence_features`.
+    """Probability that the photograph shows the object at its pose, from :func:`presence_features`.
 
     Example:
         >>> presence([8.0, 0.9]) > presence([4.0, 0.6])

@@ -1,4 +1,4 @@
-"""Hypotheses: the best distinct views of rankings, as poses in the making."""
+"""Hypotheses: the best distinct views of rankings, which later stages turn into poses."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -7,31 +7,33 @@ from torch import Tensor
 
 from ..matching import Ranking, ViewBank, distinct_views
 
-__all__ = ["Hypotheses", "distinct_mask", "hypotheses"]
+__all__ = ["Hypotheses", "distinct_mask", "start_hypotheses"]
 
 SAME = 15.0
-"""Degrees within which two hypotheses have become one."""
+"""Degrees within which two hypotheses count as one."""
 
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """H guesses at the poses of objects in photographs, several of a photograph, best first.
+    """H candidate rotations of objects in photographs; those of one photograph are adjacent, best first.
 
     Attributes:
-        photograph: (H,) int64, ascending.
-        view: (H,) int64 of the bank, where the guess comes from.
-        model: (H,) int64 of the bank.
-        rotation: (H, 3, 3) float64 allocentric rotations: of a camera that looks straight at the object.
+        image_index: (H,) int64, ascending.
+        view: (H,) int64 view of the bank that the hypothesis started from.
+        model: (H,) int64 mesh of the bank.
+        rotation: (H, 3, 3) float64 allocentric rotations.
         distance: (H,) float64 of the object's centre, model units.
-        score: (H,) float64 similarity of view and photograph.
+        ranking_score: (H,) float64 score S of ``view`` in the ranking.
+        similarity: (H,) float64 normalised correlation with the photograph as the search measured it; NaN before.
     """
 
-    photograph: Tensor
+    image_index: Tensor
     view: Tensor
     model: Tensor
     rotation: Tensor
     distance: Tensor
-    score: Tensor
+    ranking_score: Tensor
+    similarity: Tensor
 
     def __len__(self) -> int:
         return len(self.view)
@@ -39,41 +41,49 @@ class Hypotheses:
     def __getitem__(self, index: Tensor) -> "Hypotheses":
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
+    def by_model(self) -> list[tuple[int, Tensor]]:
+        """Each model that occurs, and the indices of its hypotheses."""
+        return [(m, (self.model == m).nonzero()[:, 0]) for m in self.model.unique().tolist()]
 
-def hypotheses(ranking: Ranking, bank: ViewBank, *, count: int, symmetries: Tensor | None = None) -> Hypotheses:
+
+def start_hypotheses(ranking: Ranking, bank: ViewBank, *, count: int, symmetries: Tensor | None = None) -> Hypotheses:
     """The best ``count`` distinct views of every photograph, see :func:`distinct_views`; on the CPU.
 
     Args:
         ranking: of the bank's views for B photographs.
-        count: at most so many of each photograph.
-        symmetries: of :func:`distinct_views`.
+        bank: of one or several models.
+        count: largest number of views of each photograph.
+        symmetries: see :func:`distinct_views`.
     """
     rotations = bank.rotations
     views = [distinct_views(o, rotations, count=count, symmetries=symmetries, model=bank.model) for o in ranking.order]
-    photograph = torch.tensor([b for b, chosen in enumerate(views) for _ in chosen], dtype=torch.long)
+    image_index = torch.tensor([b for b, chosen in enumerate(views) for _ in chosen], dtype=torch.long)
     view = torch.cat([torch.zeros(0, dtype=torch.long), *(chosen.cpu() for chosen in views)])
+    score = ranking.scores.cpu()[image_index, view].double()
     return Hypotheses(
-        photograph=photograph,
+        image_index=image_index,
         view=view,
         model=bank.model.cpu()[view],
         rotation=rotations.cpu()[view].double(),
         distance=bank.distances.cpu()[view],
-        score=ranking.scores.cpu()[photograph, view].double(),
+        ranking_score=score,
+        similarity=torch.full_like(score, torch.nan),
     )
 
 
-def distinct_mask(found: Hypotheses, score: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
-    """(H,) bool: False where a hypothesis ended within ``SAME`` degrees of a better one of its photograph.
+def distinct_mask(hypotheses: Hypotheses, score: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
+    """(H,) bool: False where a hypothesis is within ``SAME`` degrees of a better one of its photograph.
 
     Args:
-        score: (H,) the higher the better.
-        symmetries: of :func:`distinct_views`.
+        hypotheses: after search and contour fit.
+        score: (H,), higher is better.
+        symmetries: see :func:`distinct_views`.
     """
-    own = torch.zeros(len(found), dtype=torch.bool)
+    distinct = torch.zeros(len(hypotheses), dtype=torch.bool)
     order = score.argsort(descending=True, stable=True)
-    for b in found.photograph.unique():
-        mine = order[found.photograph[order] == b]
-        R, model, best_first = found.rotation[mine].float(), found.model[mine], torch.arange(len(mine))
-        apart = distinct_views(best_first, R, count=len(mine), angle=SAME, symmetries=symmetries, model=model)
-        own[mine[apart]] = True
-    return own
+    for b in hypotheses.image_index.unique():
+        mine = order[hypotheses.image_index[order] == b]
+        R, model, best_first = hypotheses.rotation[mine].float(), hypotheses.model[mine], torch.arange(len(mine))
+        kept = distinct_views(best_first, R, count=len(mine), angle=SAME, symmetries=symmetries, model=model)
+        distinct[mine[kept]] = True
+    return distinct

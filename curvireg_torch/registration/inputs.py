@@ -1,4 +1,4 @@
-"""Photographs, boxes and cameras as people have them, one by one made fit for the pipeline, or refused by name."""
+"""Photographs, boxes and cameras in the forms that callers have them, checked one by one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -47,18 +47,18 @@ class ImageItem:
 def image_items(
     images: Tensor | Sequence[Any], boxes: Any, camera_matrices: Any | None
 ) -> list[ImageItem | CurviregError]:
-    """Every photograph with its box and camera, or what is wrong with it.
+    """Each photograph with its box and camera, or the error that it cannot be used for.
 
     Args:
         images: (B, C, H, W), or a list of tensors (C, H, W), arrays (H, W) or (H, W, C), or paths.
-        boxes: (B, 4) x0, y0, x1, y1 in px, a tensor, an array or lists of any of them; None: the whole images.
-        camera_matrices: (B, 3, 3), or (3, 3) for all, in px, likewise; None: unknown.
+        boxes: (B, 4) x0, y0, x1, y1 in px, a tensor, an array or lists; None takes the whole images.
+        camera_matrices: (B, 3, 3), or (3, 3) for all, in px; None if unknown.
 
     Raises:
         InvalidInputError: not as many boxes or cameras as images.
     """
     if isinstance(images, str | PathLike) or (isinstance(images, Tensor) and images.ndim != 4):
-        raise InvalidInputError("images: expected a batch (B, C, H, W) or a list; put a single one into a list")
+        raise InvalidInputError("images: expected a batch (B, C, H, W) or a list; put a single image into a list")
     n = len(images)
     whole = boxes is None
     boxes = torch.zeros(n, 4) if whole else as_boxes(boxes, n)
@@ -81,7 +81,7 @@ def _item(image: Any, box: Tensor | None, K: Tensor | None) -> ImageItem:
 
 def _pixels(image: Any) -> Tensor:
     if isinstance(image, str | PathLike):
-        return read_photo(image).image  # as viewers show it, as the command line reads it
+        return read_photo(image).image
     if isinstance(image, np.ndarray):
         image = torch.from_numpy(np.ascontiguousarray(image))
         image = image[None] if image.ndim == 2 else image.movedim(-1, 0) if image.ndim == 3 else image
@@ -92,7 +92,7 @@ def _pixels(image: Any) -> Tensor:
 
 
 def check_crop(crop: Tensor) -> None:
-    """Raise :class:`ImageError` for a (C, S, S) crop in which there is nothing to register."""
+    """Raise :class:`ImageError` for a (C, S, S) crop that shows nothing to register."""
     check_pixels(crop, "of the box")
     if float(crop.amax() - crop.amin()) < 1.0 / 255.0:
         raise ImageError("the box shows one colour, nothing to register; check image and box")

@@ -1,4 +1,4 @@
-"""Hypotheses as poses before cameras, and back: of several models, each by its own describer."""
+"""Hypotheses lifted to poses in front of cameras, and back; each model has its own describer."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -10,121 +10,114 @@ from torch import Tensor
 from ..geometry.cameras import rotation_towards
 from ..geometry.translation import pose_from_box
 from ..matching import ViewDescriber
-from .contour import ContourFit, contour_support, fit_contours
+from .contours import ContourFit, contour_support, fit_contours
 from .hypotheses import Hypotheses
 from .search import FINALISTS
 
-__all__ = ["Poses", "follow_contours", "lift_to_poses", "supports", "to_allocentric"]
+__all__ = ["Poses", "edge_supports", "fit_poses", "lift_to_poses", "to_allocentric"]
 
 
 @dataclass(frozen=True)
 class Poses:
-    """H hypotheses before their photographs.
+    """H hypotheses as poses.
 
     Attributes:
-        found: the hypotheses.
+        hypotheses: with the allocentric rotations and distances of the poses.
         T: (H, 4, 4) ``T_cam_from_model``.
         cameras: (H, 3, 3) in px of the photographs.
-        fit: what the contour stage made of them, or None.
+        fit: result of the contour fit, or None.
     """
 
-    found: Hypotheses
+    hypotheses: Hypotheses
     T: Tensor
     cameras: Tensor
     fit: ContourFit | None = None
 
-    def where(self, kept: Tensor, others: "Poses") -> "Poses":
-        """Select per hypothesis: these poses where ``kept`` (H,) is True, else ``others``.
+    def where(self, keep: Tensor, others: "Poses") -> "Poses":
+        """Select per hypothesis: these poses where ``keep`` (H,) is True, else ``others``.
 
-        Scores are those of ``self``. The covariance is NaN where the pose is taken from ``others``.
+        The covariance is NaN where the pose is taken from ``others``.
         """
-        pose = kept[:, None, None]
+        pose = keep[:, None, None]
         T = torch.where(pose, self.T, others.T)
-        found = replace(
-            self.found,
-            rotation=torch.where(pose, self.found.rotation, others.found.rotation),
-            distance=torch.where(kept, self.found.distance, others.found.distance),
+        hypotheses = replace(
+            self.hypotheses,
+            rotation=torch.where(pose, self.hypotheses.rotation, others.hypotheses.rotation),
+            distance=torch.where(keep, self.hypotheses.distance, others.hypotheses.distance),
         )
         fit = self.fit
         if fit is not None:
             fit = replace(fit, transform=T, covariance=torch.where(pose, fit.covariance, torch.nan))
-        return Poses(found, T, torch.where(pose, self.cameras, others.cameras), fit)
+        return Poses(hypotheses, T, torch.where(pose, self.cameras, others.cameras), fit)
 
     def __getitem__(self, index: Tensor) -> "Poses":
         """Some of the poses, without their fit."""
-        return Poses(self.found[index], self.T[index], self.cameras[index])
+        return Poses(self.hypotheses[index], self.T[index], self.cameras[index])
 
 
-def lift_to_poses(describers: Sequence[ViewDescriber], found: Hypotheses, boxes: Tensor, K: Tensor | None) -> Poses:
+def lift_to_poses(
+    describers: Sequence[ViewDescriber], hypotheses: Hypotheses, boxes: Tensor, K: Tensor | None
+) -> Poses:
     """Hypotheses as poses that fill their boxes.
 
     Args:
         describers: of the bank's models.
-        boxes: (B, 4) of the photographs, px.
-        K: (B, 3, 3) of the photographs; None: unknown, a camera that looks straight at the box is assumed.
+        hypotheses: of B photographs.
+        boxes: (B, 4) px.
+        K: (B, 3, 3); None assumes a camera that looks straight at the centre of the box.
     """
-    T = torch.eye(4, dtype=torch.float64).repeat(len(found), 1, 1)
-    cameras = torch.eye(3, dtype=torch.float64).repeat(len(found), 1, 1)
-    for model, mine in _by_model(found):
-        describe, photograph = describers[model], found.photograph[mine]
+    T = torch.eye(4, dtype=torch.float64).repeat(len(hypotheses), 1, 1)
+    cameras = torch.eye(3, dtype=torch.float64).repeat(len(hypotheses), 1, 1)
+    for model, mine in hypotheses.by_model():
+        describer, image = describers[model], hypotheses.image_index[mine]
+        rotation, distance = hypotheses.rotation[mine], hypotheses.distance[mine]
         if K is None:
-            T[mine], cameras[mine] = describe.cameras_of_boxes(
-                found.rotation[mine], found.distance[mine], boxes[photograph]
-            )
+            T[mine], cameras[mine] = describer.cameras_of_boxes(rotation, distance, boxes[image])
         else:
-            cameras[mine] = K[photograph]
-            T[mine, :3, :3], T[mine, :3, 3] = pose_from_box(
-                describe.hull, found.rotation[mine], boxes[photograph], K[photograph]
-            )
-    return Poses(found, T, cameras)
+            cameras[mine] = K[image]
+            T[mine, :3, :3], T[mine, :3, 3] = pose_from_box(describer.hull, rotation, boxes[image], K[image])
+    return Poses(hypotheses, T, cameras)
 
 
-def to_allocentric(describers: Sequence[ViewDescriber], found: Hypotheses, T: Tensor) -> Hypotheses:
+def to_allocentric(describers: Sequence[ViewDescriber], hypotheses: Hypotheses, T: Tensor) -> Hypotheses:
     """The hypotheses with the allocentric rotations and distances of poses (H, 4, 4)."""
-    rotation, distance = found.rotation.clone(), found.distance.clone()
-    for model, mine in _by_model(found):
+    rotation, distance = hypotheses.rotation.clone(), hypotheses.distance.clone()
+    for model, mine in hypotheses.by_model():
         R, t = T[mine, :3, :3], T[mine, :3, 3]
         position = R @ describers[model].centre + t
         rotation[mine] = rotation_towards(position).mT @ R
         distance[mine] = torch.linalg.vector_norm(position, dim=1)
-    return replace(found, rotation=rotation, distance=distance)
+    return replace(hypotheses, rotation=rotation, distance=distance)
 
 
-def follow_contours(
-    describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor
-) -> Poses:
-    """What :func:`fit_contours` makes of poses of all models."""
+def fit_poses(describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor) -> Poses:
+    """Fit the contours of poses of all models, see :func:`fit_contours`."""
     parts, index = [], []
-    for model, mine in _by_model(poses.found):
-        where, shape = _before_photographs(describers[model], images, poses, boxes, mine)
-        parts.append(fit_contours(*where, **shape, finish=FINALISTS))
+    for model, mine in poses.hypotheses.by_model():
+        args, options = _contour_arguments(describers[model], images, poses, boxes, mine)
+        parts.append(fit_contours(*args, **options, finish=FINALISTS))
         index.append(mine)
-    place = torch.cat(index).argsort()
-    fit = ContourFit(*(torch.cat([getattr(part, f.name) for part in parts])[place] for f in fields(ContourFit)))
-    return Poses(to_allocentric(describers, poses.found, fit.transform), fit.transform, poses.cameras, fit)
+    back = torch.cat(index).argsort()
+    fit = ContourFit(*(torch.cat([getattr(part, f.name) for part in parts])[back] for f in fields(ContourFit)))
+    return Poses(to_allocentric(describers, poses.hypotheses, fit.transform), fit.transform, poses.cameras, fit)
 
 
-def supports(describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor) -> Tensor:
-    """(H,) contour support of poses of all models as they are, see :func:`contour_support`."""
-    out = torch.zeros(len(poses.found), dtype=torch.float64)
-    for model, mine in _by_model(poses.found):
-        where, shape = _before_photographs(describers[model], images, poses, boxes, mine)
-        out[mine] = contour_support(*where, **shape)
+def edge_supports(describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor) -> Tensor:
+    """(H,) edge support of poses of all models that are not fitted, see :func:`contour_support`."""
+    out = torch.zeros(len(poses.hypotheses), dtype=torch.float64)
+    for model, mine in poses.hypotheses.by_model():
+        args, options = _contour_arguments(describers[model], images, poses, boxes, mine)
+        out[mine] = contour_support(*args, **options)
     return out
 
 
-def _before_photographs(
-    describe: ViewDescriber, images: Sequence[Tensor], poses: Poses, boxes: Tensor, mine: Tensor
+def _contour_arguments(
+    describer: ViewDescriber, images: Sequence[Tensor], poses: Poses, boxes: Tensor, mine: Tensor
 ) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Arguments of the contour stage for the poses ``mine``, all of one model."""
-    where = describe.renderer, images, boxes, poses.cameras[mine], poses.T[mine]
-    return where, {
-        "photograph": poses.found.photograph[mine],
-        "centre": describe.centre,
-        "radius": describe.radius,
-        "margin": describe.settings.margin,
+    """Arguments of the contour functions for the poses ``mine``, all of one model."""
+    return (describer.renderer, images, boxes, poses.cameras[mine], poses.T[mine]), {
+        "image_index": poses.hypotheses.image_index[mine],
+        "centre": describer.centre,
+        "radius": describer.radius,
+        "margin": describer.settings.margin,
     }
-
-
-def _by_model(found: Hypotheses) -> list[tuple[int, Tensor]]:
-    return [(m, (found.model == m).nonzero()[:, 0]) for m in found.model.unique().tolist()]

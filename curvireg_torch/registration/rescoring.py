@@ -1,4 +1,4 @@
-"""Which of the hypotheses is it, now that each has been followed to its end?"""
+"""Final scores of hypotheses after search and contour fit."""
 
 from collections.abc import Sequence
 
@@ -9,55 +9,46 @@ from torch import Tensor
 from ..matching import ViewDescriber
 from .hypotheses import Hypotheses
 
-__all__ = ["POSE_FEATURES", "WEIGHTS", "gather_pose_features", "rescore", "similarities"]
+__all__ = ["POSE_FEATURES", "WEIGHTS", "rank_feature", "rescore", "similarities"]
 
 POSE_FEATURES = ("rank", "similarity", "edge_support", "appearance")
-"""Of a hypothesis: log S of the view it comes from, less that of the best view; normalised correlation of the pose that
-was found; strength of the photograph's edges under its contours (0 without the contour stage); how much the pose that
-was found looks like the photograph, as log S_look (0 without that term)."""
+"""Features of a pose: log S of the view it started from, minus that of the best view; normalised correlation of the
+pose's view with the photograph; edge support (0 without the contour fit); log appearance score of the pose (0 without
+that term)."""
 
 WEIGHTS, RANK_ALONE = (1.0, 5.0, 10.0, 1.0), (1.0, 0.0, 0.0, 0.0)
-"""See docs/accuracy.md."""
+"""Weights of the features with and without a camera, see docs/accuracy.md."""
 
 
-def gather_pose_features(
-    starts: Hypotheses, similarity: Tensor, edge_support: Tensor, appearance_scores: Tensor
-) -> Tensor:
-    """(H, 4) float64, see :data:`POSE_FEATURES`.
-
-    Args:
-        starts: as they were ranked, their score being S.
-        similarity: (H,) of the poses that were found.
-        support: (H,) of the contour stage, 0 without it.
-        looks: (H,) log S_look, 0 without that term.
-    """
-    log = starts.score.clamp(min=torch.finfo(torch.float64).tiny).log()
-    count = int(starts.photograph.max()) + 1 if len(starts) else 0
-    best = log.new_full((count,), -torch.inf).scatter_reduce(0, starts.photograph, log, "amax")
-    rank = log - best[starts.photograph]
-    return torch.stack([rank, similarity, edge_support, appearance_scores], dim=1)
+def rank_feature(starts: Hypotheses) -> Tensor:
+    """(H,) float64 log S of the views that hypotheses start from, minus that of their photograph's best view."""
+    log = starts.ranking_score.clamp(min=torch.finfo(torch.float64).tiny).log()
+    count = int(starts.image_index.max()) + 1 if len(starts) else 0
+    best = log.new_full((count,), -torch.inf).scatter_reduce(0, starts.image_index, log, "amax")
+    return log - best[starts.image_index]
 
 
 def rescore(evidence: Tensor, *, with_camera: bool) -> Tensor:
-    """(H,) scores of hypotheses from (H, 4) evidence: the higher, the sooner believed.
+    """(H,) scores of hypotheses, higher is better, from their (H, 4) :data:`POSE_FEATURES`.
 
-    Where the camera is known the mesh is taken to be the object's own, and what was found of it counts
-    (:data:`WEIGHTS`). Where it is not, the mesh is often another object of the kind, and the ranking's order stands.
+    With a known camera the mesh is assumed to be that of this very object, and all features count (:data:`WEIGHTS`).
+    Without, the mesh is often another object of the category, and the order of the ranking is kept.
     """
     return evidence @ torch.tensor(WEIGHTS if with_camera else RANK_ALONE, dtype=evidence.dtype)
 
 
-def similarities(describers: Sequence[ViewDescriber], descriptors: Tensor, found: Hypotheses) -> Tensor:
-    """(H,) normalised correlations of hypotheses' views with their photographs.
+def similarities(describers: Sequence[ViewDescriber], descriptors: Tensor, hypotheses: Hypotheses) -> Tensor:
+    """(H,) normalised correlations of the hypotheses' views with their photographs.
 
     Args:
         describers: of the bank's models.
-        descriptors: (B, D) of the photographs' fields, as the describers make them.
+        descriptors: (B, D) of the photographs' fields, computed by the describers.
+        hypotheses: of those photographs.
     """
     queries = F.normalize(descriptors, dim=1)
-    out = torch.zeros(len(found), dtype=torch.float64)
-    for model in found.model.unique().tolist():
-        mine = (found.model == model).nonzero()[:, 0]
-        views = F.normalize(describers[model].descriptors(found.rotation[mine], found.distance[mine]), dim=1)
-        out[mine] = (views * queries[found.photograph[mine].to(queries.device)]).sum(dim=1).double().cpu()
+    out = torch.zeros(len(hypotheses), dtype=torch.float64)
+    for model, mine in hypotheses.by_model():
+        views = describers[model].descriptors(hypotheses.rotation[mine], hypotheses.distance[mine])
+        query = queries[hypotheses.image_index[mine].to(queries.device)]
+        out[mine] = (F.normalize(views, dim=1) * query).sum(dim=1).double().cpu()
     return out

@@ -29,7 +29,13 @@ from sklearn.linear_model import LogisticRegression
 
 from curvireg_torch.evaluation.store import PredictionStore
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_error, symmetry_transforms, transform
-from curvireg_torch.registration.confidence import FEATURES, RANKING_FEATURES, RELIABLE, LogisticModel, pose_features
+from curvireg_torch.registration.confidence import (
+    CONFIDENCE_FEATURES,
+    RANKING_FEATURES,
+    RELIABLE,
+    LogisticModel,
+    confidence_features,
+)
 from curvireg_torch.registration.rescoring import POSE_FEATURES, WEIGHTS, rescore
 from scripts._shared import (
     REAL_SETS,
@@ -77,7 +83,7 @@ def features_of(row: Row, *, with_appearance: bool = True) -> tuple[dict[str, fl
     if not with_appearance:
         evidence[:, POSE_FEATURES.index("appearance")] = 0.0
     concentration = row["ranking"][RANKING_FEATURES.index("concentration")]
-    features = pose_features(evidence, rescore(evidence, with_camera=row["form"] == "exact"), concentration)
+    features = confidence_features(evidence, rescore(evidence, with_camera=row["form"] == "exact"), concentration)
     return features, row["errors"][0]
 
 
@@ -92,8 +98,8 @@ Case = Callable[..., tuple[dict[str, float | None], float]]
 MODELS: dict[str, tuple[Case, bool, str | None, tuple[str, ...]]] = {
     f"{stage}, {appearance}": (case, appearance == "appearance", form, names)
     for stage, case, form, names in (
-        ("contours, camera", features_of, "exact", FEATURES),
-        ("contours, no camera", features_of, "sibling", FEATURES),
+        ("contours, camera", features_of, "exact", CONFIDENCE_FEATURES),
+        ("contours, no camera", features_of, "sibling", CONFIDENCE_FEATURES),
         ("ranking", ranking_case, None, RANKING_FEATURES),
     )
     for appearance in ("appearance", "no appearance")

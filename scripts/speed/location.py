@@ -36,8 +36,8 @@ from curvireg_torch.matching import cached_bank
 from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
 from curvireg_torch.registration.confidence import presence
 from curvireg_torch.registration.inputs import ImageItem
-from curvireg_torch.registration.localization import representative_views
-from curvireg_torch.registration.localization.objects import ScoredCandidates
+from curvireg_torch.registration.localization import ScoredCandidates
+from curvireg_torch.registration.locator import representative_views
 from scripts._shared import REPOSITORY, commit, replace_between, today, write_json
 
 Row = dict[str, Any]

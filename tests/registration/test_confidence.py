@@ -12,18 +12,18 @@ from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import confidence, distinct_views, ranking_evidence, rescore
-from curvireg_torch.registration import registrar as registrar_module
+from curvireg_torch.registration import estimator as estimator_module
 from curvireg_torch.registration.confidence import (
     CALIBRATION,
-    FEATURES,
+    CONFIDENCE_FEATURES,
     RANKING_FEATURES,
     RELIABLE,
     UNCOMPARED,
     LogisticModel,
+    confidence_features,
     confidence_model,
-    pose_features,
 )
-from curvireg_torch.registration.contour import contour_support
+from curvireg_torch.registration.contours import contour_support
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, SIZE, scene, truck_bank, truck_registrar, unrefined
 
@@ -96,7 +96,7 @@ def test_constants_are_those_that_the_script_found():
     for name, model in CALIBRATION["confidence"].items():
         assert record["confidence"][name]["weights"] == model["weights"]
         assert record["confidence"][name]["bias"] == model["bias"]
-        assert list(model["weights"]) == list(RANKING_FEATURES if name.startswith("ranking") else FEATURES)
+        assert list(model["weights"]) == list(RANKING_FEATURES if name.startswith("ranking") else CONFIDENCE_FEATURES)
 
 
 def test_confidence_of_a_pose_is_the_logistic_function():
@@ -119,12 +119,12 @@ def test_more_evidence_is_more_confidence(with_appearance):
 def test_features_of_a_pose():
     evidence = torch.tensor([[0.0, 0.7, 0.4, 1.0], [-1.0, 0.6, 0.5, 0.4], [-2.0, 0.5, 0.1, 0.8]], dtype=torch.float64)
     verdicts = torch.tensor([9.0, 2.0, 3.0], dtype=torch.float64)
-    assert pose_features(evidence, verdicts, 0.3) == pytest.approx(
+    assert confidence_features(evidence, verdicts, 0.3) == pytest.approx(
         {"similarity": 0.7, "lead": 5.0, "edge_support": 0.4, "appearance_lead": 0.2, "concentration": 0.3}
     ), "the lead is over the best rival, and 5 at most"
-    behind = pose_features(evidence, verdicts.flip(0) - torch.tensor([9.0, 0.0, 0.0]), 0.3)
+    behind = confidence_features(evidence, verdicts.flip(0) - torch.tensor([9.0, 0.0, 0.0]), 0.3)
     assert behind["lead"] == -5.0, "nor less than -5"
-    alone = pose_features(evidence[:1], verdicts[:1], 0.0)
+    alone = confidence_features(evidence[:1], verdicts[:1], 0.0)
     assert alone["lead"] is None
     assert alone["appearance_lead"] is None
 
@@ -187,7 +187,7 @@ def test_confidence_rests_on_what_the_hypotheses_say():
         evidence = torch.tensor([list(h.evidence.values()) for h in result.hypotheses], dtype=torch.float64)
         verdicts = rescore(evidence, with_camera=K is not None)
         concentration = float(ranking_evidence(result.ranking, truck_bank().rotations)[0, 2])
-        features = pose_features(evidence, verdicts, concentration)
+        features = confidence_features(evidence, verdicts, concentration)
         assert result.confidence_features == pytest.approx(features)
         model = confidence_model("contours", with_camera=K is not None, with_appearance=False)
         assert result.confidence == pytest.approx(model(features))
@@ -200,7 +200,7 @@ def test_without_contours_the_confidence_is_that_of_the_answers_view(monkeypatch
     assert list(result.confidence_features) == list(RANKING_FEATURES)
     assert result.confidence == pytest.approx(float(confidence(result.ranking, truck_bank().rotations)))
     # Where the order of the hypotheses is not that of the ranking, the answer is judged, not the best view.
-    monkeypatch.setattr(registrar_module, "rescore", lambda evidence, **_: evidence[:, 0].neg())
+    monkeypatch.setattr(estimator_module, "rescore", lambda evidence, **_: evidence[:, 0].neg())
     other = registrar([image], box[None], CAMERA)[0]
     view = int(other.candidates[0])
     assert view != int(other.ranking.order[0, 0])

@@ -102,25 +102,25 @@ def test_boxes_are_compared_where_they_show_the_photograph():
     """An object cut off by the border has a box that ends there, its pose one that does not."""
     item = correction.ImageItem(torch.zeros(3, 100, 200), torch.tensor([150.0, 20.0, 199.5, 80.0]), CAMERA)
     same = torch.tensor([150.0, 20.0, 260.0, 80.0], dtype=torch.float64)
-    assert not correction._is_another(same, item)
-    assert correction._is_another(same - torch.tensor([20.0, 0.0, 20.0, 0.0]), item)
+    assert not correction._differs(same, item)
+    assert correction._differs(same - torch.tensor([20.0, 0.0, 20.0, 0.0]), item)
     low = correction.ImageItem(torch.zeros(3, 100, 200), torch.tensor([20.0, 50.0, 80.0, 99.5]), CAMERA)
-    assert not correction._is_another(torch.tensor([20.0, 50.0, 80.0, 300.0], dtype=torch.float64), low)
-    assert correction._is_another(torch.tensor([20.0, 30.0, 80.0, 300.0], dtype=torch.float64), low)
+    assert not correction._differs(torch.tensor([20.0, 50.0, 80.0, 300.0], dtype=torch.float64), low)
+    assert correction._differs(torch.tensor([20.0, 30.0, 80.0, 300.0], dtype=torch.float64), low)
 
 
 @pytest.mark.parametrize(("box", "another"), [((4, 10, 104, 60), False), ((12, 10, 112, 60), True)])
 def test_boxes_that_overlap_by_85_per_cent_are_the_same(box, another):
     """Moved by 4 of 100 px they overlap by 0.92, moved by 12 by 0.79."""
     item = correction.ImageItem(torch.zeros(3, 80, 120), torch.tensor([0.0, 10.0, 100.0, 60.0]), CAMERA)
-    assert correction._is_another(torch.tensor(box, dtype=torch.float64), item) == another
+    assert correction._differs(torch.tensor(box, dtype=torch.float64), item) == another
 
 
 def test_what_lies_outside_of_the_photograph_does_not_tell_boxes_apart():
     """A pose may reach far beyond the border that cut its box."""
     item = correction.ImageItem(torch.zeros(3, 80, 120), torch.tensor([-0.5, 10.0, 60.0, 79.5]), CAMERA)
     for beyond in ((-300.0, 10.0, 60.0, 79.5), (-0.5, 10.0, 60.0, 400.0)):
-        assert not correction._is_another(torch.tensor(beyond, dtype=torch.float64), item)
-    assert correction._is_another(torch.tensor([-300.0, 10.0, 20.0, 79.5], dtype=torch.float64), item)
+        assert not correction._differs(torch.tensor(beyond, dtype=torch.float64), item)
+    assert correction._differs(torch.tensor([-300.0, 10.0, 20.0, 79.5], dtype=torch.float64), item)
     nowhere = torch.tensor([-300.0, 10.0, -20.0, 79.5], dtype=torch.float64)
-    assert not correction._is_another(nowhere, item)
+    assert not correction._differs(nowhere, item)

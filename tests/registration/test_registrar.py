@@ -153,7 +153,7 @@ def test_bad_calls_are_named():
         registrar([image], box[None], CAMERA.expand(2, 3, 3))
     with pytest.raises(InvalidInputError, match=r"shape \(1, 4\), one for each image, got \(3, 4\)"):
         registrar([image], box.expand(3, 4))
-    with pytest.raises(InvalidInputError, match="put a single one into a list"):
+    with pytest.raises(InvalidInputError, match="put a single image into a list"):
         registrar(image, box[None])
     with pytest.raises(InvalidInputError, match="belong to the bank"):
         Registrar(truck_bank(), views=sample_views())

@@ -9,11 +9,12 @@ from curvireg_torch import camera_matrix
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
-from curvireg_torch.registration import contour_covariance, fit_contours
 from curvireg_torch.registration.calibration import COVARIANCE_SCALE as SCALE
-from curvireg_torch.registration.contour_covariance import pose_covariance
-from curvireg_torch.registration.contour_descent import Matches, moved, project
-from curvireg_torch.registration.contour_points import ContourPoints
+from curvireg_torch.registration.contours import covariance as contour_covariance
+from curvireg_torch.registration.contours import fit_contours
+from curvireg_torch.registration.contours.covariance import pose_covariance
+from curvireg_torch.registration.contours.descent import Matches, apply_twist, project
+from curvireg_torch.registration.contours.points import ContourPoints
 from curvireg_torch.rendering import make_renderer
 
 K = camera_matrix(300.0, 310.0, 63.5, 60.0, dtype=torch.float64)
@@ -69,7 +70,7 @@ def test_injected_noise_lies_within():
     J = (points.normals[..., None, :] @ project(points.model, T, K[None], centre)[1])[..., 0, :]
     d = 0.6 * torch.randn(400, 200, 1, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     estimates = (torch.linalg.pinv(J) @ d)[..., 0]  # turn about the centre and its shift
-    ends = moved(T.expand(400, 4, 4), estimates, centre)
+    ends = apply_twist(T.expand(400, 4, 4), estimates, centre)
     off = torch.cat([axis_angle_from_rotation(ends[:, :3, :3] @ T[:, :3, :3].mT), ends[:, :3, 3] - T[:, :3, 3]], dim=1)
     several = ContourPoints(*(x.expand(400, *x.shape[1:]) for x in (points.model, points.normals, points.valid)))
     found, _ = pose_covariance(
@@ -95,7 +96,7 @@ def fitted(mesh: trimesh.Trimesh, turn: list[float]):
     off = torch.tensor([[0.0, 0.0, 0.0, 0.1, 0.1, 0.2]], dtype=torch.float64)
     box = torch.tensor([40.0, 36, 88, 84])
     return T, fit_contours(
-        renderer, image, box, K, moved(T[None], off, centre), centre=centre, radius=mesh_radius(mesh)
+        renderer, image, box, K, apply_twist(T[None], off, centre), centre=centre, radius=mesh_radius(mesh)
     )
 
 

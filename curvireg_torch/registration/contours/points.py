@@ -1,31 +1,31 @@
-"""The two sides of the contour stage: contours of a rendered mesh as 3D points, and a photograph's edges."""
+"""Both sides of the contour fit: 3D contour points of a rendered mesh, and edges of a photograph."""
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..descriptors import field_points
-from ..filters import depth_curvilinear_saliency
-from ..filters.curvilinear import fill_depth
-from ..filters.derivatives import central_gradient, smooth
+from ...descriptors import field_points
+from ...filters import depth_curvilinear_saliency
+from ...filters.curvilinear import fill_depth
+from ...filters.derivatives import central_gradient, smooth
 
 __all__ = ["ContourPoints", "EdgeField", "contour_points"]
 
 OCCLUDING, CREASES = 256, 128
-"""Points per view: about every second pixel of an object that fills a crop of 128 px, every fourth at 256 px."""
+"""Points per view: about every second contour pixel in a crop of 128 px, every fourth at 256 px."""
 
 JUMP = 0.05
-"""Object radii by which depth jumps at an occluding contour."""
+"""Depth discontinuity at an occluding contour, in object radii."""
 
-CREASE_SHARE = 0.02
-"""Share of the pixels that may be creases."""
+CREASE_FRACTION = 0.02
+"""Largest fraction of the pixels that are creases."""
 
 CREASE = 0.1
-"""Curvature in 1/px, smoothed by 1 px, of a crease: edges between faces that differ by 15 degrees or more."""
+"""Curvature of a crease in 1/px, smoothed by 1 px: faces that meet at 15 degrees or more."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class ContourPoints:
     """Points on the contours of N views.
 
     Attributes:
-        model: (N, P, 3) float64 in model units, always on the nearer surface.
-        normals: (N, P, 2) float64 unit vectors across the contour in the image, sign free.
-        valid: (N, P) bool; the rest is padding.
+        model: (N, P, 3) float64 in model units, on the nearer surface.
+        normals: (N, P, 2) float64 unit vectors across the contour in the image, of either sign.
+        valid: (N, P) bool; False marks padding.
     """
 
     model: Tensor
@@ -47,20 +47,16 @@ class ContourPoints:
 
     @staticmethod
     def cat(parts: Sequence["ContourPoints"]) -> "ContourPoints":
-        return ContourPoints(
-            torch.cat([p.model for p in parts]),
-            torch.cat([p.normals for p in parts]),
-            torch.cat([p.valid for p in parts]),
-        )
+        return ContourPoints(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(ContourPoints)))
 
 
 def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tensor, *, radius: float) -> ContourPoints:
     """Occluding contours and creases of depth views, back-projected onto the mesh.
 
-    An occluding contour lies between two neighbouring pixels whose depth jumps (curvilinear saliency peaks on both
-    sides of a jump, never on it): half way between them on average, at the depth of the nearer one. Creases are maxima
-    of :func:`depth_curvilinear_saliency` away from jumps; bent surfaces have none. Of each kind a fixed random sample
-    is kept.
+    An occluding contour lies half-way between two neighbouring pixels at a depth discontinuity, at the depth of the
+    nearer one (curvilinear saliency peaks on both sides of a discontinuity, never on it). Creases are maxima of
+    :func:`depth_curvilinear_saliency` away from discontinuities; smooth surfaces have none. A fixed random sample of
+    each kind is returned.
 
     Args:
         depth: (N, 1, H, W) z-depth, 0 = background.
@@ -85,15 +81,15 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
     for dim in (-1, -2):
         a, b = _ends(z, dim)
         change = (b - a).abs().diff(dim=dim)
-        # What exceeds the steps before and behind is no steep face.
+        # A depth step counts where it exceeds a neighbouring step: on a steep face all steps are alike.
         first, last = ((1, 0), (0, 1)) if dim == -1 else ((0, 0, 1, 0), (0, 0, 0, 1))
         jump = F.pad(change > JUMP * radius, first) | F.pad(change < -JUMP * radius, last)
         beside |= F.pad(jump, first) | F.pad(jump, last)
         jumps.append(jump.flatten(1))
-    # Depth in px: saliency is then a curvature in 1 / px, and a threshold has a meaning.
+    # With depth in px, saliency is a curvature in 1 / px, to which a fixed threshold applies.
     scale = K[:, 0, 0].view(-1, 1, 1, 1) / z.amax(dim=(1, 2, 3), keepdim=True)
     field = depth_curvilinear_saliency(depth * scale.float(), depth_scale=1.0)
-    creases = field_points(field * ~(_widened(beside) | ~seen), fraction=CREASE_SHARE, threshold=CREASE)
+    creases = field_points(field * ~(_dilated(beside) | ~seen), fraction=CREASE_FRACTION, threshold=CREASE)
     pixel = torch.arange(H * W).view(H, W)
     neighbours = [torch.stack([x.flatten() for x in _ends(pixel, dim)]) for dim in (-1, -2)]
     samples = [
@@ -113,8 +109,8 @@ def _ends(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     return x.narrow(dim, 0, n), x.narrow(dim, 1, n)
 
 
-def _widened(mask: Tensor) -> Tensor:
-    """What is true within a square of 9 px."""
+def _dilated(mask: Tensor) -> Tensor:
+    """Dilation by a square of 9 px."""
     for dim in (-1, -2):
         for shift in (1, 3):
             n, wide = mask.shape[dim] - shift, mask.clone()
@@ -125,8 +121,10 @@ def _widened(mask: Tensor) -> Tensor:
 
 
 def _sample(found: Tensor, pixels: Tensor, depth: Tensor, normals: Tensor, count: int) -> tuple[Tensor, ...]:
-    """``count`` of the (N, M) found ones of M places, each the middle of (k, M) pixels: uv (N, P, 2), the nearer depth
-    (N, P), normal (N, P, 2), valid (N, P)."""
+    """Sample ``count`` True entries of ``found`` (N, M), each the mean of ``pixels`` (k, M).
+
+    Returns uv (N, P, 2), the nearer depth (N, P), normal (N, P, 2) and valid (N, P).
+    """
     best, index = torch.where(found, _random(found.shape[1]), -1.0).topk(min(count, found.shape[1]), dim=1)
     of, W = pixels[:, index], depth.shape[-1]  # (k, N, P)
     z = torch.stack([depth.flatten(1).gather(1, i) for i in of]).amin(dim=0)
@@ -136,15 +134,15 @@ def _sample(found: Tensor, pixels: Tensor, depth: Tensor, normals: Tensor, count
 
 @functools.cache
 def _random(count: int) -> Tensor:
-    """(count,) the same numbers each time."""
+    """(count,) the same random numbers in every call."""
     return torch.rand(count, generator=torch.Generator().manual_seed(0))
 
 
 class EdgeField:
-    """Edges of crops of photographs, to be looked for along normals.
+    """Edges of image crops, sampled along normals of contours.
 
     Args:
-        crops: (B, C, S, S), C = 1 or 3, in [0, 1]. With colours the strongest channel counts.
+        crops: (B, C, S, S), C = 1 or 3, in [0, 1]. Of several channels, the strongest edge counts.
     """
 
     def __init__(self, crops: Tensor) -> None:
@@ -152,16 +150,16 @@ class EdgeField:
         self._gradient = torch.stack([gx, gy], dim=2).flatten(1, 2)
         self._level = self._gradient.square().sum(dim=1).mean(dim=(1, 2)).sqrt().clamp(min=1e-6)
 
-    def strength(self, uv: Tensor, normals: Tensor, offsets: Tensor, photograph: Tensor) -> Tensor:
-        """How strongly the picture changes across a contour at places beside it.
+    def strength(self, uv: Tensor, normals: Tensor, offsets: Tensor, image_index: Tensor) -> Tensor:
+        """Strength of the image gradient across a contour, at offsets along its normals.
 
-        With g the gradient and c = ``|n . g| / |g|``, r = ``|n . g| c^4`` is compared with the crop's mean gradient m:
-        the strength is r / (r + m): halved where they differ by 33 degrees, 0 outside the crop.
+        With g the gradient, m the crop's root mean square gradient and c = ``|n . g| / |g|``, r = ``|n . g| c^4`` gives
+        the strength r / (r + m). It is 0 outside the crop; c^4 is one half where n and g differ by 33 degrees.
 
         Args:
-            uv, normals: (N, P, 2) pixels of the crops, and unit vectors.
+            uv, normals: (N, P, 2) pixels of the crops and unit vectors.
             offsets: (L,) px along the normals.
-            photograph: (N,) indices of the crops.
+            image_index: (N,) the crop of each pose.
 
         Returns:
             (N, P, L) float64 in [0, 1).
@@ -169,13 +167,13 @@ class EdgeField:
         S = self._gradient.shape[-1]
         grid = ((2.0 * (uv[:, :, None] + offsets[:, None] * normals[:, :, None]) + 1.0) / S - 1.0).float()
         gradient = grid.new_empty(len(uv), self._gradient.shape[1], *grid.shape[1:3])
-        for b in photograph.unique().tolist():  # expanded, a crop need not be copied for every pose
-            own = (photograph == b).nonzero()[:, 0]
-            crop = self._gradient[b].expand(len(own), -1, -1, -1)
-            gradient[own] = F.grid_sample(crop, grid[own], align_corners=False)
+        for b in image_index.unique().tolist():  # an expanded crop is not copied for every pose
+            mine = (image_index == b).nonzero()[:, 0]
+            crop = self._gradient[b].expand(len(mine), -1, -1, -1)
+            gradient[mine] = F.grid_sample(crop, grid[mine], align_corners=False)
         gx, gy = gradient[:, 0::2], gradient[:, 1::2]
         nx, ny = normals.to(gx.dtype)[:, None, :, None].unbind(-1)
         across = (gx * nx + gy * ny).abs()
         cosine = across * (gx * gx + gy * gy).clamp(min=1e-20).rsqrt()
         r = (across * cosine.square().square()).amax(dim=1)
-        return (r / (r + self._level[photograph, None, None])).double()
+        return (r / (r + self._level[image_index, None, None])).double()

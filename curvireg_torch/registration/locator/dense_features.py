@@ -1,4 +1,4 @@
-"""Local features of whole photographs and of views, on grids of cells: what a search for objects compares."""
+"""Dense features of whole photographs and of views, which the locator compares."""
 
 from abc import ABC, abstractmethod
 
@@ -12,28 +12,28 @@ from ...terms import photograph_field
 
 __all__ = ["BackboneFeatures", "DenseFeatures", "FieldFeatures", "dense_features_for"]
 
-
 FLAT = 0.01
-"""Share of the strongest edges' energy that counts as none."""
+"""Fraction of the strongest edges' energy below which a cell counts as without edges."""
 
 
 class DenseFeatures(nn.Module, ABC):
-    """Feature maps at one stride, or at two, the second twice as coarse.
+    """Feature maps at one stride, or at two, the second twice the first.
 
     Attributes:
         strides: px of a cell.
-        pictures: whether a network looked at them; how alike fields are hardly tells an object from what is beside it.
+        learned: whether a network computes them; the similarity of classical fields hardly separates the object from
+            its surroundings.
     """
 
     strides: tuple[int, ...]
-    pictures: bool
+    learned: bool
 
     def comparable(self, cells: Tensor, common: Tensor) -> Tensor:
-        """(B, C, h, w) of the same, so that inner products tell how alike cells are.
+        """(B, C, h, w) normalised features, whose inner products are similarities.
 
         Args:
             cells: of :meth:`of_photograph` or :meth:`of_views`.
-            common: (C, 1, 1) mean of the photograph at that size, or of the object in its views.
+            common: (C, 1, 1) mean over the photograph at that size, or over the object in its views.
         """
         return F.normalize(cells - common, dim=1)
 
@@ -43,14 +43,14 @@ class DenseFeatures(nn.Module, ABC):
 
     @abstractmethod
     def of_views(self, describer: ViewDescriber, rotations: Tensor, distances: Tensor, side: int) -> list[list[Tensor]]:
-        """(K, C, side / stride, side / stride) for each stride, for each way to show K views of a mesh."""
+        """(K, C, side / stride, side / stride) for each shading of K views of a mesh and each stride."""
 
 
 class BackboneFeatures(DenseFeatures):
-    """Features of the appearance term's network. Views are shaded grey, and in colours where the mesh has some."""
+    """Features of the appearance term's network. Views are shaded grey, and in colour where the mesh has colours."""
 
     strides = STRIDES
-    pictures = True
+    learned = True
 
     def __init__(self, backbone: Backbone) -> None:
         super().__init__()
@@ -62,21 +62,21 @@ class BackboneFeatures(DenseFeatures):
     def of_views(self, describer: ViewDescriber, rotations: Tensor, distances: Tensor, side: int) -> list[list[Tensor]]:
         pictures = describer.shaded(rotations, distances)
         small = F.interpolate(pictures, size=(side, side), mode="bilinear", antialias=True, align_corners=False)
-        return [self.of_photograph(way) for way in (small[:, :1], small[:, 1:]) if way.shape[1]]
+        return [self.of_photograph(shaded) for shaded in (small[:, :1], small[:, 1:]) if shaded.shape[1]]
 
 
 class FieldFeatures(DenseFeatures):
-    """Orientations of the photograph's field and of depth fields, for pipelines in which nothing was learnt."""
+    """Orientation histograms of the photograph's field and of depth fields, for classical pipelines."""
 
     strides = (8,)
-    pictures = False
+    learned = False
 
     def __init__(self, field: nn.Module) -> None:
         super().__init__()
         self.field = field
 
     def comparable(self, cells: Tensor, common: Tensor) -> Tensor:
-        """Divided by the length of the cells around, as blocks of HOG are: where there is no edge, nothing is alike."""
+        """Divided by the norm of the surrounding cells, as blocks of HOG are; cells without edges are near 0."""
         around = F.avg_pool2d(cells.square().sum(dim=1, keepdim=True), 3, stride=1, padding=1)
         return cells / (around + FLAT * around.amax(dim=(2, 3), keepdim=True)).clamp(min=1e-12).sqrt()
 
@@ -91,7 +91,7 @@ class FieldFeatures(DenseFeatures):
 
 
 def dense_features_for(matcher: ViewMatcher) -> DenseFeatures:
-    """Pictures, as the appearance term's network sees them; fields for pipelines in which nothing was learnt."""
+    """Features of the backbone, or of fields for pipelines without anything learned."""
     pipeline = matcher.pipeline
     if pipeline.field == "learned" or any(term.name == "appearance" for term in pipeline.terms):
         networks = (module for module in matcher.modules() if isinstance(module, Backbone))

@@ -10,17 +10,17 @@ import pytest
 import torch
 
 import curvireg_torch as cr
-import curvireg_torch.registration.localization.objects as finding
 from curvireg_torch.errors import ImageError, InvalidInputError
 from curvireg_torch.geometry import box_iou, rotation_error
 from curvireg_torch.registration import RELIABLE
+from curvireg_torch.registration import localization as localization_module
 from curvireg_torch.registration.confidence import presence
 from curvireg_torch.registration.inputs import ImageItem
-from curvireg_torch.registration.localization import Located
-from curvireg_torch.registration.localization.objects import ScoredCandidates, localize
+from curvireg_torch.registration.localization import ScoredCandidates, localize
+from curvireg_torch.registration.locator import Located
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, scene, unrefined
-from tests.registration.localization.test_locator import SIZE, bank, placed_scene
+from tests.registration.locator.test_locator import SIZE, bank, placed_scene
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,7 @@ def test_a_pose_that_left_the_photograph_is_of_nothing(registrar, monkeypatch):
     """It stays an answer, which nobody is to believe; the photograph does not fail."""
     image, _ = placed_scene(5, (90, 40), 0.9)
     outside = torch.tensor([-300.0, -200.0, -100.0, -50.0], dtype=torch.float64)
-    monkeypatch.setattr(finding, "projected_box", lambda *_: outside)
+    monkeypatch.setattr(localization_module, "projected_box", lambda *_: outside)
     result = registrar([image])[0]
     assert result.ok
     assert (result.localization.presence, result.confidence) == (0.0, 0.0)
@@ -122,8 +122,8 @@ def test_places_that_lead_to_one_object_give_one_answer(registrar, monkeypatch):
     beside = torch.stack([box - 0.36 * side, box + 0.36 * side]).float()
     assert box_iou(beside[:1], beside[1:]) < 0.5, "places that the locator takes for two"
     located = Located(beside, torch.tensor([9.0, 8.0]), torch.zeros(2, dtype=torch.long))
-    monkeypatch.setattr(registrar, "locator", _Proposing(located, registrar.locator.cells))
-    monkeypatch.setattr(finding, "projected_box", lambda *_: box.double())
+    monkeypatch.setattr(registrar, "locator", _Proposing(located, registrar.locator.features))
+    monkeypatch.setattr(localization_module, "projected_box", lambda *_: box.double())
     results = localize(registrar, [image], instances=2)[0]
     assert len(results) == 1
     assert torch.equal(results[0].localization.box, box.double())
@@ -136,7 +136,7 @@ def test_of_answers_that_overlap_the_surest_stays(registrar):
     less = replace(sure, localization=replace(sure.localization, presence=0.5 * sure.localization.presence))
     for first, second in ((sure, less), (less, sure)):
         answers = [beside, first]
-        finding._add(answers, second)
+        localization_module._add(answers, second)
         assert len(answers) == 2
         assert answers[0] is beside
         assert answers[1] is sure
@@ -145,8 +145,8 @@ def test_of_answers_that_overlap_the_surest_stays(registrar):
 class _Proposing:
     """A locator that always proposes the same places."""
 
-    def __init__(self, located, cells):
-        self.located, self.cells = located, cells
+    def __init__(self, located, features):
+        self.located, self.features = located, features
 
     def __call__(self, *_, **__):
         return [self.located]
@@ -170,7 +170,7 @@ def test_what_cannot_be_searched_takes_nothing_else_down(registrar):
     assert torch.equal(alone.localization.boxes, results[1].localization.boxes)
     with pytest.raises(InvalidInputError, match="distance: needs the camera"):
         registrar([image], distance=(1.0, 2.0))
-    with pytest.raises(InvalidInputError, match="distance: for objects that are looked for"):
+    with pytest.raises(InvalidInputError, match="distance: limits the search"):
         registrar([image], [[4.0, 4.0, 40.0, 40.0]], CAMERA, distance=(1.0, 2.0))
     nowhere = registrar([image], camera_matrices=CAMERA, distance=(1e-3, 2e-3))[0]
     with pytest.raises(InvalidInputError, match="image 0: nothing of such a size fits"):
@@ -181,7 +181,7 @@ def test_what_cannot_be_searched_takes_nothing_else_down(registrar):
 
 @pytest.mark.parametrize(("preset", "evidence"), [("learned", [7.0, 0.6]), ("classical", [0.6])])
 def test_constants_of_presence_are_those_that_the_script_found(preset, evidence):
-    record = Path(__file__).parents[3] / "scripts" / "results" / "location.json"
+    record = Path(__file__).parents[2] / "scripts" / "results" / "location.json"
     found = json.loads(record.read_text(encoding="utf-8"))["presence"][preset]
     logit = sum(w * v for w, v in zip(found["weights"], evidence, strict=True)) + found["bias"]
     assert presence(evidence) == pytest.approx(1 / (1 + math.exp(-logit)))
@@ -212,7 +212,7 @@ def test_presence_is_judged_by_what_it_was_fitted_on(preset, pieces):
 class Proposed:
     """A locator that proposes these boxes, whatever the photograph."""
 
-    cells = SimpleNamespace(pictures=True)
+    features = SimpleNamespace(learned=True)
 
     def __init__(self, boxes, scores):
         self.located = Located(torch.stack(boxes), torch.tensor(scores), torch.zeros(len(boxes), dtype=torch.long))

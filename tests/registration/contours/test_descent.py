@@ -14,8 +14,8 @@ from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.io.meshes import mesh_centre, mesh_radius
 from curvireg_torch.registration import fit_contours
-from curvireg_torch.registration.contour_descent import Seen, Views, moved, project
-from curvireg_torch.registration.contour_points import ContourPoints
+from curvireg_torch.registration.contours.descent import ContourProblem, ContourState, apply_twist, project
+from curvireg_torch.registration.contours.points import ContourPoints
 from curvireg_torch.rendering import make_renderer
 
 K = camera_matrix(300.0, 310.0, 63.5, 60.0, dtype=torch.float64)[None]
@@ -32,13 +32,13 @@ class Edges:
     def __init__(self, places: Tensor, heights: list[float]) -> None:
         self.places, self.heights = places, torch.tensor(heights, dtype=torch.float64)
 
-    def strength(self, uv: Tensor, normals: Tensor, offsets: Tensor, photograph: Tensor) -> Tensor:
+    def strength(self, uv: Tensor, normals: Tensor, offsets: Tensor, image_index: Tensor) -> Tensor:
         apart = (offsets - self.places[:, :, None]) / 1.5
         return (self.heights[:, None, None] * (1.0 - apart**2).clamp(min=0.0)).sum(dim=0)[None]
 
 
-def views(places: Tensor, heights: list[float]) -> Views:
-    return Views(None, Edges(places, heights), torch.tensor([0]), K, 128, CENTRE, 1.0)  # type: ignore[arg-type]
+def views(places: Tensor, heights: list[float]) -> ContourProblem:
+    return ContourProblem(None, Edges(places, heights), torch.tensor([0]), K, 128, CENTRE, 1.0)  # type: ignore[arg-type]
 
 
 def points(count: int, valid: int | None = None) -> ContourPoints:
@@ -48,8 +48,8 @@ def points(count: int, valid: int | None = None) -> ContourPoints:
     return ContourPoints(model, normals, torch.arange(count)[None] < (count if valid is None else valid))
 
 
-def there(some: ContourPoints) -> Seen:
-    return Seen(T, T, some)
+def there(some: ContourPoints) -> ContourState:
+    return ContourState(T, T, some)
 
 
 def at(count: int, *places: float) -> Tensor:
@@ -111,7 +111,7 @@ def test_starts_that_the_first_rounds_made_no_better_come_back_as_they_were() ->
     )
     off = 0.3 * torch.randn(12, 6, generator=generator, dtype=torch.float64)
     off[:4] = 0.0
-    starts = moved(pose.repeat(12, 1, 1), off, mesh_centre(mesh))
+    starts = apply_twist(pose.repeat(12, 1, 1), off, mesh_centre(mesh))
     fit = fit_contours(
         make_renderer(mesh),
         noise,

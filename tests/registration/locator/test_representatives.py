@@ -5,8 +5,8 @@ import torch
 
 from curvireg_torch import ViewBank
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.registration.localization import representative_views, representatives
-from curvireg_torch.registration.localization.representatives import _medoids
+from curvireg_torch.registration.locator import representative_views, representatives
+from curvireg_torch.registration.locator.representatives import _medoids
 from tests._support.scenes import truck_bank
 
 

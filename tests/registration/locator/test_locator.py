@@ -11,8 +11,8 @@ import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import box_iou, projected_boxes
 from curvireg_torch.matching import ViewDescriber, ViewMatcher
-from curvireg_torch.registration.localization import Locator
-from curvireg_torch.registration.localization.dense_features import BackboneFeatures, dense_features_for
+from curvireg_torch.registration.locator import Locator
+from curvireg_torch.registration.locator.dense_features import BackboneFeatures, dense_features_for
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from tests._support.scenes import CAMERA, scene, truck_bank
 
@@ -40,8 +40,8 @@ def test_the_network_of_the_appearance_term_is_not_loaded_again():
 
 def test_pictures_are_looked_at_wherever_something_was_learnt():
     """A preset without the appearance term, but with the learnt field, finds as the default does: 0 of 14 without."""
-    assert locator("fast").cells.pictures
-    assert not locator("classical").cells.pictures
+    assert locator("fast").features.learned
+    assert not locator("classical").features.learned
     image, box = placed_scene(1, (100, 30), 0.8)
     fast, default = locator("fast")([image])[0], locator()([image])[0]
     assert torch.equal(fast.boxes, default.boxes)

@@ -12,8 +12,10 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_towards
 from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
-from curvireg_torch.registration import contour, contour_descent, fit_contours
-from curvireg_torch.registration.contour_points import EdgeField, contour_points
+from curvireg_torch.registration import fit_contours
+from curvireg_torch.registration.contours import descent
+from curvireg_torch.registration.contours import fit as fit_module
+from curvireg_torch.registration.contours.points import EdgeField, contour_points
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from tests._support.scenes import CAMERA, scene, truck_bank, truck_registrar
@@ -37,11 +39,11 @@ def test_derivative_of_the_projection_is_that_of_autograd():
     T, centre = pose([0.3, -0.5, 0.2], [0.1, 0.2, 4.0])[None], torch.tensor([0.4, 0.5, 0.6], dtype=torch.float64)
 
     def pixels(step: torch.Tensor) -> torch.Tensor:
-        return contour_descent.project(points, contour_descent.moved(T, step[None], centre), K[None], centre)[0][0]
+        return descent.project(points, descent.apply_twist(T, step[None], centre), K[None], centre)[0][0]
 
     # Off zero, where the angle of an axis-angle vector has a derivative.
     expected = torch.autograd.functional.jacobian(pixels, torch.full((6,), 1e-7, dtype=torch.float64))
-    uv, derivative = contour_descent.project(points, T, K[None], centre)
+    uv, derivative = descent.project(points, T, K[None], centre)
     torch.testing.assert_close(uv[0], project_points(points[0], T[0], K))
     torch.testing.assert_close(derivative[0], expected, rtol=1e-4, atol=1e-3)
 
@@ -108,7 +110,7 @@ def test_a_pose_three_degrees_and_three_per_cent_off_is_recovered(seed):
     axis = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
     centre = mesh_centre(mesh)
     off = torch.cat([math.radians(3.0) * axis, 0.03 * T[2, 3] * torch.tensor([0.1, 0.1, 0.99])])
-    start = contour_descent.moved(T[None], off[None], centre)
+    start = descent.apply_twist(T[None], off[None], centre)
 
     def fitted(starts: torch.Tensor):
         return fit_contours(make_renderer(mesh), image, box, camera, starts, centre=centre, radius=mesh_radius(mesh))
@@ -126,7 +128,7 @@ def test_a_pose_three_degrees_and_three_per_cent_off_is_recovered(seed):
     assert float(fit.start_support) < float(fit.edge_support)
     assert 0.5 < float(fit.matched) <= 1.0
     assert 0 < float(fit.residual) < 2.0
-    assert 1 < float(fit.moved) < 40
+    assert 1 < float(fit.mean_shift) < 40
     both = fitted(torch.cat([start, T[None]]))
     torch.testing.assert_close(both.transform[:1], fit.transform)
     torch.testing.assert_close(both.edge_support[:1], fit.edge_support)
@@ -171,7 +173,7 @@ def crowd() -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor, torch.Tenso
         boxes.append(box)
         cameras.append(camera)
         off = torch.tensor([[0.05, -0.03, 0.02, 0.0, 0.0, 0.05], [0.0, 0.4, 0.0, 0.0, 0.05, 0.0]], dtype=torch.float64)
-        starts.append(contour_descent.moved(T.repeat(2, 1, 1), off, torch.zeros(3, dtype=torch.float64))[: 2 - i // 2])
+        starts.append(descent.apply_twist(T.repeat(2, 1, 1), off, torch.zeros(3, dtype=torch.float64))[: 2 - i // 2])
     # Neither in order nor equally many.
     order = torch.tensor([3, 0, 4, 1, 2])
     return images, torch.stack(boxes), torch.stack(cameras), torch.cat(starts)[order], (order // 2)
@@ -190,9 +192,9 @@ def test_many_photographs_and_hypotheses_are_fitted_as_each_alone():
             return renderer.render(*arguments, **options)
 
     rest = {"centre": mesh_centre(mesh), "radius": mesh_radius(mesh)}
-    fit = fit_contours(Counting(), images, boxes, cameras, starts, photograph=photograph, **rest)
+    fit = fit_contours(Counting(), images, boxes, cameras, starts, image_index=photograph, **rest)
     # However many photographs and starts: the first rounds twice, from the starts and from turns of them.
-    rounds = len(contour.FIRST + contour.FIRST + contour.SECOND + contour.FINE)
+    rounds = len(fit_module.FIRST + fit_module.FIRST + fit_module.SECOND + fit_module.FINE)
     assert len(calls) <= rounds + 4  # both beginnings; at full size fits, and the starts as they are
     assert 0 not in calls
     for i, b in enumerate(photograph.tolist()):
@@ -208,20 +210,20 @@ def test_many_photographs_and_hypotheses_are_fitted_as_each_alone():
         ):
             torch.testing.assert_close(getattr(fit, name)[i], getattr(alone, name)[0], rtol=0, atol=allowed)
     stacked = [F.pad(image, (0, 128 - image.shape[2], 0, 128 - image.shape[1])) for image in images]
-    inside = fit_contours(renderer, torch.stack(stacked), boxes, cameras, starts, photograph=photograph, **rest)
+    inside = fit_contours(renderer, torch.stack(stacked), boxes, cameras, starts, image_index=photograph, **rest)
     torch.testing.assert_close(inside.transform, fit.transform, rtol=0, atol=0.05)  # crops may see the padding
 
 
 def test_only_the_best_starts_of_a_photograph_are_finished():
     mesh = trimesh.creation.box((1.0, 1.4, 0.8))
     images, boxes, cameras, starts, photograph = crowd()
-    wrong = contour_descent.moved(
+    wrong = descent.apply_twist(
         starts, torch.tensor([0.6, 0.5, 0.7, 0.0, 0.0, 0.4]).double().expand(5, 6), mesh_centre(mesh)
     )
     both, of = torch.cat([wrong, starts]), torch.cat([photograph, photograph])
     rest = {"centre": mesh_centre(mesh), "radius": mesh_radius(mesh)}
-    everything = fit_contours(make_renderer(mesh), images, boxes, cameras, both, photograph=of, **rest)
-    some = fit_contours(make_renderer(mesh), images, boxes, cameras, both, photograph=of, finish=1, **rest)
+    everything = fit_contours(make_renderer(mesh), images, boxes, cameras, both, image_index=of, **rest)
+    some = fit_contours(make_renderer(mesh), images, boxes, cameras, both, image_index=of, finish=1, **rest)
     same = (some.transform - everything.transform).abs().amax(dim=(1, 2)) < 1e-9
     assert torch.bincount(of[same], minlength=3).tolist() == [1, 1, 1]  # one of each photograph
     for b in range(3):
@@ -232,12 +234,12 @@ def test_a_fit_is_trusted_for_what_it_supports_or_gains():
     none = torch.zeros(4)
     start = torch.tensor([0.49, 0.45, 0.1, 0.1])
     after = torch.tensor([0.51, 0.49, 0.35, 0.25])
-    fit = contour.ContourFit(none, none, after, start, none, none, none, none)
+    fit = fit_module.ContourFit(none, none, after, start, none, none, none, none)
     assert fit.trustworthy.tolist() == [True, False, True, False]
     mesh, T = trimesh.creation.box((1.0, 1.4, 0.8)), pose([0.4, 0.5, 0.1], [0.0, 0.0, 8.0])
     image = (make_renderer(mesh).render(T[None], K, (128, 128))[0] > 0).float()
     off = torch.tensor([[0.1, 0.1, 0.0, 0.05, 0.0, 0.1]], dtype=torch.float64)
-    start = contour_descent.moved(T[None], off, mesh_centre(mesh))
+    start = descent.apply_twist(T[None], off, mesh_centre(mesh))
     assert bool(cube_fit(image, start).trustworthy)
     noise = torch.rand(3, 128, 128, generator=torch.Generator().manual_seed(0))
     assert not bool(cube_fit(noise, start).trustworthy)
@@ -253,15 +255,15 @@ def test_bad_input_is_named():
         cube_fit(image, start, box=torch.zeros(2, 4))
     two = (make_renderer(trimesh.creation.box()), [image, image], torch.tensor([[40.0, 36, 88, 84]]).repeat(2, 1))
     rest = {"centre": torch.zeros(3), "radius": 1.0}
-    with pytest.raises(InvalidInputError, match="photograph: 2 images; say which"):
+    with pytest.raises(InvalidInputError, match="image_index: got 2 images"):
         fit_contours(*two, K, start, **rest)
     for photograph in (torch.tensor([2]), torch.tensor([-1]), torch.tensor([0, 1]), torch.tensor([0.0])):
-        with pytest.raises(InvalidInputError, match="photograph: expected"):
-            fit_contours(*two, K, start, photograph=photograph, **rest)
+        with pytest.raises(InvalidInputError, match="image_index: expected"):
+            fit_contours(*two, K, start, image_index=photograph, **rest)
     with pytest.raises(InvalidInputError, match="camera_matrices: expected one or 2"):
-        fit_contours(*two, K.repeat(3, 1, 1), start, photograph=torch.tensor([0]), **rest)
+        fit_contours(*two, K.repeat(3, 1, 1), start, image_index=torch.tensor([0]), **rest)
     with pytest.raises(InvalidInputError, match="finish: expected"):
-        fit_contours(*two, K, start, photograph=torch.tensor([0]), finish=0, **rest)
+        fit_contours(*two, K, start, image_index=torch.tensor([0]), finish=0, **rest)
     none = cube_fit(image, start[:0])
     assert none.transform.shape == (0, 4, 4)
     assert none.covariance.shape == (0, 6, 6)

@@ -1,4 +1,4 @@
-"""Localization: boxes where the object may be in a photograph that comes without one."""
+"""Locator: boxes where the object may be in a photograph that comes without one."""
 
 from .locator import Located, Locator, locate
 from .representatives import representative_views

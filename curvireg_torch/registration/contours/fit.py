@@ -1,0 +1,300 @@
+"""Contour fit: the continuous stage of the refinement, which pulls projected contours onto image edges."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ...errors import InvalidInputError
+from ...filters.inputs import fill_missing
+from ...geometry import crop_images
+from ...rendering import DepthRenderer
+from ...utils.checks import (
+    as_boxes,
+    as_numbers,
+    check_camera_matrix,
+    check_photograph,
+    check_pixels,
+    check_pose,
+    check_positive,
+    check_tensor,
+)
+from .covariance import pose_covariance
+from .descent import ContourProblem, ContourState, apply_twist
+from .points import EdgeField
+
+__all__ = ["ContourFit", "contour_support", "fit_contours"]
+
+SIZE = 256
+"""Side of the crop in px; the first rounds use half of it."""
+
+FIRST, SECOND, FINE = (6.0, 4.0), (3.0, 2.0), (6.0, 4.0, 3.0, 2.0, 2.0)
+"""Search distance for edges in px, one a round: from all starting rotations and then from the best at half size, and
+at full size."""
+
+SAME = 0.5
+"""Mean shift in px at half size below which two fits count as one."""
+
+START_ANGLE = 8.0
+"""Degrees by which the pose is rotated left, right, up and down for further starts: half the width of the basin of
+attraction, and about the error of a coarse view."""
+
+SUPPORTED, GAINED = 0.5, 0.2
+"""Edge support, or gain of it over the start, from which a fit is trusted; chosen on generated scenes."""
+
+
+@dataclass(frozen=True)
+class ContourFit:
+    """N poses fitted to photographs.
+
+    Attributes:
+        transform: (N, 4, 4) float64 ``T_cam_from_model``.
+        covariance: (N, 6, 6) float64, see :func:`fit_contours`; NaN where too few edges were found.
+        edge_support: (N,) float64 in [0, 1), mean strength of the edges within about 1 px of the contour points,
+            weighted by distance; 0 where the mesh shows no contour in the crop.
+        start_support: (N,) edge support of the starts (at half size for starts that are not finished).
+        observable: (N,) int64, number of the six directions that the contours determine; the covariance of the others
+            is that of an unknown rotation or translation.
+        matched: (N,) fraction of the contour points that lie within 2 px of an edge.
+        residual: (N,) root mean square distance of matched points from their edges, in px of a crop of 256 px.
+        mean_shift: (N,) mean shift of the contour points from the start, in the same px.
+    """
+
+    transform: Tensor
+    covariance: Tensor
+    edge_support: Tensor
+    start_support: Tensor
+    observable: Tensor
+    matched: Tensor
+    residual: Tensor
+    mean_shift: Tensor
+
+    @property
+    def trustworthy(self) -> Tensor:
+        """(N,) bool: edge support of at least 0.5, or at least 0.2 more than the start had.
+
+        Contours of *another* object of the category gain less; then the start's rotation is as good as the fit's.
+        """
+        return (self.edge_support >= SUPPORTED) | (self.edge_support - self.start_support >= GAINED)
+
+
+@torch.no_grad()
+def fit_contours(
+    renderer: DepthRenderer,
+    images: Tensor | Sequence[Tensor],
+    boxes: Any,
+    camera_matrices: Any,
+    starts: Tensor,
+    *,
+    image_index: Tensor | None = None,
+    centre: Tensor,
+    radius: float,
+    margin: float = 0.1,
+    finish: int | None = None,
+) -> ContourFit:
+    """Poses whose contours lie on a photograph's edges, by robust least squares over SE(3).
+
+    At each start the mesh is rendered; its occluding contours and creases become 3D points X_i with image normals n_i
+    (:func:`contour_points`), and edges of similar direction are searched along n_i. With d_i the distance to the
+    selected edge and J_i = n_i^T du_i/dxi, every step solves
+
+        (J^T W J + lambda diag(J^T W J)) xi = J^T W d,
+
+    where W is the strength of the edge times Tukey's weight of the residual. Within a step, edges are selected again
+    near the predicted position; the search distance shrinks from round to round, and the mesh is rendered again where
+    contours have moved. The fit begins at half size from each start and from four poses rotated away from it; the best
+    (by edge support) and the next best that differs from it continue, and end at full size. The start is returned where
+    no fit has more support. All starts of all photographs are rendered together.
+
+    The covariance is of rotation (rad) about the camera's x, y, z, then translation (model units) along them: with the
+    true pose R, t,
+
+        R = exp([w]x) R_fit,   t = t_fit + e,   (w, e) of mean 0 and that covariance,
+
+    see :func:`pose_covariance`. What contours do not determine (rotations of a sphere) has a standard deviation of pi
+    or of the distance. As least squares ignore wrong edges, the covariance is scaled by the errors of reliable results
+    on photographs (:mod:`curvireg_torch.registration.calibration`). Computed on the CPU.
+
+    Args:
+        renderer: of the mesh.
+        images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, in [0, 1] or uint8; or one photograph (C, H, W).
+            Missing pixels (NaN or infinite) are filled from their neighbours.
+        boxes: (B, 4) x0, y0, x1, y1 in px, which need not be exact. (4,) for one photograph.
+        camera_matrices: (B, 3, 3) or (3, 3) in px; or (N, 3, 3), one for each start.
+        starts: (N, 4, 4) rigid poses, within about 15 degrees.
+        image_index: (N,) the photograph of each start; optional for one photograph.
+        centre, radius: of the object, (3,) and model units.
+        margin: added around the box, as a fraction of its longer side.
+        finish: number of starts of each photograph that are fitted to the end, those with the most support after the
+            first rounds; the others are returned as those rounds left them. None: each start is fitted as if alone.
+
+    Raises:
+        InvalidInputError: wrong shapes, a pose that is not rigid and finite, an unusable box or camera matrix.
+
+    Example:
+        >>> import curvireg_torch as cr, trimesh
+        >>> from curvireg_torch.rendering import make_renderer
+        >>> K = torch.tensor([[200.0, 0, 63.5], [0, 200.0, 63.5], [0, 0, 1]], dtype=torch.float64)
+        >>> T = torch.eye(4, dtype=torch.float64); T[2, 3] = 5.0
+        >>> T[:3, :3] = cr.rotation_from_viewpoint(30.0, 20.0, 5.0)
+        >>> renderer = make_renderer(trimesh.creation.box((1, 1.5, 2)))
+        >>> image = (renderer.render(T[None], K, (128, 128))[0] > 0).float()
+        >>> start = T.clone(); start[0, 3] = 0.1                                              # 2 % to the right
+        >>> box = torch.tensor([24.0, 18, 102, 110])
+        >>> fit = fit_contours(renderer, image, box, K, start[None], centre=torch.zeros(3), radius=1.4)
+        >>> abs(float(fit.transform[0, 0, 3])) < 0.01
+        True
+    """
+    images, boxes, K, image_index = _checked(images, boxes, camera_matrices, starts, image_index)
+    check_positive(radius, "radius")
+    if finish is not None and not finish >= 1:
+        raise InvalidInputError(f"finish: expected a whole number >= 1 or None, got {finish}")
+    T0, centre = starts.detach().cpu().double(), centre.detach().cpu().double()
+    if (N := len(T0)) == 0:
+        none = T0.new_zeros(0)
+        return ContourFit(T0, T0.new_zeros(0, 6, 6), none, none, none.long(), none, none, none)
+    crops, full = _full_size(renderer, images, boxes, K, image_index, centre, radius, margin)
+    K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ full.K
+    half = ContourProblem(renderer, EdgeField(F.avg_pool2d(crops, 2)), image_index, K, SIZE // 2, centre, radius)
+    start = half.state(T0)
+    before = half.edge_support(start)
+    first = half.descend(start, FIRST)
+    support = half.edge_support(first)
+    chosen = torch.ones(N, dtype=torch.bool) if finish is None else _among_best(support, image_index, finish)
+    index, others = chosen.nonzero()[:, 0], (~chosen).nonzero()[:, 0]
+    source, T = _fit_around(half[index], T0[index], first[index], support[index])
+    # Candidates: the starts, what the first rounds made of unfinished ones, and the fits. Of equals the first wins.
+    owner = torch.cat([index, others, index[source]])
+    unfinished = torch.where((support > before)[others, None, None], first.T[others], T0[others])
+    fixed = torch.cat([T0[index], unfinished])
+    fitted = full[index[source]]
+    state = ContourState.cat([full[owner[: len(fixed)]].state(fixed), fitted.descend(fitted.state(T), FINE)])
+    support = full[owner].edge_support(state)
+    before[index] = support[: len(index)]
+    best = torch.where(owner == torch.arange(N)[:, None], support, -1.0).argmax(dim=1)
+    state, support = state[best], support[best]
+    matches = full.matches(state, FINE[-1])
+    covariance, observable = pose_covariance(matches, state.points, state.T, full.K, centre, radius=radius)
+    weight = matches.weight[..., 0]
+    mean_square = (weight * matches.distance[..., 0].square()).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-12)
+    return ContourFit(
+        transform=state.T,
+        covariance=covariance,
+        edge_support=support,
+        start_support=before,
+        observable=observable,
+        matched=(weight > 0).sum(dim=1) / state.points.valid.sum(dim=1).clamp(min=1),
+        residual=mean_square.sqrt(),
+        mean_shift=full.mean_shift(state.points, T0, state.T),
+    )
+
+
+@torch.no_grad()
+def contour_support(
+    renderer: DepthRenderer,
+    images: Tensor | Sequence[Tensor],
+    boxes: Tensor,
+    camera_matrices: Tensor,
+    poses: Tensor,
+    *,
+    image_index: Tensor | None = None,
+    centre: Tensor,
+    radius: float,
+    margin: float = 0.1,
+) -> Tensor:
+    """(N,) edge support of poses that are not fitted, as :attr:`ContourFit.edge_support` is of fitted ones.
+
+    Arguments and errors are those of :func:`fit_contours`, with ``poses`` in place of ``starts``.
+    """
+    images, boxes, K, image_index = _checked(images, boxes, camera_matrices, poses, image_index)
+    if len(poses) == 0:
+        return torch.zeros(0, dtype=torch.float64)
+    centre = centre.detach().cpu().double()
+    _, problem = _full_size(renderer, images, boxes, K, image_index, centre, radius, margin)
+    return problem.edge_support(problem.state(poses.detach().cpu().double()))
+
+
+def _full_size(
+    renderer: DepthRenderer,
+    images: Sequence[Tensor],
+    boxes: Tensor,
+    K: Tensor,
+    image_index: Tensor,
+    centre: Tensor,
+    radius: float,
+    margin: float,
+) -> tuple[Tensor, ContourProblem]:
+    """(B, C, S, S) crops without missing pixels, and the problem on them."""
+    crops, A = crop_images(images, boxes, size=SIZE, margin=margin)
+    crops = fill_missing(crops)
+    check_pixels(crops, "of the box")
+    K = A.double()[image_index] @ K
+    return crops, ContourProblem(renderer, EdgeField(crops), image_index, K, SIZE, centre, radius)
+
+
+def _fit_around(half: ContourProblem, T0: Tensor, first: ContourState, support: Tensor) -> tuple[Tensor, Tensor]:
+    """Fit from four rotations of each start ``T0`` (N, 4, 4) too, at half size.
+
+    Of these four fits and ``first``, the best and the next best that is another pose are refined. Returns the index of
+    the start that each pose belongs to, and the poses.
+    """
+    N, every = len(T0), torch.arange(len(T0))
+    offsets = torch.zeros(4, 6, dtype=torch.float64)
+    offsets[:, :2] = torch.deg2rad(START_ANGLE * torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]))
+    four = half[every.repeat_interleave(4)]
+    rotated = apply_twist(T0.repeat_interleave(4, 0), offsets.repeat(N, 1), half.centre)
+    fits = four.descend(four.state(rotated), FIRST)
+    supports = torch.cat([support[:, None], four.edge_support(fits).view(-1, 4)], dim=1)
+    five = torch.cat([every[:, None], N + torch.arange(4 * N).view(-1, 4)], dim=1)
+    states, best = ContourState.cat([first, fits]), supports.argmax(dim=1)
+    other, reference = states[five.flatten()], states[five[every, best].repeat_interleave(5)]
+    gap = half[every.repeat_interleave(5)].mean_shift(reference.points, reference.T, other.T).view(-1, 5)
+    rival, second = torch.where(gap > SAME, supports, -1.0).max(dim=1)
+    source = torch.cat([every, every[rival >= 0]])
+    chosen = five[source, torch.cat([best, second[rival >= 0]])]
+    return source, half[source].descend(states[chosen], SECOND).T
+
+
+def _among_best(support: Tensor, image_index: Tensor, count: int) -> Tensor:
+    """(N,) bool: whether fewer than ``count`` other starts of the same photograph have more support."""
+    order = torch.arange(len(support))
+    ahead = (support > support[:, None]) | ((support == support[:, None]) & (order < order[:, None]))
+    return (ahead & (image_index == image_index[:, None])).sum(dim=1) < count
+
+
+def _checked(
+    images: Tensor | Sequence[Tensor], boxes: Any, camera_matrices: Any, poses: Tensor, image_index: Tensor | None
+) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
+    """Float images, boxes (B, 4), camera matrices (N, 3, 3) of the poses and (N,) image indices, all on the CPU."""
+    check_tensor(poses, "starts", (None, 4, 4))
+    check_pose(poses, "starts")
+    if isinstance(images, Tensor) and images.ndim == 3:  # one photograph
+        box = as_numbers(boxes, "box")
+        check_tensor(box, "box", (4,))
+        images, boxes = images[None], box[None]
+    for image in images:
+        check_photograph(image)
+    B, N = len(images), len(poses)
+    boxes = as_boxes(boxes, B)
+    K = as_numbers(camera_matrices, "camera_matrices", least=torch.float64)
+    check_camera_matrix(K)
+    given = len(K) if K.ndim == 3 else 1
+    if given not in (1, B, N) or K.ndim not in (2, 3):
+        raise InvalidInputError(f"camera_matrices: expected one or {B} matrices (or {N}), got {given}")
+    if image_index is None:
+        if B != 1:
+            raise InvalidInputError(f"image_index: got {B} images; give the index of the image of each start")
+        image_index = torch.zeros(N, dtype=torch.long)
+    image_index = image_index.detach().cpu()
+    if image_index.shape != (N,) or image_index.is_floating_point():
+        got = f"{image_index.dtype} of shape {tuple(image_index.shape)}"
+        raise InvalidInputError(f"image_index: expected {N} integers, got {got}")
+    if N and not 0 <= int(image_index.min()) <= int(image_index.max()) < B:
+        raise InvalidInputError(f"image_index: expected indices of {B} images, got {image_index.tolist()}")
+    image_index, K = image_index.long(), K.detach().cpu()
+    floats = [image.detach().cpu().float() / (1 if image.is_floating_point() else 255) for image in images]
+    K = K.expand(B, 3, 3)[image_index] if given in (1, B) else K
+    return floats, boxes.detach().cpu().float(), K, image_index

@@ -1,0 +1,282 @@
+"""The stages of a registration, from photographs with boxes to poses."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import CurviregError
+from ..matching import Ranking, ViewDescriber, ViewMatcher
+from ..terms import QueryFeatures
+from ..utils.threads import map_on_threads
+from .confidence import confidence_features, confidence_model, ranking_evidence, ranking_features
+from .hypotheses import Hypotheses, distinct_mask, start_hypotheses
+from .inputs import ImageItem, check_crop
+from .locator import Locator
+from .poses import Poses, edge_supports, fit_poses, lift_to_poses
+from .rescoring import POSE_FEATURES, rank_feature, rescore, similarities
+from .results import FailedRegistration, Hypothesis, Registration
+from .search import search
+
+__all__ = ["PoseEstimator"]
+
+LEAST = 3
+"""Hypotheses that are followed at least, however few are reported: the confidence depends on rivals. Of 15 photographs
+of another object, 14 were called reliable with one hypothesis, 2 with two, none with three or five."""
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """B photographs to register.
+
+    Attributes:
+        images: (C, H, W) each.
+        boxes: (B, 4) float64 px.
+        camera_matrices: (B, 3, 3) px, or None.
+        query: their crops, cut and described by the matcher.
+        ranking: of the bank's views.
+        descriptors: (B, D) on the fine grid of search and rescoring.
+    """
+
+    images: list[Tensor]
+    boxes: Tensor
+    camera_matrices: Tensor | None
+    query: QueryFeatures
+    ranking: Ranking
+    descriptors: Tensor
+
+
+class PoseEstimator:
+    """Registers photographs with boxes: rank, search, fit contours, rescore.
+
+    Args:
+        matcher: of the bank; its pipeline decides all results.
+        symmetries: (S, 4, 4) of the mesh; hypotheses that differ by one of them are reported once.
+        progress: called with (stage, done, total) if it is a function.
+    """
+
+    def __init__(
+        self,
+        matcher: ViewMatcher,
+        *,
+        symmetries: Tensor | None = None,
+        progress: bool | Callable[[str, int, int], object] = False,
+    ) -> None:
+        self.matcher, self.bank, self.pipeline = matcher, matcher.bank, matcher.pipeline
+        self.symmetries, self.progress = symmetries, progress
+
+    @cached_property
+    def describers(self) -> tuple[ViewDescriber, ...]:
+        """Renderer and descriptor of each model, on a grid twice as fine as the bank's."""
+        settings = self.bank.settings
+        fine = replace(settings, grid=min(2 * settings.grid, settings.image_size))
+        return tuple(
+            ViewDescriber(mesh, fine, renderer=coarse.renderer, device=self.bank.device)
+            for mesh, coarse in zip(self.bank.meshes, self.matcher.describers, strict=True)
+        )
+
+    @cached_property
+    def locator(self) -> Locator:
+        """Proposes boxes where none are given."""
+        return map_on_threads(lambda _: Locator(self.matcher), [0])[0]  # one thread: rounding is always the same
+
+    def report_progress(self, stage: str) -> None:
+        """Report the beginning of a stage."""
+        if callable(self.progress):
+            self.progress(stage, 0, 1)
+
+    def map_items(
+        self,
+        items: Sequence[ImageItem | CurviregError],
+        function: Callable[[Sequence[ImageItem | CurviregError], int], list[Any]],
+    ) -> list[Any]:
+        """Results of ``function(some items, index of the first)`` for all items, in their order.
+
+        On a CPU each photograph is registered on its own thread, in which torch uses no further threads: its result
+        is the same to the bit, whatever else is registered, on however many threads. On a GPU ``chunk_size`` of the
+        matcher are registered at a time.
+        """
+        size = 1 if self.bank.device.type == "cpu" else self.matcher.chunk_size
+        _ = self.describers, self.matcher.describers  # create them once, before threads use them
+
+        @torch.no_grad()  # threads do not inherit it
+        def run(first: int) -> list[Any]:
+            return function(items[first : first + size], first)
+
+        parts = map_on_threads(run, range(0, len(items), size), device=self.bank.device)
+        return [result for part in parts for result in part]
+
+    def register_items(
+        self, items: Sequence[ImageItem | CurviregError], *, first: int = 0
+    ) -> list[Registration | FailedRegistration]:
+        """Register photographs, some of which may have failed already; boxes are not corrected.
+
+        Args:
+            items: photographs or their errors.
+            first: index of the first photograph, for error messages.
+        """
+        results: dict[int, Registration | FailedRegistration] = {
+            i: FailedRegistration(item) for i, item in enumerate(items) if not isinstance(item, ImageItem)
+        }
+        usable = {i: item for i, item in enumerate(items) if isinstance(item, ImageItem)}
+        if usable:
+            boxes = torch.stack([item.box for item in usable.values()])
+            query = self.matcher.query([item.image for item in usable.values()], boxes)
+            for i, crop in zip(usable, query.crops, strict=True):
+                try:
+                    check_crop(crop)
+                except CurviregError as error:
+                    results[i] = FailedRegistration(error.with_subject(f"image {first + i}"))
+            rows = [row for row, i in enumerate(usable) if i not in results]
+            if rows:
+                indices = [i for i in usable if i not in results]
+                registered = self.register([usable[i] for i in indices], query[torch.tensor(rows)])
+                results.update(zip(indices, registered, strict=True))
+        return [results[i] for i in range(len(items))]
+
+    @torch.no_grad()
+    def register(
+        self, items: Sequence[ImageItem], query: QueryFeatures, ranking: Ranking | None = None
+    ) -> list[Registration]:
+        """All stages after cropping.
+
+        Args:
+            items: B photographs, all with a camera matrix or all without.
+            query: the same, cropped and described by the matcher.
+            ranking: of the same; default :meth:`ViewMatcher.rank`.
+        """
+        batch = self._rank(items, query, ranking)
+        count = max(LEAST, self.pipeline.hypotheses)
+        starts = start_hypotheses(batch.ranking, self.bank, count=count, symmetries=self.symmetries)
+        hypotheses = self._search(batch, starts)
+        poses = self._fit(batch, lift_to_poses(self.describers, hypotheses, batch.boxes, batch.camera_matrices))
+        evidence = self._evidence(batch, starts, poses)
+        distinct = self._distinct(batch, poses, evidence)
+        poses, evidence = self._restore(batch, starts, poses, evidence, distinct)
+        order = self._order(batch, poses, evidence, distinct)
+        return self._results(batch, poses, evidence, order)
+
+    def _rank(self, items: Sequence[ImageItem], query: QueryFeatures, ranking: Ranking | None) -> _Batch:
+        self.report_progress("ranking")
+        matrices = [item.camera_matrix for item in items if item.camera_matrix is not None]
+        return _Batch(
+            images=[item.image for item in items],
+            boxes=torch.stack([item.box for item in items]).double(),
+            camera_matrices=torch.stack(matrices) if matrices else None,
+            query=query,
+            ranking=self.matcher.rank(query) if ranking is None else ranking,
+            descriptors=self.describers[0].descriptor(query.field),
+        )
+
+    def _search(self, batch: _Batch, starts: Hypotheses) -> Hypotheses:
+        if not self.pipeline.search:
+            return starts
+        self.report_progress("search")
+        return search(
+            self.describers,
+            batch.descriptors,
+            starts,
+            bank=self.bank,
+            ranking=batch.ranking,
+            boxes=batch.boxes,
+            camera_matrices=batch.camera_matrices,
+            brief=self.pipeline.contours,
+        )
+
+    def _fit(self, batch: _Batch, poses: Poses) -> Poses:
+        if not self.pipeline.contours:
+            return poses
+        self.report_progress("contours")
+        return fit_poses(self.describers, batch.images, poses, batch.boxes)
+
+    def _evidence(self, batch: _Batch, starts: Hypotheses, poses: Poses) -> Tensor:
+        """(H, 4) :data:`POSE_FEATURES` of poses that come from the views ``starts``."""
+        hypotheses = poses.hypotheses
+        similarity = similarities(self.describers, batch.descriptors, hypotheses)
+        if not self.pipeline.contours:
+            support = torch.zeros_like(similarity)
+        elif poses.fit is not None:
+            support = poses.fit.edge_support
+        else:
+            support = edge_supports(self.describers, batch.images, poses, batch.boxes)
+        appearance = torch.zeros_like(similarity)
+        if "appearance" in batch.ranking.terms:
+            pictures = self.matcher.pictures(hypotheses.model, hypotheses.rotation, hypotheses.distance)
+            appearance = self.matcher.reranking_score(
+                "appearance", batch.query, batch.ranking, pictures, hypotheses.image_index
+            )
+        return torch.stack([rank_feature(starts), similarity, support, appearance], dim=1)
+
+    def _distinct(self, batch: _Batch, poses: Poses, evidence: Tensor) -> Tensor:
+        """(H,) bool: False where a hypothesis has merged into a better one."""
+        scores = rescore(evidence, with_camera=batch.camera_matrices is not None)
+        return distinct_mask(poses.hypotheses, scores, symmetries=self.symmetries)
+
+    def _restore(
+        self, batch: _Batch, starts: Hypotheses, poses: Poses, evidence: Tensor, distinct: Tensor
+    ) -> tuple[Poses, Tensor]:
+        """Put hypotheses that merged, or whose fit is not trusted, back to the views that they started from.
+
+        A merged hypothesis still is a rival as its view. Without a camera the mesh is often another object of the
+        category: where its contours do not fit, the view has the smaller error.
+        """
+        keep = distinct
+        if poses.fit is not None and batch.camera_matrices is None:
+            keep = distinct & poses.fit.trustworthy
+        if bool(keep.all()):
+            return poses, evidence
+        views, back = lift_to_poses(self.describers, starts, batch.boxes, batch.camera_matrices), ~keep
+        evidence = evidence.clone()
+        evidence[back, 1:] = self._evidence(batch, starts[back], views[back])[:, 1:]
+        return poses.where(keep, views), evidence
+
+    def _order(self, batch: _Batch, poses: Poses, evidence: Tensor, distinct: Tensor) -> list[Tensor]:
+        """For each photograph its hypotheses, best first; those that merged come last."""
+        scores = rescore(evidence, with_camera=batch.camera_matrices is not None)
+        order = (scores + torch.where(distinct, 0.0, -1e6)).argsort(descending=True, stable=True)
+        return [order[poses.hypotheses.image_index[order] == b] for b in range(len(batch.images))]
+
+    def _results(self, batch: _Batch, poses: Poses, evidence: Tensor, order: list[Tensor]) -> list[Registration]:
+        """Confidences, and hypotheses as they are reported."""
+        with_camera, ranking = batch.camera_matrices is not None, batch.ranking
+        fitted, best = poses.fit is not None, torch.stack([mine[0] for mine in order])
+        # The confidence of a fitted pose was calibrated on the ranking's best view; without fit, on the result's view.
+        views = None if fitted else poses.hypotheses.view[best]
+        ranked = ranking_evidence(ranking, self.bank.rotations, answer=views, symmetries=self.symmetries)
+        model = confidence_model(
+            "contours" if fitted else "ranking",
+            with_camera=with_camera,
+            with_appearance="appearance" in ranking.terms,
+        )
+        scores = rescore(evidence, with_camera=with_camera)
+        results = []
+        for b, mine in enumerate(order):
+            features = ranking_features(ranked[b])
+            if fitted:
+                features = confidence_features(evidence[mine], scores[mine], features["concentration"])
+            reported = mine[: self.pipeline.hypotheses].tolist()
+            hypotheses = tuple(_hypothesis(h, poses, evidence, with_camera=with_camera) for h in reported)
+            results.append(Registration(hypotheses, model(features), ranking[b : b + 1], features))
+        return results
+
+
+def _hypothesis(h: int, poses: Poses, evidence: Tensor, *, with_camera: bool) -> Hypothesis:
+    hypotheses, T, fit = poses.hypotheses, poses.T[h], poses.fit
+    features = dict(zip(POSE_FEATURES, evidence[h].tolist(), strict=True))
+    known = fit is not None and with_camera and bool(fit.covariance[h].isfinite().all())
+    return Hypothesis(
+        rotation=T[:3, :3].clone() if with_camera else hypotheses.rotation[h].clone(),
+        translation=T[:3, 3].clone() if with_camera else None,
+        score=features["similarity"],
+        evidence=features,
+        allocentric_rotation=hypotheses.rotation[h].clone(),
+        distance=float(hypotheses.distance[h]),
+        projection=(T.clone(), poses.cameras[h].clone()),
+        view=int(hypotheses.view[h]),
+        model=int(hypotheses.model[h]),
+        edge_support=None if fit is None else features["edge_support"],
+        covariance=fit.covariance[h].clone() if fit is not None and known else None,
+    )

@@ -1,0 +1,191 @@
+"""Localization: objects are registered in photographs that come without a box."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from kornia.geometry.bbox import nms
+from torch import Tensor
+
+from ..errors import CurviregError, InvalidInputError
+from ..geometry.crops import box_iou
+from ..matching import Ranking
+from ..terms import QueryFeatures
+from .confidence import presence, presence_features
+from .correction import projected_box
+from .estimator import PoseEstimator
+from .inputs import ImageItem, check_crop, image_items
+from .locator import Located
+from .locator.locator import OVERLAP, check_distance
+from .results import FailedRegistration, Localization, Registration
+
+__all__ = ["ScoredCandidates", "localize"]
+
+_Result = Registration | FailedRegistration
+
+
+@torch.no_grad()
+def localize(
+    registrar: PoseEstimator,
+    images: Tensor | Sequence[Any],
+    camera_matrices: Any | None = None,
+    *,
+    instances: int = 1,
+    distance: tuple[float, float] | None = None,
+) -> list[list[_Result]]:
+    """Find and register objects in whole photographs, the most certain first.
+
+    The locator's best proposals are ranked as given boxes are, which yields the probability that each shows the object
+    (:func:`curvireg_torch.registration.confidence.presence`); the most certain are registered. The box around each pose
+    is then ranked too, which corrects the locator's coarse steps, and registered again where it is more certain.
+
+    Args:
+        registrar: :class:`Registrar` of the meshes.
+        images, camera_matrices: see :class:`Registrar`.
+        instances: largest number of objects in each photograph.
+        distance: range of the distance of an object's centre, in the mesh's unit; needs cameras.
+
+    Returns:
+        For each photograph one to ``instances`` registrations with their ``localization``; or one that failed.
+
+    Raises:
+        InvalidInputError: not as many cameras as images, ``instances`` < 1, or a bad ``distance``.
+    """
+    if instances < 1:
+        raise InvalidInputError(f"instances: expected >= 1, got {instances}")
+    check_distance(distance, with_cameras=camera_matrices is not None)
+    _ = registrar.locator  # create it once, before threads use it
+
+    def localize_some(items: Sequence[ImageItem | CurviregError], first: int) -> list[list[_Result]]:
+        return [
+            _localize_one(registrar, item, f"image {i}", instances, distance) for i, item in enumerate(items, first)
+        ]
+
+    return registrar.map_items(image_items(images, None, camera_matrices), localize_some)
+
+
+def _localize_one(
+    estimator: PoseEstimator,
+    item: ImageItem | CurviregError,
+    name: str,
+    instances: int,
+    distance: tuple[float, float] | None,
+) -> list[_Result]:
+    if not isinstance(item, ImageItem):
+        return [FailedRegistration(item)]
+    estimator.report_progress("looking")
+    try:
+        check_crop(_extremes(item.image))
+        cameras = None if item.camera_matrix is None else [item.camera_matrix]
+        located = estimator.locator([item.image], camera_matrices=cameras, distance=distance)[0]
+        if not len(located.boxes):
+            raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
+        return [*_with_proposals(_register_candidates(estimator, item, located, instances), located)]
+    except CurviregError as error:
+        return [FailedRegistration(error.with_subject(name))]
+
+
+def _register_candidates(
+    estimator: PoseEstimator, item: ImageItem, located: Located, instances: int
+) -> list[Registration]:
+    """The most certain objects, at most ``instances``, whose boxes do not overlap."""
+    count = max(estimator.pipeline.locate.candidates, instances + 1)
+    candidates = ScoredCandidates.score_boxes(estimator, item, located.boxes[:count], located.scores[:count])
+    results: list[Registration] = []
+    for k in nms(candidates.boxes, candidates.presence, OVERLAP).tolist():
+        if len(results) < instances:
+            _add(results, _refined(estimator, item, candidates.register(estimator, item, k)))
+    return sorted(results, key=_presence, reverse=True)
+
+
+def _with_proposals(results: list[Registration], located: Located) -> list[Registration]:
+    """Results with all proposals, their own boxes first, and with ``presence`` as a factor of their confidence."""
+    boxes = torch.cat([torch.stack([localization_of(r).box for r in results]), located.boxes.double()])
+    scores = torch.cat([torch.tensor([localization_of(r).score for r in results]), located.scores])
+    kept = nms(boxes, -torch.arange(len(boxes)), OVERLAP)  # in their present order
+    return [
+        replace(
+            result,
+            localization=replace(localization_of(result), boxes=boxes[kept], scores=scores[kept]),
+            confidence=result.confidence * _presence(result),
+        )
+        for result in results
+    ]
+
+
+def _add(results: list[Registration], new: Registration) -> None:
+    """Add a result. Of results whose boxes overlap the most certain is kept: proposals may lead to the same object."""
+    boxes = torch.stack([localization_of(new).box, *(localization_of(result).box for result in results)])
+    overlap = box_iou(boxes[:1], boxes[1:])[0].tolist()
+    same = [result for result, iou in zip(results, overlap, strict=True) if iou > OVERLAP]
+    if all(_presence(new) > _presence(result) for result in same):
+        results[:] = [result for result in results if not any(result is other for other in same)]
+        results.append(new)
+
+
+@dataclass(frozen=True)
+class ScoredCandidates:
+    """P boxes of one photograph, described and ranked, with the probability that each shows the object."""
+
+    boxes: Tensor
+    scores: Tensor
+    query: QueryFeatures
+    ranking: Ranking
+    evidence: list[list[float]]
+    presence: Tensor
+
+    @classmethod
+    def score_boxes(
+        cls, estimator: PoseEstimator, item: ImageItem, boxes: Tensor, scores: Tensor
+    ) -> "ScoredCandidates":
+        """Rank P boxes (P, 4) with the locator's ``scores`` (P,)."""
+        query = estimator.matcher.query([item.image] * len(boxes), boxes)
+        ranking = estimator.matcher.rank(query)
+        learned = estimator.locator.features.learned
+        evidence = [
+            presence_features(score, ranking[k : k + 1], learned=learned) for k, score in enumerate(scores.tolist())
+        ]
+        probability = torch.tensor([presence(features) for features in evidence], dtype=torch.float64)
+        return cls(boxes, scores, query, ranking, evidence, probability)
+
+    def register(self, estimator: PoseEstimator, item: ImageItem, k: int) -> Registration:
+        """Register box ``k``; the result's box is the one around its pose."""
+        one = slice(k, k + 1)
+        result = estimator.register([replace(item, box=self.boxes[k])], self.query[one], self.ranking[one])[0]
+        where = Localization(
+            box=projected_box(estimator, result),
+            presence=float(self.presence[k]),
+            score=float(self.scores[k]),
+            boxes=self.boxes[:0].double(),
+            scores=self.scores[:0],
+        )
+        return replace(result, localization=where)
+
+
+def _refined(estimator: PoseEstimator, item: ImageItem, result: Registration) -> Registration:
+    """The more certain one of a result and of the registration of the box around its pose."""
+    where = localization_of(result)
+    try:
+        candidates = ScoredCandidates.score_boxes(estimator, item, where.box[None].float(), torch.tensor([where.score]))
+    except InvalidInputError:  # the projected mesh lies outside the photograph: nothing there supports the pose
+        return replace(result, localization=replace(where, presence=0.0))
+    if float(candidates.presence[0]) <= where.presence:
+        return result
+    return candidates.register(estimator, item, 0)
+
+
+def _extremes(image: Tensor) -> Tensor:
+    """(C, 2) smallest and largest value of each channel, NaN where one is missing; as :func:`check_crop` takes them."""
+    pair = torch.stack([image.flatten(1).amin(dim=1), image.flatten(1).amax(dim=1)], dim=1)
+    return pair.float() / 255.0 if image.dtype == torch.uint8 else pair
+
+
+def localization_of(result: Registration) -> Localization:
+    """``localization`` of a result that has one."""
+    assert result.localization is not None
+    return result.localization
+
+
+def _presence(result: Registration) -> float:
+    return localization_of(result).presence
