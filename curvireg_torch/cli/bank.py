@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ..utils.files import probe_folder
+from ..utils.files import check_writable
 from ..utils.input_paths import check_given
 from .options import common_options, examples, mesh_options, pipeline_options, register_options
 
@@ -42,9 +42,9 @@ def run(arguments: argparse.Namespace) -> None:
         CurviregError: the mesh or an option cannot be used, or a file cannot be written.
     """
     check_given([], [arguments.mesh])
-    probe_folder(arguments.out.parent, "--out")
+    check_writable(arguments.out.parent, "--out")
     if arguments.adapt is not None:
-        probe_folder(arguments.adapt.parent, "--adapt")
+        check_writable(arguments.adapt.parent, "--adapt")
     from ..io.meshes import load_mesh
     from ..matching import ViewBank
 

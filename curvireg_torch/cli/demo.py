@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ..utils.files import probe_folder, write_file
+from ..utils.files import check_writable, write_file
 from .options import common_options, examples, pipeline_options, register_options
 
 __all__ = ["add_parser", "run"]
@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> None:
     Raises:
         CurviregError: an option cannot be used, or a file cannot be written.
     """
-    probe_folder(arguments.out, "--out")
+    check_writable(arguments.out, "--out")
     import torch
 
     from ..evaluation.result_files import write_result

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInputError
-from ..utils.files import probe_folder
+from ..utils.files import check_writable
 from ..utils.input_paths import check_given, is_one_photograph
 from .options import (
     add_box_and_camera,
@@ -167,7 +167,7 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
     path = options.photos[0]
     photo = read_photo(path, dtype=torch.uint8)
     if out is not None:
-        probe_folder(out, "--out")
+        check_writable(out, "--out")
     registrar = open_registrar(options, options.meshes, field)
     ready = time.perf_counter() - start
     if options.box is None and options.progress:
@@ -219,9 +219,9 @@ def _listing(options: "RegisterOptions", path: Path | None, out: Path, *, every:
 
     if path is not None:
         listing = read_list(path, options.meshes)
-        probe_folder(out, "--out")
+        check_writable(out, "--out")
     else:
-        probe_folder(out, "--out")
+        check_writable(out, "--out")
         listing = list_photographs(
             options.photos, options.meshes, box=options.box, camera=options.camera, every=every, frames=out / "frames"
         )

@@ -19,7 +19,7 @@ from ..io.meshes.up import mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..settings import BankSettings
-from ..utils.threads import one_thread_each
+from ..utils.threads import single_threaded_pool
 from .bank_file import RERANKING, read_bank, write_bank
 from .describe import ViewDescriber
 
@@ -195,7 +195,7 @@ class ViewBank:
         parts = []
         with (
             tqdm(total=len(views), desc="views", unit="view", disable=progress is not True) as bar,
-            one_thread_each() as pool,
+            single_threaded_pool() as pool,
         ):
             for part in pool.map(describe_chunk, range(0, len(views), chunk_size)):
                 parts.append(part)

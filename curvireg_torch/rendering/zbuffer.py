@@ -6,7 +6,7 @@ import trimesh
 from torch import Tensor
 
 from ..io.meshes.mesh import mesh_centre, mesh_radius
-from ..utils.threads import available_threads, one_thread_each
+from ..utils.threads import available_threads, single_threaded_pool
 from .protocol import NEAREST, check_render_arguments
 
 __all__ = ["TorchRenderer"]
@@ -67,7 +67,7 @@ class TorchRenderer:
                 self._draw(block, faces, R[i : i + views], t[i : i + views], K[i : i + views], size, orthographic)
 
         if self.device.type == "cpu" and available_threads() > 1:
-            with one_thread_each() as pool:
+            with single_threaded_pool() as pool:
                 list(pool.map(draw, range(0, len(T), views)))
         else:
             for i in range(0, len(T), views):

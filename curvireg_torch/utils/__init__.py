@@ -1,1 +1,1 @@
-"""Checks of arguments, atomic writes, threads: what every room uses."""
+"""Checks of arguments, atomic writes, digests and threads."""

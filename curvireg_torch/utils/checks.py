@@ -1,7 +1,7 @@
-"""The boundary of the library: one check per contract, through which every public entry takes what callers give.
+"""Checks of arguments, one per contract, for all public functions.
 
-Each raises :class:`InvalidInputError` (pixels: :class:`ImageError`) with what was expected and what came. Photographs,
-boxes, cameras, poses and masks are all checked here, so that layers cannot differ in what they accept.
+Each raises :class:`InvalidInputError` (pixels: :class:`ImageError`) with expected and actual value. Photographs, boxes,
+cameras, poses and masks are all checked here, so that all layers accept the same.
 """
 
 import math
@@ -13,20 +13,24 @@ from torch import Tensor
 
 from ..errors import ImageError, InvalidInputError
 
-RIGID = 1e-2
-"""Deviation from a rotation that passes: poses in files are rounded, and half precision rounds to 5e-4."""
+MAX_ROTATION_DEVIATION = 1e-2
+"""Largest deviation from a rotation: poses in files are rounded, and half precision rounds to 5e-4."""
 
-ANISOTROPY = 1.1
-"""Largest ratio of the focal lengths with which pixels still count as square."""
+MAX_PIXEL_ASPECT = 1.1
+"""Largest ratio of the focal lengths at which pixels count as square."""
+
+
+def _describe(value: Any) -> str:
+    return f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
 
 
 def check_tensor(x: Tensor, name: str, shape: tuple[int | None, ...]) -> None:
     """``x`` is a floating tensor of ``shape``; ``None`` stands for any length."""
     if not isinstance(x, Tensor):
         raise InvalidInputError(f"{name}: expected a torch.Tensor, got {type(x).__name__}")
-    if x.ndim != len(shape) or any(want is not None and want != got for want, got in zip(shape, x.shape, strict=True)):
-        wanted = "(" + ", ".join("*" if n is None else str(n) for n in shape) + ")"
-        raise InvalidInputError(f"{name}: expected shape {wanted}, got {tuple(x.shape)}")
+    if x.ndim != len(shape) or any(n is not None and n != size for n, size in zip(shape, x.shape, strict=True)):
+        expected = "(" + ", ".join("*" if n is None else str(n) for n in shape) + ")"
+        raise InvalidInputError(f"{name}: expected shape {expected}, got {tuple(x.shape)}")
     if not x.is_floating_point():
         raise InvalidInputError(
             f"{name}: expected a floating dtype, got {x.dtype}; convert with x.float() (images: divide by 255)"
@@ -71,21 +75,21 @@ def check_photograph(x: Any, name: str = "images") -> None:
 
 
 def check_pixels(x: Tensor, where: str) -> None:
-    """The pixels of floating ``x`` are finite and in [0, 1], or a thousandth beyond.
+    """The pixels of floating ``x`` are finite and in [0, 1], with a tolerance of 0.001.
 
     Args:
-        where: which pixels the message names, "of the box" for instance.
+        where: names the pixels in the message, for instance "of the box".
 
     Raises:
-        ImageError: they are not.
+        ImageError: otherwise.
     """
     if x.numel() == 0:
         return
     low, high = (float(value) for value in x.aminmax())
     if not (math.isfinite(low) and math.isfinite(high)):
-        raise ImageError(f"NaN or inf in the pixels {where}; repair the image, or give another")
+        raise ImageError(f"NaN or inf in the pixels {where}; repair the image, or use another")
     if high > 1.0 + 1e-3 or low < -1e-3:
-        raise ImageError(f"pixels outside [0, 1] {where}; divide floating images by 255, or give them as uint8")
+        raise ImageError(f"pixels outside [0, 1] {where}; divide floating images by 255, or pass uint8")
 
 
 def check_mask(mask: Tensor, like: Tensor, name: str = "mask") -> None:
@@ -98,10 +102,9 @@ def check_mask(mask: Tensor, like: Tensor, name: str = "mask") -> None:
 
 
 def check_masks(masks: Tensor, name: str) -> None:
-    """``masks`` is boolean (N, H, W): one mask without its batch axis would be taken for N rows."""
+    """``masks`` is boolean (N, H, W); a mask without its batch axis is refused."""
     if not isinstance(masks, Tensor) or masks.dtype != torch.bool or masks.ndim != 3:
-        came = f"{masks.dtype} of shape {tuple(masks.shape)}" if isinstance(masks, Tensor) else type(masks).__name__
-        raise InvalidInputError(f"{name}: expected bool (N, H, W), got {came}; one mask is mask[None]")
+        raise InvalidInputError(f"{name}: expected bool (N, H, W), got {_describe(masks)}; a single mask is mask[None]")
 
 
 def check_same_device(x: Tensor, like: Tensor, name: str) -> None:
@@ -117,8 +120,8 @@ def check_option(value: str, options: Iterable[str], name: str) -> None:
 
 def check_positive(value: float, name: str, *, zero_ok: bool = False) -> float:
     """``value``, a finite number > 0 (or >= 0). In a compiled graph it is a constant: one graph per value."""
-    # torch.compile makes a float symbolic at its second value, and no kernel can be built of symbols. Taking the number
-    # apart makes it look.
+    # torch.compile makes a float symbolic at its second value, and kernels cannot be built from symbols. Splitting the
+    # number forces its value.
     value = math.ldexp(*math.frexp(value))
     if not math.isfinite(value) or value < 0 or (value == 0 and not zero_ok):
         raise InvalidInputError(f"{name}: expected a finite number {'>=' if zero_ok else '>'} 0, got {value}")
@@ -138,35 +141,36 @@ def check_finite(x: Tensor, name: str) -> None:
 
 
 def check_rotation(R: Tensor, name: str) -> None:
-    """``R`` is floating (..., 3, 3) and each matrix a rotation: orthonormal, determinant +1, within ``RIGID``.
+    """``R`` is floating (..., 3, 3), orthonormal with determinant +1, within ``MAX_ROTATION_DEVIATION``.
 
-    A matrix with NaN or inf in it stands for an estimate that is missing and passes; :func:`check_finite` refuses it.
+    A matrix with NaN or inf, which stands for a missing estimate, passes; :func:`check_finite` refuses it.
     """
     check_last_axes(R, name, (3, 3))
-    bad = int(_deviates(R).sum())
+    bad = int(_is_no_rotation(R).sum())
     if bad:
         raise InvalidInputError(f"{name}: expected rotations (orthonormal, determinant +1), got {bad} that are not")
 
 
 def check_pose(T: Tensor, name: str) -> None:
-    """``T`` is floating (..., 4, 4), finite, and each a rigid transform [[R, t], [0, 0, 0, 1]] within ``RIGID``."""
+    """``T`` is floating (..., 4, 4) and finite, each a rigid transform [[R, t], [0, 0, 0, 1]]."""
     check_last_axes(T, name, (4, 4))
     check_finite(T, name)
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=T.dtype, device=T.device)
-    off = (T[..., 3, :] - last).abs().amax(-1) > 1e-6  # what inverting a pose may leave
-    bad = int((off | _deviates(T[..., :3, :3])).sum())
+    off = (T[..., 3, :] - last).abs().amax(-1) > 1e-6  # inverting a pose may leave this
+    bad = int((off | _is_no_rotation(T[..., :3, :3])).sum())
     if bad:
         raise InvalidInputError(
             f"{name}: expected rigid transforms [[R, t], [0, 0, 0, 1]], R orthonormal with determinant +1, "
-            f"got {bad} that are not; take scale and reflection out"
+            f"got {bad} that are not; remove scale and reflection"
         )
 
 
 def check_symmetries(symmetries: Tensor) -> None:
     """``symmetries`` is floating (S, 3, 3) or (S, 4, 4), S >= 1, of finite rotations or rigid transforms."""
     if getattr(symmetries, "ndim", 0) != 3 or symmetries.shape[1:] not in ((3, 3), (4, 4)) or not len(symmetries):
-        came = tuple(symmetries.shape) if isinstance(symmetries, Tensor) else type(symmetries).__name__
-        raise InvalidInputError(f"symmetries: expected shape (S, 4, 4) or (S, 3, 3) with S >= 1, got {came}")
+        raise InvalidInputError(
+            f"symmetries: expected shape (S, 4, 4) or (S, 3, 3) with S >= 1, got {_describe(symmetries)}"
+        )
     if symmetries.shape[1] == 4:
         check_pose(symmetries, "symmetries")
     else:
@@ -174,48 +178,47 @@ def check_symmetries(symmetries: Tensor) -> None:
         check_finite(symmetries, "symmetries")
 
 
-def _deviates(R: Tensor) -> Tensor:
-    """(...) bool: which finite ones of (..., 3, 3) matrices deviate from a rotation by more than ``RIGID``."""
+def _is_no_rotation(R: Tensor) -> Tensor:
+    """(...) bool: whether a (..., 3, 3) matrix is finite and not a rotation within ``MAX_ROTATION_DEVIATION``."""
     R = R.detach().to(torch.promote_types(R.dtype, torch.float32))
     a, b, c = R.unbind(-2)
     # Rows a and b of unit length at right angles and c = a x b: orthonormal with determinant +1.
     products = torch.stack([(a * a).sum(-1) - 1.0, (b * b).sum(-1) - 1.0, (a * b).sum(-1)], -1)
-    off = torch.cat([products, c - torch.linalg.cross(a, b)], -1).abs().amax(-1) > RIGID
+    off = torch.cat([products, c - torch.linalg.cross(a, b)], -1).abs().amax(-1) > MAX_ROTATION_DEVIATION
     return off & R.isfinite().all(-1).all(-1)
 
 
 def check_camera_matrix(K: Tensor, name: str = "camera matrix") -> None:
     """``K`` is floating (..., 3, 3): finite [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px with fx, fy > 0."""
     if not isinstance(K, Tensor) or tuple(K.shape[-2:]) != (3, 3) or not K.is_floating_point():
-        came = f"{K.dtype} of shape {tuple(K.shape)}" if isinstance(K, Tensor) else type(K).__name__
-        raise InvalidInputError(f"{name}: expected floating (..., 3, 3), got {came}")
+        raise InvalidInputError(f"{name}: expected floating (..., 3, 3), got {_describe(K)}")
     check_finite(K, name)
     if not bool((K[..., 0, 0] > 0).all() and (K[..., 1, 1] > 0).all()):
         raise InvalidInputError(f"{name}: expected focal lengths FX, FY > 0 (in pixels); check their order FX FY CX CY")
     last = torch.tensor([0.0, 0.0, 1.0], dtype=K.dtype, device=K.device)
     if not bool((K[..., 2, :] == last).all() and (K[..., 1, 0] == 0).all()):
         raise InvalidInputError(f"{name}: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    if not bool((K[..., 0, 1].abs() <= 1e-6 * K[..., 0, 0]).all()):  # what rounding leaves of none
+    if not bool((K[..., 0, 1].abs() <= 1e-6 * K[..., 0, 0]).all()):  # rounding may leave this
         raise InvalidInputError(f"{name}: expected no skew, K[0, 1] = 0; rectify the image")
 
 
 def check_square_pixels(K: Tensor, name: str = "camera matrix") -> None:
-    """Focal lengths of checked (..., 3, 3) cameras are at most 10 % apart: views are rendered with square pixels."""
+    """The focal lengths of valid (..., 3, 3) cameras are at most 10 % apart: views are rendered with square pixels."""
     ratio = K[..., 0, 0] / K[..., 1, 1]
-    if not bool(((ratio <= ANISOTROPY) & (ratio >= 1.0 / ANISOTROPY)).all()):
+    if not bool(((ratio <= MAX_PIXEL_ASPECT) & (ratio >= 1.0 / MAX_PIXEL_ASPECT)).all()):
         raise InvalidInputError(
             f"{name}: expected square pixels, FX and FY at most 10 % apart; resize the image's width by FY / FX, "
             "and FX, CX and the box with it"
         )
 
 
-def as_numbers(values: Any, name: str, *, least: torch.dtype = torch.float32) -> Tensor:
-    """A floating tensor, of dtype ``least`` or a wider one, of a tensor, an array, or nested lists of any of them."""
+def as_numbers(values: Any, name: str, *, dtype: torch.dtype = torch.float32) -> Tensor:
+    """A tensor, an array, or nested lists of these as a floating tensor of at least ``dtype``."""
     try:
         if isinstance(values, list | tuple):
             plain = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
-            parts = [] if plain else [as_numbers(value, name, least=least) for value in values]
-            x = torch.tensor(values, dtype=least) if plain else torch.stack(parts)
+            parts = [] if plain else [as_numbers(value, name, dtype=dtype) for value in values]
+            x = torch.tensor(values, dtype=dtype) if plain else torch.stack(parts)
         else:
             x = torch.as_tensor(values)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -223,11 +226,11 @@ def as_numbers(values: Any, name: str, *, least: torch.dtype = torch.float32) ->
         raise InvalidInputError(f"{name}: expected numbers, got {type(values).__name__} ({reason})") from error
     if x.is_complex() or x.dtype == torch.bool:
         raise InvalidInputError(f"{name}: expected numbers, got {x.dtype}")
-    return x.to(torch.promote_types(x.dtype, least) if x.is_floating_point() else least)
+    return x.to(torch.promote_types(x.dtype, dtype) if x.is_floating_point() else dtype)
 
 
 def as_boxes(boxes: Any, count: int) -> Tensor:
-    """(count, 4) boxes, at least float32, of a tensor, an array or lists; what they hold is checked with the images."""
+    """A tensor, an array or lists as (count, 4) boxes, at least float32; values are checked with the images."""
     x = as_numbers(boxes, "boxes")
     x = x.view(0, 4) if count == 0 and x.numel() == 0 else x
     if tuple(x.shape) != (count, 4):
@@ -236,8 +239,8 @@ def as_boxes(boxes: Any, count: int) -> Tensor:
 
 
 def as_camera_matrices(matrices: Any, count: int) -> Tensor:
-    """(count, 3, 3) float64 of one matrix for all or one for each, a tensor, an array or lists; values unchecked."""
-    K = as_numbers(matrices, "camera_matrices", least=torch.float64)
+    """One matrix for all, or one for each, as (count, 3, 3) float64; values are not checked."""
+    K = as_numbers(matrices, "camera_matrices", dtype=torch.float64)
     if tuple(K.shape[-2:]) != (3, 3) or K.ndim not in (2, 3):
         raise InvalidInputError(f"camera_matrices: expected (3, 3) or ({count}, 3, 3), got {tuple(K.shape)}")
     if K.ndim == 3 and len(K) not in (1, count):

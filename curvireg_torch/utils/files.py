@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic writes of files."""
 
 import errno
 import os
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a file, and its folder; the name stands for the old content or for all of the new, whatever is killed when.
+    """Write a file and create its folder. At any moment ``path`` holds the old content or all of the new.
 
     Raises:
-        OutputError: it cannot be written; nothing is left of it.
+        OutputError: the file cannot be written; no temporary file remains.
     """
-    target = Path(os.path.realpath(path))  # what a link points to is replaced, not the link
+    target = Path(os.path.realpath(path))  # replace the target of a link, not the link
     temporary = target.with_name(f"{target.name}.{secrets.token_hex(4)}.tmp")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -33,20 +33,20 @@ def write_file(path: Path, content: bytes) -> None:
             with temporary.open("xb") as file:
                 file.write(content)
                 file.flush()
-                os.fsync(file.fileno())  # after a crash of the machine, too, the name never stands for an empty file
+                os.fsync(file.fileno())  # else a crash of the machine may leave an empty file
             os.replace(temporary, target)
         finally:
             temporary.unlink(missing_ok=True)
     except OSError as error:
-        cure = "make room, or choose" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "choose"
-        raise OutputError(f"{path}: cannot be written ({error.strerror}); {cure} another place") from error
+        advice = "make room, or choose" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "choose"
+        raise OutputError(f"cannot be written ({error.strerror}); {advice} another place", subject=path) from error
 
 
-def probe_folder(folder: Path, name: str) -> None:
-    """Make the folder and write to it, before the work whose results go there.
+def check_writable(folder: Path, name: str) -> None:
+    """Create the folder and check that it can be written to, before the work whose results go there.
 
     Raises:
-        OutputError: names the option ``name``.
+        OutputError: it cannot; the message names the option ``name``.
     """
     probe = folder / f".probe-{secrets.token_hex(4)}"
     try:
@@ -54,7 +54,9 @@ def probe_folder(folder: Path, name: str) -> None:
         probe.unlink()
     except OSError as error:
         reason = getattr(error.__cause__ or error, "strerror", None)
-        raise OutputError(f"{name} {folder}: cannot be written to ({reason}); choose another {name}") from error
+        raise OutputError(
+            f"cannot be written to ({reason}); choose another {name}", subject=f"{name} {folder}"
+        ) from error
 
 
 def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: Mapping[str, str] | None = None) -> None:
@@ -67,8 +69,8 @@ def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: Mapping
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """Within, SIGTERM ends the process as Ctrl-C does: through every ``finally``, so that no half of a file stays."""
-    if threading.current_thread() is not threading.main_thread():  # which alone may handle signals
+    """Context in which SIGTERM ends the process as Ctrl-C does: every ``finally`` runs, and no partial file remains."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
         yield
         return
     previous = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))

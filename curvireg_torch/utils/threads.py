@@ -1,4 +1,4 @@
-"""Many small jobs on the threads that torch may use, each job on one of them."""
+"""Many small jobs on the threads that torch may use, one job per thread."""
 
 import itertools
 import os
@@ -10,20 +10,21 @@ from typing import TypeVar
 
 import torch
 
-__all__ = ["available_threads", "for_each", "map_on_threads", "one_thread_each"]
+__all__ = ["available_threads", "for_each", "map_on_threads", "single_threaded_pool"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_workers: tuple[int, ThreadPoolExecutor] | None = None
-_here = threading.local()
+_pool_of_process: tuple[int, ThreadPoolExecutor] | None = None
+_this_thread = threading.local()
 
 
 def for_each(count: int, job: Callable[[int], object]) -> None:
-    """Call ``job(0)`` to ``job(count - 1)`` on as many threads as torch may use; they are started once for the process.
+    """Call ``job(0)`` to ``job(count - 1)`` on as many threads as torch may use, which live as long as the process.
 
-    On a thread of :func:`one_thread_each`, and in a job, nothing is shared, unless :func:`map_on_threads` has threads
-    to spare. For jobs that do not call torch. The first error ends all threads after their present job and is raised.
+    Jobs must not call torch. A job that itself calls :func:`for_each`, and a thread of :func:`single_threaded_pool`,
+    runs the calls in sequence, unless :func:`map_on_threads` left threads over. The first error stops all threads after
+    their current job and is raised.
     """
     threads = min(available_threads(), count)
     numbers = itertools.count()
@@ -31,7 +32,7 @@ def for_each(count: int, job: Callable[[int], object]) -> None:
 
     def work() -> None:
         nonlocal stopped
-        _here.working = True
+        _this_thread.working = True
         try:
             while not stopped and (number := next(numbers)) < count:
                 job(number)
@@ -39,62 +40,61 @@ def for_each(count: int, job: Callable[[int], object]) -> None:
             stopped = True
             raise
 
-    if threads <= 1 or getattr(_here, "working", False):
+    if threads <= 1 or getattr(_this_thread, "working", False):
         for number in range(count):
             job(number)
         return
-    shared = [_pool().submit(work) for _ in range(threads)]
+    futures = [_pool().submit(work) for _ in range(threads)]
     try:
-        for part in shared:
-            part.result()
+        for future in futures:
+            future.result()
     finally:
-        stopped = True  # also where this thread was interrupted while it waited
+        stopped = True  # also if this thread was interrupted while it waited
 
 
 def _pool() -> ThreadPoolExecutor:
-    """The process's threads for short jobs; a fork leaves them behind."""
-    global _workers
-    if _workers is None or _workers[0] != os.getpid():
-        _workers = os.getpid(), ThreadPoolExecutor(max(os.cpu_count() or 1, torch.get_num_threads()))
-    return _workers[1]
+    """The threads of this process for short jobs; a forked process has none and starts its own."""
+    global _pool_of_process
+    if _pool_of_process is None or _pool_of_process[0] != os.getpid():
+        _pool_of_process = os.getpid(), ThreadPoolExecutor(max(os.cpu_count() or 1, torch.get_num_threads()))
+    return _pool_of_process[1]
 
 
 def available_threads() -> int:
-    """Threads that a job may use here: those of torch, and on a thread of :func:`map_on_threads` those left over."""
-    return max(getattr(_here, "threads", 1), torch.get_num_threads())
+    """Threads that a job may use here: those of torch, and in :func:`map_on_threads` those left over."""
+    return max(getattr(_this_thread, "threads", 1), torch.get_num_threads())
 
 
 def map_on_threads(
     job: Callable[[Item], Result], items: Sequence[Item], *, device: torch.device | str = "cpu"
 ) -> list[Result]:
-    """``job`` of every item, in their order, each on one thread on which torch computes alone.
+    """``job`` of every item, in order, each on a thread on which torch computes single-threaded.
 
-    How torch divides an operation among threads decides how it rounds: a result that is computed by one thread does
-    not depend on how many items there are, nor on how many threads torch may use. Threads that are left over, as with a
-    single item, share the jobs of :func:`for_each`, which do not call torch.
+    The number of threads of an operation changes its rounding. Here a result depends neither on the number of items nor
+    on the number of threads. Threads that are left over, as with a single item, help with :func:`for_each`.
 
     Args:
-        device: where the jobs compute; on another than the CPU they follow each other on this thread.
+        device: where the jobs compute; on other devices than the CPU they run in sequence on this thread.
     """
     threads = torch.get_num_threads()
     if threads == 1 or torch.device(device).type != "cpu":
         return [job(item) for item in items]
-    share = max(1, threads // max(1, len(items)))
+    threads_each = max(1, threads // max(1, len(items)))
 
-    def alone(item: Item) -> Result:
-        _here.threads = share
+    def run(item: Item) -> Result:
+        _this_thread.threads = threads_each
         return job(item)
 
-    with one_thread_each() as pool:
-        return list(pool.map(alone, items))
+    with single_threaded_pool() as pool:
+        return list(pool.map(run, items))
 
 
 @contextmanager
-def one_thread_each() -> Iterator[ThreadPoolExecutor]:
-    """A pool of :func:`available_threads` threads, on each of which torch computes alone.
+def single_threaded_pool() -> Iterator[ThreadPoolExecutor]:
+    """A pool of :func:`available_threads` threads, on each of which torch computes single-threaded.
 
-    Operations on a few images are too short to be shared among threads inside: waiting for each other then costs more
-    than the work. An error, Ctrl-C among them, does not wait for jobs that have not begun.
+    Operations on a few images are too short to be divided among threads: waiting would take longer than the work. After
+    an error or Ctrl-C, jobs that have not started are cancelled.
     """
     threads = torch.get_num_threads()
     with ThreadPoolExecutor(available_threads(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
@@ -104,4 +104,4 @@ def one_thread_each() -> Iterator[ThreadPoolExecutor]:
             pool.shutdown(cancel_futures=True)
             raise
         finally:
-            torch.set_num_threads(threads)  # some libraries underneath count for the whole process
+            torch.set_num_threads(threads)  # some libraries count threads for the whole process

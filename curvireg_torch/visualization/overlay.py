@@ -62,7 +62,7 @@ def _overlay(
     if camera_matrix is not None:
         if result.translation is None:
             raise InvalidInputError("camera_matrix: the pose was found without one; leave it out")
-        K = as_numbers(camera_matrix, "camera_matrix", least=torch.float64)
+        K = as_numbers(camera_matrix, "camera_matrix", dtype=torch.float64)
         check_camera_matrix(K)
     K = K.clone()
     K[:2, 2] -= K.new_tensor([x0, y0])

@@ -5,6 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from curvireg_torch import metrics
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import symmetry_transforms
 
 AXIS, OFFSET = [1.0, 2.0, -2.0], [10.0, -4.0, 3.0]
 CONTINUOUS = {"symmetries_continuous": [{"axis": AXIS, "offset": OFFSET}]}
@@ -12,18 +13,18 @@ HALF_TURN = [-1, 0, 0, 8, 0, -1, 0, 6, 0, 0, 1, 0, 0, 0, 0, 1]  # about the vert
 
 
 def test_without_symmetries_there_is_the_identity() -> None:
-    assert torch.equal(metrics.symmetry_transforms({"diameter": 3.0}), torch.eye(4, dtype=torch.float64)[None])
+    assert torch.equal(symmetry_transforms({"diameter": 3.0}), torch.eye(4, dtype=torch.float64)[None])
 
 
 def test_discrete_matrices_are_read_row_by_row() -> None:
-    transforms = metrics.symmetry_transforms({"symmetries_discrete": [HALF_TURN]})
+    transforms = symmetry_transforms({"symmetries_discrete": [HALF_TURN]})
     assert transforms.shape == (2, 4, 4)
     np.testing.assert_array_equal(transforms[1], np.reshape(HALF_TURN, (4, 4)))
     np.testing.assert_allclose(transforms[1] @ torch.tensor([4.0, 3.0, 7.0, 1.0]).double(), [4.0, 3.0, 7.0, 1.0])
 
 
 def test_turns_agree_with_scipy_and_keep_the_axis() -> None:
-    transforms = metrics.symmetry_transforms(CONTINUOUS, max_step_fraction=0.1).numpy()
+    transforms = symmetry_transforms(CONTINUOUS, max_step_fraction=0.1).numpy()
     assert len(transforms) == 32  # ceil(pi / 0.1)
     unit = np.array(AXIS) / 3.0
     for i, T in enumerate(transforms):
@@ -34,7 +35,7 @@ def test_turns_agree_with_scipy_and_keep_the_axis() -> None:
 
 
 def test_step_of_the_farthest_vertex_is_at_most_a_hundredth_of_the_diameter() -> None:
-    transforms = metrics.symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]})
+    transforms = symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]})
     vertex = transforms[:, :3, 0] * 50.0  # of a disc of diameter 100
     steps = torch.linalg.vector_norm(vertex - vertex.roll(1, 0), dim=1)
     assert float(steps.max()) <= 1.0
@@ -43,8 +44,8 @@ def test_step_of_the_farthest_vertex_is_at_most_a_hundredth_of_the_diameter() ->
 
 def test_discrete_symmetries_act_before_the_turns() -> None:
     info = {"symmetries_discrete": [HALF_TURN], **CONTINUOUS}
-    both = metrics.symmetry_transforms(info, max_step_fraction=0.5)
-    turns = metrics.symmetry_transforms(CONTINUOUS, max_step_fraction=0.5).numpy()
+    both = symmetry_transforms(info, max_step_fraction=0.5)
+    turns = symmetry_transforms(CONTINUOUS, max_step_fraction=0.5).numpy()
     assert len(both) == 2 * len(turns) == 14
     flip = np.reshape(HALF_TURN, (4, 4))
     products = [turn @ s for turn in turns for s in (np.eye(4), flip)]
@@ -55,7 +56,7 @@ def test_discrete_symmetries_act_before_the_turns() -> None:
 def test_turned_solid_of_revolution_has_no_error() -> None:
     angles = torch.linspace(0.0, 2 * np.pi, 60)[:-1].double()
     ring = torch.stack([50.0 * angles.cos(), 50.0 * angles.sin(), torch.zeros_like(angles)], 1)
-    symmetries = metrics.symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]})
+    symmetries = symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]})
     T = torch.eye(4, dtype=torch.float64)[None]
     turned = T.clone()
     turned[0, :3, :3] = torch.from_numpy(Rotation.from_rotvec([0, 0, 1.234]).as_matrix())
@@ -73,10 +74,10 @@ def test_turned_solid_of_revolution_has_no_error() -> None:
 )
 def test_malformed_entries_are_refused(info: dict[str, object], match: str) -> None:
     with pytest.raises(InvalidInputError, match=match):
-        metrics.symmetry_transforms(info)
+        symmetry_transforms(info)
 
 
 @pytest.mark.parametrize("step", [0.0, 1.5, -0.1])
 def test_bad_steps_are_refused(step: float) -> None:
     with pytest.raises(InvalidInputError, match="max_step_fraction"):
-        metrics.symmetry_transforms({}, max_step_fraction=step)
+        symmetry_transforms({}, max_step_fraction=step)

@@ -10,7 +10,7 @@ import pytest
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregError, OutputError
-from curvireg_torch.utils.files import probe_folder, write_file
+from curvireg_torch.utils.files import check_writable, write_file
 
 OLD, NEW = b"a" * 1000, b"b" * 5_000_000
 
@@ -66,11 +66,11 @@ def test_what_is_no_place_for_a_file(tmp_path: Path, name: str) -> None:
 
 
 def test_probes(tmp_path: Path) -> None:
-    probe_folder(tmp_path / "a" / "b", "--out")
+    check_writable(tmp_path / "a" / "b", "--out")
     assert not list((tmp_path / "a" / "b").iterdir())
     (tmp_path / "file").write_bytes(OLD)
     with pytest.raises(OutputError, match=r"^--out .*file: cannot be written to \(.*\); choose another --out$"):
-        probe_folder(tmp_path / "file", "--out")
+        check_writable(tmp_path / "file", "--out")
 
 
 @pytest.mark.parametrize("command", ["demo", "bank", "bank --adapt"])

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from curvireg_torch.utils.threads import for_each, map_on_threads, one_thread_each
+from curvireg_torch.utils.threads import for_each, map_on_threads, single_threaded_pool
 
 
 @pytest.fixture(autouse=True)
@@ -43,7 +43,7 @@ def test_threads_are_started_once() -> None:
 
 def test_where_torch_computes_alone_nothing_is_shared() -> None:
     here = []
-    with one_thread_each() as pool:
+    with single_threaded_pool() as pool:
         pool.submit(for_each, 3, lambda _: here.append(threading.get_ident())).result()
         mine = pool.submit(threading.get_ident)
         mine.result()
@@ -100,7 +100,7 @@ def test_the_process_has_its_threads_back_afterwards(monkeypatch: pytest.MonkeyP
     threads = [2]
     monkeypatch.setattr(torch, "set_num_threads", lambda n: threads.__setitem__(0, n))
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads[0])
-    with one_thread_each() as pool:
+    with single_threaded_pool() as pool:
         pool.submit(threading.get_ident).result()
         assert threads == [1]
     assert threads == [2]
@@ -120,7 +120,7 @@ def test_the_process_has_its_threads_back_after_an_error(monkeypatch: pytest.Mon
 
 
 def with_pool(job: Callable[[ThreadPoolExecutor], None]) -> None:
-    with one_thread_each() as pool:
+    with single_threaded_pool() as pool:
         job(pool)
 
 

@@ -279,7 +279,7 @@ def _checked(
         check_photograph(image)
     B, N = len(images), len(poses)
     boxes = as_boxes(boxes, B)
-    K = as_numbers(camera_matrices, "camera_matrices", least=torch.float64)
+    K = as_numbers(camera_matrices, "camera_matrices", dtype=torch.float64)
     check_camera_matrix(K)
     given = len(K) if K.ndim == 3 else 1
     if given not in (1, B, N) or K.ndim not in (2, 3):

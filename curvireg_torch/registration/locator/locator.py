@@ -122,7 +122,7 @@ class Locator(nn.Module):
         for i, image in enumerate(images):
             K = None if camera_matrices is None else camera_matrices[i]
             if K is not None:
-                K = as_numbers(K, "camera_matrices", least=torch.float64)
+                K = as_numbers(K, "camera_matrices", dtype=torch.float64)
                 check_camera_matrix(K)
                 check_square_pixels(K)
             out.append(self._locate(image, None if K is None else float(K[0, 0]), distance))
