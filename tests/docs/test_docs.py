@@ -113,6 +113,13 @@ def test_architecture_page_lists_the_import_layers() -> None:
     assert [re.split(r" {3,}", line)[0] for line in lines] == layers
 
 
+def test_glossary_names_occur_in_the_package() -> None:
+    package = "".join(p.read_text(encoding="utf-8") for p in (ROOT / "curvireg_torch").rglob("*.py"))
+    rows = [line.split("|")[3] for line in (DOCS / "glossary.md").read_text(encoding="utf-8").splitlines()[6:]]
+    missing = {n for row in rows for n in re.findall(r"`(\w+)`", row) if not re.search(rf"\b{n}\b", package)}
+    assert not missing
+
+
 LAYERS = sorted(
     {
         found
