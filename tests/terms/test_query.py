@@ -1,0 +1,79 @@
+"""Crops of a box and of jittered copies of it."""
+
+import pytest
+import torch
+from torch import nn
+
+from curvireg_torch import ViewMatcher
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import crop_images
+from curvireg_torch.terms import crop_regions, jittered_boxes
+
+
+def test_jittered_boxes_are_shifted_and_scaled():
+    box = torch.tensor([[10.0, 20, 110, 70]])
+    jittered = jittered_boxes(box, 0.2)
+    assert jittered.shape == (1, 7, 4)
+    assert jittered[0, 0].equal(box[0])
+    centres = 0.5 * (jittered[0, :, :2] + jittered[0, :, 2:]) - torch.tensor([60.0, 45])
+    expected = torch.tensor([[0.0, 0], [-15, 0], [15, 0], [0, -15], [0, 15], [0, 0], [0, 0]])
+    torch.testing.assert_close(centres, expected)
+    width = jittered[0, :, 2] - jittered[0, :, 0]
+    assert width.tolist() == pytest.approx([100] * 5 + [100 / 1.2, 120], rel=1e-5)
+    assert jittered_boxes(box, 0.0).equal(box[None])
+    assert jittered_boxes(box, 0.45).shape == (1, 7, 4)
+
+
+@pytest.mark.parametrize("box_jitter", [-0.1, 0.46, float("nan")])
+def test_jittered_boxes_refuse_bad_jitter(bank, box_jitter):
+    with pytest.raises(InvalidInputError, match="box_jitter"):
+        jittered_boxes(torch.tensor([[0.0, 0, 100, 50]]), box_jitter)
+    with pytest.raises(InvalidInputError, match="box_jitter"):
+        ViewMatcher(bank, box_jitter=box_jitter)
+
+
+def test_crop_regions_equal_crops_of_whole_images():
+    generator = torch.Generator().manual_seed(0)
+    images = [torch.rand(3, 90, 120, generator=generator), torch.rand(3, 400, 300, generator=generator)]
+    boxes = torch.tensor([[-4.0, 30, 50, 110], [20, 20, 290, 380]])
+    jittered = jittered_boxes(boxes, 0.1)
+    crops = crop_regions(images, jittered, size=32, margin=0.1)
+    for i, image in enumerate(images):
+        for k in range(7):
+            whole = crop_images([image], jittered[i, k : k + 1], size=32, margin=0.1)[0][0]
+            torch.testing.assert_close(crops[i, k], whole, atol=1e-5, rtol=0)
+
+
+def test_crop_regions_replace_a_jittered_box_outside_the_image():
+    image = torch.rand(1, 1, 40, 40)
+    crops = crop_regions(image, jittered_boxes(torch.tensor([[38.0, 5, 58, 25]]), 0.2), size=16, margin=0.1)
+    assert crops[0, 2].equal(crops[0, 0])
+    assert not crops[0, 1].equal(crops[0, 0])
+
+
+def test_terms_take_the_best_of_the_jittered_crops(bank, photographs):
+    images, boxes = photographs[0][:1], photographs[1][:1]
+    exact, jitter = ViewMatcher(bank, box_jitter=0), ViewMatcher(bank)
+    rankings = [exact(images, box[None]) for box in jittered_boxes(boxes, jitter.pipeline.box_jitter)[0]]
+    together = jitter(images, boxes)
+    for term in ("hog", "repeatability"):
+        best = torch.stack([getattr(r, term) for r in rankings]).amax(dim=0)
+        torch.testing.assert_close(getattr(together, term), best, atol=1e-5, rtol=1e-4)
+
+
+def test_box_jitter_recovers_a_shifted_view(bank):
+    S, margin = bank.settings.image_size, bank.settings.margin
+    picture = bank.silhouettes_at(slice(30, 31))[:, None].float().expand(-1, 3, -1, -1)
+    side = S / (1 + 2 * margin)
+    box = torch.tensor([[(S - side) / 2, (S - side) / 2, (S + side) / 2, (S + side) / 2]]) - 0.5
+    shifted = box + 0.075 * side * torch.tensor([1.0, 0, 1, 0])
+    exact, jitter = (ViewMatcher(bank, field=_Gradient(), box_jitter=s) for s in (0.0, 0.1))
+    cases = ((exact, box), (exact, shifted), (jitter, shifted))
+    reference, lost, recovered = (matcher(picture, b).hog[0, 30].item() for matcher, b in cases)
+    assert lost < reference - 0.05
+    assert recovered > reference - 0.01
+
+
+class _Gradient(nn.Module):
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        return torch.stack(torch.gradient(image[:, 0], dim=(2, 1)), dim=1)
