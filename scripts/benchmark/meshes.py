@@ -1,11 +1,10 @@
-#!/usr/bin/env python
-"""Real textured meshes for the benchmark: fetched, unpacked, brought into one frame and catalogued.
+"""Fetch real textured meshes for the benchmark, bring them into one frame and catalogue them.
 
-The meshes are those of Debian's package sweethome3d-furniture 1.8-1: 820 OBJ with materials and textures; CC0, CC BY
-3.0 and, model by model, what the package's ``copyright`` and the catalogue's ``license`` say. Nothing of them belongs
-to this project: they stay in OUT. In OUT/meshes every object stands on its own with z up, its front along -y, in
-metres. OUT/meshes.json lists name, kind, half (``held-out`` or ``train``: by a hash of the name; copies of held-out
-ones are left out), licence, and the turns under which shape and look stay what they are.
+The meshes are those of Debian's package sweethome3d-furniture 1.8-1: 820 OBJ files with materials and textures; CC0,
+CC BY 3.0 and, model by model, what the package's ``copyright`` and the catalogue's ``license`` say. They are not part
+of this project and stay in OUT. In OUT/meshes every object has a folder of its own; z is up, the front points along
+-y, and units are metres. OUT/meshes.json lists name, kind, half (``held-out`` or ``train``, by a hash of the name;
+copies of held-out meshes are excluded), licence, and the symmetries of shape and of appearance.
 
     python scripts/benchmark/meshes.py --out /data/benchmark [--deb sweethome3d-furniture_1.8-1_all.deb]
 """
@@ -26,11 +25,11 @@ import trimesh
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from scripts.benchmark.textured import Textured, look_symmetries
+from scripts.benchmark.textured import TexturedMesh, appearance_symmetries
 
 PACKAGE = "sweethome3d-furniture"
 SHA256 = "3ccb90c63f9525e887a767b9cd5c8b6933b8b6b2973a615a5359ee68a2118668"
-MOST_FACES, FLATTEST = 20_000, 0.04
+MAX_FACES, MIN_FLATNESS = 20_000, 0.04
 LICENCES = {
     "BlendSwap-CC-0": "CC0-1.0",
     "BlendSwap-CC-BY": "CC-BY-3.0",
@@ -39,7 +38,7 @@ LICENCES = {
     "Scopia": "CC-BY-3.0",
 }
 
-DATASETS = {
+KINDS = {
     "chair": r"((oak|osaka|ryokan|cafe|folding|plastic|teck|child|children) )?chair|chair with cushion|class seat",
     "armchair": r"(modern |rattan |winchester )?armchair",
     "sofa": r"(burlap |clear |rattan |winchester )?(sofa|couch)( [23] seats)?|futon couch|convertible sofa bz",
@@ -60,32 +59,32 @@ DATASETS = {
     "screen": r"tv( 16:9)?|wall flat tv|apple imac.*",
     "laptop": r"laptop|apple ibook",
 }
-"""Objects of one kind have one front and one build: looked at on contact sheets, and kinds left out where it is not so
-(animals, cups, desks, two-wheelers with an engine, bathtubs, pianos, shoes, people who sit). Others have no kind."""
+"""Objects of one kind share the direction of the front and the general build, as checked by eye. Groups for which this
+does not hold (animals, cups, desks, motorcycles, bathtubs, pianos, shoes, sitting people) have no kind."""
 
 UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
-"""From the catalogue's frame (y up, front +z) to ours (z up, front -y)."""
+"""Rotation from the catalogue's frame (y up, front +z) to ours (z up, front -y)."""
 
 
-def fetched(source: Path, package: str, sha256: str) -> Path:
-    """The package's file in ``source``, downloaded where it is not there: of no other edition."""
+def fetch_package(source: Path, package: str, sha256: str) -> Path:
+    """Path of the package's file in ``source``; it is downloaded if missing, and its digest is checked."""
     source.mkdir(parents=True, exist_ok=True)
     if not list(source.glob(f"{package}_*.deb")):
         subprocess.run(["apt-get", "download", package], cwd=source, check=True)
-    return checked(next(iter(source.glob(f"{package}_*.deb"))), sha256)
+    return check_digest(next(iter(source.glob(f"{package}_*.deb"))), sha256)
 
 
-def checked(deb: Path, sha256: str) -> Path:
+def check_digest(deb: Path, sha256: str) -> Path:
     found = hashlib.sha256(deb.read_bytes()).hexdigest()
     if found != sha256:
-        sys.exit(f"{deb}: another edition (sha256 {found}); the benchmark's list is that of {sha256}")
+        sys.exit(f"{deb}: sha256 is {found}, expected {sha256}; the benchmark needs this version")
     return deb
 
 
 def fetch(out: Path, deb: Path | None) -> Path:
-    """Folder with the unpacked libraries."""
+    """Download and unpack the libraries; returns their folder."""
     source = out / "source"
-    deb = fetched(source, PACKAGE, SHA256) if deb is None else checked(deb, SHA256)
+    deb = fetch_package(source, PACKAGE, SHA256) if deb is None else check_digest(deb, SHA256)
     unpacked = source / "unpacked"
     if not (unpacked / "done").exists():
         unpacked.mkdir(parents=True, exist_ok=True)
@@ -114,7 +113,7 @@ def catalogue(unpacked: Path) -> list[dict]:
                     "licence": entry.get("license") or LICENCES[library],
                     "creator": entry.get("creator", library),
                     "source": f"{library}{entry['model']}",
-                    "turn": [float(x) for x in entry.get("modelRotation", "1 0 0 0 1 0 0 0 1").split()],
+                    "rotation": [float(x) for x in entry.get("modelRotation", "1 0 0 0 1 0 0 0 1").split()],
                     "size": [float(entry[k]) / 100 for k in ("width", "depth", "height")],
                 }
             )
@@ -122,45 +121,45 @@ def catalogue(unpacked: Path) -> list[dict]:
 
 
 def kind_of(name: str) -> str | None:
-    return next((kind for kind, pattern in DATASETS.items() if re.fullmatch(pattern, name.lower())), None)
+    return next((kind for kind, pattern in KINDS.items() if re.fullmatch(pattern, name.lower())), None)
 
 
 def convert(row: dict, unpacked: Path, folder: Path) -> str | None:
-    """Write the object in our frame: the file's own lines, with other coordinates. The answer is why not, or None."""
+    """Write the object in our frame, keeping all lines but the coordinates; returns why it is left out, or None."""
     source = unpacked / row["source"]
     lines = source.read_text(encoding="latin1").splitlines()
-    if sum(len(line.split()) - 3 for line in lines if line.startswith("f ")) > MOST_FACES:
+    if sum(len(line.split()) - 3 for line in lines if line.startswith("f ")) > MAX_FACES:
         return "many faces"
     points = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=float)
-    R = UP @ np.array(row["turn"]).reshape(3, 3)
-    turned = points @ R.T
-    low, high = turned.min(axis=0), turned.max(axis=0)
-    if (high - low).min() < FLATTEST * (high - low).max():
+    R = UP @ np.array(row["rotation"]).reshape(3, 3)
+    rotated = points @ R.T
+    low, high = rotated.min(axis=0), rotated.max(axis=0)
+    if (high - low).min() < MIN_FLATNESS * (high - low).max():
         return "flat"
     if (folder / "model.obj").exists():
         return None
-    zoom = max(row["size"]) / (high - low).max()
+    scale = max(row["size"]) / (high - low).max()
     shift = np.array([*(-0.5 * (low + high)[:2]), -low[2]])
-    turned = iter((turned + shift) * zoom)
+    moved = iter((rotated + shift) * scale)
     written = []
     folder.mkdir(parents=True, exist_ok=True)
     for line in lines:
         if line.startswith("v "):
-            line = "v {:.6g} {:.6g} {:.6g}".format(*next(turned))
+            line = "v {:.6g} {:.6g} {:.6g}".format(*next(moved))
         elif line.startswith("vn "):
             line = "vn {:.5g} {:.5g} {:.5g}".format(*(R @ np.array(line.split()[1:4], dtype=float)))
         written.append(line)
     for other in source.parent.iterdir():
         if other.is_file() and other.suffix.lower() != ".obj":
             (folder / other.name).write_bytes(other.read_bytes())
-    part = folder / "model.obj.part"  # complete when it bears its name: a second run goes on where the first stopped
+    part = folder / "model.obj.part"  # renamed when complete, so that an interrupted run can be resumed
     part.write_text("\n".join(written) + "\n", encoding="latin1")
     part.replace(folder / "model.obj")
     return None
 
 
-def turns() -> np.ndarray:
-    """(32, 3, 3): none, the 23 other turns of a cube, and those by 30 degrees about z that are not among them."""
+def candidate_rotations() -> np.ndarray:
+    """(32, 3, 3) possible symmetries: the 24 rotations of a cube, identity first, and steps of 30 degrees about z."""
     signs = [np.diag(s) for s in np.array(np.meshgrid([1, -1], [1, -1], [1, -1])).reshape(3, -1).T.astype(float)]
     orders = [np.eye(3)[list(p)] for p in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))]
     cube = [s @ o for o in orders for s in signs if np.linalg.det(s @ o) > 0]
@@ -173,8 +172,8 @@ def turns() -> np.ndarray:
     return np.array(cube + about_z)
 
 
-def samples(model: Textured) -> np.ndarray:
-    """Many points of the surface about the middle of its box, in radii."""
+def sample_points(model: TexturedMesh) -> np.ndarray:
+    """20,000 points of the surface relative to the centre of its box, in radii."""
     radius, centre = model.radius_and_centre()
     corners = model.triangles.reshape(-1, 3)
     mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
@@ -182,17 +181,17 @@ def samples(model: Textured) -> np.ndarray:
 
 
 def symmetries(points: np.ndarray) -> list[int]:
-    """Numbers of the turns that leave the shape where it was: nine tenths of its points within 4 % of the radius."""
+    """Candidate rotations that map the shape to itself: 90 % of its points within 4 % of the radius."""
     tree = cKDTree(points)
 
     def fits(R: np.ndarray, some: np.ndarray) -> bool:
         return float(np.mean(np.isfinite(tree.query(some @ R.T, distance_upper_bound=0.04)[0]))) >= 0.9
 
-    return [k for k, R in enumerate(turns()) if fits(R, points[::400]) and fits(R, points[::16])]
+    return [k for k, R in enumerate(candidate_rotations()) if fits(R, points[::400]) and fits(R, points[::16])]
 
 
 def copy_of(cloud: np.ndarray, others: dict[str, tuple[np.ndarray, cKDTree]]) -> str | None:
-    """Name of the first of the others that has the same shape, to 4 % of the radius for nine tenths of the points."""
+    """Name of the first of the others with the same shape: 90 % of the points within 4 % of the radius."""
     span, some = np.ptp(cloud, axis=0), cloud[::16]
     for name, (extents, tree) in others.items():
         near = np.abs(extents - span).max() < 0.03
@@ -206,34 +205,34 @@ def half_of(name: str) -> str:
 
 
 def examine(task: tuple[dict, Path, Path]) -> tuple[dict, str | None, np.ndarray | None]:
-    """Convert one object and find its symmetries: its row, why it is left out, and points of its surface."""
+    """Convert one object; returns its row, why it is left out (or None), and points of its surface."""
     row, unpacked, out = task
     folder = out / "meshes" / row["id"]
     reason = convert(row, unpacked, folder)
     if reason is not None:
         return row, reason, None
     try:
-        model = Textured.load(folder / "model.obj")
-    except Exception as error:  # whatever the reader meets in a file
+        model = TexturedMesh.load(folder / "model.obj")
+    except Exception as error:  # a malformed file may raise anything
         return row, f"unreadable ({type(error).__name__})", None
-    cloud = samples(model)
-    described = {
+    cloud = sample_points(model)
+    row = {
         **{k: row[k] for k in ("id", "name", "category", "licence", "creator", "source")},
         "kind": kind_of(row["name"]),
-        **measured(row["id"], model, cloud),
+        **describe(row["id"], model, cloud),
     }
-    return described, None, cloud
+    return row, None, cloud
 
 
-def measured(name: str, model: Textured, cloud: np.ndarray) -> dict:
-    """What make_benchmark.py asks of the mesh ``name`` in the folder meshes, whose surface has these points."""
-    alike = symmetries(cloud)
+def describe(name: str, model: TexturedMesh, cloud: np.ndarray) -> dict:
+    """Fields of meshes.json for one mesh, given points of its surface."""
+    shape_symmetries = symmetries(cloud)
     return {
         "path": f"meshes/{name}/model.obj",
         "faces": len(model.triangles),
-        "extents": np.ptp(model.points(), axis=0).round(4).tolist(),
-        "shape_symmetries": alike,
-        "look_symmetries": look_symmetries(model, alike, turns()),
+        "extents": np.ptp(model.hull_points(), axis=0).round(4).tolist(),
+        "shape_symmetries": shape_symmetries,
+        "look_symmetries": appearance_symmetries(model, shape_symmetries, candidate_rotations()),
     }
 
 
@@ -246,25 +245,31 @@ def write_listing(out: Path, listing: dict) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--deb", type=Path, help="the package's file; default: apt-get download")
+    parser.add_argument("--deb", type=Path, help="file of the package (default: apt-get download)")
     parser.add_argument("--jobs", type=int, default=1)
     arguments = parser.parse_args()
     unpacked = fetch(arguments.out, arguments.deb)
-    once = {row["id"]: row for row in reversed(catalogue(unpacked))}  # some are listed twice
-    listing = {"package": PACKAGE, "sha256": SHA256, "turns": turns().tolist(), "meshes": [], "left_out": {}}
-    kept: dict[str, tuple[np.ndarray, cKDTree]] = {}
+    once = {row["id"]: row for row in reversed(catalogue(unpacked))}  # removes duplicates
+    listing = {
+        "package": PACKAGE,
+        "sha256": SHA256,
+        "turns": candidate_rotations().tolist(),
+        "meshes": [],
+        "left_out": {},
+    }
+    clouds: dict[str, tuple[np.ndarray, cKDTree]] = {}
     for half in ("held-out", "train"):
         tasks = [(row, unpacked, arguments.out) for name, row in sorted(once.items()) if half_of(name) == half]
         with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
-            answers = list(tqdm(pool.map(examine, tasks), desc=half, total=len(tasks)))
-        for row, why, cloud in answers:
-            like = None if why else copy_of(cloud, kept)
+            results = list(tqdm(pool.map(examine, tasks), desc=half, total=len(tasks)))
+        for row, why, cloud in results:
+            like = None if why else copy_of(cloud, clouds)
             if why is None and half == "train" and like is not None and half_of(like) == "held-out":
-                why = "a copy of one held out"
+                why = "copy of a held-out mesh"
             if why is not None:
                 listing["left_out"][row["id"]] = why
                 continue
-            kept[row["id"]] = np.ptp(cloud, axis=0), cKDTree(cloud)
+            clouds[row["id"]] = np.ptp(cloud, axis=0), cKDTree(cloud)
             listing["meshes"].append({**row, "half": half, "like": like or row["id"]})
         write_listing(arguments.out, listing)
         print(

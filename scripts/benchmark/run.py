@@ -1,13 +1,13 @@
-"""Registers the benchmark of textured meshes (scripts/benchmark/make.py) and keeps what every hypothesis rests on.
+"""Register the photographs of scripts/benchmark/make.py and store the features of every hypothesis.
 
     python scripts/benchmark/run.py FOLDER --out rows.jsonl [--pose upright] [--form sibling] [--limit N] [--jobs 2]
 
-One line for each photograph: the errors of the hypotheses in degrees up to the object's symmetries, their evidence,
-the evidence of the ranking (also of the preset "fast"), the errors of the best views, and how far the pose is off, with
-its covariance. ``exact`` photographs come with their camera matrix, ``sibling`` ones (another object of the kind)
-without, as PASCAL3D+ does. Run again, it goes on. --limit takes the first photographs of the list.
---box moves each edge of the boxes by up to that share of the side, as `curvireg evaluate --protocol box=SHARE` does.
---wrong registers "exact" photographs to a mesh that they do not show: any other, or another of the object's kind.
+One JSON line per photograph: the errors of the hypotheses in degrees up to the object's symmetries, their features,
+the features of the ranking (also of the preset "fast"), the errors of the best views, and the pose error with its
+covariance. ``exact`` photographs are registered with their camera matrix, ``sibling`` ones (another object of the kind)
+without, as on PASCAL3D+. An interrupted run can be resumed. --limit takes the first photographs of the list.
+--box moves each edge of the boxes by up to that fraction of the side, as `curvireg evaluate --protocol box=FRACTION`.
+--wrong registers "exact" photographs to a mesh that they do not show: any other, or another one of the object's kind.
 """
 
 import argparse
@@ -31,21 +31,21 @@ from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
 from curvireg_torch.registration.calibration import COVARIANCE_SCALE
 from curvireg_torch.registration.confidence import ranking_evidence
 
-KEPT = ("id", "form", "pose", "kind", "mesh", "visible", "clutter", "bare")
+COPIED = ("id", "form", "pose", "kind", "mesh", "visible", "clutter", "bare")
 
 
-def error_up_to(R: Tensor, truth: Tensor, symmetries: Tensor) -> Tensor:
+def smallest_error(R: Tensor, truth: Tensor, symmetries: Tensor) -> Tensor:
     """(N,) degrees between (N, 3, 3) rotations and the nearest of ``truth`` S."""
-    return error_up_to_each(R, truth, symmetries).amin(dim=1)
+    return symmetric_errors(R, truth, symmetries).amin(dim=1)
 
 
-def error_up_to_each(R: Tensor, truth: Tensor, symmetries: Tensor) -> Tensor:
+def symmetric_errors(R: Tensor, truth: Tensor, symmetries: Tensor) -> Tensor:
     """(N, S) degrees between (N, 3, 3) rotations and each of ``truth`` S."""
     return cr.rotation_error(R[:, None], (truth @ symmetries)[None])
 
 
 def allocentric(item: dict[str, Any]) -> Tensor:
-    """(3, 3) the true rotation as a camera sees it that looks straight at the given box."""
+    """(3, 3) true rotation as seen by a camera that looks straight at the given box."""
     x0, y0, x1, y1 = item["box"]
     K = torch.tensor(item["K"], dtype=torch.float64)
     ray = torch.linalg.inv(K) @ torch.tensor([(x0 + x1) / 2, (y0 + y1) / 2, 1.0], dtype=torch.float64)
@@ -53,13 +53,13 @@ def allocentric(item: dict[str, Any]) -> Tensor:
 
 
 def rows_of(task: dict[str, Any]) -> list[Any]:
-    """Rows of photographs of one mesh; ``wrong``: registered to this one instead, which none of them shows."""
+    """Rows of the photographs of one mesh; ``task["wrong"]`` names a mesh to register to instead."""
     torch.set_num_threads(1)
     folder, half, pipeline, protocol = task["folder"], task["half"], task["pipeline"], Protocol(box=task["box"])
     mesh = cr.load_mesh(folder / (task["wrong"] or task["items"][0]["mesh"]))
     bank = cr.ViewBank.build(mesh, pipeline=pipeline, progress=False)
     registrar = cr.Registrar(bank, pipeline=pipeline)
-    # The preset "fast" of the same views: its ranking alone.
+    # Ranking of the preset "fast" on the same views.
     fast = cr.ViewMatcher(bank, pipeline=PRESETS["fast"].with_pose_prior(pipeline.views.pose))
     rows = []
     for item in task["items"]:
@@ -68,7 +68,7 @@ def rows_of(task: dict[str, Any]) -> list[Any]:
         exact = item["form"] == "exact"
         K = torch.tensor(item["K"], dtype=torch.float64) if exact else None
         result = registrar([image], box, K)[0]
-        row = {name: item[name] for name in KEPT} | {"wrong": task["which"], "like": task["like"][item["shown"]]}
+        row = {name: item[name] for name in COPIED} | {"wrong": task["which"], "like": task["like"][item["shown"]]}
         if not result.ok:
             rows.append({**row, "failed": str(result.error)})
             continue
@@ -77,23 +77,23 @@ def rows_of(task: dict[str, Any]) -> list[Any]:
         truth = torch.tensor(item["R"], dtype=torch.float64) if exact else straight
         found = torch.stack([h.rotation for h in result.hypotheses])
         views = bank.rotations[result.ranking.order[0, :20]].double()
-        row["errors"] = error_up_to(found, truth, symmetries).tolist()
-        row["view_errors"] = error_up_to(views, straight, symmetries).tolist()
+        row["errors"] = smallest_error(found, truth, symmetries).tolist()
+        row["view_errors"] = smallest_error(views, straight, symmetries).tolist()
         row["evidence"] = [dict(h.evidence) for h in result.hypotheses]
         row["ranking"] = ranking_evidence(result.ranking, bank.rotations)[0].tolist()
         quick = fast([image], box)
         best = bank.rotations[quick.order[0, :1]].double()
         row["fast"] = {
             "ranking": ranking_evidence(quick, bank.rotations)[0].tolist(),
-            "error": float(error_up_to(best, straight, symmetries)),
+            "error": float(smallest_error(best, straight, symmetries)),
         }
         row["confidence"] = result.confidence
         row["corrected_box"] = None if result.corrected_box is None else result.corrected_box.tolist()
         answer = result.hypotheses[0]
         if answer.covariance is not None and task["wrong"] is None:
-            nearest = truth @ symmetries[error_up_to_each(found[:1], truth, symmetries)[0].argmin()]
-            turn = axis_angle_from_rotation(nearest @ answer.rotation.T)
-            row["pose_error"] = [*turn.tolist(), *(torch.tensor(item["t"]) - answer.translation).tolist()]
+            nearest = truth @ symmetries[symmetric_errors(found[:1], truth, symmetries)[0].argmin()]
+            rotation_error = axis_angle_from_rotation(nearest @ answer.rotation.T)
+            row["pose_error"] = [*rotation_error.tolist(), *(torch.tensor(item["t"]) - answer.translation).tolist()]
             row["distance"] = float(answer.translation.norm())
             row["covariance"] = answer.covariance.tolist()
             row["scale"] = COVARIANCE_SCALE
@@ -114,7 +114,7 @@ def register_benchmark(
     pipeline: cr.Pipeline | None = None,
     jobs: int = 1,
 ) -> list[dict[str, Any]]:
-    """Register what ``out`` does not hold yet, and return all rows of what was asked for; see the options of main."""
+    """Register the photographs that ``out`` does not contain yet; returns the rows of all. See main for the options."""
     items = [json.loads(line) for line in (folder / half / "items.jsonl").read_text().splitlines()]
     form = "exact" if wrong else form
     items = [i for i in items if pose in (None, i["pose"]) and form in (None, i["form"])]
@@ -126,7 +126,7 @@ def register_benchmark(
     done = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
     rows = [row for row in done if row["id"] in wanted]
     known = {row["id"] for row in rows}
-    # In an order that has nothing to do with the names: what is done when a run is stopped is a fair sample.
+    # The order is independent of the names, so that an interrupted run is a fair sample.
     todo = [i for i in items if i["id"] not in known]
     todo.sort(key=lambda i: (hashlib.md5(i["mesh"].encode()).hexdigest(), i["pose"], i["id"]))
     pipeline = preset_named(DEFAULT) if pipeline is None else pipeline
@@ -158,9 +158,9 @@ def register_benchmark(
 
 
 def wrong_meshes(which: str | None, items: list[Any], like: dict[str, str]) -> dict[str, str | None]:
-    """The mesh to register to in place of each: none, the next one, or the next one of its kind where there is one.
+    """Mesh to register to in place of each: None, the next one, or the next one of its kind if there is one.
 
-    ``like`` names what a mesh is a copy of: copies are not wrong.
+    ``like`` names the original of each mesh; copies of one original do not count as wrong.
     """
     kinds = {i["mesh"]: i["kind"] for i in items}
     names = sorted(kinds)
@@ -182,8 +182,8 @@ def main() -> None:
     parser.add_argument("--form", choices=("exact", "sibling"))
     parser.add_argument("--preset", choices=sorted(PRESETS), default=DEFAULT)
     parser.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON, instead of --preset")
-    parser.add_argument("--wrong", choices=("any", "kind"), help="register to another mesh, if need be of the kind")
-    parser.add_argument("--box", type=float, default=0.0, metavar="SHARE", help="how far edges of boxes are off")
+    parser.add_argument("--wrong", choices=("any", "kind"), help="register to another mesh, any or of the same kind")
+    parser.add_argument("--box", type=float, default=0.0, metavar="FRACTION", help="error of the boxes")
     parser.add_argument("--limit", type=int)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)

@@ -1,9 +1,10 @@
-"""AC3D files, and vehicles made of them."""
+"""scripts/benchmark/vehicles.py and ac3d.py: AC3D files, and vehicles converted from them."""
 
 import numpy as np
 import pytest
 
-from tests._support.scripts import imported
+from scripts.benchmark import vehicles
+from scripts.benchmark.ac3d import read_ac3d
 
 CORNERS = """mat 0
 refs 4
@@ -60,54 +61,49 @@ kids 0
 """
 
 
-@pytest.fixture(scope="module")
-def scripts():
-    with imported("scripts.benchmark.ac3d") as ac3d, imported("scripts.benchmark.vehicles") as vehicles:
-        yield ac3d, vehicles
-
-
-def test_objects_lie_in_the_frames_of_their_parents(scripts, tmp_path):
+@pytest.fixture
+def path(tmp_path):
     path = tmp_path / "a.ac"
     path.write_text(FILE)
-    (part,) = scripts[0].read(path)
+    return path
+
+
+def test_read_ac3d_places_objects_in_the_frame_of_their_parent(path):
+    (part,) = read_ac3d(path)
     assert (part.colour, part.gloss, part.texture) == ([1.0, 0.5, 0.0], 0.4, "paint.png")
-    # x goes along y ("rot" lists images of the axes), then up by 1, then 10 along x
+    # x is mapped to y ("rot" lists the images of the axes); then up by 1, then 10 along x
     corners = np.array([[10, 1, 0], [10, 3, 0], [9, 3, 0], [9, 1, 0]], float)
     fan, strip = corners[[[0, 1, 2], [0, 2, 3]]], corners[[[0, 1, 2], [2, 1, 3]]]
     assert part.corners.tolist() == [*fan.tolist(), *strip.tolist()], "lines and glow are left out"
-    assert part.places[0].tolist() == [[0.0, 0.5], [2.0, 0.5], [2.0, 1.5]]
+    assert part.uv[0].tolist() == [[0.0, 0.5], [2.0, 0.5], [2.0, 1.5]]
 
 
-def test_more_children_promised_than_there_are(scripts, tmp_path):
-    (tmp_path / "a.ac").write_text(FILE.replace("kids 2", "kids 3"))
-    assert len(scripts[0].read(tmp_path / "a.ac")) == 1
+def test_read_ac3d_accepts_missing_children(path):
+    path.write_text(FILE.replace("kids 2", "kids 3"))
+    assert len(read_ac3d(path)) == 1
 
 
 @pytest.mark.parametrize("content", ["", "solid\n", FILE[: len(FILE) // 2], FILE.replace("SURF 0x20", "SURF")])
-def test_broken_files_are_refused(scripts, tmp_path, content):
-    path = tmp_path / "a.ac"
+def test_read_ac3d_rejects_malformed_files(path, content):
     path.write_text(content)
     with pytest.raises(ValueError, match=r"a\.ac"):
-        scripts[0].read(path)
+        read_ac3d(path)
 
 
-def test_a_vehicle_stands_on_the_floor_and_looks_along_minus_y(scripts, tmp_path):
-    _, vehicles = scripts
-    vehicles.FEWEST_FACES, kept = 1, vehicles.FEWEST_FACES
-    (tmp_path / "b.ac").write_text(FILE)
-    row = {"id": "aircraft-b", "file": tmp_path / "b.ac"}
-    assert vehicles.convert(row, tmp_path / "out") is None
-    vehicles.FEWEST_FACES = kept
+def test_convert_puts_a_vehicle_on_the_floor_with_its_front_along_minus_y(path, tmp_path, monkeypatch):
+    row = {"id": "aircraft-b", "file": path}
     assert vehicles.convert(row, tmp_path / "out") == "few faces"
+    monkeypatch.setattr(vehicles, "MIN_FACES", 1)
+    assert vehicles.convert(row, tmp_path / "out") is None
     lines = (tmp_path / "out" / "model.obj").read_text().splitlines()
     points = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float)
     assert np.ptp(points, axis=0).tolist() == [0.0, 1.0, 2.0], "the file's z, x and y"
     assert points[:, 2].min() == 0.0
     assert points[:3, 1].tolist() == [0.5, 0.5, -0.5], "x points aft"
-    assert "Kd 1.0 0.5 0.0" in (tmp_path / "out" / "model.mtl").read_text(), "no picture: the material's colour"
+    assert "Kd 1.0 0.5 0.0" in (tmp_path / "out" / "model.mtl").read_text(), "the material's colour, without texture"
 
 
-def test_wheels_stand_where_the_car_says(scripts, tmp_path):
+def test_wheels_have_the_position_and_size_of_the_description(tmp_path):
     axles = "".join(
         f'<section name="{axle} Axle"><attnum name="xpos" val="{x}"/></section>'
         + "".join(
@@ -119,7 +115,7 @@ def test_wheels_stand_where_the_car_says(scripts, tmp_path):
         for axle, x in (("Front", 1.5), ("Rear", -1.0))
     )
     (tmp_path / "car.xml").write_text(axles)
-    tyre, hub = scripts[1].wheels(tmp_path / "car.acc")
+    tyre, hub = vehicles.wheels(tmp_path / "car.acc")
     radius = 0.5 * 20 * 0.0254 + 0.1
     low, high = tyre.corners.reshape(-1, 3).min(axis=0), tyre.corners.reshape(-1, 3).max(axis=0)
     np.testing.assert_allclose(low, [-1.0 - radius, 0.0, -0.8], atol=1e-9)
@@ -128,11 +124,11 @@ def test_wheels_stand_where_the_car_says(scripts, tmp_path):
     assert len(hub.corners) == 4 * 16 * 2
     (tmp_path / "car.xml").write_text(axles.replace("rim diameter", "rim"))
     with pytest.raises(ValueError, match="Front Right Wheel has no rim diameter"):
-        scripts[1].wheels(tmp_path / "car.acc")
+        vehicles.wheels(tmp_path / "car.acc")
 
 
-def test_kinds(scripts):
-    kind = scripts[1].kind_of
+def test_kind_of():
+    kind = vehicles.kind_of
     assert [kind("aircraft", n) for n in ("f16", "cub", "738", "sr71")] == [
         "fighter",
         "propeller aircraft",
