@@ -1,7 +1,7 @@
-"""Photographs with annotated objects: PASCAL3D+, BOP and collections of your own, as torch datasets.
+"""Photographs with annotated objects, as torch datasets: PASCAL3D+, BOP, and collections of the user.
 
-A sample is a dict, one per object. Every dataset reports what it left out and why (``skipped``, ``skipped_items``), and
-gives a sample without its photograph through ``annotation(index)``. Nothing is ever downloaded from here.
+A sample is a dict, one per object. Every dataset reports skipped objects with the reason (``skipped``,
+``skipped_items``), and ``annotation(index)`` returns a sample without its photograph. Nothing is downloaded.
 """
 
 from ..io.images import Photo, read_image, read_photo

@@ -1,4 +1,4 @@
-"""What the datasets share: dict samples, lazy images, and a count of everything that was left out."""
+"""Base class of the datasets: dict samples, images read on access, and a record of skipped objects."""
 
 import os
 from collections import Counter
@@ -20,22 +20,22 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".JPEG", ".JPG", ".PNG", ".tif", ".ti
 
 
 class ObjectDataset(Dataset[Sample]):
-    """One dict per annotated object; the index is built once, photographs are read when a sample is asked for.
+    """One dict per annotated object. The index is built once, photographs are read on access.
 
     Attributes:
-        skipped_items: reason -> what was left out for it, in the order met.
-        transforms: applied last to every sample, ``sample -> sample``; None for no change.
+        skipped_items: reason -> names of the objects and files that were skipped.
+        transforms: applied last to every sample, ``sample -> sample``, or None.
     """
 
     def __init__(self, transforms: Transform | None) -> None:
         self.transforms = transforms
         self.skipped_items: dict[str, list[str]] = {}
-        # Plain numbers, no tensors: thousands of small tensors exhaust file handles when a worker is spawned.
+        # Numbers instead of tensors: thousands of small tensors exhaust file handles when a worker is spawned.
         self._items: list[Sample] = []
 
     @property
     def skipped(self) -> Counter[str]:
-        """How many items were left out, by reason; ``missing_``, ``corrupt_`` and ``bad_`` tell of a defective tree."""
+        """Number of skipped items by reason; ``missing_``, ``corrupt_`` and ``bad_`` mean a defect of the data."""
         return Counter({reason: len(items) for reason, items in self.skipped_items.items()})
 
     def _skip(self, reason: str, item: str) -> None:
@@ -45,7 +45,7 @@ class ObjectDataset(Dataset[Sample]):
         return len(self._items)
 
     def annotation(self, index: int) -> Sample:
-        """All of sample ``index`` but its ``image``: reads no photograph and calls no ``transforms``."""
+        """Sample ``index`` without its ``image``, and without ``transforms``."""
         return {
             key: torch.tensor(value, dtype=torch.float32) if isinstance(value, tuple) else value
             for key, value in self._items[index].items()
@@ -58,13 +58,13 @@ class ObjectDataset(Dataset[Sample]):
 
 
 def existing_root(root: str | os.PathLike[str], readme: str) -> Path:
-    """``root`` as a path; it must be a folder."""
+    """``root`` as a path, if it is a folder."""
     path = Path(root)
     if not path.is_dir():
-        raise MissingFileError(f"{path}: no such folder; {readme} says where to get the data and how to lay it out")
+        raise MissingFileError(f"no such folder; {readme} says how to get the data", subject=path)
     return path
 
 
 def is_plain_name(name: str) -> bool:
-    """Whether ``name`` stays inside the folder that it is appended to."""
+    """Whether ``name`` cannot lead out of the folder that it is appended to."""
     return name not in ("", ".", "..") and len(name) <= 200 and not any(c in name for c in "/\\:\0")

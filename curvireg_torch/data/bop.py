@@ -24,31 +24,31 @@ class BOPDataset(ObjectDataset):
     Args:
         root: the folder that holds ``models`` and the split's folder.
         split: folder of the scenes, such as ``"test"`` or ``"train_pbr"``.
-        targets: True keeps the instances that ``test_targets_bop19.json`` asks for, of each image and object the
-            ``inst_count`` most visible ones; False keeps all; None is True for ``split="test"`` where the file exists.
-        min_visib: least visible fraction, in [0, 1]; above 0, instances of unknown visibility are left out too.
+        targets: True selects the instances of ``test_targets_bop19.json``, for each image and object the ``inst_count``
+            most visible ones; False selects all; None is True for ``split="test"`` if the file exists.
+        min_visib: least visible fraction, in [0, 1]; above 0, instances of unknown visibility are skipped too.
         transforms: applied to every sample, ``sample -> sample``.
 
     Attributes:
-        camera: content of ``camera.json``, empty where it is missing.
-        models_info: obj_id -> entry of ``models/models_info.json`` as it stands, symmetries included.
+        camera: content of ``camera.json``, empty if it is missing.
+        models_info: obj_id -> entry of ``models/models_info.json``, symmetries included.
 
     Samples are dicts (tensors are float32):
         - ``image`` (3, H, W) RGB in [0, 1], from ``rgb`` or ``gray``; ``image_path`` str
-        - ``box`` (4,) x0, y0, x1, y1 of the whole silhouette, which may leave the image; ``box_visible`` (4,) of its
-          visible part, NaN if nothing is visible. BOP's width is x1 - x0. NaN where ``scene_gt_info.json`` is missing
+        - ``box`` (4,) x0, y0, x1, y1 of the whole silhouette, which may extend beyond the image; ``box_visible`` (4,)
+          of its visible part, NaN if nothing is visible. BOP's width is x1 - x0. NaN without ``scene_gt_info.json``
         - ``camera_matrix`` (3, 3); ``rotation`` (3, 3), ``translation`` (3,): model to OpenCV camera, in the models'
           unit (mm)
-        - ``scene_id``, ``image_id``, ``obj_id`` int; ``instance_index`` int: place in the image's list of ``scene_gt``
-        - ``visib_fract`` float in [0, 1], NaN where unknown
+        - ``scene_id``, ``image_id``, ``obj_id`` int; ``instance_index`` int: index in the image's list of ``scene_gt``
+        - ``visib_fract`` float in [0, 1], NaN if unknown
         - ``model_path`` str; ``model_info`` dict
 
-    ``dataset.skipped`` counts what was left out by reason, ``dataset.skipped_items`` names it: ``no_target``,
-    ``not_visible``, ``bad_box`` (no area: the object is outside the image), ``missing_annotation``,
-    ``corrupt_annotation``, ``missing_image``, ``missing_mesh``, ``missing_model_info``.
+    Reasons in ``dataset.skipped`` and ``dataset.skipped_items``: ``no_target``, ``not_visible``, ``bad_box`` (no area:
+    the object is outside the image), ``missing_annotation``, ``corrupt_annotation``, ``missing_image``,
+    ``missing_mesh``, ``missing_model_info``.
 
     Raises:
-        MissingFileError: the root, the split's folder, ``models_info.json`` or a required target list is not there.
+        MissingFileError: the root, the split's folder, ``models_info.json`` or a required target list does not exist.
         InvalidInputError: ``min_visib`` out of range, or one of those files is damaged.
 
     Example:
@@ -72,7 +72,7 @@ class BOPDataset(ObjectDataset):
         self.root, self.split = existing_root(root, _README), split
         scenes = self.root / split
         if not is_plain_name(split) or not scenes.is_dir():
-            raise MissingFileError(f"{scenes}: no such folder; {_README} shows the layout")
+            raise MissingFileError(f"no such folder; {_README} shows the layout", subject=scenes)
         camera = self.root / "camera.json"
         self.camera: dict[str, Any] = read_json(camera, dict, _README) if camera.is_file() else {}
         info = read_json(self.root / "models" / "models_info.json", dict, _README)
@@ -83,14 +83,14 @@ class BOPDataset(ObjectDataset):
         target_file = self.root / "test_targets_bop19.json"
         if targets is None:
             targets = split == "test" and target_file.is_file()
-        wanted = _targets(target_file) if targets else None
+        counts = _targets(target_file) if targets else None
         for folder in sorted(p for p in scenes.iterdir() if p.is_dir() and p.name.isdecimal()):
-            self._index(folder, wanted, min_visib)
-        if wanted:  # what is left of it was asked for and never met
-            for scene_id, image_id, obj_id in sorted(wanted):
+            self._index(folder, counts, min_visib)
+        if counts:  # targets that were not found
+            for scene_id, image_id, obj_id in sorted(counts):
                 self._skip("missing_annotation", f"{split}/{scene_id:06d}/{image_id:06d} object {obj_id}")
 
-    def _index(self, folder: Path, wanted: dict[tuple[int, int, int], int] | None, min_visib: float) -> None:
+    def _index(self, folder: Path, counts: dict[tuple[int, int, int], int] | None, min_visib: float) -> None:
         scene = f"{self.split}/{folder.name}"
         contents: list[dict[str, Any]] = []
         for name in ("scene_gt.json", "scene_camera.json", "scene_gt_info.json"):
@@ -105,8 +105,8 @@ class BOPDataset(ObjectDataset):
         ground_truth, cameras, infos = contents
         images = {
             path.stem: path
-            for kind in ("gray", "rgb")  # rgb wins
-            for path in sorted((folder / kind).glob("*"))
+            for subfolder in ("gray", "rgb")  # rgb takes precedence
+            for path in sorted((folder / subfolder).glob("*"))
             if path.suffix in IMAGE_SUFFIXES
         }
         for key in sorted(ground_truth, key=lambda k: int(k) if k.isdecimal() else -1):
@@ -115,16 +115,16 @@ class BOPDataset(ObjectDataset):
                 self._skip("corrupt_annotation", item)
                 continue
             image = images.get(f"{int(key):06d}")
-            found: list[Sample] = []
+            samples: list[Sample] = []
             for index, entry in enumerate(instances):
                 info = entry_at(infos.get(key), index)
                 parsed = self._parse(entry, info, cameras.get(key))
                 if isinstance(parsed, str):
                     self._skip(parsed, f"{item} #{index}")
                 else:
-                    place = {"scene_id": int(folder.name), "image_id": int(key), "instance_index": index}
-                    found.append({**parsed, **place, "image_path": str(image)})
-            for sample in _chosen(found, wanted):
+                    ids = {"scene_id": int(folder.name), "image_id": int(key), "instance_index": index}
+                    samples.append({**parsed, **ids, "image_path": str(image)})
+            for sample in _mark_targets(samples, counts):
                 item_name = f"{item} #{sample['instance_index']}"
                 if sample.pop("no_target"):
                     self._skip("no_target", item_name)
@@ -137,7 +137,7 @@ class BOPDataset(ObjectDataset):
         return None
 
     def _parse(self, entry: object, info: dict[str, Any], camera: object) -> Sample | str:
-        """The sample of one instance, or the reason to leave it out."""
+        """The sample of one instance, or the reason to skip it."""
         if not isinstance(entry, dict) or not isinstance(entry.get("obj_id"), int):
             return "corrupt_annotation"
         if not isinstance(camera, dict):
@@ -183,33 +183,33 @@ def bop_box(values: object) -> tuple[float, ...] | None:
 
 
 def _targets(path: Path) -> dict[tuple[int, int, int], int]:
-    """(scene_id, im_id, obj_id) -> number of instances asked for."""
-    wanted = {}
+    """(scene_id, im_id, obj_id) -> number of instances to estimate."""
+    counts = {}
     for entry in read_json(path, list, _README):
         keys = ("scene_id", "im_id", "obj_id", "inst_count")
         if not isinstance(entry, dict) or not all(isinstance(entry.get(k), int) for k in keys):
-            raise InvalidInputError(f"{path}: expected entries with the numbers {', '.join(keys)}, got {entry!r}")
-        wanted[entry["scene_id"], entry["im_id"], entry["obj_id"]] = entry["inst_count"]
-    return wanted
+            raise InvalidInputError(f"expected entries with the numbers {', '.join(keys)}, got {entry!r}", subject=path)
+        counts[entry["scene_id"], entry["im_id"], entry["obj_id"]] = entry["inst_count"]
+    return counts
 
 
-def _chosen(samples: list[Sample], wanted: dict[tuple[int, int, int], int] | None) -> list[Sample]:
-    """Mark with ``no_target`` what the targets do not ask for; take what was met out of ``wanted``."""
+def _mark_targets(samples: list[Sample], counts: dict[tuple[int, int, int], int] | None) -> list[Sample]:
+    """Set ``no_target`` of the samples of one image, and remove its targets from ``counts``."""
     keys = [(s["scene_id"], s["image_id"], s["obj_id"]) for s in samples]
-    counts = {key: math.inf if wanted is None else wanted.pop(key, 0) for key in set(keys)}
+    remaining = {key: math.inf if counts is None else counts.pop(key, 0) for key in set(keys)}
 
     def visibility(i: int) -> float:
         value: float = samples[i]["visib_fract"]
         return -1.0 if math.isnan(value) else value
 
     for i in sorted(range(len(samples)), key=lambda i: (-visibility(i), i)):
-        samples[i]["no_target"] = counts[keys[i]] <= 0
-        counts[keys[i]] -= 1
+        samples[i]["no_target"] = remaining[keys[i]] <= 0
+        remaining[keys[i]] -= 1
     return samples
 
 
 def entry_at(infos: object, index: int) -> dict[str, Any]:
-    """Entry ``index`` of an image's list in ``scene_gt_info.json``, empty where there is none."""
+    """Entry ``index`` of an image's list in ``scene_gt_info.json``, empty if there is none."""
     entry = infos[index] if isinstance(infos, list) and index < len(infos) else None
     return entry if isinstance(entry, dict) else {}
 

@@ -1,4 +1,4 @@
-"""The results file of the BOP challenge: one line per pose estimate."""
+"""Results files of the BOP challenge: one line per pose estimate."""
 
 import csv
 import io
@@ -34,14 +34,14 @@ class BOPRow(TypedDict):
 
 
 def write_bop_csv(path: str | os.PathLike[str], rows: Iterable[BOPRow]) -> None:
-    """Write pose estimates in the format of the BOP challenge; ``path`` appears only when it is complete.
+    """Write pose estimates in the format of the BOP challenge, atomically and with all digits.
 
     Columns: scene_id, im_id, obj_id, score, R (9 numbers, row by row, separated by spaces), t (3 numbers, mm), time
-    (seconds for the whole image, hence equal for all rows of an image; -1 if unknown). Numbers keep all their digits.
+    (seconds for the whole image, so equal for all its rows; -1 if unknown).
 
     Args:
         path: file to write; its folder must exist.
-        rows: dicts with those keys; R (3, 3) and t (3,) finite floating tensors.
+        rows: dicts with these keys; R (3, 3) and t (3,) finite floating tensors.
 
     Raises:
         InvalidInputError: a row lacks a key, is not finite, or disagrees on an image's time.
@@ -58,7 +58,7 @@ def write_bop_csv(path: str | os.PathLike[str], rows: Iterable[BOPRow]) -> None:
     """
     path = Path(path)
     if not path.parent.is_dir():
-        raise MissingFileError(f"{path.parent}: no such folder; create it before writing results")
+        raise MissingFileError("no such folder; create it before writing results", subject=path.parent)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_HEADER)
@@ -70,16 +70,16 @@ def write_bop_csv(path: str | os.PathLike[str], rows: Iterable[BOPRow]) -> None:
 
 def _cells(row: BOPRow, name: str, times: dict[tuple[int, int], float]) -> list[str]:
     if set(row) != set(_HEADER):
-        raise InvalidInputError(f"{name}: expected the keys {', '.join(_HEADER)}, got {', '.join(row)}")
+        raise InvalidInputError(f"expected the keys {', '.join(_HEADER)}, got {', '.join(row)}", subject=name)
     check_tensor(row["R"], f"{name} R", (3, 3))
     check_tensor(row["t"], f"{name} t", (3,))
     ids = [row["scene_id"], row["im_id"], row["obj_id"]]
     R, t = row["R"].flatten().tolist(), row["t"].tolist()
     if any(isinstance(i, bool) or not isinstance(i, int) or i < 0 for i in ids):
-        raise InvalidInputError(f"{name}: expected whole ids >= 0, got {ids}")
+        raise InvalidInputError(f"expected integer ids >= 0, got {ids}", subject=name)
     numbers = finite_numbers([row["score"], *R, *t, row["time"]], 14)
     if numbers is None:
-        raise InvalidInputError(f"{name}: score, R, t and time must be finite numbers")
+        raise InvalidInputError("score, R, t and time must be finite numbers", subject=name)
     _check_time(row, times, name)
     texts = [repr(v) for v in numbers]
     return [*map(str, ids), texts[0], " ".join(texts[1:10]), " ".join(texts[10:13]), texts[13]]
@@ -88,7 +88,9 @@ def _cells(row: BOPRow, name: str, times: dict[tuple[int, int], float]) -> list[
 def _check_time(row: BOPRow, times: dict[tuple[int, int], float], name: str) -> None:
     first = times.setdefault((row["scene_id"], row["im_id"]), row["time"])
     if first != row["time"]:
-        raise InvalidInputError(f"{name}: time {row['time']}, an earlier row of that image has {first}; BOP wants one")
+        raise InvalidInputError(
+            f"time {row['time']}, but an earlier row of this image has {first}; BOP requires one", subject=name
+        )
 
 
 def read_bop_csv(path: str | os.PathLike[str]) -> list[BOPRow]:
@@ -98,12 +100,12 @@ def read_bop_csv(path: str | os.PathLike[str]) -> list[BOPRow]:
         One :class:`BOPRow` per line, in order; R (3, 3) and t (3,) float64, t in mm.
 
     Raises:
-        MissingFileError: no such file.
-        InvalidInputError: another header, or a line (named) with a wrong number of values or one that is not finite.
+        MissingFileError: the file does not exist.
+        InvalidInputError: another header, or a line with a wrong number of values or one that is not finite.
     """
     path = Path(path)
     if not path.is_file():
-        raise MissingFileError(f"{path}: no such file; write_bop_csv makes one")
+        raise MissingFileError("no such file; write_bop_csv writes one", subject=path)
     check_table_size(path)
     rows: list[BOPRow] = []
     times: dict[tuple[int, int], float] = {}
@@ -111,27 +113,27 @@ def read_bop_csv(path: str | os.PathLike[str]) -> list[BOPRow]:
         with open(path, newline="", encoding="utf-8") as file:
             lines: Any = csv.reader(file)
             if next(lines, None) != _HEADER:
-                raise InvalidInputError(f"{path}: expected the header {','.join(_HEADER)}")
+                raise InvalidInputError(f"expected the header {','.join(_HEADER)}", subject=path)
             for cells in lines:
                 if cells:
                     rows.append(_row(cells, f"{path}, line {lines.line_num}"))
                     _check_time(rows[-1], times, f"{path}, line {lines.line_num}")
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InvalidInputError(f"{path}: not a csv file ({error})") from error
+        raise InvalidInputError(f"not a csv file ({error})", subject=path) from error
     return rows
 
 
 def _row(cells: list[str], name: str) -> BOPRow:
     if len(cells) != len(_HEADER):
-        raise InvalidInputError(f"{name}: expected {len(_HEADER)} columns, got {len(cells)}")
+        raise InvalidInputError(f"expected {len(_HEADER)} columns, got {len(cells)}", subject=name)
     try:
         scene_id, im_id, obj_id = (int(c) for c in cells[:3])
         score, time = float(cells[3]), float(cells[6])
         R, t = [float(v) for v in cells[4].split()], [float(v) for v in cells[5].split()]
     except ValueError as error:
-        raise InvalidInputError(f"{name}: {error}") from error
+        raise InvalidInputError(str(error), subject=name) from error
     if len(R) != 9 or len(t) != 3 or not all(map(math.isfinite, (score, time, *R, *t))):
-        raise InvalidInputError(f"{name}: expected 9 finite numbers in R and 3 in t, got {len(R)} and {len(t)}")
+        raise InvalidInputError(f"expected 9 finite numbers in R and 3 in t, got {len(R)} and {len(t)}", subject=name)
     return BOPRow(
         scene_id=scene_id,
         im_id=im_id,

@@ -1,4 +1,4 @@
-"""Samples to batches."""
+"""Batches of samples."""
 
 from collections.abc import Sequence
 
@@ -14,8 +14,8 @@ __all__ = ["collate"]
 def collate(samples: Sequence[Sample]) -> Sample:
     """Join samples into one batch, for ``DataLoader(..., collate_fn=collate)``.
 
-    Tensors of equal shape and dtype are stacked along a new first axis. All other values become lists: photographs of
-    different sizes, texts, numbers, dicts.
+    Tensors of equal shape and dtype are stacked along a new first axis. Other values become lists, photographs of
+    different sizes among them.
 
     Args:
         samples: B >= 1 dicts with the same keys.
@@ -24,7 +24,7 @@ def collate(samples: Sequence[Sample]) -> Sample:
         One dict with those keys; each value is a (B, ...) tensor or a list of length B.
 
     Raises:
-        InvalidInputError: no sample, or keys that differ.
+        InvalidInputError: there is no sample, or their keys differ.
 
     Example:
         >>> batch = collate([{"box": torch.zeros(4), "category": "car"}, {"box": torch.ones(4), "category": "sofa"}])

@@ -25,36 +25,36 @@ class Pascal3DPlus(ObjectDataset):
 
     The tree is that of the release: ``Annotations/<class>_<part>/<id>.mat``, ``Images/<class>_<part>/<id>.*``,
     ``CAD/<class>/<NN>.off``. The ids of a class are those not marked -1 in
-    ``PASCAL/VOCdevkit/VOC2012/ImageSets/Main/<class>_<split>.txt`` for the VOC part, and where that list is absent,
-    as for the ImageNet part, those of ``Image_sets/<class>_<part>_<split>.txt``.
+    ``PASCAL/VOCdevkit/VOC2012/ImageSets/Main/<class>_<split>.txt``; without that list, and for the ImageNet part, those
+    of ``Image_sets/<class>_<part>_<split>.txt``.
 
     Args:
         root: the folder that holds ``Annotations``, ``Images`` and ``CAD``.
         split: name of the image lists, ``"train"`` or ``"val"``.
         categories: class names; None for all that have a list for ``split``, in alphabetical order.
         part: ``"pascal"`` (photographs of VOC 2012) or ``"imagenet"``.
-        occluded, truncated, difficult: False leaves objects with that flag out.
-        min_size: least width and least height of the labelled box, pixels.
-        pixel_origin: the number that ``bbox``, ``px`` and ``py`` give to the first pixel: 1 in the release (MATLAB),
-            0 in sets written from Python. It is subtracted.
+        occluded, truncated, difficult: False skips objects with that flag.
+        min_size: least width and height of the labelled box, px.
+        pixel_origin: coordinate of the first pixel in ``bbox``, ``px`` and ``py``: 1 in the release (MATLAB), 0 in sets
+            written from Python. It is subtracted.
         transforms: applied to every sample, ``sample -> sample``.
 
     Samples are dicts (tensors are float32):
         - ``image`` (3, H, W) RGB in [0, 1]; ``image_path``, ``image_id`` str
-        - ``box`` (4,) x0, y0, x1, y1: centres of the outermost labelled pixels, first pixel 0; may leave the image
+        - ``box`` (4,) x0, y0, x1, y1: centres of the outermost labelled pixels; may extend beyond the image
         - ``viewpoint`` (3,) azimuth, elevation, theta in degrees; ``rotation`` (3, 3) model to OpenCV camera
         - ``distance`` float, ``translation`` (3,) = (0, 0, distance), in units of the CAD (about its diagonal)
         - ``camera_matrix`` (3, 3): the virtual camera of the annotation, its principal point at the object's centre
         - ``category`` str, ``cad_index`` int from 1, ``cad_path`` str
-        - ``object_index`` int: place in the annotation file; ``truncated``, ``occluded``, ``difficult`` bool
+        - ``object_index`` int: index in the annotation file; ``truncated``, ``occluded``, ``difficult`` bool
 
-    ``dataset.skipped`` counts what was left out by reason, ``dataset.skipped_items`` names it: ``other_class`` (each
-    file lists every object of the photograph), ``occluded``, ``truncated``, ``difficult``, ``small``, ``no_viewpoint``,
-    ``coarse_viewpoint`` (only the 8 coarse bins were labelled: distance 0 or no fine angles), ``bad_box`` (no area),
-    ``missing_annotation``, ``corrupt_annotation``, ``missing_image``, ``missing_mesh``.
+    Reasons in ``dataset.skipped`` and ``dataset.skipped_items``: ``other_class`` (a file lists all objects of the
+    photograph), ``occluded``, ``truncated``, ``difficult``, ``small``, ``no_viewpoint``, ``coarse_viewpoint`` (only
+    coarse bins were labelled: distance 0 or no fine angles), ``bad_box`` (no area), ``missing_annotation``,
+    ``corrupt_annotation``, ``missing_image``, ``missing_mesh``.
 
     Raises:
-        MissingFileError: the root or an image list is not there.
+        MissingFileError: the root or an image list does not exist.
         InvalidInputError: an option is out of range.
 
     Example:
@@ -86,7 +86,7 @@ class Pascal3DPlus(ObjectDataset):
         self.root, self.split, self.part = existing_root(root, _README), split, part
         self.categories = sorted(self._listed() if categories is None else set(categories))
         self._pixel_origin, self._min_size = pixel_origin, min_size
-        self._unwanted = {"occluded": not occluded, "truncated": not truncated, "difficult": not difficult}
+        self._excluded = {"occluded": not occluded, "truncated": not truncated, "difficult": not difficult}
         for name in (split, *self.categories):
             if not is_plain_name(name):
                 raise InvalidInputError(f"split, categories: expected plain names, got {name!r}")
@@ -100,20 +100,20 @@ class Pascal3DPlus(ObjectDataset):
     def _listed(self) -> list[str]:
         ending = f"_{self.part}"
         folders = [p.name.removesuffix(ending) for p in (self.root / "Annotations").glob("*" + ending) if p.is_dir()]
-        found = [name for name in folders if any(p.is_file() for p in self._list_files(name))]
-        if not found:
+        names = [name for name in folders if any(p.is_file() for p in self._list_files(name))]
+        if not names:
             raise MissingFileError(
-                f"{self.root}: no {self.part} image list for split {self.split!r}; {_README} shows the layout"
+                f"no {self.part} image list for split {self.split!r}; {_README} shows the layout", subject=self.root
             )
-        return found
+        return names
 
     def _ids(self, category: str) -> list[str]:
         for path in self._list_files(category):
             if path.is_file():
                 lines = [line.split() for line in path.read_text(encoding="utf-8", errors="replace").splitlines()]
                 return [fields[0] for fields in lines if fields and fields[1:2] != ["-1"]]
-        wanted = " or ".join(str(p.relative_to(self.root)) for p in self._list_files(category))
-        raise MissingFileError(f"{self.root}: no image list {wanted}; {_README} shows the layout")
+        names = " or ".join(str(p.relative_to(self.root)) for p in self._list_files(category))
+        raise MissingFileError(f"no image list {names}; {_README} shows the layout", subject=self.root)
 
     def _index(self, category: str) -> None:
         folder = f"{category}_{self.part}"
@@ -143,12 +143,12 @@ class Pascal3DPlus(ObjectDataset):
                     )
 
     def _parse(self, entry: MatStruct, category: str) -> Sample | str:
-        """The sample of one object, or the reason to leave it out."""
+        """The sample of one object, or the reason to skip it."""
         if entry.get("class") != category:
             return "other_class"
-        flags = {name: bool(_number(entry.get(name)) or 0) for name in self._unwanted}
-        for name, unwanted in self._unwanted.items():
-            if unwanted and flags[name]:
+        flags = {name: bool(_number(entry.get(name)) or 0) for name in self._excluded}
+        for name, excluded in self._excluded.items():
+            if excluded and flags[name]:
                 return name
         box = _box(entry.get("bbox"), self._pixel_origin)
         if box is None:
@@ -192,7 +192,7 @@ def _objects(record: MatValue) -> list[MatStruct]:
 
 
 def _number(value: MatValue) -> float | None:
-    """The first number of ``value`` if there is one and it is finite."""
+    """The first number of ``value`` if it is finite, else None."""
     if not isinstance(value, np.ndarray) or value.size == 0 or not math.isfinite(value[0]):
         return None
     return float(value[0])
@@ -206,7 +206,7 @@ def _box(value: MatValue, origin: int) -> tuple[float, float, float, float] | No
 
 
 def _camera(view: MatStruct, box: tuple[float, float, float, float], origin: int) -> tuple[tuple[float, ...], ...]:
-    """K of the annotation's camera. Absent fields: focal 1, viewport 3000, principal point at the middle of the box."""
+    """K of the annotation. Defaults: focal 1, viewport 3000, principal point at the centre of the box."""
     focal = (_number(view.get("focal")) or 1.0) * (_number(view.get("viewport")) or 3000.0)
     px, py = _number(view.get("px")), _number(view.get("py"))
     cx = (box[0] + box[2]) / 2 if px is None else px - origin

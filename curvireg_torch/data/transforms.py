@@ -1,4 +1,4 @@
-"""Sample transforms, ``transforms(sample) -> sample``, for the datasets of this package."""
+"""Transforms of samples, ``sample -> sample``."""
 
 from typing import Any
 
@@ -8,17 +8,17 @@ __all__ = ["CropBox"]
 
 
 class CropBox:
-    """Replaces a sample's image by the square crop around its box, so that samples stack and feed the layers directly.
+    """Replace a sample's image by the square crop around its box, so that samples can be stacked.
 
-    The box stays in pixels of the original image; ``crop_transform`` (3, 3) maps those to pixels of the crop, and a
-    camera matrix becomes that of the crop.
+    The box stays in pixels of the original image, ``crop_transform`` (3, 3) maps them to pixels of the crop, and the
+    camera matrix, if there is one, becomes that of the crop.
 
     Args:
         size: side of the crops in px.
-        margin: room around the box on each side, as a share of its longer side.
+        margin: added on each side of the box, as a fraction of its longer side.
 
     Raises:
-        InvalidInputError: when called, for a box that is empty or wholly outside its image.
+        InvalidInputError: when called, if the box is empty or wholly outside its image.
 
     Example:
         >>> import torch

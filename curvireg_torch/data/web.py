@@ -1,4 +1,4 @@
-"""A collection of your own: some objects, each with a mesh and photographs from anywhere."""
+"""A collection of the user: objects, each with a mesh and photographs."""
 
 import csv
 import math
@@ -10,40 +10,40 @@ import torch
 from ..errors import InvalidInputError, MissingFileError
 from ..geometry import rotation_from_viewpoint
 from ..io.json_files import check_table_size
+from ..utils.choices import MESHES
 from ._base import ObjectDataset, Sample, Transform, existing_root, is_plain_name
 
 __all__ = ["WebCollection"]
 
 _README = "datasets/web/README.md"
 _COLUMNS = ["image", "x0", "y0", "x1", "y1", "azimuth", "elevation", "theta", "distance"]
-_MESH_SUFFIXES = (".glb", ".obj", ".off", ".ply", ".stl")
 
 
 class WebCollection(ObjectDataset):
-    """One folder per object with ``mesh.*``, photographs, and ``views.csv`` that says where the object is.
+    """One folder per object, with ``mesh.*``, photographs, and ``views.csv`` with boxes and poses.
 
     ``views.csv`` is UTF-8 with the header ``image,x0,y0,x1,y1,azimuth,elevation,theta,distance``: a file of the
     folder, the box in pixels (centre of the first pixel = 0), PASCAL3D+ viewpoint angles in degrees, distance in units
-    of the mesh. Pose fields may be empty: without azimuth and elevation there is no pose, an empty theta is 0. A
-    photograph may have several lines. The mesh is one of ``mesh.glb``, ``.obj``, ``.off``, ``.ply``, ``.stl``.
+    of the mesh. Pose columns may be empty: without azimuth and elevation there is no pose, an empty theta is 0. A
+    photograph may have several lines. The mesh is one file in any format of :func:`curvireg_torch.load_mesh`.
 
     Args:
-        root: the folder of the objects' folders.
+        root: the folder that holds the folders of the objects.
         transforms: applied to every sample, ``sample -> sample``.
 
     Samples are dicts (tensors are float32):
         - ``image`` (3, H, W) RGB in [0, 1]; ``image_path``, ``image_id`` str
         - ``box`` (4,) x0, y0, x1, y1
-        - ``viewpoint`` (3,) azimuth, elevation, theta in degrees; ``rotation`` (3, 3) model to OpenCV camera; NaN where
+        - ``viewpoint`` (3,) azimuth, elevation, theta in degrees; ``rotation`` (3, 3) model to OpenCV camera; NaN if
           the pose is unknown
-        - ``distance`` float, NaN where unknown
+        - ``distance`` float, NaN if unknown
         - ``category`` str, the object's folder; ``mesh_path`` str; ``object_index`` int: line of ``views.csv`` from 0
 
-    ``dataset.skipped`` counts what was left out by reason, ``dataset.skipped_items`` names it: ``missing_annotation``
-    (no ``views.csv``), ``corrupt_annotation``, ``missing_image``, ``missing_mesh``, ``bad_box`` (no area).
+    Reasons in ``dataset.skipped`` and ``dataset.skipped_items``: ``missing_annotation`` (no ``views.csv``),
+    ``corrupt_annotation``, ``missing_image``, ``missing_mesh``, ``bad_box`` (no area).
 
     Raises:
-        MissingFileError: the root is not there or holds no folder.
+        MissingFileError: the root does not exist, or holds no folder.
         InvalidInputError: a folder has two meshes.
 
     Example:
@@ -56,15 +56,15 @@ class WebCollection(ObjectDataset):
         self.root = existing_root(root, _README)
         folders = sorted(p for p in self.root.iterdir() if p.is_dir() and not p.name.startswith("."))
         if not folders:
-            raise MissingFileError(f"{self.root}: holds no folder of an object; {_README} shows the layout")
+            raise MissingFileError(f"holds no folder of an object; {_README} shows the layout", subject=self.root)
         self.categories = [folder.name for folder in folders]
         for folder in folders:
             self._index(folder)
 
     def _index(self, folder: Path) -> None:
-        meshes = [folder / f"mesh{suffix}" for suffix in _MESH_SUFFIXES if (folder / f"mesh{suffix}").is_file()]
+        meshes = [folder / f"mesh{suffix}" for suffix in MESHES if (folder / f"mesh{suffix}").is_file()]
         if len(meshes) > 1:
-            raise InvalidInputError(f"{folder}: expected one mesh, got {', '.join(p.name for p in meshes)}")
+            raise InvalidInputError(f"expected one mesh, got {', '.join(p.name for p in meshes)}", subject=folder)
         if not meshes:
             return self._skip("missing_mesh", folder.name)
         table = folder / "views.csv"
@@ -90,7 +90,7 @@ class WebCollection(ObjectDataset):
 
 
 def _parse(line: list[str], folder: Path) -> Sample | str:
-    """The sample of one line, or the reason to leave it out."""
+    """The sample of one line, or the reason to skip it."""
     try:
         numbers = [float(cell) if cell else math.nan for cell in line[1:]]
     except ValueError:

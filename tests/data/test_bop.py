@@ -13,20 +13,20 @@ def tree(tmp_path):
     return tmp_path, write_bop(tmp_path)
 
 
-def places(dataset):
+def ids(dataset):
     samples = [dataset.annotation(i) for i in range(len(dataset))]
     return [(s["scene_id"], s["image_id"], s["obj_id"], s["instance_index"]) for s in samples]
 
 
-def test_counts_everything(tree):
+def test_bop_dataset_counts_skipped_items(tree):
     root, reasons = tree
     dataset = BOPDataset(root, targets=False)
-    assert places(dataset) == [(1, 0, 1, 0), (1, 0, 2, 1), (1, 0, 1, 2), (2, 7, 1, 0)]
+    assert ids(dataset) == [(1, 0, 1, 0), (1, 0, 2, 1), (1, 0, 1, 2), (2, 7, 1, 0)]
     assert dict(dataset.skipped) == reasons
     assert dataset.skipped_items["missing_image"] == ["test/000001/4 #0"]
 
 
-def test_sample(tree):
+def test_bop_dataset_returns_documented_samples(tree):
     dataset = BOPDataset(tree[0], targets=False)
     sample = dataset[0]
     assert set(sample) == {
@@ -46,14 +46,14 @@ def test_sample(tree):
     assert dataset.camera["width"] == 80
 
 
-def test_hidden_instance_has_no_visible_box(tree):
+def test_bop_dataset_has_no_visible_box_of_hidden_instances(tree):
     hidden = BOPDataset(tree[0], targets=False).annotation(1)
     assert hidden["visib_fract"] == 0
     assert hidden["box"].isfinite().all()
     assert hidden["box_visible"].isnan().all()
 
 
-def test_grey_folder_and_missing_scene_gt_info(tree):
+def test_bop_dataset_reads_grey_images_without_scene_gt_info(tree):
     sample = BOPDataset(tree[0], targets=False)[3]
     torch.testing.assert_close(sample["image"], torch.full((3, 60, 80), 0.2))
     assert sample["box"].isnan().all()
@@ -61,41 +61,38 @@ def test_grey_folder_and_missing_scene_gt_info(tree):
     assert sample["visib_fract"] != sample["visib_fract"]
 
 
-def test_targets_take_the_most_visible_instances(tree):
+def test_targets_select_the_most_visible_instances(tree):
     for targets in (None, True):
         dataset = BOPDataset(tree[0], targets=targets)
-        assert places(dataset) == [(1, 0, 1, 2), (2, 7, 1, 0)]
+        assert ids(dataset) == [(1, 0, 1, 2), (2, 7, 1, 0)]
         assert dataset.skipped["no_target"] == 3
         assert "test/000001/000006 object 1" in dataset.skipped_items["missing_annotation"]
 
 
-def test_without_target_file(tree):
+def test_targets_need_the_target_file(tree):
     (tree[0] / "test_targets_bop19.json").unlink()
     assert len(BOPDataset(tree[0])) == 4
     with pytest.raises(MissingFileError, match="test_targets_bop19"):
         BOPDataset(tree[0], targets=True)
 
 
-def test_min_visib(tree):
+def test_min_visib_skips_hidden_instances(tree):
     dataset = BOPDataset(tree[0], targets=False, min_visib=0.85)
-    assert places(dataset) == [(1, 0, 1, 2)]
+    assert ids(dataset) == [(1, 0, 1, 2)]
     assert dataset.skipped["not_visible"] == 3
     for bad in (-0.1, 1.1, float("nan")):
         with pytest.raises(InvalidInputError, match="min_visib"):
             BOPDataset(tree[0], min_visib=bad)
 
 
-def test_other_split_has_no_targets_by_default(tree):
+def test_other_splits_have_no_targets_by_default(tree):
     (tree[0] / "test").rename(tree[0] / "train_pbr")
-    assert len(BOPDataset(tree[0], "train_pbr")) == 4
-
-
-def test_transforms(tree):
-    dataset = BOPDataset(tree[0], transforms=lambda s: {"box": s["box"], "size": s["image"].shape[-2:]})
+    dataset = BOPDataset(tree[0], "train_pbr", transforms=lambda s: {"size": s["image"].shape[-2:]})
+    assert len(dataset) == 4
     assert dataset[0]["size"] == (60, 80)
 
 
-def test_missing_things_say_what_to_do(tree, tmp_path):
+def test_bop_dataset_reports_missing_files_with_advice(tree, tmp_path):
     for root, split in ((tmp_path / "nothing", "test"), (tree[0], "train"), (tree[0], "../test")):
         with pytest.raises(MissingFileError, match=r"datasets/bop/README\.md"):
             BOPDataset(root, split)
@@ -105,14 +102,14 @@ def test_missing_things_say_what_to_do(tree, tmp_path):
 
 
 @pytest.mark.parametrize("content", ["[", "[" * 100000, "[1]", '[{"scene_id": 1}]', "{}"])
-def test_damaged_target_list(tree, content):
+def test_bop_dataset_refuses_damaged_target_lists(tree, content):
     (tree[0] / "test_targets_bop19.json").write_text(content)
     with pytest.raises(InvalidInputError, match="test_targets_bop19"):
         BOPDataset(tree[0])
 
 
 @pytest.mark.parametrize("value", [None, "x", {"a": 1}, [1, 2], ["1"] * 9, [True] * 9, [1e400] * 9, [10**400] * 9])
-def test_odd_values_are_counted(tree, value):
+def test_bop_dataset_counts_invalid_rotations(tree, value):
     path = tree[0] / "test" / "000001" / "scene_gt.json"
     content = json.loads(path.read_text())
     content["0"][0]["cam_R_m2c"] = value
@@ -122,7 +119,7 @@ def test_odd_values_are_counted(tree, value):
 
 
 @pytest.mark.parametrize(("place", "value"), [(0, 0.0), (4, -500.0), (1, 2.0), (8, 2.0)])
-def test_a_camera_that_nothing_can_be_projected_with_is_corrupt(tree, place, value):
+def test_bop_dataset_skips_invalid_cameras(tree, place, value):
     path = tree[0] / "test" / "000001" / "scene_camera.json"
     content = json.loads(path.read_text())
     before = BOPDataset(tree[0], targets=False)
@@ -134,7 +131,7 @@ def test_a_camera_that_nothing_can_be_projected_with_is_corrupt(tree, place, val
     assert after.skipped["corrupt_annotation"] == before.skipped["corrupt_annotation"] + lost
 
 
-def test_mirrored_rotation_is_corrupt(tree):
+def test_bop_dataset_skips_mirrored_rotations(tree):
     path = tree[0] / "test" / "000002" / "scene_gt.json"
     path.write_text(path.read_text().replace("[1.0, 0.0", "[-1.0, 0.0"))
     assert len(BOPDataset(tree[0], targets=False)) == 3

@@ -19,25 +19,22 @@ def row(**changes):
     return BOPRow(**{**values, **changes})
 
 
-def test_text(tmp_path):
+def test_write_bop_csv_writes_the_documented_text(tmp_path):
     write_bop_csv(tmp_path / "a.csv", [row(R=torch.arange(9.0).reshape(3, 3), t=torch.tensor([0.5, 1, 2]))])
     assert (tmp_path / "a.csv").read_bytes() == (
         b"scene_id,im_id,obj_id,score,R,t,time\n1,2,3,0.25,0.0 1.0 2.0 3.0 4.0 5.0 6.0 7.0 8.0,0.5 1.0 2.0,1.5\n"
     )
 
 
-def test_round_trip_is_exact(tmp_path):
+def test_read_bop_csv_inverts_write_bop_csv(tmp_path):
     rows = [row(), row(score=-3.0), row(im_id=5, time=-1.0)]
     write_bop_csv(str(tmp_path / "a.csv"), iter(rows))
     back = read_bop_csv(str(tmp_path / "a.csv"))
     assert len(back) == 3
-    for mine, theirs in zip(rows, back, strict=True):
-        assert torch.equal(mine["R"], theirs["R"])
-        assert torch.equal(mine["t"], theirs["t"])
-        assert all(mine[k] == theirs[k] for k in ("scene_id", "im_id", "obj_id", "score", "time"))
-
-
-def test_no_rows(tmp_path):
+    for written, read in zip(rows, back, strict=True):
+        assert torch.equal(written["R"], read["R"])
+        assert torch.equal(written["t"], read["t"])
+        assert all(written[k] == read[k] for k in ("scene_id", "im_id", "obj_id", "score", "time"))
     write_bop_csv(tmp_path / "a.csv", [])
     assert read_bop_csv(tmp_path / "a.csv") == []
 
@@ -55,7 +52,7 @@ def test_no_rows(tmp_path):
         ({"extra": 0}, "keys"),
     ],
 )
-def test_bad_rows_leave_no_file(tmp_path, change, message):
+def test_write_bop_csv_leaves_the_file_if_a_row_is_invalid(tmp_path, change, message):
     (tmp_path / "a.csv").write_text("before")
     with pytest.raises(InvalidInputError, match=message):
         write_bop_csv(tmp_path / "a.csv", [row(), {**row(), **change}])
@@ -63,7 +60,7 @@ def test_bad_rows_leave_no_file(tmp_path, change, message):
     assert (tmp_path / "a.csv").read_text() == "before"
 
 
-def test_missing_paths(tmp_path):
+def test_bop_csv_reports_missing_paths(tmp_path):
     with pytest.raises(MissingFileError, match="create it"):
         write_bop_csv(tmp_path / "nothing" / "a.csv", [])
     with pytest.raises(MissingFileError, match="no such file"):
@@ -85,15 +82,10 @@ GOOD = "1,2,3,0.5,1 0 0 0 1 0 0 0 1,0 0 1,-1\n"
         (HEADER + GOOD.replace("0.5", "nan"), "finite"),
         (HEADER + GOOD.replace("1,2", "1.5,2", 1), "line 2"),
         (HEADER + GOOD + GOOD.replace("-1", "4"), "line 3.*earlier row"),
+        (HEADER.encode() + b"\xff\xfe\x00", "not a csv"),
     ],
 )
-def test_bad_files(tmp_path, text, message):
-    (tmp_path / "a.csv").write_text(text)
+def test_read_bop_csv_refuses_invalid_lines(tmp_path, text, message):
+    (tmp_path / "a.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InvalidInputError, match=message):
-        read_bop_csv(tmp_path / "a.csv")
-
-
-def test_binary_file(tmp_path):
-    (tmp_path / "a.csv").write_bytes(HEADER.encode() + b"\xff\xfe\x00")
-    with pytest.raises(InvalidInputError, match="not a csv"):
         read_bop_csv(tmp_path / "a.csv")

@@ -10,7 +10,7 @@ from curvireg_torch.errors import InvalidInputError
 from tests._support.miniature import write_bop, write_pascal3d, write_web
 
 
-def test_stacks_equal_tensors_and_lists_the_rest():
+def test_collate_stacks_equal_tensors_and_lists_other_values():
     samples = [
         {"image": torch.zeros(3, 4, 5), "box": torch.zeros(4), "n": 1, "name": "a", "info": {"x": 1}},
         {"image": torch.zeros(3, 4, 6), "box": torch.ones(4), "n": 2, "name": "b", "info": {}},
@@ -19,15 +19,12 @@ def test_stacks_equal_tensors_and_lists_the_rest():
     assert batch["box"].tolist() == [[0] * 4, [1] * 4]
     assert [tuple(i.shape) for i in batch["image"]] == [(3, 4, 5), (3, 4, 6)]
     assert (batch["n"], batch["name"], batch["info"]) == ([1, 2], ["a", "b"], [{"x": 1}, {}])
-
-
-def test_other_dtypes_and_missing_tensors_stay_a_list():
     batch = collate([{"a": torch.zeros(2), "b": None}, {"a": torch.zeros(2).double(), "b": torch.zeros(1)}])
     assert isinstance(batch["a"], list)
     assert isinstance(batch["b"], list)
 
 
-def test_errors():
+def test_collate_refuses_no_samples_and_other_keys():
     with pytest.raises(InvalidInputError, match="at least one"):
         collate([])
     with pytest.raises(InvalidInputError, match="keys"):
@@ -36,13 +33,13 @@ def test_errors():
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 warns of fork beside threads
 @pytest.mark.parametrize("context", ["spawn", None])
-def test_loader_with_workers(tmp_path, context):
+def test_datasets_work_with_loader_workers(tmp_path, context):
     write_pascal3d(tmp_path / "pascal")
     write_bop(tmp_path / "bop")
     write_web(tmp_path / "web")
     datasets = [Pascal3DPlus(tmp_path / "pascal"), BOPDataset(tmp_path / "bop"), WebCollection(tmp_path / "web")]
     for dataset in datasets[: 1 if context else 3]:
-        workers = 1 if context else 2  # a spawned one imports everything anew
+        workers = 1 if context else 2  # a spawned worker imports everything again
         loader = DataLoader(
             dataset, batch_size=2, num_workers=workers, collate_fn=collate, multiprocessing_context=context
         )
@@ -54,7 +51,7 @@ def test_loader_with_workers(tmp_path, context):
         assert batches[0]["image_path"][0] == alone["image_path"]
 
 
-def test_public_names_are_sorted_and_options_are_keywords():
+def test_data_names_are_sorted_and_options_are_keywords():
     assert data.__all__ == sorted(data.__all__)
     for name in data.__all__:
         value = getattr(data, name)

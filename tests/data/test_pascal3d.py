@@ -14,7 +14,7 @@ def tree(tmp_path):
     return tmp_path, write_pascal3d(tmp_path)
 
 
-def test_counts_everything(tree):
+def test_pascal3d_counts_skipped_items(tree):
     root, reasons = tree
     dataset = Pascal3DPlus(root)
     assert dataset.categories == ["car", "sofa"]
@@ -25,7 +25,7 @@ def test_counts_everything(tree):
     assert dataset.skipped_items["coarse_viewpoint"] == ["car_pascal/2008_000003 #0", "car_pascal/2008_000003 #1"]
 
 
-def test_imagenet_part(tmp_path):
+def test_pascal3d_reads_the_imagenet_part(tmp_path):
     reasons = write_pascal3d(tmp_path, part="imagenet")
     dataset = Pascal3DPlus(tmp_path, part="imagenet")
     assert len(dataset) == 5
@@ -35,7 +35,7 @@ def test_imagenet_part(tmp_path):
         Pascal3DPlus(tmp_path)
 
 
-def test_sample(tree):
+def test_pascal3d_returns_documented_samples(tree):
     dataset = Pascal3DPlus(tree[0], categories=["car"])
     sample = dataset[0]
     assert set(sample) == {
@@ -54,14 +54,14 @@ def test_sample(tree):
     assert (sample["truncated"], sample["occluded"], sample["difficult"]) == (False, False, False)
 
 
-def test_pixel_origin_moves_box_and_principal_point(tree):
+def test_pixel_origin_shifts_box_and_principal_point(tree):
     sample = Pascal3DPlus(tree[0], pixel_origin=0)[0]
     assert sample["box"].tolist() == [11, 6, 71, 56]
     assert sample["camera_matrix"][:2, 2].tolist() == [41, 31]
 
 
-def test_projection_of_the_model_lies_in_the_image(tree):
-    """The cube's top is above its bottom in the photograph, and its centre is at the principal point."""
+def test_pascal3d_camera_projects_the_model_into_the_box(tree):
+    """The top of the cube is above its bottom, and its centre is at the principal point."""
     s = Pascal3DPlus(tree[0])[0]
     points = torch.tensor([[0.0, 0, 0], [0, 0, HALF], [0, 0, -HALF]])
     p = (points @ s["rotation"].T + s["translation"]) @ s["camera_matrix"].T
@@ -71,20 +71,20 @@ def test_projection_of_the_model_lies_in_the_image(tree):
 
 
 @pytest.mark.parametrize(("option", "left"), [("truncated", 3), ("occluded", 3), ("difficult", 3)])
-def test_flags_filter_and_are_counted(tree, option, left):
+def test_pascal3d_skips_flagged_objects(tree, option, left):
     dataset = Pascal3DPlus(tree[0], categories=["car"], **{option: False})
     assert len(dataset) == left
     assert dataset.skipped[option] == 1
     assert not any(dataset.annotation(i)[option] for i in range(left))
 
 
-def test_min_size(tree):
+def test_min_size_skips_small_objects(tree):
     dataset = Pascal3DPlus(tree[0], categories=["car"], min_size=5)
     assert len(dataset) == 3
     assert dataset.skipped["small"] == 1
 
 
-def test_list_beside_the_voc_list_and_odd_entries(tree):
+def test_pascal3d_reads_image_sets_with_invalid_entries(tree):
     root = tree[0]
     lists = root / "Image_sets"
     lists.mkdir()
@@ -94,7 +94,7 @@ def test_list_beside_the_voc_list_and_odd_entries(tree):
     assert dict(dataset.skipped) == {"missing_annotation": 2}
 
 
-def test_absent_camera_fields_have_documented_values(tree):
+def test_pascal3d_defaults_of_missing_camera_fields(tree):
     entry = pascal_object("car")
     entry["viewpoint"] = {"azimuth": 10.0, "elevation": 20.0, "distance": 3.0}
     write_record(tree[0] / "Annotations" / "car_pascal" / "2008_000001.mat", [entry])
@@ -104,24 +104,24 @@ def test_absent_camera_fields_have_documented_values(tree):
 
 
 @pytest.mark.parametrize("cad_index", [-1.0, 0.0, 1e300, math.nan, math.inf, "one"])
-def test_odd_cad_index(tree, cad_index):
+def test_pascal3d_skips_invalid_cad_indices(tree, cad_index):
     entry = pascal_object("car", cad_index=cad_index)
     write_record(tree[0] / "Annotations" / "car_pascal" / "2008_000001.mat", [entry])
     dataset = Pascal3DPlus(tree[0], categories=["car"])
     assert dataset.skipped["missing_mesh"] == 3
 
 
-def test_transforms_come_last_and_annotation_is_bare(tree):
+def test_annotation_has_no_image_and_no_transforms(tree):
     dataset = Pascal3DPlus(tree[0], transforms=lambda sample: {**sample, "mean": sample["image"].mean()})
     assert 0 < dataset[0]["mean"] < 1
     assert not {"image", "mean"} & set(dataset.annotation(0))
     dataset.annotation(0)["box"].zero_()
-    assert dataset.annotation(0)["box"].sum() > 0, "a sample is the caller's own"
+    assert dataset.annotation(0)["box"].sum() > 0, "a sample is a copy"
     with pytest.raises(IndexError):
         dataset[len(dataset)]
 
 
-def test_damaged_photograph_is_an_error_when_read(tree):
+def test_pascal3d_reports_damaged_photographs_on_access(tree):
     path = tree[0] / "Images" / "car_pascal" / "2008_000001.jpg"
     path.write_bytes(path.read_bytes()[:500])
     dataset = Pascal3DPlus(tree[0])
@@ -129,7 +129,7 @@ def test_damaged_photograph_is_an_error_when_read(tree):
         dataset[0]
 
 
-def test_missing_things_say_what_to_do(tree, tmp_path):
+def test_pascal3d_reports_missing_files_with_advice(tree, tmp_path):
     with pytest.raises(MissingFileError, match=r"datasets/pascal3d/README\.md"):
         Pascal3DPlus(tmp_path / "nothing")
     with pytest.raises(MissingFileError, match=r"train.*README"):
@@ -149,6 +149,6 @@ def test_missing_things_say_what_to_do(tree, tmp_path):
         ({"split": "../val", "categories": []}, "plain names"),
     ],
 )
-def test_bad_options(tree, options, message):
+def test_pascal3d_refuses_invalid_options(tree, options, message):
     with pytest.raises(InvalidInputError, match=message):
         Pascal3DPlus(tree[0], **options)

@@ -7,7 +7,7 @@ from curvireg_torch.data import BOPDataset, CropBox, Pascal3DPlus, collate
 from tests._support.miniature import write_bop, write_pascal3d
 
 
-def test_crops_stack_and_feed_the_layers(tmp_path):
+def test_crop_box_makes_samples_that_stack(tmp_path):
     write_pascal3d(tmp_path)
     dataset = Pascal3DPlus(tmp_path, transforms=CropBox(size=32))
     batch = next(iter(DataLoader(dataset, batch_size=2, collate_fn=collate)))
@@ -16,7 +16,7 @@ def test_crops_stack_and_feed_the_layers(tmp_path):
     assert describe(batch["image"].mean(dim=1, keepdim=True)).shape == (2, 1764)
 
 
-def test_the_camera_of_the_crop_projects_to_its_pixels(tmp_path):
+def test_crop_box_adapts_the_camera_matrix(tmp_path):
     write_bop(tmp_path)
     plain, cropped = BOPDataset(tmp_path)[0], CropBox(size=64, margin=0.2)(BOPDataset(tmp_path)[0])
     points = torch.randn(20, 3) * 5

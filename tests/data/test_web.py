@@ -12,7 +12,7 @@ def tree(tmp_path):
     return tmp_path, write_web(tmp_path)
 
 
-def test_counts_everything(tree):
+def test_web_collection_counts_skipped_items(tree):
     root, reasons = tree
     dataset = WebCollection(root)
     assert len(dataset) == 4
@@ -20,7 +20,7 @@ def test_counts_everything(tree):
     assert dataset.skipped_items["missing_image"] == ["cup/views.csv #3"]
 
 
-def test_sample_with_pose(tree):
+def test_web_collection_returns_documented_samples(tree):
     sample = WebCollection(tree[0])[0]
     assert set(sample) == {
         *("image", "image_path", "image_id", "box", "viewpoint", "rotation", "distance", "category", "mesh_path"),
@@ -35,7 +35,7 @@ def test_sample_with_pose(tree):
     assert sample["mesh_path"].endswith("mesh.off")
 
 
-def test_samples_without_pose_or_theta(tree):
+def test_web_collection_reads_lines_without_pose_or_theta(tree):
     dataset = WebCollection(tree[0])
     unknown, level = dataset.annotation(1), dataset.annotation(2)
     assert unknown["viewpoint"].isnan().all()
@@ -45,11 +45,11 @@ def test_samples_without_pose_or_theta(tree):
     assert level["distance"] != level["distance"]
 
 
-def test_errors(tree, tmp_path):
+def test_web_collection_refuses_unusable_roots(tree, tmp_path):
     (tmp_path / "empty").mkdir()
     for root in (tmp_path / "nothing", tmp_path / "empty"):
         with pytest.raises(MissingFileError, match=r"datasets/web/README\.md"):
             WebCollection(root)
     write_mesh(tree[0] / "cup" / "mesh.ply")
-    with pytest.raises(InvalidInputError, match=r"one mesh.*mesh\.off, mesh\.ply"):
+    with pytest.raises(InvalidInputError, match=r"one mesh.*mesh\.ply, mesh\.off"):
         WebCollection(tree[0])
