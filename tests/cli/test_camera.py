@@ -1,4 +1,4 @@
-"""``curvireg register`` without a camera: guessed when asked, and said so."""
+"""``curvireg register`` with unknown cameras: guessed only on request."""
 
 import json
 import math
@@ -9,102 +9,92 @@ import torch
 
 from curvireg_torch.cli import main
 from tests._support.exif import exif, with_exif
-from tests._support.lists import CAMERA, box_of, lines, write_files, written
+from tests._support.lists import CAMERA, box_of, lines, written
 from tests._support.scenes import scene
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """The scenes are taken with 260 px at 240 x 180: 37.5 mm over the diagonal, 49.55 degrees across."""
-    folder = write_files(tmp_path_factory.mktemp("camera"))
+@pytest.fixture(scope="module", autouse=True)
+def _exif_photographs(folder):
+    """The scenes have a focal length of 260 px at 240 x 180: 37.5 mm over the diagonal, 49.55 degrees across."""
     for suffix in ("jpg", "png"):
-        cv2.imwrite(str(folder / f"told.{suffix}"), cv2.imread(str(folder / "photos" / "0.png")))
-        with_exif(folder / f"told.{suffix}", exif(1, 38))
-    return folder
+        cv2.imwrite(str(folder / f"exif.{suffix}"), cv2.imread(str(folder / "photos" / "0.png")))
+        with_exif(folder / f"exif.{suffix}", exif(1, 38))
 
 
-def registered(folder, photo, *words):
-    files = [str(folder / photo), str(folder / "truck.safetensors"), "--box", *box_of(0)]
-    assert main(["register", *files, *words, "--json", "--quiet"]) == 0
+@pytest.fixture
+def register(folder, capsys):
+    """Register one photograph; returns the document and what was printed beside it."""
+
+    def run(photo, *words):
+        files = [str(folder / photo), str(folder / "truck.safetensors"), "--box", *box_of(0)]
+        assert main(["register", *files, *words, "--json", "--quiet"]) == 0
+        printed = capsys.readouterr()
+        return json.loads(printed.out), printed.err
+
+    return run
 
 
-def test_exif_gives_a_distance_and_no_covariance(folder, capsys):
-    registered(folder, "told.png", "--camera", *CAMERA)
-    given = json.loads(capsys.readouterr().out)
-    assert given["inputs"]["camera_source"] == "given"
-    assert given["covariance"] is not None
-    registered(folder, "told.png", "--camera", "exif")
-    printed = capsys.readouterr()
-    found = json.loads(printed.out)
+def test_exif_camera_gives_a_translation_without_covariance(register):
+    known, _ = register("exif.png", "--camera", *CAMERA)
+    assert known["inputs"]["camera_source"] == "given"
+    assert known["covariance"] is not None
+    guessed, printed = register("exif.png", "--camera", "exif")
     focal = 38 / math.hypot(36, 24) * math.hypot(240, 180)
-    assert found["inputs"]["camera"] == pytest.approx([focal, focal, 119.5, 89.5])
-    assert found["inputs"]["camera_source"] == "exif"
-    assert found["covariance"] is None
-    assert found["standard_deviations"] is None
-    assert f"camera guessed, focal length {focal:.0f} px" in printed.err
-    t = torch.tensor(found["translation"], dtype=torch.float64)
-    truth = scene(0)[2][:3, 3]
+    assert guessed["inputs"]["camera"] == pytest.approx([focal, focal, 119.5, 89.5])
+    assert guessed["inputs"]["camera_source"] == "exif"
+    assert guessed["covariance"] is guessed["standard_deviations"] is None
+    assert f"camera guessed, focal length {focal:.0f} px" in printed
+    t, truth = torch.tensor(guessed["translation"], dtype=torch.float64), scene(0)[2][:3, 3]
     assert float((t - truth).norm() / truth.norm()) < 0.1
 
 
-def test_degrees_across_the_width(folder, capsys):
-    fov = 2 * math.degrees(math.atan(120 / 260))
-    registered(folder, "photos/0.png", "--fov", str(fov))
-    found = json.loads(capsys.readouterr().out)
-    assert found["inputs"]["camera"] == pytest.approx([260, 260, 119.5, 89.5])
-    assert found["inputs"]["camera_source"] == "fov"
-    registered(folder, "photos/0.png", "--camera", *CAMERA)
-    given = json.loads(capsys.readouterr().out)
-    torch.testing.assert_close(torch.tensor(found["rotation"]), torch.tensor(given["rotation"]), atol=1e-3, rtol=0)
+def test_fov_is_the_horizontal_field_of_view(register):
+    guessed, _ = register("photos/0.png", "--fov", str(2 * math.degrees(math.atan(120 / 260))))
+    assert guessed["inputs"]["camera"] == pytest.approx([260, 260, 119.5, 89.5])
+    assert guessed["inputs"]["camera_source"] == "fov"
+    known, _ = register("photos/0.png", "--camera", *CAMERA)
+    torch.testing.assert_close(torch.tensor(guessed["rotation"]), torch.tensor(known["rotation"]), atol=1e-3, rtol=0)
 
 
-def test_nothing_is_guessed_unasked(folder, capsys):
-    registered(folder, "told.jpg")
-    found = json.loads(capsys.readouterr().out)
-    assert found["translation"] is found["inputs"]["camera"] is found["inputs"]["camera_source"] is None
+def test_exif_is_ignored_by_default(register):
+    result, _ = register("exif.jpg")
+    assert result["translation"] is result["inputs"]["camera"] is result["inputs"]["camera_source"] is None
 
 
-def test_guesses_are_of_rows_without_a_camera(folder, capsys):
-    rows = [["told.png", *CAMERA], ["told.png", *[""] * 4], ["photos/0.png", *[""] * 4]]
-    path = written(folder / "list.csv", "photo,fx,fy,cx,cy,x0,y0,x1,y1", *[[*row, *box_of(0)] for row in rows])
+def test_guesses_apply_to_rows_without_a_camera(folder, tmp_path, capsys):
+    rows = [["exif.png", *CAMERA], ["exif.png", *[""] * 4], ["photos/0.png", *[""] * 4]]
+    path = written(folder / "cameras.csv", "photo,fx,fy,cx,cy,x0,y0,x1,y1", *[[*row, *box_of(0)] for row in rows])
     words = ["register", "--list", str(path), str(folder / "truck.safetensors"), "--quiet", "--no-refine"]
-    assert main([*words, "--out", str(folder / "out"), "--camera", "exif"]) == 0
+    assert main([*words, "--out", str(tmp_path), "--camera", "exif"]) == 0
     assert "guessed" in capsys.readouterr().err
-    given, guessed, untold = lines(folder / "out")
-    assert given["inputs"]["camera_source"] == "given"
+    known, guessed, failed = lines(tmp_path)
+    assert known["inputs"]["camera_source"] == "given"
     assert guessed["inputs"]["camera_source"] == "exif"
     assert guessed["translation"] is not None
-    assert untold["status"] == "failed"
-    assert "no focal length" in untold["message"]
+    assert failed["status"] == "failed"
+    assert "no focal length" in failed["message"]
     # Another guess is another request.
-    assert main([*words, "--out", str(folder / "out"), "--fov", "50"]) == 0
-    sources = [line["inputs"]["camera_source"] for line in lines(folder / "out")]
-    assert sources == ["given", "fov", "fov"]
-
-
-@pytest.mark.parametrize("degrees", ["0", "180", "nan", "-40"])
-def test_angles_that_are_none(folder, capsys, degrees):
-    files = [str(folder / "photos" / "0.png"), str(folder / "truck.safetensors")]
-    assert main(["register", *files, f"--fov={degrees}", "--json"]) == 2
-    assert "fov: expected 0 < degrees < 180" in capsys.readouterr().err
-
-
-def test_one_camera_is_enough(capsys):
-    with pytest.raises(SystemExit):
-        main(["register", "a.jpg", "b.stl", "--json", "--camera", "exif", "--fov", "50"])
-    assert "expected one of --camera" in capsys.readouterr().err
+    assert main([*words, "--out", str(tmp_path), "--fov", "50"]) == 0
+    assert [line["inputs"]["camera_source"] for line in lines(tmp_path)] == ["given", "fov", "fov"]
 
 
 @pytest.mark.parametrize(
-    ("camera", "message"),
+    ("words", "message"),
     [
-        (["0", "260", "120", "90"], "FX, FY > 0"),
-        (["260", "-260", "120", "90"], "FX, FY > 0"),
-        (["260", "nan", "120", "90"], "finite"),
-        (["130", "260", "120", "90"], "--camera: expected square pixels"),
+        *[([f"--fov={degrees}"], "fov: expected 0 < degrees < 180") for degrees in ("0", "180", "nan", "-40")],
+        (["--camera", "0", "260", "120", "90"], "FX, FY > 0"),
+        (["--camera", "260", "-260", "120", "90"], "FX, FY > 0"),
+        (["--camera", "260", "nan", "120", "90"], "finite"),
+        (["--camera", "130", "260", "120", "90"], "--camera: expected square pixels"),
     ],
 )
-def test_cameras_that_are_none(folder, capsys, camera, message):
+def test_check_camera_refuses_unusable_values(folder, capsys, words, message):
     files = [str(folder / "photos" / "0.png"), str(folder / "truck.safetensors")]
-    assert main(["register", *files, "--json", "--camera", *camera]) == 2
+    assert main(["register", *files, "--json", *words]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_register_takes_one_camera_option(capsys):
+    with pytest.raises(SystemExit):
+        main(["register", "a.jpg", "b.stl", "--json", "--camera", "exif", "--fov", "50"])
+    assert "expected one of --camera" in capsys.readouterr().err

@@ -3,15 +3,15 @@ import pytest
 from curvireg_torch.viewer.drawing import BoxDrawing
 
 
-def drag(drawing, start, *way, reach=4.0):
+def drag(drawing, start, *points, reach=4.0):
     drawing.press(*start, reach=reach)
-    for point in way:
+    for point in points:
         drawing.move(*point)
     drawing.release()
     return drawing.box
 
 
-def test_a_box_is_drawn_whichever_way():
+def test_drag_draws_a_box_in_any_direction():
     assert drag(BoxDrawing(), (60, 50), (10, 20)) == (10, 20, 60, 50)
     assert drag(BoxDrawing(), (10, 50), (30, 30), (60, 20.26)) == (10, 20.3, 60, 50)
 
@@ -31,11 +31,11 @@ def test_a_box_is_drawn_whichever_way():
     ],
     ids=["left", "right", "top", "bottom", "corner", "other corner", "inside", "outside", "across"],
 )
-def test_edges_corners_and_the_box_itself_are_dragged(start, end, box):
+def test_drag_moves_edges_corners_and_the_box(start, end, box):
     assert drag(BoxDrawing((10, 20, 60, 50)), start, end) == box
 
 
-def test_a_click_leaves_the_box_and_draws_none():
+def test_click_changes_nothing():
     assert drag(BoxDrawing((10, 20, 60, 50)), (200, 200), (201, 202)) == (10, 20, 60, 50)
     assert drag(BoxDrawing(), (5, 5)) is None
     drawing = BoxDrawing((10, 20, 60, 50))
@@ -44,6 +44,5 @@ def test_a_click_leaves_the_box_and_draws_none():
     assert drawing.box == (10, 20, 60, 50)
 
 
-def test_a_small_box_can_be_corrected():
-    """Both edges are within reach: the nearer one moves."""
+def test_drag_takes_the_nearer_edge_of_a_small_box():
     assert drag(BoxDrawing((10, 10, 16, 16)), (15.5, 13), (30, 13), reach=8) == (10, 10, 30, 16)

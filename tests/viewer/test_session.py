@@ -1,4 +1,4 @@
-"""What the page computes, without a page: the command line's answer, then moved by hand and pulled in again."""
+"""The viewer's session: the result of the command line, moved by hand and fitted again. No page is needed."""
 
 import json
 import math
@@ -14,7 +14,7 @@ import torch
 import curvireg_torch
 from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.options import register_options
-from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, MeshError
+from curvireg_torch.errors import BankError, CurviregError, CurviregWarning, ImageError, InvalidInputError, MeshError
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.settings import BankSettings, ViewPolicy
@@ -27,7 +27,7 @@ VIEWS = ViewPolicy(pose="upright", azimuth_step=30.0, elevations=(10.0, 40.0))
 
 
 def write_scene(folder: Path, seed: int = 0) -> tuple[list[float], torch.Tensor]:
-    """photo.png, truck.ply and small.json; the photograph's box and the truth."""
+    """Write photo.png, truck.ply and small.json; returns the box and the true pose."""
     image, box, T = scene(seed)
     picture = (image.permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
     cv2.imwrite(str(folder / "photo.png"), picture)
@@ -37,8 +37,9 @@ def write_scene(folder: Path, seed: int = 0) -> tuple[list[float], torch.Tensor]
     return [float(v) for v in box], T
 
 
-def options(*words):
-    return register_options(parse(["view", *words]))
+def new_session(*words):
+    arguments = parse(["view", *words])
+    return Session(register_options(arguments, *([path] if path else [] for path in (arguments.photo, arguments.mesh))))
 
 
 @pytest.fixture
@@ -49,13 +50,13 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def answered(tmp_path_factory):
-    """A session with an answer, its folder and the truth."""
+def registered(tmp_path_factory):
+    """A session with a result, its folder and the true pose."""
     folder = tmp_path_factory.mktemp("viewer")
     box, T = write_scene(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CURVIREG_CACHE", str(folder / "cache"))
-        session = Session(options("--pipeline", str(folder / "small.json")))
+        session = new_session("--pipeline", str(folder / "small.json"))
         session.open_photo(folder / "photo.png", "my photo.png")
         session.open_mesh(folder / "truck.ply")
         session.box, session.camera = tuple(round(v, 1) for v in box), (260.0, 260.0, 119.5, 89.5)
@@ -63,9 +64,18 @@ def answered(tmp_path_factory):
         yield session, folder, T
 
 
-def test_the_command_gives_the_same_answer_to_the_digit(answered):
-    session, folder, truth = answered
+@pytest.fixture
+def session(registered):
+    """The session at its first hypothesis; its camera is restored afterwards."""
+    session = registered[0]
     session.display(0)
+    camera = session.camera
+    yield session
+    session.camera, session.fov = camera, None
+
+
+def test_command_gives_the_same_result_bit_by_bit(session, registered):
+    _, folder, truth = registered
     words = shlex.split(session.command())
     assert words[:4] == ["curvireg", "register", "my photo.png", str(folder / "truck.ply")]
     (folder / "my photo.png").write_bytes((folder / "photo.png").read_bytes())
@@ -73,45 +83,40 @@ def test_the_command_gives_the_same_answer_to_the_digit(answered):
         patch.chdir(folder)
         assert main([*words[1:], "--quiet"]) == 0
     written = json.loads((folder / "result" / "result.json").read_text())
-    ours = json.loads(session.json())
+    document = json.loads(session.json())
     for key in ("rotation", "translation", "score", "confidence", "covariance", "top", "pipeline"):
-        assert ours[key] == written[key], key
-    assert ours["inputs"]["box"] == written["inputs"]["box"]
-    assert ours["viewer"]["command"] == session.command()
-    assert {key: ours["viewer"][key] for key in ("rotation", "translation", "viewpoint")} == {
-        key: written[key] for key in ("rotation", "translation", "viewpoint")
-    }
-    assert float(rotation_error(torch.tensor(ours["rotation"]).double(), truth[:3, :3])) < 10
+        assert document[key] == written[key], key
+    assert document["inputs"]["box"] == written["inputs"]["box"]
+    assert document["viewer"]["command"] == session.command()
+    assert all(document["viewer"][key] == written[key] for key in ("rotation", "translation", "viewpoint"))
+    assert float(rotation_error(torch.tensor(document["rotation"]).double(), truth[:3, :3])) < 10
 
 
-def test_the_document_is_of_the_schema(answered):
+def test_json_follows_the_schema(session):
     jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
     schema = json.loads((Path(curvireg_torch.__file__).parent / "registration" / "result.schema.json").read_text())
-    jsonschema.validate(json.loads(answered[0].json()), schema)
+    jsonschema.validate(json.loads(session.json()), schema)
 
 
-def test_a_nudge_turns_about_the_centre_and_the_contours_bring_it_back(answered):
-    session, _, _ = answered
-    session.display(0)
+def test_move_rotates_about_the_centre_and_fit_restores_the_pose(session):
     before = session.displayed.pose
-    describe = session.result.registrar.describers[0]
-    centre = before.rotation @ describe.centre + before.translation
+    describer = session.result.registrar.describers[0]
+    centre = before.rotation @ describer.centre + before.translation
     session.move(rotation=(0, 6, 0))
-    turned = session.displayed.pose
-    assert float(rotation_error(turned.rotation, before.rotation)) == pytest.approx(6, abs=1e-4)
-    torch.testing.assert_close(turned.rotation @ describe.centre + turned.translation, centre)
-    # Right-handed about the camera's y, which points down: what was before the centre goes to the right.
+    rotated = session.displayed.pose
+    assert float(rotation_error(rotated.rotation, before.rotation)) == pytest.approx(6, abs=1e-4)
+    torch.testing.assert_close(rotated.rotation @ describer.centre + rotated.translation, centre)
+    # Right-handed about the camera's y, which points down: the point nearest to the camera moves to the left.
     front = before.rotation.T @ torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
-    assert float((turned.rotation @ front)[0]) < 0
+    assert float((rotated.rotation @ front)[0]) < 0
     session.move(translation=(0.05, 0, 0))
-    moved = session.displayed.pose.rotation @ describe.centre + session.displayed.pose.translation - centre
-    torch.testing.assert_close(moved, torch.tensor([0.05 * describe.radius, 0, 0], dtype=torch.float64))
+    moved = session.displayed.pose.rotation @ describer.centre + session.displayed.pose.translation - centre
+    torch.testing.assert_close(moved, torch.tensor([0.05 * describer.radius, 0, 0], dtype=torch.float64))
     assert np.isnan(session.displayed.pose.score)
-    told = session.fit()
-    assert told.startswith("contours fitted: ")
+    assert session.fit().startswith("contours fitted: ")
     assert float(rotation_error(session.displayed.pose.rotation, before.rotation)) < 1.5
     assert float((session.displayed.pose.translation - before.translation).norm()) < 0.03 * float(centre.norm())
-    assert [word.split()[0] for word in session.displayed.edits] == ["rotated", "moved", "contours"]
+    assert [edit.split()[0] for edit in session.displayed.edits] == ["rotated", "moved", "contours"]
     document = session.document()
     assert document["viewer"]["rotation"] == session.displayed.pose.rotation.tolist()
     assert document["rotation"] == before.rotation.tolist()
@@ -122,72 +127,65 @@ def test_a_nudge_turns_about_the_centre_and_the_contours_bring_it_back(answered)
         session.move(translation=(0, 0, -100))
 
 
-def test_without_a_camera_the_rotation_is_that_of_the_view(answered):
-    session, _, _ = answered
-    camera, session.camera = session.camera, None
-    try:
-        session.register()
-        before = session.displayed.pose
-        session.move(rotation=(0, 0, 5))
-        pose = session.displayed.pose
-        assert pose.translation is None
-        assert float(rotation_error(pose.rotation, before.rotation)) == pytest.approx(5, abs=1e-3)
-        # A shift moves the object in the picture, not its rotation as a camera sees it that looks straight at it.
-        T = pose.projection[0]
-        session.move(translation=(0.1, 0, 0))
-        assert torch.equal(session.displayed.pose.projection[0][:3, :3], T[:3, :3])
-        assert 0.1 < float(rotation_error(session.displayed.pose.rotation, pose.rotation)) < 5
-        assert session.document()["viewer"]["translation"] is None
-    finally:
-        session.camera = camera
+def test_move_without_a_camera_keeps_the_allocentric_rotation(session):
+    session.camera = None
+    session.register()
+    before = session.displayed.pose
+    session.move(rotation=(0, 0, 5))
+    pose = session.displayed.pose
+    assert pose.translation is None
+    assert float(rotation_error(pose.rotation, before.rotation)) == pytest.approx(5, abs=1e-3)
+    # A translation keeps the rotation of the projection and changes the allocentric one.
+    T = pose.projection[0]
+    session.move(translation=(0.1, 0, 0))
+    assert torch.equal(session.displayed.pose.projection[0][:3, :3], T[:3, :3])
+    assert 0.1 < float(rotation_error(session.displayed.pose.rotation, pose.rotation)) < 5
+    assert session.document()["viewer"]["translation"] is None
 
 
-def test_a_field_of_view_is_the_camera_that_it_says(answered):
-    session, _, _ = answered
-    session.display(0)
+def test_register_with_a_field_of_view(session):
     camera, session.camera = session.camera, None
     session.fov = 2 * math.degrees(math.atan(120 / 260))
-    try:
-        session.register()
-        document = session.document()
-        assert document["inputs"]["camera_source"] == "fov"
-        assert document["inputs"]["camera"] == pytest.approx(camera)
-        assert document["translation"] is not None
-        assert document["covariance"] is None
-    finally:
-        session.camera, session.fov = camera, None
+    session.register()
+    document = session.document()
+    assert document["inputs"]["camera_source"] == "fov"
+    assert document["inputs"]["camera"] == pytest.approx(camera)
+    assert document["translation"] is not None
+    assert document["covariance"] is None
 
 
-def test_files_are_called_what_the_user_calls_them(folder):
-    session = Session(options())
+def test_messages_use_the_names_of_the_user(folder):
+    session = new_session()
     (folder / "upload-1").write_text("not a picture")
     with pytest.raises(ImageError, match=r"^cat\.jpg: "):
         session.open_photo(folder / "upload-1", "cat.jpg")
-    (folder / "upload-2.obj").write_text("")
-    with pytest.raises(MeshError, match=r"^cat\.obj: ") as found:
-        session.open_mesh(folder / "upload-2.obj", "cat.obj")
-    assert str(folder) not in str(found.value)
-    assert session.photo_path is None
-    assert session.mesh_path is None
+    for suffix, error in ((".obj", MeshError), (".safetensors", BankError)):
+        (folder / f"upload-2{suffix}").write_text("")
+        with pytest.raises(error, match=rf"^cat{suffix}: ") as caught:
+            session.open_mesh(folder / f"upload-2{suffix}", f"cat{suffix}")
+        assert str(folder) not in str(caught.value)
+    assert session.photo_path is session.mesh_path is None
+    warning = CurviregWarning("large", subject=folder / "upload-2.obj")
+    assert session.describe_warning(warning) == "cat.obj: large"
+    assert session.describe_warning(UserWarning("plain")) == "plain"
     with pytest.raises(InvalidInputError, match="choose a photograph and a mesh"):
         session.register()
     with pytest.raises(InvalidInputError, match="register first"):
         session.move(rotation=(1, 0, 0))
 
 
-def test_it_says_whether_a_mesh_is_seen_in_its_colours(folder):
+def test_open_mesh_describes_the_mesh(folder):
     mesh = example_mesh()
     mesh.export(folder / "grey.ply")
     mesh.visual.face_colors = [200, 20, 20, 255]
     mesh.export(folder / "red.ply")
-    session = Session(options())
-    assert session.open_mesh(folder / "grey.ply").endswith(" m, rendered in grey")
-    assert session.open_mesh(folder / "red.ply").endswith(" m, rendered in its colours")
+    assert new_session().open_mesh(folder / "grey.ply").endswith(" m, rendered in grey")
+    assert new_session().open_mesh(folder / "red.ply").endswith(" m, rendered in its colours")
 
 
-def test_a_broken_file_leaves_the_photograph_that_was_there(folder):
+def test_open_photo_keeps_the_old_one_after_an_error(folder):
     write_scene(folder)
-    session = Session(options())
+    session = new_session()
     session.open_photo(folder / "photo.png")
     (folder / "broken.png").write_bytes((folder / "photo.png").read_bytes()[:200])
     with pytest.raises(ImageError):
@@ -195,9 +193,16 @@ def test_a_broken_file_leaves_the_photograph_that_was_there(folder):
     assert session.photo_path == folder / "photo.png"
 
 
-def test_the_exif_guess_and_the_command(folder):
+def test_load_takes_files_box_and_camera_from_the_options(folder):
     write_scene(folder)
-    session = Session(options("--unit", "mm", "--up=-y", "--pose", "any", "--preset", "fast"))
+    session = new_session("photo.png", "truck.ply", "--box", "10", "20", "90", "80", "--fov", "65")
+    assert "968 faces" in session.load()
+    assert session.command() == "curvireg register photo.png truck.ply --box 10 20 90 80 --fov 65 --out result"
+
+
+def test_command_contains_inputs_and_options(folder):
+    write_scene(folder)
+    session = new_session("--unit", "mm", "--up=-y", "--pose", "any", "--preset", "fast")
     session.open_photo(folder / "photo.png", "photo.png")
     assert session.exif_camera() is None
     with_exif(folder / "photo.png", exif(1, 50))
@@ -211,7 +216,7 @@ def test_the_exif_guess_and_the_command(folder):
     )
     session.camera = (300.0, 300.5, 119.5, 89.5)
     session.fov = 65.0
-    assert "--camera 300 300.5 119.5 89.5 --unit" in session.command(), "a camera goes before the field of view"
+    assert "--camera 300 300.5 119.5 89.5 --unit" in session.command(), "a camera takes precedence"
     session.camera = None
     assert "--box 10 20.5 90 80 --fov 65 --unit" in session.command()
     session.fov, session.options = 180.0, replace(session.options, unit="m")
@@ -220,24 +225,25 @@ def test_the_exif_guess_and_the_command(folder):
         session.register()
 
 
-def test_it_is_stopped_and_has_a_limit(folder):
+def test_register_is_cancelled_by_the_limit_and_by_the_user(folder, monkeypatch):
     box, _ = write_scene(folder)
-    session = Session(options("--pipeline", "small.json"))
+    session = new_session("--pipeline", "small.json")
     session.open_photo(folder / "photo.png")
     session.open_mesh(folder / "truck.ply")
     session.box, session.limit = tuple(box), 0.0
     with pytest.raises(CurviregError, match=r"stopped after 0 s in the stage .bank."):
         session.register()
     assert session.result is None
-    session.limit, told = 600.0, session._progress_callback
+    session.limit = 600.0
+    callback = session._progress_callback
 
-    def stopping(start):
-        def report_progress(*told_of):
+    def cancel_first(start):
+        def report_progress(*progress):
             session.cancel()
-            told(start)(*told_of)
+            callback(start)(*progress)
 
         return report_progress
 
-    session._progress_callback = stopping
+    monkeypatch.setattr(session, "_progress_callback", cancel_first)
     with pytest.raises(CurviregError, match=r"^stopped$"):
         session.register()

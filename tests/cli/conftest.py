@@ -1,0 +1,31 @@
+import json
+
+import pytest
+
+from curvireg_torch.cli import main
+from tests._support.lists import box_of, write_files
+
+
+@pytest.fixture(scope="package")
+def folder(tmp_path_factory):
+    """Photographs, a mesh and a bank on disk, see :func:`write_files`."""
+    return write_files(tmp_path_factory.mktemp("cli"))
+
+
+@pytest.fixture
+def register_one(folder, tmp_path):
+    """Run ``curvireg register`` on one photograph, by default with its box; results go to ``tmp_path / "out"``."""
+
+    def run(*words, photo="photos/0.png", mesh="truck.safetensors", box=None):
+        box = box_of(0) if box is None else box
+        boxes = ["--box", *box] if box else []
+        out = ["--out", str(tmp_path / "out"), "--quiet"]
+        return main(["register", str(folder / photo), str(folder / mesh), *boxes, *out, *map(str, words)])
+
+    return run
+
+
+@pytest.fixture
+def document(tmp_path):
+    """Read ``result.json`` of :func:`register_one`."""
+    return lambda: json.loads((tmp_path / "out" / "result.json").read_text())

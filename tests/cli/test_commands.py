@@ -1,0 +1,113 @@
+"""``curvireg demo``, ``bank``, ``cache`` and ``--help``."""
+
+import json
+import subprocess
+import sys
+
+import cv2
+import pytest
+import torch
+import trimesh
+
+from curvireg_torch.cli import main
+from curvireg_torch.evaluation.opening import RegisterOptions
+from curvireg_torch.geometry import rotation_error
+from curvireg_torch.models import LearnedCurvilinearSaliency
+from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline
+from curvireg_torch.settings import BankSettings, ViewPolicy
+from curvireg_torch.training import adapt
+from tests._support.scenes import truck_bank
+
+
+def test_help_names_the_commands(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--help"])
+    assert stop.value.code == 0
+    assert {"register", "bank", "evaluate", "demo", "view", "plot"} <= set(capsys.readouterr().out.split())
+
+
+def test_bank_is_registered_to(folder, register_one, tmp_path, capsys):
+    out = tmp_path / "new.safetensors"
+    assert main(["bank", str(folder / "truck.ply"), "--out", str(out), "--pose", "upright", "--quiet"]) == 0
+    assert "288 views" in capsys.readouterr().out
+    assert register_one("--no-refine", mesh=out) == 0
+
+
+def test_bank_refuses_an_output_that_cannot_be_written(folder, capsys):
+    out = folder / "flat.png" / "bank.safetensors"
+    assert main(["bank", str(folder / "truck.ply"), "--pose", "upright", "--quiet", "--out", str(out)]) == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    assert "flat.png" in error
+    assert "--out" in error
+
+
+def test_bank_adapts_a_field_for_register(folder, register_one, document, tmp_path, monkeypatch, capsys):
+    uprights = []
+
+    def quick(mesh, *, upright, workers, progress):
+        uprights.append(upright)
+        assert workers == 1
+        return adapt(mesh, scenes=16, upright=upright, progress=progress)
+
+    monkeypatch.setattr("curvireg_torch.training.adapt", quick)
+    small = Pipeline(views=ViewPolicy(azimuth_step=90, elevations=(20,)), bank=BankSettings(image_size=64))
+    monkeypatch.setitem(PRESETS, DEFAULT, small)
+    out, field = tmp_path / "bank.safetensors", tmp_path / "field.safetensors"
+    words = ["bank", str(folder / "truck.ply"), "--pose", "upright", "--out", str(out), "--adapt", str(field)]
+    assert main([*words, "--quiet"]) == 0
+    assert uprights == [1.0]
+    assert "adapted field" in capsys.readouterr().out
+    assert register_one("--field", field, "--no-refine", mesh=out) == 0
+    weights = small.with_field(LearnedCurvilinearSaliency(weights=field)).weights
+    assert document()["pipeline"]["weights"] == weights != small.weights
+
+
+def test_cache_lists_and_clears_banks(folder, capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path))
+    (tmp_path / "banks").mkdir()
+    bank = tmp_path / "banks" / f"bank-{'0' * 32}.safetensors"
+    bank.write_bytes((folder / "truck.safetensors").read_bytes())
+    assert main(["cache"]) == 0
+    assert "1 banks" in capsys.readouterr().out
+    assert main(["cache", "--clear"]) == 0
+    assert not bank.exists()
+
+
+def test_demo_runs_as_a_module(tmp_path, monkeypatch):
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+    command = [sys.executable, "-m", "curvireg_torch", "demo", "--out", str(tmp_path / "demo"), "--quiet"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert json.loads((tmp_path / "demo" / "result.json").read_text())["rotation_error_deg"] < 15
+    assert "error against the truth" in done.stdout
+    assert (tmp_path / "demo" / "overlay.png").stat().st_size > 10_000
+
+
+def test_demo_files_agree_with_its_truth(tmp_path, monkeypatch, capsys):
+    """The true pose projects the mesh into the box, and the errors are those of the result."""
+    options = {}
+
+    def cached_bank(_, **given):
+        options.update(given)
+        return truck_bank()
+
+    monkeypatch.setattr("curvireg_torch.matching.cached_bank", cached_bank)
+    monkeypatch.setattr(RegisterOptions, "open_pipeline", lambda _: truck_bank().pipeline)
+    assert main(["demo", "--out", str(tmp_path), "--quiet"]) == 0
+    assert options["progress"] is False
+    result = json.loads((tmp_path / "result.json").read_text())
+    R, t = (torch.tensor(result["truth"][name], dtype=torch.float64) for name in ("rotation", "translation"))
+    estimate = torch.tensor(result["rotation"], dtype=torch.float64)
+    assert result["rotation_error_deg"] == pytest.approx(float(rotation_error(estimate, R)))
+    error = (torch.tensor(result["translation"], dtype=torch.float64) - t).norm() / t.norm()
+    assert result["translation_error"] == pytest.approx(float(error))
+    points = torch.tensor(trimesh.load(tmp_path / "mesh.ply").vertices.copy()) @ R.T + t
+    pixels = 520.0 * points[:, :2] / points[:, 2:] + torch.tensor([239.5, 179.5])
+    box = torch.cat([pixels.amin(dim=0), pixels.amax(dim=0)])
+    assert (torch.tensor(result["inputs"]["box"]) - box).abs().max() < 1.5
+    photo = cv2.imread(str(tmp_path / "photo.png"))
+    assert photo.shape == (360, 480, 3)
+    assert photo.max() > 150
+    assert result["inputs"]["seed"] == 0
+    printed = capsys.readouterr().out
+    assert f"rotation {result['rotation_error_deg']:.1f} degrees" in printed
+    assert f"translation: {', '.join(f'{v:.4g}' for v in result['translation'])} m\n" in printed

@@ -1,0 +1,92 @@
+"""A headless browser that shows a page of the viewer."""
+
+import importlib.util
+import shutil
+import time
+import urllib.request
+
+__all__ = ["MISSING", "Browser", "wait_for"]
+
+PROGRAMS = [next(filter(None, map(shutil.which, names)), None)
+            for names in (("chromium", "chromium-browser", "google-chrome"), ("chromedriver",))]  # fmt: skip
+MISSING = [name for name in ("nicegui", "selenium") if importlib.util.find_spec(name) is None]
+MISSING += [name for name, path in zip(("chromium", "chromedriver"), PROGRAMS, strict=True) if path is None]
+OPTIONS = (
+    "headless=new", "no-sandbox", "disable-gpu", "disable-quic", "no-first-run", "disable-background-networking",
+    "disable-component-update", "disable-sync", "window-size=1500,1400", "use-angle=swiftshader",
+    "enable-unsafe-swiftshader",
+)  # fmt: skip
+
+
+def wait_for(address):
+    for _ in range(100):
+        try:
+            urllib.request.urlopen(address).close()
+            return
+        except OSError:
+            time.sleep(0.1)
+    raise AssertionError("the server does not answer")
+
+
+class Browser:
+    """A page; its parts are known by their test ids."""
+
+    def __init__(self, folder, address):
+        from selenium import webdriver
+
+        options = webdriver.ChromeOptions()
+        options.binary_location = PROGRAMS[0]
+        for option in (*OPTIONS, f"user-data-dir={folder / 'profile'}"):
+            options.add_argument(f"--{option}")
+        options.add_experimental_option("prefs", {"download.default_directory": str(folder / "downloads")})
+        self.driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(PROGRAMS[1]))
+        self.folder = folder
+        self.driver.get(address)
+
+    def part(self, name):
+        return self.driver.find_element("css selector", f'[data-testid="{name}"]')
+
+    def text(self, name):
+        return self.part(name).get_attribute("value") or self.part(name).text
+
+    def wait(self, condition, what, seconds=90):
+        deadline, error = time.monotonic() + seconds, None
+        while True:
+            try:
+                if value := condition():
+                    return value
+            except Exception as caught:  # the page is not ready
+                error = caught
+            assert time.monotonic() < deadline, f"{what}; page says {self.text('message')!r}; {error}"
+            time.sleep(0.1)
+
+    def click(self, name):
+        button = self.part(name)
+        self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
+        self.wait(lambda: button.click() or True, f"click {name}", 20)
+
+    def upload(self, what, path):
+        self.part(f"upload-{what}").find_element("css selector", "input[type=file]").send_keys(str(path))
+
+    def drag(self, start, end, size):
+        """Drag the mouse between pixels of the photograph, whose width is ``size`` px."""
+        from selenium.webdriver import ActionChains
+
+        image = self.part("photograph")
+        self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", image)
+        zoom = image.size["width"] / size
+        middle = image.size["width"] / 2, image.size["height"] / 2
+        (x0, y0), (x1, y1) = (
+            tuple(round((v + 0.5) * zoom - m) for v, m in zip(point, middle, strict=True)) for point in (start, end)
+        )
+        chain = ActionChains(self.driver, duration=50).move_to_element_with_offset(image, x0, y0).click_and_hold()
+        chain.move_by_offset((x1 - x0) // 2, (y1 - y0) // 2)
+        chain.move_to_element_with_offset(image, x1, y1).release().perform()
+
+    def box(self):
+        return [float(self.text(f"box-{name}") or "nan") for name in ("x0", "y0", "x1", "y1")]
+
+    def downloaded(self, name):
+        path = self.folder / "downloads" / name
+        self.wait(lambda: path.is_file() and not list(path.parent.glob("*.crdownload")), f"download of {name}")
+        return path.read_bytes()
