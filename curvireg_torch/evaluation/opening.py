@@ -146,7 +146,8 @@ def _open_bank(
     bank = ViewBank.load(mesh)
     if options.pose not in (None, bank.pipeline.views.pose):
         raise BankError(
-            f"{mesh}: built for --pose {bank.pipeline.views.pose}, expected --pose {options.pose}; "
-            "leave --pose out, or build it again with 'curvireg bank'"
+            f"built for --pose {bank.pipeline.views.pose}, not for --pose {options.pose}; "
+            "leave --pose out, or build it again with 'curvireg bank'",
+            subject=mesh,
         )
     return bank

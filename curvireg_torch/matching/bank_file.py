@@ -60,22 +60,23 @@ def read_bank(path: Path) -> tuple[list[trimesh.Trimesh], ViewSphere, Pipeline, 
     """Read and check what :func:`write_bank` wrote: meshes, views, pipeline and tensors on the CPU."""
     rebuild = "build it again with 'curvireg bank MESH --out FILE'"
     if not path.is_file():
-        raise MissingFileError(f"{path}: no such bank; build one with 'curvireg bank MESH --out {path}'")
+        raise MissingFileError(f"no such bank; build one with 'curvireg bank MESH --out {path}'", subject=path)
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             if metadata.get("format") != FORMAT:
-                raise BankError(f"{path}: not a view bank; build one with 'curvireg bank MESH --out FILE'")
+                raise BankError("not a view bank; build one with 'curvireg bank MESH --out FILE'", subject=path)
             if metadata.get("version") != str(FORMAT_VERSION):
                 raise BankError(
-                    f"{path}: bank format {metadata.get('version')}, this library reads {FORMAT_VERSION}; {rebuild}"
+                    f"bank format {metadata.get('version')}, this library reads {FORMAT_VERSION}; {rebuild}",
+                    subject=path,
                 )
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     except (SafetensorError, OSError) as error:
-        raise BankError(f"{path}: truncated or not a safetensors file ({error}); {rebuild}") from error
+        raise BankError(f"truncated or not a safetensors file ({error}); {rebuild}", subject=path) from error
     try:
         if metadata["checksum"] != tensor_digest(tensors, size=16):
-            raise BankError(f"{path}: changed since it was written (its checksum differs); {rebuild}")
+            raise BankError(f"changed since it was written (its checksum differs); {rebuild}", subject=path)
         pipeline = Pipeline.from_json(metadata["pipeline"])
         views = ViewSphere(**{f.name: tensors[f"views.{f.name}"] for f in fields(ViewSphere)})
         units, ups = metadata["units"].split(" "), metadata["up"].split(" ")
@@ -84,7 +85,7 @@ def read_bank(path: Path) -> tuple[list[trimesh.Trimesh], ViewSphere, Pipeline, 
     except (KeyError, TypeError, ValueError, CurviregError) as error:
         if isinstance(error, BankError):
             raise
-        raise BankError(f"{path}: incomplete bank ({error!r}); {rebuild}") from error
+        raise BankError(f"incomplete bank ({error!r}); {rebuild}", subject=path) from error
     return meshes, views, pipeline, tensors
 
 

@@ -12,7 +12,7 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...errors import MeshError, MissingFileError
+from ...errors import CurviregWarning, MeshError, MissingFileError
 from ...limits import MAX_MESH_COORDINATE, MAX_MESH_FACES
 from ...utils.checks import check_option
 from ...utils.choices import MESHES, UNITS, UP_AXES
@@ -66,10 +66,8 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
     mesh.metadata.update(file_name=path.name, up=up)
     size = float(np.linalg.norm(mesh.extents)) * UNITS[unit]
     if not 0.005 <= size <= 100.0:
-        warnings.warn(
-            f"{path}: in unit {unit!r} the object is {size:g} m across; if that is wrong, give the unit (mm?)",
-            stacklevel=2,
-        )
+        message = f"in unit {unit!r} the object is {size:g} m across; if that is wrong, give the unit (mm?)"
+        warnings.warn(CurviregWarning(message, subject=path), stacklevel=2)
     return mesh
 
 
