@@ -1,0 +1,272 @@
+"""Banks in memory, joined, and on disk."""
+
+import os
+import stat
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+from curvireg_torch.errors import BankError, InvalidInputError, MissingFileError
+from curvireg_torch.geometry import uniform_views
+from curvireg_torch.io.meshes.up import mesh_up
+from curvireg_torch.matching import ViewBank, ViewMatcher
+from curvireg_torch.pipeline import Pipeline
+from curvireg_torch.registration import Registrar
+from curvireg_torch.settings import BankSettings, ViewPolicy
+from curvireg_torch.terms import normalized_correlation
+
+SETTINGS = BankSettings(image_size=64)
+UPRIGHT = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
+TENSORS = ("descriptors", "points", "silhouettes", "boxes", "rotations")
+
+
+def build(mesh, views=None, **options) -> ViewBank:
+    return ViewBank.build(mesh, views, progress=False, **{"settings": SETTINGS, **options})
+
+
+@pytest.fixture(scope="module")
+def upright(truck) -> ViewBank:
+    return build(truck, pipeline=Pipeline(views=UPRIGHT))
+
+
+@pytest.fixture
+def saved(small_bank, tmp_path):
+    small_bank.save(tmp_path / "bank.safetensors")
+    return tmp_path / "bank.safetensors"
+
+
+def assert_same(a: ViewBank, b: ViewBank, *, atol: float = 0.0) -> None:
+    torch.testing.assert_close(a.descriptors, b.descriptors, rtol=0, atol=atol)
+    for name in TENSORS[1:]:
+        assert torch.equal(getattr(a, name), getattr(b, name))
+    assert a.settings == b.settings
+
+
+def test_build_does_not_depend_on_chunks_and_threads(small_bank, truck):
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        other = build(truck, small_bank.views, chunk_size=5)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+    assert_same(other, small_bank, atol=1e-5)
+
+
+def test_build_stops_at_the_first_error(truck):
+    class Broken:
+        name = "broken"
+
+        def render(self, *_, **__):
+            raise KeyboardInterrupt
+
+    before = torch.get_num_threads()
+    with pytest.raises(KeyboardInterrupt):
+        build(truck, uniform_views(3), renderer=Broken(), chunk_size=1)
+    assert torch.get_num_threads() == before
+
+
+def test_bank_unpacks_selected_masks(small_bank):
+    index = torch.tensor([3, 0])
+    assert torch.equal(small_bank.points_at(index), small_bank.points[index])
+    assert torch.equal(small_bank.silhouettes_at(slice(2, 5)), small_bank.silhouettes[2:5])
+    assert small_bank.silhouettes.dtype == torch.bool
+    assert 0.1 < float(small_bank.silhouettes.float().mean()) < 0.6
+
+
+def test_bank_moves_to_a_device(small_bank):
+    for device in ["cpu"] + (["cuda"] if torch.cuda.is_available() else []):
+        moved = small_bank.to(device)
+        assert moved.device.type == moved.rotations.device.type == moved.points.device.type == device
+        assert torch.equal(moved.silhouettes.cpu(), small_bank.silhouettes)
+
+
+def test_check_compatible_refuses_other_bank_settings(small_bank):
+    with pytest.raises(BankError, match=r"made with other settings \(image_size 64, asked for 128\)"):
+        ViewMatcher(small_bank, pipeline=Pipeline())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"pose": "any"}, "pose upright, asked for any"),
+        ({"pose": "given"}, "pose upright, asked for given"),
+        ({"azimuth_step": 60.0}, r"azimuth_step 120\.0, asked for 60\.0"),
+        ({"elevations": (5.0,)}, r"elevations \(10\.0,\), asked for \(5\.0,\)"),
+        ({"distance": 6.0}, r"distance 5\.0, asked for 6\.0"),
+    ],
+)
+def test_check_compatible_refuses_another_view_policy(upright, change, message):
+    other = replace(upright.pipeline, views=replace(UPRIGHT, **change))
+    for constructor in (ViewMatcher, Registrar):
+        with pytest.raises(BankError, match=message):
+            constructor(upright, pipeline=other)
+
+
+def test_check_compatible_ignores_what_decides_no_view(upright, small_bank):
+    other_pose = replace(upright.pipeline, views=replace(UPRIGHT, directions=9, theta_step=9.0))
+    assert ViewMatcher(upright, pipeline=other_pose).pipeline.views == UPRIGHT
+    for pose in ("any", "upright", "given"):  # the caller passed the views
+        pipeline = Pipeline(bank=SETTINGS).with_pose_prior(pose)
+        assert ViewMatcher(small_bank, pipeline=pipeline).pipeline.views.pose == "given"
+
+
+def test_join_concatenates_banks(small_bank):
+    second = build(trimesh.creation.box((0.1, 0.2, 0.1)), uniform_views(7))
+    both, n = ViewBank.join([small_bank, second]), len(small_bank)
+    assert len(both) == n + 7
+    for name in TENSORS:
+        assert torch.equal(getattr(both, name), torch.cat([getattr(small_bank, name), getattr(second, name)]))
+    points = torch.stack([second.points[2], small_bank.points[1]])
+    assert torch.equal(both.points_at(torch.tensor([n + 2, 1])), points)
+    assert [both.locate(i) for i in (0, n - 1, n, n + 6)] == [(0, 0), (0, n - 1), (1, 0), (1, 6)]
+    with pytest.raises(InvalidInputError, match="index"):
+        both.locate(len(both))
+
+
+def test_join_of_joined_banks_numbers_all_models():
+    banks = [build(trimesh.creation.box((1, 1, height)), uniform_views(2)) for height in (1, 2, 3, 4)]
+    nested = ViewBank.join([ViewBank.join(banks[:2]), ViewBank.join(banks[2:])])
+    flat = ViewBank.join(banks)
+    assert nested.model.tolist() == flat.model.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert [float(mesh.extents[2]) for mesh in nested.meshes] == [1.0, 2.0, 3.0, 4.0]
+    assert_same(nested, flat)
+
+
+def test_join_refuses_banks_that_differ(small_bank, upright, truck):
+    coarse = build(truck, uniform_views(3), settings=replace(SETTINGS, sigma=2.0))
+    with pytest.raises(InvalidInputError, match="one set of settings"):
+        ViewBank.join([small_bank, coarse])
+    with pytest.raises(InvalidInputError, match=r"one view policy, but bank 1 has .*upright.* and bank 0 .*given"):
+        ViewBank.join([small_bank, upright])
+    with pytest.raises(InvalidInputError, match="at least one bank"):
+        ViewBank.join([])
+
+
+def test_matcher_finds_the_model_in_a_joined_bank(small_bank):
+    box = build(trimesh.creation.box((0.1, 0.2, 0.1)), small_bank.views)
+    both = ViewBank.join([box, small_bank])
+    picture = small_bank.silhouettes[5].float()[None, None].repeat(1, 3, 1, 1)
+    edges = torch.tensor([[-0.5, -0.5, 63.5, 63.5]])
+    ranking = ViewMatcher(both)(picture, edges / 1.2 + 63.0 * (1 - 1 / 1.2) / 2)  # with its margin, the whole view
+    assert (1, 5) in [both.locate(int(i)) for i in ranking.top(3)[0]]
+
+
+def test_save_and_load(small_bank, tmp_path):
+    path = tmp_path / "new" / "bank.safetensors"
+    small_bank.save(path)
+    loaded = ViewBank.load(path)
+    assert_same(loaded, small_bank, atol=5e-4)
+    np.testing.assert_array_equal(loaded.mesh.vertices, small_bank.mesh.vertices)
+    np.testing.assert_array_equal(loaded.mesh.faces, small_bank.mesh.faces)
+    assert loaded.mesh.units == "m"
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    if os.name == "posix":
+        mask = os.umask(0)
+        os.umask(mask)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o666 & ~mask
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_load_restores_the_up_axis(truck, up, tmp_path):
+    mesh = truck.copy()
+    mesh.metadata["up"] = up
+    build(mesh, uniform_views(2)).save(tmp_path / "bank.safetensors")
+    assert mesh_up(ViewBank.load(tmp_path / "bank.safetensors").mesh) == up
+
+
+def test_float16_storage_changes_no_ranking(small_bank, saved):
+    # Queries differ from views as photographs do: noise of half the descriptors' length.
+    noise = torch.rand(200, small_bank.descriptors.shape[1], generator=torch.Generator().manual_seed(0))
+    noise *= 0.5 * small_bank.descriptors.norm(dim=1).mean() / noise.norm(dim=1, keepdim=True)
+    queries = small_bank.descriptors[torch.arange(200) % len(small_bank)] + noise
+    exact, stored = (normalized_correlation(queries, b.descriptors) for b in (small_bank, ViewBank.load(saved)))
+    assert float((exact - stored).abs().max()) < 1e-4
+    assert torch.equal(exact.argmax(dim=1), stored.argmax(dim=1))
+
+
+def test_interrupted_save_leaves_the_old_file(small_bank, saved, monkeypatch):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    content = saved.read_bytes()
+    monkeypatch.setattr(os, "fsync", interrupt)  # after the content is written, before the file is renamed
+    for name in (saved.name, "other.safetensors"):
+        with pytest.raises(KeyboardInterrupt):
+            small_bank.save(saved.with_name(name))
+    assert [p.name for p in saved.parent.iterdir()] == [saved.name]
+    assert saved.read_bytes() == content
+
+
+def test_load_detects_changed_bits(saved):
+    content = bytearray(saved.read_bytes())
+    for position in torch.linspace(len(content) // 3, len(content) - 1, 12).long().tolist():
+        content[position] ^= 1
+        saved.write_bytes(content)
+        with pytest.raises(BankError, match="checksum"):
+            ViewBank.load(saved)
+        content[position] ^= 1
+
+
+@pytest.mark.parametrize(
+    ("metadata", "message"),
+    [
+        ({"format": "x"}, "not a view bank"),
+        ({"version": "0"}, "bank format 0"),
+        ({"pipeline": "{"}, "incomplete"),
+        ({"pipeline": '{"bank": {"image_size": 64, "colour": 1}}'}, "incomplete"),
+        (
+            {"pipeline": Pipeline(bank=replace(SETTINGS, image_size=128)).to_json()},
+            "points, silhouettes: not of the shape",
+        ),
+    ],
+)
+def test_load_refuses_other_metadata(saved, metadata, message):
+    with safe_open(saved, framework="pt") as file:
+        original = file.metadata()
+    save_file(load_file(saved), saved, {**original, **metadata})
+    with pytest.raises(BankError, match=message):
+        ViewBank.load(saved)
+
+
+def _with_nan(x):
+    x = x.clone()
+    x[3, 1] = torch.nan
+    return x
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("descriptors", _with_nan, "not finite"),
+        ("descriptors", torch.zeros_like, "all zero"),
+        ("boxes", lambda x: x[:, [2, 1, 0, 3]], "empty"),
+        ("boxes", lambda x: x * torch.tensor([1.0, 0.0, 1.0, 0.0]), "empty"),
+        ("boxes", _with_nan, "not finite"),
+        ("boxes", lambda x: x[1:], "boxes: not of the shape"),
+        ("points", lambda x: x[:, 1:], "points: not of the shape"),
+        ("model", lambda x: x + 1, "meshes that do not exist"),
+        ("model", lambda x: x - 1, "meshes that do not exist"),
+        ("reranking.appearance", lambda x: x[1:], "appearance that do not fit"),
+        ("reranking.appearance", _with_nan, "appearance that do not fit"),
+    ],
+)
+def test_load_refuses_contents_that_no_bank_has(small_bank, tmp_path, name, change, message):
+    """The checksum of these files is correct."""
+    tensors = {**small_bank.tensors, name: change(small_bank.tensors[name])}
+    ViewBank(small_bank.meshes, small_bank.views, small_bank.pipeline, tensors).save(tmp_path / "bank")
+    with pytest.raises(BankError, match=message):
+        ViewBank.load(tmp_path / "bank")
+
+
+def test_load_refuses_truncated_and_missing_files(saved):
+    saved.write_bytes(saved.read_bytes()[:-100])
+    with pytest.raises(BankError, match="truncated"):
+        ViewBank.load(saved)
+    with pytest.raises(MissingFileError, match="no such bank"):
+        ViewBank.load(saved.with_name("none"))
