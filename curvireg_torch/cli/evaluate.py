@@ -1,9 +1,6 @@
 """``curvireg evaluate pascal3d|bop|web ROOT --out DIR``."""
 
 import argparse
-import os
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -65,10 +62,11 @@ def run(arguments: argparse.Namespace) -> None:
     Raises:
         CurviregError: the dataset is missing, an option is out of range, or the folder holds other results.
     """
-    if arguments.jobs > 1 and "TORCHELASTIC_RUN_ID" not in os.environ:
-        _run_processes(arguments.jobs, arguments.argv)
+    from ..evaluation.workers import run_processes
+
+    if run_processes(arguments.jobs, arguments.argv):
         return
-    from ..evaluation.loops import evaluate
+    from ..evaluation.datasets import evaluate
     from ..evaluation.protocol import Protocol
     from ..pipeline import Pipeline
 
@@ -83,7 +81,7 @@ def run(arguments: argparse.Namespace) -> None:
         overwrite=arguments.overwrite,
         progress=arguments.progress,
     )
-    if summary is None:  # not the first of several processes
+    if summary is None:  # another process writes it
         return
     if summary["n"] == 0:
         reasons = ", ".join(f"{count} {reason}" for reason, count in summary["skipped"].items()) or "it is empty"
@@ -102,15 +100,6 @@ def _print_summary(summary: Mapping[str, Any]) -> None:
         names = [name for name in summary if name.startswith(("acc_", "add_", "mssd_", "mspd_"))]
         numbers = [f"{name} {summary[name]:.3f}" for name in names]
         print("   ".join([*numbers, f"med_err_deg {summary['med_err_deg']:.1f}"]))
-    if "localisation" in summary:
-        (_, n), *recalls = summary["localisation"].items()
+    if "localization" in summary:
+        (_, n), *recalls = summary["localization"].items()
         print("   ".join(f"{name} {value:.3f}" for name, value in recalls) if n else "no box is annotated")
-
-
-def _run_processes(count: int, argv: list[str]) -> None:
-    """Run the same command in processes that ``torchrun`` starts."""
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
-    environment = {"OMP_NUM_THREADS": "1", **os.environ}
-    done = subprocess.run([*torchrun, "-m", "curvireg_torch", *argv], env=environment, check=False)
-    if done.returncode:
-        raise InvalidInputError(f"evaluate: a process ended with code {done.returncode}; its message is above")

@@ -22,7 +22,7 @@ from .options import (
 )
 
 if TYPE_CHECKING:
-    from ..evaluation.lists import Listing
+    from ..evaluation.lists import PhotoList
     from ..evaluation.opening import RegisterOptions
 
 __all__ = ["add_parser", "complete", "run"]
@@ -94,6 +94,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--field", type=Path, metavar="FILE", help="weights from curvireg bank --adapt")
     parser.add_argument("--top", type=int, metavar="K", help="hypotheses to carry and report (default: 5)")
     parser.add_argument("--no-refine", dest="refine", action="store_false", help="stop at the best view of the bank")
+    parser.add_argument(
+        "--jobs", type=int, default=1, metavar="N", help="processes that divide several photographs (default: 1)"
+    )
     parser.add_argument("--json", action="store_true", help="print only the results as JSON; --out is optional")
     parser.add_argument("--out", type=Path, metavar="DIR")
     parser.set_defaults(run=run)
@@ -113,6 +116,8 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "expected PHOTO MESH, PHOTO ... --mesh MESH, or --list FILE MESH"
     if arguments.out is None and not arguments.json:
         return "expected --out DIR, or --json"
+    if arguments.out is None and arguments.jobs > 1:
+        return "--jobs: several processes need --out DIR, where their results meet"
     if arguments.list is not None and len(arguments.paths) > 1:
         return f"with --list, expected at most one MESH, got {len(arguments.paths)}; give several by --mesh"
     if sum(map(bool, (arguments.camera, arguments.exif, arguments.fov))) > 1:
@@ -132,6 +137,10 @@ def run(arguments: argparse.Namespace) -> None:
     """
     check_given(arguments.photos, arguments.meshes, arguments.list)
     from ..evaluation.opening import check_camera
+    from ..evaluation.workers import run_processes
+
+    if run_processes(arguments.jobs, arguments.argv):
+        return
 
     options = register_options(arguments, arguments.photos, arguments.meshes)
     options.open_pipeline()  # errors in options come before any photograph is read
@@ -142,8 +151,10 @@ def run(arguments: argparse.Namespace) -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) if arguments.out is None else arguments.out
-        listing = _listing(options, arguments.list, out, every=arguments.every)
-        counts = _register_several(options, field, listing, out)
+        photos = _photo_list(options, arguments.list, out, every=arguments.every)
+        counts = _register_several(options, field, photos, out)
+        if counts is None:  # another process writes the tables
+            return
         if arguments.json:
             print((out / "results.jsonl").read_text(encoding="utf-8"), end="")
     table = "" if arguments.out is None else f"; see {out}/results.csv"
@@ -188,24 +199,21 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
         print_result(document, out)
 
 
-def _register_several(options: "RegisterOptions", field: Any, listing: "Listing", out: Path) -> Any:
+def _register_several(options: "RegisterOptions", field: Any, photos: "PhotoList", out: Path) -> Any:
     from ..evaluation.lists import register_list
-    from ..evaluation.loops import POSE_SOURCES
     from ..evaluation.opening import open_registrar
     from ..pipeline import field_digest
-    from ..utils.digests import code_digest
 
     settings = {
         "pipeline": options.open_pipeline().describe(),
         "field": None if field is None else field_digest(field),
-        "code": code_digest(*POSE_SOURCES),
         **{
             n: getattr(options, n)
             for n in ("bank_decides", "pose", "unit", "up", "top", "refine", "renderer", "device")
         },
     }
     return register_list(
-        listing,
+        photos,
         out,
         lambda meshes: open_registrar(options, meshes, field),
         settings=settings,
@@ -213,24 +221,24 @@ def _register_several(options: "RegisterOptions", field: Any, listing: "Listing"
     )
 
 
-def _listing(options: "RegisterOptions", path: Path | None, out: Path, *, every: int) -> "Listing":
+def _photo_list(options: "RegisterOptions", path: Path | None, out: Path, *, every: int) -> "PhotoList":
     """The photographs that are named one by one or by the list at ``path``."""
     from ..evaluation.lists import list_photographs, read_list
 
     if path is not None:
-        listing = read_list(path, options.meshes)
+        photos = read_list(path, options.meshes)
         check_writable(out, "--out")
     else:
         check_writable(out, "--out")
-        listing = list_photographs(
+        photos = list_photographs(
             options.photos, options.meshes, box=options.box, camera=options.camera, every=every, frames=out / "frames"
         )
         given = [f"--{name}" for name in ("box", "camera") if getattr(options, name) is not None]
         if given:
-            print(f"{' and '.join(given)}: used for all {len(listing.entries)} photographs", file=sys.stderr)
+            print(f"{' and '.join(given)}: used for all {len(photos.entries)} photographs", file=sys.stderr)
     if options.guess is not None:
         print("unknown cameras are guessed; distances are off by the same factor as the guesses", file=sys.stderr)
-    return replace(listing, entries=tuple(map(options.complete, listing.entries)))
+    return replace(photos, entries=tuple(map(options.complete, photos.entries)))
 
 
 def _notes(as_json: bool) -> Any:

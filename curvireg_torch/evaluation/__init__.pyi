@@ -1,6 +1,6 @@
 from .benchmark import Benchmark
 from .bop import BOPBenchmark
-from .loops import evaluate, score
+from .datasets import evaluate, score
 from .pascal3d import Pascal3DBenchmark
 from .protocol import Protocol
 from .registry import DATASETS

@@ -1,4 +1,4 @@
-"""What the two loops ask of a dataset."""
+"""A dataset as evaluation sees it: objects to register, and scores of the results."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from .protocol import Protocol
 __all__ = ["Benchmark", "BenchmarkItem", "Row"]
 
 Row = dict[str, Any]
-"""A prediction: ``rotation``, ``translation``, ``score``, ...; or ``failed``, or ``skipped`` with the reason."""
+"""A result: ``rotation``, ``translation``, ``score``, ...; or ``failed``, or ``skipped`` with the reason."""
 
 
 @dataclass(frozen=True)
@@ -21,26 +21,33 @@ class BenchmarkItem:
     """One object to register.
 
     Attributes:
-        key: its name, which no other object of the benchmark has.
+        key: a name that no other object of the benchmark has.
         index: in the dataset.
-        meshes: one, or all that may be tried.
+        photo: the file of the photograph.
+        meshes: one, or all that the protocol allows.
         box: (4,) x0, y0, x1, y1 in px, as annotated; NaN where unknown.
-        camera_matrix: (3, 3) in px, None where the method is not told.
+        camera_matrix: (3, 3) in px; None if the protocol does not give it to the method.
     """
 
     key: str
     index: int
+    photo: Path
     meshes: tuple[Path, ...]
     box: Tensor
     camera_matrix: Tensor | None
 
+    def request(self) -> Row:
+        """Box and camera matrix, to the last digit."""
+        camera = None if self.camera_matrix is None else self.camera_matrix.tolist()
+        return {"key": self.key, "box": self.box.tolist(), "camera": camera}
+
 
 class Benchmark(ABC):
-    """A dataset, the protocol that objects are registered under, and its scores.
+    """A dataset with the protocol of its evaluation, and its scores.
 
     Attributes:
-        name: of the kind of dataset.
-        unit: of its meshes.
+        name: kind of dataset.
+        unit: unit of its meshes.
         dataset, protocol: as given.
         items: all objects, in the order of the dataset.
     """
@@ -58,8 +65,8 @@ class Benchmark(ABC):
         return self.items if limit is None or limit >= n else [self.items[i * n // limit] for i in range(limit)]
 
     def settings(self) -> Row:
-        """What predictions depend on besides preset and protocol."""
-        split = getattr(self.dataset, "split", None)  # which a collection of one's own has not
+        """What results depend on besides pipeline and protocol."""
+        split = getattr(self.dataset, "split", None)  # a collection of the user's own has none
         return {"dataset": self.name, "root": str(self.dataset.root.resolve()), "split": split}
 
     @abstractmethod
@@ -72,12 +79,12 @@ class Benchmark(ABC):
 
     @abstractmethod
     def easy(self, item: BenchmarkItem) -> bool:
-        """Whether the object is seen whole."""
+        """Whether the whole object is visible."""
 
     @abstractmethod
     def summary(self, items: list[BenchmarkItem], rows: list[Row]) -> Row:
-        """Scores of the predictions ``rows`` of ``items``, none of them skipped."""
+        """Scores of the results ``rows`` of ``items``, none of them skipped."""
 
     @abstractmethod
     def write_predictions(self, path: Path, items: list[BenchmarkItem], rows: list[Row]) -> None:
-        """The predictions as one table; ``path`` appears when it is complete."""
+        """Write the results as one table; ``path`` appears when it is complete."""

@@ -55,20 +55,21 @@ class BOPBenchmark(Benchmark):
         return BenchmarkItem(
             key=f"{s['scene_id']}/{s['image_id']}/{s['instance_index']}",
             index=index,
+            photo=Path(s["image_path"]),
             meshes=(Path(s["model_path"]),),
             box=s["box"],
             camera_matrix=s["camera_matrix"],
         )
 
     def rotation_errors(self, items: list[BenchmarkItem], rows: list[Row]) -> Tensor:
-        return self._judged(items, rows)[0][0]
+        return self._errors_of(items, rows)[0][0]
 
     def easy(self, item: BenchmarkItem) -> bool:
         return float(self.dataset.annotation(item.index)["visib_fract"]) > UNOCCLUDED
 
     def summary(self, items: list[BenchmarkItem], rows: list[Row]) -> Row:
         """Rotation errors up to the objects' symmetries, ADD(-S) recall, AR of MSSD and MSPD."""
-        errors, objects = self._judged(items, rows)
+        errors, objects = self._errors_of(items, rows)
         easy = torch.tensor([self.easy(item) for item in items], dtype=torch.bool)
         return {
             **_scores(errors),
@@ -100,7 +101,7 @@ class BOPBenchmark(Benchmark):
             ],
         )
 
-    def _judged(self, items: list[BenchmarkItem], rows: list[Row]) -> tuple[Tensor, Tensor]:
+    def _errors_of(self, items: list[BenchmarkItem], rows: list[Row]) -> tuple[Tensor, Tensor]:
         """(4, N) errors in degrees, diameters, diameters and image widths, see :meth:`_errors`; (N,) object ids."""
         samples = [self.dataset.annotation(item.index) for item in items]
         objects = torch.tensor([s["obj_id"] for s in samples], dtype=torch.long)

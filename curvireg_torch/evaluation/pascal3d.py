@@ -61,6 +61,7 @@ class Pascal3DBenchmark(Benchmark):
         return BenchmarkItem(
             key=f"{sample['category']}/{sample['image_id']}/{sample['object_index']}",
             index=index,
+            photo=Path(sample["image_path"]),
             meshes=annotated if self.protocol.cad == "annotated" else self._meshes(sample["category"]),
             box=sample["box"],
             camera_matrix=None,
@@ -70,14 +71,14 @@ class Pascal3DBenchmark(Benchmark):
         return {**super().settings(), "part": self.dataset.part, "pixel_origin": self.dataset._pixel_origin}
 
     def rotation_errors(self, items: list[BenchmarkItem], rows: list[Row]) -> Tensor:
-        return self._judged(items, rows)[4]
+        return self._errors_of(items, rows)[4]
 
     def easy(self, item: BenchmarkItem) -> bool:
         return not any(self.dataset.annotation(item.index)[flag] for flag in FLAGS)
 
     def summary(self, items: list[BenchmarkItem], rows: list[Row]) -> Row:
         """Acc(pi/6), Acc(pi/18), MedErr: of all, of subsets, of each class, and up to the symmetries of the classes."""
-        samples, R, truth, plain, symmetric = self._judged(items, rows)
+        samples, R, truth, plain, symmetric = self._errors_of(items, rows)
 
         def scores_of(chosen: list[bool]) -> Row:
             mask = torch.tensor(chosen, dtype=torch.bool)
@@ -104,10 +105,12 @@ class Pascal3DBenchmark(Benchmark):
 
     def write_predictions(self, path: Path, items: list[BenchmarkItem], rows: list[Row]) -> None:
         """One line per object: what was estimated, what is true, and the error."""
-        samples, _, _, plain, symmetric = self._judged(items, rows)
+        samples, _, _, plain, symmetric = self._errors_of(items, rows)
         write_viewpoints(path, COLUMNS, samples, rows, {"error_deg": plain, "symmetric_error_deg": symmetric})
 
-    def _judged(self, items: list[BenchmarkItem], rows: list[Row]) -> tuple[list[Row], Tensor, Tensor, Tensor, Tensor]:
+    def _errors_of(
+        self, items: list[BenchmarkItem], rows: list[Row]
+    ) -> tuple[list[Row], Tensor, Tensor, Tensor, Tensor]:
         """Annotations, estimated and true rotations (N, 3, 3), and their errors (N,) without and with symmetries."""
         samples = [self.dataset.annotation(item.index) for item in items]
         R = estimated_rotations(rows)

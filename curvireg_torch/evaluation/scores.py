@@ -1,4 +1,4 @@
-"""Numbers and tables that several benchmarks write."""
+"""Scores and tables that several benchmarks share."""
 
 import csv
 import io
@@ -12,24 +12,24 @@ from torch import Tensor
 
 from ..geometry import viewpoint_from_rotation
 from ..metrics import accuracy, median_error
-from .store import write_text
+from ..utils.files import write_file
 
 __all__ = ["estimated_rotations", "or_inf", "viewpoint_scores", "write_viewpoints"]
 
 
 def viewpoint_scores(errors: Tensor, thresholds: dict[str, float]) -> dict[str, Any]:
-    """``n``, one share per threshold, and ``med_err_deg``.
+    """``n``, one accuracy for each threshold, and ``med_err_deg``.
 
     Args:
         errors: (N,) degrees, ``inf`` for a miss.
-        thresholds: name of the share -> degrees.
+        thresholds: name of the accuracy -> degrees.
 
     Example:
         >>> viewpoint_scores(torch.tensor([5.0, 50.0]), {"acc_pi_6": 30.0})
         {'n': 2, 'acc_pi_6': 0.5, 'med_err_deg': 27.5}
     """
-    shares = {name: accuracy(errors, degrees) for name, degrees in thresholds.items()}
-    return {"n": len(errors), **shares, "med_err_deg": median_error(errors)}
+    accuracies = {name: accuracy(errors, degrees) for name, degrees in thresholds.items()}
+    return {"n": len(errors), **accuracies, "med_err_deg": median_error(errors)}
 
 
 def estimated_rotations(rows: Sequence[Mapping[str, Any]]) -> Tensor:
@@ -50,13 +50,13 @@ def write_viewpoints(
     rows: Sequence[Mapping[str, Any]],
     errors: Mapping[str, Tensor],
 ) -> None:
-    """A table with one line per object; ``path`` appears when it is complete.
+    """Write a table with one line for each object; ``path`` appears when it is complete.
 
     Args:
         path: of the table.
-        columns: those of sample, row and errors, the estimate's angles, and the truth's as ``true_azimuth``, ...
+        columns: keys of samples, rows and errors; estimated angles; true angles as ``true_azimuth``, ...
         samples: annotations with ``viewpoint`` (3,), NaN where unknown.
-        rows: predictions.
+        rows: results.
         errors: (N,) degrees, by column.
     """
     names = ("azimuth", "elevation", "theta")
@@ -71,7 +71,7 @@ def write_viewpoints(
         if "rotation" in row:
             line |= {n: float(v) for n, v in zip(names, viewpoint_from_rotation(R[i]), strict=True)}
         table.writerow({name: _cell(line.get(name, "")) for name in columns})
-    write_text(path, text.getvalue())
+    write_file(path, text.getvalue().encode())
 
 
 def _cell(value: object) -> object:

@@ -1,125 +1,239 @@
-"""Predictions on disk: a folder with one small file per object and the settings that made them."""
+"""Results on disk: JSON lines that several processes append to, and the settings that produced them."""
 
 import json
 import math
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from ..errors import InvalidInputError, OutputError
 from ..utils.files import write_file
+from .workers import Workers
 
-__all__ = ["PredictionStore", "write_text"]
+__all__ = ["ResultStore", "Row", "to_json"]
 
 Row = dict[str, Any]
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a file that appears whole or not at all.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
-    write_file(path, text.encode())
-
-
-def plain(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """``value`` with every number that JSON cannot write (NaN, infinity) replaced by None."""
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def to_json(value: Any) -> str:
-    return json.dumps(plain(value), indent=2, allow_nan=False) + "\n"
+    """Indented JSON; numbers that are not finite become null."""
+    return json.dumps(finite(value), indent=2, allow_nan=False) + "\n"
 
 
-class PredictionStore:
-    """The predictions of one evaluation, in ``folder``.
+def _line(row: Mapping[str, Any]) -> bytes:
+    return (json.dumps(finite(dict(row)), allow_nan=False) + "\n").encode()
 
-    Every object has a file of its own, written beside and renamed, so that a killed run loses the object it was at and
-    nothing else, several processes may write at once, and no object is there twice. ``settings.json`` keeps what the
-    predictions depend on.
+
+@dataclass(frozen=True)
+class _Location:
+    """Where a row is on disk, and what decides whether it is still valid."""
+
+    path: Path
+    offset: int
+    digests: Row
+    revision: int
+    final: bool
+
+
+class ResultStore:
+    """One row for each item, in ``results.jsonl`` of a folder.
+
+    A row holds the ``key`` of its item and ``digests`` of everything that it depends on. It is appended and synced as
+    soon as it is known, so that a killed process loses only the item it was working on; a last line that was cut short
+    is ignored, and removed before the next row is appended. Of several processes each appends to a file of its own,
+    ``results.RANK-of-SIZE.jsonl``; a reader merges all files. Of several rows of one item the latest counts.
 
     Args:
-        folder: is made if it is not there.
+        folder: created with the first row.
+        workers: the processes that share the store.
+
+    Raises:
+        InvalidInputError: ``results.jsonl`` holds something else.
 
     Example:
         >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     store = PredictionStore(Path(folder, "predictions"))
-        ...     store.open({"preset": "default"})
-        ...     store.write("car/1 #0", {"score": 0.5})
-        ...     "car/1 #0" in store, store.read("car/1 #0")
-        (True, {'score': 0.5})
+        >>> store = ResultStore(Path(tempfile.mkdtemp()))
+        >>> store.append({"key": "car/1", "digests": {"request": "a", "photo": "b"}, "score": 0.5})
+        >>> "car/1" in store, store.is_current("car/1", {"request": "a", "photo": "b"}), store.read("car/1")["score"]
+        (True, True, 0.5)
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, workers: Workers | None = None) -> None:
+        workers = workers or Workers()
+        self.folder, self.path = folder, folder / "results.jsonl"
+        self.settings_path = folder / "settings.json"
+        shared = f"results.{workers.rank}-of-{workers.size}.jsonl"
+        self._output = folder / shared if workers.size > 1 else self.path
+        self._repaired = False
+        self.refresh()
 
     def open(self, settings: Row, *, overwrite: bool = False) -> None:
-        """Start with ``settings``, or go on with them.
+        """Bind the store to ``settings``, or continue with the same ones.
 
         Args:
             settings: plain values.
-            overwrite: remove what is there and start anew.
+            overwrite: delete existing rows and start again.
 
         Raises:
-            InvalidInputError: the folder holds predictions of other settings.
-            OutputError: it cannot be written to.
+            InvalidInputError: the folder holds results of other settings.
+            OutputError: the folder cannot be written to.
         """
-        path = self.folder / "settings.json"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OutputError(f"{self.folder}: cannot be made ({error.strerror}); choose another --out") from error
+            raise OutputError(f"{self.folder}: cannot be created ({error.strerror}); choose another --out") from error
         if overwrite:
-            path.unlink(missing_ok=True)  # first: rows without settings are refused, should this be killed
-            for row in self.folder.glob("*.json"):
-                row.unlink()
-        elif path.is_file():
-            before = _read(path)
-            if before != plain(settings):
+            self.settings_path.unlink(missing_ok=True)  # first: rows without settings are refused after a kill
+            for path in self._files():
+                path.unlink()
+            self.refresh()
+        elif self.settings_path.is_file():
+            before, now = self.settings(), finite(settings)
+            if before != now:
                 raise InvalidInputError(
-                    f"{self.folder}: made with other settings ({_difference(before, plain(settings))}); "
-                    "choose another --out, or give --overwrite to start anew"
+                    f"{self.folder}: holds results of other settings ({_difference(before, now)}); "
+                    "choose another --out, or give --overwrite to start again"
                 )
             return
-        elif any(self.folder.glob("*.json")):
+        elif self._locations:
             raise InvalidInputError(
-                f"{self.folder}: predictions of unknown settings; choose another --out or --overwrite"
+                f"{self.folder}: holds results of unknown settings; choose another --out or --overwrite"
             )
-        write_text(path, to_json(settings))
+        write_file(self.settings_path, to_json(settings).encode())
 
-    def __contains__(self, key: str) -> bool:
-        return self._path(key).is_file()
-
-    def write(self, key: str, row: Row) -> None:
-        """Put the prediction of the object ``key`` on disk; values that are not finite become None."""
-        write_text(self._path(key), json.dumps(plain(row), allow_nan=False) + "\n")
-
-    def read(self, key: str) -> Row:
-        """The prediction of the object ``key``.
+    def settings(self) -> Row:
+        """The settings that :meth:`open` wrote.
 
         Raises:
-            InvalidInputError: the file is not there or damaged.
+            InvalidInputError: the file is missing or damaged.
         """
-        return _read(self._path(key))
+        path = self.settings_path
+        try:
+            settings = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InvalidInputError(f"{path}: missing or damaged ({error}); run curvireg evaluate first") from error
+        if not isinstance(settings, dict):
+            raise InvalidInputError(f"{path}: expected a JSON object; remove it and run again")
+        return settings
 
-    def _path(self, key: str) -> Path:
-        return self.folder / f"{quote(key, safe='')}.json"  # reversible: no two keys share a file
+    def refresh(self) -> None:
+        """Read again what is on disk, rows of other processes included."""
+        self._locations: dict[str, _Location] = {}
+        for path in self._files():
+            offset = 0
+            with path.open("rb") as file:
+                for line in file:
+                    if not line.endswith(b"\n"):
+                        break  # cut short
+                    self._add(path, offset, line)
+                    offset += len(line)
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._locations
+
+    def is_complete(self, keys: Iterable[str]) -> bool:
+        """Whether all processes together have written a row of each key."""
+        self.refresh()
+        return all(key in self for key in keys)
+
+    def is_current(self, key: str, digests: Mapping[str, str]) -> bool:
+        """Whether the row of ``key`` is final and depends on exactly what ``digests`` describes."""
+        found = self._locations.get(key)
+        return found is not None and found.final and bool(digests["photo"]) and found.digests == digests
+
+    def read(self, key: str) -> Row:
+        """The latest row of ``key``.
+
+        Raises:
+            InvalidInputError: there is none.
+        """
+        for _ in range(2):
+            if key in self._locations:
+                found = self._locations[key]
+                with found.path.open("rb") as file:
+                    file.seek(found.offset)
+                    line = file.readline()
+                if (row := _parsed(line)) is not None and row["key"] == key:
+                    return row
+            self.refresh()  # another process has rewritten the file
+        raise InvalidInputError(f"{self.folder}: no result for {key}; run again")
+
+    def append(self, row: Row) -> None:
+        """Put a row on disk; numbers that are not finite become null.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        before = self._locations.get(row["key"])
+        line = _line(row if before is None else {**row, "revision": before.revision + 1})
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if not self._repaired:
+                self._remove_cut_line()
+            with self._output.open("ab") as file:
+                offset = file.tell()
+                file.write(line)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise OutputError(f"{self._output}: cannot be written ({error.strerror}); free space, run again") from error
+        self._add(self._output, offset, line)
+
+    def rewrite(self, rows: Iterable[Row], *, remove_parts: bool) -> None:
+        """Replace ``results.jsonl`` by ``rows``.
+
+        Args:
+            rows: all that shall stay.
+            remove_parts: delete the files of the processes; only if none of them is still running.
+        """
+        dropped = ("revision",) if remove_parts else ()
+        write_file(self.path, b"".join(_line({k: v for k, v in row.items() if k not in dropped}) for row in rows))
+        for path in self._files()[1:] if remove_parts else []:
+            path.unlink()
+        self.refresh()
+
+    def merge(self) -> None:
+        """Move the rows of all processes, none of which is still running, into ``results.jsonl``."""
+        if len(self._files()) > 1:
+            self.rewrite(map(self.read, list(self._locations)), remove_parts=True)
+
+    def _files(self) -> list[Path]:
+        """``results.jsonl`` first."""
+        return [path for path in (self.path, *sorted(self.folder.glob("results.*-of-*.jsonl"))) if path.is_file()]
+
+    def _add(self, path: Path, offset: int, line: bytes) -> None:
+        row = _parsed(line)
+        if row is None:
+            raise InvalidInputError(f"{path}: not results of this command; choose another --out, or move it away")
+        revision, before = row.get("revision", 0), self._locations.get(row["key"])
+        if before is None or revision >= before.revision:
+            self._locations[row["key"]] = _Location(path, offset, row["digests"], revision, "skipped" not in row)
+
+    def _remove_cut_line(self) -> None:
+        self._repaired = True
+        if self._output.is_file():
+            content = self._output.read_bytes()
+            if not content.endswith(b"\n"):
+                os.truncate(self._output, content.rfind(b"\n") + 1)
 
 
-def _read(path: Path) -> Row:
+def _parsed(line: bytes) -> Row | None:
     try:
-        row = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InvalidInputError(f"{path}: missing or damaged ({error}); remove it and run again") from error
-    if not isinstance(row, dict):
-        raise InvalidInputError(f"{path}: expected a JSON object; remove it and run again")
-    return row
+        row = json.loads(line)
+        return row if isinstance(row["key"], str) and isinstance(row["digests"], dict) else None
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
 
 
 def _difference(before: Row, now: Row) -> str:

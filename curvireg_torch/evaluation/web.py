@@ -48,6 +48,7 @@ class WebBenchmark(Benchmark):
         return BenchmarkItem(
             key=f"{s['category']}/{s['object_index']}",
             index=index,
+            photo=Path(s["image_path"]),
             meshes=(Path(s["mesh_path"]),),
             box=s["box"],
             camera_matrix=None,

@@ -14,7 +14,7 @@ from ..rendering.protocol import DepthRenderer
 from ..utils.files import write_file
 from .overlay import draw_pose
 
-__all__ = ["Shown", "thumbnail", "write_sheet"]
+__all__ = ["SheetEntry", "thumbnail", "write_sheet"]
 
 SIDE = 224
 """Of a thumbnail, px."""
@@ -39,20 +39,20 @@ figcaption {{ overflow-wrap: anywhere }}
 
 
 @dataclass(frozen=True)
-class Shown:
+class SheetEntry:
     """A photograph on the page.
 
     Attributes:
         number: of its row, from 1.
         name: of the photograph.
-        said: how it ended.
+        caption: the outcome.
         kind: "right" or "reliable" (green), "doubtful" (orange), "wrong" or "failed" (red).
         picture: makes or reads its thumbnail, None where there is none; asked only of what is shown.
     """
 
     number: int
     name: str
-    said: str
+    caption: str
     kind: str
     picture: Callable[[], bytes | None]
 
@@ -87,7 +87,7 @@ def thumbnail(renderer: DepthRenderer, projection: tuple[Tensor, Tensor], image:
     return bytes(cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes())
 
 
-def write_sheet(path: Path, title: str, rows: Sequence[Shown], *, table: str, each: int | None = None) -> None:
+def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: str, each: int | None = None) -> None:
     """Write the page, whole in one file.
 
     Args:
@@ -106,10 +106,10 @@ def write_sheet(path: Path, title: str, rows: Sequence[Shown], *, table: str, ea
     write_file(path, _PAGE.format(title=html.escape(title), note=note, figures=figures).encode())
 
 
-def _figure(shown: Shown) -> str:
-    name, jpeg, picture = html.escape(shown.name), shown.picture(), ""
+def _figure(entry: SheetEntry) -> str:
+    name, jpeg, picture = html.escape(entry.name), entry.picture(), ""
     if jpeg is not None:
         data = base64.b64encode(jpeg).decode()
         picture = f'<img alt="contours over {name}" src="data:image/jpeg;base64,{data}">'
-    caption = f"<b>{shown.number}</b> {name}<br>{html.escape(shown.said)}"
-    return f'<figure class="{shown.kind}">{picture}<figcaption>{caption}</figcaption></figure>'
+    caption = f"<b>{entry.number}</b> {name}<br>{html.escape(entry.caption)}"
+    return f'<figure class="{entry.kind}">{picture}<figcaption>{caption}</figcaption></figure>'

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from curvireg_torch.evaluation import DATASETS, Benchmark, Protocol
-from curvireg_torch.evaluation.store import PredictionStore
+from curvireg_torch.evaluation.store import ResultStore
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_error, symmetry_transforms, transform
 from curvireg_torch.registration.confidence import RELIABLE
 from scripts._shared import table_lines
@@ -187,7 +187,7 @@ def success_rates(rows: Sequence[Row]) -> dict[str, Row]:
 
 def real_set(data: Path, runs: Path, name: str, covariance: Row) -> Row:
     """Quality of the stored predictions for a real set."""
-    objects, store = open_real_set(data, name), PredictionStore(runs / name / "predictions")
+    objects, store = open_real_set(data, name), ResultStore(runs / name)
     items = objects.selection(None)
     rows = [store.read(item.key) for item in items]
     right = (objects.rotation_errors(items, rows) < RIGHT).numpy()

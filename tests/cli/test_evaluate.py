@@ -8,7 +8,7 @@ import pytest
 from curvireg_torch.cli import parse
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.evaluation import contact_sheet
-from curvireg_torch.evaluation.localisation import localisation
+from curvireg_torch.evaluation.localization import localization_recall
 from curvireg_torch.pipeline import DEFAULT, PRESETS
 from tests.evaluation.small import SMALL
 
@@ -52,22 +52,22 @@ def test_without_boxes(pascal, tmp_path, capsys, monkeypatch):
     """Recall of boxes is told beside the pose's scores; where no box is annotated, that is said."""
     evaluate("pascal3d", pascal.root, "--limit", "2", "--out", tmp_path / "out", "--protocol", "box=none")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["localisation"]["n"] == 2
-    assert f"recall_1 {summary['localisation']['recall_1']:.3f}   recall_5" in capsys.readouterr().out
+    assert summary["localization"]["n"] == 2
+    assert f"recall_1 {summary['localization']['recall_1']:.3f}   recall_5" in capsys.readouterr().out
     contact_sheet(tmp_path / "out", tmp_path / "sheet.html")
     row = next(row for row in rows_of(tmp_path / "out") if "localization" in row)
     seen = []
     monkeypatch.setattr("curvireg_torch.evaluation.sheet.thumbnail", lambda *a: seen.append(a[3]) or b"")
     contact_sheet(tmp_path / "out", tmp_path / "sheet.html")
-    assert row["localization"]["boxes"][0] in seen, "the page shows the box that was found"
-    summary["localisation"] = localisation([], [])
-    monkeypatch.setattr("curvireg_torch.evaluation.loops.evaluate", lambda *_, **__: summary)
+    assert row["localization"]["proposals"][0]["box"] in seen, "the page shows the box that was found"
+    summary["localization"] = localization_recall([], [])
+    monkeypatch.setattr("curvireg_torch.evaluation.datasets.evaluate", lambda *_, **__: summary)
     evaluate("pascal3d", pascal.root, "--limit", "2", "--out", tmp_path / "out", "--protocol", "box=none")
     assert "no box is annotated" in capsys.readouterr().out
 
 
 def rows_of(folder):
-    return [json.loads(path.read_text()) for path in (folder / "predictions").glob("*%2F*.json")]
+    return [json.loads(line) for line in (folder / "results.jsonl").read_text().splitlines()]
 
 
 def test_errors_come_before_any_work(pascal, bop, tmp_path):

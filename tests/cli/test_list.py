@@ -1,16 +1,13 @@
 """``curvireg register --list``: the contract of its files."""
 
 import json
-from dataclasses import replace
 
 import pytest
 import torch
 
 from curvireg_torch import Pipeline, ViewBank, sample_views
 from curvireg_torch.cli import main
-from curvireg_torch.evaluation.lists import run as loop
-from curvireg_torch.evaluation.lists.listing import Entry
-from curvireg_torch.evaluation.lists.records import Records
+from curvireg_torch.evaluation.lists import register as loop
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import CAMERA, RESULTS, box_of, lines, table, write_files, written
@@ -160,32 +157,6 @@ def test_it_goes_on_where_it_was(folder, monkeypatch, capsys):
     assert register(path, "--no-refine", "--top", "2", out="resumed") == 0
     assert done == names
     assert "3 photographs: 3 ok" in capsys.readouterr().out
-
-
-def test_other_mesh_files_and_other_distances_are_done_again(folder):
-    """A request is known by every file of its mesh, and by all that narrows the search for an object without a box."""
-    skin = folder / "skin.png"
-    skin.write_bytes((folder / "photos" / "0.png").read_bytes())
-    text = "mtllib skin.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl skin\nf 1/1 2/2 3/3\n"
-    (folder / "skin.obj").write_text(text)
-    (folder / "skin.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
-    entry = Entry(("0.png",), "0.png", folder / "photos" / "0.png", (folder / "skin.obj",))
-    assert request(entry) == request(entry)
-    others = [replace(entry, distance=(0.4, 0.9)), replace(entry, distance=(0.4, 0.8)), replace(entry, instances=2)]
-    others += [replace(entry, box=(1.0, 2.0, 3.0, 4.0)), replace(entry, camera=(260.0, 260.0, 119.5, 89.5))]
-    others += [replace(entry, camera=(260.0, 260.0, 119.5, 89.25)), replace(entry, guess=60.0)]
-    requests = [request(one) for one in (entry, *others)]
-    skin.write_bytes((folder / "photos" / "1.png").read_bytes())
-    requests.append(request(entry))
-    (folder / "skin.mtl").write_text("newmtl skin\nKd 1 0 0\n")
-    requests.append(request(entry))
-    assert len(set(requests)) == len(requests)
-
-
-def request(entry):
-    """What a new run calls the request of an entry."""
-    run = loop._Run(Records(entry.photo.parent / "requests"), lambda _: None, "{}", progress=False)
-    return run._request(entry)
 
 
 def test_a_photograph_that_was_missing_is_tried_again(folder):

@@ -117,7 +117,7 @@ def test_coco_boxes_count_from_the_pictures_corner(tmp_path):
     first, second = found.entries
     assert (first.photo, first.box) == (tmp_path / "b.jpg", (-0.5, 9.5, 19.5, 39.5))
     assert first.cells[5:] == ("5", "8", "truck")
-    assert "no bbox" in second.trouble
+    assert "no bbox" in second.error
 
 
 def test_a_scene_of_a_bop_set(tmp_path):
@@ -132,9 +132,7 @@ def test_a_scene_of_a_bop_set(tmp_path):
     scene = tmp_path / "test" / f"{scene_id:06d}"
     found = read_list(scene)
     usable = {
-        (str(entry.photo), entry.box, entry.camera, entry.meshes[0].name)
-        for entry in found.entries
-        if not entry.trouble
+        (str(entry.photo), entry.box, entry.camera, entry.meshes[0].name) for entry in found.entries if not entry.error
     }
     assert items
     for item in items:
@@ -142,7 +140,7 @@ def test_a_scene_of_a_bop_set(tmp_path):
         camera = tuple(float(v) for v in (K[0][0], K[1][1], K[0][2], K[1][2]))
         mesh = item["model_path"].rpartition("/")[2]
         assert (item["image_path"], tuple(item["box"].tolist()), camera, mesh) in usable
-    assert any("no bbox_obj" in entry.trouble for entry in found.entries)
+    assert any("no bbox_obj" in entry.error for entry in found.entries)
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,12 @@
-"""``python -m tests.evaluation.small``: the command with a bank so small that tests are quick, and a way to die.
+"""``python -m tests.evaluation.small WORDS``: the command line with a small bank, and a way to kill it.
 
-``CURVIREG_TEST_KILL=n`` kills the process with signal 9 when it is about to give the n-th file its name.
+``CURVIREG_TEST_KILL=n`` kills the process with signal 9 in its n-th write of a result, whose last bytes are lost.
 """
 
 import os
 import signal
 import sys
+from pathlib import Path
 
 from curvireg_torch.cli import main
 from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline
@@ -20,22 +21,24 @@ SMALL = Pipeline(
 )
 
 
-def die_at(count: int) -> None:
-    """Kill this process at its ``count``-th rename within an evaluation's folder."""
-    replace, seen = os.replace, 0
+def kill_in_write(count: int) -> None:
+    """Kill this process in its ``count``-th write of a file that is neither a bank nor a picture."""
+    sync, writes = os.fsync, 0
 
-    def replace_or_die(source, target):
-        nonlocal seen
-        seen += not str(target).endswith(".safetensors")
-        if seen == count:
+    def sync_or_die(file):
+        nonlocal writes
+        name = Path(f"/proc/self/fd/{file}").readlink().name
+        writes += not any(kind in name for kind in (".safetensors", ".jpg", ".probe"))
+        if writes == count:
+            os.truncate(file, os.fstat(file).st_size - 20)
             os.kill(os.getpid(), signal.SIGKILL)
-        replace(source, target)
+        sync(file)
 
-    os.replace = replace_or_die
+    os.fsync = sync_or_die
 
 
 if __name__ == "__main__":
     PRESETS[DEFAULT] = SMALL
     if "CURVIREG_TEST_KILL" in os.environ:
-        die_at(int(os.environ["CURVIREG_TEST_KILL"]))
-    sys.exit(main(["evaluate", *sys.argv[1:]]))
+        kill_in_write(int(os.environ["CURVIREG_TEST_KILL"]))
+    sys.exit(main([*sys.argv[1:], "--quiet"]))

@@ -1,4 +1,4 @@
-"""Several processes, and processes that die."""
+"""Evaluations and lists in several processes, and in processes that are killed."""
 
 import csv
 import json
@@ -10,58 +10,109 @@ from pathlib import Path
 
 import pytest
 
-from curvireg_torch.data import BOPDataset
-from curvireg_torch.evaluation import Benchmark, BOPBenchmark, Pascal3DBenchmark, Protocol, evaluate
+from curvireg_torch.cli import main
+from tests._support.lists import RESULTS, box_of, lines, table, write_files, written
 
 REPOSITORY = Path(__file__).parents[2]
+PYTHON = (sys.executable, "-m")
+TORCHRUN = (*PYTHON, "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m")
+
+pytestmark = pytest.mark.slow
 
 
-def start(*words, launcher=(sys.executable, "-m"), kill=None):
+def run(words, *, launcher=PYTHON, **variables):
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPOSITORY)}
-    if kill is not None:
-        environment["CURVIREG_TEST_KILL"] = str(kill)
     return subprocess.run(
-        [*launcher, "tests.evaluation.small", *map(str, words), "--quiet"],
-        env=environment, cwd=REPOSITORY, capture_output=True, text=True, timeout=120,
+        [*launcher, "tests.evaluation.small", *map(str, words)],
+        env={**environment, **{name: str(value) for name, value in variables.items()}},
+        cwd=REPOSITORY, capture_output=True, text=True, timeout=120,
     )  # fmt: skip
 
 
-def results(out):
-    """Everything that was written, without timings."""
+def evaluation(out):
+    """Everything that an evaluation wrote, without times."""
     summary = json.loads((out / "summary.json").read_text())
     del summary["seconds"]
-    text = (out / "predictions.csv").read_text()
     with open(out / "predictions.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     for row in rows:
         del row[{"seconds", "time"}.intersection(row).pop()]
-    return summary, rows, text.count("\n")
+    return summary, rows
 
 
-@pytest.mark.slow
-def test_killed_and_started_again(pascal, tmp_path):
-    evaluate(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "whole", progress=False)
-    words = ("pascal3d", pascal.root, "--out", tmp_path / "killed")
-    for kill in (1, 3, 5):  # at its settings, at the second prediction, at predictions.csv
-        assert start(*words, kill=kill).returncode == -signal.SIGKILL
-        assert not (tmp_path / "killed" / "predictions.csv").exists()
-    done = start(*words)
+def list_results(out):
+    """Everything that a list wrote, without times."""
+    rows = [{k: v for k, v in row.items() if k not in ("seconds", "revision")} for row in lines(out)]
+    return rows, (out / "results.csv").read_text(), (out / "index.html").read_text()
+
+
+@pytest.fixture(params=["pascal3d", "bop", "list"])
+def case(request, tmp_path):
+    """The words of a command without ``--out``, and a function that reads what it wrote."""
+    if request.param != "list":
+        dataset = request.getfixturevalue(request.param.removesuffix("3d"))
+        return ["evaluate", request.param, dataset.root], evaluation
+    write_files(tmp_path)
+    rows = [[f"photos/{seed}.png", *box_of(seed), mesh] for seed in range(3) for mesh in ("truck.ply", "other.ply")]
+    (tmp_path / "other.ply").write_bytes((tmp_path / "truck.ply").read_bytes())
+    path = written(tmp_path / "list.csv", "photo,x0,y0,x1,y1,mesh", *rows, ["none.png", "", "", "", "", "truck.ply"])
+    return ["register", "--list", path], list_results
+
+
+@pytest.fixture
+def expected(case, tmp_path):
+    words, read = case
+    assert main([*map(str, words), "--out", str(tmp_path / "one"), "--quiet"]) == 0
+    return read(tmp_path / "one")
+
+
+def test_killed_runs_continue(case, expected, tmp_path):
+    words, read = case
+    out = tmp_path / "killed"
+    for write in (2, 3, 1):
+        assert run([*words, "--out", out], CURVIREG_TEST_KILL=write).returncode == -signal.SIGKILL
+        assert not (out / "summary.json").exists()
+        assert not (out / "results.csv").exists()
+    assert not (out / "results.jsonl").read_bytes().endswith(b"\n"), "a line was cut short"
+    done = run([*words, "--out", out])
     assert done.returncode == 0, done.stderr
-    assert results(tmp_path / "killed") == results(tmp_path / "whole")
-    assert len(list((tmp_path / "killed" / "predictions").glob("*.json"))) == 6, "five objects and the settings"
+    assert read(out) == expected
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["pascal3d", "bop"])
-def test_two_processes_do_the_same_as_one(request, tmp_path, kind):
-    dataset = request.getfixturevalue(kind.removesuffix("3d"))
-    if kind == "bop":
-        alone: Benchmark = BOPBenchmark(BOPDataset(dataset.root), Protocol(pose="any"))
-    else:
-        alone = Pascal3DBenchmark(dataset, Protocol())
-    evaluate(alone, tmp_path / "one", progress=False)
-    torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m")
-    two = start(kind, dataset.root, "--out", tmp_path / "two", launcher=torchrun)
-    assert two.returncode == 0, two.stderr
-    assert results(tmp_path / "two") == results(tmp_path / "one")
-    assert two.stdout.count("protocol:") == 1, "one process reports"
+def test_torchrun_gives_the_same_results(case, expected, tmp_path):
+    words, read = case
+    out = tmp_path / "two"
+    done = run([*words, "--out", out], launcher=TORCHRUN)
+    assert done.returncode == 0, done.stderr
+    assert read(out) == expected
+    assert done.stdout.count(f"see {out}") == 1, "one process reports"
+    assert not list(out.glob("results.*-of-*")), "the files of the processes are merged"
+
+
+def test_job_array_gives_the_same_results(case, expected, tmp_path):
+    words, read = case
+    out = tmp_path / "array"
+    for rank in (1, 0):
+        done = run([*words, "--out", out], RANK=rank, WORLD_SIZE=2)
+        assert done.returncode == 0, done.stderr
+        assert (f"see {out}" in done.stdout) == (rank == 0), "the last job completes it"
+    assert read(out) == expected
+    assert len(list(out.glob("results.*-of-2.jsonl"))) == 2
+    assert run([*words, "--out", out]).returncode == 0
+    assert read(out) == expected
+    assert not list(out.glob("results.*-of-*"))
+
+
+def test_results_have_the_columns_of_the_list(tmp_path):
+    write_files(tmp_path)
+    path = written(tmp_path / "list.csv", "photo,x0,y0,x1,y1", ["photos/0.png", *box_of(0)])
+    words = ["register", "--list", path, tmp_path / "truck.ply", "--out", tmp_path / "out"]
+    assert run(words, launcher=TORCHRUN).returncode == 0, "fewer photographs than processes"
+    assert list(table(tmp_path / "out")[0])[5:] == RESULTS
+
+
+def test_overwrite_is_refused_in_a_job_array(pascal, tmp_path):
+    words = ["evaluate", "pascal3d", pascal.root, "--out", tmp_path, "--overwrite"]
+    done = run(words, RANK=0, WORLD_SIZE=2)
+    assert done.returncode == 2
+    assert "job array" in done.stderr

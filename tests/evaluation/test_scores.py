@@ -10,7 +10,7 @@ import trimesh
 from curvireg_torch.data import Pascal3DPlus, read_bop_csv
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, score
-from curvireg_torch.evaluation.store import PredictionStore
+from curvireg_torch.evaluation.store import ResultStore
 from curvireg_torch.geometry import rotation_from_viewpoint
 from tests._support.miniature import pascal_object, write_image, write_mesh, write_record
 
@@ -27,11 +27,11 @@ def turned(sample, axis, degrees):
 
 
 def write_predictions(benchmark, out, rows):
-    store = PredictionStore(out / "predictions")
+    store = ResultStore(out)
     store.open({"root": "/some/where", "protocol": str(benchmark.protocol)})
     for item, row in zip(benchmark.items, rows, strict=True):
         full = {"score": 0.5, "confidence": 0.5, "mesh": "01.off", "image_size": [60, 80], "seconds": SECONDS}
-        store.write(item.key, row if "skipped" in row else full | row)
+        store.append({"key": item.key, "digests": {}, **(row if "skipped" in row else full | row)})
 
 
 @pytest.fixture
@@ -174,7 +174,7 @@ def test_nothing_to_score(tmp_path, bop, furniture, kind):
 
 
 def test_missing_prediction_is_named(furniture, tmp_path):
-    PredictionStore(tmp_path / "out" / "predictions").open({"root": "x"})
+    ResultStore(tmp_path / "out").open({"root": "x"})
     with pytest.raises(InvalidInputError, match=r"bottle.*run again"):
         score(furniture, tmp_path / "out")
 

@@ -2,68 +2,128 @@ import json
 
 import pytest
 
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evaluation.store import PredictionStore, to_json, write_text
+from curvireg_torch.errors import InvalidInputError, OutputError
+from curvireg_torch.evaluation.store import ResultStore, to_json
+from curvireg_torch.evaluation.workers import Workers
+
+DIGESTS = {"request": "a", "photo": "b"}
 
 
-def test_keys_do_not_share_files(tmp_path):
-    store = PredictionStore(tmp_path / "new" / "predictions")
-    store.open({})
-    keys = ["a/1", "a-1", "a 1", "a%2F1", "../a", "settings/1"]
+def row(key, **values):
+    return {"key": key, "digests": DIGESTS, **values}
+
+
+def test_rows_are_read_again(tmp_path):
+    store = ResultStore(tmp_path / "new")
+    keys = ["a/1", "a-1", "../a", "é"]
     for i, key in enumerate(keys):
         assert key not in store
-        store.write(key, {"i": i})
-    assert [store.read(key)["i"] for key in keys] == list(range(len(keys)))
-    assert {p.parent for p in tmp_path.rglob("*.json")} == {store.folder}
+        store.append(row(key, i=i, value=float("nan")))
+    for again in (store, ResultStore(tmp_path / "new")):
+        assert [again.read(key) for key in keys] == [row(key, i=i, value=None) for i, key in enumerate(keys)]
+        assert again.is_complete(keys)
+        assert not again.is_complete([*keys, "b"])
+    with pytest.raises(InvalidInputError, match=r"no result for b; run again"):
+        store.read("b")
+
+
+@pytest.mark.parametrize("workers", [None, Workers(1, 2)])
+def test_rows_replace_older_ones(tmp_path, workers):
+    """Also those in the file of another process that sorts later."""
+    ResultStore(tmp_path, Workers(2, 3)).append(row("a", i=0))
+    for i in (1, 2):
+        store = ResultStore(tmp_path, workers)
+        store.append(row("a", i=i))
+        assert store.read("a")["i"] == ResultStore(tmp_path).read("a")["i"] == i
+    store.merge()
+    assert [path.name for path in tmp_path.iterdir()] == ["results.jsonl"]
+    assert store.read("a") == row("a", i=2)
+
+
+def test_is_current_compares_digests(tmp_path):
+    store = ResultStore(tmp_path)
+    store.append(row("a"))
+    store.append(row("b", skipped="unreadable_image"))
+    store.append({"key": "c", "digests": {"request": "a", "photo": ""}})
+    assert store.is_current("a", dict(DIGESTS))
+    assert not store.is_current("a", {**DIGESTS, "request": "c"})
+    assert not store.is_current("a", {**DIGESTS, "photo": "c"})
+    assert not store.is_current("b", DIGESTS), "what was skipped is tried again"
+    assert not store.is_current("c", {"request": "a", "photo": ""}), "the photograph could not be read"
+    assert not store.is_current("d", DIGESTS)
+
+
+@pytest.mark.parametrize("cut", [1, 20, -1])
+def test_cut_line_is_removed(tmp_path, cut):
+    store = ResultStore(tmp_path)
+    for key in "abc":
+        store.append(row(key))
+    whole = store.path.read_bytes()
+    last = whole.splitlines(keepends=True)[-1][:cut]
+    store.path.write_bytes(whole[: whole.rindex(b'{"key"')] + last)
+    reader, store = ResultStore(tmp_path), ResultStore(tmp_path)
+    assert [key in reader for key in "abc"] == [True, True, False]
+    store.append(row("c"))
+    assert store.path.read_bytes() == whole
+    assert store.read("c") == row("c")
+
+
+def test_read_finds_rows_that_have_moved(tmp_path):
+    """As when another job of an array writes results.jsonl in the order of its list."""
+    store, other = ResultStore(tmp_path), ResultStore(tmp_path)
+    for key in "ab":
+        store.append(row(key, i=key))
+    other.refresh()
+    store.rewrite([row(key, i=key, more=1) for key in "ba"], remove_parts=False)
+    assert other.read("a") == row("a", i="a", more=1)
+
+
+@pytest.mark.parametrize("content", ['{"score": 1}\n', "[1]\n", "no JSON\n", '{"key": "a"}\n', "[" * 100_000 + "\n"])
+def test_other_files_are_refused(tmp_path, content):
+    (tmp_path / "results.jsonl").write_text(content)
+    with pytest.raises(InvalidInputError, match=r"results\.jsonl: not results"):
+        ResultStore(tmp_path)
 
 
 def test_other_settings_are_refused(tmp_path):
-    store = PredictionStore(tmp_path)
+    store = ResultStore(tmp_path)
     store.open({"preset": "a", "seed": 1})
-    store.write("x/1", {})
+    store.append(row("x"))
     store.open({"preset": "a", "seed": 1})
     with pytest.raises(InvalidInputError, match=r"preset: 'a' there, 'b' now.*--overwrite"):
         store.open({"preset": "b", "seed": 1})
-    assert "x/1" in store
+    assert "x" in store
     store.open({"preset": "b", "seed": 1}, overwrite=True)
-    assert "x/1" not in store
-    store.open({"preset": "b", "seed": 1})
+    assert "x" not in store
+    assert not store.path.exists()
+    assert store.settings() == {"preset": "b", "seed": 1}
 
 
-def test_predictions_without_settings_are_refused(tmp_path):
-    store = PredictionStore(tmp_path)
-    store.write("x/1", {})
+def test_results_without_settings_are_refused(tmp_path):
+    store = ResultStore(tmp_path)
+    with pytest.raises(InvalidInputError, match="missing or damaged"):
+        store.settings()
+    store.append(row("x"))
     with pytest.raises(InvalidInputError, match="unknown settings"):
         store.open({})
+    store.settings_path.write_text("[1]")
+    with pytest.raises(InvalidInputError, match="expected a JSON object"):
+        store.settings()
 
 
-def test_damaged_prediction_is_named(tmp_path):
-    store = PredictionStore(tmp_path)
-    for content in ("{", "[1]"):
-        tmp_path.joinpath("x.json").write_text(content)
-        with pytest.raises(InvalidInputError, match=r"x\.json.*remove it"):
-            store.read("x")
-
-
-def test_file_appears_whole_or_not_at_all(tmp_path, monkeypatch):
-    path = tmp_path / "a.json"
-    write_text(path, "old")
+def test_folder_that_cannot_be_written(tmp_path, monkeypatch):
+    (tmp_path / "out").write_text("")
+    with pytest.raises(OutputError, match="choose another --out"):
+        ResultStore(tmp_path / "out").open({})
 
     def full_disk(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("os.replace", full_disk)
-    with pytest.raises(InvalidInputError, match="No space left"):
-        write_text(path, "new")
-    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
-    assert path.read_text() == "old"
+    store = ResultStore(tmp_path)
+    monkeypatch.setattr("os.fsync", full_disk)
+    with pytest.raises(OutputError, match="No space left"):
+        store.append(row("x"))
 
 
-def test_folder_that_is_a_file(tmp_path):
-    tmp_path.joinpath("out").write_text("")
-    with pytest.raises(InvalidInputError, match="choose another --out"):
-        PredictionStore(tmp_path / "out" / "predictions").open({})
-
-
-def test_json_holds_no_nan():
+def test_to_json_writes_null_for_nan():
     assert json.loads(to_json({"a": float("nan"), "b": [float("inf"), 1.5]})) == {"a": None, "b": [None, 1.5]}

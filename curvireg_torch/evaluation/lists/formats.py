@@ -10,17 +10,17 @@ from typing import Any
 from ...data.bop import bop_box, entry_at
 from ...errors import InvalidInputError, MissingFileError
 from ...io.json_files import check_table_size, finite_numbers
-from .listing import BOX, CAMERA, Listing, listing
+from .entries import BOX, CAMERA, PhotoList, photo_list
 
 __all__ = ["read_list"]
 
 Row = dict[str, Any]
 
 
-def read_list(path: Path, meshes: Sequence[Path] = ()) -> Listing:
+def read_list(path: Path, meshes: Sequence[Path] = ()) -> PhotoList:
     """The photographs of a list on disk.
 
-    - ``.csv``: a header and the columns of :func:`listing`; blank lines are no rows.
+    - ``.csv``: a header and the columns of :func:`photo_list`; blank lines are no rows.
     - ``.json``: a list of objects ``{"photo": "a.jpg", "box": [x0, y0, x1, y1], "camera": [fx, fy, cx, cy], "mesh":
       "part.stl"}``, all but ``photo`` if wanted; other keys are passed through. Or COCO annotations: one row each, with
       ``image_id``, ``annotation_id`` and ``category``; COCO counts pixels from the picture's corner, so half a pixel is
@@ -53,7 +53,7 @@ def read_list(path: Path, meshes: Sequence[Path] = ()) -> Listing:
         if path.suffix.lower() != ".json":
             table = csv.reader(io.StringIO(text, newline=""), strict=True)
             lines = [cells for cells in table if any(map(str.strip, cells))]
-            return listing(str(path), lines[0] if lines else [], lines[1:], path.parent, meshes)
+            return photo_list(str(path), lines[0] if lines else [], lines[1:], path.parent, meshes)
         content = json.loads(text)
     except (UnicodeDecodeError, csv.Error) as error:
         raise InvalidInputError(f"{path}: not a table in UTF-8 ({error}); save it as CSV in UTF-8") from error
@@ -66,10 +66,10 @@ def read_list(path: Path, meshes: Sequence[Path] = ()) -> Listing:
     return _listed(path, [_row(entry) for entry in content], path.parent, meshes)
 
 
-def _listed(path: Path, rows: Sequence[Row], folder: Path, meshes: Sequence[Path]) -> Listing:
+def _listed(path: Path, rows: Sequence[Row], folder: Path, meshes: Sequence[Path]) -> PhotoList:
     """A table of all keys that rows have."""
     columns = list(dict.fromkeys(["photo", *BOX, *(key for row in rows for key in row)]))
-    return listing(str(path), columns, [[_text(row.get(name)) for name in columns] for row in rows], folder, meshes)
+    return photo_list(str(path), columns, [[_text(row.get(name)) for name in columns] for row in rows], folder, meshes)
 
 
 def _text(value: Any) -> str:

@@ -11,7 +11,7 @@ from ...limits import MAX_IMAGE_PIXELS
 from ...utils.choices import IMAGES, VIDEOS
 from ...utils.files import write_file
 from ...utils.input_paths import is_one_photograph, is_pattern
-from .listing import Listing, listing
+from .entries import PhotoList, photo_list
 
 __all__ = ["is_one_photograph", "list_photographs"]
 
@@ -26,7 +26,7 @@ def list_photographs(
     camera: Sequence[float] | None = None,
     every: int = 1,
     frames: Path,
-) -> Listing:
+) -> PhotoList:
     """A list of photographs, all with the same box and camera.
 
     Args:
@@ -45,7 +45,7 @@ def list_photographs(
         raise InvalidInputError(f"--every: expected >= 1, got {every}")
     numbers = [*([""] * 4 if box is None else map(str, box)), *([""] * 4 if camera is None else map(str, camera))]
     rows = [[str(photo), *numbers] for path in paths for photo in _found(path, every, frames)]
-    return listing("photographs", _COLUMNS, rows, Path(), meshes)
+    return photo_list("photographs", _COLUMNS, rows, Path(), meshes)
 
 
 def _found(path: Path, every: int, frames: Path) -> Iterator[Path]:

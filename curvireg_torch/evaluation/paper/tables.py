@@ -9,7 +9,6 @@ from pathlib import Path
 from ...errors import MissingDependencyError
 from ...utils.files import write_file
 from ...visualization import plots
-from ..store import write_text
 
 __all__ = ["Table", "write_table"]
 
@@ -63,8 +62,8 @@ class Table:
 def write_table(table: Table, folder: Path) -> list[Path]:
     """Write ``NAME.csv``, ``NAME.md`` and, where matplotlib is installed, ``NAME.png``; returns their paths."""
     paths = [folder / f"{table.name}.{suffix}" for suffix in ("csv", "md")]
-    write_text(paths[0], table.csv())
-    write_text(paths[1], table.markdown())
+    write_file(paths[0], table.csv().encode())
+    write_file(paths[1], table.markdown().encode())
     try:
         figure = (plots.curves if table.curve else plots.bars)(table.columns, table.rows, title=table.title, ylabel="")
     except MissingDependencyError:

@@ -1,0 +1,226 @@
+"""Registration of a list of photographs."""
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ...errors import BankError, CurviregError, ImageError, InvalidInputError, MeshError
+from ...geometry import camera_matrix
+from ...geometry.cameras import camera_of_view
+from ...io import Photo, read_photo
+from ...registration import FailedRegistration, Registrar, Registration, localize
+from ...registration.document import SCHEMA, localization_document, result_document, used_box
+from ...utils.files import write_file
+from ...visualization.sheet import SheetEntry, thumbnail, write_sheet
+from ..runner import OpenRegistrar, run_items
+from ..store import ResultStore, Row
+from ..workers import workers
+from .entries import Entry, PhotoList
+from .tables import write_bop_results, write_results
+
+__all__ = ["Counts", "register_entry", "register_list"]
+
+_NO_DIGESTS = {"request": "", "photo": ""}
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Numbers of rows with a pose, without one, and with a reliable one."""
+
+    ok: int
+    failed: int
+    reliable: int
+
+    def __str__(self) -> str:
+        return f"{self.ok + self.failed} photographs: {self.ok} ok, {self.failed} failed, {self.reliable} reliable"
+
+
+def register_list(
+    photos: PhotoList,
+    out: Path,
+    open_registrar: OpenRegistrar,
+    *,
+    settings: Mapping[str, Any],
+    progress: bool = True,
+) -> Counts | None:
+    """Register the photographs of a list; ``out`` gets ``results.jsonl``, ``results.csv`` and ``index.html``.
+
+    A second call registers only what is new or has changed, see :func:`~curvireg_torch.evaluation.runner.run_items`. A
+    row that cannot be registered (photograph or mesh missing or damaged, invalid box or camera) ends as ``failed``,
+    with the reason; it does not stop the others. Under ``torchrun``, or in a job array that sets ``RANK`` and
+    ``WORLD_SIZE``, each process registers a part of the rows.
+
+    Args:
+        photos: the list.
+        out: folder for the results.
+        open_registrar: opens the registrar of one mesh, or of several.
+        settings: plain values, all that results depend on besides the files.
+        progress: show a bar.
+
+    Returns:
+        The counts; None in processes that do not write the tables.
+
+    Raises:
+        CurviregError: ``open_registrar`` refuses its options, or ``out`` cannot be written to.
+    """
+
+    def opened(meshes: tuple[Path, ...]) -> Registrar | Exception:
+        try:
+            return open_registrar(meshes)
+        except (MeshError, BankError, OSError) as error:
+            return error
+
+    def register(entry: Entry, registrar: Registrar | Exception, seconds: float, digests: Row) -> Row:
+        return _register(entry, registrar, seconds, _thumbnail_path(out, digests))
+
+    items = list({entry.key: entry for entry in photos.entries if not entry.error}.values())
+    with workers() as group:
+        if (out / "settings.json").exists():
+            raise InvalidInputError(f"{out}: holds the evaluation of a dataset; choose another --out")
+        if group.leads:
+            ResultStore(out).merge()
+        group.wait()
+        for older in ("results.csv", "index.html", "bop.csv"):  # they would not match newer rows
+            (out / older).unlink(missing_ok=True)
+        store = ResultStore(out, group)
+        run_items(
+            items,
+            store,
+            opened,
+            register,
+            settings=dict(settings),
+            workers=group,
+            label="register",
+            progress=progress and group.rank == 0,
+        )
+        group.wait()
+        if not group.reports or not store.is_complete(entry.key for entry in items):
+            return None
+        return _write_tables(photos, out, store, remove_parts=group.leads)
+
+
+def register_entry(
+    entry: Entry, photo: Photo, registrar: Registrar, *, bank_seconds: float
+) -> tuple[Registration, Row]:
+    """Register one photograph.
+
+    Args:
+        entry: its name, box and camera.
+        photo: as read from its file.
+        registrar: of its meshes.
+        bank_seconds: time that opening the registrar took.
+
+    Returns:
+        The registration, and its document.
+
+    Raises:
+        CurviregError: it cannot be registered; the message begins with the photograph's name.
+    """
+    start = time.perf_counter()
+    K, source = _camera(entry, photo)
+    if entry.box is None:
+        results = localize(registrar, [photo.image], K, instances=entry.instances, distance=entry.distance)[0]
+    else:
+        results = registrar([photo.image], torch.tensor(entry.box)[None], K)
+    result = results[0]
+    if isinstance(result, FailedRegistration):
+        raise result.error.with_subject(entry.name)
+    box = torch.tensor(entry.box) if result.localization is None else result.localization.box
+    document = result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start})
+    document["mesh"] = str(entry.meshes[result.model])
+    for pose, hypothesis in zip(document["top"], result.hypotheses, strict=True):
+        pose["mesh"] = str(entry.meshes[hypothesis.model])
+    document["inputs"] = {
+        "photo": entry.name,
+        "mesh": ", ".join(map(str, entry.meshes)),
+        "box": box.tolist(),
+        "camera": None if K is None else [float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))],
+        "camera_source": source,
+        "picture": photo.facts(),
+    }
+    if result.localization is not None:
+        document["localization"] = localization_document([r for r in results if isinstance(r, Registration)])
+    if source in ("exif", "fov"):  # the error of a guessed camera is unknown
+        document["covariance"] = document["standard_deviations"] = document["squared_radius"] = None
+    return result, document
+
+
+def _camera(entry: Entry, photo: Photo) -> tuple[torch.Tensor | None, str | None]:
+    """(3, 3) camera matrix, and its source: "given", "exif" or "fov"."""
+    if entry.camera is not None:
+        return camera_matrix(*entry.camera, dtype=torch.float64), "given"
+    if entry.guess is None:
+        return None, None
+    if isinstance(entry.guess, float):
+        H, W = photo.image.shape[-2:]
+        return camera_of_view(entry.guess, (H, W)), "fov"
+    K = photo.guessed_camera_matrix()
+    if K is None:
+        raise InvalidInputError(f"{entry.name}: no focal length in its EXIF; give --camera FX FY CX CY, or --fov DEG")
+    return K, "exif"
+
+
+def _register(entry: Entry, registrar: Registrar | Exception, bank_seconds: float, picture: Path) -> Row:
+    """The row of an entry; its thumbnail is on disk before."""
+    try:
+        photo = read_photo(entry.photo, dtype=torch.uint8)
+    except (CurviregError, OSError) as error:
+        return _failed(str(error))
+    if isinstance(registrar, Exception):
+        return _failed(str(registrar))
+    try:
+        result, document = register_entry(entry, photo, registrar, bank_seconds=bank_seconds)
+    except (ImageError, InvalidInputError) as error:
+        return _failed(str(error))
+    renderer = registrar.describers[result.model].renderer
+    write_file(picture, thumbnail(renderer, result.projection, photo.image, used_box(document)))
+    return {"status": "ok", "message": "", **document}
+
+
+def _failed(message: str) -> Row:
+    return {"schema": SCHEMA, "status": "failed", "message": " ".join(message.split())}
+
+
+def _thumbnail_path(out: Path, digests: Row) -> Path:
+    return out / "thumbnails" / f"{digests['request']}.jpg"
+
+
+def _write_tables(photos: PhotoList, out: Path, store: ResultStore, *, remove_parts: bool) -> Counts:
+    entries = photos.entries
+    sheet = [_sheet_entry(entry, row, out) for entry, row in zip(entries, _rows(photos, store), strict=True)]
+    kinds = [shown.kind for shown, _ in sheet]
+    counts = Counts(len(kinds) - kinds.count("failed"), kinds.count("failed"), kinds.count("reliable"))
+    sheet.sort(key=lambda pair: pair[1])
+    several = any(len(entry.meshes) > 1 for entry in entries)
+    write_sheet(out / "index.html", str(counts), [shown for shown, _ in sheet], table="results.csv")
+    store.rewrite(_rows(photos, store), remove_parts=remove_parts)
+    write_bop_results(out / "bop.csv", photos.columns, _rows(photos, store))
+    write_results(out / "results.csv", photos.columns, _rows(photos, store), best_mesh=several)
+    return counts
+
+
+def _rows(photos: PhotoList, store: ResultStore) -> Iterator[Row]:
+    """The result of each entry, in the order of the list, with its number and its cells."""
+    for number, entry in enumerate(photos.entries, start=1):
+        head = {"row": number, "columns": dict(zip(photos.columns, entry.cells, strict=True))}
+        unusable = {"key": "", "digests": _NO_DIGESTS, **_failed(entry.error)}
+        yield {**head, **(unusable if entry.error else store.read(entry.key)), **head}
+
+
+def _sheet_entry(entry: Entry, row: Row, out: Path) -> tuple[SheetEntry, tuple[bool, bool, float, int]]:
+    """A row on the page, and its sort key."""
+    message, reliable, confidence = row["message"], row.get("reliable", False), row.get("confidence", 0.0)
+    kind = "failed" if message else "reliable" if reliable else "doubtful"
+    path = _thumbnail_path(out, row["digests"])
+    entry_on_page = SheetEntry(
+        number=row["row"],
+        name=entry.name,
+        caption=message or f"confidence {confidence:.2f}, {kind}",
+        kind=kind,
+        picture=lambda: path.read_bytes() if not message and path.is_file() else None,
+    )
+    return entry_on_page, (bool(message), not reliable, -confidence, row["row"])

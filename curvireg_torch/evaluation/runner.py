@@ -1,0 +1,115 @@
+"""The resumable loop over photographs, for lists and for datasets."""
+
+import json
+import threading
+import time
+from collections.abc import Callable, Sequence
+from functools import cache
+from itertools import groupby
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from tqdm import tqdm
+
+from ..io.meshes.files import mesh_digest
+from ..registration import Registrar
+from ..utils.digests import code_digest, file_digest, text_digest
+from ..utils.threads import map_on_threads
+from .store import ResultStore, Row
+from .workers import Workers
+
+__all__ = ["POSE_SOURCES", "Item", "OpenRegistrar", "run_items"]
+
+
+class Item(Protocol):
+    """One photograph to register."""
+
+    @property
+    def key(self) -> str:
+        """A name that no other item of the run has."""
+
+    @property
+    def photo(self) -> Path:
+        """The file of the photograph."""
+
+    @property
+    def meshes(self) -> tuple[Path, ...]:
+        """Mesh files; of several the best is found."""
+
+    def request(self) -> Any:
+        """Plain values of all that the result depends on besides files and the settings of the run."""
+
+
+ItemT = TypeVar("ItemT", bound=Item)
+
+POSE_SOURCES = (
+    *("data", "descriptors", "filters", "geometry", "io", "matching", "models", "registration", "rendering", "terms"),
+    *("utils", "errors.py", "limits.py", "pipeline.py", "settings.py"),
+)
+"""Parts of the package that results depend on."""
+
+OpenRegistrar = Callable[[tuple[Path, ...]], Registrar | Exception]
+"""Opens the registrar of some mesh files, or returns why there is none."""
+
+
+def run_items(
+    items: Sequence[ItemT],
+    store: ResultStore,
+    open_registrar: OpenRegistrar,
+    register: Callable[[ItemT, Registrar | Exception, float, Row], Row],
+    *,
+    settings: Any,
+    workers: Workers,
+    label: str,
+    progress: bool = True,
+) -> None:
+    """Register the part of ``items`` that belongs to this process, as far as ``store`` does not hold it already.
+
+    A stored row is used again if its digests are the same: that of the photograph's content, and that of the request,
+    which covers ``settings``, the code of this library, the item's own request and every file of its meshes. Rows that
+    are marked ``skipped`` are tried again. Items of the same meshes follow each other, so that only one bank is in
+    memory, and are registered side by side on torch's threads; each row is on disk as soon as it is known.
+
+    Args:
+        items: of different keys.
+        store: opened by the caller.
+        open_registrar: called once for each set of meshes.
+        register: called with an item, what ``open_registrar`` returned, the seconds that this took (0 for all items but
+            the first), and the digests; returns the row. An error that it raises ends the run.
+        settings: plain values, everything that all results depend on.
+        workers: the processes that share the items.
+        label: of the progress bar.
+        progress: show it.
+    """
+    common = json.dumps([settings, code_digest(*POSE_SOURCES)], sort_keys=True)
+    digest_of_photo, digest_of_mesh = cache(file_digest), cache(mesh_digest)
+
+    def digests(item: ItemT) -> dict[str, str]:
+        meshes = [(path.name, digest_of_mesh(path)) for path in item.meshes]
+        return {
+            "request": text_digest(json.dumps([common, item.request(), meshes])),
+            "photo": digest_of_photo(item.photo),
+        }
+
+    order = {meshes: place for place, meshes in enumerate(dict.fromkeys(item.meshes for item in items))}
+    mine = workers.part(sorted(items, key=lambda item: order[item.meshes]))
+    todo = [(item, found) for item in mine if not store.is_current(item.key, found := digests(item))]
+    lock = threading.Lock()
+    with tqdm(total=len(mine), initial=len(mine) - len(todo), desc=label, unit="photo", disable=not progress) as bar:
+        registrar: Registrar | Exception | None
+        for meshes, group in groupby(todo, key=lambda pair: pair[0].meshes):
+            registrar = None  # free its memory before the next one is opened
+            start = time.perf_counter()
+            registrar = open_registrar(meshes)
+            seconds = time.perf_counter() - start
+            pairs = list(group)
+
+            def register_one(k: int, registrar: Registrar | Exception = registrar) -> None:
+                item, found = pairs[k]  # noqa: B023
+                row = register(item, registrar, 0.0 if k else seconds, found)  # noqa: B023
+                with lock:
+                    store.append({"key": item.key, "digests": found, **row})
+                    bar.update()
+
+            device = registrar.bank.device if isinstance(registrar, Registrar) else "cpu"
+            map_on_threads(register_one, range(len(pairs)), device=device)

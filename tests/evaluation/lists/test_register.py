@@ -1,0 +1,116 @@
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from curvireg_torch import Registrar, ViewBank, sample_views
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evaluation.lists import Entry, PhotoList, register
+from curvireg_torch.io import read_photo
+from curvireg_torch.pipeline import PRESETS
+from curvireg_torch.registration import Registration
+from curvireg_torch.synthetic import example_mesh
+from tests._support.scenes import SIZE, scene, unrefined
+
+CAMERA = (260.0, 260.0, 119.5, 89.5)
+
+
+@pytest.fixture(scope="module")
+def registrar():
+    """The example mesh in eight views, without refinement."""
+    views = sample_views(azimuth_step=45, elevations=[20])
+    bank = ViewBank.build(example_mesh(), views, pipeline=PRESETS["classical"], image_size=64, progress=False)
+    return Registrar(bank, pipeline=unrefined(bank))
+
+
+@pytest.fixture
+def entry(tmp_path):
+    """A photograph with its box."""
+    picture = (scene(0)[0].permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "photo.png"), picture)
+    (tmp_path / "mesh.ply").write_text("a mesh")
+    return Entry((), "photo.png", tmp_path / "photo.png", (tmp_path / "mesh.ply",), box=tuple(scene(0)[1].tolist()))
+
+
+def register_rows(rows, out, registrar, settings=None):
+    photos = PhotoList((), tuple(rows))
+    return register.register_list(photos, out, lambda _: registrar, settings=settings or {}, progress=False)
+
+
+def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, monkeypatch):
+    unknown_box = replace(entry, box=None, camera=CAMERA)
+    rows = [entry, replace(entry, camera=CAMERA), replace(unknown_box, instances=2), replace(entry, guess=50.0), entry]
+    done = []
+
+    def register_entry(one, photo, registrar, **_):
+        done.append(one)
+        return original(replace(one, box=entry.box, instances=1), photo, registrar, bank_seconds=0.0)
+
+    original = register.register_entry
+    monkeypatch.setattr(register, "register_entry", register_entry)
+    for settings in ({"top": 1}, {"top": 2}):
+        done.clear()
+        for _ in range(2):
+            assert register_rows(rows, tmp_path / "out", registrar, settings).ok == 5
+        assert done == rows[:4], "equal rows are registered once"
+
+
+def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp_path):
+    (tmp_path / "settings.json").write_text("{}")
+    with pytest.raises(InvalidInputError, match="holds the evaluation of a dataset"):
+        register_rows([entry], tmp_path, registrar)
+
+
+@pytest.mark.parametrize(
+    ("camera", "guess", "source"),
+    [(CAMERA, None, "given"), (None, 50.0, "fov"), (None, "exif", "exif"), (None, None, None)],
+)
+def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entry, monkeypatch, camera, guess, source):
+    def with_covariance(image, box, K):
+        (result,) = registrar(image, box, K)
+        assert isinstance(result, Registration)
+        best, *others = result.hypotheses
+        best = replace(best, covariance=None if K is None else torch.eye(6, dtype=torch.float64))
+        return [replace(result, confidence=1.0, hypotheses=(best, *others))]
+
+    class Certain:
+        bank, pipeline = registrar.bank, registrar.pipeline
+        __call__ = staticmethod(with_covariance)
+
+    photo = read_photo(entry.photo)
+    monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: register.camera_of_view(40.0, SIZE))
+    one = replace(entry, camera=camera, guess=guess)
+    result, document = register.register_entry(one, photo, Certain(), bank_seconds=0.0)
+    assert document["inputs"]["camera_source"] == source
+    known = source == "given"
+    assert document["covariance"] == (torch.eye(6).tolist() if known else None)
+    assert (document["squared_radius"] is not None) == known
+    assert (document["standard_deviations"] is not None) == known
+    assert (result.translation is not None) == (source is not None)
+    json.dumps(document, allow_nan=False)
+
+
+def test_page_shows_reliable_results_first_and_failures_last(registrar, entry, tmp_path, monkeypatch):
+    """Equally reliable ones are ordered by confidence, then by their row."""
+    confidence = {"a": 0.3, "b": 0.95, "c": None, "d": 0.85, "e": 0.5, "f": 0.95}
+
+    def register_entry(one, photo, registrar, **_):
+        value = confidence[one.name]
+        if value is None:
+            raise InvalidInputError("dark")
+        result, document = original(replace(one, name="photo.png"), photo, registrar, bank_seconds=0.0)
+        return result, {**document, "confidence": value, "reliable": value >= 0.8}
+
+    shown = []
+    original = register.register_entry
+    monkeypatch.setattr(register, "register_entry", register_entry)
+    monkeypatch.setattr(register, "write_sheet", lambda _path, _title, entries, **_: shown.extend(entries))
+    counts = register_rows([replace(entry, name=name) for name in confidence], tmp_path / "out", registrar)
+    assert [one.name for one in shown] == ["b", "f", "d", "e", "a", "c"]
+    assert [one.number for one in shown] == [2, 6, 4, 5, 1, 3]
+    assert [one.kind for one in shown] == ["reliable"] * 3 + ["doubtful"] * 2 + ["failed"]
+    assert shown[-1].caption == "dark"
+    assert (counts.ok, counts.failed, counts.reliable) == (5, 1, 3)
