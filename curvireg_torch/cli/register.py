@@ -139,15 +139,14 @@ def run(arguments: argparse.Namespace) -> None:
     from ..evaluation.opening import check_camera
     from ..evaluation.workers import run_processes
 
-    if run_processes(arguments.jobs, arguments.argv):
-        return
-
     options = register_options(arguments, arguments.photos, arguments.meshes)
     options.open_pipeline()  # errors in options come before any photograph is read
     field = options.open_field()
     check_camera(options.camera, options.guess)
     if arguments.list is None and is_one_photograph(options.photos):
         _register_one(options, field, arguments.out, as_json=arguments.json)
+        return
+    if run_processes(arguments.jobs, arguments.argv):
         return
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) if arguments.out is None else arguments.out

@@ -104,7 +104,7 @@ def test_of_many_the_best_and_the_worst_are_shown(tmp_path, monkeypatch):
     monkeypatch.setattr(sheet, "SHOWN", 2)
     asked = []
     rows = [
-        sheet.Shown(number=k, name=f"{k}.png", said="", kind="doubtful", picture=lambda k=k: asked.append(k))
+        sheet.SheetEntry(number=k, name=f"{k}.png", caption="", kind="doubtful", picture=lambda k=k: asked.append(k))
         for k in range(7, 0, -1)
     ]
     sheet.write_sheet(tmp_path / "index.html", "7 photographs", rows, table="results.csv")

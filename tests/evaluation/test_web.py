@@ -16,7 +16,7 @@ def test_a_collection_is_evaluated(web, tmp_path, capsys):
     evaluate("web", web.root, "--out", tmp_path / "out")
     out = capsys.readouterr().out
     assert "4 objects, 0 failed" in out
-    assert "the pose of 2 is known: of these\nacc_15_deg" in out
+    assert "the true pose of 2 is known: their scores are\nacc_15_deg" in out
     with open(tmp_path / "out" / "predictions.csv", newline="") as file:
         lines = list(csv.DictReader(file))
     assert [line["category"] for line in lines] == ["cup"] * 3 + ["shoe"]
@@ -54,7 +54,7 @@ def test_no_pose_is_known(web, tmp_path, capsys):
             path.unlink()
     evaluate("web", web.root, "--out", tmp_path / "out")
     out = capsys.readouterr().out
-    assert "the pose of 0 is known: nothing to compare" in out
+    assert "the true pose of 0 is known: nothing to compare" in out
     assert "acc_" not in out
 
 

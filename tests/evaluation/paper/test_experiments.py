@@ -112,7 +112,7 @@ def test_cases_leave_out_what_the_paper_leaves_out(tmp_path):
     write_bop(tmp_path / "bop")
     with pytest.raises(InvalidInputError, match="no whole object"):
         paper.find_cases("bop", tmp_path / "bop")
-    with pytest.raises(InvalidInputError, match="kind"):
+    with pytest.raises(InvalidInputError, match="dataset: expected one of"):
         paper.find_cases("coco", tmp_path)
 
 
