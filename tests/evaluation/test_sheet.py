@@ -109,5 +109,5 @@ def test_contact_sheet_refuses_other_folders(web, tmp_path, capsys):
         contact_sheet(folder, tmp_path / "sheet.html", each=0)
     for settings in ({"dataset": "shop"}, {"dataset": "web", "root": 3, "protocol": ""}, {"dataset": "web"}):
         (folder / "settings.json").write_text(json.dumps(settings))
-        with pytest.raises(InvalidInputError, match="not settings of an evaluation|dataset: expected one of"):
+        with pytest.raises(InvalidInputError, match=r"not settings of an evaluation|dataset: expected one of"):
             contact_sheet(folder, tmp_path / "sheet.html")
