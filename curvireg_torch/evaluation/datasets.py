@@ -90,6 +90,8 @@ def evaluate(
         group.wait()
         if not group.reports or not store.is_complete(item.key for item in items):
             return None
+        if group.leads:
+            store.merge()
         return score(benchmark, out, limit=limit)
 
 
