@@ -58,9 +58,6 @@ class ContourFit:
         start_support: (N,) edge support of the starts (at half size for starts that are not finished).
         observable: (N,) int64, number of the six directions that the contours determine; the covariance of the others
             is that of an unknown rotation or translation.
-        matched: (N,) fraction of the contour points that lie within 2 px of an edge.
-        residual: (N,) root mean square distance of matched points from their edges, in px of a crop of 256 px.
-        mean_shift: (N,) mean shift of the contour points from the start, in the same px.
     """
 
     transform: Tensor
@@ -68,9 +65,6 @@ class ContourFit:
     edge_support: Tensor
     start_support: Tensor
     observable: Tensor
-    matched: Tensor
-    residual: Tensor
-    mean_shift: Tensor
 
     @property
     def trustworthy(self) -> Tensor:
@@ -155,7 +149,7 @@ def fit_contours(
     T0, centre = starts.detach().cpu().double(), centre.detach().cpu().double()
     if (N := len(T0)) == 0:
         none = T0.new_zeros(0)
-        return ContourFit(T0, T0.new_zeros(0, 6, 6), none, none, none.long(), none, none, none)
+        return ContourFit(T0, T0.new_zeros(0, 6, 6), none, none, none.long())
     crops, full = _full_size(renderer, images, boxes, K, image_index, centre, radius, margin)
     K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ full.K
     half = ContourProblem(renderer, EdgeField(F.avg_pool2d(crops, 2)), image_index, K, SIZE // 2, centre, radius)
@@ -178,18 +172,7 @@ def fit_contours(
     state, support = state[best], support[best]
     matches = full.matches(state, FINE[-1])
     covariance, observable = pose_covariance(matches, state.points, state.T, full.K, centre, radius=radius)
-    weight = matches.weight[..., 0]
-    mean_square = (weight * matches.distance[..., 0].square()).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-12)
-    return ContourFit(
-        transform=state.T,
-        covariance=covariance,
-        edge_support=support,
-        start_support=before,
-        observable=observable,
-        matched=(weight > 0).sum(dim=1) / state.points.valid.sum(dim=1).clamp(min=1),
-        residual=mean_square.sqrt(),
-        mean_shift=full.mean_shift(state.points, T0, state.T),
-    )
+    return ContourFit(state.T, covariance, edge_support=support, start_support=before, observable=observable)
 
 
 @torch.no_grad()

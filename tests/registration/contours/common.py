@@ -1,0 +1,51 @@
+"""A cube in front of a camera, shared by the tests of the contour fit."""
+
+from typing import Any
+
+import torch
+import trimesh
+from torch import Tensor
+
+from curvireg_torch import camera_matrix
+from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.geometry.cameras import transform
+from curvireg_torch.io.meshes import mesh_centre, mesh_radius
+from curvireg_torch.registration import ContourFit, fit_contours
+from curvireg_torch.rendering import make_renderer
+
+K = camera_matrix(300.0, 310.0, 63.5, 60.0, dtype=torch.float64)
+BOX = torch.tensor([40.0, 36, 88, 84])
+
+
+def cube() -> trimesh.Trimesh:
+    return trimesh.creation.box((1.0, 1.4, 0.8))
+
+
+def pose(axis_angle: list[float], position: list[float]) -> Tensor:
+    """(4, 4) of a rotation in rad and a position."""
+    R = rotation_from_axis_angle(torch.tensor(axis_angle, dtype=torch.float64))
+    return transform(R, torch.tensor(position, dtype=torch.float64))
+
+
+CUBE_POSE = pose([0.4, 0.5, 0.1], [0.0, 0.0, 8.0])
+
+
+def geometry(mesh: trimesh.Trimesh) -> dict[str, Any]:
+    """The options of :func:`fit_contours` that depend on the mesh."""
+    return {"centre": mesh_centre(mesh), "radius": mesh_radius(mesh)}
+
+
+def silhouette(mesh: trimesh.Trimesh, T: Tensor) -> Tensor:
+    """(1, 128, 128) white object on black."""
+    return (make_renderer(mesh).render(T[None], K, (128, 128))[0] > 0).float()
+
+
+def noise() -> Tensor:
+    return torch.rand(3, 128, 128, generator=torch.Generator().manual_seed(0))
+
+
+def fitted(image: Tensor, starts: Tensor, *, mesh: trimesh.Trimesh | None = None, **options: Any) -> ContourFit:
+    """Fit a mesh, by default the cube, to a photograph that shows it in ``BOX``."""
+    mesh = mesh or cube()
+    box, renderer = options.pop("box", BOX), options.pop("renderer", None) or make_renderer(mesh)
+    return fit_contours(renderer, image, box, K, starts, **geometry(mesh), **options)
