@@ -1,5 +1,7 @@
 """K-medoids of a bank's views."""
 
+import copy
+
 import pytest
 import torch
 
@@ -10,28 +12,45 @@ from curvireg_torch.registration.locator.representatives import _medoids
 from tests._support.scenes import truck_bank
 
 
-def test_medoids_are_the_middles_of_clusters() -> None:
-    """Three tight groups on a line: their middle points, whatever the order."""
-    places = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1, 5.2, 9.0, 9.1, 9.2])[torch.randperm(9)]
-    apart = (places[:, None] - places).square()
-    assert sorted(places[_medoids(apart, 3)].tolist()) == pytest.approx([0.1, 5.1, 9.1])
+def squared_distances(points: torch.Tensor) -> torch.Tensor:
+    return (points[:, None] - points).square()
 
 
-def test_medoids_lie_nearer_to_all_views_than_as_many_taken_at_random() -> None:
+def bank_of_ratios(ratios: torch.Tensor) -> ViewBank:
+    """A bank whose views differ in the aspect ratio (width / height) of their boxes only."""
+    bank = copy.copy(truck_bank())
+    bank.descriptors = torch.ones_like(bank.descriptors)
+    corner = torch.stack([ratios, torch.ones_like(ratios)], dim=1)
+    bank.boxes = torch.cat([-corner, corner], dim=1)
+    return bank
+
+
+def test_medoids_are_the_centres_of_clusters() -> None:
+    points = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1, 5.2, 9.0, 9.1, 9.2])[torch.randperm(9)]
+    assert sorted(points[_medoids(squared_distances(points), 3)].tolist()) == pytest.approx([0.1, 5.1, 9.1])
+
+
+def test_medoids_are_better_than_random_choices() -> None:
     points = torch.randn(300, 4, generator=torch.Generator().manual_seed(0))
-    apart = torch.cdist(points, points).square()
-    cost = apart[:, _medoids(apart, 12)].amin(dim=1).sum()
+    distances = torch.cdist(points, points).square()
+    cost = distances[:, _medoids(distances, 12)].amin(dim=1).sum()
     generator = torch.Generator().manual_seed(1)
-    chance = [apart[:, torch.randperm(300, generator=generator)[:12]].amin(dim=1).sum() for _ in range(20)]
-    assert cost < 0.9 * min(chance)
+    random = [distances[:, torch.randperm(300, generator=generator)[:12]].amin(dim=1).sum() for _ in range(20)]
+    assert cost < 0.9 * min(random)
 
 
-def test_twins_do_not_make_two_medoids_of_one() -> None:
-    apart = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 4.0], [4.0, 4.0, 0.0]])
-    assert sorted(_medoids(apart, 2).tolist()) in ([0, 2], [1, 2])
+def test_medoids_of_duplicates_are_different_points() -> None:
+    points = torch.tensor([0.0, 0.0, 2.0])
+    assert sorted(_medoids(squared_distances(points), 2).tolist()) in ([0, 2], [1, 2])
 
 
-def test_each_model_has_its_own() -> None:
+def test_medoids_start_at_the_centre_and_continue_with_the_farthest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(representatives, "ROUNDS", 0)
+    points = torch.tensor([1.0, 0.0, 3.0, 10.0, 2.0])
+    assert points[_medoids(squared_distances(points), 3)].tolist() == [3.0, 10.0, 0.0]
+
+
+def test_representative_views_of_each_model() -> None:
     bank = ViewBank.join([truck_bank(), truck_bank()])
     views = representative_views(bank, 7)
     assert torch.equal(views, views.unique())
@@ -41,34 +60,11 @@ def test_each_model_has_its_own() -> None:
         representative_views(bank, 0)
 
 
-def test_boxes_count_beside_descriptors() -> None:
-    """Views with one descriptor and two shapes of boxes: both shapes are represented."""
-    bank = truck_bank()
-    plain = bank.__class__.__new__(bank.__class__)
-    plain.__dict__.update(bank.__dict__)
-    plain.descriptors = torch.ones_like(bank.descriptors)
-    wide = torch.tensor([-2.0, -1.0, 2.0, 1.0], dtype=bank.boxes.dtype)
-    tall = torch.tensor([-1.0, -2.0, 1.0, 2.0], dtype=bank.boxes.dtype)
-    plain.boxes = torch.where((torch.arange(len(bank)) < 5)[:, None], tall, wide)
-    views = representative_views(plain, 2)
-    assert (views < 5).tolist() == [True, False]
-
-
-def test_the_most_central_view_starts_and_the_farthest_follow(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(representatives, "ROUNDS", 0)
-    places = torch.tensor([1.0, 0.0, 3.0, 10.0, 2.0])
-    apart = (places[:, None] - places).square()
-    assert places[_medoids(apart, 3)].tolist() == [3.0, 10.0, 0.0]
-
-
-def test_proportions_of_boxes_differ_by_their_logarithms() -> None:
-    """Boxes 8 times as tall as wide differ more from squares than boxes 3 times as wide as tall do."""
-    bank = truck_bank()
-    plain = bank.__class__.__new__(bank.__class__)
-    plain.__dict__.update(bank.__dict__)
-    plain.descriptors = torch.ones_like(bank.descriptors)
-    proportion = torch.ones(len(bank), dtype=bank.boxes.dtype)
-    proportion[:2], proportion[2:12] = 1.0 / 8.0, 3.0
-    corner = torch.stack([proportion, torch.ones_like(proportion)], dim=1)
-    plain.boxes = torch.cat([-corner, corner], dim=1)
-    assert sorted(proportion[representative_views(plain, 2)].tolist()) == [0.125, 1.0]
+def test_representative_views_differ_by_logarithms_of_aspect_ratios() -> None:
+    """Ratios of 1:8 differ more from squares than ratios of 3:1 do."""
+    n, dtype = len(truck_bank()), truck_bank().boxes.dtype
+    two = torch.where(torch.arange(n) < 5, 0.5, 2.0).to(dtype)
+    assert (representative_views(bank_of_ratios(two), 2) < 5).tolist() == [True, False]
+    three = torch.ones(n, dtype=dtype)
+    three[:2], three[2:12] = 1.0 / 8.0, 3.0
+    assert sorted(three[representative_views(bank_of_ratios(three), 2)].tolist()) == [0.125, 1.0]
