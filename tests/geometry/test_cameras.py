@@ -1,4 +1,4 @@
-"""Cameras and projections, by hand and against OpenCV."""
+"""Cameras and projections, against values by hand and OpenCV."""
 
 import cv2
 import numpy as np
@@ -13,13 +13,13 @@ from curvireg_torch.utils.checks import check_camera_matrix
 K = torch.tensor([[240.0, 0.0, 70.3], [0, 260.0, 51.8], [0, 0, 1]], dtype=torch.float64)
 
 
-def test_the_four_numbers_have_their_places() -> None:
+def test_camera_matrix_by_hand() -> None:
     assert g.camera_matrix(1.0, 2.0, 3.0, 4.0).tolist() == [[1, 0, 3], [0, 2, 4], [0, 0, 1]]
     assert g.camera_matrix(1.0, 2.0, 3.0, 4.0).dtype == torch.float32
     assert g.camera_matrix(1.0, 2.0, 3.0, 4.0, dtype=torch.float64).dtype == torch.float64
 
 
-def test_transform_is_rotation_and_translation() -> None:
+def test_transform_joins_rotation_and_translation() -> None:
     R = torch.arange(18.0).view(2, 3, 3)
     t = torch.arange(6.0).view(2, 3) + 100.0
     T = g.transform(R, t)
@@ -29,7 +29,7 @@ def test_transform_is_rotation_and_translation() -> None:
     assert T[:, 3].tolist() == [[0, 0, 0, 1]] * 2
 
 
-def test_projection_is_opencvs() -> None:
+def test_project_points_agrees_with_opencv() -> None:
     X = np.random.default_rng(0).uniform(-1, 1, (40, 3))
     rotation, t = np.array([0.3, -0.8, 0.2]), np.array([0.2, -0.1, 5.0])
     theirs = cv2.projectPoints(X, rotation, t, K.numpy(), None)[0][:, 0]
@@ -40,7 +40,7 @@ def test_projection_is_opencvs() -> None:
     np.testing.assert_allclose(box, [*theirs.min(0), *theirs.max(0)], atol=1e-9)
 
 
-def test_orthographic_projection_forgets_the_depth() -> None:
+def test_project_points_orthographic_ignores_depth() -> None:
     X = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 30.0]], dtype=torch.float64)
     uv = g.project_points(X, torch.eye(4, dtype=torch.float64), K, orthographic=True)
     expected = torch.tensor([240.0 + 70.3, 520.0 + 51.8], dtype=torch.float64)
@@ -65,7 +65,7 @@ def test_orthographic_projection_forgets_the_depth() -> None:
         (K.T.contiguous(), r"\[0, fy, cy\]"),
     ],
 )
-def test_a_matrix_that_is_no_camera_is_refused(bad: torch.Tensor, match: str) -> None:
+def test_check_camera_matrix_refuses_invalid_matrices(bad: torch.Tensor, match: str) -> None:
     with pytest.raises(InvalidInputError, match=match):
         check_camera_matrix(bad)
     with pytest.raises(InvalidInputError, match="focal"):

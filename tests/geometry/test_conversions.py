@@ -1,4 +1,4 @@
-"""Every converter projects points as the convention it converts to, and back."""
+"""Conversions agree with the definition of each convention, and invert each other."""
 
 import math
 
@@ -24,7 +24,7 @@ def points() -> torch.Tensor:
 
 
 @pytest.mark.parametrize("orthographic", [False, True])
-def test_opengl_window_coordinates_are_the_pixels(orthographic: bool) -> None:
+def test_opengl_window_coordinates_agree_with_project_points(orthographic: bool) -> None:
     T, X = poses(), points()
     camera = K.clone()
     if orthographic:
@@ -42,7 +42,7 @@ def test_opengl_window_coordinates_are_the_pixels(orthographic: bool) -> None:
     torch.testing.assert_close(back, T, rtol=0, atol=0)
 
 
-def test_opengl_near_and_far_planes() -> None:
+def test_opengl_projection_maps_near_and_far_planes() -> None:
     for orthographic in (False, True):
         P = g.opengl_projection(K, SIZE, near=2.0, far=9.0, orthographic=orthographic)
         for z, expected in ((-2.0, -1.0), (-9.0, 1.0)):
@@ -50,7 +50,7 @@ def test_opengl_near_and_far_planes() -> None:
             assert float(clip[2] / clip[3]) == pytest.approx(expected)
 
 
-def test_pytorch3d_screen_coordinates_are_the_pixels() -> None:
+def test_pytorch3d_screen_coordinates_agree_with_project_points() -> None:
     # The formulas of PyTorch3D's documentation: x_view = x R + T; screen = principal point - focal x / z, where +x is
     # left, +y is up and the first pixel covers [0, 1].
     T, X = poses(), points()
@@ -62,14 +62,14 @@ def test_pytorch3d_screen_coordinates_are_the_pixels() -> None:
     torch.testing.assert_close(g.opencv_from_pytorch3d(R, t), T, rtol=0, atol=1e-15)
 
 
-def test_pascal3d_angles_project_as_the_data_set_says() -> None:
-    # p = diag(f, f, -1) Rx(e - 90) Rz(-a) (X - C); turned by theta; v = py - y, written out in numpy.
+def test_rotation_from_viewpoint_agrees_with_the_definition_of_pascal3d() -> None:
+    # p = diag(f, f, -1) Rx(e - 90) Rz(-a) (X - C), rotated by theta; v = py - y.
     X, f, (px, py) = points().numpy(), 3000.0, (70.3, 51.8)
     for a, e, t, d in ((30.0, 20.0, -10.0, 5.0), (200.0, -35.0, 100.0, 4.0), (0.0, 0.0, 0.0, 9.0)):
         ar, er, tr = (math.radians(v) for v in (a, e, t))
         C = d * np.array([math.cos(er) * math.sin(ar), -math.cos(er) * math.cos(ar), math.sin(er)])
-        turn = Rotation.from_euler("x", er - math.pi / 2).as_matrix() @ Rotation.from_euler("z", -ar).as_matrix()
-        p = (X - C) @ turn.T @ np.diag([f, f, -1.0])
+        R_camera = Rotation.from_euler("x", er - math.pi / 2).as_matrix() @ Rotation.from_euler("z", -ar).as_matrix()
+        p = (X - C) @ R_camera.T @ np.diag([f, f, -1.0])
         xy = p[:, :2] / p[:, 2:]
         xy = xy @ np.array([[math.cos(tr), math.sin(tr)], [-math.sin(tr), math.cos(tr)]])
         expected = np.stack([px + xy[:, 0], py - xy[:, 1]], 1)
@@ -85,7 +85,7 @@ ANGLES = [0.0, 1e-8, 1e-4, 1.0, math.pi - 1e-4, math.pi - 1e-8, math.pi]
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_axis_angle_and_quaternion_are_scipys(angle: float) -> None:
+def test_axis_angle_and_quaternion_agree_with_scipy(angle: float) -> None:
     axes = np.random.default_rng(0).normal(size=(40, 3))
     vectors = axes / np.linalg.norm(axes, axis=1, keepdims=True) * angle
     R = Rotation.from_rotvec(vectors).as_matrix()
@@ -105,7 +105,7 @@ def test_axis_angle_and_quaternion_are_scipys(angle: float) -> None:
     np.testing.assert_allclose(g.project_points(X, T, K), uv, atol=1e-10)
 
 
-def test_shapes_and_errors() -> None:
+def test_conversions_keep_batch_shapes_and_refuse_invalid_input() -> None:
     R = torch.eye(3).expand(2, 5, 3, 3)
     assert g.quaternion_from_rotation(R).shape == (2, 5, 4)
     assert g.axis_angle_from_rotation(R[:0]).shape == (0, 5, 3)

@@ -1,4 +1,4 @@
-"""Boxes, squares and crops: where a pixel goes, and what its value becomes."""
+"""Boxes, squares and crops: positions and values of pixels."""
 
 import pytest
 import torch
@@ -15,11 +15,11 @@ def ramp(height: int, width: int) -> torch.Tensor:
     return torch.stack([x, y])[None]
 
 
-def test_the_whole_image_reaches_from_border_to_border() -> None:
+def test_whole_image_box_covers_the_borders() -> None:
     assert g.whole_image_box(torch.zeros(3, 40, 60)).tolist() == [-0.5, -0.5, 59.5, 39.5]
 
 
-def test_squares_by_hand() -> None:
+def test_square_boxes_match_values_by_hand() -> None:
     boxes = torch.tensor([[10.0, 20.0, 30.0, 24.0], [0.0, 0.0, 2.0, 8.0]])
     assert g.square_boxes(boxes, 0.0).tolist() == [[10.0, 12.0, 30.0, 32.0], [-3.0, 0.0, 5.0, 8.0]]
     assert g.square_boxes(boxes, 0.25).tolist() == [[5.0, 7.0, 35.0, 37.0], [-5.0, -2.0, 7.0, 10.0]]
@@ -27,15 +27,15 @@ def test_squares_by_hand() -> None:
         g.square_boxes(boxes, -0.1)
 
 
-def test_borders_of_the_square_become_borders_of_the_crop() -> None:
+def test_crop_transforms_map_borders_to_borders() -> None:
     square = torch.tensor([[10.0, 30.0, 26.0, 46.0]])
     A = g.crop_transforms(square, 32)[0]
     corners = torch.tensor([[10.0, 30.0, 1.0], [26.0, 46.0, 1.0]]) @ A.T
     assert corners.tolist() == [[-0.5, -0.5, 1.0], [31.5, 31.5, 1.0]]
 
 
-def test_back_from_the_crop_with_nothing_where_cameras_have_nothing() -> None:
-    """A camera matrix with 1e-16 where zeros belong is refused; inverses by LAPACK leave such, by version."""
+def test_image_transforms_invert_crop_transforms_with_exact_zeros() -> None:
+    # A camera matrix with 1e-16 in place of 0, which some versions of LAPACK leave, is refused.
     squares = torch.tensor([[10.0, 30.0, 26.3, 46.3], [-3.7, 2.1, 0.4, 6.2]], dtype=torch.float64)
     back = image_transforms(squares, 32)
     torch.testing.assert_close(back @ g.crop_transforms(squares, 32), torch.eye(3).double().expand(2, 3, 3))
@@ -43,8 +43,8 @@ def test_back_from_the_crop_with_nothing_where_cameras_have_nothing() -> None:
 
 
 @pytest.mark.parametrize(("side", "size", "off"), [(8.0, 8, 2e-4), (8.0, 16, 2e-4), (24.0, 8, 2e-4), (20.5, 12, 0.1)])
-def test_pixels_of_a_ramp_say_where_they_came_from(side: float, size: int, off: float) -> None:
-    # Bilinear weights keep a ramp, those widened by a whole number too, others nearly: crop pixel p shows A^-1 p.
+def test_crop_images_agrees_with_its_transforms_on_a_ramp(side: float, size: int, off: float) -> None:
+    # Bilinear weights preserve a ramp exactly, also if widened by an integer factor, else nearly.
     image = ramp(60, 80)
     box = torch.tensor([[30.2, 18.3, 30.2 + side, 18.3 + 0.5 * side]])
     crops, A = g.crop_images(image, box, size=size, margin=0.0)
@@ -54,7 +54,7 @@ def test_pixels_of_a_ramp_say_where_they_came_from(side: float, size: int, off: 
     torch.testing.assert_close(crops[0].double(), expected, rtol=0, atol=off)
 
 
-def test_a_lone_pixel_keeps_its_place_and_its_mass() -> None:
+def test_crop_images_keeps_position_and_sum_of_a_single_pixel() -> None:
     image = torch.zeros(1, 1, 40, 40)
     image[0, 0, 22, 13] = 1.0
     same, _ = g.crop_images(image, torch.tensor([[3.5, 11.5, 23.5, 31.5]]), size=20, margin=0.0)
@@ -65,7 +65,7 @@ def test_a_lone_pixel_keeps_its_place_and_its_mass() -> None:
     assert float(halved[0, 0, 5, 4]) == float(halved.max())
 
 
-def test_outside_of_the_image_its_border_is_repeated() -> None:
+def test_crop_images_repeats_the_border() -> None:
     crop, _ = g.crop_images(ramp(10, 10), torch.tensor([[-8.0, -8.0, 8.0, 8.0]]), size=16, margin=0.0)
     assert torch.equal(crop[0, 0, :, :7], torch.zeros(16, 7))
     assert torch.equal(crop[0, 1, :7], torch.zeros(7, 16))
@@ -73,18 +73,18 @@ def test_outside_of_the_image_its_border_is_repeated() -> None:
     assert torch.equal(far[0, 0, :, 8:], torch.full((16, 8), 9.0))
 
 
-def test_a_list_of_sizes_and_a_margin_agree_with_one_by_one() -> None:
+def test_crop_images_is_batch_independent() -> None:
     images = [torch.rand(3, 30, 40), torch.rand(3, 50, 20)]
     boxes = torch.tensor([[3.0, 4.0, 20.0, 22.0], [1.0, 10.0, 15.0, 40.0]])
     crops, A = g.crop_images(images, boxes, size=24, margin=0.2)
     assert torch.equal(A, g.crop_transforms(g.square_boxes(boxes, 0.2), 24))
     for i, image in enumerate(images):
-        alone, own = g.crop_images(image[None], boxes[i : i + 1], size=24, margin=0.2)
+        alone, A_alone = g.crop_images(image[None], boxes[i : i + 1], size=24, margin=0.2)
         torch.testing.assert_close(crops[i], alone[0])
-        assert torch.equal(A[i], own[0])
+        assert torch.equal(A[i], A_alone[0])
     default, _ = g.crop_images(images, boxes)
     torch.testing.assert_close(default, g.crop_images(images, boxes, size=256, margin=0.1)[0], rtol=0, atol=0)
-    whole = g.crop_images(images[:1], boxes[:1].long(), size=8)[0]  # boxes of integers are boxes too
+    whole = g.crop_images(images[:1], boxes[:1].long(), size=8)[0]  # integer boxes
     torch.testing.assert_close(whole, g.crop_images(images[:1], boxes[:1], size=8)[0])
 
 
@@ -101,12 +101,12 @@ def test_a_list_of_sizes_and_a_margin_agree_with_one_by_one() -> None:
         ([0.0, 19.5, 5.0, 40.0], "wholly outside"),
     ],
 )
-def test_boxes_that_show_nothing_are_refused(box: list[float], match: str) -> None:
+def test_check_boxes_refuses_boxes_without_pixels(box: list[float], match: str) -> None:
     with pytest.raises(InvalidInputError, match=rf"box 1 .*{match}"):
         check_boxes(torch.tensor([[0.0, 0.0, 5.0, 5.0], box]), [(20, 30), (20, 30)])
 
 
-def test_boxes_that_touch_the_last_pixel_pass() -> None:
+def test_check_boxes_accepts_boxes_at_the_border() -> None:
     for box in ([-9.0, 0.0, -0.4, 5.0], [0.0, -9.0, 5.0, -0.4], [29.4, 0.0, 40.0, 5.0], [0.0, 19.4, 5.0, 40.0]):
         check_boxes(torch.tensor([box]), [(20, 30)])
     with pytest.raises(InvalidInputError, match="boxes"):

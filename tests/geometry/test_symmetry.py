@@ -12,18 +12,18 @@ CONTINUOUS = {"symmetries_continuous": [{"axis": AXIS, "offset": OFFSET}]}
 HALF_TURN = [-1, 0, 0, 8, 0, -1, 0, 6, 0, 0, 1, 0, 0, 0, 0, 1]  # about the vertical line through (4, 3)
 
 
-def test_without_symmetries_there_is_the_identity() -> None:
+def test_symmetry_transforms_without_symmetries_is_the_identity() -> None:
     assert torch.equal(symmetry_transforms({"diameter": 3.0}), torch.eye(4, dtype=torch.float64)[None])
 
 
-def test_discrete_matrices_are_read_row_by_row() -> None:
+def test_symmetry_transforms_reads_matrices_row_by_row() -> None:
     transforms = symmetry_transforms({"symmetries_discrete": [HALF_TURN]})
     assert transforms.shape == (2, 4, 4)
     np.testing.assert_array_equal(transforms[1], np.reshape(HALF_TURN, (4, 4)))
     np.testing.assert_allclose(transforms[1] @ torch.tensor([4.0, 3.0, 7.0, 1.0]).double(), [4.0, 3.0, 7.0, 1.0])
 
 
-def test_turns_agree_with_scipy_and_keep_the_axis() -> None:
+def test_symmetry_transforms_agrees_with_scipy_and_fixes_the_axis() -> None:
     transforms = symmetry_transforms(CONTINUOUS, max_step_fraction=0.1).numpy()
     assert len(transforms) == 32  # ceil(pi / 0.1)
     unit = np.array(AXIS) / 3.0
@@ -34,7 +34,7 @@ def test_turns_agree_with_scipy_and_keep_the_axis() -> None:
             np.testing.assert_allclose(T[:3, :3] @ point + T[:3, 3], point, atol=1e-12)
 
 
-def test_step_of_the_farthest_vertex_is_at_most_a_hundredth_of_the_diameter() -> None:
+def test_symmetry_transforms_bounds_the_step_of_a_vertex() -> None:
     transforms = symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]})
     vertex = transforms[:, :3, 0] * 50.0  # of a disc of diameter 100
     steps = torch.linalg.vector_norm(vertex - vertex.roll(1, 0), dim=1)
@@ -42,18 +42,18 @@ def test_step_of_the_farthest_vertex_is_at_most_a_hundredth_of_the_diameter() ->
     assert float(steps.min()) > 0.99  # and no finer than needed
 
 
-def test_discrete_symmetries_act_before_the_turns() -> None:
+def test_symmetry_transforms_applies_discrete_symmetries_first() -> None:
     info = {"symmetries_discrete": [HALF_TURN], **CONTINUOUS}
     both = symmetry_transforms(info, max_step_fraction=0.5)
-    turns = symmetry_transforms(CONTINUOUS, max_step_fraction=0.5).numpy()
-    assert len(both) == 2 * len(turns) == 14
+    rotations = symmetry_transforms(CONTINUOUS, max_step_fraction=0.5).numpy()
+    assert len(both) == 2 * len(rotations) == 14
     flip = np.reshape(HALF_TURN, (4, 4))
-    products = [turn @ s for turn in turns for s in (np.eye(4), flip)]
+    products = [R @ s for R in rotations for s in (np.eye(4), flip)]
     np.testing.assert_allclose(both, products, atol=1e-12)
     assert torch.equal(both[0], torch.eye(4, dtype=torch.float64))
 
 
-def test_turned_solid_of_revolution_has_no_error() -> None:
+def test_mssd_error_of_a_rotated_solid_of_revolution_is_small() -> None:
     angles = torch.linspace(0.0, 2 * np.pi, 60)[:-1].double()
     ring = torch.stack([50.0 * angles.cos(), 50.0 * angles.sin(), torch.zeros_like(angles)], 1)
     symmetries = symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]})
@@ -72,12 +72,12 @@ def test_turned_solid_of_revolution_has_no_error() -> None:
         ({"symmetries_continuous": [{"axis": [0, 1], "offset": [0, 0, 0]}]}, "axis: expected 3"),
     ],
 )
-def test_malformed_entries_are_refused(info: dict[str, object], match: str) -> None:
+def test_symmetry_transforms_refuses_malformed_entries(info: dict[str, object], match: str) -> None:
     with pytest.raises(InvalidInputError, match=match):
         symmetry_transforms(info)
 
 
 @pytest.mark.parametrize("step", [0.0, 1.5, -0.1])
-def test_bad_steps_are_refused(step: float) -> None:
+def test_symmetry_transforms_refuses_invalid_steps(step: float) -> None:
     with pytest.raises(InvalidInputError, match="max_step_fraction"):
         symmetry_transforms({}, max_step_fraction=step)

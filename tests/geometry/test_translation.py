@@ -1,4 +1,4 @@
-"""Poses from boxes against synthetic truth."""
+"""Poses from boxes, against synthetic truth."""
 
 import pytest
 import torch
@@ -12,13 +12,13 @@ from curvireg_torch.synthetic import example_mesh
 K = g.camera_matrix(800.0, 820.0, 310.0, 255.0, dtype=torch.float64)
 
 
-def truths(spread: float, count: int = 25) -> list[tuple[torch.Tensor, ...]]:
+def true_poses(spread: float, count: int = 25) -> list[tuple[torch.Tensor, ...]]:
     """(hull, centre, view R, R, t, box) of objects 3 to 12 radii away, ``spread`` (tangent) off the axis."""
     mesh = example_mesh()
     mesh.apply_translation([3.0, -2.0, 1.0])  # the centre is far from the origin
     centre, radius, hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
     generator = torch.Generator().manual_seed(0)
-    found = []
+    poses = []
     for i in range(count):
         u = torch.rand(3, generator=generator, dtype=torch.float64)
         ray = torch.stack([spread * (2 * u[0] - 1), spread * (2 * u[1] - 1), torch.ones_like(u[0])])
@@ -26,43 +26,43 @@ def truths(spread: float, count: int = 25) -> list[tuple[torch.Tensor, ...]]:
         view = torch.from_numpy(Rotation.random(random_state=i).as_matrix())
         R = g.rotation_towards(ray) @ view
         t = ray - R @ centre
-        found.append((hull, centre, view, R, t, g.projected_boxes(hull, g.transform(R, t), K)))
-    return found
+        poses.append((hull, centre, view, R, t, g.projected_boxes(hull, g.transform(R, t), K)))
+    return poses
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.3])
-def test_true_rotation_and_box_give_the_true_translation(spread: float) -> None:
-    for hull, _, _, R, t, box in truths(spread):
+def test_translation_from_box_recovers_the_true_translation(spread: float) -> None:
+    for hull, _, _, R, t, box in true_poses(spread):
         found = g.translation_from_box(hull, R, box, K)
         assert float((found - t).norm() / t.norm()) < 1e-6
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.3])
-def test_true_view_and_box_give_the_true_pose(spread: float) -> None:
-    for hull, centre, view, R, t, box in truths(spread):
+def test_pose_from_box_recovers_the_true_pose(spread: float) -> None:
+    for hull, centre, view, R, t, box in true_poses(spread):
         found_R, found_t = g.pose_from_box(hull, view, box, K)
         distance = (R @ centre + t).norm()
         assert float(g.rotation_error(found_R, R)) < 0.01
         assert float((found_R @ centre + found_t - R @ centre - t).norm() / distance) < 1e-4
 
 
-def test_scale_of_the_model_scales_the_translation() -> None:
-    hull, _, view, _, _, box = truths(0.3, 1)[0]
+def test_pose_from_box_scales_with_the_model() -> None:
+    hull, _, view, _, _, box = true_poses(0.3, 1)[0]
     R1, t1 = g.pose_from_box(hull, view, box, K)
     R2, t2 = g.pose_from_box(1000.0 * hull, view, box, K)
     torch.testing.assert_close(R2, R1, rtol=0, atol=1e-12)
     torch.testing.assert_close(t2, 1000.0 * t1, rtol=1e-12, atol=0)
 
 
-def test_a_box_one_percent_too_large_brings_the_object_one_percent_nearer() -> None:
-    for hull, centre, _, R, t, box in truths(0.0, 8):
+def test_translation_from_box_is_closer_for_a_larger_box() -> None:
+    for hull, centre, _, R, t, box in true_poses(0.0, 8):
         middle = 0.5 * (box[:2] + box[2:]).repeat(2)
         found = g.translation_from_box(hull, R, middle + 1.01 * (box - middle), K)
         ratio = float((R @ centre + found).norm() / (R @ centre + t).norm())
         assert 0.985 < ratio < 0.993
 
 
-def test_rotation_towards_takes_the_axis_there_by_the_shortest_way() -> None:
+def test_rotation_towards_is_the_smallest_rotation_onto_the_ray() -> None:
     rays = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     rays[:, 2] = rays[:, 2].abs() + 0.1
     R = g.rotation_towards(rays)
@@ -73,9 +73,8 @@ def test_rotation_towards_takes_the_axis_there_by_the_shortest_way() -> None:
     torch.testing.assert_close(g.rotation_error(R, torch.eye(3, dtype=torch.float64).expand(50, 3, 3)), angle)
 
 
-def test_the_object_stays_in_front_of_the_camera_whatever_the_box() -> None:
-    """Boxes that only an object at the camera would fill: its centre stays 1.05 extents away, so that no turn of it
-    reaches the camera."""
+def test_translation_from_box_keeps_the_object_in_front_of_the_camera() -> None:
+    """The centre stays 1.05 extents away from the camera, even for a box that only an object at the camera fills."""
     cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
     box = torch.tensor([-1e5, -1e5, 1e5, 1e5], dtype=torch.float64) + K[:2, 2].repeat(2)
     nearest = 1.05 * 3.0**0.5

@@ -1,4 +1,4 @@
-"""The up axis: views of standing objects turn with it, meshes and poses do not."""
+"""The up axis: views rotate with it, meshes and poses do not."""
 
 import numpy as np
 import pytest
@@ -18,31 +18,31 @@ AXES = {s + a: (-1 if s else 1) * np.eye(3)[i] for i, a in enumerate("xyz") for 
 
 
 @pytest.mark.parametrize("up", UP_AXES)
-def test_the_axis_goes_to_z_by_a_rotation(up: str) -> None:
+def test_up_rotation_takes_the_axis_to_z(up: str) -> None:
     R = up_rotation(up).numpy()
     assert np.linalg.det(R) == 1
     assert np.array_equal(R @ R.T, np.eye(3))
     assert np.array_equal(R @ AXES[up], [0, 0, 1])
 
 
-def test_the_front_of_gltf_is_the_front_of_pascal3d() -> None:
+def test_up_rotation_takes_the_front_of_gltf_to_that_of_pascal3d() -> None:
     assert (up_rotation("y").numpy() @ [0, 0, 1]).tolist() == [0, -1, 0]
 
 
 @pytest.mark.parametrize("up", UP_AXES)
-def test_views_of_the_turned_object_show_the_same(up: str) -> None:
+def test_for_up_shows_the_same_views_of_a_rotated_object(up: str) -> None:
     views = cr.sample_views(azimuth_step=40, elevations=[-20, 30, 90], thetas=[0, 25])
     seen = views.for_up(up).rotations.double() @ up_rotation(up).T
     torch.testing.assert_close(seen, views.rotations.double(), rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize(("suffix", "up"), [("glb", "y"), ("ply", "z"), ("stl", "z"), ("off", "z"), ("obj", "z")])
-def test_default_of_the_format_and_what_is_given(tmp_path, suffix: str, up: str) -> None:
+def test_load_mesh_notes_the_up_axis(tmp_path, suffix: str, up: str) -> None:
     box = trimesh.creation.box((1.0, 2.0, 3.0))
     box.export(tmp_path / f"a.{suffix}")
     mesh = cr.load_mesh(tmp_path / f"a.{suffix}")
     assert mesh_up(mesh) == mesh_up(as_mesh(mesh)) == up
-    np.testing.assert_allclose(mesh.extents, [1, 2, 3], rtol=1e-6)  # nothing is turned
+    np.testing.assert_allclose(mesh.extents, [1, 2, 3], rtol=1e-6)  # not rotated
     given = cr.load_mesh(tmp_path / f"a.{suffix}", up="-x")
     assert mesh_up(given) == "-x"
     np.testing.assert_allclose(with_z_up(given).extents, [3, 2, 1], rtol=1e-6)
@@ -50,7 +50,7 @@ def test_default_of_the_format_and_what_is_given(tmp_path, suffix: str, up: str)
         cr.load_mesh(tmp_path / f"a.{suffix}", up="w")
 
 
-def test_a_registrar_of_a_mesh_looks_at_it_upright(tmp_path, monkeypatch) -> None:
+def test_registrar_renders_upright_views_of_y_up_meshes(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path))
     trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / "a.glb")
     few = cr.Pipeline(views=ViewPolicy(pose="upright", azimuth_step=180.0), terms=PRESETS["classical"].terms)

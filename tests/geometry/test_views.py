@@ -1,4 +1,4 @@
-"""View sets: how many, how dense, in which range, which duplicates."""
+"""View sets: number, density, range and duplicates."""
 
 import math
 
@@ -26,7 +26,7 @@ def directions(views: ViewSphere) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("count", [2, 5, 20, 100, 300, 700])
-def test_stated_covering_radius(count: int) -> None:
+def test_uniform_views_has_the_stated_covering_radius(count: int) -> None:
     probes = torch.randn(100_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     probes = torch.nn.functional.normalize(torch.cat([probes, torch.eye(3).double(), -torch.eye(3).double()]), dim=1)
     nearest = torch.cat([(p @ directions(uniform_views(count)).T).amax(1) for p in probes.split(20_000)])
@@ -34,7 +34,7 @@ def test_stated_covering_radius(count: int) -> None:
     assert 0.9 * 157 / math.sqrt(count) < radius <= 157 / math.sqrt(count)
 
 
-def test_covering_radius_of_rotations_with_in_plane_turns() -> None:
+def test_uniform_views_covers_rotations_with_thetas() -> None:
     views = uniform_views(200, thetas=range(0, 360, 20))
     R = torch.from_numpy(Rotation.random(2000, random_state=0).as_matrix())
     nearest = (R.flatten(1) @ views.rotations.double().flatten(1).T).argmax(dim=1)
@@ -42,7 +42,7 @@ def test_covering_radius_of_rotations_with_in_plane_turns() -> None:
     assert float(error.max()) <= 157 / math.sqrt(200) + 10.0
 
 
-def test_paper_grid() -> None:
+def test_paper_views_is_the_grid_of_the_paper() -> None:
     views = paper_views()
     assert len(views) == 756
     assert sorted({round(float(d), 4) for d in views.distance}) == pytest.approx([1.5, 3.0, 4.5, 6.0, 7.5, 9.0])
@@ -50,16 +50,16 @@ def test_paper_grid() -> None:
     assert len(one_shell) == 126
     R = one_shell.rotations.double()
     assert float((rotation_error(R[:, None], R) + 9.0 * torch.eye(126)).min()) > 3.0  # no view twice
-    # Elevation runs around: neighbours in the grid are turns of 50 degrees about the camera's x axis.
+    # Neighbours in elevation differ by 50 degrees about the camera's x axis.
     grid = one_shell.rotations.view(7, 18, 3, 3)
     assert torch.allclose(rotation_error(grid[1:], grid[:-1]), torch.tensor(50.0), atol=1e-3)
-    turn = grid[1:] @ grid[:-1].mT
-    assert torch.allclose(turn[..., 0, 0], torch.tensor(1.0), atol=1e-5)
+    step = grid[1:] @ grid[:-1].mT
+    assert torch.allclose(step[..., 0, 0], torch.tensor(1.0), atol=1e-5)
     with pytest.raises(InvalidInputError, match="object_radius"):
         paper_views(object_radius=0.3)
 
 
-def test_pose_range() -> None:
+def test_within_selects_a_range() -> None:
     views = sample_views(azimuth_step=10, elevations=[-20, 0, 20], thetas=[-10, 0, 10])
     car = views.within(azimuth=(350, 10), elevation=(0, 20), theta=(0, 10))
     assert len(car) == 3 * 2 * 2
@@ -76,12 +76,12 @@ def test_pose_range() -> None:
 
 
 @pytest.mark.parametrize(("info", "expected"), [({}, 72 * 3), (HALF_TURN, 36 * 3), (AXIS, 1 * 3)])
-def test_symmetric_duplicates_of_a_grid_go(info: dict[str, object], expected: int) -> None:
+def test_views_without_symmetric_drops_duplicates_of_a_grid(info: dict[str, object], expected: int) -> None:
     views = sample_views(azimuth_step=5, elevations=[-30, 0, 30])
     assert len(views_without_symmetric(views, symmetry_transforms(info))) == expected
 
 
-def test_every_dropped_view_is_still_seen_from_a_kept_one() -> None:
+def test_views_without_symmetric_keeps_one_view_of_each_appearance() -> None:
     views = uniform_views(150, thetas=range(0, 360, 30), distances=[3, 5])
     symmetries = symmetry_transforms(HALF_TURN)
     kept = views_without_symmetric(views, symmetries, tolerance=12.0)
@@ -92,7 +92,7 @@ def test_every_dropped_view_is_still_seen_from_a_kept_one() -> None:
         all_views = views[views.distance == distance].rotations.double()
         nearest = (all_views.flatten(1) @ seen.flatten(1).T).argmax(dim=1)
         assert float(rotation_error(all_views, seen[nearest]).max()) <= 12.01
-    # and no two kept views are duplicates
+    # No two remaining views are duplicates.
     R = kept[kept.distance == 3].rotations.double()
     turned = R[:, None] @ symmetries[1:, :3, :3]
     off = rotation_error(R[None], turned)
@@ -100,7 +100,7 @@ def test_every_dropped_view_is_still_seen_from_a_kept_one() -> None:
     assert float(off.min()) > 12.0
 
 
-def test_bad_view_sets() -> None:
+def test_view_functions_refuse_invalid_options() -> None:
     one = torch.zeros(1)
     for call, match in (
         (lambda: ViewSphere(one, one, one, one + 1), "distances > 1"),
