@@ -1,5 +1,7 @@
 """Boxes, squares and crops: positions and values of pixels."""
 
+import math
+
 import pytest
 import torch
 
@@ -115,3 +117,42 @@ def test_check_boxes_accepts_boxes_at_the_border() -> None:
         g.crop_images([], torch.zeros(0, 4))
     with pytest.raises(InvalidInputError, match="images"):
         g.crop_images([torch.rand(4, 4)], torch.tensor([[0.0, 0.0, 2.0, 2.0]]))
+
+
+def test_crop_images_spreads_missing_pixels_no_further_than_its_filter() -> None:
+    image = torch.rand(1, 3, 60, 80)
+    boxes = torch.tensor([[30.0, 20.0, 60.0, 50.0]])
+    clean, _ = g.crop_images(image, boxes, size=32)
+    outside = image.clone()
+    outside[0, :, 2, 3], outside[0, 1, 59, 79] = math.nan, math.inf
+    crop, _ = g.crop_images(outside, boxes, size=32)
+    torch.testing.assert_close(crop, clean, rtol=0, atol=0)
+    inside = image.clone()
+    inside[0, 1, 35, 45] = math.nan
+    crop, A = g.crop_images(inside, boxes, size=32)
+    lost = crop.isnan()
+    at = A[0] @ torch.tensor([45.0, 35.0, 1.0])
+    rows, columns = lost[0, 1].nonzero().unbind(1)
+    assert 1 <= int(lost.sum()) == int(lost[0, 1].sum()) <= 9
+    assert float((columns - at[0]).abs().max()) < 2.0
+    assert float((rows - at[1]).abs().max()) < 2.0
+    torch.testing.assert_close(crop[~lost], clean[~lost], rtol=0, atol=0)
+    several = torch.cat([inside, image])
+    crops, _ = g.crop_images(several, boxes.expand(2, 4), size=32)
+    torch.testing.assert_close(crops[1], clean[0])
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_crop_images_computes_half_types_in_float32(dtype: torch.dtype) -> None:
+    ramp = torch.linspace(0.0, 1.0, 3000).expand(1, 1, 1500, 3000)
+    image = (37.0 * ramp).frac().to(dtype)  # many edges, so that a shift by one pixel shows
+    boxes = torch.tensor([[2001.0, 1001.0, 2101.0, 1101.0]])
+    half, A = g.crop_images(image, boxes, size=64)
+    full, expected = g.crop_images(image.float(), boxes, size=64)
+    assert half.dtype == dtype
+    assert torch.equal(half, full.to(dtype))
+    assert A.dtype == torch.float32
+    assert torch.equal(A, expected)
+    assert g.crop_images(image, boxes.double(), size=64)[1].dtype == torch.float64
+    few = torch.tensor([[1.0, 2.0, 31.0, 32.0]], dtype=dtype)
+    assert g.crop_images(image[..., :99], few)[1].dtype == torch.float32

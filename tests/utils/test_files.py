@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, whatever happens, and folders that cannot be written to."""
+"""Atomic writes under every kind of interruption, and folders that cannot be written to."""
 
 import errno
 import os
@@ -15,7 +15,7 @@ from curvireg_torch.utils.files import check_writable, write_file
 OLD, NEW = b"a" * 1000, b"b" * 5_000_000
 
 
-def test_whole_files(tmp_path: Path) -> None:
+def test_write_file_replaces_files_and_targets_of_links(tmp_path: Path) -> None:
     path = tmp_path / "new" / "folder" / "file"
     write_file(path, OLD)
     write_file(path, NEW)
@@ -28,7 +28,7 @@ def test_whole_files(tmp_path: Path) -> None:
     assert path.read_bytes() == OLD
 
 
-def test_a_disk_that_fills_up_midway(tmp_path: Path) -> None:
+def test_write_file_keeps_the_old_content_if_writing_fails(tmp_path: Path) -> None:
     path = tmp_path / "file"
     write_file(path, OLD)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -42,7 +42,7 @@ def test_a_disk_that_fills_up_midway(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_full_disk_asks_for_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_write_file_advises_to_make_room_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -53,7 +53,7 @@ def test_a_full_disk_asks_for_room(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("name", ["file/x", "folder", "null"])
-def test_what_is_no_place_for_a_file(tmp_path: Path, name: str) -> None:
+def test_write_file_refuses_other_targets(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").write_bytes(OLD)
     (tmp_path / "folder").mkdir()
     (tmp_path / "null").symlink_to(os.devnull)
@@ -65,7 +65,7 @@ def test_what_is_no_place_for_a_file(tmp_path: Path, name: str) -> None:
     assert not Path(os.devnull).is_file()
 
 
-def test_probes(tmp_path: Path) -> None:
+def test_check_writable_leaves_nothing_and_names_the_option(tmp_path: Path) -> None:
     check_writable(tmp_path / "a" / "b", "--out")
     assert not list((tmp_path / "a" / "b").iterdir())
     (tmp_path / "file").write_bytes(OLD)
@@ -74,11 +74,11 @@ def test_probes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["demo", "bank", "bank --adapt"])
-def test_the_place_is_probed_before_the_work(
+def test_commands_check_the_output_folder_before_they_work(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def work(*_: object, **__: object) -> None:
-        raise AssertionError("began to work")
+        raise AssertionError("work has started")
 
     for name in ("matching.cached_bank", "io.meshes.load_mesh"):
         monkeypatch.setattr(f"curvireg_torch.{name}", work)
@@ -99,7 +99,7 @@ def test_the_place_is_probed_before_the_work(
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_interrupted_in_the_middle_of_a_file(
+def test_write_file_keeps_the_old_content_if_interrupted(
     number: signal.Signals, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "file"
@@ -107,7 +107,7 @@ def test_interrupted_in_the_middle_of_a_file(
     monkeypatch.setattr(os, "fsync", lambda _: signal.raise_signal(number))
     monkeypatch.setattr("curvireg_torch.matching.list_cache", lambda: write_file(path, NEW))
     before = signal.getsignal(signal.SIGTERM)
-    ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # of a suite that a shell runs in the background
+    ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for jobs in the background
     try:
         ended = main(["cache"])
     except SystemExit as stop:
@@ -121,7 +121,7 @@ def test_interrupted_in_the_middle_of_a_file(
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 warns of fork beside threads
-def test_killed_in_the_middle_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_write_file_keeps_the_old_content_if_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "file"
     write_file(path, OLD)
     child = os.fork()
@@ -131,6 +131,5 @@ def test_killed_in_the_middle_of_a_file(tmp_path: Path, monkeypatch: pytest.Monk
         os._exit(0)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
     assert path.read_bytes() == OLD
-    left = [found.name for found in tmp_path.iterdir() if found != path]
-    assert len(left) == 1
-    assert left[0].endswith(".tmp")
+    (temporary,) = (other.name for other in tmp_path.iterdir() if other != path)
+    assert temporary.endswith(".tmp")

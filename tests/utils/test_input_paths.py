@@ -1,4 +1,4 @@
-"""Files named on the command line: looked at at once, and known from each other."""
+"""Checks of the files that a command names."""
 
 from argparse import Namespace
 from pathlib import Path
@@ -12,22 +12,22 @@ from tests.utils.test_lazy import HEAVY, imported_by
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
-    """Names alone: nothing of these files is read."""
+def files(tmp_path, monkeypatch):
+    """Empty files: none of them is read."""
     monkeypatch.chdir(tmp_path)
     for name in ("photo.jpg", "part.stl", "bank.safetensors", "list.csv", "odd.part"):
         Path(name).touch()
     Path("shots").mkdir()
 
 
-MISTAKEN = "where a photograph is expected"
+MISPLACED = "where a photograph is expected"
 SWAPPED = "seem to be swapped: the photograph comes first, the mesh last"
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
-        (["register", "part.stl", "photo.jpg"], f"part.stl: a mesh {MISTAKEN}; it and photo.jpg {SWAPPED}"),
+        (["register", "part.stl", "photo.jpg"], f"part.stl: a mesh {MISPLACED}; it and photo.jpg {SWAPPED}"),
         (["register", "bank.safetensors", "photo.jpg"], f"it and photo.jpg {SWAPPED}"),
         (["register", "part.stl", "shots"], f"it and shots {SWAPPED}"),
         (["register", "part.stl", "shots/*.jpg"], f"it and shots/*.jpg {SWAPPED}"),
@@ -50,18 +50,18 @@ SWAPPED = "seem to be swapped: the photograph comes first, the mesh last"
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )  # fmt: skip
-@pytest.mark.usefixtures("here")
-def test_what_is_missing_or_swapped_is_said_in_one_line(words, said, capsys):
+@pytest.mark.usefixtures("files")
+def test_check_given_reports_missing_and_swapped_files_in_one_line(words, message, capsys):
     out = [] if words[0] == "view" else ["--out", "out"]
     assert main([*words, *out]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert said in line
+    assert message in line
     assert not Path("out").exists()
 
 
 @pytest.mark.parametrize("words", [["none.jpg", "part.stl"], ["photo.jpg", "none.stl"], ["part.stl", "photo.jpg"]])
-@pytest.mark.usefixtures("here")
-def test_it_is_said_before_anything_heavy_is_imported(words):
+@pytest.mark.usefixtures("files")
+def test_check_given_runs_before_heavy_imports(words):
     code = f"from curvireg_torch.cli import main; assert main({['register', *words, '--json']}) == 2"
     assert not imported_by(code) & HEAVY
 
@@ -76,14 +76,14 @@ def test_it_is_said_before_anything_heavy_is_imported(words):
         ["--box", "10", "20", "30.5", "40"],
     ],
 )
-def test_numbers_may_be_divided_by_commas(words):
+def test_options_accept_numbers_with_commas(words):
     arguments = parse(["register", "a,1.jpg", *words, "5,6", "--out", "out"])
     assert arguments.box == [10.0, 20.0, 30.5, 40.0]
     assert arguments.paths == [Path("a,1.jpg"), Path("5,6")]
     assert parse(["view", *words]).box == arguments.box
 
 
-def test_cameras_and_distances_may_be_divided_by_commas_too():
+def test_camera_and_distance_accept_numbers_with_commas():
     words = ["register", "a.jpg", "b.stl", "--camera=1e3,1000,-.5,2", "--distance", ".5,1", "--json"]
     arguments = parse(words)
     assert arguments.camera == [1000.0, 1000.0, -0.5, 2.0]
@@ -92,14 +92,14 @@ def test_cameras_and_distances_may_be_divided_by_commas_too():
 
 
 @pytest.mark.parametrize("numbers", ["1,2,3", "1,2,3,4,5", "1,2,three,4"])
-def test_other_numbers_are_refused(numbers, capsys):
+def test_box_refuses_other_numbers(numbers, capsys):
     with pytest.raises(SystemExit):
         parse(["register", "a.jpg", "b.stl", "--box", numbers, "--json"])
     assert "argument --box: " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    ("raised", "code", "said"),
+    ("raised", "code", "message"),
     [
         (KeyboardInterrupt(), 130, "curvireg: interrupted\n"),
         (
@@ -110,10 +110,10 @@ def test_other_numbers_are_refused(numbers, capsys):
         (CurviregError("no good"), 2, "curvireg: error: no good\n"),
     ],
 )
-def test_what_stops_a_command_is_one_line_and_a_code(raised, code, said, monkeypatch, capsys):
+def test_main_reports_errors_in_one_line_with_a_code(raised, code, message, monkeypatch, capsys):
     def stop(_):
         raise raised
 
     monkeypatch.setattr(cli, "parse", lambda _: Namespace(run=stop, debug=False))
     assert main(["cache"]) == code
-    assert capsys.readouterr().err.startswith(said)
+    assert capsys.readouterr().err.startswith(message)

@@ -1,4 +1,4 @@
-"""What is imported when: help at once, names when they are asked for."""
+"""Lazy imports: help is fast, names are imported on first use."""
 
 import subprocess
 import sys
@@ -16,7 +16,7 @@ UNUSED = {"sklearn", "matplotlib", "skimage", "pyrender", "OpenGL", "timm", "tor
 
 
 def imported_by(code: str) -> set[str]:
-    """Top-level modules that are there after ``code`` has run in a fresh process."""
+    """Top-level modules after ``code`` has run in a new process."""
     script = (
         f"import sys\ntry:\n    {code}\nexcept SystemExit:\n    pass\nprint('\\n'.join(sys.modules), file=sys.stderr)"
     )
@@ -33,11 +33,11 @@ def test_help_imports_nothing_heavy(words):
     assert not imported_by(f"from curvireg_torch.cli import main; main({words!r})") & HEAVY
 
 
-def test_the_package_alone_imports_nothing_heavy():
+def test_importing_the_package_imports_nothing_heavy():
     assert not imported_by("import curvireg_torch; curvireg_torch.CurviregError") & HEAVY
 
 
-def test_commands_import_no_more_than_they_use():
+def test_commands_import_only_what_they_use():
     loaded = imported_by("import curvireg_torch.evaluation.opening")
     assert {"torch", "trimesh"} <= loaded
     assert not loaded & UNUSED
@@ -50,12 +50,12 @@ def test_every_lazy_name_can_be_imported(package):
     assert set(package.__all__) <= set(dir(package))
 
 
-def test_unknown_names_are_attribute_errors():
+def test_unknown_names_raise_attribute_errors():
     with pytest.raises(AttributeError, match="registrar_of"):
         curvireg_torch.registrar_of  # noqa: B018
     assert curvireg_torch.filters is import_module("curvireg_torch.filters")
 
 
-def test_names_on_the_command_line_are_those_of_the_library():
+def test_choices_agree_with_the_presets():
     assert list(PRESETS) == list(choices.PRESET_NAMES)
     assert choices.DEFAULT in PRESETS

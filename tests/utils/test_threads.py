@@ -1,9 +1,8 @@
-"""Jobs shared among the process's threads."""
+"""Jobs on the threads of the process."""
 
 import os
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -19,8 +18,8 @@ def two_threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def test_every_job_once_and_two_at_a_time() -> None:
-    both = threading.Barrier(2, timeout=20)  # broken, unless two jobs run at the same time
+def test_for_each_runs_every_job_once_and_two_at_a_time() -> None:
+    both = threading.Barrier(2, timeout=20)  # times out unless two jobs run at the same time
     done: list[int] = []
 
     def job(number: int) -> None:
@@ -33,7 +32,7 @@ def test_every_job_once_and_two_at_a_time() -> None:
         assert sorted(done) == list(range(6))
 
 
-def test_threads_are_started_once() -> None:
+def test_for_each_reuses_its_threads() -> None:
     seen = set()
     for _ in range(20):
         for_each(4, lambda _: seen.add(threading.get_ident()))
@@ -41,7 +40,7 @@ def test_threads_are_started_once() -> None:
     assert threading.get_ident() not in seen
 
 
-def test_where_torch_computes_alone_nothing_is_shared() -> None:
+def test_for_each_runs_in_sequence_on_single_threads() -> None:
     here = []
     with single_threaded_pool() as pool:
         pool.submit(for_each, 3, lambda _: here.append(threading.get_ident())).result()
@@ -53,14 +52,14 @@ def test_where_torch_computes_alone_nothing_is_shared() -> None:
     assert here[3:] == [threading.get_ident()] * 2
 
 
-def test_jobs_that_share_jobs_end() -> None:
-    # Every thread waiting for others that never get one: that must not be.
+def test_for_each_may_be_nested() -> None:
+    # Threads that wait for others without a free thread would never end.
     done = []
     for_each(40, lambda i: for_each(3, lambda k: done.append((i, k))))
     assert sorted(done) == [(i, k) for i in range(40) for k in range(3)]
 
 
-def test_an_error_stops_and_is_raised() -> None:
+def test_for_each_stops_at_an_error_and_raises_it() -> None:
     done = []
 
     def job(number: int) -> None:
@@ -71,12 +70,12 @@ def test_an_error_stops_and_is_raised() -> None:
     with pytest.raises(ValueError, match="two"):
         for_each(100_000, job)
     assert len(done) < 99_999
-    for_each(2, done.append)  # the threads live on
+    for_each(2, done.append)  # the threads survive
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_a_forked_process_starts_its_own() -> None:
+def test_for_each_works_in_a_forked_process() -> None:
     for_each(4, lambda _: None)
     child = os.fork()
     if child == 0:
@@ -95,8 +94,8 @@ def test_a_forked_process_starts_its_own() -> None:
     assert os.waitstatus_to_exitcode(status) == 0
 
 
-def test_the_process_has_its_threads_back_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a library underneath counts threads for the whole process, a worker's one thread is everybody's."""
+def test_single_threaded_pool_restores_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some libraries count threads for the whole process, so that a worker changes the number for all."""
     threads = [2]
     monkeypatch.setattr(torch, "set_num_threads", lambda n: threads.__setitem__(0, n))
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads[0])
@@ -106,25 +105,21 @@ def test_the_process_has_its_threads_back_afterwards(monkeypatch: pytest.MonkeyP
     assert threads == [2]
 
 
-def test_the_process_has_its_threads_back_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[int] = []
-    monkeypatch.setattr(torch, "set_num_threads", asked.append)
+def test_single_threaded_pool_restores_the_number_of_threads_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[int] = []
+    monkeypatch.setattr(torch, "set_num_threads", calls.append)
 
-    def failing(pool: ThreadPoolExecutor) -> None:
-        pool.submit(threading.get_ident).result()
-        raise ValueError("within")
+    def fail() -> None:
+        with single_threaded_pool() as pool:
+            pool.submit(threading.get_ident).result()
+            raise ValueError("within")
 
     with pytest.raises(ValueError, match="within"):
-        with_pool(failing)
-    assert asked == [1, 2]
+        fail()
+    assert calls == [1, 2]
 
 
-def with_pool(job: Callable[[ThreadPoolExecutor], None]) -> None:
-    with single_threaded_pool() as pool:
-        job(pool)
-
-
-def test_mapped_jobs_keep_their_order_and_each_has_one_thread_of_torch() -> None:
+def test_map_on_threads_keeps_the_order_on_single_threads() -> None:
     def job(number: int) -> tuple[int, int, int]:
         return number, torch.get_num_threads(), threading.get_ident()
 
@@ -136,7 +131,7 @@ def test_mapped_jobs_keep_their_order_and_each_has_one_thread_of_torch() -> None
     assert map_on_threads(job, []) == []
 
 
-def test_a_single_mapped_job_shares_its_rays_among_the_threads_that_are_left() -> None:
+def test_map_on_threads_leaves_threads_to_for_each() -> None:
     both = threading.Barrier(2, timeout=20)
     assert map_on_threads(lambda _: for_each(2, lambda _: both.wait()), [0]) == [None]
     here: list[tuple[int, int]] = []
@@ -147,10 +142,10 @@ def test_a_single_mapped_job_shares_its_rays_among_the_threads_that_are_left() -
 
     map_on_threads(job, [0, 1])
     assert len(here) == 6
-    assert all(mine == other for mine, other in here), "with two jobs no thread is left over"
+    assert all(mine == other for mine, other in here), "two jobs leave no thread over"
 
 
-def test_an_error_in_a_mapped_job_is_raised_and_threads_are_restored() -> None:
+def test_map_on_threads_raises_errors_and_restores_threads() -> None:
     def job(number: int) -> None:
         raise ValueError(f"job {number}")
 
