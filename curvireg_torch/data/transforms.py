@@ -18,7 +18,7 @@ class CropBox:
         margin: added on each side of the box, as a fraction of its longer side.
 
     Raises:
-        InvalidInputError: when called, if the box is empty or wholly outside its image.
+        InvalidInputError: when called, if the box is empty or entirely outside its image.
 
     Example:
         >>> import torch

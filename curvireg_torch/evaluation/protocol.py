@@ -17,7 +17,7 @@ CHOICES = {"cad": ("annotated", "any", "fused"), "pose": ("upright", "any")}
 
 @dataclass(frozen=True)
 class Protocol:
-    """What the method is told about an object, besides the photograph.
+    """The information that the method gets about an object, besides the photograph.
 
     Attributes:
         cad: "annotated": the CAD that the annotation names. "any": every CAD of the class is registered, the best score

@@ -1,4 +1,4 @@
-"""Collections of one's own: viewpoints of given objects, as far as they are known."""
+"""Evaluation on web collections: viewpoints of given objects, where they are known."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ COLUMNS = [
 
 
 class WebBenchmark(Benchmark):
-    """Viewpoints on a collection of one's own. The method is given the box and the object's mesh, and no camera.
+    """Viewpoints on a web collection. The method is given the box and the object's mesh, and no camera.
 
     Photographs of unknown pose are registered, too: they count in ``n``, ``reliable`` and ``mean_confidence``, but in
     no share or error; those are of the ``n_posed`` others.

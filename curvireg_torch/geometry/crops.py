@@ -27,7 +27,7 @@ def whole_image_box(image: Tensor) -> Tensor:
 
 
 def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
-    """Raise :class:`InvalidInputError` for boxes that are empty, not finite or wholly outside their image.
+    """Raise :class:`InvalidInputError` for boxes that are empty, not finite or entirely outside their image.
 
     Args:
         boxes: (B, 4) x0, y0, x1, y1 in px.
@@ -43,7 +43,7 @@ def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
         if x1 <= x0 or y1 <= y0:
             raise InvalidInputError(f"{name}: expected X0 < X1 and Y0 < Y1; give corners, not width and height")
         if x1 <= -0.5 or y1 <= -0.5 or x0 >= W - 0.5 or y0 >= H - 0.5:
-            raise InvalidInputError(f"{name}: wholly outside the {W} x {H} image; give pixel coordinates of this image")
+            raise InvalidInputError(f"{name}: entirely outside the {W} x {H} image; give pixel coordinates of this image")
 
 
 def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
@@ -113,7 +113,7 @@ def crop_images(
         float32.
 
     Raises:
-        InvalidInputError: wrong shapes, or a box is empty or wholly outside its image.
+        InvalidInputError: wrong shapes, or a box is empty or entirely outside its image.
 
     Example:
         >>> crops, A = crop_images(torch.rand(2, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30], [10, 5, 60, 47]]), size=32)

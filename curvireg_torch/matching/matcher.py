@@ -51,7 +51,7 @@ class ViewMatcher(nn.Module):
     change scores by rounding, relatively by about 1e-5; :class:`curvireg_torch.Registrar` prevents that.
 
     Args:
-        bank: the views of one model, or of several that are to be told apart.
+        bank: the views of one or several models.
         pipeline: field, terms and box jitter; default the bank's. Its bank settings and view policy must be those of
             the bank, unless the bank's views were passed by the caller.
         field: custom photograph filter (B, 1, S, S) -> (B, 2, S, S). With an attribute ``colour = True`` it gets colour

@@ -97,7 +97,7 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
     Args:
         images: (B, C, H, W), or a list of (C, H, W), floating in [0, 1] or uint8; if channel counts differ, grey images
             get three channels.
-        boxes: (B, K, 4) x0, y0, x1, y1 in px, from :func:`jittered_boxes`; a box wholly outside its image is replaced
+        boxes: (B, K, 4) x0, y0, x1, y1 in px, from :func:`jittered_boxes`; a box entirely outside its image is replaced
             by the first box.
         size, margin: see :func:`crop_images`.
 
@@ -105,7 +105,7 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
         Floating crops; (0, K, 3, S, S) for an empty batch.
 
     Raises:
-        InvalidInputError: wrong shapes, or a first box that is empty or wholly outside its image.
+        InvalidInputError: wrong shapes, or a first box that is empty or entirely outside its image.
     """
     for image in images:
         check_photograph(image)

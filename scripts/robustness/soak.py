@@ -3,7 +3,7 @@
     python scripts/robustness/soak.py                     2000 registrations in each of two processes that share a cache
     python scripts/robustness/soak.py --count 100 --processes 1
 
-Every process registers noisy copies of one photograph made in code, and opens its bank anew from the shared cache every
+Every process registers noisy copies of one photograph made in code, and reopens its bank from the shared cache every
 ``--reopen`` registrations; the cache is trimmed to nothing by each, so that they also remove what the other one reads.
 ``scripts/results/soak.json`` gets resident memory, open files and threads over the course, and by how much the median
 of the last quarter exceeds that of the second one (the first quarter warms up). Exits 1 if by more than ``--allow`` MB,

@@ -49,7 +49,7 @@ def test_bop_supposes_any_orientation(bop, tmp_path):
 
 
 def test_without_boxes(pascal, tmp_path, capsys, monkeypatch):
-    """Recall of boxes is told beside the pose's scores; where no box is annotated, that is said."""
+    """The summary has the recall of boxes, or says that no box is annotated."""
     evaluate("pascal3d", pascal.root, "--limit", "2", "--out", tmp_path / "out", "--protocol", "box=none")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["localization"]["n"] == 2

@@ -69,7 +69,7 @@ def test_every_row_is_answered_in_the_lists_order(folder, capsys):
     truth = scene(0)[2][:3, 3]
     assert float((t - truth).norm() / truth.norm()) < 0.1
     assert [found[1][name] for name in ("tx", "ty", "tz")] == [""] * 3
-    words = {2: "no such file", 3: "text.jpg", 4: "wholly outside", 5: "finite", 6: "x1: expected a number, got '9o'"}
+    words = {2: "no such file", 3: "text.jpg", 4: "entirely outside", 5: "finite", 6: "x1: expected a number, got '9o'"}
     words |= {7: "nothing for x1", 8: "nothing for fy", 9: "finite", 10: "focal", 11: "one colour", 12: "2 cells"}
     for k, word in words.items():
         assert found[k]["status"] == "failed"

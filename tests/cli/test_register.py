@@ -111,7 +111,7 @@ def broken_files(folder):
         ({"photo": "flat.png", "box": ()}, [], ["flat.png", "one colour"]),
         ({"mesh": "broken.safetensors"}, [], ["broken.safetensors", "build"]),
         ({"box": ["5", "5", "5", "9"]}, [], ["X0 < X1"]),
-        ({"box": ["900", "5", "950", "9"]}, [], ["wholly outside"]),
+        ({"box": ["900", "5", "950", "9"]}, [], ["entirely outside"]),
         ({}, ["--camera", "0", "260", "119", "89"], ["focal"]),
         ({}, ["--top", "0"], ["hypotheses"]),
         ({}, ["--field", "none"], ["none"]),

@@ -1,4 +1,4 @@
-"""Detectors against their definitions, written out once more: numbers, defaults and orders, not only places."""
+"""Detectors against their definitions, implemented independently: numbers, defaults and orders, not only places."""
 
 import cv2
 import numpy as np

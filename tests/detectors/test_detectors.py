@@ -91,7 +91,7 @@ def test_colour_becomes_grey_and_missing_pixels_detect_nothing(name: str) -> Non
 
 
 def _near(points: np.ndarray, others: np.ndarray, radius: int) -> float:
-    """Share of the points with another within ``radius`` px (square)."""
+    """Fraction of the points with another within ``radius`` px (square)."""
     grown = binary_dilation(others, np.ones((2 * radius + 1,) * 2))
     return float(grown[points].mean())
 

@@ -65,7 +65,7 @@ def test_objects_fail_alone(bop, tmp_path):
     summary = run(benchmark, tmp_path / "out")
     rows = rows_of(benchmark, tmp_path / "out")
     assert "square pixels" in rows[first.key]["failed"]
-    assert "wholly outside" in rows[second.key]["failed"]
+    assert "entirely outside" in rows[second.key]["failed"]
     assert "rotation" in rows[third.key]
     assert summary["failed"] == 2
 

@@ -1,4 +1,4 @@
-"""A collection of one's own, whose poses are known in part, and the table of all kinds of datasets."""
+"""A web collection whose poses are partly known, and the table of all kinds of datasets."""
 
 import csv
 

@@ -97,10 +97,10 @@ def test_crop_images_is_batch_independent() -> None:
         ([0.0, 0.0, 1e9, 5.0], "finite"),
         ([5.0, 0.0, 5.0, 5.0], "X0 < X1"),
         ([0.0, 6.0, 5.0, 5.0], "X0 < X1"),
-        ([-9.0, 0.0, -0.5, 5.0], "wholly outside the 30 x 20 image"),
-        ([0.0, -9.0, 5.0, -0.5], "wholly outside"),
-        ([29.5, 0.0, 40.0, 5.0], "wholly outside"),
-        ([0.0, 19.5, 5.0, 40.0], "wholly outside"),
+        ([-9.0, 0.0, -0.5, 5.0], "entirely outside the 30 x 20 image"),
+        ([0.0, -9.0, 5.0, -0.5], "entirely outside"),
+        ([29.5, 0.0, 40.0, 5.0], "entirely outside"),
+        ([0.0, 19.5, 5.0, 40.0], "entirely outside"),
     ],
 )
 def test_check_boxes_refuses_boxes_without_pixels(box: list[float], match: str) -> None:

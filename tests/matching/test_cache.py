@@ -242,7 +242,7 @@ def _builder(folder: str, edges: tuple[float, ...]) -> float:
     return sum(float(build(Path(folder), edge).descriptors.sum()) for edge in edges)
 
 
-# Forked processes: spawned ones would import everything anew, some seconds each.
+# Forked processes: spawned ones would import everything again, some seconds each.
 forking = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
 
 

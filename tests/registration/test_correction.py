@@ -13,7 +13,7 @@ from curvireg_torch.registration.document import result_document, used_box
 from tests._support.scenes import CAMERA, scene, truck_bank, unrefined
 
 EDGES = torch.tensor([-0.18, 0.15, 0.02, 0.2])
-"""Shares of a box's sides by which its edges are wrong."""
+"""Errors of a box's edges as fractions of its sides."""
 
 
 def roughly(box):

@@ -1,6 +1,6 @@
 """Real photographs, the default pipeline: the poses that come out are the annotated ones, in the right frame and unit.
 
-Only photographs are taken that are registered rightly with room to spare; shares of right answers are measured
+Only photographs are taken that are registered rightly with room to spare; fractions of right answers are measured
 elsewhere (docs/accuracy.md). About 70 seconds of one core, most of it for banks of any orientation.
 """
 
@@ -28,7 +28,7 @@ class Case:
         name: of the set.
         keys: of the benchmark's objects.
         rotation: degrees, up to the object's symmetries.
-        sideways, depth: across and along the optical axis, as shares of the distance.
+        sideways, depth: across and along the optical axis, as fractions of the distance.
     """
 
     name: str

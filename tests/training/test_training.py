@@ -1,4 +1,4 @@
-"""Lessons, losses and fine-tuning."""
+"""Training samples, losses and fine-tuning."""
 
 import os
 import subprocess
@@ -46,7 +46,7 @@ def test_the_right_answer_has_no_loss(batch):
 
 
 def test_mirroring_keeps_answers_right(batch):
-    """All lessons are mirrored, or none: the code's loss of a mirrored right answer stays 0."""
+    """All samples are mirrored, or none: the code's loss of a mirrored right answer stays 0."""
     found = set()
     for seed in range(6):
         one = {k: v[:1] for k, v in batch.items()}

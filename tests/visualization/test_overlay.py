@@ -29,14 +29,14 @@ def drawn(picture):
 
 
 def near(contour, mask, pixels):
-    """Share of the contour's pixels within so many px of the contour of a mask."""
+    """Fraction of the contour's pixels within so many px of the contour of a mask."""
     assert contour.sum() > 50
     edge = mask & ~binary_erosion(mask)
     return float((distance_transform_edt(~edge)[contour] <= pixels).mean())
 
 
 def wrong(box, share):
-    """The box moved to the right and up by a share of its longer side."""
+    """The box moved to the right and up by a fraction of its longer side."""
     side = (box[2:] - box[:2]).max()
     return box + share * side * torch.tensor([1.0, -1.0, 1.0, -1.0])
 

@@ -71,14 +71,14 @@ def rank_views(cases: list[Case], views: ViewSphere, settings: BankSettings, pro
 
 
 def precision_table(rankings: Rankings) -> Table:
-    """Share of the photographs whose best view is nearly right, per category."""
+    """Fraction of the photographs whose best view is nearly right, per category."""
     rows: list[list[str | float]] = []
     for category in [*sorted(set(rankings.categories)), "all"]:
         mask = torch.tensor([category in (c, "all") for c in rankings.categories])
         best = [rankings.errors.gather(1, order[:, :1])[mask, 0] for order in rankings.orders.values()]
         rows.append([category, *(accuracy(errors, THRESHOLD_DEG) for errors in best)])
     text = (
-        f"Precision: share of the photographs whose best view is within {THRESHOLD_DEG:g} degrees of the true one. "
+        f"Precision: fraction of the photographs whose best view is within {THRESHOLD_DEG:g} degrees of the true one. "
         f"{rankings.definition}"
     )
     return Table("precision", "Precision, depth filter / photograph filter", text, ["category", *rankings.orders], rows)
@@ -97,7 +97,7 @@ def rank_tables(rankings: Rankings) -> list[Table]:
             for order in rankings.orders.values()
         ]
         rows: list[list[str | float]] = [[float(k), *(column[k] for column in columns)] for k in RANKS]
-        definition = f"Share of the photographs with {text} among the best k. {rankings.definition}"
+        definition = f"Fraction of the photographs with {text} among the best k. {rankings.definition}"
         tables.append(
             Table(name, f"Precision at rank k: {text}", definition, ["k", *rankings.orders], rows, curve=True)
         )

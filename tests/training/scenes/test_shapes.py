@@ -68,7 +68,7 @@ def test_a_users_mesh_is_centred_scaled_and_split_into_its_parts():
 
 
 def test_parts_of_an_stl_are_connected_where_their_corners_coincide(tmp_path):
-    """Such a file lists the corners of every triangle anew."""
+    """Such a file lists the corners of every triangle separately."""
     parts = [trimesh.creation.box(), trimesh.creation.icosphere(subdivisions=1), trimesh.creation.box((0.5, 2, 3))]
     for i, part in enumerate(parts):
         part.apply_translation((5 * i, 0, 0))
