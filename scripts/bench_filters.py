@@ -82,8 +82,8 @@ def smallest(function: Callable[[], object], repetitions: int) -> float:
 def smoothings() -> dict[str, dict[str, float]]:
     """What the smoothing under MCS costs and finds, on the five scenes of the detectors' figure.
 
-    ``near_contour`` is the fraction of the points within 2 px of the solid's silhouette, ``contour_found`` the fraction of
-    the silhouette within 2 px of a point; as many points as the silhouettes have on average, 1.3 % of the pixels.
+    ``near_contour`` is the fraction of points within 2 px of the silhouette, ``contour_found`` that of
+    the silhouette within 2 px of a point, with as many points as the silhouettes have on average, 1.3 % of the pixels.
     """
     photo = torch.cat([scene(i)[0] for i in range(5)])
     contour = torch.cat([silhouette(scene(i)[1]) for i in range(5)])

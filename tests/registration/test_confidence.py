@@ -199,7 +199,7 @@ def test_without_contours_the_confidence_is_that_of_the_answers_view(monkeypatch
     result = registrar([image], box[None], CAMERA)[0]
     assert list(result.confidence_features) == list(RANKING_FEATURES)
     assert result.confidence == pytest.approx(float(confidence(result.ranking, truck_bank().rotations)))
-    # Where the order of the hypotheses is not that of the ranking, the confidence is that of the answer, not of the best view.
+    # If the hypotheses are reordered, the confidence is that of the answer, not of the best view.
     monkeypatch.setattr(estimator_module, "rescore", lambda evidence, **_: evidence[:, 0].neg())
     other = registrar([image], box[None], CAMERA)[0]
     view = int(other.candidates[0])
