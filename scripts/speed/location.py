@@ -5,8 +5,8 @@
 
 BENCH is the folder of scripts/benchmark/make.py. Each photograph in which more than 0.7 of the object's silhouette is
 seen becomes a quarter of a mosaic of 640 x 480 px, three others, of other kinds of objects, the rest; a second mosaic
-has none of it. Rows say where the proposals lie (overlap with the visible box) and what presence is judged by; run
-again, it goes on. LINEMOD gets the same representative views, shaded grey, at the same sizes; it needs
+has none of it. Rows hold the proposals' overlap with the visible box and the features of presence; a second run
+resumes. LINEMOD gets the same representative views, shaded grey, at the same sizes; it needs
 opencv-contrib-python-headless in place of opencv-python-headless.
 """
 
@@ -46,7 +46,7 @@ Curves = dict[str, tuple[list[bool], list[float]]]
 
 SIZE = (480, 640)
 VISIBLE = 0.7
-"""Photographs become mosaics where more than this share of the object's silhouette is seen."""
+"""Photographs become mosaics where more than this fraction of the object's silhouette is seen."""
 RECORD = REPOSITORY / "scripts" / "results" / "location.json"
 PAGE = REPOSITORY / "docs" / "guides" / "without-a-box.md"
 MARKERS = "<!-- location:begin -->", "<!-- location:end -->"

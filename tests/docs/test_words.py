@@ -46,8 +46,8 @@ PATTERN = re.compile(rf"\b(?:{'|'.join(DIALECT)})(?!\w)", flags=re.IGNORECASE)
 SCOPE = {
     "pages": PAGES,
     **{
-        folder: sorted((ROOT / folder).rglob("*.py"))
-        for folder in ("curvireg_torch/registration", "curvireg_torch/viewer", "datasets", "docs/gallery")
+        folder: [path for path in sorted((ROOT / folder).rglob("*.py")) if path != Path(__file__)]
+        for folder in ("curvireg_torch", "datasets", "docs/gallery", "scripts", "tests")
     },
 }
 """Files without dialect."""
