@@ -11,7 +11,7 @@ import trimesh
 
 from curvireg_torch.rendering import make_renderer
 
-from .scenes import BACKENDS, camera, require
+from .conftest import BACKENDS, camera, require
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -1,4 +1,4 @@
-"""Cameras and checks that the renderers' tests share."""
+"""Backends, cameras and pixel masks that the renderers' tests share."""
 
 import functools
 
@@ -25,16 +25,26 @@ def _works(backend: str) -> bool:
 
 
 def require(*backends: str) -> None:
-    """Skip where a backend has no driver; only pyrender needs one."""
-    for backend in backends:
-        if backend == "pyrender" and not _works(backend):
-            pytest.skip("pyrender needs EGL")
+    """Skip where pyrender has no driver; the others need none."""
+    if "pyrender" in backends and not _works("pyrender"):
+        pytest.skip("pyrender needs EGL")
+
+
+@pytest.fixture(params=BACKENDS)
+def backend(request: pytest.FixtureRequest) -> str:
+    require(request.param)
+    return str(request.param)
+
+
+@pytest.fixture(params=[False, True], ids=["perspective", "orthographic"])
+def orthographic(request: pytest.FixtureRequest) -> bool:
+    return bool(request.param)
 
 
 def camera(
     count: int, *, radius: float = 1.0, centre: Tensor | None = None, orthographic: bool = False
 ) -> tuple[Tensor, Tensor, tuple[int, int]]:
-    """Views from all around by an off-centre camera with oblong pixels and a wide image, object partly outside."""
+    """Views from all around: off-centre camera, rectangular pixels, wide image, object partly outside."""
     R = uniform_views(count).rotations.double()
     centre = torch.zeros(3, dtype=torch.float64) if centre is None else centre
     t = -(R @ centre)
@@ -42,6 +52,12 @@ def camera(
     f = 60.0 / radius if orthographic else 240.0
     K = torch.tensor([[f, 0.0, 70.3], [0, 1.1 * f, 51.8], [0, 0, 1]], dtype=torch.float64)
     return transform(R, t), K, (108, 154)
+
+
+def pixel_grid(size: tuple[int, int]) -> Tensor:
+    """(H, W, 3) homogeneous pixel coordinates, float64."""
+    v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in size), indexing="ij")
+    return torch.stack([u, v, torch.ones_like(u)], -1)
 
 
 def interior(a: Tensor, b: Tensor) -> Tensor:
@@ -59,7 +75,7 @@ def smooth(depth: Tensor, *, bend: float) -> Tensor:
     H, W = depth.shape[-2:]
     worst = torch.zeros_like(depth)
     for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        one = padded[..., 1 + dy : 1 + dy + H, 1 + dx : 1 + dx + W]
-        two = padded[..., 1 - dy : 1 - dy + H, 1 - dx : 1 - dx + W]
-        worst = torch.maximum(worst, (one + two - 2 * depth).abs())
+        a = padded[..., 1 + dy : 1 + dy + H, 1 + dx : 1 + dx + W]
+        b = padded[..., 1 - dy : 1 - dy + H, 1 - dx : 1 - dx + W]
+        worst = torch.maximum(worst, (a + b - 2 * depth).abs())
     return F.max_pool2d(worst, 3, 1, 1) < bend
