@@ -21,7 +21,7 @@ __all__ = [
 
 
 class _SubjectError(Exception):
-    """What errors and warnings have in common."""
+    """Message and subject of errors and warnings."""
 
     def __init__(self, message: str = "", *, subject: object = "") -> None:
         super().__init__(message)
@@ -31,7 +31,7 @@ class _SubjectError(Exception):
         return f"{self.subject}: {self.message}" if self.subject else self.message
 
     def with_subject(self, subject: object) -> Self:
-        """A copy of it about ``subject``, in place of its present subject."""
+        """A copy about another subject."""
         return type(self)(self.message, subject=subject)
 
 
@@ -51,7 +51,7 @@ class CurviregError(_SubjectError):
 
 
 class CurviregWarning(_SubjectError, UserWarning):  # noqa: N818
-    """A file can be used, but is perhaps not what the user means; ``message`` and ``subject`` as of an error."""
+    """A file is usable, but perhaps not what the user means; fields as of :class:`CurviregError`."""
 
 
 class InvalidInputError(CurviregError, ValueError):

@@ -8,15 +8,6 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..utils.checks import check_camera_matrix, check_pose
 
-__all__ = [
-    "camera_matrix",
-    "camera_of_view",
-    "project_points",
-    "projected_boxes",
-    "rotation_towards",
-    "transform",
-]
-
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dtype = torch.float32) -> Tensor:
     """(3, 3) OpenCV camera matrix; all arguments in px.
@@ -59,17 +50,13 @@ def transform(R: Tensor, t: Tensor) -> Tensor:
 
 
 def project_points(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False) -> Tensor:
-    """Pixel coordinates of model points, as ``cv2.projectPoints`` gives without distortion.
+    """(..., P, 2) pixel coordinates of model points, as ``cv2.projectPoints`` gives without distortion.
 
     Args:
         points: (P, 3) or (N, P, 3) in model units.
         T_cam_from_model: (N, 4, 4) or (4, 4), rigid.
-        K: (N, 3, 3) or (3, 3), without skew. An orthographic camera uses ``u = fx x + cx``, with fx in px per model
-            unit.
-        orthographic: drop the division by z.
-
-    Returns:
-        (..., P, 2) pixel coordinates; pixel (0, 0) is the centre of the top-left pixel.
+        K: (N, 3, 3) or (3, 3), without skew.
+        orthographic: do not divide by z; focal lengths are in px per model unit.
 
     Raises:
         InvalidInputError: a pose is not rigid and finite, or the camera matrix is unusable.

@@ -17,32 +17,16 @@ from ..errors import InvalidInputError
 from ..utils.checks import check_camera_matrix, check_pose, check_rotation, check_tensor
 from .cameras import transform
 
-__all__ = [
-    "axis_angle_from_rotation",
-    "opencv_from_opengl",
-    "opencv_from_pytorch3d",
-    "opengl_from_opencv",
-    "opengl_projection",
-    "pytorch3d_from_opencv",
-    "quaternion_from_rotation",
-    "rotation_from_axis_angle",
-    "rotation_from_quaternion",
-]
-
 
 def _flip(matrix: Tensor, signs: tuple[float, ...]) -> Tensor:
     return matrix * torch.tensor(signs, dtype=matrix.dtype, device=matrix.device)[:, None]
 
 
 def opengl_from_opencv(T_cam_from_model: Tensor) -> Tensor:
-    """Transform into the OpenGL camera: a view matrix, as of ``gluLookAt``.
+    """(..., 4, 4) transforms into the OpenGL camera, from those into the OpenCV camera.
 
-    Args:
-        T_cam_from_model: (..., 4, 4) into the OpenCV camera.
-
-    Returns:
-        (..., 4, 4) into the camera with x right, y up, z backward. Its inverse is the camera's pose in the model frame,
-        which trimesh, pyrender and Blender expect.
+    They are view matrices, as of ``gluLookAt``. The inverse of one is the camera's pose in the model frame, which
+    trimesh, pyrender and Blender expect.
 
     Raises:
         InvalidInputError: not a finite, rigid, floating (..., 4, 4) transform.
@@ -105,15 +89,9 @@ def opengl_projection(
 
 
 def pytorch3d_from_opencv(T_cam_from_model: Tensor) -> tuple[Tensor, Tensor]:
-    """``R`` and ``T`` of a PyTorch3D camera.
+    """R (..., 3, 3) and T (..., 3) of PyTorch3D cameras, from (..., 4, 4) transforms into the OpenCV camera.
 
     With ``in_ndc=False``, ``focal_length=(fx, fy)`` and ``principal_point=(cx + 0.5, cy + 0.5)`` complete the camera.
-
-    Args:
-        T_cam_from_model: (..., 4, 4) into the OpenCV camera.
-
-    Returns:
-        R (..., 3, 3), T (..., 3) with ``x_cam = x R + T`` for row vectors x; x left, y up, z forward.
 
     Raises:
         InvalidInputError: not a finite, rigid, floating (..., 4, 4) transform.

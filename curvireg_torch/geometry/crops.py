@@ -9,16 +9,6 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..utils.checks import as_boxes, check_positive, check_tensor
 
-__all__ = [
-    "box_iou",
-    "check_boxes",
-    "crop_images",
-    "crop_transforms",
-    "image_transforms",
-    "square_boxes",
-    "whole_image_box",
-]
-
 
 def whole_image_box(image: Tensor) -> Tensor:
     """(4,) box of a whole (..., H, W) image."""

@@ -6,8 +6,6 @@ This reader replaces Pillow's because :mod:`.image_headers` needs the offsets of
 import struct
 from dataclasses import dataclass
 
-__all__ = ["Directory", "Exif", "read_exif"]
-
 _FORMATS = {1: "B", 3: "H", 4: "I"}  # byte, short, long
 _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
 

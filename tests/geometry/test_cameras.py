@@ -32,12 +32,12 @@ def test_transform_joins_rotation_and_translation() -> None:
 def test_project_points_agrees_with_opencv() -> None:
     X = np.random.default_rng(0).uniform(-1, 1, (40, 3))
     rotation, t = np.array([0.3, -0.8, 0.2]), np.array([0.2, -0.1, 5.0])
-    theirs = cv2.projectPoints(X, rotation, t, K.numpy(), None)[0][:, 0]
+    expected = cv2.projectPoints(X, rotation, t, K.numpy(), None)[0][:, 0]
     T = g.transform(torch.from_numpy(Rotation.from_rotvec(rotation).as_matrix()), torch.from_numpy(t))
     ours = g.project_points(torch.from_numpy(X), T, K)
-    np.testing.assert_allclose(ours, theirs, atol=1e-9)
+    np.testing.assert_allclose(ours, expected, atol=1e-9)
     box = g.projected_boxes(torch.from_numpy(X), T, K)
-    np.testing.assert_allclose(box, [*theirs.min(0), *theirs.max(0)], atol=1e-9)
+    np.testing.assert_allclose(box, [*expected.min(0), *expected.max(0)], atol=1e-9)
 
 
 def test_project_points_orthographic_ignores_depth() -> None:

@@ -58,10 +58,10 @@ def test_mssd_error_of_a_rotated_solid_of_revolution_is_small() -> None:
     ring = torch.stack([50.0 * angles.cos(), 50.0 * angles.sin(), torch.zeros_like(angles)], 1)
     symmetries = symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]})
     T = torch.eye(4, dtype=torch.float64)[None]
-    turned = T.clone()
-    turned[0, :3, :3] = torch.from_numpy(Rotation.from_rotvec([0, 0, 1.234]).as_matrix())
-    assert float(metrics.mssd_error(turned, T, ring, symmetries=symmetries)) <= 0.5  # half a step
-    assert float(metrics.mssd_error(turned, T, ring)) > 50.0
+    rotated = T.clone()
+    rotated[0, :3, :3] = torch.from_numpy(Rotation.from_rotvec([0, 0, 1.234]).as_matrix())
+    assert float(metrics.mssd_error(rotated, T, ring, symmetries=symmetries)) <= 0.5  # half a step
+    assert float(metrics.mssd_error(rotated, T, ring)) > 50.0
 
 
 @pytest.mark.parametrize(

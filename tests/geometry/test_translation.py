@@ -80,5 +80,5 @@ def test_translation_from_box_keeps_the_object_in_front_of_the_camera() -> None:
     nearest = 1.05 * 3.0**0.5
     straight = g.translation_from_box(cube, torch.eye(3, dtype=torch.float64), box, K)
     assert float(straight[2]) == pytest.approx(nearest, rel=1e-6)
-    turned = g.rotation_from_viewpoint(20.0, 30.0, 10.0).double()
-    assert float(g.translation_from_box(cube, turned, box, K)[2]) > nearest - 1e-6
+    rotated = g.rotation_from_viewpoint(20.0, 30.0, 10.0).double()
+    assert float(g.translation_from_box(cube, rotated, box, K)[2]) > nearest - 1e-6

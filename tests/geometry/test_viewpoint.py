@@ -71,10 +71,10 @@ def test_rotation_error_agrees_with_scipy() -> None:
     differences = Rotation.from_rotvec([[0, 0, v] for v in (0.0, 1e-9, 1e-4, 1.0, 3.0, math.pi)] * 10)
     B = A * differences
     ours = g.rotation_error(torch.from_numpy(A.as_matrix()), torch.from_numpy(B.as_matrix()))
-    theirs = torch.rad2deg(torch.from_numpy((A.inv() * B).magnitude()))
-    torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-5)
-    small = ours[theirs < 1e-6]
-    torch.testing.assert_close(small, theirs[theirs < 1e-6], rtol=0.02, atol=1e-12)
+    expected = torch.rad2deg(torch.from_numpy((A.inv() * B).magnitude()))
+    torch.testing.assert_close(ours, expected, rtol=0, atol=1e-5)
+    small = ours[expected < 1e-6]
+    torch.testing.assert_close(small, expected[expected < 1e-6], rtol=0.02, atol=1e-12)
     assert g.rotation_error(torch.eye(3).expand(4, 1, 3, 3), torch.eye(3).expand(5, 3, 3)).shape == (4, 5)
 
 

@@ -94,8 +94,8 @@ def test_views_without_symmetric_keeps_one_view_of_each_appearance() -> None:
         assert float(rotation_error(all_views, seen[nearest]).max()) <= 12.01
     # No two remaining views are duplicates.
     R = kept[kept.distance == 3].rotations.double()
-    turned = R[:, None] @ symmetries[1:, :3, :3]
-    off = rotation_error(R[None], turned)
+    rotated = R[:, None] @ symmetries[1:, :3, :3]
+    off = rotation_error(R[None], rotated)
     off[torch.arange(len(R)), torch.arange(len(R))] = 180.0
     assert float(off.min()) > 12.0
 

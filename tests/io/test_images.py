@@ -81,7 +81,7 @@ def test_guessed_camera_matrix_uses_the_exif_focal_length(tmp_path):
     photo = read_photo(path)
     assert photo.focal_35mm == photo.facts()["focal_35mm"] == 27
     K = photo.guessed_camera_matrix()
-    # The diagonal of 50 px subtends what the 43.27 mm of a 36 x 24 mm film do; the turned picture is 30 wide.
+    # The diagonal of 50 px corresponds to 43.27 mm on a 36 x 24 mm film; the rotated picture is 30 px wide.
     assert float(K[0, 0]) == float(K[1, 1]) == pytest.approx(27 * 50 / 43.2666, rel=1e-5)
     assert K[:2, 2].tolist() == [14.5, 19.5]
 
@@ -156,12 +156,12 @@ def test_read_photo_names_other_formats(tmp_path, content, name):
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-@pytest.mark.parametrize("kept", [0.02, 0.5, 0.9])
-def test_read_image_refuses_truncated_files(tmp_path, suffix, kept):
+@pytest.mark.parametrize("fraction", [0.02, 0.5, 0.9])
+def test_read_image_refuses_truncated_files(tmp_path, suffix, fraction):
     path = tmp_path / f"a{suffix}"
     write_image(path, (64, 64))
     data = path.read_bytes()
-    path.write_bytes(data[: int(len(data) * kept)])
+    path.write_bytes(data[: int(len(data) * fraction)])
     with pytest.raises(ImageError, match=r"truncated|not an image"):
         read_image(path)
 

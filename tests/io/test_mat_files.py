@@ -43,11 +43,11 @@ def test_read_mat_agrees_with_scipy(tmp_path, compress):
     path = tmp_path / "a.mat"
     scipy.io.savemat(path, {"other": 1.0, "record": record}, do_compression=compress)
     (ours,) = read_mat(path, "record")
-    theirs = scipy.io.loadmat(path)["record"][0, 0]
+    expected = scipy.io.loadmat(path)["record"][0, 0]
     for kind in numbers:
-        np.testing.assert_array_equal(ours[f"n_{kind}"], theirs[f"n_{kind}"].ravel("F"))
+        np.testing.assert_array_equal(ours[f"n_{kind}"], expected[f"n_{kind}"].ravel("F"))
         assert type(ours[f"n_{kind}"]) is np.ndarray
-    assert ours["text"] == theirs["text"][0]
+    assert ours["text"] == expected["text"][0]
     assert ours["flag"] == [1.0]
     assert [s["a"] for s in ours["structs"]] == ["x", ""]
     np.testing.assert_array_equal(ours["structs"][0]["b"], [1, 0, 0, 1])

@@ -1,5 +1,6 @@
 """Jobs on the threads of the process."""
 
+import contextlib
 import os
 import threading
 from collections.abc import Iterator
@@ -94,29 +95,25 @@ def test_for_each_works_in_a_forked_process() -> None:
     assert os.waitstatus_to_exitcode(status) == 0
 
 
-def test_single_threaded_pool_restores_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [None, ValueError("within")])
+def test_single_threaded_pool_restores_the_number_of_threads(
+    monkeypatch: pytest.MonkeyPatch, error: Exception | None
+) -> None:
     """Some libraries count threads for the whole process, so that a worker changes the number for all."""
     threads = [2]
-    monkeypatch.setattr(torch, "set_num_threads", lambda n: threads.__setitem__(0, n))
-    monkeypatch.setattr(torch, "get_num_threads", lambda: threads[0])
-    with single_threaded_pool() as pool:
-        pool.submit(threading.get_ident).result()
-        assert threads == [1]
-    assert threads == [2]
+    monkeypatch.setattr(torch, "set_num_threads", lambda n: threads.append(n))
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads[-1])
 
-
-def test_single_threaded_pool_restores_the_number_of_threads_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[int] = []
-    monkeypatch.setattr(torch, "set_num_threads", calls.append)
-
-    def fail() -> None:
+    def run() -> None:
         with single_threaded_pool() as pool:
             pool.submit(threading.get_ident).result()
-            raise ValueError("within")
+            assert threads[-1] == 1
+            if error is not None:
+                raise error
 
-    with pytest.raises(ValueError, match="within"):
-        fail()
-    assert calls == [1, 2]
+    with pytest.raises(ValueError, match="within") if error else contextlib.nullcontext():
+        run()
+    assert threads == [2, 1, 2]
 
 
 def test_map_on_threads_keeps_the_order_on_single_threads() -> None:

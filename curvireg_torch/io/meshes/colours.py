@@ -88,13 +88,7 @@ class SurfaceColours:
 
 
 def has_colours(mesh: Any) -> bool:
-    """Whether a mesh has colours.
-
-    Example:
-        >>> import trimesh
-        >>> has_colours(trimesh.creation.box())
-        False
-    """
+    """Whether a mesh has colours, see :func:`surface_colours`."""
     return surface_colours(mesh) is not None
 
 

@@ -20,17 +20,6 @@ from .colours import SurfaceColours, surface_colours
 from .files import read_mesh
 from .up import format_up, mesh_up
 
-__all__ = [
-    "as_mesh",
-    "box_corners",
-    "extreme_points",
-    "load_mesh",
-    "mesh_centre",
-    "mesh_radius",
-    "mesh_unit",
-    "normalization_transform",
-]
-
 
 def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = None) -> trimesh.Trimesh:
     """Read a mesh file; scenes become one mesh, polygons become triangles, normals are ignored.

@@ -94,9 +94,9 @@ def test_mesh_digest_changes_when_textures_swap_places(tmp_path: Path) -> None:
     (tmp_path / "part.mtl").write_text("newmtl skin\nmap_Kd picture.png\nnewmtl cloth\nmap_Kd other.png\n")
     assert len(mesh_files(tmp_path / "part.obj")) == 4
     before = mesh_digest(tmp_path / "part.obj")
-    (tmp_path / "other.png").rename(tmp_path / "kept.png")
+    (tmp_path / "other.png").rename(tmp_path / "spare.png")
     (tmp_path / "picture.png").rename(tmp_path / "other.png")
-    (tmp_path / "kept.png").rename(tmp_path / "picture.png")
+    (tmp_path / "spare.png").rename(tmp_path / "picture.png")
     assert mesh_digest(tmp_path / "part.obj") != before
 
 

@@ -243,6 +243,6 @@ def test_divide_faces_counts_before_it_divides(tmp_path: Path, monkeypatch: pyte
 
 
 def test_as_mesh_refuses_a_part_with_malformed_vertices():
-    odd = trimesh.Trimesh(np.zeros((3, 1)), [[0, 1, 2]], process=False)
+    malformed = trimesh.Trimesh(np.zeros((3, 1)), [[0, 1, 2]], process=False)
     with pytest.raises(MeshError, match="put together"):
-        mesh_module.as_mesh(trimesh.Scene([trimesh.creation.box(), odd]))
+        mesh_module.as_mesh(trimesh.Scene([trimesh.creation.box(), malformed]))

@@ -45,9 +45,9 @@ def test_bank_of_a_moved_copy_holds_the_same_views() -> None:
     copy = moved(mesh, quarter, 12.0, [30.0, -7.0, 2.0])
     views = g.sample_views(azimuth_step=30, elevations=[-20, 40])
     first, second = (ViewBank.build(m, views, settings=settings, progress=False) for m in (mesh, copy))
-    turned = (first.rotations.double() @ quarter.T).flatten(1) @ second.rotations.double().flatten(1).T
-    assert float(turned.amax(dim=1).min()) > 3.0 - 1e-5  # traces: every view is there
-    order = turned.argmax(dim=1)
+    rotated = (first.rotations.double() @ quarter.T).flatten(1) @ second.rotations.double().flatten(1).T
+    assert float(rotated.amax(dim=1).min()) > 3.0 - 1e-5  # traces: every view is there
+    order = rotated.argmax(dim=1)
     assert order.tolist() != list(range(len(views)))
     similarity = torch.cosine_similarity(first.descriptors, second.descriptors[order])
     assert float(similarity.min()) > 0.999
