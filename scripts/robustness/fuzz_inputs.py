@@ -1,4 +1,4 @@
-"""What scripts/robustness/fuzz.py throws at the readers: valid files, broken in ways that know their structure."""
+"""Inputs of fuzz.py: valid files with structure-aware faults."""
 
 import json
 import math
@@ -16,65 +16,58 @@ import numpy as np
 import scipy.io
 import torch
 import trimesh
-from hypothesis import HealthCheck, Phase, given, seed, settings
-from hypothesis import strategies as st
 from safetensors.torch import load, save
 
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset, WebCollection, read_bop_csv
 from curvireg_torch.errors import CurviregError
-from curvireg_torch.geometry import camera_matrix, crop_images, pose_from_box, square_boxes, translation_from_box
-from curvireg_torch.geometry.crops import check_boxes
 from curvireg_torch.io import read_photo
 from curvireg_torch.io.mat_files import read_mat
-from curvireg_torch.io.meshes.mesh import extreme_points
-from curvireg_torch.matching.bank_file import _checksum
+from curvireg_torch.matching.bank_file import tensor_digest
 from curvireg_torch.synthetic import example_mesh
-from curvireg_torch.terms import crop_regions, jittered_boxes
-
-__all__ = ["DATASETS", "attack"]
 
 NUMBERS = [0, 1, -1, 2, 255, 65535, 2**31 - 1, -(2**31), 2**32 - 1, 10**9, 10**18, 0.5, 1e308, math.nan, math.inf]
+BOXES = {"bbox_obj": [1, 2, 30, 20], "bbox_visib": [1, 2, 3, 4]}
 WORDS = b" -1 0 1 nan inf 1e999 99999999999 4294967295 1000000000 x -0 3.5".split(b" ")
 
 
-def mutated(data: bytes, rng: np.random.Generator, other: bytes) -> bytes:
-    """``data`` with one to four faults, mostly one: bits, numbers, pieces missing, doubled or foreign, no end."""
+def mutate_bytes(data: bytes, rng: np.random.Generator, other: bytes) -> bytes:
+    """Add one to four random faults: changed bits and numbers; missing, repeated, foreign or truncated parts."""
     out = bytearray(data)
     for _ in range(min(4, int(rng.geometric(0.6)))):
         n = len(out)
         if n < 8:
             break
-        # Headers are short and decide: half of the faults go there.
-        place = int(rng.integers(0, min(n, 400) if rng.random() < 0.5 else n))
-        stop = min(n, place + int(rng.geometric(0.05)))
+        # Half of the faults are in the header, which is short and decisive.
+        start = int(rng.integers(0, min(n, 400) if rng.random() < 0.5 else n))
+        stop = min(n, start + int(rng.geometric(0.05)))
         match int(rng.integers(0, 8)):
             case 0:
-                out[place] ^= 1 << int(rng.integers(0, 8))
+                out[start] ^= 1 << int(rng.integers(0, 8))
             case 1:
-                out[place] = int(rng.choice([0, 1, 127, 128, 255]))
+                out[start] = int(rng.choice([0, 1, 127, 128, 255]))
             case 2:
                 value = int(rng.choice([0, 1, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0x3B9ACA00]))
-                out[place : place + 4] = struct.pack("<>"[int(rng.integers(2))] + "I", value)
+                out[start : start + 4] = struct.pack("<>"[int(rng.integers(2))] + "I", value)
             case 3:
-                del out[place:stop]
+                del out[start:stop]
             case 4:
-                out[place:place] = out[place:stop] * int(rng.integers(1, 4))
+                out[start:start] = out[start:stop] * int(rng.integers(1, 4))
             case 5:
-                start = int(rng.integers(0, max(1, len(other))))
-                out[place:stop] = other[start : start + stop - place]
+                source = int(rng.integers(0, max(1, len(other))))
+                out[start:stop] = other[source : source + stop - start]
             case 6:
-                del out[place:]
+                del out[start:]
             case 7:
-                found = list(re.finditer(rb"-?\d+(?:\.\d+)?", bytes(out[place : place + 200])))
+                found = list(re.finditer(rb"-?\d+(?:\.\d+)?", bytes(out[start : start + 200])))
                 if found:
                     chosen = found[int(rng.integers(len(found)))]
-                    out[place + chosen.start() : place + chosen.end()] = WORDS[int(rng.integers(len(WORDS)))]
+                    out[start + chosen.start() : start + chosen.end()] = WORDS[int(rng.integers(len(WORDS)))]
     return bytes(out)
 
 
-def mutated_json(tree: Any, rng: np.random.Generator) -> Any:
-    """``tree`` with one to three values replaced, missing, doubled or nested."""
+def mutate_json(tree: Any, rng: np.random.Generator) -> Any:
+    """Replace, remove, repeat or nest one to three values of a JSON tree."""
     tree = json.loads(json.dumps(tree))
     for _ in range(min(3, int(rng.geometric(0.6)))):
         places: list[tuple[Any, Any]] = []
@@ -104,7 +97,7 @@ def mutated_json(tree: Any, rng: np.random.Generator) -> Any:
     return tree
 
 
-def dumped(tree: Any) -> bytes:
+def to_json(tree: Any) -> bytes:
     try:
         return json.dumps(tree).encode()
     except RecursionError:
@@ -123,31 +116,34 @@ def images() -> dict[str, list[bytes]]:
                 pixels = rng.integers(0, np.iinfo(dtype).max, shape).astype(dtype)
                 flags = [cv2.IMWRITE_JPEG_PROGRESSIVE, len(shape) - 2] if suffix == ".jpg" else []
                 found.setdefault(suffix, []).append(cv2.imencode(suffix, pixels, flags)[1].tobytes())
-    block = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    body = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
     jpeg = found[".jpg"][0]
-    body = b"Exif\0\0" + block
     found[".jpg"].append(jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:])
     return found
 
 
-def image(rng: np.random.Generator, folder: Path) -> None:
-    seeds = images()
+def choose(seeds: dict[str, list[bytes]], rng: np.random.Generator) -> tuple[str, bytes, bytes]:
+    """A random suffix and two files of it."""
     suffix = list(seeds)[int(rng.integers(len(seeds)))]
     data, other = (seeds[suffix][int(rng.integers(len(seeds[suffix])))] for _ in range(2))
-    broken = mutated(data, rng, other)
+    return suffix, data, other
+
+
+def image(rng: np.random.Generator, folder: Path) -> None:
+    suffix, data, other = choose(images(), rng)
+    broken = mutate_bytes(data, rng, other)
     if suffix == ".png" and rng.random() < 0.7:
-        broken = _with_checksums(broken)
+        broken = with_png_checksums(broken)
     path = folder / f"a{suffix}"
     path.write_bytes(broken)
     photo = read_photo(path, dtype=torch.float32 if rng.random() < 0.5 else torch.uint8)
     assert photo.image.shape[0] == 3
-    assert bool((photo.image >= 0).all())
-    assert photo.image.dtype == torch.uint8 or bool((photo.image <= 1).all())
+    assert bool(((photo.image >= 0) & (photo.image <= (255 if photo.image.dtype == torch.uint8 else 1))).all())
     photo.guessed_camera_matrix()
     json.dumps(photo.facts(), allow_nan=False)
 
 
-def _with_checksums(data: bytes) -> bytes:
+def with_png_checksums(data: bytes) -> bytes:
     out, position = bytearray(data[:8]), 8
     while position + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, position)
@@ -182,35 +178,27 @@ def meshes() -> dict[str, list[bytes]]:
     ]
     found[".stl"] = [box.export(file_type="stl"), box.export(file_type="stl_ascii").encode()]
     found[".glb"] = [scene.export(file_type="glb")]
-    found[".gltf"] = [_one_file(scene)]
+    found[".gltf"] = [bytes(trimesh.exchange.gltf.export_gltf(scene, embed_buffers=True)["model.gltf"])]
     return {suffix: [d if isinstance(d, bytes) else d.encode() for d in some] for suffix, some in found.items()}
 
 
-def _one_file(scene: trimesh.Scene) -> bytes:
-    parts = trimesh.exchange.gltf.export_gltf(scene, embed_buffers=True)
-    return bytes(parts["model.gltf"])
-
-
 def mesh(rng: np.random.Generator, folder: Path) -> None:
-    seeds = meshes()
-    suffix = list(seeds)[int(rng.integers(len(seeds)))]
-    data, other = (seeds[suffix][int(rng.integers(len(seeds[suffix])))] for _ in range(2))
+    suffix, data, other = choose(meshes(), rng)
     if suffix == ".gltf" and rng.random() < 0.8:
-        broken = dumped(mutated_json(json.loads(data), rng))
+        broken = to_json(mutate_json(json.loads(data), rng))
     elif suffix == ".glb" and rng.random() < 0.8:
         (length,) = struct.unpack_from("<I", data, 12)
-        text = dumped(mutated_json(json.loads(data[20 : 20 + length]), rng))
+        text = to_json(mutate_json(json.loads(data[20 : 20 + length]), rng))
         text += b" " * (-len(text) % 4)
         rest = data[20 + length :]
         broken = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
     else:
-        broken = mutated(data, rng, other)
+        broken = mutate_bytes(data, rng, other)
     path = folder / f"a{suffix}"
     path.write_bytes(broken)
     loaded = cr.load_mesh(path)
     assert np.isfinite(loaded.vertices).all()
-    assert loaded.faces.min() >= 0
-    assert loaded.faces.max() < len(loaded.vertices)
+    assert 0 <= loaded.faces.min() <= loaded.faces.max() < len(loaded.vertices)
 
 
 @cache
@@ -231,8 +219,8 @@ def mat_files() -> list[bytes]:
 def mat(rng: np.random.Generator, folder: Path) -> None:
     seeds = mat_files()
     which = int(rng.random() < 0.2)
-    broken = mutated(seeds[which], rng, seeds[0])
-    if which == 0 and rng.random() < 0.3 and len(broken) > 136:  # a compressed variable of broken content
+    broken = mutate_bytes(seeds[which], rng, seeds[0])
+    if which == 0 and rng.random() < 0.3 and len(broken) > 136:  # broken content in a valid compressed variable
         body = zlib.compress(broken[128:])
         broken = broken[:128] + struct.pack("<II", 15, len(body)) + body
     (folder / "a.mat").write_bytes(broken)
@@ -240,14 +228,12 @@ def mat(rng: np.random.Generator, folder: Path) -> None:
 
 
 def tables(rng: np.random.Generator, folder: Path) -> None:
-    """JSON of a BOP set, a results file and a web collection."""
+    """JSON files of a BOP set, a results file and a web collection."""
     K, R = [300.0, 0, 40, 0, 300, 30, 0, 0, 1], [1.0, 0, 0, 0, 1, 0, 0, 0, 1]
     trees: dict[str, Any] = {
         "test/000001/scene_gt.json": {"0": [{"cam_R_m2c": R, "cam_t_m2c": [1.0, 2, 400], "obj_id": 1}]},
         "test/000001/scene_camera.json": {"0": {"cam_K": K, "depth_scale": 1.0}},
-        "test/000001/scene_gt_info.json": {
-            "0": [{"bbox_obj": [1, 2, 30, 20], "bbox_visib": [1, 2, 3, 4], "visib_fract": 0.5}]
-        },
+        "test/000001/scene_gt_info.json": {"0": [{**BOXES, "visib_fract": 0.5}]},
         "models/models_info.json": {"1": {"diameter": 86.6}},
         "camera.json": {"fx": 300.0},
         "test_targets_bop19.json": [{"scene_id": 1, "im_id": 0, "obj_id": 1, "inst_count": 1}],
@@ -256,19 +242,19 @@ def tables(rng: np.random.Generator, folder: Path) -> None:
     for name, tree in trees.items():
         path = folder / "bop" / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        data = dumped(mutated_json(tree, rng) if name == broken else tree)
-        path.write_bytes(mutated(data, rng, data) if name == broken and rng.random() < 0.3 else data)
+        data = to_json(mutate_json(tree, rng) if name == broken else tree)
+        path.write_bytes(mutate_bytes(data, rng, data) if name == broken and rng.random() < 0.3 else data)
     for name in ("test/000001/rgb/000000.png", "models/obj_000001.ply"):
         (folder / "bop" / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / "bop" / name).write_bytes(b"")
     line = b"1,2,3,0.5,1 0 0 0 1 0 0 0 1,1 2 3,-1\n"
     rows = b"scene_id,im_id,obj_id,score,R,t,time\n" + line * 3
-    (folder / "a.csv").write_bytes(mutated(rows, rng, rows))
+    (folder / "a.csv").write_bytes(mutate_bytes(rows, rng, rows))
     (folder / "web" / "cup").mkdir(parents=True, exist_ok=True)
     for name in ("mesh.off", "0.jpg"):
         (folder / "web" / "cup" / name).write_bytes(b"")
     views = b"image,x0,y0,x1,y1,azimuth,elevation,theta,distance\n" + b"0.jpg,10,5,70,55,30,10,-5,3\n" * 2
-    (folder / "web" / "cup" / "views.csv").write_bytes(mutated(views, rng, views))
+    (folder / "web" / "cup" / "views.csv").write_bytes(mutate_bytes(views, rng, views))
     for read in (
         lambda: [BOPDataset(folder / "bop").annotation(0)],
         lambda: read_bop_csv(folder / "a.csv"),
@@ -278,7 +264,7 @@ def tables(rng: np.random.Generator, folder: Path) -> None:
             read()
         except (CurviregError, IndexError) as error:
             if isinstance(error, IndexError) and "list index" not in str(error):
-                raise  # the set may be empty
+                raise  # any other index error is a defect; this one means an empty set
 
 
 @cache
@@ -293,15 +279,15 @@ def bank_bytes() -> bytes:
 def bank(rng: np.random.Generator, folder: Path) -> None:
     data = bank_bytes()
     (length,) = struct.unpack_from("<Q", data)
-    broken, kind = mutated(data, rng, data), rng.random()
-    if kind < 0.5:  # a header of another sense
-        header = dumped(mutated_json(json.loads(data[8 : 8 + length]), rng))
+    broken, kind = mutate_bytes(data, rng, data), rng.random()
+    if kind < 0.5:  # a header with other values
+        header = to_json(mutate_json(json.loads(data[8 : 8 + length]), rng))
         broken = struct.pack("<Q", len(header)) + header + data[8 + length :]
-    elif kind < 0.8:  # other numbers, whose checksum is right
+    elif kind < 0.8:  # other numbers with a valid checksum
         tensors, metadata = load(data), json.loads(data[8 : 8 + length])["__metadata__"]
         changed = tensors[str(rng.choice(sorted(tensors)))].view(-1)
         changed[int(rng.integers(len(changed)))] = rng.choice([0, 1, 2, 255 if changed.dtype == torch.uint8 else -1])
-        broken = save(tensors, {**metadata, "checksum": _checksum(tensors)})
+        broken = save(tensors, {**metadata, "checksum": tensor_digest(tensors, size=16)})
     elif kind < 0.83:
         broken = save({"descriptors": torch.zeros(2, 3)}, {"format": "curvireg_torch.ViewBank"})
     (folder / "a.safetensors").write_bytes(broken)
@@ -309,79 +295,11 @@ def bank(rng: np.random.Generator, folder: Path) -> None:
     assert len(loaded) == len(loaded.descriptors) == len(loaded.points)
 
 
-_VALUES = st.floats(width=32) | st.sampled_from([-0.5, 0.0, 1e-30, 63.5, 47.5, 1e9, -1e9, 1e30, math.nan])
-_IMAGE = torch.linspace(0, 1, 3 * 48 * 64).view(3, 48, 64)
-
-
-def _box(values: list[float], sides: tuple[int, int], margin: float) -> None:
-    box, image = torch.tensor([values]), _IMAGE[:, : sides[0], : sides[1]]
-    crops, A = crop_images([image], box, size=16, margin=abs(margin) % 4)
-    assert bool(crops.isfinite().all())
-    assert bool(A.isfinite().all())
-    assert bool((crops >= -1e-3).all() and (crops <= 1.001).all())
-    regions = crop_regions([image], jittered_boxes(box, 0.1), size=16, margin=0.1)
-    assert bool(regions.isfinite().all())
-    square_boxes(box, 0.1)
-
-
-def _camera(values: list[float], box: list[float]) -> None:
-    K = camera_matrix(*values, dtype=torch.float64)
-    corners = extreme_points(trimesh.creation.box((0.1, 0.2, 0.3)))
-    boxes = torch.tensor(box, dtype=torch.float64)
-    check_boxes(boxes[None], [(48, 64)])
-    R, t = pose_from_box(corners, torch.eye(3, dtype=torch.float64), boxes, K)
-    assert bool(R.isfinite().all() and t.isfinite().all())
-    assert bool(translation_from_box(corners, torch.eye(3, dtype=torch.float64), boxes, K).isfinite().all())
-
-
-def _by_hypothesis(check: Callable[..., None], *strategies: Any) -> Callable[[int, int], int]:
-    """Runs ``count`` examples that hypothesis finds from ``number``; returns how many it had."""
-
-    def run(number: int, count: int) -> int:
-        tried = 0
-
-        @seed(number)
-        @settings(
-            max_examples=count, database=None, deadline=None, phases=[Phase.generate, Phase.shrink],
-            suppress_health_check=list(HealthCheck),
-        )  # fmt: skip
-        @given(st.tuples(*strategies))
-        def examples(values: tuple[Any, ...]) -> None:
-            nonlocal tried
-            tried += 1
-            try:
-                check(*values)
-            except CurviregError:
-                return
-
-        examples()
-        return tried
-
-    return run
-
-
-_four = st.lists(_VALUES, min_size=4, max_size=4)
-_plain = st.tuples(st.floats(-5, 60), st.floats(-5, 45), st.floats(0.01, 200), st.floats(0.01, 200))
-_boxes = _four | _plain.map(lambda b: [b[0], b[1], b[0] + b[2], b[1] + b[3]])
-DATASETS: dict[str, Any] = {
+INPUTS: dict[str, Callable[[np.random.Generator, Path], None]] = {
     "images": image,
     "meshes": mesh,
     "mat": mat,
     "tables": tables,
     "banks": bank,
-    "boxes": _by_hypothesis(_box, _boxes, st.tuples(st.integers(1, 48), st.integers(1, 64)), _VALUES),
-    "cameras": _by_hypothesis(_camera, _four, _boxes),
 }
-"""Name: what throws one input at a reader, ``(generator, folder)``; for boxes and cameras ``(seed, count)``."""
-
-
-def attack(kind: str, number: int, folder: Path) -> str:
-    """Input ``number`` of ``kind``: the name of what came of it; anything but a result or our error is raised."""
-    try:
-        DATASETS[kind](np.random.default_rng([number, list(DATASETS).index(kind)]), folder)
-    except CurviregError as error:
-        text = str(error)
-        assert text, "an error without a message"
-        assert len(text.splitlines()) == 1, f"a message of several lines: {text!r}"
-        return type(error).__name__
-    return "result"
+"""Functions that write one broken input to a folder and read it."""

@@ -1,13 +1,13 @@
-"""Many registrations in one process: do memory and open files stay where they are?
+"""Check that memory, open files and threads do not grow over many registrations in one process.
 
-    python scripts/robustness/soak.py                     2000 registrations in each of two processes that share a cache
+    python scripts/robustness/soak.py                     2000 registrations in each of two processes with one cache
     python scripts/robustness/soak.py --count 100 --processes 1
 
-Every process registers noisy copies of one photograph made in code, and reopens its bank from the shared cache every
-``--reopen`` registrations; the cache is trimmed to nothing by each, so that they also remove what the other one reads.
-``scripts/results/soak.json`` gets resident memory, open files and threads over the course, and by how much the median
-of the last quarter exceeds that of the second one (the first quarter warms up). Exits 1 if by more than ``--allow`` MB,
-or if files or threads became more.
+Every process registers noisy copies of one synthetic photograph, and reopens its bank from the shared cache every
+``--reopen`` registrations. The cache limit is 0, so each process also removes banks that the other one reads.
+``scripts/results/soak.json`` records resident memory, open files and threads over time, and the growth: the median of
+the last quarter minus that of the second quarter (the first one warms up). Exit code 1 if memory grew by more than
+``--allow`` MB, or files or threads grew at all.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from curvireg_torch import Pipeline, Registrar, camera_matrix, sample_views
 from curvireg_torch.matching import cached_bank
 from curvireg_torch.settings import BankSettings
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
-from scripts._shared import REPOSITORY, commit, today
+from scripts._shared import RESULTS, commit, today
 
 CAMERA, SIZE = (260.0, 260.0, 119.5, 89.5), (180, 240)
 Sample = dict[str, float]
@@ -37,10 +37,10 @@ Sample = dict[str, float]
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=2000, help="registrations of each process (default: 2000)")
-    parser.add_argument("--processes", type=int, default=2, help="that share one cache (default: 2)")
+    parser.add_argument("--processes", type=int, default=2, help="processes that share one cache (default: 2)")
     parser.add_argument("--reopen", type=int, default=10, help="registrations per opened bank (default: 10)")
-    parser.add_argument("--allow", type=float, default=20.0, metavar="MB", help="growth that passes (default: 20)")
-    parser.add_argument("--out", type=Path, default=REPOSITORY / "scripts" / "results" / "soak.json", metavar="FILE")
+    parser.add_argument("--allow", type=float, default=20.0, metavar="MB", help="largest growth (default: 20)")
+    parser.add_argument("--out", type=Path, default=RESULTS / "soak.json", metavar="FILE")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as cache:
         os.environ.update(CURVIREG_CACHE=cache, CURVIREG_CACHE_LIMIT="0")
@@ -60,7 +60,7 @@ def main() -> int:
 
 
 def soak(count: int, reopen: int, seed: int) -> list[Sample]:
-    """Register ``count`` times; resources after about a hundred of them."""
+    """Register ``count`` times; returns about a hundred samples of the resources."""
     torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(seed)
     mesh, K = example_mesh(), camera_matrix(*CAMERA, dtype=torch.float64)
@@ -70,7 +70,7 @@ def soak(count: int, reopen: int, seed: int) -> list[Sample]:
     course, start = [], time.monotonic()
     for i in tqdm(range(count), unit="registration", position=seed):
         if i % reopen == 0:
-            settings = BankSettings(image_size=64 if i // reopen % 2 else 96)  # each removes the other's bank
+            settings = BankSettings(image_size=64 if i // reopen % 2 else 96)  # each size removes the other's bank
             registrar = Registrar(cached_bank(mesh, views, pipeline=Pipeline(bank=settings), progress=False))
         noisy = (image + 0.02 * torch.randn(image.shape, generator=generator)).clamp(0, 1)
         result = registrar([noisy], box[None], K)[0]
@@ -92,7 +92,7 @@ def resources() -> Sample:
 
 
 def growth(course: list[Sample]) -> Sample:
-    """Median of the last quarter less that of the second one, of each resource."""
+    """Median of the last quarter minus that of the second quarter, for each resource."""
     quarter = len(course) // 4
 
     def median(samples: list[Sample], name: str) -> float:

@@ -1,14 +1,15 @@
-"""The largest and slowest input that each limit of SECURITY.md still lets in: how long it takes, and how much memory.
+"""Time and memory of the largest and slowest inputs that the limits of SECURITY.md admit.
 
-    python scripts/robustness/worst_cases.py              all of them
-    python scripts/robustness/worst_cases.py obj off      some; the others stay as they were measured
+    python scripts/robustness/worst_cases.py              all cases
+    python scripts/robustness/worst_cases.py obj off      only these; the records of the others stay
 
-Each input is made, then read in a process of its own on one thread: its seconds of CPU, and its memory, libraries
-included. ``scripts/results/worst_cases.json`` keeps them, and SECURITY.md has their table. Exit code 1 if one ends in
-anything but a result or one of our errors, or takes longer or more than the table states.
+Each input is generated, then read in a separate process on one thread. CPU seconds and memory (libraries included) go
+to ``scripts/results/worst_cases.json`` and to the table of SECURITY.md. Exit code 1 if a case ends in anything but a
+result or one of our errors, or exceeds the time or memory that the table states.
 """
 
 import argparse
+import importlib
 import json
 import os
 import resource
@@ -28,63 +29,31 @@ import numpy as np
 
 from curvireg_torch import limits
 from curvireg_torch.errors import CurviregError
-from scripts._shared import REPOSITORY, commit, replace_between, today, write_json
+from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, update_page, write_json
 
-RESULT = REPOSITORY / "scripts" / "results" / "worst_cases.json"
+RESULT = RESULTS / "worst_cases.json"
 DOCUMENT = REPOSITORY / "SECURITY.md"
-BEGIN, END = "<!-- worst cases:begin -->", "<!-- worst cases:end -->"
 SIDE = int(limits.MAX_IMAGE_PIXELS**0.5)
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is read, by what, and the seconds and MB that it may take."""
+    """An input, its reader, and the CPU seconds and MB that it may take."""
 
-    says: str
+    caption: str
     make: Callable[[Path], None]
     read: Callable[[Path], Any]
     seconds: float
     megabytes: int
 
 
-def photo(path: Path) -> Any:
-    from curvireg_torch.io import read_photo
-
-    return read_photo(path)
-
-
-def floats(path: Path) -> Any:
-    from curvireg_torch.io import read_image
-
-    return read_image(path)
-
-
-def mesh(path: Path) -> Any:
-    from curvireg_torch import load_mesh
-
-    return load_mesh(path)
-
-
-def table(path: Path) -> Any:
-    from curvireg_torch.data import read_bop_csv
-
-    return read_bop_csv(path)
-
-
-def json_file(path: Path) -> Any:
-    from curvireg_torch.io.json_files import read_json
-
-    return read_json(path, dict, "docs/datasets.md")
-
-
-def mat(path: Path) -> Any:
-    from curvireg_torch.io.mat_files import read_mat
-
-    return read_mat(path, "record")
+def reader(module: str, name: str, *arguments: Any) -> Callable[[Path], Any]:
+    """Function of the package that is imported only by the worker that needs it."""
+    return lambda path: getattr(importlib.import_module(f"curvireg_torch.{module}"), name)(path, *arguments)
 
 
 def sliver(path: Path) -> Any:
-    """A picture 2 px high, with every preset."""
+    """Register in an image of 2 px height, with two presets."""
     import torch
 
     import curvireg_torch as cr
@@ -102,7 +71,7 @@ def sliver(path: Path) -> Any:
 
 
 def png(path: Path) -> None:
-    """16 bits, three channels, noise in the low bits would not fit the bytes: one colour."""
+    """16 bits, three channels, one colour: noise would exceed the limit on file size."""
     packer = zlib.compressobj(1)
     row = bytes([0]) + b"\x12\x34" * (3 * SIDE)
 
@@ -120,7 +89,7 @@ def png(path: Path) -> None:
 
 
 def jpeg(path: Path) -> None:
-    """Progressive, the last scan said again and again."""
+    """Progressive, with the last scan repeated."""
     rng = np.random.default_rng(0)
     tile = np.kron(rng.integers(0, 256, (128, 128, 3), dtype=np.uint8), np.ones((8, 8, 1), np.uint8))
     repeats = -(-SIDE // 1024)
@@ -158,38 +127,26 @@ def obj(path: Path) -> None:
         file.writelines(lines(faces + 1, "f "))
 
 
-def off(path: Path) -> None:
-    vertices, faces = triangles(limits.MAX_MESH_FACES)
+def write_off(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     with path.open("wb") as file:
         file.write(b"OFF\n%d %d 0\n" % (len(vertices), len(faces)))
         file.writelines(lines(vertices, ""))
-        file.writelines(lines(faces, "3 "))
+        file.writelines(lines(faces, f"{faces.shape[1]} "))
 
 
-def quads_of(count: int) -> Callable[[Path], None]:
-    def make(path: Path) -> None:
-        vertices, quads = grid(int(count**0.5) + 1)
-        with path.open("wb") as file:
-            file.write(b"OFF\n%d %d 0\n" % (len(vertices), len(quads)))
-            file.writelines(lines(vertices, ""))
-            file.writelines(lines(quads, "4 "))
-
-    return make
+def off(path: Path) -> None:
+    write_off(path, *triangles(limits.MAX_MESH_FACES))
 
 
-def tangled(count: int, corners: int) -> Callable[[Path], None]:
-    """Faces that cross themselves, with the same corners in any order."""
+def quads(path: Path) -> None:
+    write_off(path, *grid(int(2_000_000**0.5) + 1))
 
-    def make(path: Path) -> None:
-        rng = np.random.default_rng(0)
-        vertices = np.concatenate([rng.standard_normal((corners, 2)), np.zeros((corners, 1))], axis=1)
-        face = " ".join([str(corners), *map(str, rng.permutation(corners))]) + "\n"
-        with path.open("w") as file:
-            file.write(f"OFF\n{corners} {count} 0\n")
-            file.writelines(f"{x} {y} {z}\n" for x, y, z in vertices)
-            file.writelines([face] * count)
 
-    return make
+def tangled(path: Path) -> None:
+    """Five self-intersecting faces of 2000 corners in random order."""
+    rng = np.random.default_rng(0)
+    vertices = np.concatenate([rng.standard_normal((2000, 2)), np.zeros((2000, 1))], axis=1)
+    write_off(path, vertices, np.tile(rng.permutation(2000), (5, 1)))
 
 
 def stl(path: Path) -> None:
@@ -200,7 +157,7 @@ def stl(path: Path) -> None:
 
 
 def parts(path: Path) -> None:
-    """As many parts as there may be, each as deep as it may be."""
+    """The largest number of parts, each at the largest depth."""
     count, depth = limits.MAX_MESH_PARTS, limits.MAX_MESH_DEPTH
     chain = [{"children": [i + 1], "translation": [1e-3, 0, 0]} for i in range(depth - 2)]
     nodes = [*chain, {"children": list(range(depth - 1, depth - 1 + count))}]
@@ -221,7 +178,7 @@ def parts(path: Path) -> None:
 
 
 def deep_json(path: Path) -> None:
-    """Small values take most memory for their bytes."""
+    """Small values need the most memory per byte."""
     path.write_bytes(b'{"0": [' + b"[],{}," * ((limits.MAX_TABLE_BYTES - 20) // 6) + b"[]]}")
 
 
@@ -232,7 +189,7 @@ def csv_rows(path: Path) -> None:
 
 
 def mat_bomb(path: Path) -> None:
-    """One array of structs whose values are empty."""
+    """One array of structs with empty values."""
 
     def element(kind: int, content: bytes) -> bytes:
         return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
@@ -244,24 +201,32 @@ def mat_bomb(path: Path) -> None:
     path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + struct.pack("<II", 15, len(packed)) + packed)
 
 
-def nothing(path: Path) -> None:
+def empty(path: Path) -> None:
     path.write_bytes(b"")
 
 
+PHOTO, MESH = reader("io", "read_photo"), reader("io", "load_mesh")
+JSON = reader("io.json_files", "read_json", dict, "docs/datasets.md")
 CASES = {
-    "png": Case("PNG, 134 million pixels of 16 bits, as bytes", png, photo, 60, 6000),
-    "float": Case("the same as float32", png, floats, 60, 6000),
-    "jpg": Case("progressive JPEG, 134 million pixels, 64 scans", jpeg, photo, 60, 6000),
-    "obj": Case("OBJ, 10 million triangles", obj, mesh, 180, 9000),
-    "off": Case("OFF, 10 million triangles", off, mesh, 180, 9000),
-    "stl": Case("STL, 10 million triangles that share no corner", stl, mesh, 180, 9000),
-    "quads": Case("OFF, quads", quads_of(2_000_000), mesh, 180, 9000),
-    "tangled": Case("OFF, five faces of 2000 corners that cross themselves", tangled(5, 2000), mesh, 180, 9000),
-    "gltf": Case("glTF, 10,000 parts 200 deep", parts, mesh, 60, 4000),
-    "json": Case("JSON, 32 MiB of empty lists", deep_json, json_file, 60, 4000),
-    "csv": Case("CSV, 32 MiB of poses", csv_rows, table, 60, 4000),
-    "mat": Case("MATLAB, 16 MiB unpacked", mat_bomb, mat, 60, 4000),
-    "sliver": Case("registration of a picture of 2 x 600 px", nothing, sliver, 60, 4000),
+    "png": Case("PNG, 134 million pixels of 16 bits, as bytes", png, PHOTO, 60, 6000),
+    "float": Case("the same as float32", png, reader("io", "read_image"), 60, 6000),
+    "jpg": Case("progressive JPEG, 134 million pixels, 64 scans", jpeg, PHOTO, 60, 6000),
+    "obj": Case("OBJ, 10 million triangles", obj, MESH, 180, 9000),
+    "off": Case("OFF, 10 million triangles", off, MESH, 180, 9000),
+    "stl": Case("STL, 10 million triangles that share no corner", stl, MESH, 180, 9000),
+    "quads": Case("OFF, quads", quads, MESH, 180, 9000),
+    "tangled": Case("OFF, five faces of 2000 corners that cross themselves", tangled, MESH, 180, 9000),
+    "gltf": Case("glTF, 10,000 parts 200 deep", parts, MESH, 60, 4000),
+    "json": Case(
+        "JSON, 32 MiB of empty lists",
+        deep_json,
+        reader("io.json_files", "read_json", dict, "docs/datasets.md"),
+        60,
+        4000,
+    ),
+    "csv": Case("CSV, 32 MiB of poses", csv_rows, reader("data", "read_bop_csv"), 60, 4000),
+    "mat": Case("MATLAB, 16 MiB unpacked", mat_bomb, reader("io.mat_files", "read_mat", "record"), 60, 4000),
+    "sliver": Case("registration of a picture of 2 x 600 px", empty, sliver, 60, 4000),
 }
 SUFFIX = {"float": ".png", "quads": ".off", "tangled": ".off", "sliver": ""}
 
@@ -277,7 +242,7 @@ def worker(name: str, path: Path) -> None:
     print(json.dumps({"outcome": outcome, "seconds": time.process_time() - begin, "megabytes": peak}))
 
 
-def measured(name: str) -> dict[str, Any]:
+def measure(name: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, f"case{SUFFIX.get(name, '.' + name)}")
         CASES[name].make(path)
@@ -301,36 +266,34 @@ def main() -> int:
     if options.worker:
         worker(options.worker[0], Path(options.worker[1]))
         return 0
-    kept = json.loads(RESULT.read_text()) if RESULT.is_file() else {}
-    here = commit()
-    bad = 0
+    record = json.loads(RESULT.read_text()) if RESULT.is_file() else {}
+    here, failed = commit(), 0
     for name in options.names or CASES:
-        found = measured(name)
+        found = measure(name)
         print(f"{name}: {found['bytes'] / 1e6:.0f} MB, {found['seconds']:.1f} s, {found['megabytes']:.0f} MB, "
               f"{found['outcome']}", flush=True)  # fmt: skip
-        bad += not within(name, found)
-        kept[name] = {**found, "date": today(), "commit": here}
-        write_json(RESULT, kept)
-    text = DOCUMENT.read_text(encoding="utf-8")
-    DOCUMENT.write_text(replace_between(text, BEGIN, END, table(kept)), encoding="utf-8")
-    return int(bad > 0)
+        failed += not within(name, found)
+        record[name] = {**found, "date": today(), "commit": here}
+        write_json(RESULT, record)
+    update_page(DOCUMENT, "worst cases", table(record))
+    return int(failed > 0)
 
 
 def within(name: str, found: dict[str, Any]) -> bool:
-    """Whether a case ended as the table states."""
-    most = CASES[name]
+    """Whether a case stayed within its limits."""
+    limit = CASES[name]
     ended = found["outcome"] == "read" or found["outcome"].startswith("refused")
-    return ended and found["seconds"] <= most.seconds and found["megabytes"] <= most.megabytes
+    return ended and found["seconds"] <= limit.seconds and found["megabytes"] <= limit.megabytes
 
 
-def table(kept: dict[str, Any]) -> str:
-    rows = [
-        f"| {case.says} | {kept[name]['outcome']} | {kept[name]['seconds']:.1f} (at most {case.seconds:g}) "
-        f"| {kept[name]['megabytes']:.0f} (at most {case.megabytes}) |"
-        for name, case in CASES.items()
-        if name in kept
-    ]
-    return "\n".join(["| input | outcome | s | MB |", "| --- | --- | --- | --- |", *rows, ""])
+def table(record: dict[str, Any]) -> str:
+    rows = [["input", "outcome", "s", "MB"]]
+    for name, case in CASES.items():
+        if name in record:
+            seconds = f"{record[name]['seconds']:.1f} (at most {case.seconds:g})"
+            memory = f"{record[name]['megabytes']:.0f} (at most {case.megabytes})"
+            rows.append([case.caption, record[name]["outcome"], seconds, memory])
+    return "\n".join([*table_lines(rows), ""])
 
 
 if __name__ == "__main__":
