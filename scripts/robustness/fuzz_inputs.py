@@ -244,15 +244,11 @@ def tables(rng: np.random.Generator, folder: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         data = to_json(mutate_json(tree, rng) if name == broken else tree)
         path.write_bytes(mutate_bytes(data, rng, data) if name == broken and rng.random() < 0.3 else data)
-    for name in ("test/000001/rgb/000000.png", "models/obj_000001.ply"):
-        (folder / "bop" / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / "bop" / name).write_bytes(b"")
-    line = b"1,2,3,0.5,1 0 0 0 1 0 0 0 1,1 2 3,-1\n"
-    rows = b"scene_id,im_id,obj_id,score,R,t,time\n" + line * 3
+    for name in ("bop/test/000001/rgb/000000.png", "bop/models/obj_000001.ply", "web/cup/mesh.off", "web/cup/0.jpg"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"")
+    rows = b"scene_id,im_id,obj_id,score,R,t,time\n" + b"1,2,3,0.5,1 0 0 0 1 0 0 0 1,1 2 3,-1\n" * 3
     (folder / "a.csv").write_bytes(mutate_bytes(rows, rng, rows))
-    (folder / "web" / "cup").mkdir(parents=True, exist_ok=True)
-    for name in ("mesh.off", "0.jpg"):
-        (folder / "web" / "cup" / name).write_bytes(b"")
     views = b"image,x0,y0,x1,y1,azimuth,elevation,theta,distance\n" + b"0.jpg,10,5,70,55,30,10,-5,3\n" * 2
     (folder / "web" / "cup" / "views.csv").write_bytes(mutate_bytes(views, rng, views))
     for read in (
@@ -302,4 +298,4 @@ INPUTS: dict[str, Callable[[np.random.Generator, Path], None]] = {
     "tables": tables,
     "banks": bank,
 }
-"""Functions that write one broken input to a folder and read it."""
+"""Functions that write a broken input to a folder and read it."""
