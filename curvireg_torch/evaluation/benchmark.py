@@ -3,17 +3,16 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from torch import Tensor
 
 from ..data import BOPDataset, Pascal3DPlus, WebCollection
+from ..errors import InvalidInputError
 from .protocol import Protocol
+from .store import Row
 
 __all__ = ["Benchmark", "BenchmarkItem", "Row"]
-
-Row = dict[str, Any]
-"""A result: ``rotation``, ``translation``, ``score``, ...; or ``failed``, or ``skipped`` with the reason."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class BenchmarkItem:
         photo: the file of the photograph.
         meshes: one, or all that the protocol allows.
         box: (4,) x0, y0, x1, y1 in px, as annotated; NaN where unknown.
-        camera_matrix: (3, 3) in px; None if the protocol does not give it to the method.
+        camera_matrix: (3, 3) in px; None if the method does not get it.
     """
 
     key: str
@@ -48,16 +47,25 @@ class Benchmark(ABC):
     Attributes:
         name: kind of dataset.
         unit: unit of its meshes.
+        key: format of the items' keys, from a sample.
+        mesh: key of the mesh in a sample.
+        gives_camera: whether the method gets the camera matrix.
         dataset, protocol: as given.
         items: all objects, in the order of the dataset.
+
+    Raises:
+        InvalidInputError: a ``cad`` that the dataset cannot offer.
     """
 
     name: ClassVar[str]
-    unit: ClassVar[str]
+    unit: ClassVar[str] = "m"
+    key: ClassVar[str]
+    mesh: ClassVar[str]
+    gives_camera: ClassVar[bool] = False
 
     def __init__(self, dataset: Pascal3DPlus | BOPDataset | WebCollection, protocol: Protocol) -> None:
         self.dataset, self.protocol = dataset, protocol
-        self.items = [self.item(i) for i in range(len(dataset))]
+        self.items = [self._item(i, dataset.annotation(i)) for i in range(len(dataset))]
 
     def selection(self, limit: int | None) -> list[BenchmarkItem]:
         """``limit`` items spread evenly over the dataset, or all."""
@@ -69,17 +77,32 @@ class Benchmark(ABC):
         split = getattr(self.dataset, "split", None)  # a collection of the user's own has none
         return {"dataset": self.name, "root": str(self.dataset.root.resolve()), "split": split}
 
-    @abstractmethod
-    def item(self, index: int) -> BenchmarkItem:
-        """Object ``index`` of the dataset."""
+    def samples(self, items: list[BenchmarkItem]) -> list[Row]:
+        """Annotations of the items."""
+        return [self.dataset.annotation(item.index) for item in items]
+
+    def meshes(self, sample: Row) -> tuple[Path, ...]:
+        """Meshes that an object is registered to: its own; other datasets may offer more."""
+        if self.protocol.cad != "annotated":
+            raise InvalidInputError(
+                f"protocol: each object of this dataset has one mesh, so cad=annotated; got cad={self.protocol.cad}"
+            )
+        return (Path(sample[self.mesh]),)
+
+    def _item(self, index: int, sample: Row) -> BenchmarkItem:
+        return BenchmarkItem(
+            key=self.key.format_map(sample),
+            index=index,
+            photo=Path(sample["image_path"]),
+            meshes=self.meshes(sample),
+            box=sample["box"],
+            camera_matrix=sample["camera_matrix"] if self.gives_camera else None,
+        )
 
     @abstractmethod
     def rotation_errors(self, items: list[BenchmarkItem], rows: list[Row]) -> Tensor:
-        """(N,) float64 errors in degrees up to the objects' symmetries, ``inf`` for a miss."""
-
-    @abstractmethod
-    def easy(self, item: BenchmarkItem) -> bool:
-        """Whether the whole object is visible."""
+        """(N,) float64 errors in degrees, up to the symmetries that the dataset knows; ``inf`` for a miss, NaN where
+        the truth is unknown."""
 
     @abstractmethod
     def summary(self, items: list[BenchmarkItem], rows: list[Row]) -> Row:

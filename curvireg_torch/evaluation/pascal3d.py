@@ -1,4 +1,4 @@
-"""PASCAL3D+: viewpoints of objects of twelve classes, with CADs of the class."""
+"""PASCAL3D+: viewpoints of objects of twelve classes, with CADs of each class."""
 
 from collections.abc import Callable
 from functools import cache
@@ -25,60 +25,49 @@ COLUMNS = [
 ]
 
 
-def _any_turn(R: Tensor, truth: Tensor) -> Tensor:
+def _any_rotation(R: Tensor, truth: Tensor) -> Tensor:
     return axis_rotation_error(R, truth, torch.tensor([0.0, 0.0, 1.0], dtype=R.dtype))
 
 
-def _half_turn(R: Tensor, truth: Tensor) -> Tensor:
+def _half_rotation(R: Tensor, truth: Tensor) -> Tensor:
     return symmetric_rotation_error(R, truth, torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=R.dtype))[None])
 
 
 SYMMETRIES: dict[str, tuple[str, Callable[[Tensor, Tensor], Tensor]]] = {
-    "bottle": ("any turn about z", _any_turn),
-    "diningtable": ("half a turn about z", _half_turn),
+    "bottle": ("any rotation about z", _any_rotation),
+    "diningtable": ("half a rotation about z", _half_rotation),
 }
-"""Classes whose objects look alike, or nearly, from several azimuths."""
+"""Classes whose objects have the same, or nearly the same, appearance from several azimuths."""
 
 
 class Pascal3DBenchmark(Benchmark):
-    """Viewpoints on PASCAL3D+. The method is given no camera: viewpoints are those of one looking straight at the box.
+    """Viewpoints on PASCAL3D+. The method gets no camera: viewpoints are relative to a camera that looks at the box.
 
     Args:
         dataset: :class:`Pascal3DPlus` of any split, categories and filters.
         protocol: see :class:`Protocol`.
     """
 
-    name, unit = "pascal3d", "m"
+    name, key, mesh = "pascal3d", "{category}/{image_id}/{object_index}", "cad_path"
     dataset: Pascal3DPlus
 
     def __init__(self, dataset: Pascal3DPlus, protocol: Protocol) -> None:
-        self._meshes = cache(lambda category: tuple(sorted((dataset.root / "CAD" / category).glob("*.off"))))
+        self._cads = cache(lambda category: tuple(sorted((dataset.root / "CAD" / category).glob("*.off"))))
         super().__init__(dataset, protocol)
 
-    def item(self, index: int) -> BenchmarkItem:
-        sample = self.dataset.annotation(index)
-        annotated = (Path(sample["cad_path"]),)
-        return BenchmarkItem(
-            key=f"{sample['category']}/{sample['image_id']}/{sample['object_index']}",
-            index=index,
-            photo=Path(sample["image_path"]),
-            meshes=annotated if self.protocol.cad == "annotated" else self._meshes(sample["category"]),
-            box=sample["box"],
-            camera_matrix=None,
-        )
+    def meshes(self, sample: Row) -> tuple[Path, ...]:
+        return super().meshes(sample) if self.protocol.cad == "annotated" else self._cads(sample["category"])
 
     def settings(self) -> Row:
         return {**super().settings(), "part": self.dataset.part, "pixel_origin": self.dataset._pixel_origin}
 
     def rotation_errors(self, items: list[BenchmarkItem], rows: list[Row]) -> Tensor:
-        return self._errors_of(items, rows)[4]
-
-    def easy(self, item: BenchmarkItem) -> bool:
-        return not any(self.dataset.annotation(item.index)[flag] for flag in FLAGS)
+        return self._errors(items, rows)[3]
 
     def summary(self, items: list[BenchmarkItem], rows: list[Row]) -> Row:
         """Acc(pi/6), Acc(pi/18), MedErr: of all, of subsets, of each class, and up to the symmetries of the classes."""
-        samples, R, truth, plain, symmetric = self._errors_of(items, rows)
+        samples = self.samples(items)
+        R, truth, plain, symmetric = self._errors(items, rows)
 
         def scores_of(chosen: list[bool]) -> Row:
             mask = torch.tensor(chosen, dtype=torch.bool)
@@ -91,7 +80,7 @@ class Pascal3DBenchmark(Benchmark):
         return {
             **scores_of([True] * len(samples)),
             "subsets": {
-                "easy": scores_of([self.easy(item) for item in items]),
+                "easy": scores_of([not any(s[flag] for flag in FLAGS) for s in samples]),
                 **{flag: scores_of([s[flag] for s in samples]) for flag in FLAGS},
             },
             "per_class": {c: scores_of([s["category"] == c for s in samples]) for c in classes},
@@ -104,20 +93,17 @@ class Pascal3DBenchmark(Benchmark):
         }
 
     def write_predictions(self, path: Path, items: list[BenchmarkItem], rows: list[Row]) -> None:
-        """One line per object: what was estimated, what is true, and the error."""
-        samples, _, _, plain, symmetric = self._errors_of(items, rows)
-        write_viewpoints(path, COLUMNS, samples, rows, {"error_deg": plain, "symmetric_error_deg": symmetric})
+        """One line for each object: estimate, truth and error."""
+        _, _, plain, symmetric = self._errors(items, rows)
+        errors = {"error_deg": plain, "symmetric_error_deg": symmetric}
+        write_viewpoints(path, COLUMNS, self.samples(items), rows, errors)
 
-    def _errors_of(
-        self, items: list[BenchmarkItem], rows: list[Row]
-    ) -> tuple[list[Row], Tensor, Tensor, Tensor, Tensor]:
-        """Annotations, estimated and true rotations (N, 3, 3), and their errors (N,) without and with symmetries."""
-        samples = [self.dataset.annotation(item.index) for item in items]
-        R = estimated_rotations(rows)
+    def _errors(self, items: list[BenchmarkItem], rows: list[Row]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Estimated and true rotations (N, 3, 3), and their errors (N,) without and with symmetries."""
+        samples, R = self.samples(items), estimated_rotations(rows)
         truth = torch.stack([s["rotation"].double() for s in samples]) if samples else R
-        plain = rotation_error(R, truth)
-        symmetric = plain
+        plain = symmetric = rotation_error(R, truth)
         for category, (_, error) in SYMMETRIES.items():
             mask = torch.tensor([s["category"] == category for s in samples], dtype=torch.bool)
             symmetric = torch.where(mask, error(R, truth), symmetric)
-        return samples, R, truth, or_inf(plain, R), or_inf(symmetric, R)
+        return R, truth, or_inf(plain, R), or_inf(symmetric, R)

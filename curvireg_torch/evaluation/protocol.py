@@ -1,4 +1,4 @@
-"""Under which conditions objects are registered: which CAD, which poses, which box."""
+"""The conditions of an evaluation: which CADs, which pose prior, which box."""
 
 import hashlib
 from collections.abc import Iterable
@@ -20,12 +20,12 @@ class Protocol:
     """The information that the method gets about an object, besides the photograph.
 
     Attributes:
-        cad: "annotated": the CAD that the annotation names. "any": every CAD of the class is registered, the best score
-            wins. "fused": the scores of a view are averaged over the CADs of the class, and the best view wins.
-        pose: "upright": the object stands upright and is not seen from below. "any": nothing is known.
-        box: 0 for the annotated box; x > 0 moves each edge by a random share, up to x, of the box's side; None: no box
-            is given, the object is looked for.
-        seed: of those moves. The move of an object depends on its name and on nothing else.
+        cad: "annotated": the annotated CAD. "any": all CADs of the class, the best hypothesis wins. "fused": the scores
+            of a view are averaged over the CADs of the class, the best view wins.
+        pose: pose prior: "upright" or "any".
+        box: 0 for the annotated box; x > 0 moves each edge at random by up to x of the side; None: the object is
+            localized.
+        seed: of the random numbers, which depend on the object's key besides.
 
     Raises:
         InvalidInputError: an unknown choice, or a box outside [0, 0.45].
@@ -47,11 +47,11 @@ class Protocol:
         for name, options in CHOICES.items():
             check_option(getattr(self, name), options, name)
         if self.box is not None and not 0.0 <= self.box <= 0.45:
-            raise InvalidInputError(f"box: expected a share in [0, 0.45], got {self.box}")
+            raise InvalidInputError(f"box: expected a fraction in [0, 0.45], got {self.box}")
 
     @classmethod
     def parse(cls, words: Iterable[str], *, pose: str = "upright") -> "Protocol":
-        """From words such as ``cad=any``, ``pose=any``, ``box=0.1``, ``seed=1``; what is not named keeps its default.
+        """Parse words such as ``cad=any``, ``pose=any``, ``box=0.1``, ``seed=1``.
 
         Args:
             words: KEY=VALUE each; ``box=annotated`` is 0, ``box=none`` is None.
@@ -80,13 +80,13 @@ class Protocol:
 
 
 def perturbed_box(box: Tensor, protocol: Protocol, key: str) -> Tensor:
-    """The box that the method is given for the object named ``key``.
+    """The box that the method gets for the object ``key``.
 
     Args:
         box: (4,) x0, y0, x1, y1 in px.
 
     Returns:
-        (4,) px, the edges moved as ``protocol.box`` says; as it is if that is 0 or None.
+        (4,) px, with edges moved by up to ``protocol.box`` of the side.
 
     Example:
         >>> box = torch.tensor([0.0, 0.0, 100.0, 50.0])
@@ -97,6 +97,6 @@ def perturbed_box(box: Tensor, protocol: Protocol, key: str) -> Tensor:
     if not protocol.box:
         return box
     seed = int.from_bytes(hashlib.sha256(f"{protocol.seed} {key}".encode()).digest()[:7])
-    shift = 2.0 * torch.rand(4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1.0
+    offset = 2.0 * torch.rand(4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1.0
     sides = (box[2:] - box[:2]).repeat(2)
-    return (box + protocol.box * shift * sides).to(box.dtype)
+    return (box + protocol.box * offset * sides).to(box.dtype)

@@ -14,7 +14,9 @@ from ..geometry import viewpoint_from_rotation
 from ..metrics import accuracy, median_error
 from ..utils.files import write_file
 
-__all__ = ["estimated_rotations", "or_inf", "viewpoint_scores", "write_viewpoints"]
+__all__ = ["THRESHOLDS", "estimated_rotations", "or_inf", "viewpoint_scores", "write_viewpoints"]
+
+THRESHOLDS = {"acc_15_deg": 15.0, "acc_30_deg": 30.0}
 
 
 def viewpoint_scores(errors: Tensor, thresholds: dict[str, float]) -> dict[str, Any]:

@@ -76,7 +76,7 @@ def test_errors_come_before_any_work(pascal, bop, tmp_path):
         evaluate("pascal3d", tmp_path / "nowhere", "--out", out)
     with pytest.raises(InvalidInputError, match="cad: expected one of"):
         evaluate("pascal3d", pascal.root, "--out", out, "--protocol", "cad=all")
-    with pytest.raises(InvalidInputError, match="BOP names the object"):
+    with pytest.raises(InvalidInputError, match="has one mesh, so cad=annotated"):
         evaluate("bop", bop.root, "--out", out, "--protocol", "cad=any")
     with pytest.raises(SystemExit):
         evaluate("bop", bop.root, "--out", out, "--preset", "best")

@@ -160,7 +160,7 @@ def test_bop_table(bop, tmp_path):
 
 
 def test_bop_knows_the_object(bop):
-    with pytest.raises(InvalidInputError, match="BOP names the object"):
+    with pytest.raises(InvalidInputError, match="has one mesh, so cad=annotated"):
         BOPBenchmark(bop, Protocol(cad="any"))
 
 

@@ -1,4 +1,4 @@
-"""How well feature points of photographs and of the right view fall on each other: IP, HD, repeatability."""
+"""Agreement of feature points of photographs with those of the true view: IP, Hausdorff distance, repeatability."""
 
 from collections import defaultdict
 from dataclasses import replace
@@ -15,29 +15,30 @@ from ...metrics import hausdorff_distance, intersection_percentage, view_repeata
 from ...settings import BankSettings
 from .cases import Case, grouped
 from .fields import PHOTO_FIELDS, photo_detectors
-from .tables import Table
+from .tables import Cell, Table
 
 __all__ = ["CURVE_OFFSETS", "curve_table", "detector_tables", "repeatability_table"]
 
 CURVE_OFFSETS = tuple(range(-100, 100, 5))
-"""Degrees about the object's z axis: 40 views, the right one in the middle."""
+"""Degrees about the object's z axis: 40 views, the true one in the middle."""
 
 CURVE_DETECTORS = ("mfc", "mcs", "ig", "sift", "sobel")
 
+Scores = defaultdict[str, defaultdict[str, list[float]]]
+"""Values by category and column."""
+
 
 def detector_tables(cases: list[Case], settings: BankSettings, eps_px: float, progress: bool = True) -> list[Table]:
-    """IP and Hausdorff distances of every detector against the curvilinear saliency of the right view, per category."""
+    """IP and Hausdorff distances of each detector against the curvilinear saliency of the true view, per category."""
     detectors = photo_detectors(settings.point_fraction)
-    scores: dict[str, dict[str, dict[str, list[float]]]] = {
-        name: defaultdict(lambda: defaultdict(list)) for name in ("ip", "hausdorff", "hausdorff_95", "points")
-    }
+    scores = {name: _no_scores() for name in ("ip", "hausdorff", "hausdorff_95", "points")}
     for mesh, group in grouped(cases, "detectors", progress):
         describe = ViewDescriber(mesh, settings)
         for case in group:
-            view = _view_points(describe, settings, *case.view(mesh))
+            view = _points(_depth(describe, *case.view(mesh)), settings)
             crop = _crop(case, settings)
-            anywhere = intersection_percentage(torch.ones_like(view), view, eps_px=eps_px)
-            scores["ip"][case.category]["chance"].append(float(anywhere))
+            chance = intersection_percentage(torch.ones_like(view), view, eps_px=eps_px)
+            scores["ip"][case.category]["chance"].append(float(chance))
             for name, detect in detectors.items():
                 photo = detect(crop)
                 values = (
@@ -49,21 +50,20 @@ def detector_tables(cases: list[Case], settings: BankSettings, eps_px: float, pr
                 for table, value in zip(scores, values, strict=True):
                     if bool(value.isfinite().all()):
                         scores[table][case.category][name].append(float(value))
-    where = f"Crops of {settings.image_size} px, N = {len(cases)}; mean over photographs in which points were found"
-    told = {
+    where = f"Crops of {settings.image_size} px, N = {len(cases)}; mean over photographs with points"
+    definitions = {
         "ip": (
             "Intersection percentage",
-            f"share of the photograph's points within {eps_px:g} px of a point of the view; chance: of all pixels",
+            f"fraction of the photograph's points within {eps_px:g} px of a point of the view; chance: of all pixels",
         ),
         "hausdorff": ("Hausdorff distance", "in px of the crop"),
         "hausdorff_95": ("Hausdorff distance, 95th percentile", "in px of the crop"),
         "points": ("Number of points", "in the photograph's crop"),
     }
     tables = []
-    for name, (title, text) in told.items():
+    for name, (title, text) in definitions.items():
         columns = [*detectors, "chance"] if name == "ip" else [*detectors]
-        rows = _rows(scores[name], columns)
-        tables.append(Table(name, f"{title}, by detector", f"{title}: {text}. {where}.", ["category", *columns], rows))
+        tables.append(_table(name, f"{title}, by detector", f"{title}: {text}. {where}.", scores[name], columns))
     return tables
 
 
@@ -71,8 +71,7 @@ def repeatability_table(cases: list[Case], settings: BankSettings, eps_px: float
     """Repeatability of each depth filter's points in each photograph filter's points."""
     detectors = {n: d for n, d in photo_detectors(settings.point_fraction).items() if n in PHOTO_FIELDS}
     depths = ("CS", "ASG", "HFN")
-    columns = [f"{d}/{p}" for d in depths for p in detectors]
-    scores: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    scores = _no_scores()
     for mesh, group in grouped(cases, "repeatability", progress):
         describe = ViewDescriber(mesh, settings)
         for case in group:
@@ -86,43 +85,43 @@ def repeatability_table(cases: list[Case], settings: BankSettings, eps_px: float
                     if value == value:
                         scores[case.category][f"{name}/{photo_name}"].append(value)
     text = (
-        f"Repeatability: share of the points of the right view with a point of the photograph within {eps_px:g} px. "
-        f"Crops of {settings.image_size} px, {settings.point_fraction:.0%} of the pixels at most, N = {len(cases)}."
+        f"Repeatability: fraction of the points of the true view with a point of the photograph within {eps_px:g} px. "
+        f"Crops of {settings.image_size} px, at most {settings.point_fraction:.0%} of the pixels, N = {len(cases)}."
     )
-    return Table(
-        "repeatability",
-        "Repeatability, depth filter / photograph filter",
-        text,
-        ["category", *columns],
-        _rows(scores, columns),
-    )
+    title = "Repeatability, depth filter / photograph filter"
+    return _table("repeatability", title, text, scores, [f"{d}/{p}" for d in depths for p in detectors])
 
 
 def curve_table(cases: list[Case], settings: BankSettings, eps_px: float, progress: bool = True) -> Table:
-    """Repeatability in 40 views around the right one."""
+    """Repeatability in 40 views around the true one."""
     detectors = {n: d for n, d in photo_detectors(settings.point_fraction).items() if n.lower() in CURVE_DETECTORS}
     angles = torch.deg2rad(torch.tensor(CURVE_OFFSETS, dtype=torch.float64))
-    turns = torch.zeros(len(angles), 3, 3, dtype=torch.float64)
-    turns[:, 0, 0] = turns[:, 1, 1] = angles.cos()
-    turns[:, 1, 0], turns[:, 0, 1], turns[:, 2, 2] = angles.sin(), -angles.sin(), 1.0
+    rotations = torch.zeros(len(angles), 3, 3, dtype=torch.float64)
+    rotations[:, 0, 0] = rotations[:, 1, 1] = angles.cos()
+    rotations[:, 1, 0], rotations[:, 0, 1], rotations[:, 2, 2] = angles.sin(), -angles.sin(), 1.0
     sums = torch.zeros(len(detectors), len(angles), dtype=torch.float64)
     for mesh, group in grouped(cases, "curve", progress):
         describe = ViewDescriber(mesh, settings)
         for case in group:
             R, distance = case.view(mesh)
-            views = _view_points(describe, settings, R @ turns, distance)
+            views = _points(_depth(describe, R @ rotations, distance), settings)
             crop = _crop(case, settings)
             for k, detect in enumerate(detectors.values()):
                 photo = detect(crop).expand_as(views)
                 sums[k] += view_repeatability(views, photo, eps_px=eps_px).nan_to_num().double()
-    rows = [[float(o), *means] for o, means in zip(CURVE_OFFSETS, (sums / len(cases)).T.tolist(), strict=True)]
+    rows: list[list[Cell]] = [
+        [float(o), *means] for o, means in zip(CURVE_OFFSETS, (sums / len(cases)).T.tolist(), strict=True)
+    ]
     text = (
-        f"Share of the points of the view with a point of the photograph within {eps_px:g} px, the object turned about "
-        f"its z axis; curvilinear saliency on depth. Crops of {settings.image_size} px, mean over N = {len(cases)}."
+        f"Fraction of the points of the view with a point of the photograph within {eps_px:g} px, with the object "
+        f"rotated about its z axis; curvilinear saliency on depth. Crops of {settings.image_size} px, mean over "
+        f"N = {len(cases)}."
     )
-    return Table(
-        "curve", "Repeatability around the right view", text, ["offset_deg", *detectors], list(rows), curve=True
-    )
+    return Table("curve", "Repeatability around the true view", text, ["offset_deg", *detectors], rows, curve=True)
+
+
+def _no_scores() -> Scores:
+    return defaultdict(lambda: defaultdict(list))
 
 
 def _crop(case: Case, settings: BankSettings) -> Tensor:
@@ -134,22 +133,21 @@ def _crop(case: Case, settings: BankSettings) -> Tensor:
 def _depth(describe: ViewDescriber, R: Tensor, distance: float) -> Tensor:
     """Depth (N, 1, S, S) of the views (..., 3, 3) at ``distance`` in model units."""
     R = R.reshape(-1, 3, 3)
-    distances = torch.full((len(R),), distance, dtype=torch.float64)
-    return describe.depth(R, distances)[0]
+    return describe.depth(R, torch.full((len(R),), distance, dtype=torch.float64))[0]
 
 
 def _points(depth: Tensor, settings: BankSettings, name: str = "CS") -> Tensor:
+    """(N, S, S) bool, feature points of the depth filter ``name``."""
     with torch.no_grad():
         field = depth_filter(replace(settings, depth_field=name))(depth)
     return field_points(field, fraction=settings.point_fraction)[:, 0]
 
 
-def _view_points(describe: ViewDescriber, settings: BankSettings, R: Tensor, distance: float) -> Tensor:
-    return _points(_depth(describe, R, distance), settings)
-
-
-def _rows(scores: dict[str, dict[str, list[float]]], columns: list[str]) -> list[list[str | float]]:
+def _table(name: str, title: str, text: str, scores: Scores, columns: list[str]) -> Table:
     """One row of means per category, and the mean of all photographs."""
     everything = {c: [v for by_name in scores.values() for v in by_name[c]] for c in columns}
-    table = [*sorted(scores.items()), ("all", everything)]
-    return [[name, *(fmean(values[c]) if values[c] else float("nan") for c in columns)] for name, values in table]
+    means: list[list[Cell]] = [
+        [category, *(fmean(values[c]) if values[c] else float("nan") for c in columns)]
+        for category, values in [*sorted(scores.items()), ("all", everything)]
+    ]
+    return Table(name, title, text, ["category", *columns], means)
