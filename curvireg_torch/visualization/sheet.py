@@ -1,4 +1,4 @@
-"""One page that shows how many photographs ended: thumbnails with the contours that were found, best or worst first."""
+"""One HTML page of results: thumbnails with the contours at the estimated poses, best or worst first."""
 
 import base64
 import html
@@ -12,15 +12,16 @@ from torch import Tensor
 
 from ..rendering.protocol import DepthRenderer
 from ..utils.files import write_file
+from .encoding import jpeg
 from .overlay import draw_pose
 
 __all__ = ["SheetEntry", "thumbnail", "write_sheet"]
 
 SIDE = 224
-"""Of a thumbnail, px."""
+"""Longer side of a thumbnail in px."""
 
-SHOWN = 500
-"""Of the best, and of the worst: a page of them all would be too large to open."""
+MAX_ENTRIES = 500
+"""Of the best, and of the worst: a larger page would be slow to open."""
 
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>curvireg: {title}</title><style>
@@ -45,9 +46,9 @@ class SheetEntry:
     Attributes:
         number: of its row, from 1.
         name: of the photograph.
-        caption: the outcome.
+        caption: the outcome in words.
         kind: "right" or "reliable" (green), "doubtful" (orange), "wrong" or "failed" (red).
-        picture: makes or reads its thumbnail, None where there is none; asked only of what is shown.
+        picture: returns its thumbnail or None; called only for entries that are written.
     """
 
     number: int
@@ -62,15 +63,15 @@ def thumbnail(renderer: DepthRenderer, projection: tuple[Tensor, Tensor], image:
 
     Args:
         renderer: of the mesh.
-        seen_by: (4, 4) ``T_cam_from_model`` and (3, 3) camera matrix in px of the photograph, see
+        projection: (4, 4) ``T_cam_from_model`` and (3, 3) camera matrix in px of the photograph, see
             :class:`~curvireg_torch.registration.Hypothesis`.
         image: (3, H, W) uint8.
         box: x0, y0, x1, y1 px.
     """
     H, W = image.shape[-2:]
-    room = 0.25 * max(box[2] - box[0], box[3] - box[1])
-    left, top = (max(0, int(v - room)) for v in box[:2])
-    right, bottom = min(W, int(box[2] + room) + 1), min(H, int(box[3] + room) + 1)
+    margin = 0.25 * max(box[2] - box[0], box[3] - box[1])
+    left, top = (max(0, int(v - margin)) for v in box[:2])
+    right, bottom = min(W, int(box[2] + margin) + 1), min(H, int(box[3] + margin) + 1)
     scale = min(1.0, SIDE / max(right - left, bottom - top))
     size = max(1, round((right - left) * scale)), max(1, round((bottom - top) * scale))
     small = cv2.resize(
@@ -84,20 +85,20 @@ def thumbnail(renderer: DepthRenderer, projection: tuple[Tensor, Tensor], image:
     (x0, x1), (y0, y1), _ = (to_small @ corners).tolist()
     T, K = projection
     draw_pose(small, renderer, (T, to_small @ K), (x0, y0, x1, y1))
-    return bytes(cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes())
+    return jpeg(small, 80)
 
 
 def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: str, each: int | None = None) -> None:
-    """Write the page, whole in one file.
+    """Write the page as one file.
 
     Args:
         path: of the page.
-        title: how they ended.
-        rows: the best first.
-        table: name of the file that has them all.
-        each: how many of the best, and of the worst, are shown where there are more (default: 500).
+        title: summary of the results.
+        rows: entries, best first.
+        table: name of the file that has all of them.
+        each: number of the best, and of the worst, that are shown (default: 500).
     """
-    each = SHOWN if each is None else each
+    each = MAX_ENTRIES if each is None else each
     note = "Best first; failed ones last."
     if len(rows) > 2 * each:
         rows = [*rows[:each], *rows[-each:]]
@@ -107,9 +108,9 @@ def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: st
 
 
 def _figure(entry: SheetEntry) -> str:
-    name, jpeg, picture = html.escape(entry.name), entry.picture(), ""
-    if jpeg is not None:
-        data = base64.b64encode(jpeg).decode()
+    name, thumbnail, picture = html.escape(entry.name), entry.picture(), ""
+    if thumbnail is not None:
+        data = base64.b64encode(thumbnail).decode()
         picture = f'<img alt="contours over {name}" src="data:image/jpeg;base64,{data}">'
     caption = f"<b>{entry.number}</b> {name}<br>{html.escape(entry.caption)}"
     return f'<figure class="{entry.kind}">{picture}<figcaption>{caption}</figcaption></figure>'

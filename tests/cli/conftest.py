@@ -29,3 +29,13 @@ def register_one(folder, tmp_path):
 def document(tmp_path):
     """Read ``result.json`` of :func:`register_one`."""
     return lambda: json.loads((tmp_path / "out" / "result.json").read_text())
+
+
+@pytest.fixture
+def register(tmp_path):
+    """Run ``curvireg register`` without refinement; results go to ``tmp_path / out``."""
+
+    def run(*words, out="out"):
+        return main(["register", *map(str, words), "--out", str(tmp_path / out), "--quiet", "--no-refine"])
+
+    return run

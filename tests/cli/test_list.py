@@ -1,4 +1,4 @@
-"""``curvireg register --list``: the contract of its files."""
+"""``curvireg register --list``: its tables and how it resumes."""
 
 import json
 
@@ -7,206 +7,206 @@ import torch
 
 from curvireg_torch import Pipeline, ViewBank, sample_views
 from curvireg_torch.cli import main
-from curvireg_torch.evaluation.lists import register as loop
+from curvireg_torch.evaluation.lists import register as lists_register
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
-from tests._support.lists import CAMERA, RESULTS, box_of, lines, table, write_files, written
+from tests._support.lists import CAMERA, RESULTS, box_of, lines, table, written
 from tests._support.scenes import scene
 
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return write_files(tmp_path_factory.mktemp("list"))
+HEADER = "photo,x0,y0,x1,y1"
+EMPTY = [""] * 4
 
 
-def register(path, *more, mesh="truck.safetensors", out="out"):
-    meshes = [] if mesh is None else [str(path.parent / mesh)]
-    return main(["register", "--list", str(path), *meshes, "--out", str(path.parent / out), "--quiet", *more])
+@pytest.fixture
+def register_list(folder, register):
+    """Write a list and register it to the bank of the truck."""
+
+    def run(name, header, *rows, mesh="truck.safetensors", words=(), out="out"):
+        path = written(folder / name, header, *rows)
+        return register("--list", path, *([folder / mesh] if mesh else []), *words, out=out)
+
+    return run
 
 
-def pose(row):
+@pytest.fixture
+def registered(monkeypatch):
+    """Names of the photographs that are registered; ``stop_after`` of them, Ctrl-C is simulated."""
+    names = []
+    register_one = lists_register.register_entry
+
+    def register_entry(entry, *rest, **options):
+        if len(names) == register_entry.stop_after:
+            raise KeyboardInterrupt
+        names.append(entry.name)
+        return register_one(entry, *rest, **options)
+
+    register_entry.stop_after = None
+    monkeypatch.setattr(lists_register, "register_entry", register_entry)
+    return names, register_entry
+
+
+def rotation(row):
     return torch.tensor([[float(row[f"r{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)], dtype=torch.float64)
 
 
-def test_every_row_is_answered_in_the_lists_order(folder, capsys):
-    """Columns in any order, others passed through; what is wrong with a row is said there and stops no other."""
+ROWS = [
+    # note, photo, box, camera; message, or the seed of the scene
+    (['a "quoted", note', "photos/0.png", *box_of(0), *CAMERA], 0),
+    (["é\nü", "photos/1.png", *box_of(1), *EMPTY], 1),
+    (["missing", "photos/none.png", *EMPTY, *EMPTY], "no such file"),
+    (["no picture", "text.jpg", *EMPTY, *EMPTY], "text.jpg"),
+    (["outside", "photos/0.png", "900", "1", "950", "9", *EMPTY], "entirely outside"),
+    (["NaN box", "photos/0.png", "nan", "1", "95", "9", *EMPTY], "finite"),
+    (["no number", "photos/0.png", "1", "1", "9o", "9", *EMPTY], "x1: expected a number, got '9o'"),
+    (["part of a box", "photos/0.png", "1", "1", "", "9", *EMPTY], "nothing for x1"),
+    (["part of a camera", "photos/0.png", *box_of(0), "260", "", "119.5", "89.5"], "nothing for fy"),
+    (["NaN camera", "photos/0.png", *box_of(0), "260", "260", "nan", "89.5"], "finite"),
+    (["negative", "photos/0.png", *box_of(0), "-260", "260", "119.5", "89.5"], "focal"),
+    (["one colour", "flat.png", *EMPTY, *EMPTY], "one colour"),
+    (["short", "photos/0.png"], "2 cells"),
+    (["localized", "photos/2.png", *EMPTY, *EMPTY], None),
+    (["last", " photos/2.png ", *box_of(2), *CAMERA], 2),
+]
+
+
+def test_list_reports_every_row_in_order(register_list, tmp_path, capsys):
+    """Columns come in any order and others are passed through; an unusable row does not affect the others."""
     header = "note,photo,x0,y0,x1,y1,fx,fy,cx,cy"
-    nothing = [""] * 4
-    rows = [
-        ['a "quoted", note', "photos/0.png", *box_of(0), *CAMERA],
-        ["é\nü", "photos/1.png", *box_of(1), *nothing],
-        ["gone", "photos/none.png", *nothing, *nothing],
-        ["no picture", "text.jpg", *nothing, *nothing],
-        ["outside", "photos/0.png", "900", "1", "950", "9", *nothing],
-        ["NaN box", "photos/0.png", "nan", "1", "95", "9", *nothing],
-        ["no number", "photos/0.png", "1", "1", "9o", "9", *nothing],
-        ["part of a box", "photos/0.png", "1", "1", "", "9", *nothing],
-        ["part of a camera", "photos/0.png", *box_of(0), "260", "", "119.5", "89.5"],
-        ["NaN camera", "photos/0.png", *box_of(0), "260", "260", "nan", "89.5"],
-        ["negative", "photos/0.png", *box_of(0), "-260", "260", "119.5", "89.5"],
-        ["one colour", "flat.png", *nothing, *nothing],
-        ["short", "photos/0.png"],
-        ["looked for", "photos/2.png", *nothing, *nothing],
-        ["last", " photos/2.png ", *box_of(2), *CAMERA],
-    ]
-    path = written(folder / "all.csv", header, *rows)
-    assert register(path, "--no-refine") == 0
-    out = folder / "out"
-    assert (out / "results.csv").read_text().splitlines()[0].split(",") == [*header.split(","), *RESULTS]
-    found = table(out)
-    assert [
-        [row[name] for name in header.split(",")][: len(cells)] for row, cells in zip(found, rows, strict=True)
-    ] == rows
-    good = {0: 0, 1: 1, 13: None, 14: 2}
-    assert [k for k, row in enumerate(found) if row["status"] == "ok"] == list(good)
-    for k, seed in good.items():
-        assert found[k]["message"] == ""
-        assert 0 <= float(found[k]["confidence"]) <= 1
-        assert found[k]["reliable"] in ("true", "false")
-        if seed is not None:
-            assert float(rotation_error(pose(found[k]), scene(seed)[2][:3, :3])) < 15
-    t = torch.tensor([float(found[0][name]) for name in ("tx", "ty", "tz")], dtype=torch.float64)
+    names = header.split(",")
+    assert register_list("all.csv", header, *(cells for cells, _ in ROWS)) == 0
+    out = tmp_path / "out"
+    assert (out / "results.csv").read_text().splitlines()[0].split(",") == [*names, *RESULTS]
+    rows, documents = table(out), lines(out)
+    for number, ((cells, expected), row, document) in enumerate(zip(ROWS, rows, documents, strict=True), start=1):
+        assert [row[name] for name in names][: len(cells)] == cells
+        assert (document["row"], document["status"], document["message"]) == (number, row["status"], row["message"])
+        if isinstance(expected, str):
+            assert row["status"] == "failed"
+            assert expected in row["message"]
+            assert len(row["message"].splitlines()) == 1
+            assert [row[name] for name in RESULTS[2:]] == ["", "false", *[""] * 12]
+        else:
+            assert (row["status"], row["message"]) == ("ok", "")
+            assert 0 <= float(row["confidence"]) <= 1
+            assert row["reliable"] in ("true", "false")
+            assert expected is None or float(rotation_error(rotation(row), scene(expected)[2][:3, :3])) < 15
+    t = torch.tensor([float(rows[0][name]) for name in ("tx", "ty", "tz")], dtype=torch.float64)
     truth = scene(0)[2][:3, 3]
     assert float((t - truth).norm() / truth.norm()) < 0.1
-    assert [found[1][name] for name in ("tx", "ty", "tz")] == [""] * 3
-    words = {2: "no such file", 3: "text.jpg", 4: "entirely outside", 5: "finite", 6: "x1: expected a number, got '9o'"}
-    words |= {7: "nothing for x1", 8: "nothing for fy", 9: "finite", 10: "focal", 11: "one colour", 12: "2 cells"}
-    for k, word in words.items():
-        assert found[k]["status"] == "failed"
-        assert word in found[k]["message"]
-        assert len(found[k]["message"].splitlines()) == 1
-        assert [found[k][name] for name in RESULTS[2:]] == ["", "false", *[""] * 12]
-    documents = lines(out)
-    assert [(d["row"], d["status"], d["message"]) for d in documents] == [
-        (number, row["status"], row["message"]) for number, row in enumerate(found, start=1)
-    ]
-    assert documents[0]["rotation"] == pose(found[0]).tolist()
-    assert documents[0]["columns"] == dict(zip(header.split(","), rows[0], strict=True))
+    assert [rows[1][name] for name in ("tx", "ty", "tz")] == [""] * 3
+    assert documents[0]["rotation"] == rotation(rows[0]).tolist()
+    assert documents[0]["columns"] == dict(zip(names, ROWS[0][0], strict=True))
     assert {"top", "covariance", "pipeline", "versions", "seconds", "conventions", "inputs"} <= set(documents[0])
-    reliable = sum(row["reliable"] == "true" for row in found)
+    reliable = sum(row["reliable"] == "true" for row in rows)
     printed = capsys.readouterr().out.strip()
     assert printed == f"15 photographs: 4 ok, 11 failed, {reliable} reliable; see {out}/results.csv"
 
 
-def test_the_pose_of_a_row_is_that_of_the_photograph_alone(folder):
-    """To the bit, with the network and the search, in which roundings grow."""
+def test_list_equals_single_photographs_bit_by_bit(folder, tmp_path):
+    """With the network and the search, where rounding errors would grow."""
     views = sample_views(azimuth_step=45, elevations=[20])
-    ViewBank.build(example_mesh(), views, pipeline=Pipeline(), progress=False).save(folder / "learned.safetensors")
+    bank = folder / "learned.safetensors"
+    ViewBank.build(example_mesh(), views, pipeline=Pipeline(), progress=False).save(bank)
     rows = [[f"photos/{seed}.png", *box_of(seed), *CAMERA] for seed in range(2)]
-    path = written(folder / "alone.csv", "photo,x0,y0,x1,y1,fx,fy,cx,cy", *rows)
-    assert register(path, mesh="learned.safetensors", out="together") == 0
-    for line, (photo, *numbers) in zip(lines(folder / "together"), rows, strict=True):
-        words = ["--box", *numbers[:4], "--camera", *numbers[4:]]
-        files = [str(folder / photo), str(folder / "learned.safetensors"), "--out", str(folder / "one")]
-        assert main(["register", *files, *words, "--quiet"]) == 0
-        alone = json.loads((folder / "one" / "result.json").read_text())
-        same = ("rotation", "translation", "score", "confidence", "covariance", "top", "pipeline")
-        assert [line[name] for name in same] == [alone[name] for name in same]
+    path = written(folder / "alone.csv", f"{HEADER},fx,fy,cx,cy", *rows)
+    assert main(["register", "--list", str(path), str(bank), "--out", str(tmp_path / "list"), "--quiet"]) == 0
+    for line, (photo, *numbers) in zip(lines(tmp_path / "list"), rows, strict=True):
+        words = ["--box", *numbers[:4], "--camera", *numbers[4:], "--out", str(tmp_path / "one"), "--quiet"]
+        assert main(["register", str(folder / photo), str(bank), *words]) == 0
+        alone = json.loads((tmp_path / "one" / "result.json").read_text())
+        keys = ("rotation", "translation", "score", "confidence", "covariance", "top", "pipeline")
+        assert [line[name] for name in keys] == [alone[name] for name in keys]
 
 
-def counted(monkeypatch, stop_after=None):
-    """Names of the photographs that are registered from now on; the one behind ``stop_after`` is interrupted."""
-    done = []
-
-    def register_entry(entry, *rest, **options):
-        if len(done) == stop_after:
-            raise KeyboardInterrupt
-        done.append(entry.name)
-        return true(entry, *rest, **options)
-
-    true = loop.register_entry
-    monkeypatch.setattr(loop, "register_entry", register_entry)
-    return done
-
-
-def test_it_goes_on_where_it_was(folder, monkeypatch, capsys):
-    names = [f"photos/{seed}.png" for seed in range(3)]
-    rows = [[name, *box_of(seed)] for seed, name in enumerate(names)]
-    path = written(folder / "resumed.csv", "photo,x0,y0,x1,y1", *rows, rows[0])
-    assert register(path, "--no-refine", out="whole") == 0
-    out = folder / "resumed"
-    for k in (1, 2):  # killed twice, while it wrote
-        with monkeypatch.context() as patch:
-            counted(patch, stop_after=1)
-            assert register(path, "--no-refine", out="resumed") == 130
-        torn = (out / "results.jsonl").read_bytes()
-        assert [json.loads(line)["inputs"]["photo"] for line in torn.splitlines()] == names[:k]
+def test_list_resumes_after_an_interruption(register_list, tmp_path, registered):
+    names, spy = registered
+    photos = [f"photos/{seed}.png" for seed in range(3)]
+    rows = [[name, *box_of(seed)] for seed, name in enumerate(photos)]
+    rows.append(rows[0])
+    assert register_list("resumed.csv", HEADER, *rows, out="whole") == 0
+    out = tmp_path / "out"
+    for k in (1, 2):
+        names.clear()
+        spy.stop_after = 1
+        assert register_list("resumed.csv", HEADER, *rows) == 130
+        content = (out / "results.jsonl").read_bytes()
+        assert [json.loads(line)["inputs"]["photo"] for line in content.splitlines()] == photos[:k]
         assert not (out / "results.csv").exists()
-        (out / "results.jsonl").write_bytes(torn + torn.splitlines()[0][:500])
-    done = counted(monkeypatch)
-    assert register(path, "--no-refine", out="resumed") == 0
-    assert done == names[2:]
-    whole = (folder / "whole" / "results.csv").read_bytes()
-    assert (out / "results.csv").read_bytes() == whole
+        (out / "results.jsonl").write_bytes(content + content.splitlines()[0][:500])  # killed while it wrote
+    names.clear()
+    spy.stop_after = None
+    assert register_list("resumed.csv", HEADER, *rows) == 0
+    assert names == photos[2:]
+    assert (out / "results.csv").read_bytes() == (tmp_path / "whole" / "results.csv").read_bytes()
     assert [line["row"] for line in lines(out)] == [1, 2, 3, 4]
-    # Nothing to do, another order and another column: nothing is done.
-    path = written(folder / "resumed.csv", "x0,y0,x1,y1,photo,id", *[[*row[1:], row[0], "7"] for row in rows[::-1]])
-    assert register(path, "--no-refine", out="resumed") == 0
-    assert done == names[2:]
-    assert [(line["row"], line["columns"]["photo"]) for line in lines(out)] == list(enumerate(names[::-1], start=1))
-    # Another photograph of that name; another box; other options: done again.
-    (folder / "photos" / "2.png").rename(folder / "kept.png")
+
+
+def test_list_registers_again_what_has_changed(folder, register_list, tmp_path, registered, capsys):
+    names, _ = registered
+    photos = [f"photos/{seed}.png" for seed in range(3)]
+    rows = [[name, *box_of(seed)] for seed, name in enumerate(photos)]
+    assert register_list("changed.csv", HEADER, *rows) == 0
+    names.clear()
+    # The order of rows and columns, and other columns, do not matter.
+    reordered = [[*row[1:], row[0], "7"] for row in rows[::-1]]
+    assert register_list("changed.csv", "x0,y0,x1,y1,photo,id", *reordered) == 0
+    assert names == []
+    found = [(line["row"], line["columns"]["photo"]) for line in lines(tmp_path / "out")]
+    assert found == list(enumerate(photos[::-1], start=1))
+    # Another photograph of the same name, another box, other options.
+    original = (folder / "photos" / "2.png").read_bytes()
     (folder / "photos" / "2.png").write_bytes((folder / "photos" / "1.png").read_bytes())
     rows[0][1] = "1"
-    path = written(folder / "resumed.csv", "photo,x0,y0,x1,y1", *rows)
-    done.clear()
-    assert register(path, "--no-refine", out="resumed") == 0
-    (folder / "kept.png").rename(folder / "photos" / "2.png")
-    assert sorted(done) == ["photos/0.png", "photos/2.png"]
-    done.clear()
-    assert register(path, "--no-refine", "--top", "2", out="resumed") == 0
-    assert done == names
+    assert register_list("changed.csv", HEADER, *rows) == 0
+    (folder / "photos" / "2.png").write_bytes(original)
+    assert sorted(names) == ["photos/0.png", "photos/2.png"]
+    names.clear()
+    assert register_list("changed.csv", HEADER, *rows, words=["--top", "2"]) == 0
+    assert names == photos
     assert "3 photographs: 3 ok" in capsys.readouterr().out
 
 
-def test_a_photograph_that_was_missing_is_tried_again(folder):
-    path = written(folder / "again.csv", "photo,x0,y0,x1,y1", ["photos/0.png", *box_of(0)], ["late.png", *box_of(1)])
-    assert register(path, "--no-refine", out="again") == 0
-    assert [row["status"] for row in table(folder / "again")] == ["ok", "failed"]
+def test_list_retries_a_missing_photograph(folder, register_list, tmp_path):
+    rows = [["photos/0.png", *box_of(0)], ["late.png", *box_of(1)]]
+    assert register_list("again.csv", HEADER, *rows) == 0
+    assert [row["status"] for row in table(tmp_path / "out")] == ["ok", "failed"]
     (folder / "late.png").write_bytes((folder / "photos" / "1.png").read_bytes())
-    assert register(path, "--no-refine", out="again") == 0
+    assert register_list("again.csv", HEADER, *rows) == 0
     (folder / "late.png").unlink()
-    assert [row["status"] for row in table(folder / "again")] == ["ok", "ok"]
+    assert [row["status"] for row in table(tmp_path / "out")] == ["ok", "ok"]
 
 
-def test_rows_name_meshes(folder, monkeypatch):
-    """Each bank is fetched once, whatever the order of the rows; a mesh that is missing or broken fails its rows."""
-    opened = []
-
-    def load(path, **options):
-        opened.append(path.name)
-        return true(path, **options)
-
-    true = ViewBank.load
-    monkeypatch.setattr(ViewBank, "load", load)
-    (folder / "other.safetensors").write_bytes((folder / "truck.safetensors").read_bytes())
-    (folder / "broken.safetensors").write_bytes((folder / "truck.safetensors").read_bytes()[:1000])
-    meshes = ["", "other.safetensors", "", "none.ply", "broken.safetensors", "other.safetensors", "broken.safetensors"]
+def test_list_opens_each_mesh_once(folder, register_list, tmp_path, monkeypatch):
+    """A mesh that is missing or broken fails only its rows."""
+    opened, load = [], ViewBank.load
+    monkeypatch.setattr(ViewBank, "load", lambda path, **options: opened.append(path.name) or load(path, **options))
+    content = (folder / "truck.safetensors").read_bytes()
+    (folder / "other.safetensors").write_bytes(content)
+    (folder / "cut.safetensors").write_bytes(content[:1000])
+    meshes = ["", "other.safetensors", "", "none.ply", "cut.safetensors", "other.safetensors", "cut.safetensors"]
     rows = [[mesh, "photos/0.png", *box_of(0)] for mesh in meshes]
-    path = written(folder / "meshes.csv", "mesh,photo,x0,y0,x1,y1", *rows)
-    assert register(path, "--no-refine", out="meshes") == 0
-    found = table(folder / "meshes")
+    assert register_list("meshes.csv", f"mesh,{HEADER}", *rows) == 0
+    found = table(tmp_path / "out")
     assert [row["status"] for row in found] == ["ok", "ok", "ok", "failed", "failed", "ok", "failed"]
     assert "none.ply" in found[3]["message"]
     assert "build" in found[4]["message"]
-    assert opened == ["truck.safetensors", "other.safetensors", "broken.safetensors"]
-    assert register(path, "--no-refine", mesh=None, out="own") == 0
-    found = table(folder / "own")
+    assert opened == ["truck.safetensors", "other.safetensors", "cut.safetensors"]
+    assert register_list("meshes.csv", f"mesh,{HEADER}", *rows, mesh=None, out="no mesh") == 0
+    found = table(tmp_path / "no mesh")
     assert [row["status"] for row in found] == ["failed", "ok", "failed", "failed", "failed", "ok", "failed"]
     assert "no MESH" in found[0]["message"]
 
 
-def test_none_is_exit_code_2_and_the_table_says_why(folder, capsys):
-    path = written(folder / "none.csv", "photo,x0,y0,x1,y1", ["none.png", "", "", "", ""])
-    assert register(path, "--no-refine", out="none") == 2
+def test_list_without_any_result_ends_with_code_2(register_list, tmp_path, capsys):
+    assert register_list("none.csv", HEADER, ["none.png", *EMPTY]) == 2
     printed = capsys.readouterr()
     assert printed.out.startswith("1 photographs: 0 ok, 1 failed, 0 reliable")
     assert len(printed.err.strip().splitlines()) == 1
-    assert "no such file" in table(folder / "none")[0]["message"]
+    assert "no such file" in table(tmp_path / "out")[0]["message"]
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "messages"),
     [
         (None, ["no such file"]),
         (b"", ["no column"]),
@@ -220,19 +220,18 @@ def test_none_is_exit_code_2_and_the_table_says_why(folder, capsys):
         (b'photo,x0,y0,x1,y1\n"a.png,1,2,3,4\n', ["CSV"]),
     ],
 )
-def test_lists_that_cannot_be_used(folder, tmp_path, capsys, content, words):
+def test_list_reports_unusable_files_in_one_line(folder, register, tmp_path, capsys, content, messages):
     path = tmp_path / "list.csv"
     if content is not None:
         path.write_bytes(content)
-    assert main(["register", "--list", str(path), str(folder / "truck.safetensors"), "--out", str(tmp_path)]) == 2
-    error = capsys.readouterr().err.strip()
-    assert len(error.splitlines()) == 1
-    for word in ["list.csv", *words]:
-        assert word in error
+    assert register("--list", path, folder / "truck.safetensors") == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    for message in ["list.csv", *messages]:
+        assert message in error
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["--list", "a.csv", "a.stl", "b.stl"], "at most one MESH"),
         (["--list", "a.csv", "a.stl", "--box", "1", "2", "3", "4"], "leave --box"),
@@ -241,30 +240,23 @@ def test_lists_that_cannot_be_used(folder, tmp_path, capsys, content, words):
         (["a.jpg", "a.stl", "--bogus", "3"], "unrecognized arguments: --bogus"),
     ],
 )
-def test_words_that_do_not_go_together(words, said, capsys):
+def test_parse_refuses_options_that_exclude_each_other(register, words, message, capsys):
     with pytest.raises(SystemExit) as stop:
-        main(["register", *words, "--out", "out"])
+        register(*words)
     assert stop.value.code == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
-def test_options_between_photograph_and_mesh(folder):
-    box = ["--box", *box_of(0)]
-    files = [str(folder / "photos" / "0.png"), *box, str(folder / "truck.safetensors")]
-    assert main(["register", *files, "--out", str(folder / "between"), "--no-refine", "--quiet"]) == 0
+def test_parse_takes_options_between_photograph_and_mesh(folder, register):
+    assert register(folder / "photos/0.png", "--box", *box_of(0), folder / "truck.safetensors") == 0
 
 
-def test_options_that_are_refused_are_no_rows(folder, capsys):
-    path = written(folder / "top.csv", "photo,x0,y0,x1,y1", ["photos/0.png", *box_of(0)])
-    assert register(path, "--top", "0", out="top") == 2
+def test_list_refuses_unusable_options_and_foreign_results(register_list, tmp_path, capsys):
+    row = ["photos/0.png", *box_of(0)]
+    assert register_list("options.csv", HEADER, row, words=["--top", "0"]) == 2
     assert "hypotheses" in capsys.readouterr().err
-    assert not (folder / "top" / "results.csv").exists()
-
-
-def test_results_of_something_else_stay(folder, capsys):
-    path = written(folder / "foreign.csv", "photo,x0,y0,x1,y1", ["photos/0.png", *box_of(0)])
-    (folder / "foreign").mkdir()
-    (folder / "foreign" / "results.jsonl").write_text('{"score": 1}\n')
-    assert register(path, "--no-refine", out="foreign") == 2
+    assert not (tmp_path / "out" / "results.csv").exists()
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "results.jsonl").write_text('{"score": 1}\n')
+    assert register_list("options.csv", HEADER, row, out="foreign") == 2
     assert "results.jsonl" in capsys.readouterr().err
-    assert (folder / "foreign" / "results.jsonl").read_text() == '{"score": 1}\n'

@@ -1,0 +1,53 @@
+"""The page of thumbnails."""
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from curvireg_torch import Registrar
+from curvireg_torch.geometry import project_points
+from curvireg_torch.visualization import sheet
+from tests._support.scenes import scene, truck_bank, unrefined
+
+
+@pytest.mark.parametrize("scale", [1, 4])
+def test_thumbnail_draws_contours_on_the_object(scale):
+    """The outline is the projection of the mesh after crop and resize."""
+    image, box, _ = scene(1)
+    large = torch.nn.functional.interpolate(image[None], scale_factor=scale, mode="bilinear")[0]
+    photograph = (large * 255).round().byte()
+    edges = ((box + 0.5) * scale - 0.5).tolist()
+    registrar = Registrar(truck_bank(), pipeline=unrefined(truck_bank()))
+    result = registrar([photograph], [edges])[0]
+    grey = torch.full_like(photograph, 100)
+    jpeg = sheet.thumbnail(registrar.describers[0].renderer, result.projection, grey, edges)
+    pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), 1)
+    y, x = np.nonzero(pixels[..., 1].astype(int) - pixels[..., 2] > 60)  # the outline's green
+    assert len(x) > 50
+    # Project the vertices into the thumbnail.
+    T, K = result.projection
+    uv = project_points(torch.as_tensor(registrar.bank.mesh.vertices, dtype=torch.float64), T[None], K)[0]
+    margin = 0.25 * max(edges[2] - edges[0], edges[3] - edges[1])
+    left, top = int(edges[0] - margin), int(edges[1] - margin)
+    shrink = pixels.shape[1] / (int(edges[2] + margin) + 1 - left)
+    expected = [(v + 0.5 - start) * shrink - 0.5 for v, start in zip(uv.T, (left, top), strict=True)]
+    for drawn, projected in zip((x, y), expected, strict=True):
+        # The box is drawn over the outermost pixels.
+        assert abs(drawn.min() - float(projected.min())) <= 3
+        assert abs(drawn.max() - float(projected.max())) <= 3
+
+
+def test_write_sheet_shows_the_best_and_the_worst(tmp_path, monkeypatch):
+    monkeypatch.setattr(sheet, "MAX_ENTRIES", 2)
+    read = []
+    rows = [
+        sheet.SheetEntry(number=k, name=f"{k}.png", caption="", kind="doubtful", picture=lambda k=k: read.append(k))
+        for k in range(7, 0, -1)
+    ]
+    sheet.write_sheet(tmp_path / "index.html", "7 photographs", rows, table="results.csv")
+    page = (tmp_path / "index.html").read_text()
+    assert [int(n) for n in re.findall(r"<b>(\d+)</b>", page)] == read == [7, 6, 2, 1]
+    assert "The 2 best, then the 2 worst; results.csv has them all" in page
