@@ -1,5 +1,3 @@
-"""Depth views lit by a lamp beside the camera."""
-
 import math
 
 import pytest
@@ -10,32 +8,28 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.rendering.shading import AMBIENT, LIT, shade
 
+from .conftest import pixel_grid
+
 K = torch.tensor([[80.0, 0, 20.0], [0, 90.0, 40.0], [0, 0, 1]], dtype=torch.float64)
+RAYS = (pixel_grid((64, 64)) @ torch.linalg.inv(K).T).permute(2, 0, 1)
 
 
-def rays(size=64):
-    v, u = torch.meshgrid(torch.arange(size).double(), torch.arange(size).double(), indexing="ij")
-    return torch.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], torch.ones_like(u)])
+@pytest.mark.parametrize("normal", [[0.3, -0.2, 1.0], [-0.4, 0.5, 1.0], [0.0, 0.0, 1.0]])
+def test_shade_is_exact_for_planes(normal):
+    n = torch.tensor(normal, dtype=torch.float64)
+    along = torch.einsum("i,ihw->hw", n, RAYS)
+    cosine = along / n.norm() / RAYS.norm(dim=0)
+    grey = shade((5.0 / along)[None, None], K)[0, 0]
+    torch.testing.assert_close(grey, AMBIENT + (LIT - AMBIENT) * cosine, atol=2e-4, rtol=0)
 
 
-def test_planes_are_exact_in_perspective():
-    ray = rays()
-    for normal in ([0.3, -0.2, 1.0], [-0.4, 0.5, 1.0], [0.0, 0.0, 1.0]):
-        n = torch.tensor(normal, dtype=torch.float64)
-        along = torch.einsum("i,ihw->hw", n, ray)
-        depth = (5.0 / along)[None, None]
-        cosine = along / n.norm() / ray.norm(dim=0)
-        torch.testing.assert_close(shade(depth, K)[0, 0], AMBIENT + (LIT - AMBIENT) * cosine, atol=2e-4, rtol=0)
-
-
-def test_planes_are_exact_in_parallel_projection():
-    ray = rays()
-    depth = (7.0 + 0.3 * ray[0] - 0.6 * ray[1])[None, None]
+def test_shade_is_exact_for_planes_in_parallel_projection():
+    depth = (7.0 + 0.3 * RAYS[0] - 0.6 * RAYS[1])[None, None]
     expected = AMBIENT + (LIT - AMBIENT) / math.sqrt(1 + 0.3**2 + 0.6**2)
     torch.testing.assert_close(shade(depth, K, orthographic=True), torch.full_like(depth, expected), atol=2e-4, rtol=0)
 
 
-def test_a_rendered_sphere_darkens_towards_its_rim():
+def test_shade_follows_lamberts_law_on_a_sphere():
     size, focal, distance = 129, 400.0, 6.0
     camera = torch.tensor([[focal, 0, 64.0], [0, focal, 64.0], [0, 0, 1]])
     T = torch.eye(4)
@@ -49,36 +43,28 @@ def test_a_rendered_sphere_darkens_towards_its_rim():
     assert (grey[depth[0, 0] == 0] == 1.0).all()
 
 
-def test_contours_and_creases_stay_sharp():
+def test_shade_is_sharp_at_contours_and_steps():
     depth = torch.zeros(1, 1, 12, 24)
     depth[..., 3:9, 2:8] = 4.0
     depth[..., 3:9, 8:14] = 9.0  # a step
-    depth[..., 1, 20] = 3.0  # one pixel alone
-    near = torch.tensor([[1000.0, 0, 11.5], [0, 1000.0, 5.5], [0, 0, 1]])
-    grey = shade(depth, near)
+    depth[..., 1, 20] = 3.0  # a single pixel
+    grey = shade(depth, torch.tensor([[1000.0, 0, 11.5], [0, 1000.0, 5.5], [0, 0, 1]]))
     assert (grey[depth > 0] > LIT - 1e-3).all()
     assert (grey[depth == 0] == 1.0).all()
 
 
-def test_batches_cameras_dtypes_and_nothing_at_all():
+def test_shade_batches_and_dtypes():
     depth = 4.0 + torch.rand(3, 1, 16, 16)
     cameras = torch.stack([K, 1.5 * K, 2.0 * K]).float()
     cameras[:, 2, 2] = 1.0
-    together = shade(depth, cameras)
-    torch.testing.assert_close(together[1:2], shade(depth[1:2], cameras[1]))
+    torch.testing.assert_close(shade(depth, cameras)[1:2], shade(depth[1:2], cameras[1]))
     assert shade(depth.double(), cameras).dtype == torch.float64
     assert shade(depth[:0], cameras[:0]).shape == (0, 1, 16, 16)
     assert (shade(torch.zeros(1, 1, 4, 4), K) == 1.0).all()
-
-
-@pytest.mark.parametrize(
-    ("depth", "camera"),
-    [
+    for bad, camera in (
         (torch.ones(4, 4), K),
         (torch.ones(2, 1, 4, 4), torch.eye(3).expand(3, 3, 3)),
         (torch.ones(1, 1, 4, 4, dtype=torch.int), K),
-    ],
-)
-def test_refuses_what_is_no_depth_or_camera(depth, camera):
-    with pytest.raises(InvalidInputError):
-        shade(depth, camera)
+    ):
+        with pytest.raises(InvalidInputError):
+            shade(bad, camera)

@@ -1,0 +1,98 @@
+"""Renderers in threads and forked processes, and OpenGL's context at exit."""
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+import trimesh
+
+from curvireg_torch.rendering import make_renderer
+
+from .conftest import camera, require
+
+
+def run_script(script: str, *arguments: str, **environment: str) -> str:
+    command = [sys.executable, "-c", script, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env={**os.environ, **environment})
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+def test_threads_share_a_renderer(backend: str) -> None:
+    renderer = make_renderer(trimesh.creation.icosphere(subdivisions=3), backend)
+    T, K, size = camera(6)
+    expected = renderer.render(T, K, size)
+    with ThreadPoolExecutor(2) as pool:
+        results = list(pool.map(lambda _: renderer.render(T, K, size), range(6)))
+    assert all(torch.equal(result, expected) for result in results)
+
+
+def test_threads_build_renderers(backend: str) -> None:
+    T, K, size = camera(2)
+
+    def render(edge: int) -> torch.Tensor:
+        return make_renderer(trimesh.creation.box([edge] * 3), backend).render(T, K, size)
+
+    with ThreadPoolExecutor(2) as pool:
+        for edge, depth in zip((1, 2, 1, 2), pool.map(render, (1, 2, 1, 2)), strict=True):
+            assert torch.equal(depth, render(edge))
+
+
+_SCENE = """
+import atexit, os, sys, torch, trimesh
+from curvireg_torch.errors import RenderingError
+from curvireg_torch.rendering import make_renderer, opengl
+
+T = torch.eye(4)[None]; T[0, 2, 3] = 4.0
+K = torch.tensor([[60.0, 0, 19.5], [0, 60.0, 14.5], [0, 0, 1]])
+"""
+
+_FORK = """
+for backend in sys.argv[1:]:
+    renderer = make_renderer(trimesh.creation.box(), backend)
+    before = renderer.render(T, K, (30, 40))
+    child = os.fork()
+    if child == 0:
+        code = 1
+        torch.set_num_threads(1)  # as torch's DataLoader does in its workers
+        try:
+            shared = torch.equal(renderer.render(T, K, (30, 40)), before)
+            built = torch.equal(make_renderer(trimesh.creation.box(), backend).render(T, K, (30, 40)), before)
+            code = 0 if shared and built else 2
+        except RenderingError as error:
+            code = 3 if "spawn" in str(error) else 4
+        finally:
+            os._exit(code)
+    _, status = os.waitpid(child, 0)
+    assert torch.equal(renderer.render(T, K, (30, 40)), before)  # the parent still works
+    print(os.waitstatus_to_exitcode(status))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+@pytest.mark.parametrize(("backends", "codes"), [(["embree", "torch"], ["0", "0"]), (["pyrender"], ["3"])])
+def test_renderers_after_a_fork(backends: list[str], codes: list[str]) -> None:
+    """embree and torch work in the child; OpenGL cannot, and the error says what to do."""
+    require(*backends)
+    assert run_script(_SCENE + _FORK, *backends, OMP_NUM_THREADS="2").split() == codes
+
+
+def test_opengl_context_is_deleted_at_exit() -> None:
+    require("pyrender")
+    script = """
+atexit.register(lambda: print(opengl._context))  # runs last, because it is registered first
+for i in range(30):
+    make_renderer(trimesh.creation.box(), "pyrender").render(T, K, (30 + i % 3, 40))
+print(len(opengl._context[1]._renderer._meshes))
+"""
+    assert run_script(_SCENE + script).split() == ["1", "None"]
+
+
+def test_triton_loads_after_opengl() -> None:
+    """Mesa's LLVM and triton's in one process crash unless triton's is loaded first."""
+    pytest.importorskip("triton")
+    require("pyrender")
+    run_script(_SCENE + 'make_renderer(trimesh.creation.box(), "pyrender").render(T, K, (32, 32)); import triton')
