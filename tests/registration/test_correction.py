@@ -1,4 +1,4 @@
-"""Boxes that are only roughly right."""
+"""Boxes that are only roughly right are corrected."""
 
 from dataclasses import replace
 
@@ -10,117 +10,95 @@ from curvireg_torch.geometry import box_iou, rotation_error
 from curvireg_torch.registration import correction
 from curvireg_torch.registration.correction import projected_box
 from curvireg_torch.registration.document import result_document, used_box
-from tests._support.scenes import CAMERA, scene, truck_bank, unrefined
+from curvireg_torch.registration.inputs import ImageItem
+from tests._support.scenes import CAMERA, scene, truck_bank, truck_registrar
 
 EDGES = torch.tensor([-0.18, 0.15, 0.02, 0.2])
-"""Errors of a box's edges as fractions of its sides."""
+"""Errors of a box's edges, as fractions of its sides."""
+IMAGE, BOX, TRUTH = scene(0)
+WRONG = BOX + EDGES * (BOX[2:] - BOX[:2]).repeat(2)
 
 
-def roughly(box):
-    return box + EDGES * (box[2:] - box[:2]).repeat(2)
-
-
-@pytest.fixture(scope="module")
+@pytest.fixture
 def registrar():
     return cr.Registrar(truck_bank())
 
 
-def as_it_is(registrar, image, box, camera=CAMERA):
-    """The answer with the box as it is given."""
-    return cr.Registrar(registrar.bank, pipeline=replace(registrar.pipeline, box_jitter=0.0))(
-        [image], box[None], camera
-    )[0]
+def uncorrected(registrar, box):
+    return registrar.register_items([ImageItem(IMAGE, box, CAMERA)])[0]
 
 
-def test_the_box_around_the_pose_takes_the_place_of_one_that_is_wrong(registrar):
-    image, box, truth = scene(0)
-    wrong = roughly(box)
-    result = registrar([image], wrong[None], CAMERA)[0]
-    (before,) = registrar.register_items([correction.ImageItem(image, wrong, CAMERA)])
-    assert rotation_error(before.rotation, truth[:3, :3]) > 5
-    assert rotation_error(result.rotation, truth[:3, :3]) < 2
+def test_wrong_box_is_corrected(registrar):
+    result, before = registrar([IMAGE], WRONG[None], CAMERA)[0], uncorrected(registrar, WRONG)
+    assert rotation_error(before.rotation, TRUTH[:3, :3]) > 5
+    assert rotation_error(result.rotation, TRUTH[:3, :3]) < 2
     assert result.score > before.score
     assert torch.equal(result.corrected_box, projected_box(registrar, before).float().double())
-    right = box[None].double()
-    assert box_iou(result.corrected_box[None], right) > box_iou(wrong[None].double(), right) + 0.1
+    overlap = box_iou(torch.stack([result.corrected_box, WRONG.double()]), BOX[None].double())[:, 0]
+    assert overlap[0] > overlap[1] + 0.1
     document = {**result_document(result, registrar, {}), "inputs": {"box": [1.0, 2.0, 3.0, 4.0]}}
     assert used_box(document) == document["corrected_box"] == result.corrected_box.tolist()
     assert used_box({**document, "corrected_box": None}) == [1.0, 2.0, 3.0, 4.0]
 
 
-def test_one_answer_of_a_batch_may_be_corrected(registrar):
-    scenes = [scene(seed) for seed in (0, 1, 3)]
-    boxes = torch.stack([roughly(scenes[0][1]), scenes[1][1], roughly(scenes[2][1])])
-    boxes[2] = torch.tensor([9e3, 9e3, 1e4, 1e4])  # outside: fails as ever
-    results = registrar([image for image, *_ in scenes], boxes, CAMERA)
+def test_correction_is_batch_independent(registrar):
+    other, box, _ = scene(1)
+    outside = torch.tensor([9e3, 9e3, 1e4, 1e4])
+    results = registrar([IMAGE, other, scene(3)[0]], torch.stack([WRONG, box, outside]), CAMERA)
     assert [result.ok for result in results] == [True, True, False]
-    alone = registrar([scenes[0][0]], boxes[:1], CAMERA)[0]
+    alone = registrar([IMAGE], WRONG[None], CAMERA)[0]
     assert torch.equal(results[0].corrected_box, alone.corrected_box)
     assert torch.allclose(results[0].rotation, alone.rotation, atol=1e-9)
     assert results[1].corrected_box is None
 
 
-def test_boxes_that_fit_stay(registrar, monkeypatch):
-    """They cost nothing: nothing is registered again."""
-    image, box, _ = scene(0)
-    (expected,) = registrar.register_items([correction.ImageItem(image, box, CAMERA)])
-    asked = []
-    monkeypatch.setattr(registrar, "register", lambda items, _: asked.append(len(items)) or [expected] * len(items))
-    assert registrar([image], box[None], CAMERA)[0] is expected
-    assert asked == [1]
+def test_fitting_box_is_registered_once(registrar, monkeypatch):
+    expected, calls = uncorrected(registrar, BOX), []
+    monkeypatch.setattr(registrar, "register", lambda items, _: calls.append(len(items)) or [expected] * len(items))
+    assert registrar([IMAGE], BOX[None], CAMERA)[0] is expected
+    assert calls == [1]
 
 
 @pytest.mark.parametrize("better", [True, False])
-def test_the_view_that_is_more_like_the_photograph_stays(registrar, monkeypatch, better):
-    image, box, _ = scene(0)
-    (first,) = registrar.register_items([correction.ImageItem(image, box, CAMERA)])
-    other = replace(first, hypotheses=(replace(first.hypotheses[0], score=first.score + (0.01 if better else -0.01)),))
+def test_corrected_result_is_kept_if_its_score_is_higher(registrar, monkeypatch, better):
+    first = uncorrected(registrar, BOX)
+    score = first.score + (0.01 if better else -0.01)
+    other = replace(first, hypotheses=(replace(first.hypotheses[0], score=score),))
     answers = iter([[first], [other]])
     monkeypatch.setattr(registrar, "register_items", lambda *_, **__: next(answers))
-    result = registrar([image], roughly(box)[None], CAMERA)[0]
+    result = registrar([IMAGE], WRONG[None], CAMERA)[0]
     assert (result is first) != better
     assert (result.corrected_box is None) != better
 
 
-def test_boxes_are_taken_as_they_are_where_that_is_asked_for(registrar):
-    image, box, _ = scene(0)
-    wrong = roughly(box)
-    assert as_it_is(registrar, image, wrong).corrected_box is None
-    assert registrar([image], wrong[None])[0].corrected_box is None, "without a camera a pose keeps to its box"
-    ranked = cr.Registrar(registrar.bank, pipeline=unrefined(registrar.bank))
-    assert ranked([image], wrong[None], CAMERA)[0].corrected_box is None
+def test_boxes_are_not_corrected_without_jitter_camera_or_search(registrar):
+    assert truck_registrar(box_jitter=0.0)([IMAGE], WRONG[None], CAMERA)[0].corrected_box is None
+    assert registrar([IMAGE], WRONG[None])[0].corrected_box is None
+    quick = truck_registrar(search=False, contours=False)
+    assert quick([IMAGE], WRONG[None], CAMERA)[0].corrected_box is None
 
 
 @pytest.mark.parametrize("box", [[-300.0, -200.0, -100.0, -50.0], [torch.nan] * 4, [240.0, 10.0, 300.0, 90.0]])
-def test_a_pose_that_left_the_photograph_corrects_nothing(registrar, monkeypatch, box):
-    image, given, _ = scene(0)
+def test_pose_outside_the_photograph_corrects_nothing(registrar, monkeypatch, box):
     monkeypatch.setattr(correction, "projected_box", lambda *_: torch.tensor(box, dtype=torch.float64))
-    assert registrar([image], given[None], CAMERA)[0].corrected_box is None
+    assert registrar([IMAGE], BOX[None], CAMERA)[0].corrected_box is None
 
 
-def test_boxes_are_compared_where_they_show_the_photograph():
-    """An object cut off by the border has a box that ends there, its pose one that does not."""
-    item = correction.ImageItem(torch.zeros(3, 100, 200), torch.tensor([150.0, 20.0, 199.5, 80.0]), CAMERA)
-    same = torch.tensor([150.0, 20.0, 260.0, 80.0], dtype=torch.float64)
-    assert not correction._differs(same, item)
-    assert correction._differs(same - torch.tensor([20.0, 0.0, 20.0, 0.0]), item)
-    low = correction.ImageItem(torch.zeros(3, 100, 200), torch.tensor([20.0, 50.0, 80.0, 99.5]), CAMERA)
-    assert not correction._differs(torch.tensor([20.0, 50.0, 80.0, 300.0], dtype=torch.float64), low)
-    assert correction._differs(torch.tensor([20.0, 30.0, 80.0, 300.0], dtype=torch.float64), low)
-
-
-@pytest.mark.parametrize(("box", "another"), [((4, 10, 104, 60), False), ((12, 10, 112, 60), True)])
-def test_boxes_that_overlap_by_85_per_cent_are_the_same(box, another):
-    """Moved by 4 of 100 px they overlap by 0.92, moved by 12 by 0.79."""
-    item = correction.ImageItem(torch.zeros(3, 80, 120), torch.tensor([0.0, 10.0, 100.0, 60.0]), CAMERA)
-    assert correction._differs(torch.tensor(box, dtype=torch.float64), item) == another
-
-
-def test_what_lies_outside_of_the_photograph_does_not_tell_boxes_apart():
-    """A pose may reach far beyond the border that cut its box."""
-    item = correction.ImageItem(torch.zeros(3, 80, 120), torch.tensor([-0.5, 10.0, 60.0, 79.5]), CAMERA)
-    for beyond in ((-300.0, 10.0, 60.0, 79.5), (-0.5, 10.0, 60.0, 400.0)):
-        assert not correction._differs(torch.tensor(beyond, dtype=torch.float64), item)
-    assert correction._differs(torch.tensor([-300.0, 10.0, 20.0, 79.5], dtype=torch.float64), item)
-    nowhere = torch.tensor([-300.0, 10.0, -20.0, 79.5], dtype=torch.float64)
-    assert not correction._differs(nowhere, item)
+@pytest.mark.parametrize(
+    ("size", "given", "box", "expected"),
+    [
+        ((100, 200), (150.0, 20.0, 199.5, 80.0), (150.0, 20.0, 260.0, 80.0), False),  # cut off by the right border
+        ((100, 200), (150.0, 20.0, 199.5, 80.0), (130.0, 20.0, 240.0, 80.0), True),
+        ((100, 200), (20.0, 50.0, 80.0, 99.5), (20.0, 50.0, 80.0, 300.0), False),  # by the lower border
+        ((100, 200), (20.0, 50.0, 80.0, 99.5), (20.0, 30.0, 80.0, 300.0), True),
+        ((80, 120), (0.0, 10.0, 100.0, 60.0), (4.0, 10.0, 104.0, 60.0), False),  # IoU 0.92
+        ((80, 120), (0.0, 10.0, 100.0, 60.0), (12.0, 10.0, 112.0, 60.0), True),  # IoU 0.79
+        ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, 60.0, 79.5), False),  # by two borders
+        ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-0.5, 10.0, 60.0, 400.0), False),
+        ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, 20.0, 79.5), True),
+        ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, -20.0, 79.5), False),  # outside: not used
+    ],
+)
+def test_boxes_are_compared_inside_the_photograph(size, given, box, expected):
+    item = ImageItem(torch.zeros(3, *size), torch.tensor(given), CAMERA)
+    assert correction._differs(torch.tensor(box, dtype=torch.float64), item) == expected

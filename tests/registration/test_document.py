@@ -1,4 +1,4 @@
-"""What a result says as JSON, of registrations that are made up."""
+"""JSON documents of made-up registrations."""
 
 import json
 from types import SimpleNamespace
@@ -8,17 +8,16 @@ import torch
 
 from curvireg_torch import Registration
 from curvireg_torch.matching import Ranking
-from curvireg_torch.registration import Hypothesis
+from curvireg_torch.registration import Hypothesis, Localization
 from curvireg_torch.registration.document import correction, localization_document, result_document
-from curvireg_torch.registration.results import Localization
 
 
 def registration(covariance=None, confidence=0.9, localization=None, distance=2.0):
-    """Of a bank of two views, the second of which one term did not compare."""
+    """A registration to a bank of two views, the second of which one term did not compare."""
     terms = {"hog": torch.tensor([[0.5, 0.4]]), "appearance": torch.tensor([[0.3, torch.nan]])}
     ranking = Ranking(torch.tensor([[0.9, 0.8]]), torch.tensor([[0, 1]]), terms)
     eye = torch.eye(3, dtype=torch.float64)
-    poses = tuple(
+    hypotheses = tuple(
         Hypothesis(
             rotation=eye,
             translation=torch.tensor([0.0, 0.0, distance], dtype=torch.float64),
@@ -33,7 +32,7 @@ def registration(covariance=None, confidence=0.9, localization=None, distance=2.
         )
         for view in (0, 1)
     )
-    return Registration(poses, confidence, ranking, localization=localization)
+    return Registration(hypotheses, confidence, ranking, localization=localization)
 
 
 class Bank(list):
@@ -43,18 +42,18 @@ class Bank(list):
 REGISTRAR = SimpleNamespace(bank=Bank([0, 1]), pipeline=SimpleNamespace(describe=dict))
 
 
-def test_deviations_without_bound_are_null():
-    """One radian of turn, or a shift of half the distance, is not known at all."""
+def test_to_dict_replaces_unbounded_deviations_by_null():
+    """Unbounded from one radian, and from half the distance."""
     variances = torch.tensor([0.25, 0.81, 1.21, 0.81, 0.9801, 1.0201], dtype=torch.float64)
-    document = result_document(registration(torch.diag(variances)), REGISTRAR, {})
-    told = document["standard_deviations"]
+    document = registration(torch.diag(variances)).to_dict()
     degrees = 180.0 / torch.pi
-    assert told["rotation_deg"] == [pytest.approx(0.5 * degrees), pytest.approx(0.9 * degrees), None]
-    assert told["translation"] == [pytest.approx(0.9), pytest.approx(0.99), None]
+    deviations = document["standard_deviations"]
+    assert deviations["rotation_deg"] == [pytest.approx(0.5 * degrees), pytest.approx(0.9 * degrees), None]
+    assert deviations["translation"] == [pytest.approx(0.9), pytest.approx(0.99), None]
     json.dumps(document, allow_nan=False)
 
 
-def test_terms_that_did_not_compare_a_view_are_left_out():
+def test_result_document_leaves_out_terms_that_did_not_compare_a_view():
     document = result_document(registration(), REGISTRAR, {"bank": 1.0})
     assert [list(pose["terms"]) for pose in document["top"]] == [["hog", "appearance"], ["hog"]]
     assert [pose["score"] for pose in document["top"]] == pytest.approx([0.7, 0.6])
@@ -62,21 +61,17 @@ def test_terms_that_did_not_compare_a_view_are_left_out():
     json.dumps(document, allow_nan=False)
 
 
-def test_presence_is_that_of_the_surest_instance():
+def test_localization_document_reports_the_presence_of_the_most_certain_instance():
     boxes, scores = torch.tensor([[1.0, 2, 30, 40], [50, 2, 80, 40]]).double(), torch.tensor([7.0, 6.5])
-    results = [
-        registration(localization=Localization(box, presence, score, boxes, scores), confidence=0.5 * presence)
-        for box, presence, score in zip(boxes, (0.9, 0.4), (7.0, 6.5), strict=True)
-    ]
-    document = localization_document(results)
+    found = [Localization(box, p, s, boxes, scores) for box, p, s in zip(boxes, (0.9, 0.4), (7.0, 6.5), strict=True)]
+    document = localization_document([registration(localization=x, confidence=0.5 * x.presence) for x in found])
     assert document["presence"] == 0.9
-    assert [one["presence"] for one in document["instances"]] == [0.9, 0.4]
-    assert [one["confidence"] for one in document["instances"]] == [0.45, 0.2]
+    assert [(one["presence"], one["confidence"]) for one in document["instances"]] == [(0.9, 0.45), (0.4, 0.2)]
     assert [one["box"] for one in document["proposals"]] == boxes.tolist()
     assert [one["score"] for one in document["proposals"]] == [7.0, 6.5]
 
 
-def test_a_corrected_box_is_told_in_whole_pixels():
+def test_correction_prints_whole_pixels():
     assert correction({"corrected_box": None}) == []
     (line,) = correction({"corrected_box": [1.4, 2.6, 30.49, 40.51]})
     assert line.endswith(": 1 3 30 41")

@@ -1,4 +1,4 @@
-"""A can looks the same upside down but for its print: a mesh with a texture tells, a grey one cannot."""
+"""A can looks the same upside down except for its label: only a mesh with a texture tells the two apart."""
 
 from dataclasses import replace
 
@@ -18,6 +18,7 @@ from tests._support.scenes import CAMERA, SIZE
 
 VIEWS = sample_views(azimuth_step=30, elevations=[-25, 25], thetas=[0, 180]).for_up("y")
 PIPELINE = replace(Pipeline(field="focus", box_jitter=0.0, hypotheses=4), bank=replace(Pipeline().bank, image_size=64))
+UNREFINED = replace(PIPELINE, search=False, contours=False)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +46,7 @@ def cans(tmp_path_factory) -> dict[str, trimesh.Trimesh]:
 
 
 def photograph(mesh, T):
-    """In another light than views are shaded with, before a floor and a wall, blurred and with noise."""
+    """In other light than the views, in front of a floor and a wall, blurred and with noise."""
     picture, (H, W) = render_colour(mesh, T, CAMERA, SIZE)[0], SIZE
     room = torch.full((H, W), 0.45)
     room[2 * H // 3 :] = 0.75
@@ -56,24 +57,22 @@ def photograph(mesh, T):
     return (image + 0.02 * noise).clamp(0, 1)
 
 
-def stands(hypothesis) -> bool:
-    """Whether the can's lid points up in the photograph."""
+def is_upright(hypothesis) -> bool:
     return float(hypothesis.rotation[1, 1]) < 0
 
 
 @pytest.mark.parametrize("upright", [True, False])
-def test_the_print_tells_top_from_bottom(cans, upright):
+def test_texture_tells_top_from_bottom(cans, upright):
     view = (17.0, 22.0, 0.0) if upright else (17.0, -22.0, 180.0)
     R = rotation_from_viewpoint(*torch.tensor(view, dtype=torch.float64)) @ up_rotation("y")
     T = transform(R[None], torch.tensor([[0.1, -0.05, 7.0]], dtype=torch.float64))
     image, box = photograph(cans["printed"], T), projected_boxes(extreme_points(cans["printed"]), T, CAMERA)
     printed, grey = (
         Registrar(cans[name], views=VIEWS, pipeline=pipeline)([image], box, CAMERA)[0]
-        for name, pipeline in (("printed", PIPELINE), ("grey", replace(PIPELINE, search=False, contours=False)))
+        for name, pipeline in (("printed", PIPELINE), ("grey", UNREFINED))
     )
     assert float(rotation_error(printed.rotation, R)) < 15
-    assert stands(printed.hypotheses[0]) == upright
-    assert all(h.evidence["rank"] < -0.3 for h in printed.hypotheses if stands(h) != upright)
-    # Without it both stand and fall together.
-    ways = {stands(h) for h in grey.hypotheses if h.evidence["rank"] > -0.001}
-    assert ways == {True, False}
+    assert is_upright(printed.hypotheses[0]) == upright
+    assert all(h.evidence["rank"] < -0.3 for h in printed.hypotheses if is_upright(h) != upright)
+    best_of_grey = {is_upright(h) for h in grey.hypotheses if h.evidence["rank"] > -0.001}
+    assert best_of_grey == {True, False}

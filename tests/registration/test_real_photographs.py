@@ -1,7 +1,7 @@
-"""Real photographs, the default pipeline: the poses that come out are the annotated ones, in the right frame and unit.
+"""Real photographs, default pipeline: the poses agree with the annotations in frame and unit.
 
-Only photographs are taken that are registered rightly with room to spare; fractions of right answers are measured
-elsewhere (docs/accuracy.md). About 70 seconds of one core, most of it for banks of any orientation.
+These photographs are registered correctly by a wide margin; docs/accuracy.md has fractions of correct results. The
+tests take about 70 seconds on one core, mostly for banks of any orientation.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.data
 
 @dataclass(frozen=True)
 class Case:
-    """Photographs of one mesh and what their poses may be off.
+    """Photographs of one mesh, and the largest errors of their poses.
 
     Attributes:
         name: of the set.
@@ -52,7 +52,7 @@ SIMILAR = [
 
 
 def registered(benchmark, case):
-    """(annotation, result) of each photograph, registered by itself to the bank of the mesh that they share."""
+    """(annotation, result) of each photograph, registered alone to the bank of their common mesh."""
     items = {item.key: item for item in benchmark.items}
     chosen = [items[key] for key in case.keys]
     assert len({item.meshes for item in chosen}) == 1
@@ -67,12 +67,12 @@ def registered(benchmark, case):
 
 @pytest.mark.parametrize("case", EXACT, ids=lambda case: case.name)
 def test_poses_of_exact_meshes(case):
-    """Camera and box given; the mesh is in millimetres, and so is the translation."""
+    """With camera and box; mesh and translation are in millimetres."""
     benchmark = BOPBenchmark(BOPDataset(real_data(f"bop/{case.name}")), Protocol(pose="any"))
     for key, (known, result) in zip(case.keys, registered(benchmark, case), strict=True):
-        turns = symmetry_transforms(known["model_info"])[:, :3, :3]
+        symmetries = symmetry_transforms(known["model_info"])[:, :3, :3]
         R, t = result.rotation.double(), known["translation"].double()
-        error = float(symmetric_rotation_error(R[None], known["rotation"].double()[None], turns)[0])
+        error = float(symmetric_rotation_error(R[None], known["rotation"].double()[None], symmetries)[0])
         assert error < case.rotation, f"{key}: {error:.1f} degrees"
         shift = (result.translation.double() - t) / t[2]
         assert float(shift[:2].norm()) < case.sideways, f"{key}: {shift.tolist()} of the distance"
@@ -81,12 +81,12 @@ def test_poses_of_exact_meshes(case):
 
 @pytest.mark.parametrize("case", SIMILAR, ids=lambda case: case.keys[0])
 def test_viewpoints_of_similar_meshes(case):
-    """No camera, another object's CAD that stands upright: a viewpoint in the annotation's angles."""
+    """Without a camera, upright, with the CAD of another object."""
     dataset = Pascal3DPlus(real_data("pascal3d_mini"), pixel_origin=0, categories=[case.name])
     benchmark = Pascal3DBenchmark(dataset, Protocol(pose="upright"))
     for key, (known, result) in zip(case.keys, registered(benchmark, case), strict=True):
         error = float(rotation_error(result.rotation.double(), known["rotation"].double()))
         assert error < case.rotation, f"{key}: {error:.1f} degrees"
-        told = cr.rotation_from_viewpoint(*(torch.as_tensor(v, dtype=torch.float64) for v in result.viewpoint))
-        assert float(rotation_error(told, known["rotation"].double())) < case.rotation, key
+        reported = cr.rotation_from_viewpoint(*(torch.as_tensor(v, dtype=torch.float64) for v in result.viewpoint))
+        assert float(rotation_error(reported, known["rotation"].double())) < case.rotation, key
         assert result.translation is None
