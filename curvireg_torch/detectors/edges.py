@@ -13,18 +13,20 @@ from ..utils.checks import check_fraction, check_positive
 from .base import Detection, detection_from_field, detector, to_uint8_images
 
 
-@detector
-def sobel(image: Tensor, *, fraction: float = 0.04) -> Detection:
-    """Gradient by the Sobel kernels, per px (their sums divided by 8), borders replicated.
-
-    Own code, because kornia's ``spatial_gradient`` is slower and its ``sobel`` is not 0 on constant images.
-    """
+def sobel_gradient(image: Tensor) -> Tensor:
+    """(B, 2, H, W) gradient of (B, 1, H, W) by the Sobel kernels, per px (their sums divided by 8)."""
     p = replicate_pad(image, 1)
     along_x = p[..., 2:] - p[..., :-2]
     along_y = p[..., 2:, :] - p[..., :-2, :]
     gx = along_x[..., :-2, :] + 2.0 * along_x[..., 1:-1, :] + along_x[..., 2:, :]
     gy = along_y[..., :-2] + 2.0 * along_y[..., 1:-1] + along_y[..., 2:]
-    return detection_from_field(torch.cat([gx, gy], dim=1) / 8.0, fraction)
+    return torch.cat([gx, gy], dim=1) / 8.0
+
+
+@detector
+def sobel(image: Tensor, *, fraction: float = 0.04) -> Detection:
+    """Gradient by the Sobel kernels per px, borders replicated."""
+    return detection_from_field(sobel_gradient(image), fraction)
 
 
 @detector
