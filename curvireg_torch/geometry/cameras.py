@@ -96,7 +96,7 @@ def rotation_towards(rays: Tensor) -> Tensor:
         rays: (..., 3), z > 0, any length.
 
     Returns:
-        (..., 3, 3) rotations with R (0, 0, 1) = ray / |ray|.
+        (..., 3, 3) rotations with ``R (0, 0, 1) = ray / |ray|``.
     """
     x, y, z = (rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)).unbind(-1)
     # Rodrigues with axis (0, 0, 1) x ray = (-y, x, 0): R = I + [v] + [v]^2 / (1 + z).
