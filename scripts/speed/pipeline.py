@@ -1,15 +1,16 @@
-"""Times the path from mesh to pose: build a bank, open it from disk, rank and register one photograph and many.
+"""Time the path from mesh to pose: build a bank, open it from disk, rank and register photographs.
 
     python scripts/speed/pipeline.py                    # scripts/results/bench_pipeline.json, docs/performance.md
     python scripts/speed/pipeline.py --device cuda      # scripts/results/bench_pipeline_cuda.json, with the GPU's name
 
-All with the default pipeline. The mesh is a sphere with dents, made in code, so that the number of faces can be chosen.
+The pipeline is the default one. The mesh is a dented sphere with a chosen number of faces.
 """
 
 import argparse
 import platform
 import statistics
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ import trimesh
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, ViewMatcher, camera_matrix
 from curvireg_torch.synthetic import random_pose, synthesize_photograph
-from scripts._shared import REPOSITORY, commit, replace_between, timed, today, write_json
+from scripts._shared import REPOSITORY, RESULTS, commit, timed, today, update_page, write_json
 
 
 def dented_sphere(faces: int) -> trimesh.Trimesh:
@@ -32,13 +33,13 @@ def dented_sphere(faces: int) -> trimesh.Trimesh:
     return mesh
 
 
-def seconds(call, repeats: int = 3) -> float:
-    """Median of a few runs."""
+def seconds(call: Callable[[], object], repeats: int = 3) -> float:
+    """Median of the runs."""
     return statistics.median(timed(call, repeats))
 
 
 def over_products(matcher: ViewMatcher, images: list[torch.Tensor], boxes: torch.Tensor) -> float:
-    """Ranking of described photographs by S_hog S_rep S_box over the bare matrix products in it, turn about; minima."""
+    """Time of ranking by S_hog S_rep S_box over that of its matrix products alone; minima of alternating runs."""
     hog, points = matcher.get_submodule("_terms.hog"), matcher.get_submodule("_terms.repeatability")
     with torch.no_grad():
         query = matcher.query(images, boxes)
@@ -52,7 +53,7 @@ def over_products(matcher: ViewMatcher, images: list[torch.Tensor], boxes: torch
 
 
 def pipeline_times(mesh: trimesh.Trimesh, pipeline: Pipeline, photographs: int, device: str) -> dict[str, float]:
-    """Seconds by what takes them; on another device the torch renderer draws the views there."""
+    """Seconds of each step; devices other than the CPU use the torch renderer."""
     renderer = "auto" if device == "cpu" else "torch"
 
     def build() -> ViewBank:
@@ -79,7 +80,7 @@ def pipeline_times(mesh: trimesh.Trimesh, pipeline: Pipeline, photographs: int, 
     )
     one = images[:1], boxes[:1], K
     for name, registrar in (("rank", ranked), ("register_1_hypothesis", single), ("register", whole)):
-        registrar(*one)  # makes what is made once
+        registrar(*one)  # warm-up
         times[name] = seconds(lambda: registrar(*one))  # noqa: B023
     times["register_many_each"] = seconds(lambda: whole(images, boxes, K), 1) / photographs
     three = [term for term in pipeline.terms if term.name != "appearance"]
@@ -98,7 +99,7 @@ def pipeline_table(record: dict[str, Any]) -> str:
         ("register it, five hypotheses", t["register"]),
         (f"{n} photographs in one call, each", t["register_many_each"]),
     ]
-    lines = ["| what | seconds |", "|---|---|", *(f"| {what} | {value:.2f} |" for what, value in rows)]
+    lines = ["| step | seconds |", "|---|---|", *(f"| {what} | {value:.2f} |" for what, value in rows)]
     products = (
         f"Ranking by the first three terms takes {t['rank_over_products']:.1f} times the bare matrix products in it."
     )
@@ -127,15 +128,11 @@ def main() -> None:
         "times": pipeline_times(mesh, Pipeline(), photographs, device),
     }
     print(pipeline_table(record))
-    results = REPOSITORY / "scripts" / "results"
     if device != "cpu":
-        write_json(results / "bench_pipeline_cuda.json", record)
+        write_json(RESULTS / "bench_pipeline_cuda.json", record)
         return
-    write_json(results / "bench_pipeline.json", record)
-    page = REPOSITORY / "docs" / "performance.md"
-    text = page.read_text(encoding="utf-8")
-    marks = "<!-- pipeline:begin -->", "<!-- pipeline:end -->"
-    page.write_text(replace_between(text, *marks, pipeline_table(record)), encoding="utf-8")
+    write_json(RESULTS / "bench_pipeline.json", record)
+    update_page(REPOSITORY / "docs" / "performance.md", "pipeline", pipeline_table(record))
 
 
 if __name__ == "__main__":

@@ -1,10 +1,9 @@
-"""Views per second of every renderer, and the cost of a whole bank.
+"""Measure the views per second of every renderer, and the cost of a bank.
 
     python scripts/speed/rendering.py [--views 16] [--out scripts/results/bench_rendering.json]
 
-All candidates render the same views of the same mesh in the same run, the object filling the image, interleaved; the
-best of three rounds counts. "trimesh" is trimesh's own ray caster over all pixels; "naive pyrender" opens a renderer,
-renders one view and closes it, as a first program does.
+All renderers draw the same views of the same mesh in alternation, the object filling the image; the best of three
+rounds counts. "trimesh" is trimesh's ray caster over all pixels. "naive pyrender" creates a renderer for each view.
 """
 
 import argparse
@@ -15,6 +14,8 @@ import resource
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ FACES = {"1k": 3, "20k": 5, "300k": 7}  # subdivisions of an icosahedron: 1280, 
 
 
 def bumpy_sphere(subdivisions: int) -> trimesh.Trimesh:
-    """A ball with hills, so that views differ and hide parts of it."""
+    """A bumpy ball: its views differ and have self-occlusion."""
     mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
     v = mesh.vertices
     height = 1.0 + 0.15 * np.sin(5 * v[:, 0] + 1) * np.cos(4 * v[:, 1]) + 0.1 * np.sin(7 * v[:, 2])
@@ -88,7 +89,7 @@ def rates(subdivisions: int, size: int, count: int) -> dict[str, float]:
     describe = ViewDescriber(mesh, BankSettings(image_size=size))
     T, K, _ = describe.cameras(views.rotations, views.distance * mesh_radius(mesh))
     best: dict[str, float] = {}
-    for repeat in range(4):  # the first round warms up
+    for repeat in range(4):  # the first round is a warm-up
         for name, render in candidates(mesh).items():
             few = max(2, count // 8) if name == "trimesh" else count
             start = time.perf_counter()
@@ -102,7 +103,7 @@ def rates(subdivisions: int, size: int, count: int) -> dict[str, float]:
 
 
 def naive_rates(count: int = 4) -> dict[str, float]:
-    """In a process of its own: closing its context takes that of other renderers along."""
+    """Rates of naive pyrender. Run it in a separate process: closing its context breaks other renderers."""
     found = {}
     for name, subdivisions in FACES.items():
         mesh = bumpy_sphere(subdivisions)
@@ -117,7 +118,7 @@ def naive_rates(count: int = 4) -> dict[str, float]:
 
 
 def bank_costs() -> dict[str, float]:
-    """700 views of 20 480 faces at 256 px."""
+    """Cost of 700 views of 20,480 faces at 256 px."""
     mesh, views = bumpy_sphere(FACES["20k"]), uniform_views(700)
     describe = ViewDescriber(mesh, BankSettings())
     distances = views.distance * mesh_radius(mesh)
@@ -141,14 +142,11 @@ def bank_costs() -> dict[str, float]:
     }
 
 
-def in_a_process_of_its_own(function: Callable[[], dict[str, float]]) -> dict[str, float] | str:
-    import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor
-
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+def in_new_process(function: Callable[[], dict[str, float]]) -> dict[str, float] | str:
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         try:
             return pool.submit(function).result()
-        except Exception as error:  # without a driver, or pyrender fails when used naively
+        except Exception as error:  # no driver, or a failure of naive pyrender
             return f"{type(error).__name__}: {error}"
 
 
@@ -167,8 +165,8 @@ def main() -> None:
             "python": platform.python_version(),
             "torch": torch.__version__,
         },
-        "bank_of_700_views": in_a_process_of_its_own(bank_costs),
-        "naive_pyrender_views_per_second": in_a_process_of_its_own(naive_rates),
+        "bank_of_700_views": in_new_process(bank_costs),
+        "naive_pyrender_views_per_second": in_new_process(naive_rates),
     }
     print(json.dumps(results, indent=2), flush=True)
     table = {}

@@ -1,0 +1,75 @@
+"""scripts/speed: times of the pipeline, recall without a box, and the tables of the documentation."""
+
+import json
+from contextlib import nullcontext
+from dataclasses import replace
+
+import pytest
+import torch
+
+from curvireg_torch import Pipeline, Registrar, ViewMatcher
+from curvireg_torch.settings import BankSettings, ViewPolicy
+from scripts.speed import pipeline
+from tests._support.pretended import PRETENDING, pretended_gpu
+from tests._support.scenes import scene, truck_bank
+
+for name in ("sklearn", "matplotlib"):
+    pytest.importorskip(name, reason=f"{name} is not installed")
+from scripts.speed import location  # noqa: E402
+
+PIPELINE_RECORD = pipeline.RESULTS / "bench_pipeline.json"
+
+
+def test_over_products_is_positive():
+    image, box, _ = scene(0)
+    assert pipeline.over_products(ViewMatcher(truck_bank()), [image], box[None]) > 0.0
+
+
+@pytest.mark.parametrize("on_gpu", [False, pytest.param(True, marks=[*PRETENDING, pytest.mark.slow])])
+def test_pipeline_times_are_of_the_device(on_gpu, monkeypatch):
+    few = replace(Pipeline(), search=False, contours=False)  # tests/test_device.py covers these
+    few = replace(few, views=ViewPolicy(directions=4, theta_step=180.0), bank=BankSettings(image_size=64))
+    on = pretended_gpu() if on_gpu else nullcontext(torch.device("cpu"))
+    used = []
+    monkeypatch.setattr(pipeline, "seconds", lambda call, *_: pipeline.timed(call, 1)[0])
+    monkeypatch.setattr(pipeline, "Registrar", lambda bank, **o: used.append(bank.device.type) or Registrar(bank, **o))
+    with on as device:
+        times = pipeline.pipeline_times(pipeline.dented_sphere(200), few, 1, str(device))
+    assert set(times) == set(json.loads(PIPELINE_RECORD.read_text())["times"])
+    assert all(value > 0.0 for value in times.values())
+    assert used[-3:] == [device.type] * 3  # the earlier banks are read from disk
+
+
+def row(number, *, right, preset="learned", linemod=False):
+    """The right one of three proposals has the highest score; those without the object score lower."""
+    overlaps = [0.6 if k == right else 0.1 for k in range(3)]
+    evidence = [[9.0 if k == right else 6.0 + 0.01 * number, 0.7] for k in range(3)]
+    absent = {"overlaps": [0.0] * 3, "evidence": [[5.0 + 0.1 * (number % 7), 0.6]] * 3}
+    one = {"id": number, "pose": "upright", "form": "exact", "mesh": f"m{number}", "preset": preset}
+    peer = {"linemod": {"overlaps": [0.1, 0.55, 0.0]}} if linemod else {}
+    return {**one, "present": {"overlaps": overlaps, "evidence": evidence}, "absent": absent, **peer}
+
+
+def test_location_record_of_known_rows():
+    rows = [row(k, right=k % 2, linemod=k < 4) for k in range(12)] + [row(20, right=2, preset="fast")]
+    record, drawn = location.record_of(rows)
+    learned, fast = record["sets"]
+    assert (learned["set"], learned["preset"], learned["n"]) == ("exact upright", "learned", 12)
+    assert [learned[f"recall_{k}"] for k in (1, 5, 20)] == [0.5, 1.0, 1.0]
+    assert learned["surest"] == 1.0, "the right proposal scores highest"
+    assert (learned["linemod_n"], learned["linemod"]["recall_1"], learned["linemod"]["recall_5"]) == (4, 0.0, 1.0)
+    assert (fast["n"], fast["recall_1"], fast["recall_5"], fast["linemod"]) == (1, 0.0, 1.0, None)
+    assert set(record["presence"]) == {"learned"}, "presence is fitted for some presets only"
+    fitted = record["presence"]["learned"]
+    assert fitted["weights"][0] > 0
+    assert fitted["forms"]["exact"]["photographs"] == {"n": 24, "true": 12, "auc": 1.0}
+    assert fitted["forms"]["exact"]["places"] == {"n": 72, "true": 12, "auc": 1.0}
+    assert [len(axes.lines) for axes in location.draw(drawn).axes] == [2, 2], "a curve and the diagonal"
+
+
+def test_pages_have_the_recorded_tables():
+    page = (pipeline.REPOSITORY / "docs" / "performance.md").read_text(encoding="utf-8")
+    table = pipeline.pipeline_table(json.loads(PIPELINE_RECORD.read_text()))
+    assert f"<!-- pipeline:begin -->\n{table}<!-- pipeline:end -->" in page
+    table = location.table(json.loads(location.RECORD.read_text(encoding="utf-8")))
+    assert f"<!-- location:begin -->\n{table}<!-- location:end -->" in location.PAGE.read_text(encoding="utf-8")
