@@ -24,7 +24,7 @@ from .search import search
 __all__ = ["PoseEstimator"]
 
 LEAST = 3
-"""Hypotheses that are followed at least, however few are reported: the confidence depends on rivals. Of 15 photographs
+"""Hypotheses that are refined at least, even if fewer are reported: the confidence depends on rivals. Of 15 photographs
 of another object, 14 were called reliable with one hypothesis, 2 with two, none with three or five."""
 
 

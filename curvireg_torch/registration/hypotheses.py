@@ -1,4 +1,4 @@
-"""Hypotheses: the best distinct views of rankings, which later stages turn into poses."""
+"""Hypotheses: the best distinct views of rankings, which later stages refine to poses."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -84,6 +84,6 @@ def distinct_mask(hypotheses: Hypotheses, score: Tensor, *, symmetries: Tensor |
     for b in hypotheses.image_index.unique():
         mine = order[hypotheses.image_index[order] == b]
         R, model, best_first = hypotheses.rotation[mine].float(), hypotheses.model[mine], torch.arange(len(mine))
-        kept = distinct_views(best_first, R, count=len(mine), angle=SAME, symmetries=symmetries, model=model)
-        distinct[mine[kept]] = True
+        chosen = distinct_views(best_first, R, count=len(mine), angle=SAME, symmetries=symmetries, model=model)
+        distinct[mine[chosen]] = True
     return distinct

@@ -70,7 +70,7 @@ def image_items(
         try:
             out.append(_item(images[i], None if whole else boxes[i].detach().cpu().float(), cameras[i]))
         except CurviregError as error:
-            out.append(error.with_subject(f"image {i}"))
+            out.append(error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])])))
     return out
 
 

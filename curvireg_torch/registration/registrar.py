@@ -86,7 +86,7 @@ class Registrar(PoseEstimator):
             matcher = bank_or_mesh
         else:
             bank = bank_or_mesh if device is None else bank_or_mesh.to(device)
-            # Built on one thread, so that its values are rounded alike however many threads torch has.
+            # Built on one thread, so that rounding does not depend on the number of threads.
             matcher = map_on_threads(
                 lambda bank: ViewMatcher(bank, pipeline=pipeline, field=field, renderer=renderer), [bank]
             )[0]
@@ -125,7 +125,7 @@ class Registrar(PoseEstimator):
             InvalidInputError: not as many boxes or cameras as images, or ``distance`` together with boxes.
         """
         if boxes is None:
-            return [found[0] for found in localize(self, images, camera_matrices, distance=distance)]
+            return [results[0] for results in localize(self, images, camera_matrices, distance=distance)]
         if distance is not None:
             raise InvalidInputError("distance: limits the search for objects without boxes; leave out one of the two")
         return self.map_items(image_items(images, boxes, camera_matrices), self._register_boxes)

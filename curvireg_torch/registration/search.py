@@ -153,8 +153,8 @@ def _among_best(state: Hypotheses, count: int) -> Tensor:
     """(H,) bool: whether a hypothesis is among the best ``count`` of its photograph."""
     order = state.similarity.argsort(descending=True, stable=True)
     same = state.image_index[order, None] == state.image_index[order]
-    place = same.tril(-1).sum(dim=1)
-    return torch.zeros(len(state), dtype=torch.bool).index_put((order,), place < count)
+    rank = same.tril(-1).sum(dim=1)
+    return torch.zeros(len(state), dtype=torch.bool).index_put((order,), rank < count)
 
 
 def _all_coherent(starts: Hypotheses, bank: ViewBank, ranking: Ranking) -> Tensor:

@@ -131,7 +131,7 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
     results = ranking_registrar()(images, boxes, CAMERA)
     assert [result.ok for result in results] == [True, False, False, False, False, False, False, True]
     assert results[0].rotation.equal(results[7].rotation)
-    messages = ["one colour", "NaN", "X0 < X1", "no such file", r"\[0, 1\]", "channels"]
+    messages = ["one colour", "NaN", "X0 < X1", "none.png: no such file", r"\[0, 1\]", "channels"]
     for i, (result, message) in enumerate(zip(results[1:7], messages, strict=True), start=1):
         assert isinstance(result, FailedRegistration)
         with pytest.raises(CurviregError, match=f"image {i}: .*{message}"):

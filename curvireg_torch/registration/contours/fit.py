@@ -160,7 +160,7 @@ def fit_contours(
     chosen = torch.ones(N, dtype=torch.bool) if finish is None else _among_best(support, image_index, finish)
     index, others = chosen.nonzero()[:, 0], (~chosen).nonzero()[:, 0]
     source, T = _fit_around(half[index], T0[index], first[index], support[index])
-    # Candidates: the starts, what the first rounds made of unfinished ones, and the fits. Of equals the first wins.
+    # Candidates: the starts, the half-size fits of unfinished starts, and the full-size fits. Ties go to the first.
     owner = torch.cat([index, others, index[source]])
     unfinished = torch.where((support > before)[others, None, None], first.T[others], T0[others])
     fixed = torch.cat([T0[index], unfinished])

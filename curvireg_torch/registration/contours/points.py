@@ -81,7 +81,7 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
     for dim in (-1, -2):
         a, b = _ends(z, dim)
         change = (b - a).abs().diff(dim=dim)
-        # A depth step counts where it exceeds a neighbouring step: on a steep face all steps are alike.
+        # A depth step counts where it exceeds a neighbouring one; on a steep face all steps are equal.
         first, last = ((1, 0), (0, 1)) if dim == -1 else ((0, 0, 1, 0), (0, 0, 0, 1))
         jump = F.pad(change > JUMP * radius, first) | F.pad(change < -JUMP * radius, last)
         beside |= F.pad(jump, first) | F.pad(jump, last)
@@ -120,12 +120,12 @@ def _dilated(mask: Tensor) -> Tensor:
     return mask
 
 
-def _sample(found: Tensor, pixels: Tensor, depth: Tensor, normals: Tensor, count: int) -> tuple[Tensor, ...]:
-    """Sample ``count`` True entries of ``found`` (N, M), each the mean of ``pixels`` (k, M).
+def _sample(mask: Tensor, pixels: Tensor, depth: Tensor, normals: Tensor, count: int) -> tuple[Tensor, ...]:
+    """Sample ``count`` True entries of ``mask`` (N, M), each the mean of ``pixels`` (k, M).
 
     Returns uv (N, P, 2), the nearer depth (N, P), normal (N, P, 2) and valid (N, P).
     """
-    best, index = torch.where(found, _random(found.shape[1]), -1.0).topk(min(count, found.shape[1]), dim=1)
+    best, index = torch.where(mask, _random(mask.shape[1]), -1.0).topk(min(count, mask.shape[1]), dim=1)
     of, W = pixels[:, index], depth.shape[-1]  # (k, N, P)
     z = torch.stack([depth.flatten(1).gather(1, i) for i in of]).amin(dim=0)
     n = torch.stack([normals.flatten(2).gather(2, i[:, None].expand(-1, 2, -1)) for i in of]).mean(dim=0)
