@@ -1,7 +1,6 @@
-"""One device: photographs are described, compared and searched where the bank lives, and give what the CPU gives.
+"""Registration on a device gives the results of the CPU.
 
-No GPU is needed: the device is pretended (``_support/pretended.py``). What only a real one shows are its own rounding,
-its memory and its speed.
+The device is simulated (``_support/pretended.py``), so no GPU is needed.
 """
 
 import copy
@@ -25,8 +24,8 @@ VIEWS = cr.sample_views(azimuth_step=45, elevations=[10, 40])
 
 
 @pytest.fixture(autouse=True)
-def _one_picture_at_a_time(monkeypatch):
-    """As on a CPU, and on one thread: convolutions round in a way that depends on how many pictures and threads."""
+def _single_picture_and_thread(monkeypatch):
+    """As on a CPU: the rounding of convolutions depends on the numbers of pictures and threads."""
     monkeypatch.setattr(appearance, "CHUNK", 1)
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -39,13 +38,13 @@ def bank():
     return cr.ViewBank.build(example_mesh(), VIEWS, image_size=64, progress=False)
 
 
-def test_what_a_gpu_refuses_is_refused():
+def test_pretended_gpu_refuses_what_a_gpu_refuses():
     with pretended_gpu() as device:
         x, here = torch.ones(2, 3, device=device), torch.ones(2, 3)
         for mix in (lambda: x + here, lambda: here[x[:, 0].long() - 1], lambda: torch.cat([x, here]), x.numpy):
             with pytest.raises((RuntimeError, TypeError), match="device"):
                 mix()
-        assert isinstance(x[torch.tensor([0])] + torch.tensor(1.0), Pretended)  # what it does not
+        assert isinstance(x[torch.tensor([0])] + torch.tensor(1.0), Pretended)  # a GPU accepts these
         assert x.add_(1.0) is x
         assert x.cpu().tolist() == x.tolist() == [[2.0] * 3] * 2
         assert torch.zeros_like(x).device == torch.tensor([1.0], device=device).device == device
@@ -68,9 +67,7 @@ LAYERS = [
 
 
 @pytest.mark.parametrize("layer", LAYERS, ids=lambda layer: type(layer).__name__)
-def test_layers(layer):
-    """And HOG behind those that give fields."""
-
+def test_layers_on_a_device(layer):
     def described(layer, image):
         out = layer(image)
         return cr.HOG()(out) if out.shape[1] == 2 else out
@@ -85,7 +82,7 @@ def test_layers(layer):
 
 
 @pytest.mark.parametrize("name", DETECTORS)
-def test_detectors(name):
+def test_detectors_on_a_device(name):
     image = torch.rand(1, 1, 40, 48, generator=torch.Generator().manual_seed(0))
     expected = DETECTORS[name](image)
     with pretended_gpu() as device:
@@ -93,7 +90,7 @@ def test_detectors(name):
         assert torch.equal(found.points.cpu(), expected.points)
 
 
-def test_numbers_beside_tensors():
+def test_rotation_from_viewpoint_mixes_numbers_and_device_tensors():
     with pretended_gpu() as device:
         azimuth = torch.tensor([10.0, 20.0], device=device)
         assert torch.equal(
@@ -102,29 +99,29 @@ def test_numbers_beside_tensors():
         assert cr.rotation_from_viewpoint(0.0, azimuth).device == device
 
 
-def test_a_bank_is_made_there(bank):
+def test_build_on_a_device(bank):
     with pretended_gpu() as device:
-        made = cr.ViewBank.build(example_mesh(), VIEWS, image_size=64, progress=False, device=device)
-        assert made.device == device
+        built = cr.ViewBank.build(example_mesh(), VIEWS, image_size=64, progress=False, device=device)
+        assert built.device == device
         for name, tensor in bank.tensors.items():
-            assert torch.equal(made.tensors[name].cpu(), tensor), name
+            assert torch.equal(built.tensors[name].cpu(), tensor), name
         rendered = cr.ViewBank.build(
             example_mesh(), VIEWS, image_size=64, progress=False, device=device, renderer="torch"
         )
         assert (rendered.descriptors.cpu() - bank.descriptors).abs().mean() < 0.01
 
 
-def same(ours, expected):
+def assert_same(ours, expected):
     assert torch.equal(ours.rotation.cpu(), expected.rotation)
     assert torch.equal(ours.translation.cpu(), expected.translation)
     assert ours.score == expected.score
-    assert ours.confidence == pytest.approx(expected.confidence, rel=1e-6)  # a batch of two there, each alone here
+    assert ours.confidence == pytest.approx(expected.confidence, rel=1e-6)  # batches differ
     assert len(ours.hypotheses) == len(expected.hypotheses)
 
 
 @pytest.mark.parametrize("preset", ["learned", "classical"])
-def test_photographs_are_registered_there(preset):
-    """Wherever they come from; one of them with a box that is corrected."""
+def test_registrar_on_a_device(preset):
+    """Photographs on either device; the box of one is corrected."""
     pipeline = replace(PRESETS[preset], bank=replace(PRESETS[preset].bank, image_size=64), hypotheses=2)
     bank = cr.ViewBank.build(example_mesh(), VIEWS, pipeline=pipeline, progress=False)
     image, box, _ = scene(0)
@@ -137,21 +134,21 @@ def test_photographs_are_registered_there(preset):
             [images[0].to(device), images[1]], boxes.to(device), CAMERA.to(device)
         )
         for result, one in zip(results, expected, strict=True):
-            same(result, one)
+            assert_same(result, one)
         assert torch.equal(results[1].corrected_box, expected[1].corrected_box)
 
 
-def test_objects_are_found_there(bank):
+def test_localize_on_a_device(bank):
     image, _, _ = scene(0)
     expected = localize(cr.Registrar(bank), [image], CAMERA)[0]
     with pretended_gpu() as device:
         found = localize(cr.Registrar(bank, device=device), [image.to(device)], CAMERA)[0]
-        same(found[0], expected[0])
+        assert_same(found[0], expected[0])
         assert torch.equal(found[0].localization.box.cpu(), expected[0].localization.box)
         assert found[0].localization.presence == expected[0].localization.presence
 
 
-def test_another_default_dtype_changes_nothing():
+def test_registrar_ignores_the_default_dtype():
     image, box, _ = scene(0)
     expected = cr.Registrar(truck_bank())([image], box[None], CAMERA)[0]
     torch.set_default_dtype(torch.float64)

@@ -1,4 +1,4 @@
-"""Scenes with known truth: real meshes before real backgrounds, with random texture and light."""
+"""Ranking on synthetic photographs: real meshes before real backgrounds, random texture and light."""
 
 import pytest
 import torch
@@ -27,7 +27,7 @@ CAMERA = camera_matrix(600.0, 600.0, 239.5, 179.5, dtype=torch.float64)
 PHOTOGRAPHS = 40
 
 
-def share_within_30_degrees(field: torch.nn.Module, bank: ViewBank, scenes: list) -> float:
+def fraction_within_30_degrees(field: torch.nn.Module, bank: ViewBank, scenes: list) -> float:
     matcher = ViewMatcher(bank, field=field)
     images, boxes = [image for image, _, _ in scenes], torch.stack([box for _, box, _ in scenes])
     best = bank.rotations[matcher(images, boxes).order[:, 0]]
@@ -39,7 +39,7 @@ def share_within_30_degrees(field: torch.nn.Module, bank: ViewBank, scenes: list
 
 @pytest.mark.data
 @pytest.mark.slow
-def test_focus_curves_find_the_view_and_beat_the_plainer_fields():
+def test_focus_curves_rank_better_than_simpler_fields():
     folder, backgrounds = real_data("meshes"), sorted(real_data("backgrounds").glob("*.jpg"))
     pictures = [F.interpolate(read_image(p)[None], SIZE, mode="bilinear", antialias=True)[0] for p in backgrounds]
     fields = {
@@ -47,7 +47,7 @@ def test_focus_curves_find_the_view_and_beat_the_plainer_fields():
         "MCS": MultiScaleCurvilinearSaliency(),
         "gradient": ImageGradient(),
     }
-    shares: dict[str, list[float]] = {name: [] for name in fields}
+    fractions: dict[str, list[float]] = {name: [] for name in fields}
     for name in ("spot", "rocker-arm", "beetle"):
         mesh = load_mesh(folder / f"{name}.obj")
         mesh.apply_transform(trimesh.transformations.rotation_matrix(torch.pi / 2, [1, 0, 0]))  # y up to z up
@@ -59,8 +59,8 @@ def test_focus_curves_find_the_view_and_beat_the_plainer_fields():
             background = pictures[seed % len(pictures)]
             scenes.append((*synthesize_photograph(mesh, T, CAMERA, SIZE, generator, background=background), T))
         for field_name, field in fields.items():
-            shares[field_name].append(share_within_30_degrees(field, bank, scenes))
-    mean = {name: sum(values) / len(values) for name, values in shares.items()}
-    print(f"share within 30 degrees, N = 3 x {PHOTOGRAPHS}: {mean}  per mesh: {shares}")
+            fractions[field_name].append(fraction_within_30_degrees(field, bank, scenes))
+    mean = {name: sum(values) / len(values) for name, values in fractions.items()}
+    print(f"fraction within 30 degrees, N = 3 x {PHOTOGRAPHS}: {mean}  per mesh: {fractions}")
     assert mean["MFC"] >= 0.6
     assert mean["MFC"] >= mean["MCS"] >= mean["gradient"]

@@ -1,4 +1,4 @@
-"""The annotated poses of real photographs reproduce their silhouettes' boxes."""
+"""Rendered silhouettes of annotated poses have the boxes that real BOP sets give."""
 
 import json
 
@@ -15,7 +15,7 @@ from .._support.real_data import real_data
 
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "expected"), [("dino", 105), ("hope", 80), ("lm", 8)])
-def test_silhouette_boxes_of_annotated_poses(name: str, expected: int) -> None:
+def test_render_depth_reproduces_annotated_boxes(name: str, expected: int) -> None:
     root = real_data("bop") / name
     meshes, renderers, count = {}, {}, 0
     for scene in sorted((root / "test").iterdir()):
@@ -32,7 +32,7 @@ def test_silhouette_boxes_of_annotated_poses(name: str, expected: int) -> None:
                 T = torch.eye(4, dtype=torch.float64)
                 T[:3, :3] = torch.tensor(instance["cam_R_m2c"]).view(3, 3)
                 T[:3, 3] = torch.tensor(instance["cam_t_m2c"])
-                # A canvas that holds the whole object, also where it leaves the image.
+                # An image that contains the whole object, even where it leaves the photograph.
                 box = projected_boxes(extreme_points(meshes[model]), T, K)
                 corner = box[:2].floor() - 3
                 width, height = (int(n) for n in (box[2:] - corner).ceil() + 3)

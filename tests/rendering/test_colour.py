@@ -1,4 +1,4 @@
-"""A mesh's own colours: kept by the loader, and seen where they belong."""
+"""Meshes with colours: loading and rendering."""
 
 import math
 from pathlib import Path
@@ -27,7 +27,7 @@ def camera(azimuth: float, elevation: float, theta: float = 0.0, distance: float
 
 
 def textured_box() -> trimesh.Trimesh:
-    """A box whose six sides show six stripes of one texture, the left half of each darker."""
+    """A box whose six sides show six stripes of one texture; the left half of each is darker."""
     picture = np.zeros((16, 6 * 32, 3), np.uint8)
     for i, colour in enumerate(COLOURS):
         picture[:, 32 * i : 32 * (i + 1)] = colour
@@ -45,7 +45,7 @@ def textured_box() -> trimesh.Trimesh:
 
 
 def expected_albedo(points: np.ndarray) -> np.ndarray:
-    """Colour of points of the box by its definition: which side, which half."""
+    """Colour of points on the box, from their side and half."""
     side = np.abs(points).argmax(axis=1)
     sign = points[np.arange(len(points)), side] > 0
     colour = np.array(COLOURS)[2 * side + sign] / 255
@@ -53,9 +53,8 @@ def expected_albedo(points: np.ndarray) -> np.ndarray:
     return np.where(first[:, None] < 0, colour // (2 / 255) / 255, colour)
 
 
-@pytest.mark.parametrize("orthographic", [False, True])
 @pytest.mark.parametrize("view", [(20.0, 30.0, 0.0), (140.0, -40.0, 25.0), (260.0, 10.0, -70.0)])
-def test_every_side_shows_its_own_texture(view: tuple[float, float, float], orthographic: bool) -> None:
+def test_render_colour_shows_the_texture_of_every_side(view: tuple[float, float, float], orthographic: bool) -> None:
     mesh, T = textured_box(), camera(*view)
     intrinsics = K.clone()
     if orthographic:
@@ -66,26 +65,24 @@ def test_every_side_shows_its_own_texture(view: tuple[float, float, float], orth
     z = depth[0, 0].double().numpy()
     v, u = np.nonzero(z)
     rays = np.stack([u, v, np.ones_like(u)], 1) @ np.linalg.inv(intrinsics.numpy()).T
-    points = rays * z[v, u, None]
-    if orthographic:
-        points = np.concatenate([rays[:, :2], z[v, u, None]], axis=1)
+    points = np.c_[rays[:, :2], z[v, u]] if orthographic else rays * z[v, u, None]
     points = (points - T[0, :3, 3].numpy()) @ T[0, :3, :3].numpy()
     order = np.sort(np.abs(points), axis=1)
     middle = np.abs(points[np.arange(len(points)), (np.abs(points).argmax(axis=1) + 1) % 3])
-    clear = (order[:, 1] < 0.38) & (middle > 0.12)  # off the edges, and off the line between the halves
+    clear = (order[:, 1] < 0.38) & (middle > 0.12)  # away from edges and from the line between the halves
     sides = np.unique(np.abs(points).argmax(axis=1)[clear])
     assert clear.sum() > 300
     assert len(sides) >= 2
     expected = expected_albedo(points) * grey[v, u, None]
-    right = np.abs(picture[v, u] - expected).max(axis=1) < 0.02
-    assert right[clear].mean() > 0.97  # the rest mix with what lies behind a contour
+    correct = np.abs(picture[v, u] - expected).max(axis=1) < 0.02
+    assert correct[clear].mean() > 0.97  # the rest are mixed at contours
     for side in sides:
-        assert right[clear & (np.abs(points).argmax(axis=1) == side)].mean() > 0.8
+        assert correct[clear & (np.abs(points).argmax(axis=1) == side)].mean() > 0.8
     assert picture[0, 0].tolist() == [1.0, 1.0, 1.0]
 
 
 def can() -> trimesh.Trimesh:
-    """A cylinder with a printed band nearer to its top."""
+    """A cylinder with a printed band near its top."""
     print_ = np.full((64, 64, 3), 255, np.uint8)
     print_[8:24] = (200, 0, 0)
     angle = np.linspace(0, 2 * math.pi, 33)
@@ -99,7 +96,7 @@ def can() -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
 
 
-def test_a_can_upside_down_differs_only_in_colour() -> None:
+def test_render_colour_distinguishes_a_can_from_the_same_can_upside_down() -> None:
     mesh = can()
     up, down = camera(0.0, 0.0, distance=12.0), camera(0.0, 0.0, 180.0, distance=12.0)
     a, b = (render_colour(mesh, T, K, SIZE) for T in (up, down))
@@ -112,21 +109,21 @@ def test_a_can_upside_down_differs_only_in_colour() -> None:
     assert float((b[0, 0] - b[0, 1] > 0.3).nonzero()[:, 0].float().mean()) > SIZE[0] / 2 + 3
 
 
-def test_without_colours_and_without_faces_it_is_grey() -> None:
+def test_render_colour_is_grey_without_colours_or_faces() -> None:
     mesh, T = textured_box(), camera(20.0, 30.0)
     bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert has_colours(mesh)
     assert not has_colours(bare)
-    one, other = render_colour(bare, T, K, SIZE), render_colour(mesh, T, K, SIZE, renderer="torch")
-    assert float((one - other).abs().mean()) < 1e-3
-    assert bool((one[:, 0] == one[:, 1]).all())
-    assert float((one - render_colour(mesh, T, K, SIZE)).abs().mean()) > 0.05
+    grey, other = render_colour(bare, T, K, SIZE), render_colour(mesh, T, K, SIZE, renderer="torch")
+    assert float((grey - other).abs().mean()) < 1e-3
+    assert bool((grey[:, 0] == grey[:, 1]).all())
+    assert float((grey - render_colour(mesh, T, K, SIZE)).abs().mean()) > 0.05
     assert render_colour(mesh, T[:0], K, SIZE).shape == (0, 3, *SIZE)
 
 
-def test_vertex_and_face_colours_survive_cleaning() -> None:
+def test_cleaning_preserves_vertex_and_face_colours() -> None:
     box = trimesh.creation.box()
-    faces = np.concatenate([[[0, 0, 1]], box.faces])  # a degenerate one first: removed, and the others move up
+    faces = np.concatenate([[[0, 0, 1]], box.faces])  # cleaning removes the degenerate face, which shifts the others
     by_face = np.concatenate([[[9, 9, 9, 255]], np.tile([[0, 0, 250, 255]], (12, 1))]).astype(np.uint8)
     mesh = trimesh.Trimesh(box.vertices, faces, face_colors=by_face, process=False)
     middle = render_colour(mesh, camera(0.0, 0.0), K, SIZE)[0, :, 36, 48]
@@ -140,13 +137,12 @@ def test_vertex_and_face_colours_survive_cleaning() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])
-def test_files_keep_textures_and_materials(tmp_path: Path, suffix: str) -> None:
+def test_load_mesh_reads_textures_and_materials(tmp_path: Path, suffix: str) -> None:
     red = trimesh.creation.box((0.4, 0.4, 0.4))
     material = trimesh.visual.material
-    look = material.PBRMaterial(baseColorFactor=[250, 10, 10, 255]) if suffix == ".glb" else material.SimpleMaterial()
-    if suffix == ".obj":
-        look.diffuse = np.array([250, 10, 10, 255], np.uint8)
-    red.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(red.vertices), 2)), material=look)
+    rgba = np.array([250, 10, 10, 255], np.uint8)
+    plain = material.PBRMaterial(baseColorFactor=rgba) if suffix == ".glb" else material.SimpleMaterial(diffuse=rgba)
+    red.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(red.vertices), 2)), material=plain)
     scene = trimesh.Scene()
     scene.add_geometry(textured_box(), geom_name="printed")
     shift = trimesh.transformations.translation_matrix([1.5, 0, 0])
@@ -159,21 +155,21 @@ def test_files_keep_textures_and_materials(tmp_path: Path, suffix: str) -> None:
     assert colours is not None
     assert len(colours) == len(mesh.faces) == 24
     assert len(colours.textures) == 1
-    own = textured_box()
     assert len(render_colour(mesh, camera(20.0, 30.0), K, SIZE)) == 1
-    place = mesh.triangles_center[:, 0] > 1.0
-    assert place.sum() == 12
+    is_red = mesh.triangles_center[:, 0] > 1.0
+    assert is_red.sum() == 12
     centre = np.full(24, 1 / 3, np.float32)
     found = colours.at(np.arange(24, dtype=np.int32), centre, centre)
-    np.testing.assert_allclose(found[place], np.tile([250 / 255, 10 / 255, 10 / 255], (12, 1)), atol=0.01)
-    expected = surface_colours(own)
+    np.testing.assert_allclose(found[is_red], np.tile([250 / 255, 10 / 255, 10 / 255], (12, 1)), atol=0.01)
+    box = textured_box()
+    expected = surface_colours(box)
     assert expected is not None
-    by_place = {tuple(np.round(c, 4)): i for i, c in enumerate(own.triangles_center)}
-    match = np.array([by_place[tuple(np.round(c, 4))] for c in mesh.triangles_center[~place]], np.int32)
-    np.testing.assert_allclose(found[~place], expected.at(match, centre[:12], centre[:12]), atol=0.02)
+    by_centre = {tuple(np.round(c, 4)): i for i, c in enumerate(box.triangles_center)}
+    match = np.array([by_centre[tuple(np.round(c, 4))] for c in mesh.triangles_center[~is_red]], np.int32)
+    np.testing.assert_allclose(found[~is_red], expected.at(match, centre[:12], centre[:12]), atol=0.02)
 
 
-def test_a_damaged_texture_warns_and_leaves_the_shape(tmp_path: Path) -> None:
+def test_load_mesh_warns_of_a_damaged_texture(tmp_path: Path) -> None:
     textured_box().export(tmp_path / "box.obj")
     picture = next(p for p in tmp_path.iterdir() if p.suffix in (".png", ".jpg", ".jpeg"))
     picture.write_bytes(picture.read_bytes()[: picture.stat().st_size // 2])
@@ -182,8 +178,7 @@ def test_a_damaged_texture_warns_and_leaves_the_shape(tmp_path: Path) -> None:
     assert len(mesh.faces) == 12
 
 
-@pytest.mark.parametrize("orthographic", [False, True])
-def test_faces_come_with_the_depth_of_render(orthographic):
+def test_faces_at_returns_the_depth_of_render(orthographic: bool) -> None:
     mesh = trimesh.creation.icosphere(2)
     renderer = EmbreeRenderer(mesh)
     T = torch.eye(4, dtype=torch.float64)[None].repeat(2, 1, 1)
