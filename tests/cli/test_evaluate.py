@@ -1,4 +1,4 @@
-"""``curvireg evaluate`` as the command line holds it."""
+"""``curvireg evaluate``."""
 
 import json
 from dataclasses import replace
@@ -19,80 +19,77 @@ def _small_pipeline(monkeypatch, tmp_path):
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
 
 
-def evaluate(*words):
-    arguments = parse(["evaluate", *map(str, words), "--quiet"])
-    arguments.run(arguments)
+@pytest.fixture
+def evaluate(tmp_path):
+    """Run ``curvireg evaluate``; returns the summary."""
+
+    def run(*words):
+        arguments = parse(["evaluate", *map(str, words), "--out", str(tmp_path / "out"), "--quiet"])
+        arguments.run(arguments)
+        return json.loads((tmp_path / "out" / "summary.json").read_text())
+
+    return run
 
 
-def test_pascal3d(pascal, tmp_path, capsys):
-    words = ("pascal3d", pascal.root, "--categories", "car", "--out", tmp_path / "out")
-    evaluate(*words, "--limit", "2")
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["limit"] == 2
-    evaluate(*words)
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+def test_evaluate_pascal3d(pascal, evaluate, capsys):
+    words = ("pascal3d", pascal.root, "--categories", "car")
+    assert evaluate(*words, "--limit", "2")["limit"] == 2
+    summary = evaluate(*words)
     assert list(summary["per_class"]) == ["car"]
     assert (summary["n"], summary["protocol"]) == (3, "cad=annotated pose=upright box=annotated")
     lines = capsys.readouterr().out.splitlines()
     assert lines[-3].startswith("3 objects, 0 failed, ")
-    assert lines[-2].split()[:4] == [
-        "acc_pi_6", f"{summary['acc_pi_6']:.3f}", "acc_pi_18", f"{summary['acc_pi_18']:.3f}",
-    ]  # fmt: skip
+    numbers = f"acc_pi_6 {summary['acc_pi_6']:.3f}   acc_pi_18 {summary['acc_pi_18']:.3f}   "
+    assert lines[-2].startswith(numbers)
 
 
-def test_bop_supposes_any_orientation(bop, tmp_path):
-    evaluate("bop", bop.root, "--out", tmp_path / "out", "--protocol", "box=0.1", "seed=3")
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+def test_evaluate_bop_assumes_any_pose(bop, evaluate):
+    summary = evaluate("bop", bop.root, "--protocol", "box=0.1", "seed=3")
     assert summary["protocol"] == "cad=annotated pose=any box=0.1 seed=3"
     assert summary["settings"]["dataset"] == "bop"
     views = summary["settings"]["pipeline"]["views"]
     assert (views["pose"], views["directions"], views["theta_step"]) == ("any", 18, 360.0)
 
 
-def test_without_boxes(pascal, tmp_path, capsys, monkeypatch):
-    """The summary has the recall of boxes, or says that no box is annotated."""
-    evaluate("pascal3d", pascal.root, "--limit", "2", "--out", tmp_path / "out", "--protocol", "box=none")
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+def test_evaluate_without_boxes_reports_localization(pascal, evaluate, tmp_path, capsys, monkeypatch):
+    """The summary has the recall of boxes, or says that no box is annotated; thumbnails show the found box."""
+    words = ("pascal3d", pascal.root, "--limit", "2", "--protocol", "box=none")
+    summary = evaluate(*words)
     assert summary["localization"]["n"] == 2
     assert f"recall_1 {summary['localization']['recall_1']:.3f}   recall_5" in capsys.readouterr().out
+    rows = [json.loads(line) for line in (tmp_path / "out" / "results.jsonl").read_text().splitlines()]
+    row = next(row for row in rows if "localization" in row)
+    boxes = []
+    monkeypatch.setattr("curvireg_torch.evaluation.sheet.thumbnail", lambda *a: boxes.append(a[3]) or b"")
     contact_sheet(tmp_path / "out", tmp_path / "sheet.html")
-    row = next(row for row in rows_of(tmp_path / "out") if "localization" in row)
-    seen = []
-    monkeypatch.setattr("curvireg_torch.evaluation.sheet.thumbnail", lambda *a: seen.append(a[3]) or b"")
-    contact_sheet(tmp_path / "out", tmp_path / "sheet.html")
-    assert row["localization"]["proposals"][0]["box"] in seen, "the page shows the box that was found"
+    assert row["localization"]["proposals"][0]["box"] in boxes
     summary["localization"] = localization_recall([], [])
     monkeypatch.setattr("curvireg_torch.evaluation.datasets.evaluate", lambda *_, **__: summary)
-    evaluate("pascal3d", pascal.root, "--limit", "2", "--out", tmp_path / "out", "--protocol", "box=none")
+    evaluate(*words)
     assert "no box is annotated" in capsys.readouterr().out
 
 
-def rows_of(folder):
-    return [json.loads(line) for line in (folder / "results.jsonl").read_text().splitlines()]
-
-
-def test_errors_come_before_any_work(pascal, bop, tmp_path):
-    out = tmp_path / "out"
+def test_evaluate_checks_options_before_any_work(pascal, bop, evaluate, tmp_path):
     with pytest.raises(MissingFileError, match="no such folder"):
-        evaluate("pascal3d", tmp_path / "nowhere", "--out", out)
+        evaluate("pascal3d", tmp_path / "nowhere")
     with pytest.raises(InvalidInputError, match="cad: expected one of"):
-        evaluate("pascal3d", pascal.root, "--out", out, "--protocol", "cad=all")
-    with pytest.raises(InvalidInputError, match="has one mesh, so cad=annotated"):
-        evaluate("bop", bop.root, "--out", out, "--protocol", "cad=any")
+        evaluate("pascal3d", pascal.root, "--protocol", "cad=all")
+    with pytest.raises(InvalidInputError, match="one mesh"):
+        evaluate("bop", bop.root, "--protocol", "cad=any")
     with pytest.raises(SystemExit):
-        evaluate("bop", bop.root, "--out", out, "--preset", "best")
-    assert not out.exists()
+        evaluate("bop", bop.root, "--preset", "best")
+    assert not (tmp_path / "out").exists()
 
 
-def test_nothing_scored_is_an_error(pascal, tmp_path):
+def test_evaluate_reports_when_nothing_was_scored(pascal, evaluate, tmp_path):
     for photograph in (pascal.root / "Images").rglob("*.jpg"):
         photograph.write_bytes(b"")
     with pytest.raises(InvalidInputError, match=r"nothing was scored .*unreadable_image"):
-        evaluate("pascal3d", pascal.root, "--out", tmp_path / "out")
+        evaluate("pascal3d", pascal.root)
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["n"] == 0
 
 
-def test_a_pipeline_of_ones_own(pascal, tmp_path):
-    (tmp_path / "own.json").write_text(replace(SMALL, box_jitter=0.0).to_json())
-    evaluate("pascal3d", pascal.root, "--out", tmp_path / "out", "--pipeline", tmp_path / "own.json")
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert (summary["settings"]["preset"], summary["settings"]["pipeline"]["box_jitter"]) == ("own", 0.0)
+def test_evaluate_takes_a_pipeline_file(pascal, evaluate, tmp_path):
+    (tmp_path / "pipeline.json").write_text(replace(SMALL, box_jitter=0.0).to_json())
+    settings = evaluate("pascal3d", pascal.root, "--pipeline", tmp_path / "pipeline.json")["settings"]
+    assert (settings["preset"], settings["pipeline"]["box_jitter"]) == ("own", 0.0)

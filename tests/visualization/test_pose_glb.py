@@ -1,4 +1,4 @@
-"""The GLB is read back, and its camera sees the mesh and the photograph where the photograph has them."""
+"""The GLB is read back; its camera projects the mesh and the photograph to their pixels."""
 
 import json
 import struct
@@ -21,8 +21,8 @@ def tree_of(data: bytes) -> dict:
     return json.loads(data[20 : 20 + length])
 
 
-def seen(points: np.ndarray, tree: dict) -> np.ndarray:
-    """Pixels at which the file's camera, at the origin and looking along -z, sees points in metres."""
+def project(points: np.ndarray, tree: dict) -> np.ndarray:
+    """Pixels of points in metres in the file's camera, which is at the origin and looks along -z."""
     W, H = SIZE[1], SIZE[0]
     lens = tree["cameras"][0]["perspective"]
     up = 1 / np.tan(lens["yfov"] / 2)
@@ -31,7 +31,7 @@ def seen(points: np.ndarray, tree: dict) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("mm", 0.001)])
-def test_the_files_camera_sees_the_mesh_where_it_was_found(unit, metres):
+def test_pose_glb_camera_projects_mesh_and_photograph(unit, metres):
     image, _, T = scene(0)
     mesh = trimesh.creation.box((0.1, 0.2, 0.05))
     mesh.units = unit
@@ -41,15 +41,15 @@ def test_the_files_camera_sees_the_mesh_where_it_was_found(unit, metres):
     boxes = [n for n in parts if len(back.geometry[n].faces) == 12]
     points = trimesh.transform_points(back.geometry[boxes[0]].vertices, parts[boxes[0]])
     expected = project_points(torch.from_numpy(np.array(mesh.triangles.reshape(-1, 3))), T, CAMERA).numpy()
-    np.testing.assert_allclose(seen(points, tree), expected, atol=1e-2)
+    np.testing.assert_allclose(project(points, tree), expected, atol=1e-2)
     depth = float((T[:3, 3])[2])
     assert -points[:, 2].mean() == pytest.approx(depth * metres, rel=1e-3)
-    # The photograph's plane: its corners are the picture's, behind the mesh.
+    # The corners of the photograph's plane are behind the mesh.
     plane = next(n for n in parts if n not in boxes)
     corners = trimesh.transform_points(back.geometry[plane].vertices, parts[plane])
     H, W = SIZE
     expected = np.array([(-0.5, -0.5), (W - 0.5, -0.5), (W - 0.5, H - 0.5), (-0.5, H - 0.5)])
-    np.testing.assert_allclose(seen(corners, tree), expected, atol=1e-2)
+    np.testing.assert_allclose(project(corners, tree), expected, atol=1e-2)
     assert corners[:, 2].max() < points[:, 2].min()
     # It faces the camera, and its top is the picture's top.
     assert back.geometry[plane].face_normals[0] @ parts[plane][:3, :3].T @ [0, 0, 1] > 0
@@ -59,7 +59,7 @@ def test_the_files_camera_sees_the_mesh_where_it_was_found(unit, metres):
     np.testing.assert_allclose(back.geometry[plane].visual.uv[0], [0, 1], atol=1e-6)
 
 
-def test_extras_hold_the_exact_pose_and_camera():
+def test_pose_glb_extras_hold_pose_and_camera():
     image, _, T = scene(0)
     K = camera_matrix(260.0, 255.0, 100.0, 95.0, dtype=torch.float64)
     tree = tree_of(pose_glb(trimesh.creation.box(), T, K, image, photograph=False))
@@ -69,7 +69,7 @@ def test_extras_hold_the_exact_pose_and_camera():
     assert "images" not in tree
 
 
-def test_colours_of_corners_are_kept():
+def test_pose_glb_keeps_vertex_colours():
     image, _, T = scene(0)
     mesh = trimesh.creation.box()
     mesh.visual.face_colors = [[200, 20, 20, 255]] * 6 + [[20, 20, 200, 255]] * 6
@@ -81,11 +81,11 @@ def test_colours_of_corners_are_kept():
     start = data.index(b"BIN\0") + 4 + view["byteOffset"]
     colours = np.frombuffer(data[start : start + view["byteLength"]], np.uint8).reshape(accessor["count"], -1)
     assert {tuple(c[:3]) for c in colours.tolist()} == {(200, 20, 20), (20, 20, 200)}
-    # Not of metal, which is black where there is no room to mirror.
+    # Metal would be black without surroundings to reflect.
     assert tree["materials"][part["material"]]["pbrMetallicRoughness"]["metallicFactor"] == 0
 
 
-def test_a_pose_behind_the_camera_is_refused():
+def test_pose_glb_refuses_poses_behind_the_camera():
     T = torch.eye(4, dtype=torch.float64)
     T[2, 3] = -2.0
     with pytest.raises(InvalidInputError, match="behind the camera"):

@@ -20,41 +20,41 @@ def ranked(scores):
     return Ranking(scores, scores.argsort(dim=1, descending=True), {"hog": scores})
 
 
-def test_each_direction_has_its_best_turn_and_distance(bank):
+def test_direction_scores_take_the_best_in_plane_rotation_and_distance(bank):
     scores = torch.rand(2, len(bank), generator=torch.Generator().manual_seed(0))
     azimuth, elevation, best = direction_scores(bank, ranked(scores), image_index=1)
     assert len(best) == 8
     for a, e, s in zip(azimuth.tolist(), elevation.tolist(), best.tolist(), strict=True):
-        mine = (bank.views.azimuth == a) & (bank.views.elevation == e)
-        assert int(mine.sum()) == 4
-        assert s == float(scores[1][mine].max())
+        views = (bank.views.azimuth == a) & (bank.views.elevation == e)
+        assert int(views.sum()) == 4
+        assert s == float(scores[1][views].max())
     with pytest.raises(InvalidInputError, match="image 2"):
         direction_scores(bank, ranked(scores), image_index=2)
     with pytest.raises(InvalidInputError, match="1 meshes"):
         direction_scores(bank, ranked(scores), model=1)
 
 
-def test_the_map_shows_the_nearest_direction():
+def test_sphere_map_shows_the_nearest_direction():
     views = uniform_views(200)
     score = torch.arange(200.0)
-    sky = sphere_map(views.azimuth, views.elevation, score, size=(18, 36))
-    assert sky.shape == (18, 36)
-    assert not np.isnan(sky).any()
+    picture = sphere_map(views.azimuth, views.elevation, score, size=(18, 36))
+    assert picture.shape == (18, 36)
+    assert not np.isnan(picture).any()
     for row, column in ((0, 3), (9, 30), (17, 17)):
         e, a = np.radians(90 - (row + 0.5) * 10), np.radians((column + 0.5) * 10)
         cell = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         az, el = np.radians(views.azimuth.numpy()), np.radians(views.elevation.numpy())
-        all_of = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=1)
-        assert sky[row, column] == float((all_of @ cell).argmax())
-    # Where nothing was looked at, nothing is shown.
+        directions = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=1)
+        assert picture[row, column] == float((directions @ cell).argmax())
+    # NaN far from all directions.
     upright = sample_views(azimuth_step=10, elevations=[0, 10, 20])
-    sky = sphere_map(upright.azimuth, upright.elevation, torch.ones(len(upright)), size=(18, 36))
-    assert np.isnan(sky[:5]).all()
-    assert np.isnan(sky[11:]).all()
-    assert not np.isnan(sky[7:9]).any()
+    picture = sphere_map(upright.azimuth, upright.elevation, torch.ones(len(upright)), size=(18, 36))
+    assert np.isnan(picture[:5]).all()
+    assert np.isnan(picture[11:]).all()
+    assert not np.isnan(picture[7:9]).any()
 
 
-def test_the_picture_holds_the_map_and_the_hypotheses(bank):
+def test_view_sphere_draws_the_map_and_the_hypotheses(bank):
     image, box, _ = scene(0)
     registrar = Registrar(bank, pipeline=unrefined(bank, hypotheses=3))
     result = registrar([image], box[None], CAMERA)[0]
@@ -66,5 +66,5 @@ def test_the_picture_holds_the_map_and_the_hypotheses(bank):
     drawn = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines]
     assert drawn == [(h.viewpoint[0] % 360, h.viewpoint[1]) for h in result.hypotheses]
     assert [text.get_text() for text in axes.texts] == ["1", "2", "3"]
-    assert not any(line.get_clip_on() for line in axes.lines)  # whole on the border, too
+    assert not any(line.get_clip_on() for line in axes.lines)  # complete at the border
     assert not view_sphere(bank, result.ranking).axes[0].lines
