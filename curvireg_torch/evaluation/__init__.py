@@ -1,7 +1,7 @@
-"""Evaluation on datasets: one loop writes predictions to disk, another scores what is there.
+"""Evaluation on datasets, and registration of lists of photographs.
 
-The command is ``curvireg evaluate pascal3d|bop|web ROOT --out DIR``; under ``torchrun`` the
-processes share the objects.
+Both use one resumable loop (:mod:`.runner`) and one store of results (:mod:`.store`), in one process or several.
+The command is ``curvireg evaluate pascal3d|bop|web ROOT --out DIR``.
 To add a dataset, write a benchmark and add a row to :mod:`.registry`.
 """
 

@@ -2,14 +2,13 @@
 
 from .entries import Entry, PhotoList
 from .formats import read_list
-from .photographs import is_one_photograph, list_photographs
+from .photographs import list_photographs
 from .register import Counts, register_entry, register_list
 
 __all__ = [
     "Counts",
     "Entry",
     "PhotoList",
-    "is_one_photograph",
     "list_photographs",
     "read_list",
     "register_entry",

@@ -1,4 +1,4 @@
-"""Lists of photographs in the formats that people have: CSV, JSON, COCO, a scene of a BOP set."""
+"""Readers of lists of photographs: CSV, JSON, COCO annotations, a scene of a BOP dataset."""
 
 import csv
 import io
@@ -18,23 +18,21 @@ Row = dict[str, Any]
 
 
 def read_list(path: Path, meshes: Sequence[Path] = ()) -> PhotoList:
-    """The photographs of a list on disk.
+    """Read a list of photographs.
 
-    - ``.csv``: a header and the columns of :func:`photo_list`; blank lines are no rows.
+    - ``.csv``: a header and the columns of :func:`photo_list`; blank lines are ignored.
     - ``.json``: a list of objects ``{"photo": "a.jpg", "box": [x0, y0, x1, y1], "camera": [fx, fy, cx, cy], "mesh":
-      "part.stl"}``, all but ``photo`` if wanted; other keys are passed through. Or COCO annotations: one row each, with
-      ``image_id``, ``annotation_id`` and ``category``; COCO counts pixels from the picture's corner, so half a pixel is
-      taken off.
-    - a folder: a scene of a BOP set, with the boxes of whole objects, and the models where they lie in the set's
-      ``models``.
+      "part.stl"}``, all but ``photo`` optional; other keys are passed through. Or COCO annotations: one row each, with
+      ``image_id``, ``annotation_id`` and ``category``; half a pixel is subtracted, as COCO measures from the corner.
+    - a folder: a scene of a BOP dataset, with the boxes of whole objects, and the models of the dataset if present.
 
     Args:
-        path: the file or folder, from which its paths count.
-        meshes: of rows that name none; several: which of them is it?
+        path: the file or folder, to which its paths are relative.
+        meshes: for rows that name none; of several the best is found.
 
     Raises:
         MissingFileError: no such file.
-        InvalidInputError: not such a list, or one without rows.
+        InvalidInputError: another format, or no rows.
 
     Example:
         >>> import tempfile
@@ -44,7 +42,7 @@ def read_list(path: Path, meshes: Sequence[Path] = ()) -> PhotoList:
         (1.0, 2.0, 30.0, 40.5)
     """
     if path.is_dir():
-        return _listed(path, _bop_rows(path), path, meshes)
+        return _from_rows(path, _bop_rows(path), path, meshes)
     if not path.is_file():
         raise MissingFileError(f"{path}: no such file; check the path of the list")
     check_table_size(path)
@@ -60,14 +58,13 @@ def read_list(path: Path, meshes: Sequence[Path] = ()) -> PhotoList:
     except (ValueError, RecursionError) as error:
         raise InvalidInputError(f"{path}: not JSON ({error})") from error
     if isinstance(content, dict) and {"images", "annotations"} <= set(content):
-        return _listed(path, _coco_rows(path, content), path.parent, meshes)
+        return _from_rows(path, _coco_rows(path, content), path.parent, meshes)
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise InvalidInputError(f"{path}: expected a list of objects with photo, box, camera, mesh; or COCO's images")
-    return _listed(path, [_row(entry) for entry in content], path.parent, meshes)
+    return _from_rows(path, [_row(entry) for entry in content], path.parent, meshes)
 
 
-def _listed(path: Path, rows: Sequence[Row], folder: Path, meshes: Sequence[Path]) -> PhotoList:
-    """A table of all keys that rows have."""
+def _from_rows(path: Path, rows: Sequence[Row], folder: Path, meshes: Sequence[Path]) -> PhotoList:
     columns = list(dict.fromkeys(["photo", *BOX, *(key for row in rows for key in row)]))
     return photo_list(str(path), columns, [[_text(row.get(name)) for name in columns] for row in rows], folder, meshes)
 
@@ -77,7 +74,7 @@ def _text(value: Any) -> str:
 
 
 def _row(entry: Mapping[str, Any]) -> Row:
-    """``box`` and ``camera`` as columns; what are no four numbers stand there as they are, to be refused."""
+    """``box`` and ``camera`` as columns; values that are not four numbers are kept, and refused later."""
     row: Row = {"photo": entry.get("photo")}
     for key, names in (("box", BOX), ("camera", CAMERA)):
         values = entry.get(key)
@@ -128,7 +125,7 @@ def _bop_rows(folder: Path) -> list[Row]:
 
 
 def _bop_objects(folder: Path, cameras: Any, truths: Any, infos: Any) -> Iterator[Row]:
-    """What is missing or broken of an object stands in its row as a text, to be refused there."""
+    """Rows of a scene; a text in place of a missing or invalid value makes the row fail later."""
     for key, objects in truths.items():
         kinds, suffixes = ("rgb", "gray"), (".png", ".jpg", ".tif")
         pictures = [f"{kind}/{key.zfill(6)}{suffix}" for kind in kinds for suffix in suffixes]

@@ -1,4 +1,4 @@
-"""Photographs named one by one, as folders, patterns or videos."""
+"""Lists of photographs from files, folders, patterns and videos."""
 
 import glob
 from collections.abc import Iterator, Sequence
@@ -10,10 +10,10 @@ from ...errors import ImageError, InvalidInputError, MissingFileError
 from ...limits import MAX_IMAGE_PIXELS
 from ...utils.choices import IMAGES, VIDEOS
 from ...utils.files import write_file
-from ...utils.input_paths import is_one_photograph, is_pattern
+from ...utils.input_paths import is_pattern
 from .entries import PhotoList, photo_list
 
-__all__ = ["is_one_photograph", "list_photographs"]
+__all__ = ["list_photographs"]
 
 _COLUMNS = ["photo", "x0", "y0", "x1", "y1", "fx", "fy", "cx", "cy"]
 
@@ -27,15 +27,15 @@ def list_photographs(
     every: int = 1,
     frames: Path,
 ) -> PhotoList:
-    """A list of photographs, all with the same box and camera.
+    """List photographs that have the same box and camera.
 
     Args:
         paths: photographs, folders of them, patterns such as ``shots/*.jpg``, videos.
-        meshes: of all of them; several: which of them is it?
-        box: x0, y0, x1, y1 in px of every photograph; default: the object is looked for.
-        camera: fx, fy, cx, cy in px of every photograph.
-        every: of a video, every how many frames.
-        frames: folder for frames of videos, as PNG.
+        meshes: mesh files; of several the best is found.
+        box: x0, y0, x1, y1 in px; default: the object is localized.
+        camera: fx, fy, cx, cy in px.
+        every: use every n-th frame of videos.
+        frames: folder for the frames of videos, as PNG.
 
     Raises:
         MissingFileError: a pattern or folder without photographs.
@@ -62,7 +62,7 @@ def _found(path: Path, every: int, frames: Path) -> Iterator[Path]:
 
 
 def _frames(path: Path, every: int, folder: Path) -> Iterator[Path]:
-    """Frames 0, every, 2 every, ... as files, without loss."""
+    """Write frames 0, every, 2 every, ... as files."""
     video = cv2.VideoCapture(str(path))
     try:
         width, height = (int(video.get(k)) for k in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))

@@ -1,4 +1,4 @@
-"""Photographs whose true view is known, from any of the datasets."""
+"""Photographs with known true view, from any of the datasets."""
 
 import math
 from collections.abc import Iterator
@@ -29,9 +29,9 @@ class Case:
 
     Attributes:
         category: class or object.
-        image_path, mesh_path, unit: files, and the mesh's unit.
+        image_path, mesh_path, unit: files, and the unit of the mesh.
         box: (4,) x0, y0, x1, y1 in px.
-        pose: (3, 4) float64 model to camera; without a translation (NaN), of a camera that looks straight at the box.
+        pose: (3, 4) float64 model to camera; without translation (NaN) it is that of a camera that looks at the box.
     """
 
     category: str
@@ -42,14 +42,14 @@ class Case:
     pose: Tensor
 
     def crop(self, settings: BankSettings) -> Tensor:
-        """(1, 3, S, S) of the photograph, framed as the bank's views are."""
+        """(1, 3, S, S) crop of the photograph, framed as the views of a bank."""
         image = read_image(self.image_path)
         return crop_images([image], self.box[None], size=settings.image_size, margin=settings.margin)[0]
 
     def view(self, mesh: trimesh.Trimesh) -> tuple[Tensor, float]:
-        """The view that a camera looking at the object's centre has: rotation (3, 3), distance in model units.
+        """Rotation (3, 3) and distance in model units of a camera that looks at the object's centre.
 
-        Without a translation the distance is that of banks: a photograph of unknown focal length does not tell it.
+        Without translation the distance is that of banks: without a focal length it is unknown.
         """
         R, t = self.pose[:, :3], self.pose[:, 3]
         if not bool(t.isfinite().all()):
@@ -59,20 +59,20 @@ class Case:
 
 
 def find_cases(kind: str, root: Path, *, pixel_origin: int = 1, limit: int | None = None) -> list[Case]:
-    """The objects of a dataset that the paper would take: neither occluded nor truncated, with a known pose.
+    """The objects of a dataset that the paper uses: neither occluded nor truncated, with known pose.
 
     Args:
         kind: "pascal3d", "bop" or "web".
         root: of the dataset.
         pixel_origin: of PASCAL3D+, see :class:`Pascal3DPlus`.
-        limit: only so many, spread evenly.
+        limit: use only this many, spread evenly.
 
     Returns:
-        Cases, those of one mesh together.
+        Cases, grouped by mesh.
 
     Raises:
-        InvalidInputError: nothing is left, or an unknown kind.
-        MissingFileError: the dataset is not there.
+        InvalidInputError: no such object, or an unknown kind.
+        MissingFileError: the dataset is missing.
     """
     row = DATASETS[kind]
     origin = {"pixel_origin": pixel_origin} if "pixel_origin" in row.options else {}
@@ -95,7 +95,7 @@ def _case(kind: DatasetSpec, s: dict[str, Any]) -> Case | None:
 
 
 def grouped(cases: list[Case], label: str, progress: bool) -> Iterator[tuple[trimesh.Trimesh, list[Case]]]:
-    """Meshes with their cases, one mesh in memory at a time."""
+    """Meshes with their cases; one mesh is in memory at a time."""
     with tqdm(total=len(cases), desc=label, unit="photo", disable=not progress) as bar:
         for path in dict.fromkeys(case.mesh_path for case in cases):
             group = [case for case in cases if case.mesh_path == path]

@@ -1,4 +1,4 @@
-"""The filters that the paper compares, by the names it gives them."""
+"""The filters that the paper compares, by their names there."""
 
 from collections.abc import Callable
 from typing import Any

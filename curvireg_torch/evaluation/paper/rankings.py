@@ -1,4 +1,4 @@
-"""Where the right view comes in the ranking: precision, errors of angles, precision at rank."""
+"""Rank of the true view: precision, precision at rank k, errors of the angles."""
 
 from dataclasses import dataclass, replace
 
@@ -21,12 +21,12 @@ THRESHOLD_DEG = 30.0
 
 @dataclass(frozen=True)
 class Rankings:
-    """The best views of every photograph, for every pair of filters.
+    """The best views of each photograph, for each pair of filters.
 
     Attributes:
         views: of all banks.
         categories: (B) of the photographs.
-        truth: (B, 4) azimuth, elevation, theta in degrees, and distance 0, which the banks do not vary.
+        truth: (B, 4) azimuth, elevation, theta in degrees, and distance 0, as banks have one distance.
         errors: (B, N) rotation errors of the views, degrees.
         orders: pair such as "CS/MFC" -> (B, 20) indices of the best views.
     """
@@ -85,7 +85,7 @@ def precision_table(rankings: Rankings) -> Table:
 
 
 def rank_tables(rankings: Rankings) -> list[Table]:
-    """Precision at rank 1, 3, 5, 10, 20, in both readings of what the paper leaves undefined."""
+    """Precision at rank 1, 3, 5, 10, 20, in two readings of a definition that the paper leaves open."""
     readings = {
         "ranks": (f"a view within {THRESHOLD_DEG:g} degrees of the true one", THRESHOLD_DEG),
         "ranks_nearest": ("the view of the bank that is nearest to the true one", None),
@@ -105,7 +105,7 @@ def rank_tables(rankings: Rankings) -> list[Table]:
 
 
 def angle_table(rankings: Rankings) -> Table:
-    """Mean errors of elevation, azimuth and in-plane angle: of the estimate, and of the bank's closest view."""
+    """Mean errors of elevation, azimuth and in-plane angle: of the estimate and of the closest view of the bank."""
     v = rankings.views
     views = torch.stack([v.azimuth, v.elevation, v.theta, torch.zeros(len(v))], dim=1)
     rows: list[list[str | float]] = []
@@ -113,9 +113,9 @@ def angle_table(rankings: Rankings) -> Table:
         means = pose_parameter_errors(views[order[:, 0]], rankings.truth, views)
         rows.append([name, *(means[k][a] for a in ("elevation", "azimuth", "theta") for k in ("est", "clo"))])
     text = (
-        "Mean absolute errors in degrees: Est. of the best-ranked view, Clo. of the bank's view that is closest to the "
-        "true one. "
-        f"Distance is left out: the banks have one. {rankings.definition}"
+        "Mean absolute errors in degrees: Est. of the best-ranked view, Clo. of the view that is closest to the true "
+        "one. "
+        f"Distance is omitted: banks have one. {rankings.definition}"
     )
     columns = [f"{angle} {kind}" for angle in ("elevation", "azimuth", "in-plane") for kind in ("Est.", "Clo.")]
     return Table("angles", "Errors of angles", text, ["filters", *columns], rows)

@@ -1,4 +1,4 @@
-"""Tables as CSV, Markdown and pictures."""
+"""Tables as CSV, Markdown and figures."""
 
 import csv
 import io
@@ -24,7 +24,7 @@ class Table:
         title, definition: what was measured, on what.
         columns: the first names the rows.
         rows: as long as ``columns``.
-        curve: the first column is a number, the others are curves over it.
+        curve: the other columns are curves over the first, which is numeric.
     """
 
     name: str
