@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..descriptors.points import field_points, strongest_points
 from ..filters.inputs import fill_missing, may_have_missing, missing_mask, to_grey
-from ..filters.numerics import at_least_float32, safe_sqrt
+from ..filters.numerics import at_least_float32, full_precision, safe_sqrt
 from ..utils.checks import check_colour_image
 
 Function = TypeVar("Function", bound=Callable[..., "Detection"])
@@ -52,10 +52,11 @@ def detector(function: Function) -> Function:
     def on_photograph(image: Tensor, **options: float) -> Detection:
         check_colour_image(image)
         x = to_grey(at_least_float32(image))
-        if not may_have_missing(x):
-            return function(x, **options)
-        mask = missing_mask(x)
-        response, points = function(fill_missing(x, mask), **options)
+        with full_precision(x):
+            if not may_have_missing(x):
+                return function(x, **options)
+            mask = missing_mask(x)
+            response, points = function(fill_missing(x, mask), **options)
         return Detection(torch.where(mask, 0.0, response), points & ~mask)
 
     return cast(Function, on_photograph)

@@ -1,4 +1,4 @@
-"""Layers and detectors inside kornia's own pipelines."""
+"""Layers and detectors in pipelines of kornia."""
 
 import re
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from curvireg_torch import detectors, filters
 from curvireg_torch.descriptors import HOG
 from curvireg_torch.detectors import Response
 
-from ..filters.layer_cases import photos
+from ..filters.layer_cases import colour_photos, photos
 
 
 def _discs() -> tuple[Tensor, Tensor]:
@@ -41,18 +41,18 @@ def _discs() -> tuple[Tensor, Tensor]:
     ],
     ids=lambda x: getattr(x, "__name__", type(x).__name__),
 )
-def test_saliencies_and_detectors_drive_kornias_scale_space_detector(
+def test_response_in_kornias_scale_space_detector(
     layer: Callable[[Tensor], Tensor | detectors.Detection], power: float
 ) -> None:
     image, centres = _discs()
     lafs, responses = ScaleSpaceDetector(num_features=8, resp_module=Response(layer, power=power))(image)
     kept = lafs[0, responses[0] > 0.01 * responses.max()]
     assert len(kept) > 0
-    # In a disc or at its rim, nothing on the even ground.
+    # All points are inside a disc or near its edge.
     assert float(torch.cdist(kept[:, :, 2], centres).amin(dim=1).max()) < 9.0 + 5.0
 
 
-def test_a_response_is_the_length_of_a_field_and_a_detectors_own() -> None:
+def test_response_of_fields_detectors_and_maps() -> None:
     image = photos(2, 32)
     field = filters.image_gradient(image)
     torch.testing.assert_close(Response(filters.ImageGradient())(image), field.norm(dim=1, keepdim=True))
@@ -63,20 +63,20 @@ def test_a_response_is_the_length_of_a_field_and_a_detectors_own() -> None:
     assert torch.equal(single, filters.edge_blur(image, reblur_sigmas=(1.0,)))
 
 
-def test_hog_describes_kornias_local_affine_frames() -> None:
+def test_hog_describes_local_affine_frames() -> None:
     describe = LAFDescriptor(nn.Sequential(filters.ImageGradient(), HOG(grid=4)), patch_size=32)
     image = photos(1, 96, seed=4)
     centres = torch.tensor([[[30.0, 40.0], [60.0, 50.0], [44.0, 66.0]]])
     scales = torch.full((1, 3, 1, 1), 12.0)
     lafs = laf_from_center_scale_ori(centres, scales)
-    own = describe(image, lafs)
-    assert own.shape == (1, 3, HOG(grid=4).length)
-    # A photograph of other contrast, moved by 5 px: each frame still finds itself.
+    original = describe(image, lafs)
+    assert original.shape == (1, 3, HOG(grid=4).length)
+    # With other contrast and a translation of 5 px, each frame still matches itself.
     moved = torch.roll(0.1 + 0.8 * image, (5, 5), (-2, -1))
-    there = describe(moved, laf_from_center_scale_ori(centres + 5.0, scales))
-    assert torch.cdist(own[0], there[0]).argmin(dim=1).tolist() == [0, 1, 2]
-    assert float((own - there).abs().max()) < 0.02
-    torch.testing.assert_close(describe(image.expand(-1, 3, -1, -1), lafs), own, rtol=1e-3, atol=1e-4)
+    translated = describe(moved, laf_from_center_scale_ori(centres + 5.0, scales))
+    assert torch.cdist(original[0], translated[0]).argmin(dim=1).tolist() == [0, 1, 2]
+    assert float((original - translated).abs().max()) < 0.02
+    torch.testing.assert_close(describe(image.expand(-1, 3, -1, -1), lafs), original, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -91,19 +91,19 @@ def test_hog_describes_kornias_local_affine_frames() -> None:
     ],
     ids=lambda x: type(x).__name__,
 )
-def test_layers_in_kornias_sequences(layer: nn.Module) -> None:
-    colour = torch.stack([photos(2, 32, seed=i)[:, 0] for i in range(3)], dim=1)
+def test_layers_in_kornias_augmentation_sequences(layer: nn.Module) -> None:
+    colour = colour_photos(2, 32)
     flipped = colour.flip(-1)
     in_image = ImageSequential(RandomHorizontalFlip(p=1.0), layer)
     torch.testing.assert_close(in_image(colour), layer(flipped))
     augment = AugmentationSequential(RandomHorizontalFlip(p=1.0), layer, data_keys=["input", "mask"])
     mask = (colour[:, :1] > 0.5).float()
-    seen, turned = augment(colour, mask)
-    torch.testing.assert_close(seen, layer(flipped))
-    torch.testing.assert_close(turned, mask.flip(-1))
+    image, flipped_mask = augment(colour, mask)
+    torch.testing.assert_close(image, layer(flipped))
+    torch.testing.assert_close(flipped_mask, mask.flip(-1))
 
 
-def test_the_page_runs_as_it_stands() -> None:
+def test_kornia_page_runs() -> None:
     page = (Path(__file__).parents[2] / "docs" / "guides" / "kornia.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
     names: dict[str, object] = {}
@@ -113,15 +113,12 @@ def test_the_page_runs_as_it_stands() -> None:
     assert names["descriptors"].shape == (1, 50, 324)
 
 
-def test_our_smoothing_and_derivatives_are_kornias() -> None:
-    """What is written out because it is faster (docs/performance.md) is what kornia computes."""
+def test_smoothing_derivatives_and_sobel_equal_kornias() -> None:
     image = photos(2, 40, dtype=torch.float64)
     inner = (..., slice(6, -6), slice(6, -6))  # borders differ
     smooth = kornia.filters.gaussian_blur2d(image, (9, 9), (1.0, 1.0), border_type="replicate")
     torch.testing.assert_close(filters.gaussian_smooth(image, 1.0), smooth)
     first = kornia.filters.spatial_gradient(smooth, "diff", 1)[:, 0]
     torch.testing.assert_close(filters.image_gradient(image)[inner], first[inner])
-    bilateral = kornia.filters.bilateral_blur(image, (9, 9), 0.1, (2.0, 2.0))
-    torch.testing.assert_close(filters.bilateral_smooth(image, sigma=2.0, kappa=0.1)[inner], bilateral[inner])
     sobel = kornia.filters.spatial_gradient(image, "sobel", 1)[:, 0].norm(dim=1, keepdim=True)
     torch.testing.assert_close(detectors.sobel(image).response[inner], sobel[inner])
