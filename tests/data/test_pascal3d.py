@@ -70,18 +70,16 @@ def test_pascal3d_camera_projects_the_model_into_the_box(tree):
     assert v[1] < v[0] < v[2]
 
 
-@pytest.mark.parametrize(("option", "left"), [("truncated", 3), ("occluded", 3), ("difficult", 3)])
-def test_pascal3d_skips_flagged_objects(tree, option, left):
-    dataset = Pascal3DPlus(tree[0], categories=["car"], **{option: False})
-    assert len(dataset) == left
-    assert dataset.skipped[option] == 1
-    assert not any(dataset.annotation(i)[option] for i in range(left))
-
-
-def test_min_size_skips_small_objects(tree):
-    dataset = Pascal3DPlus(tree[0], categories=["car"], min_size=5)
+@pytest.mark.parametrize(
+    ("option", "value", "reason"),
+    [("truncated", False, "truncated"), ("occluded", False, "occluded"), ("difficult", False, "difficult"),
+     ("min_size", 5, "small")],
+)  # fmt: skip
+def test_pascal3d_skips_flagged_and_small_objects(tree, option, value, reason):
+    dataset = Pascal3DPlus(tree[0], categories=["car"], **{option: value})
     assert len(dataset) == 3
-    assert dataset.skipped["small"] == 1
+    assert dataset.skipped[reason] == 1
+    assert not any(dataset.annotation(i).get(option) for i in range(3))
 
 
 def test_pascal3d_reads_image_sets_with_invalid_entries(tree):

@@ -6,9 +6,8 @@ from functools import cache
 import pytest
 import torch
 import trimesh
-from torch.utils.data import DataLoader
 
-from curvireg_torch.data import BOPDataset, Pascal3DPlus, collate
+from curvireg_torch.data import BOPDataset, Pascal3DPlus
 from tests._support.real_data import real_data
 
 pytestmark = pytest.mark.data
@@ -73,17 +72,3 @@ def test_bop_visibility():
     fractions = Counter(dataset.annotation(i)["visib_fract"] for i in range(len(dataset)))
     assert fractions == {1.0: 45, 0.7: 20, 0.4: 15}
     assert len(BOPDataset(dataset.root, min_visib=0.5)) == 65
-
-
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 warns of fork beside threads
-def test_loader_with_workers():
-    for dataset in (Pascal3DPlus(real_data("pascal3d_mini"), pixel_origin=0), BOPDataset(real_data("bop/lm"))):
-        loader = DataLoader(dataset, batch_size=16, num_workers=2, collate_fn=collate)
-        seen = 0
-        for batch in loader:
-            seen += len(batch["image"])
-            assert batch["rotation"].shape[1:] == (3, 3)
-            for image in batch["image"]:
-                assert image.shape[0] == 3
-                assert 0 <= image.min() < image.max() <= 1
-        assert seen == len(dataset)
