@@ -12,8 +12,8 @@ import torch
 import curvireg_torch as cr
 from curvireg_torch.errors import ImageError, InvalidInputError
 from curvireg_torch.geometry import box_iou, rotation_error
-from curvireg_torch.registration import RELIABLE, localize
 from curvireg_torch.registration import localization as localization_module
+from curvireg_torch.registration import localize
 from curvireg_torch.registration.confidence import presence
 from curvireg_torch.registration.inputs import ImageItem
 from curvireg_torch.registration.localization import ScoredCandidates
@@ -80,16 +80,6 @@ def test_localization_with_camera_and_distance(registrar):
     far = float(truth[2, 3])
     within = registrar([image], camera_matrices=CAMERA, distance=(0.8 * far, 1.2 * far))[0]
     assert 0.75 * far < float(within.translation[2]) < 1.3 * far
-
-
-def test_unreliable_registration_has_no_covariance(registrar):
-    image, box, _ = scene(5)
-    given = registrar([image], box[None], CAMERA)[0]
-    known = tuple(replace(h, covariance=torch.eye(6, dtype=torch.float64)) for h in given.hypotheses)
-    for confidence, reliable in ((RELIABLE, True), (RELIABLE - 0.01, False)):
-        result = replace(given, hypotheses=known, confidence=confidence)
-        assert result.reliable == reliable
-        assert (result.covariance is not None) == (result.standard_deviations is not None) == reliable
 
 
 def test_pose_outside_the_photograph_has_presence_zero(registrar, found, monkeypatch):
