@@ -1,6 +1,5 @@
 """A cache of banks on disk, found again by a digest of everything they depend on."""
 
-import hashlib
 import json
 import os
 import re
@@ -22,7 +21,7 @@ from ..io.meshes.mesh import as_mesh, mesh_unit
 from ..io.meshes.up import mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
-from ..utils.digests import code_digest
+from ..utils.digests import code_digest, tensor_digest, text_digest
 from .bank import ViewBank
 from .bank_file import FORMAT_VERSION, colour_arrays
 
@@ -90,16 +89,12 @@ def bank_key(
 ) -> str:
     """32 hexadecimal digits: digest of mesh (with colours, unit and up axis), views, settings, renderer and code."""
     settings = (pipeline or Pipeline()).bank_key_fields(len(views))
-    facts = [FORMAT_VERSION, settings, mesh_unit(mesh), mesh_up(mesh), renderer, code_digest(*_SOURCES)]
-    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
-    digest.update(np.ascontiguousarray(mesh.vertices, np.float64).tobytes())
-    digest.update(np.ascontiguousarray(mesh.faces, np.int64).tobytes())
-    for name, part in colour_arrays(mesh).items():
-        digest.update(f"{name} {part.shape}".encode())
-        digest.update(np.ascontiguousarray(part).tobytes())
-    for field in fields(ViewSphere):
-        digest.update(getattr(views, field.name).cpu().double().numpy().tobytes())
-    return digest.hexdigest()[:32]
+    arrays = {"vertices": np.array(mesh.vertices, np.float64), "faces": np.array(mesh.faces, np.int64)}
+    tensors = {name: torch.from_numpy(np.array(x)) for name, x in {**arrays, **colour_arrays(mesh)}.items()}
+    tensors |= {f"views.{field.name}": getattr(views, field.name).double() for field in fields(ViewSphere)}
+    facts = [FORMAT_VERSION, settings, mesh_unit(mesh), mesh_up(mesh), renderer]
+    digests = [code_digest(*_SOURCES), tensor_digest(tensors, size=16)]
+    return text_digest(json.dumps([facts, digests], sort_keys=True), size=16)
 
 
 def cached_bank(

@@ -14,9 +14,9 @@ __all__ = ["code_digest", "file_digest", "tensor_digest", "text_digest"]
 _PACKAGE = Path(__file__).parents[1]
 
 
-def text_digest(text: str) -> str:
-    """16 hexadecimal digits of a text."""
-    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+def text_digest(text: str, *, size: int = 8) -> str:
+    """``2 * size`` hexadecimal digits of a text."""
+    return hashlib.blake2b(text.encode(), digest_size=size).hexdigest()
 
 
 def file_digest(path: Path) -> str:
