@@ -16,6 +16,9 @@ from .rendering import render_depth
 
 __all__ = ["example_mesh", "procedural_background", "random_pose", "synthesize_photograph"]
 
+DEFOCUS = 1.5
+"""Blur of the background in px."""
+
 
 def example_mesh() -> trimesh.Trimesh:
     """A toy truck, 0.25 m long, without symmetries; z up, front along -y, in metres."""
@@ -88,7 +91,6 @@ def synthesize_photograph(
     *,
     background: Tensor | None = None,
     texture: float = 0.35,
-    defocus: float = 1.5,
 ) -> tuple[Tensor, Tensor]:
     """A synthetic photograph of the mesh: random light, a random solid texture, defocused background, sensor noise.
 
@@ -96,7 +98,6 @@ def synthesize_photograph(
         mesh, T_cam_from_model (4, 4), camera_matrix (3, 3), size (H, W): the scene.
         background: (3, H, W) in [0, 1]; default :func:`procedural_background`.
         texture: contrast of the texture, 0 = none.
-        defocus: blur of the background in px.
 
     Returns:
         image (3, H, W) in [0, 1] and the object's box (4,) in px.
@@ -128,7 +129,7 @@ def synthesize_photograph(
     coverage = F.avg_pool2d(mask[None, None].float(), 2)[0]
     front = F.avg_pool2d((surface * mask[..., None]).permute(2, 0, 1)[None].float(), 2)[0]
     back = procedural_background(size, generator) if background is None else background
-    back = gaussian_smooth(back[None], defocus)[0]
+    back = gaussian_smooth(back[None], DEFOCUS)[0]
     image = front + (1.0 - coverage) * back
     image = image + 0.01 * torch.randn(3, H, W, generator=generator)
     rows, columns = mask.any(dim=1).nonzero(), mask.any(dim=0).nonzero()

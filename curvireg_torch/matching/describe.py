@@ -33,29 +33,16 @@ class DescribedViews:
     """N described views.
 
     Attributes:
-        settings: how they were rendered and described.
         descriptors: (N, D) float32.
         points, silhouettes: (N, S, S) bool.
         boxes: (N, 4) float64 boxes of the object in normalised image coordinates (focal length 1), the object's centre
             on the axis; model units for an orthographic camera.
     """
 
-    settings: BankSettings
     descriptors: Tensor
     points: Tensor
     silhouettes: Tensor
     boxes: Tensor
-
-    def __len__(self) -> int:
-        return len(self.boxes)
-
-    def points_at(self, index: Tensor | slice) -> Tensor:
-        """(K, S, S) bool feature points of some views."""
-        return self.points[index]
-
-    def silhouettes_at(self, index: Tensor | slice) -> Tensor:
-        """(K, S, S) bool silhouettes of some views."""
-        return self.silhouettes[index]
 
 
 class ViewDescriber:
@@ -183,7 +170,7 @@ class ViewDescriber:
             x0, y0, x1, y1 = boxes.T
             clockwise = [x0, y0, x1, y1, -y1, x0, -y0, x1, -x1, -y1, -x0, -y0, y0, -x1, y1, -x0]
             boxes = torch.stack(clockwise, dim=1).view(-1, 4, 4).transpose(0, 1)[selected]
-        return DescribedViews(self.settings, descriptors, points, silhouettes, boxes)
+        return DescribedViews(descriptors, points, silhouettes, boxes)
 
 
 def quarter_turns(rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from ..descriptors import field_points
 from ..errors import InvalidInputError
-from ..geometry.crops import crop_images
 from ..io.meshes.colours import has_colours
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
@@ -18,13 +17,11 @@ from ..terms import (
     QueryFeatures,
     RerankingModule,
     RerankingTerm,
-    Whitening,
     crop_regions,
     jittered_boxes,
     photograph_field,
     whole_box_shapes,
 )
-from ..terms.correlation import CorrelationModule
 from ..utils.checks import as_boxes, check_photograph, check_pixels
 from ..utils.threads import map_on_threads
 from .bank import ViewBank
@@ -57,7 +54,6 @@ class ViewMatcher(nn.Module):
         field: custom photograph filter (B, 1, S, S) -> (B, 2, S, S). With an attribute ``colour = True`` it gets colour
             photographs as (B, 3, S, S).
         box_jitter: instead of the pipeline's.
-        whitening: compare whitened descriptors (:class:`DescriptorStatistics`), whatever the term "hog" says.
         renderer: for views that a :class:`RerankingTerm` needs.
         chunk_size: photographs in memory at a time.
 
@@ -81,7 +77,6 @@ class ViewMatcher(nn.Module):
         pipeline: Pipeline | None = None,
         field: nn.Module | None = None,
         box_jitter: float | None = None,
-        whitening: Whitening | None = None,
         renderer: str | DepthRenderer = "auto",
         chunk_size: int = 16,
     ) -> None:
@@ -99,18 +94,11 @@ class ViewMatcher(nn.Module):
         self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
         self.descriptor = hog_layer(bank.settings)
         self._terms = nn.ModuleDict({term.name: term.build(bank) for term in pipeline.terms}).to(bank.device)
-        if whitening is not None:
-            self._terms["hog"] = CorrelationModule(bank.descriptors, whitening)
 
     @property
     def device(self) -> torch.device:
         """The bank's device, where photographs are described and compared."""
         return self.bank.device
-
-    def crop(self, images: Tensor | Sequence[Tensor], boxes: Any) -> tuple[Tensor, Tensor]:
-        """(B, C, S, S) crops and (B, 3, 3) crop transforms, as the bank's views are cropped."""
-        settings = self.bank.settings
-        return crop_images(images, boxes, size=settings.image_size, margin=settings.margin)
 
     def forward(self, images: Tensor | Sequence[Tensor], boxes: Any) -> Ranking:
         """Rank all views.
@@ -143,7 +131,7 @@ class ViewMatcher(nn.Module):
         return self.describe(regions, whole_box_shapes(boxes, [(int(i.shape[-2]), int(i.shape[-1])) for i in images]))
 
     def features(self, crops: Tensor) -> QueryFeatures:
-        """Describe (B, 1 or 3, S, S) crops of :meth:`crop`, without jitter and box shapes."""
+        """Describe (B, 1 or 3, S, S) crops of boxes, without box jitter and shapes."""
         return self.describe(crops[:, None], torch.full_like(crops[:, 0, 0, 0], torch.nan))
 
     def describe(self, regions: Tensor, shapes: Tensor) -> QueryFeatures:

@@ -7,14 +7,13 @@ from .box_shape import BoxShape, box_shape_score, box_shapes, whole_box_shapes
 from .correlation import Correlation, normalized_correlation, unit_score
 from .query import QueryFeatures, crop_regions, jittered_boxes, photograph_field
 from .repeatability import Repeatability, dilate_points, repeatability, repeatability_score
-from .whitening import DescriptorStatistics, Whitening
+from .whitening import Whitening, ledoit_wolf
 
 __all__ = [
     "TERMS",
     "Appearance",
     "BoxShape",
     "Correlation",
-    "DescriptorStatistics",
     "QueryFeatures",
     "Repeatability",
     "RerankingModule",
@@ -27,6 +26,7 @@ __all__ = [
     "crop_regions",
     "dilate_points",
     "jittered_boxes",
+    "ledoit_wolf",
     "normalized_correlation",
     "photograph_field",
     "repeatability",

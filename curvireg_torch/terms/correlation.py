@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from ..utils.checks import check_option, check_tensor
 from .base import Term, Views
 from .query import QueryFeatures
-from .whitening import DescriptorStatistics, Whitening
+from .whitening import Whitening, ledoit_wolf
 
 __all__ = ["Correlation", "normalized_correlation", "unit_score"]
 
@@ -73,10 +73,8 @@ class Correlation(Term):
         check_option(self.whitening, ("none", "bank"), "whitening")
 
     def build(self, views: Views) -> nn.Module:
-        if self.whitening == "none":
-            return CorrelationModule(views.descriptors)
-        statistics = DescriptorStatistics.from_descriptors(views.descriptors)
-        return CorrelationModule(views.descriptors, statistics.whitening(shrinkage="ledoit-wolf"))
+        whitening = None if self.whitening == "none" else Whitening(*ledoit_wolf(views.descriptors))
+        return CorrelationModule(views.descriptors, whitening)
 
     def log_score(self, raw: Tensor) -> Tensor:
         return _log_score(raw)

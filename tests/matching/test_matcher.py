@@ -10,7 +10,6 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.matching import Ranking
 from curvireg_torch.terms import (
     Correlation,
-    DescriptorStatistics,
     dilate_points,
     normalized_correlation,
     repeatability,
@@ -152,9 +151,10 @@ def test_matcher_scores_models_of_a_joined_bank_independently(bank):
 
 
 def test_matcher_in_half_precision(bank):
-    for whitening in (None, DescriptorStatistics.from_descriptors(bank.descriptors).whitening()):
-        single = ViewMatcher(bank, whitening=whitening)(*batch(0))
-        half = ViewMatcher(bank, whitening=whitening).half()(*batch(0))
+    for whitening in ("none", "bank"):
+        pipeline = bank.pipeline.with_term("hog", whitening=whitening)
+        single = ViewMatcher(bank, pipeline=pipeline)(*batch(0))
+        half = ViewMatcher(bank, pipeline=pipeline).half()(*batch(0))
         assert half.scores.dtype == torch.float32
         torch.testing.assert_close(half.hog, single.hog, rtol=0, atol=4e-3)
         torch.testing.assert_close(half.repeatability, single.repeatability, rtol=0, atol=4e-3)

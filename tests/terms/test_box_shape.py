@@ -54,7 +54,7 @@ def test_matcher_scores_the_whole_box(bank, photographs):
     torch.testing.assert_close(matcher(images, boxes).box, expected)
     H, W = images[0].shape[1:]
     assert bool((matcher(images, [[-0.5, -0.5, W - 0.5, H - 0.5]]).box == 1).all())
-    assert bool((matcher.rank(matcher.features(matcher.crop(images, boxes)[0])).box == 1).all())
+    assert bool((matcher.rank(matcher.features(matcher.query(images, boxes).crops)).box == 1).all())
 
 
 @pytest.mark.parametrize("shape", [math.nan, math.inf, -math.inf])

@@ -1,17 +1,18 @@
 """Correlation of descriptors, and whitening."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import sklearn.covariance
 import torch
 import torch.nn.functional as F
-from sklearn.covariance import ledoit_wolf, ledoit_wolf_shrinkage
 
 from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.terms import Correlation, DescriptorStatistics, Whitening, normalized_correlation, unit_score
+from curvireg_torch.terms import Correlation, Whitening, ledoit_wolf, normalized_correlation, unit_score
 from curvireg_torch.terms.correlation import CorrelationModule
 
 
@@ -39,55 +40,45 @@ def sample(count: int, length: int = 12) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("count", [5, 30, 2000])
-def test_shrinkage_equals_scikit_learn(count):
+def test_ledoit_wolf_equals_scikit_learn(count):
     x = sample(count)
-    statistics = DescriptorStatistics.from_descriptors(x)
-    expected = ledoit_wolf_shrinkage(x.double().numpy())
-    assert statistics.shrinkage("ledoit-wolf") == pytest.approx(expected, rel=1e-4)
-    if count == 30:
-        whitening = statistics.whitening(shrinkage="ledoit-wolf")
-        precision = np.linalg.inv(ledoit_wolf(x.double().numpy())[0])
-        np.testing.assert_allclose((whitening.matrix.T @ whitening.matrix).numpy(), precision, rtol=2e-3, atol=1e-5)
+    mean, covariance = ledoit_wolf(x)
+    expected = sklearn.covariance.ledoit_wolf(x.double().numpy())[0]
+    np.testing.assert_allclose(covariance.numpy(), expected, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(mean, x.mean(dim=0))
 
 
-def test_whitening_without_shrinkage_decorrelates():
+def test_whitening_decorrelates():
     x = sample(4000)
-    white = DescriptorStatistics.from_descriptors(x).whitening(shrinkage=0.0)(x)
+    white = Whitening(x.mean(dim=0), x.T.cov(correction=0))(x)
     torch.testing.assert_close(white.mean(dim=0), torch.zeros(12), atol=1e-3, rtol=0)
     torch.testing.assert_close(white.T @ white / len(white), torch.eye(12), atol=1e-2, rtol=0)
+    with pytest.raises(InvalidInputError, match="positive definite"):
+        Whitening(x[:5].mean(dim=0), x[:5].T.cov())
+    with pytest.raises(InvalidInputError, match="covariance"):
+        Whitening(torch.zeros(3), torch.eye(2))
 
 
-def test_whitening_with_full_shrinkage_centres_and_scales():
-    x = sample(30)
-    statistics = DescriptorStatistics.from_descriptors(x)
-    scale = float(statistics.covariance.diagonal().mean()) ** 0.5
-    torch.testing.assert_close(statistics.whitening(shrinkage=1.0)(x), (x - statistics.mean) / scale)
-    assert torch.equal(statistics.whitening()(x), statistics.whitening(shrinkage=0.5)(x))
-    assert not torch.allclose(statistics.whitening()(x), statistics.whitening(shrinkage=1.0)(x))
-
-
-def test_whitening_refuses_unusable_statistics():
-    assert DescriptorStatistics.from_descriptors(torch.ones(4, 3)).shrinkage("ledoit-wolf") == 1.0
-    few = DescriptorStatistics.from_descriptors(sample(5))
-    for call, message in (
-        (lambda: few.whitening(shrinkage=0.0), "positive definite"),
-        (lambda: few.shrinkage(1.5), "shrinkage"),
-        (lambda: few.shrinkage("oas"), "shrinkage"),
-        (lambda: DescriptorStatistics.from_descriptors(torch.ones(1, 3)), "at least 2"),
-        (lambda: Whitening(torch.zeros(3), torch.eye(2)), "covariance"),
-    ):
-        with pytest.raises(InvalidInputError, match=message):
-            call()
+def test_ledoit_wolf_of_degenerate_samples():
+    """All shrinkage, because equal descriptors have no covariance; and no shrinkage is below 0."""
+    two = torch.tensor([[1.0, 0, 0], [-1.0, 0, 0]])
+    mean, covariance = ledoit_wolf(two)
+    assert torch.equal(mean, torch.zeros(3))
+    expected = sklearn.covariance.ledoit_wolf(two.numpy())[0]
+    np.testing.assert_allclose(covariance.numpy(), expected, rtol=1e-5)
+    assert torch.equal(ledoit_wolf(torch.ones(4, 3))[1], torch.zeros(3, 3))
+    with pytest.raises(InvalidInputError, match="at least 2"):
+        ledoit_wolf(torch.ones(1, 3))
 
 
 def test_matcher_ranks_by_whitened_correlation(bank, photographs):
     assert Correlation().build(bank).whitening is None
-    assert Correlation(whitening="bank").build(bank).whitening is not None
     images, boxes = photographs[0][:1], photographs[1][:1]
-    whitening = DescriptorStatistics.from_descriptors(bank.descriptors).whitening()
-    matcher = ViewMatcher(bank, box_jitter=0.0, whitening=whitening)
+    pipeline = replace(bank.pipeline.with_term("hog", whitening="bank"), box_jitter=0.0)
+    matcher = ViewMatcher(bank, pipeline=pipeline)
     query = matcher.query(images, boxes).descriptors[:, 0]
-    factor = torch.linalg.inv(whitening.matrix)
-    a, b = (torch.linalg.solve(factor, (x - whitening.mean).T).T for x in (query, bank.descriptors))
-    expected = F.cosine_similarity(a[:, None], b[None], dim=2)
+    mean, covariance = ledoit_wolf(bank.descriptors)
+    factor = torch.linalg.cholesky(covariance.double())
+    a, b = (torch.linalg.solve(factor, (x - mean).double().T).T for x in (query, bank.descriptors))
+    expected = F.cosine_similarity(a[:, None], b[None], dim=2).float()
     torch.testing.assert_close(matcher(images, boxes).hog, expected, atol=1e-4, rtol=1e-3)
