@@ -1,14 +1,14 @@
-"""Lay ObjectNet3D out as PASCAL3D+, so that Pascal3DPlus(..., part="imagenet") reads it.
+"""Arrange ObjectNet3D like PASCAL3D+, so that Pascal3DPlus(..., part="imagenet") can read it.
 
     python datasets/convert_objectnet3d.py OBJECTNET3D OUT [--splits train val]
 
-ObjectNet3D keeps all annotations and photographs in one folder each; PASCAL3D+ has one per class. Files are hard-linked
-where the file system allows it and copied otherwise; the source is not changed. An image that shows several classes
+ObjectNet3D has one folder for all annotations and one for all photographs; PASCAL3D+ has one per class. Files are hard-
+linked if the file system allows it, and copied otherwise; the source is not changed. An image of several classes
 appears under each of them.
 
-Read from OBJECTNET3D: Annotations/<id>.mat, Images/<id>.JPEG, Image_sets/<split>.txt, CAD/off/<class>/<NN>.off or
+Input in OBJECTNET3D: Annotations/<id>.mat, Images/<id>.JPEG, Image_sets/<split>.txt, CAD/off/<class>/<NN>.off or
 CAD/<class>/<NN>.off.
-Exit code 0: all ids of the lists were found. 1: some were not (they are counted). 2: not an ObjectNet3D tree.
+Exit code 0: all ids of the lists were found. 1: some are missing. 2: not an ObjectNet3D tree.
 """
 
 import argparse
@@ -41,7 +41,7 @@ def classes_of(annotation: Path) -> set[str]:
 
 
 def convert_split(root: Path, out: Path, split: str) -> Counter[str]:
-    """Counts ``lift_to_poses`` images and what was missing."""
+    """Convert one split; returns the numbers of placed images and of missing or corrupt files."""
     counts: Counter[str] = Counter()
     lists: dict[str, list[str]] = {}
     for image_id in (root / "Image_sets" / f"{split}.txt").read_text(encoding="utf-8").split():

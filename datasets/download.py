@@ -1,11 +1,11 @@
-"""Download dataset archives, resuming what was interrupted and checking what is there.
+"""Download dataset archives, resume interrupted downloads and verify existing files.
 
     python datasets/download.py URL [URL ...] --out FOLDER
 
-FOLDER/manifest.json keeps URL, size and SHA-256 of every finished file. The first complete download of a file is
-recorded; every later run verifies the file against that record instead of fetching it again. A known checksum can be
-given with --sha256 (one URL only). Interrupted http(s) downloads continue where they stopped if the server still has
-the same file; ftp starts again. Nothing is unpacked: `python -m zipfile -e ARCHIVE.zip FOLDER` does that.
+FOLDER/manifest.json records URL, size and SHA-256 of every complete file; later runs verify the file against this
+record instead of downloading it again. --sha256 gives a known checksum (one URL only). Interrupted http(s) downloads
+are resumed if the server still has the same file; ftp downloads start again. Archives are not unpacked: use
+`python -m zipfile -e ARCHIVE.zip FOLDER`.
 """
 
 import argparse
@@ -23,7 +23,7 @@ CHUNK = 1 << 20
 
 
 class DownloadError(Exception):
-    """What went wrong with one file, and what to do."""
+    """A download failed; the message says what to do."""
 
 
 def sha256_of(path: Path) -> str:
@@ -55,43 +55,40 @@ def file_name(url: str) -> str:
 
 
 def fetch(url: str, part: Path, validator: str | None, timeout: float) -> int | None:
-    """Append what is missing to ``part``; returns the full size where the server tells it."""
-    have = part.stat().st_size if part.is_file() else 0
+    """Append the missing bytes to ``part``; returns the full size if the server reports it."""
+    present = part.stat().st_size if part.is_file() else 0
     request = urllib.request.Request(url)
-    if have and validator and url.startswith("http"):
-        request.add_header("Range", f"bytes={have}-")
+    if present and validator and url.startswith("http"):
+        request.add_header("Range", f"bytes={present}-")
         request.add_header("If-Range", validator)
     try:
         response = urllib.request.urlopen(request, timeout=timeout)
     except urllib.error.HTTPError as error:
-        if error.code == 416:  # nothing left, or another file: start again
+        if error.code == 416:  # nothing is left, or the file has changed: start again
             part.unlink(missing_ok=True)
             return fetch(url, part, None, timeout)
         raise
     with response:
         headers = response.headers
         resumed = getattr(response, "status", None) == 206
-        if resumed and not headers.get("Content-Range", "").startswith(f"bytes {have}-"):
-            raise DownloadError(f"{url}: the server sent another range than asked for; delete {part} and run again")
+        if resumed and not headers.get("Content-Range", "").startswith(f"bytes {present}-"):
+            raise DownloadError(f"{url}: the server sent another range than requested; delete {part} and run again")
         length = headers.get("Content-Length")
-        total = None if length is None else int(length) + (have if resumed else 0)
+        total = None if length is None else int(length) + (present if resumed else 0)
         tag = headers.get("ETag") or "W/"
-        new_validator = headers.get("Last-Modified", "") if tag.startswith("W/") else tag  # a weak tag promises little
+        new_validator = headers.get("Last-Modified", "") if tag.startswith("W/") else tag
         part.with_suffix(part.suffix + ".validator").write_text(new_validator)
         with open(part, "ab" if resumed else "wb") as file:
             while chunk := response.read(CHUNK):
                 file.write(chunk)
-                print(
-                    f"\r{part.stem}: {file.tell() / 1e6:.1f} MB of {(total or 0) / 1e6:.1f}",
-                    end="",
-                    file=sys.stderr,
-                )
+                message = f"\r{part.stem}: {file.tell() / 1e6:.1f} MB of {(total or 0) / 1e6:.1f}"
+                print(message, end="", file=sys.stderr)
         print(file=sys.stderr)
     return total
 
 
 def download(url: str, folder: Path, sha256: str | None = None, timeout: float = 60.0) -> str:
-    """Fetch or verify one file; says what was done."""
+    """Download or verify one file; returns a message."""
     name = file_name(url)
     path, part = folder / name, folder / f"{name}.part"
     manifest = load_manifest(folder)
@@ -127,10 +124,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("urls", nargs="+", metavar="URL", help="address of an archive; see the README of the dataset")
     parser.add_argument("--out", type=Path, required=True, help="folder for the files and manifest.json")
     parser.add_argument("--sha256", help="checksum that the file must have (one URL only)")
-    parser.add_argument("--timeout", type=float, default=60.0, help="seconds without an answer before giving up")
+    parser.add_argument("--timeout", type=float, default=60.0, help="seconds without a response before giving up")
     options = parser.parse_args(arguments)
     if options.sha256 and len(options.urls) > 1:
-        parser.error("--sha256 goes with one URL")
+        parser.error("--sha256 expects a single URL")
     options.out.mkdir(parents=True, exist_ok=True)
     failed = 0
     for url in options.urls:

@@ -1,10 +1,10 @@
-"""Check a dataset tree against its layout; print what is usable and what is not.
+"""Check a dataset tree against its layout and report defects.
 
     python datasets/verify.py pascal3d ROOT [--split val] [--part pascal] [--categories car sofa]
     python datasets/verify.py bop ROOT [--split test]
     python datasets/verify.py web ROOT
 
-Exit code 0: sound. 1: usable with defects (missing, corrupt or bad items, which the library skips). 2: unusable.
+Exit code 0: no defects. 1: usable with defects (missing, corrupt or bad items, which the library skips). 2: unusable.
 """
 
 import argparse
@@ -21,7 +21,7 @@ DEFECTS = ("missing_", "corrupt_", "bad_")
 
 
 def unreadable(dataset: Dataset) -> list[str]:
-    """Reads every photograph once."""
+    """Errors of the photographs that cannot be decoded."""
     problems = []
     for path in sorted({dataset.annotation(i)["image_path"] for i in range(len(dataset))}):
         try:
@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
         command = kinds.add_parser(name)
         kind.add_arguments(command)
         command.add_argument("--images", action="store_true", help="also decode every photograph (slow)")
-        command.add_argument("--show", type=int, default=5, help="how many items to name for each defect")
+        command.add_argument("--show", type=int, default=5, help="number of items to list for each defect")
         command.set_defaults(kind=kind)
     options = parser.parse_args(arguments)
     try:

@@ -1,11 +1,11 @@
-"""The README's table of results, made from ``scripts/results/evaluation_*.json`` and from nothing else.
+"""Write the README's table of results from ``scripts/results/evaluation_*.json``.
 
-    python scripts/results_table.py --record DIR/summary.json NAME    keep a summary of ``curvireg evaluate`` as NAME
+    python scripts/results_table.py --record DIR/summary.json NAME    store a summary of ``curvireg evaluate`` as NAME
     python scripts/results_table.py                                   write the table into the README
-    python scripts/results_table.py --check                           exit 1 if the README says something else
+    python scripts/results_table.py --check                           exit 1 if the README's table is out of date
 
-A kept summary has the day and the commit it was kept at ("+": with changes that are not committed): record right after
-measuring. The table stands between ``<!-- results:begin -->`` and ``<!-- results:end -->``.
+A stored summary contains the date and the commit at which it was recorded ("+": with uncommitted changes), so record
+it right after measuring. The table is between ``<!-- results:begin -->`` and ``<!-- results:end -->``.
 """
 
 import argparse
@@ -45,14 +45,14 @@ BOP = (
 
 
 LIGHTINGS = {"hope": 5}
-"""Sets in which each view was photographed under so many lightings: their objects are not independent."""
+"""Lightings per view. Objects of these sets are not independent."""
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--record", nargs=2, metavar=("SUMMARY", "NAME"), help="keep a summary.json under a name")
-    parser.add_argument("--check", action="store_true", help="change nothing; exit 1 if the README is out of date")
-    parser.add_argument("--root", type=Path, default=REPOSITORY, metavar="DIR", help="of the repository")
+    parser.add_argument("--record", nargs=2, metavar=("SUMMARY", "NAME"), help="store a summary.json under a name")
+    parser.add_argument("--check", action="store_true", help="write nothing; exit 1 if the README is out of date")
+    parser.add_argument("--root", type=Path, default=REPOSITORY, metavar="DIR", help="root of the repository")
     arguments = parser.parse_args()
     results, readme = arguments.root / "scripts" / "results", arguments.root / "README.md"
     if arguments.record:
@@ -62,17 +62,17 @@ def main() -> int:
     if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
         print(f"results_table: error: {readme}: expected {BEGIN} and then {END}, once each", file=sys.stderr)
         return 2
-    wanted = replace_between(text, BEGIN, END, table(results))
+    expected = replace_between(text, BEGIN, END, table(results))
     if arguments.check:
-        if wanted != text:
-            print(f"results_table: {readme} is not what {results} says; run scripts/results_table.py", file=sys.stderr)
-        return int(wanted != text)
-    readme.write_text(wanted, encoding="utf-8")
+        if expected != text:
+            print(f"results_table: {readme} differs from {results}; run scripts/results_table.py", file=sys.stderr)
+        return int(expected != text)
+    readme.write_text(expected, encoding="utf-8")
     return 0
 
 
 def record(summary: Path, name: str, results: Path, root: Path) -> Path:
-    """Keep ``summary`` with the day and the commit; returns the path."""
+    """Store ``summary`` with the date and the commit; returns the path."""
     path = results / f"evaluation_{name}.json"
     content = {
         "name": name,
@@ -85,63 +85,71 @@ def record(summary: Path, name: str, results: Path, root: Path) -> Path:
 
 
 def table(results: Path) -> str:
-    """Markdown of everything that was kept."""
-    kept = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(results.glob("evaluation_*.json"))]
+    """Markdown of all stored summaries."""
+    records = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(results.glob("evaluation_*.json"))]
     parts = []
     for title, kind, (columns, definition), cells in (
         ("Viewpoints on PASCAL3D+", "pascal3d", PASCAL3D, pascal3d_cells),
         ("Poses on BOP sets", "bop", BOP, bop_cells),
     ):
-        chosen = [k for k in kept if k["summary"]["settings"]["dataset"] == kind]
+        chosen = [r for r in records if r["summary"]["settings"]["dataset"] == kind]
         if chosen:
-            lines = [columns, ["---"] * len(columns), *(cells(k["name"], k["summary"]) for k in chosen)]
+            lines = [columns, ["---"] * len(columns), *(cells(r["name"], r["summary"]) for r in chosen)]
             body = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-            notes = "\n".join(f"- {note(k)}" for k in chosen)
+            notes = "\n".join(f"- {note(r)}" for r in chosen)
             parts.append(f"**{title}.** {definition}\n\n{body}\n\n{notes}\n")
     return "\n".join(parts)
 
 
-def note(kept: dict[str, Any]) -> str:
-    """Under what conditions one line was measured."""
-    summary = kept["summary"]
+def note(record: dict[str, Any]) -> str:
+    """Conditions under which one line was measured."""
+    summary = record["summary"]
     settings = summary["settings"]
     limit = "" if summary["limit"] is None else f", limited to {summary['limit']} objects"
     skipped = sum(summary["skipped"].values())
     return (
-        f"{kept['name']}: split {settings['split']}{limit}; {summary['protocol']}; "
+        f"{record['name']}: split {settings['split']}{limit}; {summary['protocol']}; "
         f"preset {settings['preset']}; {summary['failed']} failed, {skipped} skipped; "
-        f"{kept['date']}, commit {kept['commit']}"
+        f"{record['date']}, commit {record['commit']}"
     )
 
 
 def pascal3d_cells(name: str, s: dict[str, Any]) -> list[str]:
     easy, aware = s["subsets"]["easy"], s["symmetry_aware"]
-    shares = [percent(s["acc_pi_6"]), percent(s["acc_pi_18"]), degrees(s["med_err_deg"]), percent(aware["acc_pi_6"])]
-    return [name, str(s["n"]), *shares, percent(easy["acc_pi_6"]), degrees(easy["med_err_deg"]), each(s)]
+    values = [percent(s["acc_pi_6"]), percent(s["acc_pi_18"]), degrees(s["med_err_deg"]), percent(aware["acc_pi_6"])]
+    return [name, str(s["n"]), *values, percent(easy["acc_pi_6"]), degrees(easy["med_err_deg"]), seconds_each(s)]
 
 
 def bop_cells(name: str, s: dict[str, Any]) -> list[str]:
     whole = s["subsets"]["unoccluded"]
-    shares = [percent(s["acc_15_deg"]), percent(s["acc_30_deg"]), degrees(s["med_err_deg"])]
+    values = [percent(s["acc_15_deg"]), percent(s["acc_30_deg"]), degrees(s["med_err_deg"])]
     recalls = [percent(s[key]) for key in ("add_recall_0.1d", "mssd_ar", "mspd_ar")]
-    return [name, counted(name, s["n"]), *shares, *recalls, str(whole["n"]), percent(whole["acc_30_deg"]), each(s)]
+    return [
+        name,
+        counted(name, s["n"]),
+        *values,
+        *recalls,
+        str(whole["n"]),
+        percent(whole["acc_30_deg"]),
+        seconds_each(s),
+    ]
 
 
 def counted(name: str, n: int) -> str:
-    """The number of objects, and how many views and lightings it is made of."""
+    """The number of objects, with the numbers of views and lightings if the set has several lightings."""
     lightings = LIGHTINGS.get(name, 1)
     return str(n) if lightings == 1 or n % lightings else f"{n} ({n // lightings} views x {lightings} lightings)"
 
 
-def percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f} %"
+def percent(fraction: float | None) -> str:
+    return "-" if fraction is None else f"{100 * fraction:.1f} %"
 
 
 def degrees(value: float | None) -> str:
     return "-" if value is None else f"{value:.1f}°"
 
 
-def each(summary: dict[str, Any]) -> str:
+def seconds_each(summary: dict[str, Any]) -> str:
     seconds = summary["seconds"]["register_each"]
     return "-" if seconds is None else f"{seconds:.1f}"
 

@@ -1,10 +1,9 @@
-"""Train the learned field on generated scenes: no photograph, no annotation, no foreign weights.
+"""Train the learned field on generated scenes, without photographs, annotations or pretrained weights.
 
     python scripts/calibration/train_learned_field.py --out runs/field --minutes 90
 
-Every step draws a batch, partly fresh scenes, partly scenes seen before, recoloured and mirrored. Losses: see
-curvireg_torch.training.losses; one goes straight through HOG, since our layers are differentiable. A second start
-with the same --out goes on where the first one stopped.
+A batch consists of fresh scenes and of earlier ones, with new colours and mirrored. For the losses see
+curvireg_torch.training.losses; one of them is backpropagated through HOG. A second start with the same --out resumes.
 """
 
 import argparse
@@ -38,7 +37,7 @@ VALIDATION_SEED = 1_000_003
 
 
 class Validation:
-    """Held-out scenes of upright objects, each ranked against the views of its own mesh."""
+    """Held-out scenes of upright objects, each ranked against the views of its mesh."""
 
     def __init__(self, count: int) -> None:
         scenes = GeneratedScenes(count, seed=VALIDATION_SEED, upright=1.0)
@@ -60,8 +59,8 @@ class Validation:
         for image, depth, error, bank in zip(self.images, self.depths, self.errors, self.banks, strict=True):
             query = descriptor(field(image[None]))
             errors.append(float(error[normalized_correlation(query, bank.float())[0].argmax()]))
-            right = descriptor(depth_filter(SETTINGS)(depth[None]))
-            cosines.append(float(normalized_correlation(query, right)))
+            target = descriptor(depth_filter(SETTINGS)(depth[None]))
+            cosines.append(float(normalized_correlation(query, target)))
         e = np.array(errors)
         return {
             "accuracy_30": float((e < 30).mean()),
@@ -71,7 +70,7 @@ class Validation:
         }
 
     def picture(self, network: torch.nn.Module, path: Path, count: int = 8) -> None:
-        """Photograph, predicted field, mask and wanted field."""
+        """Write photographs, predicted fields and masks, and target fields as a picture."""
         images, depths = torch.stack(self.images[:count]), torch.stack(self.depths[:count])
         with torch.no_grad():
             output = F.interpolate(network(images), scale_factor=2.0, mode="bilinear")
@@ -128,13 +127,19 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of checkpoints, log and pictures")
     parser.add_argument("--minutes", type=float, default=90.0, help="training time, over all starts (default 90)")
     parser.add_argument("--batch", type=int, default=32, help="scenes in a step (default 32)")
-    parser.add_argument("--fresh", type=int, default=8, help="of them new ones (default 8)")
-    parser.add_argument("--replay", type=int, default=15_000, help="scenes kept in memory, 100 kB each (default 15000)")
+    parser.add_argument("--fresh", type=int, default=8, help="fresh scenes among them (default 8)")
+    parser.add_argument(
+        "--replay", type=int, default=15_000, help="scenes stored for reuse, 100 kB each (default 15000)"
+    )
     parser.add_argument("--workers", type=int, default=1, help="processes that generate scenes (default 1)")
     parser.add_argument("--rate", type=float, default=3e-3, help="highest learning rate (default 3e-3)")
-    parser.add_argument("--descriptor-weight", type=float, default=1.0, help="of the descriptor's loss (default 1)")
-    parser.add_argument("--ranking-weight", type=float, default=0.1, help="of the ranking loss (default 0.1)")
-    parser.add_argument("--rivals-weight", type=float, default=0.2, help="of the loss among views (default 0.2)")
+    parser.add_argument(
+        "--descriptor-weight", type=float, default=1.0, help="weight of the descriptor loss (default 1)"
+    )
+    parser.add_argument("--ranking-weight", type=float, default=0.1, help="weight of the ranking loss (default 0.1)")
+    parser.add_argument(
+        "--other-views-weight", type=float, default=0.2, help="weight of the loss among views (default 0.2)"
+    )
     parser.add_argument("--validate", type=int, default=60, help="held-out scenes (default 60)")
     parser.add_argument("--every", type=float, default=10.0, help="minutes between validations (default 10)")
     parser.add_argument("--seed", type=int, default=0)
@@ -154,31 +159,33 @@ def main() -> None:
         load_state(checkpoint, network, average, optimizer)
         last = json.loads(log.read_text().splitlines()[-1])
         spent, step, scenes = last["minutes"], last["step"], last["scenes"]
-    weights = {f"{name}_weight": getattr(options, f"{name}_weight") for name in ("descriptor", "ranking", "rivals")}
+    weights = {
+        f"{name}_weight": getattr(options, f"{name}_weight") for name in ("descriptor", "ranking", "other_views")
+    }
     validation = Validation(options.validate)
     if step == 0:
-        print("MFC, for comparison:", validation(_Grey()))
+        print("MFC for comparison:", validation(_Grey()))
 
     generated = GeneratedScenes(10**9, seed=options.seed)
     fresh = range(scenes, len(generated))
-    lessons = FieldDataset(generated)
+    dataset = FieldDataset(generated)
     loader = iter(
-        DataLoader(lessons, options.fresh, sampler=fresh, num_workers=options.workers, multiprocessing_context="spawn")
+        DataLoader(dataset, options.fresh, sampler=fresh, num_workers=options.workers, multiprocessing_context="spawn")
     )
     replay = ReplayBuffer(options.replay)
     generator = torch.Generator().manual_seed(options.seed + step)
     totals: dict[str, float] = {}
     start = marked = time.monotonic()
-    before, seen_at_mark, step_at_mark = spent, scenes, step
+    earlier, scenes_at_mark, step_at_mark = spent, scenes, step
     bar = tqdm(total=round(options.minutes), initial=int(spent), unit="min", mininterval=10)
     while spent < options.minutes:
         replay.add(next(loader))
         scenes += options.fresh
         batch = augment(replay.draw(options.fresh, options.batch, generator), generator)
         batch = {name: values.to(options.device) for name, values in batch.items()}
-        share = spent / options.minutes
+        progress = spent / options.minutes
         for group in optimizer.param_groups:
-            group["lr"] = options.rate * min(1.0, (step + 1) / 200) * 0.5 * (1 + math.cos(math.pi * share))
+            group["lr"] = options.rate * min(1.0, (step + 1) / 200) * 0.5 * (1 + math.cos(math.pi * progress))
         network.train()
         with torch.autocast(torch.device(options.device).type, torch.bfloat16):
             output = network(batch["image"].contiguous(memory_format=torch.channels_last))
@@ -195,14 +202,14 @@ def main() -> None:
                 mean.lerp_(now.float().to(mean.device), 1 - keep)
         for name, value in parts.items():
             totals[name] = totals.get(name, 0.0) + float(value)
-        spent = before + (time.monotonic() - start) / 60
+        spent = earlier + (time.monotonic() - start) / 60
         if int(spent) > bar.n:
             bar.update(int(spent) - bar.n)
         if time.monotonic() - marked > 60 * options.every or spent >= options.minutes:
             seconds, steps = time.monotonic() - marked, step - step_at_mark
             entry = {"step": step, "minutes": round(spent, 2), "scenes": scenes}
             entry |= {name: round(value / steps, 4) for name, value in totals.items()}
-            entry["scenes_per_second"] = round((scenes - seen_at_mark) / seconds, 1)
+            entry["scenes_per_second"] = round((scenes - scenes_at_mark) / seconds, 1)
             entry["samples_per_second"] = round(steps * options.batch / seconds, 1)
             entry |= {name: round(value, 4) for name, value in validation(_Field(average)).items()}
             save_state(checkpoint, network, average, optimizer, **entry)
@@ -210,7 +217,7 @@ def main() -> None:
                 lines.write(json.dumps(entry) + "\n")
             validation.picture(average, options.out / f"step{step:06d}.png")
             tqdm.write(json.dumps(entry))
-            totals, marked, seen_at_mark, step_at_mark = {}, time.monotonic(), scenes, step
+            totals, marked, scenes_at_mark, step_at_mark = {}, time.monotonic(), scenes, step
     save_weights(average, options.out / "field.safetensors")
     print(f"weights: {options.out / 'field.safetensors'}")
 

@@ -1,4 +1,4 @@
-"""The paper's tables and figures on a dataset of your own choice, as CSV, Markdown and pictures.
+"""Measure the paper's tables and figures on a dataset, as CSV, Markdown and pictures.
 
     python scripts/paper/reproduce_paper.py TABLE pascal3d|bop|web ROOT --out DIR
 
@@ -12,8 +12,8 @@ TABLE is one of
 - ranks: precision at rank 1, 3, 5, 10, 20, in both readings
 - all
 
-Every table says what was measured and on how many photographs. Only objects that are neither occluded nor truncated
-take part, as in the paper.
+Every table states what was measured and the number of photographs. Only objects that are neither occluded nor
+truncated are used, as in the paper.
 """
 
 import argparse
@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument("kind", choices=DATASETS)
     result.add_argument("root", type=Path, metavar="ROOT")
     result.add_argument("--out", type=Path, required=True, metavar="DIR")
-    result.add_argument("--limit", type=int, metavar="N", help="only N photographs, spread evenly over the set")
+    result.add_argument("--limit", type=int, metavar="N", help="use N photographs, spread evenly over the set")
     result.add_argument("--image-size", type=int, default=128, metavar="PX", help="side of crops (default: 128)")
     result.add_argument("--eps", type=float, default=2.0, metavar="PX", help="radius of a hit in the crop (default: 2)")
     result.add_argument("--pose", choices=("upright", "any"), help="views of the banks (default: the dataset's)")
@@ -68,12 +68,12 @@ def run(arguments: argparse.Namespace) -> None:
     if any(name in wanted for name in RANKINGS):
         views = Pipeline().with_pose_prior(arguments.pose or DATASETS[arguments.kind].pose).views.sphere()
         rankings = paper.rank_views(cases, views, settings, progress)
-        made = {
+        tables_of = {
             "precision": lambda: [paper.precision_table(rankings)],
             "angles": lambda: [paper.angle_table(rankings)],
             "ranks": lambda: paper.rank_tables(rankings),
         }
-        tables += [table for name in RANKINGS if name in wanted for table in made[name]()]
+        tables += [table for name in RANKINGS if name in wanted for table in tables_of[name]()]
     for table in tables:
         paper.write_table(table, arguments.out)
         print(table.markdown())

@@ -1,4 +1,4 @@
-"""The scripts of ``datasets/``: against the generated trees, and against a server of our own on this machine."""
+"""Scripts of ``datasets/``, with generated trees and a local server."""
 
 import hashlib
 import importlib.util
@@ -32,12 +32,9 @@ def test_help(name, monkeypatch, capsys):
     with pytest.raises(SystemExit) as stop:
         runpy.run_path(str(SCRIPTS / f"{name}.py"), run_name="__main__")
     assert not stop.value.code
-    told = capsys.readouterr()
-    assert "Exit code" in told.out or "manifest" in told.out
-    assert not told.err
-
-
-# --- verify
+    output = capsys.readouterr()
+    assert "Exit code" in output.out or "manifest" in output.out
+    assert not output.err
 
 
 def test_verify_defective_trees(tmp_path, capsys):
@@ -51,7 +48,7 @@ def test_verify_defective_trees(tmp_path, capsys):
     assert "defect, missing_image: 1\n  car_pascal/2008_000009" in out
 
 
-def test_verify_sound_tree_and_its_photographs(tmp_path, capsys):
+def test_verify_tree_without_defects_and_with_a_truncated_photograph(tmp_path, capsys):
     verify = load("verify")
     write_pascal3d(tmp_path)
     arguments = ["pascal3d", str(tmp_path), "--categories", "sofa", "--images"]
@@ -65,9 +62,6 @@ def test_verify_sound_tree_and_its_photographs(tmp_path, capsys):
 def test_verify_unusable_tree(tmp_path, capsys):
     assert load("verify").main(["bop", str(tmp_path)]) == 2
     assert "datasets/bop/README.md" in capsys.readouterr().err
-
-
-# --- convert_objectnet3d
 
 
 @pytest.mark.parametrize("cad", ["CAD/off", "CAD"])
@@ -97,8 +91,6 @@ def test_convert_objectnet3d(tmp_path, cad, capsys):
     assert convert.main([str(tmp_path / "nothing"), str(out)]) == 2
 
 
-# --- download
-
 CONTENT = bytes(range(256)) * 40
 
 
@@ -109,10 +101,10 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self):
         cls = type(self)
-        begin, asked = 0, self.headers.get("Range")
-        cls.ranges.append(asked)
-        if asked and self.headers.get("If-Range") == cls.tag:
-            begin = int(asked.removeprefix("bytes=").removesuffix("-"))
+        begin, requested = 0, self.headers.get("Range")
+        cls.ranges.append(requested)
+        if requested and self.headers.get("If-Range") == cls.tag:
+            begin = int(requested.removeprefix("bytes=").removesuffix("-"))
             if begin >= len(cls.content):
                 self.send_error(416)
                 return
@@ -149,7 +141,7 @@ def test_download_records_then_verifies(tmp_path, server, capsys):
         "set a.zip": {"url": url, "size": len(CONTENT), "sha256": hashlib.sha256(CONTENT).hexdigest()}
     }
     assert main([url, "--out", str(tmp_path / "new")]) == 0
-    assert len(handler.ranges) == 1, "the second run fetches nothing"
+    assert len(handler.ranges) == 1, "the second run downloads nothing"
     assert capsys.readouterr().out.splitlines() == ["set a.zip: downloaded", "set a.zip: verified"]
     (tmp_path / "new" / "set a.zip").write_bytes(b"changed")
     assert main([url, "--out", str(tmp_path / "new")]) == 1
@@ -179,7 +171,7 @@ def test_download_starts_again_when_the_file_changed(tmp_path, server):
     assert (tmp_path / "set a.zip").read_bytes() == CONTENT[::-1]
 
 
-def test_download_with_everything_but_the_name_done(tmp_path, server):
+def test_download_completes_a_finished_part(tmp_path, server):
     handler, url = server
     (tmp_path / "set a.zip.part").write_bytes(CONTENT)
     (tmp_path / "set a.zip.part.validator").write_text(handler.tag)

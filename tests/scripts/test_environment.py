@@ -1,4 +1,4 @@
-"""What the scripts of a clean machine install, and what they say where they cannot: with a pretended Python."""
+"""``scripts/_environment.sh`` with a fake Python: what it installs, and its error messages."""
 
 import os
 import subprocess
@@ -10,9 +10,9 @@ REPOSITORY = Path(__file__).parents[2]
 
 
 def source(tmp_path: Path, python: str, *, venv: bool = True, gpu: bool = False) -> tuple[int, str, list[str]]:
-    """Exit code, output and the calls of pip of ``_environment.sh`` with ``python``, the body of a shell script."""
-    made = tmp_path / "venv" / "bin" / "python" if venv else tmp_path / "python"
-    for path, body in ((made, python), (tmp_path / "bin" / "nvidia-smi", f"exit {int(not gpu)}")):
+    """Exit code, output and pip calls of the script; ``python`` is the shell body of the fake Python."""
+    fake = tmp_path / "venv" / "bin" / "python" if venv else tmp_path / "python"
+    for path, body in ((fake, python), (tmp_path / "bin" / "nvidia-smi", f"exit {int(not gpu)}")):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(f'#!/bin/sh\necho "$*" >> {tmp_path}/calls\n{body}\n')
         path.chmod(0o755)
@@ -38,7 +38,7 @@ NO_TORCH = 'case "$*" in *"import torch"*) exit 1;; *versions*) echo "{versions}
         ("2.15.0, 2.14.1+cpu", True, ""),
     ],
 )
-def test_the_cpu_build_is_taken_where_there_is_one_and_no_gpu(
+def test_environment_installs_the_cpu_build_without_a_gpu(
     tmp_path: Path, versions: str, gpu: bool, installed: str
 ) -> None:
     listing = f"torch (2.15.0)\nAvailable versions: {versions}"
@@ -51,7 +51,7 @@ def test_the_cpu_build_is_taken_where_there_is_one_and_no_gpu(
     assert library == "install -e .[dev]"
 
 
-def test_torch_that_is_there_stays(tmp_path: Path) -> None:
+def test_environment_does_not_reinstall_torch(tmp_path: Path) -> None:
     assert source(tmp_path, "exit 0") == (0, "", ["--version", "install -e .[dev]"])
 
 
@@ -63,7 +63,7 @@ def test_torch_that_is_there_stays(tmp_path: Path) -> None:
         ('case "$*" in "-m venv"*) exit 1;; esac', "set CURVIREG_VENV to a folder that can be written"),
     ],
 )
-def test_pythons_that_will_not_do(tmp_path: Path, python: str, message: str) -> None:
+def test_environment_rejects_unsuitable_pythons(tmp_path: Path, python: str, message: str) -> None:
     code, output, _ = source(tmp_path, python, venv=False)
     assert code == 1
     assert message in output
@@ -71,7 +71,7 @@ def test_pythons_that_will_not_do(tmp_path: Path, python: str, message: str) -> 
     assert not (tmp_path / "venv").exists()
 
 
-def test_half_made_environments(tmp_path: Path) -> None:
+def test_environment_reports_a_broken_virtual_environment(tmp_path: Path) -> None:
     code, output, _ = source(tmp_path, 'case "$*" in *pip*) exit 1;; esac')
     assert code == 1
     assert "remove it" in output

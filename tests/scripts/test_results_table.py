@@ -1,3 +1,5 @@
+"""``scripts/results_table.py``: the README's table from recorded summaries."""
+
 import json
 import subprocess
 import sys
@@ -5,19 +7,20 @@ import sys
 import pytest
 
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, evaluate
-from tests._support.scripts import imported
+from curvireg_torch.pipeline import DEFAULT, PRESETS
+from scripts import results_table
+from tests.evaluation.small import SMALL
 
 
 @pytest.fixture
 def run(monkeypatch):
-    """The script's exit code for a repository and words."""
-    with imported("scripts.results_table") as script:
+    """Run the script on a repository; returns its exit code."""
 
-        def exit_code(root, *words):
-            monkeypatch.setattr(sys, "argv", ["results_table.py", "--root", str(root), *map(str, words)])
-            return script.main()
+    def exit_code(root, *words):
+        monkeypatch.setattr(sys, "argv", ["results_table.py", "--root", str(root), *map(str, words)])
+        return results_table.main()
 
-        yield exit_code
+    return exit_code
 
 
 @pytest.fixture
@@ -28,14 +31,16 @@ def repository(tmp_path):
     return root
 
 
-def test_table_from_summaries(run, repository, pascal, bop, tmp_path):
+def test_results_table_from_summaries(run, repository, pascal, bop, tmp_path, monkeypatch):
+    monkeypatch.setitem(PRESETS, DEFAULT, SMALL)
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
     for name, benchmark in (
         ("mini", Pascal3DBenchmark(pascal, Protocol())),
         ("cubes", BOPBenchmark(bop, Protocol(pose="any", box=0.1))),
     ):
         evaluate(benchmark, tmp_path / name, progress=False)
         assert run(repository, "--record", tmp_path / name / "summary.json", name) == 0
-    assert run(repository, "--check") == 1, "the README still has the old table"
+    assert run(repository, "--check") == 1, "the README has the old table"
     assert run(repository) == 0
     assert run(repository, "--check") == 0
     text = (repository / "README.md").read_text()
@@ -52,25 +57,24 @@ def test_table_from_summaries(run, repository, pascal, bop, tmp_path):
     assert (repository / "README.md").read_text() == text
 
 
-def test_objects_that_were_photographed_under_several_lightings_are_told():
-    with imported("scripts.results_table") as script:
-        assert script.counted("hope", 80) == "80 (16 views x 5 lightings)"
-        assert script.counted("hope", 12) == "12", "a limited run"
-        assert script.counted("dino", 105) == "105"
+def test_counted_names_views_and_lightings():
+    assert results_table.counted("hope", 80) == "80 (16 views x 5 lightings)"
+    assert results_table.counted("hope", 12) == "12", "a limited run"
+    assert results_table.counted("dino", 105) == "105"
 
 
-def test_readme_without_markers(run, repository, capsys):
+def test_results_table_rejects_a_readme_without_markers(run, repository, capsys):
     repository.joinpath("README.md").write_text("# Title\n")
     assert run(repository) == 2
     assert "results:begin" in capsys.readouterr().err
 
 
-def test_no_results_no_table(run, repository):
+def test_results_table_is_empty_without_results(run, repository):
     assert run(repository) == 0
     assert "<!-- results:begin -->\n<!-- results:end -->" in (repository / "README.md").read_text()
 
 
-def test_commit_is_kept(run, repository, tmp_path):
+def test_record_stores_the_commit(run, repository, tmp_path):
     tmp_path.joinpath("summary.json").write_text("{}")
     run(repository, "--record", tmp_path / "summary.json", "x")
     path = repository / "scripts" / "results" / "evaluation_x.json"
@@ -85,7 +89,7 @@ def test_commit_is_kept(run, repository, tmp_path):
     subprocess.run([*git, "add", "scripts"], check=True)
     repository.joinpath("README.md").write_text("changed")
     run(repository, "--record", tmp_path / "summary.json", "x")
-    assert json.loads(path.read_text())["commit"] == clean, "no measurement depends on what the script itself writes"
+    assert json.loads(path.read_text())["commit"] == clean, "measurements do not depend on files that scripts write"
     (repository / "code.py").write_text("x = 2\n")
     run(repository, "--record", tmp_path / "summary.json", "x")
     assert json.loads(path.read_text())["commit"] == clean + "+"

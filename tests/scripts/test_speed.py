@@ -9,7 +9,7 @@ import torch
 
 from curvireg_torch import Pipeline, Registrar, ViewMatcher
 from curvireg_torch.settings import BankSettings, ViewPolicy
-from scripts.speed import pipeline
+from scripts.speed import filters, pipeline
 from tests._support.pretended import PRETENDING, pretended_gpu
 from tests._support.scenes import scene, truck_bank
 
@@ -73,3 +73,18 @@ def test_pages_have_the_recorded_tables():
     assert f"<!-- pipeline:begin -->\n{table}<!-- pipeline:end -->" in page
     table = location.table(json.loads(location.RECORD.read_text(encoding="utf-8")))
     assert f"<!-- location:begin -->\n{table}<!-- location:end -->" in location.PAGE.read_text(encoding="utf-8")
+
+
+def test_filters_script_compares_equal_functions(tmp_path):
+    out, page = tmp_path / "filters.json", tmp_path / "page.md"
+    filters.main(["--batch", "1", "--size", "48", "--repetitions", "1", "--no-compile", "--out", str(out)])
+    record = json.loads(out.read_text(encoding="utf-8"))
+    assert set(record["blocks"]) == set(filters.BLOCKS)
+    assert all(row["max_difference"] < 1e-5 for row in record["blocks"].values())
+    assert set(record["layers"]) == set(filters.LAYERS)
+    assert all(row["near_contour"] > 0.7 for row in record["mcs_smoothing"].values())
+    page.write_text("<!-- layers:begin -->\nold\n<!-- layers:end -->\n", encoding="utf-8")
+    filters.write_tables(record, page)
+    text = page.read_text(encoding="utf-8")
+    assert "old" not in text
+    assert all(f"| {name} |" in text for name in (*filters.BLOCKS, *filters.LAYERS))
