@@ -1,4 +1,8 @@
-"""The command ``curvireg``: one module per command, which imports what is heavy only when the command runs."""
+"""The command ``curvireg``.
+
+Each command is a module with ``add_parser`` and ``run``. It imports heavy modules only in ``run``, so that help and
+errors in options appear at once. ``run`` raises :class:`CurviregError` for input that cannot be used.
+"""
 
 import argparse
 import os

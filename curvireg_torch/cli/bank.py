@@ -36,11 +36,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Build and save a bank.
-
-    Raises:
-        CurviregError: the mesh or an option cannot be used, or a file cannot be written.
-    """
+    """Build and save a bank."""
     check_given([], [arguments.mesh])
     check_writable(arguments.out.parent, "--out")
     if arguments.adapt is not None:

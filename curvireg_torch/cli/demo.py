@@ -25,11 +25,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Generate a photograph of the example mesh, register it and print the error.
-
-    Raises:
-        CurviregError: an option cannot be used, or a file cannot be written.
-    """
+    """Generate a photograph of the example mesh, register it and print the error."""
     check_writable(arguments.out, "--out")
     import torch
 

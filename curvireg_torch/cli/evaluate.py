@@ -30,8 +30,7 @@ def add_parser(commands: Any) -> None:
             name,
             parents=[common_options()],
             help=kind.help,
-            description="Writes DIR/summary.json, DIR/predictions.csv and, while it runs, DIR/predictions; the same "
-            "command resumes.",
+            description="Writes DIR/summary.json and DIR/predictions.csv; the same command resumes if interrupted.",
             **examples(
                 f"curvireg evaluate {name} {kind.example} --out out/{name}",
                 f"curvireg evaluate {name} {kind.example} --jobs 2 --limit 100 --preset fast --out out/{name}-fast",
@@ -57,11 +56,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Evaluate a dataset and print the headline.
-
-    Raises:
-        CurviregError: the dataset is missing, an option is out of range, or the folder holds other results.
-    """
+    """Evaluate a dataset and print the headline."""
     from ..evaluation.workers import run_processes
 
     if run_processes(arguments.jobs, arguments.argv):

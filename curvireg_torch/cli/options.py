@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
 from ..utils.choices import DEFAULT, PRESET_NAMES, RENDERER_NAMES, UNITS, UP_AXES
 
@@ -27,26 +27,12 @@ _COUNTS = {"--box": 4, "--camera": 4, "--distance": 2}
 _NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
 
-class _Help(TypedDict):
-    epilog: str
-    formatter_class: type[argparse.HelpFormatter]
-
-
-class _Formatter(argparse.RawDescriptionHelpFormatter):
-    """Keeps the lines of the examples and wraps everything else."""
-
-    def _fill_text(self, text: str, width: int, indent: str) -> str:
-        keep = text.startswith("examples:")
-        return (
-            super()._fill_text(text, width, indent)
-            if keep
-            else argparse.HelpFormatter._fill_text(self, text, width, indent)
-        )
-
-
-def examples(*lines: str) -> _Help:
+def examples(*lines: str) -> dict[str, Any]:
     """Arguments for ``add_parser`` that show these command lines below the help."""
-    return {"epilog": "\n  ".join(["examples:", *lines]), "formatter_class": _Formatter}
+    return {
+        "epilog": "\n  ".join(["examples:", *lines]),
+        "formatter_class": argparse.RawDescriptionHelpFormatter,
+    }
 
 
 def common_options() -> argparse.ArgumentParser:

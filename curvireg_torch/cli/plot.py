@@ -55,46 +55,39 @@ def add_parser(commands: Any) -> None:
         ),
     )
     kinds = plot.add_subparsers(required=True, metavar="KIND")
-    for kind, text in {**REGISTERED, **EVALUATED, **TABLES}.items():
-        source = "photo.jpg part.stl" if kind in REGISTERED else "table.csv" if kind in TABLES else "results/pascal3d"
-        formats = _formats(kind)
-        parser = kinds.add_parser(
-            kind,
-            parents=[common_options(), *([pipeline_options(), mesh_options()] if kind in REGISTERED else [])],
-            help=text,
-            **examples(f"curvireg plot {kind} {source} --out {kind}{formats[0]}"),
-        )
-        if kind in REGISTERED:
-            parser.add_argument("photo", type=Path, metavar="PHOTO")
-            parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh or a bank")
-            add_box_and_camera(parser)
-        elif kind in EVALUATED:
-            sets = "pascal3d, bop or web" if kind == "sheet" else "pascal3d or web"
-            parser.add_argument("source", type=Path, metavar="DIR", help=f"of curvireg evaluate {sets}")
-        else:
-            parser.add_argument("source", type=Path, metavar="FILE.csv")
+    for kind, text in REGISTERED.items():
+        parser = _add_kind(kinds, kind, text, "photo.jpg part.stl", pipeline_options(), mesh_options())
+        parser.add_argument("photo", type=Path, metavar="PHOTO")
+        parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh or a bank")
+        add_box_and_camera(parser)
+    for kind, text in EVALUATED.items():
+        parser = _add_kind(kinds, kind, text, "results/pascal3d")
+        sets = "pascal3d, bop or web" if kind == "sheet" else "pascal3d or web"
+        parser.add_argument("source", type=Path, metavar="DIR", help=f"of curvireg evaluate {sets}")
         if kind == "confusion":
-            parser.add_argument(
-                "--bins", type=int, default=8, choices=(4, 8, 16, 24), help="of the circle (default: 8)"
-            )
-        elif kind in EVALUATED:
+            parser.add_argument("--bins", type=int, default=8, choices=(4, 8, 16, 24), help="number (default: 8)")
+        else:
             parser.add_argument(
                 "--within", type=float, default=30.0, metavar="DEG", help="largest right error (default: 30)"
             )
         if kind == "sheet":
-            parser.add_argument(
-                "--each", type=int, default=30, metavar="N", help="of the best, and of the worst (default: 30)"
-            )
-        parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=", ".join(formats))
-        parser.set_defaults(run=run, kind=kind)
+            parser.add_argument("--each", type=int, default=30, metavar="N", help="best and worst (default: 30)")
+    for kind, text in TABLES.items():
+        parser = _add_kind(kinds, kind, text, "table.csv")
+        parser.add_argument("source", type=Path, metavar="FILE.csv")
+
+
+def _add_kind(kinds: Any, kind: str, text: str, source: str, *parents: argparse.ArgumentParser) -> Any:
+    formats = _formats(kind)
+    example = examples(f"curvireg plot {kind} {source} --out {kind}{formats[0]}")
+    parser = kinds.add_parser(kind, parents=[common_options(), *parents], help=text, **example)
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=", ".join(formats))
+    parser.set_defaults(run=run, kind=kind)
+    return parser
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Draw one figure.
-
-    Raises:
-        CurviregError: a file is missing or cannot be used, or matplotlib is not installed.
-    """
+    """Draw one figure."""
     kind, out, formats = arguments.kind, arguments.out, _formats(arguments.kind)
     if kind in REGISTERED:
         check_given([arguments.photo], [arguments.mesh])
@@ -109,11 +102,9 @@ def run(arguments: argparse.Namespace) -> None:
     if kind in REGISTERED:
         figure = _registration_figure(kind, register_options(arguments, [arguments.photo], [arguments.mesh]))
     elif kind in TABLES:
-        figure = _table_figure(kind, arguments.source)
-    elif kind == "confusion":
-        figure = _confusion_figure(arguments.source / "predictions.csv", arguments.bins)
+        figure = _table_figure(kind, _Table(arguments.source))
     else:
-        figure = _error_figure(kind, arguments.source / "predictions.csv", arguments.within)
+        figure = _evaluation_figure(kind, _Table(arguments.source / "predictions.csv"), arguments)
     content = BytesIO()
     figure.savefig(content, format=out.suffix[1:].lower(), dpi=150)
     write_file(out, content.getvalue())
@@ -142,32 +133,25 @@ def _registration_figure(kind: str, options: "RegisterOptions") -> Any:
     return plots.fields(registrar, result, photo.image, torch.tensor(used_box(document)))
 
 
-def _table_figure(kind: str, path: Path) -> Any:
+def _table_figure(kind: str, table: "_Table") -> Any:
     from ..visualization import plots
 
-    table = _Table(path)
     first: Callable[[str], str | float] = str if kind == "bars" else table.number
     rows = [[first(row[0]), *map(table.number, row[1:])] for row in table.rows]
     return getattr(plots, kind)(table.columns, rows)
 
 
-def _confusion_figure(path: Path, bins: int) -> Any:
+def _evaluation_figure(kind: str, table: "_Table", arguments: argparse.Namespace) -> Any:
     from ..visualization import plots
 
-    table = _Table(path)
-    return plots.azimuth_confusion(table.numbers("azimuth"), table.numbers("true_azimuth"), bins=bins)
-
-
-def _error_figure(kind: str, path: Path, within_deg: float) -> Any:
-    from ..visualization import plots
-
-    table = _Table(path)
+    if kind == "confusion":
+        return plots.azimuth_confusion(table.numbers("azimuth"), table.numbers("true_azimuth"), bins=arguments.bins)
     errors = table.numbers("error_deg")
     if kind == "classes":
-        return plots.errors_by_class(table.column("category"), errors, threshold_deg=within_deg)
+        return plots.errors_by_class(table.column("category"), errors, threshold_deg=arguments.within)
     confidence = table.numbers("confidence").nan_to_num()  # a failed object has no confidence
     plot = plots.reliability if kind == "reliability" else plots.risk_coverage
-    return plot(confidence, errors < within_deg)
+    return plot(confidence, errors < arguments.within)
 
 
 class _Table:

@@ -36,8 +36,8 @@ def add_parser(commands: Any) -> None:
         help="find the pose of MESH in PHOTO",
         usage="curvireg register PHOTO... MESH --out DIR [options]\n       "
         "curvireg register --list LIST [MESH] --out DIR [options]",
-        description="One photograph: writes DIR/result.json, DIR/overlay.png and DIR/pose.glb. Several, or a list: "
-        "DIR/results.csv, DIR/results.jsonl and DIR/index.html; after an interruption the same command resumes.",
+        description="One photograph: writes DIR/result.json, DIR/overlay.png and DIR/pose.glb.\nSeveral, or a list: "
+        "DIR/results.csv, DIR/results.jsonl and DIR/index.html;\nafter an interruption the same command resumes.",
         **examples(
             "curvireg register photo.jpg part.stl --unit mm --box 410 220 890 700 --out out/part",
             "curvireg register photo.jpg part.stl --camera 1450 1450 960 540 --json",
@@ -130,11 +130,7 @@ def complete(arguments: argparse.Namespace) -> str | None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Register one photograph, or several.
-
-    Raises:
-        CurviregError: a file or an option cannot be used, or no photograph could be registered.
-    """
+    """Register one photograph, or several."""
     check_given(arguments.photos, arguments.meshes, arguments.list)
     from ..evaluation.opening import check_camera
     from ..evaluation.workers import run_processes

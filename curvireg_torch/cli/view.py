@@ -43,12 +43,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Serve the page until Ctrl-C.
-
-    Raises:
-        MissingDependencyError: NiceGUI or matplotlib is not installed.
-        CurviregError: the photograph, the mesh or an option cannot be used.
-    """
+    """Serve the page until Ctrl-C."""
     photos, meshes = ([path] if path else [] for path in (arguments.photo, arguments.mesh))
     check_given(photos, meshes)
     try:

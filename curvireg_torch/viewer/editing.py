@@ -35,8 +35,7 @@ def move_displayed(
     """Rotate and move the object.
 
     Args:
-        registrar: of the pose.
-        displayed: the pose.
+        registrar, displayed: the pose.
         rotation: degrees about the camera's x, y and z axes through the object's centre.
         translation: along these axes, in units of the object's radius.
 
@@ -58,14 +57,7 @@ def move_displayed(
 
 
 def fit_displayed(registrar: Registrar, displayed: DisplayedPose, image: Tensor, box: Tensor) -> DisplayedPose:
-    """Fit the contours of the mesh at the pose to the edges of the photograph, as :func:`fit_contours` does.
-
-    Args:
-        registrar: of the pose.
-        displayed: the pose.
-        image: (3, H, W).
-        box: (4,) px.
-    """
+    """Fit the mesh's contours to the edges of an image (3, H, W) with a box (4,), see :func:`fit_contours`."""
     describer = registrar.describers[displayed.pose.model]
     T, K = displayed.pose.projection
     fit = fit_contours(
