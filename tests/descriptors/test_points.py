@@ -23,7 +23,7 @@ def _line(angle: float) -> torch.Tensor:
 
 @pytest.mark.parametrize("angle", [0.0, 20.0, 45.0, 70.0, 90.0, 135.0, 160.0])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_ridge_becomes_a_thin_line(angle: float, sign: float) -> None:
+def test_field_points_of_a_ridge_are_a_thin_line(angle: float, sign: float) -> None:
     points = field_points(sign * _line(angle)[None], fraction=1.0, threshold=0.5)[0, 0]
     y, x = (points.nonzero().T - 20).float()
     a = torch.tensor(angle).deg2rad()
@@ -34,7 +34,7 @@ def test_a_ridge_becomes_a_thin_line(angle: float, sign: float) -> None:
 
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 1000), fraction=st.floats(0.01, 0.3))
-def test_share_limits_each_image_by_itself_and_keeps_the_longest(seed: int, fraction: float) -> None:
+def test_field_points_fraction_selects_the_longest_of_each_image(seed: int, fraction: float) -> None:
     field = image_gradient(photos(3, 24, seed=seed, dtype=torch.float64))
     field = field * torch.tensor([1.0, 0.01, 5.0]).view(3, 1, 1, 1)
     points = field_points(field, fraction=fraction)
@@ -47,14 +47,14 @@ def test_share_limits_each_image_by_itself_and_keeps_the_longest(seed: int, frac
             assert float(v[p].min()) >= float(v[e & ~p].max())
 
 
-def test_threshold_and_no_suppression() -> None:
+def test_field_points_threshold_without_suppression() -> None:
     field = torch.zeros(1, 2, 1, 6)
     field[0, 1, 0] = torch.tensor([0.0, 1.0, 2.0, 3.0, 2.0, 1.0])
     assert field_points(field, fraction=1.0, suppress=False)[0, 0, 0].tolist() == [False, True, True, True, True, True]
     assert field_points(field, fraction=1.0, suppress=False, threshold=1.5).sum() == 3
 
 
-def test_nothing_has_no_points_and_bad_input_is_refused() -> None:
+def test_field_points_of_zero_fields_and_bad_input() -> None:
     assert not field_points(torch.zeros(2, 2, 8, 8)).any()
     assert field_points(torch.zeros(0, 2, 8, 8)).shape == (0, 1, 8, 8)
     with pytest.raises(InvalidInputError, match="fraction"):
@@ -63,7 +63,7 @@ def test_nothing_has_no_points_and_bad_input_is_refused() -> None:
         field_points(torch.zeros(1, 2, 8, 8), threshold=-1.0)
 
 
-def test_a_share_of_less_than_a_pixel_keeps_the_strongest() -> None:
+def test_field_points_of_a_fraction_below_one_pixel() -> None:
     field = torch.zeros(1, 2, 1, 9)
     field[0, 0, 0, [1, 4, 7]] = torch.tensor([1.0, 3.0, 2.0])
     assert field_points(field, fraction=1e-3, suppress=False)[0, 0, 0].nonzero().flatten().tolist() == [4]

@@ -1,0 +1,92 @@
+"""Photograph layers on edges, lines and ramps with known results."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from curvireg_torch import filters
+
+from .layer_cases import grid
+
+
+def _edge(sigma: float, offset: float, size: int = 81) -> Tensor:
+    x, _ = grid(size)
+    return (0.2 + 0.6 * 0.5 * (1.0 + torch.erf((x - offset) / (sigma * math.sqrt(2.0)))))[None, None]
+
+
+@pytest.mark.parametrize("mode", ["reblur-image", "reblur-saliency"])
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 3.0, 4.0])
+@pytest.mark.parametrize("transposed", [False, True])
+def test_edge_blur_of_a_step_edge(mode: str, sigma: float, transposed: bool) -> None:
+    image = _edge(sigma, 0.0)
+    blur = filters.edge_blur(image.mT if transposed else image, mode=mode)[0, :, 40, 40]
+    torch.testing.assert_close(blur, torch.full_like(blur, sigma), rtol=0.02, atol=0.0)
+
+
+def test_multiscale_focus_curves_rank_edges_by_sharpness() -> None:
+    x, _ = grid(121)
+    sharp, blurred = (torch.erf((x - c) / (s * math.sqrt(2.0))) for c, s in ((-30.0, 1.0), (30.0, 3.0)))
+    field = filters.multiscale_focus_curves((0.5 + 0.2 * (sharp - blurred))[None, None], saliency_weight=False)
+    focus = field[0, :, 60].norm(dim=0)
+    assert float(1 / focus[30]) == pytest.approx(math.sqrt(1 + 1), rel=0.03)  # includes the pre-smoothing of 1 px
+    assert float(1 / focus[90]) == pytest.approx(math.sqrt(9 + 1), rel=0.03)
+
+
+@pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0, 3.0])
+def test_multiscale_focus_curves_are_limited_by_sigma_on_edges(sigma: float) -> None:
+    step = (torch.arange(65.0) > 32).to(torch.float64).expand(1, 1, 65, 65)
+    noise = torch.rand(1, 1, 65, 65, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    of_step, of_noise = (
+        float(filters.multiscale_focus_curves(x, sigma=sigma, saliency_weight=0.0).norm(dim=1).max())
+        for x in (step, noise)
+    )
+    assert 0.7 / sigma < of_step <= 1.0 / sigma
+    assert of_noise == pytest.approx(1.0 / 0.6, rel=1e-3)
+
+
+def test_image_gradient_and_curvilinear_saliency_of_a_ramp() -> None:
+    x, y = grid(33)
+    ramp = (0.03 * x - 0.04 * y)[None, None]
+    inner = (..., slice(6, -6), slice(6, -6))
+    gradient = filters.image_gradient(ramp)[inner]
+    saliency = filters.image_curvilinear_saliency(ramp)[inner]
+    want = torch.tensor([0.03, -0.04], dtype=torch.float64).view(1, 2, 1, 1).expand_as(gradient)
+    torch.testing.assert_close(gradient, want)
+    torch.testing.assert_close(saliency, want * 0.05)
+
+
+def test_principal_curvature_image_of_dark_and_bright_lines() -> None:
+    x, _ = grid(65)
+    bright = torch.exp(-0.5 * (x / 2.0) ** 2)[None, None]
+    for image, right, wrong in ((1 - bright, "largest", "smallest"), (bright, "smallest", "largest")):
+        field = filters.principal_curvature_image(image, eigenvalue=right)[0, :, 32]
+        other = filters.principal_curvature_image(image, eigenvalue=wrong)[0, :, 32]
+        assert int(field.norm(dim=0).argmax()) == 32
+        assert float(other[:, 32].norm()) < 1e-9
+        # s^2 2 / (4 + s^2)^1.5 is largest at s = 2 sqrt 2, so the scale of 2.8 px has the maximum.
+        assert float(field[:, 32].norm()) == pytest.approx(2.8**2 * 2 / (4 + 2.8**2) ** 1.5, rel=0.03)
+        assert float(field[1, 32].abs()) < 1e-9
+
+
+@pytest.mark.parametrize(("dtype", "ulp"), [(torch.float16, 2**-11), (torch.bfloat16, 2**-8)])
+@pytest.mark.parametrize("sigma", [1.0, 8.0, torch.tensor(3.0)])
+def test_gaussian_smooth_rounds_half_types_once(dtype: torch.dtype, ulp: float, sigma: float | Tensor) -> None:
+    x = torch.rand(1, 2, 64, 64, generator=torch.Generator().manual_seed(0)).to(dtype)
+    smooth = filters.gaussian_smooth(x, sigma)
+    assert smooth.dtype == dtype
+    exact = filters.gaussian_smooth(x.double(), sigma)
+    assert float((smooth.double() - exact).abs().max()) <= 0.51 * ulp  # half a unit in the last place of 0.5 to 1
+
+
+def test_principal_curvature_image_has_the_direction_of_the_best_scale() -> None:
+    """Length and direction together are those of the single scale with the largest curvature."""
+    image = torch.rand(1, 1, 48, 48, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    sigmas = (1.0, 2.0, 4.0)
+    single = torch.cat([filters.principal_curvature_image(image, sigmas=[sigma]) for sigma in sigmas])
+    winner = single.norm(dim=1).argmax(dim=0)
+    assert len(winner.unique()) == 3
+    best = single.gather(0, winner.expand(1, 2, -1, -1))
+    found = filters.principal_curvature_image(image, sigmas=sigmas)
+    torch.testing.assert_close((found * best).sum(dim=1).abs(), best.square().sum(dim=1))  # the sign is free
