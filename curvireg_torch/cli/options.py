@@ -1,4 +1,4 @@
-"""Options that several commands share, and what is read from them."""
+"""Options of several commands, and how they are read."""
 
 import argparse
 import re

@@ -31,7 +31,7 @@ REGISTERED = {
 EVALUATED = {
     "confusion": "azimuth bins, true against estimated",
     "reliability": "fraction of right results over confidence",
-    "risk": "fraction of wrong results over the fraction that is kept, by confidence",
+    "risk": "fraction of wrong results over the fraction of results kept, by confidence",
     "classes": "every error, class by class",
     "sheet": "a page of the best and the worst photographs, with the contours at the estimated poses",
 }

@@ -74,7 +74,7 @@ def _localize_one(
 ) -> list[_Result]:
     if not isinstance(item, ImageItem):
         return [FailedRegistration(item)]
-    estimator.report_progress("looking")
+    estimator.report_progress("localization")
     try:
         check_crop(_extremes(item.image))
         cameras = None if item.camera_matrix is None else [item.camera_matrix]

@@ -43,7 +43,7 @@ class Registrar(PoseEstimator):
         symmetries: (S, 4, 4) of the mesh, from :func:`curvireg_torch.geometry.symmetry_transforms`; hypotheses that
             differ by one of them are reported once.
         device: of modules, bank and search.
-        progress: True shows bars. A callback gets (stage, done, total), with the stages "looking" (without a box),
+        progress: True shows bars. A callback gets (stage, done, total), with the stages "localization" (without a box),
             "bank", "ranking", "search" and "contours"; it may raise to cancel. On a CPU photographs are registered in
             parallel: callback, custom renderer and custom field are then called from several threads.
 

@@ -23,7 +23,7 @@ WORKER = ThreadPoolExecutor(1, thread_name_prefix="viewer")
 
 STAGES = {
     "bank": "rendering views",
-    "looking": "localizing the object",
+    "localization": "localizing the object",
     "ranking": "ranking views",
     "search": "searching",
     "contours": "fitting contours",

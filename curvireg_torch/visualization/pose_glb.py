@@ -21,7 +21,7 @@ from .overlay import to_uint8
 __all__ = ["pose_glb"]
 
 _PHOTO_SIDE = 1024
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's camera to glTF's: y up, looking along -z
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenCV's camera to glTF's, which has y up and looks along -z
 _MATT = {"name": "matt", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}, "doubleSided": True}
 
 

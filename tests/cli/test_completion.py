@@ -1,4 +1,4 @@
-"""``curvireg completion``: the shells themselves are asked for completions."""
+"""``curvireg completion``: the shells complete lines with its scripts."""
 
 import shutil
 import subprocess

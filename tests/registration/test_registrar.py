@@ -217,7 +217,7 @@ def test_progress_reports_stages_and_may_cancel():
     )
     assert calls == [("bank", 3, 8), ("bank", 6, 8), ("bank", 8, 8)]
     registrar = Registrar(bank, progress=lambda stage, *_: calls.append(stage))
-    for boxes, expected in ((BOX[None], []), (None, ["looking"])):
+    for boxes, expected in ((BOX[None], []), (None, ["localization"])):
         calls.clear()
         registrar([IMAGE], boxes, CAMERA)
         assert calls[: len(expected) + 3] == [*expected, "ranking", "search", "contours"]
@@ -230,7 +230,7 @@ def test_progress_reports_stages_and_may_cancel():
         ViewBank.build(example_mesh(), views, image_size=64, progress=cancel)
     with pytest.raises(InvalidInputError, match="cancelled in ranking"):
         Registrar(bank, progress=cancel)([IMAGE], BOX[None])
-    with pytest.raises(InvalidInputError, match="cancelled in looking"):
+    with pytest.raises(InvalidInputError, match="cancelled in localization"):
         Registrar(bank, progress=cancel)([IMAGE])
 
 

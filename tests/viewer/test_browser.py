@@ -193,7 +193,7 @@ def test_page_refuses_broken_and_hostile_files(browser, folder):
     browser.upload("mesh", folder / "hostile.obj")
     browser.wait(lambda: "hostile.obj" in browser.text("message"), "refusal")
     assert "NaN" in browser.text("message")
-    browser.click("register")  # the photograph and the mesh of before are kept
+    browser.click("register")  # the previous photograph and mesh remain
     browser.wait(lambda: browser.text("message") == "" and browser.text("stage") == "done", "answer")
 
 
