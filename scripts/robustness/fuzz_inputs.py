@@ -267,8 +267,7 @@ def tables(rng: np.random.Generator, folder: Path) -> None:
 def bank_bytes() -> bytes:
     views = cr.sample_views(azimuth_step=180, elevations=[20])
     bank = cr.ViewBank.build(example_mesh(), views, image_size=32, progress=False)
-    path = Path(tempfile.mkdtemp()) / "a.safetensors"
-    bank.save(path)
+    bank.save(path := Path(tempfile.mkdtemp()) / "a.safetensors")
     return path.read_bytes()
 
 

@@ -19,13 +19,13 @@ from curvireg_torch.training.scenes import GeneratedScenes
 
 @pytest.fixture(scope="module")
 def batch():
-    lessons = FieldDataset(GeneratedScenes(4, seed=1))
-    items = [lessons[i] for i in range(4)]
+    dataset = FieldDataset(GeneratedScenes(4, seed=1))
+    items = [dataset[i] for i in range(4)]
     stacked = {k: torch.stack([item[k] for item in items]).float() for k in items[0]}
     return {**stacked, "image": stacked["image"] / 255}
 
 
-def test_the_answers_are_those_of_the_banks_filters(batch):
+def test_field_dataset_targets_are_those_of_a_bank(batch):
     scenes = GeneratedScenes(4, seed=1)
     field = depth_filter(SETTINGS)(scenes[2]["depth"][None])
     assert torch.allclose(batch["descriptors"][2, 0], hog_layer(SETTINGS)(field)[0], atol=1e-3)
@@ -34,18 +34,18 @@ def test_the_answers_are_those_of_the_banks_filters(batch):
     assert same == pytest.approx(1.0, abs=1e-3)
 
 
-def test_the_right_answer_has_no_loss(batch):
+def test_losses_of_the_target_are_small(batch):
     mask = torch.logit(batch["mask"].clamp(1e-6, 1 - 1e-6))
     right = losses(torch.cat([batch["code"], mask], dim=1), batch)
-    nothing = losses(torch.zeros(4, 3, 64, 64), batch)
+    zero = losses(torch.zeros(4, 3, 64, 64), batch)
     assert right["field"] == 0
-    assert nothing["field"] == pytest.approx(1.0)
-    assert right["mask"] < nothing["mask"]
-    assert right["descriptor"] < 0.1 < nothing["descriptor"]
-    assert right["ranking"] < 0.01 < nothing["ranking"]
+    assert zero["field"] == pytest.approx(1.0)
+    assert right["mask"] < zero["mask"]
+    assert right["descriptor"] < 0.1 < zero["descriptor"]
+    assert right["ranking"] < 0.01 < zero["ranking"]
 
 
-def test_mirroring_keeps_answers_right(batch):
+def test_augment_mirrors_targets(batch):
     """All samples are mirrored, or none: the code's loss of a mirrored right answer stays 0."""
     found = set()
     for seed in range(6):
@@ -55,12 +55,12 @@ def test_mirroring_keeps_answers_right(batch):
         found.add(reflection)
         expected = one["code"].flip(3) * torch.tensor([1.0, -1.0])[:, None, None] if reflection else one["code"]
         assert torch.equal(other["code"], expected)
-        answer = torch.cat([other["code"], torch.zeros_like(other["mask"])], dim=1)
-        assert losses(answer, other)["descriptor"] < 0.1
+        output = torch.cat([other["code"], torch.zeros_like(other["mask"])], dim=1)
+        assert losses(output, other)["descriptor"] < 0.1
     assert found == {False, True}
 
 
-def test_replay_keeps_the_latest(batch):
+def test_replay_buffer_keeps_the_latest(batch):
     replay = ReplayBuffer(6)
     for k in range(4):
         replay.add({name: values[:2] * 0 + k for name, values in batch.items()})
@@ -69,7 +69,7 @@ def test_replay_keeps_the_latest(batch):
     assert (drawn["mask"][:2] == 3).all()
 
 
-def test_a_few_steps_lower_the_loss(batch):
+def test_losses_decrease_in_training(batch):
     torch.manual_seed(0)
     network = FieldNetwork((8, 8, 16, 16))
     optimizer = torch.optim.AdamW(network.parameters(), lr=3e-3)
@@ -84,7 +84,7 @@ def test_a_few_steps_lower_the_loss(batch):
     assert history[-1] < 0.7 * history[0]
 
 
-def test_adapting_changes_the_network_and_leaves_its_statistics():
+def test_adapt_changes_weights_but_no_statistics():
     mesh = trimesh.creation.box((1, 2, 3))
     before = FieldNetwork().state_dict().keys()
     field = adapt(mesh, scenes=8, workers=0, progress=False)
@@ -99,8 +99,8 @@ def test_adapting_changes_the_network_and_leaves_its_statistics():
     assert not any(p.requires_grad for p in field.network.parameters())
 
 
-def test_adapting_works_from_a_plain_script(tmp_path):
-    """One without ``if __name__ == "__main__":``, which a spawned process would run again."""
+def test_adapt_works_in_a_script_without_main_guard(tmp_path):
+    """A spawned process would run such a script again."""
     script = tmp_path / "plain.py"
     script.write_text(
         "import trimesh\n"
@@ -109,25 +109,19 @@ def test_adapting_works_from_a_plain_script(tmp_path):
         "print('done')\n"
     )
     root = Path(__file__).parents[2]
-    found = subprocess.run(
-        [sys.executable, script],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(root)},
-        capture_output=True,
-        text=True,
-    )
-    assert found.returncode == 0, found.stderr
-    assert found.stdout == "done\n"
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run([sys.executable, script], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "done\n"), done.stderr
     assert (tmp_path / "adapted.safetensors").is_file()
 
 
-def test_errors():
+def test_adapt_rejects_zero_scenes():
     with pytest.raises(InvalidInputError, match="scenes"):
         adapt(trimesh.creation.box(), scenes=0)
 
 
-def test_pictures_are_mirrored_with_their_answers():
-    """What is drawn in one half of a picture stays on the side of the mask, whatever becomes of its colours."""
+def test_augment_mirrors_images_with_their_masks():
+    """A pattern in one half of an image stays on the side of the mask, whatever its new colours."""
     B = 32
     image, mask = torch.full((B, 3, 16, 16), 0.5), torch.zeros(B, 1, 8, 8)
     image[..., ::2, :8] = 0.9

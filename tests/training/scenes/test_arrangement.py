@@ -1,4 +1,4 @@
-"""Scenes are drawn first and rendered after."""
+"""Random arrangements and their rendering."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ def drawn():
     return arrange(shape, [other, other], np.random.default_rng(7), size=48, upright=1.0)
 
 
-def test_a_scene_is_its_arrangement_photographed():
+def test_make_scene_renders_an_arrangement():
     shape = random_shape(np.random.default_rng(1), "table")
     rng = np.random.default_rng(5)
     apart = render_scene(arrange(shape, [], rng, size=32), rng)
@@ -25,14 +25,13 @@ def test_a_scene_is_its_arrangement_photographed():
     assert np.array_equal(apart.depth, whole.depth)
 
 
-def test_rendering_draws_nothing(drawn):
-    """The camera's faults apart, an arrangement has one picture."""
+def test_render_scene_is_deterministic(drawn):
     one, same = (render_scene(drawn, np.random.default_rng(3)) for _ in range(2))
     assert np.array_equal(one.image, same.image)
 
 
-def test_parts_of_an_arrangement_can_be_exchanged(drawn):
-    """Another light changes the picture and leaves the truth; without clutter more of the object is seen, not less."""
+def test_render_scene_with_other_light_or_without_clutter(drawn):
+    """Light changes the image only; without clutter no part of the object becomes invisible."""
     before = render_scene(drawn, np.random.default_rng(3))
     dark = dataclasses.replace(drawn.light, lamps=(), sky=(0.5, 0.0), reflection=None)
     after = render_scene(dataclasses.replace(drawn, light=dark), np.random.default_rng(3))
@@ -43,8 +42,8 @@ def test_parts_of_an_arrangement_can_be_exchanged(drawn):
     assert (alone.visible | ~before.visible).all()
 
 
-def test_a_border_that_cuts_the_object_leaves_part_of_it_outside():
-    """10 to 45 % of its width or height lie beyond the border, give or take the jitter of the box."""
+def test_crop_camera_border_cuts_the_object():
+    """10 to 45 % of the width or height are outside, up to the jitter of the box."""
     corners = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.7, 0.7) for z in (4.7, 5.3)])
     size, sides = 200, set()
     for seed in range(60):
@@ -62,8 +61,8 @@ def test_a_border_that_cuts_the_object_leaves_part_of_it_outside():
     assert len(sides) <= 5
 
 
-def test_nothing_is_visible_beyond_the_border(drawn):
-    """Where the photograph ends in the middle of the object, its other half is not seen; its depth is still known."""
+def test_render_scene_has_nothing_visible_outside_the_photo(drawn):
+    """If the photograph ends in the middle of the object, only its depth continues."""
     whole = render_scene(drawn, np.random.default_rng(3))
     half = render_scene(dataclasses.replace(drawn, photo_area=(24, 0, 48, 48)), np.random.default_rng(3))
     assert whole.visible[:, :24].any()

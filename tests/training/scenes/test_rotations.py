@@ -1,4 +1,4 @@
-"""Any orientation means every orientation."""
+"""Uniformly distributed rotations."""
 
 import numpy as np
 import torch
@@ -17,15 +17,15 @@ def haar(count, rng):
     return np.stack([a, b, np.cross(a, b)], axis=2)
 
 
-def test_all_rotations_are_equally_likely():
-    """The mean vanishes, an angle from any rotation has the density (1 - cos t) / pi, and no probe is left out."""
+def test_random_rotation_is_uniform():
+    """The mean is 0, angles have the density (1 - cos t) / pi, and every probe has a rotation nearby."""
     rng = np.random.default_rng(0)
-    turns = np.stack([random_rotation(rng) for _ in range(8000)])
-    assert np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3))
-    assert np.allclose(np.linalg.det(turns), 1.0)
-    assert np.abs(turns.mean(axis=0)).max() < 0.03  # five standard errors of sqrt(1 / 3 / 8000)
+    rotations = np.stack([random_rotation(rng) for _ in range(8000)])
+    assert np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3))
+    assert np.allclose(np.linalg.det(rotations), 1.0)
+    assert np.abs(rotations.mean(axis=0)).max() < 0.03  # five standard errors of sqrt(1 / 3 / 8000)
     probes = torch.from_numpy(haar(1000, rng))
-    cosine = (torch.einsum("pij,nij->pn", probes, torch.from_numpy(turns)) - 1.0) / 2.0
+    cosine = (torch.einsum("pij,nij->pn", probes, torch.from_numpy(rotations)) - 1.0) / 2.0
     near = torch.rad2deg(torch.acos(cosine.max(dim=1).values.clamp(-1, 1)))
     assert near.max() < 15.0
     angles = np.sort(torch.acos(cosine[0].clamp(-1, 1)).numpy())
@@ -33,9 +33,9 @@ def test_all_rotations_are_equally_likely():
     assert np.abs(expected - np.linspace(0, 1, len(angles))).max() < 0.02  # Kolmogorov-Smirnov, p = 0.003
 
 
-def test_scenes_that_do_not_stand_have_any_orientation():
-    """Not the identity, not the quarter with R00 < 0 that the QR decomposition of LAPACK gives."""
+def test_generated_scenes_have_uniform_orientations():
+    """Neither the identity nor the quarter with R00 < 0 that LAPACK's QR decomposition gives."""
     scenes = GeneratedScenes(40, seed=3, upright=0.0, image_size=16)
-    turns = torch.stack([scenes[i]["rotation"] for i in range(40)])
-    assert all(((turns[:, k, k] < 0).float().mean() - 0.5).abs() < 0.3 for k in range(3))
-    assert rotation_error(turns[:, None], turns[None]).median() > 90.0
+    rotations = torch.stack([scenes[i]["rotation"] for i in range(40)])
+    assert all(((rotations[:, k, k] < 0).float().mean() - 0.5).abs() < 0.3 for k in range(3))
+    assert rotation_error(rotations[:, None], rotations[None]).median() > 90.0

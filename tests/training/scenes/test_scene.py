@@ -1,4 +1,4 @@
-"""Generated scenes: the truth that comes with them is that of the picture."""
+"""Generated scenes and their ground truth."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def scenes():
     return GeneratedScenes(200, seed=5)
 
 
-def test_a_sample_depends_on_seed_and_index_alone(scenes):
+def test_generated_scenes_depend_on_seed_and_index(scenes):
     again = GeneratedScenes(10, seed=5)
     for i in (3, 0):
         for name, value in scenes[i].items():
@@ -27,7 +27,7 @@ def test_a_sample_depends_on_seed_and_index_alone(scenes):
     assert not torch.equal(scenes[3]["image"], GeneratedScenes(10, seed=6)[3]["image"])
 
 
-def test_shapes_ranges_and_types(scenes):
+def test_generated_scenes_have_the_stated_shapes_and_ranges(scenes):
     for i in range(6):
         sample = scenes[i]
         assert sample["image"].shape == (3, 128, 128)
@@ -39,15 +39,15 @@ def test_shapes_ranges_and_types(scenes):
         assert (sample["depth"] > 0).float().mean() > 0.003
 
 
-def test_what_is_visible_is_the_object(scenes):
-    """Visible pixels lie on the object's silhouette, or within a pixel of it."""
+def test_visible_pixels_are_within_the_silhouette(scenes):
+    """Up to one pixel."""
     for i in range(12):
         silhouette = torch.nn.functional.max_pool2d((scenes[i]["depth"] > 0).float(), 3, 1, 1) > 0
         assert (scenes[i]["visible"] & ~silhouette).float().sum() == 0
 
 
-def test_depth_is_that_of_a_banks_view_of_the_same_pose():
-    """Independent oracle: the bank's renderer, given rotation and distance; boxes are jittered, hence the tolerance."""
+def test_depth_matches_the_view_of_a_bank():
+    """Independent oracle: the bank's renderer at the same rotation and distance; the box is jittered."""
     scenes = GeneratedScenes(12, seed=8, upright=1.0)
     agree = []
     for i in range(12):
@@ -62,8 +62,8 @@ def test_depth_is_that_of_a_banks_view_of_the_same_pose():
     assert np.median(agree) > 0.8
 
 
-def test_the_object_stands_out_of_the_picture():
-    """Colours inside and outside differ more than two halves of the background do: the picture shows the mask."""
+def test_image_has_edges_at_the_border_of_the_mask():
+    """Colours change more across the mask's border than elsewhere."""
     scenes = GeneratedScenes(12, seed=9)
     edges = []
     for i in range(12):
@@ -75,7 +75,7 @@ def test_the_object_stands_out_of_the_picture():
     assert np.median(edges) > 2.0
 
 
-def test_own_meshes_take_the_objects_place():
+def test_generated_scenes_of_given_meshes():
     box = trimesh.creation.box((1, 2, 3))
     scenes = GeneratedScenes(4, meshes=[box], upright=0.0, image_size=64)
     assert np.allclose(
@@ -84,21 +84,21 @@ def test_own_meshes_take_the_objects_place():
     assert scenes[2]["image"].shape == (3, 64, 64)
 
 
-def test_upright_objects_are_seen_upright():
+def test_upright_objects_have_z_up_in_the_image():
     up = torch.stack([GeneratedScenes(30, seed=2, upright=1.0)[i]["rotation"][:, 2] for i in range(8)])
     assert (up[:, 1] < -0.3).all()  # the model's z axis points up in the picture
     views = sample_views()
     assert (views.rotations[:, 1, 2] < 0).all()  # as in an upright bank
 
 
-def test_errors():
+def test_generated_scenes_reject_bad_lengths_and_indices():
     with pytest.raises(InvalidInputError, match="length"):
         GeneratedScenes(0)
     with pytest.raises(IndexError):
         GeneratedScenes(3)[3]
 
 
-def test_a_camera_keeps_the_picture_recognisable():
+def test_simulate_camera_keeps_bright_areas_bright():
     rng = np.random.default_rng(0)
     clean = np.zeros((64, 64, 3), np.float32)
     clean[16:48, 16:48] = 0.8
@@ -109,8 +109,8 @@ def test_a_camera_keeps_the_picture_recognisable():
         assert picture[24:40, 24:40].mean() > picture[:8].mean() + 40
 
 
-def test_the_object_is_in_every_picture():
-    """Also where the ground or clutter would hide it; and its pixels are its own, not the background's."""
+def test_object_is_visible_in_every_scene():
+    """Also if ground or clutter would hide it."""
     scenes = GeneratedScenes(400, seed=77_000_001, upright=1.0)
     for i in range(24):
         sample = scenes[i]
@@ -118,8 +118,8 @@ def test_the_object_is_in_every_picture():
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_backgrounds_can_be_drawn_into(seed):
-    """Of every kind: rays write their colours into the picture itself."""
+def test_random_picture_is_writable(seed):
+    """For every kind of background, because rendering writes into it."""
     picture = random_picture(np.random.default_rng(seed), 16)
     picture.reshape(-1, 3)[:] = 0.5
     assert (picture == 0.5).all()

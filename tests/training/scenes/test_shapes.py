@@ -1,4 +1,4 @@
-"""Procedural shapes."""
+"""Procedural shapes and surfaces."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from curvireg_torch.training.scenes.surfaces import bar, box, lathe, superquadri
 
 
 @pytest.mark.parametrize("family", sorted(FAMILIES))
-def test_every_family_makes_finite_shapes_of_radius_one(family):
+def test_random_shape_of_every_family_has_radius_one(family):
     for seed in range(5):
         shape = random_shape(np.random.default_rng(seed), family)
         assert np.isfinite(shape.vertices).all()
@@ -22,7 +22,7 @@ def test_every_family_makes_finite_shapes_of_radius_one(family):
         assert shape.mesh().area > 0.05
 
 
-def test_the_seed_decides():
+def test_random_shape_depends_on_the_seed():
     one, same, other = (random_shape(np.random.default_rng(s)) for s in (3, 3, 4))
     assert np.array_equal(one.vertices, same.vertices)
     assert one.vertices.shape != other.vertices.shape or not np.array_equal(one.vertices, other.vertices)
@@ -33,7 +33,7 @@ def volume(surface):
     return abs(float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6))
 
 
-def test_surfaces_enclose_the_volumes_of_the_textbook():
+def test_surfaces_have_the_volumes_of_closed_forms():
     assert volume(box((1, 2, 3))) == pytest.approx(6.0)
     assert volume(box((2, 2, 3), top=0.5)) == pytest.approx(3 / 3 * (4 + 1 + 2))  # frustum
     assert volume(lathe([0.5, 0.5], [0, 2])) == pytest.approx(np.pi * 0.25 * 2, rel=0.01)
@@ -43,7 +43,7 @@ def test_surfaces_enclose_the_volumes_of_the_textbook():
 
 
 def open_bed(seed):
-    """Whether the rear third of a car, seen from above, is a trough: lower inside than at both sides and at the end."""
+    """Whether the rear third of a car, seen from above, is lower inside than at the sides and at the end."""
     shape = random_shape(np.random.default_rng(seed), "car")
     low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
     x, y = np.meshgrid(np.linspace(low[0], high[0], 61), np.linspace(low[1], high[1], 121))
@@ -55,11 +55,11 @@ def open_bed(seed):
     return all(np.median(rim) > inside + 0.03 for rim in rims)
 
 
-def test_some_cars_have_an_open_bed():
+def test_some_cars_are_pickups():
     assert 3 <= sum(open_bed(seed) for seed in range(40)) <= 16
 
 
-def test_a_users_mesh_is_centred_scaled_and_split_into_its_parts():
+def test_shape_from_mesh_is_centred_scaled_and_split():
     parts = [trimesh.creation.box(), trimesh.creation.icosphere(subdivisions=1)]
     parts[1].apply_translation((5, 0, 0))
     shape = shape_from_mesh(trimesh.util.concatenate(parts))
@@ -67,7 +67,7 @@ def test_a_users_mesh_is_centred_scaled_and_split_into_its_parts():
     assert len(set(shape.materials)) == 2
 
 
-def test_parts_of_an_stl_are_connected_where_their_corners_coincide(tmp_path):
+def test_shape_from_mesh_connects_coincident_corners(tmp_path):
     """Such a file lists the corners of every triangle separately."""
     parts = [trimesh.creation.box(), trimesh.creation.icosphere(subdivisions=1), trimesh.creation.box((0.5, 2, 3))]
     for i, part in enumerate(parts):
