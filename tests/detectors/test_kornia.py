@@ -1,8 +1,6 @@
 """Layers and detectors in pipelines of kornia."""
 
-import re
 from collections.abc import Callable
-from pathlib import Path
 
 import kornia
 import pytest
@@ -101,16 +99,6 @@ def test_layers_in_kornias_augmentation_sequences(layer: nn.Module) -> None:
     image, flipped_mask = augment(colour, mask)
     torch.testing.assert_close(image, layer(flipped))
     torch.testing.assert_close(flipped_mask, mask.flip(-1))
-
-
-def test_kornia_page_runs() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "guides" / "kornia.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
-    names: dict[str, object] = {}
-    with torch.random.fork_rng(devices=[]):
-        exec(compile(code, "docs/guides/kornia.md", "exec"), names)
-    assert isinstance(names["descriptors"], Tensor)
-    assert names["descriptors"].shape == (1, 50, 324)
 
 
 def test_smoothing_derivatives_and_sobel_equal_kornias() -> None:
