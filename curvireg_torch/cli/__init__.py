@@ -87,7 +87,3 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _show_warning(message: Any, *_: Any, **__: Any) -> None:
     print(f"curvireg: warning: {message}", file=sys.stderr)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
