@@ -7,7 +7,6 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from ..errors import InvalidInputError
 from ..pipeline import DEFAULT, PRESETS, Pipeline, preset_named
 from ..utils.checks import check_positive
 from ..utils.digests import code_digest
@@ -15,10 +14,9 @@ from ..utils.files import write_file
 from ..version import __version__
 from .benchmark import Benchmark, Row
 from .localization import localization_recall
-from .predict import predict
-from .runner import POSE_SOURCES
+from .predict import register_object, registrar_opener
+from .runner import POSE_SOURCES, run_items
 from .store import ResultStore, to_json
-from .workers import Workers, workers
 
 __all__ = ["evaluate", "score"]
 
@@ -70,40 +68,18 @@ def evaluate(
     name = next((known for known, settings in PRESETS.items() if settings is pipeline), "own")
     if limit is not None:
         check_positive(limit, "limit")
-    items = benchmark.selection(limit)
     settings = _settings(benchmark, name, pipeline, renderer)
-    with workers() as group:
-        _open(out, settings, overwrite, group)
-        group.wait()
-        store = ResultStore(out, group)
-        predict(
-            benchmark,
-            items,
-            store,
-            pipeline,
-            settings=settings,
-            workers=group,
-            renderer=renderer,
-            field=field,
-            progress=progress and group.rank == 0,
-        )
-        group.wait()
-        if not group.reports or not store.is_complete(item.key for item in items):
-            return None
-        if group.leads:
-            store.merge()
-        return score(benchmark, out, limit=limit)
-
-
-def _open(out: Path, settings: Row, overwrite: bool, group: Workers) -> None:
-    """Check the folder, by the first process where they can wait for it, else by each."""
-    if overwrite and not group.joined and group.size > 1:
-        raise InvalidInputError("--overwrite: not in a job array, where it would delete the results of other jobs")
-    if group.leads or not group.joined:
-        store = ResultStore(out)
-        store.open(settings, overwrite=overwrite)
-        if group.leads:
-            store.merge()
+    store = run_items(
+        benchmark.selection(limit),
+        out,
+        registrar_opener(benchmark, pipeline, renderer=renderer, field=field),
+        lambda item, registrar, seconds, _: register_object(benchmark, item, registrar, bank_seconds=seconds),
+        settings=settings,
+        prepare=lambda store: store.open(settings, overwrite=overwrite),
+        label=benchmark.name,
+        progress=progress,
+    )
+    return None if store is None else score(benchmark, out, limit=limit)
 
 
 def score(benchmark: Benchmark, out: Path, *, limit: int | None = None) -> Row:

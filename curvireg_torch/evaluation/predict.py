@@ -1,7 +1,6 @@
 """Poses of the objects of a dataset, from the CADs that the protocol allows."""
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 from torch import nn
@@ -16,29 +15,17 @@ from ..registration.document import localization_document
 from ..terms import QueryFeatures
 from .benchmark import Benchmark, BenchmarkItem, Row
 from .protocol import perturbed_box
-from .runner import run_items
-from .store import ResultStore
-from .workers import Workers
+from .runner import OpenRegistrar
 
-__all__ = ["FusedMatcher", "predict", "register_object"]
+__all__ = ["FusedMatcher", "register_object", "registrar_opener"]
 
 
-def predict(
-    benchmark: Benchmark,
-    items: Sequence[BenchmarkItem],
-    store: ResultStore,
-    pipeline: Pipeline,
-    *,
-    settings: Row,
-    workers: Workers,
-    renderer: str = "auto",
-    field: nn.Module | None = None,
-    progress: bool = True,
-) -> None:
-    """Register the objects that ``store`` does not hold yet, see :func:`~curvireg_torch.evaluation.runner.run_items`.
+def registrar_opener(
+    benchmark: Benchmark, pipeline: Pipeline, *, renderer: str = "auto", field: nn.Module | None = None
+) -> OpenRegistrar:
+    """A function that opens the registrar of mesh files under the protocol of a benchmark.
 
-    A photograph or mesh that cannot be read, or an unknown box, gives a row ``skipped``; an object that the method
-    refuses gives a row ``failed``, which scores count as a miss. Any other error is a defect and ends the run.
+    It returns the error of a mesh that cannot be read; any other error is a defect, and is raised.
     """
     protocol = benchmark.protocol
     pipeline = pipeline.with_pose_prior(protocol.pose)
@@ -52,19 +39,7 @@ def predict(
         matcher = FusedMatcher if protocol.cad == "fused" else ViewMatcher
         return Registrar(matcher(ViewBank.join(banks), pipeline=pipeline, field=field), renderer=renderer)
 
-    def register(item: BenchmarkItem, registrar: Registrar | Exception, seconds: float, _: Row) -> Row:
-        return register_object(benchmark, item, registrar, bank_seconds=seconds)
-
-    run_items(
-        items,
-        store,
-        open_registrar,
-        register,
-        settings=settings,
-        workers=workers,
-        label=benchmark.name,
-        progress=progress,
-    )
+    return open_registrar
 
 
 def register_object(
@@ -81,7 +56,7 @@ def register_object(
     Returns:
         :meth:`Registration.to_dict` with the name of the ``mesh``, the ``image_size`` (height, width), ``localization``
         and ``seconds`` as in docs/results.md, and ``projection``, see :class:`Hypothesis`; or ``failed`` or ``skipped``
-        with the reason.
+        with the reason. Scores count ``failed`` as a miss.
     """
     protocol = benchmark.protocol
     if protocol.box is not None and not bool(item.box.isfinite().all()):

@@ -16,7 +16,7 @@ from ..registration import Registrar
 from ..utils.digests import code_digest, file_digest, text_digest
 from ..utils.threads import map_on_threads
 from .store import ResultStore, Row
-from .workers import Workers
+from .workers import Workers, workers
 
 __all__ = ["POSE_SOURCES", "Item", "OpenRegistrar", "run_items"]
 
@@ -54,16 +54,16 @@ OpenRegistrar = Callable[[tuple[Path, ...]], Registrar | Exception]
 
 def run_items(
     items: Sequence[ItemT],
-    store: ResultStore,
+    out: Path,
     open_registrar: OpenRegistrar,
     register: Callable[[ItemT, Registrar | Exception, float, Row], Row],
     *,
     settings: Any,
-    workers: Workers,
+    prepare: Callable[[ResultStore], None],
     label: str,
     progress: bool = True,
-) -> None:
-    """Register the part of ``items`` that belongs to this process, as far as ``store`` does not hold it already.
+) -> ResultStore | None:
+    """Register the items that the store in ``out`` does not hold yet, in one process or several.
 
     A stored row is used again if its digests are the same: that of the photograph's content, and that of the request,
     which covers ``settings``, the code of this library, the item's own request and every file of its meshes. Rows that
@@ -72,15 +72,47 @@ def run_items(
 
     Args:
         items: of different keys.
-        store: opened by the caller.
+        out: folder of the store.
         open_registrar: called once for each set of meshes.
         register: called with an item, what ``open_registrar`` returned, the seconds that this took (0 for all items but
             the first), and the digests; returns the row. An error that it raises ends the run.
         settings: plain values, everything that all results depend on.
-        workers: the processes that share the items.
+        prepare: called with the store by one process before the others start; in a job array by each.
         label: of the progress bar.
         progress: show it.
+
+    Returns:
+        The store, which holds all items; None in processes that leave the report to another.
     """
+    with workers() as group:
+        if group.reports:
+            prepare(ResultStore(out, group))
+        group.wait()
+        store = ResultStore(out, group)
+        register_part(
+            items, store, open_registrar, register,
+            settings=settings, workers=group, label=label, progress=progress and group.rank == 0,
+        )  # fmt: skip
+        group.wait()
+        if not group.reports or not store.is_complete(item.key for item in items):
+            return None
+        if group.leads:
+            store.merge()
+        return store
+
+
+def register_part(
+    items: Sequence[ItemT],
+    store: ResultStore,
+    open_registrar: OpenRegistrar,
+    register: Callable[[ItemT, Registrar | Exception, float, Row], Row],
+    *,
+    settings: Any,
+    workers: Workers,
+    label: str,
+    progress: bool,
+) -> None:
+    """The part of :func:`run_items` that belongs to this process."""
     common = json.dumps([settings, code_digest(*POSE_SOURCES)], sort_keys=True)
     digest_of_photo, digest_of_mesh = cache(file_digest), cache(mesh_digest)
 

@@ -51,8 +51,8 @@ class ResultStore:
 
     A row holds the ``key`` of its item and ``digests`` of everything that it depends on. It is appended and synced as
     soon as it is known, so that a killed process loses only the item it was working on; a last line that was cut short
-    is ignored, and removed before the next row is appended. Of several processes each appends to a file of its own,
-    ``results.RANK-of-SIZE.jsonl``; a reader merges all files. Of several rows of one item the latest counts.
+    is ignored, and removed before the next row. Each of several processes appends to a file of its own,
+    ``results.RANK-of-SIZE.jsonl``; readers merge all files. The latest of several rows of one item counts.
 
     Args:
         folder: created with the first row.
@@ -75,6 +75,7 @@ class ResultStore:
         self.settings_path = folder / "settings.json"
         shared = f"results.{workers.rank}-of-{workers.size}.jsonl"
         self._output = folder / shared if workers.size > 1 else self.path
+        self._in_job_array = workers.size > 1 and not workers.joined
         self._repaired = False
         self.refresh()
 
@@ -86,13 +87,11 @@ class ResultStore:
             overwrite: delete existing rows and start again.
 
         Raises:
-            InvalidInputError: the folder holds results of other settings.
-            OutputError: the folder cannot be written to.
+            InvalidInputError: the folder holds results of other settings, or ``overwrite`` in a job array.
+            OutputError: it cannot be written to.
         """
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{self.folder}: cannot be created ({error.strerror}); choose another --out") from error
+        if overwrite and self._in_job_array:
+            raise InvalidInputError("--overwrite: not in a job array, where it would delete the results of other jobs")
         if overwrite:
             self.settings_path.unlink(missing_ok=True)  # first: rows without settings are refused after a kill
             for path in self._files():
@@ -100,9 +99,11 @@ class ResultStore:
             self.refresh()
         elif self.settings_path.is_file():
             before, now = self.settings(), finite(settings)
-            if before != now:
+            changed = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
+            if changed:
+                changes = ", ".join(f"{name}: {before.get(name)!r} there, {now.get(name)!r} now" for name in changed)
                 raise InvalidInputError(
-                    f"{self.folder}: holds results of other settings ({_difference(before, now)}); "
+                    f"{self.folder}: holds results of other settings ({changes}); "
                     "choose another --out, or give --overwrite to start again"
                 )
             return
@@ -118,14 +119,13 @@ class ResultStore:
         Raises:
             InvalidInputError: the file is missing or damaged.
         """
-        path = self.settings_path
         try:
-            settings = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise InvalidInputError(f"{path}: missing or damaged ({error}); run curvireg evaluate first") from error
-        if not isinstance(settings, dict):
-            raise InvalidInputError(f"{path}: expected a JSON object; remove it and run again")
-        return settings
+            settings = json.loads(self.settings_path.read_text(encoding="utf-8"))
+            return dict(settings.items())
+        except (OSError, ValueError, AttributeError) as error:
+            raise InvalidInputError(
+                f"{self.settings_path}: missing or damaged ({error}); run curvireg evaluate first"
+            ) from error
 
     def refresh(self) -> None:
         """Read again what is on disk, rows of other processes included."""
@@ -190,23 +190,20 @@ class ResultStore:
             raise OutputError(f"{self._output}: cannot be written ({error.strerror}); free space, run again") from error
         self._add(self._output, offset, line)
 
-    def rewrite(self, rows: Iterable[Row], *, remove_parts: bool) -> None:
-        """Replace ``results.jsonl`` by ``rows``.
-
-        Args:
-            rows: all that shall stay.
-            remove_parts: delete the files of the processes; only if none of them is still running.
-        """
-        dropped = ("revision",) if remove_parts else ()
-        write_file(self.path, b"".join(_line({k: v for k, v in row.items() if k not in dropped}) for row in rows))
-        for path in self._files()[1:] if remove_parts else []:
-            path.unlink()
+    def rewrite(self, rows: Iterable[Row]) -> None:
+        """Replace ``results.jsonl`` by ``rows``."""
+        write_file(self.path, b"".join(map(_line, rows)))
         self.refresh()
 
     def merge(self) -> None:
-        """Move the rows of all processes, none of which is still running, into ``results.jsonl``."""
-        if len(self._files()) > 1:
-            self.rewrite(map(self.read, list(self._locations)), remove_parts=True)
+        """Move the latest rows of all processes, none of which may still be running, into ``results.jsonl``."""
+        parts = [path for path in self._files() if path != self.path]
+        if parts or any(found.revision for found in self._locations.values()):
+            rows = [self.read(key) for key in self._locations]
+            write_file(self.path, b"".join(_line({k: v for k, v in row.items() if k != "revision"}) for row in rows))
+            for path in parts:
+                path.unlink()
+            self.refresh()
 
     def _files(self) -> list[Path]:
         """``results.jsonl`` first."""
@@ -234,8 +231,3 @@ def _parsed(line: bytes) -> Row | None:
         return row if isinstance(row["key"], str) and isinstance(row["digests"], dict) else None
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
-
-
-def _difference(before: Row, now: Row) -> str:
-    names = sorted(n for n in {*before, *now} if before.get(n) != now.get(n))
-    return ", ".join(f"{n}: {before.get(n)!r} there, {now.get(n)!r} now" for n in names)

@@ -28,12 +28,12 @@ class Workers:
 
     @property
     def leads(self) -> bool:
-        """Whether this process prepares the store, and merges it when all are done."""
+        """Whether this process merges the store when all are done."""
         return self.rank == 0 and (self.joined or self.size == 1)
 
     @property
     def reports(self) -> bool:
-        """Whether this process writes the tables once the store is complete; in a job array each may."""
+        """Whether this process prepares the store, and writes the tables once it is complete; in a job array each."""
         return self.leads or not self.joined
 
     def wait(self) -> None:

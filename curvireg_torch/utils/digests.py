@@ -49,7 +49,7 @@ def tensor_digest(tensors: Mapping[str, "Tensor"], *, size: int = 8) -> str:
 
 @cache
 def code_digest(*parts: str) -> str:
-    """16 hexadecimal digits of the package's sources in ``parts``: folders, with their subfolders, and files.
+    """16 hexadecimal digits of ``parts`` of the package: folders with their code, weights and constants, and files.
 
     Example:
         >>> code_digest("filters") == code_digest("filters", "descriptors")
@@ -58,6 +58,7 @@ def code_digest(*parts: str) -> str:
     digest = hashlib.blake2b(digest_size=8)
     for part in parts:
         path = _PACKAGE / part
-        for source in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+        inside = sorted(p for p in path.rglob("*") if p.suffix in (".py", ".json", ".safetensors"))
+        for source in inside if path.is_dir() else [path]:
             digest.update(source.read_bytes())
     return digest.hexdigest()

@@ -10,7 +10,7 @@ from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.evaluation import runner
 from curvireg_torch.evaluation.benchmark import BenchmarkItem
 from curvireg_torch.evaluation.lists import Entry
-from curvireg_torch.evaluation.runner import run_items
+from curvireg_torch.evaluation.runner import register_part
 from curvireg_torch.evaluation.store import ResultStore
 from curvireg_torch.evaluation.workers import Workers, run_processes, workers
 
@@ -49,7 +49,7 @@ def registered(items, folder, *, settings=None, row=None, workers=None, register
         assert (seconds > 0) == (sum(key[1] == item.key[1] for key in keys) == 1), "the first pays for the bank"
         return row or {}
 
-    run_items(
+    register_part(
         items, ResultStore(folder, workers), lambda meshes: MeshError(meshes[0].name), register or plain,
         settings=settings or {}, workers=workers or Workers(), label="", progress=False,
     )  # fmt: skip

@@ -12,14 +12,12 @@ import torch
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, contact_sheet, evaluate
+from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, WebBenchmark, contact_sheet, evaluate
 from curvireg_torch.evaluation.store import ResultStore
 from curvireg_torch.io import read_image
 from curvireg_torch.io.meshes import load_mesh
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.visualization.sheet import thumbnail
-
-from ..cli.test_evaluate import evaluate as evaluate_by_command
 
 
 def figures(page):
@@ -86,7 +84,7 @@ def test_contact_sheet_shows_failures_last_and_no_picture_of_missing_files(bop, 
 
 
 def test_contact_sheet_orders_unknown_poses_by_confidence(web, tmp_path):
-    evaluate_by_command("web", web.root, "--out", tmp_path / "out")
+    evaluate(WebBenchmark(web, Protocol(pose="any")), tmp_path / "out", progress=False)
     contact_sheet(tmp_path / "out", tmp_path / "sheet.html")
     found = figures(tmp_path / "sheet.html")
     assert ["pose unknown" in caption for _, _, _, caption, _ in found] == [False, False, True, True]

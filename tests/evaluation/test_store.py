@@ -74,7 +74,7 @@ def test_read_finds_rows_that_have_moved(tmp_path):
     for key in "ab":
         store.append(row(key, i=key))
     other.refresh()
-    store.rewrite([row(key, i=key, more=1) for key in "ba"], remove_parts=False)
+    store.rewrite([row(key, i=key, more=1) for key in "ba"])
     assert other.read("a") == row("a", i="a", more=1)
 
 
@@ -107,13 +107,13 @@ def test_results_without_settings_are_refused(tmp_path):
     with pytest.raises(InvalidInputError, match="unknown settings"):
         store.open({})
     store.settings_path.write_text("[1]")
-    with pytest.raises(InvalidInputError, match="expected a JSON object"):
+    with pytest.raises(InvalidInputError, match="missing or damaged"):
         store.settings()
 
 
 def test_folder_that_cannot_be_written(tmp_path, monkeypatch):
     (tmp_path / "out").write_text("")
-    with pytest.raises(OutputError, match="choose another --out"):
+    with pytest.raises(OutputError, match="choose another place"):
         ResultStore(tmp_path / "out").open({})
 
     def full_disk(*_):

@@ -18,7 +18,6 @@ from ...utils.files import write_file
 from ...visualization.sheet import SheetEntry, thumbnail, write_sheet
 from ..runner import OpenRegistrar, run_items
 from ..store import ResultStore, Row
-from ..workers import workers
 from .entries import Entry, PhotoList
 from .tables import write_bop_results, write_results
 
@@ -78,29 +77,17 @@ def register_list(
         return _register(entry, registrar, seconds, _thumbnail_path(out, digests))
 
     items = list({entry.key: entry for entry in photos.entries if not entry.error}.values())
-    with workers() as group:
-        if (out / "settings.json").exists():
-            raise InvalidInputError(f"{out}: holds the evaluation of a dataset; choose another --out")
-        if group.leads:
-            ResultStore(out).merge()
-        group.wait()
-        for older in ("results.csv", "index.html", "bop.csv"):  # they would not match newer rows
-            (out / older).unlink(missing_ok=True)
-        store = ResultStore(out, group)
-        run_items(
-            items,
-            store,
-            opened,
-            register,
-            settings=dict(settings),
-            workers=group,
-            label="register",
-            progress=progress and group.rank == 0,
-        )
-        group.wait()
-        if not group.reports or not store.is_complete(entry.key for entry in items):
-            return None
-        return _write_tables(photos, out, store, remove_parts=group.leads)
+    store = run_items(
+        items, out, opened, register, settings=dict(settings), prepare=_prepare, label="register", progress=progress
+    )
+    return None if store is None else _write_tables(photos, out, store)
+
+
+def _prepare(store: ResultStore) -> None:
+    if store.settings_path.exists():
+        raise InvalidInputError(f"{store.folder}: holds the evaluation of a dataset; choose another --out")
+    for name in ("results.csv", "index.html", "bop.csv"):  # they would not match newer rows
+        (store.folder / name).unlink(missing_ok=True)
 
 
 def register_entry(
@@ -189,7 +176,7 @@ def _thumbnail_path(out: Path, digests: Row) -> Path:
     return out / "thumbnails" / f"{digests['request']}.jpg"
 
 
-def _write_tables(photos: PhotoList, out: Path, store: ResultStore, *, remove_parts: bool) -> Counts:
+def _write_tables(photos: PhotoList, out: Path, store: ResultStore) -> Counts:
     entries = photos.entries
     sheet = [_sheet_entry(entry, row, out) for entry, row in zip(entries, _rows(photos, store), strict=True)]
     kinds = [shown.kind for shown, _ in sheet]
@@ -197,7 +184,7 @@ def _write_tables(photos: PhotoList, out: Path, store: ResultStore, *, remove_pa
     sheet.sort(key=lambda pair: pair[1])
     several = any(len(entry.meshes) > 1 for entry in entries)
     write_sheet(out / "index.html", str(counts), [shown for shown, _ in sheet], table="results.csv")
-    store.rewrite(_rows(photos, store), remove_parts=remove_parts)
+    store.rewrite(_rows(photos, store))
     write_bop_results(out / "bop.csv", photos.columns, _rows(photos, store))
     write_results(out / "results.csv", photos.columns, _rows(photos, store), best_mesh=several)
     return counts
