@@ -25,14 +25,11 @@ def chair(rng: Rng) -> list[Part]:
         parts.append((bar((0, 0, 0.1), (0, 0, h), 1.5 * leg), 1))
         spokes = 2 * np.pi * np.arange(5) / 5
         parts += [(bar((0, 0, 0.1), (0.5 * w * np.cos(t), 0.5 * w * np.sin(t), 0.03), leg), 1) for t in spokes]
-    posts = [
-        np.array([(s * (0.5 * w - leg), 0.5 * d, h), (s * (0.5 * w - leg), 0.5 * d + lean, h + back)]) for s in (-1, 1)
-    ]
+    sides_x = [s * (0.5 * w - leg) for s in (-1, 1)]
+    posts = [np.array([(x, 0.5 * d, h), (x, 0.5 * d + lean, h + back)]) for x in sides_x]
     if rng.random() < 0.5:
-        panel = rounded_box(rng, (w, thick * 0.7, back)).moved(
-            (0, 0.5 * d + 0.5 * lean, h + 0.5 * back), rotation(0, -lean / back)
-        )
-        parts.append((panel, 0))
+        panel, centre = rounded_box(rng, (w, thick * 0.7, back)), (0, 0.5 * d + 0.5 * lean, h + 0.5 * back)
+        parts.append((panel.moved(centre, rotation(0, -lean / back)), 0))
     else:
         parts += [(tube(p, leg), 1) for p in posts]
         if rng.random() < 0.5:
@@ -59,28 +56,13 @@ def table(rng: Rng) -> list[Part]:
     w, d, h = rng.uniform((0.6, 0.4, 0.3), (1.6, 1.0, 0.8))
     thick, leg = rng.uniform(0.02, 0.08), rng.uniform(0.015, 0.06)
     round_top = rng.random() < 0.3
-    top = (
-        lathe(np.full(2, 0.5 * w), np.array([0, thick])).moved((0, 0, h))
-        if round_top
-        else box((w, d, thick)).moved((0, 0, h))
-    )
-    parts = [(top, 0)]
+    top = lathe(np.full(2, 0.5 * w), np.array([0, thick])) if round_top else box((w, d, thick))
+    parts = [(top.moved((0, 0, h)), 0)]
     d = w if round_top else d
     if rng.random() < 0.7:
         reach = 0.6 if round_top else 0.9
-        parts += [
-            (
-                bar(
-                    (sx * 0.5 * reach * w, sy * 0.5 * reach * d, 0),
-                    (sx * 0.5 * reach * w, sy * 0.5 * reach * d, h),
-                    leg,
-                    sides=int(rng.choice([4, 10])),
-                ),
-                1,
-            )
-            for sx in (-1, 1)
-            for sy in (-1, 1)
-        ]
+        feet = [(sx * 0.5 * reach * w, sy * 0.5 * reach * d) for sx in (-1, 1) for sy in (-1, 1)]
+        parts += [(bar((x, y, 0), (x, y, h), leg, sides=int(rng.choice([4, 10]))), 1) for x, y in feet]
     else:
         parts.append((bar((0, 0, 0), (0, 0, h), 2 * leg), 1))
         parts.append((lathe(np.full(2, 0.3 * w), np.array([0, 0.03])), 1))
@@ -95,37 +77,19 @@ def sofa(rng: Rng) -> list[Part]:
     w, d, h, back = rng.uniform((0.8, 0.5, 0.25, 0.3), (2.0, 0.8, 0.4, 0.5))
     arm, deep = rng.uniform(0.08, 0.25), rng.uniform(0.12, 0.25)
     parts = [(rounded_box(rng, (w, d, h)).moved((0, 0, 0.5 * h + 0.05)), 0)]
-    parts.append(
-        (
-            rounded_box(rng, (w, deep, h + back)).moved(
-                (0, 0.5 * d, 0.5 * (h + back) + 0.05), rotation(0, -rng.uniform(0, 0.2))
-            ),
-            0,
-        )
-    )
+    rest = rounded_box(rng, (w, deep, h + back))
+    parts.append((rest.moved((0, 0.5 * d, 0.5 * (h + back) + 0.05), rotation(0, -rng.uniform(0, 0.2))), 0))
     rise = rng.uniform(0.1, 0.9) * back
-    parts += [
-        (
-            rounded_box(rng, (arm, d + deep, h + rise)).moved(
-                (s * 0.5 * (w + arm), 0.3 * deep, 0.5 * (h + rise) + 0.05)
-            ),
-            0,
-        )
-        for s in (-1, 1)
-    ]
+    for s in (-1, 1):
+        side = rounded_box(rng, (arm, d + deep, h + rise))
+        parts.append((side.moved((s * 0.5 * (w + arm), 0.3 * deep, 0.5 * (h + rise) + 0.05)), 0))
     n = int(rng.integers(1, 4))
     for k in range(n):
         x = w * ((k + 0.5) / n - 0.5)
         parts.append((superquadric((0.48 * w / n, 0.45 * d, 0.08), (0.4, 0.3)).moved((x, -0.05, h + 0.08)), 1))
         if rng.random() < 0.6:
-            parts.append(
-                (
-                    superquadric((0.46 * w / n, 0.08, 0.4 * back), (0.4, 0.4)).moved(
-                        (x, 0.5 * d - deep * 0.6, h + 0.5 * back)
-                    ),
-                    1,
-                )
-            )
+            cushion = superquadric((0.46 * w / n, 0.08, 0.4 * back), (0.4, 0.4))
+            parts.append((cushion.moved((x, 0.5 * d - deep * 0.6, h + 0.5 * back)), 1))
     return parts
 
 

@@ -37,12 +37,9 @@ def compound(rng: Rng) -> list[Part]:
     centre = np.zeros(3)
     mirrored = rng.random() < 0.5
     for k in range(int(rng.integers(2, 8))):
-        pose = (
-            random_rotation(rng)
-            if rng.random() < 0.3
-            else rotation(int(rng.integers(3)), 0.5 * np.pi * rng.integers(4))
-        )
-        piece = _piece(rng).moved(centre, pose, rng.uniform(0.3, 1.0))
+        any_angle = rng.random() < 0.3
+        R = random_rotation(rng) if any_angle else rotation(int(rng.integers(3)), 0.5 * np.pi * rng.integers(4))
+        piece = _piece(rng).moved(centre, R, rng.uniform(0.3, 1.0))
         parts.append((piece, k))
         if mirrored:
             parts.append((Surface(piece.vertices * (-1, 1, 1), piece.faces), k))

@@ -161,15 +161,8 @@ def aircraft(rng: Rng) -> list[Part]:
     for k in range(n):
         for s in (-1, 1):
             pod = lathe(0.4 * r * np.array([0.7, 1, 1, 0.6]), np.array([-0.15, -0.1, 0.05, 0.15]))
-            parts.append(
-                (
-                    pod.moved(
-                        (s * span * (k + 1) / (n + 1.5), 0.5 * sweep * (k + 1) / n - 0.2, height - 0.5 * r),
-                        rotation(0, np.pi / 2),
-                    ),
-                    3,
-                )
-            )
+            at = (s * span * (k + 1) / (n + 1.5), 0.5 * sweep * (k + 1) / n - 0.2, height - 0.5 * r)
+            parts.append((pod.moved(at, rotation(0, np.pi / 2)), 3))
     if n == 0 and rng.random() < 0.6:
         parts.append((box((0.5, 0.02, 0.05)).moved((0, -1.0, 0), rotation(1, rng.uniform(0, np.pi))), 3))
     return parts
@@ -200,13 +193,7 @@ def boat(rng: Rng) -> list[Part]:
         mast, high = np.array([0, -0.1 * length, 0]), rng.uniform(0.8, 2.2)
         parts.append((bar(mast, mast + np.array((0, 0, high)), 0.015), 3))
         if rng.random() < 0.7:
-            sail = np.array(
-                [
-                    mast + np.array((0, 0.02, 0.15)),
-                    mast + np.array((0, 0.4 * length, 0.15)),
-                    mast + np.array((0.02, 0.02, high)),
-                ]
-            )
+            sail = mast + np.array([(0, 0.02, 0.15), (0, 0.4 * length, 0.15), (0.02, 0.02, high)])
             parts.append((Surface(sail, np.array([[0, 1, 2]])), 4))
             parts.append((Surface(sail * (1, -0.9, 1) + (0, 2 * mast[1] * 0.95, 0), np.array([[0, 1, 2]])), 4))
     return parts
