@@ -52,9 +52,9 @@ def photos(n: int = 2, size: int = 24, *, seed: int = 0, dtype: torch.dtype = to
     return (x / x.amax(dim=(1, 2, 3), keepdim=True)).to(dtype)
 
 
-def colour_photos(n: int = 1, size: int = 24, *, dtype: torch.dtype = torch.float32) -> Tensor:
+def colour_photos(n: int = 1, size: int = 24, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Tensor:
     """(n, 3, size, size) in [0, 1]."""
-    return torch.cat([photos(n, size, seed=seed, dtype=dtype) for seed in range(3)], dim=1)
+    return torch.cat([photos(n, size, seed=seed + i, dtype=dtype) for i in range(3)], dim=1)
 
 
 def fields(n: int = 2, size: int = 24, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Tensor:
