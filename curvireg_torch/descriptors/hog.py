@@ -226,12 +226,12 @@ class HOG(OptionsModule):
         """Number of entries of a descriptor."""
         return hog_length(grid=self.grid, bins=self.bins, block=self.block)
 
-    def half_turned(self, descriptors: Tensor) -> Tensor:
+    def rotated_by_180(self, descriptors: Tensor) -> Tensor:
         """Descriptors (B, D) of the fields rotated by 180 degrees: cells are permuted, orientations are unchanged.
 
         Example:
             >>> field, layer = torch.randn(1, 2, 64, 64), HOG()
-            >>> torch.allclose(layer.half_turned(layer(field)), layer(-field.rot90(2, (2, 3))), atol=1e-6)
+            >>> torch.allclose(layer.rotated_by_180(layer(field)), layer(-field.rot90(2, (2, 3))), atol=1e-6)
             True
         """
         n = self.grid - self.block + 1

@@ -162,7 +162,7 @@ class ViewDescriber:
         if not bool(rendered.all()):
             selected = quarters.to(self._device), (rendered.cumsum(0) - 1)[source].to(self._device)
             sideways = self.descriptor(torch.stack([-field[:, 1], field[:, 0]], dim=1).rot90(-1, (2, 3)))
-            halves = (self.descriptor.half_turned(x) for x in (descriptors, sideways))
+            halves = (self.descriptor.rotated_by_180(x) for x in (descriptors, sideways))
             descriptors = torch.stack([descriptors, sideways, *halves])[selected]
             points, silhouettes = (
                 torch.stack([x.rot90(-k, (1, 2)) for k in range(4)])[selected] for x in (points, silhouettes)
