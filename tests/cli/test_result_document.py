@@ -1,4 +1,4 @@
-"""Result documents, their schema and their page; what is printed with ``--json``; examples in the help."""
+"""Result documents and their schema, ``--json``, and examples in the help."""
 
 import argparse
 import json
@@ -13,7 +13,7 @@ import trimesh
 import curvireg_torch as cr
 from curvireg_torch.cli import build_parser, main, parse
 from curvireg_torch.registration.document import result_document
-from tests._support.lists import CAMERA, box_of, write_files, written
+from tests._support.lists import CAMERA, box_of, written
 from tests._support.scenes import unrefined
 
 ROOT = Path(__file__).parents[2]
@@ -21,19 +21,14 @@ SCHEMA = json.loads((ROOT / "curvireg_torch" / "registration" / "result.schema.j
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return write_files(tmp_path_factory.mktemp("results"))
-
-
-@pytest.fixture(scope="module")
 def check():
-    """Raise for a document that is not of the schema."""
+    """Raise for a document that violates the schema."""
     jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     return jsonschema.Draft202012Validator(SCHEMA).validate
 
 
-def register(*words):
+def run_register(*words):
     return main(["register", *map(str, words), "--quiet"])
 
 
@@ -41,25 +36,25 @@ def printed(capsys):
     return capsys.readouterr().out
 
 
-def test_json_is_all_that_is_printed(folder, capsys, check):
+def test_register_json_prints_only_the_document(folder, tmp_path, capsys, check):
     files = [folder / "photos" / "0.png", folder / "truck.safetensors"]
     words = [*files, "--box", *box_of(0), "--camera", *CAMERA, "--json"]
-    assert register(*words) == 0
+    assert run_register(*words) == 0
     document = json.loads(printed(capsys))
     check(document)
-    assert register(*words, "--out", folder / "one") == 0
+    assert run_register(*words, "--out", tmp_path / "one") == 0
     again = json.loads(printed(capsys))
     check(again)
-    assert json.loads((folder / "one" / "result.json").read_text()) == again
+    assert json.loads((tmp_path / "one" / "result.json").read_text()) == again
     assert {**again, "seconds": 0} == {**document, "seconds": 0}
-    assert register(folder / "none.png", files[1], "--json") == 2
+    assert run_register(folder / "none.png", files[1], "--json") == 2
     assert printed(capsys) == ""
 
 
 @pytest.mark.parametrize(
     ("named", "unit"), [(None, None), ("none", None), ("yards", None), ("mm", "mm"), ("ft", "ft"), ("meters", "m")]
 )
-def test_a_mesh_without_a_unit_of_ours_has_none_also_from_a_file(tmp_path, check, named, unit):
+def test_result_document_has_the_unit_of_the_mesh(tmp_path, check, named, unit):
     """trimesh writes "none" for None, and "meters" where we say "m"."""
     mesh = trimesh.creation.box((1.0, 2.0, 3.0))
     if named is not None:
@@ -76,9 +71,9 @@ def test_a_mesh_without_a_unit_of_ours_has_none_also_from_a_file(tmp_path, check
         check({**json.loads(json.dumps(document)), "inputs": {"box": [10, 10, 50, 50]}})
 
 
-def test_without_a_box_it_says_what_was_found_where(folder, capsys, check):
+def test_register_json_without_a_box_has_the_localization(folder, tmp_path, capsys, check):
     words = [folder / "photos" / "0.png", folder / "truck.safetensors", "--camera", *CAMERA, "--no-refine"]
-    assert register(*words, "--json", "--instances", "2") == 0
+    assert run_register(*words, "--json", "--instances", "2") == 0
     document = json.loads(printed(capsys))
     check(document)
     found = document["localization"]
@@ -86,22 +81,22 @@ def test_without_a_box_it_says_what_was_found_where(folder, capsys, check):
     assert document["rotation"] == found["instances"][0]["rotation"]
     assert found["presence"] == found["instances"][0]["presence"] >= found["instances"][-1]["presence"]
     assert document["confidence"] <= found["presence"]
-    assert register(*words, "--out", folder / "found") == 0
+    assert run_register(*words, "--out", tmp_path / "found") == 0
     assert re.search(r"found in box [-\d ]+: there with probability 0\.\d\d", printed(capsys))
     given = [*words, "--box", *box_of(0), "--json"]
-    assert register(*given) == 0
+    assert run_register(*given) == 0
     assert "localization" not in json.loads(printed(capsys))
     for more in (["--instances", "2"], ["--distance", "1", "2"]):
         with pytest.raises(SystemExit):
-            register(*given, *more)
+            run_register(*given, *more)
         assert "apply only without a box" in capsys.readouterr().err
 
 
-def test_json_of_a_list_is_one_line_each(folder, capsys, check):
+def test_register_list_json_prints_one_line_per_row(folder, capsys, check):
     rows = [["photos/0.png", *box_of(0)], ["none.png", "", "", "", ""], ["photos/1.png", "1", "", "", ""]]
     path = written(folder / "list.csv", "photo,x0,y0,x1,y1", *rows)
     before = sorted(found.name for found in folder.iterdir())
-    assert register("--list", path, folder / "truck.safetensors", "--no-refine", "--json") == 0
+    assert run_register("--list", path, folder / "truck.safetensors", "--no-refine", "--json") == 0
     found = capsys.readouterr()
     documents = [json.loads(line) for line in found.out.splitlines()]
     assert [document["status"] for document in documents] == ["ok", "failed", "failed"]
@@ -111,11 +106,11 @@ def test_json_of_a_list_is_one_line_each(folder, capsys, check):
     assert sorted(found.name for found in folder.iterdir()) == before
 
 
-def test_the_schema_refuses_what_is_no_result(folder, capsys, check):
+def test_schema_refuses_other_documents(folder, capsys, check):
     import jsonschema
 
     files = [folder / "photos" / "0.png", folder / "truck.safetensors"]
-    assert register(*files, "--no-refine", "--json") == 0
+    assert run_register(*files, "--no-refine", "--json") == 0
     good = json.loads(printed(capsys))
     check(good)
     for change in (
@@ -135,13 +130,13 @@ def test_the_schema_refuses_what_is_no_result(folder, capsys, check):
             check({key: value for key, value in good.items() if key != missing})
 
 
-def test_the_demos_document_is_of_the_schema(tmp_path, monkeypatch, check):
+def test_demo_document_follows_the_schema(tmp_path, monkeypatch, check):
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
     assert main(["demo", "--out", str(tmp_path / "demo"), "--preset", "fast", "--quiet"]) == 0
     check(json.loads((tmp_path / "demo" / "result.json").read_text()))
 
 
-def test_the_schema_is_printed(capsys):
+def test_schema_command_prints_the_schema(capsys):
     assert main(["schema"]) == 0
     assert json.loads(printed(capsys)) == SCHEMA
 
@@ -156,7 +151,7 @@ def keys(schema):
         yield from keys(inside)
 
 
-def test_the_page_explains_every_key():
+def test_results_page_explains_every_key():
     text = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
     explained = set(re.findall(r"`(\w+)`", text))
     assert set(keys(SCHEMA)) - explained == set()
@@ -173,7 +168,7 @@ def commands(parser, words=()):
 @pytest.mark.parametrize(
     ("words", "parser"), [pytest.param(w, p, id=" ".join(w)) for w, p in commands(build_parser()) if w]
 )
-def test_every_command_shows_examples_that_parse(words, parser):
+def test_help_shows_examples_that_parse(words, parser):
     text = parser.format_help()
     assert "\nexamples:\n" in text
     lines = [line.strip() for line in text.split("\nexamples:\n")[1].splitlines()]
@@ -185,7 +180,7 @@ def test_every_command_shows_examples_that_parse(words, parser):
         parse(said)
 
 
-def test_neither_out_nor_json(capsys):
+def test_register_needs_out_or_json(capsys):
     with pytest.raises(SystemExit):
         main(["register", "a.jpg", "b.stl"])
     assert "expected --out DIR, or --json" in capsys.readouterr().err
