@@ -123,10 +123,12 @@ class Pipeline:
             InvalidInputError: a custom field, or packaged weights with another digest than ``weights``.
         """
         if self.field.startswith(CUSTOM):
-            raise InvalidInputError(f"field: {self.field!r} came with the call; give the module again (field=...)")
+            raise InvalidInputError(
+                f"field: {self.field!r} was passed by the caller; pass the module again (field=...)"
+            )
         if self.field == "learned" and self.weights != SHA256[:16]:
             raise InvalidInputError(
-                f"field: made with weights {self.weights}, packaged are {SHA256[:16]}; give the module (field=...)"
+                f"field: expected weights {self.weights}, got packaged {SHA256[:16]}; pass the module (field=...)"
             )
         return FIELDS[self.field]()
 

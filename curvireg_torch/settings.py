@@ -68,7 +68,7 @@ class ViewPolicy:
             InvalidInputError: ``pose`` is "given".
         """
         if self.pose == "given":
-            raise InvalidInputError("views: this pipeline's views came with the call; give them again")
+            raise InvalidInputError("views: the views of this pipeline were passed by the caller; pass them again")
         if self.pose == "upright":
             grid = sample_views(azimuth_step=self.azimuth_step, elevations=self.elevations, distances=[self.distance])
             return grid.for_up(up)

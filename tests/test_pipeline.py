@@ -128,7 +128,7 @@ def test_read_completes_a_partial_file_with_defaults(tmp_path):
         ('{"hypotheses": 0}', "hypotheses"),
         ('{"terms": {"appearance": {}}}', "compare all views"),
         ('{"terms": {"hog": {}, "appearance": {"top": 0}}}', "top"),
-        ('{"terms": {"hog": {}, "appearance": {"weights": "0"}}}', "made with weights 0"),
+        ('{"terms": {"hog": {}, "appearance": {"weights": "0"}}}', "expected weights 0"),
     ],
 )
 def test_read_names_the_file_and_the_mistake(tmp_path, text, message):
@@ -140,12 +140,12 @@ def test_read_names_the_file_and_the_mistake(tmp_path, text, message):
 
 
 def test_photograph_field_refuses_other_weights():
-    with pytest.raises(InvalidInputError, match="made with weights feed"):
+    with pytest.raises(InvalidInputError, match="expected weights feed"):
         Pipeline(weights="feed").photograph_field()
     custom = Pipeline().with_field(torch.nn.Conv2d(1, 2, 3, padding=1))
     assert custom.field == "custom:Conv2d"
     assert custom.weights != Pipeline().with_field(torch.nn.Conv2d(1, 2, 3, padding=1)).weights
-    with pytest.raises(InvalidInputError, match="came with the call"):
+    with pytest.raises(InvalidInputError, match="passed by the caller"):
         custom.photograph_field()
 
 
@@ -153,5 +153,5 @@ def test_view_policy_sphere():
     assert len(ViewPolicy(directions=50, theta_step=90).sphere()) == 200
     upright = ViewPolicy(pose="upright", azimuth_step=90, elevations=(0.0,), distance=3.0).sphere()
     assert upright.distance.tolist() == [3.0] * 4
-    with pytest.raises(InvalidInputError, match="came with the call"):
+    with pytest.raises(InvalidInputError, match="passed by the caller"):
         ViewPolicy(pose="given").sphere()

@@ -118,12 +118,9 @@ class ViewBank:
             mine |= self.pipeline.views.key_fields()
             theirs |= pipeline.views.key_fields()
         if mine != theirs:
-            differences = [
-                f"{n} {mine[n]}, asked for {theirs[n]}" for n in mine if n in theirs and mine[n] != theirs[n]
-            ]
-            raise BankError(
-                f"bank: made with other settings ({', '.join(differences)}); build it again, or use bank.pipeline"
-            )
+            names = [n for n in mine if n in theirs and mine[n] != theirs[n]]
+            differences = ", ".join(f"{n} {mine[n]}, expected {theirs[n]}" for n in names)
+            raise BankError(f"bank: built with other settings ({differences}); build it again, or use bank.pipeline")
 
     @classmethod
     def build(

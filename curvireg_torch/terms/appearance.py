@@ -35,7 +35,7 @@ class Appearance(RerankingTerm):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.weights != SHA256[:16]:
-            raise InvalidInputError(f"appearance: made with weights {self.weights}, installed are {SHA256[:16]}")
+            raise InvalidInputError(f"appearance: expected weights {self.weights}, got installed weights {SHA256[:16]}")
 
     def build(self, views: Views | None) -> RerankingModule:
         return _AppearanceModule()

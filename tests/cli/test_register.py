@@ -115,7 +115,7 @@ def broken_files(folder):
         ({}, ["--camera", "0", "260", "119", "89"], ["focal"]),
         ({}, ["--top", "0"], ["hypotheses"]),
         ({}, ["--field", "none"], ["none"]),
-        ({}, ["--preset", "paper"], ["made with other settings"]),
+        ({}, ["--preset", "paper"], ["built with other settings"]),
         ({}, ["--pose", "upright"], ["--pose"]),
     ],
 )

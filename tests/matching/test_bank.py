@@ -87,18 +87,18 @@ def test_bank_moves_to_a_device(small_bank):
 
 
 def test_check_compatible_refuses_other_bank_settings(small_bank):
-    with pytest.raises(BankError, match=r"made with other settings \(image_size 64, asked for 128\)"):
+    with pytest.raises(BankError, match=r"built with other settings \(image_size 64, expected 128\)"):
         ViewMatcher(small_bank, pipeline=Pipeline())
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"pose": "any"}, "pose upright, asked for any"),
-        ({"pose": "given"}, "pose upright, asked for given"),
-        ({"azimuth_step": 60.0}, r"azimuth_step 120\.0, asked for 60\.0"),
-        ({"elevations": (5.0,)}, r"elevations \(10\.0,\), asked for \(5\.0,\)"),
-        ({"distance": 6.0}, r"distance 5\.0, asked for 6\.0"),
+        ({"pose": "any"}, "pose upright, expected any"),
+        ({"pose": "given"}, "pose upright, expected given"),
+        ({"azimuth_step": 60.0}, r"azimuth_step 120\.0, expected 60\.0"),
+        ({"elevations": (5.0,)}, r"elevations \(10\.0,\), expected \(5\.0,\)"),
+        ({"distance": 6.0}, r"distance 5\.0, expected 6\.0"),
     ],
 )
 def test_check_compatible_refuses_another_view_policy(upright, change, message):
