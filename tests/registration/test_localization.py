@@ -96,11 +96,25 @@ def test_presence_is_lower_without_the_object(registrar):
     assert min(there) > max(result.localization.presence for result in absent)
 
 
-def test_localize_finds_several_instances(registrar):
+def two_trucks():
     first, box = pasted_scene(5, (0, 0), 0.7)
     second, other = pasted_scene(5, (150, 70), 0.7)
-    image = first.clone()
-    image[:, 70:, 150:] = second[:, 70:, 150:]
+    first[:, 70:, 150:] = second[:, 70:, 150:]
+    return first, box, other
+
+
+def test_localize_sorts_by_the_presence_of_refined_boxes(registrar, monkeypatch):
+    def inverted(_, __, result):
+        where = result.localization
+        return replace(result, localization=replace(where, presence=1.0 - where.presence))
+
+    monkeypatch.setattr(localization_module, "_refined", inverted)
+    first, second = localize(registrar, [two_trucks()[0]], instances=2)[0]
+    assert first.localization.presence > second.localization.presence
+
+
+def test_localize_finds_several_instances(registrar):
+    image, box, other = two_trucks()
     results = localize(registrar, [image], instances=2)[0]
     boxes = torch.stack([r.localization.box for r in results])
     overlap = box_iou(boxes, torch.stack([box, other]).double())
