@@ -1,4 +1,4 @@
-"""On photographs that are made from the meshes' own views, where the right view must win."""
+"""The experiments on rendered photographs, for which the true view must win."""
 
 import csv
 import os
@@ -38,15 +38,8 @@ def collection(tmp_path_factory):
         T[:3, :3] = rotation_from_viewpoint(float(azimuth), float(elevation)).double()
         T[:3, 3] = -T[:3, :3] @ torch.from_numpy(mesh.bounds.mean(axis=0))
         T[2, 3] += 5.0 * 0.5 * float(torch.tensor(mesh.extents).norm())
-        image, box = synthesize_photograph(
-            mesh,
-            T,
-            K,
-            (120, 160),
-            torch.Generator().manual_seed(i),
-            background=torch.full((3, 120, 160), 0.9),
-            texture=0.0,
-        )
+        generator, background = torch.Generator().manual_seed(i), torch.full((3, 120, 160), 0.9)
+        image, box = synthesize_photograph(mesh, T, K, (120, 160), generator, background=background, texture=0.0)
         pixels = (image.permute(1, 2, 0).flip(-1) * 255).byte().numpy()
         assert cv2.imwrite(str(folder / f"{i}.png"), pixels)
         lines.append(f"{i}.png,{','.join(f'{v:g}' for v in box.tolist())},{azimuth},{elevation},0,")
@@ -59,7 +52,7 @@ def cases(collection):
     return paper.find_cases("web", collection)
 
 
-def test_right_view_repeats_best(cases):
+def test_curve_table_peaks_at_the_true_view(cases):
     table = paper.curve_table(cases, SETTINGS, 1.5, progress=False)
     assert [row[0] for row in table.rows] == list(range(-100, 100, 5))
     assert len(table.rows) == 40
@@ -70,7 +63,7 @@ def test_right_view_repeats_best(cases):
             assert best[k] > 0.5, name
 
 
-def test_rankings_find_the_right_view(cases):
+def test_rank_tables_find_the_true_view(cases):
     rankings = paper.rank_views(cases, VIEWS, SETTINGS, progress=False)
     assert rankings.errors.shape == (2, len(VIEWS))
     assert rankings.errors.amin(1).max() < 0.1, "the truth is in the bank"
@@ -80,8 +73,8 @@ def test_rankings_find_the_right_view(cases):
     assert precision.rows[1][column] == 1.0
     for table in paper.rank_tables(rankings):
         assert [row[0] for row in table.rows] == [1, 3, 5, 10, 20]
-        for column_of_shares in list(zip(*table.rows, strict=True))[1:]:
-            assert list(column_of_shares) == sorted(column_of_shares), "more views, more hits"
+        for column_of_values in list(zip(*table.rows, strict=True))[1:]:
+            assert list(column_of_values) == sorted(column_of_values), "precision grows with k"
     angles = paper.angle_table(rankings)
     row = dict(zip(angles.columns, angles.rows[0], strict=True))
     assert row["azimuth Clo."] == row["elevation Clo."] == pytest.approx(0, abs=1e-3)
@@ -90,7 +83,7 @@ def test_rankings_find_the_right_view(cases):
     assert row["azimuth Est."] == pytest.approx(float(expected), abs=1e-3)
 
 
-def test_points_of_the_photograph_lie_on_the_view(cases):
+def test_detector_and_repeatability_tables(cases):
     ip, hausdorff, robust, points = paper.detector_tables(cases, SETTINGS, 2.0, progress=False)
     column = ip.columns.index("MFC")
     assert [row[0] for row in ip.rows] == ["thing", "all"]
@@ -102,7 +95,7 @@ def test_points_of_the_photograph_lie_on_the_view(cases):
     assert 0.5 < table.rows[1][table.columns.index("CS/MFC")] <= 1
 
 
-def test_cases_leave_out_what_the_paper_leaves_out(tmp_path):
+def test_find_cases_omits_occluded_objects_and_unknown_poses(tmp_path):
     write_pascal3d(tmp_path / "pascal")
     found = paper.find_cases("pascal3d", tmp_path / "pascal")
     assert [case.category for case in found] == ["car", "car", "sofa"], "neither truncated nor occluded"
@@ -116,19 +109,19 @@ def test_cases_leave_out_what_the_paper_leaves_out(tmp_path):
         paper.find_cases("coco", tmp_path)
 
 
-def test_view_of_a_camera_that_looks_aside():
-    """A camera that looks straight at an object off the axis sees it turned by the angle of the ray."""
+def test_case_view_of_an_object_off_the_axis():
+    """The rotation is relative to a camera that looks at the object: it differs by the angle of the ray."""
     pose = torch.cat([torch.eye(3), torch.tensor([[3.0], [0.0], [4.0]])], dim=1).double()
     case = paper.Case("x", "", "", "m", torch.zeros(4), pose)
     R, distance = case.view(trimesh.creation.box())
     assert distance == pytest.approx(5.0)
     assert float(rotation_error(R, torch.eye(3).double())) == pytest.approx(36.87, abs=0.01)
-    turned_centre = R @ torch.tensor([0.0, 0.0, 1.0]).double()
-    assert turned_centre[0] < 0, "the model's z axis, parallel to the optical axis, leans to the other side"
+    z_axis = R @ torch.tensor([0.0, 0.0, 1.0]).double()
+    assert z_axis[0] < 0
 
 
 @pytest.mark.slow
-def test_command(collection, tmp_path):
+def test_reproduce_paper_command(collection, tmp_path):
     words = ["curve", "web", str(collection), "--out", str(tmp_path / "out"), "--image-size", "64", "--quiet"]
     done = subprocess.run(
         [sys.executable, str(REPOSITORY / "scripts" / "paper" / "reproduce_paper.py"), *words],

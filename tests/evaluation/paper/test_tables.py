@@ -12,20 +12,20 @@ TABLE = Table(
 )
 
 
-def test_csv_keeps_all_digits():
+def test_table_csv_has_all_digits():
     rows = list(csv.reader(io.StringIO(TABLE.csv())))
     assert rows[0] == TABLE.columns
     assert float(rows[1][1]) == 0.123456
 
 
-def test_markdown_says_what_it_shows():
+def test_table_markdown():
     lines = TABLE.markdown().splitlines()
     assert lines[:3] == ["## A title", "", "Shares, N = 2."]
     assert lines[4:] == ["| category | a | b |", "|---|---|---|", "| car | 0.123 | 1 |", "| all | - | 2 |"]
 
 
 @pytest.mark.parametrize("curve", [False, True])
-def test_files(tmp_path, curve, monkeypatch):
+def test_write_table(tmp_path, curve, monkeypatch):
     pytest.importorskip("matplotlib")
     name, drawn = "curves" if curve else "bars", []
     plain = getattr(plots, name)
@@ -37,6 +37,6 @@ def test_files(tmp_path, curve, monkeypatch):
     assert drawn == [(table.columns, table.rows)]
 
 
-def test_without_matplotlib(tmp_path, monkeypatch):
+def test_write_table_without_matplotlib(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert [p.suffix for p in write_table(TABLE, tmp_path)] == [".csv", ".md"]
