@@ -40,8 +40,7 @@ class Located:
 
     Attributes:
         boxes: (P, 4) x0, y0, x1, y1 in px, of the whole object: they may extend beyond the image.
-        scores: (P,) similarity of view and photograph there, in standard deviations above the view's mean over the
-            photograph.
+        scores: (P,) similarity, in standard deviations above the view's mean over the photograph.
         views: (P,) int64 view of the bank.
     """
 
