@@ -19,6 +19,7 @@ from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import Registrar
 from curvireg_torch.settings import BankSettings, ViewPolicy
 from curvireg_torch.terms import normalized_correlation
+from curvireg_torch.utils.digests import tensor_digest
 
 SETTINGS = BankSettings(image_size=64)
 UPRIGHT = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
@@ -69,6 +70,17 @@ def test_build_stops_at_the_first_error(truck):
     with pytest.raises(KeyboardInterrupt):
         build(truck, uniform_views(3), renderer=Broken(), chunk_size=1)
     assert torch.get_num_threads() == before
+
+
+def test_bank_refuses_bad_arguments(truck, small_bank):
+    with pytest.raises(InvalidInputError, match="views: expected at least one"):
+        build(truck, small_bank.views[:0])
+    with pytest.raises(InvalidInputError, match="chunk_size"):
+        build(truck, chunk_size=0)
+    with pytest.raises(InvalidInputError, match="chunk_size"):
+        ViewMatcher(small_bank, chunk_size=0)
+    with pytest.raises(InvalidInputError, match=r"choose one of bank\.meshes"):
+        _ = ViewBank.join([small_bank, small_bank]).mesh
 
 
 def test_bank_unpacks_selected_masks(small_bank):
@@ -240,6 +252,10 @@ def _with_nan(x):
     return x
 
 
+def _infinite(x):
+    return torch.full_like(x, torch.inf)
+
+
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
@@ -250,18 +266,25 @@ def _with_nan(x):
         ("boxes", _with_nan, "not finite"),
         ("boxes", lambda x: x[1:], "boxes: not of the shape"),
         ("points", lambda x: x[:, 1:], "points: not of the shape"),
+        ("views.distance", _infinite, "viewpoints that are not finite"),
         ("model", lambda x: x + 1, "meshes that do not exist"),
         ("model", lambda x: x - 1, "meshes that do not exist"),
         ("reranking.appearance", lambda x: x[1:], "appearance that do not fit"),
         ("reranking.appearance", _with_nan, "appearance that do not fit"),
+        ("mesh0.faces", lambda x: x + 10**6, "mesh 0 is not a mesh"),
     ],
 )
 def test_load_refuses_contents_that_no_bank_has(small_bank, tmp_path, name, change, message):
     """The checksum of these files is correct."""
-    tensors = {**small_bank.tensors, name: change(small_bank.tensors[name])}
-    ViewBank(small_bank.meshes, small_bank.views, small_bank.pipeline, tensors).save(tmp_path / "bank")
+    path = tmp_path / "bank"
+    small_bank.save(path)
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    tensors = load_file(path)
+    tensors[name] = change(tensors[name]).contiguous()
+    save_file(tensors, path, {**metadata, "checksum": tensor_digest(tensors, size=16)})
     with pytest.raises(BankError, match=message):
-        ViewBank.load(tmp_path / "bank")
+        ViewBank.load(path)
 
 
 def test_load_refuses_truncated_and_missing_files(saved):
