@@ -41,7 +41,7 @@ def view_repeatability(view: Tensor, photo: Tensor, *, eps_px: float = 2.0) -> T
     """Repeatability of a detector: fraction of the view's points within ``eps_px`` of a point of the photograph.
 
     This is :func:`intersection_percentage` with the roles exchanged. The paper's Rep, which ranks views
-    (:func:`curvireg_torch.matching.repeatability`), has the other direction.
+    (:func:`curvireg_torch.terms.repeatability.repeatability`), has the other direction.
 
     Args, returns and errors are those of :func:`intersection_percentage`.
 

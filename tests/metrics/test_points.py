@@ -8,8 +8,9 @@ import torch
 from scipy.spatial.distance import cdist
 from skimage.metrics import hausdorff_distance as skimage_hausdorff
 
-from curvireg_torch import matching, metrics
+from curvireg_torch import metrics
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.terms.repeatability import dilate_points, repeatability
 
 
 def _masks(seed: int, n: int = 4, density: float = 0.02) -> torch.Tensor:
@@ -31,9 +32,9 @@ def test_intersection_percentage_and_view_repeatability_against_a_distance_matri
     assert not np.allclose(ip, rep)
 
 
-def test_matching_repeatability_equals_intersection_percentage() -> None:
+def test_repeatability_term_equals_intersection_percentage() -> None:
     photo, view = _masks(0, density=0.1), _masks(1)
-    rep = matching.repeatability(photo, matching.dilate_points(view, 1.5)).diagonal()
+    rep = repeatability(photo, dilate_points(view, 1.5)).diagonal()
     torch.testing.assert_close(rep, metrics.intersection_percentage(photo, view, eps_px=1.5))
     ours = metrics.view_repeatability(view, photo, eps_px=1.5)
     assert not np.allclose(ours, rep)
