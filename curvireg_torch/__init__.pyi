@@ -59,6 +59,7 @@ from .filters import (
     principal_curvature_image as principal_curvature_image,
 )
 from .geometry import (
+    PosePrior as PosePrior,
     ViewSphere as ViewSphere,
     camera_matrix as camera_matrix,
     crop_images as crop_images,

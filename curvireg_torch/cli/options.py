@@ -7,14 +7,17 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..utils.choices import DEFAULT, PRESET_NAMES, RENDERER_NAMES, UNITS, UP_AXES
+from ..errors import InvalidInputError
+from ..utils.choices import DEFAULT, PRESET_NAMES, RENDERER_NAMES, SIDE_NAMES, UNITS, UP_AXES
 
 if TYPE_CHECKING:
     from ..evaluation.opening import RegisterOptions
+    from ..geometry.pose_prior import PosePrior
 
 __all__ = [
     "add_box_and_camera",
     "add_fov",
+    "add_pose_prior",
     "common_options",
     "examples",
     "mesh_options",
@@ -23,7 +26,7 @@ __all__ = [
     "split_numbers",
 ]
 
-_COUNTS = {"--box": 4, "--camera": 4, "--distance": 2}
+_COUNTS = {"--box": 4, "--camera": 4, "--distance": 2, "--azimuth": 2, "--elevation": 2, "--theta": 2}
 _NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
 
@@ -82,6 +85,46 @@ def add_fov(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fov", type=float, metavar="DEG", help="horizontal field of view in degrees")
 
 
+def add_pose_prior(parser: argparse.ArgumentParser) -> None:
+    """Add the options that limit the pose."""
+    group = parser.add_argument_group(
+        "what is known about the pose", "limits in degrees; all that are given must hold; the result stays within them"
+    )
+    limits = ("LOW", "HIGH")
+    group.add_argument("--azimuth", type=float, nargs=2, metavar=limits, help="counted upwards; 300 60 goes through 0")
+    group.add_argument("--elevation", type=float, nargs=2, metavar=limits, help="-90 below to 90 above the object")
+    group.add_argument("--theta", type=float, nargs=2, metavar=limits, help="in-plane rotation")
+    group.add_argument("--side", choices=SIDE_NAMES, help="side that faces the camera, 45 degrees to either side of it")
+    group.add_argument("--near", type=float, nargs="+", metavar="DEG", help="AZIMUTH ELEVATION [THETA] nearby")
+    group.add_argument("--within", type=float, metavar="DEG", help="largest angle from --near (default: 45)")
+    group.add_argument(
+        "--front", choices=UP_AXES, help="axis of the mesh file that points out of its front, at azimuth 0"
+    )
+    group.add_argument(
+        "--softness", type=float, metavar="DEG", help="soft limits: standard deviation of what exceeds them"
+    )
+
+
+def _pose_prior(arguments: argparse.Namespace) -> "PosePrior | None":
+    given = {n: getattr(arguments, n, None) for n in ("azimuth", "elevation", "theta", "front", "softness")}
+    side, near, within = (getattr(arguments, n, None) for n in ("side", "near", "within"))
+    if side is None and near is None and within is None and all(value is None for value in given.values()):
+        return None
+    from ..geometry.pose_prior import PosePrior
+
+    if side is not None:
+        if given["azimuth"] is not None:
+            raise InvalidInputError("--side: give it or --azimuth")
+        given["azimuth"] = PosePrior.side(side).azimuth
+    if near is not None:
+        if len(near) not in (2, 3):
+            raise InvalidInputError(f"--near: expected AZIMUTH ELEVATION [THETA], got {len(near)} numbers")
+        given |= {"viewpoint": (*near, 0.0)[:3], "within": 45.0 if within is None else within}
+    elif within is not None:
+        raise InvalidInputError("--within: expected --near beside it")
+    return PosePrior(**{name: value for name, value in given.items() if value is not None})
+
+
 def register_options(
     arguments: argparse.Namespace, photos: Sequence[Path] = (), meshes: Sequence[Path] = ()
 ) -> "RegisterOptions":
@@ -96,6 +139,7 @@ def register_options(
         for name, value in vars(arguments).items()
         if name in names and value is not None
     }
+    values["prior"] = _pose_prior(arguments)
     guess = "exif" if getattr(arguments, "exif", False) else getattr(arguments, "fov", None)
     return RegisterOptions(photos=tuple(photos), meshes=tuple(meshes), guess=guess, **values)
 

@@ -14,6 +14,7 @@ from ..utils.input_paths import check_given, is_one_photograph
 from .options import (
     add_box_and_camera,
     add_fov,
+    add_pose_prior,
     common_options,
     examples,
     mesh_options,
@@ -81,6 +82,7 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--exif", action="store_true", help=argparse.SUPPRESS)
     add_fov(parser)
+    add_pose_prior(parser)
     parser.add_argument(
         "--instances", type=int, default=1, metavar="N", help="without a box: up to N objects (default: 1)"
     )

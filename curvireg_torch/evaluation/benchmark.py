@@ -9,7 +9,9 @@ from torch import Tensor
 
 from ..data import BOPDataset, Pascal3DPlus, WebCollection
 from ..errors import InvalidInputError
-from .protocol import Protocol
+from ..geometry.pose_prior import PosePrior, object_frame
+from ..io.meshes.up import format_up
+from .protocol import Protocol, hint_of_truth
 from .store import Row
 
 __all__ = ["Benchmark", "BenchmarkItem", "Row"]
@@ -26,6 +28,7 @@ class BenchmarkItem:
         meshes: one, or all that the protocol allows.
         box: (4,) x0, y0, x1, y1 in px, as annotated; NaN where unknown.
         camera_matrix: (3, 3) in px; None if the method does not get it.
+        prior: limits on the pose that the protocol's ``hint`` gives to the method.
     """
 
     key: str
@@ -34,11 +37,13 @@ class BenchmarkItem:
     meshes: tuple[Path, ...]
     box: Tensor
     camera_matrix: Tensor | None
+    prior: PosePrior | None = None
 
     def request(self) -> Row:
-        """Box and camera matrix, to the last digit."""
+        """Box, camera matrix and prior, to the last digit."""
         camera = None if self.camera_matrix is None else self.camera_matrix.tolist()
-        return {"key": self.key, "box": self.box.tolist(), "camera": camera}
+        hint = {} if self.prior is None else {"prior": self.prior.to_dict()}
+        return {"key": self.key, "box": self.box.tolist(), "camera": camera, **hint}
 
 
 class Benchmark(ABC):
@@ -90,13 +95,16 @@ class Benchmark(ABC):
         return (Path(sample[self.mesh]),)
 
     def _item(self, index: int, sample: Row) -> BenchmarkItem:
+        key, meshes = self.key.format_map(sample), self.meshes(sample)
+        frame = object_frame(format_up(meshes[0].suffix))
         return BenchmarkItem(
-            key=self.key.format_map(sample),
+            key=key,
             index=index,
             photo=Path(sample["image_path"]),
-            meshes=self.meshes(sample),
+            meshes=meshes,
             box=sample["box"],
             camera_matrix=sample["camera_matrix"] if self.gives_camera else None,
+            prior=hint_of_truth(sample["rotation"], frame, self.protocol, key),
         )
 
     @abstractmethod

@@ -7,6 +7,7 @@ from pathlib import Path
 from ..errors import BankError
 from ..geometry import camera_matrix
 from ..geometry.cameras import camera_of_view
+from ..geometry.pose_prior import PosePrior
 from ..io.meshes import load_mesh
 from ..matching import ViewBank, cached_bank
 from ..models import LearnedCurvilinearSaliency
@@ -31,6 +32,7 @@ class RegisterOptions:
         guess: replaces an unknown camera: "exif" takes the focal length in the photograph's file, a number is the
             horizontal field of view in degrees.
         instances, distance: without a box, see :func:`curvireg_torch.registration.localize`.
+        prior: limits on the pose.
         preset, pipeline: name of a pipeline, or its JSON file; None: the pipeline of a bank, or the default.
         pose: the pose prior, "any" or "upright"; None: that of the pipeline.
         field: weights of an adapted field.
@@ -48,6 +50,7 @@ class RegisterOptions:
     guess: str | float | None = None
     instances: int = 1
     distance: tuple[float, float] | None = None
+    prior: PosePrior | None = None
     preset: str | None = None
     pipeline: Path | None = None
     pose: str | None = None
@@ -89,7 +92,7 @@ class RegisterOptions:
 
     def complete(self, entry: Entry) -> Entry:
         """A photograph of a list with the options that a list does not hold."""
-        return replace(entry, guess=self.guess, instances=self.instances, distance=self.distance)
+        return replace(entry, guess=self.guess, instances=self.instances, distance=self.distance, prior=self.prior)
 
 
 def check_camera(camera: Sequence[float] | None, guess: str | float | None) -> None:

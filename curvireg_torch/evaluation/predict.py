@@ -1,9 +1,10 @@
 """Poses of the objects of a dataset, from the CADs that the protocol allows."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
-from torch import nn
+from torch import Tensor, nn
 
 from ..errors import ImageError, MeshError, MissingFileError
 from ..io import read_image
@@ -70,7 +71,7 @@ def register_object(
     size: Row = {"image_size": list(image.shape[1:])}
     start = time.perf_counter()
     box = None if protocol.box is None else perturbed_box(item.box, protocol, item.key)[None]
-    result = registrar([image], box, item.camera_matrix)[0]
+    result = registrar([image], box, item.camera_matrix, prior=item.prior)[0]
     seconds = {"bank": bank_seconds, "register": time.perf_counter() - start}
     if isinstance(result, FailedRegistration):
         return {**size, "failed": result.error.message, "seconds": seconds}
@@ -88,10 +89,10 @@ class FusedMatcher(ViewMatcher):
     The mean is given to the model that scores best in that view; the others get 0.
     """
 
-    def rank(self, query: QueryFeatures) -> Ranking:
-        ranking = super().rank(query)
+    def rank(self, query: QueryFeatures, log_prior: Tensor | None = None) -> Ranking:
+        ranking = super().rank(query, log_prior)
         scores = ranking.scores.unflatten(1, (len(self.bank.meshes), -1))
         best = scores == scores.amax(dim=1, keepdim=True)
         first = best & (best.cumsum(dim=1) == 1)
         mean = (scores.mean(dim=1, keepdim=True) * first).flatten(1)
-        return Ranking(mean, mean.argsort(dim=1, descending=True, stable=True), ranking.terms)
+        return replace(ranking, scores=mean, order=mean.argsort(dim=1, descending=True, stable=True))

@@ -8,9 +8,13 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
+from ..geometry import rotation_from_axis_angle, viewpoint_from_rotation
+from ..geometry.pose_prior import PosePrior
 from ..utils.checks import check_option
 
-__all__ = ["Protocol", "perturbed_box"]
+__all__ = ["Protocol", "hint_of_truth", "perturbed_box"]
+
+HINTS = ("azimuth", "pose")
 
 CHOICES = {"cad": ("annotated", "any", "fused"), "pose": ("upright", "any")}
 
@@ -25,10 +29,12 @@ class Protocol:
         pose: pose prior: "upright" or "any".
         box: 0 for the annotated box; x > 0 moves each edge at random by up to x of the side; None: the object is
             localized.
+        hint: knowledge of the pose: "azimuth:45": the azimuth lies within 45 degrees of a value that is itself up
+            to 45 degrees off; "pose:45": the same of the whole rotation; "none".
         seed: of the random numbers, which depend on the object's key besides.
 
     Raises:
-        InvalidInputError: an unknown choice, or a box outside [0, 0.45].
+        InvalidInputError: an unknown choice, a box outside [0, 0.45], or a hint outside (0, 180).
 
     Example:
         >>> protocol = Protocol.parse(["cad=any", "box=0.1"])
@@ -41,6 +47,7 @@ class Protocol:
     cad: str = "annotated"
     pose: str = "upright"
     box: float | None = 0.0
+    hint: str = "none"
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -48,6 +55,8 @@ class Protocol:
             check_option(getattr(self, name), options, name)
         if self.box is not None and not 0.0 <= self.box <= 0.45:
             raise InvalidInputError(f"box: expected a fraction in [0, 0.45], got {self.box}")
+        if self.hint != "none":
+            self.hint_tolerance()
 
     @classmethod
     def parse(cls, words: Iterable[str], *, pose: str = "upright") -> "Protocol":
@@ -74,9 +83,23 @@ class Protocol:
                 raise InvalidInputError(f"protocol: expected {key}=NUMBER, got {word!r}") from error
         return cls(**values)  # type: ignore[arg-type]
 
+    def hint_tolerance(self) -> tuple[str, float]:
+        """Kind of the hint and its tolerance in degrees."""
+        kind, _, text = self.hint.partition(":")
+        try:
+            degrees = float(text)
+        except ValueError as error:
+            raise InvalidInputError(f"hint: expected azimuth:DEGREES or pose:DEGREES, got {self.hint!r}") from error
+        check_option(kind, HINTS, "hint")
+        if not 0.0 < degrees < 180.0:
+            raise InvalidInputError(f"hint: expected degrees in (0, 180), got {self.hint!r}")
+        return kind, degrees
+
     def __str__(self) -> str:
-        box = f"box={self.box:g} seed={self.seed}" if self.box else f"box={'none' if self.box is None else 'annotated'}"
-        return f"cad={self.cad} pose={self.pose} {box}"
+        box = "none" if self.box is None else f"{self.box:g}" if self.box else "annotated"
+        hint = "" if self.hint == "none" else f" hint={self.hint}"
+        seed = f" seed={self.seed}" if self.box or hint else ""
+        return f"cad={self.cad} pose={self.pose} box={box}{hint}{seed}"
 
 
 def perturbed_box(box: Tensor, protocol: Protocol, key: str) -> Tensor:
@@ -96,7 +119,38 @@ def perturbed_box(box: Tensor, protocol: Protocol, key: str) -> Tensor:
     """
     if not protocol.box:
         return box
-    seed = int.from_bytes(hashlib.sha256(f"{protocol.seed} {key}".encode()).digest()[:7])
-    offset = 2.0 * torch.rand(4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1.0
+    offset = 2.0 * torch.rand(4, generator=_generator(protocol, key), dtype=torch.float64) - 1.0
     sides = (box[2:] - box[:2]).repeat(2)
     return (box + protocol.box * offset * sides).to(box.dtype)
+
+
+def hint_of_truth(rotation: Tensor, frame: Tensor, protocol: Protocol, key: str) -> PosePrior | None:
+    """The hint about the object ``key``: a range around its true pose moved at random by up to half its width.
+
+    Args:
+        rotation: (3, 3) true rotation, NaN where it is unknown.
+        frame: of the mesh, see :func:`curvireg_torch.geometry.pose_prior.object_frame`.
+
+    Example:
+        >>> R = torch.eye(3, dtype=torch.float64)
+        >>> hint = hint_of_truth(R, R, Protocol(hint="pose:30"), "car 1")
+        >>> hint.within, float(hint.excess(R)) <= 0.0
+        (30.0, True)
+    """
+    if protocol.hint == "none" or not bool(rotation.isfinite().all()):
+        return None
+    kind, degrees = protocol.hint_tolerance()
+    generator = _generator(protocol, f"hint {key}")
+    R = rotation.double()
+    if kind == "azimuth":
+        offset = degrees * (2.0 * torch.rand((), generator=generator, dtype=torch.float64) - 1.0)
+        centre = float(viewpoint_from_rotation(R @ frame.mT)[0] + offset)
+        return PosePrior(azimuth=((centre - degrees) % 360.0, (centre + degrees) % 360.0))
+    axis = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+    angle = torch.deg2rad(degrees * torch.rand((), generator=generator, dtype=torch.float64))
+    return PosePrior(rotation=rotation_from_axis_angle(axis * angle) @ R, within=degrees)
+
+
+def _generator(protocol: Protocol, key: str) -> torch.Generator:
+    seed = int.from_bytes(hashlib.sha256(f"{protocol.seed} {key}".encode()).digest()[:7])
+    return torch.Generator().manual_seed(seed)

@@ -22,6 +22,7 @@ from .conversions import (
     rotation_from_quaternion,
 )
 from .crops import box_iou, crop_images, crop_transforms, square_boxes, whole_image_box
+from .pose_prior import PosePrior, object_frame
 from .symmetry import symmetry_transforms, views_without_symmetric
 from .translation import pose_from_box, translation_from_box
 from .up import up_rotation
@@ -29,12 +30,14 @@ from .viewpoint import rotation_error, rotation_from_viewpoint, viewpoint_from_r
 from .views import ViewSphere, paper_views, sample_views, uniform_views
 
 __all__ = [
+    "PosePrior",
     "ViewSphere",
     "axis_angle_from_rotation",
     "box_iou",
     "camera_matrix",
     "crop_images",
     "crop_transforms",
+    "object_frame",
     "opencv_from_opengl",
     "opencv_from_pytorch3d",
     "opengl_from_opencv",

@@ -147,8 +147,12 @@ class ViewMatcher(nn.Module):
             shapes=shapes.to(regions),
         )
 
-    def rank(self, query: QueryFeatures) -> Ranking:
+    def rank(self, query: QueryFeatures, log_prior: Tensor | None = None) -> Ranking:
         """Compare described photographs with all views.
+
+        Args:
+            query: B photographs.
+            log_prior: (B, N) log prior of the views, added to the log of their scores; ``-inf`` excludes a view.
 
         Raises:
             ImageError: missing pixels in the crop of a box, or pixels outside [0, 1].
@@ -156,13 +160,27 @@ class ViewMatcher(nn.Module):
         check_pixels(query.crops, "of the box")
         first = [t for t in self.pipeline.terms if not isinstance(t, RerankingTerm)]
         terms = {t.name: self._terms[t.name](query) for t in first}
-        log = torch.stack([t.weight * t.log_score(terms[t.name]) for t in first]).sum(dim=0)
+        first_log = torch.stack([t.weight * t.log_score(terms[t.name]) for t in first]).sum(dim=0)
+        log, reranked = self._reranked(query, first_log)
+        if log_prior is None:
+            scores = log.exp()
+            return Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), {**terms, **reranked})
+        log_prior = log_prior.to(log)
+        without = log.amax(dim=1)
+        log, reranked = self._reranked(query, first_log + log_prior)
+        scores = log.exp()
+        order = log.argsort(dim=1, descending=True, stable=True)
+        ratio = (log.amax(dim=1) - without).clamp(max=0.0).exp()
+        return Ranking(scores, order, {**terms, **reranked}, log_prior > -torch.inf, ratio)
+
+    def _reranked(self, query: QueryFeatures, log: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """(B, N) log scores with all reranking terms, and the raw scores of these terms."""
+        raw: dict[str, Tensor] = {}
         for term in self.pipeline.terms:
             if isinstance(term, RerankingTerm):
-                terms[term.name], log_score = self._rerank(term, query, log)
+                raw[term.name], log_score = self._rerank(term, query, log)
                 log = log + term.weight * log_score
-        scores = log.exp()
-        return Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), terms)
+        return log, raw
 
     def _rerank(self, term: RerankingTerm, query: QueryFeatures, log: Tensor) -> tuple[Tensor, Tensor]:
         """(B, N) raw scores, NaN for views that were not compared, and log scores of all views."""
@@ -176,6 +194,7 @@ class ViewMatcher(nn.Module):
         R, model = self.bank.rotations, self.bank.model
         order = log.argsort(dim=1, descending=True, stable=True)
         selected = [distinct_views(o, R, count=term.top, angle=term.min_angle, model=model) for o in order]
+        selected = [index[row[index] > -torch.inf] for index, row in zip(selected, log, strict=True)]
         compared = torch.cat(selected).unique()
         similarity = module.compare(query, self._reranking_features(term.name, compared)).to(log)
         for b, index in enumerate(selected):

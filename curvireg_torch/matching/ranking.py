@@ -21,11 +21,15 @@ class Ranking:
         terms: name -> (B, N) raw scores of each term: "hog": normalised correlation of descriptors, in [0, 1], or in
             [-1, 1] if they are whitened; "repeatability": fraction of the photograph's points found in the view; "box":
             S_box in [0, 1], similarity of the boxes' aspect ratios, best view 1.
+        allowed: (B, N) bool, which views a pose prior leaves; None without one.
+        prior_ratio: (B,) best score under the pose prior divided by the best score without it; None without one.
     """
 
     scores: Tensor
     order: Tensor
     terms: Mapping[str, Tensor]
+    allowed: Tensor | None = None
+    prior_ratio: Tensor | None = None
 
     def __len__(self) -> int:
         return self.scores.shape[0]
@@ -33,7 +37,9 @@ class Ranking:
     def __getitem__(self, index: slice) -> "Ranking":
         """Rankings of some photographs, as copies that do not keep the batch in memory."""
         terms = {name: raw[index].clone() for name, raw in self.terms.items()}
-        return Ranking(self.scores[index].clone(), self.order[index].clone(), terms)
+        allowed = None if self.allowed is None else self.allowed[index].clone()
+        ratio = None if self.prior_ratio is None else self.prior_ratio[index].clone()
+        return Ranking(self.scores[index].clone(), self.order[index].clone(), terms, allowed, ratio)
 
     @property
     def hog(self) -> Tensor:
@@ -58,7 +64,15 @@ class Ranking:
     def cat(parts: Sequence["Ranking"]) -> "Ranking":
         """Concatenate rankings of the same views."""
         terms = {name: torch.cat([part.terms[name] for part in parts]) for name in parts[0].terms}
-        return Ranking(torch.cat([p.scores for p in parts]), torch.cat([p.order for p in parts]), terms)
+        allowed = [p.allowed for p in parts if p.allowed is not None]
+        ratios = [p.prior_ratio for p in parts if p.prior_ratio is not None]
+        return Ranking(
+            torch.cat([p.scores for p in parts]),
+            torch.cat([p.order for p in parts]),
+            terms,
+            torch.cat(allowed) if allowed else None,
+            torch.cat(ratios) if ratios else None,
+        )
 
 
 def distinct_views(

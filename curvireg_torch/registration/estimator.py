@@ -17,6 +17,7 @@ from .hypotheses import Hypotheses, distinct_mask, start_hypotheses
 from .inputs import ImageItem, check_crop
 from .locator import Locator
 from .poses import Poses, edge_supports, fit_poses, lift_to_poses
+from .priors import BatchPriors
 from .rescoring import POSE_FEATURES, rank_feature, rescore, similarities
 from .results import FailedRegistration, Hypothesis, Registration
 from .search import search
@@ -39,6 +40,7 @@ class _Batch:
         query: their crops, cut and described by the matcher.
         ranking: of the bank's views.
         descriptors: (B, D) on the fine grid of search and rescoring.
+        priors: limits on the poses, or None if no photograph has any.
     """
 
     images: list[Tensor]
@@ -47,6 +49,7 @@ class _Batch:
     query: QueryFeatures
     ranking: Ranking
     descriptors: Tensor
+    priors: BatchPriors | None
 
 
 class PoseEstimator:
@@ -125,9 +128,11 @@ class PoseEstimator:
         if usable:
             boxes = torch.stack([item.box for item in usable.values()])
             query = self.matcher.query([item.image for item in usable.values()], boxes)
-            for i, crop in zip(usable, query.crops, strict=True):
+            for (i, item), crop in zip(usable.items(), query.crops, strict=True):
                 try:
                     check_crop(crop)
+                    if item.prior is not None:
+                        BatchPriors.of([item], self.bank).log_prior(self.bank)
                 except CurviregError as error:
                     results[i] = FailedRegistration(error.with_subject(f"image {first + i}"))
             rows = [row for row, i in enumerate(usable) if i not in results]
@@ -151,6 +156,7 @@ class PoseEstimator:
         batch = self._rank(items, query, ranking)
         count = max(LEAST, self.pipeline.hypotheses)
         starts = start_hypotheses(batch.ranking, self.bank, count=count, symmetries=self.symmetries)
+        starts = starts if batch.priors is None else batch.priors.moved_inside(starts)
         hypotheses = self._search(batch, starts)
         poses = self._fit(batch, lift_to_poses(self.describers, hypotheses, batch.boxes, batch.camera_matrices))
         evidence = self._evidence(batch, starts, poses)
@@ -162,13 +168,17 @@ class PoseEstimator:
     def _rank(self, items: Sequence[ImageItem], query: QueryFeatures, ranking: Ranking | None) -> _Batch:
         self.report_progress("ranking")
         matrices = [item.camera_matrix for item in items if item.camera_matrix is not None]
+        priors = BatchPriors.of(items, self.bank) if any(item.prior is not None for item in items) else None
+        if ranking is None:
+            ranking = self.matcher.rank(query, None if priors is None else priors.log_prior(self.bank))
         return _Batch(
             images=[item.image for item in items],
             boxes=torch.stack([item.box for item in items]).double(),
             camera_matrices=torch.stack(matrices) if matrices else None,
             query=query,
-            ranking=self.matcher.rank(query) if ranking is None else ranking,
+            ranking=ranking,
             descriptors=self.describers[0].descriptor(query.field),
+            priors=priors,
         )
 
     def _search(self, batch: _Batch, starts: Hypotheses) -> Hypotheses:
@@ -184,6 +194,7 @@ class PoseEstimator:
             boxes=batch.boxes,
             camera_matrices=batch.camera_matrices,
             brief=self.pipeline.contours,
+            priors=batch.priors,
         )
 
     def _fit(self, batch: _Batch, poses: Poses) -> Poses:
@@ -226,6 +237,8 @@ class PoseEstimator:
         keep = distinct
         if poses.fit is not None and batch.camera_matrices is None:
             keep = distinct & poses.fit.trustworthy
+        if batch.priors is not None:
+            keep = keep & batch.priors.keeps(poses.hypotheses, poses.T)
         if bool(keep.all()):
             return poses, evidence
         views, back = lift_to_poses(self.describers, starts, batch.boxes, batch.camera_matrices), ~keep
@@ -259,7 +272,10 @@ class PoseEstimator:
                 features = confidence_features(evidence[mine], scores[mine], features["concentration"])
             reported = mine[: self.pipeline.hypotheses].tolist()
             hypotheses = tuple(_hypothesis(h, poses, evidence, with_camera=with_camera) for h in reported)
-            results.append(Registration(hypotheses, model(features), ranking[b : b + 1], features))
+            registration = Registration(hypotheses, model(features), ranking[b : b + 1], features)
+            if batch.priors is not None:
+                registration = batch.priors.note(registration, poses.hypotheses, int(mine[0]), poses.T)
+            results.append(registration)
         return results
 
 

@@ -56,7 +56,10 @@ def start_hypotheses(ranking: Ranking, bank: ViewBank, *, count: int, symmetries
         symmetries: see :func:`distinct_views`.
     """
     rotations = bank.rotations
-    views = [distinct_views(o, rotations, count=count, symmetries=symmetries, model=bank.model) for o in ranking.order]
+    orders = list(ranking.order)
+    if ranking.allowed is not None:
+        orders = [order[allowed[order]] for order, allowed in zip(orders, ranking.allowed, strict=True)]
+    views = [distinct_views(o, rotations, count=count, symmetries=symmetries, model=bank.model) for o in orders]
     image_index = torch.tensor([b for b, chosen in enumerate(views) for _ in chosen], dtype=torch.long)
     view = torch.cat([torch.zeros(0, dtype=torch.long), *(chosen.cpu() for chosen in views)])
     score = ranking.scores.cpu()[image_index, view].double()

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..errors import CurviregError, ImageError, InvalidInputError
 from ..geometry.crops import check_boxes, whole_image_box
+from ..geometry.pose_prior import PosePrior
 from ..io.images import read_photo
 from ..utils.checks import (
     as_boxes,
@@ -28,6 +29,8 @@ __all__ = ["ImageItem", "check_crop", "image_items"]
 class ImageItem:
     """One photograph to register: ``image`` (1 or 3, H, W) float or uint8, ``box`` (4,), ``camera_matrix`` (3, 3).
 
+    ``prior`` limits the pose.
+
     Raises:
         InvalidInputError: something else, an empty box or one outside the image, skew, or pixels that are not square.
     """
@@ -35,6 +38,7 @@ class ImageItem:
     image: Tensor
     box: Tensor
     camera_matrix: Tensor | None
+    prior: PosePrior | None = None
 
     def __post_init__(self) -> None:
         check_photograph(self.image, "photograph")
@@ -45,7 +49,10 @@ class ImageItem:
 
 
 def image_items(
-    images: Tensor | Sequence[Any], boxes: Any, camera_matrices: Any | None
+    images: Tensor | Sequence[Any],
+    boxes: Any,
+    camera_matrices: Any | None,
+    prior: PosePrior | Sequence[PosePrior | None] | None = None,
 ) -> list[ImageItem | CurviregError]:
     """Each photograph with its box and camera, or the error that it cannot be used for.
 
@@ -53,9 +60,10 @@ def image_items(
         images: (B, C, H, W), or a list of tensors (C, H, W), arrays (H, W) or (H, W, C), or paths.
         boxes: (B, 4) x0, y0, x1, y1 in px, a tensor, an array or lists; None takes the whole images.
         camera_matrices: (B, 3, 3), or (3, 3) for all, in px; None if unknown.
+        prior: limits on the pose, of all photographs or one for each.
 
     Raises:
-        InvalidInputError: not as many boxes or cameras as images.
+        InvalidInputError: not as many boxes, cameras or priors as images.
     """
     if isinstance(images, str | PathLike) or (isinstance(images, Tensor) and images.ndim != 4):
         raise InvalidInputError("images: expected a batch (B, C, H, W) or a list; put a single image into a list")
@@ -65,18 +73,21 @@ def image_items(
     cameras: Sequence[Tensor | None] = [None] * n
     if camera_matrices is not None:
         cameras = list(as_camera_matrices(camera_matrices, n).detach().cpu())
+    priors = [prior] * n if prior is None or isinstance(prior, PosePrior) else list(prior)
+    if len(priors) != n or not all(p is None or isinstance(p, PosePrior) for p in priors):
+        raise InvalidInputError(f"prior: expected a PosePrior, or a list of {n} with None where there is none")
     out: list[ImageItem | CurviregError] = []
     for i in range(n):
         try:
-            out.append(_item(images[i], None if whole else boxes[i].detach().cpu().float(), cameras[i]))
+            out.append(_item(images[i], None if whole else boxes[i].detach().cpu().float(), cameras[i], priors[i]))
         except CurviregError as error:
             out.append(error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])])))
     return out
 
 
-def _item(image: Any, box: Tensor | None, K: Tensor | None) -> ImageItem:
+def _item(image: Any, box: Tensor | None, K: Tensor | None, prior: PosePrior | None) -> ImageItem:
     pixels = _pixels(image)
-    return ImageItem(pixels, whole_image_box(pixels).cpu() if box is None else box, K)
+    return ImageItem(pixels, whole_image_box(pixels).cpu() if box is None else box, K, prior)
 
 
 def _pixels(image: Any) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError
 from ..geometry.crops import box_iou
+from ..geometry.pose_prior import PosePrior
 from ..matching import Ranking
 from ..terms import QueryFeatures
 from .confidence import presence, presence_features
@@ -18,6 +19,7 @@ from .estimator import PoseEstimator
 from .inputs import ImageItem, check_crop, image_items
 from .locator import Located
 from .locator.locator import OVERLAP, check_distance
+from .priors import BatchPriors
 from .results import FailedRegistration, Localization, Registration
 
 __all__ = ["ScoredCandidates", "localize"]
@@ -33,6 +35,7 @@ def localize(
     *,
     instances: int = 1,
     distance: tuple[float, float] | None = None,
+    prior: PosePrior | Sequence[PosePrior | None] | None = None,
 ) -> list[list[_Result]]:
     """Find and register objects in whole photographs, the most certain first.
 
@@ -44,6 +47,7 @@ def localize(
         registrar: :class:`Registrar` of the meshes.
         images, camera_matrices: see :class:`Registrar`.
         instances: largest number of objects in each photograph.
+        prior: see :class:`Registrar`; it limits the poses in the proposed boxes.
         distance: range of the distance of an object's centre, in the mesh's unit; needs cameras.
 
     Returns:
@@ -62,7 +66,7 @@ def localize(
             _localize_one(registrar, item, f"image {i}", instances, distance) for i, item in enumerate(items, first)
         ]
 
-    return registrar.map_items(image_items(images, None, camera_matrices), localize_some)
+    return registrar.map_items(image_items(images, None, camera_matrices, prior), localize_some)
 
 
 def _localize_one(
@@ -141,7 +145,11 @@ class ScoredCandidates:
     ) -> "ScoredCandidates":
         """Rank P boxes (P, 4) with the locator's ``scores`` (P,)."""
         query = estimator.matcher.query([item.image] * len(boxes), boxes)
-        ranking = estimator.matcher.rank(query)
+        log_prior = None
+        if item.prior is not None:
+            each = [replace(item, box=box) for box in boxes.float()]
+            log_prior = BatchPriors.of(each, estimator.bank).log_prior(estimator.bank)
+        ranking = estimator.matcher.rank(query, log_prior)
         learned = estimator.locator.features.learned
         evidence = [
             presence_features(score, ranking[k : k + 1], learned=learned) for k, score in enumerate(scores.tolist())

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import CurviregError, InvalidInputError
+from ..geometry.pose_prior import PosePrior
 from ..geometry.views import ViewSphere
 from ..matching import ViewBank, ViewMatcher, cached_bank
 from ..pipeline import Pipeline
@@ -105,6 +106,7 @@ class Registrar(PoseEstimator):
         camera_matrices: Any | None = None,
         *,
         distance: tuple[float, float] | None = None,
+        prior: PosePrior | Sequence[PosePrior | None] | None = None,
     ) -> list[Registration | FailedRegistration]:
         """Register a batch.
 
@@ -116,6 +118,8 @@ class Registrar(PoseEstimator):
                 a camera that looks straight at the box.
             distance: without boxes, range of the distance of the object's centre, in the mesh's unit.
 
+            prior: what is known of the poses in advance, one for all photographs or a list.
+
         Returns:
             One :class:`Registration` for each photograph, in their order; a :class:`FailedRegistration` for one that
             cannot be registered (unreadable, box empty or outside, one colour, NaN), which raises its error on access
@@ -125,10 +129,10 @@ class Registrar(PoseEstimator):
             InvalidInputError: not as many boxes or cameras as images, or ``distance`` together with boxes.
         """
         if boxes is None:
-            return [results[0] for results in localize(self, images, camera_matrices, distance=distance)]
+            return [results[0] for results in localize(self, images, camera_matrices, distance=distance, prior=prior)]
         if distance is not None:
             raise InvalidInputError("distance: limits the search for objects without boxes; leave out one of the two")
-        return self.map_items(image_items(images, boxes, camera_matrices), self._register_boxes)
+        return self.map_items(image_items(images, boxes, camera_matrices, prior), self._register_boxes)
 
     def _register_boxes(
         self, items: Sequence[ImageItem | CurviregError], first: int

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..errors import CurviregError
 from ..geometry.cameras import transform
+from ..geometry.pose_prior import PosePrior
 from ..geometry.viewpoint import viewpoint_from_rotation
 from ..matching import Ranking
 from .calibration import SQUARED_RADIUS
@@ -127,6 +128,9 @@ class Registration:
             reported. ``lead`` is None where the bank has no rival view, which bounds the confidence.
         localization: where the object was found; None if its box was given.
         corrected_box: (4,) float64, the box that replaced a given one that did not fit the pose; else None.
+        prior: the limits on the pose that were given.
+        prior_contradiction: "better outside": views outside the limits match much better; "at the limit": the pose lies
+            within a degree of a limit. None otherwise.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -135,6 +139,8 @@ class Registration:
     confidence_features: Mapping[str, float | None] = field(default_factory=dict)
     localization: Localization | None = None
     corrected_box: Tensor | None = None
+    prior: PosePrior | None = None
+    prior_contradiction: str | None = None
 
     ok = True
     """Always True; False of a :class:`FailedRegistration`."""
@@ -220,8 +226,14 @@ class Registration:
             "covariance": None if covariance is None else covariance.tolist(),
             "squared_radius": None if covariance is None else {f"{k:g}": r for k, r in SQUARED_RADIUS.items()},
             "corrected_box": None if self.corrected_box is None else self.corrected_box.tolist(),
+            **self._prior_dict(),
             "top": [self._hypothesis_dict(hypothesis) for hypothesis in self.hypotheses],
         }
+
+    def _prior_dict(self) -> dict[str, Any]:
+        if self.prior is None:
+            return {}
+        return {"prior": {**self.prior.to_dict(), "contradiction": self.prior_contradiction}}
 
     def _hypothesis_dict(self, hypothesis: Hypothesis) -> dict[str, Any]:
         view = hypothesis.view

@@ -1,7 +1,7 @@
 """Coarse-to-fine search around views of rankings (the paper's section "Registration of 2D images"), batched."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from ..geometry import rotation_error, rotation_from_axis_angle
 from ..geometry.translation import pose_from_box
 from ..matching import Ranking, ViewBank, ViewDescriber
 from .hypotheses import Hypotheses
+from .priors import BatchPriors
 from .rescoring import similarities
 
 __all__ = ["coherent_views", "search"]
@@ -57,6 +58,7 @@ def search(
     boxes: Tensor | None = None,
     camera_matrices: Tensor | None = None,
     brief: bool = False,
+    priors: BatchPriors | None = None,
 ) -> Hypotheses:
     """Search around hypotheses in ever smaller steps until each pose converges.
 
@@ -73,6 +75,7 @@ def search(
         starts: hypotheses of those photographs.
         bank, ranking: that the starts come from; not needed for a brief search.
         boxes, camera_matrices: (B, 4) px and (B, 3, 3) of the photographs; both or none.
+        priors: limits on the poses of the photographs; the starts lie within them.
         brief: before a contour fit: at most ``BRIEF`` rounds, from the hypotheses' views, without coherent views.
 
     Returns:
@@ -94,11 +97,12 @@ def search(
         if len(active) == 0:
             break
         before = state[active]
-        scores = _scores(describers, descriptors, before, candidates, starts.rotation[active])
+        reach = _Reach(starts.rotation[active], priors)
+        scores = _scores(describers, descriptors, before, candidates, reach)
         now = _best(before, candidates, scores)
         if rounds:
             peak = _peak(before, scores, step[active])[:, None]
-            now = _best(now, peak, _scores(describers, descriptors, before, peak, starts.rotation[active]))
+            now = _best(now, peak, _scores(describers, descriptors, before, peak, reach))
         if camera_matrices is not None and boxes is not None and rounds in (0, AFTER):
             filling = _box_filling_distances(describers, now, boxes, camera_matrices)
             now = replace(now, distance=torch.where(now.similarity > before.similarity, filling, before.distance))
@@ -114,14 +118,27 @@ def search(
     return state
 
 
+@dataclass(frozen=True)
+class _Reach:
+    """Where the search may go: within ``REACH`` of the (H, 3, 3) starts, and within the priors."""
+
+    starts: Tensor
+    priors: BatchPriors | None
+
+    def excludes(self, state: Hypotheses, candidates: Tensor) -> Tensor:
+        """(H, C) bool."""
+        outside = rotation_error(candidates, self.starts[:, None]) > REACH
+        return outside if self.priors is None else outside | ~self.priors.allow(state, candidates)
+
+
 def _scores(
-    describers: Sequence[ViewDescriber], descriptors: Tensor, state: Hypotheses, candidates: Tensor, starts: Tensor
+    describers: Sequence[ViewDescriber], descriptors: Tensor, state: Hypotheses, candidates: Tensor, reach: _Reach
 ) -> Tensor:
-    """(H, C) normalised correlations of (H, C, 3, 3) candidates; -1 beyond ``REACH`` of the (H, 3, 3) starts."""
+    """(H, C) normalised correlations of (H, C, 3, 3) candidates; -1 for those out of reach."""
     H, C = candidates.shape[:2]
     each = replace(state[torch.arange(H).repeat_interleave(C)], rotation=candidates.flatten(0, 1))
     scores = similarities(describers, descriptors, each).view(H, C)
-    return scores.masked_fill(rotation_error(candidates, starts[:, None]) > REACH, -1.0)
+    return scores.masked_fill(reach.excludes(state, candidates), -1.0)
 
 
 def _best(state: Hypotheses, candidates: Tensor, scores: Tensor) -> Hypotheses:

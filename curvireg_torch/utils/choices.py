@@ -18,6 +18,9 @@ MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 MESHES_AND_BANKS = (*MESHES, ".safetensors")
 """Suffixes of file names, in lower case."""
 
+SIDE_NAMES = ("front", "front-right", "right", "back-right", "back", "back-left", "left", "front-left")
+"""Sides of an object, every 45 degrees of azimuth from 0."""
+
 UP_AXES = {
     "x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
     "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],

@@ -14,7 +14,7 @@ from curvireg_torch.cli.options import register_options
 from curvireg_torch.cli.report import print_result
 from curvireg_torch.errors import BankError
 from curvireg_torch.evaluation import evaluate
-from curvireg_torch.geometry import rotation_error, up_rotation
+from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
 from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline, preset_named
 from curvireg_torch.registration import registrar
 from curvireg_torch.settings import ViewPolicy
@@ -210,3 +210,28 @@ def test_print_result_advises_when_not_reliable(pose, changes, expected, unexpec
     printed = capsys.readouterr().out
     assert expected in printed
     assert unexpected not in printed
+
+
+def test_register_limits_the_pose(register_one, document):
+    azimuth = viewpoint_from_rotation(scene(0)[2][:3, :3])[0]
+    low, high = float(azimuth + 140) % 360, float(azimuth + 220) % 360
+    assert register_one("--no-refine", "--azimuth", f"{low},{high}", "--elevation", "-90", "90") == 0
+    result = document()
+    assert result["prior"] == {"azimuth": [low, high], "elevation": [-90, 90], "contradiction": "better outside"}
+    for pose in result["top"]:
+        assert (pose["viewpoint"]["azimuth"] - low) % 360 <= 80 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--near", "10"], "--near: expected AZIMUTH ELEVATION"),
+        (["--within", "10"], "--within: expected --near"),
+        (["--side", "left", "--azimuth", "0", "10"], "--side: give it or --azimuth"),
+        (["--elevation", "50", "10"], "elevation: expected"),
+    ],
+    ids=str,
+)
+def test_register_refuses_unusable_limits_on_the_pose(register_one, capsys, options, message):
+    assert register_one(*options) == 2
+    assert message in capsys.readouterr().err

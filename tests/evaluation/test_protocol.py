@@ -1,9 +1,13 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import Protocol
-from curvireg_torch.evaluation.protocol import perturbed_box
+from curvireg_torch.evaluation.protocol import hint_of_truth, perturbed_box
+from curvireg_torch.geometry import rotation_from_viewpoint
+from curvireg_torch.geometry.pose_prior import object_frame
 
 BOX = torch.tensor([10.0, 20.0, 110.0, 70.0])
 
@@ -53,3 +57,30 @@ def test_perturbed_box_fills_the_range():
     assert fraction.abs().max() <= 0.1
     assert fraction.abs().amax(0).min() > 0.095
     assert fraction.mean(0).abs().max() < 0.01
+
+
+@pytest.mark.parametrize("hint", ["azimuth:45", "azimuth:5", "pose:30"])
+def test_hint_of_truth_holds_the_truth_and_is_off_centre(hint):
+    frame = object_frame("y")
+    protocol = Protocol(hint=hint)
+    degrees = protocol.hint_tolerance()[1]
+    R = rotation_from_viewpoint(torch.linspace(0, 350, 30, dtype=torch.float64), 20.0) @ frame
+    missed = torch.stack([hint_of_truth(r, frame, protocol, str(i)).excess(r, frame) for i, r in enumerate(R)])
+    assert float(missed.max()) <= 0.0
+    assert float(missed.min()) >= -degrees
+    assert float(missed.std()) > 0.15 * degrees
+    assert hint_of_truth(R[0], frame, protocol, "a") == hint_of_truth(R[0], frame, protocol, "a")
+    assert hint_of_truth(R[0], frame, protocol, "a") != hint_of_truth(R[0], frame, replace(protocol, seed=1), "a")
+
+
+def test_hint_of_truth_is_none_without_truth_or_hint():
+    eye = torch.eye(3, dtype=torch.float64)
+    assert hint_of_truth(eye, eye, Protocol(), "a") is None
+    assert hint_of_truth(torch.nan * eye, eye, Protocol(hint="pose:5"), "a") is None
+
+
+@pytest.mark.parametrize("hint", ["azimuth", "azimuth:x", "azimuth:0", "azimuth:180", "side:45"])
+def test_protocol_refuses_unknown_hints(hint):
+    with pytest.raises(InvalidInputError, match="hint"):
+        Protocol.parse([f"hint={hint}"])
+    assert str(Protocol.parse(["hint=azimuth:45"])) == "cad=annotated pose=upright box=annotated hint=azimuth:45 seed=0"

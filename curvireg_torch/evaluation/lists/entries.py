@@ -8,6 +8,7 @@ from typing import Any
 
 from ...errors import InvalidInputError
 from ...geometry import camera_matrix
+from ...geometry.pose_prior import PosePrior
 from ...utils.digests import text_digest
 from .tables import BEST_MESH, RESULT_COLUMNS
 
@@ -32,6 +33,7 @@ class Entry:
         guess: replaces an unknown camera: "exif" takes the focal length in the photograph's file, a number is the
             horizontal field of view in degrees; None: no camera.
         instances, distance: without a box, see :func:`curvireg_torch.registration.localize`.
+        prior: limits on the pose.
         error: why the row cannot be used; "" if it can.
     """
 
@@ -44,11 +46,13 @@ class Entry:
     guess: str | float | None = None
     instances: int = 1
     distance: tuple[float, float] | None = None
+    prior: PosePrior | None = None
     error: str = ""
 
     def request(self) -> Any:
         """Plain values of all that the result depends on besides the content of files."""
-        return [self.name, self.box, self.camera, self.guess, self.instances, self.distance]
+        prior = None if self.prior is None else self.prior.to_dict()
+        return [self.name, self.box, self.camera, self.guess, self.instances, self.distance, prior]
 
     @cached_property
     def key(self) -> str:

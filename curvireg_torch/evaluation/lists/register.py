@@ -110,9 +110,11 @@ def register_entry(
     start = time.perf_counter()
     K, source = _camera(entry, photo)
     if entry.box is None:
-        results = localize(registrar, [photo.image], K, instances=entry.instances, distance=entry.distance)[0]
+        results = localize(
+            registrar, [photo.image], K, instances=entry.instances, distance=entry.distance, prior=entry.prior
+        )[0]
     else:
-        results = registrar([photo.image], torch.tensor(entry.box)[None], K)
+        results = registrar([photo.image], torch.tensor(entry.box)[None], K, prior=entry.prior)
     result = results[0]
     if isinstance(result, FailedRegistration):
         raise result.error.with_subject(entry.name)

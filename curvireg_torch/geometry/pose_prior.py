@@ -1,0 +1,253 @@
+"""What is known about the pose in advance: ranges of the viewpoint, a rotation nearby, which way is up."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInputError
+from ..utils.checks import as_numbers, check_option, check_positive, check_rotation
+from ..utils.choices import SIDE_NAMES, UP_AXES
+from .conversions import axis_angle_from_rotation, rotation_from_axis_angle
+from .up import up_rotation
+from .viewpoint import rotation_error, rotation_from_viewpoint, viewpoint_from_rotation
+
+__all__ = ["SIDES", "PosePrior", "object_frame"]
+
+SIDES = {name: 45.0 * k for k, name in enumerate(SIDE_NAMES)}
+"""Azimuth in degrees from which a side of the object is seen; right and left as in a photograph of its front."""
+
+SIDE_WIDTH = 45.0
+"""Degrees of azimuth to either side of the middle that a named side covers."""
+
+_HALF_TURN = 180.0
+
+_LIMITS = ("azimuth", "elevation", "theta", "up", "viewpoint", "rotation")
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    r"""Limits on the pose that hold for a photograph; all that are given must hold.
+
+    Angles are those of :func:`viewpoint_from_rotation` for an object with z up whose front is at azimuth 0. Methods
+    take rotations of the mesh file's axes and ``frame``, the rotation of these axes to the object's
+    (:func:`object_frame`); the default frame is the identity.
+
+    Attributes:
+        azimuth: (low, high) in degrees, counted upwards from low to high: (300, 60) goes through 0.
+        elevation: (low, high) in degrees within [-90, 90].
+        theta: (low, high) of the in-plane rotation in degrees, counted upwards as the azimuth is.
+        up: direction (x, y) in the photograph, y down, in which the object's up axis points, within ``within`` degrees;
+            (0, -1) for a camera that is held level.
+        viewpoint: (azimuth, elevation, theta) in degrees; the pose lies within ``within`` degrees of it.
+        rotation: (3, 3) from the mesh file's axes to the camera; the pose lies within ``within`` degrees of it.
+        within: tolerance in degrees of ``up``, ``viewpoint`` and ``rotation``; needed by each of them.
+        front: the mesh's axis that points out of its front, for :func:`object_frame`.
+        softness: standard deviation in degrees of a soft limit: a pose that misses it by :math:`e` degrees has the log
+            prior :math:`-e^2 / (2 \sigma^2)`. 0: a hard limit, no pose outside is considered.
+
+    Raises:
+        InvalidInputError: a range that is not two finite numbers, an empty prior, ``within`` missing or out of range.
+
+    Example:
+        >>> prior = PosePrior(azimuth=(300, 60), elevation=(0, 45))
+        >>> R = rotation_from_viewpoint(torch.tensor([350.0, 80.0]), 20.0)
+        >>> prior.log_prior(R).tolist()
+        [0.0, -inf]
+    """
+
+    azimuth: tuple[float, float] | None = None
+    elevation: tuple[float, float] | None = None
+    theta: tuple[float, float] | None = None
+    up: tuple[float, float] | None = None
+    viewpoint: tuple[float, float, float] | None = None
+    rotation: Any = None
+    within: float | None = None
+    front: str | None = None
+    softness: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("azimuth", "elevation", "theta", "up"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _numbers(getattr(self, name), name, 2))
+        if self.viewpoint is not None:
+            object.__setattr__(self, "viewpoint", _numbers(self.viewpoint, "viewpoint", 3))
+        if self.elevation is not None and not -90.0 <= self.elevation[0] <= self.elevation[1] <= 90.0:
+            raise InvalidInputError(f"elevation: expected -90 <= low <= high <= 90, got {self.elevation}")
+        if self.up is not None and math.hypot(*self.up) == 0.0:
+            raise InvalidInputError("up: expected a direction, got (0, 0)")
+        if self.rotation is not None:
+            R = as_numbers(self.rotation, "rotation", dtype=torch.float64)
+            if R.shape != (3, 3):
+                raise InvalidInputError(f"rotation: expected (3, 3), got {tuple(R.shape)}")
+            check_rotation(R, "rotation")
+            object.__setattr__(self, "rotation", tuple(map(tuple, R.tolist())))
+        check_positive(self.softness, "softness", zero_ok=True)
+        if self.front is not None:
+            check_option(self.front, UP_AXES, "front")
+        if any(v is not None for v in (self.rotation, self.viewpoint, self.up)) != (self.within is not None):
+            raise InvalidInputError("within: expected degrees beside rotation, viewpoint or up, and only there")
+        if self.within is not None and not 0.0 < self.within <= _HALF_TURN:
+            raise InvalidInputError(f"within: expected degrees in (0, 180], got {self.within}")
+        if all(getattr(self, name) is None for name in _LIMITS):
+            raise InvalidInputError("prior: expected at least one limit, got none; leave the prior out")
+
+    @classmethod
+    def side(cls, name: str) -> "PosePrior":
+        """The side of the object that faces the camera: one of :data:`SIDES`, 45 degrees to either side of it.
+
+        Example:
+            >>> PosePrior.side("front").azimuth
+            (315.0, 45.0)
+        """
+        check_option(name, SIDES, "side")
+        return cls(azimuth=((SIDES[name] - SIDE_WIDTH) % 360.0, (SIDES[name] + SIDE_WIDTH) % 360.0))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The limits that are given, as plain numbers and texts."""
+        plain = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {name: value for name, value in plain.items() if value not in (None, 0.0)}
+
+    def excess(self, rotations: Tensor, frame: Tensor | None = None) -> Tensor:
+        """(...) degrees by which (..., 3, 3) rotations miss the worst of the limits.
+
+        Negative within all limits: minus the distance to the nearest of them, at least -180.
+        """
+        worst = torch.full_like(rotations[..., 0, 0], -_HALF_TURN)
+        if self.azimuth or self.elevation or self.theta or self.up:
+            azimuth, elevation, theta = viewpoint_from_rotation(_in_object_frame(rotations, frame))
+            if self.azimuth is not None:
+                worst = torch.maximum(worst, _outside(azimuth, self.azimuth))
+            if self.elevation is not None:
+                low, high = self.elevation
+                worst = worst if low == -90.0 else torch.maximum(worst, low - elevation)
+                worst = worst if high == 90.0 else torch.maximum(worst, elevation - high)
+            for limits in (self.theta, self._theta_of_up):
+                if limits is not None:
+                    worst = torch.maximum(worst, _outside(theta, limits))
+        for R in self._centres(rotations, frame):
+            worst = torch.maximum(worst, rotation_error(rotations, R) - (self.within or 0.0))
+        return worst
+
+    def log_prior(self, rotations: Tensor, frame: Tensor | None = None, *, margin: float = 0.0) -> Tensor:
+        """(...) log prior of (..., 3, 3) rotations: 0 within the limits, less outside, ``-inf`` for hard limits.
+
+        Args:
+            rotations: from the mesh file's axes to the camera.
+            frame: (3, 3) of :func:`object_frame`.
+            margin: degrees by which limits are widened, for views that stand for poses around them.
+        """
+        excess = (self.excess(rotations, frame) - margin).clamp(min=0.0)
+        if self.softness > 0.0:
+            return -0.5 * (excess / self.softness).square()
+        return torch.zeros_like(excess).masked_fill(excess > 1e-4, -torch.inf)
+
+    def nearest(self, rotations: Tensor, frame: Tensor | None = None) -> Tensor:
+        """(..., 3, 3) rotations moved into the limits, one limit after the other; those within them are not changed."""
+        moved = rotations
+        if self.azimuth or self.elevation or self.theta or self.up:
+            azimuth, elevation, theta = viewpoint_from_rotation(_in_object_frame(rotations, frame))
+            if self.azimuth is not None:
+                azimuth = _clamped(azimuth, self.azimuth)
+            if self.elevation is not None:
+                elevation = elevation.clamp(*self.elevation)
+            for limits in (self.theta, self._theta_of_up):
+                theta = theta if limits is None else _clamped(theta, limits)
+            moved = rotation_from_viewpoint(azimuth, elevation, theta)
+            moved = moved if frame is None else moved @ frame.to(moved)
+        for R in self._centres(rotations, frame):
+            vector = axis_angle_from_rotation(moved @ R.mT)
+            angle = torch.rad2deg(torch.linalg.vector_norm(vector, dim=-1, keepdim=True))
+            shorter = vector * ((self.within or 0.0) / angle.clamp(min=1e-9)).clamp(max=1.0)
+            moved = torch.where((angle > (self.within or 0.0))[..., None], rotation_from_axis_angle(shorter) @ R, moved)
+        return torch.where((self.excess(rotations, frame) > 0.0)[..., None, None], moved, rotations)
+
+    def _centres(self, like: Tensor, frame: Tensor | None) -> list[Tensor]:
+        """(3, 3) rotations around which the pose lies."""
+        centres = []
+        if self.viewpoint is not None:
+            R = rotation_from_viewpoint(*torch.tensor(self.viewpoint, dtype=torch.float64).to(like))
+            centres.append(R if frame is None else R @ frame.to(R))
+        if self.rotation is not None:
+            centres.append(torch.tensor(self.rotation, dtype=torch.float64).to(like))
+        return centres
+
+    @property
+    def _theta_of_up(self) -> tuple[float, float] | None:
+        """Range of the in-plane rotation that ``up`` stands for."""
+        if self.up is None or self.within is None:
+            return None
+        x, y = self.up
+        middle = math.degrees(math.atan2(-x, -y))
+        return (middle - self.within, middle + self.within) if self.within < _HALF_TURN else None
+
+
+def object_frame(up: str = "z", front: str | None = None) -> Tensor:
+    """(3, 3) float64 rotation from a mesh file's axes to those of :class:`PosePrior`: z up, the front at azimuth 0.
+
+    Args:
+        up: the mesh's axis that points up, such as "z" or "-y".
+        front: the mesh's axis that points out of its front; default "-y" where z is up, as in PASCAL3D+, and what
+            :func:`up_rotation` turns to it where another axis is.
+
+    Raises:
+        InvalidInputError: an unknown axis, or front and up on the same axis.
+
+    Example:
+        >>> (object_frame("y", "z") @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)).round().tolist()
+        [0.0, -1.0, 0.0]
+    """
+    R = up_rotation(up)
+    if front is None:
+        return R
+    check_option(front, UP_AXES, "front")
+    axis = torch.zeros(3, dtype=torch.float64)
+    axis["xyz".index(front[-1])] = -1.0 if front.startswith("-") else 1.0
+    x, y, z = (R @ axis).tolist()
+    if abs(z) > 0.5:
+        raise InvalidInputError(f"front: expected another axis than the one that points up ({up}), got {front!r}")
+    # Rotate about z until the front points along -y, where the camera of azimuth 0 stands.
+    angle = torch.tensor([0.0, 0.0, -math.pi / 2 - math.atan2(y, x)], dtype=torch.float64)
+    return rotation_from_axis_angle(angle) @ R
+
+
+def _in_object_frame(rotations: Tensor, frame: Tensor | None) -> Tensor:
+    return rotations if frame is None else rotations @ frame.mT.to(rotations)
+
+
+def _numbers(values: Sequence[float], name: str, count: int) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(value) for value in values)
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(f"{name}: expected {count} numbers, got {values!r}") from error
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise InvalidInputError(f"{name}: expected {count} finite numbers, got {values!r}")
+    return numbers
+
+
+def _position(angle: Tensor, limits: tuple[float, ...]) -> tuple[Tensor, float]:
+    """Degrees from the lower limit upwards, in [0, 360), and the width of the range."""
+    low, high = limits
+    width = 360.0 if abs(high - low) >= 360.0 else (high - low) % 360.0
+    return (angle - low) % 360.0, width
+
+
+def _outside(angle: Tensor, limits: tuple[float, ...]) -> Tensor:
+    """Degrees to the nearer limit of a circular range, negative within it."""
+    beyond, width = _position(angle, limits)
+    if width == 360.0:
+        return torch.full_like(angle, -_HALF_TURN)
+    return torch.where(
+        beyond <= width, -torch.minimum(beyond, width - beyond), torch.minimum(beyond - width, 360.0 - beyond)
+    )
+
+
+def _clamped(angle: Tensor, limits: tuple[float, ...]) -> Tensor:
+    """The nearest angle of a circular range."""
+    beyond, width = _position(angle, limits)
+    to_high = beyond - width <= 360.0 - beyond
+    moved = torch.where(to_high, torch.full_like(angle, limits[0] + width), torch.full_like(angle, limits[0]))
+    return torch.where(beyond <= width, angle, moved)

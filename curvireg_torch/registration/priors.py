@@ -1,0 +1,143 @@
+"""Pose priors of a batch of photographs, applied to views of a bank and to hypotheses."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInputError
+from ..geometry.cameras import rotation_towards
+from ..geometry.pose_prior import PosePrior, object_frame
+from ..io.meshes import mesh_up
+from ..matching import ViewBank
+from .hypotheses import Hypotheses
+from .inputs import ImageItem
+from .results import Registration
+
+__all__ = ["BatchPriors"]
+
+VIEW_SPACING = 7.5
+"""Degrees by which the limits are widened for views of a bank: each stands for the poses up to halfway to the next."""
+
+TOLERANCE = 3.0
+"""Degrees by which the contour fit may leave the limits: it measures more precisely than limits are usually known."""
+
+
+AT_LIMIT = 1.0
+"""Degrees from a limit within which a result is reported to lie at the limit."""
+
+LOW_RATIO = 0.25
+"""Ratio of the best scores with and without the prior below which the photograph contradicts the prior."""
+
+
+class BatchPriors:
+    """Limits on the poses of B photographs; None for a photograph without any.
+
+    The limits hold for rotations in the photograph's own camera. Views and hypotheses are allocentric; the ray through
+    the centre of the box turns them.
+
+    Args:
+        priors: of each photograph.
+        boxes: (B, 4) px.
+        camera_matrices: (B, 3, 3) in px, or None.
+        bank: whose meshes say which of their axes points up.
+    """
+
+    def __init__(
+        self, priors: Sequence[PosePrior | None], boxes: Tensor, camera_matrices: Tensor | None, bank: ViewBank
+    ) -> None:
+        self._priors = list(priors)
+        self._ups = [mesh_up(mesh) for mesh in bank.meshes]
+        self._towards = torch.eye(3, dtype=torch.float64).repeat(len(boxes), 1, 1)
+        if camera_matrices is not None:
+            centres = (boxes[:, :2] + boxes[:, 2:]).double() / 2.0
+            rays = torch.linalg.solve(camera_matrices.double(), torch.nn.functional.pad(centres, (0, 1), value=1.0))
+            self._towards = rotation_towards(rays)
+
+    @classmethod
+    def of(cls, items: Sequence[ImageItem], bank: ViewBank) -> "BatchPriors":
+        """Of photographs, all with a camera matrix or all without."""
+        matrices = [item.camera_matrix for item in items if item.camera_matrix is not None]
+        boxes = torch.stack([item.box for item in items])
+        return cls([item.prior for item in items], boxes, torch.stack(matrices) if matrices else None, bank)
+
+    def log_prior(self, bank: ViewBank) -> Tensor:
+        """(B, N) of the views of a bank.
+
+        Raises:
+            InvalidInputError: the limits of a photograph leave no view.
+        """
+        views, model = bank.rotations.cpu().double(), bank.model.cpu()
+        out = torch.zeros(len(self._priors), len(views), dtype=torch.float64)
+        for b, prior in enumerate(self._priors):
+            if prior is None:
+                continue
+            for m in model.unique().tolist():
+                mine = model == m
+                R = self._towards[b] @ views[mine]
+                out[b, mine] = prior.log_prior(R, self._frame(prior, m), margin=VIEW_SPACING)
+            if bool((out[b] == -torch.inf).all()):
+                raise InvalidInputError(f"prior: no view of the bank lies within {prior}; widen it, or leave it out")
+        return out
+
+    def moved_inside(self, hypotheses: Hypotheses) -> Hypotheses:
+        """Hypotheses with rotations moved into hard limits, each no further than it must be."""
+        rotation = hypotheses.rotation.clone()
+        for h, prior, frame, Q in self._each(hypotheses):
+            if prior.softness == 0.0 and float(prior.excess(Q @ rotation[h], frame)) > 0.0:
+                rotation[h] = Q.mT @ prior.nearest(Q @ rotation[h], frame)
+        return replace(hypotheses, rotation=rotation)
+
+    def allow(self, hypotheses: Hypotheses, candidates: Tensor) -> Tensor:
+        """(H, C) bool: whether (H, C, 3, 3) rotations lie within the hard limits of their hypotheses' photographs."""
+        allowed = torch.ones(candidates.shape[:2], dtype=torch.bool)
+        for h, prior, frame, Q in self._each(hypotheses):
+            if prior.softness == 0.0:
+                allowed[h] = prior.excess(Q @ candidates[h], frame) <= 1e-3
+        return allowed
+
+    def excess(self, hypotheses: Hypotheses, rotations: Tensor) -> Tensor:
+        """(H,) degrees by which (H, 3, 3) rotations in the photographs' cameras miss the limits."""
+        out = torch.zeros(len(hypotheses), dtype=torch.float64)
+        for h, prior, frame, _ in self._each(hypotheses):
+            out[h] = prior.excess(rotations[h], frame)
+        return out
+
+    def keeps(self, hypotheses: Hypotheses, T: Tensor) -> Tensor:
+        """(H,) bool: whether fitted (H, 4, 4) poses stay within the hard limits by ``TOLERANCE``."""
+        keep = self.excess(hypotheses, T[:, :3, :3]) <= TOLERANCE
+        for h, prior, _, _ in self._each(hypotheses):
+            if prior.softness > 0.0:
+                keep[h] = True
+        return keep
+
+    def note(self, registration: Registration, hypotheses: Hypotheses, h: int, T: Tensor) -> Registration:
+        """The registration with its prior, and how the photograph contradicts it, see :class:`Registration`.
+
+        Args:
+            registration: of one photograph.
+            hypotheses: of all photographs.
+            h: the best one of this photograph.
+            T: (H, 4, 4) poses of the hypotheses.
+        """
+        one = hypotheses[torch.tensor([h])]
+        prior, ratio = self._priors[int(one.image_index)], registration.ranking.prior_ratio
+        contradiction = None
+        if prior is not None and float(self.excess(one, T[h : h + 1, :3, :3])) > -AT_LIMIT:
+            contradiction = "at the limit"
+        if prior is not None and ratio is not None and float(ratio) < LOW_RATIO:
+            contradiction = "better outside"
+        return replace(registration, prior=prior, prior_contradiction=contradiction)
+
+    def _frame(self, prior: PosePrior, model: int) -> Tensor:
+        return object_frame(self._ups[model], prior.front)
+
+    def _each(self, hypotheses: Hypotheses) -> list[tuple[int, PosePrior, Tensor, Tensor]]:
+        """Index, prior, frame of the mesh and rotation towards the box of each hypothesis that has a prior."""
+        known = []
+        for h, (b, m) in enumerate(zip(hypotheses.image_index.tolist(), hypotheses.model.tolist(), strict=True)):
+            prior = self._priors[b]
+            if prior is not None:
+                known.append((h, prior, self._frame(prior, m), self._towards[b]))
+        return known

@@ -1,0 +1,157 @@
+"""Limits on the pose: angles that wrap, tolerances about a rotation, soft limits, and moves into the limits."""
+
+import math
+
+import pytest
+import torch
+
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint, viewpoint_from_rotation
+from curvireg_torch.geometry.pose_prior import SIDES, PosePrior, object_frame
+
+
+def rotations(azimuth, elevation=0.0, theta=0.0):
+    return rotation_from_viewpoint(*(torch.as_tensor(v, dtype=torch.float64) for v in (azimuth, elevation, theta)))
+
+
+@pytest.mark.parametrize(
+    ("limits", "azimuth", "missed"),
+    [
+        ((300, 60), 0, 0),
+        ((300, 60), 61, 1),
+        ((300, 60), 290, 10),
+        ((300, 60), 180, 120),
+        ((60, 300), 0, 60),
+        ((-30, 30), 345, 0),
+        ((-30, 30), 320, 10),
+        ((0, 360), 123, 0),
+        ((350, 350), 10, 20),
+    ],
+)
+def test_azimuth_limits_wrap_around_zero(limits, azimuth, missed):
+    excess = PosePrior(azimuth=limits).excess(rotations(float(azimuth), 20.0))
+    assert float(excess.clamp(min=0.0)) == pytest.approx(missed, abs=1e-6)
+
+
+def test_elevation_and_theta_are_limited_each_by_itself():
+    prior = PosePrior(elevation=(0, 45), theta=(-10, 10))
+    R = rotations([10.0, 10.0, 10.0, 10.0], [20.0, 50.0, -30.0, 20.0], [0.0, 0.0, 0.0, 25.0])
+    assert prior.excess(R).tolist() == pytest.approx([-10.0, 5.0, 30.0, 15.0], abs=1e-6)
+    assert PosePrior(elevation=(-90, 90)).excess(R).tolist() == [-180.0] * 4
+
+
+@pytest.mark.parametrize("theta", [-120.0, 0.0, 30.0])
+def test_up_is_where_the_objects_up_axis_points_in_the_photograph(theta):
+    R = rotations(40.0, 25.0, theta)
+    x, y, _ = (R @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)).tolist()
+    assert float(PosePrior(up=(x, y), within=1.0).excess(R)) == pytest.approx(-1.0, abs=1e-6)
+    other = PosePrior(up=(x, y), within=5.0).excess(rotations(40.0, 25.0, theta + 12.0))
+    assert float(other) == pytest.approx(7.0, abs=1e-6)
+
+
+def test_rotation_limit_is_the_geodesic_distance():
+    prior = PosePrior(viewpoint=(30.0, 20.0, 5.0), within=10.0)
+    centre, R = rotations(30.0, 20.0, 5.0), rotations([30.0, 60.0], [20.0, 20.0], [5.0, 5.0])
+    expected = rotation_error(R, centre) - 10.0
+    assert torch.allclose(prior.excess(R), expected)
+    assert expected[1] > 10.0
+
+
+def test_log_prior_is_gaussian_beyond_a_soft_limit_and_margin_widens_it():
+    R = rotations([0.0, 25.0, 40.0])
+    hard = PosePrior(azimuth=(-20, 20))
+    assert hard.log_prior(R).tolist() == [0.0, -math.inf, -math.inf]
+    assert hard.log_prior(R, margin=7.5).tolist() == [0.0, 0.0, -math.inf]
+    soft = PosePrior(azimuth=(-20, 20), softness=10.0).log_prior(R)
+    assert soft.tolist() == pytest.approx([0.0, -0.125, -2.0], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        PosePrior(azimuth=(300, 60)),
+        PosePrior(elevation=(10, 30), theta=(-5, 5)),
+        PosePrior(azimuth=(100, 140), up=(0, -1), within=15.0),
+        PosePrior(rotation=rotations(200.0, 40.0, -20.0), within=25.0),
+    ],
+    ids=["azimuth", "elevation, theta", "azimuth, up", "rotation"],
+)
+def test_nearest_moves_rotations_to_the_border_and_keeps_those_inside(prior):
+    generator = torch.Generator().manual_seed(0)
+    a, e, t = torch.rand(3, 4000, generator=generator, dtype=torch.float64)
+    R = rotations(360.0 * a, 160.0 * e - 80.0, 360.0 * t - 180.0)
+    before, moved = prior.excess(R), prior.nearest(R)
+    assert float(prior.excess(moved).max()) < 1e-5
+    inside = before <= 0.0
+    assert inside.any()
+    assert not inside.all()
+    assert torch.equal(moved[inside], R[inside])
+    if prior.rotation is not None:
+        assert torch.allclose(rotation_error(moved, R), before.clamp(min=0.0), atol=1e-5)
+
+
+def test_nearest_clamps_each_angle_to_its_nearer_limit():
+    prior = PosePrior(azimuth=(300, 60), elevation=(0, 45))
+    azimuth, elevation, _ = viewpoint_from_rotation(prior.nearest(rotations([70.0, 290.0, 179.0], [60.0, -5.0, 20.0])))
+    assert azimuth.tolist() == pytest.approx([60.0, 300.0, 60.0])
+    assert elevation.tolist() == pytest.approx([45.0, 0.0, 20.0])
+
+
+@pytest.mark.parametrize("prior", [PosePrior(azimuth=(300, 60)), PosePrior(viewpoint=(20, 10, 0), within=30)], ids=str)
+def test_angles_are_counted_about_the_objects_own_axes(prior):
+    frame = object_frame("y", "x")
+    R = rotations(torch.arange(0.0, 360.0, 20.0), 15.0)
+    in_file = R @ frame
+    assert torch.allclose(prior.excess(in_file, frame), prior.excess(R), atol=1e-5)
+    assert torch.allclose(prior.nearest(in_file, frame), prior.nearest(R) @ frame, atol=1e-6)
+
+
+def test_rotation_is_one_of_the_mesh_files_axes():
+    R = rotations(70.0, 10.0)
+    prior = PosePrior(rotation=R, within=1.0)
+    assert float(prior.excess(R, object_frame("y"))) == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize("name", SIDES)
+def test_side_is_centred_on_its_azimuth(name):
+    prior = PosePrior.side(name)
+    around = rotations([SIDES[name], SIDES[name] + 44.0, SIDES[name] - 46.0], 10.0)
+    assert prior.excess(around).tolist() == pytest.approx([-45.0, -1.0, 1.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
+def test_object_frame_puts_up_on_z_and_the_front_towards_azimuth_zero(up):
+    for front in ("x", "y", "z", "-x", "-y", "-z"):
+        if front[-1] == up[-1]:
+            with pytest.raises(InvalidInputError, match="front: expected another axis"):
+                object_frame(up, front)
+            continue
+        axes = {s + a: (1.0 - 2.0 * bool(s)) * torch.eye(3).double()[i] for i, a in enumerate("xyz") for s in ("", "-")}
+        R = object_frame(up, front)
+        assert torch.allclose(R @ axes[up], axes["z"], atol=1e-12)
+        assert torch.allclose(R @ axes[front], axes["-y"], atol=1e-12)
+        assert torch.det(R) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "at least one limit"),
+        ({"azimuth": (1, 2, 3)}, "azimuth: expected 2 finite"),
+        ({"azimuth": (1, math.nan)}, "azimuth: expected 2 finite"),
+        ({"elevation": (50, 40)}, "elevation: expected -90 <= low"),
+        ({"up": (0, 0), "within": 5}, "up: expected a direction"),
+        ({"up": (0, -1)}, "within: expected degrees beside"),
+        ({"azimuth": (0, 9), "within": 5}, "within: expected degrees beside"),
+        ({"rotation": torch.eye(3), "within": 0.0}, r"within: expected degrees in \(0, 180\]"),
+        ({"rotation": torch.eye(4), "within": 5.0}, r"rotation: expected \(3, 3\)"),
+        ({"rotation": 2 * torch.eye(3), "within": 5.0}, "rotation"),
+        ({"azimuth": (0, 9), "softness": -1.0}, "softness"),
+        ({"azimuth": (0, 9), "front": "w"}, "front"),
+        ({"viewpoint": (0, "a", 0), "within": 5.0}, "viewpoint: expected 3 numbers"),
+    ],
+    ids=str,
+)
+def test_pose_prior_refuses_what_it_cannot_mean(options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        PosePrior(**options)
