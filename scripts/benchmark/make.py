@@ -48,7 +48,7 @@ class Meshes:
         self.out, self.rotations = out, np.array(listing["turns"])
         about_z = [k for k, R in enumerate(self.rotations) if R[2, 2] > 0.99]
         self.all = [m for m in listing["meshes"] if m["half"] == half]
-        self.good = [m for m in self.all if m["extents"][2] > 0 and min(m["extents"]) > 0.08 * max(m["extents"])]
+        self.good = [m for m in self.all if min(m["extents"]) > 0.08 * max(m["extents"])]
         self.good = [m for m in self.good if len(set(m["look_symmetries"]) & set(about_z)) < FULL_TURN]
         self.clutter = [m for m in self.all if m["faces"] < 6000]
         self.kinds = {}

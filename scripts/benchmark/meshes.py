@@ -66,25 +66,17 @@ UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 """Rotation from the catalogue's frame (y up, front +z) to ours (z up, front -y)."""
 
 
-def fetch_package(source: Path, package: str, sha256: str) -> Path:
-    """Path of the package's file in ``source``; it is downloaded if missing, and its digest is checked."""
-    source.mkdir(parents=True, exist_ok=True)
-    if not list(source.glob(f"{package}_*.deb")):
-        subprocess.run(["apt-get", "download", package], cwd=source, check=True)
-    return check_digest(next(iter(source.glob(f"{package}_*.deb"))), sha256)
-
-
-def check_digest(deb: Path, sha256: str) -> Path:
-    found = hashlib.sha256(deb.read_bytes()).hexdigest()
-    if found != sha256:
-        sys.exit(f"{deb}: sha256 is {found}, expected {sha256}; the benchmark needs this version")
-    return deb
-
-
 def fetch(out: Path, deb: Path | None) -> Path:
-    """Download and unpack the libraries; returns their folder."""
+    """Download the package if needed, check its digest and unpack it; returns the folder of the libraries."""
     source = out / "source"
-    deb = fetch_package(source, PACKAGE, SHA256) if deb is None else check_digest(deb, SHA256)
+    source.mkdir(parents=True, exist_ok=True)
+    if deb is None:
+        if not list(source.glob(f"{PACKAGE}_*.deb")):
+            subprocess.run(["apt-get", "download", PACKAGE], cwd=source, check=True)
+        deb = next(iter(source.glob(f"{PACKAGE}_*.deb")))
+    found = hashlib.sha256(deb.read_bytes()).hexdigest()
+    if found != SHA256:
+        sys.exit(f"{deb}: sha256 is {found}, expected {SHA256}; the benchmark needs this version")
     unpacked = source / "unpacked"
     if not (unpacked / "done").exists():
         unpacked.mkdir(parents=True, exist_ok=True)
@@ -216,30 +208,17 @@ def examine(task: tuple[dict, Path, Path]) -> tuple[dict, str | None, np.ndarray
     except Exception as error:  # a malformed file may raise anything
         return row, f"unreadable ({type(error).__name__})", None
     cloud = sample_points(model)
+    shape_symmetries = symmetries(cloud)
     row = {
         **{k: row[k] for k in ("id", "name", "category", "licence", "creator", "source")},
         "kind": kind_of(row["name"]),
-        **describe(row["id"], model, cloud),
-    }
-    return row, None, cloud
-
-
-def describe(name: str, model: TexturedMesh, cloud: np.ndarray) -> dict:
-    """Fields of meshes.json for one mesh, given points of its surface."""
-    shape_symmetries = symmetries(cloud)
-    return {
-        "path": f"meshes/{name}/model.obj",
+        "path": f"meshes/{row['id']}/model.obj",
         "faces": len(model.triangles),
         "extents": np.ptp(model.hull_points(), axis=0).round(4).tolist(),
         "shape_symmetries": shape_symmetries,
         "look_symmetries": appearance_symmetries(model, shape_symmetries, candidate_rotations()),
     }
-
-
-def write_listing(out: Path, listing: dict) -> None:
-    part = out / "meshes.json.part"
-    part.write_text(json.dumps(listing, indent=1))
-    part.replace(out / "meshes.json")
+    return row, None, cloud
 
 
 def main() -> None:
@@ -250,13 +229,8 @@ def main() -> None:
     arguments = parser.parse_args()
     unpacked = fetch(arguments.out, arguments.deb)
     once = {row["id"]: row for row in reversed(catalogue(unpacked))}  # removes duplicates
-    listing = {
-        "package": PACKAGE,
-        "sha256": SHA256,
-        "turns": candidate_rotations().tolist(),
-        "meshes": [],
-        "left_out": {},
-    }
+    listing = {"package": PACKAGE, "sha256": SHA256, "turns": candidate_rotations().tolist()}
+    listing |= {"meshes": [], "left_out": {}}
     clouds: dict[str, tuple[np.ndarray, cKDTree]] = {}
     for half in ("held-out", "train"):
         tasks = [(row, unpacked, arguments.out) for name, row in sorted(once.items()) if half_of(name) == half]
@@ -264,17 +238,18 @@ def main() -> None:
             results = list(tqdm(pool.map(examine, tasks), desc=half, total=len(tasks)))
         for row, why, cloud in results:
             like = None if why else copy_of(cloud, clouds)
-            if why is None and half == "train" and like is not None and half_of(like) == "held-out":
+            if like is not None and half == "train" and half_of(like) == "held-out":
                 why = "copy of a held-out mesh"
             if why is not None:
                 listing["left_out"][row["id"]] = why
                 continue
             clouds[row["id"]] = np.ptp(cloud, axis=0), cKDTree(cloud)
             listing["meshes"].append({**row, "half": half, "like": like or row["id"]})
-        write_listing(arguments.out, listing)
-        print(
-            f"{half}: {sum(m['half'] == half for m in listing['meshes'])} meshes; left out {len(listing['left_out'])}"
-        )
+        part = arguments.out / "meshes.json.part"
+        part.write_text(json.dumps(listing, indent=1))
+        part.replace(arguments.out / "meshes.json")
+        count = sum(mesh["half"] == half for mesh in listing["meshes"])
+        print(f"{half}: {count} meshes; left out {len(listing['left_out'])}")
 
 
 if __name__ == "__main__":

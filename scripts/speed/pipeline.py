@@ -2,16 +2,21 @@
 
     python scripts/speed/pipeline.py                    # scripts/results/bench_pipeline.json, docs/performance.md
     python scripts/speed/pipeline.py --device cuda      # scripts/results/bench_pipeline_cuda.json, with the GPU's name
+    python scripts/speed/pipeline.py --renderers        # views per second of every renderer, printed as JSON
 
-The pipeline is the default one. The mesh is a dented sphere with a chosen number of faces.
+The pipeline is the default one. The mesh is a dented sphere with a chosen number of faces. Renderers draw the same
+views in alternation, the object filling the image, and the best of three rounds counts.
 """
 
 import argparse
+import json
 import platform
 import statistics
 import tempfile
+import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +25,12 @@ import torch
 import trimesh
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, ViewMatcher, camera_matrix
+from curvireg_torch.errors import RenderingError
+from curvireg_torch.geometry import uniform_views
+from curvireg_torch.io.meshes import mesh_radius
+from curvireg_torch.matching import ViewDescriber
+from curvireg_torch.rendering import make_renderer
+from curvireg_torch.settings import BankSettings
 from curvireg_torch.synthetic import random_pose, synthesize_photograph
 from scripts._shared import REPOSITORY, RESULTS, commit, timed, today, update_page, write_json
 
@@ -89,6 +100,34 @@ def pipeline_times(mesh: trimesh.Trimesh, pipeline: Pipeline, photographs: int, 
     return times
 
 
+def renderers_of(mesh: trimesh.Trimesh) -> dict[str, Callable[..., object]]:
+    found: dict[str, Callable[..., object]] = {}
+    for name, device in (("embree", "cpu"), ("pyrender", "cpu"), ("torch", "cpu"), ("torch", "cuda")):
+        try:
+            if device == "cpu" or torch.cuda.is_available():
+                found[f"{name} {device}"] = make_renderer(mesh, name, device=device).render
+        except RenderingError as error:
+            print(error)
+    return found
+
+
+def views_per_second(faces: int, size: int, count: int = 16) -> dict[str, float]:
+    """Rate of each renderer at ``size`` px, with the exact number of faces."""
+    mesh, views = dented_sphere(faces), uniform_views(count)
+    describe = ViewDescriber(mesh, BankSettings(image_size=size))
+    T, K, _ = describe.cameras(views.rotations, views.distance * mesh_radius(mesh))
+    best: dict[str, float] = {}
+    for repeat in range(4):  # the first round is a warm-up
+        for name, render in renderers_of(mesh).items():
+            start = time.perf_counter()
+            render(T, K, (size, size))
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
+            if repeat:
+                best[name] = min(best.get(name, np.inf), time.perf_counter() - start)
+    return {"faces": len(mesh.faces), "size": size} | {name: round(count / spent, 1) for name, spent in best.items()}
+
+
 def pipeline_table(record: dict[str, Any]) -> str:
     t, n = record["times"], record["photographs"]
     rows = [
@@ -114,7 +153,12 @@ def main() -> None:
         "--device", choices=("cpu", "cuda"), default="cpu", help="of modules, bank, search and the views' renderer"
     )
     parser.add_argument("--photographs", type=int, default=32)
+    parser.add_argument("--renderers", action="store_true", help="measure only the renderers")
     arguments = parser.parse_args()
+    if arguments.renderers:
+        for faces, size in product((640, 10_240, 163_840), (128, 256)):
+            print(json.dumps(views_per_second(faces, size)), flush=True)
+        return
     mesh, photographs, device = dented_sphere(arguments.faces), arguments.photographs, arguments.device
     record = {
         "date": today(),
