@@ -10,9 +10,8 @@ import torch
 from torch.utils.data import Dataset
 
 from ..errors import MissingFileError
+from ..geometry import rotation_from_viewpoint
 from ..io.images import read_image
-
-__all__ = ["IMAGE_SUFFIXES", "ObjectDataset", "Sample", "Transform", "existing_root", "is_plain_name"]
 
 Sample = dict[str, Any]
 Transform = Callable[[Sample], Sample]
@@ -22,9 +21,7 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".JPEG", ".JPG", ".PNG", ".tif", ".ti
 class ObjectDataset(Dataset[Sample]):
     """One dict per annotated object. The index is built once, photographs are read on access.
 
-    Attributes:
-        skipped_items: reason -> names of the objects and files that were skipped.
-        transforms: applied last to every sample, ``sample -> sample``, or None.
+    ``skipped_items`` maps reasons to names of skipped objects and files; ``transforms`` is applied last to a sample.
     """
 
     def __init__(self, transforms: Transform | None) -> None:
@@ -63,6 +60,12 @@ def existing_root(root: str | os.PathLike[str], readme: str) -> Path:
     if not path.is_dir():
         raise MissingFileError(f"no such folder; {readme} says how to get the data", subject=path)
     return path
+
+
+def pose_fields(*viewpoint: float) -> Sample:
+    """The fields ``viewpoint`` and ``rotation`` of a sample, from azimuth, elevation and theta."""
+    rotation = rotation_from_viewpoint(*torch.tensor(viewpoint, dtype=torch.float64).unbind())
+    return {"viewpoint": viewpoint, "rotation": tuple(map(tuple, rotation.tolist()))}
 
 
 def is_plain_name(name: str) -> bool:

@@ -12,8 +12,6 @@ from ..io.json_files import finite_numbers, read_json
 from ..utils.checks import check_camera_matrix, check_positive, check_rotation
 from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name
 
-__all__ = ["BOPDataset"]
-
 _README = "datasets/bop/README.md"
 _UNKNOWN_BOX = (math.nan,) * 4
 
@@ -37,23 +35,19 @@ class BOPDataset(ObjectDataset):
         - ``image`` (3, H, W) RGB in [0, 1], from ``rgb`` or ``gray``; ``image_path`` str
         - ``box`` (4,) x0, y0, x1, y1 of the whole silhouette, which may extend beyond the image; ``box_visible`` (4,)
           of its visible part, NaN if nothing is visible. BOP's width is x1 - x0. NaN without ``scene_gt_info.json``
-        - ``camera_matrix`` (3, 3); ``rotation`` (3, 3), ``translation`` (3,): model to OpenCV camera, in the models'
-          unit (mm)
+        - ``camera_matrix`` (3, 3); ``rotation`` (3, 3), ``translation`` (3,) in mm: model to OpenCV camera
         - ``scene_id``, ``image_id``, ``obj_id`` int; ``instance_index`` int: index in the image's list of ``scene_gt``
-        - ``visib_fract`` float in [0, 1], NaN if unknown
-        - ``model_path`` str; ``model_info`` dict
+        - ``visib_fract`` float in [0, 1], NaN if unknown; ``model_path`` str; ``model_info`` dict
 
-    Reasons in ``dataset.skipped`` and ``dataset.skipped_items``: ``no_target``, ``not_visible``, ``bad_box`` (no area:
-    the object is outside the image), ``missing_annotation``, ``corrupt_annotation``, ``missing_image``,
-    ``missing_mesh``, ``missing_model_info``.
+    Reasons in ``skipped``: ``no_target``, ``not_visible``, ``bad_box`` (no area: the object is outside the image),
+    ``missing_annotation``, ``corrupt_annotation``, ``missing_image``, ``missing_mesh``, ``missing_model_info``.
 
     Raises:
         MissingFileError: the root, the split's folder, ``models_info.json`` or a required target list does not exist.
         InvalidInputError: ``min_visib`` out of range, or one of those files is damaged.
 
     Example:
-        >>> lm = BOPDataset("data/bop/lm", min_visib=0.1)         # doctest: +SKIP
-        >>> lm[0]["translation"], lm[0]["model_info"]["diameter"]  # doctest: +SKIP
+        >>> BOPDataset("data/bop/lm", min_visib=0.1)[0]["translation"]  # doctest: +SKIP
     """
 
     def __init__(
@@ -117,8 +111,7 @@ class BOPDataset(ObjectDataset):
             image = images.get(f"{int(key):06d}")
             samples: list[Sample] = []
             for index, entry in enumerate(instances):
-                info = entry_at(infos.get(key), index)
-                parsed = self._parse(entry, info, cameras.get(key))
+                parsed = self._parse(entry, entry_at(infos.get(key), index), cameras.get(key))
                 if isinstance(parsed, str):
                     self._skip(parsed, f"{item} #{index}")
                 else:
@@ -197,12 +190,8 @@ def _mark_targets(samples: list[Sample], counts: dict[tuple[int, int, int], int]
     """Set ``no_target`` of the samples of one image, and remove its targets from ``counts``."""
     keys = [(s["scene_id"], s["image_id"], s["obj_id"]) for s in samples]
     remaining = {key: math.inf if counts is None else counts.pop(key, 0) for key in set(keys)}
-
-    def visibility(i: int) -> float:
-        value: float = samples[i]["visib_fract"]
-        return -1.0 if math.isnan(value) else value
-
-    for i in sorted(range(len(samples)), key=lambda i: (-visibility(i), i)):
+    visibility = [-1.0 if math.isnan(s["visib_fract"]) else s["visib_fract"] for s in samples]
+    for i in sorted(range(len(samples)), key=lambda i: -visibility[i]):  # stable: ties keep their order
         samples[i]["no_target"] = remaining[keys[i]] <= 0
         remaining[keys[i]] -= 1
     return samples

@@ -16,8 +16,6 @@ from ..io.json_files import check_table_size, finite_numbers
 from ..utils.checks import check_tensor
 from ..utils.files import write_file
 
-__all__ = ["BOPRow", "read_bop_csv", "write_bop_csv"]
-
 _HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
 
 
@@ -38,10 +36,6 @@ def write_bop_csv(path: str | os.PathLike[str], rows: Iterable[BOPRow]) -> None:
 
     Columns: scene_id, im_id, obj_id, score, R (9 numbers, row by row, separated by spaces), t (3 numbers, mm), time
     (seconds for the whole image, so equal for all its rows; -1 if unknown).
-
-    Args:
-        path: file to write; its folder must exist.
-        rows: dicts with these keys; R (3, 3) and t (3,) finite floating tensors.
 
     Raises:
         InvalidInputError: a row lacks a key, is not finite, or disagrees on an image's time.
@@ -94,10 +88,7 @@ def _check_time(row: BOPRow, times: dict[tuple[int, int], float], name: str) -> 
 
 
 def read_bop_csv(path: str | os.PathLike[str]) -> list[BOPRow]:
-    """Read a results file of the BOP challenge.
-
-    Returns:
-        One :class:`BOPRow` per line, in order; R (3, 3) and t (3,) float64, t in mm.
+    """Read a results file of the BOP challenge; R and t are float64.
 
     Raises:
         MissingFileError: the file does not exist.
@@ -129,17 +120,11 @@ def _row(cells: list[str], name: str) -> BOPRow:
     try:
         scene_id, im_id, obj_id = (int(c) for c in cells[:3])
         score, time = float(cells[3]), float(cells[6])
-        R, t = [float(v) for v in cells[4].split()], [float(v) for v in cells[5].split()]
+        R, t = ([float(v) for v in cell.split()] for cell in cells[4:6])
     except ValueError as error:
         raise InvalidInputError(str(error), subject=name) from error
     if len(R) != 9 or len(t) != 3 or not all(map(math.isfinite, (score, time, *R, *t))):
         raise InvalidInputError(f"expected 9 finite numbers in R and 3 in t, got {len(R)} and {len(t)}", subject=name)
-    return BOPRow(
-        scene_id=scene_id,
-        im_id=im_id,
-        obj_id=obj_id,
-        score=score,
-        R=torch.tensor(R, dtype=torch.float64).reshape(3, 3),
-        t=torch.tensor(t, dtype=torch.float64),
-        time=time,
-    )
+    pose = torch.tensor([*R, *t], dtype=torch.float64)
+    rotation, position = pose[:9].view(3, 3), pose[9:]
+    return BOPRow(scene_id=scene_id, im_id=im_id, obj_id=obj_id, score=score, R=rotation, t=position, time=time)

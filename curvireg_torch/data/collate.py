@@ -8,23 +8,12 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ._base import Sample
 
-__all__ = ["collate"]
-
 
 def collate(samples: Sequence[Sample]) -> Sample:
-    """Join samples into one batch, for ``DataLoader(..., collate_fn=collate)``.
+    """Join B >= 1 samples with the same keys into one batch, for ``DataLoader(..., collate_fn=collate)``.
 
-    Tensors of equal shape and dtype are stacked along a new first axis. Other values become lists, photographs of
-    different sizes among them.
-
-    Args:
-        samples: B >= 1 dicts with the same keys.
-
-    Returns:
-        One dict with those keys; each value is a (B, ...) tensor or a list of length B.
-
-    Raises:
-        InvalidInputError: there is no sample, or their keys differ.
+    Tensors of equal shape and dtype are stacked to (B, ...). Other values become lists of length B, photographs of
+    different sizes among them. :class:`InvalidInputError` if there is no sample, or their keys differ.
 
     Example:
         >>> batch = collate([{"box": torch.zeros(4), "category": "car"}, {"box": torch.ones(4), "category": "sofa"}])

@@ -6,15 +6,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from ..errors import InvalidInputError, MissingFileError
-from ..geometry import rotation_from_viewpoint
 from ..io.mat_files import MatStruct, MatValue, read_mat
 from ..utils.checks import check_option, check_positive
-from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name
-
-__all__ = ["Pascal3DPlus"]
+from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name, pose_fields
 
 _README = "datasets/pascal3d/README.md"
 _VOC_LISTS = Path("PASCAL", "VOCdevkit", "VOC2012", "ImageSets", "Main")
@@ -48,18 +44,16 @@ class Pascal3DPlus(ObjectDataset):
         - ``category`` str, ``cad_index`` int from 1, ``cad_path`` str
         - ``object_index`` int: index in the annotation file; ``truncated``, ``occluded``, ``difficult`` bool
 
-    Reasons in ``dataset.skipped`` and ``dataset.skipped_items``: ``other_class`` (a file lists all objects of the
-    photograph), ``occluded``, ``truncated``, ``difficult``, ``small``, ``no_viewpoint``, ``coarse_viewpoint`` (only
-    coarse bins were labelled: distance 0 or no fine angles), ``bad_box`` (no area), ``missing_annotation``,
-    ``corrupt_annotation``, ``missing_image``, ``missing_mesh``.
+    Reasons in ``skipped``: ``other_class`` (a file lists all objects of the photograph), ``occluded``, ``truncated``,
+    ``difficult``, ``small``, ``no_viewpoint``, ``coarse_viewpoint`` (only coarse bins were labelled), ``bad_box`` (no
+    area), ``missing_annotation``, ``corrupt_annotation``, ``missing_image``, ``missing_mesh``.
 
     Raises:
         MissingFileError: the root or an image list does not exist.
         InvalidInputError: an option is out of range.
 
     Example:
-        >>> cars = Pascal3DPlus("data/PASCAL3D+_release1.1", categories=["car"], truncated=False)  # doctest: +SKIP
-        >>> cars[0]["rotation"].shape, dict(cars.skipped)                                          # doctest: +SKIP
+        >>> Pascal3DPlus("data/PASCAL3D+_release1.1", categories=["car"])[0]["rotation"]  # doctest: +SKIP
     """
 
     def __init__(
@@ -138,9 +132,8 @@ class Pascal3DPlus(ObjectDataset):
                 if isinstance(parsed, str):
                     self._skip(parsed, f"{item} #{index}")
                 else:
-                    self._items.append(
-                        {"image_path": str(image), "image_id": image_id, "object_index": index, **parsed}
-                    )
+                    ids = {"image_path": str(image), "image_id": image_id, "object_index": index}
+                    self._items.append({**ids, **parsed})
 
     def _parse(self, entry: MatStruct, category: str) -> Sample | str:
         """The sample of one object, or the reason to skip it."""
@@ -165,13 +158,9 @@ class Pascal3DPlus(ObjectDataset):
         cad = self.root / "CAD" / category / f"{int(cad_index):02d}.off"
         if not 1 <= cad_index < 1000 or not cad.is_file():
             return "missing_mesh"
-        viewpoint = (azimuth, elevation, _number(views[0].get("theta")) or 0.0)
-        angles = torch.tensor(viewpoint, dtype=torch.float64)
-        rotation = rotation_from_viewpoint(*angles.unbind())
         return {
             "box": box,
-            "viewpoint": viewpoint,
-            "rotation": tuple(map(tuple, rotation.tolist())),
+            **pose_fields(azimuth, elevation, _number(views[0].get("theta")) or 0.0),
             "distance": distance,
             "translation": (0.0, 0.0, distance),
             "camera_matrix": _camera(views[0], box, self._pixel_origin),

@@ -4,8 +4,6 @@ from typing import Any
 
 from ..geometry import crop_images
 
-__all__ = ["CropBox"]
-
 
 class CropBox:
     """Replace a sample's image by the square crop around its box, so that samples can be stacked.

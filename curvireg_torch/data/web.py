@@ -5,15 +5,10 @@ import math
 import os
 from pathlib import Path
 
-import torch
-
 from ..errors import InvalidInputError, MissingFileError
-from ..geometry import rotation_from_viewpoint
 from ..io.json_files import check_table_size
 from ..utils.choices import MESHES
-from ._base import ObjectDataset, Sample, Transform, existing_root, is_plain_name
-
-__all__ = ["WebCollection"]
+from ._base import ObjectDataset, Sample, Transform, existing_root, is_plain_name, pose_fields
 
 _README = "datasets/web/README.md"
 _COLUMNS = ["image", "x0", "y0", "x1", "y1", "azimuth", "elevation", "theta", "distance"]
@@ -27,10 +22,6 @@ class WebCollection(ObjectDataset):
     of the mesh. Pose columns may be empty: without azimuth and elevation there is no pose, an empty theta is 0. A
     photograph may have several lines. The mesh is one file in any format of :func:`curvireg_torch.load_mesh`.
 
-    Args:
-        root: the folder that holds the folders of the objects.
-        transforms: applied to every sample, ``sample -> sample``.
-
     Samples are dicts (tensors are float32):
         - ``image`` (3, H, W) RGB in [0, 1]; ``image_path``, ``image_id`` str
         - ``box`` (4,) x0, y0, x1, y1
@@ -39,16 +30,15 @@ class WebCollection(ObjectDataset):
         - ``distance`` float, NaN if unknown
         - ``category`` str, the object's folder; ``mesh_path`` str; ``object_index`` int: line of ``views.csv`` from 0
 
-    Reasons in ``dataset.skipped`` and ``dataset.skipped_items``: ``missing_annotation`` (no ``views.csv``),
-    ``corrupt_annotation``, ``missing_image``, ``missing_mesh``, ``bad_box`` (no area).
+    Reasons in ``skipped``: ``missing_annotation`` (no ``views.csv``), ``corrupt_annotation``, ``missing_image``,
+    ``missing_mesh``, ``bad_box`` (no area).
 
     Raises:
         MissingFileError: the root does not exist, or holds no folder.
         InvalidInputError: a folder has two meshes.
 
     Example:
-        >>> mine = WebCollection("data/web")           # doctest: +SKIP
-        >>> mine[0]["category"], mine[0]["viewpoint"]  # doctest: +SKIP
+        >>> WebCollection("data/web")[0]["viewpoint"]  # doctest: +SKIP
     """
 
     def __init__(self, root: str | os.PathLike[str], *, transforms: Transform | None = None) -> None:
@@ -83,9 +73,8 @@ class WebCollection(ObjectDataset):
             if isinstance(parsed, str):
                 self._skip(parsed, f"{folder.name}/views.csv #{index}")
             else:
-                self._items.append(
-                    {**parsed, "category": folder.name, "mesh_path": str(meshes[0]), "object_index": index}
-                )
+                ids = {"category": folder.name, "mesh_path": str(meshes[0]), "object_index": index}
+                self._items.append({**parsed, **ids})
         return None
 
 
@@ -105,16 +94,6 @@ def _parse(line: list[str], folder: Path) -> Sample | str:
     image = folder / line[0]
     if not image.is_file():
         return "missing_image"
-    if math.isnan(azimuth):
-        theta = math.nan
-    elif math.isnan(theta):
-        theta = 0.0
-    rotation = rotation_from_viewpoint(*torch.tensor([azimuth, elevation, theta], dtype=torch.float64).unbind())
-    return {
-        "image_path": str(image),
-        "image_id": image.stem,
-        "box": (x0, y0, x1, y1),
-        "viewpoint": (azimuth, elevation, theta),
-        "rotation": tuple(map(tuple, rotation.tolist())),
-        "distance": distance,
-    }
+    theta = math.nan if math.isnan(azimuth) else 0.0 if math.isnan(theta) else theta
+    image_fields = {"image_path": str(image), "image_id": image.stem, "box": (x0, y0, x1, y1)}
+    return {**image_fields, **pose_fields(azimuth, elevation, theta), "distance": distance}

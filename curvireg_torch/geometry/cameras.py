@@ -28,9 +28,6 @@ def camera_of_view(fov: float, size: tuple[int, int]) -> Tensor:
         fov: degrees, 0 < fov < 180.
         size: (H, W) of the image in px.
 
-    Raises:
-        InvalidInputError: ``fov`` is out of range.
-
     Example:
         >>> camera_of_view(90.0, (480, 640))[0].round(decimals=6).tolist()
         [320.0, 0.0, 319.5]
@@ -93,19 +90,10 @@ def rotation_towards(rays: Tensor) -> Tensor:
     """Smallest rotations that take the optical axis (0, 0, 1) onto rays; they turn allocentric rotations into poses.
 
     Args:
-        rays: (..., 3), z > 0, any length.
-
-    Returns:
-        (..., 3, 3) rotations with ``R (0, 0, 1) = ray / |ray|``.
+        rays: (..., 3), z > 0, any length; the (..., 3, 3) rotations satisfy ``R (0, 0, 1) = ray / |ray|``.
     """
     x, y, z = (rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)).unbind(-1)
     # Rodrigues with axis (0, 0, 1) x ray = (-y, x, 0): R = I + [v] + [v]^2 / (1 + z).
     f = 1.0 / (1.0 + z)
-    return torch.stack(
-        [
-            torch.stack([1.0 - f * x * x, -f * x * y, x], -1),
-            torch.stack([-f * x * y, 1.0 - f * y * y, y], -1),
-            torch.stack([-x, -y, z], -1),
-        ],
-        -2,
-    )
+    rows = [1.0 - f * x * x, -f * x * y, x], [-f * x * y, 1.0 - f * y * y, y], [-x, -y, z]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)

@@ -6,7 +6,8 @@
 | OpenGL | x right, y up, z backward | ``x_cam = R x + t`` | (i + 0.5, j + 0.5) |
 | PyTorch3D | x left, y up, z forward | ``x_cam = x R + T`` (rows) | (i + 0.5, j + 0.5) |
 
-Quaternions are (w, x, y, z), of length 1; axis-angle vectors have the angle, in radians, as their length.
+Quaternions are (w, x, y, z), of length 1; axis-angle vectors have the angle, in radians, as their length. All functions
+raise :class:`InvalidInputError` for other shapes and dtypes and for what is no rotation, rigid transform or camera.
 """
 
 import torch
@@ -14,7 +15,7 @@ from kornia.geometry import conversions as kornia_conversions
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import check_camera_matrix, check_pose, check_rotation, check_tensor
+from ..utils.checks import check_camera_matrix, check_last_axes, check_pose, check_rotation, check_tensor
 from .cameras import transform
 
 
@@ -27,9 +28,6 @@ def opengl_from_opencv(T_cam_from_model: Tensor) -> Tensor:
 
     They are view matrices, as of ``gluLookAt``. The inverse of one is the camera's pose in the model frame, which
     trimesh, pyrender and Blender expect.
-
-    Raises:
-        InvalidInputError: not a finite, rigid, floating (..., 4, 4) transform.
 
     Example:
         >>> opengl_from_opencv(torch.eye(4)).diagonal().tolist()
@@ -47,19 +45,15 @@ def opencv_from_opengl(T_cam_from_model: Tensor) -> Tensor:
 def opengl_projection(
     K: Tensor, size: tuple[int, int], *, near: float, far: float, orthographic: bool = False
 ) -> Tensor:
-    """OpenGL projection matrix of an OpenCV camera matrix.
+    """OpenGL projection matrix of an OpenCV camera matrix, perspective or ``orthographic`` (parallel).
 
     Args:
         K: (..., 3, 3) in px; orthographic: fx, fy in px per model unit.
         size: (H, W) of the image in px.
         near, far: clip distances along the optical axis in model units; 0 < near < far (orthographic: near < far).
-        orthographic: parallel projection.
 
     Returns:
         (..., 4, 4) from the OpenGL camera to clip coordinates; row 0 of OpenGL is the last row of the image.
-
-    Raises:
-        InvalidInputError: K, size or clip distances are invalid.
 
     Example:
         >>> K = torch.tensor([[64.0, 0, 31.5], [0, 64.0, 31.5], [0, 0, 1]])
@@ -75,7 +69,7 @@ def opengl_projection(
     fx, fy = K[..., 0, 0], K[..., 1, 1]
     # OpenGL counts from the corner of a pixel, half a pixel from its centre.
     x0, y0 = 2.0 * (K[..., 0, 2] + 0.5) / W - 1.0, 1.0 - 2.0 * (K[..., 1, 2] + 0.5) / H
-    P = torch.zeros(*K.shape[:-2], 4, 4, dtype=K.dtype, device=K.device)
+    P = K.new_zeros(*K.shape[:-2], 4, 4)
     P[..., 0, 0], P[..., 1, 1] = 2.0 * fx / W, 2.0 * fy / H
     if orthographic:
         P[..., 0, 3], P[..., 1, 3] = x0, y0
@@ -92,9 +86,6 @@ def pytorch3d_from_opencv(T_cam_from_model: Tensor) -> tuple[Tensor, Tensor]:
     """R (..., 3, 3) and T (..., 3) of PyTorch3D cameras, from (..., 4, 4) transforms into the OpenCV camera.
 
     With ``in_ndc=False``, ``focal_length=(fx, fy)`` and ``principal_point=(cx + 0.5, cy + 0.5)`` complete the camera.
-
-    Raises:
-        InvalidInputError: not a finite, rigid, floating (..., 4, 4) transform.
 
     Example:
         >>> R, T = pytorch3d_from_opencv(transform(torch.eye(3), torch.tensor([1.0, 2.0, 3.0])))
@@ -132,28 +123,18 @@ def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
         >>> rotation_from_quaternion(torch.tensor([0.0, 0.0, 0.0, 2.0])).diagonal().tolist()
         [-1.0, -1.0, 1.0]
     """
-    check_tensor(quaternion, "quaternion", (None,) * (quaternion.ndim - 1) + (4,))
+    check_last_axes(quaternion, "quaternion", (4,))
     R: Tensor = kornia_conversions.quaternion_to_rotation_matrix(quaternion)
     return R
 
 
 def axis_angle_from_rotation(R: Tensor) -> Tensor:
-    """(..., 3, 3) rotations to (..., 3) axis x angle, the angle in radians, at most pi.
-
-    Example:
-        >>> axis_angle_from_rotation(torch.diag(torch.tensor([1.0, -1.0, -1.0]))).abs().tolist()[0]
-        3.1415927410125732
-    """
+    """(..., 3, 3) rotations to (..., 3) axis x angle, the angle in radians, at most pi."""
     axis_angle: Tensor = kornia_conversions.quaternion_to_axis_angle(quaternion_from_rotation(R))
     return axis_angle
 
 
 def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
-    """(..., 3) axis x angle in radians to (..., 3, 3) rotations.
-
-    Example:
-        >>> rotation_from_axis_angle(torch.zeros(3)).diagonal().tolist()
-        [1.0, 1.0, 1.0]
-    """
-    check_tensor(axis_angle, "axis_angle", (None,) * (axis_angle.ndim - 1) + (3,))
+    """(..., 3) axis x angle in radians to (..., 3, 3) rotations."""
+    check_last_axes(axis_angle, "axis_angle", (3,))
     return rotation_from_quaternion(kornia_conversions.axis_angle_to_quaternion(axis_angle))

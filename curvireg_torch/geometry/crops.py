@@ -17,12 +17,7 @@ def whole_image_box(image: Tensor) -> Tensor:
 
 
 def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
-    """Raise :class:`InvalidInputError` for boxes that are empty, not finite or entirely outside their image.
-
-    Args:
-        boxes: (B, 4) x0, y0, x1, y1 in px.
-        sizes: (H, W) of each image.
-    """
+    """Refuse (B, 4) boxes that are empty, not finite or entirely outside their image, of the (H, W) in ``sizes``."""
     check_tensor(boxes, "boxes", (len(sizes), 4))
     for i, (box, (H, W)) in enumerate(zip(boxes.tolist(), sizes, strict=True)):
         x0, y0, x1, y1 = box
@@ -89,8 +84,7 @@ def crop_images(
 ) -> tuple[Tensor, Tensor]:
     """Square crops around boxes, resampled bilinearly, with a wider triangle filter (no aliasing) when shrinking.
 
-    Pixels that are NaN or infinite are missing: exactly those pixels of the crop are NaN that depend on one. Half types
-    are resampled in float32.
+    Crops are NaN where they depend on a pixel that is not finite. Half types are resampled in float32.
 
     Args:
         images: (B, C, H, W), or a list of (C, H, W) of different sizes. Pixels outside an image repeat its border.

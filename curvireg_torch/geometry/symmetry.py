@@ -9,10 +9,8 @@ from kornia.geometry import vector_to_skew_symmetric_matrix
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import check_positive, check_symmetries
+from ..utils.checks import check_fraction, check_positive, check_symmetries
 from .views import ViewSphere
-
-__all__ = ["symmetry_transforms", "views_without_symmetric"]
 
 
 def symmetry_transforms(info: Mapping[str, Any], *, max_step_fraction: float = 0.01) -> Tensor:
@@ -31,54 +29,41 @@ def symmetry_transforms(info: Mapping[str, Any], *, max_step_fraction: float = 0
         (S, 4, 4) float64 on the CPU, S >= 1, in the unit of ``info`` (BOP: mm); the identity comes first.
 
     Raises:
-        InvalidInputError: a matrix does not have 16 numbers, an axis or offset 3, an axis has length 0, or the step is
-            out of range.
+        InvalidInputError: wrong number of values, an axis of length 0, or ``max_step_fraction`` out of range.
 
     Example:
-        >>> symmetry_transforms({"diameter": 100.0}).shape
-        torch.Size([1, 4, 4])
         >>> symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]}).shape
         torch.Size([315, 4, 4])
     """
-    check_positive(max_step_fraction, "max_step_fraction")
-    if max_step_fraction > 1.0:
-        raise InvalidInputError(f"max_step_fraction: expected a number in (0, 1], got {max_step_fraction}")
+    check_fraction(max_step_fraction, "max_step_fraction")
     identity = torch.eye(4, dtype=torch.float64)
-    discrete = [identity]
-    for matrix in info.get("symmetries_discrete", ()):
-        discrete.append(_numbers(matrix, 16, "symmetries_discrete").view(4, 4))
+    matrices = [_numbers(matrix, 16, "symmetries_discrete") for matrix in info.get("symmetries_discrete", ())]
+    discrete = torch.stack([identity, *(matrix.view(4, 4) for matrix in matrices)])
     rotations = [identity[None]]
     for symmetry in info.get("symmetries_continuous", ()):
         axis = _numbers(symmetry["axis"], 3, "axis")
         offset = _numbers(symmetry.get("offset", (0.0, 0.0, 0.0)), 3, "offset")
         rotations.append(_axis_rotations(axis, offset, math.ceil(math.pi / max_step_fraction)))
     # (C, 1, 4, 4) @ (D, 4, 4): the discrete symmetry acts first.
-    return (torch.cat(rotations).unsqueeze(1) @ torch.stack(discrete)).flatten(0, 1)
+    return (torch.cat(rotations).unsqueeze(1) @ discrete).flatten(0, 1)
 
 
 def views_without_symmetric(views: ViewSphere, symmetries: Tensor, *, tolerance: float = 1.0) -> ViewSphere:
-    """The views of a symmetric object that look different.
-
-    A view is dropped if an earlier one at the same distance shows the same, up to a symmetry.
+    """The views, in their order, without those that an earlier one at the same distance shows up to a symmetry.
 
     Args:
-        views: N views.
         symmetries: (S, 4, 4) or (S, 3, 3) of the model, from :func:`symmetry_transforms`.
         tolerance: degrees within which two views count as the same. For a regular grid half a step of the symmetries
             suffices (0.6 degrees for BOP's 315 steps); for a scattered sampling use its covering radius.
-
-    Returns:
-        K <= N views, in their order.
 
     Raises:
         InvalidInputError: symmetries of another shape or not rigid, or a negative tolerance.
 
     Example:
         >>> from curvireg_torch.geometry import sample_views
-        >>> info = {"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]}
-        >>> len(sample_views(elevations=[0, 30])), len(
-        ...     views_without_symmetric(sample_views(elevations=[0, 30]), symmetry_transforms(info)))
-        (72, 2)
+        >>> about_z = symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1]}]})
+        >>> len(views_without_symmetric(sample_views(elevations=[0, 30]), about_z))
+        2
     """
     check_positive(tolerance, "tolerance", zero_ok=True)
     check_symmetries(symmetries)

@@ -8,13 +8,11 @@ from ..errors import InvalidInputError
 from ..utils.checks import check_camera_matrix, check_finite, check_rotation
 from .cameras import boxes_around, projected, rotation_towards, transform
 
-__all__ = ["pose_from_box", "translation_from_box"]
-
 _ITERATIONS = 20
 
 
 def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor) -> Tensor:
-    """Translation with which the projected points fill a box.
+    """Translation with which the projected points fill a box, with the object in front of the camera.
 
     Fixed point of two closed-form steps: the sizes of the projected and the given box determine the distance, their
     centres the offset. With the true rotation and box it converges to the true translation; with others, to the best
@@ -27,7 +25,7 @@ def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tenso
         K: (..., 3, 3).
 
     Returns:
-        (..., 3) float64 translation in model units, with the object in front of the camera.
+        (..., 3) float64 in model units.
 
     Raises:
         InvalidInputError: a matrix is not a rotation, the box is empty, or the camera matrix is unusable.
@@ -45,9 +43,7 @@ def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tenso
 def pose_from_box(points: Tensor, view_rotation: Tensor, box: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """Pose of an object from its allocentric rotation and its box.
 
-    An object away from the principal point is seen along a ray, not along the optical axis: every step of
-    :func:`translation_from_box` also rotates the view towards the ray of the object's current centre. With the true
-    view and box the pose is the true one.
+    Every step of :func:`translation_from_box` also rotates the view towards the ray of the object's current centre.
 
     Args:
         points, box, K: see :func:`translation_from_box`.

@@ -6,8 +6,6 @@ from torch import Tensor
 from ..utils.checks import check_option
 from ..utils.choices import UP_AXES
 
-__all__ = ["up_rotation"]
-
 
 def up_rotation(up: str) -> Tensor:
     """(3, 3) float64 rotation from a frame whose axis ``up`` points up to one whose z axis does.

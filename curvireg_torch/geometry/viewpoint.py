@@ -7,22 +7,19 @@ up in the image, rotated by ``theta`` about the optical axis. With the image's y
 """
 
 import math
+from functools import reduce
 
 import torch
 from torch import Tensor
 
 from ..utils.checks import check_rotation
 
-__all__ = ["rotation_error", "rotation_from_viewpoint", "viewpoint_from_rotation"]
-
 
 def _as_floating(*values: Tensor | float) -> list[Tensor]:
     device = next((v.device for v in values if isinstance(v, Tensor)), None)  # of the tensors, for plain numbers
     tensors = [v if isinstance(v, Tensor) else torch.tensor(float(v), device=device) for v in values]
     tensors = [t if t.is_floating_point() else t.to(torch.get_default_dtype()) for t in tensors]
-    dtype = tensors[0].dtype
-    for t in tensors[1:]:
-        dtype = torch.promote_types(dtype, t.dtype)
+    dtype = reduce(torch.promote_types, (t.dtype for t in tensors))
     return list(torch.broadcast_tensors(*(t.to(dtype) for t in tensors)))
 
 
@@ -33,7 +30,7 @@ def rotation_from_viewpoint(azimuth: Tensor | float, elevation: Tensor | float, 
         azimuth, elevation, theta: degrees, numbers or tensors of broadcastable shapes (...).
 
     Returns:
-        (..., 3, 3) rotations ``x_cam = R x_model``; x right, y down, z forward.
+        (..., 3, 3) rotations.
 
     Example:
         >>> R = rotation_from_viewpoint(0.0, 0.0, 0.0)      # camera on the -y axis, model's z up
@@ -43,27 +40,21 @@ def rotation_from_viewpoint(azimuth: Tensor | float, elevation: Tensor | float, 
     a, e, t = (torch.deg2rad(v) for v in _as_floating(azimuth, elevation, theta))
     ca, sa, ce, se, ct, st = a.cos(), a.sin(), e.cos(), e.sin(), t.cos(), t.sin()
     # Rows of Rz(theta) Rx(e - 90) Rz(-a), rows two and three negated.
-    return torch.stack(
-        [
-            torch.stack([ct * ca - st * se * -sa, ct * sa - st * se * ca, -st * ce], -1),
-            torch.stack([-(st * ca + ct * se * -sa), -(st * sa + ct * se * ca), -ct * ce], -1),
-            torch.stack([-ce * sa, ce * ca, -se], -1),
-        ],
-        -2,
-    )
+    rows = [
+        [ct * ca - st * se * -sa, ct * sa - st * se * ca, -st * ce],
+        [-(st * ca + ct * se * -sa), -(st * sa + ct * se * ca), -ct * ce],
+        [-ce * sa, ce * ca, -se],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
 def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Inverse of :func:`rotation_from_viewpoint`.
-
-    Args:
-        R: (..., 3, 3) rotations into the OpenCV camera.
+    """Inverse of :func:`rotation_from_viewpoint` for (..., 3, 3) rotations.
 
     Returns:
         azimuth in [0, 360), elevation in [-90, 90], theta in [-180, 180), degrees, each of shape (...). At the poles
-        (elevation +-90) azimuth and theta rotate about the same axis, and theta is 0. Close to a pole, where rounding
-        decides, the azimuth is arbitrary and theta matches it. :func:`rotation_from_viewpoint` gives R back everywhere,
-        within 5e-5 rad in float32.
+        (elevation +-90) theta is 0; close to one, rounding decides the azimuth, and theta matches it.
+        :func:`rotation_from_viewpoint` gives R back everywhere, within 5e-5 rad in float32.
 
     Raises:
         InvalidInputError: another shape or dtype, or a matrix is not a rotation.
@@ -81,8 +72,7 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     pole = planar < 4 * torch.finfo(R.dtype).eps
     # At the pole R[0] = (cos(a -+ theta), sin(a -+ theta), 0).
     a = torch.atan2(torch.where(pole, R[..., 0, 1], cx), torch.where(pole, R[..., 0, 0], -cy))
-    # Near the pole rounding decides the azimuth. The first column of R Rz(a), (cos theta, -sin theta, 0), gives the
-    # theta that belongs to it.
+    # The first column of R Rz(a), (cos theta, -sin theta, 0), gives the theta that belongs to this azimuth.
     ca, sa = a.cos(), a.sin()
     theta = torch.atan2(-(R[..., 1, 0] * ca + R[..., 1, 1] * sa), R[..., 0, 0] * ca + R[..., 0, 1] * sa)
     theta = torch.where(pole, torch.zeros_like(theta), theta)

@@ -2,17 +2,15 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import check_positive
+from ..utils.checks import check_positive, check_tensor
 from .up import up_rotation
 from .viewpoint import rotation_from_viewpoint, viewpoint_from_rotation
-
-__all__ = ["DEFAULT_DISTANCE", "ViewSphere", "paper_views", "sample_views", "uniform_views"]
 
 DEFAULT_DISTANCE = 5.0
 """Distance of a view in units of the object's radius: ``docs/experiments.md`` compares others."""
@@ -57,14 +55,11 @@ class ViewSphere:
         elevation: tuple[float, float] = (-90.0, 90.0),
         theta: tuple[float, float] = (-180.0, 180.0),
     ) -> "ViewSphere":
-        """The views inside a range of viewpoints, borders included.
+        """The views inside a range of viewpoints, borders included; :class:`InvalidInputError` if there is none.
 
         Args:
             azimuth, theta: (from, to) in degrees, upwards modulo 360: (350, 10) are the 20 degrees around 0.
             elevation: (low, high) in degrees.
-
-        Raises:
-            InvalidInputError: no view is inside the range.
 
         Example:
             >>> len(uniform_views(100).within(elevation=(0, 90)))
@@ -84,11 +79,6 @@ class ViewSphere:
 
         Args:
             up: "x", "y", "z", "-x", "-y" or "-z"; see :func:`curvireg_torch.io.meshes.mesh_up`.
-
-        Example:
-            >>> y_up = sample_views(azimuths=[0.0], elevations=[90.0]).for_up("y")          # from above
-            >>> (y_up.rotations[0] @ torch.tensor([0.0, 1.0, 0.0])).round().tolist()        # y points at the camera
-            [0.0, 0.0, -1.0]
         """
         T = torch.eye(4, dtype=torch.float64)
         T[:3, :3] = up_rotation(up)
@@ -101,20 +91,9 @@ class ViewSphere:
         while poses stay in the frame of the file.
 
         Args:
-            T_views_from_model: (4, 4) similarity from the model's frame to that of these views.
-
-        Raises:
-            InvalidInputError: not a similarity.
-
-        Example:
-            >>> len(uniform_views(100).in_model_frame(torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0]))))
-            100
+            T_views_from_model: (4, 4) similarity; anything else raises :class:`InvalidInputError`.
         """
-        if T_views_from_model.shape != (4, 4) or not T_views_from_model.is_floating_point():
-            raise InvalidInputError(
-                f"T_views_from_model: expected floating (4, 4), got {T_views_from_model.dtype} of shape "
-                f"{tuple(T_views_from_model.shape)}"
-            )
+        check_tensor(T_views_from_model, "T_views_from_model", (4, 4))
         linear = T_views_from_model[:3, :3].double()
         scale = torch.linalg.det(linear)
         R = linear / scale.abs() ** (1 / 3)
@@ -181,9 +160,8 @@ def sample_views(
 def paper_views(*, object_radius: float = 0.2) -> ViewSphere:
     """The paper's grid: azimuth in steps of 20 degrees, elevation of 50 degrees, distance of 0.3 m up to 2 m.
 
-    The paper states "around 700" views. Its steps give 18 x 7 x 6 = 756 if elevation covers the whole circle (0, 50,
-    ..., 300 degrees); past a pole the camera is upside down. For the paper's orthographic camera the distance does not
-    matter, and 126 of the views differ.
+    The paper states "around 700" views; its steps give 18 x 7 x 6 = 756 if elevation covers the whole circle (0, 50,
+    ..., 300 degrees). For the paper's orthographic camera the distance does not matter, and 126 of the views differ.
 
     Args:
         object_radius: in m, because the paper's distances are metric; below 0.3, the distance of the nearest camera.
@@ -203,9 +181,7 @@ def paper_views(*, object_radius: float = 0.2) -> ViewSphere:
         # Past the pole the camera is on the other side, upside down.
         half = 180.0 if 90 < angle < 270 else 0.0
         grids.append(ViewSphere((grid.azimuth + half) % 360.0, grid.elevation, grid.theta - half, grid.distance))
-    return ViewSphere(
-        *(torch.cat([getattr(g, name) for g in grids]) for name in ("azimuth", "elevation", "theta", "distance"))
-    )
+    return ViewSphere(*(torch.cat([getattr(grid, f.name) for grid in grids]) for f in fields(ViewSphere)))
 
 
 def uniform_views(
@@ -217,9 +193,8 @@ def uniform_views(
 ) -> ViewSphere:
     """Near-uniform view directions on (a band of) the sphere, by the Fibonacci spiral.
 
-    Covering radius: on the full sphere no direction is farther than ``157 / sqrt(count)`` degrees from the nearest view
-    (measured for 2 to 3000 directions; 5.9 degrees for 700). With thetas in steps of ``s`` degrees around the circle no
-    rotation is farther than that + ``s / 2``.
+    On the full sphere no direction is farther than ``157 / sqrt(count)`` degrees from the nearest view (measured for 2
+    to 3000 directions). With thetas in steps of ``s`` degrees no rotation is farther than that + ``s / 2``.
 
     Args:
         count: number of view directions; each is combined with every theta and distance.

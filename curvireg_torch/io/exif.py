@@ -11,14 +11,9 @@ _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
 
 
 class Directory:
-    """The integer entries of one directory of a TIFF or EXIF block.
+    """The integer entries of one directory of a TIFF or EXIF block; ValueError if the block is damaged.
 
-    Attributes:
-        next: offset of the following directory, 0 after the last.
-        offsets: tag -> offset of the entry's value field.
-
-    Raises:
-        ValueError: not a TIFF block, or the block ends inside the directory.
+    ``next`` is the offset of the following directory, 0 after the last; ``offsets`` are those of the entries' values.
     """
 
     def __init__(self, block: bytes, offset: int | None = None) -> None:

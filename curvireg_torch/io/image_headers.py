@@ -11,23 +11,16 @@ from dataclasses import dataclass, field
 
 from .exif import Directory, Exif, read_exif
 
-__all__ = ["ImageHeader", "read_header"]
-
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Size and format of a picture.
+    """Size (px, as stored) and format of a picture.
 
     Attributes:
-        width, height: px, as stored.
-        data: the bytes to decode, without what follows the picture. A TIFF's orientation is set to 1, because OpenCV
-            always applies it.
+        data: the bytes to decode; a TIFF's orientation is set to 1, because OpenCV always applies it.
         colour: "RGB", "grey", "palette" or "CMYK".
-        bits: per channel.
-        alpha: whether the picture has an alpha channel.
-        surplus: number of bytes after the picture.
+        surplus: number of bytes after the picture, which ``data`` omits.
         scans: passes over the picture.
-        has_more_pages: whether the file holds several pictures.
     """
 
     width: int
@@ -48,11 +41,7 @@ _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def read_header(data: bytes) -> ImageHeader:
-    """The header of a JPEG, PNG, TIFF, WebP, BMP, PGM or PPM file.
-
-    Raises:
-        ValueError: another format, or a damaged file; the message is for the user.
-    """
+    """The header of a file; ValueError, with a message for the user, for another format or a damaged file."""
     try:
         for start, reader in _READERS.items():
             if data.startswith(start):
@@ -111,9 +100,7 @@ def _png(data: bytes) -> ImageHeader:
     colour = {0: "grey", 3: "palette", 4: "grey"}.get(colour_type, "RGB")
     alpha |= colour_type in (4, 6)
     surplus = len(data) - position
-    return ImageHeader(
-        width, height, data[:position], colour, bits, alpha, exif, surplus=surplus, has_more_pages=animated
-    )
+    return ImageHeader(width, height, data[:position], colour, bits, alpha, exif, surplus, has_more_pages=animated)
 
 
 def _tiff(data: bytes) -> ImageHeader:

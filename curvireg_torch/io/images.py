@@ -18,8 +18,6 @@ from ..limits import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, MAX_IMAGE_SCANS
 from ..utils.checks import check_option
 from .image_headers import ImageHeader, read_header
 
-__all__ = ["Photo", "read_image", "read_photo"]
-
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _APPLY_ORIENTATION = {  # stored (H, W, C) pixels to viewed ones, for each EXIF orientation
     1: lambda x: x,
@@ -52,8 +50,7 @@ class Photo:
     def guessed_camera_matrix(self) -> Tensor | None:
         """(3, 3) float64 camera matrix from the EXIF focal length, or None without one.
 
-        The focal length is taken relative to the diagonal, and the principal point is the centre. That is right for a
-        picture that was neither cropped nor undistorted.
+        The focal length is relative to the diagonal, the principal point the centre: the picture must not be cropped.
         """
         if self.focal_35mm is None:
             return None
@@ -101,20 +98,12 @@ def read_photo(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.uint8
 def read_image(
     path: str | os.PathLike[str], *, orientation: str = "stored", dtype: torch.dtype = torch.float32
 ) -> Tensor:
-    """Read a photograph as RGB.
+    """Read a photograph as (3, H, W) RGB; ``path``, ``dtype`` and errors as in :func:`read_photo`.
 
     Grey images get three equal channels, an alpha channel is dropped, 16-bit images keep their precision in float32.
 
     Args:
-        path, dtype: see :func:`read_photo`.
-        orientation: ``"stored"`` for pixels as stored, to which the boxes of datasets refer; ``"viewed"`` to apply the
-            EXIF orientation.
-
-    Returns:
-        (3, H, W).
-
-    Raises:
-        MissingFileError, ImageError: see :func:`read_photo`.
+        orientation: ``"stored"``, to which the boxes of datasets refer, or ``"viewed"`` to apply that of EXIF.
 
     Example:
         >>> read_image("missing.jpg")
@@ -172,9 +161,8 @@ def _decode_silently(data: bytes) -> NDArray[Any] | None:
 def _to_tensor(bgr: NDArray[Any], dtype: torch.dtype) -> Tensor:
     rgb = bgr[..., ::-1].transpose(2, 0, 1)
     if dtype == torch.uint8:
-        if bgr.dtype == np.uint16:
-            rgb = (rgb.astype(np.uint32) + 128) // 257
-        return torch.from_numpy(np.ascontiguousarray(rgb, dtype=np.uint8))
+        rounded = (rgb.astype(np.uint32) + 128) // 257 if bgr.dtype == np.uint16 else rgb
+        return torch.from_numpy(np.ascontiguousarray(rounded, dtype=np.uint8))
     if dtype != torch.float32:
         raise InvalidInputError(f"dtype: expected torch.uint8 or torch.float32, got {dtype}")
     return torch.from_numpy(np.ascontiguousarray(rgb, dtype=np.float32)).div_(float(np.iinfo(bgr.dtype).max))

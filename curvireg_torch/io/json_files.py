@@ -9,8 +9,6 @@ from typing import Any
 from ..errors import InvalidInputError, MissingFileError
 from ..limits import MAX_TABLE_BYTES
 
-__all__ = ["check_table_size", "finite_numbers", "read_json"]
-
 
 def read_json(path: Path, kind: type[Any], readme: str) -> Any:
     """The content of a JSON file whose top level must be a ``kind`` (dict or list)."""

@@ -1,8 +1,7 @@
 """A bounded reader for MATLAB 5 annotation files.
 
-It replaces ``scipy.io.loadmat``, which overflows the C stack on a file of deeply nested cells, and so kills the
-process, and which allocates whatever size a header claims. Annotations are downloaded files. This reader takes structs,
-text and real numbers, with bounds on depth and size; all else (cells, objects, function handles, sparse) becomes None.
+It replaces ``scipy.io.loadmat``, which crashes on deeply nested cells and allocates whatever size a header claims. It
+reads structs, text and real numbers, with bounds on depth and size; all else (cells, objects, sparse) becomes None.
 """
 
 import math
@@ -16,8 +15,6 @@ from numpy.typing import NDArray
 from ..errors import InvalidInputError
 from ..limits import MAX_MAT_BYTES, MAX_MAT_DEPTH, MAX_MAT_UNPACKED_BYTES
 
-__all__ = ["MatStruct", "MatValue", "read_mat"]
-
 MatStruct = dict[str, "MatValue"]
 MatValue = list[MatStruct] | str | NDArray[np.float64] | None
 """A struct array, a text, real numbers in MATLAB's column order, or None for any other type."""
@@ -29,11 +26,7 @@ _COMPLEX = 0x0800
 
 
 def read_mat(path: Path, variable: str) -> MatValue:
-    """The value of ``variable`` in a MATLAB 5 to 7.2 file.
-
-    Raises:
-        InvalidInputError: the file is unreadable, too large, too deep, of another format, or lacks the variable.
-    """
+    """The value of ``variable`` in a MATLAB 5 to 7.2 file; :class:`InvalidInputError` for any other file."""
     try:
         if path.stat().st_size > MAX_MAT_BYTES:
             raise InvalidInputError(f"larger than {MAX_MAT_BYTES} bytes, not an annotation")
@@ -118,9 +111,8 @@ def _struct(body: bytes, position: int, order: str, depth: int, count: int) -> l
     _, content, position = _element(body, position, order)
     if width < 1:
         raise InvalidInputError(f"field names of {width} bytes")
-    fields = [
-        content[i : i + width].split(b"\0")[0].decode("latin-1") for i in range(0, len(content) - width + 1, width)
-    ]
+    starts = range(0, len(content) - width + 1, width)
+    fields = [content[i : i + width].split(b"\0")[0].decode("latin-1") for i in starts]
     if not fields:
         return []
     if count * len(fields) * 8 > len(body) - position:  # every value has a tag of 8 bytes

@@ -1,7 +1,6 @@
-"""Checks of arguments, one per contract, for all public functions.
+"""Checks of arguments, one per contract, shared by all layers, so that all accept the same.
 
-Each raises :class:`InvalidInputError` (pixels: :class:`ImageError`) with expected and actual value. Photographs, boxes,
-cameras, poses and masks are all checked here, so that all layers accept the same.
+Each raises :class:`InvalidInputError` (pixels: :class:`ImageError`) with expected and actual value.
 """
 
 import math
@@ -75,14 +74,7 @@ def check_photograph(x: Any, name: str = "images") -> None:
 
 
 def check_pixels(x: Tensor, where: str) -> None:
-    """The pixels of floating ``x`` are finite and in [0, 1], with a tolerance of 0.001.
-
-    Args:
-        where: names the pixels in the message, for instance "of the box".
-
-    Raises:
-        ImageError: otherwise.
-    """
+    """The pixels of floating ``x`` are finite and in [0, 1] within 0.001; ``where`` names them, as "of the box"."""
     if x.numel() == 0:
         return
     low, high = (float(value) for value in x.aminmax())
@@ -95,9 +87,7 @@ def check_pixels(x: Tensor, where: str) -> None:
 def check_mask(mask: Tensor, like: Tensor, name: str = "mask") -> None:
     """``mask`` is boolean, of the shape and on the device of ``like``."""
     if mask.dtype != torch.bool or mask.shape != like.shape:
-        raise InvalidInputError(
-            f"{name}: expected bool of shape {tuple(like.shape)}, got {mask.dtype} of shape {tuple(mask.shape)}"
-        )
+        raise InvalidInputError(f"{name}: expected bool of shape {tuple(like.shape)}, got {_describe(mask)}")
     check_same_device(mask, like, name)
 
 
@@ -120,8 +110,7 @@ def check_option(value: str, options: Iterable[str], name: str) -> None:
 
 def check_positive(value: float, name: str, *, zero_ok: bool = False) -> float:
     """``value``, a finite number > 0 (or >= 0). In a compiled graph it is a constant: one graph per value."""
-    # torch.compile makes a float symbolic at its second value, and kernels cannot be built from symbols. Splitting the
-    # number forces its value.
+    # torch.compile makes a float symbolic at its second value; splitting it forces the value, which kernels need.
     value = math.ldexp(*math.frexp(value))
     if not math.isfinite(value) or value < 0 or (value == 0 and not zero_ok):
         raise InvalidInputError(f"{name}: expected a finite number {'>=' if zero_ok else '>'} 0, got {value}")
@@ -141,10 +130,7 @@ def check_finite(x: Tensor, name: str) -> None:
 
 
 def check_rotation(R: Tensor, name: str) -> None:
-    """``R`` is floating (..., 3, 3), orthonormal with determinant +1, within ``MAX_ROTATION_DEVIATION``.
-
-    A matrix with NaN or inf, which stands for a missing estimate, passes; :func:`check_finite` refuses it.
-    """
+    """``R`` is floating (..., 3, 3), rotations within ``MAX_ROTATION_DEVIATION`` or not finite (missing estimates)."""
     check_last_axes(R, name, (3, 3))
     bad = int(_is_no_rotation(R).sum())
     if bad:
@@ -171,11 +157,8 @@ def check_symmetries(symmetries: Tensor) -> None:
         raise InvalidInputError(
             f"symmetries: expected shape (S, 4, 4) or (S, 3, 3) with S >= 1, got {_describe(symmetries)}"
         )
-    if symmetries.shape[1] == 4:
-        check_pose(symmetries, "symmetries")
-    else:
-        check_rotation(symmetries, "symmetries")
-        check_finite(symmetries, "symmetries")
+    (check_pose if symmetries.shape[1] == 4 else check_rotation)(symmetries, "symmetries")
+    check_finite(symmetries, "symmetries")
 
 
 def _is_no_rotation(R: Tensor) -> Tensor:
@@ -241,8 +224,6 @@ def as_boxes(boxes: Any, count: int) -> Tensor:
 def as_camera_matrices(matrices: Any, count: int) -> Tensor:
     """One matrix for all, or one for each, as (count, 3, 3) float64; values are not checked."""
     K = as_numbers(matrices, "camera_matrices", dtype=torch.float64)
-    if tuple(K.shape[-2:]) != (3, 3) or K.ndim not in (2, 3):
+    if K.shape[-2:] != (3, 3) or K.shape[:-2] not in ((), (1,), (count,)):
         raise InvalidInputError(f"camera_matrices: expected (3, 3) or ({count}, 3, 3), got {tuple(K.shape)}")
-    if K.ndim == 3 and len(K) not in (1, count):
-        raise InvalidInputError(f"camera_matrices: expected one or {count} matrices, got {len(K)}")
     return K.expand(count, 3, 3)

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["code_digest", "file_digest", "tensor_digest", "text_digest"]
-
 _PACKAGE = Path(__file__).parents[1]
 
 
@@ -31,13 +29,7 @@ def file_digest(path: Path) -> str:
 
 
 def tensor_digest(tensors: Mapping[str, "Tensor"], *, size: int = 8) -> str:
-    """``2 * size`` hexadecimal digits of named tensors: names, dtypes, shapes and values.
-
-    Example:
-        >>> import torch
-        >>> tensor_digest({"a": torch.zeros(2)}) == tensor_digest({"a": torch.zeros(2).half()})
-        False
-    """
+    """``2 * size`` hexadecimal digits of named tensors: names, dtypes, shapes and values."""
     import torch
 
     digest = hashlib.blake2b(digest_size=size)
@@ -49,12 +41,7 @@ def tensor_digest(tensors: Mapping[str, "Tensor"], *, size: int = 8) -> str:
 
 @cache
 def code_digest(*parts: str) -> str:
-    """16 hexadecimal digits of ``parts`` of the package: folders with their code, weights and constants, and files.
-
-    Example:
-        >>> code_digest("filters") == code_digest("filters", "descriptors")
-        False
-    """
+    """16 hexadecimal digits of ``parts`` of the package: folders with their code, weights and constants, and files."""
     digest = hashlib.blake2b(digest_size=8)
     for part in parts:
         path = _PACKAGE / part

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a file and create its folder. At any moment ``path`` holds the old content or all of the new.
+    """Write a file and create its folder; at any moment ``path`` holds the old content or all of the new.
 
     Raises:
         OutputError: the file cannot be written; no temporary file remains.
@@ -43,11 +43,7 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 def check_writable(folder: Path, name: str) -> None:
-    """Create the folder and check that it can be written to, before the work whose results go there.
-
-    Raises:
-        OutputError: it cannot; the message names the option ``name``.
-    """
+    """Create a folder, or raise :class:`OutputError` that names option ``name``, before work whose results go there."""
     probe = folder / f".probe-{secrets.token_hex(4)}"
     try:
         write_file(probe, b"probe")

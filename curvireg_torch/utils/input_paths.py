@@ -7,8 +7,6 @@ from pathlib import Path
 from ..errors import InvalidInputError, MissingFileError
 from .choices import IMAGES, MESHES, MESHES_AND_BANKS, VIDEOS
 
-__all__ = ["check_given", "is_one_photograph", "is_pattern"]
-
 _ORDER = "the photograph comes first, the mesh last"
 
 
@@ -23,13 +21,9 @@ def is_one_photograph(paths: Sequence[Path]) -> bool:
 
 
 def check_given(photos: Sequence[Path], meshes: Sequence[Path], listed: Path | None = None) -> None:
-    """Refuse missing files and files of the wrong kind.
+    """Refuse files of another kind, swapped files, and a missing list, mesh or only photograph.
 
     Of several photographs, those that are missing are reported later, each by itself.
-
-    Raises:
-        InvalidInputError: photograph and mesh are swapped, or a file is of another kind.
-        MissingFileError: the list, a mesh or the only photograph does not exist.
     """
     for path, kind in [*((photo, "a photograph") for photo in photos), *([(listed, "a list")] if listed else [])]:
         if path.suffix.lower() in MESHES_AND_BANKS:

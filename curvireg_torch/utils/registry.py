@@ -46,12 +46,7 @@ class Registry(Mapping[str, T], Generic[T]):
     @overload
     def register(self, name: str, target: T | str) -> T | str: ...
     def register(self, name: str, target: Any = None) -> Any:
-        """Register ``target``, or what is decorated, and return it. A name that is registered again is replaced.
-
-        Args:
-            name: under which the object is found.
-            target: the object, or "package.module:attribute" of one.
-        """
+        """Register ``target``, or what is decorated, and return it. A name that is registered again is replaced."""
         if target is None:
             return lambda decorated: self.register(name, decorated)
         self._entries[name] = target

@@ -10,8 +10,6 @@ from typing import TypeVar
 
 import torch
 
-__all__ = ["available_threads", "for_each", "map_on_threads", "single_threaded_pool"]
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -22,9 +20,8 @@ _this_thread = threading.local()
 def for_each(count: int, job: Callable[[int], object]) -> None:
     """Call ``job(0)`` to ``job(count - 1)`` on as many threads as torch may use, which live as long as the process.
 
-    Jobs must not call torch. A job that itself calls :func:`for_each`, and a thread of :func:`single_threaded_pool`,
-    runs the calls in sequence, unless :func:`map_on_threads` left threads over. The first error stops all threads after
-    their current job and is raised.
+    Jobs must not call torch. Nested calls, and those on threads of :func:`single_threaded_pool`, run in sequence unless
+    :func:`map_on_threads` left threads over. The first error stops all threads after their current job and is raised.
     """
     threads = min(available_threads(), count)
     numbers = itertools.count()
@@ -70,11 +67,8 @@ def map_on_threads(
 ) -> list[Result]:
     """``job`` of every item, in order, each on a thread on which torch computes single-threaded.
 
-    The number of threads of an operation changes its rounding. Here a result depends neither on the number of items nor
-    on the number of threads. Threads that are left over, as with a single item, help with :func:`for_each`.
-
-    Args:
-        device: where the jobs compute; on other devices than the CPU they run in sequence on this thread.
+    A result depends neither on the number of items nor on the number of threads, which would change its rounding.
+    Threads that are left over help with :func:`for_each`. For other devices than the CPU, jobs run in sequence here.
     """
     threads = torch.get_num_threads()
     if threads == 1 or torch.device(device).type != "cpu":
@@ -93,8 +87,7 @@ def map_on_threads(
 def single_threaded_pool() -> Iterator[ThreadPoolExecutor]:
     """A pool of :func:`available_threads` threads, on each of which torch computes single-threaded.
 
-    Operations on a few images are too short to be divided among threads: waiting would take longer than the work. After
-    an error or Ctrl-C, jobs that have not started are cancelled.
+    Operations on a few images are too short to divide. After an error, jobs that have not started are cancelled.
     """
     threads = torch.get_num_threads()
     with ThreadPoolExecutor(available_threads(), initializer=torch.set_num_threads, initargs=(1,)) as pool:

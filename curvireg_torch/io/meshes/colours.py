@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...limits import MAX_IMAGE_PIXELS
-
-__all__ = ["SurfaceColours", "has_colours", "surface_colours"]
 
 TEXTURE_SIDE = 512
 """Textures are reduced to this longer side in px; views are smaller."""
@@ -22,9 +20,7 @@ _PLAIN = 255
 
 @dataclass(frozen=True)
 class SurfaceColours:
-    """Colours of F faces: interpolated between the corners and multiplied by a texture.
-
-    All values belong to corners of faces, so that vertices may be merged and renumbered.
+    """Colours of F faces, stored by corner: interpolated between the corners and multiplied by a texture.
 
     Attributes:
         corners: (F, 3, 3) uint8 RGB.
@@ -50,11 +46,8 @@ class SurfaceColours:
         valid = all(x.shape == shape and x.dtype == dtype for x, shape, dtype in parts)
         valid = valid and self.texture.shape == (faces,) and self.texture.dtype == np.int32
         valid = valid and all(t.ndim == 3 and t.shape[2] == 3 and t.size and t.dtype == np.uint8 for t in self.textures)
-        if (
-            not valid
-            or not np.isfinite(self.uv).all()
-            or not -1 <= self.texture.min() <= self.texture.max() < len(self.textures)
-        ):
+        valid = valid and bool(np.isfinite(self.uv).all())
+        if not (valid and -1 <= self.texture.min() <= self.texture.max() < len(self.textures)):
             raise ValueError("colours that do not match the mesh")
 
     @classmethod
@@ -93,10 +86,9 @@ def has_colours(mesh: Any) -> bool:
 
 
 def surface_colours(mesh: Any) -> SurfaceColours | None:
-    """The colours of a ``trimesh.Trimesh``, or None where it has none.
+    """The colours of a ``trimesh.Trimesh``, or None where it has none; transparent texels are white.
 
-    They come from ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else from ``mesh.visual``: texture,
-    face colours, vertex colours or the material's colour. Transparent texels are white.
+    They come from ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else from ``mesh.visual``.
     """
     colours = mesh.metadata.get("colours")
     if isinstance(colours, SurfaceColours) and len(colours) == len(mesh.faces):
@@ -105,9 +97,9 @@ def surface_colours(mesh: Any) -> SurfaceColours | None:
     plain = SurfaceColours.plain(len(faces))
     if visual.kind == "face":
         corners = np.repeat(np.asarray(visual.face_colors, np.uint8)[:, None, :3], 3, axis=1)
-        return SurfaceColours(corners, plain.uv, plain.texture)
+        return replace(plain, corners=corners)
     if visual.kind == "vertex":
-        return SurfaceColours(np.asarray(visual.vertex_colors, np.uint8)[faces][..., :3], plain.uv, plain.texture)
+        return replace(plain, corners=np.asarray(visual.vertex_colors, np.uint8)[faces][..., :3])
     if visual.kind != "texture":
         return None
     material = visual.material

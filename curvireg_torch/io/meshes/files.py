@@ -17,8 +17,6 @@ from ...utils.digests import file_digest, text_digest
 from . import obj, off, ply
 from .gltf import check_gltf
 
-__all__ = ["mesh_digest", "mesh_files", "read_mesh", "with_triangles"]
-
 _WITH_COMPANIONS = (".glb", ".gltf", ".obj", ".ply")
 """Formats whose files may name buffers, material files or textures beside them."""
 
@@ -26,13 +24,9 @@ _POLYGON_FORMATS = {".obj": obj.with_triangles, ".off": off.with_triangles, ".pl
 
 
 def mesh_files(path: Path) -> list[Path]:
-    """The mesh file and every file that is read with it: buffers and images of glTF, MTL files, textures.
+    """The mesh file and those that it names, missing ones too: buffers and images of glTF, MTL files, textures.
 
-    They are found by reading the mesh. If that fails, those requested before the failure are listed. Files that are
-    named but missing are listed too, because the mesh changes when they appear.
-
-    Args:
-        path: a mesh; any other file is listed alone.
+    They are found by reading the mesh; if that fails, those requested before are listed. Other files stand alone.
     """
     folder = _Folder(path)
     if path.suffix.lower() in _WITH_COMPANIONS and path.is_file():
@@ -42,28 +36,17 @@ def mesh_files(path: Path) -> list[Path]:
 
 
 def mesh_digest(path: Path) -> str:
-    """16 hexadecimal digits of the contents of :func:`mesh_files`, whatever their folder.
-
-    Missing and unreadable files count too, so that the digest changes when they are repaired.
-    """
+    """16 hexadecimal digits of the contents of :func:`mesh_files`, whatever their folder; missing files count too."""
     return text_digest(" ".join(map(file_digest, mesh_files(path))))
 
 
 def read_mesh(path: Path) -> Any:
-    """Read a mesh file, and the files that it names, with trimesh.
-
-    Raises:
-        MeshError: the file cannot be read, or is beyond :mod:`curvireg_torch.limits`.
-    """
+    """Read a mesh file, and the files that it names, with trimesh; :class:`MeshError` if that fails."""
     return _read(path, _Folder(path))
 
 
 def with_triangles(data: bytes, suffix: str) -> bytes:
-    """The content of an OBJ, OFF or PLY file with every face a triangle; the same bytes if all are.
-
-    Raises:
-        ValueError: the file is damaged, or beyond :mod:`curvireg_torch.limits`.
-    """
+    """The content of an OBJ, OFF or PLY file with every face a triangle; ValueError if the file is damaged."""
     try:
         return _POLYGON_FORMATS[suffix](data)
     except (struct.error, IndexError) as error:
@@ -94,11 +77,7 @@ def _read(path: Path, folder: "_Folder") -> Any:
 
 
 class _Folder(trimesh.resolvers.Resolver):  # type: ignore[misc]
-    """Access to the files beside a mesh and in folders below; to no others, and not to the network.
-
-    Attributes:
-        requested: the files that were requested, existing or not.
-    """
+    """Access to the files beside a mesh and in folders below; ``requested`` lists them, existing or not."""
 
     def __init__(self, path: Path) -> None:
         self.folder, self.file_name = path.parent.resolve(), path.name

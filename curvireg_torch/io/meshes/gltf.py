@@ -7,8 +7,6 @@ from typing import Any
 
 from ...limits import MAX_MESH_BYTES, MAX_MESH_DEPTH, MAX_MESH_FACES, MAX_MESH_PARTS, MAX_TABLE_BYTES
 
-__all__ = ["check_gltf"]
-
 _OPTIONAL_EXTENSIONS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_", "KHR_animation_")
 _COMPONENTS = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -18,16 +16,9 @@ _PER_TRIANGLE = {4: 3, 5: 1, 6: 1}  # indices for each triangle of a list, strip
 def check_gltf(data: bytes, suffix: str, size_of: Callable[[str], int]) -> None:
     """Refuse files that name others outside their folder, take too much memory, or need unknown extensions.
 
-    Args:
-        data: a .glb or .gltf file.
-        size_of: bytes of a file beside the mesh; raises ValueError for any other.
-
-    Raises:
-        ValueError: the message is for the user.
+    ``size_of`` gives the bytes of a file beside the mesh, or raises ValueError. So does this function, for the user.
     """
-    chunk = None
-    if suffix == ".glb":
-        data, chunk = _chunks(data)
+    data, chunk = _chunks(data) if suffix == ".glb" else (data, None)
     if len(data) > MAX_TABLE_BYTES:
         raise ValueError(f"its JSON is larger than {MAX_TABLE_BYTES:,} bytes")
     try:
@@ -47,10 +38,9 @@ def check_gltf(data: bytes, suffix: str, size_of: Callable[[str], int]) -> None:
 
 def _chunks(data: bytes) -> tuple[bytes, int | None]:
     """The JSON, and the length of the binary chunk."""
-    try:
-        magic, version, _, length, kind = struct.unpack_from("<4sIII4s", data)
-    except struct.error:
-        raise ValueError("the file ends too early") from None
+    if len(data) < 20:
+        raise ValueError("the file ends too early")
+    magic, version, _, length, kind = struct.unpack_from("<4sIII4s", data)
     if magic != b"glTF" or kind != b"JSON":
         raise ValueError("not a GLB file")
     if version != 2:

@@ -18,24 +18,24 @@ from ...utils.checks import check_option
 from ...utils.choices import MESHES, UNITS, UP_AXES
 from .colours import SurfaceColours, surface_colours
 from .files import read_mesh
-from .up import format_up, mesh_up
+from .up import mesh_up
 
 
 def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = None) -> trimesh.Trimesh:
     """Read a mesh file; scenes become one mesh, polygons become triangles, normals are ignored.
 
-    Nothing is rescaled: vertices, and every pose computed from them, stay in the file's own frame and unit.
+    Nothing is rescaled: vertices, and every pose computed from them, stay in the file's frame and unit.
 
     Args:
         path: .obj, .ply, .stl, .off, .glb or .gltf.
         unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. An object that
             would be smaller than 5 mm or larger than 100 m gets a warning.
-        up: the axis that points up when the object stands ("x", "y", "z", "-x", "-y", "-z"), kept in
-            ``mesh.metadata["up"]`` for :meth:`ViewSphere.for_up`; None: y for glTF, else z.
+        up: the axis that points up ("x", "y", "z", "-x", "-y", "-z"), kept in ``mesh.metadata["up"]``; None: y for
+            glTF, by its specification, else z.
 
     Returns:
-        ``trimesh.Trimesh`` with (V, 3) float64 vertices and (F, 3) faces, degenerate faces removed. Textures and other
-        colours are kept as one :class:`SurfaceColours` in ``mesh.metadata["colours"]``.
+        Vertices (V, 3) float64, faces (F, 3) without degenerate ones, and textures and other colours as one
+        :class:`SurfaceColours` in ``mesh.metadata["colours"]``.
 
     Raises:
         MissingFileError: the file does not exist.
@@ -44,7 +44,7 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
     """
     check_option(unit, UNITS, "unit")
     path = Path(path)
-    up = format_up(path.suffix) if up is None else up
+    up = up or ("y" if path.suffix.lower() in (".glb", ".gltf") else "z")
     check_option(up, UP_AXES, "up")
     if not path.is_file():
         raise MissingFileError("no such file; check the path of the mesh", subject=path)
@@ -119,8 +119,6 @@ def mesh_unit(mesh: trimesh.Trimesh) -> str | None:
 
     Example:
         >>> mesh = trimesh.creation.box()
-        >>> mesh_unit(mesh) is None
-        True
         >>> mesh.units = "millimeters"
         >>> mesh_unit(mesh)
         'mm'
@@ -201,14 +199,11 @@ def mesh_radius(mesh: trimesh.Trimesh) -> float:
 
 
 def normalization_transform(mesh: trimesh.Trimesh, *, align_axes: bool = False) -> Tensor:
-    """Similarity from the model's frame to a normalised frame.
+    """(4, 4) float64 similarity from the model's frame to a normalised frame.
 
     The area-weighted centroid goes to the origin and the farthest vertex to distance 1. With ``align_axes`` (the
     paper's normalisation) the principal axes of the surface go to x, y, z in decreasing order of variance. The third
     moments of the surface along x and y are positive; z completes a right-handed frame.
-
-    Returns:
-        (4, 4) float64 ``T_normalized_from_model``.
 
     Example:
         >>> T = normalization_transform(trimesh.creation.box((2.0, 4.0, 4.0)))

@@ -6,8 +6,6 @@ import numpy as np
 
 from .polygons import check_line_count, divide_faces
 
-__all__ = ["with_triangles"]
-
 _NEEDS_REWRITING = re.compile(rb"^f[ \t]+(?:(?:[^ \t\r\n]+[ \t]+){3}[^ \t\r\n#]|[^\r\n]*-)", re.MULTILINE)
 """A face of more than three corners, or with indices that count back from the end."""
 

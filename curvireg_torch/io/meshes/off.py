@@ -6,8 +6,6 @@ import numpy as np
 
 from .polygons import check_face_count, check_line_count, divide_faces
 
-__all__ = ["with_triangles"]
-
 
 def with_triangles(data: bytes) -> bytes:
     """The content of an OFF file with every face a triangle; the same bytes if all are."""

@@ -12,8 +12,6 @@ import numpy as np
 
 from .polygons import Floats, check_face_count, check_line_count, divide_faces
 
-__all__ = ["with_triangles"]
-
 _TYPES = {
     **dict.fromkeys(["char", "int8"], "b"),
     **dict.fromkeys(["uchar", "uint8"], "B"),
@@ -188,14 +186,13 @@ def _read_binary(data: bytes, layout: _Layout) -> _Body:
 
 
 def _pack(values: list[Any], layout: _Layout) -> bytes:
-    order, parts = layout.order, []
+    packed = b""
     for (_, length_type, kind), value in zip(layout.face.properties, values, strict=True):
-        if length_type is None:
-            parts.append(struct.pack(order + kind, value))
-        else:
-            parts.append(struct.pack(f"{order}{length_type}", len(value)))
-            parts.append(struct.pack(f"{order}{len(value)}{kind}", *value))
-    return b"".join(parts)
+        if length_type is not None:
+            packed += struct.pack(layout.order + length_type, len(value))
+        each = [value] if length_type is None else value
+        packed += struct.pack(f"{layout.order}{len(each)}{kind}", *each)
+    return packed
 
 
 def _has_triangles_only(data: bytes, start: int, layout: _Layout) -> bool:
@@ -203,12 +200,9 @@ def _has_triangles_only(data: bytes, start: int, layout: _Layout) -> bool:
     face, order = layout.face, layout.order
     if sum(length is not None for _, length, _ in face.properties) > 1:
         return False
-    fields: list[Any] = []
-    for index, (_, length, kind) in enumerate(face.properties):
-        if index == layout.corners:
-            fields += [("corners", f"{order}{length}"), ("indices", order + kind, (3,))]
-        else:
-            fields.append((f"other{index}", order + kind))
+    fields: list[Any] = [(f"other{index}", order + kind) for index, (_, _, kind) in enumerate(face.properties)]
+    _, length, kind = face.properties[layout.corners]
+    fields[layout.corners : layout.corners + 1] = [("corners", f"{order}{length}"), ("indices", order + kind, (3,))]
     row_type = np.dtype(fields)
     if start + face.count * row_type.itemsize > len(data):
         return False

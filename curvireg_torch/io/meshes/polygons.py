@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from ...limits import MAX_MESH_FACES, MAX_MESH_LINES, MAX_POLYGON_CORNERS, MAX_POLYGON_WORK
 
-__all__ = ["check_face_count", "check_line_count", "divide_faces", "triangulate"]
-
 Floats = NDArray[np.float64]
 
 
@@ -30,13 +28,7 @@ def check_line_count(data: bytes) -> None:
 
 
 def divide_faces(vertices: Floats, faces: list[list[int]]) -> Iterator[tuple[int, list[list[int]]]]:
-    """Yield the index of each face and its triangles, as indices of its corners.
-
-    Faces of fewer than three corners yield nothing.
-
-    Args:
-        vertices: (V, 3).
-        faces: vertex indices of each face.
+    """Yield the index of each face of three or more corners, and its triangles as indices of its corners.
 
     Raises:
         ValueError: a vertex does not exist, or the faces are beyond :mod:`curvireg_torch.limits`.
@@ -57,16 +49,10 @@ def divide_faces(vertices: Floats, faces: list[list[int]]) -> Iterator[tuple[int
 
 
 def triangulate(polygons: Floats) -> list[list[list[int]]]:
-    """Triangles that cover each of N planar polygons of n corners, in the polygon's orientation.
+    """Triangles, as indices of corners, that cover each of (N, n, 3) planar polygons in the polygon's orientation.
 
-    Convex polygons become fans. Corners may repeat, as where a bridge joins a hole to the outline. A polygon that
-    crosses itself or is not finite gives some triangles.
-
-    Args:
-        polygons: (N, n, 3) corners in order, n >= 3.
-
-    Returns:
-        For each polygon its triangles, three indices of corners each; n - 2 if it does not cross itself.
+    Convex polygons become fans. Corners may repeat, as where a bridge joins a hole to the outline. A polygon has n - 2
+    triangles unless it crosses itself.
 
     Raises:
         ValueError: a concave polygon has more than ``MAX_POLYGON_CORNERS`` corners.
