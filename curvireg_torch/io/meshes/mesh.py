@@ -18,7 +18,7 @@ from ...utils.checks import check_option
 from ...utils.choices import MESHES, UNITS, UP_AXES
 from .colours import SurfaceColours, surface_colours
 from .files import read_mesh
-from .up import mesh_up
+from .up import format_up, mesh_up
 
 
 def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = None) -> trimesh.Trimesh:
@@ -31,7 +31,7 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
         unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. An object that
             would be smaller than 5 mm or larger than 100 m gets a warning.
         up: the axis that points up ("x", "y", "z", "-x", "-y", "-z"), kept in ``mesh.metadata["up"]``; None: y for
-            glTF, by its specification, else z.
+            glTF, else z.
 
     Returns:
         Vertices (V, 3) float64, faces (F, 3) without degenerate ones, and textures and other colours as one
@@ -44,7 +44,7 @@ def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = No
     """
     check_option(unit, UNITS, "unit")
     path = Path(path)
-    up = up or ("y" if path.suffix.lower() in (".glb", ".gltf") else "z")
+    up = format_up(path.suffix) if up is None else up
     check_option(up, UP_AXES, "up")
     if not path.is_file():
         raise MissingFileError("no such file; check the path of the mesh", subject=path)

@@ -7,6 +7,11 @@ import numpy as np
 from ...geometry.up import up_rotation
 
 
+def format_up(suffix: str) -> str:
+    """The axis that points up in files of a format: y in glTF, by its specification; else z, as in CAD."""
+    return "y" if suffix.lower() in (".glb", ".gltf") else "z"
+
+
 def mesh_up(mesh: Any) -> str:
     """The up axis that :func:`load_mesh` noted, "z" for meshes from elsewhere."""
     return str(mesh.metadata.get("up", "z"))
