@@ -25,13 +25,8 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("mesh", type=Path, metavar="MESH")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE")
-    parser.add_argument(
-        "--adapt",
-        type=Path,
-        metavar="FILE",
-        help="also fine-tune the learned field on generated photographs of MESH (minutes) and write its weights to "
-        "FILE, for register --field",
-    )
+    adapt = "also fine-tune the learned field on generated photographs (minutes); its weights, for register --field"
+    parser.add_argument("--adapt", type=Path, metavar="FILE", help=adapt)
     parser.set_defaults(run=run)
 
 
@@ -44,8 +39,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..io.meshes import load_mesh
     from ..matching import ViewBank
 
-    start = time.perf_counter()
-    options = register_options(arguments)
+    start, options = time.perf_counter(), register_options(arguments)
     pipeline = options.open_pipeline()
     mesh = load_mesh(arguments.mesh, unit=options.unit, up=options.up)
     bank = ViewBank.build(

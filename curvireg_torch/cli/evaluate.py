@@ -37,21 +37,15 @@ def add_parser(commands: Any) -> None:
             ),
         )
         kind.add_arguments(dataset)
-        dataset.add_argument(
-            "--protocol",
-            nargs="+",
-            default=[],
-            metavar="KEY=VALUE",
-            help=f"{PROTOCOL} (default: cad=annotated pose={kind.pose} box=annotated)",
-        )
-        dataset.add_argument("--preset", choices=sorted(PRESET_NAMES), default=DEFAULT, help=f"default: {DEFAULT}")
-        dataset.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
-        dataset.add_argument(
-            "--jobs", type=int, default=1, metavar="N", help="processes that divide the objects (default: 1)"
-        )
-        dataset.add_argument("--limit", type=int, metavar="N", help="only N objects, spread evenly over the set")
-        dataset.add_argument("--overwrite", action="store_true", help="replace the predictions of other settings")
-        dataset.add_argument("--out", type=Path, required=True, metavar="DIR")
+        add = dataset.add_argument
+        protocol = f"{PROTOCOL} (default: cad=annotated pose={kind.pose} box=annotated)"
+        add("--protocol", nargs="+", default=[], metavar="KEY=VALUE", help=protocol)
+        add("--preset", choices=sorted(PRESET_NAMES), default=DEFAULT, help=f"default: {DEFAULT}")
+        add("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
+        add("--jobs", type=int, default=1, metavar="N", help="processes that divide the objects (default: 1)")
+        add("--limit", type=int, metavar="N", help="only N objects, spread evenly over the set")
+        add("--overwrite", action="store_true", help="replace the predictions of other settings")
+        add("--out", type=Path, required=True, metavar="DIR")
         dataset.set_defaults(run=run, dataset=name)
 
 
@@ -66,7 +60,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..pipeline import Pipeline
 
     kind = DATASETS[arguments.dataset]
-    dataset = kind.open(arguments.root, **{name: getattr(arguments, name) for name in kind.options})
+    dataset = kind.open(arguments.root, **kind.chosen(arguments))
     summary = evaluate(
         kind.scored(dataset, Protocol.parse(arguments.protocol, pose=kind.pose)),
         arguments.out,
@@ -92,8 +86,8 @@ def _print_summary(summary: Mapping[str, Any]) -> None:
         posed = summary["n_posed"]
         print(f"the true pose of {posed} is known: " + ("their scores are" if posed else "nothing to compare"))
     if summary["med_err_deg"] is not None:
-        names = [name for name in summary if name.startswith(("acc_", "add_", "mssd_", "mspd_"))]
-        numbers = [f"{name} {summary[name]:.3f}" for name in names]
+        prefixes = ("acc_", "add_", "mssd_", "mspd_")
+        numbers = [f"{name} {value:.3f}" for name, value in summary.items() if name.startswith(prefixes)]
         print("   ".join([*numbers, f"med_err_deg {summary['med_err_deg']:.1f}"]))
     if "localization" in summary:
         (_, n), *recalls = summary["localization"].items()

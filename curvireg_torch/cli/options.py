@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "add_box_and_camera",
-    "add_fov",
     "add_pose_prior",
     "common_options",
     "examples",
@@ -32,10 +31,8 @@ _NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
 def examples(*lines: str) -> dict[str, Any]:
     """Arguments for ``add_parser`` that show these command lines below the help."""
-    return {
-        "epilog": "\n  ".join(["examples:", *lines]),
-        "formatter_class": argparse.RawDescriptionHelpFormatter,
-    }
+    epilog = "\n  ".join(["examples:", *lines])
+    return {"epilog": epilog, "formatter_class": argparse.RawDescriptionHelpFormatter}
 
 
 def common_options() -> argparse.ArgumentParser:
@@ -50,9 +47,8 @@ def common_options() -> argparse.ArgumentParser:
 def pipeline_options() -> argparse.ArgumentParser:
     """Parent parser: ``--preset --pipeline --device``."""
     parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument(
-        "--preset", choices=sorted(PRESET_NAMES), help=f"default: the pipeline of a bank, else {DEFAULT}"
-    )
+    default = f"default: the pipeline of a bank, else {DEFAULT}"
+    parser.add_argument("--preset", choices=sorted(PRESET_NAMES), help=default)
     parser.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
     parser.add_argument("--device", default="cpu", help="device of modules, bank and search (default: cpu)")
     return parser
@@ -74,15 +70,14 @@ def mesh_options() -> argparse.ArgumentParser:
     return parser
 
 
-def add_box_and_camera(parser: argparse.ArgumentParser, *, box: str = "px", camera: str = "px") -> None:
-    """Add ``--box`` and ``--camera`` with these help texts."""
+def add_box_and_camera(
+    parser: argparse.ArgumentParser, *, box: str = "px", camera: str = "px", fov: bool = True
+) -> None:
+    """Add ``--box`` and ``--camera`` with these help texts, and ``--fov``."""
     parser.add_argument("--box", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help=box)
     parser.add_argument("--camera", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help=camera)
-
-
-def add_fov(parser: argparse.ArgumentParser) -> None:
-    """Add ``--fov``."""
-    parser.add_argument("--fov", type=float, metavar="DEG", help="horizontal field of view in degrees")
+    if fov:
+        parser.add_argument("--fov", type=float, metavar="DEG", help="horizontal field of view in degrees")
 
 
 def add_pose_prior(parser: argparse.ArgumentParser) -> None:
@@ -91,18 +86,15 @@ def add_pose_prior(parser: argparse.ArgumentParser) -> None:
         "what is known about the pose", "limits in degrees; all that are given must hold; the result stays within them"
     )
     limits = ("LOW", "HIGH")
-    group.add_argument("--azimuth", type=float, nargs=2, metavar=limits, help="counted upwards; 300 60 goes through 0")
-    group.add_argument("--elevation", type=float, nargs=2, metavar=limits, help="-90 below to 90 above the object")
-    group.add_argument("--theta", type=float, nargs=2, metavar=limits, help="in-plane rotation")
-    group.add_argument("--side", choices=SIDE_NAMES, help="side that faces the camera, 45 degrees to either side of it")
-    group.add_argument("--near", type=float, nargs="+", metavar="DEG", help="AZIMUTH ELEVATION [THETA] nearby")
-    group.add_argument("--within", type=float, metavar="DEG", help="largest angle from --near (default: 45)")
-    group.add_argument(
-        "--front", choices=UP_AXES, help="axis of the mesh file that points out of its front, at azimuth 0"
-    )
-    group.add_argument(
-        "--softness", type=float, metavar="DEG", help="soft limits: standard deviation of what exceeds them"
-    )
+    add = group.add_argument
+    add("--azimuth", type=float, nargs=2, metavar=limits, help="counted upwards; 300 60 goes through 0")
+    add("--elevation", type=float, nargs=2, metavar=limits, help="-90 below to 90 above the object")
+    add("--theta", type=float, nargs=2, metavar=limits, help="in-plane rotation")
+    add("--side", choices=SIDE_NAMES, help="side that faces the camera, 45 degrees to either side of it")
+    add("--near", type=float, nargs="+", metavar="DEG", help="AZIMUTH ELEVATION [THETA] nearby")
+    add("--within", type=float, metavar="DEG", help="largest angle from --near (default: 45)")
+    add("--front", choices=UP_AXES, help="axis of the mesh file that points out of its front, at azimuth 0")
+    add("--softness", type=float, metavar="DEG", help="soft limits: standard deviation of what exceeds them")
 
 
 def _pose_prior(arguments: argparse.Namespace) -> "PosePrior | None":

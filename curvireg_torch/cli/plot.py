@@ -10,14 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.files import write_file
 from ..utils.input_paths import check_given
-from .options import (
-    add_box_and_camera,
-    common_options,
-    examples,
-    mesh_options,
-    pipeline_options,
-    register_options,
-)
+from .options import add_box_and_camera, common_options, examples, mesh_options, pipeline_options, register_options
 
 if TYPE_CHECKING:
     from ..evaluation.opening import RegisterOptions
@@ -35,10 +28,7 @@ EVALUATED = {
     "classes": "every error, class by class",
     "sheet": "a page of the best and the worst photographs, with the contours at the estimated poses",
 }
-TABLES = {
-    "curves": "columns of a table over its first one",
-    "bars": "a group of bars for each row of a table",
-}
+TABLES = {"curves": "columns of a table over its first one", "bars": "a group of bars for each row of a table"}
 FORMATS = (".png", ".svg", ".pdf")
 
 
@@ -59,7 +49,7 @@ def add_parser(commands: Any) -> None:
         parser = _add_kind(kinds, kind, text, "photo.jpg part.stl", pipeline_options(), mesh_options())
         parser.add_argument("photo", type=Path, metavar="PHOTO")
         parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh or a bank")
-        add_box_and_camera(parser)
+        add_box_and_camera(parser, fov=False)
     for kind, text in EVALUATED.items():
         parser = _add_kind(kinds, kind, text, "results/pascal3d")
         sets = "pascal3d, bop or web" if kind == "sheet" else "pascal3d or web"
@@ -67,9 +57,8 @@ def add_parser(commands: Any) -> None:
         if kind == "confusion":
             parser.add_argument("--bins", type=int, default=8, choices=(4, 8, 16, 24), help="number (default: 8)")
         else:
-            parser.add_argument(
-                "--within", type=float, default=30.0, metavar="DEG", help="largest right error (default: 30)"
-            )
+            largest = "largest right error (default: 30)"
+            parser.add_argument("--within", type=float, default=30.0, metavar="DEG", help=largest)
         if kind == "sheet":
             parser.add_argument("--each", type=int, default=30, metavar="N", help="best and worst (default: 30)")
     for kind, text in TABLES.items():

@@ -5,6 +5,7 @@ import sys
 import tempfile
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,6 @@ from ..utils.files import check_writable
 from ..utils.input_paths import check_given, is_one_photograph
 from .options import (
     add_box_and_camera,
-    add_fov,
     add_pose_prior,
     common_options,
     examples,
@@ -49,7 +49,8 @@ def add_parser(commands: Any) -> None:
             "curvireg register photo.jpg --mesh mug.obj --mesh bowl.obj --out out/which",
         ),
     )
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "paths",
         type=Path,
         nargs="*",
@@ -57,15 +58,9 @@ def add_parser(commands: Any) -> None:
         help="photographs, folders of them, patterns ('shots/*.jpg') or videos; last a mesh (.obj .ply .stl .off .glb "
         ".gltf) or a bank. Textures and colours of .glb .obj .ply are compared too; a mesh without colours is grey",
     )
-    parser.add_argument(
-        "--mesh",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="MESH",
-        help="a candidate mesh; repeat the option, and the best of them is reported",
-    )
-    parser.add_argument(
+    candidates = "a candidate mesh; repeat the option, and the best of them is reported"
+    add("--mesh", type=Path, action="append", default=[], metavar="MESH", help=candidates)
+    add(
         "--list",
         type=Path,
         metavar="LIST",
@@ -73,43 +68,29 @@ def add_parser(commands: Any) -> None:
         "folder. Empty cells mean: localize the object, no camera, MESH. Or the same as JSON, COCO annotations, or the "
         "folder of a BOP scene",
     )
-    parser.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th frame of videos (default: 1)")
+    add("--every", type=int, default=1, metavar="N", help="use every N-th frame of videos (default: 1)")
     add_box_and_camera(
         parser,
         box="px; default: the object is localized",
         camera="px; gives the translation. For an unknown camera give --camera exif (focal length in the photograph's "
         "file) or --fov; the result then has no covariance",
     )
-    parser.add_argument("--exif", action="store_true", help=argparse.SUPPRESS)
-    add_fov(parser)
+    add("--exif", action="store_true", help=argparse.SUPPRESS)
     add_pose_prior(parser)
-    parser.add_argument(
-        "--instances", type=int, default=1, metavar="N", help="without a box: up to N objects (default: 1)"
-    )
-    parser.add_argument(
-        "--distance",
-        type=float,
-        nargs=2,
-        metavar=("MIN", "MAX"),
-        help="without a box: range of the object's distance in the mesh's unit; needs --camera",
-    )
-    parser.add_argument("--field", type=Path, metavar="FILE", help="weights from curvireg bank --adapt")
-    parser.add_argument("--top", type=int, metavar="K", help="hypotheses to carry and report (default: 5)")
-    parser.add_argument("--no-refine", dest="refine", action="store_false", help="stop at the best view of the bank")
-    parser.add_argument(
-        "--jobs", type=int, default=1, metavar="N", help="processes that divide several photographs (default: 1)"
-    )
-    parser.add_argument("--json", action="store_true", help="print only the results as JSON; --out is optional")
-    parser.add_argument("--out", type=Path, metavar="DIR")
+    add("--instances", type=int, default=1, metavar="N", help="without a box: up to N objects (default: 1)")
+    distances = "without a box: range of the object's distance in the mesh's unit; needs --camera"
+    add("--distance", type=float, nargs=2, metavar=("MIN", "MAX"), help=distances)
+    add("--field", type=Path, metavar="FILE", help="weights from curvireg bank --adapt")
+    add("--top", type=int, metavar="K", help="hypotheses to carry and report (default: 5)")
+    add("--no-refine", dest="refine", action="store_false", help="stop at the best view of the bank")
+    add("--jobs", type=int, default=1, metavar="N", help="processes that divide several photographs (default: 1)")
+    add("--json", action="store_true", help="print only the results as JSON; --out is optional")
+    add("--out", type=Path, metavar="DIR")
     parser.set_defaults(run=run)
 
 
 def complete(arguments: argparse.Namespace) -> str | None:
-    """Divide ``paths`` into ``photos`` and ``meshes``, and set the default of ``unit``.
-
-    Returns:
-        What is wrong with the combination of options, or None.
-    """
+    """Divide ``paths`` into ``photos`` and ``meshes``; returns what is wrong with the options together, or None."""
     arguments.photos = [] if arguments.list else arguments.paths if arguments.mesh else arguments.paths[:-1]
     arguments.meshes = [*arguments.paths[len(arguments.photos) :], *arguments.mesh]
     if arguments.unit is None and arguments.list is not None and arguments.list.is_dir():
@@ -155,7 +136,7 @@ def run(arguments: argparse.Namespace) -> None:
         if arguments.json:
             print((out / "results.jsonl").read_text(encoding="utf-8"), end="")
     table = "" if arguments.out is None else f"; see {out}/results.csv"
-    print(f"{counts}{table}", file=_notes(arguments.json))
+    print(f"{counts}{table}", file=sys.stderr if arguments.json else sys.stdout)
     if not counts.ok:
         raise InvalidInputError("no photograph could be registered; the message of each gives the reason")
 
@@ -181,14 +162,15 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
     if options.box is None and options.progress:
         print(f"{path}: localizing the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
     result, document = register_entry(options.entry(path), photo, registrar, bank_seconds=ready)
+    notes = sys.stderr if as_json else sys.stdout  # with --json, standard output holds only the result
     if out is not None:
         write_result(out, document, registrar, result, photo.image, used_box(document))
     if document["inputs"]["camera_source"] in ("exif", "fov"):
         focal = document["inputs"]["camera"][0]
         note = f"camera guessed, focal length {focal:.0f} px; distances are off by the same factor"
-        print(f"{path}: {note}", file=_notes(as_json))
+        print(f"{path}: {note}", file=notes)
     if photo.notes:
-        print(f"{path}: {'; '.join(photo.notes)}", file=_notes(as_json))
+        print(f"{path}: {'; '.join(photo.notes)}", file=notes)
     if as_json:
         print(to_json(document), end="")
     else:
@@ -201,21 +183,14 @@ def _register_several(options: "RegisterOptions", field: Any, photos: "PhotoList
     from ..evaluation.opening import open_registrar
     from ..pipeline import field_digest
 
+    names = ("bank_decides", "pose", "unit", "up", "top", "refine", "renderer", "device")
     settings = {
         "pipeline": options.open_pipeline().describe(),
         "field": None if field is None else field_digest(field),
-        **{
-            n: getattr(options, n)
-            for n in ("bank_decides", "pose", "unit", "up", "top", "refine", "renderer", "device")
-        },
+        **{name: getattr(options, name) for name in names},
     }
-    return register_list(
-        photos,
-        out,
-        lambda meshes: open_registrar(options, meshes, field),
-        settings=settings,
-        progress=options.progress,
-    )
+    open_meshes = partial(open_registrar, options, field=field)
+    return register_list(photos, out, open_meshes, settings=settings, progress=options.progress)
 
 
 def _photo_list(options: "RegisterOptions", path: Path | None, out: Path, *, every: int) -> "PhotoList":
@@ -236,8 +211,3 @@ def _photo_list(options: "RegisterOptions", path: Path | None, out: Path, *, eve
     if options.guess is not None:
         print("unknown cameras are guessed; distances are off by the same factor as the guesses", file=sys.stderr)
     return replace(photos, entries=tuple(map(options.complete, photos.entries)))
-
-
-def _notes(as_json: bool) -> Any:
-    """The stream for messages: with ``--json``, standard output holds only results."""
-    return sys.stderr if as_json else sys.stdout

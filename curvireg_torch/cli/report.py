@@ -10,12 +10,7 @@ __all__ = ["print_result"]
 
 
 def print_result(document: Mapping[str, Any], out: Path) -> None:
-    """Print a result.
-
-    Args:
-        document: of :func:`curvireg_torch.registration.document.result_document`.
-        out: the folder of its files.
-    """
+    """Print a :func:`~curvireg_torch.registration.document.result_document`; ``out`` is the folder of its files."""
     angles = ", ".join(f"{name} {value:.1f}" for name, value in document["viewpoint"].items())
     print(f"viewpoint: {angles} degrees   score {document['score']:.3f}   confidence {document['confidence']:.2f}")
     if not document["reliable"]:
@@ -34,10 +29,8 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
             ", ".join("unknown" if v is None else f"{v:.2g}" for v in deviations[name])
             for name in ("rotation_deg", "translation")
         )
-        print(
-            f"standard deviations: {rotation} degrees; {translation} {document['unit']}   "
-            "(about and along the camera's axes)"
-        )
+        values = f"{rotation} degrees; {translation} {document['unit']}"
+        print(f"standard deviations: {values}   (about and along the camera's axes)")
     seconds = document["seconds"]
     print(f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see {out}/overlay.png")
 

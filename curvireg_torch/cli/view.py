@@ -6,15 +6,7 @@ from typing import Any
 
 from ..errors import MissingDependencyError
 from ..utils.input_paths import check_given
-from .options import (
-    add_box_and_camera,
-    add_fov,
-    common_options,
-    examples,
-    mesh_options,
-    pipeline_options,
-    register_options,
-)
+from .options import add_box_and_camera, common_options, examples, mesh_options, pipeline_options, register_options
 
 __all__ = ["add_parser", "run"]
 
@@ -33,10 +25,8 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("photo", type=Path, nargs="?", metavar="PHOTO")
     parser.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help="a mesh or a bank; both can be added later")
     add_box_and_camera(parser, box="px; can be drawn")
-    add_fov(parser)
-    parser.add_argument(
-        "--host", default=LOCAL, help=f"who may connect: {LOCAL}, only this machine (default), or 0.0.0.0, everyone"
-    )
+    hosts = f"who may connect: {LOCAL}, only this machine (default), or 0.0.0.0, everyone"
+    parser.add_argument("--host", default=LOCAL, help=hosts)
     parser.add_argument("--port", type=int, default=0, help="default: a free one")
     parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
     parser.set_defaults(run=run)
@@ -50,9 +40,8 @@ def run(arguments: argparse.Namespace) -> None:
         import matplotlib  # noqa: F401
         import nicegui  # noqa: F401
     except ImportError as error:
-        raise MissingDependencyError(
-            f"curvireg view: {error.name} is not installed; pip install 'curvireg_torch[viewer]'"
-        ) from error
+        message = f"curvireg view: {error.name} is not installed; pip install 'curvireg_torch[viewer]'"
+        raise MissingDependencyError(message) from error
     from ..viewer.server import serve
 
     options = register_options(arguments, photos, meshes)

@@ -27,20 +27,16 @@ class RegisterOptions:
     Attributes:
         photos: photographs, folders, patterns or videos.
         meshes: mesh files or banks; of several, each photograph is registered to the best.
-        box: x0, y0, x1, y1 in px; None: the object is localized.
-        camera: fx, fy, cx, cy in px; None: unknown.
-        guess: replaces an unknown camera: "exif" takes the focal length in the photograph's file, a number is the
-            horizontal field of view in degrees.
+        box, camera: x0, y0, x1, y1 and fx, fy, cx, cy in px; None: localized, and unknown.
+        guess: of an unknown camera: "exif", or the horizontal field of view in degrees.
         instances, distance: without a box, see :func:`curvireg_torch.registration.localize`.
         prior: limits on the pose.
         preset, pipeline: name of a pipeline, or its JSON file; None: the pipeline of a bank, or the default.
-        pose: the pose prior, "any" or "upright"; None: that of the pipeline.
+        pose, top: the pose prior, and the number of hypotheses; None: those of the pipeline.
         field: weights of an adapted field.
-        top: number of hypotheses; None: that of the pipeline.
         refine: False stops at the best view of the bank.
         unit, up: of mesh files, see :func:`curvireg_torch.load_mesh`.
         renderer, device: where views are rendered, and where the search runs.
-        progress: show progress bars.
     """
 
     photos: tuple[Path, ...] = ()
@@ -69,26 +65,17 @@ class RegisterOptions:
         return self.preset is None and self.pipeline is None
 
     def open_pipeline(self) -> Pipeline:
-        """The pipeline that ``preset``, ``pipeline`` and ``pose`` choose.
-
-        Raises:
-            CurviregError: the file is missing or does not hold a pipeline.
-        """
+        """The pipeline that ``preset``, ``pipeline`` and ``pose`` choose."""
         chosen = preset_named(self.preset or DEFAULT) if self.pipeline is None else Pipeline.read(self.pipeline)
         return chosen if self.pose is None else chosen.with_pose_prior(self.pose)
 
     def open_field(self) -> LearnedCurvilinearSaliency | None:
-        """The network of ``field``, or None.
-
-        Raises:
-            CurviregError: the file is missing or does not hold weights.
-        """
+        """The network of ``field``, or None."""
         return None if self.field is None else LearnedCurvilinearSaliency(weights=self.field)
 
     def entry(self, photo: Path) -> Entry:
         """A photograph with the box, camera and meshes of these options."""
-        entry = Entry(cells=(), name=str(photo), photo=photo, meshes=self.meshes, box=self.box, camera=self.camera)
-        return self.complete(entry)
+        return self.complete(Entry((), str(photo), photo, self.meshes, self.box, self.camera))
 
     def complete(self, entry: Entry) -> Entry:
         """A photograph of a list with the options that a list does not hold."""
@@ -118,8 +105,7 @@ def open_registrar(
 
     Args:
         options: its settings; ``photos``, ``meshes`` and what belongs to a photograph are not used.
-        meshes: files; of several, each photograph is registered to the best.
-        field: from :meth:`RegisterOptions.open_field`.
+        meshes, field: the files, and the network from :meth:`RegisterOptions.open_field`.
         progress: called while banks are built, instead of showing a bar.
 
     Raises:
@@ -129,7 +115,7 @@ def open_registrar(
     banks = [_open_bank(options, mesh, pipeline, progress or options.progress) for mesh in meshes]
     bank = ViewBank.join(banks).to(options.device)
     if all(mesh.suffix == ".safetensors" for mesh in meshes):
-        if options.preset is None and options.pipeline is None:
+        if options.bank_decides:
             pipeline = bank.pipeline
         elif options.pose is None and options.pipeline is None:  # a preset does not fix the views
             pipeline = replace(pipeline, views=bank.pipeline.views)
@@ -148,9 +134,6 @@ def _open_bank(
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
     bank = ViewBank.load(mesh)
     if options.pose not in (None, bank.pipeline.views.pose):
-        raise BankError(
-            f"built for --pose {bank.pipeline.views.pose}, not for --pose {options.pose}; "
-            "leave --pose out, or build it again with 'curvireg bank'",
-            subject=mesh,
-        )
+        message = f"built for --pose {bank.pipeline.views.pose}, not for --pose {options.pose}; leave --pose out, or "
+        raise BankError(f"{message}build it again with 'curvireg bank'", subject=mesh)
     return bank

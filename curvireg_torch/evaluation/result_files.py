@@ -11,19 +11,15 @@ from .store import to_json
 
 __all__ = ["write_result"]
 
-MAX_GLB_FACES = 300_000
-"""Faces of the largest mesh that is written to ``pose.glb``: viewers are slow with files above 30 MB."""
+MAX_GLB_FACES = 300_000  # of the largest mesh that is written: viewers are slow with files above 30 MB
 
 
 def write_result(
     out: Path, document: dict[str, Any], registrar: Registrar, result: Registration, image: Any, box: Any
 ) -> None:
-    """Write the files of a result into the folder ``out``; ``pose.glb`` only for meshes of up to 300,000 faces.
+    """Write the files of a result into the folder ``out``; ``document`` is the content of ``result.json``.
 
-    Args:
-        out: the folder.
-        document: the content of ``result.json``.
-        registrar, result, image, box: as for :func:`curvireg_torch.visualization.registration_sheet`.
+    The other arguments are those of :func:`curvireg_torch.visualization.registration_sheet`.
 
     Raises:
         OutputError: a file cannot be written.

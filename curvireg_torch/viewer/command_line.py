@@ -15,11 +15,7 @@ _DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
 
 
 def command_line(options: RegisterOptions, names: Mapping[Path, str]) -> str:
-    """``curvireg register`` with these options.
-
-    Args:
-        options: with at most one photograph and one mesh.
-        names: what the user calls the files.
+    """``curvireg register`` with these options; ``names`` are what the user calls the files.
 
     Example:
         >>> photo = Path("upload-1")
@@ -27,12 +23,10 @@ def command_line(options: RegisterOptions, names: Mapping[Path, str]) -> str:
         'curvireg register a.jpg MESH --fov 60 --unit mm --out result'
     """
     words = ["curvireg", "register"]
-    words += [names[path] for path in options.photos] or ["PHOTO"]
-    words += [names[path] for path in options.meshes] or ["MESH"]
-    if options.box is not None:
-        words += ["--box", *map(_number, options.box)]
-    if options.camera is not None:
-        words += ["--camera", *map(_number, options.camera)]
+    for paths, placeholder in ((options.photos, "PHOTO"), (options.meshes, "MESH")):
+        words += [names[path] for path in paths] or [placeholder]
+    for name, numbers in (("--box", options.box), ("--camera", options.camera)):
+        words += [] if numbers is None else [name, *map(_number, numbers)]
     if isinstance(options.guess, float):
         words += ["--fov", _number(options.guess)]
     elif options.guess is not None:

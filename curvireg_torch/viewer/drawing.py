@@ -6,8 +6,7 @@ __all__ = ["BoxDrawing"]
 
 Box = tuple[float, float, float, float]
 
-MIN_SIDE = 3.0
-"""Smallest side in px of a new box; a smaller one was a click."""
+MIN_SIDE = 3.0  # px of a new box; a smaller one was a click
 
 
 @dataclass
@@ -15,9 +14,6 @@ class BoxDrawing:
     """A box in px of a picture, as the mouse changes it.
 
     The mouse drags an edge or a corner that it is near to, inside the box the whole box, and elsewhere a new box.
-
-    Attributes:
-        box: x0, y0, x1, y1, or None.
 
     Example:
         >>> drawing = BoxDrawing()
@@ -27,7 +23,7 @@ class BoxDrawing:
         (10.0, 20.0, 80.0, 50.0)
     """
 
-    box: Box | None = None
+    box: Box | None = None  # x0, y0, x1, y1
     _before: Box | None = None
     _corners: Box | None = None  # while dragged; x0 may exceed x1
     _dragged: tuple[int | None, int | None] = (None, None)  # indices of the x and the y that follow the mouse

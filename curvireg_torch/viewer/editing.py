@@ -16,13 +16,7 @@ __all__ = ["DisplayedPose", "fit_displayed", "move_displayed"]
 
 @dataclass(frozen=True)
 class DisplayedPose:
-    """The pose on the page.
-
-    Attributes:
-        pose: the hypothesis, moved.
-        number: of the hypothesis, from 0.
-        edits: what the user did to it, in words.
-    """
+    """The pose on the page: a hypothesis with its number from 0, and what the user did to it in words."""
 
     pose: Hypothesis
     number: int
@@ -44,12 +38,11 @@ def move_displayed(
     """
     describer = registrar.describers[displayed.pose.model]
     T = displayed.pose.projection[0].clone()
-    angles = torch.deg2rad(torch.tensor([float(v) for v in rotation], dtype=torch.float64))
-    centre = T[:3, :3] @ describer.centre + T[:3, 3]
-    centre = centre + describer.radius * torch.tensor([float(v) for v in translation], dtype=torch.float64)
+    angles, shift = (torch.tensor(list(v), dtype=torch.float64) for v in (rotation, translation))
+    centre = T[:3, :3] @ describer.centre + T[:3, 3] + describer.radius * shift
     if float(centre[2]) < 1.2 * describer.radius:
         raise InvalidInputError("the object would touch the camera; move it away")
-    T[:3, :3] = rotation_from_axis_angle(angles) @ T[:3, :3]
+    T[:3, :3] = rotation_from_axis_angle(torch.deg2rad(angles)) @ T[:3, :3]
     T[:3, 3] = centre - T[:3, :3] @ describer.centre
     edits = [f"rotated {v:g} degrees about {axis}" for v, axis in zip(rotation, "xyz", strict=True) if v]
     edits += [f"moved {v:g} radii along {axis}" for v, axis in zip(translation, "xyz", strict=True) if v]

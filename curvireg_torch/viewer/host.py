@@ -10,17 +10,11 @@ __all__ = ["Host"]
 
 
 class Host(Protocol):
-    """The page, as its inputs and panels see it.
-
-    Attributes:
-        session: the state of the page.
-        busy: whether a job is running.
-        scale: of the displayed photograph to the photograph.
-    """
+    """The page, as its inputs and panels see it."""
 
     session: Session
-    busy: bool
-    scale: float
+    busy: bool  # whether a job is running
+    scale: float  # of the displayed photograph to the photograph
 
     async def run(self, job: Callable[[], Any]) -> Any:
         """Run a job in a thread and show its errors; returns its result or True, None after an error."""

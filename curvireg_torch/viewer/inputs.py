@@ -16,11 +16,7 @@ __all__ = ["Inputs"]
 
 
 class Inputs:
-    """Input fields; what is typed, chosen or dropped goes into the session.
-
-    Args:
-        host: the page.
-    """
+    """Input fields; what is typed, chosen or dropped goes into the session."""
 
     def __init__(self, host: Host) -> None:
         self.host, self.session, self.drawing = host, host.session, BoxDrawing()

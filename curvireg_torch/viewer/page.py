@@ -18,8 +18,8 @@ from .session import Session
 
 __all__ = ["Page"]
 
+# Runs the jobs of all pages one after the other: two at a time would slow each other down.
 WORKER = ThreadPoolExecutor(1, thread_name_prefix="viewer")
-"""Runs the jobs of all pages one after the other: two at a time would slow each other down."""
 
 STAGES = {
     "bank": "rendering views",
@@ -36,10 +36,7 @@ _thread = threading.local()
 class Page:
     """The page of one browser window; it is the :class:`~curvireg_torch.viewer.host.Host` of its parts.
 
-    Args:
-        session: its state.
-        folder: for uploaded files.
-        address: under which ``files`` are served.
+    ``folder`` is for uploaded files; ``files`` are served under ``address``.
     """
 
     def __init__(self, session: Session, folder: Path, address: str) -> None:

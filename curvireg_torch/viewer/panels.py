@@ -28,11 +28,7 @@ TRANSLATIONS = {"right": (1, 0, 0), "down": (0, 1, 0), "away": (0, 0, 1)}
 
 
 class Panels:
-    """The tabs, and above them the pose in words and the buttons that change it.
-
-    Args:
-        host: the page.
-    """
+    """The tabs, and above them the pose in words and the buttons that change it."""
 
     def __init__(self, host: Host) -> None:
         self.host, self.session, self.outdated = host, host.session, set[str]()

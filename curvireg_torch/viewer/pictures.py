@@ -13,8 +13,7 @@ from ..visualization.overlay import depth_picture, draw_contours, to_uint8
 
 __all__ = ["photograph_jpeg", "pose_layers", "view_pictures"]
 
-SIDE = 1400
-"""Longer side of the displayed photograph in px."""
+SIDE = 1400  # longer side of the displayed photograph in px
 
 
 def photograph_jpeg(image: Tensor) -> tuple[bytes, float]:
@@ -24,12 +23,9 @@ def photograph_jpeg(image: Tensor) -> tuple[bytes, float]:
 
 
 def pose_layers(registrar: Registrar, pose: Hypothesis, size: tuple[int, int], scale: float) -> tuple[bytes, bytes]:
-    """Two transparent PNGs in the size of the displayed photograph: the shaded mesh at a pose, and its contours.
+    """Two transparent PNGs of ``size`` (H, W), that of the displayed photograph: the shaded mesh, and its contours.
 
-    Args:
-        registrar, pose: the pose.
-        size: (H, W) of the displayed photograph.
-        scale: of the displayed photograph to the photograph.
+    ``scale`` is that of the displayed photograph to the photograph.
     """
     T, K = pose.projection
     half = 0.5 * scale - 0.5

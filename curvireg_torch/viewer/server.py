@@ -44,8 +44,7 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
 
     Args:
         options: the inputs of a new page.
-        host: address to listen on.
-        port: 0 for a free one.
+        host, port: address to listen on, and 0 for a free port.
         browser: open a browser.
 
     Raises:

@@ -27,30 +27,21 @@ from .editing import DisplayedPose, fit_displayed, move_displayed
 
 __all__ = ["MAX_PROPOSALS", "Result", "Session"]
 
-MAX_PROPOSALS = 5
-"""Proposed boxes that are drawn where the object was localized."""
+MAX_PROPOSALS = 5  # proposed boxes that are drawn where the object was localized
 
 Numbers = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
 class Result:
-    """A registration with its inputs.
-
-    Attributes:
-        registrar, registration: the registrar and its result.
-        document: the content of ``result.json``.
-        image: (3, H, W) uint8.
-        box: (4,) px, with which the pose was found.
-        command: the command line that gives the same result.
-    """
+    """A registration with its inputs."""
 
     registrar: Registrar
     registration: Registration
-    document: dict[str, Any]
-    image: Tensor
-    box: Tensor
-    command: str
+    document: dict[str, Any]  # the content of result.json
+    image: Tensor  # (3, H, W) uint8
+    box: Tensor  # (4,) px, with which the pose was found
+    command: str  # gives the same result
 
 
 @dataclass
@@ -59,14 +50,11 @@ class Session:
 
     Attributes:
         options: of ``curvireg view``; replace them to change unit, up, pose or preset.
-        photo_path, mesh_path: the files, or None.
         names: what the user calls the files, for messages and the command line.
-        photo: the photograph as it was read.
         box, camera, fov: as ``--box``, ``--camera`` and ``--fov``, or None; a camera takes precedence over ``fov``.
         result, displayed: the last result and the pose on the page, or None.
         limit: seconds after which a registration is cancelled.
         progress: stage, done and total.
-        cancelled: whether :meth:`cancel` was called.
     """
 
     options: RegisterOptions
@@ -85,14 +73,7 @@ class Session:
     _registrar: tuple[RegisterOptions, Registrar] | None = None
 
     def load(self) -> str:
-        """Open the files that the options name, and take their box and camera.
-
-        Returns:
-            A description of the mesh, or "".
-
-        Raises:
-            CurviregError: a file cannot be used.
-        """
+        """Open the files that the options name, and take their box and camera; describes the mesh, or ""."""
         options = self.options
         self.options = replace(options, photos=(), meshes=(), box=None, camera=None, guess=None)
         for path in options.photos:
@@ -103,11 +84,7 @@ class Session:
         return facts
 
     def open_photo(self, path: Path, name: str | None = None) -> Photo:
-        """Read a photograph; it replaces box, camera and result of the one before.
-
-        Raises:
-            MissingFileError, ImageError.
-        """
+        """Read a photograph; it replaces box, camera and result of the one before."""
         self.names[path] = name or str(path)
         with self._user_names():
             photo = read_photo(path, dtype=torch.uint8)
@@ -116,14 +93,7 @@ class Session:
         return photo
 
     def open_mesh(self, path: Path, name: str | None = None) -> str:
-        """Check that a mesh or a bank can be used; it replaces the one before.
-
-        Returns:
-            A description of it.
-
-        Raises:
-            MissingFileError, MeshError, BankError.
-        """
+        """Check that a mesh or a bank can be used, and describe it; it replaces the one before."""
         self.names[path] = name or str(path)
         with self._user_names():
             if path.suffix == ".safetensors":
@@ -182,25 +152,17 @@ class Session:
         with self._user_names():
             registrar = self._open_registrar(request.meshes[0], report_progress)
             registrar.progress = report_progress
-            entry = replace(
-                request.entry(request.photos[0]),
-                name=self.names[request.photos[0]],
-                meshes=tuple(names[path] for path in request.meshes),
-            )
+            entry = request.entry(request.photos[0])
+            entry = replace(entry, name=self.names[entry.photo], meshes=tuple(names[p] for p in entry.meshes))
             ready = time.perf_counter() - start
             registration, document = register_entry(entry, photo, registrar, bank_seconds=ready)
-        box = torch.tensor(used_box(document))
-        command = command_line(request, self.names)
+        box, command = torch.tensor(used_box(document)), command_line(request, self.names)
         self.result = Result(registrar, registration, document, photo.image, box, command)
         self.display(0)
         return registration
 
     def require_result(self) -> tuple[Result, DisplayedPose]:
-        """The result and the displayed pose.
-
-        Raises:
-            InvalidInputError: there is none yet.
-        """
+        """The result and the displayed pose; an error if there is none yet."""
         if self.result is None or self.displayed is None:
             raise InvalidInputError("there is no result yet; register first")
         return self.result, self.displayed
@@ -229,13 +191,8 @@ class Session:
     def document(self) -> dict[str, Any]:
         """``result.json`` of the command line; ``viewer`` holds that command line and the displayed pose."""
         result, displayed = self.require_result()
-        viewer = {
-            "command": result.command,
-            "hypothesis": displayed.number,
-            "by_hand": list(displayed.edits),
-            **displayed.pose.pose_dict(),
-        }
-        return {**result.document, "viewer": viewer}
+        edits = {"hypothesis": displayed.number, "by_hand": list(displayed.edits)}
+        return {**result.document, "viewer": {"command": result.command, **edits, **displayed.pose.pose_dict()}}
 
     def json(self) -> bytes:
         """:meth:`document` as a file."""
@@ -250,14 +207,10 @@ class Session:
         """End the registration at its next step."""
         self.cancelled = True
 
-    def user_name(self, subject: str) -> str:
-        """What the user calls the file at a path; other texts as they are."""
-        return self.names.get(Path(subject), subject)
-
     def describe_warning(self, warning: Warning) -> str:
         """The text of a warning, with the user's name of its file."""
         if isinstance(warning, CurviregWarning):
-            warning = warning.with_subject(self.user_name(warning.subject))
+            warning = warning.with_subject(self.names.get(Path(warning.subject), warning.subject))
         return str(warning)
 
     def _progress_callback(self, start: float) -> Callable[[str, int, int], None]:
@@ -286,4 +239,4 @@ class Session:
         try:
             yield
         except CurviregError as error:
-            raise error.with_subject(self.user_name(error.subject)) from error
+            raise error.with_subject(self.names.get(Path(error.subject), error.subject)) from error

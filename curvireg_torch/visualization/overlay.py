@@ -20,22 +20,17 @@ __all__ = ["contour_overlay", "registration_sheet", "side_pictures"]
 
 _CONTOUR, _INNER, _BOX = (0, 255, 80), (255, 170, 0), (255, 255, 255)
 _TILE = 192
+_Window = tuple[int, int, int, int]
 
 
 def contour_overlay(
-    registrar: Registrar,
-    result: Registration | Hypothesis,
-    image: Any,
-    box: Any,
-    camera_matrix: Any | None = None,
+    registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any, camera_matrix: Any | None = None
 ) -> np.ndarray:
     """The photograph with the mesh's outer (green) and inner (orange) contours at the pose, and the box (white).
 
     Args:
-        registrar: the registrar that computed ``result``.
-        result: a registration, or one of its hypotheses; it is drawn with its ``projection``.
-        image: the photograph, as the registrar takes it: a (1 or 3, H, W) tensor, an array or a path.
-        box: (4,) px.
+        registrar, result: the result of this registrar, or one of its hypotheses; it is drawn with its ``projection``.
+        image, box: the photograph, as the registrar takes it: a (1 or 3, H, W) tensor, an array or a path; (4,) px.
         camera_matrix: (3, 3), if ``image`` is another one from the same position, such as a smaller copy.
 
     Returns:
@@ -50,11 +45,7 @@ def contour_overlay(
 
 
 def _overlay(
-    registrar: Registrar,
-    result: Registration | Hypothesis,
-    item: ImageItem,
-    window: tuple[int, int, int, int],
-    camera_matrix: Any | None,
+    registrar: Registrar, result: Registration | Hypothesis, item: ImageItem, window: _Window, camera_matrix: Any | None
 ) -> np.ndarray:
     """:func:`contour_overlay` of columns x0 to x1 - 1 and rows y0 to y1 - 1."""
     x0, y0, x1, y1 = window
@@ -72,17 +63,13 @@ def _overlay(
     return picture
 
 
-def _window(item: ImageItem) -> tuple[int, int, int, int]:
+def _window(item: ImageItem) -> _Window:
     """The box with a margin of half its longer side, inside the photograph."""
     H, W = item.image.shape[-2:]
     x0, y0, x1, y1 = item.box.tolist()
     margin = 0.5 * max(x1 - x0, y1 - y0)
-    return (
-        max(0, round(x0 - margin)),
-        max(0, round(y0 - margin)),
-        min(W, round(x1 + margin)),
-        min(H, round(y1 + margin)),
-    )
+    left, top = max(0, round(x0 - margin)), max(0, round(y0 - margin))
+    return left, top, min(W, round(x1 + margin)), min(H, round(y1 + margin))
 
 
 def draw_pose(
@@ -90,8 +77,7 @@ def draw_pose(
 ) -> None:
     """Draw a mesh's contours and a box into (H, W, 3) uint8; ``projection`` is pose and camera matrix."""
     T, K = projection
-    H, W = picture.shape[:2]
-    width = draw_contours(picture, renderer.render(T[None], K, (H, W))[0, 0].cpu().numpy())
+    width = draw_contours(picture, renderer.render(T[None], K, picture.shape[:2])[0, 0].cpu().numpy())
     x0, y0, x1, y1 = (round(v) for v in box)
     cv2.rectangle(picture, (x0, y0), (x1, y1), _BOX, max(1, width // 2))
 
@@ -102,7 +88,8 @@ def draw_contours(picture: np.ndarray, depth: np.ndarray) -> int:
     opaque = (255,) * (picture.shape[2] - 3)
     mask = (depth > 0).astype(np.uint8)
     inner = _depth_edges(depth) & (cv2.erode(mask, np.ones((3, 3), np.uint8)) > 0)
-    picture[_thick(inner, width)] = (*_INNER, *opaque)
+    thick = cv2.dilate(inner.astype(np.uint8), np.ones((width, width), np.uint8)) > 0
+    picture[thick] = (*_INNER, *opaque)
     outline, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(picture, outline, -1, (*_CONTOUR, *opaque), width)
     return width
@@ -131,10 +118,6 @@ def _depth_edges(depth: np.ndarray) -> np.ndarray:
     return np.asarray(edges & mask)
 
 
-def _thick(mask: np.ndarray, width: int) -> np.ndarray:
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((width, width), np.uint8)) > 0)
-
-
 @torch.no_grad()
 def registration_sheet(
     registrar: Registrar, result: Registration, image: Any, box: Any, camera_matrix: Any | None = None
@@ -142,10 +125,7 @@ def registration_sheet(
     """Contour overlay; beside it crop, field, pose and its field; below the hypotheses, best first.
 
     The overlay shows the box with a margin of half its longer side. The caption of a hypothesis is its score and its
-    rotation from the best. Arguments as for :func:`contour_overlay`.
-
-    Returns:
-        (H', W', 3) uint8 RGB.
+    rotation from the best. Arguments as for :func:`contour_overlay`; returns (H', W', 3) uint8 RGB.
     """
     item = _item(image, box)
     overlay = _overlay(registrar, result, item, _window(item), camera_matrix)
@@ -155,8 +135,7 @@ def registration_sheet(
         for i, h in enumerate(result.hypotheses, start=1)
     ]
     panel = np.vstack([np.hstack(side[:2]), np.hstack(side[2:])])
-    height = panel.shape[0]
-    scale = height / overlay.shape[0]
+    scale = (height := panel.shape[0]) / overlay.shape[0]
     shrink = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     overlay = cv2.resize(overlay, (max(1, round(overlay.shape[1] * scale)), height), interpolation=shrink)
     top, bottom = np.hstack([overlay, panel]), np.hstack(poses)
@@ -168,7 +147,7 @@ def registration_sheet(
 def side_pictures(
     registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any
 ) -> dict[str, np.ndarray]:
-    """The compared pictures, (S, S, 3) uint8 RGB each: "photograph", "photograph field", "pose", "view field".
+    """(S, S, 3) uint8 RGB each of "photograph", "photograph field", "pose" and "view field".
 
     Arguments as for :func:`contour_overlay`.
     """
@@ -209,7 +188,7 @@ def depth_picture(depth: Tensor) -> np.ndarray:
     mask = depth > 0
     if not bool(mask.any()):
         return to_uint8(torch.zeros_like(depth)[None])
-    near, far = depth[mask].min(), depth[mask].max()
+    near, far = depth[mask].aminmax()
     shade = 1.0 - 0.75 * (depth - near) / (far - near).clamp(min=1e-9)
     return to_uint8((shade * mask)[None])
 
@@ -224,8 +203,8 @@ def _tile(picture: np.ndarray) -> np.ndarray:
 
 
 def _caption(picture: np.ndarray, text: str) -> np.ndarray:
-    cv2.putText(picture, text, (5, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 3, cv2.LINE_AA)
-    cv2.putText(picture, text, (5, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 0), 1, cv2.LINE_AA)
+    for colour, width in (((0, 0, 0), 3), ((255, 255, 0), 1)):
+        cv2.putText(picture, text, (5, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, width, cv2.LINE_AA)
     return picture
 
 

@@ -50,29 +50,20 @@ def _axes(width: float, height: float) -> Any:
 
 
 def view_sphere(bank: ViewBank, ranking: Ranking | Registration, *, image_index: int = 0, model: int = 0) -> Any:
-    """Best score of every viewing direction over in-plane rotations; several maxima are rival poses.
+    """The scores of :func:`~curvireg_torch.visualization.sphere.direction_scores`; several maxima are rival poses.
 
     Hypotheses of a registration are numbered, best first.
-
-    Args:
-        bank: the views.
-        ranking: their ranking, or a registration.
-        image_index: photograph of the ranking.
-        model: mesh of the bank.
-
-    Raises:
-        InvalidInputError: see :func:`~curvireg_torch.visualization.sphere.direction_scores`.
     """
-    poses = ranking.hypotheses if isinstance(ranking, Registration) else ()
-    ranking = ranking.ranking if isinstance(ranking, Registration) else ranking
+    poses: Sequence[Hypothesis] = ()
+    if isinstance(ranking, Registration):
+        poses, ranking = ranking.hypotheses, ranking.ranking
     scores = direction_scores(bank, ranking, image_index=image_index, model=model)
     figure = _figure(7.0, 3.8)
     axes = figure.subplots()
     picture = axes.imshow(sphere_map(*scores), extent=(0, 360, -90, 90), aspect="auto", cmap="viridis")
     figure.colorbar(picture, ax=axes, label="score S")
-    axes.set(
-        xlabel="azimuth, degrees", ylabel="elevation, degrees", xticks=range(0, 361, 45), yticks=range(-90, 91, 30)
-    )
+    axes.set(xlabel="azimuth, degrees", xticks=range(0, 361, 45))
+    axes.set(ylabel="elevation, degrees", yticks=range(-90, 91, 30))
     for number, pose in enumerate(poses, start=1):
         if pose.model == model:
             azimuth, elevation, _ = pose.viewpoint
@@ -82,10 +73,7 @@ def view_sphere(bank: ViewBank, ranking: Ranking | Registration, *, image_index:
 
 
 def fields(registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any) -> Any:
-    """The photograph and its field, the pose and its field.
-
-    Arguments and errors as for :func:`curvireg_torch.visualization.contour_overlay`.
-    """
+    """The photograph and its field, the pose and its field; arguments as for :func:`.contour_overlay`."""
     pictures = side_pictures(registrar, result, image, box)
     figure = _figure(10.0, 2.9)
     for axes, (name, picture) in zip(figure.subplots(1, len(pictures)), pictures.items(), strict=True):
@@ -95,19 +83,14 @@ def fields(registrar: Registrar, result: Registration | Hypothesis, image: Any, 
     return figure
 
 
-def curves(columns: Sequence[str], rows: Sequence[Row], *, title: str = "", ylabel: str = "fraction") -> Any:
+def curves(columns: Sequence[str], rows: Sequence[Row]) -> Any:
     """Curves over the first column, for example precision at rank k.
 
-    Args:
-        columns: names; the first one labels the abscissa.
-        rows: as long as ``columns``.
-        title, ylabel: labels.
-
     Raises:
-        InvalidInputError: rows of other lengths, or none.
+        InvalidInputError: no rows, or rows that are not as long as ``columns``.
 
     Example:
-        >>> figure = curves(["k", "CS/MFC"], [[1, 0.5], [3, 0.7], [5, 0.8]], ylabel="precision")
+        >>> figure = curves(["k", "CS/MFC"], [[1, 0.5], [3, 0.7], [5, 0.8]])
         >>> figure.axes[0].lines[0].get_ydata().tolist()
         [0.5, 0.7, 0.8]
     """
@@ -115,24 +98,19 @@ def curves(columns: Sequence[str], rows: Sequence[Row], *, title: str = "", ylab
     axes = _axes(7.0, 4.0)
     for name, y in values.items():
         axes.plot([float(row[0]) for row in rows], y, marker="." if len(rows) < 12 else "", label=name)
-    axes.set(xlabel=columns[0], ylabel=ylabel, title=title)
+    axes.set(xlabel=columns[0], ylabel="fraction")
     axes.legend(fontsize="small", ncols=2)
     return axes.figure
 
 
-def bars(columns: Sequence[str], rows: Sequence[Row], *, title: str = "", ylabel: str = "fraction") -> Any:
-    """A group of bars for each row, for example precision by class.
-
-    Args:
-        columns: names; the first one is that of the groups.
-        rows: as long as ``columns``: the name of a group and its numbers.
-        title, ylabel: labels.
+def bars(columns: Sequence[str], rows: Sequence[Row]) -> Any:
+    """A group of bars for each row, for example precision by class; the first column names the groups.
 
     Raises:
-        InvalidInputError: rows of other lengths, or none.
+        InvalidInputError: no rows, or rows that are not as long as ``columns``.
 
     Example:
-        >>> figure = bars(["class", "CS/MFC", "CS/IG"], [["car", 0.5, 0.4], ["sofa", 0.7, 0.6]], ylabel="precision")
+        >>> figure = bars(["class", "CS/MFC", "CS/IG"], [["car", 0.5, 0.4], ["sofa", 0.7, 0.6]])
         >>> [float(bar.get_height()) for bar in figure.axes[0].containers[1]]
         [0.4, 0.6]
     """
@@ -142,7 +120,7 @@ def bars(columns: Sequence[str], rows: Sequence[Row], *, title: str = "", ylabel
     for k, (name, heights) in enumerate(values.items()):
         axes.bar([i + (k + 0.5) * width - 0.4 for i in range(len(rows))], heights, width, label=name)
     axes.set_xticks(range(len(rows)), [str(row[0]) for row in rows], rotation=30, ha="right")
-    axes.set(ylabel=ylabel, title=title)
+    axes.set(ylabel="fraction")
     axes.legend(fontsize="small", ncols=2)
     return axes.figure
 
@@ -161,7 +139,6 @@ def azimuth_confusion(azimuth: Tensor, truth: Tensor, *, bins: int = 8) -> Any:
 
     Args:
         azimuth, truth: (N,) degrees; pairs with NaN are left out.
-        bins: number of bins.
 
     Raises:
         InvalidInputError: different lengths, or no pair.
@@ -185,9 +162,8 @@ def azimuth_confusion(azimuth: Tensor, truth: Tensor, *, bins: int = 8) -> Any:
     for row, column in count.nonzero().tolist():
         colour = "white" if fraction[row, column] > 0.5 else "black"
         axes.text(column, row, str(int(count[row, column])), ha="center", va="center", color=colour, fontsize=8)
-    centres = [f"{360 * i / bins:g}" for i in range(bins)]
-    axes.set_xticks(range(bins), centres)
-    axes.set_yticks(range(bins), centres)
+    for set_ticks in (axes.set_xticks, axes.set_yticks):
+        set_ticks(range(bins), [f"{360 * i / bins:g}" for i in range(bins)])
     axes.set(xlabel="estimated azimuth, degrees", ylabel="true azimuth, degrees")
     figure.colorbar(picture, ax=axes, label="fraction of the true bin")
     return figure
@@ -199,8 +175,7 @@ def reliability(confidence: Tensor, correct: Tensor, *, bins: int = 10) -> Any:
     A calibrated confidence lies on the diagonal; below it, it is too high. Areas are the numbers of results.
 
     Args:
-        confidence: (N,) in [0, 1].
-        correct: (N,) bool.
+        confidence, correct: (N,) in [0, 1] and (N,) bool.
         bins: number of bins of equal width.
 
     Raises:
@@ -230,12 +205,7 @@ def reliability(confidence: Tensor, correct: Tensor, *, bins: int = 10) -> Any:
 def risk_coverage(confidence: Tensor, correct: Tensor) -> Any:
     """Risk-coverage curve: fraction of wrong results among the most confident ones, over the fraction that is kept.
 
-    Args:
-        confidence: (N,) in [0, 1].
-        correct: (N,) bool.
-
-    Raises:
-        InvalidInputError: different lengths, empty, or outside [0, 1].
+    Arguments and errors as for :func:`reliability`.
 
     Example:
         >>> figure = risk_coverage(torch.tensor([0.9, 0.2, 0.5, 0.7]), torch.tensor([True, False, False, True]))
@@ -261,8 +231,7 @@ def errors_by_class(categories: Sequence[str], errors: Tensor, *, threshold_deg:
     """Every error as a mark, class by class, lowest median first; diamonds are medians.
 
     Args:
-        categories: classes of N objects.
-        errors: (N,) degrees; ``inf`` for a miss, which is drawn above 180.
+        categories, errors: classes of N objects, and (N,) degrees; ``inf`` for a miss, which is drawn above 180.
         threshold_deg: largest correct error, for the fractions beside the names.
 
     Raises:

@@ -30,14 +30,12 @@ def pose_glb(
 ) -> bytes:
     """A GLB file: the mesh at its pose, a camera at the origin, and the photograph on a plane behind the mesh.
 
-    Lengths are metres and y points up, as glTF requires. From the camera "photograph", a viewer shows the mesh over the
-    photograph. A glTF camera has no principal point, so the exact camera and the pose, in the mesh's unit, are in the
-    ``extras`` of the camera's node. Textures are reduced to colours of vertices.
+    Lengths are metres and y points up, as glTF requires. A glTF camera has no principal point, so the exact camera and
+    the pose, in the mesh's unit, are in the ``extras`` of the node "photograph". Textures become colours of vertices.
 
     Args:
         mesh: from :func:`curvireg_torch.load_mesh`, with its unit in ``mesh.units``.
-        T_cam_from_model: (4, 4), OpenCV camera, in the mesh's unit.
-        camera_matrix: (3, 3) px.
+        T_cam_from_model, camera_matrix: (4, 4), OpenCV camera, in the mesh's unit; (3, 3) px.
         image: (1 or 3, H, W) floating in [0, 1] or uint8.
         photograph: False leaves the plane out.
 
@@ -59,7 +57,7 @@ def pose_glb(
     if depth <= 0:
         raise InvalidInputError("T_cam_from_model: the object is behind the camera; check the pose")
     H, W = (int(n) for n in image.shape[-2:])
-    unit = mesh_unit(mesh) or "m"  # glTF is in metres
+    unit = mesh_unit(mesh) or "m"
     metres = UNITS[unit]
     scale = np.diag([metres, metres, metres, 1.0])
     scene = trimesh.Scene()
@@ -110,18 +108,15 @@ def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def _photograph_plane(image: Tensor, K: Tensor, depth: float) -> trimesh.Trimesh:
     """The photograph as a plane at a depth, in OpenCV's camera frame."""
     H, W = (int(n) for n in image.shape[-2:])
-    edges = [(-0.5, -0.5), (W - 0.5, -0.5), (W - 0.5, H - 0.5), (-0.5, H - 0.5)]
-    pixels = torch.tensor([[u, v, 1.0] for u, v in edges], dtype=torch.float64)
+    right, bottom = W - 0.5, H - 0.5
+    edges = [[-0.5, -0.5, 1.0], [right, -0.5, 1.0], [right, bottom, 1.0], [-0.5, bottom, 1.0]]
+    pixels = torch.tensor(edges, dtype=torch.float64)
     corners = (depth * pixels @ torch.linalg.inv(K).T).numpy()
     uv = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
     faces = np.array([[0, 3, 2], [0, 2, 1]])  # counterclockwise after the flip
+    texture = Image.open(BytesIO(jpeg(shrink(to_uint8(image), _PHOTO_SIDE), 85)))  # exporters write it as JPEG
     material = trimesh.visual.material.PBRMaterial(
-        name="picture", baseColorTexture=_jpeg(image), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
+        name="picture", baseColorTexture=texture, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
     )
     visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
     return trimesh.Trimesh(corners, faces, visual=visual, process=False)
-
-
-def _jpeg(image: Tensor) -> Any:
-    """A small copy of the photograph that exporters write as JPEG."""
-    return Image.open(BytesIO(jpeg(shrink(to_uint8(image), _PHOTO_SIDE), 85)))

@@ -17,11 +17,8 @@ from .overlay import draw_pose
 
 __all__ = ["SheetEntry", "thumbnail", "write_sheet"]
 
-SIDE = 224
-"""Longer side of a thumbnail in px."""
-
-MAX_ENTRIES = 500
-"""Of the best, and of the worst: a larger page would be slow to open."""
+SIDE = 224  # longer side of a thumbnail in px
+MAX_ENTRIES = 500  # of the best, and of the worst: a larger page would be slow to open
 
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>curvireg: {title}</title><style>
@@ -44,9 +41,7 @@ class SheetEntry:
     """A photograph on the page.
 
     Attributes:
-        number: of its row, from 1.
-        name: of the photograph.
-        caption: the outcome in words.
+        number, name, caption: of its row, from 1; of the photograph; the outcome in words.
         kind: "right" or "reliable" (green), "doubtful" (orange), "wrong" or "failed" (red).
         picture: returns its thumbnail or None; called only for entries that are written.
     """
@@ -59,29 +54,24 @@ class SheetEntry:
 
 
 def thumbnail(renderer: DepthRenderer, projection: tuple[Tensor, Tensor], image: Tensor, box: Sequence[float]) -> bytes:
-    """JPEG of the photograph around the box, with the mesh's contours at the pose.
+    """JPEG of a (3, H, W) uint8 photograph around a box in px, with the mesh's contours at the pose.
 
-    Args:
-        renderer: of the mesh.
-        projection: (4, 4) ``T_cam_from_model`` and (3, 3) camera matrix in px of the photograph, see
-            :class:`~curvireg_torch.registration.Hypothesis`.
-        image: (3, H, W) uint8.
-        box: x0, y0, x1, y1 px.
+    ``projection`` is ``T_cam_from_model`` (4, 4) and the camera matrix (3, 3) of the photograph.
     """
     H, W = image.shape[-2:]
-    margin = 0.25 * max(box[2] - box[0], box[3] - box[1])
-    left, top = (max(0, int(v - margin)) for v in box[:2])
-    right, bottom = min(W, int(box[2] + margin) + 1), min(H, int(box[3] + margin) + 1)
+    x0, y0, x1, y1 = box
+    margin = 0.25 * max(x1 - x0, y1 - y0)
+    left, top = max(0, int(x0 - margin)), max(0, int(y0 - margin))
+    right, bottom = min(W, int(x1 + margin) + 1), min(H, int(y1 + margin) + 1)
     scale = min(1.0, SIDE / max(right - left, bottom - top))
     size = max(1, round((right - left) * scale)), max(1, round((bottom - top) * scale))
-    small = cv2.resize(
-        image[:, top:bottom, left:right].permute(1, 2, 0).numpy(), size, interpolation=cv2.INTER_AREA
-    ).reshape(size[1], size[0], 3)
+    cropped = image[:, top:bottom, left:right].permute(1, 2, 0).numpy()
+    small = cv2.resize(cropped, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], 3)
     x, y = size[0] / (right - left), size[1] / (bottom - top)
     to_small = torch.tensor(
         [[x, 0.0, x * (0.5 - left) - 0.5], [0.0, y, y * (0.5 - top) - 0.5], [0.0, 0.0, 1.0]], dtype=torch.float64
     )
-    corners = torch.tensor([[box[0], box[2]], [box[1], box[3]], [1.0, 1.0]], dtype=torch.float64)
+    corners = torch.tensor([[x0, x1], [y0, y1], [1.0, 1.0]], dtype=torch.float64)
     (x0, x1), (y0, y1), _ = (to_small @ corners).tolist()
     T, K = projection
     draw_pose(small, renderer, (T, to_small @ K), (x0, y0, x1, y1))
@@ -92,8 +82,7 @@ def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: st
     """Write the page as one file.
 
     Args:
-        path: of the page.
-        title: summary of the results.
+        path, title: of the page.
         rows: entries, best first.
         table: name of the file that has all of them.
         each: number of the best, and of the worst, that are shown (default: 500).
@@ -108,9 +97,9 @@ def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: st
 
 
 def _figure(entry: SheetEntry) -> str:
-    name, thumbnail, picture = html.escape(entry.name), entry.picture(), ""
-    if thumbnail is not None:
-        data = base64.b64encode(thumbnail).decode()
+    name, content, picture = html.escape(entry.name), entry.picture(), ""
+    if content is not None:
+        data = base64.b64encode(content).decode()
         picture = f'<img alt="contours over {name}" src="data:image/jpeg;base64,{data}">'
     caption = f"<b>{entry.number}</b> {name}<br>{html.escape(entry.caption)}"
     return f'<figure class="{entry.kind}">{picture}<figcaption>{caption}</figcaption></figure>'

@@ -16,12 +16,6 @@ def direction_scores(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Best score of every viewing direction of a bank, over in-plane rotations and distances.
 
-    Args:
-        bank: N views.
-        ranking: of these views.
-        image_index: photograph of the ranking.
-        model: mesh of the bank.
-
     Returns:
         azimuth and elevation (M,) in degrees, [0, 360) and [-90, 90], and score (M,); float64.
 
@@ -59,19 +53,13 @@ def direction_scores(
 def sphere_map(
     azimuth: Tensor, elevation: Tensor, score: Tensor, *, size: tuple[int, int] = (180, 360)
 ) -> NDArray[np.float64]:
-    """Map of scores: rows from elevation 90 to -90, columns from azimuth 0 to 360.
+    """Map of scores of (M,) directions: rows from elevation 90 to -90, columns from azimuth 0 to 360.
 
-    Args:
-        azimuth, elevation, score: (M,) of directions.
-        size: (rows, columns).
-
-    Returns:
-        Score of the direction nearest to each cell's centre; NaN if it is farther away than any direction is from its
-        nearest neighbour.
+    A cell has the score of the nearest direction, or NaN if that is farther away than any direction is from its
+    nearest neighbour.
 
     Example:
-        >>> scores = sphere_map(torch.tensor([0.0, 180.0]), torch.zeros(2), torch.tensor([1.0, 2.0]), size=(1, 4))
-        >>> scores.tolist()
+        >>> sphere_map(torch.tensor([0.0, 180]), torch.zeros(2), torch.tensor([1.0, 2]), size=(1, 4)).tolist()
         [[1.0, 2.0, 2.0, 1.0]]
     """
     rows, columns = size

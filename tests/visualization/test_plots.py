@@ -58,7 +58,7 @@ def test_curves_and_bars_draw_the_columns():
     assert [line.get_label() for line in axes.lines] == ["mfc", "ig"]
     assert axes.lines[1].get_xdata().tolist() == [-10, 0, 10]
     assert axes.lines[1].get_ydata().tolist() == [0.2, 0.4, 0.1]
-    axes = plots.bars(["class", "mfc", "ig"], [["car", 0.1, 0.2], ["sofa", 0.5, 0.4]], title="Precision").axes[0]
+    axes = plots.bars(["class", "mfc", "ig"], [["car", 0.1, 0.2], ["sofa", 0.5, 0.4]]).axes[0]
     assert [[bar.get_height() for bar in group] for group in axes.containers] == [[0.1, 0.5], [0.2, 0.4]]
     assert [text.get_text() for text in axes.get_xticklabels()] == ["car", "sofa"]
     assert [round(bar.get_x(), 6) for bar in axes.containers[1]] == [0.0, 1.0]
