@@ -1,7 +1,7 @@
 """The command ``curvireg``.
 
-Each command is a module with ``add_parser`` and ``run``. It imports heavy modules only in ``run``, so that help and
-errors in options appear at once. ``run`` raises :class:`CurviregError` for input that cannot be used.
+Each command is a module: ``add_parser`` adds it to the subparsers, ``run`` runs it. It imports heavy modules only in
+``run``, so that help and errors in options appear at once. ``run`` raises :class:`CurviregError` for unusable input.
 """
 
 import argparse
@@ -69,15 +69,11 @@ def _run(arguments: argparse.Namespace) -> int:
             warnings.showwarning = _show_warning
         try:
             arguments.run(arguments)
-        except CurviregError as error:
-            if arguments.debug:
-                raise
-            print(f"curvireg: error: {error}", file=sys.stderr)
-            return 2
-        except OSError as error:
+        except (CurviregError, OSError) as error:
             if arguments.debug or isinstance(error, BrokenPipeError):
                 raise
-            print(f"curvireg: error: {error}; check that it exists and can be read", file=sys.stderr)
+            advice = "" if isinstance(error, CurviregError) else "; check that it exists and can be read"
+            print(f"curvireg: error: {error}{advice}", file=sys.stderr)
             return 2
         except KeyboardInterrupt:
             print("curvireg: interrupted", file=sys.stderr)

@@ -9,11 +9,8 @@ from ..utils.files import check_writable
 from ..utils.input_paths import check_given
 from .options import common_options, examples, mesh_options, pipeline_options, register_options
 
-__all__ = ["add_parser", "run"]
-
 
 def add_parser(commands: Any) -> None:
-    """Add ``bank`` to the subparsers."""
     parser = commands.add_parser(
         "bank",
         parents=[common_options(), pipeline_options(), mesh_options()],

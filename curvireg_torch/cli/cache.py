@@ -6,11 +6,8 @@ from typing import Any
 
 from .options import common_options, examples
 
-__all__ = ["add_parser", "run"]
-
 
 def add_parser(commands: Any) -> None:
-    """Add ``cache`` to the subparsers."""
     parser = commands.add_parser(
         "cache",
         parents=[common_options()],

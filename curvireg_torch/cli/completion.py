@@ -7,11 +7,8 @@ from typing import Any
 
 from .options import examples
 
-__all__ = ["add_parser", "run"]
-
 
 def add_parser(commands: Any) -> None:
-    """Add ``completion`` to the subparsers."""
     parser = commands.add_parser(
         "completion",
         help="print a script that completes this command line",

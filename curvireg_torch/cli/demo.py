@@ -8,11 +8,8 @@ from typing import Any
 from ..utils.files import check_writable, write_file
 from .options import common_options, examples, pipeline_options, register_options
 
-__all__ = ["add_parser", "run"]
-
 
 def add_parser(commands: Any) -> None:
-    """Add ``demo`` to the subparsers."""
     parser = commands.add_parser(
         "demo",
         parents=[common_options(), pipeline_options()],

@@ -10,8 +10,6 @@ from ..evaluation.registry import DATASETS
 from ..utils.choices import DEFAULT, PRESET_NAMES
 from .options import common_options, examples
 
-__all__ = ["add_parser", "run"]
-
 PROTOCOL = (
     "cad=annotated|any|fused: the annotated CAD model, the best of the class, or one vote of all of the class; "
     "pose=upright|any: whether objects are known to stand upright; "
@@ -20,7 +18,6 @@ PROTOCOL = (
 
 
 def add_parser(commands: Any) -> None:
-    """Add ``evaluate`` and its datasets to the subparsers."""
     parser = commands.add_parser(
         "evaluate", help="register and score a dataset", **examples("curvireg evaluate bop data/bop/lm --out out/lm")
     )

@@ -14,18 +14,7 @@ if TYPE_CHECKING:
     from ..evaluation.opening import RegisterOptions
     from ..geometry.pose_prior import PosePrior
 
-__all__ = [
-    "add_box_and_camera",
-    "add_pose_prior",
-    "common_options",
-    "examples",
-    "mesh_options",
-    "pipeline_options",
-    "register_options",
-    "split_numbers",
-]
-
-_COUNTS = {"--box": 4, "--camera": 4, "--distance": 2, "--azimuth": 2, "--elevation": 2, "--theta": 2}
+_COUNTS = {"--box": 4, "--camera": 4, "--distance": 2}
 _NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
 

@@ -15,8 +15,6 @@ from .options import add_box_and_camera, common_options, examples, mesh_options,
 if TYPE_CHECKING:
     from ..evaluation.opening import RegisterOptions
 
-__all__ = ["add_parser", "run"]
-
 REGISTERED = {
     "sphere": "score over the viewing directions, and the hypotheses",
     "fields": "the photograph and its field, the pose and its field",
@@ -33,7 +31,6 @@ FORMATS = (".png", ".svg", ".pdf")
 
 
 def add_parser(commands: Any) -> None:
-    """Add ``plot`` and its kinds to the subparsers."""
     plot = commands.add_parser(
         "plot",
         help="draw a figure of a registration or an evaluation",

@@ -26,11 +26,8 @@ if TYPE_CHECKING:
     from ..evaluation.lists import PhotoList
     from ..evaluation.opening import RegisterOptions
 
-__all__ = ["add_parser", "complete", "run"]
-
 
 def add_parser(commands: Any) -> None:
-    """Add ``register`` to the subparsers."""
     parser = commands.add_parser(
         "register",
         parents=[common_options(), pipeline_options(), mesh_options()],

@@ -6,11 +6,8 @@ from typing import Any
 
 from .options import examples
 
-__all__ = ["add_parser", "run"]
-
 
 def add_parser(commands: Any) -> None:
-    """Add ``schema`` to the subparsers."""
     parser = commands.add_parser(
         "schema",
         help="print the JSON schema of results",

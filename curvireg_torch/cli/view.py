@@ -8,13 +8,10 @@ from ..errors import MissingDependencyError
 from ..utils.input_paths import check_given
 from .options import add_box_and_camera, common_options, examples, mesh_options, pipeline_options, register_options
 
-__all__ = ["add_parser", "run"]
-
 LOCAL = "127.0.0.1"
 
 
 def add_parser(commands: Any) -> None:
-    """Add ``view`` to the subparsers."""
     parser = commands.add_parser(
         "view",
         parents=[common_options(), pipeline_options(), mesh_options()],

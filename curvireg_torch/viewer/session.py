@@ -1,9 +1,11 @@
 """The state of one page: inputs, result and displayed pose. It needs no page and no NiceGUI."""
 
+import math
+import shlex
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,6 @@ from ..matching import ViewBank
 from ..registration import Registrar, Registration
 from ..registration.document import used_box
 from ..visualization import pose_glb
-from .command_line import command_line
 from .editing import DisplayedPose, fit_displayed, move_displayed
 
 __all__ = ["MAX_PROPOSALS", "Result", "Session"]
@@ -30,6 +31,9 @@ __all__ = ["MAX_PROPOSALS", "Result", "Session"]
 MAX_PROPOSALS = 5  # proposed boxes that are drawn where the object was localized
 
 Numbers = tuple[float, float, float, float]
+
+_OPTIONS = ("unit", "up", "pose", "preset", "pipeline", "renderer", "device")
+_DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
 
 
 @dataclass(frozen=True)
@@ -135,7 +139,7 @@ class Session:
 
     def command(self) -> str:
         """The command line that gives the same result."""
-        return command_line(self.request(), self.names)
+        return _command_line(self.request(), self.names)
 
     def register(self) -> Registration:
         """Find the pose, as ``curvireg register`` does.
@@ -156,7 +160,7 @@ class Session:
             entry = replace(entry, name=self.names[entry.photo], meshes=tuple(names[p] for p in entry.meshes))
             ready = time.perf_counter() - start
             registration, document = register_entry(entry, photo, registrar, bank_seconds=ready)
-        box, command = torch.tensor(used_box(document)), command_line(request, self.names)
+        box, command = torch.tensor(used_box(document)), _command_line(request, self.names)
         self.result = Result(registrar, registration, document, photo.image, box, command)
         self.display(0)
         return registration
@@ -240,3 +244,25 @@ class Session:
             yield
         except CurviregError as error:
             raise error.with_subject(self.names.get(Path(error.subject), error.subject)) from error
+
+
+def _command_line(options: RegisterOptions, names: Mapping[Path, str]) -> str:
+    """``curvireg register`` with these options; ``names`` are what the user calls the files."""
+    words = ["curvireg", "register"]
+    for paths, placeholder in ((options.photos, "PHOTO"), (options.meshes, "MESH")):
+        words += [names[path] for path in paths] or [placeholder]
+    for name, numbers in (("--box", options.box), ("--camera", options.camera)):
+        words += [] if numbers is None else [name, *map(_number, numbers)]
+    if isinstance(options.guess, float):
+        words += ["--fov", _number(options.guess)]
+    elif options.guess is not None:
+        words += ["--camera", options.guess]
+    for name in _OPTIONS:
+        value = getattr(options, name)
+        if value != _DEFAULTS[name]:
+            words += [f"--{name}={value}"] if str(value).startswith("-") else [f"--{name}", str(value)]
+    return shlex.join([*words, "--out", "result"])
+
+
+def _number(value: float) -> str:
+    return repr(int(value)) if math.isfinite(value) and value == int(value) else repr(float(value))

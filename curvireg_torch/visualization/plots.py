@@ -1,6 +1,7 @@
 """Figures of numbers, one function each, as ``matplotlib.figure.Figure``: ``.savefig("a.png")`` writes them.
 
-They need matplotlib (``pip install 'curvireg_torch[plot]'``) and raise :class:`MissingDependencyError` without it.
+They need matplotlib (``pip install 'curvireg_torch[plot]'``) and raise :class:`MissingDependencyError` without it, and
+:class:`InvalidInputError` for empty inputs, unequal lengths and numbers out of range.
 """
 
 from collections.abc import Sequence
@@ -30,8 +31,7 @@ __all__ = [
 
 Row = Sequence[str | float]
 
-_MISS = 200.0
-"""Position in degrees at which an object without an estimate is drawn."""
+_MISS = 200.0  # position in degrees at which an object without an estimate is drawn
 
 
 def _figure(width: float, height: float) -> Any:
@@ -83,11 +83,8 @@ def fields(registrar: Registrar, result: Registration | Hypothesis, image: Any, 
     return figure
 
 
-def curves(columns: Sequence[str], rows: Sequence[Row]) -> Any:
+def curves(columns: Sequence[str], rows: Sequence[Row], *, title: str = "", ylabel: str = "fraction") -> Any:
     """Curves over the first column, for example precision at rank k.
-
-    Raises:
-        InvalidInputError: no rows, or rows that are not as long as ``columns``.
 
     Example:
         >>> figure = curves(["k", "CS/MFC"], [[1, 0.5], [3, 0.7], [5, 0.8]])
@@ -98,16 +95,13 @@ def curves(columns: Sequence[str], rows: Sequence[Row]) -> Any:
     axes = _axes(7.0, 4.0)
     for name, y in values.items():
         axes.plot([float(row[0]) for row in rows], y, marker="." if len(rows) < 12 else "", label=name)
-    axes.set(xlabel=columns[0], ylabel="fraction")
+    axes.set(xlabel=columns[0], ylabel=ylabel, title=title)
     axes.legend(fontsize="small", ncols=2)
     return axes.figure
 
 
-def bars(columns: Sequence[str], rows: Sequence[Row]) -> Any:
+def bars(columns: Sequence[str], rows: Sequence[Row], *, title: str = "", ylabel: str = "fraction") -> Any:
     """A group of bars for each row, for example precision by class; the first column names the groups.
-
-    Raises:
-        InvalidInputError: no rows, or rows that are not as long as ``columns``.
 
     Example:
         >>> figure = bars(["class", "CS/MFC", "CS/IG"], [["car", 0.5, 0.4], ["sofa", 0.7, 0.6]])
@@ -120,7 +114,7 @@ def bars(columns: Sequence[str], rows: Sequence[Row]) -> Any:
     for k, (name, heights) in enumerate(values.items()):
         axes.bar([i + (k + 0.5) * width - 0.4 for i in range(len(rows))], heights, width, label=name)
     axes.set_xticks(range(len(rows)), [str(row[0]) for row in rows], rotation=30, ha="right")
-    axes.set(ylabel="fraction")
+    axes.set(ylabel=ylabel, title=title)
     axes.legend(fontsize="small", ncols=2)
     return axes.figure
 
@@ -135,13 +129,8 @@ def _columns(columns: Sequence[str], rows: Sequence[Row]) -> dict[str, list[floa
 def azimuth_confusion(azimuth: Tensor, truth: Tensor, *, bins: int = 8) -> Any:
     """Confusion matrix of azimuth bins, as fractions of each true bin; the numbers are counts.
 
-    Bins are those of :func:`curvireg_torch.metrics.azimuth_bin`. Errors of 180 degrees form a second diagonal.
-
-    Args:
-        azimuth, truth: (N,) degrees; pairs with NaN are left out.
-
-    Raises:
-        InvalidInputError: different lengths, or no pair.
+    Azimuths are (N,) degrees; pairs with NaN are left out. Bins are those of
+    :func:`curvireg_torch.metrics.azimuth_bin`. Errors of 180 degrees form a second diagonal.
 
     Example:
         >>> figure = azimuth_confusion(torch.tensor([1.0, 2.0, 181.0]), torch.tensor([0.0, 180.0, 180.0]), bins=4)
@@ -172,14 +161,8 @@ def azimuth_confusion(azimuth: Tensor, truth: Tensor, *, bins: int = 8) -> Any:
 def reliability(confidence: Tensor, correct: Tensor, *, bins: int = 10) -> Any:
     """Reliability diagram: fraction of correct results over mean confidence, bin by bin.
 
-    A calibrated confidence lies on the diagonal; below it, it is too high. Areas are the numbers of results.
-
-    Args:
-        confidence, correct: (N,) in [0, 1] and (N,) bool.
-        bins: number of bins of equal width.
-
-    Raises:
-        InvalidInputError: different lengths, empty, or outside [0, 1].
+    Confidences are (N,) in [0, 1], ``correct`` is (N,) bool. A calibrated confidence lies on the diagonal; below it, it
+    is too high. Areas are the numbers of results.
 
     Example:
         >>> figure = reliability(torch.tensor([0.91, 0.93, 0.15]), torch.tensor([True, False, False]))
@@ -205,7 +188,7 @@ def reliability(confidence: Tensor, correct: Tensor, *, bins: int = 10) -> Any:
 def risk_coverage(confidence: Tensor, correct: Tensor) -> Any:
     """Risk-coverage curve: fraction of wrong results among the most confident ones, over the fraction that is kept.
 
-    Arguments and errors as for :func:`reliability`.
+    Confidences are (N,) in [0, 1], ``correct`` is (N,) bool.
 
     Example:
         >>> figure = risk_coverage(torch.tensor([0.9, 0.2, 0.5, 0.7]), torch.tensor([True, False, False, True]))
@@ -230,12 +213,8 @@ def risk_coverage(confidence: Tensor, correct: Tensor) -> Any:
 def errors_by_class(categories: Sequence[str], errors: Tensor, *, threshold_deg: float = 30.0) -> Any:
     """Every error as a mark, class by class, lowest median first; diamonds are medians.
 
-    Args:
-        categories, errors: classes of N objects, and (N,) degrees; ``inf`` for a miss, which is drawn above 180.
-        threshold_deg: largest correct error, for the fractions beside the names.
-
-    Raises:
-        InvalidInputError: different lengths, or empty.
+    Errors are (N,) degrees, ``inf`` for a miss, which is drawn above 180. Beside the names are the fractions of errors
+    below ``threshold_deg``.
 
     Example:
         >>> figure = errors_by_class(["car", "sofa", "car"], torch.tensor([4.0, 90.0, torch.inf]))
