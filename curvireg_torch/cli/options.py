@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ..evaluation.opening import RegisterOptions
     from ..geometry.pose_prior import PosePrior
 
-_COUNTS = {"--box": 4, "--camera": 4, "--distance": 2}
+_COUNTS = {"--box": 4, "--camera": 4, "--distance": 2, "--azimuth": 2, "--elevation": 2, "--theta": 2}
 _NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
 
