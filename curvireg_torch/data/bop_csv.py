@@ -1,7 +1,6 @@
 """Results files of the BOP challenge: one line per pose estimate."""
 
 import csv
-import io
 import math
 import os
 from collections.abc import Iterable
@@ -14,7 +13,7 @@ from torch import Tensor
 from ..errors import InvalidInputError, MissingFileError
 from ..io.json_files import check_table_size, finite_numbers
 from ..utils.checks import check_tensor
-from ..utils.files import write_file
+from ..utils.files import write_csv
 
 _HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
 
@@ -53,13 +52,8 @@ def write_bop_csv(path: str | os.PathLike[str], rows: Iterable[BOPRow]) -> None:
     path = Path(path)
     if not path.parent.is_dir():
         raise MissingFileError("no such folder; create it before writing results", subject=path.parent)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_HEADER)
     times: dict[tuple[int, int], float] = {}
-    for number, row in enumerate(rows):
-        writer.writerow(_cells(row, f"row {number}", times))
-    write_file(path, text.getvalue().encode("ascii"))
+    write_csv(path, [_HEADER, *(_cells(row, f"row {number}", times) for number, row in enumerate(rows))])
 
 
 def _cells(row: BOPRow, name: str, times: dict[tuple[int, int], float]) -> list[str]:

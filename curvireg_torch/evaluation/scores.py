@@ -1,25 +1,23 @@
 """Scores and tables that several benchmarks share."""
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..geometry import viewpoint_from_rotation
 from ..metrics import accuracy, median_error
-from ..utils.files import write_file
+from ..utils.files import write_csv
+from .store import Row
 
 __all__ = ["THRESHOLDS", "estimated_rotations", "or_inf", "viewpoint_scores", "write_viewpoints"]
 
 THRESHOLDS = {"acc_15_deg": 15.0, "acc_30_deg": 30.0}
 
 
-def viewpoint_scores(errors: Tensor, thresholds: dict[str, float]) -> dict[str, Any]:
+def viewpoint_scores(errors: Tensor, thresholds: dict[str, float]) -> Row:
     """``n``, one accuracy for each threshold, and ``med_err_deg``.
 
     Args:
@@ -34,7 +32,7 @@ def viewpoint_scores(errors: Tensor, thresholds: dict[str, float]) -> dict[str, 
     return {"n": len(errors), **accuracies, "med_err_deg": median_error(errors)}
 
 
-def estimated_rotations(rows: Sequence[Mapping[str, Any]]) -> Tensor:
+def estimated_rotations(rows: Sequence[Row]) -> Tensor:
     """(N, 3, 3) float64; NaN for rows without an estimate."""
     missing = [[float("nan")] * 3] * 3
     return torch.tensor([row.get("rotation", missing) for row in rows], dtype=torch.float64).view(-1, 3, 3)
@@ -48,32 +46,29 @@ def or_inf(errors: Tensor, R: Tensor) -> Tensor:
 def write_viewpoints(
     path: Path,
     columns: Sequence[str],
-    samples: Sequence[Mapping[str, Any]],
-    rows: Sequence[Mapping[str, Any]],
+    samples: Sequence[Row],
+    rows: Sequence[Row],
     errors: Mapping[str, Tensor],
 ) -> None:
-    """Write a table with one line for each object; ``path`` appears when it is complete.
+    """Write a table with one line for each object.
 
     Args:
         path: of the table.
-        columns: keys of samples, rows and errors; estimated angles; true angles as ``true_azimuth``, ...
+        columns: keys of samples, rows and errors (N,); estimated angles; true angles as ``true_azimuth``, ...
         samples: annotations with ``viewpoint`` (3,), NaN where unknown.
-        rows: results.
-        errors: (N,) degrees, by column.
+        rows, errors: results, and degrees by column.
     """
     names = ("azimuth", "elevation", "theta")
     R = estimated_rotations(rows)
-    text = io.StringIO()
-    table = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
-    table.writeheader()
+    lines: list[Sequence[object]] = [columns]
     for i, (sample, row) in enumerate(zip(samples, rows, strict=True)):
         line = {**sample, **row, "seconds": row["seconds"]["register"]}
         line |= {f"true_{name}": float(v) for name, v in zip(names, sample["viewpoint"], strict=True)}
         line |= {name: float(values[i]) for name, values in errors.items()}
         if "rotation" in row:
             line |= {n: float(v) for n, v in zip(names, viewpoint_from_rotation(R[i]), strict=True)}
-        table.writerow({name: _cell(line.get(name, "")) for name in columns})
-    write_file(path, text.getvalue().encode())
+        lines.append([_cell(line.get(name, "")) for name in columns])
+    write_csv(path, lines)
 
 
 def _cell(value: object) -> object:

@@ -31,13 +31,13 @@ def to_json(value: Any) -> str:
     return json.dumps(finite(value), indent=2, allow_nan=False) + "\n"
 
 
-def _line(row: Mapping[str, Any]) -> bytes:
-    return (json.dumps(finite(dict(row)), allow_nan=False) + "\n").encode()
+def _line(row: Row) -> bytes:
+    return (json.dumps(finite(row), allow_nan=False) + "\n").encode()
 
 
 @dataclass(frozen=True)
 class _Location:
-    """Where a row is on disk, and what decides whether it is still valid."""
+    """Where a row is on disk, and whether it is valid."""
 
     path: Path
     offset: int
@@ -49,10 +49,9 @@ class _Location:
 class ResultStore:
     """One row for each item, in ``results.jsonl`` of a folder.
 
-    A row holds the ``key`` of its item and ``digests`` of everything that it depends on. It is appended and synced as
-    soon as it is known, so that a killed process loses only the item it was working on; a last line that was cut short
-    is ignored, and removed before the next row. Each of several processes appends to a file of its own,
-    ``results.RANK-of-SIZE.jsonl``; readers merge all files. The latest of several rows of one item counts.
+    A row holds the ``key`` of its item and ``digests`` of all that it depends on. It is synced to disk once it is
+    known; a last line that was cut short is ignored, and removed before the next row. Each of several processes appends
+    to ``results.RANK-of-SIZE.jsonl``; readers merge all files. The latest of several rows of one item counts.
 
     Args:
         folder: created with the first row.
@@ -71,20 +70,15 @@ class ResultStore:
 
     def __init__(self, folder: Path, workers: Workers | None = None) -> None:
         workers = workers or Workers()
-        self.folder, self.path = folder, folder / "results.jsonl"
-        self.settings_path = folder / "settings.json"
-        shared = f"results.{workers.rank}-of-{workers.size}.jsonl"
-        self._output = folder / shared if workers.size > 1 else self.path
+        self.folder, self.path, self.settings_path = folder, folder / "results.jsonl", folder / "settings.json"
+        part = folder / f"results.{workers.rank}-of-{workers.size}.jsonl"
+        self._output = part if workers.size > 1 else self.path
         self._in_job_array = workers.size > 1 and not workers.joined
         self._repaired = False
         self.refresh()
 
     def open(self, settings: Row, *, overwrite: bool = False) -> None:
-        """Bind the store to ``settings``, or continue with the same ones.
-
-        Args:
-            settings: plain values.
-            overwrite: delete existing rows and start again.
+        """Bind the store to ``settings`` of plain values, or continue with the same ones; ``overwrite`` deletes rows.
 
         Raises:
             InvalidInputError: the folder holds results of other settings, or ``overwrite`` in a job array.
@@ -120,12 +114,10 @@ class ResultStore:
             InvalidInputError: the file is missing or damaged.
         """
         try:
-            settings = json.loads(self.settings_path.read_text(encoding="utf-8"))
-            return dict(settings.items())
+            return dict(json.loads(self.settings_path.read_text(encoding="utf-8")).items())
         except (OSError, ValueError, AttributeError) as error:
-            raise InvalidInputError(
-                f"{self.settings_path}: missing or damaged ({error}); run curvireg evaluate first"
-            ) from error
+            message = f"{self.settings_path}: missing or damaged ({error}); run curvireg evaluate first"
+            raise InvalidInputError(message) from error
 
     def refresh(self) -> None:
         """Read again what is on disk, rows of other processes included."""
@@ -153,11 +145,7 @@ class ResultStore:
         return found is not None and found.final and bool(digests["photo"]) and found.digests == digests
 
     def read(self, key: str) -> Row:
-        """The latest row of ``key``.
-
-        Raises:
-            InvalidInputError: there is none.
-        """
+        """The latest row of ``key``; :class:`InvalidInputError` if there is none."""
         for _ in range(2):
             if key in self._locations:
                 found = self._locations[key]
@@ -170,11 +158,7 @@ class ResultStore:
         raise InvalidInputError(f"{self.folder}: no result for {key}; run again")
 
     def append(self, row: Row) -> None:
-        """Put a row on disk; numbers that are not finite become null.
-
-        Raises:
-            OutputError: it cannot be written.
-        """
+        """Put a row on disk; numbers that are not finite become null. :class:`OutputError` if this fails."""
         before = self._locations.get(row["key"])
         line = _line(row if before is None else {**row, "revision": before.revision + 1})
         try:
@@ -199,8 +183,8 @@ class ResultStore:
         """Move the latest rows of all processes, none of which may still be running, into ``results.jsonl``."""
         parts = [path for path in self._files() if path != self.path]
         if parts or any(found.revision for found in self._locations.values()):
-            rows = [self.read(key) for key in self._locations]
-            write_file(self.path, b"".join(_line({k: v for k, v in row.items() if k != "revision"}) for row in rows))
+            rows = [{k: v for k, v in self.read(key).items() if k != "revision"} for key in self._locations]
+            write_file(self.path, b"".join(map(_line, rows)))
             for path in parts:
                 path.unlink()
             self.refresh()
@@ -220,9 +204,7 @@ class ResultStore:
     def _remove_cut_line(self) -> None:
         self._repaired = True
         if self._output.is_file():
-            content = self._output.read_bytes()
-            if not content.endswith(b"\n"):
-                os.truncate(self._output, content.rfind(b"\n") + 1)
+            os.truncate(self._output, self._output.read_bytes().rfind(b"\n") + 1)
 
 
 def _parsed(line: bytes) -> Row | None:

@@ -1,12 +1,14 @@
 """Atomic writes of files."""
 
+import csv
 import errno
+import io
 import os
 import secrets
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,6 +42,13 @@ def write_file(path: Path, content: bytes) -> None:
     except OSError as error:
         advice = "make room, or choose" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "choose"
         raise OutputError(f"cannot be written ({error.strerror}); {advice} another place", subject=path) from error
+
+
+def write_csv(path: Path, rows: Iterable[Sequence[object]]) -> None:
+    """:func:`write_file` of rows of comma-separated cells."""
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    write_file(path, text.getvalue().encode())
 
 
 def check_writable(folder: Path, name: str) -> None:

@@ -9,12 +9,11 @@ from typing import Any
 
 from ...data.bop import bop_box, entry_at
 from ...errors import InvalidInputError, MissingFileError
-from ...io.json_files import check_table_size, finite_numbers
+from ...io.json_files import check_table_size, finite_numbers, read_json
+from ..store import Row
 from .entries import BOX, CAMERA, PhotoList, photo_list
 
 __all__ = ["read_list"]
-
-Row = dict[str, Any]
 
 
 def read_list(path: Path, meshes: Sequence[Path] = ()) -> PhotoList:
@@ -27,7 +26,7 @@ def read_list(path: Path, meshes: Sequence[Path] = ()) -> PhotoList:
     - a folder: a scene of a BOP dataset, with the boxes of whole objects, and the models of the dataset if present.
 
     Args:
-        path: the file or folder, to which its paths are relative.
+        path: the file or folder; paths in it are relative to its folder.
         meshes: for rows that name none; of several the best is found.
 
     Raises:
@@ -50,8 +49,8 @@ def read_list(path: Path, meshes: Sequence[Path] = ()) -> PhotoList:
         text = path.read_text(encoding="utf-8-sig")
         if path.suffix.lower() != ".json":
             table = csv.reader(io.StringIO(text, newline=""), strict=True)
-            lines = [cells for cells in table if any(map(str.strip, cells))]
-            return photo_list(str(path), lines[0] if lines else [], lines[1:], path.parent, meshes)
+            columns, *rows = [cells for cells in table if any(map(str.strip, cells))] or [[]]
+            return photo_list(str(path), columns, rows, path.parent, meshes)
         content = json.loads(text)
     except (UnicodeDecodeError, csv.Error) as error:
         raise InvalidInputError(f"{path}: not a table in UTF-8 ({error}); save it as CSV in UTF-8") from error
@@ -74,11 +73,10 @@ def _text(value: Any) -> str:
 
 
 def _row(entry: Mapping[str, Any]) -> Row:
-    """``box`` and ``camera`` as columns; values that are not four numbers are kept, and refused later."""
+    """``box`` and ``camera`` as columns; values that are not four numbers are refused later."""
     row: Row = {"photo": entry.get("photo")}
     for key, names in (("box", BOX), ("camera", CAMERA)):
-        values = entry.get(key)
-        if values is not None:
+        if (values := entry.get(key)) is not None:
             four = values if isinstance(values, list) and len(values) == 4 else [values] * 4
             row |= dict(zip(names, four, strict=True))
     return row | {key: value for key, value in entry.items() if key not in ("photo", "box", "camera")}
@@ -88,36 +86,31 @@ def _coco_rows(path: Path, content: Mapping[str, Any]) -> list[Row]:
     try:
         files = {image["id"]: image["file_name"] for image in content["images"]}
         kinds = {kind["id"]: kind["name"] for kind in content.get("categories", [])}
-        rows = []
-        for annotation in content["annotations"]:
-            box = finite_numbers(annotation.get("bbox"), 4)
-            corners: list[float | str] = ["no bbox"] * 4
-            if box is not None:
-                corners = [box[0] - 0.5, box[1] - 0.5, box[0] + box[2] - 0.5, box[1] + box[3] - 0.5]
-            rows.append(
-                {
-                    "photo": files[annotation["image_id"]],
-                    **dict(zip(BOX, corners, strict=True)),
-                    "image_id": annotation["image_id"],
-                    "annotation_id": annotation.get("id"),
-                    "category": kinds.get(annotation.get("category_id")),
-                }
-            )
+        return [
+            {
+                "photo": files[annotation["image_id"]],
+                **dict(zip(BOX, _coco_corners(annotation.get("bbox")), strict=True)),
+                "image_id": annotation["image_id"],
+                "annotation_id": annotation.get("id"),
+                "category": kinds.get(annotation.get("category_id")),
+            }
+            for annotation in content["annotations"]
+        ]
     except (KeyError, TypeError, AttributeError) as error:
         raise InvalidInputError(f"{path}: not COCO annotations ({type(error).__name__}: {error})") from error
-    return rows
+
+
+def _coco_corners(bbox: object) -> Sequence[float | str]:
+    box = finite_numbers(bbox, 4)
+    if box is None:
+        return ["no bbox"] * 4
+    return [box[0] - 0.5, box[1] - 0.5, box[0] + box[2] - 0.5, box[1] + box[3] - 0.5]
 
 
 def _bop_rows(folder: Path) -> list[Row]:
-    contents = []
-    for name in ("scene_camera.json", "scene_gt.json", "scene_gt_info.json"):
-        if not (folder / name).is_file():
-            raise MissingFileError(f"{folder / name}: no such file; --list takes a scene's folder of a BOP set")
-        check_table_size(folder / name)
-        try:
-            contents.append(json.loads((folder / name).read_text(encoding="utf-8")))
-        except (ValueError, RecursionError) as error:
-            raise InvalidInputError(f"{folder / name}: not JSON ({error})") from error
+    names = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
+    readme = "--list takes the folder of a BOP scene; datasets/README.md"
+    contents = [read_json(folder / name, dict, readme) for name in names]
     try:
         return list(_bop_objects(folder, *contents))
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
@@ -127,8 +120,7 @@ def _bop_rows(folder: Path) -> list[Row]:
 def _bop_objects(folder: Path, cameras: Any, truths: Any, infos: Any) -> Iterator[Row]:
     """Rows of a scene; a text in place of a missing or invalid value makes the row fail later."""
     for key, objects in truths.items():
-        kinds, suffixes = ("rgb", "gray"), (".png", ".jpg", ".tif")
-        pictures = [f"{kind}/{key.zfill(6)}{suffix}" for kind in kinds for suffix in suffixes]
+        pictures = [f"{kind}/{key.zfill(6)}{end}" for kind in ("rgb", "gray") for end in (".png", ".jpg", ".tif")]
         photo = next((name for name in pictures if (folder / name).is_file()), pictures[0])
         camera = cameras.get(key)
         K = finite_numbers(camera.get("cam_K") if isinstance(camera, dict) else None, 9) or ["no cam_K"] * 9

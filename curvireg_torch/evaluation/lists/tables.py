@@ -1,7 +1,5 @@
 """The results of a list as tables: CSV, and the format of the BOP challenge."""
 
-import csv
-import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -9,7 +7,7 @@ import torch
 
 from ...data import BOPRow, write_bop_csv
 from ...utils.choices import UNITS
-from ...utils.files import write_file
+from ...utils.files import write_csv
 from ..store import Row
 
 __all__ = ["BEST_MESH", "RESULT_COLUMNS", "write_bop_results", "write_results"]
@@ -28,20 +26,10 @@ _BOP_NUMBERS = ("scene_id", "im_id", "obj_id")
 
 
 def write_results(path: Path, columns: Sequence[str], rows: Iterable[Row], *, best_mesh: bool) -> None:
-    """Write the table of all rows.
-
-    Args:
-        path: of the table.
-        columns: of the list.
-        rows: results, with the cells of the list as ``columns``.
-        best_mesh: add the column :data:`BEST_MESH`.
-    """
-    table = io.StringIO(newline="")
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow([*columns, *RESULT_COLUMNS, *[BEST_MESH][: int(best_mesh)]])
-    for row in rows:
-        writer.writerow([*row["columns"].values(), *_result_cells(row), *[row.get("mesh", "")][: int(best_mesh)]])
-    write_file(path, table.getvalue().encode())
+    """Write all rows: the cells of the list, which are their ``columns``, results, and :data:`BEST_MESH` if wanted."""
+    lines = [[*columns, *RESULT_COLUMNS, BEST_MESH]]
+    lines += [[*row["columns"].values(), *_result_cells(row), row.get("mesh", "")] for row in rows]
+    write_csv(path, lines if best_mesh else [line[:-1] for line in lines])
 
 
 def _result_cells(row: Row) -> list[str]:
@@ -54,11 +42,7 @@ def _result_cells(row: Row) -> list[str]:
 
 
 def write_bop_results(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
-    """Write the poses that have a translation, in mm; nothing for a list without scene, image and object numbers.
-
-    Args:
-        path, columns, rows: as for :func:`write_results`.
-    """
+    """Write the poses that have a translation, in mm; nothing for a list without scene, image and object numbers."""
     if not set(_BOP_NUMBERS) <= set(columns):
         return
     poses: list[BOPRow] = []
@@ -66,17 +50,11 @@ def write_bop_results(path: Path, columns: Sequence[str], rows: Iterable[Row]) -
         numbers = [row["columns"][name] for name in _BOP_NUMBERS]
         if row["status"] != "ok" or row["translation"] is None or not all(map(str.isdecimal, numbers)):
             continue
-        scene_id, im_id, obj_id = map(int, numbers)
         millimetres = UNITS[row["unit"] or "m"] / UNITS["mm"]
-        poses.append(
-            {
-                "scene_id": scene_id,
-                "im_id": im_id,
-                "obj_id": obj_id,
-                "score": row["confidence"],
-                "R": torch.tensor(row["rotation"], dtype=torch.float64),
-                "t": torch.tensor(row["translation"], dtype=torch.float64) * millimetres,
-                "time": -1.0,
-            }
+        R, t = (torch.tensor(row[name], dtype=torch.float64) for name in ("rotation", "translation"))
+        scene_id, im_id, obj_id = map(int, numbers)
+        pose = BOPRow(
+            scene_id=scene_id, im_id=im_id, obj_id=obj_id, score=row["confidence"], R=R, t=t * millimetres, time=-1.0
         )
+        poses.append(pose)
     write_bop_csv(path, poses)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from ...settings import BankSettings
 from ..bop import UNOCCLUDED
 from ..registry import DATASETS, DatasetSpec
 
-__all__ = ["DATASETS", "Case", "find_cases", "grouped"]
+__all__ = ["Case", "find_cases", "grouped"]
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Case:
     def view(self, mesh: trimesh.Trimesh) -> tuple[Tensor, float]:
         """Rotation (3, 3) and distance in model units of a camera that looks at the object's centre.
 
-        Without translation the distance is that of banks: without a focal length it is unknown.
+        Without translation the distance is that of banks.
         """
         R, t = self.pose[:, :3], self.pose[:, 3]
         if not bool(t.isfinite().all()):
@@ -59,16 +60,13 @@ class Case:
 
 
 def find_cases(kind: str, root: Path, *, pixel_origin: int = 1, limit: int | None = None) -> list[Case]:
-    """The objects of a dataset that the paper uses: neither occluded nor truncated, with known pose.
+    """The objects that the paper uses: neither occluded nor truncated, with known pose; grouped by mesh.
 
     Args:
         kind: "pascal3d", "bop" or "web".
         root: of the dataset.
         pixel_origin: of PASCAL3D+, see :class:`Pascal3DPlus`.
         limit: use only this many, spread evenly.
-
-    Returns:
-        Cases, grouped by mesh.
 
     Raises:
         InvalidInputError: no such object, or an unknown kind.
@@ -97,7 +95,7 @@ def _case(kind: DatasetSpec, s: dict[str, Any]) -> Case | None:
 def grouped(cases: list[Case], label: str, progress: bool) -> Iterator[tuple[trimesh.Trimesh, list[Case]]]:
     """Meshes with their cases; one mesh is in memory at a time."""
     with tqdm(total=len(cases), desc=label, unit="photo", disable=not progress) as bar:
-        for path in dict.fromkeys(case.mesh_path for case in cases):
-            group = [case for case in cases if case.mesh_path == path]
-            yield load_mesh(path, unit=group[0].unit), group
-            bar.update(len(group))
+        for (path, unit), group in groupby(cases, key=lambda case: (case.mesh_path, case.unit)):
+            chosen = list(group)
+            yield load_mesh(path, unit=unit), chosen
+            bar.update(len(chosen))

@@ -10,10 +10,10 @@ from ...matching import ViewBank, ViewMatcher
 from ...metrics import accuracy, pose_parameter_errors, rank_precision
 from ...settings import BankSettings
 from .cases import Case, grouped
-from .fields import PHOTO_FIELDS
-from .tables import Table
+from .points import PHOTO_FIELDS
+from .tables import Cell, Table
 
-__all__ = ["RANKS", "Rankings", "angle_table", "precision_table", "rank_tables", "rank_views"]
+__all__ = ["angle_table", "precision_table", "rank_tables", "rank_views"]
 
 RANKS = (1, 3, 5, 10, 20)
 THRESHOLD_DEG = 30.0
@@ -39,9 +39,8 @@ class Rankings:
 
     @property
     def definition(self) -> str:
-        return (
-            f"{len(self.views)} views per object, no refinement, CAD and box as annotated, N = {len(self.categories)}."
-        )
+        settings = "no refinement, CAD and box as annotated"
+        return f"{len(self.views)} views per object, {settings}, N = {len(self.categories)}."
 
 
 @torch.no_grad()
@@ -60,8 +59,7 @@ def rank_views(cases: list[Case], views: ViewSphere, settings: BankSettings, pro
             truth.append(torch.tensor([*map(float, viewpoint_from_rotation(R)), 0.0]))
             errors.append(rotation_error(R[None].float(), views.rotations))
         for depth in depths:
-            changed = replace(settings, depth_field=depth)
-            bank = ViewBank.build(mesh, views, settings=changed, progress=False)
+            bank = ViewBank.build(mesh, views, settings=replace(settings, depth_field=depth), progress=False)
             for photo, field in photos.items():
                 matcher = ViewMatcher(bank, field=field)
                 for chunk in crops.split(matcher.chunk_size):
@@ -72,7 +70,7 @@ def rank_views(cases: list[Case], views: ViewSphere, settings: BankSettings, pro
 
 def precision_table(rankings: Rankings) -> Table:
     """Fraction of the photographs whose best view is nearly right, per category."""
-    rows: list[list[str | float]] = []
+    rows: list[list[Cell]] = []
     for category in [*sorted(set(rankings.categories)), "all"]:
         mask = torch.tensor([category in (c, "all") for c in rankings.categories])
         best = [rankings.errors.gather(1, order[:, :1])[mask, 0] for order in rankings.orders.values()]
@@ -86,21 +84,18 @@ def precision_table(rankings: Rankings) -> Table:
 
 def rank_tables(rankings: Rankings) -> list[Table]:
     """Precision at rank 1, 3, 5, 10, 20, in two readings of a definition that the paper leaves open."""
-    readings = {
-        "ranks": (f"a view within {THRESHOLD_DEG:g} degrees of the true one", THRESHOLD_DEG),
-        "ranks_nearest": ("the view of the bank that is nearest to the true one", None),
-    }
+    readings = (
+        ("ranks", f"a view within {THRESHOLD_DEG:g} degrees of the true one", THRESHOLD_DEG),
+        ("ranks_nearest", "the view of the bank that is nearest to the true one", None),
+    )
+    names = ["k", *rankings.orders]
     tables = []
-    for name, (text, threshold) in readings.items():
-        columns = [
-            rank_precision(order, rankings.errors, ks=RANKS, threshold_deg=threshold)
-            for order in rankings.orders.values()
-        ]
-        rows: list[list[str | float]] = [[float(k), *(column[k] for column in columns)] for k in RANKS]
-        definition = f"Fraction of the photographs with {text} among the best k. {rankings.definition}"
-        tables.append(
-            Table(name, f"Precision at rank k: {text}", definition, ["k", *rankings.orders], rows, curve=True)
-        )
+    for name, reading, limit in readings:
+        orders = rankings.orders.values()
+        columns = [rank_precision(order, rankings.errors, ks=RANKS, threshold_deg=limit) for order in orders]
+        rows: list[list[Cell]] = [[float(k), *(column[k] for column in columns)] for k in RANKS]
+        text = f"Fraction of the photographs with {reading} among the best k. {rankings.definition}"
+        tables.append(Table(name, f"Precision at rank k: {reading}", text, names, rows, curve=True))
     return tables
 
 
@@ -108,14 +103,13 @@ def angle_table(rankings: Rankings) -> Table:
     """Mean errors of elevation, azimuth and in-plane angle: of the estimate and of the closest view of the bank."""
     v = rankings.views
     views = torch.stack([v.azimuth, v.elevation, v.theta, torch.zeros(len(v))], dim=1)
-    rows: list[list[str | float]] = []
+    rows: list[list[Cell]] = []
     for name, order in rankings.orders.items():
         means = pose_parameter_errors(views[order[:, 0]], rankings.truth, views)
         rows.append([name, *(means[k][a] for a in ("elevation", "azimuth", "theta") for k in ("est", "clo"))])
     text = (
         "Mean absolute errors in degrees: Est. of the best-ranked view, Clo. of the view that is closest to the true "
-        "one. "
-        f"Distance is omitted: banks have one. {rankings.definition}"
+        f"one. Distance is omitted: banks have one. {rankings.definition}"
     )
     columns = [f"{angle} {kind}" for angle in ("elevation", "azimuth", "in-plane") for kind in ("Est.", "Clo.")]
     return Table("angles", "Errors of angles", text, ["filters", *columns], rows)

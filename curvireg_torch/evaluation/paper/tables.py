@@ -1,13 +1,12 @@
 """Tables as CSV, Markdown and figures."""
 
-import csv
 import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
 
 from ...errors import MissingDependencyError
-from ...utils.files import write_file
+from ...utils.files import write_csv, write_file
 from ...visualization import plots
 
 __all__ = ["Table", "write_table"]
@@ -34,44 +33,26 @@ class Table:
     rows: list[list[Cell]]
     curve: bool = False
 
-    def csv(self) -> str:
-        """Comma-separated values with a header; all digits."""
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([self.columns, *self.rows])
-        return text.getvalue()
-
     def markdown(self) -> str:
-        """Title, definition and table, three digits.
-
-        Example:
-            >>> print(Table("a", "A", "Shares.", ["class", "x"], [["car", 0.5]]).markdown())
-            ## A
-            <BLANKLINE>
-            Shares.
-            <BLANKLINE>
-            | class | x |
-            |---|---|
-            | car | 0.5 |
-            <BLANKLINE>
-        """
-        lines = [self.columns, ["---"] * len(self.columns), *([_short(v) for v in row] for row in self.rows)]
-        body = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-        return f"## {self.title}\n\n{self.definition}\n\n{body.replace('| --- |', '|---|').replace(' --- |', '---|')}\n"
+        """Title, definition and table, three digits."""
+        lines = [self.columns, *([_short(v) for v in row] for row in self.rows)]
+        head, *body = ("| " + " | ".join(line) + " |\n" for line in lines)
+        return f"## {self.title}\n\n{self.definition}\n\n{head}|{'---|' * len(self.columns)}\n{''.join(body)}"
 
 
 def write_table(table: Table, folder: Path) -> list[Path]:
     """Write ``NAME.csv``, ``NAME.md`` and, where matplotlib is installed, ``NAME.png``; returns their paths."""
-    paths = [folder / f"{table.name}.{suffix}" for suffix in ("csv", "md")]
-    write_file(paths[0], table.csv().encode())
+    paths = [folder / f"{table.name}.{suffix}" for suffix in ("csv", "md", "png")]
+    write_csv(paths[0], [table.columns, *table.rows])
     write_file(paths[1], table.markdown().encode())
     try:
         figure = (plots.curves if table.curve else plots.bars)(table.columns, table.rows, title=table.title, ylabel="")
     except MissingDependencyError:
-        return paths
+        return paths[:2]
     picture = io.BytesIO()
     figure.savefig(picture, dpi=120, format="png")
-    write_file(folder / f"{table.name}.png", picture.getvalue())
-    return [*paths, folder / f"{table.name}.png"]
+    write_file(paths[2], picture.getvalue())
+    return paths
 
 
 def _short(value: Cell) -> str:

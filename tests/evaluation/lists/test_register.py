@@ -69,7 +69,7 @@ def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp
     [(CAMERA, None, "given"), (None, 50.0, "fov"), (None, "exif", "exif"), (None, None, None)],
 )
 def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entry, monkeypatch, camera, guess, source):
-    def with_covariance(image, box, K):
+    def with_covariance(image, box, K, **_):
         (result,) = registrar(image, box, K)
         assert isinstance(result, Registration)
         best, *others = result.hypotheses
