@@ -16,8 +16,7 @@ from .rendering import render_depth
 
 __all__ = ["example_mesh", "procedural_background", "random_pose", "synthesize_photograph"]
 
-DEFOCUS = 1.5
-"""Blur of the background in px."""
+DEFOCUS = 1.5  # blur of the background in px
 
 
 def example_mesh() -> trimesh.Trimesh:
@@ -72,13 +71,11 @@ def random_pose(
     """(4, 4) float64 pose of an upright object that fills ``fill`` of the image's shorter side, near its middle."""
     u = torch.rand(6, generator=generator, dtype=torch.float64)
     elevation = elevations[0] + (elevations[1] - elevations[0]) * u[1]
-    R = rotation_from_viewpoint(360.0 * u[0], elevation, 10.0 * u[2] - 5.0)
     fraction = fill[0] + (fill[1] - fill[0]) * float(u[3])
-    focal = float(camera_matrix[0, 0])
-    distance = 2.0 * mesh_radius(mesh) * focal / (fraction * min(size))
+    distance = 2.0 * mesh_radius(mesh) * float(camera_matrix[0, 0]) / (fraction * min(size))
     pixel = torch.stack([size[1] * (0.4 + 0.2 * u[4]), size[0] * (0.4 + 0.2 * u[5]), torch.ones_like(u[0])])
     ray = torch.linalg.inv(camera_matrix.double()) @ pixel
-    R = rotation_towards(ray) @ R
+    R = rotation_towards(ray) @ rotation_from_viewpoint(360.0 * u[0], elevation, 10.0 * u[2] - 5.0)
     return transform(R, ray / torch.linalg.vector_norm(ray) * distance - R @ mesh_centre(mesh))
 
 
@@ -95,7 +92,7 @@ def synthesize_photograph(
     """A synthetic photograph of the mesh: random light, a random solid texture, defocused background, sensor noise.
 
     Args:
-        mesh, T_cam_from_model (4, 4), camera_matrix (3, 3), size (H, W): the scene.
+        mesh, T_cam_from_model, camera_matrix, size: the scene; (4, 4), (3, 3) and (H, W).
         background: (3, H, W) in [0, 1]; default :func:`procedural_background`.
         texture: contrast of the texture, 0 = none.
 
@@ -103,18 +100,18 @@ def synthesize_photograph(
         image (3, H, W) in [0, 1] and the object's box (4,) in px.
     """
     H, W = size
-    zoom = torch.tensor(
-        [[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]], dtype=torch.float64
-    )  # supersampling by two
-    K = zoom @ camera_matrix.double()
+    # Supersampling by two.
+    K = torch.tensor([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]]).double() @ camera_matrix.double()
     depth = render_depth(mesh, T_cam_from_model, K, (2 * H, 2 * W))[0, 0].double()
     mask = depth > 0
+    rows, columns = mask.any(dim=1).nonzero(), mask.any(dim=0).nonzero()
+    if len(rows) == 0:
+        raise InvalidInputError("T_cam_from_model: expected a pose that shows the object, but no pixel does")
     v, u = torch.meshgrid(torch.arange(2.0 * H), torch.arange(2.0 * W), indexing="ij")
     pixels = torch.stack([u, v, torch.ones_like(u)], dim=-1).double()
     points = depth[..., None] * (pixels @ torch.linalg.inv(K).T)
     # Normals come from neighbouring points; at occluding contours they point to the camera.
-    du = torch.gradient(points, dim=1)[0]
-    dv = torch.gradient(points, dim=0)[0]
+    dv, du = torch.gradient(points, dim=(0, 1))
     normal = F.normalize(torch.linalg.cross(dv, du), dim=-1)
     jump = torch.maximum(du[..., 2].abs(), dv[..., 2].abs()) > 0.2 * mesh.scale
     normal[jump] = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
@@ -130,11 +127,7 @@ def synthesize_photograph(
     front = F.avg_pool2d((surface * mask[..., None]).permute(2, 0, 1)[None].float(), 2)[0]
     back = procedural_background(size, generator) if background is None else background
     back = gaussian_smooth(back[None], DEFOCUS)[0]
-    image = front + (1.0 - coverage) * back
-    image = image + 0.01 * torch.randn(3, H, W, generator=generator)
-    rows, columns = mask.any(dim=1).nonzero(), mask.any(dim=0).nonzero()
-    if len(rows) == 0:
-        raise InvalidInputError("T_cam_from_model: expected a pose that shows the object, but no pixel does")
+    image = front + (1.0 - coverage) * back + 0.01 * torch.randn(3, H, W, generator=generator)
     # Outer borders of the outermost pixels, converted from the fine grid to the picture's.
     border = torch.tensor([int(columns[0]) - 0.5, int(rows[0]) - 0.5, int(columns[-1]) + 0.5, int(rows[-1]) + 0.5])
     return image.clamp(0, 1), (border - 0.5) / 2.0

@@ -15,8 +15,7 @@ from .scenes import GeneratedScenes
 
 __all__ = ["adapt"]
 
-BATCH = 16
-RATE = 5e-4
+BATCH, RATE = 16, 5e-4
 
 
 def adapt(
@@ -31,8 +30,8 @@ def adapt(
 ) -> LearnedCurvilinearSaliency:
     """Fine-tune the learned field on generated photographs of one mesh. This takes some minutes on a CPU.
 
-    No photograph of the object is needed: light, textures and clutter are random, see
-    :class:`curvireg_torch.training.scenes.GeneratedScenes`. Batch statistics are not updated.
+    No photograph of the object is needed, see :class:`curvireg_torch.training.scenes.GeneratedScenes`. Batch statistics
+    are not updated. Save the result with :meth:`LearnedCurvilinearSaliency.save`.
 
     Args:
         mesh: a mesh or the path of one.
@@ -43,9 +42,6 @@ def adapt(
         workers: processes that generate scenes; 0 uses this one. Processes are spawned, so a script that uses them
             needs ``if __name__ == "__main__":``.
         progress: show a progress bar.
-
-    Returns:
-        The adapted field. Save it with :meth:`LearnedCurvilinearSaliency.save`.
 
     Raises:
         InvalidInputError: ``scenes`` is not positive.

@@ -22,20 +22,16 @@ TEMPERATURE = 0.05
 """Of the ranking losses: about the difference between the correlations of right and wrong views."""
 
 OTHER_VIEWS = 5
-"""Number of other views of the same object in a sample."""
 
 
 class FieldDataset(Dataset[dict[str, Tensor]]):
-    """Generated scenes with the targets of the learned field.
-
-    Args:
-        scenes: scenes of ``WORK_SIZE`` px.
+    """Generated scenes of ``WORK_SIZE`` px with the targets of the learned field.
 
     Items (a dict): ``image`` (3, S, S) uint8, and in half precision
 
     - ``code`` (2, S/2, S/2), the field of the clean depth encoded by :func:`doubled_angle`, of length about 1 on edges;
     - ``mask`` (1, S/2, S/2), the object's silhouette, occluded parts included;
-    - ``descriptors`` (2 + OTHER_VIEWS, D): of that field, of the true view as a bank describes it, and of other views.
+    - ``descriptors`` (7, D): of that field, of the true view as a bank describes it, and of five other views.
     """
 
     def __init__(self, scenes: GeneratedScenes) -> None:
@@ -95,7 +91,7 @@ class ReplayBuffer:
         self._store: dict[str, Tensor] = {}
 
     def add(self, batch: dict[str, Tensor]) -> None:
-        """Store a batch. It replaces the oldest samples when the buffer is full."""
+        """Store a batch, in place of the oldest samples when the buffer is full."""
         if not self._store:
             self._store = {k: v.new_zeros(self.capacity, *v.shape[1:]) for k, v in batch.items()}
         index = torch.arange(self.added, self.added + len(batch["image"])) % self.capacity
@@ -114,14 +110,12 @@ class ReplayBuffer:
 
 def augment(batch: dict[str, Tensor], generator: torch.Generator) -> dict[str, Tensor]:
     """Mirror the samples and change colours, contrast and noise, each at random. Targets are mirrored with images."""
-    images = batch["image"]
-    B = len(images)
 
     def draw(*shape: int) -> Tensor:
-        return torch.rand(B, *shape, generator=generator)
+        return torch.rand(len(batch["image"]), *shape, generator=generator)
 
     mirror = draw(1, 1, 1) < 0.5
-    images = torch.where(mirror, images.flip(3), images)
+    images = torch.where(mirror, batch["image"].flip(3), batch["image"])
     code = torch.where(mirror, batch["code"].flip(3) * torch.tensor([1.0, -1.0])[:, None, None], batch["code"])
     mask = torch.where(mirror, batch["mask"].flip(3), batch["mask"])
     descriptors = torch.where(mirror[:, 0], mirrored_descriptors(batch["descriptors"]), batch["descriptors"])
@@ -151,7 +145,6 @@ def losses(
     Args:
         output: (B, 3, S/2, S/2) of :class:`FieldNetwork`.
         batch: samples of :class:`FieldDataset` as float32.
-        descriptor_weight, ranking_weight, other_views_weight: factors of the last three terms.
     """
     code, target = output[:, :2], batch["code"]
     predicted = hog_layer(SETTINGS)(halved_angle(code))

@@ -25,9 +25,9 @@ from tqdm import tqdm
 
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.cameras import rotation_towards
-from curvireg_torch.training.scenes.camera_noise import simulate_camera
 from curvireg_torch.training.scenes.materials import random_colour, random_picture
 from curvireg_torch.training.scenes.rotations import random_rotation
+from curvireg_torch.training.scenes.scene import simulate_camera
 from scripts.benchmark.textured import TexturedMesh, render
 
 FORMS = [(cad, pose) for cad in ("exact", "sibling") for pose in ("upright", "free")]

@@ -1,7 +1,6 @@
 """Random arrangement of a scene before it is rendered: shapes, materials, light and camera."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,17 +11,11 @@ from .light import Light, random_light
 from .materials import Material, random_picture
 from .rotations import random_rotation
 from .shapes import Shape
-from .surfaces import Array
+from .surfaces import Array, Rng
 
-__all__ = ["Arrangement", "PlacedShape", "arrange"]
+__all__ = ["Arrangement", "arrange"]
 
-
-class PlacedShape(NamedTuple):
-    """A shape in the camera's frame: vertices (V, 3) in radii of the object, faces (F, 3), materials (F,)."""
-
-    vertices: Array
-    faces: Array
-    materials: Array
+MARGIN = 0.1  # around the object's box, as in BankSettings
 
 
 @dataclass(frozen=True)
@@ -31,12 +24,10 @@ class Arrangement:
 
     Attributes:
         rotation: (3, 3) model -> camera of the object; the camera looks straight at it.
-        distance: distance of the object's centre in radii.
-        shapes: the object first, then its surroundings.
+        distance: of the object's centre, in radii.
+        shapes: the object first, then its surroundings; in the camera's frame and in radii of the object.
         materials: one dictionary per shape, from material number to material.
-        light: light of the scene.
-        camera_matrix: (3, 3) of the crop around the object's box.
-        size: side of the crop in px.
+        camera_matrix, size: (3, 3) of the crop around the object's box, and its side in px.
         photo_area: x0, y0, x1, y1 in px, the part of the crop that lies within the photograph.
         background: (B, B, 3) linear picture behind everything, B = 3 size // 2.
         defocus: blur of the distant background in px; 0 = none.
@@ -44,7 +35,7 @@ class Arrangement:
 
     rotation: Array
     distance: float
-    shapes: tuple[PlacedShape, ...]
+    shapes: tuple[Shape, ...]
     materials: tuple[dict[int, Material], ...]
     light: Light
     camera_matrix: Array
@@ -53,28 +44,11 @@ class Arrangement:
     background: Array
     defocus: float
 
-    @property
-    def centre(self) -> Array:
-        """(3,) centre of the object in the camera's frame."""
-        return np.array([0.0, 0.0, self.distance])
 
+def arrange(shape: Shape, clutter: list[Shape], rng: Rng, *, size: int = 128, upright: float = 0.6) -> Arrangement:
+    """Draw a random arrangement of a shape among clutter.
 
-def arrange(
-    shape: Shape,
-    clutter: list[Shape],
-    rng: np.random.Generator,
-    *,
-    size: int = 128,
-    margin: float = 0.1,
-    upright: float = 0.6,
-) -> Arrangement:
-    """Draw a random arrangement. See :func:`make_scene` for the arguments.
-
-    Example:
-        >>> from curvireg_torch.training.scenes import random_shape
-        >>> rng = np.random.default_rng(0)
-        >>> arrange(random_shape(rng), [], rng, size=64).camera_matrix.shape
-        (3, 3)
+    ``size`` is the side of the crop in px, ``upright`` the probability that the object stands upright.
     """
     standing = bool(rng.random() < upright)
     if standing:
@@ -84,9 +58,9 @@ def arrange(
         R = random_rotation(rng)
     distance = float(np.exp(rng.uniform(np.log(2.2), np.log(14.0))))
     centre = np.array([0.0, 0.0, distance])
-    placed = shape.vertices @ R.T + centre
-    K, photo_area = _crop_camera(placed, rng, size, margin)
-    shapes = [PlacedShape(placed, shape.faces, shape.materials)]
+    placed = shape._replace(vertices=shape.vertices @ R.T + centre)
+    K, photo_area = _crop_camera(placed.vertices, rng, size)
+    shapes = [placed]
     floor = float((shape.vertices[:, 2]).min())
     above = float(-(R.T @ centre)[2]) > floor + 0.1  # the ground would hide everything from a camera below it
     ground = standing and rng.random() < 0.6 and above
@@ -103,21 +77,18 @@ def arrange(
     return Arrangement(R, distance, tuple(shapes), materials, light, K, size, photo_area, background, defocus)
 
 
-def _crop_camera(
-    placed: Array, rng: np.random.Generator, size: int, margin: float
-) -> tuple[Array, tuple[int, int, int, int]]:
+def _crop_camera(placed: Array, rng: Rng, size: int) -> tuple[Array, tuple[int, int, int, int]]:
     """Camera matrix of the crop around a jittered box, and the part of the crop that lies within the photograph."""
     flat = placed[:, :2] / np.maximum(placed[:, 2:], 0.1)
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    side = high - low
-    jitter = rng.normal(0, rng.choice([0.01, 0.05]), 4)
-    box = np.concatenate([low + jitter[:2] * side, high + jitter[2:] * side])
+    side = np.ptp(flat, axis=0)
+    box = np.concatenate([flat.min(axis=0), flat.max(axis=0)])
+    box += rng.normal(0, rng.choice([0.01, 0.05]), 4) * np.tile(side, 2)
     border = np.array([-np.inf, -np.inf, np.inf, np.inf])
     if rng.random() < 0.2:  # the photograph's border cuts the object
         k = int(rng.integers(4))
         box[k] += (0.5 - k // 2) * 2 * rng.uniform(0.1, 0.45) * side[k % 2]
         border[k] = box[k]
-    A = crop_transforms(square_boxes(torch.from_numpy(box), margin), size).numpy()
+    A = crop_transforms(square_boxes(torch.from_numpy(box), MARGIN), size).numpy()
     corners = np.where(np.isfinite(border), border, 0).reshape(2, 2) @ A[:2, :2] + A[:2, 2]
     whole = np.array([0, 0, size, size])
     area = np.where(np.isfinite(border), np.round(corners.reshape(-1) + 0.5), whole)
@@ -125,9 +96,7 @@ def _crop_camera(
     return A, (x0, y0, x1, y1)
 
 
-def _beside(
-    other: Shape, R: Array, centre: Array, floor: float | None, K: Array, size: int, rng: np.random.Generator
-) -> PlacedShape:
+def _beside(other: Shape, R: Array, centre: Array, floor: float | None, K: Array, size: int, rng: Rng) -> Shape:
     """Place another shape in the picture: mostly behind the object, sometimes in front of it."""
     scale = np.exp(rng.uniform(-1.0, 0.8))
     upright = R @ rotation_from_viewpoint(rng.uniform(0, 360), 90.0, 0.0).numpy()  # about the vertical
@@ -137,7 +106,7 @@ def _beside(
         where = np.array([reach * np.cos(towards), reach * np.sin(towards), floor - scale * other.vertices[:, 2].min()])
         points = scale * other.vertices @ upright.T + R @ where + centre
         if points[:, 2].min() > 0.3:
-            return PlacedShape(points, other.faces, other.materials)
+            return other._replace(vertices=points)
     front = rng.random() < 0.25
     z = centre[2] + (-1.3 if front else rng.uniform(0.5, 4.0))
     scale = scale * (0.3 if front else 1.0)
@@ -145,23 +114,22 @@ def _beside(
     if front:  # near the border, so that it hides only a part of the object
         pixel[rng.integers(2)] = size * rng.choice([0.1, 0.9])
     ray = np.array([(pixel[0] - K[0, 2]) / K[0, 0], (pixel[1] - K[1, 2]) / K[1, 1], 1.0])
-    points = scale * other.vertices @ (upright if rng.random() < 0.5 else random_rotation(rng)).T + ray * max(
-        z, 0.4 + scale
-    )
-    return PlacedShape(points, other.faces, other.materials)
+    R = upright if rng.random() < 0.5 else random_rotation(rng)
+    return other._replace(vertices=scale * other.vertices @ R.T + ray * max(z, 0.4 + scale))
 
 
-def _ground(R: Array, centre: Array, floor: float, rng: np.random.Generator) -> PlacedShape:
+def _ground(R: Array, centre: Array, floor: float, rng: Rng) -> Shape:
     reach = rng.choice([1.6, 4.0, 60.0])
     corners = reach * np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0.0)]) + (0, 0, floor - 0.002)
-    return PlacedShape(corners @ R.T + centre, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(2, int))
+    return _quadrilateral(corners @ R.T + centre)
 
 
-def _wall(distance: float, rng: np.random.Generator) -> PlacedShape:
+def _wall(distance: float, rng: Rng) -> Shape:
     far = distance + rng.uniform(1.2, 5.0)
     slope = rng.normal(0, 0.4)
-    x = 3 * far
-    corners = np.array(
-        [(-x, -x, far - slope * 3), (x, -x, far + slope * 3), (x, x, far + slope * 3), (-x, x, far - slope * 3)]
-    )
-    return PlacedShape(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(2, int))
+    x, left, right = 3 * far, far - slope * 3, far + slope * 3
+    return _quadrilateral(np.array([(-x, -x, left), (x, -x, right), (x, x, right), (-x, x, left)]))
+
+
+def _quadrilateral(corners: Array) -> Shape:
+    return Shape(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(2, int))

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import torch
@@ -10,14 +9,14 @@ import trimesh
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from ...errors import InvalidInputError
-from .scene import make_scene
+from ...utils.checks import check_positive
+from .arrangement import arrange
+from .scene import render_scene
 from .shapes import Shape, random_shape, shape_from_mesh
 
 __all__ = ["GeneratedScenes"]
 
-CLUTTER = 500
-"""Number of shapes that clutter is drawn from. Each process builds them once."""
+CLUTTER = 500  # shapes that clutter is drawn from; each process builds them once
 
 
 class GeneratedScenes(Dataset[dict[str, Tensor]]):
@@ -28,7 +27,7 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
     Args:
         length: number of samples.
         seed: another seed gives other objects.
-        image_size, margin: side of the crops in px and margin around the object's box, as in :class:`BankSettings`.
+        image_size: side of the crops in px.
         upright: fraction of the objects that stand upright.
         meshes: use these instead of procedural objects.
 
@@ -50,14 +49,11 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
         *,
         seed: int = 0,
         image_size: int = 128,
-        margin: float = 0.1,
         upright: float = 0.6,
         meshes: Sequence[trimesh.Trimesh] = (),
     ) -> None:
-        if length < 1:
-            raise InvalidInputError(f"length: expected >= 1, got {length}")
-        self._length, self._seed = length, seed
-        self._options: dict[str, Any] = {"size": image_size, "margin": margin, "upright": upright}
+        check_positive(length, "length")
+        self._length, self._seed, self._size, self._upright = length, seed, image_size, upright
         self._shapes = [shape_from_mesh(mesh) for mesh in meshes]
 
     def __len__(self) -> int:
@@ -74,13 +70,14 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
             raise IndexError(index)
         rng = np.random.default_rng((self._seed, index, 1))
         clutter = [_clutter(int(k)) for k in rng.integers(0, CLUTTER, int(rng.choice([0, 1, 2, 4, 7])))]
-        scene = make_scene(self.shape(index), clutter, rng, **self._options)
+        arrangement = arrange(self.shape(index), clutter, rng, size=self._size, upright=self._upright)
+        image, depth, visible = render_scene(arrangement, rng)
         return {
-            "image": torch.from_numpy(scene.image).permute(2, 0, 1).float() / 255.0,
-            "depth": torch.from_numpy(scene.depth)[None],
-            "visible": torch.from_numpy(scene.visible)[None],
-            "rotation": torch.from_numpy(scene.rotation).float(),
-            "distance": torch.tensor(scene.distance, dtype=torch.float32),
+            "image": torch.from_numpy(image).permute(2, 0, 1).float() / 255.0,
+            "depth": torch.from_numpy(depth)[None],
+            "visible": torch.from_numpy(visible)[None],
+            "rotation": torch.from_numpy(arrangement.rotation).float(),
+            "distance": torch.tensor(arrangement.distance, dtype=torch.float32),
         }
 
 

@@ -1,28 +1,21 @@
 """Light from the sky and from lamps, with shadows and highlights."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from ...rendering.embree import RayScene
 from .materials import random_colour
-from .surfaces import Array
+from .surfaces import Array, Rng
 
 __all__ = ["Lamp", "Light", "random_light", "shade_points"]
 
-SHADOW = 0.1
-"""Fraction of a lamp's light that reaches shadowed points, as indirect light would."""
+SHADOW = 0.1  # fraction of a lamp's light that reaches shadowed points, as indirect light would
 
 
-@dataclass(frozen=True)
-class Lamp:
-    """A distant lamp.
-
-    Attributes:
-        towards: (3,) unit vector from the scene to the lamp, in the camera's frame.
-        power: (3,) linear light.
-        shadows: whether the lamp casts shadows.
-    """
+class Lamp(NamedTuple):
+    """A distant lamp: unit vector (3,) to it in the camera's frame, linear light (3,), and whether it casts shadows."""
 
     towards: Array
     power: Array
@@ -35,9 +28,7 @@ class Light:
 
     Attributes:
         up: (3,) unit vector to the zenith, in the camera's frame.
-        sky: ambient light, and the additional light from above.
-        tint: (3,) colour of the sky.
-        lamps: any number of lamps.
+        sky, tint: ambient light and the additional light from above; (3,) colour of both.
         reflection: height of the horizon and (3,) colour above it, mirrored by glossy surfaces; None for none.
     """
 
@@ -48,14 +39,8 @@ class Light:
     reflection: tuple[float, Array] | None
 
 
-def random_light(up: Array, rng: np.random.Generator) -> Light:
-    """Random light for a scene whose z axis is ``up`` (3,) in the camera's frame.
-
-    Example:
-        >>> light = random_light(np.array([0.0, -1.0, 0.0]), np.random.default_rng(0))
-        >>> 1 <= len(light.lamps) <= 2
-        True
-    """
+def random_light(up: Array, rng: Rng) -> Light:
+    """Random light for a scene whose z axis is ``up`` (3,) in the camera's frame."""
     up = up if rng.random() < 0.7 else np.array([0.0, -1.0, 0.0])
     sky = (rng.uniform(0.2, 0.7), rng.uniform(0.0, 0.3))
     tint = 1 + rng.normal(0, 0.05, 3)
@@ -69,13 +54,7 @@ def random_light(up: Array, rng: np.random.Generator) -> Light:
 
 
 def shade_points(
-    scene: RayScene,
-    points: Array,
-    normal: Array,
-    colour: Array,
-    gloss: Array,
-    shininess: Array,
-    light: Light,
+    scene: RayScene, points: Array, normal: Array, colour: Array, gloss: Array, shininess: Array, light: Light
 ) -> Array:
     """(N, 3) linear light that N surface points send to a camera at the origin.
 
@@ -84,7 +63,7 @@ def shade_points(
         points, normal: (N, 3); normals have unit length and face the camera.
         colour: (N, 3) albedo.
         gloss, shininess: (N,) strength and exponent of the highlights.
-        light: for instance of :func:`random_light`.
+        light: of :func:`random_light`.
     """
     view = -points / np.linalg.norm(points, axis=1, keepdims=True)
     level, more = light.sky

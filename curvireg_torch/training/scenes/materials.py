@@ -3,12 +3,12 @@
 import cv2
 import numpy as np
 
-from .surfaces import Array
+from .surfaces import Array, Rng
 
 __all__ = ["Material", "random_colour", "random_picture"]
 
 
-def random_colour(rng: np.random.Generator) -> Array:
+def random_colour(rng: Rng) -> Array:
     """(3,) colour in [0, 1]; half of the colours are nearly grey."""
     grey = rng.uniform(0.03, 0.97)
     tint = rng.normal(0, rng.choice([0.03, 0.25]), 3)
@@ -17,14 +17,9 @@ def random_colour(rng: np.random.Generator) -> Array:
 
 
 class Material:
-    """A random pattern of colours in space, with gloss.
+    """A random pattern of colours in space, with gloss; ``plain`` is the probability of a uniform colour."""
 
-    Args:
-        rng: random generator.
-        plain: probability of a uniform colour.
-    """
-
-    def __init__(self, rng: np.random.Generator, *, plain: float = 0.5) -> None:
+    def __init__(self, rng: Rng, *, plain: float = 0.5) -> None:
         self._first, self._second = random_colour(rng), random_colour(rng)
         kinds = ("waves", "stripes", "checks", "cells", "print", "grain")
         self._kind = "plain" if rng.random() < plain else str(rng.choice(kinds))
@@ -43,8 +38,7 @@ class Material:
         along = points @ self._axes + self._phases
         if self._kind == "cells":
             nearest = ((points[:, None] - self._seeds) ** 2).sum(axis=-1).argmin(axis=1)
-            mixed: Array = np.clip(self._first + self._strength * (self._palette[nearest] - self._first), 0, 1)
-            return mixed
+            return np.asarray(np.clip(self._first + self._strength * (self._palette[nearest] - self._first), 0, 1))
         if self._kind == "waves":
             weight = 0.5 + 0.5 * np.sin(along).mean(axis=1)
         elif self._kind == "stripes":
@@ -61,7 +55,7 @@ class Material:
         return self._first + blend
 
 
-def random_picture(rng: np.random.Generator, size: int) -> Array:
+def random_picture(rng: Rng, size: int) -> Array:
     """(size, size, 3) float32 flat background in [0, 1]: gradients, clouds, foliage, or a clutter of shapes."""
     top, bottom = random_colour(rng), random_colour(rng)
     if rng.random() < 0.4:
@@ -85,7 +79,7 @@ def random_picture(rng: np.random.Generator, size: int) -> Array:
             x, y = rng.integers(0, size, 2).tolist()
             reach = rng.uniform(0.02, 0.4) * size
             if rng.random() < 0.3:
-                end = (rng.integers(0, size, 2)).tolist()
+                end = rng.integers(0, size, 2).tolist()
                 cv2.line(picture, (x, y), end, colour, int(rng.integers(1, 5)), cv2.LINE_AA)
             elif rng.random() < 0.5:
                 corners = np.asarray([x, y]) + rng.normal(0, reach, (int(rng.integers(3, 6)), 2))

@@ -4,21 +4,12 @@ import numpy as np
 import torch
 
 from ...geometry.conversions import rotation_from_quaternion
-from .surfaces import Array
-
-__all__ = ["random_rotation", "rotation"]
+from .surfaces import Array, Rng
 
 
-def random_rotation(rng: np.random.Generator) -> Array:
-    """(3, 3) rotation, uniformly distributed because a quaternion of normal numbers has no preferred direction.
-
-    Example:
-        >>> R = random_rotation(np.random.default_rng(0))
-        >>> bool(np.allclose(R @ R.T, np.eye(3))), round(float(np.linalg.det(R)), 6)
-        (True, 1.0)
-    """
-    rotation: Array = rotation_from_quaternion(torch.from_numpy(rng.normal(size=4))).numpy()
-    return rotation
+def random_rotation(rng: Rng) -> Array:
+    """(3, 3) rotation, uniformly distributed because a quaternion of normal numbers has no preferred direction."""
+    return np.asarray(rotation_from_quaternion(torch.from_numpy(rng.normal(size=4))))
 
 
 def rotation(axis: int, angle: float) -> Array:

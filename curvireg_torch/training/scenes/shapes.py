@@ -6,19 +6,13 @@ import numpy as np
 import trimesh
 
 from .families import FAMILIES
-from .parts import Rng
-from .surfaces import Array, join
+from .surfaces import Array, Rng, join
 
 __all__ = ["FAMILIES", "Shape", "random_shape", "shape_from_mesh"]
 
 
 class Shape(NamedTuple):
-    """An object of radius 1 around the origin, z up.
-
-    Attributes:
-        vertices, faces: (V, 3) and (F, 3).
-        materials: (F,) number of each triangle's material.
-    """
+    """An object of radius 1 around the origin, z up: vertices (V, 3), faces (F, 3) and their material numbers (F,)."""
 
     vertices: Array
     faces: Array

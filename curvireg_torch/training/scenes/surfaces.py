@@ -4,14 +4,12 @@ from itertools import pairwise
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-
-__all__ = ["Array", "Surface", "bar", "box", "extrude", "lathe", "loft", "superquadric", "torus", "tube"]
+from numpy.typing import ArrayLike
 
 Array: TypeAlias = np.ndarray[Any, Any]
-"""Array of any shape."""
+Rng: TypeAlias = np.random.Generator
 
-AROUND = 36
-"""Number of vertices around a round surface; enough for pictures of 128 px."""
+AROUND = 36  # vertices around a round surface; enough for pictures of 128 px
 
 
 class Surface(NamedTuple):
@@ -20,13 +18,15 @@ class Surface(NamedTuple):
     vertices: Array
     faces: Array
 
-    def moved(
-        self, translation: object = (0.0, 0.0, 0.0), rotation: Array | None = None, scale: object = 1.0
-    ) -> "Surface":
+    def moved(self, translation: ArrayLike = 0.0, rotation: Array | None = None, scale: ArrayLike = 1.0) -> "Surface":
         """The surface after scaling, rotation and translation, in this order."""
         points = self.vertices * np.asarray(scale, dtype=float)
         points = points if rotation is None else points @ rotation.T
         return Surface(points + np.asarray(translation, dtype=float), self.faces)
+
+
+Part: TypeAlias = tuple[Surface, int]
+"""A surface and its material number; parts with the same number have the same material."""
 
 
 def _grid(points: Array, *, close: bool = True, caps: bool = True) -> Surface:
@@ -52,17 +52,25 @@ def _circle(n: int = AROUND) -> Array:
     return np.stack([np.cos(t), np.sin(t)], -1)
 
 
-def loft(outlines: Array, heights: Array) -> Surface:
+def loft(outlines: Array, heights: ArrayLike) -> Surface:
     """Closed surface through (M, N, 2) outlines at (M,) heights along z."""
     z = np.broadcast_to(np.asarray(heights, dtype=float)[:, None, None], (*outlines.shape[:2], 1))
     return _grid(np.concatenate([outlines, z], -1))
 
 
-def box(size: object, *, top: float = 1.0) -> Surface:
+def box(size: ArrayLike, *, top: float = 1.0) -> Surface:
     """Box of (3,) ``size`` around the origin; the upper end is scaled by ``top``."""
     x, y, z = (0.5 * float(s) for s in np.broadcast_to(np.asarray(size, dtype=float), 3))
     square = np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
     return loft(np.stack([square, top * square]), np.array([-z, z]))
+
+
+def rounded_box(rng: Rng, size: ArrayLike) -> Surface:
+    """A box of side lengths ``size``, with sharp or rounded edges."""
+    if rng.random() < 0.5:
+        return box(size, top=rng.choice([1.0, rng.uniform(0.7, 1.0)]))
+    e = rng.uniform(0.1, 0.5)
+    return superquadric(0.5 * np.asarray(size), (e, e))
 
 
 def extrude(outline: Array, height: float) -> Surface:
@@ -70,12 +78,12 @@ def extrude(outline: Array, height: float) -> Surface:
     return loft(np.stack([outline, outline]), np.array([-0.5 * height, 0.5 * height]))
 
 
-def lathe(radii: Array, heights: Array) -> Surface:
+def lathe(radii: ArrayLike, heights: ArrayLike) -> Surface:
     """Surface of revolution about z through (M,) radii at (M,) heights."""
     return loft(np.asarray(radii, dtype=float)[:, None, None] * _circle(), heights)
 
 
-def superquadric(size: object, roundness: tuple[float, float]) -> Surface:
+def superquadric(size: ArrayLike, roundness: tuple[float, float]) -> Surface:
     """Superquadric with half axes ``size``: exponents 1 make an ellipsoid, towards 0 a box."""
     v = np.linspace(-0.5, 0.5, AROUND // 2 + 1) * np.pi
     ring = _power(_circle(), roundness[1])
@@ -97,7 +105,7 @@ def torus(radius: float, thickness: float) -> Surface:
     return _grid(np.concatenate([flat, np.broadcast_to(section[None, :, 1:], (*flat.shape[:2], 1))], -1), caps=False)
 
 
-def bar(start: object, end: object, radius: float, *, sides: int = 10) -> Surface:
+def bar(start: ArrayLike, end: ArrayLike, radius: float, *, sides: int = 10) -> Surface:
     """Straight rod between two points; ``sides=4`` makes it square."""
     a, b = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     axis = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)

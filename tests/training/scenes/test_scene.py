@@ -10,8 +10,8 @@ from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.settings import BankSettings
 from curvireg_torch.training.scenes import GeneratedScenes
-from curvireg_torch.training.scenes.camera_noise import simulate_camera
 from curvireg_torch.training.scenes.materials import random_picture
+from curvireg_torch.training.scenes.scene import simulate_camera
 
 
 @pytest.fixture(scope="module")

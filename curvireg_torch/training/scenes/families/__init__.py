@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from ..parts import Part, Rng
+from ..surfaces import Part, Rng
 from . import furniture, household, solids, vehicles
 
 __all__ = ["FAMILIES"]

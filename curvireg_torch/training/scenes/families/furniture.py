@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from ..parts import Part, Rng, rounded_box
 from ..rotations import rotation
-from ..surfaces import bar, box, lathe, superquadric, tube
+from ..surfaces import Part, Rng, bar, box, lathe, rounded_box, superquadric, tube
 
 __all__ = ["chair", "frame", "screen", "sofa", "table"]
 
@@ -32,18 +31,13 @@ def chair(rng: Rng) -> list[Part]:
         parts.append((panel.moved(centre, rotation(0, -lean / back)), 0))
     else:
         parts += [(tube(p, leg), 1) for p in posts]
-        if rng.random() < 0.5:
-            parts += [
-                (bar(posts[0][0] * (1 - s) + posts[0][1] * s, posts[1][0] * (1 - s) + posts[1][1] * s, leg), 1)
-                for s in np.linspace(0.3, 1, int(rng.integers(2, 6)))
-            ]
-        else:
-            low, high = (np.stack([p[k] for p in posts]) for k in (0, 1))
-            parts += [
-                (bar(low[0] * (1 - s) + low[1] * s, high[0] * (1 - s) + high[1] * s, 0.7 * leg), 1)
-                for s in np.linspace(0, 1, int(rng.integers(3, 8)))
-            ]
-            parts.append((bar(high[0], high[1], 1.5 * leg), 1))
+        horizontal = rng.random() < 0.5
+        a, b = posts if horizontal else np.stack(posts, axis=1)
+        first, rod, few, many = (0.3, leg, 2, 6) if horizontal else (0.0, 0.7 * leg, 3, 8)
+        steps = np.linspace(first, 1, int(rng.integers(few, many)))
+        parts += [(bar(a[0] * (1 - s) + a[1] * s, b[0] * (1 - s) + b[1] * s, rod), 1) for s in steps]
+        if not horizontal:
+            parts.append((bar(b[0], b[1], 1.5 * leg), 1))
     if rng.random() < 0.4:
         z = h + rng.uniform(0.15, 0.3)
         for s in (-1, 1):
@@ -117,9 +111,8 @@ def frame(rng: Rng) -> list[Part]:
         if rng.random() < 0.6:
             parts.append((box((w, d, 0.02)).moved((0, 0, z)), 1))
         else:
-            parts += [
-                (bar((*corners[i], z), (*corners[j], z), rod, sides=4), 0) for i, j in ((0, 1), (1, 3), (3, 2), (2, 0))
-            ]
+            edges = ((0, 1), (1, 3), (3, 2), (2, 0))
+            parts += [(bar((*corners[i], z), (*corners[j], z), rod, sides=4), 0) for i, j in edges]
     for _ in range(int(rng.integers(0, 4))):
         a, b = rng.uniform(-0.5, 0.5, (2, 3)) * (w, d, h) + (0, 0, 0.5 * h)
         parts.append((bar(a, b, rod), 0))

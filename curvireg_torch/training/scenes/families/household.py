@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from ..parts import Part, Rng
 from ..rotations import rotation
-from ..surfaces import bar, box, lathe, superquadric, torus, tube
+from ..surfaces import Part, Rng, bar, box, lathe, superquadric, torus, tube
 
 __all__ = ["creature", "package", "vessel"]
 
@@ -24,8 +23,7 @@ def vessel(rng: Rng) -> list[Part]:
         low, high = 0.3 * heights[2], heights[2]
         parts.append((lathe(np.full(2, radii[:3].max() * 1.01), np.array([low, high])), 2))
     if rng.random() < 0.3:
-        ring = torus(0.15, 0.02).moved((radii.max(), 0, 0.5), rotation(0, np.pi / 2))
-        parts.append((ring, 3))
+        parts.append((torus(0.15, 0.02).moved((radii.max(), 0, 0.5), rotation(0, np.pi / 2)), 3))
     return parts
 
 
@@ -41,17 +39,14 @@ def creature(rng: Rng) -> list[Part]:
     parts.append((superquadric(size, ball).moved(head), 0))
     for s in (-1, 1):
         ear = superquadric((0.03, 0.05, rng.uniform(0.05, 0.2)), ball)
-        parts.append(
-            (ear.moved(head + np.array((s * 0.7 * size[0], 0.03, size[2])), rotation(1, s * rng.uniform(0, 0.5))), 1)
-        )
+        at = head + np.array((s * 0.7 * size[0], 0.03, size[2]))
+        parts.append((ear.moved(at, rotation(1, s * rng.uniform(0, 0.5))), 1))
         for y in (-0.6, 0.6):
             foot = (s * rng.uniform(0.8, 1.1) * body[0], y * body[1] + rng.normal(0, 0.05), 0)
             parts.append((bar((s * 0.7 * body[0], y * body[1], high), foot, rng.uniform(0.03, 0.08)), 0))
     if rng.random() < 0.6:
-        tail = np.array(
-            [(0, body[1], high), (0, body[1] + 0.2, high + 0.1), (0, body[1] + 0.3, high + rng.uniform(-0.2, 0.4))]
-        )
-        parts.append((tube(tail, 0.03), 1))
+        y, tip = body[1], high + rng.uniform(-0.2, 0.4)
+        parts.append((tube(np.array([(0, y, high), (0, y + 0.2, high + 0.1), (0, y + 0.3, tip)]), 0.03), 1))
     return parts
 
 
@@ -63,7 +58,7 @@ def package(rng: Rng) -> list[Part]:
         return [(box((w, d, h)), 0)]
     if kind == 1:
         r = 0.4 * w
-        return [(lathe(np.array([0.9 * r, r, r, 0.9 * r]), np.array([0, 0.03, 0.97, 1]) * h), 0)]
+        return [(lathe([0.9 * r, r, r, 0.9 * r], np.array([0, 0.03, 0.97, 1]) * h), 0)]
     if kind == 2:  # flat bottle with shoulders
         e = (rng.uniform(0.2, 0.6), rng.uniform(0.4, 1.0))
         parts = [(superquadric((0.5 * w, 0.5 * d, 0.5 * h), e), 0)]

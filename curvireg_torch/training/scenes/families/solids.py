@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from ..parts import Part, Rng, rounded_box
 from ..rotations import random_rotation, rotation
-from ..surfaces import Surface, bar, box, extrude, lathe, superquadric, torus
+from ..surfaces import Part, Rng, Surface, bar, box, extrude, lathe, rounded_box, superquadric, torus
 
 __all__ = ["bracket", "compound", "lump", "stack"]
 

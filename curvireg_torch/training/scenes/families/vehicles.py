@@ -1,19 +1,18 @@
 """Procedural vehicles, one function per family; the front points along -y."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ..parts import Part, Rng, rounded_box
 from ..rotations import rotation
-from ..surfaces import Array, Surface, bar, box, lathe, loft, superquadric, torus, tube
+from ..surfaces import Array, Part, Rng, Surface, bar, box, lathe, loft, rounded_box, superquadric, torus, tube
 
 __all__ = ["aircraft", "bicycle", "boat", "car", "train"]
 
 
 def _wheels(rng: Rng, length: float, width: float, radius: float) -> list[Part]:
     across = rotation(1, np.pi / 2)
-    tyre = lathe(
-        radius * np.array([0.55, 0.6, 0.95, 1, 1, 0.95]), np.array([0.0, -0.35, -0.5, -0.3, 0.3, 0.5]) * radius * 0.5
-    )
+    heights = np.array([0.0, -0.35, -0.5, -0.3, 0.3, 0.5]) * radius * 0.5
+    tyre = lathe(radius * np.array([0.55, 0.6, 0.95, 1, 1, 0.95]), heights)
     hub = lathe(np.full(2, 0.55 * radius), np.array([-0.24, 0.24]) * radius)
     where = [
         (s * 0.5 * width, y * length, radius)
@@ -42,21 +41,17 @@ def car(rng: Rng) -> list[Part]:
     cabin = np.array([(bonnet, belt * height), (roof_front, height), (roof_back, 0.98 * height), (boot, belt * height)])
 
     def across(outline: Array, wide: float) -> Surface:
-        y = (outline[:, 0] - 0.5) * length
+        y, n = (outline[:, 0] - 0.5) * length, len(outline)
         narrow = wide * np.where(outline[:, 1] > belt * height + 1e-6, rng.uniform(0.7, 0.9), 1.0)
         points = np.stack([np.stack([s * 0.5 * narrow, y, outline[:, 1]], -1) for s in (-1, 1)])
-        flat = points.reshape(-1, 3)
-        n = len(outline)
         ring = np.arange(n)
-        middle = points.mean(axis=1)
         following = (ring + 1) % n
         faces = [np.stack([ring, following, following + n], -1), np.stack([ring, following + n, ring + n], -1)]
         faces += [np.stack([k * n + ring, k * n + following, np.full(n, 2 * n + k)], -1) for k in (0, 1)]
-        return Surface(np.concatenate([flat, middle]), np.concatenate(faces))
+        return Surface(np.concatenate([points.reshape(-1, 3), points.mean(axis=1)]), np.concatenate(faces))
 
-    parts: list[Part] = [(across(body, width), 0)]
+    parts: list[Part] = [(across(body, width), 0), (across(cabin, width), 0)]
     centre = cabin.mean(axis=0)
-    parts.append((across(cabin, width), 0))
     if rng.random() < 0.85:  # windows, slightly outside the cabin
         glass = centre + (cabin - centre) * np.array([0.86, 0.75])
         parts.append((across(glass, width * 1.02), 1))
@@ -64,35 +59,26 @@ def car(rng: Rng) -> list[Part]:
         for a, b in ((cabin[0], cabin[1]), (cabin[3], cabin[2])):
             p, q = a + 0.15 * (b - a), a + 0.88 * (b - a)
             out = np.sign(p[0] - 0.5) * 0.004
-            quad = np.array(
-                [(s * 0.5 * wide, (e[0] - 0.5 + out) * length, e[1] + 0.004) for e in (p, q) for s in (-1, 1)]
-            )
-            parts.append((Surface(quad, np.array([[0, 1, 3], [0, 3, 2]])), 1))
+            quad = [(s * 0.5 * wide, (e[0] - 0.5 + out) * length, e[1] + 0.004) for e in (p, q) for s in (-1, 1)]
+            parts.append((Surface(np.array(quad), np.array([[0, 1, 3], [0, 3, 2]])), 1))
     if pickup:
         parts += _bed(length, width, boot, (low, rng.uniform(0.5, 0.7) * belt * height, tail * height))
     for s in (-1, 1):
         lamp = box((0.2 * width, 0.02, 0.06)).moved((s * 0.35 * width, -0.5 * length, nose * height - 0.05))
-        parts.append((lamp, 2))
-        parts.append((lamp.moved((0, length, (tail - nose) * height)), 3))
+        parts += [(lamp, 2), (lamp.moved((0, length, (tail - nose) * height)), 3)]
     return parts + _wheels(rng, length, width, radius)
 
 
 def _bed(length: float, width: float, start: float, heights: tuple[float, float, float]) -> list[Part]:
-    """Open bed of a pick-up: a floor, two sides and a tailgate.
-
-    ``start``: fraction of the length at which it begins. ``heights``: of the underside, the floor and the rim.
-    """
+    """Open bed from the fraction ``start`` of the length; ``heights`` of its underside, floor and rim."""
     low, floor, rim = heights
     thick, long = 0.05 * width, (1 - start) * length
     middle = (0.5 * (start + 1) - 0.5) * length
     wall, at = rim - low, 0.5 * (rim + low)
-    sides = [box((thick, long, wall)).moved((s * 0.5 * (width - thick), middle, at)) for s in (-1, 1)]
+    base = box((width, long, floor - low)).moved((0, middle, 0.5 * (floor + low)))
     gate = box((width, thick, wall)).moved((0, 0.5 * (length - thick), at))
-    return [
-        (box((width, long, floor - low)).moved((0, middle, 0.5 * (floor + low))), 0),
-        (gate, 0),
-        *((s, 0) for s in sides),
-    ]
+    sides = [box((thick, long, wall)).moved((s * 0.5 * (width - thick), middle, at)) for s in (-1, 1)]
+    return [(part, 0) for part in (base, gate, *sides)]
 
 
 def bicycle(rng: Rng) -> list[Part]:
@@ -128,34 +114,20 @@ def bicycle(rng: Rng) -> list[Part]:
 def aircraft(rng: Rng) -> list[Part]:
     r, span = rng.uniform(0.07, 0.13), rng.uniform(0.6, 1.1)
     y = np.array([-1, -0.97, -0.85, -0.5, 0.4, 0.8, 1.0])
-    parts: list[Part] = [
-        (lathe(r * np.array([0.05, 0.4, 0.85, 1, 1, 0.6, 0.15]), y).moved(rotation=rotation(0, np.pi / 2)), 0)
-    ]
-    parts[0] = (parts[0][0].moved(scale=(1, -1, 1)), 0)
+    body = lathe(r * np.array([0.05, 0.4, 0.85, 1, 1, 0.6, 0.15]), y).moved(rotation=rotation(0, np.pi / 2))
+    parts: list[Part] = [(body.moved(scale=(1, -1, 1)), 0)]
 
-    def wing(
-        root: float, tip: float, half: float, sweep: float, at: object, thick: float, rise: float
-    ) -> list[Surface]:
-        outline = np.array([(-0.5, -0.3), (0.5, -0.3), (0.5, 0.3), (-0.5, 0.3)]) * (1, thick)
-        made = []
-        for s in (-1, 1):
-            ends = np.stack([outline * root, outline * tip + (sweep, rise)])
-            solid = loft(ends, np.array([0, half]))
-            swap = np.stack([s * solid.vertices[:, 2], solid.vertices[:, 0], solid.vertices[:, 1]], -1)
-            made.append(Surface(swap + np.asarray(at, dtype=float), solid.faces))
-        return made
+    def wings(root: float, tip: float, half: float, sweep: float, at: ArrayLike, rise: float) -> list[Part]:
+        outline = np.array([(-0.5, -0.3), (0.5, -0.3), (0.5, 0.3), (-0.5, 0.3)]) * (1, 0.15)
+        solid = loft(np.stack([outline * root, outline * tip + (sweep, rise)]), np.array([0, half]))
+        x, y, z = solid.vertices.T
+        return [(Surface(np.stack([s * z, x, y], -1), solid.faces).moved(at), 1) for s in (-1, 1)]
 
     height, sweep = rng.choice([-0.5, 0.0, 0.9]) * r, rng.uniform(0, 0.5)
-    parts += [
-        (s, 1)
-        for s in wing(
-            rng.uniform(0.25, 0.45), rng.uniform(0.08, 0.25), span, sweep, (0, -0.05, height), 0.15, rng.uniform(0, 0.1)
-        )
-    ]
-    parts += [
-        (s, 1) for s in wing(0.2, 0.1, 0.35 * span, 0.6 * sweep, (0, 0.85, rng.choice([0.3, 2.0]) * r), 0.15, 0.02)
-    ]
-    fin = wing(0.25, 0.12, rng.uniform(0.2, 0.35), 0.15, (0, 0.85, 0), 0.15, 0.0)[1]
+    root, tip, rise = rng.uniform(0.25, 0.45), rng.uniform(0.08, 0.25), rng.uniform(0, 0.1)
+    parts += wings(root, tip, span, sweep, (0, -0.05, height), rise)
+    parts += wings(0.2, 0.1, 0.35 * span, 0.6 * sweep, (0, 0.85, rng.choice([0.3, 2.0]) * r), 0.02)
+    fin, _ = wings(0.25, 0.12, rng.uniform(0.2, 0.35), 0.15, (0, 0.85, 0), 0.0)[1]
     parts.append((fin.moved((0, 0, 0.5 * r), rotation(1, -np.pi / 2)), 2))
     n = int(rng.integers(0, 3))
     for k in range(n):
@@ -185,17 +157,16 @@ def boat(rng: Rng) -> list[Part]:
     top = 0.0
     for k in range(int(rng.integers(0, 4))):
         size = np.array([rng.uniform(0.4, 0.8) * width, rng.uniform(0.15, 0.5) * length, rng.uniform(0.08, 0.25)])
-        parts.append(
-            (rounded_box(rng, size).moved((0, rng.uniform(-0.1, 0.2) * length, top + 0.5 * size[2])), 1 + k % 2)
-        )
+        deck = rounded_box(rng, size)
+        parts.append((deck.moved((0, rng.uniform(-0.1, 0.2) * length, top + 0.5 * size[2])), 1 + k % 2))
         top += size[2]
     if rng.random() < 0.5:
         mast, high = np.array([0, -0.1 * length, 0]), rng.uniform(0.8, 2.2)
         parts.append((bar(mast, mast + np.array((0, 0, high)), 0.015), 3))
         if rng.random() < 0.7:
             sail = mast + np.array([(0, 0.02, 0.15), (0, 0.4 * length, 0.15), (0.02, 0.02, high)])
-            parts.append((Surface(sail, np.array([[0, 1, 2]])), 4))
-            parts.append((Surface(sail * (1, -0.9, 1) + (0, 2 * mast[1] * 0.95, 0), np.array([[0, 1, 2]])), 4))
+            for corners in (sail, sail * (1, -0.9, 1) + (0, 2 * mast[1] * 0.95, 0)):
+                parts.append((Surface(corners, np.array([[0, 1, 2]])), 4))
     return parts
 
 
