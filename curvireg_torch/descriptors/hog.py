@@ -20,8 +20,6 @@ from ..filters.numerics import (
 )
 from ..utils.checks import check_field, check_option, check_positive, check_tensor
 
-__all__ = ["HOG", "hog", "hog_length", "orientation_cells"]
-
 VOTINGS = ("linear", "hard")
 
 _EPSILON = 1e-5
@@ -29,12 +27,7 @@ _EPSILON = 1e-5
 
 
 def hog_length(*, grid: int = 8, bins: int = 9, block: int = 2) -> int:
-    """Number of entries of a descriptor: (grid - block + 1)^2 block^2 bins.
-
-    Example:
-        >>> hog_length()
-        1764
-    """
+    """Number of entries of a descriptor: (grid - block + 1)^2 block^2 bins."""
     return (grid - block + 1) ** 2 * block**2 * bins
 
 
@@ -53,12 +46,11 @@ def hog(
     Each pixel votes with the length of its vector for the orientation of the vector modulo 180 degrees. ``"linear"``
     voting interpolates between the two nearest bins and the four nearest cells; ``"hard"`` voting uses one bin and one
     cell, as ``skimage.feature.hog`` does. Cell histograms are means over the cell area. Blocks of ``block`` x ``block``
-    cells are normalised by L2-Hys: to unit length, clipped, and to unit length again. The regularisation is relative to
-    the strongest block of the image, so the descriptor is invariant to the unit of the field and to contrast.
+    cells are normalised by L2-Hys, regularised relative to the strongest block of the image, so the descriptor is
+    invariant to the unit of the field and to contrast.
 
     Args:
-        field: (B, 2, H, W), channel 0 = x, 1 = y, H and W >= grid. Vectors with a NaN or infinite component have no
-            vote.
+        field: (B, 2, H, W), channel 0 = x, 1 = y, H and W >= grid. Vectors that are not finite have no vote.
         grid: cells along each side.
         bins: orientations over 180 degrees.
         block: cells along the side of a block, <= grid.
@@ -69,10 +61,7 @@ def hog(
 
     Returns:
         (B, D), D = (grid - block + 1)^2 block^2 bins = 1764 by default, ordered block row, block column, cell row, cell
-        column, bin; entries in [0, 1]. A field of zeros gives zeros. dtype kept (half types compute in float32).
-
-    Raises:
-        InvalidInputError: wrong shape, dtype or option, or fewer pixels than cells.
+        column, bin; entries in [0, 1]. A field of zeros gives zeros.
 
     Example:
         >>> hog(torch.randn(4, 2, 64, 64)).shape
@@ -104,15 +93,11 @@ def orientation_cells(field: Tensor, *, grid: tuple[int, int], bins: int = 9) ->
     """Cell histograms of :func:`hog` before block normalisation, on a grid that may be rectangular.
 
     Args:
-        field: (B, 2, H, W), channel 0 = x, 1 = y; vectors with a NaN or infinite component have no vote.
+        field, bins: as in :func:`hog`.
         grid: rows and columns of cells, at most H and W.
-        bins: orientations over 180 degrees.
 
     Returns:
         (B, bins, rows, columns) mean vector length per orientation in the unit of the field.
-
-    Raises:
-        InvalidInputError: wrong shape, dtype or option, or fewer pixels than cells.
 
     Example:
         >>> orientation_cells(torch.randn(1, 2, 48, 64), grid=(6, 8)).shape
@@ -183,18 +168,13 @@ class HOG(OptionsModule):
     """Module twin of :func:`hog`.
 
     Args:
-        grid: cells along each side.
-        bins: orientations over 180 degrees.
-        block: cells along the side of a block, <= grid.
-        clip: upper limit of L2-Hys in (0, 1].
-        voting: ``"linear"`` or ``"hard"``.
+        grid, bins, block, clip, voting: as in the function.
         learnable: make ``bin_weights`` (bins,), initially 1, a positive parameter; otherwise it is None.
 
     Shape:
         Input (B, 2, H, W); output (B, D), D = :func:`hog_length` of grid, bins and block.
 
     Example:
-        >>> import torch
         >>> layer = HOG(grid=4)
         >>> layer(torch.randn(2, 2, 32, 32)).shape, layer.length
         (torch.Size([2, 324]), 324)
@@ -223,7 +203,7 @@ class HOG(OptionsModule):
 
     @property
     def length(self) -> int:
-        """Number of entries of a descriptor."""
+        """As :func:`hog_length`."""
         return hog_length(grid=self.grid, bins=self.bins, block=self.block)
 
     def rotated_by_180(self, descriptors: Tensor) -> Tensor:

@@ -9,15 +9,12 @@ from ..filters.numerics import at_least_float32, safe_sqrt
 from ..filters.suppression import is_directional_maximum
 from ..utils.checks import check_field, check_fraction
 
-__all__ = ["field_points", "strongest_points"]
-
 
 def field_points(field: Tensor, *, fraction: float = 0.04, threshold: float = 0.0, suppress: bool = True) -> Tensor:
     """Feature points: maxima of the length of a vector field across its direction, restricted to the longest vectors.
 
     Each length is compared with the two neighbours along the direction of the field, rounded to 45 degrees as in Canny.
-    The longest maxima above ``threshold`` are selected, up to ``fraction`` of all pixels; ties at the limit are all
-    selected.
+    Ties at the limit of ``fraction`` are all selected.
 
     Args:
         field: (B, 2, H, W). Vectors with a NaN or infinite component count as 0.
@@ -27,9 +24,6 @@ def field_points(field: Tensor, *, fraction: float = 0.04, threshold: float = 0.
 
     Returns:
         (B, 1, H, W) bool.
-
-    Raises:
-        InvalidInputError: wrong shape, dtype, fraction or threshold.
 
     Example:
         >>> field = torch.zeros(1, 2, 9, 9)

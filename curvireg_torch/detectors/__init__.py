@@ -8,11 +8,10 @@ from collections.abc import Callable
 
 from ..utils.registry import Registry
 from .base import Detection
-from .corners import harris, minimum_eigenvalue
 from .edges import canny, fuzzy_edges, laplacian_of_gaussian, sobel
 from .fast_hessian import fast_hessian
 from .fields import focus_curves, gradient, multiscale_saliency, principal_curvature
-from .keypoints import sift
+from .keypoints import harris, minimum_eigenvalue, sift
 from .response import Response
 
 __all__ = [

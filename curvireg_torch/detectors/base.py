@@ -44,8 +44,7 @@ class Detection(NamedTuple):
 def detector(function: Function) -> Function:
     """Decorator that lets a detector on finite grey levels accept any photograph.
 
-    (B, 3, H, W) is RGB and becomes grey; half types compute in float32. NaN and infinite pixels are filled from their
-    surroundings and have no detections.
+    RGB becomes grey, half types compute in float32, and missing pixels are filled and have no detections.
     """
 
     @functools.wraps(function)

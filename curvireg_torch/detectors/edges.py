@@ -16,8 +16,7 @@ from .base import Detection, detection_from_field, detector, to_uint8_images
 def sobel_gradient(image: Tensor) -> Tensor:
     """(B, 2, H, W) gradient of (B, 1, H, W) by the Sobel kernels, per px (their sums divided by 8)."""
     p = replicate_pad(image, 1)
-    along_x = p[..., 2:] - p[..., :-2]
-    along_y = p[..., 2:, :] - p[..., :-2, :]
+    along_x, along_y = p[..., 2:] - p[..., :-2], p[..., 2:, :] - p[..., :-2, :]
     gx = along_x[..., :-2, :] + 2.0 * along_x[..., 1:-1, :] + along_x[..., 2:, :]
     gy = along_y[..., :-2] + 2.0 * along_y[..., 1:-1] + along_y[..., 2:]
     return torch.cat([gx, gy], dim=1) / 8.0
@@ -89,15 +88,9 @@ def canny(image: Tensor, *, sigma: float = 1.4, edges: float = 0.3, fraction: fl
 def fuzzy_edges(image: Tensor, *, width: float = 0.1, fraction: float = 0.04) -> Detection:
     r"""Edges by fuzzy rules on the two derivatives, each divided by the largest derivative of the image.
 
-    The membership of "zero" is :math:`\mu(g) = \exp(-g^2 / (2\,\mathrm{width}^2))`. AND is min, OR is max, NOT is
-    1 - mu.
-
-    1. If I_x is zero and I_y is zero, the pixel is uniform (0).
-    2. If I_x is not zero or I_y is not zero, the pixel is an edge (1).
-
-    The response is the mean of 0 and 1 weighted by the truth of each rule (Sugeno). Rule 2 is the negation of rule 1,
-    so the weights add up to 1 and the response is :math:`1 - \min(\mu(I_x), \mu(I_y))`. Points are its maxima along the
-    gradient.
+    With "zero" as :math:`\mu(g) = \exp(-g^2 / (2\,\mathrm{width}^2))` and AND as min, a pixel is uniform (0) if I_x is
+    zero and I_y is zero, and an edge (1) otherwise. The response is the mean of 0 and 1 weighted by the truth of each
+    rule (Sugeno), :math:`1 - \min(\mu(I_x), \mu(I_y))`. Points are its maxima along the gradient.
     """
     check_positive(width, "width")
     gradient = image_gradient(image, sigma=1.0)

@@ -16,18 +16,11 @@ OCTAVES = ((9, 15, 21, 27), (15, 27, 39, 51), (27, 51, 75, 99))
 def fast_hessian(image: Tensor, *, threshold: float = 1e-4, fraction: float = 0.04) -> Detection:
     r"""Fast-Hessian (Bay et al. 2008): determinant of a Hessian of box filters, the detector of SURF.
 
-    Own code, because OpenCV packages come without SURF. The second derivatives are box sums, computed from an integral
-    image and divided by the filter area; the response is :math:`D_{xx} D_{yy} - (0.9 D_{xy})^2`. Points are maxima over
-    3 x 3 px and three neighbouring filter sides of an octave. Every octave is sampled at every pixel, without sub-pixel
-    refinement. Filters larger than the image are skipped; borders are replicated. Computed in float64 on the CPU.
-
-    Args:
-        image: (B, 1, H, W) grey levels in [0, 1].
-        threshold: on the determinant, > 0.
-        fraction: largest fraction of the pixels that become points.
-
-    Returns:
-        The response is the largest determinant over all sides, where positive.
+    Own code, because OpenCV packages come without SURF. The second derivatives are box sums divided by the filter area;
+    the response is the largest :math:`D_{xx} D_{yy} - (0.9 D_{xy})^2` over all filter sides, where positive. Points are
+    maxima above ``threshold`` > 0 over 3 x 3 px and three neighbouring sides of an octave. Every octave is sampled at
+    every pixel, without sub-pixel refinement. Filters larger than the image are skipped; borders are replicated.
+    Computed in float64 on the CPU.
     """
     check_positive(threshold, "threshold")
     H, W = image.shape[-2:]

@@ -7,8 +7,6 @@ from torch import Tensor, nn
 from ..filters.numerics import safe_sqrt
 from .base import Detection
 
-__all__ = ["Response"]
-
 
 class Response(nn.Module):
     """Response map of a filter or detector, as ``resp_module`` of ``kornia.feature.ScaleSpaceDetector``.

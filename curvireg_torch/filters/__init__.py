@@ -1,6 +1,8 @@
 """Images and depth images (B, 1, H, W) to vector fields (B, 2, H, W).
 
-Channel 0 = x, 1 = y; the length is the measure, the direction points across the edge, its sign is arbitrary.
+Channel 0 = x, 1 = y; the length is the measure, the direction points across the edge, its sign is arbitrary. Each
+function has a module twin with the same options. The dtype is kept (half types compute in float32). Wrong shapes,
+dtypes, masks and options raise :class:`~curvireg_torch.errors.InvalidInputError`.
 
 The bilateral filter is kornia's. These parts are own code, with the time of kornia's as a multiple of ours on one CPU
 thread (``scripts/speed/filters.py``): gradient 27, gradient and Hessian 26, Sobel 14, differences of neighbours in the

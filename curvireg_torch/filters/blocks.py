@@ -9,8 +9,6 @@ from torch import Tensor
 
 from .numerics import is_traced
 
-__all__ = ["BLOCK", "Planes", "apply_in_blocks", "stack_channels"]
-
 Planes = tuple[Tensor, ...]
 """Channels of a result: several tensors (B, 1, H, W), or one tensor that holds them all."""
 

@@ -13,13 +13,6 @@ from .inputs import apply_to_photograph
 from .learnable import OptionsModule, check_scalar
 from .numerics import at_least_float32, clone_if_grad, safe_eps, safe_sqrt, squared_length
 
-__all__ = [
-    "DepthCurvilinearSaliency",
-    "ImageCurvilinearSaliency",
-    "depth_curvilinear_saliency",
-    "image_curvilinear_saliency",
-]
-
 BACKGROUND = 1.25
 """Depth of missing pixels behind the nearest visible point, in units of the visible depth range."""
 
@@ -32,9 +25,8 @@ FORMULAS = ("geometric", "paper")
 def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Depth with missing pixels at the largest number; nearest depth and depth range of each image, (B, 1, 1, 1).
 
-    Missing pixels are 0, negative, inf, NaN or outside ``mask``. A range of at most 1e-6 of the largest depth is
-    rounding on a surface parallel to the image and must not be stretched: the largest depth is returned instead, so
-    that the unit of depth does not matter. The range of an empty image is 1.
+    Missing pixels are 0, negative, inf, NaN or outside ``mask``. For a range of at most ``_MIN_RELATIVE_RANGE``, which
+    must not be stretched, the largest depth is returned instead. The range of an empty image is 1.
     """
     # Two equivalent forms: eager, torch.where takes seven times as long; compiled, nan_to_num is not vectorised.
     compiling = torch.compiler.is_compiling()
@@ -50,11 +42,7 @@ def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, T
 
 
 def fill_depth(depth: Tensor, mask: Tensor | None, depth_scale: float | None) -> Tensor:
-    """Depth as a graph surface: nearest visible point at 0, missing pixels at ``BACKGROUND`` depth ranges.
-
-    With ``depth_scale=None`` the visible range is scaled to 1; a number multiplies the depth instead. An image without
-    visible pixels becomes constant.
-    """
+    """Depth as a graph surface: nearest visible point at 0, missing pixels at ``BACKGROUND`` depth ranges."""
     surface, near, span = visible_range(depth, mask)
     scale = 1.0 / span if depth_scale is None else depth_scale
     return torch.minimum(surface - near, BACKGROUND * span).mul_(scale)
@@ -88,10 +76,7 @@ def depth_curvilinear_saliency(
             (1 with depth in px gives curvature in 1/px).
 
     Returns:
-        (B, 2, H, W) vector field, finite everywhere; its length is CS >= 0. dtype kept (half types compute in float32).
-
-    Raises:
-        InvalidInputError: wrong shape, dtype, mask or option.
+        (B, 2, H, W) vector field, finite everywhere; its length is CS >= 0.
 
     Example:
         >>> y, x = torch.meshgrid(torch.arange(65.0) - 32, torch.arange(65.0) - 32, indexing="ij")
@@ -113,7 +98,7 @@ def depth_curvilinear_saliency(
 
 
 def check_depth(depth: Tensor, mask: Tensor | None) -> Tensor | None:
-    """Check both; return the mask expanded to the shape of the depth."""
+    """The mask expanded to the shape of the depth."""
     check_image(depth, "depth")
     if mask is None:
         return None
@@ -129,7 +114,7 @@ def check_depth_scale(depth_scale: float | None) -> float | None:
 
 
 def _shape_operator(z: Tensor, formula: str) -> Planes:
-    """Ratio of CS to half the eigenvalue difference of M, and M row by row, from z with a margin of 1 px."""
+    """Ratio of CS to half the eigenvalue difference of M, and M row by row; z has a margin of 1 px."""
     zx, zy, zxx, zyy, zxy = central_derivatives(z)
     # M = adj(I_P) H_Z = H_Z + (z_y, -z_x)^T (u, -v).
     u, v = (zy * zxx).addcmul_(zx, zxy, value=-1), (zx * zyy).addcmul_(zy, zxy, value=-1)
@@ -146,11 +131,10 @@ def _shape_operator(z: Tensor, formula: str) -> Planes:
 def dominant_eigenvector(
     m11: Tensor, m12: Tensor, m21: Tensor, m22: Tensor, sign: float | Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Dominant eigenvector of [[m11, m12], [m21, m22]] with real eigenvalues, and half the eigenvalue difference.
+    """Eigenvector (vx, vy) of [[m11, m12], [m21, m22]] with real eigenvalues, and half the eigenvalue difference.
 
-    Returns:
-        (vx, vy, half_gap): (vx, vy), of any length, belongs to the eigenvalue largest in absolute value, or with
-        ``sign=1`` to the largest one. It is 0 for a multiple of the identity.
+    It belongs to the eigenvalue largest in absolute value, or with ``sign=1`` to the largest one, and has any length.
+    It is 0 for a multiple of the identity.
     """
     gap = m11 - m22
     # tr^2 / 4 - det in a form without cancellation.
@@ -181,15 +165,10 @@ def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) ->
     r"""Curvilinear saliency of a photograph, :math:`\mu_1-\mu_2 = |\nabla I|^2` (the paper's ``equ:PG:004``).
 
     Args:
-        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB. NaN pixels are missing: 0 in the
-            result.
-        sigma: smoothing in px before differentiation, >= 0.
+        image, sigma: as in :func:`image_gradient`.
 
     Returns:
-        (B, 2, H, W): length :math:`|\nabla I|^2`, direction of the gradient. dtype kept.
-
-    Raises:
-        InvalidInputError: wrong shape, dtype or sigma.
+        (B, 2, H, W): length :math:`|\nabla I|^2`, direction of the gradient.
 
     Example:
         >>> ramp = 3 * torch.arange(8.0).expand(1, 1, 8, 8)
@@ -210,16 +189,13 @@ class DepthCurvilinearSaliency(OptionsModule):
     """Module twin of :func:`depth_curvilinear_saliency`.
 
     Args:
-        sigma: smoothing in px before differentiation, >= 0.
-        formula: ``"geometric"`` or ``"paper"``.
-        depth_scale: None rescales each image's visible depth range to 1; a number multiplies the depth.
+        sigma, formula, depth_scale: as in the function.
         learnable: make sigma a positive parameter.
 
     Shape:
         Input (B, 1, H, W) depth and optionally a mask that broadcasts to it; output (B, 2, H, W).
 
     Example:
-        >>> import torch
         >>> plane = torch.arange(32.0).expand(1, 1, 32, 32) + 10
         >>> round(float(DepthCurvilinearSaliency()(plane).norm()), 3)
         0.0
@@ -236,9 +212,7 @@ class DepthCurvilinearSaliency(OptionsModule):
         check_option(formula, FORMULAS, "formula")
         check_scalar(sigma, "sigma", zero_ok=True)
         check_depth_scale(depth_scale)
-        super().__init__(
-            sigma=sigma, formula=formula, depth_scale=depth_scale, learnable=("sigma",) if learnable else ()
-        )
+        super().__init__(learnable, sigma=sigma, formula=formula, depth_scale=depth_scale)
 
     def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
         return depth_curvilinear_saliency(depth, mask, **self.options)
@@ -248,22 +222,20 @@ class ImageCurvilinearSaliency(OptionsModule):
     """Module twin of :func:`image_curvilinear_saliency`.
 
     Args:
-        sigma: smoothing in px before differentiation, >= 0.
+        sigma: as in the function.
         learnable: make sigma a positive parameter.
 
     Shape:
         Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
 
     Example:
-        >>> import torch
-        >>> layer = ImageCurvilinearSaliency(learnable=True)
-        >>> layer(torch.rand(2, 3, 32, 32)).shape, len(list(layer.parameters()))
-        (torch.Size([2, 2, 32, 32]), 1)
+        >>> len(list(ImageCurvilinearSaliency(learnable=True).parameters()))
+        1
     """
 
     def __init__(self, *, sigma: float = 1.0, learnable: bool = False) -> None:
         check_scalar(sigma, "sigma", zero_ok=True)
-        super().__init__(sigma=sigma, learnable=("sigma",) if learnable else ())
+        super().__init__(learnable, sigma=sigma)
 
     def forward(self, image: Tensor) -> Tensor:
         return image_curvilinear_saliency(image, **self.options)

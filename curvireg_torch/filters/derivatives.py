@@ -1,8 +1,4 @@
-"""Gaussian smoothing and finite differences on (B, C, H, W) tensors.
-
-Own code in place of ``kornia.filters.spatial_gradient``, which takes 26 times as long on a CPU, and
-``gaussian_blur2d``, which takes 1.0 to 1.3 times as long and rounds differently (``scripts/speed/filters.py``).
-"""
+"""Gaussian smoothing and finite differences on (B, C, H, W) tensors."""
 
 import math
 from collections.abc import Sequence
@@ -13,8 +9,6 @@ from torch import Tensor
 
 from .learnable import check_scalar
 from .numerics import at_least_float32, is_host_readable
-
-__all__ = ["central_derivatives", "central_gradient", "extrapolate_pad", "gaussian_smooth", "replicate_pad", "smooth"]
 
 _MAX_TENSOR_RADIUS = 16
 """Largest kernel radius in px for a sigma that is a tensor: a traced graph reserves it, since it cannot read sigma."""
@@ -27,16 +21,10 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
     """Separable Gaussian smoothing with replicated borders.
 
     Args:
-        x: (B, C, H, W), any floating dtype (kept; half types compute in float32). NaN spreads.
+        x: (B, C, H, W), as the result. NaN spreads.
         sigma: standard deviation in px, >= 0; 0 returns ``x``. A scalar tensor is differentiable. The kernel is cut at
             ceil(4 sigma) px, for a tensor at 16 px at most. While tracing (compile, export, vmap), the sign of a tensor
             cannot be checked, and values below 0.001 px are clamped to 0.001 px.
-
-    Returns:
-        (B, C, H, W), dtype of ``x``.
-
-    Raises:
-        InvalidInputError: negative, infinite or NaN sigma, or a tensor that is not a scalar.
 
     Example:
         >>> gaussian_smooth(torch.ones(1, 1, 5, 5), 1.0).shape

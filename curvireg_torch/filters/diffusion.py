@@ -11,8 +11,6 @@ from .inputs import fill_missing
 from .learnable import OptionsModule, check_scalar, safe_reciprocal
 from .numerics import at_least_float32
 
-__all__ = ["AnisotropicDiffusion", "anisotropic_diffusion"]
-
 CONDUCTANCES = ("rational", "exponential")
 
 
@@ -37,10 +35,7 @@ def anisotropic_diffusion(
         conductance: ``"rational"`` or ``"exponential"``.
 
     Returns:
-        (B, C, H, W) with the mean of the input and values within its range. dtype kept (half types compute in float32).
-
-    Raises:
-        InvalidInputError: wrong shape, dtype or option.
+        (B, C, H, W) with the mean of the input and values within its range.
 
     Example:
         >>> anisotropic_diffusion(torch.rand(1, 3, 16, 16), iterations=5).shape
@@ -58,7 +53,7 @@ def anisotropic_diffusion(
 def check_diffusion(
     iterations: int, kappa: float | Tensor, step: float, conductance: str
 ) -> tuple[float | Tensor, float]:
-    """Check all options; return kappa and step."""
+    """Returns kappa and step."""
     check_option(conductance, CONDUCTANCES, "conductance")
     if iterations < 0:
         raise InvalidInputError(f"iterations: expected >= 0, got {iterations}")
@@ -90,21 +85,19 @@ class AnisotropicDiffusion(OptionsModule):
     """Module twin of :func:`anisotropic_diffusion`.
 
     Args:
-        iterations: number of steps, >= 0.
-        kappa: difference in grey levels above which an edge is preserved, > 0.
-        step: time step in (0, 0.25].
-        conductance: ``"rational"`` or ``"exponential"``.
+        iterations, kappa, step, conductance: as in the function.
         learnable: make kappa a positive parameter.
 
     Shape:
         Input (B, C, H, W); output the same.
 
     Example:
-        >>> import torch
         >>> noise = torch.rand(1, 3, 32, 32)
         >>> bool(AnisotropicDiffusion(iterations=10, kappa=1.0)(noise).std() < 0.5 * noise.std())
         True
     """
+
+    LEARNABLE = ("kappa",)
 
     def __init__(
         self,
@@ -116,13 +109,7 @@ class AnisotropicDiffusion(OptionsModule):
         learnable: bool = False,
     ) -> None:
         check_diffusion(iterations, kappa, step, conductance)
-        super().__init__(
-            iterations=iterations,
-            kappa=kappa,
-            step=step,
-            conductance=conductance,
-            learnable=("kappa",) if learnable else (),
-        )
+        super().__init__(learnable, iterations=iterations, kappa=kappa, step=step, conductance=conductance)
 
     def forward(self, image: Tensor) -> Tensor:
         return anisotropic_diffusion(image, **self.options)

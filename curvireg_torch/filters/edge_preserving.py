@@ -1,8 +1,4 @@
-"""Bilateral and guided filters, alternatives to Perona-Malik diffusion under MCS.
-
-The bilateral filter is kornia's. The guided filter is own code, because ``kornia.filters.guided_blur`` takes three
-times as long.
-"""
+"""Bilateral and guided filters, alternatives to Perona-Malik diffusion under MCS."""
 
 import math
 
@@ -16,8 +12,6 @@ from .inputs import fill_missing
 from .learnable import check_scalar, safe_reciprocal
 from .numerics import at_least_float32
 
-__all__ = ["bilateral_smooth", "guided_smooth"]
-
 
 def bilateral_smooth(image: Tensor, *, sigma: float, kappa: float | Tensor = 0.03) -> Tensor:
     r"""Bilateral filter (Tomasi and Manduchi 1998) over a square window of radius ceil(2 sigma), borders replicated.
@@ -28,10 +22,7 @@ def bilateral_smooth(image: Tensor, *, sigma: float, kappa: float | Tensor = 0.0
         kappa: standard deviation in grey levels, > 0; a scalar tensor is differentiable.
 
     Returns:
-        (B, C, H, W), within the range of the input. dtype kept (half types compute in float32).
-
-    Raises:
-        InvalidInputError: wrong shape, dtype or option.
+        (B, C, H, W), within the range of the input.
 
     Example:
         >>> import torch
@@ -58,16 +49,9 @@ def guided_smooth(image: Tensor, *, sigma: float, kappa: float | Tensor = 0.03) 
     image where it is well above.
 
     Args:
-        image: (B, C, H, W); channels are smoothed independently. NaN pixels are missing and filled.
+        image, kappa: as in :func:`bilateral_smooth`.
         sigma: standard deviation in px of the smoothing in flat regions, > 0. It determines the radius r >= 1 of the
             box of side 2 r + 1, since two box means have the variance (2/3) r (r + 1).
-        kappa: standard deviation in grey levels, > 0; a scalar tensor is differentiable.
-
-    Returns:
-        (B, C, H, W). dtype kept (half types compute in float32).
-
-    Raises:
-        InvalidInputError: wrong shape, dtype or option.
 
     Example:
         >>> import torch

@@ -13,10 +13,8 @@ from .blocks import Planes
 from .curvilinear import scaled_direction
 from .derivatives import central_gradient, smooth
 from .inputs import apply_to_photograph
-from .learnable import OptionsModule, check_scalar
+from .learnable import OptionsModule, check_scalar, check_sigmas
 from .numerics import image_maximum, safe_eps, safe_sqrt, squared_length
-
-__all__ = ["EdgeBlur", "MultiScaleFocusCurves", "edge_blur", "multiscale_focus_curves"]
 
 MODES = ("reblur-image", "reblur-saliency")
 MAX_BLUR = 1000.0
@@ -31,10 +29,7 @@ _MIN_RELATIVE_SALIENCY = 1e-3
 
 
 def edge_blur(
-    image: Tensor,
-    *,
-    reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0),
-    mode: str = "reblur-image",
+    image: Tensor, *, reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0), mode: str = "reblur-image"
 ) -> Tensor:
     r"""Blur (standard deviation in px) of the step edge through each pixel, one estimate per re-blurring.
 
@@ -49,16 +44,12 @@ def edge_blur(
     subtracted. The estimate is accurate on the centre line of the edge and grows beside it.
 
     Args:
-        image: (B, 1, H, W) grey levels, or (B, 3, H, W) RGB. NaN pixels are missing: 1000 in the result.
+        image: (B, 1, H, W) grey levels, or (B, 3, H, W) RGB. Missing (NaN) pixels give 1000.
         reblur_sigmas: S re-blurring sigmas in px, > 0.
         mode: ``"reblur-image"`` or ``"reblur-saliency"``.
 
     Returns:
-        (B, S, H, W) blur in px, in [0, 1000]; 1000 where re-blurring does not lower the saliency. dtype kept (half
-        types compute in float32).
-
-    Raises:
-        InvalidInputError: wrong shape, dtype or option.
+        (B, S, H, W) blur in px, in [0, 1000]; 1000 where re-blurring does not lower the saliency.
 
     Example:
         >>> x = torch.arange(65.0) - 32
@@ -66,7 +57,8 @@ def edge_blur(
         >>> abs(float(edge_blur(edge)[0, 0, 32, 32]) - 2.0) < 0.06
         True
     """
-    sigmas = _check_reblurring(reblur_sigmas, mode)
+    check_option(mode, MODES, "mode")
+    sigmas = check_sigmas(reblur_sigmas, "reblur_sigmas")
 
     def layer(x: Tensor) -> Planes:
         gx, gy = central_gradient(smooth(x, 0.0))
@@ -75,15 +67,8 @@ def edge_blur(
     return apply_to_photograph(layer, image, missing_value=MAX_BLUR)
 
 
-def _check_reblurring(reblur_sigmas: Sequence[float], mode: str) -> list[float]:
-    check_option(mode, MODES, "mode")
-    if len(reblur_sigmas) == 0:
-        raise InvalidInputError("reblur_sigmas: expected at least one sigma, got none")
-    return [check_positive(float(sigma), "reblur_sigmas") for sigma in reblur_sigmas]
-
-
 def _edge_blur(x: Tensor, saliency: Tensor, reblur_sigmas: Sequence[float], mode: str) -> list[Tensor]:
-    blurs: list[Tensor] = []
+    blurs = []
     for sigma in reblur_sigmas:
         if mode == "reblur-image":
             rx, ry = central_gradient(smooth(x, sigma))
@@ -117,7 +102,7 @@ def multiscale_focus_curves(
     edges; only the derivative kernel limits their value, to 1/0.6 = 1.67 per px at every sigma.
 
     Args:
-        image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB. NaN pixels are missing: 0 in the result.
+        image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
         scales: n >= 2.
         sigma: smoothing in px before all other steps, >= 0.
         mode: of :func:`edge_blur`.
@@ -126,10 +111,7 @@ def multiscale_focus_curves(
         threshold: T >= 0 in 1/px; None is the paper's :math:`e^{-n}`.
 
     Returns:
-        (B, 2, H, W) focus in 1/px, times CS^p in (grey levels per px)^2p, along the gradient. dtype kept.
-
-    Raises:
-        InvalidInputError: wrong shape, dtype or option.
+        (B, 2, H, W) focus in 1/px, times CS^p in (grey levels per px)^2p, along the gradient.
 
     Example:
         >>> multiscale_focus_curves(torch.rand(2, 1, 32, 32)).shape
@@ -154,7 +136,7 @@ def multiscale_focus_curves(
 
 
 def _check_focus(scales: int, mode: str, saliency_weight: float, threshold: float | None) -> tuple[float, float]:
-    """Check the options; return p and T."""
+    """Returns p and T."""
     check_option(mode, MODES, "mode")
     if scales < 2:
         raise InvalidInputError(f"scales: expected >= 2, got {scales}")
@@ -166,20 +148,19 @@ class EdgeBlur(OptionsModule):
     """Module twin of :func:`edge_blur`.
 
     Args:
-        reblur_sigmas: S re-blurring sigmas in px, > 0.
-        mode: ``"reblur-image"`` or ``"reblur-saliency"``.
+        reblur_sigmas, mode: as in the function.
 
     Shape:
         Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, S, H, W) in px.
 
     Example:
-        >>> import torch
         >>> EdgeBlur(reblur_sigmas=(1.0, 2.0))(torch.rand(1, 1, 32, 32)).shape
         torch.Size([1, 2, 32, 32])
     """
 
     def __init__(self, *, reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0), mode: str = "reblur-image") -> None:
-        _check_reblurring(reblur_sigmas, mode)
+        check_option(mode, MODES, "mode")
+        check_sigmas(reblur_sigmas, "reblur_sigmas")
         super().__init__(reblur_sigmas=tuple(reblur_sigmas), mode=mode)
 
     def forward(self, image: Tensor) -> Tensor:
@@ -190,18 +171,13 @@ class MultiScaleFocusCurves(OptionsModule):
     """Module twin of :func:`multiscale_focus_curves`.
 
     Args:
-        scales: n >= 2; the image is re-blurred by 1, 2, ..., n-1 px.
-        sigma: smoothing in px before all other steps, >= 0.
-        mode: of :func:`edge_blur`.
-        saliency_weight: p >= 0; the focus is multiplied by CS^p.
-        threshold: T >= 0 in 1/px; None is e^-n.
+        scales, sigma, mode, saliency_weight, threshold: as in the function.
         learnable: make sigma a positive parameter.
 
     Shape:
         Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
 
     Example:
-        >>> import torch
         >>> from curvireg_torch import HOG
         >>> torch.nn.Sequential(MultiScaleFocusCurves(), HOG())(torch.rand(2, 3, 64, 64)).shape
         torch.Size([2, 1764])
@@ -220,12 +196,7 @@ class MultiScaleFocusCurves(OptionsModule):
         _check_focus(scales, mode, saliency_weight, threshold)
         check_scalar(sigma, "sigma", zero_ok=True)
         super().__init__(
-            scales=scales,
-            sigma=sigma,
-            mode=mode,
-            saliency_weight=saliency_weight,
-            threshold=threshold,
-            learnable=("sigma",) if learnable else (),
+            learnable, scales=scales, sigma=sigma, mode=mode, saliency_weight=saliency_weight, threshold=threshold
         )
 
     def forward(self, image: Tensor) -> Tensor:

@@ -11,26 +11,12 @@ from ..utils.checks import check_colour_image
 from .blocks import Planes, apply_in_blocks
 from .numerics import at_least_float32, is_host_readable
 
-__all__ = [
-    "apply_to_photograph",
-    "fill_missing",
-    "may_have_missing",
-    "missing_mask",
-    "to_grey",
-    "zero_nonfinite_vectors",
-]
-
 _PYRAMID_LEVELS = 5
 """Holes of up to 2^5 px are filled from their surroundings, the middle of larger ones with the mean of the image."""
 
 
 def apply_to_photograph(layer: Callable[[Tensor], Planes], image: Tensor, *, missing_value: float = 0.0) -> Tensor:
-    """Apply ``layer`` to photographs with the same input conventions for every layer.
-
-    (B, 3, H, W) is RGB and converted by :func:`to_grey`. NaN and infinite pixels are missing: they are filled from
-    their surroundings before the layer runs, and its result there is ``missing_value``. Half types compute in float32;
-    the result has the dtype of the image.
-    """
+    """Apply ``layer`` to grey levels; missing pixels are filled from their surroundings and give ``missing_value``."""
     check_colour_image(image)
 
     def on_filled(x: Tensor) -> Planes:
@@ -63,21 +49,15 @@ def missing_mask(x: Tensor) -> Tensor:
 
 
 def fill_missing(x: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Fill each missing pixel with the mean of the smallest pyramid cell of 2, 4, ... px that has any valid pixel.
+    """Fill each missing pixel of (B, C, H, W) with the mean of the smallest pyramid cell that has any valid pixel.
 
-    Args:
-        x: (B, C, H, W).
-        mask: True where a pixel is missing; None: where x is not finite.
-
-    Returns:
-        (B, C, H, W); an image without any valid pixel becomes 0.
+    ``mask`` is True where a pixel is missing; None: where x is not finite. An image without valid pixels becomes 0.
     """
     if mask is None:
         if not may_have_missing(x):
             return x
         mask = missing_mask(x)
-    sums = [torch.where(mask, 0.0, x)]
-    weights = [(~mask).to(x.dtype)]
+    sums, weights = [torch.where(mask, 0.0, x)], [(~mask).to(x.dtype)]
     for _ in range(_PYRAMID_LEVELS):
         sums.append(F.avg_pool2d(sums[-1], 2, ceil_mode=True))
         weights.append(F.avg_pool2d(weights[-1], 2, ceil_mode=True))

@@ -1,16 +1,15 @@
 """Options that a module can learn, and the base class of the modules that mirror a function."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
+from ..errors import InvalidInputError
 from ..utils.checks import check_positive, check_tensor
 from .numerics import is_host_readable
-
-__all__ = ["OptionsModule", "Positive", "check_scalar", "safe_reciprocal"]
 
 
 class Positive(nn.Module):
@@ -24,18 +23,16 @@ class Positive(nn.Module):
 
 
 class OptionsModule(nn.Module):
-    """Module twin of a function: it holds the function's options, learnable ones as positive parameters.
+    """Module twin of a function: it holds all options of the function, in the order in which ``repr`` shows them."""
 
-    Args:
-        learnable: names of the options that become parameters; their values must be positive.
-        options: all options of the function by name, in the order in which ``repr`` shows them.
-    """
+    LEARNABLE: ClassVar[tuple[str, ...]] = ("sigma",)
+    """Options that ``learnable=True`` makes positive parameters."""
 
-    def __init__(self, *, learnable: Sequence[str] = (), **options: Any) -> None:
+    def __init__(self, learnable: bool = False, **options: Any) -> None:
         super().__init__()
         self._names = tuple(options)
         for name, value in options.items():
-            if name in learnable:
+            if learnable and name in self.LEARNABLE:
                 self.register_parameter(name, nn.Parameter(torch.tensor(check_positive(value, name))))
                 parametrize.register_parametrization(self, name, Positive())
             else:
@@ -47,11 +44,8 @@ class OptionsModule(nn.Module):
         return {name: getattr(self, name) for name in self._names}
 
     def extra_repr(self) -> str:
-        return ", ".join(f"{name}={_plain(value)!r}" for name, value in self.options.items())
-
-
-def _plain(value: object) -> object:
-    return round(float(value.detach()), 6) if isinstance(value, Tensor) else value
+        numbers = {k: round(float(v.detach()), 6) if isinstance(v, Tensor) else v for k, v in self.options.items()}
+        return ", ".join(f"{name}={value!r}" for name, value in numbers.items())
 
 
 def check_scalar(value: float | Tensor, name: str, *, zero_ok: bool = False) -> float | Tensor:
@@ -62,6 +56,13 @@ def check_scalar(value: float | Tensor, name: str, *, zero_ok: bool = False) -> 
     if is_host_readable(value):
         check_positive(float(value.detach()), name, zero_ok=zero_ok)
     return value
+
+
+def check_sigmas(sigmas: Sequence[float], name: str) -> list[float]:
+    """At least one standard deviation, each > 0."""
+    if len(sigmas) == 0:
+        raise InvalidInputError(f"{name}: expected at least one sigma, got none")
+    return [check_positive(sigma, name) for sigma in sigmas]
 
 
 def safe_reciprocal(value: float | Tensor) -> float | Tensor:

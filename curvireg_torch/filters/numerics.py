@@ -7,18 +7,6 @@ import torch
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
-__all__ = [
-    "at_least_float32",
-    "clone_if_grad",
-    "full_precision",
-    "image_maximum",
-    "is_host_readable",
-    "is_traced",
-    "safe_eps",
-    "safe_sqrt",
-    "squared_length",
-]
-
 
 def safe_eps(x: Tensor) -> float:
     """Smallest positive number of x's dtype whose power -1.5, the derivative of ``rsqrt``, is finite with a margin."""

@@ -5,15 +5,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..errors import InvalidInputError
-from ..utils.checks import check_option, check_positive
+from ..utils.checks import check_option
 from .blocks import Planes
 from .curvilinear import default_to_x, dominant_eigenvector, scaled_direction
 from .derivatives import central_derivatives, smooth
 from .inputs import apply_to_photograph
-from .learnable import OptionsModule
-
-__all__ = ["PrincipalCurvatureImage", "principal_curvature_image"]
+from .learnable import OptionsModule, check_sigmas
 
 EIGENVALUES = ("largest", "smallest")
 
@@ -25,21 +22,16 @@ def principal_curvature_image(
 
     :math:`\max_\sigma \sigma^2 \max(\lambda, 0)` with :math:`\lambda` an eigenvalue of the Hessian of the image
     smoothed by :math:`\sigma`: the largest one (``"largest"``: dark lines and the dark side of edges) or the negated
-    smallest one (``"smallest"``: bright lines and the bright side). Deng et al. combine maxima over three neighbouring
-    scales in a watershed; like the paper, this function takes the maximum over all scales.
+    smallest one (``"smallest"``: bright lines and the bright side).
 
     Args:
-        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB. NaN pixels are missing: 0 in the
-            result.
+        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
         sigmas: scales in px, > 0.
         eigenvalue: ``"largest"`` or ``"smallest"``.
 
     Returns:
         (B, 2, H, W): the length is the curvature >= 0 in grey levels, the direction is across the line at the scale of
-        the maximum, with arbitrary sign. dtype kept (half types compute in float32).
-
-    Raises:
-        InvalidInputError: wrong shape, dtype or option.
+        the maximum, with arbitrary sign.
 
     Example:
         >>> line = torch.ones(1, 1, 33, 33)
@@ -48,7 +40,8 @@ def principal_curvature_image(
         >>> int(field[0, 0, 16].abs().argmax())
         16
     """
-    scales = _check_scales(sigmas, eigenvalue)
+    check_option(eigenvalue, EIGENVALUES, "eigenvalue")
+    scales = check_sigmas(sigmas, "sigmas")
     sign = 1.0 if eigenvalue == "largest" else -1.0
 
     def layer(image: Tensor) -> Planes:
@@ -64,33 +57,23 @@ def principal_curvature_image(
     return apply_to_photograph(layer, image)
 
 
-def _check_scales(sigmas: Sequence[float], eigenvalue: str) -> list[float]:
-    check_option(eigenvalue, EIGENVALUES, "eigenvalue")
-    if len(sigmas) == 0:
-        raise InvalidInputError("sigmas: expected at least one sigma, got none")
-    return [check_positive(sigma, "sigmas") for sigma in sigmas]
-
-
 class PrincipalCurvatureImage(OptionsModule):
     """Module twin of :func:`principal_curvature_image`.
 
     Args:
-        sigmas: scales in px, > 0.
-        eigenvalue: ``"largest"`` for dark lines or ``"smallest"`` for bright lines.
+        sigmas, eigenvalue: as in the function.
 
     Shape:
         Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
 
     Example:
-        >>> import torch
-        >>> line = torch.zeros(1, 1, 33, 33)
-        >>> line[..., 16] = 1.0                                                     # bright, along y
-        >>> int(PrincipalCurvatureImage(eigenvalue="smallest")(line)[0, 0, 16].abs().argmax())
-        16
+        >>> PrincipalCurvatureImage(eigenvalue="smallest")(torch.rand(2, 3, 32, 32)).shape
+        torch.Size([2, 2, 32, 32])
     """
 
     def __init__(self, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0), eigenvalue: str = "largest") -> None:
-        _check_scales(sigmas, eigenvalue)
+        check_option(eigenvalue, EIGENVALUES, "eigenvalue")
+        check_sigmas(sigmas, "sigmas")
         super().__init__(sigmas=tuple(sigmas), eigenvalue=eigenvalue)
 
     def forward(self, image: Tensor) -> Tensor:

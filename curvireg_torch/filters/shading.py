@@ -24,8 +24,6 @@ from .derivatives import central_derivatives, smooth
 from .learnable import OptionsModule, check_scalar
 from .numerics import at_least_float32, is_host_readable, safe_sqrt
 
-__all__ = ["AverageShadingGradient", "HessianFrobeniusNorm", "average_shading_gradient", "hessian_frobenius_norm"]
-
 
 def average_shading_gradient(
     depth: Tensor,
@@ -41,20 +39,14 @@ def average_shading_gradient(
     surface: a bound on the gradient of a Lambertian image averaged over all light directions.
 
     Args:
-        depth: (B, 1, H, W) z-depth. 0, negative, inf and NaN are background.
-        mask: bool, False = background; (B, 1, H, W) or broadcastable to it.
+        depth, mask, sigma: as in :func:`depth_curvilinear_saliency`.
         camera_matrix: (3, 3), (1, 3, 3) or (B, 3, 3) in px without skew: N is the normal of the surface seen by this
             perspective camera (``equ:PG:300``), for any unit of depth. None (orthographic): N is the normal of the
             graph of Z.
-        sigma: smoothing in px before differentiation, >= 0.
-        depth_scale: of :func:`depth_curvilinear_saliency`; orthographic only.
+        depth_scale: of :func:`depth_curvilinear_saliency`; refused together with ``camera_matrix``.
 
     Returns:
-        (B, 2, H, W): length ASG in 1/px, direction in which the normal changes fastest, with arbitrary sign. dtype kept
-        (half types compute in float32).
-
-    Raises:
-        InvalidInputError: wrong shape, dtype, mask or option, or ``depth_scale`` together with ``camera_matrix``.
+        (B, 2, H, W): length ASG in 1/px, direction in which the normal changes fastest, with arbitrary sign.
 
     Example:
         >>> y, x = torch.meshgrid(torch.arange(65.0) - 32, torch.arange(65.0) - 32, indexing="ij")
@@ -77,7 +69,7 @@ def average_shading_gradient(
 def check_shading(
     sigma: float | Tensor, depth_scale: float | None, camera_matrix: Tensor | None
 ) -> tuple[float | Tensor, float | None]:
-    """Check all options; return sigma and depth_scale."""
+    """Returns sigma and depth_scale."""
     if camera_matrix is not None:
         check_tensor(camera_matrix, "camera_matrix", (None,) * (camera_matrix.ndim == 3) + (3, 3))
         if is_host_readable(camera_matrix):
@@ -151,11 +143,7 @@ def hessian_frobenius_norm(
         depth, mask, sigma, depth_scale: as in :func:`depth_curvilinear_saliency`.
 
     Returns:
-        (B, 2, H, W): length HFN, direction of the largest second derivative, with arbitrary sign. dtype kept (half
-        types compute in float32).
-
-    Raises:
-        InvalidInputError: wrong shape, dtype, mask or option.
+        (B, 2, H, W): length HFN, direction of the largest second derivative, with arbitrary sign.
 
     Example:
         >>> y, x = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
@@ -175,7 +163,7 @@ def hessian_frobenius_norm(
 
 
 class CameraModule(OptionsModule):
-    """A module with a camera matrix that moves between devices and keeps its dtype: ``.half()`` would round it."""
+    """A module whose camera matrix moves between devices and keeps its dtype: ``.half()`` would round it."""
 
     camera_matrix: Tensor | None
 
@@ -198,16 +186,12 @@ class AverageShadingGradient(CameraModule):
     """Module twin of :func:`average_shading_gradient`.
 
     Args:
-        camera_matrix: (3, 3), (1, 3, 3) or (B, 3, 3) in px; it moves with the module and keeps its dtype. None:
-            orthographic.
-        sigma: smoothing in px before differentiation, >= 0.
-        depth_scale: of :func:`depth_curvilinear_saliency`; orthographic only.
+        camera_matrix, sigma, depth_scale: as in the function; the camera keeps its dtype.
 
     Shape:
         Input (B, 1, H, W) depth and optionally a mask that broadcasts to it; output (B, 2, H, W).
 
     Example:
-        >>> import torch
         >>> camera = torch.tensor([[50.0, 0.0, 15.5], [0.0, 50.0, 15.5], [0.0, 0.0, 1.0]])
         >>> wall = torch.full((1, 1, 32, 32), 3.0)
         >>> round(float(AverageShadingGradient(camera_matrix=camera)(wall).norm()), 3)
@@ -228,18 +212,14 @@ class HessianFrobeniusNorm(OptionsModule):
     """Module twin of :func:`hessian_frobenius_norm`.
 
     Args:
-        sigma: smoothing in px before differentiation, >= 0.
-        depth_scale: None rescales each image's visible depth range to 1; a number multiplies the depth.
+        sigma, depth_scale: as in the function.
 
     Shape:
         Input (B, 1, H, W) depth and optionally a mask that broadcasts to it; output (B, 2, H, W).
 
     Example:
-        >>> import torch
-        >>> x = torch.arange(33.0) - 16
-        >>> bowl = (1 + 0.5 * x**2).expand(1, 1, 33, 33)
-        >>> HessianFrobeniusNorm(sigma=0.0, depth_scale=1.0)(bowl)[0, :, 16, 16].tolist()
-        [1.0, 0.0]
+        >>> HessianFrobeniusNorm()(torch.ones(1, 1, 32, 32)).shape
+        torch.Size([1, 2, 32, 32])
     """
 
     def __init__(self, *, sigma: float = 1.0, depth_scale: float | None = None) -> None:

@@ -3,8 +3,6 @@
 import torch
 from torch import Tensor
 
-__all__ = ["is_directional_maximum"]
-
 
 def is_directional_maximum(length: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """True where ``length`` is a maximum along (x, y), rounded to 45 degrees as in Canny; all (B, 1, H, W)."""

@@ -1,7 +1,9 @@
 """Metrics of poses, rankings and feature points, as functions of a whole set.
 
 An average over no items is NaN. A missing estimate has the error ``inf`` and counts as a miss. Thresholds are strict:
-an error equal to the threshold is a miss; a radius in pixels is inclusive.
+an error equal to the threshold is a miss; a radius in pixels is inclusive. Arguments outside the documented shapes and
+ranges, on different devices, or with NaN or inf where no estimate can be missing raise
+:class:`~curvireg_torch.errors.InvalidInputError`.
 """
 
 from .points import hausdorff_distance, intersection_percentage, view_repeatability

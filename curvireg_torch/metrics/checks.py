@@ -17,11 +17,6 @@ def check_errors(errors: Tensor, name: str = "errors") -> None:
         )
 
 
-def type_and_shape(x: object) -> str:
-    """What was passed instead of the expected tensor, for an error message."""
-    return f"{x.dtype} of shape {tuple(x.shape)}" if isinstance(x, Tensor) else type(x).__name__
-
-
 def inf_unless(valid: Tensor, errors: Tensor) -> Tensor:
     """``errors``, replaced by ``inf`` where ``valid`` is False."""
     return torch.where(valid, errors, torch.full_like(errors, torch.inf))

@@ -9,10 +9,9 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import check_mask, check_positive
-from .checks import type_and_shape
+from ..utils.checks import check_mask, check_positive, type_and_shape
 
-__all__ = ["hausdorff_distance", "intersection_percentage", "view_repeatability"]
+Mask = NDArray[np.bool_]
 
 
 def intersection_percentage(photo: Tensor, view: Tensor, *, eps_px: float = 2.0) -> Tensor:
@@ -25,12 +24,8 @@ def intersection_percentage(photo: Tensor, view: Tensor, *, eps_px: float = 2.0)
     Returns:
         (...) in [0, 1]; NaN where the photograph has no points, 0 where only the view has none.
 
-    Raises:
-        InvalidInputError: masks that are not boolean or differ in shape or device; a bad radius.
-
     Example:
-        >>> photo = torch.tensor([[True, False, False, True]])
-        >>> view = torch.tensor([[False, True, False, False]])
+        >>> photo, view = torch.tensor([[[True, False, False, True]], [[False, True, False, False]]])
         >>> float(intersection_percentage(photo, view, eps_px=1.0))
         0.5
     """
@@ -43,11 +38,8 @@ def view_repeatability(view: Tensor, photo: Tensor, *, eps_px: float = 2.0) -> T
     This is :func:`intersection_percentage` with the roles exchanged. The paper's Rep, which ranks views
     (:func:`curvireg_torch.terms.repeatability.repeatability`), has the other direction.
 
-    Args, returns and errors are those of :func:`intersection_percentage`.
-
     Example:
-        >>> photo = torch.tensor([[True, False, False, True]])
-        >>> view = torch.tensor([[False, True, False, False]])
+        >>> photo, view = torch.tensor([[[True, False, False, True]], [[False, True, False, False]]])
         >>> float(view_repeatability(view, photo, eps_px=1.0))
         1.0
     """
@@ -68,19 +60,15 @@ def hausdorff_distance(a: Tensor, b: Tensor, *, percentile: float = 100.0, direc
     Returns:
         (...) px >= 0; ``inf`` where one mask is empty, NaN where both are.
 
-    Raises:
-        InvalidInputError: masks that are not boolean or differ in shape or device; a bad percentile.
-
     Example:
-        >>> a = torch.tensor([[True, False, False, False]])
-        >>> b = torch.tensor([[True, False, False, True]])
+        >>> a, b = torch.tensor([[[True, False, False, False]], [[True, False, False, True]]])
         >>> float(hausdorff_distance(a, b)), float(hausdorff_distance(a, b, directed=True))
         (3.0, 0.0)
     """
     if not 0.0 < percentile <= 100.0:
         raise InvalidInputError(f"percentile: expected a number in (0, 100], got {percentile}")
 
-    def of_pair(x: NDArray[np.bool_], y: NDArray[np.bool_]) -> float:
+    def of_pair(x: Mask, y: Mask) -> float:
         if not (x.any() and y.any()):
             return np.inf if x.any() or y.any() else np.nan
         forward = float(np.percentile(_distances(x, y), percentile))
@@ -89,12 +77,12 @@ def hausdorff_distance(a: Tensor, b: Tensor, *, percentile: float = 100.0, direc
     return _per_image(of_pair, a, b, ("a", "b"))
 
 
-def _fraction_within(eps_px: float) -> Callable[[NDArray[np.bool_], NDArray[np.bool_]], float]:
+def _fraction_within(eps_px: float) -> Callable[[Mask, Mask], float]:
     check_positive(eps_px, "eps_px", zero_ok=True)
     return lambda a, b: float((_distances(a, b) <= eps_px).mean()) if a.any() else np.nan
 
 
-def _distances(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _distances(a: Mask, b: Mask) -> NDArray[np.float64]:
     """Distance from each point of ``a`` to the nearest point of ``b``; ``inf`` if ``b`` is empty."""
     if not b.any():
         return np.full(int(a.sum()), np.inf)
@@ -102,16 +90,12 @@ def _distances(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.float64
     return to_b[a]
 
 
-def _per_image(
-    score: Callable[[NDArray[np.bool_], NDArray[np.bool_]], float], a: Tensor, b: Tensor, names: tuple[str, str]
-) -> Tensor:
+def _per_image(score: Callable[[Mask, Mask], float], a: Tensor, b: Tensor, names: tuple[str, str]) -> Tensor:
     """``score`` of each pair of (..., H, W) masks, as a (...) tensor of the default dtype on their device."""
     for name, mask in zip(names, (a, b), strict=True):
         if not isinstance(mask, Tensor) or mask.ndim < 2 or mask.dtype != torch.bool:
             raise InvalidInputError(f"{name}: expected bool (..., H, W), got {type_and_shape(mask)}")
     check_mask(b, a, names[1])
-    height, width = a.shape[-2:]
-    n = a.shape[:-2].numel()
-    pairs = zip(*(m.reshape(n, height, width).cpu().numpy() for m in (a, b)), strict=True)
-    scores = [score(x, y) for x, y in pairs]
+    shape = (a.shape[:-2].numel(), *a.shape[-2:])
+    scores = [score(x, y) for x, y in zip(*(m.reshape(shape).cpu().numpy() for m in (a, b)), strict=True)]
     return torch.tensor(scores, dtype=torch.get_default_dtype(), device=a.device).reshape(a.shape[:-2])

@@ -1,8 +1,7 @@
 """Errors of 6D poses (ADD, ADD-S, MSSD, MSPD) and the recalls of BOP.
 
-All functions take the estimated and the true pose ``T_cam_from_model`` and points on the surface of the model in one
-unit. A missing estimate is a pose of NaN; its error is ``inf``, so that it counts as a miss. Any other pose that is not
-rigid is refused.
+All errors take the estimated and the true pose ``T_cam_from_model`` and points on the surface of the model in one unit.
+A missing estimate is a pose of NaN; any other pose that is not rigid is refused.
 
 - ADD (Hinterstoisser et al. 2012): mean over the points x of ``|T_est x - T_gt x|``;
 - ADD-S: mean over x of the distance of ``T_gt x`` to the nearest ``T_est y``;
@@ -27,8 +26,6 @@ from ..utils.checks import (
 )
 from .checks import check_errors, fraction_true, inf_unless, per_item
 
-__all__ = ["add_error", "add_recall", "adds_error", "mspd_error", "mspd_recall", "mssd_error", "mssd_recall"]
-
 _CHUNK = 1 << 22
 """Points transformed at once: 50 MB of float32 coordinates."""
 
@@ -37,17 +34,14 @@ _MSPD_THRESHOLDS = tuple(5.0 * step for step in range(1, 11))
 
 
 def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
-    """ADD: mean distance of the model points under the two poses.
+    """ADD: mean distance of the points under the two poses.
 
     Args:
         T_est, T_gt: (B, 4, 4) rigid model -> camera; NaN in ``T_est`` for a missing estimate.
         points: (P, 3) on the model's surface, P >= 1.
 
     Returns:
-        (B,) in the unit of the points.
-
-    Raises:
-        InvalidInputError: wrong shape, dtype or device, no points, a pose that is not rigid, NaN in ``T_gt``.
+        (B,) in the unit of the points, ``inf`` for a missing estimate.
 
     Example:
         >>> T = torch.eye(4)[None]
@@ -65,14 +59,7 @@ def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
 
     Computed in float64 on the CPU with one k-d tree in the model frame, since rigid poses preserve distances.
 
-    Args:
-        T_est, T_gt, points: as in :func:`add_error`.
-
-    Returns:
-        (B,) in the unit of the points, on the device and in the dtype of ``T_est``.
-
-    Raises:
-        InvalidInputError: as :func:`add_error`.
+    Arguments and result are those of :func:`add_error`.
 
     Example:
         >>> T = torch.eye(4)[None]
@@ -96,18 +83,10 @@ def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tenso
         symmetries: (S, 4, 4) of the model, S >= 1, including the identity, for example from
             :func:`curvireg_torch.geometry.symmetry_transforms`; None: only the identity.
 
-    Returns:
-        (B,) in the unit of the points.
-
-    Raises:
-        InvalidInputError: as :func:`add_error`, or no symmetry.
-
     Example:
         >>> T = torch.eye(4)[None]
         >>> half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))[None]
         >>> points = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 5.0]])
-        >>> mssd_error(half_turn, T, points).tolist()
-        [2.0]
         >>> mssd_error(half_turn, T, points, symmetries=torch.cat([T, half_turn])).tolist()
         [0.0]
     """
@@ -123,15 +102,11 @@ def mspd_error(
     """MSPD: maximum distance of the model points in the image, minimum over the symmetries of the object.
 
     Args:
-        T_est, T_gt, points: as in :func:`add_error`.
+        T_est, T_gt, points, symmetries: as in :func:`mssd_error`.
         camera_matrix: (B, 3, 3) or (3, 3) in px.
-        symmetries: as in :func:`mssd_error`.
 
     Returns:
         (B,) px; ``inf`` where a point is not in front of the camera.
-
-    Raises:
-        InvalidInputError: as :func:`mssd_error`, or no camera matrix.
 
     Example:
         >>> T = torch.eye(4)[None]; T[0, 2, 3] = 2.0
@@ -141,9 +116,8 @@ def mspd_error(
         5.0
     """
     T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
-    check_tensor(
-        camera_matrix, "camera_matrix", (3, 3) if getattr(camera_matrix, "ndim", 0) == 2 else (len(T_est), 3, 3)
-    )
+    batch = () if getattr(camera_matrix, "ndim", 0) == 2 else (len(T_est),)
+    check_tensor(camera_matrix, "camera_matrix", (*batch, 3, 3))
     check_same_device(camera_matrix, T_est, "camera_matrix")
     check_camera_matrix(camera_matrix)
     K = camera_matrix.to(T_est.dtype)
@@ -159,18 +133,12 @@ def mspd_error(
 
 
 def add_recall(errors: Tensor, diameter: Tensor | float, *, fraction: float = 0.1) -> float:
-    """Fraction of the poses with ADD (or ADD-S) below a fraction of the object diameter.
+    """Fraction of the poses with ADD (or ADD-S) below a fraction of the object diameter; NaN for N = 0.
 
     Args:
-        errors: (N,) from :func:`add_error` or :func:`adds_error`.
-        diameter: of the objects, a number or (N,), in the unit of the errors.
+        errors: (N,) >= 0 from :func:`add_error` or :func:`adds_error`.
+        diameter: of the objects, a number or (N,) > 0, in the unit of the errors.
         fraction: of the diameter, > 0.
-
-    Returns:
-        [0, 1], NaN for N = 0.
-
-    Raises:
-        InvalidInputError: errors that are negative or NaN, wrong shapes, a diameter or fraction that is not > 0.
 
     Example:
         >>> add_recall(torch.tensor([1.0, 9.0, 11.0, torch.inf]), 100.0)
@@ -184,15 +152,7 @@ def add_recall(errors: Tensor, diameter: Tensor | float, *, fraction: float = 0.
 def mssd_recall(errors: Tensor, diameter: Tensor | float) -> float:
     """AR_MSSD of BOP: fraction of the poses with MSSD below 0.05, 0.10, ..., 0.50 diameters, averaged.
 
-    Args:
-        errors: (N,) from :func:`mssd_error`.
-        diameter: of the objects, a number or (N,), in the unit of the errors.
-
-    Returns:
-        [0, 1], NaN for N = 0.
-
-    Raises:
-        InvalidInputError: errors that are negative or NaN, wrong shapes, a diameter that is not > 0.
+    ``diameter`` is that of :func:`add_recall`, ``errors`` come from :func:`mssd_error`.
 
     Example:
         >>> mssd_recall(torch.tensor([26.0]), 100.0)      # below 0.30, 0.35, 0.40, 0.45 and 0.50
@@ -205,15 +165,7 @@ def mssd_recall(errors: Tensor, diameter: Tensor | float) -> float:
 def mspd_recall(errors: Tensor, image_width: Tensor | float) -> float:
     """AR_MSPD of BOP: fraction of the poses with MSPD below 5, 10, ..., 50 px times image width / 640, averaged.
 
-    Args:
-        errors: (N,) px from :func:`mspd_error`.
-        image_width: px, a number or (N,).
-
-    Returns:
-        [0, 1], NaN for N = 0.
-
-    Raises:
-        InvalidInputError: errors that are negative or NaN, wrong shapes, a width that is not > 0.
+    ``image_width`` in px is a number or (N,) > 0, ``errors`` come from :func:`mspd_error`.
 
     Example:
         >>> mspd_recall(torch.tensor([26.0]), 640), mspd_recall(torch.tensor([26.0]), 1280)
@@ -228,7 +180,7 @@ def _average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
 
 
 def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Arguments in the dtype of ``T_est``, missing estimates replaced by the truth, and a mask of valid estimates."""
+    """In the dtype of ``T_est``, missing estimates replaced by the truth; and a mask of valid estimates."""
     check_tensor(T_est, "T_est", (None, 4, 4))
     check_tensor(T_gt, "T_gt", (len(T_est), 4, 4))
     check_tensor(points, "points", (None, 3))

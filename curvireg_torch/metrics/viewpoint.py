@@ -27,33 +27,17 @@ from ..utils.checks import (
 )
 from .checks import check_errors, fraction_true, inf_unless
 
-__all__ = [
-    "AVP_BINS",
-    "accuracy",
-    "axis_rotation_error",
-    "azimuth_bin",
-    "binned_accuracy",
-    "median_error",
-    "symmetric_rotation_error",
-]
-
 AVP_BINS = (4, 8, 16, 24)
 """Numbers of azimuth bins in PASCAL3D+ tables."""
 
 
 def accuracy(errors: Tensor, threshold_deg: float, *, legacy_sqrt2: bool = False) -> float:
-    """Fraction of the errors below a threshold: Acc(pi/6) with 30, Acc(pi/18) with 10.
+    """Fraction of the errors below a threshold: Acc(pi/6) with 30, Acc(pi/18) with 10; NaN for N = 0.
 
     Args:
         errors: (N,) degrees >= 0; ``inf`` for an object without an estimate (a miss).
-        threshold_deg: degrees > 0; an error equal to it is a miss.
+        threshold_deg: degrees > 0.
         legacy_sqrt2: divide the errors by sqrt(2) first, as flawed evaluation code does (see module).
-
-    Returns:
-        [0, 1], NaN for N = 0.
-
-    Raises:
-        InvalidInputError: errors that are not (N,), floating, >= 0; a threshold that is not > 0.
 
     Example:
         >>> errors = torch.tensor([5.0, 12.0, 40.0, 170.0])
@@ -66,17 +50,10 @@ def accuracy(errors: Tensor, threshold_deg: float, *, legacy_sqrt2: bool = False
 
 
 def median_error(errors: Tensor, *, legacy_sqrt2: bool = False) -> float:
-    """Median of the errors (MedErr); the mean of the middle two for an even number.
+    """Median of the errors (MedErr); the mean of the middle two for an even number, NaN for N = 0.
 
     Args:
-        errors: (N,) degrees >= 0; ``inf`` for an object without an estimate.
-        legacy_sqrt2: as in :func:`accuracy`.
-
-    Returns:
-        Degrees >= 0; ``inf`` if half of the estimates are missing, NaN for N = 0.
-
-    Raises:
-        InvalidInputError: errors that are not (N,), floating, >= 0.
+        errors, legacy_sqrt2: as in :func:`accuracy`; the median is ``inf`` if half of the errors are.
 
     Example:
         >>> median_error(torch.tensor([40.0, 5.0, 12.0, 170.0]))
@@ -101,9 +78,6 @@ def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) ->
     Returns:
         (...) degrees in [0, 180]; ``inf`` for a missing estimate.
 
-    Raises:
-        InvalidInputError: wrong shape, dtype or device; NaN or inf in ``R_gt`` or ``symmetries``.
-
     Example:
         >>> half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
         >>> float(symmetric_rotation_error(half_turn, torch.eye(3), half_turn[None]))
@@ -126,15 +100,9 @@ def axis_rotation_error(R_est: Tensor, R_gt: Tensor, axis: Tensor) -> Tensor:
     digits near 0.
 
     Args:
-        R_est, R_gt: (..., 3, 3), broadcast against each other; NaN in ``R_est`` for a missing estimate.
+        R_est, R_gt: as in :func:`symmetric_rotation_error`, as is the result.
         axis: (3,) direction of the axis in the model frame, of any length > 0. Its two ends differ; for a solid that
             looks the same upside down, take the minimum with the flipped rotation too.
-
-    Returns:
-        (...) degrees in [0, 180]; ``inf`` for a missing estimate.
-
-    Raises:
-        InvalidInputError: wrong shape, dtype or device; NaN or inf in ``R_gt``; an axis of length 0 or not finite.
 
     Example:
         >>> from curvireg_torch.geometry import rotation_from_viewpoint
@@ -154,7 +122,7 @@ def axis_rotation_error(R_est: Tensor, R_gt: Tensor, axis: Tensor) -> Tensor:
 
 
 def _check_rotations(R_est: Tensor, R_gt: Tensor) -> Tensor:
-    """Check both; return (...) bool, which estimates are not missing."""
+    """Which estimates are not missing, (...) bool."""
     for name, R in (("R_est", R_est), ("R_gt", R_gt)):
         check_last_axes(R, name, (3, 3))
     check_same_device(R_est, R_gt, "R_est")
@@ -165,17 +133,11 @@ def _check_rotations(R_est: Tensor, R_gt: Tensor) -> Tensor:
 
 
 def azimuth_bin(azimuth: Tensor, bins: int) -> Tensor:
-    """Azimuth bin of PASCAL3D+; bin 0 is centred on azimuth 0.
+    """Azimuth bin of PASCAL3D+, int64 in [0, bins); bin i is [(i - 1/2) 360/bins, (i + 1/2) 360/bins).
 
     Args:
-        azimuth: (...) degrees, finite, not restricted to [0, 360).
+        azimuth: (...) degrees, not restricted to [0, 360).
         bins: 4, 8, 16 or 24.
-
-    Returns:
-        (...) int64 in [0, bins); bin i is [(i - 1/2) 360/bins, (i + 1/2) 360/bins).
-
-    Raises:
-        InvalidInputError: another number of bins, or an azimuth that is not a finite floating tensor.
 
     Example:
         >>> azimuth_bin(torch.tensor([0.0, 44.0, 45.0, 350.0]), 4).tolist()
@@ -188,17 +150,11 @@ def azimuth_bin(azimuth: Tensor, bins: int) -> Tensor:
 
 
 def binned_accuracy(azimuth_est: Tensor, azimuth_gt: Tensor, bins: int) -> float:
-    """Fraction of the objects whose azimuth is in the correct bin: AVP with ground-truth boxes.
+    """Fraction of the objects whose azimuth is in the correct bin: AVP with ground-truth boxes; NaN for N = 0.
 
     Args:
         azimuth_est, azimuth_gt: (N,) degrees; NaN or inf in ``azimuth_est`` for a missing estimate.
         bins: 4, 8, 16 or 24.
-
-    Returns:
-        [0, 1], NaN for N = 0.
-
-    Raises:
-        InvalidInputError: different shapes, not (N,), NaN or inf in ``azimuth_gt``, or another number of bins.
 
     Example:
         >>> binned_accuracy(torch.tensor([3.0, 100.0]), torch.tensor([350.0, 130.0]), 8)

@@ -1,4 +1,7 @@
-"""Appearance scores: photographs and shaded views compared by local backbone features, cell by cell."""
+"""Appearance scores: photographs and shaded views compared by local backbone features, cell by cell.
+
+Wrong shapes and dtypes raise :class:`~curvireg_torch.errors.InvalidInputError`.
+"""
 
 import torch
 import torch.nn.functional as F
@@ -30,9 +33,6 @@ def describe(images: Tensor, backbone: Backbone) -> Tensor:
     Returns:
         (N, D) float16 of unit length; D = 17 408 at S = 128.
 
-    Raises:
-        InvalidInputError: wrong shape or dtype.
-
     Example:
         >>> describe(torch.rand(2, 3, 64, 64), Backbone()).shape
         torch.Size([2, 4352])
@@ -51,21 +51,14 @@ def _describe_chunk(images: Tensor, backbone: Backbone) -> Tensor:
 
 
 def similarity(photographs: Tensor, views: Tensor) -> Tensor:
-    """Mean cosine similarity of the cells, maximum over the crops of each photograph.
+    """Mean cosine similarity of the cells, maximum over the crops of each photograph, (B, N) float32 in [-1, 1].
 
     Args:
         photographs: (B, K, D) descriptors of K crops each, from :func:`describe`.
         views: (N, D).
 
-    Returns:
-        (B, N) float32 in [-1, 1].
-
-    Raises:
-        InvalidInputError: wrong shapes.
-
     Example:
-        >>> net = Backbone()
-        >>> d = describe(torch.rand(6, 3, 32, 32), net)
+        >>> d = describe(torch.rand(6, 3, 32, 32), Backbone())
         >>> similarity(d.view(2, 3, -1), d[:1]).shape
         torch.Size([2, 1])
     """

