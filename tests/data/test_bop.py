@@ -1,4 +1,5 @@
 import json
+import operator
 
 import pytest
 import torch
@@ -11,6 +12,13 @@ from tests._support.miniature import write_bop
 @pytest.fixture
 def tree(tmp_path):
     return tmp_path, write_bop(tmp_path)
+
+
+def edit(tree, name, change):
+    path = tree[0] / "test" / "000001" / name
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
 
 
 def ids(dataset):
@@ -46,15 +54,12 @@ def test_bop_dataset_returns_documented_samples(tree):
     assert dataset.camera["width"] == 80
 
 
-def test_bop_dataset_has_no_visible_box_of_hidden_instances(tree):
-    hidden = BOPDataset(tree[0], targets=False).annotation(1)
+def test_bop_dataset_reads_hidden_instances_and_grey_images_without_scene_gt_info(tree):
+    dataset = BOPDataset(tree[0], targets=False)
+    hidden, sample = dataset[1], dataset[3]
     assert hidden["visib_fract"] == 0
     assert hidden["box"].isfinite().all()
     assert hidden["box_visible"].isnan().all()
-
-
-def test_bop_dataset_reads_grey_images_without_scene_gt_info(tree):
-    sample = BOPDataset(tree[0], targets=False)[3]
     torch.testing.assert_close(sample["image"], torch.full((3, 60, 80), 0.2))
     assert sample["box"].isnan().all()
     assert sample["box_visible"].isnan().all()
@@ -67,9 +72,6 @@ def test_targets_select_the_most_visible_instances(tree):
         assert ids(dataset) == [(1, 0, 1, 2), (2, 7, 1, 0)]
         assert dataset.skipped["no_target"] == 3
         assert "test/000001/000006 object 1" in dataset.skipped_items["missing_annotation"]
-
-
-def test_targets_need_the_target_file(tree):
     (tree[0] / "test_targets_bop19.json").unlink()
     assert len(BOPDataset(tree[0])) == 4
     with pytest.raises(MissingFileError, match="test_targets_bop19"):
@@ -115,21 +117,15 @@ MIRRORED = [-1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]
     "value", [None, "x", {"a": 1}, [1, 2], ["1"] * 9, [True] * 9, [1e400] * 9, [10**400] * 9, MIRRORED]
 )
 def test_bop_dataset_counts_invalid_rotations(tree, value):
-    path = tree[0] / "test" / "000001" / "scene_gt.json"
-    content = json.loads(path.read_text())
-    content["0"][0]["cam_R_m2c"] = value
-    path.write_text(json.dumps(content))
+    edit(tree, "scene_gt.json", lambda content: content["0"][0].update(cam_R_m2c=value))
     dataset = BOPDataset(tree[0], targets=False)
     assert dataset.skipped["corrupt_annotation"] == tree[1]["corrupt_annotation"] + 1
 
 
 @pytest.mark.parametrize(("place", "value"), [(0, 0.0), (4, -500.0), (1, 2.0), (8, 2.0)])
 def test_bop_dataset_skips_invalid_cameras(tree, place, value):
-    path = tree[0] / "test" / "000001" / "scene_camera.json"
-    content = json.loads(path.read_text())
     before = BOPDataset(tree[0], targets=False)
-    content["0"]["cam_K"][place] = value
-    path.write_text(json.dumps(content))
+    edit(tree, "scene_camera.json", lambda content: operator.setitem(content["0"]["cam_K"], place, value))
     after = BOPDataset(tree[0], targets=False)
     lost = len(before) - len(after)
     assert lost > 0

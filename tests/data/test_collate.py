@@ -5,9 +5,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from curvireg_torch import data
-from curvireg_torch.data import BOPDataset, Pascal3DPlus, WebCollection, collate
+from curvireg_torch.data import collate
 from curvireg_torch.errors import InvalidInputError
-from tests._support.miniature import write_bop, write_pascal3d, write_web
 
 
 def test_collate_stacks_equal_tensors_and_lists_other_values():
@@ -33,17 +32,11 @@ def test_collate_refuses_no_samples_and_other_keys():
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 warns of fork beside threads
 @pytest.mark.parametrize("context", ["spawn", None])
-def test_datasets_work_with_loader_workers(tmp_path, context):
-    write_pascal3d(tmp_path / "pascal")
-    write_bop(tmp_path / "bop")
-    write_web(tmp_path / "web")
-    datasets = [Pascal3DPlus(tmp_path / "pascal"), BOPDataset(tmp_path / "bop"), WebCollection(tmp_path / "web")]
-    for dataset in datasets[: 1 if context else 3]:
-        workers = 1 if context else 2  # a spawned worker imports everything again
-        loader = DataLoader(
-            dataset, batch_size=2, num_workers=workers, collate_fn=collate, multiprocessing_context=context
-        )
-        batches = list(loader)
+def test_datasets_work_with_loader_workers(bop, web, context):
+    workers = 1 if context else 2  # a spawned worker imports everything again
+    options = {"num_workers": workers, "collate_fn": collate, "multiprocessing_context": context}
+    for dataset in [web] if context else [bop, web]:
+        batches = list(DataLoader(dataset, batch_size=2, **options))
         assert sum(len(b["image"]) for b in batches) == len(dataset)
         assert batches[0]["box"].shape == (2, 4)
         alone = dataset[0]
@@ -53,10 +46,7 @@ def test_datasets_work_with_loader_workers(tmp_path, context):
 
 def test_data_names_are_sorted_and_options_are_keywords():
     assert data.__all__ == sorted(data.__all__)
-    for name in data.__all__:
-        value = getattr(data, name)
-        if name == "BOPRow":
-            continue
-        for parameter in inspect.signature(value).parameters.values():
+    for name in {*data.__all__} - {"BOPRow"}:
+        for parameter in inspect.signature(getattr(data, name)).parameters.values():
             if parameter.default is not inspect.Parameter.empty and parameter.name != "split":
                 assert parameter.kind is inspect.Parameter.KEYWORD_ONLY, f"{name}: {parameter.name}"

@@ -52,12 +52,9 @@ def test_pascal3d_returns_documented_samples(tree):
     assert sample["cad_path"].endswith("01.off")
     assert all(v.dtype == torch.float32 for v in sample.values() if isinstance(v, torch.Tensor))
     assert (sample["truncated"], sample["occluded"], sample["difficult"]) == (False, False, False)
-
-
-def test_pixel_origin_shifts_box_and_principal_point(tree):
-    sample = Pascal3DPlus(tree[0], pixel_origin=0)[0]
-    assert sample["box"].tolist() == [11, 6, 71, 56]
-    assert sample["camera_matrix"][:2, 2].tolist() == [41, 31]
+    shifted = Pascal3DPlus(tree[0], pixel_origin=0)[0]
+    assert shifted["box"].tolist() == [11, 6, 71, 56]
+    assert shifted["camera_matrix"][:2, 2].tolist() == [41, 31]
 
 
 def test_pascal3d_camera_projects_the_model_into_the_box(tree):
@@ -71,15 +68,14 @@ def test_pascal3d_camera_projects_the_model_into_the_box(tree):
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "reason"),
-    [("truncated", False, "truncated"), ("occluded", False, "occluded"), ("difficult", False, "difficult"),
-     ("min_size", 5, "small")],
-)  # fmt: skip
-def test_pascal3d_skips_flagged_and_small_objects(tree, option, value, reason):
-    dataset = Pascal3DPlus(tree[0], categories=["car"], **{option: value})
+    "option", [{"truncated": False}, {"occluded": False}, {"difficult": False}, {"min_size": 5}], ids=str
+)
+def test_pascal3d_skips_flagged_and_small_objects(tree, option):
+    dataset = Pascal3DPlus(tree[0], categories=["car"], **option)
     assert len(dataset) == 3
-    assert dataset.skipped[reason] == 1
-    assert not any(dataset.annotation(i).get(option) for i in range(3))
+    (name,) = option
+    assert dataset.skipped["small" if name == "min_size" else name] == 1
+    assert not any(dataset.annotation(i).get(name) for i in range(3))
 
 
 def test_pascal3d_reads_image_sets_with_invalid_entries(tree):

@@ -21,11 +21,10 @@ def test_web_collection_counts_skipped_items(tree):
 
 
 def test_web_collection_returns_documented_samples(tree):
-    sample = WebCollection(tree[0])[0]
-    assert set(sample) == {
-        *("image", "image_path", "image_id", "box", "viewpoint", "rotation", "distance", "category", "mesh_path"),
-        "object_index",
-    }
+    dataset = WebCollection(tree[0])
+    sample, unknown, level = (dataset[i] for i in range(3))
+    names = "image image_path image_id box viewpoint rotation distance category mesh_path object_index"
+    assert set(sample) == set(names.split())
     assert sample["image"].shape == (3, 60, 80)
     assert sample["box"].tolist() == [10, 5, 70, 55]
     assert sample["viewpoint"].tolist() == [30, 10, -5]
@@ -33,11 +32,6 @@ def test_web_collection_returns_documented_samples(tree):
     assert sample["distance"] == 3
     assert sample["category"] == "cup"
     assert sample["mesh_path"].endswith("mesh.off")
-
-
-def test_web_collection_reads_lines_without_pose_or_theta(tree):
-    dataset = WebCollection(tree[0])
-    unknown, level = dataset.annotation(1), dataset.annotation(2)
     assert unknown["viewpoint"].isnan().all()
     assert unknown["rotation"].isnan().all()
     assert level["viewpoint"].tolist() == [90, 0, 0]

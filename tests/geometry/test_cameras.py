@@ -23,9 +23,7 @@ def test_transform_joins_rotation_and_translation() -> None:
     R = torch.arange(18.0).view(2, 3, 3)
     t = torch.arange(6.0).view(2, 3) + 100.0
     T = g.transform(R, t)
-    assert T.shape == (2, 4, 4)
-    assert torch.equal(T[:, :3, :3], R)
-    assert torch.equal(T[:, :3, 3], t)
+    assert torch.equal(T[:, :3], torch.cat([R, t[..., None]], -1))
     assert T[:, 3].tolist() == [[0, 0, 0, 1]] * 2
 
 
@@ -55,14 +53,11 @@ def test_project_points_orthographic_ignores_depth() -> None:
         (torch.eye(4), "expected floating"),
         (torch.eye(3).long(), "expected floating"),
         (K * float("nan"), "finite"),
-        (K * float("inf"), "finite"),
-        (torch.diag(torch.tensor([0.0, 1.0, 1.0])), "FX FY CX CY"),
         (torch.diag(torch.tensor([1.0, 0.0, 1.0])), "FX FY CX CY"),
         (torch.stack([torch.eye(3), torch.diag(torch.tensor([1.0, -1.0, 1.0]))]), "FX FY CX CY"),
         (torch.diag(torch.tensor([1.0, 1.0, 2.0])), r"\[0, fy, cy\]"),
         (torch.eye(3) + torch.tensor([[0.0, 0.5, 0.0], [0.0] * 3, [0.0] * 3]), "no skew"),
         (torch.eye(3) + torch.tensor([[0.0] * 3, [0.5, 0, 0], [0.0] * 3]), r"\[0, fy, cy\]"),
-        (K.T.contiguous(), r"\[0, fy, cy\]"),
     ],
 )
 def test_check_camera_matrix_refuses_invalid_matrices(bad: torch.Tensor, match: str) -> None:

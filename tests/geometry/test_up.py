@@ -1,5 +1,3 @@
-"""The up axis: views rotate with it, meshes and poses do not."""
-
 import numpy as np
 import pytest
 import torch

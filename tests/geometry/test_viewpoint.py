@@ -1,5 +1,3 @@
-"""Round trips of viewpoints and rotations, at the poles and in every dtype."""
-
 import math
 
 import pytest

@@ -7,15 +7,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import (
-    ViewSphere,
-    paper_views,
-    rotation_error,
-    sample_views,
-    symmetry_transforms,
-    uniform_views,
-    views_without_symmetric,
-)
+from curvireg_torch.geometry import ViewSphere, paper_views, rotation_error, sample_views, uniform_views
+from curvireg_torch.geometry.symmetry import symmetry_transforms, views_without_symmetric
 
 AXIS = {"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]}
 HALF_TURN = {"symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}
@@ -94,9 +87,7 @@ def test_views_without_symmetric_keeps_one_view_of_each_appearance() -> None:
         assert float(rotation_error(all_views, seen[nearest]).max()) <= 12.01
     # No two remaining views are duplicates.
     R = kept[kept.distance == 3].rotations.double()
-    rotated = R[:, None] @ symmetries[1:, :3, :3]
-    off = rotation_error(R[None], rotated)
-    off[torch.arange(len(R)), torch.arange(len(R))] = 180.0
+    off = rotation_error(R[None], R[:, None] @ symmetries[1:, :3, :3]).fill_diagonal_(180.0)
     assert float(off.min()) > 12.0
 
 

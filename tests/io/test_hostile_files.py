@@ -6,6 +6,7 @@ import time
 import tracemalloc
 import zlib
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -99,15 +100,10 @@ def test_read_photo_ignores_the_film_of_a_motion_photo(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("shape", [(2, 600), (600, 2), (1, 1), (1, 5000)])
 def test_learned_field_does_not_enlarge_slivers(shape: tuple[int, int]) -> None:
-    field, seen = cr.LearnedCurvilinearSaliency(), []
-
-    def answer(image: torch.Tensor) -> torch.Tensor:
-        seen.append(image.shape)
-        return image.new_zeros(len(image), 3, image.shape[2] // 2, image.shape[3] // 2)
-
-    field.network.forward = answer
+    field = cr.LearnedCurvilinearSaliency()
+    field.network.forward = Mock(side_effect=lambda x: x.new_zeros(len(x), 3, x.shape[2] // 2, x.shape[3] // 2))
     assert field(torch.rand(1, 3, *shape)).shape == (1, 2, *shape)
-    assert seen[0][2] * seen[0][3] <= 8 * 128 * 128
+    assert field.network.forward.call_args.args[0][0, 0].numel() <= 8 * 128 * 128
 
 
 def test_read_mat_bounds_all_compressed_variables_together(tmp_path: Path) -> None:
@@ -134,14 +130,11 @@ def test_read_json_refuses_malicious_files(tmp_path: Path, content: bytes) -> No
 
 def test_check_table_size_bounds_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_bop(tmp_path)
-    for path, read in (
-        (tmp_path / "camera.json", lambda: BOPDataset(tmp_path)),
-        (tmp_path / "a.csv", lambda: read_bop_csv(tmp_path / "a.csv")),
-    ):
-        with open(path, "wb") as file:
+    for path, read, given in (("camera.json", BOPDataset, tmp_path), ("a.csv", read_bop_csv, tmp_path / "a.csv")):
+        with open(tmp_path / path, "wb") as file:
             file.truncate(1 << 27)  # a sparse file
         with pytest.raises(InvalidInputError, match="33,554,432 bytes"):
-            read()
+            read(given)
     (tmp_path / "some").write_bytes(bytes(100))
     for limit in (99, 100):
         monkeypatch.setattr(json_files, "MAX_TABLE_BYTES", limit)

@@ -99,18 +99,13 @@ def test_read_image_returns_uint8_on_request(tmp_path):
 
 
 def test_read_photo_notes_changes_of_channels(tmp_path):
-    for name, pixels, notes in (
-        ("grey.png", np.full((4, 4), 9, np.uint8), ("grey: three equal channels",)),
-        ("alpha.png", np.full((4, 4, 4), 9, np.uint8), ("alpha channel dropped",)),
-        ("deep.png", np.full((4, 4, 3), 9, np.uint16), ("16 bits rounded to 8",)),
-        ("plain.webp", np.full((4, 4, 3), 9, np.uint8), ()),
-        ("alpha.webp", np.full((4, 4, 4), 9, np.uint8), ("alpha channel dropped",)),
-        ("grey.tiff", np.full((4, 4), 9, np.uint8), ("grey: three equal channels",)),
-        ("plain.bmp", np.full((4, 4, 3), 9, np.uint8), ()),
-        ("grey.pgm", np.full((4, 4), 9, np.uint8), ("grey: three equal channels",)),
-    ):
-        assert cv2.imwrite(str(tmp_path / name), pixels)
-        assert read_photo(tmp_path / name).notes == notes, name
+    notes = {1: ("grey: three equal channels",), 3: (), 4: ("alpha channel dropped",)}
+    for name, channels in {"png": (1, 4), "webp": (3, 4), "tiff": (1,), "bmp": (3,), "pgm": (1,)}.items():
+        for count in channels:
+            assert cv2.imwrite(str(tmp_path / f"a.{name}"), np.full((4, 4, count), 9, np.uint8))
+            assert read_photo(tmp_path / f"a.{name}").notes == notes[count], name
+    assert cv2.imwrite(str(tmp_path / "deep.png"), np.full((4, 4, 3), 9, np.uint16))
+    assert read_photo(tmp_path / "deep.png").notes == ("16 bits rounded to 8",)
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.tif"])
@@ -121,23 +116,19 @@ def test_read_photo_converts_cmyk(tmp_path, name):
     assert (photo.image[:, 4, 4].int() - torch.tensor([250, 10, 30])).abs().max() <= 4
 
 
-def test_read_photo_refuses_cielab(tmp_path):
+def test_read_photo_refuses_cielab_and_floating_pixels(tmp_path):
     Image.new("LAB", (8, 8), (120, 10, 30)).save(tmp_path / "a.tif")
-    with pytest.raises(ImageError, match="CIELAB"):
-        read_photo(tmp_path / "a.tif")
+    assert cv2.imwrite(str(tmp_path / "b.tif"), np.ones((4, 4, 3), np.float32))
+    for name, match in (("a.tif", "CIELAB"), ("b.tif", "float32")):
+        with pytest.raises(ImageError, match=match):
+            read_photo(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    ("content", "name"),
-    [
-        (b"\0\0\0\x18ftypheic\0\0\0\0", "HEIC"),
-        (b"\0\0\0\x18ftypmif1\0\0\0\0", "HEIC"),
-        (b"\0\0\0\x18ftypavif\0\0\0\0", "AVIF"),
-        (b"\0\0\0\x18ftypisom\0\0\0\0", "video"),
-        (b"GIF89a", "GIF"),
-        (b"%PDF-1.4", "PDF"),
-    ],
-)
+OTHERS = {b"heic": "HEIC", b"mif1": "HEIC", b"avif": "AVIF", b"isom": "video"}
+OTHERS = {b"\0\0\0\x18ftyp" + brand: name for brand, name in OTHERS.items()} | {b"GIF89a": "GIF", b"%PDF-1.4": "PDF"}
+
+
+@pytest.mark.parametrize(("content", "name"), OTHERS.items())
 def test_read_photo_names_other_formats(tmp_path, content, name):
     (tmp_path / "a.jpg").write_bytes(content + bytes(100))
     with pytest.raises(ImageError, match=rf"a\.jpg: .*{name}.*convert it"):
@@ -145,14 +136,14 @@ def test_read_photo_names_other_formats(tmp_path, content, name):
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-@pytest.mark.parametrize("fraction", [0.02, 0.5, 0.9])
-def test_read_image_refuses_truncated_files(tmp_path, suffix, fraction):
+def test_read_image_refuses_truncated_files(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     write_image(path, (64, 64))
     data = path.read_bytes()
-    path.write_bytes(data[: int(len(data) * fraction)])
-    with pytest.raises(ImageError, match=r"truncated|not an image"):
-        read_image(path)
+    for fraction in (0.02, 0.5, 0.9):
+        path.write_bytes(data[: int(len(data) * fraction)])
+        with pytest.raises(ImageError, match=r"truncated|not an image"):
+            read_image(path)
 
 
 def test_read_photo_ignores_bytes_after_the_picture(tmp_path):
@@ -179,12 +170,6 @@ def test_read_image_refuses_other_content(tmp_path, content):
     (tmp_path / "a.jpg").write_bytes(content)
     with pytest.raises(ImageError, match=r"a\.jpg"):
         read_image(tmp_path / "a.jpg")
-
-
-def test_read_image_refuses_floating_pixels(tmp_path):
-    assert cv2.imwrite(str(tmp_path / "a.tiff"), np.ones((4, 4, 3), np.float32))
-    with pytest.raises(ImageError, match="float32"):
-        read_image(tmp_path / "a.tiff")
 
 
 def test_read_image_reports_missing_files(tmp_path):

@@ -33,9 +33,8 @@ def nested_struct(depth: int) -> bytes:
 
 @pytest.mark.parametrize("compress", [False, True])
 def test_read_mat_agrees_with_scipy(tmp_path, compress):
-    numbers = {
-        t: np.array([[1, 2, 3], [4, 5, 100]], t) for t in ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
-    }
+    types = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
+    numbers = {t: np.array([[1, 2, 3], [4, 5, 100]], t) for t in types}
     structs = np.empty((1, 2), dtype=[("a", object), ("b", object)])
     structs[0, 0], structs[0, 1] = ("x", np.eye(2)), ("", np.empty((0, 0)))
     record = {**{f"n_{k}": v for k, v in numbers.items()}, "text": "car äβ", "flag": True, "structs": structs}

@@ -1,6 +1,5 @@
 """Public functions that share their checks, and a scene to call them with."""
 
-import re
 from collections.abc import Callable
 from typing import Any
 
@@ -19,36 +18,29 @@ from curvireg_torch.matching import distinct_views
 from curvireg_torch.registration import fit_contours, localize
 from curvireg_torch.rendering import make_renderer, render_colour
 from curvireg_torch.rendering.shading import shade
-from curvireg_torch.synthetic import example_mesh, synthesize_photograph
+from curvireg_torch.synthetic import synthesize_photograph
 from curvireg_torch.visualization import contour_overlay, pose_glb, registration_sheet
 from tests._support.scenes import unrefined
 
-SIZE = (96, 128)
 BACKENDS = ("torch", "embree")
 CAMERA = torch.tensor([[220.1, 0.0, 63.5], [0.0, 220.1, 47.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
-def mesh() -> trimesh.Trimesh:
-    return example_mesh()
-
-
-@pytest.fixture(scope="module")
-def pose(mesh: trimesh.Trimesh) -> Tensor:
+def pose(truck: trimesh.Trimesh) -> Tensor:
     R = cr.rotation_from_viewpoint(30.0, 20.0).double()
-    centre = mesh_centre(mesh)
-    return transform(R, torch.tensor([0.0, 0.0, 6.0 * mesh_radius(mesh)], dtype=torch.float64) - R @ centre)
+    return transform(R, torch.tensor([0.0, 0.0, 6.0 * mesh_radius(truck)]).double() - R @ mesh_centre(truck))
 
 
 @pytest.fixture(scope="module")
-def photograph(mesh: trimesh.Trimesh, pose: Tensor) -> tuple[Tensor, Tensor]:
-    return synthesize_photograph(mesh, pose, CAMERA, SIZE, torch.Generator().manual_seed(0))
+def photograph(truck: trimesh.Trimesh, pose: Tensor) -> tuple[Tensor, Tensor]:
+    return synthesize_photograph(truck, pose, CAMERA, (96, 128), torch.Generator().manual_seed(0))
 
 
 @pytest.fixture(scope="module")
-def default_registrar(mesh: trimesh.Trimesh) -> cr.Registrar:
+def default_registrar(truck: trimesh.Trimesh) -> cr.Registrar:
     views = cr.sample_views(azimuth_step=30, elevations=[20])
-    return cr.Registrar(cr.ViewBank.build(mesh, views, image_size=64, progress=False))
+    return cr.Registrar(cr.ViewBank.build(truck, views, image_size=64, progress=False))
 
 
 @pytest.fixture(scope="module")
@@ -63,22 +55,14 @@ class Entries:
         (image, box), R = photograph, pose[:3, :3]
         points = torch.from_numpy(np.array(mesh.vertices))
         renderers = {name: make_renderer(mesh, name) for name in BACKENDS}
-        size, radius, centre = (24, 32), mesh_radius(mesh), mesh_centre(mesh)
+        size, radius, centre, bank = (24, 32), mesh_radius(mesh), mesh_centre(mesh), registrar.bank
         depth = torch.rand(1, 1, 16, 16) + 1.0
         result = registrar([image], box[None], CAMERA)[0]
         symmetries = torch.eye(4, dtype=torch.float64)[None]
         views = cr.sample_views(azimuth_step=90, elevations=[0])
-        bank = registrar.bank
 
-        def fit(**given: Any) -> object:
-            arguments = {
-                "images": [image],
-                "boxes": box[None],
-                "camera_matrices": CAMERA,
-                "starts": pose[None],
-                **given,
-            }
-            return fit_contours(renderers["embree"], *arguments.values(), centre=centre, radius=radius)
+        def fit(photo: Any = image, boxes: Any = box[None], K: Tensor = CAMERA, start: Tensor = pose) -> object:
+            return fit_contours(renderers["embree"], [photo], boxes, K, start[None], centre=centre, radius=radius)
 
         def one(result: list[Any]) -> object:
             return result[0].rotation  # raises the error of a failed registration
@@ -89,7 +73,7 @@ class Entries:
             "localize": lambda K: one(localize(registrar, [image], K)[0]),
             "Locator": lambda K: registrar.locator([image], camera_matrices=[K]),
             "locate": lambda K: cr.locate(registrar.pipeline, bank, [image], camera_matrices=[K]),
-            "fit_contours": lambda K: fit(camera_matrices=K),
+            "fit_contours": lambda K: fit(K=K),
             "render_depth": lambda K: cr.render_depth(mesh, pose, K, size),
             "render_colour": lambda K: render_colour(mesh, pose, K, size),
             **{f"{b}.render": lambda K, b=b: renderers[b].render(pose[None], K, size) for b in BACKENDS},
@@ -110,7 +94,7 @@ class Entries:
         }
         self.needs_square_pixels = ("Registrar", "Registrar, no box", "localize", "Locator", "locate")
         self.poses: dict[str, Callable[[Tensor], object]] = {
-            "fit_contours": lambda T: fit(starts=T[None]),
+            "fit_contours": lambda T: fit(start=T),
             "render_depth": lambda T: cr.render_depth(mesh, T, CAMERA, size),
             "render_colour": lambda T: render_colour(mesh, T, CAMERA, size),
             **{f"{b}.render": lambda T, b=b: renderers[b].render(T[None], CAMERA, size) for b in BACKENDS},
@@ -148,7 +132,7 @@ class Entries:
             "ViewMatcher": lambda x: registrar.matcher([x], box[None]),
             "Locator": lambda x: registrar.locator([x]),
             "locate": lambda x: cr.locate(registrar.pipeline, bank, [x]),
-            "fit_contours": lambda x: fit(images=[x]),
+            "fit_contours": fit,
             "pose_glb": lambda x: pose_glb(mesh, pose, CAMERA, x),
             "contour_overlay": lambda x: contour_overlay(registrar, result, x, box),
         }
@@ -161,21 +145,16 @@ class Entries:
 
 
 @pytest.fixture(scope="module")
-def entries(mesh: trimesh.Trimesh, pose: Tensor, photograph: tuple[Tensor, Tensor], registrar: cr.Registrar) -> Entries:
-    return Entries(mesh, pose, photograph, registrar)
+def entries(truck: trimesh.Trimesh, pose: Tensor, photograph: tuple[Tensor, Tensor], registrar: Any) -> Entries:
+    return Entries(truck, pose, photograph, registrar)
 
 
-def refused(name: str, call: Callable[[Any], object], given: Any, match: str = "") -> CurviregError:
+def refused(name: str, call: Callable[[Any], object], given: Any, match: str = ".") -> CurviregError:
     """The one-line error with which an entry refuses ``given``."""
-    error: CurviregError | None = None
-    try:
+    with pytest.raises(CurviregError, match=match) as caught:
         call(given)
-    except CurviregError as raised:
-        error = raised
-    assert error is not None, f"{name} accepts {given}"
-    assert re.search(match, str(error)), f"{name}: {error}"
-    assert "\n" not in str(error), name
-    return error
+    assert "\n" not in str(caught.value), name
+    return caught.value
 
 
 def changed(matrix: Tensor, *changes: tuple[int, int, float]) -> Tensor:

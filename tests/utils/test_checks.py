@@ -5,17 +5,15 @@ import math
 import numpy as np
 import pytest
 import torch
-import trimesh
 from torch import Tensor
 
 import curvireg_torch as cr
 from curvireg_torch import geometry, metrics
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry.cameras import transform
-from curvireg_torch.rendering import make_renderer
 from curvireg_torch.terms import dilate_points
 from curvireg_torch.utils.checks import check_pose, check_rotation, check_square_pixels
-from tests.utils.conftest import BACKENDS, CAMERA, SIZE, Entries, changed, refused
+from tests.utils.conftest import CAMERA, Entries, changed, refused
 
 BAD_CAMERAS = {
     "NaN": changed(CAMERA, (0, 2, math.nan)),
@@ -82,8 +80,8 @@ def bad_poses(T: Tensor) -> dict[str, Tensor]:
 
 
 def test_check_pose_runs_in_every_entry(entries: Entries, pose: Tensor) -> None:
-    invalid_rows = changed(pose, (3, 0, 0.1)), changed(pose, (3, 3, 2.0)), changed(pose, (2, 3, math.inf))
-    for T in (*bad_poses(pose).values(), *invalid_rows):
+    other_rows = ((3, 0, 0.1), (3, 3, 2.0), (2, 3, math.inf))
+    for T in (*bad_poses(pose).values(), *(changed(pose, row) for row in other_rows)):
         for name, call in entries.poses.items():
             refused(name, call, T, "expected (rigid|finite)")
 
@@ -139,17 +137,9 @@ def test_as_boxes_and_as_camera_matrices_accept_tensors_arrays_and_lists(
 
 
 def test_as_boxes_refuses_other_values(entries: Entries) -> None:
-    for bad in (
-        [["a", "b", "c", "d"]],
-        [[1.0, 2.0, 3.0]],
-        [[1.0, 2.0], [3.0, 4.0, 5.0]],
-        [None],
-        {"x": 1},
-        np.array([[1, 2, 3, None]]),
-        torch.ones(1, 4, dtype=torch.bool),
-        [[9.0, 9.0, 3.0, 3.0]],
-        [[math.nan, 0.0, 3.0, 3.0]],
-    ):
+    others = [["a", "b", "c", "d"]], [[1.0, 2.0, 3.0]], [[1.0, 2.0], [3.0, 4.0, 5.0]], [None], {"x": 1}
+    others += np.array([[1, 2, 3, None]]), torch.ones(1, 4, dtype=torch.bool)
+    for bad in (*others, [[9.0, 9.0, 3.0, 3.0]], [[math.nan, 0.0, 3.0, 3.0]]):
         for name, call in entries.boxes.items():
             refused(name, call, bad, "box")
 
@@ -163,10 +153,6 @@ def test_as_camera_matrices_refuses_other_values(registrar: cr.Registrar, photog
 
 def test_check_masks_refuses_other_shapes_and_dtypes() -> None:
     mask = torch.zeros(1, 9, 9, dtype=torch.bool)
-    mask[0, 4, 4] = True
-    grown = dilate_points(mask, 2.0)
-    assert int(grown.sum()) == 13
-    assert torch.equal(grown, grown.mT)
     for bad in (mask[0], mask[None], mask.float(), mask.byte(), mask.numpy()):
         with pytest.raises(InvalidInputError, match=r"points: expected bool \(N, H, W\)"):
             dilate_points(bad, 2.0)
@@ -176,9 +162,3 @@ def test_check_masks_refuses_other_shapes_and_dtypes() -> None:
             cr.depth_curvilinear_saliency(depth, bad)
     with pytest.raises(InvalidInputError, match="photo: expected bool"):
         metrics.intersection_percentage(mask.float(), mask)
-
-
-def test_renderers_agree_on_the_silhouette(mesh: trimesh.Trimesh, pose: Tensor) -> None:
-    counts = [int((make_renderer(mesh, name).render(pose[None], CAMERA, SIZE) > 0).sum()) for name in BACKENDS]
-    assert abs(counts[0] - counts[1]) <= 2
-    assert counts[0] > 500

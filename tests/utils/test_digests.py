@@ -1,5 +1,3 @@
-"""Digests of tensors and of the package's sources; those of files are tested with meshes and lists."""
-
 from pathlib import Path
 
 import pytest

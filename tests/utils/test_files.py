@@ -4,7 +4,9 @@ import errno
 import os
 import resource
 import signal
+import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -13,6 +15,12 @@ from curvireg_torch.errors import CurviregError, OutputError
 from curvireg_torch.utils.files import check_writable, write_file
 
 OLD, NEW = b"a" * 1000, b"b" * 5_000_000
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    write_file(tmp_path / "file", OLD)
+    return tmp_path / "file"
 
 
 def test_write_file_replaces_files_and_targets_of_links(tmp_path: Path) -> None:
@@ -28,9 +36,7 @@ def test_write_file_replaces_files_and_targets_of_links(tmp_path: Path) -> None:
     assert path.read_bytes() == OLD
 
 
-def test_write_file_keeps_the_old_content_if_writing_fails(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    write_file(path, OLD)
+def test_write_file_keeps_the_old_content_if_writing_fails(path: Path) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
@@ -39,13 +45,11 @@ def test_write_file_keeps_the_old_content_if_writing_fails(tmp_path: Path) -> No
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.read_bytes() == OLD
-    assert list(tmp_path.iterdir()) == [path]
+    assert list(path.parent.iterdir()) == [path]
 
 
 def test_write_file_advises_to_make_room_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
+    full = Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OutputError, match=r"\(No space left on device\); make room, or choose another place"):
         write_file(tmp_path / "file", OLD)
@@ -73,57 +77,43 @@ def test_check_writable_leaves_nothing_and_names_the_option(tmp_path: Path) -> N
         check_writable(tmp_path / "file", "--out")
 
 
-@pytest.mark.parametrize("command", ["demo", "bank", "bank --adapt"])
-def test_commands_check_the_output_folder_before_they_work(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def work(*_: object, **__: object) -> None:
-        raise AssertionError("work has started")
+BANK = "bank {folder}/mesh.ply"
+COMMANDS = "demo --out {blocked}/out", f"{BANK} --out {{blocked}}/a", f"{BANK} --out {{folder}}/a --adapt {{blocked}}/b"
 
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_check_the_output_folder_before_they_work(
+    command: str, path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("matching.cached_bank", "io.meshes.load_mesh"):
-        monkeypatch.setattr(f"curvireg_torch.{name}", work)
-    blocked = tmp_path / "file"
-    blocked.write_bytes(OLD)
-    (tmp_path / "mesh.ply").write_bytes(OLD)
-    mesh = str(tmp_path / "mesh.ply")
-    arguments = {
-        "demo": ["demo", "--out", str(blocked / "out")],
-        "bank": ["bank", mesh, "--out", str(blocked / "a.safetensors")],
-        "bank --adapt": ["bank", mesh, "--out", str(tmp_path / "a"), "--adapt", str(blocked / "b")],
-    }[command]
-    option = "--adapt" if "--adapt" in arguments else "--out"
-    assert main(arguments) == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"curvireg: error: {option} {blocked}")
-    assert len(error.splitlines()) == 1
+        monkeypatch.setattr(f"curvireg_torch.{name}", Mock(side_effect=AssertionError("work has started")))
+    (path.parent / "mesh.ply").write_bytes(OLD)
+    words = command.format(blocked=path, folder=path.parent).split()
+    assert main(words) == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    assert error.startswith(f"curvireg: error: {words[-2]} {path}")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_write_file_keeps_the_old_content_if_interrupted(
-    number: signal.Signals, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    number: signal.Signals, code: int, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "file"
-    write_file(path, OLD)
     monkeypatch.setattr(os, "fsync", lambda _: signal.raise_signal(number))
     monkeypatch.setattr("curvireg_torch.matching.list_cache", lambda: write_file(path, NEW))
     before = signal.getsignal(signal.SIGTERM)
     ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for jobs in the background
     try:
-        ended = main(["cache"])
-    except SystemExit as stop:
-        ended = stop.code
+        with pytest.raises(SystemExit, match=str(code)):
+            sys.exit(main(["cache"]))
     finally:
         signal.signal(signal.SIGINT, ignored)
-    assert ended == code
     assert path.read_bytes() == OLD
-    assert list(tmp_path.iterdir()) == [path]
+    assert list(path.parent.iterdir()) == [path]
     assert signal.getsignal(signal.SIGTERM) == before
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 warns of fork beside threads
-def test_write_file_keeps_the_old_content_if_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "file"
-    write_file(path, OLD)
+def test_write_file_keeps_the_old_content_if_killed(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     child = os.fork()
     if child == 0:
         monkeypatch.setattr(os, "fsync", lambda _: os.kill(os.getpid(), signal.SIGKILL))
@@ -131,5 +121,5 @@ def test_write_file_keeps_the_old_content_if_killed(tmp_path: Path, monkeypatch:
         os._exit(0)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
     assert path.read_bytes() == OLD
-    (temporary,) = (other.name for other in tmp_path.iterdir() if other != path)
+    (temporary,) = (other.name for other in path.parent.iterdir() if other != path)
     assert temporary.endswith(".tmp")

@@ -22,10 +22,10 @@ def at(uv: tuple[float, float], corners: tuple[int, int, int] = (255, 255, 255))
 def test_at_returns_the_colour_of_a_texel_at_its_centre(row: int, column: int) -> None:
     """(0, 0) is the bottom left corner of the texture, rows run down from its top."""
     uv = ((column + 0.5) / 5.0, 1.0 - (row + 0.5) / 4.0)
-    assert at(uv) == pytest.approx(TEXTURE[row, column].tolist(), abs=1e-3)
-    assert at((uv[0] + 2.0, uv[1] - 1.0)) == pytest.approx(TEXTURE[row, column].tolist(), abs=1e-3), "it repeats"
-    half = [0.5 * v for v in TEXTURE[row, column].tolist()]
-    assert at(uv, (127, 127, 127)) == pytest.approx(half, rel=0.01, abs=1e-3)
+    expected = TEXTURE[row, column].astype(float)
+    assert at(uv) == pytest.approx(expected, abs=1e-3)
+    assert at((uv[0] + 2.0, uv[1] - 1.0)) == pytest.approx(expected, abs=1e-3), "it repeats"
+    assert at(uv, (127, 127, 127)) == pytest.approx(0.5 * expected, rel=0.01, abs=1e-3)
 
 
 def test_at_interpolates_between_texels_and_across_the_seam() -> None:

@@ -1,5 +1,3 @@
-"""The files of a mesh are listed, and changing any of them changes its digest."""
-
 import json
 from pathlib import Path
 
@@ -11,6 +9,7 @@ from PIL import Image
 from curvireg_torch.errors import MeshError
 from curvireg_torch.io.meshes import load_mesh
 from curvireg_torch.io.meshes.files import mesh_digest, mesh_files
+from tests.io.meshes.test_hostile_meshes import tree
 
 EXPECTED = {
     "gltf": {"part.gltf", "picture.png", "points.bin"},
@@ -34,33 +33,22 @@ def write(folder: Path, suffix: str) -> Path:
     (folder / "beside.png").write_bytes(b"no part of the mesh")
     path = folder / f"part.{suffix}"
     if suffix == "gltf":
-        corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
-        uv = np.array([[0, 0], [1, 0], [0, 1]], np.float32)
+        corners, uv = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32), np.float32([[0, 0], [1, 0], [0, 1]])
         (folder / "points.bin").write_bytes(corners.tobytes() + uv.tobytes())
-        tree = {
-            "asset": {"version": "2.0"},
-            "buffers": [{"byteLength": 60, "uri": "points.bin"}],
-            "bufferViews": [
-                {"buffer": 0, "byteOffset": 0, "byteLength": 36},
-                {"buffer": 0, "byteOffset": 36, "byteLength": 24},
-            ],
-            "accessors": [
-                {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 3, "min": [0] * 3, "max": [1] * 3},
-                {"bufferView": 1, "componentType": 5126, "type": "VEC2", "count": 3},
-            ],
-            "images": [{"uri": "picture.png"}],
-            "textures": [{"source": 0}],
-            "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
-            "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}],
-            "nodes": [{"mesh": 0}],
-            "scenes": [{"nodes": [0]}],
-        }
-        path.write_text(json.dumps(tree))
+        content = tree(
+            buffers=[{"byteLength": 60, "uri": "points.bin"}],
+            bufferViews=[{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 24}],
+            images=[{"uri": "picture.png"}],
+            textures=[{"source": 0}],
+            materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+            meshes=[{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}],
+        )
+        content["accessors"].append({"bufferView": 1, "componentType": 5126, "type": "VEC2", "count": 3})
+        path.write_text(json.dumps(content))
     elif suffix == "obj":
         (folder / "part.mtl").write_text("newmtl skin\nmap_Kd picture.png\n")
-        path.write_text(
-            "mtllib part.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl skin\nf 1/1 2/2 3/3\n"
-        )
+        points = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
+        path.write_text(f"mtllib part.mtl\n{points}usemtl skin\nf 1/1 2/2 3/3\n")
     elif suffix == "ply":
         header = "ply\nformat ascii 1.0\ncomment TextureFile picture.png\nelement vertex 3\n"
         header += "".join(f"property float {name}\n" for name in ("x", "y", "z", "s", "t"))

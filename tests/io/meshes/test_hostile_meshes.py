@@ -14,7 +14,6 @@ import pytest
 import trimesh
 
 import curvireg_torch as cr
-from curvireg_torch import limits
 from curvireg_torch.errors import MeshError
 from curvireg_torch.io.meshes import files as mesh_files
 from curvireg_torch.io.meshes import gltf, polygons
@@ -81,7 +80,9 @@ CHAIN = [{"children": [i + 1]} for i in range(1000)] + [{"mesh": 0}]
         ({"accessors": [{"bufferView": 0, "componentType": 5126, "count": 10**6, "type": "VEC3"}]}, "view holds"),
         ({"accessors": [{"bufferView": 0, "componentType": 5126, "count": -3, "type": "VEC3"}]}, "-3"),
         ({"bufferViews": [{"buffer": 0, "byteLength": 10**12}]}, "beyond its buffer"),
-        ({"buffers": [{"byteLength": 10**12, "uri": "data:;base64,AAAA"}]}, "claims 1000000000000 bytes"),
+        ({"buffers": [{"byteLength": 10**12, "uri": "data:;base64,AAAA"}]}, "claims 1000000000000 bytes, 3 are there"),
+        ({"buffers": [{"byteLength": 36}]}, "a buffer without content"),
+        ({"buffers": [{"byteLength": 36, "uri": "data:text/plain,abc"}]}, "not base64"),
         ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "KHR_draco_mesh_compression.*export without it"),
         ({"extensionsRequired": ["EXT_meshopt_compression"]}, "EXT_meshopt_compression"),
         ({"asset": {"version": "1.0"}}, "version 2"),
@@ -113,25 +114,9 @@ def test_check_gltf_refuses_damaged_glb(tmp_path: Path, data: bytes, match: str)
     refused(tmp_path / "a.glb", data, match)
 
 
-@pytest.mark.parametrize(
-    ("buffer", "match"),
-    [
-        ({"byteLength": 36}, "a buffer without content"),
-        ({"byteLength": 36, "uri": "data:text/plain,abc"}, "not base64"),
-        ({"byteLength": 36, "uri": "data:;base64,AAAA"}, "a buffer claims 36 bytes, 3 are there"),
-    ],
-)
-def test_check_gltf_refuses_damaged_buffers(tmp_path: Path, buffer: dict[str, Any], match: str) -> None:
-    refused(tmp_path / "a.gltf", json.dumps(tree(buffers=[buffer])).encode(), match)
-
-
 def test_check_gltf_counts_every_copy_of_a_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gltf, "MAX_MESH_FACES", 100)
     refused(tmp_path / "a.gltf", json.dumps(tree(nodes=[{"mesh": 0}] * 200)).encode(), "more than 100 faces")
-
-
-def test_check_gltf_refuses_deep_json(tmp_path: Path) -> None:
-    refused(tmp_path / "a.gltf", b'{"asset": ' + b"[" * 1_000_000, "JSON is damaged")
 
 
 OUTSIDE = ["../b.bin", "/etc/passwd", "file:///etc/passwd", "http://127.0.0.1:9/b.bin", "%2e%2e/b.bin"]
@@ -147,13 +132,10 @@ def test_load_mesh_opens_no_file_outside_the_folder(tmp_path: Path, uri: str) ->
     refused(folder / "a.gltf", json.dumps(content).encode(), "no file of its folder")
 
 
-def test_load_mesh_opens_files_of_the_folder(tmp_path: Path) -> None:
+def test_load_mesh_opens_files_of_the_folder_and_ignores_others(tmp_path: Path) -> None:
     (tmp_path / "b c.bin").write_bytes(POINTS)
     (tmp_path / "a.gltf").write_text(json.dumps(tree(buffers=[{"byteLength": 36, "uri": "b%20c.bin"}])))
     assert cr.load_mesh(tmp_path / "a.gltf").area == 0.5
-
-
-def test_load_mesh_ignores_materials_outside_the_folder(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_text("mtllib ../../secret.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl x\nf 1 2 3\n")
     assert cr.load_mesh(tmp_path / "a.obj").area == 0.5
 
@@ -174,6 +156,7 @@ PLY += b"property list uchar int vertex_indices\nend_header\n"
         ("a.ply", PLY.replace(b"9000000", b"10000001") % (b"ascii", 0), "more than 10,000,000 faces"),
         ("a.off", b"OFF\n3 10000001 0\n" + b"\n".join([b"0 0 0"] * 3), "early"),
         ("a.stl", b"\0" * 80 + struct.pack("<I", 10**9) + b"\0" * 50, "got none"),
+        ("a.gltf", b'{"asset": ' + b"[" * 1_000_000, "JSON is damaged"),
         ("a.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", r"\(3, 2\)"),
         ("a.obj", b"v 0 0 0\nv 1e300 0 0\nv 0 1 0\nf 1 2 3\n", r"1e\+12"),
         ("a.obj", b"v 0 0 0\n" * 9 + b"f " + b"1 2 3 " * 2_000 + b"\n", "degenerate"),
@@ -190,7 +173,6 @@ def test_load_mesh_bounds_faces_and_bytes(tmp_path: Path, monkeypatch: pytest.Mo
     refused(tmp_path / "a.stl", content, "1,280 faces")
     monkeypatch.setattr(mesh_files, "MAX_MESH_BYTES", 1000)
     refused(tmp_path / "a.stl", content, "larger than 1,000 bytes")
-    assert limits.MAX_MESH_FACES > 1_000_000
 
 
 def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path: Path) -> None:
@@ -213,9 +195,8 @@ def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path: Path) ->
 
 def test_as_mesh_places_parts_above_the_base_frame() -> None:
     scene = trimesh.Scene()
-    scene.add_geometry(
-        trimesh.creation.box(), node_name="a", transform=trimesh.transformations.translation_matrix([2, 0, 0])
-    )
+    moved = trimesh.transformations.translation_matrix([2, 0, 0])
+    scene.add_geometry(trimesh.creation.box(), node_name="a", transform=moved)
     scene.add_geometry(trimesh.creation.box(), node_name="b", parent_node_name="a")
     scene.graph.base_frame = "b"
     found = mesh_module.as_mesh(scene)

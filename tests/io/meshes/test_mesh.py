@@ -1,5 +1,3 @@
-"""The normalised frame of a mesh."""
-
 import pytest
 import torch
 import trimesh
@@ -9,7 +7,6 @@ from curvireg_torch import geometry as g
 from curvireg_torch.io.meshes import normalization_transform
 from curvireg_torch.matching import ViewBank
 from curvireg_torch.settings import BankSettings
-from curvireg_torch.synthetic import example_mesh
 
 
 def moved(mesh: trimesh.Trimesh, rotation: torch.Tensor, scale: float, offset: list[float]) -> trimesh.Trimesh:
@@ -19,32 +16,28 @@ def moved(mesh: trimesh.Trimesh, rotation: torch.Tensor, scale: float, offset: l
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_normalization_transform_is_invariant_to_similarities(seed: int) -> None:
-    mesh = example_mesh()
+def test_normalization_transform_is_invariant_to_similarities(truck: trimesh.Trimesh, seed: int) -> None:
     R = torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
-    copy = moved(mesh, R, 7.0, [3.0, -2.0, 5.0])
-    normalised = [
-        m.copy().apply_transform(normalization_transform(m, align_axes=True).numpy()).vertices for m in (mesh, copy)
-    ]
-    torch.testing.assert_close(*map(torch.tensor, normalised), rtol=0, atol=1e-9)
-    spread = torch.tensor(normalised[0]).square().mean(dim=0)
+    meshes = truck, moved(truck, R, 7.0, [3.0, -2.0, 5.0])
+    transforms = [normalization_transform(mesh, align_axes=True) for mesh in meshes]
+    first, second = (
+        torch.tensor(mesh.copy().apply_transform(T.numpy()).vertices)
+        for mesh, T in zip(meshes, transforms, strict=True)
+    )
+    torch.testing.assert_close(first, second, rtol=0, atol=1e-9)
+    spread = first.square().mean(dim=0)
     assert spread[0] > spread[1] > spread[2]
-    assert float(torch.tensor(normalised[0]).norm(dim=1).max()) == pytest.approx(1.0)
+    assert float(first.norm(dim=1).max()) == pytest.approx(1.0)
+    assert float(torch.linalg.det(transforms[0][:3, :3])) > 0, "not mirrored"
 
 
-def test_normalization_transform_does_not_mirror() -> None:
-    mesh = example_mesh()
-    T = normalization_transform(mesh, align_axes=True)
-    assert float(torch.linalg.det(T[:3, :3])) > 0
-
-
-def test_bank_of_a_moved_copy_holds_the_same_views() -> None:
+def test_bank_of_a_moved_copy_holds_the_same_views(truck: trimesh.Trimesh) -> None:
     # A quarter rotation about z maps the box, and a grid of azimuths, onto themselves.
-    mesh, settings = example_mesh(), BankSettings(image_size=64)
+    settings = BankSettings(image_size=64)
     quarter = torch.from_numpy(Rotation.from_euler("z", 90, degrees=True).as_matrix())
-    copy = moved(mesh, quarter, 12.0, [30.0, -7.0, 2.0])
+    copy = moved(truck, quarter, 12.0, [30.0, -7.0, 2.0])
     views = g.sample_views(azimuth_step=30, elevations=[-20, 40])
-    first, second = (ViewBank.build(m, views, settings=settings, progress=False) for m in (mesh, copy))
+    first, second = (ViewBank.build(m, views, settings=settings, progress=False) for m in (truck, copy))
     rotated = (first.rotations.double() @ quarter.T).flatten(1) @ second.rotations.double().flatten(1).T
     assert float(rotated.amax(dim=1).min()) > 3.0 - 1e-5  # traces: every view is there
     order = rotated.argmax(dim=1)
@@ -56,12 +49,11 @@ def test_bank_of_a_moved_copy_holds_the_same_views() -> None:
     assert int(differ.max()) <= 4  # pixels on rims
 
 
-def test_in_model_frame_keeps_poses_in_the_frame_of_the_file() -> None:
-    mesh = example_mesh()
-    copy = moved(mesh, torch.from_numpy(Rotation.random(random_state=1).as_matrix()), 3.0, [1.0, 2.0, 3.0])
+def test_in_model_frame_keeps_poses_in_the_frame_of_the_file(truck: trimesh.Trimesh) -> None:
+    copy = moved(truck, torch.from_numpy(Rotation.random(random_state=1).as_matrix()), 3.0, [1.0, 2.0, 3.0])
     views = g.uniform_views(12)
     directions = []
-    for m in (mesh, copy):
+    for m in (truck, copy):
         T = normalization_transform(m, align_axes=True)
         R = views.in_model_frame(T).rotations.double()
         scale = torch.linalg.det(T[:3, :3]) ** (1 / 3)
