@@ -13,7 +13,6 @@ from torch import Tensor
 
 from ..matching import Ranking
 from .calibration import CALIBRATION
-from .rescoring import POSE_FEATURES
 
 __all__ = [
     "CONFIDENCE_FEATURES",
@@ -59,22 +58,13 @@ Features = Mapping[str, float | None]
 
 @dataclass(frozen=True)
 class LogisticModel:
-    """P = 1 / (1 + exp(-(bias + sum of weight x feature))).
-
-    Attributes:
-        weights: of the features, by name.
-        bias: logit where all features are 0.
-    """
+    """P = 1 / (1 + exp(-(bias + sum of weight x feature))), with weights by the names of features."""
 
     weights: Mapping[str, float]
     bias: float
 
     def __call__(self, features: Features) -> float:
-        """Probability in (0, 1).
-
-        A feature that is None, because there is no rival to compare with, counts as 0, as in a tie, and the probability
-        is at most ``UNCOMPARED``: there is no evidence against another pose.
-        """
+        """Probability in (0, 1); at most ``UNCOMPARED`` if a feature is None, which counts as 0, as in a tie."""
         logit = self.bias + sum(weight * (features[name] or 0.0) for name, weight in self.weights.items())
         probability = 0.5 * (1.0 + math.tanh(0.5 * logit))  # the logistic function, which overflows nowhere
         return probability if None not in features.values() else min(probability, UNCOMPARED)
@@ -85,7 +75,7 @@ def confidence_model(stage: str, *, with_camera: bool, with_appearance: bool) ->
 
     Args:
         stage: "ranking" for views, "contours" for fitted poses.
-        with_camera: whether the camera matrix is known; the model of a ranking does not depend on it.
+        with_camera: ignored for a ranking.
         with_appearance: whether the pipeline has the appearance term.
     """
     camera = [] if stage == "ranking" else ["camera" if with_camera else "no camera"]
@@ -128,17 +118,11 @@ def ranking_evidence(
 
 def ranking_features(evidence: Tensor) -> dict[str, float | None]:
     """Features by name of one ranking, from (3,) :func:`ranking_evidence`; None instead of NaN."""
-    known = zip(RANKING_FEATURES, evidence.tolist(), strict=True)
-    return {name: None if math.isnan(value) else value for name, value in known}
+    return {n: None if math.isnan(v) else v for n, v in zip(RANKING_FEATURES, evidence.tolist(), strict=True)}
 
 
 def confidence(ranking: Ranking, rotations: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
     """Probability that the best view is within 30 degrees of the truth, from :func:`ranking_evidence`.
-
-    Args:
-        ranking: of N views for B photographs.
-        rotations: (N, 3, 3) of the views.
-        symmetries: see :func:`ranking_evidence`.
 
     Returns:
         (B,) in (0, 1).
@@ -163,17 +147,12 @@ def confidence_features(evidence: Tensor, scores: Tensor, concentration: float |
 
     Args:
         evidence: (H, 4) :data:`POSE_FEATURES` of the hypotheses, the best first.
-        scores: (H,) of the same, see :func:`rescore`.
+        scores: (H,) of :func:`rescore`.
         concentration: of the ranking.
     """
-    best = dict(zip(POSE_FEATURES, evidence[0].tolist(), strict=True))
-    return {
-        "similarity": best["similarity"],
-        "lead": _lead(scores),
-        "edge_support": best["edge_support"],
-        "appearance_lead": _lead(evidence[:, POSE_FEATURES.index("appearance")]),
-        "concentration": concentration,
-    }
+    _, similarity, edge_support, _ = evidence[0].tolist()
+    values = (similarity, _lead(scores), edge_support, _lead(evidence[:, 3]), concentration)
+    return dict(zip(CONFIDENCE_FEATURES, values, strict=True))
 
 
 def _lead(values: Tensor) -> float | None:
@@ -182,24 +161,19 @@ def _lead(values: Tensor) -> float | None:
 
 
 def presence_features(score: float, ranking: Ranking, *, learned: bool) -> list[float]:
-    """Features of the probability that the photograph shows the object at all (``PRESENCE_FEATURES``).
+    """``PRESENCE_FEATURES`` of a box: the locator's score, and the best correlation of its ranking (B = 1).
 
-    Args:
-        score: of the locator for the box.
-        ranking: of that box (B = 1); its best correlation is the similarity.
-        learned: whether the locator compares learned features; its score of classical fields is not informative.
+    The score of a locator that is not ``learned`` is not informative, and left out.
     """
     similarity = float(ranking.hog.detach().max())
     return [score, similarity] if learned else [similarity]
 
 
 def presence(evidence: Sequence[float]) -> float:
-    """Probability that the photograph shows the object at its pose, from :func:`presence_features`.
+    """Probability that the photograph shows the object, from :func:`presence_features`.
 
     Example:
         >>> presence([8.0, 0.9]) > presence([4.0, 0.6])
-        True
-        >>> presence([0.9]) > presence([0.6])
         True
     """
     weights, bias = _PRESENCE[len(evidence)]

@@ -13,7 +13,7 @@ from .estimator import PoseEstimator
 from .inputs import ImageItem
 from .results import FailedRegistration, Registration
 
-__all__ = ["AGREE", "corrected", "projected_box"]
+__all__ = ["corrected", "projected_box"]
 
 AGREE = 0.85
 """Overlap (IoU) from which two boxes count as the same: boxes drawn by hand had at least 0.86 with the box of the pose
@@ -25,15 +25,9 @@ Results = Sequence[Registration | FailedRegistration]
 def corrected(
     estimator: PoseEstimator, items: Sequence[ImageItem | CurviregError], results: Results
 ) -> list[Registration | FailedRegistration]:
-    """Register again with the box of the pose where it differs from the given box, and keep the better result.
+    """Register again with the box of the pose where it differs from the given box, and keep the higher ``score``.
 
-    The better result is the one with the higher ``score``. Results without a camera matrix are returned unchanged, as
-    those poses are derived from their boxes.
-
-    Args:
-        estimator: that computed the results.
-        items: B photographs with their boxes.
-        results: of the same.
+    Results without a camera matrix are returned unchanged, as those poses are derived from their boxes.
     """
     changed: dict[int, ImageItem] = {}
     for k, (item, result) in enumerate(zip(items, results, strict=True)):

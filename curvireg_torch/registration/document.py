@@ -14,7 +14,7 @@ from .confidence import RELIABLE
 from .registrar import Registrar
 from .results import Registration
 
-__all__ = ["CONVENTIONS", "SCHEMA", "corners", "correction", "localization_document", "result_document", "used_box"]
+__all__ = ["SCHEMA", "corners", "correction", "localization_document", "result_document", "used_box"]
 
 SCHEMA = 2
 """Version of ``result.schema.json``; raised when a key is removed or changes its meaning."""
@@ -41,13 +41,7 @@ CONVENTIONS = {
 
 
 def result_document(result: Registration, registrar: Registrar, seconds: Mapping[str, float]) -> dict[str, Any]:
-    """:meth:`Registration.to_dict` and how the result was computed: pipeline, versions, times, conventions.
-
-    Args:
-        result: of ``registrar``.
-        registrar: that computed it.
-        seconds: time spent in ``bank`` and ``register``.
-    """
+    """:meth:`Registration.to_dict` and how the result was computed, with the seconds of ``bank`` and ``register``."""
     bank = registrar.bank
     return {
         "schema": SCHEMA,
@@ -69,26 +63,15 @@ def result_document(result: Registration, registrar: Registrar, seconds: Mapping
 
 
 def localization_document(results: Sequence[Registration]) -> dict[str, Any]:
-    """The key ``localization``: objects that were found in one photograph, the most certain first.
-
-    Args:
-        results: of :func:`curvireg_torch.registration.localize`.
-    """
+    """The key ``localization``: the objects that :func:`localize` found in one photograph."""
     located = [(result, result.localization) for result in results if result.localization is not None]
     first = located[0][1]
     return {
         "presence": first.presence,
-        "proposals": [
-            {"box": box, "score": score} for box, score in zip(first.boxes.tolist(), first.scores.tolist(), strict=True)
-        ],
+        "proposals": [{"box": b.tolist(), "score": float(s)} for b, s in zip(first.boxes, first.scores, strict=True)],
         "instances": [
-            {
-                "box": where.box.tolist(),
-                "presence": where.presence,
-                "confidence": result.confidence,
-                **result.pose_dict(),
-            }
-            for result, where in located
+            {"box": at.box.tolist(), "presence": at.presence, "confidence": result.confidence, **result.pose_dict()}
+            for result, at in located
         ],
     }
 

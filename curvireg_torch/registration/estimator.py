@@ -31,17 +31,7 @@ of another object, 14 were called reliable with one hypothesis, 2 with two, none
 
 @dataclass(frozen=True)
 class _Batch:
-    """B photographs to register.
-
-    Attributes:
-        images: (C, H, W) each.
-        boxes: (B, 4) float64 px.
-        camera_matrices: (B, 3, 3) px, or None.
-        query: their crops, cut and described by the matcher.
-        ranking: of the bank's views.
-        descriptors: (B, D) on the fine grid of search and rescoring.
-        priors: limits on the poses, or None if no photograph has any.
-    """
+    """B photographs: boxes (B, 4) float64 px, cameras (B, 3, 3) or None, descriptors (B, D) on the search's grid."""
 
     images: list[Tensor]
     boxes: Tensor
@@ -50,6 +40,9 @@ class _Batch:
     ranking: Ranking
     descriptors: Tensor
     priors: BatchPriors | None
+
+    def scores(self, evidence: Tensor) -> Tensor:
+        return rescore(evidence, with_camera=self.camera_matrices is not None)
 
 
 class PoseEstimator:
@@ -74,8 +67,7 @@ class PoseEstimator:
     @cached_property
     def describers(self) -> tuple[ViewDescriber, ...]:
         """Renderer and descriptor of each model, on a grid twice as fine as the bank's."""
-        settings = self.bank.settings
-        fine = replace(settings, grid=min(2 * settings.grid, settings.image_size))
+        fine = replace(self.bank.settings, grid=min(2 * self.bank.settings.grid, self.bank.settings.image_size))
         return tuple(
             ViewDescriber(mesh, fine, renderer=coarse.renderer, device=self.bank.device)
             for mesh, coarse in zip(self.bank.meshes, self.matcher.describers, strict=True)
@@ -87,7 +79,6 @@ class PoseEstimator:
         return map_on_threads(lambda _: Locator(self.matcher), [0])[0]  # one thread: rounding is always the same
 
     def report_progress(self, stage: str) -> None:
-        """Report the beginning of a stage."""
         if callable(self.progress):
             self.progress(stage, 0, 1)
 
@@ -98,9 +89,8 @@ class PoseEstimator:
     ) -> list[Any]:
         """Results of ``function(some items, index of the first)`` for all items, in their order.
 
-        On a CPU each photograph is registered on its own thread, in which torch uses no further threads: its result
-        is the same to the bit, whatever else is registered, on however many threads. On a GPU ``chunk_size`` of the
-        matcher are registered at a time.
+        On a CPU each photograph has a thread, in which torch uses no further ones: its result is the same to the bit,
+        whatever else is registered. On a GPU the matcher's ``chunk_size`` are registered at a time.
         """
         size = 1 if self.bank.device.type == "cpu" else self.matcher.chunk_size
         _ = self.describers, self.matcher.describers  # create them once, before threads use them
@@ -115,32 +105,25 @@ class PoseEstimator:
     def register_items(
         self, items: Sequence[ImageItem | CurviregError], *, first: int = 0
     ) -> list[Registration | FailedRegistration]:
-        """Register photographs, some of which may have failed already; boxes are not corrected.
-
-        Args:
-            items: photographs or their errors.
-            first: index of the first photograph, for error messages.
-        """
-        results: dict[int, Registration | FailedRegistration] = {
-            i: FailedRegistration(item) for i, item in enumerate(items) if not isinstance(item, ImageItem)
-        }
-        usable = {i: item for i, item in enumerate(items) if isinstance(item, ImageItem)}
+        """Results of photographs or errors, the first of which has the index ``first``; boxes are not corrected."""
+        results: list[Any] = [item if isinstance(item, ImageItem) else FailedRegistration(item) for item in items]
+        usable = [i for i, item in enumerate(items) if isinstance(item, ImageItem)]
         if usable:
-            boxes = torch.stack([item.box for item in usable.values()])
-            query = self.matcher.query([item.image for item in usable.values()], boxes)
-            for (i, item), crop in zip(usable.items(), query.crops, strict=True):
+            boxes = torch.stack([results[i].box for i in usable])
+            query = self.matcher.query([results[i].image for i in usable], boxes)
+            for i, crop in zip(usable, query.crops, strict=True):
                 try:
                     check_crop(crop)
-                    if item.prior is not None:
-                        BatchPriors.of([item], self.bank).log_prior(self.bank)
+                    if results[i].prior is not None:
+                        BatchPriors([results[i]], self.bank).log_prior(self.bank)
                 except CurviregError as error:
                     results[i] = FailedRegistration(error.with_subject(f"image {first + i}"))
-            rows = [row for row, i in enumerate(usable) if i not in results]
+            rows = [row for row, i in enumerate(usable) if isinstance(results[i], ImageItem)]
             if rows:
-                indices = [i for i in usable if i not in results]
-                registered = self.register([usable[i] for i in indices], query[torch.tensor(rows)])
-                results.update(zip(indices, registered, strict=True))
-        return [results[i] for i in range(len(items))]
+                registered = self.register([results[usable[row]] for row in rows], query[torch.tensor(rows)])
+                for row, result in zip(rows, registered, strict=True):
+                    results[usable[row]] = result
+        return results
 
     @torch.no_grad()
     def register(
@@ -157,18 +140,20 @@ class PoseEstimator:
         count = max(LEAST, self.pipeline.hypotheses)
         starts = start_hypotheses(batch.ranking, self.bank, count=count, symmetries=self.symmetries)
         starts = starts if batch.priors is None else batch.priors.moved_inside(starts)
-        hypotheses = self._search(batch, starts)
-        poses = self._fit(batch, lift_to_poses(self.describers, hypotheses, batch.boxes, batch.camera_matrices))
+        hypotheses = self._search(batch, starts) if self.pipeline.search else starts
+        poses = lift_to_poses(self.describers, hypotheses, batch.boxes, batch.camera_matrices)
+        if self.pipeline.contours:
+            self.report_progress("contours")
+            poses = fit_poses(self.describers, batch.images, poses, batch.boxes)
         evidence = self._evidence(batch, starts, poses)
-        distinct = self._distinct(batch, poses, evidence)
+        distinct = distinct_mask(poses.hypotheses, batch.scores(evidence), symmetries=self.symmetries)
         poses, evidence = self._restore(batch, starts, poses, evidence, distinct)
-        order = self._order(batch, poses, evidence, distinct)
-        return self._results(batch, poses, evidence, order)
+        return self._results(batch, poses, evidence, distinct)
 
     def _rank(self, items: Sequence[ImageItem], query: QueryFeatures, ranking: Ranking | None) -> _Batch:
         self.report_progress("ranking")
         matrices = [item.camera_matrix for item in items if item.camera_matrix is not None]
-        priors = BatchPriors.of(items, self.bank) if any(item.prior is not None for item in items) else None
+        priors = BatchPriors(items, self.bank) if any(item.prior is not None for item in items) else None
         if ranking is None:
             ranking = self.matcher.rank(query, None if priors is None else priors.log_prior(self.bank))
         return _Batch(
@@ -182,8 +167,6 @@ class PoseEstimator:
         )
 
     def _search(self, batch: _Batch, starts: Hypotheses) -> Hypotheses:
-        if not self.pipeline.search:
-            return starts
         self.report_progress("search")
         return search(
             self.describers,
@@ -196,12 +179,6 @@ class PoseEstimator:
             brief=self.pipeline.contours,
             priors=batch.priors,
         )
-
-    def _fit(self, batch: _Batch, poses: Poses) -> Poses:
-        if not self.pipeline.contours:
-            return poses
-        self.report_progress("contours")
-        return fit_poses(self.describers, batch.images, poses, batch.boxes)
 
     def _evidence(self, batch: _Batch, starts: Hypotheses, poses: Poses) -> Tensor:
         """(H, 4) :data:`POSE_FEATURES` of poses that come from the views ``starts``."""
@@ -216,25 +193,16 @@ class PoseEstimator:
         appearance = torch.zeros_like(similarity)
         if "appearance" in batch.ranking.terms:
             pictures = self.matcher.pictures(hypotheses.model, hypotheses.rotation, hypotheses.distance)
-            appearance = self.matcher.reranking_score(
-                "appearance", batch.query, batch.ranking, pictures, hypotheses.image_index
-            )
+            options = (batch.query, batch.ranking, pictures, hypotheses.image_index)
+            appearance = self.matcher.reranking_score("appearance", *options)
         return torch.stack([rank_feature(starts), similarity, support, appearance], dim=1)
-
-    def _distinct(self, batch: _Batch, poses: Poses, evidence: Tensor) -> Tensor:
-        """(H,) bool: False where a hypothesis has merged into a better one."""
-        scores = rescore(evidence, with_camera=batch.camera_matrices is not None)
-        return distinct_mask(poses.hypotheses, scores, symmetries=self.symmetries)
 
     def _restore(
         self, batch: _Batch, starts: Hypotheses, poses: Poses, evidence: Tensor, distinct: Tensor
     ) -> tuple[Poses, Tensor]:
-        """Put hypotheses that merged, or whose fit is not trusted, back to the views that they started from.
-
-        A merged hypothesis still is a rival as its view. Without a camera the mesh is often another object of the
-        category: where its contours do not fit, the view has the smaller error.
-        """
+        """Put hypotheses that merged, or whose fit is not trusted, back to the views that they started from."""
         keep = distinct
+        # Without a camera the mesh is often another object: where contours do not fit, the view has the smaller error.
         if poses.fit is not None and batch.camera_matrices is None:
             keep = distinct & poses.fit.trustworthy
         if batch.priors is not None:
@@ -246,27 +214,19 @@ class PoseEstimator:
         evidence[back, 1:] = self._evidence(batch, starts[back], views[back])[:, 1:]
         return poses.where(keep, views), evidence
 
-    def _order(self, batch: _Batch, poses: Poses, evidence: Tensor, distinct: Tensor) -> list[Tensor]:
-        """For each photograph its hypotheses, best first; those that merged come last."""
-        scores = rescore(evidence, with_camera=batch.camera_matrices is not None)
+    def _results(self, batch: _Batch, poses: Poses, evidence: Tensor, distinct: Tensor) -> list[Registration]:
+        """Hypotheses of each photograph, best first, those that merged last, and their confidence."""
+        with_camera, ranking, fitted = batch.camera_matrices is not None, batch.ranking, poses.fit is not None
+        scores = batch.scores(evidence)
         order = (scores + torch.where(distinct, 0.0, -1e6)).argsort(descending=True, stable=True)
-        return [order[poses.hypotheses.image_index[order] == b] for b in range(len(batch.images))]
-
-    def _results(self, batch: _Batch, poses: Poses, evidence: Tensor, order: list[Tensor]) -> list[Registration]:
-        """Confidences, and hypotheses as they are reported."""
-        with_camera, ranking = batch.camera_matrices is not None, batch.ranking
-        fitted, best = poses.fit is not None, torch.stack([mine[0] for mine in order])
+        of_image = [order[poses.hypotheses.image_index[order] == b] for b in range(len(batch.images))]
         # The confidence of a fitted pose was calibrated on the ranking's best view; without fit, on the result's view.
-        views = None if fitted else poses.hypotheses.view[best]
+        views = None if fitted else poses.hypotheses.view[torch.stack([mine[0] for mine in of_image])]
         ranked = ranking_evidence(ranking, self.bank.rotations, answer=views, symmetries=self.symmetries)
-        model = confidence_model(
-            "contours" if fitted else "ranking",
-            with_camera=with_camera,
-            with_appearance="appearance" in ranking.terms,
-        )
-        scores = rescore(evidence, with_camera=with_camera)
+        stage, with_appearance = "contours" if fitted else "ranking", "appearance" in ranking.terms
+        model = confidence_model(stage, with_camera=with_camera, with_appearance=with_appearance)
         results = []
-        for b, mine in enumerate(order):
+        for b, mine in enumerate(of_image):
             features = ranking_features(ranked[b])
             if fitted:
                 features = confidence_features(evidence[mine], scores[mine], features["concentration"])

@@ -47,16 +47,8 @@ class Hypotheses:
 
 
 def start_hypotheses(ranking: Ranking, bank: ViewBank, *, count: int, symmetries: Tensor | None = None) -> Hypotheses:
-    """The best ``count`` distinct views of every photograph, see :func:`distinct_views`; on the CPU.
-
-    Args:
-        ranking: of the bank's views for B photographs.
-        bank: of one or several models.
-        count: largest number of views of each photograph.
-        symmetries: see :func:`distinct_views`.
-    """
-    rotations = bank.rotations
-    orders = list(ranking.order)
+    """At most ``count`` best distinct views of every photograph, see :func:`distinct_views`; on the CPU."""
+    rotations, orders = bank.rotations, list(ranking.order)
     if ranking.allowed is not None:
         orders = [order[allowed[order]] for order, allowed in zip(orders, ranking.allowed, strict=True)]
     views = [distinct_views(o, rotations, count=count, symmetries=symmetries, model=bank.model) for o in orders]
@@ -75,13 +67,7 @@ def start_hypotheses(ranking: Ranking, bank: ViewBank, *, count: int, symmetries
 
 
 def distinct_mask(hypotheses: Hypotheses, score: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
-    """(H,) bool: False where a hypothesis is within ``SAME`` degrees of a better one of its photograph.
-
-    Args:
-        hypotheses: after search and contour fit.
-        score: (H,), higher is better.
-        symmetries: see :func:`distinct_views`.
-    """
+    """(H,) bool: False where a hypothesis is within ``SAME`` degrees of one with a higher ``score`` (H,)."""
     distinct = torch.zeros(len(hypotheses), dtype=torch.bool)
     order = score.argsort(descending=True, stable=True)
     for b in hypotheses.image_index.unique():

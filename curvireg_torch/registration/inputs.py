@@ -29,8 +29,6 @@ __all__ = ["ImageItem", "check_crop", "image_items"]
 class ImageItem:
     """One photograph to register: ``image`` (1 or 3, H, W) float or uint8, ``box`` (4,), ``camera_matrix`` (3, 3).
 
-    ``prior`` limits the pose.
-
     Raises:
         InvalidInputError: something else, an empty box or one outside the image, skew, or pixels that are not square.
     """
@@ -54,13 +52,7 @@ def image_items(
     camera_matrices: Any | None,
     prior: PosePrior | Sequence[PosePrior | None] | None = None,
 ) -> list[ImageItem | CurviregError]:
-    """Each photograph with its box and camera, or the error that it cannot be used for.
-
-    Args:
-        images: (B, C, H, W), or a list of tensors (C, H, W), arrays (H, W) or (H, W, C), or paths.
-        boxes: (B, 4) x0, y0, x1, y1 in px, a tensor, an array or lists; None takes the whole images.
-        camera_matrices: (B, 3, 3), or (3, 3) for all, in px; None if unknown.
-        prior: limits on the pose, of all photographs or one for each.
+    """Photographs with boxes (None: the whole images) and cameras, or their errors; arguments as of ``Registrar``.
 
     Raises:
         InvalidInputError: not as many boxes, cameras or priors as images.
@@ -68,8 +60,7 @@ def image_items(
     if isinstance(images, str | PathLike) or (isinstance(images, Tensor) and images.ndim != 4):
         raise InvalidInputError("images: expected a batch (B, C, H, W) or a list; put a single image into a list")
     n = len(images)
-    whole = boxes is None
-    boxes = torch.zeros(n, 4) if whole else as_boxes(boxes, n)
+    boxes = None if boxes is None else as_boxes(boxes, n)
     cameras: Sequence[Tensor | None] = [None] * n
     if camera_matrices is not None:
         cameras = list(as_camera_matrices(camera_matrices, n).detach().cpu())
@@ -79,15 +70,12 @@ def image_items(
     out: list[ImageItem | CurviregError] = []
     for i in range(n):
         try:
-            out.append(_item(images[i], None if whole else boxes[i].detach().cpu().float(), cameras[i], priors[i]))
+            pixels = _pixels(images[i])
+            box = (whole_image_box(pixels) if boxes is None else boxes[i].detach()).cpu()
+            out.append(ImageItem(pixels, box if boxes is None else box.float(), cameras[i], priors[i]))
         except CurviregError as error:
             out.append(error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])])))
     return out
-
-
-def _item(image: Any, box: Tensor | None, K: Tensor | None, prior: PosePrior | None) -> ImageItem:
-    pixels = _pixels(image)
-    return ImageItem(pixels, whole_image_box(pixels).cpu() if box is None else box, K, prior)
 
 
 def _pixels(image: Any) -> Tensor:

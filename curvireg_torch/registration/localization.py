@@ -39,15 +39,13 @@ def localize(
 ) -> list[list[_Result]]:
     """Find and register objects in whole photographs, the most certain first.
 
-    The locator's best proposals are ranked as given boxes are, which yields the probability that each shows the object
-    (:func:`curvireg_torch.registration.confidence.presence`); the most certain are registered. The box around each pose
-    is then ranked too, which corrects the locator's coarse steps, and registered again where it is more certain.
+    The locator's best proposals are ranked as given boxes are, which yields the probability that each shows the object;
+    the most certain are registered. The box around each pose is ranked too, and registered where it is more certain.
 
     Args:
         registrar: :class:`Registrar` of the meshes.
-        images, camera_matrices: see :class:`Registrar`.
+        images, camera_matrices, prior: see :class:`Registrar`.
         instances: largest number of objects in each photograph.
-        prior: see :class:`Registrar`; it limits the poses in the proposed boxes.
         distance: range of the distance of an object's centre, in the mesh's unit; needs cameras.
 
     Returns:
@@ -61,33 +59,26 @@ def localize(
     check_distance(distance, with_cameras=camera_matrices is not None)
     _ = registrar.locator  # create it once, before threads use it
 
-    def localize_some(items: Sequence[ImageItem | CurviregError], first: int) -> list[list[_Result]]:
-        return [
-            _localize_one(registrar, item, f"image {i}", instances, distance) for i, item in enumerate(items, first)
-        ]
+    def localize_one(item: ImageItem | CurviregError, index: int) -> list[_Result]:
+        if not isinstance(item, ImageItem):
+            return [FailedRegistration(item)]
+        registrar.report_progress("localization")
+        try:
+            check_crop(_extremes(item.image))
+            cameras = None if item.camera_matrix is None else [item.camera_matrix]
+            located = registrar.locator([item.image], camera_matrices=cameras, distance=distance)[0]
+            if not len(located.boxes):
+                raise InvalidInputError(
+                    "nothing of such a size fits into the photograph; give other distances, or the box"
+                )
+            return [*_with_proposals(_register_candidates(registrar, item, located, instances), located)]
+        except CurviregError as error:
+            return [FailedRegistration(error.with_subject(f"image {index}"))]
 
-    return registrar.map_items(image_items(images, None, camera_matrices, prior), localize_some)
-
-
-def _localize_one(
-    estimator: PoseEstimator,
-    item: ImageItem | CurviregError,
-    name: str,
-    instances: int,
-    distance: tuple[float, float] | None,
-) -> list[_Result]:
-    if not isinstance(item, ImageItem):
-        return [FailedRegistration(item)]
-    estimator.report_progress("localization")
-    try:
-        check_crop(_extremes(item.image))
-        cameras = None if item.camera_matrix is None else [item.camera_matrix]
-        located = estimator.locator([item.image], camera_matrices=cameras, distance=distance)[0]
-        if not len(located.boxes):
-            raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
-        return [*_with_proposals(_register_candidates(estimator, item, located, instances), located)]
-    except CurviregError as error:
-        return [FailedRegistration(error.with_subject(name))]
+    return registrar.map_items(
+        image_items(images, None, camera_matrices, prior),
+        lambda items, first: [localize_one(item, i) for i, item in enumerate(items, first)],
+    )
 
 
 def _register_candidates(
@@ -148,12 +139,10 @@ class ScoredCandidates:
         log_prior = None
         if item.prior is not None:
             each = [replace(item, box=box) for box in boxes.float()]
-            log_prior = BatchPriors.of(each, estimator.bank).log_prior(estimator.bank)
+            log_prior = BatchPriors(each, estimator.bank).log_prior(estimator.bank)
         ranking = estimator.matcher.rank(query, log_prior)
-        learned = estimator.locator.features.learned
-        evidence = [
-            presence_features(score, ranking[k : k + 1], learned=learned) for k, score in enumerate(scores.tolist())
-        ]
+        learned, numbers = estimator.locator.features.learned, scores.tolist()
+        evidence = [presence_features(s, ranking[k : k + 1], learned=learned) for k, s in enumerate(numbers)]
         probability = torch.tensor([presence(features) for features in evidence], dtype=torch.float64)
         return cls(boxes, scores, query, ranking, evidence, probability)
 
@@ -161,13 +150,8 @@ class ScoredCandidates:
         """Register box ``k``; the result's box is the one around its pose."""
         one = slice(k, k + 1)
         result = estimator.register([replace(item, box=self.boxes[k])], self.query[one], self.ranking[one])[0]
-        where = Localization(
-            box=projected_box(estimator, result),
-            presence=float(self.presence[k]),
-            score=float(self.scores[k]),
-            boxes=self.boxes[:0].double(),
-            scores=self.scores[:0],
-        )
+        box, none = projected_box(estimator, result), (self.boxes[:0].double(), self.scores[:0])
+        where = Localization(box, float(self.presence[k]), float(self.scores[k]), *none)
         return replace(result, localization=where)
 
 
@@ -178,9 +162,7 @@ def _refined(estimator: PoseEstimator, item: ImageItem, result: Registration) ->
         candidates = ScoredCandidates.score_boxes(estimator, item, where.box[None].float(), torch.tensor([where.score]))
     except InvalidInputError:  # the projected mesh lies outside the photograph: nothing there supports the pose
         return replace(result, localization=replace(where, presence=0.0))
-    if float(candidates.presence[0]) <= where.presence:
-        return result
-    return candidates.register(estimator, item, 0)
+    return result if float(candidates.presence[0]) <= where.presence else candidates.register(estimator, item, 0)
 
 
 def _extremes(image: Tensor) -> Tensor:

@@ -14,19 +14,12 @@ from .contours import ContourFit, contour_support, fit_contours
 from .hypotheses import Hypotheses
 from .search import FINALISTS
 
-__all__ = ["Poses", "edge_supports", "fit_poses", "lift_to_poses", "to_allocentric"]
+__all__ = ["Poses", "edge_supports", "fit_poses", "lift_to_poses"]
 
 
 @dataclass(frozen=True)
 class Poses:
-    """H hypotheses as poses.
-
-    Attributes:
-        hypotheses: with the allocentric rotations and distances of the poses.
-        T: (H, 4, 4) ``T_cam_from_model``.
-        cameras: (H, 3, 3) in px of the photographs.
-        fit: result of the contour fit, or None.
-    """
+    """H hypotheses as poses ``T`` (H, 4, 4) ``T_cam_from_model`` in front of ``cameras`` (H, 3, 3) px, after a fit."""
 
     hypotheses: Hypotheses
     T: Tensor
@@ -34,10 +27,7 @@ class Poses:
     fit: ContourFit | None = None
 
     def where(self, keep: Tensor, others: "Poses") -> "Poses":
-        """Select per hypothesis: these poses where ``keep`` (H,) is True, else ``others``.
-
-        The covariance is NaN where the pose is taken from ``others``.
-        """
+        """These poses where ``keep`` (H,) is True, else ``others``, whose covariance is NaN."""
         pose = keep[:, None, None]
         T = torch.where(pose, self.T, others.T)
         hypotheses = replace(
@@ -51,21 +41,14 @@ class Poses:
         return Poses(hypotheses, T, torch.where(pose, self.cameras, others.cameras), fit)
 
     def __getitem__(self, index: Tensor) -> "Poses":
-        """Some of the poses, without their fit."""
+        """The poses without their fit."""
         return Poses(self.hypotheses[index], self.T[index], self.cameras[index])
 
 
 def lift_to_poses(
     describers: Sequence[ViewDescriber], hypotheses: Hypotheses, boxes: Tensor, K: Tensor | None
 ) -> Poses:
-    """Hypotheses as poses that fill their boxes.
-
-    Args:
-        describers: of the bank's models.
-        hypotheses: of B photographs.
-        boxes: (B, 4) px.
-        K: (B, 3, 3); None assumes a camera that looks straight at the centre of the box.
-    """
+    """Hypotheses as poses that fill (B, 4) boxes; without ``K`` (B, 3, 3) cameras look straight at the boxes."""
     T = torch.eye(4, dtype=torch.float64).repeat(len(hypotheses), 1, 1)
     cameras = torch.eye(3, dtype=torch.float64).repeat(len(hypotheses), 1, 1)
     for model, mine in hypotheses.by_model():

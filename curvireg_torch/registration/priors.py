@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import InvalidInputError
@@ -23,7 +24,6 @@ VIEW_SPACING = 7.5
 TOLERANCE = 3.0
 """Degrees by which the contour fit may leave the limits: it measures more precisely than limits are usually known."""
 
-
 AT_LIMIT = 1.0
 """Degrees from a limit within which a result is reported to lie at the limit."""
 
@@ -32,35 +32,22 @@ LOW_RATIO = 0.25
 
 
 class BatchPriors:
-    """Limits on the poses of B photographs; None for a photograph without any.
+    """Limits on the poses of B photographs, all with a camera matrix or all without.
 
-    The limits hold for rotations in the photograph's own camera. Views and hypotheses are allocentric; the ray through
-    the centre of the box turns them.
-
-    Args:
-        priors: of each photograph.
-        boxes: (B, 4) px.
-        camera_matrices: (B, 3, 3) in px, or None.
-        bank: whose meshes say which of their axes points up.
+    The limits hold for rotations in the photograph's own camera. Views and hypotheses are allocentric, and are rotated
+    towards the ray through the centre of the box.
     """
 
-    def __init__(
-        self, priors: Sequence[PosePrior | None], boxes: Tensor, camera_matrices: Tensor | None, bank: ViewBank
-    ) -> None:
-        self._priors = list(priors)
+    def __init__(self, items: Sequence[ImageItem], bank: ViewBank) -> None:
+        self._priors = [item.prior for item in items]
         self._ups = [mesh_up(mesh) for mesh in bank.meshes]
-        self._towards = torch.eye(3, dtype=torch.float64).repeat(len(boxes), 1, 1)
-        if camera_matrices is not None:
+        self._towards = torch.eye(3, dtype=torch.float64).repeat(len(items), 1, 1)
+        matrices = [item.camera_matrix.double() for item in items if item.camera_matrix is not None]
+        if matrices:
+            boxes = torch.stack([item.box for item in items])
             centres = (boxes[:, :2] + boxes[:, 2:]).double() / 2.0
-            rays = torch.linalg.solve(camera_matrices.double(), torch.nn.functional.pad(centres, (0, 1), value=1.0))
+            rays = torch.linalg.solve(torch.stack(matrices), F.pad(centres, (0, 1), value=1.0))
             self._towards = rotation_towards(rays)
-
-    @classmethod
-    def of(cls, items: Sequence[ImageItem], bank: ViewBank) -> "BatchPriors":
-        """Of photographs, all with a camera matrix or all without."""
-        matrices = [item.camera_matrix for item in items if item.camera_matrix is not None]
-        boxes = torch.stack([item.box for item in items])
-        return cls([item.prior for item in items], boxes, torch.stack(matrices) if matrices else None, bank)
 
     def log_prior(self, bank: ViewBank) -> Tensor:
         """(B, N) of the views of a bank.
@@ -75,8 +62,8 @@ class BatchPriors:
                 continue
             for m in model.unique().tolist():
                 mine = model == m
-                R = self._towards[b] @ views[mine]
-                out[b, mine] = prior.log_prior(R, self._frame(prior, m), margin=VIEW_SPACING)
+                frame = object_frame(self._ups[m], prior.front)
+                out[b, mine] = prior.log_prior(self._towards[b] @ views[mine], frame, margin=VIEW_SPACING)
             if bool((out[b] == -torch.inf).all()):
                 raise InvalidInputError(f"prior: no view of the bank lies within {prior}; widen it, or leave it out")
         return out
@@ -113,14 +100,7 @@ class BatchPriors:
         return keep
 
     def note(self, registration: Registration, hypotheses: Hypotheses, h: int, T: Tensor) -> Registration:
-        """The registration with its prior, and how the photograph contradicts it, see :class:`Registration`.
-
-        Args:
-            registration: of one photograph.
-            hypotheses: of all photographs.
-            h: the best one of this photograph.
-            T: (H, 4, 4) poses of the hypotheses.
-        """
+        """The registration with its prior, and how hypothesis ``h``, its best, contradicts it; ``T`` (H, 4, 4)."""
         one = hypotheses[torch.tensor([h])]
         prior, ratio = self._priors[int(one.image_index)], registration.ranking.prior_ratio
         contradiction = None
@@ -130,14 +110,11 @@ class BatchPriors:
             contradiction = "better outside"
         return replace(registration, prior=prior, prior_contradiction=contradiction)
 
-    def _frame(self, prior: PosePrior, model: int) -> Tensor:
-        return object_frame(self._ups[model], prior.front)
-
     def _each(self, hypotheses: Hypotheses) -> list[tuple[int, PosePrior, Tensor, Tensor]]:
         """Index, prior, frame of the mesh and rotation towards the box of each hypothesis that has a prior."""
         known = []
         for h, (b, m) in enumerate(zip(hypotheses.image_index.tolist(), hypotheses.model.tolist(), strict=True)):
             prior = self._priors[b]
             if prior is not None:
-                known.append((h, prior, self._frame(prior, m), self._towards[b]))
+                known.append((h, prior, object_frame(self._ups[m], prior.front), self._towards[b]))
         return known

@@ -28,14 +28,13 @@ __all__ = ["Registrar"]
 class Registrar(PoseEstimator):
     """Registers photographs to a mesh, or to the best of several.
 
-    Each box is cropped, converted to a field and ranked against the views of the bank; the best distinct views become
-    hypotheses. Each hypothesis is searched around in small steps, and its contours are pulled onto image edges
-    (:func:`fit_contours`); the resulting evidence decides their order. With a camera matrix the result is rotation and
-    translation with their covariance; without, the rotation. ``curvireg register`` gives the same result to the bit.
+    The views of the bank are ranked for each box; the best distinct ones become hypotheses, which a search in small
+    steps (:func:`search`) and a fit of contours (:func:`fit_contours`) refine, and whose evidence decides their order.
+    With a camera matrix the result is rotation and translation with their covariance; without, the rotation.
 
     Args:
-        bank_or_mesh: a :class:`ViewBank`, a :class:`ViewMatcher`, a mesh, the path of a mesh, or a list of meshes or
-            paths (which of them is it?); the bank of a mesh is read from the disk cache or built.
+        bank_or_mesh: a :class:`ViewBank`, a :class:`ViewMatcher`, a mesh, its path, or a list of meshes or paths, of
+            which the best is reported; the bank of a mesh is read from the disk cache or built.
         pipeline: all settings; default that of a bank, else ``Pipeline()``. ``replace(pipeline, search=False,
             contours=False)`` reports views of the bank, ``replace(pipeline, hypotheses=k)`` k hypotheses.
         views, settings: custom viewpoints and bank settings, for a mesh.
@@ -71,16 +70,16 @@ class Registrar(PoseEstimator):
         device: torch.device | str | None = None,
         progress: bool | Callable[[str, int, int], object] = False,
     ) -> None:
+        options: dict[str, Any]
         if isinstance(bank_or_mesh, ViewBank | ViewMatcher):
             if views is not None or settings is not None:
                 raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
         else:
             pipeline = pipeline or Pipeline()
-            pipeline = pipeline if settings is None else replace(pipeline, bank=settings)
+            pipeline = replace(pipeline, bank=settings or pipeline.bank)
             meshes = list(bank_or_mesh) if isinstance(bank_or_mesh, list | tuple) else [bank_or_mesh]
-            options: dict[str, Any] = {"pipeline": pipeline, "renderer": renderer, "progress": progress}
-            banks = [cached_bank(mesh, views, device=device or "cpu", **options) for mesh in meshes]
-            bank_or_mesh = ViewBank.join(banks)
+            options = {"pipeline": pipeline, "renderer": renderer, "progress": progress, "device": device or "cpu"}
+            bank_or_mesh = ViewBank.join([cached_bank(mesh, views, **options) for mesh in meshes])
         if isinstance(bank_or_mesh, ViewMatcher):
             if pipeline is not None or field is not None:
                 raise InvalidInputError("Registrar: pipeline and field belong to the matcher; give them to ViewMatcher")
@@ -88,11 +87,9 @@ class Registrar(PoseEstimator):
         else:
             bank = bank_or_mesh if device is None else bank_or_mesh.to(device)
             # Built on one thread, so that rounding does not depend on the number of threads.
-            matcher = map_on_threads(
-                lambda bank: ViewMatcher(bank, pipeline=pipeline, field=field, renderer=renderer), [bank]
-            )[0]
-        if not isinstance(renderer, str) and len(matcher.bank.meshes) != 1:
-            n = len(matcher.bank.meshes)
+            options = {"pipeline": pipeline, "field": field, "renderer": renderer}
+            matcher = map_on_threads(lambda bank: ViewMatcher(bank, **options), [bank])[0]
+        if not isinstance(renderer, str) and (n := len(matcher.bank.meshes)) != 1:
             raise InvalidInputError(f"renderer: a custom renderer knows one mesh, the bank has {n}; give a name")
         if symmetries is not None:
             check_symmetries(symmetries)
@@ -114,16 +111,13 @@ class Registrar(PoseEstimator):
             images: (B, C, H, W) or a list of (C, H, W) tensors, (H, W, C) arrays or paths, C = 1 or 3, floating in
                 [0, 1] or uint8.
             boxes: (B, 4) x0, y0, x1, y1 in px; None searches for the object, see :func:`localize`.
-            camera_matrices: (B, 3, 3) or (3, 3) in px; without them translations are None and rotations are relative to
-                a camera that looks straight at the box.
+            camera_matrices: (B, 3, 3) or (3, 3) in px; None: rotations are relative to a camera that looks at the box.
             distance: without boxes, range of the distance of the object's centre, in the mesh's unit.
-
             prior: what is known of the poses in advance, one for all photographs or a list.
 
         Returns:
-            One :class:`Registration` for each photograph, in their order; a :class:`FailedRegistration` for one that
-            cannot be registered (unreadable, box empty or outside, one colour, NaN), which raises its error on access
-            to a pose.
+            A :class:`Registration` for each photograph; a :class:`FailedRegistration` for one that cannot be registered
+            (unreadable, box empty or outside, one colour, NaN), which raises its error on access to a pose.
 
         Raises:
             InvalidInputError: not as many boxes or cameras as images, or ``distance`` together with boxes.

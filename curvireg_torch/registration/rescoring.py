@@ -38,13 +38,7 @@ def rescore(evidence: Tensor, *, with_camera: bool) -> Tensor:
 
 
 def similarities(describers: Sequence[ViewDescriber], descriptors: Tensor, hypotheses: Hypotheses) -> Tensor:
-    """(H,) normalised correlations of the hypotheses' views with their photographs.
-
-    Args:
-        describers: of the bank's models.
-        descriptors: (B, D) of the photographs' fields, computed by the describers.
-        hypotheses: of those photographs.
-    """
+    """(H,) normalised correlations of hypotheses' views with their photographs, of (B, D) descriptors."""
     queries = F.normalize(descriptors, dim=1)
     out = torch.zeros(len(hypotheses), dtype=torch.float64)
     for model, mine in hypotheses.by_model():

@@ -29,22 +29,19 @@ class Hypothesis:
     Attributes:
         rotation: (3, 3) float64, ``x_cam = R x_model + t``, OpenCV camera.
         translation: (3,) float64 in model units, None without a camera matrix.
-        score: normalised correlation of photograph and rendered view in [0, 1], on the grid of the search (twice as
-            fine as the bank's).
+        score: normalised correlation of photograph and rendered view in [0, 1].
         evidence: the features that the hypotheses are ordered by, see :data:`.rescoring.POSE_FEATURES`.
-        allocentric_rotation: (3, 3) float64, relative to a camera that looks straight at the object; equal to
-            ``rotation`` without a camera matrix.
+        allocentric_rotation: (3, 3) float64, relative to a camera that looks straight at the object.
         distance: distance of the object's centre in model units.
         projection: (4, 4) ``T_cam_from_model`` and (3, 3) camera matrix in px, float64, which project the mesh onto
-            the photograph. Without a camera matrix, a camera is assumed that looks straight at the object.
+            the photograph; without a camera matrix, those of a camera that looks straight at the object.
         view: index of the bank's view that the hypothesis started from.
         model: index of the mesh in the bank.
-        edge_support: how strongly image edges lie under the projected contours, in [0, 1]; None without the contour
-            fit (:func:`curvireg_torch.registration.fit_contours`).
+        edge_support: strength of the image edges under the projected contours, in [0, 1]; None without contour fit.
         covariance: (6, 6) float64 of rotation (rad) about the camera's x, y, z axes and translation (model units) along
-            them, ``R_true = exp([w]x) R``, ``t_true = t + e``, given that this is the right pose. None without a camera
-            matrix, without the contour fit, and where the contours do not determine the pose. Errors have heavier tails
-            than a Gaussian, see :data:`curvireg_torch.registration.calibration.SQUARED_RADIUS`.
+            them, ``R_true = exp([w]x) R``, ``t_true = t + e``, if this is the right pose; None without a camera matrix,
+            without contour fit, and where too few edges were found. Errors have heavier tails than a Gaussian, see
+            :data:`curvireg_torch.registration.calibration.SQUARED_RADIUS`.
     """
 
     rotation: Tensor
@@ -69,8 +66,7 @@ class Hypothesis:
     def standard_deviations(self) -> tuple[Tensor, Tensor] | None:
         """(3,) degrees about and (3,) model units along the camera's axes; None without a covariance.
 
-        ``inf`` marks what the contours do not determine: the rotation about an axis of symmetry, or a translation with
-        a deviation of half the distance or more.
+        ``inf`` marks what the contours do not determine: deviations from a radian, or from half the distance.
         """
         if self.covariance is None:
             return None
@@ -98,8 +94,7 @@ class Localization:
 
     Attributes:
         box: (4,) float64 x0, y0, x1, y1 in px, around the projected mesh.
-        presence: probability that the photograph shows the object there, see
-            :func:`curvireg_torch.registration.confidence.presence`.
+        presence: probability that the photograph shows the object there.
         score: the locator's score of the proposal that led here.
         boxes: (P, 4) float64, all proposals, the results' boxes first, with their ``scores`` (P,).
     """
@@ -120,12 +115,11 @@ class Registration:
 
     Attributes:
         hypotheses: distinct poses, best first; all but the first are rivals, such as the pose seen from behind.
-        confidence: probability that the best pose is within 30 degrees of the truth, see
-            :func:`curvireg_torch.registration.confidence`; times ``localization.presence`` for an object without a box.
+        confidence: probability that the best pose is within 30 degrees of the truth; times ``localization.presence``
+            for an object without a box.
         ranking: scores of the bank's views for this photograph (B = 1).
-        confidence_features: the features that the confidence is computed from, by name, see
-            :func:`.confidence.pose_features` and :func:`.confidence.ranking_evidence`; they include rivals that are not
-            reported. ``lead`` is None where the bank has no rival view, which bounds the confidence.
+        confidence_features: what the confidence is computed from, see :func:`.confidence.confidence_features` and
+            :func:`.confidence.ranking_evidence`; ``lead`` is None where the bank has no rival view.
         localization: where the object was found; None if its box was given.
         corrected_box: (4,) float64, the box that replaced a given one that did not fit the pose; else None.
         prior: the limits on the pose that were given.
@@ -143,11 +137,11 @@ class Registration:
     prior_contradiction: str | None = None
 
     ok = True
-    """Always True; False of a :class:`FailedRegistration`."""
+    """False of a :class:`FailedRegistration`."""
 
     @property
     def reliable(self) -> bool:
-        """Whether the confidence is high enough; if False, the pose is a guess."""
+        """Whether the confidence is at least ``RELIABLE``; if False, the pose is a guess."""
         return self.confidence >= RELIABLE
 
     @property
@@ -208,11 +202,9 @@ class Registration:
         return self.hypotheses[0].pose_dict()
 
     def to_dict(self) -> dict[str, Any]:
-        """Pose, scores and uncertainty as JSON values, under the keys of ``result.json`` (docs/results.md).
-
-        :func:`.document.result_document` adds how the result was computed.
-        """
+        """Pose, scores and uncertainty as JSON values, under the keys of ``result.json`` (docs/results.md)."""
         deviations, covariance = self.standard_deviations, self.covariance
+        prior = None if self.prior is None else {**self.prior.to_dict(), "contradiction": self.prior_contradiction}
         return {
             **self.pose_dict(),
             "score": self.score,
@@ -226,23 +218,17 @@ class Registration:
             "covariance": None if covariance is None else covariance.tolist(),
             "squared_radius": None if covariance is None else {f"{k:g}": r for k, r in SQUARED_RADIUS.items()},
             "corrected_box": None if self.corrected_box is None else self.corrected_box.tolist(),
-            **self._prior_dict(),
+            **({} if prior is None else {"prior": prior}),
             "top": [self._hypothesis_dict(hypothesis) for hypothesis in self.hypotheses],
         }
 
-    def _prior_dict(self) -> dict[str, Any]:
-        if self.prior is None:
-            return {}
-        return {"prior": {**self.prior.to_dict(), "contradiction": self.prior_contradiction}}
-
     def _hypothesis_dict(self, hypothesis: Hypothesis) -> dict[str, Any]:
-        view = hypothesis.view
-        terms = {name: float(raw[0, view]) for name, raw in self.ranking.terms.items()}
+        terms = {name: float(raw[0, hypothesis.view]) for name, raw in self.ranking.terms.items()}
         return {
             **hypothesis.pose_dict(),
             "score": hypothesis.score,
             "evidence": dict(hypothesis.evidence),
-            "view": view,
+            "view": hypothesis.view,
             "terms": {name: value for name, value in terms.items() if math.isfinite(value)},
         }
 
@@ -254,11 +240,7 @@ def _finite(deviations: Tensor) -> list[float | None]:
 
 @dataclass(frozen=True)
 class FailedRegistration:
-    """A photograph of a batch that could not be registered. Access to a pose raises its error.
-
-    Attributes:
-        error: what is wrong with this photograph, its box or its camera.
-    """
+    """A photograph that could not be registered because of its ``error``, which access to a pose raises."""
 
     error: CurviregError
 

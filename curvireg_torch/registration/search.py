@@ -1,7 +1,7 @@
 """Coarse-to-fine search around views of rankings (the paper's section "Registration of 2D images"), batched."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -34,15 +34,7 @@ selected."""
 
 
 def coherent_views(rotations: Tensor, order: Tensor, *, count: int = 5, angle: float = REACH) -> Tensor:
-    """The best ``count`` views without those farther than ``angle`` degrees from the first.
-
-    Args:
-        rotations: (N, 3, 3).
-        order: (N,) view indices, best first.
-
-    Returns:
-        (K,) view indices, 1 <= K <= count.
-    """
+    """(K,) views, at most the ``count`` first of ``order`` (N,), within ``angle`` degrees of the first."""
     best = order[:count]
     return best[rotation_error(rotations[best], rotations[best[:1]]) <= angle]
 
@@ -65,9 +57,8 @@ def search(
     The first round compares the coherent views of the bank (:func:`coherent_views`). Every further round takes the six
     rotations by +-step about the camera's axes around the best pose, and the pose where the parabolas through their
     scores peak; the step is halved where the best moves by less than half of it. With camera matrices, the distance is
-    computed from the box in closed form twice during the search, so that perspective is that of the photograph. The
-    search stays within ``REACH`` degrees of the start. All hypotheses of all photographs are searched together; the
-    best ``FINALISTS`` of each photograph are searched to the end.
+    computed from the box twice, so that perspective is that of the photograph. The search stays within ``REACH``
+    degrees of the start; the best ``FINALISTS`` of each photograph are searched to the end.
 
     Args:
         describers: of the bank's models.
@@ -76,7 +67,7 @@ def search(
         bank, ranking: that the starts come from; not needed for a brief search.
         boxes, camera_matrices: (B, 4) px and (B, 3, 3) of the photographs; both or none.
         priors: limits on the poses of the photographs; the starts lie within them.
-        brief: before a contour fit: at most ``BRIEF`` rounds, from the hypotheses' views, without coherent views.
+        brief: before a contour fit: at most ``BRIEF`` rounds, without coherent views.
 
     Returns:
         The hypotheses with better ``rotation`` and ``distance``, and with their ``similarity`` in [0, 1].
@@ -84,6 +75,16 @@ def search(
     Raises:
         InvalidInputError: the search is not brief and lacks a bank or a ranking.
     """
+
+    def scored(state: Hypotheses, candidates: Tensor) -> Tensor:
+        """(H, C) normalised correlations of (H, C, 3, 3) candidates; -1 beyond ``REACH`` or outside the priors."""
+        H, C = candidates.shape[:2]
+        each = replace(state[torch.arange(H).repeat_interleave(C)], rotation=candidates.flatten(0, 1))
+        outside = rotation_error(candidates, starts.rotation[active][:, None]) > REACH
+        if priors is not None:
+            outside |= ~priors.allow(state, candidates)
+        return similarities(describers, descriptors, each).view(H, C).masked_fill(outside, -1.0)
+
     state = replace(starts, similarity=torch.full_like(starts.similarity, -1.0))
     if brief:
         candidates = starts.rotation[:, None]
@@ -97,12 +98,11 @@ def search(
         if len(active) == 0:
             break
         before = state[active]
-        reach = _Reach(starts.rotation[active], priors)
-        scores = _scores(describers, descriptors, before, candidates, reach)
+        scores = scored(before, candidates)
         now = _best(before, candidates, scores)
         if rounds:
             peak = _peak(before, scores, step[active])[:, None]
-            now = _best(now, peak, _scores(describers, descriptors, before, peak, reach))
+            now = _best(now, peak, scored(before, peak))
         if camera_matrices is not None and boxes is not None and rounds in (0, AFTER):
             filling = _box_filling_distances(describers, now, boxes, camera_matrices)
             now = replace(now, distance=torch.where(now.similarity > before.similarity, filling, before.distance))
@@ -116,29 +116,6 @@ def search(
             active = active[_among_best(state, FINALISTS)[active]]
         candidates = _six_rotations(step[active]) @ state.rotation[active][:, None]
     return state
-
-
-@dataclass(frozen=True)
-class _Reach:
-    """Where the search may go: within ``REACH`` of the (H, 3, 3) starts, and within the priors."""
-
-    starts: Tensor
-    priors: BatchPriors | None
-
-    def excludes(self, state: Hypotheses, candidates: Tensor) -> Tensor:
-        """(H, C) bool."""
-        outside = rotation_error(candidates, self.starts[:, None]) > REACH
-        return outside if self.priors is None else outside | ~self.priors.allow(state, candidates)
-
-
-def _scores(
-    describers: Sequence[ViewDescriber], descriptors: Tensor, state: Hypotheses, candidates: Tensor, reach: _Reach
-) -> Tensor:
-    """(H, C) normalised correlations of (H, C, 3, 3) candidates; -1 for those out of reach."""
-    H, C = candidates.shape[:2]
-    each = replace(state[torch.arange(H).repeat_interleave(C)], rotation=candidates.flatten(0, 1))
-    scores = similarities(describers, descriptors, each).view(H, C)
-    return scores.masked_fill(reach.excludes(state, candidates), -1.0)
 
 
 def _best(state: Hypotheses, candidates: Tensor, scores: Tensor) -> Hypotheses:
@@ -162,8 +139,7 @@ def _peak(state: Hypotheses, scores: Tensor, step: Tensor) -> Tensor:
     curvature = (up - 2.0 * state.similarity[:, None] + down).clamp(max=-1e-9)
     offset = (0.5 * (down - up) / curvature).clamp(-1.0, 1.0)
     offset = torch.where((up < 0) | (down < 0), torch.zeros_like(offset), offset)  # a rotation beyond REACH
-    rotated: Tensor = rotation_from_axis_angle(offset * torch.deg2rad(step)[:, None]) @ state.rotation
-    return rotated
+    return rotation_from_axis_angle(offset * torch.deg2rad(step)[:, None]) @ state.rotation
 
 
 def _among_best(state: Hypotheses, count: int) -> Tensor:

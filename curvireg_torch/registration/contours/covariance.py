@@ -44,14 +44,11 @@ def pose_covariance(
 
     Errors produce information as well: normals that are off by 0.05 rad and points that are off by 0.05 radii along
     the line of sight produce E. Directions x with x^T A x < 0.75 x^T (A + E) x count as unknown: the rotations of a
-    sphere, or that of a cylinder about its axis. Their standard deviation is pi (rotation) or the distance
-    (translation).
+    sphere, or that of a cylinder about its axis. Their standard deviation is pi (rotation) or the distance.
 
     Args:
-        matches: edges near the points.
-        points: contour points of N poses.
-        T: (N, 4, 4).
-        K: (N, 3, 3) of the crops.
+        matches: edges near the contour ``points`` of N poses.
+        T, K: (N, 4, 4) and (N, 3, 3) of the crops.
         centre, radius: of the object, (3,) and model units.
 
     Returns:

@@ -56,16 +56,7 @@ class ContourState:
 
 @dataclass(frozen=True)
 class ContourProblem:
-    """N poses of a mesh to be fitted, each to the crop of its image.
-
-    Attributes:
-        renderer: of the mesh.
-        edges: of B crops.
-        image_index: (N,) the crop of each pose.
-        K: (N, 3, 3) of the crops.
-        size: of the crops in px.
-        centre, radius: of the object, (3,) and model units.
-    """
+    """N poses of a mesh, fitted to ``edges`` of crops of ``size`` px with indices (N,) and cameras ``K`` (N, 3, 3)."""
 
     renderer: DepthRenderer
     edges: EdgeField

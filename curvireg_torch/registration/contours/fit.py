@@ -53,11 +53,9 @@ class ContourFit:
     Attributes:
         transform: (N, 4, 4) float64 ``T_cam_from_model``.
         covariance: (N, 6, 6) float64, see :func:`fit_contours`; NaN where too few edges were found.
-        edge_support: (N,) float64 in [0, 1), mean strength of the edges within about 1 px of the contour points,
-            weighted by distance; 0 where the mesh shows no contour in the crop.
+        edge_support: (N,) float64 in [0, 1), mean strength of the edges within about 1 px of the contour points.
         start_support: (N,) edge support of the starts (at half size for starts that are not finished).
-        observable: (N,) int64, number of the six directions that the contours determine; the covariance of the others
-            is that of an unknown rotation or translation.
+        observable: (N,) int64, number of the six directions that the contours determine.
     """
 
     transform: Tensor
@@ -68,10 +66,7 @@ class ContourFit:
 
     @property
     def trustworthy(self) -> Tensor:
-        """(N,) bool: edge support of at least 0.5, or at least 0.2 more than the start had.
-
-        Contours of *another* object of the category gain less; then the start's rotation is as good as the fit's.
-        """
+        """(N,) bool: edge support of at least 0.5, or 0.2 more than the start's; less where the mesh is another."""
         return (self.edge_support >= SUPPORTED) | (self.edge_support - self.start_support >= GAINED)
 
 
@@ -108,22 +103,20 @@ def fit_contours(
 
         R = exp([w]x) R_fit,   t = t_fit + e,   (w, e) of mean 0 and that covariance,
 
-    see :func:`pose_covariance`. What contours do not determine (rotations of a sphere) has a standard deviation of pi
-    or of the distance. As least squares ignore wrong edges, the covariance is scaled by the errors of reliable results
-    on photographs (:mod:`curvireg_torch.registration.calibration`). Computed on the CPU.
+    see :func:`pose_covariance`; it is scaled by the errors of reliable results on photographs. Computed on the CPU.
 
     Args:
         renderer: of the mesh.
         images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, in [0, 1] or uint8; or one photograph (C, H, W).
             Missing pixels (NaN or infinite) are filled from their neighbours.
-        boxes: (B, 4) x0, y0, x1, y1 in px, which need not be exact. (4,) for one photograph.
+        boxes: (B, 4) x0, y0, x1, y1 in px, which need not be exact; (4,) for one photograph.
         camera_matrices: (B, 3, 3) or (3, 3) in px; or (N, 3, 3), one for each start.
         starts: (N, 4, 4) rigid poses, within about 15 degrees.
         image_index: (N,) the photograph of each start; optional for one photograph.
         centre, radius: of the object, (3,) and model units.
         margin: added around the box, as a fraction of its longer side.
         finish: number of starts of each photograph that are fitted to the end, those with the most support after the
-            first rounds; the others are returned as those rounds left them. None: each start is fitted as if alone.
+            first rounds; None: all, each as if alone.
 
     Raises:
         InvalidInputError: wrong shapes, a pose that is not rigid and finite, an unusable box or camera matrix.
@@ -212,17 +205,15 @@ def _full_size(
 ) -> tuple[Tensor, ContourProblem]:
     """(B, C, S, S) crops without missing pixels, and the problem on them."""
     crops, A = crop_images(images, boxes, size=SIZE, margin=margin)
-    crops = fill_missing(crops)
+    crops, K = fill_missing(crops), A.double()[image_index] @ K
     check_pixels(crops, "of the box")
-    K = A.double()[image_index] @ K
     return crops, ContourProblem(renderer, EdgeField(crops), image_index, K, SIZE, centre, radius)
 
 
 def _fit_around(half: ContourProblem, T0: Tensor, first: ContourState, support: Tensor) -> tuple[Tensor, Tensor]:
-    """Fit from four rotations of each start ``T0`` (N, 4, 4) too, at half size.
+    """Fit from four rotations of each start too, at half size; refine the best and the next best that is another pose.
 
-    Of these four fits and ``first``, the best and the next best that is another pose are refined. Returns the index of
-    the start that each pose belongs to, and the poses.
+    Returns the index of the start that each pose belongs to, and the poses.
     """
     N, every = len(T0), torch.arange(len(T0))
     offsets = torch.zeros(4, 6, dtype=torch.float64)

@@ -30,13 +30,8 @@ CREASE = 0.1
 
 @dataclass(frozen=True)
 class ContourPoints:
-    """Points on the contours of N views.
-
-    Attributes:
-        model: (N, P, 3) float64 in model units, on the nearer surface.
-        normals: (N, P, 2) float64 unit vectors across the contour in the image, of either sign.
-        valid: (N, P) bool; False marks padding.
-    """
+    """Points (N, P, 3) on the contours of N views, float64 in model units, with unit ``normals`` (N, P, 2) across the
+    contour in the image, of either sign; False in ``valid`` (N, P) marks padding."""
 
     model: Tensor
     normals: Tensor
@@ -54,9 +49,8 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
     """Occluding contours and creases of depth views, back-projected onto the mesh.
 
     An occluding contour lies half-way between two neighbouring pixels at a depth discontinuity, at the depth of the
-    nearer one (curvilinear saliency peaks on both sides of a discontinuity, never on it). Creases are maxima of
-    :func:`depth_curvilinear_saliency` away from discontinuities; smooth surfaces have none. A fixed random sample of
-    each kind is returned.
+    nearer one. Creases are maxima of :func:`depth_curvilinear_saliency` away from discontinuities. A fixed random
+    sample of each kind is returned.
 
     Args:
         depth: (N, 1, H, W) z-depth, 0 = background.
@@ -121,10 +115,7 @@ def _dilated(mask: Tensor) -> Tensor:
 
 
 def _sample(mask: Tensor, pixels: Tensor, depth: Tensor, normals: Tensor, count: int) -> tuple[Tensor, ...]:
-    """Sample ``count`` True entries of ``mask`` (N, M), each the mean of ``pixels`` (k, M).
-
-    Returns uv (N, P, 2), the nearer depth (N, P), normal (N, P, 2) and valid (N, P).
-    """
+    """uv, nearer depth, normal and valid, (N, P, ...), of ``count`` entries of ``mask`` (N, M), means of ``pixels``."""
     best, index = torch.where(mask, _random(mask.shape[1]), -1.0).topk(min(count, mask.shape[1]), dim=1)
     of, W = pixels[:, index], depth.shape[-1]  # (k, N, P)
     z = torch.stack([depth.flatten(1).gather(1, i) for i in of]).amin(dim=0)
@@ -139,11 +130,7 @@ def _random(count: int) -> Tensor:
 
 
 class EdgeField:
-    """Edges of image crops, sampled along normals of contours.
-
-    Args:
-        crops: (B, C, S, S), C = 1 or 3, in [0, 1]. Of several channels, the strongest edge counts.
-    """
+    """Edges of image crops (B, C, S, S) in [0, 1]; the strongest of several channels counts."""
 
     def __init__(self, crops: Tensor) -> None:
         gx, gy = central_gradient(smooth(crops, 1.0))

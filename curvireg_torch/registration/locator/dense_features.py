@@ -10,7 +10,7 @@ from ...matching import ViewDescriber, ViewMatcher
 from ...models.backbone import STRIDES, Backbone
 from ...terms import photograph_field
 
-__all__ = ["BackboneFeatures", "DenseFeatures", "FieldFeatures", "dense_features_for"]
+__all__ = ["BackboneFeatures", "DenseFeatures", "dense_features_for"]
 
 FLAT = 0.01
 """Fraction of the strongest edges' energy below which a cell counts as without edges."""
@@ -21,20 +21,14 @@ class DenseFeatures(nn.Module, ABC):
 
     Attributes:
         strides: px of a cell.
-        learned: whether a network computes them; the similarity of classical fields hardly separates the object from
-            its surroundings.
+        learned: whether a network computes them.
     """
 
     strides: tuple[int, ...]
     learned: bool
 
     def comparable(self, cells: Tensor, common: Tensor) -> Tensor:
-        """(B, C, h, w) normalised features, whose inner products are similarities.
-
-        Args:
-            cells: of :meth:`of_photograph` or :meth:`of_views`.
-            common: (C, 1, 1) mean over the photograph at that size, or over the object in its views.
-        """
+        """(B, C, h, w) unit features without what they have in common: (C, 1, 1) means over photograph or object."""
         return F.normalize(cells - common, dim=1)
 
     @abstractmethod
@@ -82,12 +76,10 @@ class FieldFeatures(DenseFeatures):
 
     def of_photograph(self, image: Tensor) -> list[Tensor]:
         H, W = image.shape[-2:]
-        (cell,) = self.strides
-        return [orientation_cells(photograph_field(self.field, image), grid=(H // cell, W // cell))]
+        return [orientation_cells(photograph_field(self.field, image), grid=(H // 8, W // 8))]
 
     def of_views(self, describer: ViewDescriber, rotations: Tensor, distances: Tensor, side: int) -> list[list[Tensor]]:
-        (cell,) = self.strides
-        return [[orientation_cells(describer.fields(rotations, distances), grid=(side // cell, side // cell))]]
+        return [[orientation_cells(describer.fields(rotations, distances), grid=(side // 8, side // 8))]]
 
 
 def dense_features_for(matcher: ViewMatcher) -> DenseFeatures:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -51,13 +52,10 @@ class Located:
 
 @dataclass(frozen=True)
 class _Templates:
-    """K views.
+    """K views of a bank, and their weights (K, C, h, w) for each stride and each shading.
 
-    Attributes:
-        views: (K,) of the bank.
-        weights: (K, C, h, w) for each stride and each shading.
-        boxes: (K, 4) in px of the templates, from the outer border.
-        unit: (K,) distance at which a camera of 1 px focal length sees the object at this size.
+    ``boxes`` (K, 4) are in px of the templates, from the outer border; at the distances ``unit`` (K,) a camera with a
+    focal length of 1 px sees the object at this size.
     """
 
     views: Tensor
@@ -70,14 +68,12 @@ class Locator(nn.Module):
     r"""Searches whole photographs for a bank's objects, in place of a detector.
 
     A few representative views (:func:`representative_views`) are compared with every position of the photograph, at
-    sizes in steps of :math:`\sqrt 2`. The mean over the object or the photograph is subtracted from the dense features
-    of both, and cells become unit vectors (:class:`.DenseFeatures`); a view's similarity is the mean cosine over the
-    cells that it covers, one convolution. Its score is the similarity in standard deviations above its mean over the
-    photograph. Peaks over position, size and view are boxes.
+    sizes in steps of :math:`\sqrt 2`. A view's similarity is the mean cosine of its dense features
+    (:class:`.DenseFeatures`) and the photograph's over the cells that it covers; its score is the similarity in
+    standard deviations above its mean over the photograph. Peaks over position, size and view are boxes.
 
     Args:
-        matcher: of the bank; its pipeline sets the number of views (``locate.views``), the smallest object
-            (``locate.min_size``) and the number of boxes (``locate.proposals``).
+        matcher: of the bank; ``locate`` of its pipeline holds the settings.
 
     Example:
         >>> import trimesh
@@ -111,8 +107,7 @@ class Locator(nn.Module):
             distance: range of the distance of the object's centre, in the mesh's unit.
 
         Raises:
-            InvalidInputError: wrong shape or dtype, an image of one px, or a ``distance`` without cameras or not
-                0 < MIN <= MAX.
+            InvalidInputError: wrong shape or dtype, or a ``distance`` without cameras or not 0 < MIN <= MAX.
             ImageError: missing pixels (NaN or infinite), or pixels outside [0, 1].
         """
         known = camera_matrices is not None and all(K is not None for K in camera_matrices)
@@ -168,20 +163,14 @@ class Locator(nn.Module):
 
     def _similarity(self, image: Tensor) -> Tensor:
         """(K, h, w) mean cosines; position (i, j) is that of a view whose centre is at px 8 i, 8 j."""
-        out = None
-        maps = self.features.of_photograph(image)
-        for n, (cells, weights) in enumerate(zip(maps, self._templates.weights, strict=True)):
+        cosines: list[Tensor] = []
+        for cells, weights in zip(self.features.of_photograph(image), self._templates.weights, strict=True):
             cells = self.features.comparable(cells, cells.mean(dim=(0, 2, 3))[:, None, None])
-            pad = weights[0].shape[-1] // 2
-            padded = F.pad(cells, (pad, pad, pad, pad))
-            cosine = torch.stack([F.conv2d(padded, shading)[0] for shading in weights]).amax(dim=0)
-            if out is None:
-                out = cosine
-            else:
-                fine = F.interpolate(cosine[None], size=out.shape[1:], mode="bilinear", align_corners=True)[0]
-                out = (out * n + fine) / (n + 1)
-        assert out is not None
-        return out
+            padded = F.pad(cells, (weights[0].shape[-1] // 2,) * 4)
+            cosines.append(torch.stack([F.conv2d(padded, shading)[0] for shading in weights]).amax(dim=0))
+        size = cosines[0].shape[1:]
+        fine = [F.interpolate(c[None], size=size, mode="bilinear", align_corners=True)[0] for c in cosines[1:]]
+        return sum(fine, cosines[0]) / len(cosines)
 
     def _peaks(self, maps: list[Tensor], allowed: list[Tensor], ratios: list[tuple[float, float]]) -> Located:
         templates = self._templates
@@ -252,11 +241,9 @@ def _resized(image: Tensor, size: tuple[int, int]) -> Tensor:
     """(C, h, w) float32 in [0, 1]."""
     if tuple(image.shape[-2:]) == size and image.is_floating_point():
         return image.float()
-    channels = [  # one at a time to save memory: photographs are large
-        F.interpolate(channel[None, None].float(), size=size, mode="bilinear", antialias=True, align_corners=False)[0]
-        for channel in image
-    ]
-    small = torch.cat(channels)
+    options: dict[str, Any] = {"size": size, "mode": "bilinear", "antialias": True, "align_corners": False}
+    # One channel at a time to save memory: photographs are large.
+    small = torch.cat([F.interpolate(channel[None, None].float(), **options)[0] for channel in image])
     return small / 255.0 if image.dtype == torch.uint8 else small
 
 
@@ -270,17 +257,10 @@ def locate(
 ) -> tuple[Tensor, Tensor]:
     """Boxes in which photographs may show a bank's object; for many calls, :class:`Locator` is faster.
 
-    Args:
-        pipeline: its ``locate`` holds the settings.
-        bank: of one or several models.
-        images, camera_matrices, distance: see :meth:`Locator.forward`.
+    Arguments and errors are those of :meth:`Locator.forward`; ``pipeline.locate`` holds the settings.
 
     Returns:
-        boxes (B, P, 4) x0, y0, x1, y1 in px, and scores (B, P), best first; NaN and -inf where a photograph has fewer
-        than P.
-
-    Raises:
-        InvalidInputError: see :meth:`Locator.forward`.
+        boxes (B, P, 4) x0, y0, x1, y1 in px, and scores (B, P), best first; NaN and -inf where there are fewer than P.
 
     Example:
         >>> import trimesh
