@@ -11,12 +11,7 @@ class CropBox:
     The box stays in pixels of the original image, ``crop_transform`` (3, 3) maps them to pixels of the crop, and the
     camera matrix, if there is one, becomes that of the crop.
 
-    Args:
-        size: side of the crops in px.
-        margin: added on each side of the box, as a fraction of its longer side.
-
-    Raises:
-        InvalidInputError: when called, if the box is empty or entirely outside its image.
+    ``size``, ``margin`` and errors as in :func:`curvireg_torch.geometry.crop_images`.
 
     Example:
         >>> import torch

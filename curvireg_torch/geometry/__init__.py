@@ -25,8 +25,7 @@ from .crops import box_iou, crop_images, crop_transforms, square_boxes, whole_im
 from .pose_prior import PosePrior, object_frame
 from .symmetry import symmetry_transforms, views_without_symmetric
 from .translation import pose_from_box, translation_from_box
-from .up import up_rotation
-from .viewpoint import rotation_error, rotation_from_viewpoint, viewpoint_from_rotation
+from .viewpoint import rotation_error, rotation_from_viewpoint, up_rotation, viewpoint_from_rotation
 from .views import ViewSphere, paper_views, sample_views, uniform_views
 
 __all__ = [

@@ -10,23 +10,16 @@ from ..utils.checks import check_camera_matrix, check_pose
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dtype = torch.float32) -> Tensor:
-    """(3, 3) OpenCV camera matrix; all arguments in px.
-
-    Example:
-        >>> camera_matrix(500.0, 500.0, 319.5, 239.5).shape
-        torch.Size([3, 3])
-    """
+    """(3, 3) OpenCV camera matrix; all arguments in px."""
     K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=dtype)
     check_camera_matrix(K)
     return K
 
 
 def camera_of_view(fov: float, size: tuple[int, int]) -> Tensor:
-    """(3, 3) float64 camera matrix of a horizontal field of view; square pixels, the principal point in the centre.
+    """(3, 3) float64 camera matrix of a horizontal field of view, 0 < ``fov`` < 180 degrees, and an (H, W) in px.
 
-    Args:
-        fov: degrees, 0 < fov < 180.
-        size: (H, W) of the image in px.
+    Pixels are square, the principal point is in the centre.
 
     Example:
         >>> camera_of_view(90.0, (480, 640))[0].round(decimals=6).tolist()
@@ -87,10 +80,9 @@ def boxes_around(pixels: Tensor) -> Tensor:
 
 
 def rotation_towards(rays: Tensor) -> Tensor:
-    """Smallest rotations that take the optical axis (0, 0, 1) onto rays; they turn allocentric rotations into poses.
+    """(..., 3, 3) smallest rotations with ``R (0, 0, 1) = ray / |ray|``, for (..., 3) rays of any length with z > 0.
 
-    Args:
-        rays: (..., 3), z > 0, any length; the (..., 3, 3) rotations satisfy ``R (0, 0, 1) = ray / |ray|``.
+    They turn allocentric rotations into poses.
     """
     x, y, z = (rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)).unbind(-1)
     # Rodrigues with axis (0, 0, 1) x ray = (-y, x, 0): R = I + [v] + [v]^2 / (1 + z).

@@ -105,12 +105,7 @@ def opencv_from_pytorch3d(R: Tensor, T: Tensor) -> Tensor:
 
 
 def quaternion_from_rotation(R: Tensor) -> Tensor:
-    """(..., 3, 3) rotations to (..., 4) unit quaternions (w, x, y, z); q and -q are the same rotation.
-
-    Example:
-        >>> quaternion_from_rotation(torch.eye(3)).tolist()
-        [1.0, 0.0, 0.0, 0.0]
-    """
+    """(..., 3, 3) rotations to (..., 4) unit quaternions (w, x, y, z); q and -q are the same rotation."""
     check_rotation(R, "R")
     quaternion: Tensor = kornia_conversions.rotation_matrix_to_quaternion(R.contiguous())
     return quaternion

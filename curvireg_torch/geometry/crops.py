@@ -59,10 +59,7 @@ def square_boxes(boxes: Tensor, margin: float) -> Tensor:
 
 
 def crop_transforms(squares: Tensor, size: int) -> Tensor:
-    """(..., 3, 3) maps from image pixels to crop pixels; ``A @ K`` is the crop's camera matrix.
-
-    The outer border of the crop, [-0.5, size - 0.5], falls on that of the square.
-    """
+    """(..., 3, 3) maps from image to crop pixels, borders onto borders; ``A @ K`` is the crop's camera matrix."""
     scale = size / (squares[..., 2] - squares[..., 0])
     return _scale_and_shift(scale, -squares[..., 0] * scale - 0.5, -squares[..., 1] * scale - 0.5)
 
@@ -89,12 +86,10 @@ def crop_images(
     Args:
         images: (B, C, H, W), or a list of (C, H, W) of different sizes. Pixels outside an image repeat its border.
         boxes: (B, 4) x0, y0, x1, y1 in px, a tensor, an array or lists; may extend beyond the image.
-        size: side of the crops in px.
         margin: added on each side of the box, as a fraction of its longer side.
 
     Returns:
-        crops (B, C, size, size) in the dtype of the images, and their (B, 3, 3) :func:`crop_transforms` A, at least
-        float32.
+        crops (B, C, size, size) in the dtype of the images, and (B, 3, 3) :func:`crop_transforms`, at least float32.
 
     Raises:
         InvalidInputError: wrong shapes, or a box is empty or entirely outside its image.

@@ -12,8 +12,7 @@ from ..errors import InvalidInputError
 from ..utils.checks import as_numbers, check_option, check_positive, check_rotation
 from ..utils.choices import SIDE_NAMES, UP_AXES
 from .conversions import axis_angle_from_rotation, rotation_from_axis_angle
-from .up import up_rotation
-from .viewpoint import rotation_error, rotation_from_viewpoint, viewpoint_from_rotation
+from .viewpoint import rotation_error, rotation_from_viewpoint, up_rotation, viewpoint_from_rotation
 
 __all__ = ["SIDES", "PosePrior", "object_frame"]
 

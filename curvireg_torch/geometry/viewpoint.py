@@ -4,6 +4,8 @@ The PASCAL3D+ camera looks from ``C = d (cos e sin a, -cos e cos a, sin e)`` at 
 up in the image, rotated by ``theta`` about the optical axis. With the image's y flipped to OpenCV's that is
 
     R = diag(1, -1, -1) Rz(theta) Rx(e - 90 deg) Rz(-a),    x_cam = R x_model + t,    t = (0, 0, d).
+
+Other shapes and dtypes, and matrices that are no rotations, raise :class:`InvalidInputError`.
 """
 
 import math
@@ -12,7 +14,8 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from ..utils.checks import check_rotation
+from ..utils.checks import check_option, check_rotation
+from ..utils.choices import UP_AXES
 
 
 def _as_floating(*values: Tensor | float) -> list[Tensor]:
@@ -24,13 +27,10 @@ def _as_floating(*values: Tensor | float) -> list[Tensor]:
 
 
 def rotation_from_viewpoint(azimuth: Tensor | float, elevation: Tensor | float, theta: Tensor | float = 0.0) -> Tensor:
-    """Rotation model -> OpenCV camera of a PASCAL3D+ viewpoint; the module states the equation.
+    """(..., 3, 3) rotations model -> OpenCV camera of PASCAL3D+ viewpoints; the module states the equation.
 
     Args:
         azimuth, elevation, theta: degrees, numbers or tensors of broadcastable shapes (...).
-
-    Returns:
-        (..., 3, 3) rotations.
 
     Example:
         >>> R = rotation_from_viewpoint(0.0, 0.0, 0.0)      # camera on the -y axis, model's z up
@@ -56,9 +56,6 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         (elevation +-90) theta is 0; close to one, rounding decides the azimuth, and theta matches it.
         :func:`rotation_from_viewpoint` gives R back everywhere, within 5e-5 rad in float32.
 
-    Raises:
-        InvalidInputError: another shape or dtype, or a matrix is not a rotation.
-
     Example:
         >>> a, e, t = viewpoint_from_rotation(rotation_from_viewpoint(30.0, 20.0, -10.0))
         >>> round(float(a)), round(float(e)), round(float(t))
@@ -82,19 +79,26 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return torch.where(azimuth >= 360.0, torch.zeros_like(azimuth), azimuth), torch.rad2deg(elevation), theta
 
 
+def up_rotation(up: str) -> Tensor:
+    """(3, 3) float64 rotation from a frame whose axis ``up`` points up to one whose z axis does.
+
+    ``up`` is "x", "y", "z", "-x", "-y" or "-z". glTF's front, +z under y up, becomes -y, PASCAL3D+'s at azimuth 0.
+
+    Example:
+        >>> (up_rotation("y") @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)).tolist()
+        [0.0, 0.0, 1.0]
+    """
+    check_option(up, UP_AXES, "up")
+    return torch.tensor(UP_AXES[up], dtype=torch.float64)
+
+
 def rotation_error(R1: Tensor, R2: Tensor) -> Tensor:
-    """Geodesic distance of rotations, ``acos((tr(R1^T R2) - 1) / 2)`` in degrees.
+    """(...) geodesic distances of rotations, ``acos((tr(R1^T R2) - 1) / 2)`` in degrees in [0, 180].
 
     Computed as ``2 asin(|R1 - R2|_F / (2 sqrt 2))``, which is accurate near 0, unlike ``acos``.
 
     Args:
-        R1, R2: (..., 3, 3), broadcast against each other; NaN for a missing estimate.
-
-    Returns:
-        (...) degrees in [0, 180]; NaN for a missing estimate.
-
-    Raises:
-        InvalidInputError: another shape or dtype, or a matrix is not a rotation.
+        R1, R2: (..., 3, 3), broadcast against each other; NaN for a missing estimate, whose error is NaN.
 
     Example:
         >>> round(float(rotation_error(rotation_from_viewpoint(0.0, 0.0), rotation_from_viewpoint(30.0, 0.0))), 3)

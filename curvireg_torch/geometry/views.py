@@ -9,8 +9,7 @@ from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_positive, check_tensor
-from .up import up_rotation
-from .viewpoint import rotation_from_viewpoint, viewpoint_from_rotation
+from .viewpoint import rotation_from_viewpoint, up_rotation, viewpoint_from_rotation
 
 DEFAULT_DISTANCE = 5.0
 """Distance of a view in units of the object's radius: ``docs/experiments.md`` compares others."""
@@ -75,11 +74,7 @@ class ViewSphere:
         return self[inside]
 
     def for_up(self, up: str) -> "ViewSphere":
-        """The same views of an object whose axis ``up`` points up instead of z, in the frame of that object.
-
-        Args:
-            up: "x", "y", "z", "-x", "-y" or "-z"; see :func:`curvireg_torch.io.meshes.mesh_up`.
-        """
+        """The same views of an object whose axis ``up`` (:func:`up_rotation`) points up, in its own frame."""
         T = torch.eye(4, dtype=torch.float64)
         T[:3, :3] = up_rotation(up)
         return self if up == "z" else self.in_model_frame(T)
@@ -87,11 +82,8 @@ class ViewSphere:
     def in_model_frame(self, T_views_from_model: Tensor) -> "ViewSphere":
         """Views of another frame of the model, expressed in the model's frame.
 
-        With :func:`curvireg_torch.io.meshes.normalization_transform` views follow the principal axes of an object
-        while poses stay in the frame of the file.
-
-        Args:
-            T_views_from_model: (4, 4) similarity; anything else raises :class:`InvalidInputError`.
+        With :func:`curvireg_torch.io.meshes.normalization_transform`, a (4, 4) similarity, views follow the principal
+        axes of an object while poses stay in the frame of the file.
         """
         check_tensor(T_views_from_model, "T_views_from_model", (4, 4))
         linear = T_views_from_model[:3, :3].double()
@@ -165,10 +157,6 @@ def paper_views(*, object_radius: float = 0.2) -> ViewSphere:
 
     Args:
         object_radius: in m, because the paper's distances are metric; below 0.3, the distance of the nearest camera.
-
-    Example:
-        >>> len(paper_views())
-        756
     """
     check_positive(object_radius, "object_radius")
     if object_radius >= 0.3:

@@ -104,12 +104,6 @@ def read_image(
 
     Args:
         orientation: ``"stored"``, to which the boxes of datasets refer, or ``"viewed"`` to apply that of EXIF.
-
-    Example:
-        >>> read_image("missing.jpg")
-        Traceback (most recent call last):
-        ...
-        curvireg_torch.errors.MissingFileError: missing.jpg: no such file; check the path of the photograph
     """
     check_option(orientation, ("stored", "viewed"), "orientation")
     header, pixels = _decode(Path(path))

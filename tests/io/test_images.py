@@ -174,5 +174,5 @@ def test_read_image_refuses_other_content(tmp_path, content):
 
 def test_read_image_reports_missing_files(tmp_path):
     for path in (tmp_path / "nothing.jpg", tmp_path):
-        with pytest.raises(MissingFileError, match="no such file"):
+        with pytest.raises(MissingFileError, match="no such file; check the path of the photograph"):
             read_image(path)

@@ -48,14 +48,8 @@ class _Layout:
     corners: int
 
 
-@dataclass
-class _Body:
-    """Vertices, the values of each face, and the bytes that the faces take; no rows if all are triangles."""
-
-    vertices: Floats
-    rows: list[list[Any]]
-    start: int
-    stop: int
+_Body = tuple[Floats, list[list[Any]], int, int]
+"""Vertices, the values of each face (none if all are triangles), and start and stop of the bytes of the faces."""
 
 
 def with_triangles(data: bytes) -> bytes:
@@ -76,18 +70,17 @@ def with_triangles(data: bytes) -> bytes:
     corners = [name for name, _, _ in face.properties].index(key)
     check_face_count(face.count)
     layout = _Layout(order, end.end(), before, face, corners)
-    body = _read_binary(data, layout) if order else _read_text(data, layout)
-    faces = [[int(n) for n in row[corners]] for row in body.rows]
+    vertices, rows, start, stop = _read_binary(data, layout) if order else _read_text(data, layout)
+    faces = [[int(n) for n in row[corners]] for row in rows]
     if all(len(face) == 3 for face in faces):
         return data
     written = []
-    for index, triangles in divide_faces(body.vertices, faces):
-        row, n = body.rows[index], len(faces[index])
+    for index, triangles in divide_faces(vertices, faces):
         for triangle in triangles:
-            values = [_of_triangle(value, triangle, n) for value in row]
+            values = [_of_triangle(value, triangle, len(faces[index])) for value in rows[index]]
             written.append(_pack(values, layout) if order else _format(values))
     header = re.sub(r"(element[ \t]+face[ \t]+)\d+", rf"\g<1>{len(written)}", header)
-    return header.encode("latin-1") + data[end.end() : body.start] + b"".join(written) + data[body.stop :]
+    return header.encode("latin-1") + data[end.end() : start] + b"".join(written) + data[stop:]
 
 
 def _parse_header(header: str) -> tuple[str, list[_Element]]:
@@ -136,7 +129,7 @@ def _read_text(data: bytes, layout: _Layout) -> _Body:
         raise ValueError("the file ends too early")
     stop = start + sum(map(len, lines))
     if layout.corners == 0 and all(line.lstrip().startswith(b"3 ") for line in lines):
-        return _Body(vertices, [], start, stop)
+        return vertices, [], start, stop
     rows = []
     for line in lines:
         row: list[Any] = []
@@ -152,7 +145,7 @@ def _read_text(data: bytes, layout: _Layout) -> _Body:
                 if position > len(words):
                     raise ValueError("the file ends too early")
         rows.append(row)
-    return _Body(vertices, rows, start, stop)
+    return vertices, rows, start, stop
 
 
 def _format(values: list[Any]) -> bytes:
@@ -182,7 +175,7 @@ def _read_binary(data: bytes, layout: _Layout) -> _Body:
             position += struct.calcsize(kind) * int(length)
             row.append(values[0] if length_type is None else values)
         rows.append(row)
-    return _Body(vertices, rows, start, position)
+    return vertices, rows, start, position
 
 
 def _pack(values: list[Any], layout: _Layout) -> bytes:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ...geometry.up import up_rotation
+from ...geometry.viewpoint import up_rotation
 
 
 def format_up(suffix: str) -> str:
