@@ -24,8 +24,7 @@ class BenchmarkItem:
     Attributes:
         key: a name that no other object of the benchmark has.
         index: in the dataset.
-        photo: the file of the photograph.
-        meshes: one, or all that the protocol allows.
+        photo, meshes: files; one mesh, or all that the protocol allows.
         box: (4,) x0, y0, x1, y1 in px, as annotated; NaN where unknown.
         camera_matrix: (3, 3) in px; None if the method does not get it.
         prior: limits on the pose that the protocol's ``hint`` gives to the method.
@@ -75,11 +74,12 @@ class Benchmark(ABC):
     def selection(self, limit: int | None) -> list[BenchmarkItem]:
         """``limit`` items spread evenly over the dataset, or all."""
         n = len(self.items)
-        return self.items if limit is None or limit >= n else [self.items[i * n // limit] for i in range(limit)]
+        count = n if limit is None else min(limit, n)
+        return [self.items[i * n // count] for i in range(count)]
 
     def settings(self) -> Row:
         """What results depend on besides pipeline and protocol."""
-        split = getattr(self.dataset, "split", None)  # a collection of the user's own has none
+        split = getattr(self.dataset, "split", None)  # web collections have none
         return {"dataset": self.name, "root": str(self.dataset.root.resolve()), "split": split}
 
     def samples(self, items: list[BenchmarkItem]) -> list[Row]:
@@ -109,8 +109,7 @@ class Benchmark(ABC):
 
     @abstractmethod
     def rotation_errors(self, items: list[BenchmarkItem], rows: list[Row]) -> Tensor:
-        """(N,) float64 errors in degrees, up to the symmetries that the dataset knows; ``inf`` for a miss, NaN where
-        the truth is unknown."""
+        """(N,) float64 errors in degrees, up to symmetries; ``inf`` for a miss, NaN where the truth is unknown."""
 
     @abstractmethod
     def summary(self, items: list[BenchmarkItem], rows: list[Row]) -> Row:

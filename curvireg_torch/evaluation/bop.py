@@ -1,6 +1,7 @@
 """BOP datasets: 6D poses of known objects with calibrated cameras."""
 
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -23,19 +24,14 @@ from ..metrics import (
 from .benchmark import Benchmark, BenchmarkItem, Row
 from .scores import THRESHOLDS, estimated_rotations, or_inf, viewpoint_scores
 
-__all__ = ["BOPBenchmark"]
+__all__ = ["BOPBenchmark", "bop_row"]
 
 UNOCCLUDED = 0.95
 """Visible fraction above which an object counts as whole."""
 
 
 class BOPBenchmark(Benchmark):
-    """Poses on one BOP dataset. The method gets the box of the whole silhouette and the camera matrix.
-
-    Args:
-        dataset: :class:`BOPDataset`.
-        protocol: with ``cad="annotated"``.
-    """
+    """Poses on one BOP dataset. The method gets the box of the whole silhouette and the camera matrix."""
 
     name, unit, mesh, gives_camera = "bop", "mm", "model_path", True
     key = "{scene_id}/{image_id}/{instance_index}"
@@ -62,16 +58,8 @@ class BOPBenchmark(Benchmark):
         for image, _, row in results:
             times[image] += row["seconds"]["register"]
         poses = [
-            BOPRow(
-                scene_id=image[0],
-                im_id=image[1],
-                obj_id=sample["obj_id"],
-                score=row["score"],
-                R=torch.tensor(row["rotation"], dtype=torch.float64),
-                t=torch.tensor(row["translation"], dtype=torch.float64),
-                time=times[image],
-            )
-            for image, sample, row in results
+            bop_row((*image, s["obj_id"]), row["score"], row, time=times[image])
+            for image, s, row in results
             if "rotation" in row
         ]
         write_bop_csv(path, poses)
@@ -91,11 +79,9 @@ class BOPBenchmark(Benchmark):
         points = torch.from_numpy(load_mesh(samples[0]["model_path"], unit=self.unit).vertices.copy())
         symmetries = symmetry_transforms(info)
         R = estimated_rotations(rows)
-        missing = [float("nan")] * 3
-        t = torch.tensor([row.get("translation", missing) for row in rows], dtype=torch.float64)
-        R_true, t_true, K = (
-            torch.stack([s[name].double() for s in samples]) for name in ("rotation", "translation", "camera_matrix")
-        )
+        t = torch.tensor([row.get("translation", [float("nan")] * 3) for row in rows], dtype=torch.float64)
+        names = ("rotation", "translation", "camera_matrix")
+        R_true, t_true, K = (torch.stack([s[name].double() for s in samples]) for name in names)
         T, T_true = transform(R, t), transform(R_true, t_true)
         rotation = or_inf(symmetric_rotation_error(R, R_true, symmetries[:, :3, :3]), R)
         add = (adds_error if len(symmetries) > 1 else add_error)(T, T_true, points)
@@ -103,6 +89,12 @@ class BOPBenchmark(Benchmark):
         mspd = mspd_error(T, T_true, points, K, symmetries=symmetries)
         width = torch.tensor([row["image_size"][1] for row in rows], dtype=torch.float64)
         return torch.stack([rotation, add / info["diameter"], mssd / info["diameter"], mspd / width])
+
+
+def bop_row(ids: Sequence[int], score: float, pose: Row, *, time: float = -1.0, scale: float = 1.0) -> BOPRow:
+    """A line of the BOP format: scene, image, object, and the pose of a result, whose unit is ``scale`` mm."""
+    R, t = (torch.tensor(pose[name], dtype=torch.float64) for name in ("rotation", "translation"))
+    return BOPRow(scene_id=ids[0], im_id=ids[1], obj_id=ids[2], score=score, R=R, t=t * scale, time=time)
 
 
 def _scores(errors: Tensor) -> Row:

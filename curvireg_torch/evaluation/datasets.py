@@ -13,9 +13,9 @@ from ..utils.digests import code_digest
 from ..utils.files import write_file
 from ..version import __version__
 from .benchmark import Benchmark, Row
-from .localization import localization_recall
 from .predict import register_object, registrar_opener
 from .runner import POSE_SOURCES, run_items
+from .scores import localization_recall
 from .store import ResultStore, to_json
 
 __all__ = ["evaluate", "score"]
@@ -42,8 +42,7 @@ def evaluate(
     or in a job array that sets ``RANK`` and ``WORLD_SIZE``, each process registers a part of the objects.
 
     Args:
-        benchmark: the objects.
-        out: folder for the results; created if needed.
+        benchmark, out: the objects, and the folder for the results.
         preset: name of a pipeline, or a pipeline.
         limit: register only this many objects, spread evenly over the dataset.
         renderer: of the views.
@@ -83,13 +82,7 @@ def evaluate(
 
 
 def score(benchmark: Benchmark, out: Path, *, limit: int | None = None) -> Row:
-    """Write ``predictions.csv`` and ``summary.json`` from the results in ``out``; renders nothing.
-
-    Args:
-        benchmark, out, limit: as for :func:`evaluate`.
-
-    Returns:
-        The summary.
+    """Write ``predictions.csv`` and ``summary.json`` from the results in ``out``, and return the summary.
 
     Raises:
         InvalidInputError: a result is missing or damaged.
@@ -98,8 +91,8 @@ def score(benchmark: Benchmark, out: Path, *, limit: int | None = None) -> Row:
     pairs = [(item, store.read(item.key)) for item in benchmark.selection(limit)]
     skipped = Counter({k: n for k, n in benchmark.dataset.skipped.items() if k not in NOT_EVALUATED})
     skipped.update(row["skipped"] for _, row in pairs if "skipped" in row)
-    scored = [(item, row) for item, row in pairs if "skipped" not in row]
-    items, rows = [item for item, _ in scored], [row for _, row in scored]
+    items = [item for item, row in pairs if "skipped" not in row]
+    rows = [row for _, row in pairs if "skipped" not in row]
     seconds = {name: sum(row["seconds"][name] for row in rows) for name in ("bank", "register")}
     settings = store.settings()
     settings["root"] = Path(settings["root"]).name  # a summary is shared: no paths

@@ -25,28 +25,21 @@ COLUMNS = [
 ]
 
 
-def _any_rotation(R: Tensor, truth: Tensor) -> Tensor:
-    return axis_rotation_error(R, truth, torch.tensor([0.0, 0.0, 1.0], dtype=R.dtype))
-
-
-def _half_rotation(R: Tensor, truth: Tensor) -> Tensor:
-    return symmetric_rotation_error(R, truth, torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=R.dtype))[None])
-
+Z_AXIS = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+HALF_ROTATION = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
 
 SYMMETRIES: dict[str, tuple[str, Callable[[Tensor, Tensor], Tensor]]] = {
-    "bottle": ("any rotation about z", _any_rotation),
-    "diningtable": ("half a rotation about z", _half_rotation),
+    "bottle": ("any rotation about z", lambda R, truth: axis_rotation_error(R, truth, Z_AXIS)),
+    "diningtable": (
+        "half a rotation about z",
+        lambda R, truth: symmetric_rotation_error(R, truth, HALF_ROTATION[None]),
+    ),
 }
 """Classes whose objects have the same, or nearly the same, appearance from several azimuths."""
 
 
 class Pascal3DBenchmark(Benchmark):
-    """Viewpoints on PASCAL3D+. The method gets no camera: viewpoints are relative to a camera that looks at the box.
-
-    Args:
-        dataset: :class:`Pascal3DPlus` of any split, categories and filters.
-        protocol: see :class:`Protocol`.
-    """
+    """Viewpoints on PASCAL3D+. The method gets no camera: viewpoints are relative to a camera that looks at the box."""
 
     name, key, mesh = "pascal3d", "{category}/{image_id}/{object_index}", "cad_path"
     dataset: Pascal3DPlus

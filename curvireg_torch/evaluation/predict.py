@@ -24,10 +24,7 @@ __all__ = ["FusedMatcher", "register_object", "registrar_opener"]
 def registrar_opener(
     benchmark: Benchmark, pipeline: Pipeline, *, renderer: str = "auto", field: nn.Module | None = None
 ) -> OpenRegistrar:
-    """A function that opens the registrar of mesh files under the protocol of a benchmark.
-
-    It returns the error of a mesh that cannot be read; any other error is a defect, and is raised.
-    """
+    """A function that opens the registrar of mesh files, or returns the error of a mesh that cannot be read."""
     protocol = benchmark.protocol
     pipeline = pipeline.with_pose_prior(protocol.pose)
 
@@ -49,10 +46,8 @@ def register_object(
     """Register one object of a dataset to its mesh, or to the best of several.
 
     Args:
-        benchmark: the dataset and the protocol.
-        item: the object.
-        registrar: of its meshes, or why there is none.
-        bank_seconds: time that opening the registrar took.
+        benchmark, item: the dataset and the protocol, and the object.
+        registrar, bank_seconds: of its meshes, or why there is none; time that opening it took.
 
     Returns:
         :meth:`Registration.to_dict` with the name of the ``mesh``, the ``image_size`` (height, width), ``localization``
@@ -75,9 +70,10 @@ def register_object(
     seconds = {"bank": bank_seconds, "register": time.perf_counter() - start}
     if isinstance(result, FailedRegistration):
         return {**size, "failed": result.error.message, "seconds": seconds}
-    row = {**size, **result.to_dict(), "mesh": item.meshes[result.model].name, "seconds": seconds}
+    names = [path.name for path in item.meshes]
+    row = {**size, **result.to_dict(), "mesh": names[result.model], "seconds": seconds}
     for pose, hypothesis in zip(row["top"], result.hypotheses, strict=True):
-        pose["mesh"] = item.meshes[hypothesis.model].name
+        pose["mesh"] = names[hypothesis.model]
     if result.localization is not None:
         row["localization"] = localization_document([result])
     return {**row, "projection": [matrix.tolist() for matrix in result.projection]}

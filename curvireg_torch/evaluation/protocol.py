@@ -14,8 +14,6 @@ from ..utils.checks import check_option
 
 __all__ = ["Protocol", "hint_of_truth", "perturbed_box"]
 
-HINTS = ("azimuth", "pose")
-
 CHOICES = {"cad": ("annotated", "any", "fused"), "pose": ("upright", "any")}
 
 
@@ -24,13 +22,12 @@ class Protocol:
     """The information that the method gets about an object, besides the photograph.
 
     Attributes:
-        cad: "annotated": the annotated CAD. "any": all CADs of the class, the best hypothesis wins. "fused": the scores
-            of a view are averaged over the CADs of the class, the best view wins.
+        cad: "annotated": that CAD. "any": all CADs of the class, the best hypothesis wins. "fused": the scores of a
+            view are averaged over the CADs of the class, the best view wins.
         pose: pose prior: "upright" or "any".
-        box: 0 for the annotated box; x > 0 moves each edge at random by up to x of the side; None: the object is
-            localized.
-        hint: knowledge of the pose: "azimuth:45": the azimuth lies within 45 degrees of a value that is itself up
-            to 45 degrees off; "pose:45": the same of the whole rotation; "none".
+        box: 0: as annotated; x > 0 moves each edge at random by up to x of the side; None: the object is localized.
+        hint: "azimuth:45": the azimuth lies within 45 degrees of a value that is itself up to 45 degrees off;
+            "pose:45": the same of the whole rotation; "none".
         seed: of the random numbers, which depend on the object's key besides.
 
     Raises:
@@ -60,11 +57,7 @@ class Protocol:
 
     @classmethod
     def parse(cls, words: Iterable[str], *, pose: str = "upright") -> "Protocol":
-        """Parse words such as ``cad=any``, ``pose=any``, ``box=0.1``, ``seed=1``.
-
-        Args:
-            words: KEY=VALUE each; ``box=annotated`` is 0, ``box=none`` is None.
-            pose: the default of ``pose``.
+        """Parse words KEY=VALUE; ``box=annotated`` is 0, ``box=none`` is None. ``pose`` is the default of that key.
 
         Raises:
             InvalidInputError: an unknown key or value.
@@ -90,7 +83,7 @@ class Protocol:
             degrees = float(text)
         except ValueError as error:
             raise InvalidInputError(f"hint: expected azimuth:DEGREES or pose:DEGREES, got {self.hint!r}") from error
-        check_option(kind, HINTS, "hint")
+        check_option(kind, ("azimuth", "pose"), "hint")
         if not 0.0 < degrees < 180.0:
             raise InvalidInputError(f"hint: expected degrees in (0, 180), got {self.hint!r}")
         return kind, degrees
@@ -103,13 +96,7 @@ class Protocol:
 
 
 def perturbed_box(box: Tensor, protocol: Protocol, key: str) -> Tensor:
-    """The box that the method gets for the object ``key``.
-
-    Args:
-        box: (4,) x0, y0, x1, y1 in px.
-
-    Returns:
-        (4,) px, with edges moved by up to ``protocol.box`` of the side.
+    """The box (4,) in px that the method gets for the object ``key``: edges move by up to ``protocol.box`` of the side.
 
     Example:
         >>> box = torch.tensor([0.0, 0.0, 100.0, 50.0])

@@ -48,11 +48,7 @@ class DatasetSpec:
         return {name: getattr(arguments, name) for name in self.options}
 
     def open(self, root: str | PathLike[str], **options: Any) -> Any:
-        """Open the dataset.
-
-        Raises:
-            CurviregError: it does not exist, or an option is out of range.
-        """
+        """Open the dataset; :class:`CurviregError` if it does not exist, or an option is out of range."""
         return resolve(self.dataset)(root, **options)
 
     @property

@@ -22,22 +22,19 @@ __all__ = ["POSE_SOURCES", "Item", "OpenRegistrar", "run_items"]
 
 
 class Item(Protocol):
-    """One photograph to register."""
+    """One photograph to register.
+
+    ``key`` is a name that no other item of the run has; of several ``meshes`` the best is found; ``request`` returns
+    plain values of all that the result depends on besides files and the settings of the run.
+    """
 
     @property
-    def key(self) -> str:
-        """A name that no other item of the run has."""
-
+    def key(self) -> str: ...
     @property
-    def photo(self) -> Path:
-        """The file of the photograph."""
-
+    def photo(self) -> Path: ...
     @property
-    def meshes(self) -> tuple[Path, ...]:
-        """Mesh files; of several the best is found."""
-
-    def request(self) -> Any:
-        """Plain values of all that the result depends on besides files and the settings of the run."""
+    def meshes(self) -> tuple[Path, ...]: ...
+    def request(self) -> Any: ...
 
 
 ItemT = TypeVar("ItemT", bound=Item)
@@ -89,10 +86,9 @@ def run_items(
             prepare(ResultStore(out, group))
         group.wait()
         store = ResultStore(out, group)
-        register_part(
-            items, store, open_registrar, register,
-            settings=settings, workers=group, label=label, progress=progress and group.rank == 0,
-        )  # fmt: skip
+        common = json.dumps([settings, code_digest(*POSE_SOURCES)], sort_keys=True)
+        with tqdm(desc=label, unit="photo", disable=not (progress and group.rank == 0)) as bar:
+            _register_part(items, group, store, open_registrar, register, common, bar)
         group.wait()
         if not group.reports or not store.is_complete(item.key for item in items):
             return None
@@ -101,19 +97,15 @@ def run_items(
         return store
 
 
-def register_part(
+def _register_part(
     items: Sequence[ItemT],
+    workers: Workers,
     store: ResultStore,
     open_registrar: OpenRegistrar,
     register: Callable[[ItemT, Registrar | Exception, float, Row], Row],
-    *,
-    settings: Any,
-    workers: Workers,
-    label: str,
-    progress: bool,
+    common: str,
+    bar: "tqdm[Any]",
 ) -> None:
-    """The part of :func:`run_items` that belongs to this process."""
-    common = json.dumps([settings, code_digest(*POSE_SOURCES)], sort_keys=True)
     digest_of_photo, digest_of_mesh = cache(file_digest), cache(mesh_digest)
 
     def digests(item: ItemT) -> dict[str, str]:
@@ -126,22 +118,22 @@ def register_part(
     order = {meshes: place for place, meshes in enumerate(dict.fromkeys(item.meshes for item in items))}
     mine = workers.part(sorted(items, key=lambda item: order[item.meshes]))
     todo = [(item, found) for item in mine if not store.is_current(item.key, found := digests(item))]
+    bar.reset(len(mine))
+    bar.update(len(mine) - len(todo))
     lock = threading.Lock()
-    with tqdm(total=len(mine), initial=len(mine) - len(todo), desc=label, unit="photo", disable=not progress) as bar:
-        registrar: Registrar | Exception | None
-        for meshes, group in groupby(todo, key=lambda pair: pair[0].meshes):
-            registrar = None  # free its memory before the next one is opened
-            start = time.perf_counter()
-            registrar = open_registrar(meshes)
-            seconds = time.perf_counter() - start
-            pairs = list(group)
+    registrar: Registrar | Exception | None
+    for meshes, pairs in [(meshes, list(group)) for meshes, group in groupby(todo, key=lambda pair: pair[0].meshes)]:
+        registrar = None  # free its memory before the next one is opened
+        start = time.perf_counter()
+        registrar = open_registrar(meshes)
+        seconds = time.perf_counter() - start
 
-            def register_one(k: int, registrar: Registrar | Exception = registrar) -> None:
-                item, found = pairs[k]  # noqa: B023
-                row = register(item, registrar, 0.0 if k else seconds, found)  # noqa: B023
-                with lock:
-                    store.append({"key": item.key, "digests": found, **row})
-                    bar.update()
+        def register_one(k: int, registrar: Registrar | Exception = registrar) -> None:
+            item, found = pairs[k]  # noqa: B023
+            row = register(item, registrar, 0.0 if k else seconds, found)  # noqa: B023
+            with lock:
+                store.append({"key": item.key, "digests": found, **row})
+                bar.update()
 
-            device = registrar.bank.device if isinstance(registrar, Registrar) else "cpu"
-            map_on_threads(register_one, range(len(pairs)), device=device)
+        device = registrar.bank.device if isinstance(registrar, Registrar) else "cpu"
+        map_on_threads(register_one, range(len(pairs)), device=device)

@@ -1,4 +1,4 @@
-"""Scores and tables that several benchmarks share."""
+"""Scores and tables that several benchmarks share, and the recall of localized boxes."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,21 +8,28 @@ import torch
 from torch import Tensor
 
 from ..geometry import viewpoint_from_rotation
+from ..geometry.crops import box_iou
 from ..metrics import accuracy, median_error
 from ..utils.files import write_csv
-from .store import Row
+from .benchmark import BenchmarkItem, Row
 
-__all__ = ["THRESHOLDS", "estimated_rotations", "or_inf", "viewpoint_scores", "write_viewpoints"]
+__all__ = [
+    "THRESHOLDS",
+    "estimated_rotations",
+    "localization_recall",
+    "or_inf",
+    "viewpoint_scores",
+    "write_viewpoints",
+]
 
 THRESHOLDS = {"acc_15_deg": 15.0, "acc_30_deg": 30.0}
 
+MIN_IOU = 0.5
+"""Intersection over union from which a box is right."""
+
 
 def viewpoint_scores(errors: Tensor, thresholds: dict[str, float]) -> Row:
-    """``n``, one accuracy for each threshold, and ``med_err_deg``.
-
-    Args:
-        errors: (N,) degrees, ``inf`` for a miss.
-        thresholds: name of the accuracy -> degrees.
+    """``n``, one accuracy for each threshold, and ``med_err_deg`` of errors (N,) in degrees, ``inf`` for a miss.
 
     Example:
         >>> viewpoint_scores(torch.tensor([5.0, 50.0]), {"acc_pi_6": 30.0})
@@ -41,6 +48,30 @@ def estimated_rotations(rows: Sequence[Row]) -> Tensor:
 def or_inf(errors: Tensor, R: Tensor) -> Tensor:
     """``errors`` (N,), ``inf`` where the estimate ``R`` (N, 3, 3) is missing (NaN)."""
     return torch.where(R.isfinite().flatten(1).all(1), errors, torch.full_like(errors, torch.inf))
+
+
+def localization_recall(items: Sequence[BenchmarkItem], rows: Sequence[Row]) -> Row:
+    """``recall_1``, ``recall_5``, ``recall_20``: fractions of the ``n`` annotated boxes that the best proposals find.
+
+    Boxes are clipped to the image on both sides: some datasets annotate the visible part, some the whole object. A row
+    that failed has no proposals. Recalls are None if no box is annotated.
+    """
+    ranks = [_rank(item.box, row) for item, row in zip(items, rows, strict=True) if bool(item.box.isfinite().all())]
+    recalls = {f"recall_{k}": sum(rank <= k for rank in ranks) / len(ranks) if ranks else None for k in (1, 5, 20)}
+    return {"n": len(ranks), **recalls}
+
+
+def _rank(box: Tensor, row: Row) -> float:
+    """Rank of the first right proposal, from 1; infinite if none is right."""
+    if "localization" not in row:
+        return float("inf")
+    boxes = [proposal["box"] for proposal in row["localization"]["proposals"]]
+    proposals = torch.tensor(boxes, dtype=torch.float64).view(-1, 4)
+    H, W = row["image_size"]
+    end = torch.tensor([W, H, W, H], dtype=torch.float64) - 0.5
+    clipped = [torch.minimum(boxes.clamp(min=-0.5), end) for boxes in (proposals, box.double()[None])]
+    right = (box_iou(*clipped)[:, 0] >= MIN_IOU).nonzero()[:, 0]
+    return float(right[0]) + 1 if len(right) else float("inf")
 
 
 def write_viewpoints(

@@ -28,8 +28,7 @@ def contact_sheet(
     Objects are ordered by error; then those of unknown pose, by confidence; then those that failed.
 
     Args:
-        folder: of :func:`evaluate` or ``curvireg evaluate``.
-        path: of the page.
+        folder, path: of :func:`evaluate`, and of the page.
         benchmark: what was evaluated; default: the whole dataset that the folder names, at its old place.
         each: number of the best objects, and of the worst.
         within_deg: poses with a smaller error are right.
@@ -39,10 +38,6 @@ def contact_sheet(
 
     Raises:
         InvalidInputError: no evaluation, ``each`` below 1, or a dataset that is missing.
-
-    Example:
-        >>> contact_sheet(Path("results/mine"), Path("results/mine/index.html"))                    # doctest: +SKIP
-        12
     """
     if each < 1:
         raise InvalidInputError(f"each: expected at least 1, got {each}")
@@ -53,7 +48,8 @@ def contact_sheet(
     if not results:
         raise InvalidInputError(f"{folder}: no object was evaluated; run curvireg evaluate first")
     errors = benchmark.rotation_errors([item for item, _ in results], [row for _, row in results]).tolist()
-    ranked = sorted(zip(results, errors, strict=True), key=lambda pair: _rank(pair[0][1], pair[1]))
+    shown = [_outcome(row, error, within_deg) for (_, row), error in zip(results, errors, strict=True)]
+    ranked = sorted(zip(results, shown, strict=True), key=lambda pair: pair[1][2])
     right = sum(error < within_deg for error in errors)
     known = sum(not math.isnan(error) for error in errors)
     failed = sum("failed" in row for _, row in results)
@@ -61,11 +57,11 @@ def contact_sheet(
         SheetEntry(
             number=benchmark.items.index(item) + 1,
             name=item.key,
-            caption=_caption(row, error),
-            kind=_kind(row, error, within_deg),
+            caption=caption,
+            kind=kind,
             picture=lambda item=item, row=row: _picture(benchmark, item, row),  # type: ignore[misc]
         )
-        for (item, row), error in ranked
+        for (item, row), (kind, caption, _) in ranked
     ]
     title = f"{len(entries)} objects: {right} of {known} within {within_deg:g} degrees, {failed} failed"
     write_sheet(path, title, entries, table="predictions.csv", each=each)
@@ -85,43 +81,31 @@ def _open_benchmark(store: ResultStore) -> Benchmark:
         raise InvalidInputError(f"{store.settings_path}: not settings of an evaluation ({error!r})") from error
 
 
-def _rank(row: Row, error: float) -> tuple[bool, bool, float]:
+def _outcome(row: Row, error: float, within_deg: float) -> tuple[str, str, tuple[int, float]]:
+    """Kind, caption and sort key of a result."""
     if "failed" in row:
-        return True, False, 0.0
-    return False, math.isnan(error), -row["confidence"] if math.isnan(error) else error
-
-
-def _caption(row: Row, error: float) -> str:
-    if "failed" in row:
-        return str(row["failed"])
-    outcome = "pose unknown" if math.isnan(error) else f"{error:.1f} degrees off"
-    return f"{outcome}, confidence {row['confidence']:.2f}"
-
-
-def _kind(row: Row, error: float, within_deg: float) -> str:
-    if "failed" in row:
-        return "failed"
+        return "failed", str(row["failed"]), (2, 0.0)
+    confidence = f"confidence {row['confidence']:.2f}"
     if math.isnan(error):
-        return "reliable" if row["reliable"] else "doubtful"
-    return "right" if error < within_deg else "wrong"
+        return "reliable" if row["reliable"] else "doubtful", f"pose unknown, {confidence}", (1, -row["confidence"])
+    return "right" if error < within_deg else "wrong", f"{error:.1f} degrees off, {confidence}", (0, error)
 
 
 def _picture(benchmark: Benchmark, item: BenchmarkItem, row: Row) -> bytes | None:
-    """The thumbnail; None for a failed object, and if the photograph or the mesh cannot be read any more."""
+    """The thumbnail; None for a failed object, and if a file cannot be read any more."""
     if "failed" in row:
         return None
     T, K = (torch.tensor(matrix, dtype=torch.float64) for matrix in row["projection"])
-    mesh = next((path for path in item.meshes if path.name == row["mesh"]), None)
     try:
+        renderer = _renderer(next(path for path in item.meshes if path.name == row["mesh"]), benchmark.unit)
         image = read_image(item.photo, dtype=torch.uint8)
-        renderer = None if mesh is None else _renderer(mesh, benchmark.unit)
-    except CurviregError:
+    except (CurviregError, StopIteration):
         return None
     if "localization" in row:
         box = row["localization"]["proposals"][0]["box"]
     else:
         box = perturbed_box(item.box, benchmark.protocol, item.key).tolist()
-    return None if renderer is None else thumbnail(renderer, (T, K), image, box)
+    return thumbnail(renderer, (T, K), image, box)
 
 
 @lru_cache(maxsize=8)  # objects share their meshes

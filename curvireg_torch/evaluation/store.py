@@ -18,7 +18,7 @@ Row = dict[str, Any]
 
 
 def finite(value: Any) -> Any:
-    """``value`` with every number that JSON cannot write (NaN, infinity) replaced by None."""
+    """``value`` with None for NaN and infinity, which JSON cannot write."""
     if isinstance(value, dict):
         return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -163,8 +163,9 @@ class ResultStore:
         line = _line(row if before is None else {**row, "revision": before.revision + 1})
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            if not self._repaired:
-                self._remove_cut_line()
+            if not self._repaired and self._output.is_file():  # remove a line that was cut short
+                os.truncate(self._output, self._output.read_bytes().rfind(b"\n") + 1)
+            self._repaired = True
             with self._output.open("ab") as file:
                 offset = file.tell()
                 file.write(line)
@@ -200,11 +201,6 @@ class ResultStore:
         revision, before = row.get("revision", 0), self._locations.get(row["key"])
         if before is None or revision >= before.revision:
             self._locations[row["key"]] = _Location(path, offset, row["digests"], revision, "skipped" not in row)
-
-    def _remove_cut_line(self) -> None:
-        self._repaired = True
-        if self._output.is_file():
-            os.truncate(self._output, self._output.read_bytes().rfind(b"\n") + 1)
 
 
 def _parsed(line: bytes) -> Row | None:

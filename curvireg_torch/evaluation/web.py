@@ -23,10 +23,6 @@ class WebBenchmark(Benchmark):
 
     Photographs of unknown pose are registered too. They count in ``n``, ``reliable`` and ``mean_confidence``; accuracy
     and errors are those of the ``n_posed`` others.
-
-    Args:
-        dataset: :class:`WebCollection`.
-        protocol: with ``cad="annotated"``.
     """
 
     name, key, mesh = "web", "{category}/{object_index}", "mesh_path"

@@ -33,7 +33,7 @@ class Workers:
 
     @property
     def reports(self) -> bool:
-        """Whether this process prepares the store, and writes the tables once it is complete; in a job array each."""
+        """Whether this process prepares the store and writes the tables once it is complete; in a job array each."""
         return self.leads or not self.joined
 
     def wait(self) -> None:
@@ -49,7 +49,7 @@ class Workers:
 
 @contextmanager
 def workers() -> Iterator[Workers]:
-    """The processes that ``torchrun`` started, joined through gloo; without it those of a job array, or this one alone.
+    """The processes that ``torchrun`` started, joined; without it those of a job array, or this one alone.
 
     A job array sets ``RANK``, from 0, and ``WORLD_SIZE``; its processes need not run at the same time.
 
@@ -62,7 +62,10 @@ def workers() -> Iterator[Workers]:
         (0, 1)
     """
     if not (dist.is_available() and dist.is_torchelastic_launched()):
-        yield _job_array()
+        rank, size = os.environ.get("RANK", "0"), os.environ.get("WORLD_SIZE", "1")
+        if not (rank.isdecimal() and size.isdecimal() and int(rank) < int(size)):
+            raise InvalidInputError(f"RANK, WORLD_SIZE: expected 0 <= RANK < WORLD_SIZE, got {rank!r} and {size!r}")
+        yield Workers(int(rank), int(size))
         return
     # Parts differ in cost, and the first process to finish waits for the last.
     dist.init_process_group("gloo", timeout=timedelta(days=7))
@@ -72,18 +75,8 @@ def workers() -> Iterator[Workers]:
         dist.destroy_process_group()
 
 
-def _job_array() -> Workers:
-    rank, size = os.environ.get("RANK", "0"), os.environ.get("WORLD_SIZE", "1")
-    if not (rank.isdecimal() and size.isdecimal() and int(rank) < int(size)):
-        raise InvalidInputError(f"RANK, WORLD_SIZE: expected 0 <= RANK < WORLD_SIZE, got {rank!r} and {size!r}")
-    return Workers(int(rank), int(size))
-
-
 def run_processes(count: int, words: Sequence[str]) -> bool:
-    """Run ``curvireg WORDS`` in ``count`` processes that ``torchrun`` starts.
-
-    Returns:
-        False without running anything if this is one of those processes already, or ``count`` is 1.
+    """Run ``curvireg WORDS`` in ``count`` processes; False if ``count`` is 1, or this is one of those processes.
 
     Raises:
         InvalidInputError: a process failed.

@@ -8,7 +8,7 @@ import pytest
 from curvireg_torch.cli import parse
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.evaluation import contact_sheet
-from curvireg_torch.evaluation.localization import localization_recall
+from curvireg_torch.evaluation.scores import localization_recall
 from curvireg_torch.pipeline import DEFAULT, PRESETS
 from tests.evaluation.small import SMALL
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from curvireg_torch.evaluation.benchmark import BenchmarkItem
-from curvireg_torch.evaluation.localization import localization_recall
+from curvireg_torch.evaluation.scores import localization_recall
 
 BOX = (10.0, 10.0, 30.0, 30.0)
 AWAY = (150, 50, 160, 60)

@@ -1,7 +1,9 @@
 """The loop over items, with a function in place of the registration."""
 
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -10,8 +12,7 @@ from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.evaluation import runner
 from curvireg_torch.evaluation.benchmark import BenchmarkItem
 from curvireg_torch.evaluation.lists import Entry
-from curvireg_torch.evaluation.runner import register_part
-from curvireg_torch.evaluation.store import ResultStore
+from curvireg_torch.evaluation.runner import run_items
 from curvireg_torch.evaluation.workers import Workers, run_processes, workers
 
 
@@ -49,10 +50,11 @@ def registered(items, folder, *, settings=None, row=None, workers=None, register
         assert (seconds > 0) == (sum(key[1] == item.key[1] for key in keys) == 1), "the first pays for the bank"
         return row or {}
 
-    register_part(
-        items, ResultStore(folder, workers), lambda meshes: MeshError(meshes[0].name), register or plain,
-        settings=settings or {}, workers=workers or Workers(), label="", progress=False,
-    )  # fmt: skip
+    with patch.object(runner, "workers", lambda: nullcontext(workers or Workers())):
+        run_items(
+            items, folder, lambda meshes: MeshError(meshes[0].name), register or plain,
+            settings=settings or {}, prepare=lambda _: None, label="", progress=False,
+        )  # fmt: skip
     return keys
 
 

@@ -25,8 +25,7 @@ class Entry:
 
     Attributes:
         cells: the texts of the row, one for each column of the list.
-        name: the photograph, as the list names it.
-        photo: its file.
+        name, photo: the photograph as the list names it, and its file.
         meshes: mesh files; of several the best is found.
         box: x0, y0, x1, y1 in px; None: the object is localized.
         camera: fx, fy, cx, cy in px; None if unknown.
@@ -50,7 +49,7 @@ class Entry:
     error: str = ""
 
     def request(self) -> Any:
-        """Plain values of all that the result depends on besides the content of files."""
+        """All that the result depends on besides the content of files."""
         prior = None if self.prior is None else self.prior.to_dict()
         return [self.name, self.box, self.camera, self.guess, self.instances, self.distance, prior]
 
@@ -78,8 +77,7 @@ def photo_list(
     holds the reason in its ``error``.
 
     Args:
-        name: of the table, for errors.
-        columns, rows: its texts.
+        name, columns, rows: of the table; errors begin with the name.
         folder: to which its paths are relative.
         meshes: for rows that name none; of several the best is found.
 
@@ -129,21 +127,17 @@ def _entry(cells: list[str], count: int, indices: Mapping[str, int], folder: Pat
 
 
 def _four_numbers(values: Mapping[str, str], names: tuple[str, ...]) -> tuple[float, ...] | None:
-    """The numbers of these columns; None if all are empty."""
     texts = [values.get(name, "") for name in names]
     empty = [name for name, text in zip(names, texts, strict=True) if not text]
     if len(empty) == len(names):
         return None
     if empty:
-        present = ", ".join(text for text in texts if text)
-        raise InvalidInputError(
-            f"{', '.join(names)}: expected all four or none, got {present} and nothing for {', '.join(empty)}"
-        )
-    return tuple(_number(text, name) for text, name in zip(texts, names, strict=True))
-
-
-def _number(text: str, name: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InvalidInputError(f"{name}: expected a number, got {text[:40]!r}") from None
+        present = f"{', '.join(filter(None, texts))} and nothing for {', '.join(empty)}"
+        raise InvalidInputError(f"{', '.join(names)}: expected all four or none, got {present}")
+    numbers = []
+    for name, text in zip(names, texts, strict=True):
+        try:
+            numbers.append(float(text))
+        except ValueError:
+            raise InvalidInputError(f"{name}: expected a number, got {text[:40]!r}") from None
+    return tuple(numbers)

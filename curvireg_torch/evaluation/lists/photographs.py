@@ -11,11 +11,9 @@ from ...limits import MAX_IMAGE_PIXELS
 from ...utils.choices import IMAGES, VIDEOS
 from ...utils.files import write_file
 from ...utils.input_paths import is_pattern
-from .entries import PhotoList, photo_list
+from .entries import BOX, CAMERA, PhotoList, photo_list
 
 __all__ = ["list_photographs"]
-
-_COLUMNS = ["photo", "x0", "y0", "x1", "y1", "fx", "fy", "cx", "cy"]
 
 
 def list_photographs(
@@ -32,10 +30,8 @@ def list_photographs(
     Args:
         paths: photographs, folders of them, patterns such as ``shots/*.jpg``, videos.
         meshes: mesh files; of several the best is found.
-        box: x0, y0, x1, y1 in px; default: the object is localized.
-        camera: fx, fy, cx, cy in px.
-        every: use every n-th frame of videos.
-        frames: folder for the frames of videos, as PNG.
+        box, camera: x0, y0, x1, y1 (default: the object is localized) and fx, fy, cx, cy, in px.
+        every, frames: use every n-th frame of videos; folder for these, as PNG.
 
     Raises:
         MissingFileError: a pattern or folder without photographs.
@@ -43,9 +39,9 @@ def list_photographs(
     """
     if every < 1:
         raise InvalidInputError(f"--every: expected >= 1, got {every}")
-    numbers = [*([""] * 4 if box is None else map(str, box)), *([""] * 4 if camera is None else map(str, camera))]
+    numbers = [text for four in (box, camera) for text in (map(str, four) if four else [""] * 4)]
     rows = [[str(photo), *numbers] for path in paths for photo in _found(path, every, frames)]
-    return photo_list("photographs", _COLUMNS, rows, Path(), meshes)
+    return photo_list("photographs", ["photo", *BOX, *CAMERA], rows, Path(), meshes)
 
 
 def _found(path: Path, every: int, frames: Path) -> Iterator[Path]:

@@ -23,8 +23,6 @@ from .tables import write_bop_results, write_results
 
 __all__ = ["Counts", "register_entry", "register_list"]
 
-_NO_DIGESTS = {"request": "", "photo": ""}
-
 
 @dataclass(frozen=True)
 class Counts:
@@ -54,8 +52,7 @@ def register_list(
     ``WORLD_SIZE``, each process registers a part of the rows.
 
     Args:
-        photos: the list.
-        out: folder for the results.
+        photos, out: the list, and the folder for the results.
         open_registrar: opens the registrar of one mesh, or of several.
         settings: plain values, all that results depend on besides the files.
         progress: show a bar.
@@ -93,13 +90,7 @@ def _prepare(store: ResultStore) -> None:
 def register_entry(
     entry: Entry, photo: Photo, registrar: Registrar, *, bank_seconds: float
 ) -> tuple[Registration, Row]:
-    """Register one photograph.
-
-    Args:
-        entry: its name, box and camera.
-        photo: as read from its file.
-        registrar: of its meshes.
-        bank_seconds: time that opening the registrar took.
+    """Register one photograph with the registrar of its meshes, which took ``bank_seconds`` to open.
 
     Returns:
         The registration, and its document.
@@ -139,7 +130,7 @@ def register_entry(
 
 
 def _camera(entry: Entry, photo: Photo) -> tuple[torch.Tensor | None, str | None]:
-    """(3, 3) camera matrix, and its source: "given", "exif" or "fov"."""
+    """Camera matrix, and its source."""
     if entry.camera is not None:
         return camera_matrix(*entry.camera, dtype=torch.float64), "given"
     if entry.guess is None:
@@ -158,20 +149,20 @@ def _register(entry: Entry, registrar: Registrar | Exception, bank_seconds: floa
     try:
         photo = read_photo(entry.photo, dtype=torch.uint8)
     except (CurviregError, OSError) as error:
-        return _failed(str(error))
+        return _failed(error)
     if isinstance(registrar, Exception):
-        return _failed(str(registrar))
+        return _failed(registrar)
     try:
         result, document = register_entry(entry, photo, registrar, bank_seconds=bank_seconds)
     except (ImageError, InvalidInputError) as error:
-        return _failed(str(error))
+        return _failed(error)
     renderer = registrar.describers[result.model].renderer
     write_file(picture, thumbnail(renderer, result.projection, photo.image, used_box(document)))
     return {"status": "ok", "message": "", **document}
 
 
-def _failed(message: str) -> Row:
-    return {"schema": SCHEMA, "status": "failed", "message": " ".join(message.split())}
+def _failed(error: Exception | str) -> Row:
+    return {"schema": SCHEMA, "status": "failed", "message": " ".join(str(error).split())}
 
 
 def _thumbnail_path(out: Path, digests: Row) -> Path:
@@ -179,12 +170,11 @@ def _thumbnail_path(out: Path, digests: Row) -> Path:
 
 
 def _write_tables(photos: PhotoList, out: Path, store: ResultStore) -> Counts:
-    entries = photos.entries
-    sheet = [_sheet_entry(entry, row, out) for entry, row in zip(entries, _rows(photos, store), strict=True)]
+    sheet = [_sheet_entry(entry, row, out) for entry, row in zip(photos.entries, _rows(photos, store), strict=True)]
     kinds = [shown.kind for shown, _ in sheet]
     counts = Counts(len(kinds) - kinds.count("failed"), kinds.count("failed"), kinds.count("reliable"))
     sheet.sort(key=lambda pair: pair[1])
-    several = any(len(entry.meshes) > 1 for entry in entries)
+    several = any(len(entry.meshes) > 1 for entry in photos.entries)
     write_sheet(out / "index.html", str(counts), [shown for shown, _ in sheet], table="results.csv")
     store.rewrite(_rows(photos, store))
     write_bop_results(out / "bop.csv", photos.columns, _rows(photos, store))
@@ -196,12 +186,11 @@ def _rows(photos: PhotoList, store: ResultStore) -> Iterator[Row]:
     """The result of each entry, in the order of the list, with its number and its cells."""
     for number, entry in enumerate(photos.entries, start=1):
         head = {"row": number, "columns": dict(zip(photos.columns, entry.cells, strict=True))}
-        unusable = {"key": "", "digests": _NO_DIGESTS, **_failed(entry.error)}
+        unusable = {"key": "", "digests": {"request": "", "photo": ""}, **_failed(entry.error)}
         yield {**head, **(unusable if entry.error else store.read(entry.key)), **head}
 
 
 def _sheet_entry(entry: Entry, row: Row, out: Path) -> tuple[SheetEntry, tuple[bool, bool, float, int]]:
-    """A row on the page, and its sort key."""
     message, reliable, confidence = row["message"], row.get("reliable", False), row.get("confidence", 0.0)
     kind = "failed" if message else "reliable" if reliable else "doubtful"
     path = _thumbnail_path(out, row["digests"])

@@ -3,11 +3,10 @@
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import torch
-
 from ...data import BOPRow, write_bop_csv
 from ...utils.choices import UNITS
 from ...utils.files import write_csv
+from ..bop import bop_row
 from ..store import Row
 
 __all__ = ["BEST_MESH", "RESULT_COLUMNS", "write_bop_results", "write_results"]
@@ -51,10 +50,5 @@ def write_bop_results(path: Path, columns: Sequence[str], rows: Iterable[Row]) -
         if row["status"] != "ok" or row["translation"] is None or not all(map(str.isdecimal, numbers)):
             continue
         millimetres = UNITS[row["unit"] or "m"] / UNITS["mm"]
-        R, t = (torch.tensor(row[name], dtype=torch.float64) for name in ("rotation", "translation"))
-        scene_id, im_id, obj_id = map(int, numbers)
-        pose = BOPRow(
-            scene_id=scene_id, im_id=im_id, obj_id=obj_id, score=row["confidence"], R=R, t=t * millimetres, time=-1.0
-        )
-        poses.append(pose)
+        poses.append(bop_row([*map(int, numbers)], row["confidence"], row, scale=millimetres))
     write_bop_csv(path, poses)
