@@ -83,11 +83,7 @@ class RegisterOptions:
 
 
 def check_camera(camera: Sequence[float] | None, guess: str | float | None) -> None:
-    """Refuse a camera (fx, fy, cx, cy) or field of view that cannot be used, before any file is read.
-
-    Raises:
-        InvalidInputError: not finite or positive, pixels that are not square, or an angle outside (0, 180).
-    """
+    """Refuse a camera (fx, fy, cx, cy) or field of view that cannot be used, before any file is read."""
     if camera is not None:
         check_square_pixels(camera_matrix(*camera), "--camera")
     if isinstance(guess, float):

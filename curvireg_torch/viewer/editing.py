@@ -26,12 +26,7 @@ class DisplayedPose:
 def move_displayed(
     registrar: Registrar, displayed: DisplayedPose, *, rotation: Sequence[float], translation: Sequence[float]
 ) -> DisplayedPose:
-    """Rotate and move the object.
-
-    Args:
-        registrar, displayed: the pose.
-        rotation: degrees about the camera's x, y and z axes through the object's centre.
-        translation: along these axes, in units of the object's radius.
+    """Rotate the object about its centre, in degrees about the camera's x, y and z axes, and move it in its radii.
 
     Raises:
         InvalidInputError: the object would touch the camera.

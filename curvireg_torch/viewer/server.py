@@ -40,12 +40,7 @@ class _UploadLimit:
 
 
 def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> None:
-    """Serve the page until Ctrl-C; the printed address contains a random token.
-
-    Args:
-        options: the inputs of a new page.
-        host, port: address to listen on, and 0 for a free port.
-        browser: open a browser.
+    """Serve pages with these inputs until Ctrl-C; the printed address contains a random token.
 
     Raises:
         CurviregError: a file of the options cannot be used.

@@ -129,18 +129,18 @@ def registration_sheet(
     """
     item = _item(image, box)
     overlay = _overlay(registrar, result, item, _window(item), camera_matrix)
-    side = [_caption(_tile(p), name) for name, p in side_pictures(registrar, result, item.image, item.box).items()]
+    side = [_tile(p, name) for name, p in side_pictures(registrar, result, item.image, item.box).items()]
     poses = [
-        _caption(_tile(depth_picture(_depth(registrar, h)[0, 0])), _hypothesis_caption(registrar, result, i))
+        _tile(depth_picture(_depth(registrar, h)[0, 0]), _hypothesis_caption(registrar, result, i))
         for i, h in enumerate(result.hypotheses, start=1)
     ]
     panel = np.vstack([np.hstack(side[:2]), np.hstack(side[2:])])
     scale = (height := panel.shape[0]) / overlay.shape[0]
     shrink = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     overlay = cv2.resize(overlay, (max(1, round(overlay.shape[1] * scale)), height), interpolation=shrink)
-    top, bottom = np.hstack([overlay, panel]), np.hstack(poses)
-    width = max(top.shape[1], bottom.shape[1])
-    return np.vstack([_widen(top, width), _widen(bottom, width)])
+    rows = [np.hstack([overlay, panel]), np.hstack(poses)]
+    width = max(row.shape[1] for row in rows)
+    return np.vstack([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows])
 
 
 @torch.no_grad()
@@ -198,15 +198,8 @@ def _field_picture(field: Tensor) -> np.ndarray:
     return to_uint8((length / length.max().clamp(min=1e-12)).sqrt())
 
 
-def _tile(picture: np.ndarray) -> np.ndarray:
-    return np.asarray(cv2.resize(picture, (_TILE, _TILE), interpolation=cv2.INTER_AREA))
-
-
-def _caption(picture: np.ndarray, text: str) -> np.ndarray:
+def _tile(picture: np.ndarray, text: str) -> np.ndarray:
+    picture = np.asarray(cv2.resize(picture, (_TILE, _TILE), interpolation=cv2.INTER_AREA))
     for colour, width in (((0, 0, 0), 3), ((255, 255, 0), 1)):
         cv2.putText(picture, text, (5, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, width, cv2.LINE_AA)
     return picture
-
-
-def _widen(picture: np.ndarray, width: int) -> np.ndarray:
-    return np.pad(picture, ((0, 0), (0, width - picture.shape[1]), (0, 0)))

@@ -79,13 +79,9 @@ def thumbnail(renderer: DepthRenderer, projection: tuple[Tensor, Tensor], image:
 
 
 def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: str, each: int | None = None) -> None:
-    """Write the page as one file.
+    """Write the page of ``rows``, best first, as one file; ``table`` is the name of the file that has all of them.
 
-    Args:
-        path, title: of the page.
-        rows: entries, best first.
-        table: name of the file that has all of them.
-        each: number of the best, and of the worst, that are shown (default: 500).
+    Of many rows, ``each`` of the best and of the worst are shown (default: 500).
     """
     each = MAX_ENTRIES if each is None else each
     note = "Best first; failed ones last."

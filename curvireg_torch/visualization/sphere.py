@@ -21,20 +21,10 @@ def direction_scores(
 
     Raises:
         InvalidInputError: a ranking of other views, or no such photograph or model.
-
-    Example:
-        >>> import trimesh
-        >>> from curvireg_torch import ViewMatcher, sample_views
-        >>> views = sample_views(azimuth_step=90, elevations=[0, 30], thetas=[0, 90])
-        >>> bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), views, image_size=64, progress=False)
-        >>> ranking = ViewMatcher(bank)(torch.rand(1, 3, 64, 64), torch.tensor([[8.0, 8, 56, 56]]))
-        >>> len(bank), len(direction_scores(bank, ranking)[0])
-        (16, 8)
     """
     if ranking.scores.shape[1] != len(bank) or not 0 <= image_index < len(ranking):
-        raise InvalidInputError(
-            f"ranking: expected {len(bank)} views and image {image_index}, got {tuple(ranking.scores.shape)}"
-        )
+        expected = f"{len(bank)} views and image {image_index}"
+        raise InvalidInputError(f"ranking: expected {expected}, got {tuple(ranking.scores.shape)}")
     views = (bank.model == model).nonzero()[:, 0].cpu()
     if len(views) == 0:
         raise InvalidInputError(f"model: the bank has {len(bank.meshes)} meshes, got {model}")
@@ -42,7 +32,7 @@ def direction_scores(
     elevation = bank.views.elevation.cpu().double()[views]
     azimuth = torch.where(elevation.abs() > 89.999, 0.0, azimuth)  # at a pole azimuth is an in-plane rotation
     keys = torch.stack([azimuth, elevation], dim=1).mul(1000).round().long()
-    _, group = keys.unique(dim=0, return_inverse=True)
+    group = keys.unique(dim=0, return_inverse=True)[1]
     count = int(group.max()) + 1
     score = torch.full((count,), -torch.inf, dtype=torch.float64)
     score = score.scatter_reduce(0, group, ranking.scores[image_index].cpu().double()[views], "amax")

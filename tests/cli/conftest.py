@@ -13,6 +13,19 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture
+def refused(capsys):
+    """Check that a command was refused with code 2 and one line that contains these texts."""
+
+    def check(code, *messages):
+        (error,) = capsys.readouterr().err.splitlines()
+        assert code == 2
+        for message in messages:
+            assert message in error
+
+    return check
+
+
+@pytest.fixture
 def register_one(folder, tmp_path):
     """Run ``curvireg register`` on one photograph, by default with its box; results go to ``tmp_path / "out"``."""
 

@@ -25,34 +25,23 @@ COMPLETIONS = [
 ]
 
 
-def script(shell, tmp_path, capsys):
+@pytest.mark.parametrize("shell", ["bash", "fish"])
+@pytest.mark.parametrize(("line", "words"), COMPLETIONS)
+def test_completion_completes(shell, line, words, tmp_path, capsys):
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed")
     assert main(["completion", shell]) == 0
-    path = tmp_path / "script"
-    path.write_text(capsys.readouterr().out)
+    (tmp_path / "script").write_text(capsys.readouterr().out)
     for name in ("part.stl", "weights"):
         (tmp_path / name).touch()
-    return path
-
-
-def completions(folder, *command):
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True, timeout=60)
-    assert done.stderr == ""
-    return {line.split("\t")[0].strip() for line in done.stdout.splitlines() if line}
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
-@pytest.mark.parametrize(("line", "words"), COMPLETIONS)
-def test_completion_bash(line, words, tmp_path, capsys):
     typed = " ".join(f"'{word}'" for word in line.split(" "))
     ask = f"COMP_WORDS=({typed}); COMP_CWORD={line.count(' ')}; _shtab_curvireg; printf '%s\\n' \"${{COMPREPLY[@]}}\""
-    assert completions(tmp_path, "bash", "-c", f". {script('bash', tmp_path, capsys)}; {ask}") == words
-
-
-@pytest.mark.skipif(shutil.which("fish") is None, reason="fish is not installed")
-@pytest.mark.parametrize(("line", "words"), COMPLETIONS)
-def test_completion_fish(line, words, tmp_path, capsys):
-    path = script("fish", tmp_path, capsys)
-    assert completions(tmp_path, "fish", "--no-config", "-c", f"source {path}; complete -C '{line}'") == words
+    options = {"bash": ["-c", f". ./script; {ask}"], "fish": ["--no-config", "-c", f". ./script; complete -C '{line}'"]}
+    done = subprocess.run(
+        [shell, *options[shell]], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stderr == ""
+    assert {found.split("\t")[0].strip() for found in done.stdout.splitlines() if found} == words
 
 
 def test_completion_zsh(capsys):

@@ -32,27 +32,22 @@ def test_list_page_shows_every_row_best_first(folder, register, tmp_path):
     out = tmp_path / "out"
     page = (out / "index.html").read_text(encoding="utf-8")
     assert "<h1>4 photographs: 3 ok, 1 failed" in page
-    assert "<script>alert" not in page
-    assert not re.search(r'(src|href)="(?!data:)', page)
-    assert "http" not in page
+    assert not re.search(r'<script>alert|(src|href)="(?!data:)|http', page)
     figures = re.findall(r'<figure class="(\w+)">(.*?)</figure>', page, flags=re.DOTALL)
-    assert len(figures) == 4
     found = table(out)
     order = sorted(range(1, 4), key=lambda k: -float(found[k]["confidence"]))
     numbers = [int(re.search(r"<b>(\d+)</b>", text)[1]) for _, text in figures]
     assert numbers == [k + 1 for k in order] + [1]
-    for number, (kind, text) in zip(numbers, figures, strict=True):
-        row = found[number - 1]
-        assert html.escape(row["photo"]) in text
-        picture = re.search(r'src="data:image/jpeg;base64,([^"]+)"', text)
-        if number == 1:
-            assert kind == "failed"
-            assert picture is None
-            assert "no such file" in text
-        else:
-            assert kind == ("reliable" if row["reliable"] == "true" else "doubtful")
-            pixels = cv2.imdecode(np.frombuffer(base64.b64decode(picture[1]), np.uint8), cv2.IMREAD_COLOR)
+    kinds = ["reliable" if found[number - 1]["reliable"] == "true" else "doubtful" for number in numbers[:-1]]
+    assert [kind for kind, _ in figures] == [*kinds, "failed"]
+    for number, (_, text) in zip(numbers, figures, strict=True):
+        assert html.escape(found[number - 1]["photo"]) in text
+        pictures = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', text)
+        assert len(pictures) == (number != 1)
+        for picture in pictures:
+            pixels = cv2.imdecode(np.frombuffer(base64.b64decode(picture), np.uint8), cv2.IMREAD_COLOR)
             assert max(pixels.shape) <= sheet.SIDE
+    assert "no such file" in figures[-1][1]
     # A second run computes nothing and writes the same page.
     assert register("--list", path, folder / "truck.safetensors") == 0
     assert (out / "index.html").read_text(encoding="utf-8") == page

@@ -24,7 +24,6 @@ from tests._support.lists import CAMERA, box_of
 from tests._support.scenes import scene, truck_bank, unrefined
 
 BOX = [float(v) for v in box_of(0)]
-KEYS = ("viewpoint", "score", "confidence", "reliable", "edge_support", "seconds", "versions", "conventions")
 
 
 def rotation(document):
@@ -34,7 +33,6 @@ def rotation(document):
 def test_register_writes_result_and_overlay(register_one, document, tmp_path, capsys):
     assert register_one("--camera", *CAMERA, "--top", "3") == 0
     result, truth = document(), scene(0)[2]
-    assert set(KEYS) <= set(result)
     assert float(rotation_error(rotation(result), truth[:3, :3])) < 15
     # Swapped CX and CY would move the object by 30 px of 260: 0.16 of its distance.
     t = torch.tensor(result["translation"], dtype=torch.float64)
@@ -59,8 +57,8 @@ def test_register_without_box_and_camera(folder, register_one, document, capsys)
     assert "0.png: localizing the object" in capsys.readouterr().err
     assert register_one("--no-refine", box=()) == 0
     assert capsys.readouterr().err == ""
-    for key in ("translation", "covariance", "squared_radius", "standard_deviations"):
-        assert document()[key] is None
+    keys = ("translation", "covariance", "squared_radius", "standard_deviations")
+    assert {document()[key] for key in keys} == {None}
 
 
 def test_register_applies_the_exif_orientation(folder, register_one, document, capsys):
@@ -112,21 +110,19 @@ def broken_files(folder):
         ({"mesh": "broken.safetensors"}, [], ["broken.safetensors", "build"]),
         ({"box": ["5", "5", "5", "9"]}, [], ["X0 < X1"]),
         ({"box": ["900", "5", "950", "9"]}, [], ["entirely outside"]),
-        ({}, ["--camera", "0", "260", "119", "89"], ["focal"]),
         ({}, ["--top", "0"], ["hypotheses"]),
         ({}, ["--field", "none"], ["none"]),
         ({}, ["--preset", "paper"], ["built with other settings"]),
         ({}, ["--pose", "upright"], ["--pose"]),
+        ({}, ["--near", "10"], ["--near: expected AZIMUTH ELEVATION"]),
+        ({}, ["--within", "10"], ["--within: expected --near"]),
+        ({}, ["--side", "left", "--azimuth", "0", "10"], ["--side: give it or --azimuth"]),
+        ({}, ["--elevation", "50", "10"], ["elevation: expected"]),
     ],
 )
 @pytest.mark.usefixtures("broken_files")
-def test_register_reports_bad_input_in_one_line(register_one, capsys, files, options, messages):
-    assert register_one(*options, **files) == 2
-    error = capsys.readouterr().err.strip()
-    assert len(error.splitlines()) == 1
-    assert "Traceback" not in error
-    for message in messages:
-        assert message in error
+def test_register_reports_bad_input_in_one_line(register_one, refused, files, options, messages):
+    refused(register_one(*options, "--no-refine", **files), *messages)
 
 
 def test_register_debug_shows_the_traceback(register_one):
@@ -134,15 +130,8 @@ def test_register_debug_shows_the_traceback(register_one):
         register_one("--debug", photo="none.png")
 
 
-def test_register_refuses_a_file_as_output_folder(folder, register_one, capsys):
-    assert register_one("--no-refine", "--out", folder / "photos/0.png") == 2
-    assert "--out" in capsys.readouterr().err
-
-
-def test_register_checks_the_camera_before_reading(register_one, monkeypatch, capsys):
-    monkeypatch.setattr("curvireg_torch.io.read_photo", lambda *_, **__: pytest.fail("read"))
-    assert register_one("--camera", "0", "260", "119", "89") == 2
-    assert "focal" in capsys.readouterr().err
+def test_register_refuses_a_file_as_output_folder(folder, register_one, refused):
+    refused(register_one("--out", folder / "photos/0.png"), "--out")
 
 
 @pytest.mark.parametrize("preset", ["learned", "classical", "fast"])
@@ -172,8 +161,8 @@ def test_register_equals_registrar_bit_by_bit(folder, register_one, document, mo
     written = document()
     registrar = Registrar(str(folder / "truck.ply"), pipeline=Pipeline.read(folder / "pipeline.json"))
     result = registrar([folder / "photos/0.png"], torch.tensor([BOX]), camera_matrix(*map(float, CAMERA)))[0]
-    assert written["rotation"] == result.rotation.tolist()
-    assert written["translation"] == result.translation.tolist()
+    for name in ("rotation", "translation"):
+        assert written[name] == getattr(result, name).tolist()
     assert (written["score"], written["confidence"]) == (result.score, result.confidence)
     assert [top["rotation"] for top in written["top"]] == [h.rotation.tolist() for h in result.hypotheses]
     assert written["pipeline"] == registrar.pipeline.describe()
@@ -220,18 +209,3 @@ def test_register_limits_the_pose(register_one, document):
     assert result["prior"] == {"azimuth": [low, high], "elevation": [-90, 90], "contradiction": "better outside"}
     for pose in result["top"]:
         assert (pose["viewpoint"]["azimuth"] - low) % 360 <= 80 + 1e-6
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--near", "10"], "--near: expected AZIMUTH ELEVATION"),
-        (["--within", "10"], "--within: expected --near"),
-        (["--side", "left", "--azimuth", "0", "10"], "--side: give it or --azimuth"),
-        (["--elevation", "50", "10"], "elevation: expected"),
-    ],
-    ids=str,
-)
-def test_register_refuses_unusable_limits_on_the_pose(register_one, capsys, options, message):
-    assert register_one(*options) == 2
-    assert message in capsys.readouterr().err

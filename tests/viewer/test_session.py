@@ -37,6 +37,15 @@ def write_scene(folder: Path, seed: int = 0) -> tuple[list[float], torch.Tensor]
     return [float(v) for v in box], T
 
 
+def run_command(folder: Path, command: str) -> dict:
+    """Run a command line of the viewer; returns its result."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("CURVIREG_CACHE", str(folder / "cache"))
+        assert main([*shlex.split(command)[1:], "--quiet"]) == 0
+    return json.loads((folder / "result" / "result.json").read_text())
+
+
 def new_session(*words):
     arguments = parse(["view", *words])
     return Session(register_options(arguments, *([path] if path else [] for path in (arguments.photo, arguments.mesh))))
@@ -44,8 +53,10 @@ def new_session(*words):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
+    """The present folder, with a scene."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+    write_scene(tmp_path)
     return tmp_path
 
 
@@ -76,13 +87,9 @@ def session(registered):
 
 def test_command_gives_the_same_result_bit_by_bit(session, registered):
     _, folder, truth = registered
-    words = shlex.split(session.command())
-    assert words[:4] == ["curvireg", "register", "my photo.png", str(folder / "truck.ply")]
+    assert session.command().startswith(f"curvireg register 'my photo.png' {folder / 'truck.ply'} ")
     (folder / "my photo.png").write_bytes((folder / "photo.png").read_bytes())
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        assert main([*words[1:], "--quiet"]) == 0
-    written = json.loads((folder / "result" / "result.json").read_text())
+    written = run_command(folder, session.command())
     document = json.loads(session.json())
     for key in ("rotation", "translation", "score", "confidence", "covariance", "top", "pipeline"):
         assert document[key] == written[key], key
@@ -165,9 +172,8 @@ def test_messages_use_the_names_of_the_user(folder):
             session.open_mesh(folder / f"upload-2{suffix}", f"cat{suffix}")
         assert str(folder) not in str(caught.value)
     assert session.photo_path is session.mesh_path is None
-    warning = CurviregWarning("large", subject=folder / "upload-2.obj")
-    assert session.describe_warning(warning) == "cat.obj: large"
-    assert session.describe_warning(UserWarning("plain")) == "plain"
+    warnings = CurviregWarning("large", subject=folder / "upload-2.obj"), UserWarning("plain")
+    assert list(map(session.describe_warning, warnings)) == ["cat.obj: large", "plain"]
     with pytest.raises(InvalidInputError, match="choose a photograph and a mesh"):
         session.register()
     with pytest.raises(InvalidInputError, match="register first"):
@@ -184,7 +190,6 @@ def test_open_mesh_describes_the_mesh(folder):
 
 
 def test_open_photo_keeps_the_old_one_after_an_error(folder):
-    write_scene(folder)
     session = new_session()
     session.open_photo(folder / "photo.png")
     (folder / "broken.png").write_bytes((folder / "photo.png").read_bytes()[:200])
@@ -193,15 +198,14 @@ def test_open_photo_keeps_the_old_one_after_an_error(folder):
     assert session.photo_path == folder / "photo.png"
 
 
-def test_load_takes_files_box_and_camera_from_the_options(folder):
-    write_scene(folder)
+@pytest.mark.usefixtures("folder")
+def test_load_takes_files_box_and_camera_from_the_options():
     session = new_session("photo.png", "truck.ply", "--box", "10", "20", "90", "80", "--fov", "65")
     assert "968 faces" in session.load()
     assert session.command() == "curvireg register photo.png truck.ply --box 10 20 90 80 --fov 65 --out result"
 
 
 def test_command_contains_inputs_and_options(folder):
-    write_scene(folder)
     session = new_session("--unit", "mm", "--up=-y", "--pose", "any", "--preset", "fast")
     session.open_photo(folder / "photo.png", "photo.png")
     assert session.exif_camera() is None
@@ -225,12 +229,12 @@ def test_command_contains_inputs_and_options(folder):
         session.register()
 
 
-def test_register_is_cancelled_by_the_limit_and_by_the_user(folder, monkeypatch):
-    box, _ = write_scene(folder)
-    session = new_session("--pipeline", "small.json")
-    session.open_photo(folder / "photo.png")
-    session.open_mesh(folder / "truck.ply")
-    session.box, session.limit = tuple(box), 0.0
+@pytest.mark.usefixtures("folder")
+def test_register_is_cancelled_by_the_limit_and_by_the_user(monkeypatch):
+    box = map(str, scene(0)[1].tolist())
+    session = new_session("photo.png", "truck.ply", "--pipeline", "small.json", "--box", *box)
+    session.load()
+    session.limit = 0.0
     with pytest.raises(CurviregError, match=r"stopped after 0 s in the stage .bank."):
         session.register()
     assert session.result is None

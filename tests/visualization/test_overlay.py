@@ -37,8 +37,7 @@ def fraction_near(contour, mask, pixels):
 
 def shifted(box, fraction):
     """The box moved to the right and up by a fraction of its longer side."""
-    side = (box[2:] - box[:2]).max()
-    return box + fraction * side * torch.tensor([1.0, -1.0, 1.0, -1.0])
+    return box + fraction * (box[2:] - box[:2]).max() * torch.tensor([1.0, -1.0, 1.0, -1.0])
 
 
 def registered(fraction, camera):
@@ -77,14 +76,14 @@ def check_assumed_camera(registrar, result, image, box, truth):
     assert result.translation is None
     check_contour(is_contour(contour_overlay(registrar, result, image, box)), truth)
     rotation, distance = result.allocentric_rotation[None], torch.tensor([result.distance])
-    T, K = (matrices[0] for matrices in registrar.describers[0].cameras_of_boxes(rotation, distance, box[None]))
-    filling = replace(result.hypotheses[0], projection=(T, K))
+    T, K = registrar.describers[0].cameras_of_boxes(rotation, distance, box[None])
+    filling = replace(result.hypotheses[0], projection=(T[0], K[0]))
     assert fraction_near(is_contour(contour_overlay(registrar, filling, image, box)), truth, 2) < 0.5
 
 
 def test_contour_overlay_without_a_camera(without_camera):
-    registrar, result, image, box, T = without_camera
-    check_assumed_camera(registrar, result, image, box, silhouette(T))
+    *registered, T = without_camera
+    check_assumed_camera(*registered, silhouette(T))
 
 
 def test_contour_overlay_of_an_orthographic_pipeline():
@@ -116,9 +115,8 @@ def test_hypotheses_are_projected_at_their_poses(with_camera, without_camera):
         assert float((bounds - box).abs().max()) < 0.35 * float((box[2:] - box[:2]).max())
 
 
-def test_restored_hypotheses_have_the_projection_of_their_start(without_camera):
+def test_restored_hypotheses_have_the_projection_of_their_start(without_camera, bank):
     _, result, image, box, _ = without_camera
-    bank = truck_bank()
     starts = Registrar(bank, pipeline=unrefined(bank))([image], box[None])[0].hypotheses
     start_of_view = {start.view: start for start in starts}
     restored = [h for h in result.hypotheses if torch.equal(h.rotation, start_of_view[h.view].rotation)]
@@ -127,33 +125,22 @@ def test_restored_hypotheses_have_the_projection_of_their_start(without_camera):
         torch.testing.assert_close(hypothesis.projection, start_of_view[hypothesis.view].projection)
 
 
-def test_contour_overlay_uses_the_renderer_of_the_registrar():
-    image, box, _ = scene(0)
-
-    class RecordingRenderer:
-        name = "recording"
-
-        def __init__(self):
-            self.inner, self.sizes = make_renderer(example_mesh()), []
-
-        def render(self, T, K, size, *, orthographic=False):
-            self.sizes.append(size)
-            return self.inner.render(T, K, size, orthographic=orthographic)
-
-    bank = truck_bank()
-    registrar = Registrar(bank, pipeline=unrefined(bank), renderer=RecordingRenderer())
+def test_contour_overlay_uses_the_renderer_of_the_registrar(bank):
+    (image, box, _), renderer, sizes = scene(0), make_renderer(example_mesh()), []
+    render = renderer.render
+    renderer.render = lambda T, K, size, **options: sizes.append(size) or render(T, K, size, **options)
+    registrar = Registrar(bank, pipeline=unrefined(bank), renderer=renderer)
     contour_overlay(registrar, registrar([image], box[None])[0], image, box)
-    assert registrar.describers[0].renderer.sizes[-1] == SIZE
+    assert sizes[-1] == SIZE
     with pytest.raises(InvalidInputError, match="the bank has 2"):
-        Registrar(ViewBank.join([bank, bank]), renderer=RecordingRenderer())
+        Registrar(ViewBank.join([bank, bank]), renderer=renderer)
 
 
 def test_contour_overlay_draws_the_mesh_of_the_hypothesis():
     views = sample_views(azimuth_step=30, elevations=[0, 30])
-    pole = trimesh.creation.box((0.02, 0.02, 0.3))
-    pipeline = truck_bank().pipeline
-    banks = [ViewBank.build(mesh, views, pipeline=pipeline, progress=False) for mesh in (pole, example_mesh())]
-    bank = ViewBank.join(banks)
+    meshes = pole, _ = trimesh.creation.box((0.02, 0.02, 0.3)), example_mesh()
+    options = {"pipeline": truck_bank().pipeline, "progress": False}
+    bank = ViewBank.join([ViewBank.build(mesh, views, **options) for mesh in meshes])
     registrar = Registrar(bank, pipeline=unrefined(bank))
     image, box, T = scene(0)
     result = registrar([image], box[None], CAMERA)[0]
@@ -189,13 +176,13 @@ def test_registration_sheet_enlarges_small_objects(with_camera):
     registrar, result, image, box, _ = with_camera
     sheet = registration_sheet(registrar, result, image, box)
     H, W = SIZE
-    canvas = torch.zeros(3, 4 * H, 4 * W)
-    canvas[:, H : 2 * H, W : 2 * W] = image
+    canvas = torch.nn.functional.pad(image, (W, 2 * W, H, 2 * H))
     shift = torch.tensor([W, H], dtype=torch.float64)
-    T, K = result.projection
+    first, *others = result.hypotheses
+    T, K = first.projection
     K = K.clone()
     K[:2, 2] += shift
-    moved = replace(result, hypotheses=(replace(result.hypotheses[0], projection=(T, K)), *result.hypotheses[1:]))
+    moved = replace(result, hypotheses=(replace(first, projection=(T, K)), *others))
     other = registration_sheet(registrar, moved, canvas, box + shift.repeat(2))
     assert other.shape == sheet.shape
     overlay = np.s_[: 2 * TILE, : sheet.shape[1] - 2 * TILE]

@@ -63,9 +63,8 @@ def test_pose_glb_extras_hold_pose_and_camera():
     image, _, T = scene(0)
     K = camera_matrix(260.0, 255.0, 100.0, 95.0, dtype=torch.float64)
     tree = tree_of(pose_glb(trimesh.creation.box(), T, K, image, photograph=False))
-    node = next(n for n in tree["nodes"] if "camera" in n)
-    assert node["extras"]["T_cam_from_model"] == T.tolist()
-    assert node["extras"]["camera_matrix"] == K.tolist()
+    extras = next(n for n in tree["nodes"] if "camera" in n)["extras"]
+    assert (extras["T_cam_from_model"], extras["camera_matrix"]) == (T.tolist(), K.tolist())
     assert "images" not in tree
 
 
@@ -85,10 +84,9 @@ def test_pose_glb_keeps_vertex_colours():
     assert tree["materials"][part["material"]]["pbrMetallicRoughness"]["metallicFactor"] == 0
 
 
-def test_pose_glb_refuses_poses_behind_the_camera():
+@pytest.mark.parametrize(("z", "message"), [(-2.0, "behind the camera"), (torch.nan, "finite")])
+def test_pose_glb_refuses_unusable_poses(z, message):
     T = torch.eye(4, dtype=torch.float64)
-    T[2, 3] = -2.0
-    with pytest.raises(InvalidInputError, match="behind the camera"):
+    T[2, 3] = z
+    with pytest.raises(InvalidInputError, match=message):
         pose_glb(trimesh.creation.box(), T, CAMERA, torch.rand(3, *SIZE))
-    with pytest.raises(InvalidInputError, match="finite"):
-        pose_glb(trimesh.creation.box(), T * torch.nan, CAMERA, torch.rand(3, *SIZE))
