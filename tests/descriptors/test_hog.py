@@ -125,15 +125,14 @@ def test_hog_bin_weights_stay_positive() -> None:
     assert float(out.min()) >= 0.0
 
 
-@pytest.mark.parametrize("weight", [-1e-3, math.nan])
-def test_hog_rejects_negative_bin_weights(weight: float) -> None:
-    with pytest.raises(InvalidInputError, match="bin_weights: expected factors >= 0"):
-        hog(torch.zeros(1, 2, 16, 16), bin_weights=torch.tensor([weight, *[1.0] * 8]))
-
-
-def test_hog_rejects_wrong_shapes() -> None:
-    field = torch.zeros(1, 2, 16, 16)
-    with pytest.raises(InvalidInputError, match="at least 32 x 32 px"):
-        hog(field, grid=32)
-    with pytest.raises(InvalidInputError, match=r"bin_weights: expected shape \(9\)"):
-        hog(field, bin_weights=torch.ones(8))
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        *(({"bin_weights": torch.tensor([w, *[1.0] * 8])}, "expected factors >= 0") for w in (-1e-3, math.nan)),
+        ({"bin_weights": torch.ones(8)}, r"bin_weights: expected shape \(9\)"),
+        ({"grid": 32}, "at least 32 x 32 px"),
+    ],
+)
+def test_hog_rejects_wrong_weights_and_grids(options: dict[str, object], message: str) -> None:
+    with pytest.raises(InvalidInputError, match=message):
+        hog(torch.zeros(1, 2, 16, 16), **options)

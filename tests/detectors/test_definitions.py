@@ -107,16 +107,6 @@ def test_sift_keeps_the_strongest_keypoint_of_each_pixel(fraction: float) -> Non
     assert torch.equal(detection.points, detection.response > 0)
 
 
-def test_laplacian_of_gaussian_finds_the_outline_of_a_disc() -> None:
-    axis = torch.arange(65.0) - 32
-    r = (axis[:, None] ** 2 + axis**2).sqrt()
-    detection = detectors.laplacian_of_gaussian(torch.sigmoid((20 - r) / 0.5)[None, None], fraction=0.04)
-    # Rounding causes crossings in flat regions too, a thousand times weaker.
-    strong = detection.points[0, 0] & (detection.response[0, 0] > 1e-3 * detection.response.max())
-    assert int(strong.sum()) > 100
-    assert float((r[strong] - 20).abs().max()) < 1.5
-
-
 @pytest.mark.parametrize("contrast", [1.0, -0.5])
 @pytest.mark.parametrize("transposed", [False, True])
 def test_laplacian_of_gaussian_finds_a_step_through_a_pixel_centre(contrast: float, transposed: bool) -> None:
@@ -145,9 +135,8 @@ def test_laplacian_of_gaussian_finds_a_step_through_a_pixel_centre(contrast: flo
 def test_laplacian_of_gaussian_of_a_step_has_the_closed_form(sigma: float, tolerance: float, transposed: bool) -> None:
     """Beside a step of height A smoothed by s, L(x) = -A x exp(-x^2 / 2 s^2) / (sqrt(2 pi) s^3), sampled at +-1/2."""
     image = (0.8 * (torch.arange(64) >= 30).double()).expand(1, 1, 40, 64)
-    response = detectors.laplacian_of_gaussian(image.mT if transposed else image, sigma=sigma, fraction=1.0).response[
-        0, 0
-    ]
+    image = image.mT if transposed else image
+    response = detectors.laplacian_of_gaussian(image, sigma=sigma, fraction=1.0).response[0, 0]
     line = response[:, 20] if transposed else response[20]
     expected = 0.8 * math.exp(-0.125 / sigma**2) / (math.sqrt(2 * math.pi) * sigma**3)
     assert int(line.argmax()) == 29  # the left or upper one of the two pixels

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import kornia
 import pytest
 import torch
 from kornia.augmentation import AugmentationSequential, ImageSequential, RandomHorizontalFlip
@@ -99,14 +98,3 @@ def test_layers_in_kornias_augmentation_sequences(layer: nn.Module) -> None:
     image, flipped_mask = augment(colour, mask)
     torch.testing.assert_close(image, layer(flipped))
     torch.testing.assert_close(flipped_mask, mask.flip(-1))
-
-
-def test_smoothing_derivatives_and_sobel_equal_kornias() -> None:
-    image = photos(2, 40, dtype=torch.float64)
-    inner = (..., slice(6, -6), slice(6, -6))  # borders differ
-    smooth = kornia.filters.gaussian_blur2d(image, (9, 9), (1.0, 1.0), border_type="replicate")
-    torch.testing.assert_close(filters.gaussian_smooth(image, 1.0), smooth)
-    first = kornia.filters.spatial_gradient(smooth, "diff", 1)[:, 0]
-    torch.testing.assert_close(filters.image_gradient(image)[inner], first[inner])
-    sobel = kornia.filters.spatial_gradient(image, "sobel", 1)[:, 0].norm(dim=1, keepdim=True)
-    torch.testing.assert_close(detectors.sobel(image).response[inner], sobel[inner])

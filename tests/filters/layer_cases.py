@@ -80,39 +80,30 @@ PAIRS = {
 """Function, inputs and module of every layer."""
 
 OPTIONS: dict[str, dict[str, object]] = {
-    "cs": {},
+    **{name: {} for name in PAIRS},
     "cs-paper": {"formula": "paper"},
-    "asg": {},
     "asg-perspective": {"camera_matrix": CAMERA},
-    "hfn": {},
-    "ar": {},
-    "ig": {},
-    "ics": {},
     "diffusion": {"iterations": 4},
     "diffusion-exponential": {"iterations": 4, "conductance": "exponential"},
     "mcs": {"scales": 3},
     "mcs-bilateral": {"scales": 2, "smoothing": "bilateral"},
     "mcs-guided": {"scales": 3, "smoothing": "guided"},
-    "blur": {},
     "blur-saliency": {"mode": "reblur-saliency"},
-    "mfc": {},
     "mfc-alone": {"saliency_weight": 0.0},
     "pci": {"sigmas": (1.0, 2.0)},
-    "hog": {},
     "hog-hard": {"voting": "hard"},
 }
 
 
 def _case(name: str, options: dict[str, object]) -> LayerCase:
     kind = name.partition("-")[0]
-    is_hog = kind == "hog"
     return LayerCase(
         name,
         *PAIRS[kind],
         options,
-        gradcheck_options={"grid": 4} if is_hog else {},
+        gradcheck_options={"grid": 4} if kind == "hog" else {},
         constant_gives_zero=kind not in ("diffusion", "blur", "hog"),
-        min_size=8 if is_hog else 1,
+        min_size=8 if kind == "hog" else 1,
         accepts_colour=kind != "diffusion",
     )
 

@@ -19,14 +19,9 @@ MODULES = {
     "cs": (filters.DepthCurvilinearSaliency, {"sigma": 0.9}, depths, {"sigma"}),
     "diffusion": (filters.AnisotropicDiffusion, {"iterations": 3}, photos, {"kappa"}),
     "mcs": (filters.MultiScaleCurvilinearSaliency, {"sigma": 0.9, "scales": 3}, photos, {"sigma", "kappa"}),
-    "mcs-guided": (
-        filters.MultiScaleCurvilinearSaliency,
-        {"sigma": 0.9, "scales": 3, "smoothing": "guided"},
-        photos,
-        {"sigma", "kappa"},
-    ),
     "mfc": (filters.MultiScaleFocusCurves, {"sigma": 0.9}, photos, {"sigma"}),
 }
+MODULES["mcs-guided"] = (MODULES["mcs"][0], {**MODULES["mcs"][1], "smoothing": "guided"}, *MODULES["mcs"][2:])
 
 
 @pytest.mark.parametrize("name", list(MODULES))
@@ -75,14 +70,8 @@ def test_learnable_modules_stay_positive_and_finite_after_large_steps(name: str)
 def test_learnable_options_reject_values_that_are_not_positive() -> None:
     for call, message in (
         (lambda: filters.ImageGradient(sigma=0.0, learnable=True), "sigma: expected a finite number > 0, got 0"),
-        (
-            lambda: filters.AnisotropicDiffusion(iterations=1, kappa=-1.0, learnable=True),
-            "kappa: expected a finite number > 0, got -1",
-        ),
-        (
-            lambda: filters.image_gradient(photos(), sigma=torch.tensor(-1.0)),
-            "sigma: expected a finite number >= 0, got -1",
-        ),
+        (lambda: filters.AnisotropicDiffusion(iterations=1, kappa=-1.0, learnable=True), "kappa: .* > 0, got -1"),
+        (lambda: filters.image_gradient(photos(), sigma=torch.tensor(-1.0)), "sigma: .* >= 0, got -1"),
         (lambda: filters.image_gradient(photos(), sigma=torch.ones(2)), r"sigma: expected shape \(\), got \(2,\)"),
     ):
         with pytest.raises(InvalidInputError, match=message):

@@ -18,11 +18,7 @@ WRONG: list[tuple[str, dict[str, object], str]] = [
     ("cs", {"depth_scale": 0.0}, "depth_scale"),
     ("asg", {"sigma": math.nan}, "sigma"),
     ("asg", {"camera_matrix": torch.eye(4)}, "camera_matrix: expected shape"),
-    (
-        "asg",
-        {"camera_matrix": torch.eye(3), "depth_scale": 1.0},
-        "depth_scale: has no meaning with a camera_matrix",
-    ),
+    ("asg", {"camera_matrix": torch.eye(3), "depth_scale": 1.0}, "depth_scale: has no meaning with a camera_matrix"),
     ("ar", {"camera_matrix": torch.eye(3), "depth_scale": 1.0}, "depth_scale: has no meaning with a camera_matrix"),
     ("ar", {"depth_scale": -1.0}, "depth_scale"),
     ("hfn", {"depth_scale": math.inf}, "depth_scale"),

