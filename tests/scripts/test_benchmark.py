@@ -19,10 +19,8 @@ def folder(tmp_path_factory):
     picture[:32, :32], picture[:32, 32:], picture[32:, :32] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
     cv2.imwrite(str(folder / "print.png"), picture[..., ::-1])
     (folder / "model.mtl").write_text("newmtl paper\nKd 1 1 1\nmap_Kd print.png\nnewmtl grey\nKd 0.5 0.5 0.5\n")
-    lines = ["mtllib model.mtl"]
-    lines += [f"v {x} {y} {z}" for x in (-1, 1) for y in (-0.5, 0.5) for z in (0, 1)]
-    lines += ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
-    lines += ["usemtl paper", "f 1/1 5/2 6/3 2/4"]  # the front, y = -0.5
+    lines = ["mtllib model.mtl", *(f"v {x} {y} {z}" for x in (-1, 1) for y in (-0.5, 0.5) for z in (0, 1))]
+    lines += ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1", "usemtl paper", "f 1/1 5/2 6/3 2/4"]  # the front, y = -0.5
     lines += ["usemtl grey", "f 3 4 8 7", "f 1 2 4 3", "f 5 7 8 6", "f 2 6 8 4", "f 1 3 7 5"]
     (folder / "model.obj").write_text("\n".join(lines) + "\n")
     return folder

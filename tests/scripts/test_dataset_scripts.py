@@ -3,45 +3,37 @@
 import hashlib
 import importlib.util
 import json
-import runpy
-import sys
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import ClassVar
 
 import pytest
 
 from curvireg_torch.data import Pascal3DPlus
-from tests._support.miniature import pascal_object, write_bop, write_image, write_mesh, write_pascal3d, write_record
-from tests._support.miniature import write_web as write_web_tree
-
-SCRIPTS = Path(__file__).parents[2] / "datasets"
+from tests._support import miniature
+from tests._support.miniature import pascal_object, write_bop, write_pascal3d, write_web
+from tests._support.scripts import ROOT
 
 
 def load(name):
-    spec = importlib.util.spec_from_file_location(f"datasets_{name}", SCRIPTS / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(f"datasets_{name}", ROOT / "datasets" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
 @pytest.mark.parametrize("name", ["download", "verify", "convert_objectnet3d"])
-def test_help(name, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", [f"{name}.py", "--help"])
-    with pytest.raises(SystemExit) as stop:
-        runpy.run_path(str(SCRIPTS / f"{name}.py"), run_name="__main__")
-    assert not stop.value.code
-    output = capsys.readouterr()
-    assert "Exit code" in output.out or "manifest" in output.out
-    assert not output.err
+def test_help(name, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        load(name).main(["--help"])
+    output = capsys.readouterr().out
+    assert "Exit code" in output or "manifest" in output
 
 
 def test_verify_defective_trees(tmp_path, capsys):
-    verify = load("verify")
-    for kind, write in (("pascal3d", write_pascal3d), ("bop", write_bop), ("web", write_web_tree)):
+    for kind, write in (("pascal3d", write_pascal3d), ("bop", write_bop), ("web", write_web)):
         write(tmp_path / kind)
-        assert verify.main([kind, str(tmp_path / kind)]) == 1
+        assert load("verify").main([kind, str(tmp_path / kind)]) == 1
     out = capsys.readouterr().out
     assert "5 objects in 4 photographs" in out
     assert "left out, other_class: 3" in out
@@ -49,13 +41,12 @@ def test_verify_defective_trees(tmp_path, capsys):
 
 
 def test_verify_tree_without_defects_and_with_a_truncated_photograph(tmp_path, capsys):
-    verify = load("verify")
     write_pascal3d(tmp_path)
     arguments = ["pascal3d", str(tmp_path), "--categories", "sofa", "--images"]
-    assert verify.main(arguments) == 0
+    assert load("verify").main(arguments) == 0
     path = tmp_path / "Images" / "sofa_pascal" / "2008_000002.jpg"
     path.write_bytes(path.read_bytes()[:300])
-    assert verify.main(arguments) == 1
+    assert load("verify").main(arguments) == 1
     assert "defect, corrupt_image: 1" in capsys.readouterr().out
 
 
@@ -66,29 +57,28 @@ def test_verify_unusable_tree(tmp_path, capsys):
 
 @pytest.mark.parametrize("cad", ["CAD/off", "CAD"])
 def test_convert_objectnet3d(tmp_path, cad, capsys):
-    convert = load("convert_objectnet3d")
+    convert = load("convert_objectnet3d").main
     root, out = tmp_path / "ObjectNet3D", tmp_path / "out"
-    both = [pascal_object("car", viewpoint={"viewport": 2000.0}), pascal_object("ashtray")]
-    write_record(root / "Annotations" / "n1_1.mat", both)
-    write_record(root / "Annotations" / "n1_2.mat", [pascal_object("ashtray")])
-    write_record(root / "Annotations" / "n1_3.mat", [])
-    for i in (1, 2, 3):
-        write_image(root / "Images" / f"n1_{i}.jpg")
-        (root / "Images" / f"n1_{i}.jpg").rename(root / "Images" / f"n1_{i}.JPEG")
-    write_mesh(root / cad / "car" / "01.off")
-    write_mesh(root / cad / "ashtray" / "01.off")
+    arguments = [str(root), str(out), "--splits", "val"]
+    car, ashtray = pascal_object("car", viewpoint={"viewport": 2000.0}), pascal_object("ashtray")
+    for name, objects in (("n1_1", [car, ashtray]), ("n1_2", [ashtray]), ("n1_3", [])):
+        miniature.write_record(root / "Annotations" / f"{name}.mat", objects)
+        miniature.write_image(root / "Images" / f"{name}.jpg")
+        (root / "Images" / f"{name}.jpg").rename(root / "Images" / f"{name}.JPEG")
+    for category in ("car", "ashtray"):
+        miniature.write_mesh(root / cad / category / "01.off")
     (root / "Image_sets").mkdir()
     (root / "Image_sets" / "val.txt").write_text("n1_1\nn1_2\nn1_3\n")
-    assert convert.main([str(root), str(out), "--splits", "val"]) == 0
-    assert convert.main([str(root), str(out), "--splits", "val"]) == 0, "running it again changes nothing"
+    assert convert(arguments) == 0
+    assert convert(arguments) == 0, "running it again changes nothing"
     dataset = Pascal3DPlus(out, part="imagenet")
     found = [(s["category"], s["image_id"]) for s in map(dataset.annotation, range(len(dataset)))]
     assert found == [("ashtray", "n1_1"), ("ashtray", "n1_2"), ("car", "n1_1")]
     assert dataset[2]["camera_matrix"][0, 0] == 2000
     (root / "Image_sets" / "val.txt").write_text("n1_1\nn1_9\n../n1_1\n")
-    assert convert.main([str(root), str(out), "--splits", "val"]) == 1
+    assert convert(arguments) == 1
     assert "2 missing_annotation, 1 placed" in capsys.readouterr().out
-    assert convert.main([str(tmp_path / "nothing"), str(out)]) == 2
+    assert convert([str(tmp_path / "nothing"), str(out)]) == 2
 
 
 CONTENT = bytes(range(256)) * 40
@@ -132,60 +122,53 @@ def server():
         thread.join()
 
 
-def test_download_records_then_verifies(tmp_path, server, capsys):
+@pytest.fixture
+def download(tmp_path, server):
+    """Run the script with ``words``; returns its exit code."""
+    return lambda *words: load("download").main([server[1], "--out", str(tmp_path / "new"), *words])
+
+
+def test_download_records_then_verifies(tmp_path, server, download, capsys):
     handler, url = server
-    main = load("download").main
-    assert main([url, "--out", str(tmp_path / "new")]) == 0
+    assert download() == 0
     assert (tmp_path / "new" / "set a.zip").read_bytes() == CONTENT
     assert json.loads((tmp_path / "new" / "manifest.json").read_text()) == {
         "set a.zip": {"url": url, "size": len(CONTENT), "sha256": hashlib.sha256(CONTENT).hexdigest()}
     }
-    assert main([url, "--out", str(tmp_path / "new")]) == 0
+    assert download() == 0
     assert len(handler.ranges) == 1, "the second run downloads nothing"
     assert capsys.readouterr().out.splitlines() == ["set a.zip: downloaded", "set a.zip: verified"]
     (tmp_path / "new" / "set a.zip").write_bytes(b"changed")
-    assert main([url, "--out", str(tmp_path / "new")]) == 1
+    assert download() == 1
     assert "delete the file" in capsys.readouterr().err
     assert sorted(p.name for p in (tmp_path / "new").iterdir()) == ["manifest.json", "set a.zip"]
 
 
-def test_download_resumes(tmp_path, server, capsys):
-    handler, url = server
-    main = load("download").main
+@pytest.mark.parametrize(("tag", "content"), [('"v1"', CONTENT), ('"v2"', CONTENT[::-1])])
+def test_download_resumes_unless_the_file_changed(tmp_path, server, download, capsys, tag, content):
+    handler = server[0]
     handler.cut = 5000
-    assert main([url, "--out", str(tmp_path)]) == 1
+    assert download() == 1
     assert "run again" in capsys.readouterr().err
-    handler.cut = None
-    assert main([url, "--out", str(tmp_path)]) == 0
+    handler.cut, handler.tag, handler.content = None, tag, content
+    assert download() == 0
     assert handler.ranges == [None, "bytes=5000-"]
-    assert (tmp_path / "set a.zip").read_bytes() == CONTENT
+    assert (tmp_path / "new" / "set a.zip").read_bytes() == content
 
 
-def test_download_starts_again_when_the_file_changed(tmp_path, server):
-    handler, url = server
-    main = load("download").main
-    handler.cut = 5000
-    assert main([url, "--out", str(tmp_path)]) == 1
-    handler.cut, handler.tag, handler.content = None, '"v2"', CONTENT[::-1]
-    assert main([url, "--out", str(tmp_path)]) == 0
-    assert (tmp_path / "set a.zip").read_bytes() == CONTENT[::-1]
+def test_download_completes_a_finished_part(tmp_path, server, download):
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / "set a.zip.part").write_bytes(CONTENT)
+    (tmp_path / "new" / "set a.zip.part.validator").write_text(server[0].tag)
+    assert download() == 0
+    assert (tmp_path / "new" / "set a.zip").read_bytes() == CONTENT
 
 
-def test_download_completes_a_finished_part(tmp_path, server):
-    handler, url = server
-    (tmp_path / "set a.zip.part").write_bytes(CONTENT)
-    (tmp_path / "set a.zip.part.validator").write_text(handler.tag)
-    assert load("download").main([url, "--out", str(tmp_path)]) == 0
-    assert (tmp_path / "set a.zip").read_bytes() == CONTENT
-
-
-def test_download_with_checksum(tmp_path, server, capsys):
-    _, url = server
-    main = load("download").main
-    assert main([url, "--out", str(tmp_path), "--sha256", "0" * 64]) == 1
+def test_download_with_checksum(tmp_path, download, capsys):
+    assert download("--sha256", "0" * 64) == 1
     assert "discarded" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-    assert main([url, "--out", str(tmp_path), "--sha256", hashlib.sha256(CONTENT).hexdigest().upper()]) == 0
+    assert list((tmp_path / "new").iterdir()) == []
+    assert download("--sha256", hashlib.sha256(CONTENT).hexdigest().upper()) == 0
 
 
 @pytest.mark.parametrize("url", ["file:///etc/hostname", "https://host/", "plain"])

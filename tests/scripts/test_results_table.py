@@ -13,22 +13,22 @@ from tests.evaluation.small import SMALL
 
 
 @pytest.fixture
-def run(monkeypatch):
-    """Run the script on a repository; returns its exit code."""
-
-    def exit_code(root, *words):
-        monkeypatch.setattr(sys, "argv", ["results_table.py", "--root", str(root), *map(str, words)])
-        return results_table.main()
-
-    return exit_code
-
-
-@pytest.fixture
 def repository(tmp_path):
     root = tmp_path / "repository"
     root.mkdir()
     root.joinpath("README.md").write_text("# Title\n\n<!-- results:begin -->\nold\n<!-- results:end -->\n\nend\n")
     return root
+
+
+@pytest.fixture
+def run(repository, monkeypatch):
+    """Run the script on the repository; returns its exit code."""
+
+    def exit_code(*words):
+        monkeypatch.setattr(sys, "argv", ["results_table.py", "--root", str(repository), *map(str, words)])
+        return results_table.main()
+
+    return exit_code
 
 
 def test_results_table_from_summaries(run, repository, pascal, bop, tmp_path, monkeypatch):
@@ -39,10 +39,10 @@ def test_results_table_from_summaries(run, repository, pascal, bop, tmp_path, mo
         ("cubes", BOPBenchmark(bop, Protocol(pose="any", box=0.1))),
     ):
         evaluate(benchmark, tmp_path / name, progress=False)
-        assert run(repository, "--record", tmp_path / name / "summary.json", name) == 0
-    assert run(repository, "--check") == 1, "the README has the old table"
-    assert run(repository) == 0
-    assert run(repository, "--check") == 0
+        assert run("--record", tmp_path / name / "summary.json", name) == 0
+    assert run("--check") == 1, "the README has the old table"
+    assert run() == 0
+    assert run("--check") == 0
     text = (repository / "README.md").read_text()
     assert text.startswith("# Title\n\n<!-- results:begin -->\n**Viewpoints")
     assert text.endswith("<!-- results:end -->\n\nend\n")
@@ -53,7 +53,7 @@ def test_results_table_from_summaries(run, repository, pascal, bop, tmp_path, mo
     widths = [line.count("|") for line in text.splitlines() if line.startswith("|")]
     assert set(widths[:3]) == {widths[0]}
     assert set(widths[3:]) == {widths[3]}
-    assert run(repository) == 0
+    assert run() == 0
     assert (repository / "README.md").read_text() == text
 
 
@@ -65,31 +65,30 @@ def test_counted_names_views_and_lightings():
 
 def test_results_table_rejects_a_readme_without_markers(run, repository, capsys):
     repository.joinpath("README.md").write_text("# Title\n")
-    assert run(repository) == 2
+    assert run() == 2
     assert "results:begin" in capsys.readouterr().err
 
 
 def test_results_table_is_empty_without_results(run, repository):
-    assert run(repository) == 0
+    assert run() == 0
     assert "<!-- results:begin -->\n<!-- results:end -->" in (repository / "README.md").read_text()
 
 
 def test_record_stores_the_commit(run, repository, tmp_path):
+    def recorded_commit():
+        run("--record", tmp_path / "summary.json", "x")
+        return json.loads((repository / "scripts" / "results" / "evaluation_x.json").read_text())["commit"]
+
     tmp_path.joinpath("summary.json").write_text("{}")
-    run(repository, "--record", tmp_path / "summary.json", "x")
-    path = repository / "scripts" / "results" / "evaluation_x.json"
-    assert json.loads(path.read_text())["commit"] == "unknown"
+    assert recorded_commit() == "unknown"
     git = ["git", "-C", str(repository), "-c", "user.name=a", "-c", "user.email=a@b"]
     (repository / "code.py").write_text("x = 1\n")
     for words in (["init", "-q"], ["add", "README.md", "code.py"], ["commit", "-qm", "x"]):
         subprocess.run([*git, *words], check=True)
-    run(repository, "--record", tmp_path / "summary.json", "x")
-    clean = json.loads(path.read_text())["commit"]
+    clean = recorded_commit()
     assert clean.isalnum()
     subprocess.run([*git, "add", "scripts"], check=True)
     repository.joinpath("README.md").write_text("changed")
-    run(repository, "--record", tmp_path / "summary.json", "x")
-    assert json.loads(path.read_text())["commit"] == clean, "measurements do not depend on files that scripts write"
+    assert recorded_commit() == clean, "measurements do not depend on files that scripts write"
     (repository / "code.py").write_text("x = 2\n")
-    run(repository, "--record", tmp_path / "summary.json", "x")
-    assert json.loads(path.read_text())["commit"] == clean + "+"
+    assert recorded_commit() == clean + "+"

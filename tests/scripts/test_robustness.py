@@ -96,7 +96,7 @@ def test_soak_growth_is_detected():
 def test_soak_of_two_processes_with_one_cache(tmp_path):
     out = tmp_path / "soak.json"
     # --allow: so few registrations only warm up.
-    words = ["--count", "40", "--processes", "2", "--reopen", "5", "--allow", "100", "--out", str(out)]
+    words = ["--count", "40", "--processes", "2", "--reopen", "5", "--allow", "100", "--out", out]
     command = [sys.executable, "-m", "scripts.robustness.soak", *words]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, cwd=ROOT)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,14 +14,14 @@ from curvireg_torch.models import FieldNetwork, LearnedCurvilinearSaliency, doub
 from curvireg_torch.training import FieldDataset, ReplayBuffer, adapt, augment, losses
 from curvireg_torch.training.field_dataset import SETTINGS
 from curvireg_torch.training.scenes import GeneratedScenes
+from tests._support.scripts import ROOT
 
 
 @pytest.fixture(scope="module")
 def batch():
     dataset = FieldDataset(GeneratedScenes(4, seed=1))
-    items = [dataset[i] for i in range(4)]
-    stacked = {k: torch.stack([item[k] for item in items]).float() for k in items[0]}
-    return {**stacked, "image": stacked["image"] / 255}
+    stacked = torch.utils.data.default_collate([dataset[i] for i in range(4)])
+    return {name: values.float() / (255 if name == "image" else 1) for name, values in stacked.items()}
 
 
 def test_field_dataset_targets_are_those_of_a_bank(batch):
@@ -75,28 +74,22 @@ def test_losses_decrease_in_training(batch):
     optimizer = torch.optim.AdamW(network.parameters(), lr=3e-3)
     history = []
     for _ in range(25):
-        parts = losses(network(batch["image"]), batch)
-        loss = torch.stack(list(parts.values())).sum()
-        history.append(float(loss.detach()))
+        history.append(sum(losses(network(batch["image"]), batch).values()))
         optimizer.zero_grad()
-        loss.backward()
+        history[-1].backward()
         optimizer.step()
     assert history[-1] < 0.7 * history[0]
 
 
 def test_adapt_changes_weights_but_no_statistics():
-    mesh = trimesh.creation.box((1, 2, 3))
-    before = FieldNetwork().state_dict().keys()
-    field = adapt(mesh, scenes=8, workers=0, progress=False)
-    again = adapt(mesh, scenes=8, workers=0, progress=False)
+    networks = [adapt(trimesh.creation.box((1, 2, 3)), scenes=8, progress=False).network for _ in range(2)]
+    adapted, again = (network.state_dict() for network in networks)
     packaged = LearnedCurvilinearSaliency().network.state_dict()
-    adapted = field.network.state_dict()
-    assert adapted.keys() == before
+    assert adapted.keys() == packaged.keys()
     assert not torch.equal(adapted["head.weight"], packaged["head.weight"])
-    means = [k for k in before if k.endswith("running_mean")]
-    assert all(torch.equal(adapted[k], packaged[k]) for k in means)
-    assert torch.equal(adapted["head.weight"], again.network.state_dict()["head.weight"])
-    assert not any(p.requires_grad for p in field.network.parameters())
+    assert torch.equal(adapted["head.weight"], again["head.weight"])
+    assert all(torch.equal(adapted[k], packaged[k]) for k in packaged if k.endswith("running_mean"))
+    assert not any(p.requires_grad for p in networks[0].parameters())
 
 
 def test_adapt_works_in_a_script_without_main_guard(tmp_path):
@@ -108,8 +101,7 @@ def test_adapt_works_in_a_script_without_main_guard(tmp_path):
         "adapt(trimesh.creation.box(), scenes=1, progress=False).save('adapted.safetensors')\n"
         "print('done')\n"
     )
-    root = Path(__file__).parents[2]
-    environment = {**os.environ, "PYTHONPATH": str(root)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, script], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, "done\n"), done.stderr
     assert (tmp_path / "adapted.safetensors").is_file()
