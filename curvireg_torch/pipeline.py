@@ -1,8 +1,8 @@
 """Everything that decides a result, in one frozen value: the only source of defaults."""
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from dataclasses import field as dataclass_field
 from os import PathLike
 from pathlib import Path
@@ -20,14 +20,7 @@ from .utils.choices import DEFAULT
 from .utils.digests import tensor_digest
 from .utils.registry import Registry
 
-__all__ = [
-    "DEFAULT",
-    "FIELDS",
-    "PRESETS",
-    "Pipeline",
-    "field_digest",
-    "preset_named",
-]
+__all__ = ["DEFAULT", "FIELDS", "PRESETS", "Pipeline", "field_digest", "preset_named"]
 
 VERSION = 1
 """Of the JSON form."""
@@ -117,15 +110,9 @@ class Pipeline:
         return replace(self, field=f"{CUSTOM}{type(field).__name__}", weights=field_digest(field))
 
     def photograph_field(self) -> nn.Module:
-        """The filter of photographs.
-
-        Raises:
-            InvalidInputError: a custom field, or packaged weights with another digest than ``weights``.
-        """
+        """The filter of photographs; refuses a custom field, and packaged weights of another digest."""
         if self.field.startswith(CUSTOM):
-            raise InvalidInputError(
-                f"field: {self.field!r} was passed by the caller; pass the module again (field=...)"
-            )
+            raise InvalidInputError(f"field: {self.field!r} was passed by the caller; pass it again (field=...)")
         if self.field == "learned" and self.weights != SHA256[:16]:
             raise InvalidInputError(
                 f"field: expected weights {self.weights}, got packaged {SHA256[:16]}; pass the module (field=...)"
@@ -142,26 +129,16 @@ class Pipeline:
 
     def describe(self) -> dict[str, Any]:
         """All settings as plain numbers, strings, lists and dictionaries for JSON."""
-        described = {f.name: getattr(self, f.name) for f in fields(self)}
-        nested = {
-            "views": {**asdict(self.views), "elevations": list(self.views.elevations)},
-            "bank": asdict(self.bank),
-            "terms": {term.name: asdict(term) for term in self.terms},
-            "locate": asdict(self.locate),
-        }
-        return {"version": VERSION, **described, **nested}
+        described = {"version": VERSION, **asdict(self), "terms": {term.name: asdict(term) for term in self.terms}}
+        described["views"]["elevations"] = list(self.views.elevations)
+        return described
 
     def to_json(self) -> str:
-        """The pipeline as a JSON text, which :meth:`from_json` reads."""
         return json.dumps(self.describe(), indent=2) + "\n"
 
     @classmethod
     def from_json(cls, text: str) -> "Pipeline":
-        """Read what :meth:`to_json` wrote, or a part of it; what is missing keeps its default.
-
-        Raises:
-            InvalidInputError: not JSON, another version, an unknown name or a number out of range.
-        """
+        """Read what :meth:`to_json` wrote, or a part of it; what is missing keeps its default."""
         try:
             data = json.loads(text)
         except (ValueError, RecursionError) as error:
@@ -175,18 +152,14 @@ class Pipeline:
                 if name in data:
                     data[name] = settings(**data[name])
             if "terms" in data:
-                data["terms"] = tuple(_term(name, options) for name, options in data["terms"].items())
+                data["terms"] = tuple(TERMS[name](**options) for name, options in data["terms"].items())
             return cls(**data)
         except (TypeError, AttributeError) as error:
             raise InvalidInputError(f"pipeline: {error}; compare with Pipeline().to_json()") from error
 
     @classmethod
     def read(cls, path: str | PathLike[str]) -> "Pipeline":
-        """Read a JSON file.
-
-        Raises:
-            MissingFileError, InvalidInputError.
-        """
+        """Read a JSON file, see :meth:`from_json`."""
         path = Path(path)
         if not path.is_file():
             raise MissingFileError(f"{path}: no such pipeline; write one with Pipeline().to_json()")
@@ -200,10 +173,6 @@ def field_digest(field: nn.Module) -> str:
     """16 hexadecimal digits of a module's parameters and buffers; "" for a module without any."""
     state = field.state_dict()
     return tensor_digest(state) if state else ""
-
-
-def _term(name: str, options: Mapping[str, Any]) -> Term:
-    return TERMS[name](**options)
 
 
 _CLASSICAL_TERMS: tuple[Term, ...] = (Correlation(), Repeatability(), BoxShape())
@@ -225,10 +194,6 @@ the paper's own settings, as far as it states them."""
 
 
 def preset_named(name: str) -> Pipeline:
-    """The preset of that name.
-
-    Raises:
-        InvalidInputError: there is none.
-    """
+    """``PRESETS[name]``, or an :class:`InvalidInputError` that lists the presets."""
     check_option(name, list(PRESETS), "preset")
     return PRESETS[name]

@@ -59,14 +59,7 @@ class ViewPolicy:
         return {name: getattr(self, name) for name in ("pose", *names.get(self.pose, ()))}
 
     def sphere(self, up: str = "z") -> ViewSphere:
-        """The viewpoints.
-
-        Args:
-            up: axis of the mesh that points up, for "upright" (:func:`curvireg_torch.io.meshes.mesh_up`).
-
-        Raises:
-            InvalidInputError: ``pose`` is "given".
-        """
+        """The viewpoints; ``up`` is the axis of the mesh that points up, for "upright"."""
         if self.pose == "given":
             raise InvalidInputError("views: the views of this pipeline were passed by the caller; pass them again")
         if self.pose == "upright":

@@ -42,11 +42,7 @@ def fraction_within_30_degrees(field: torch.nn.Module, bank: ViewBank, scenes: l
 def test_focus_curves_rank_better_than_simpler_fields():
     folder, backgrounds = real_data("meshes"), sorted(real_data("backgrounds").glob("*.jpg"))
     pictures = [F.interpolate(read_image(p)[None], SIZE, mode="bilinear", antialias=True)[0] for p in backgrounds]
-    fields = {
-        "MFC": MultiScaleFocusCurves(),
-        "MCS": MultiScaleCurvilinearSaliency(),
-        "gradient": ImageGradient(),
-    }
+    fields = {"MFC": MultiScaleFocusCurves(), "MCS": MultiScaleCurvilinearSaliency(), "gradient": ImageGradient()}
     fractions: dict[str, list[float]] = {name: [] for name in fields}
     for name in ("spot", "rocker-arm", "beetle"):
         mesh = load_mesh(folder / f"{name}.obj")

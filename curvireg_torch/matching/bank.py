@@ -61,11 +61,7 @@ class ViewBank:
 
     @property
     def mesh(self) -> trimesh.Trimesh:
-        """The mesh of a bank of one mesh.
-
-        Raises:
-            InvalidInputError: there are several; see ``meshes``.
-        """
+        """The mesh of a bank of one mesh; an error if there are several."""
         if len(self.meshes) != 1:
             raise InvalidInputError(f"bank: has {len(self.meshes)} meshes; choose one of bank.meshes")
         return self.meshes[0]
@@ -160,11 +156,9 @@ class ViewBank:
             >>> len(bank), bank.descriptors.shape
             (4, torch.Size([4, 1764]))
         """
-        mesh = as_mesh(mesh)
-        pipeline = Pipeline() if pipeline is None else pipeline
-        settings = pipeline.bank if settings is None else settings
-        settings = settings if image_size is None else replace(settings, image_size=image_size)
-        settings = settings if camera is None else replace(settings, camera=camera)
+        mesh, pipeline = as_mesh(mesh), pipeline or Pipeline()
+        options: dict[str, Any] = {"image_size": image_size, "camera": camera}
+        settings = replace(settings or pipeline.bank, **{k: v for k, v in options.items() if v is not None})
         pipeline = replace(pipeline, bank=settings)
         if views is None:
             views = pipeline.views.sphere(mesh_up(mesh))
@@ -180,14 +174,12 @@ class ViewBank:
 
         def describe_chunk(start: int) -> dict[str, Tensor]:
             chunk = rotations[start : start + chunk_size], distances[start : start + chunk_size]
-            described = describe(*chunk)
-            return {
-                **{RERANKING + n: module.describe(describe.shaded(*chunk)).half() for n, module in reranking.items()},
-                "descriptors": described.descriptors,
-                "points": _pack(described.points),
-                "silhouettes": _pack(described.silhouettes),
-                "boxes": described.boxes,
+            tensors = {**vars(describe(*chunk))}
+            tensors |= {name: _pack(tensors[name]) for name in ("points", "silhouettes")}
+            features = {
+                RERANKING + n: module.describe(describe.shaded(*chunk)).half() for n, module in reranking.items()
             }
+            return {**tensors, **features}
 
         parts = []
         with (
@@ -205,13 +197,7 @@ class ViewBank:
 
     @classmethod
     def join(cls, banks: "Sequence[ViewBank]") -> "ViewBank":
-        """Concatenate banks, so that photographs are compared with the views of several models.
-
-        Args:
-            banks: at least one, with equal settings and view policies, on one device.
-
-        Raises:
-            InvalidInputError: no bank, or banks that differ.
+        """Concatenate one or more banks of equal settings, view policies and devices into one of several models.
 
         Example:
             >>> from curvireg_torch.geometry import sample_views
@@ -224,14 +210,12 @@ class ViewBank:
         if not banks:
             raise InvalidInputError("banks: expected at least one bank, got none")
         first = banks[0]
-        properties: dict[str, Callable[[ViewBank], object]] = {
-            "set of settings": lambda bank: bank.settings,
-            "view policy": lambda bank: bank.pipeline.views.key_fields(),
-            "device": lambda bank: bank.device,
-        }
-        for what, value in properties.items():
-            for i, bank in enumerate(banks):
-                mine, theirs = value(bank), value(first)
+        for i, bank in enumerate(banks):
+            for what, mine, theirs in (
+                ("set of settings", bank.settings, first.settings),
+                ("view policy", bank.pipeline.views.key_fields(), first.pipeline.views.key_fields()),
+                ("device", bank.device, first.device),
+            ):
                 if mine != theirs:
                     raise InvalidInputError(f"banks: expected one {what}, but bank {i} has {mine} and bank 0 {theirs}")
         names = [name for name in first.tensors if all(name in bank.tensors for bank in banks)]
@@ -240,13 +224,6 @@ class ViewBank:
         tensors["model"] = torch.cat([bank.model + n for bank, n in zip(banks, shift, strict=True)])
         views = ViewSphere(*(torch.cat([getattr(b.views, f.name) for b in banks]) for f in fields(ViewSphere)))
         return cls([mesh for bank in banks for mesh in bank.meshes], views, first.pipeline, tensors)
-
-    def locate(self, index: int) -> tuple[int, int]:
-        """Index of the model that view ``index`` shows, and of the view among that model's views."""
-        if not 0 <= index < len(self):
-            raise InvalidInputError(f"index: expected 0 <= index < {len(self)}, got {index}")
-        model = int(self.model[index])
-        return model, int((self.model[:index] == model).sum())
 
     def to(self, device: torch.device | str) -> "ViewBank":
         """The same bank on another device."""

@@ -32,11 +32,7 @@ _NO_UNIT = "none"
 
 
 def write_bank(
-    path: Path,
-    meshes: Sequence[trimesh.Trimesh],
-    views: ViewSphere,
-    pipeline: Pipeline,
-    tensors: Mapping[str, Tensor],
+    path: Path, meshes: Sequence[trimesh.Trimesh], views: ViewSphere, pipeline: Pipeline, tensors: Mapping[str, Tensor]
 ) -> None:
     """Write the parts of a bank, see :meth:`ViewBank.save`."""
     contents = {**tensors, "descriptors": tensors["descriptors"].half()}
@@ -66,11 +62,9 @@ def read_bank(path: Path) -> tuple[list[trimesh.Trimesh], ViewSphere, Pipeline, 
             metadata = file.metadata() or {}
             if metadata.get("format") != FORMAT:
                 raise BankError("not a view bank; build one with 'curvireg bank MESH --out FILE'", subject=path)
-            if metadata.get("version") != str(FORMAT_VERSION):
-                raise BankError(
-                    f"bank format {metadata.get('version')}, this library reads {FORMAT_VERSION}; {rebuild}",
-                    subject=path,
-                )
+            if (version := metadata.get("version")) != str(FORMAT_VERSION):
+                message = f"bank format {version}, this library reads {FORMAT_VERSION}; {rebuild}"
+                raise BankError(message, subject=path)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     except (SafetensorError, OSError) as error:
         raise BankError(f"truncated or not a safetensors file ({error}); {rebuild}", subject=path) from error
@@ -121,26 +115,22 @@ def _check_contents(meshes: int, views: ViewSphere, settings: BankSettings, tens
     """Raise ValueError for contents that no bank has: a checksum only shows that the file was not changed."""
     N, S = len(views), settings.image_size
     packed = (N, -(-(S**2) // 8))
-    shapes = {
-        "descriptors": (N, hog_layer(settings).length),
-        "boxes": (N, 4),
-        "model": (N,),
-        "points": packed,
-        "silhouettes": packed,
-    }
+    descriptors, boxes, model = tensors["descriptors"], tensors["boxes"], tensors["model"]
+    shapes = {"descriptors": (N, hog_layer(settings).length), "boxes": (N, 4), "model": (N,)}
+    shapes |= {"points": packed, "silhouettes": packed}
     wrong = [name for name, shape in shapes.items() if tuple(tensors[name].shape) != shape]
     if wrong:
         raise ValueError(f"{', '.join(wrong)}: not of the shape that the settings say")
     viewpoints = torch.stack([getattr(views, f.name).double() for f in fields(ViewSphere)])
-    if not bool(viewpoints.isfinite().all()):
-        raise ValueError("viewpoints that are not finite")
-    for name, x in tensors.items():
-        if name.startswith(RERANKING) and (x.ndim != 2 or len(x) != N or not bool(x.isfinite().all())):
-            raise ValueError(f"features of {name} that do not fit the views, or are not finite")
-    descriptors, boxes, model = tensors["descriptors"], tensors["boxes"], tensors["model"]
-    if not bool(descriptors.isfinite().all()) or not bool(descriptors.any()):
-        raise ValueError("descriptors that are not finite, or all zero")
-    if not bool(boxes.isfinite().all() and (boxes[:, 2:] > boxes[:, :2]).all()):
-        raise ValueError("boxes that are empty or not finite")
-    if int(model.min()) < 0 or int(model.max()) >= meshes:
-        raise ValueError("views of meshes that do not exist")
+    valid: dict[str, Tensor | bool] = {
+        "viewpoints that are not finite": viewpoints.isfinite().all(),
+        "descriptors that are not finite, or all zero": descriptors.isfinite().all() and descriptors.any(),
+        "boxes that are empty or not finite": boxes.isfinite().all() and (boxes[:, 2:] > boxes[:, :2]).all(),
+        "views of meshes that do not exist": ((model >= 0) & (model < meshes)).all(),
+    }
+    for name in (name for name in tensors if name.startswith(RERANKING)):
+        x, message = tensors[name], f"features of {name} that do not fit the views, or are not finite"
+        valid[message] = x.isfinite().all() and x.ndim == 2 and len(x) == N
+    for message, passed in valid.items():
+        if not bool(passed):
+            raise ValueError(message)

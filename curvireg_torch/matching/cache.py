@@ -7,6 +7,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -113,12 +114,9 @@ def cached_bank(
     its limit.
 
     Args:
-        mesh: a mesh or the path of one.
-        views: custom viewpoints; default those of the pipeline.
-        pipeline: default ``Pipeline()``.
+        mesh, views, pipeline, device, progress: see :meth:`ViewBank.build`.
         renderer: for a new bank; its name is part of the key. With a custom renderer the cache is not used.
         folder: default :func:`cache_folder`.
-        device, progress: of :meth:`ViewBank.build`.
 
     Example:
         >>> import tempfile
@@ -128,9 +126,7 @@ def cached_bank(
         >>> len(list_cache(folder)), clear_cache(folder)
         (1, 1)
     """
-    mesh = as_mesh(mesh)
-    folder = folder or cache_folder()
-    pipeline = pipeline or Pipeline()
+    mesh, folder, pipeline = as_mesh(mesh), folder or cache_folder(), pipeline or Pipeline()
     if views is None:
         views = pipeline.views.sphere(mesh_up(mesh))
     else:
@@ -151,7 +147,8 @@ def cached_bank(
         except BankError:  # build it again and replace the file
             pass
         else:
-            _mark_used(path)
+            with suppress(OSError):  # a read-only cache
+                os.utime(path)
             bank.pipeline = pipeline  # pipelines that differ in ranking or search share a bank
             return bank
     bank = build()
@@ -163,16 +160,14 @@ def cached_bank(
     try:
         bank.save(path)
     except OSError as error:
-        warnings.warn(
-            f"the bank is not cached, so it will be built again: {error}, by CURVIREG_CACHE=FOLDER", stacklevel=2
-        )
+        warning = f"the bank is not cached, so it will be built again: {error}, by CURVIREG_CACHE=FOLDER"
+        warnings.warn(warning, stacklevel=2)
         return bank
     try:
         trim_cache(folder, keep=path)
     except OSError as error:  # files may be added to the folder, but not removed
-        warnings.warn(
-            f"the cache exceeds its limit: {error.filename} cannot be removed ({error.strerror})", stacklevel=2
-        )
+        warning = f"the cache exceeds its limit: {error.filename} cannot be removed ({error.strerror})"
+        warnings.warn(warning, stacklevel=2)
     return bank
 
 
@@ -180,11 +175,9 @@ def list_cache(folder: Path | None = None) -> list[CachedBank]:
     """The banks of the cache, most recently used first."""
     banks = []
     for path in _files(folder or cache_folder(), _BANK):
-        try:
+        with suppress(FileNotFoundError):  # removed by another process
             status = path.stat()
-        except FileNotFoundError:  # removed by another process
-            continue
-        banks.append(CachedBank(path, status.st_size, status.st_mtime))
+            banks.append(CachedBank(path, status.st_size, status.st_mtime))
     return sorted(banks, key=lambda bank: bank.used, reverse=True)
 
 
@@ -197,24 +190,14 @@ def clear_cache(folder: Path | None = None) -> int:
     return len(banks)
 
 
-def trim_cache(folder: Path | None = None, *, limit: int | None = None, keep: Path | None = None) -> int:
-    """Remove the least recently used banks until the cache fits its limit; returns how many were removed.
-
-    Args:
-        folder: default :func:`cache_folder`.
-        limit: bytes; default ``$CURVIREG_CACHE_LIMIT``, else :data:`CACHE_LIMIT`.
-        keep: a bank that stays, whatever its size.
-    """
-    folder = folder or cache_folder()
-    if limit is None:
-        given = os.environ.get("CURVIREG_CACHE_LIMIT", "")
-        limit = int(given) if given.isdecimal() else CACHE_LIMIT
+def trim_cache(folder: Path | None = None, *, keep: Path | None = None) -> int:
+    """Remove the least recently used banks, but not ``keep``, until the limit is met; returns how many were removed."""
+    folder, given = folder or cache_folder(), os.environ.get("CURVIREG_CACHE_LIMIT", "")
+    limit = int(given) if given.isdecimal() else CACHE_LIMIT
     for path in _files(folder, _INCOMPLETE):
-        try:
+        with suppress(FileNotFoundError):
             if time.time() - path.stat().st_mtime > _ABANDONED:
-                path.unlink(missing_ok=True)
-        except FileNotFoundError:
-            continue
+                path.unlink()
     removed, total = 0, 0
     for bank in list_cache(folder):
         total += bank.size
@@ -235,10 +218,7 @@ def _files(folder: Path, name: re.Pattern[str]) -> Iterator[Path]:
 
 
 def _is_bank(path: Path) -> bool:
-    """Whether the header of this safetensors file, complete or truncated behind it, names this library.
-
-    An empty file, which a killed process may leave, counts too.
-    """
+    """Whether this safetensors header names this library. An empty file, which a killed process may leave, counts."""
     try:
         with path.open("rb") as file:
             size = file.read(8)
@@ -246,10 +226,3 @@ def _is_bank(path: Path) -> bool:
         return not size or str(json.loads(header)["__metadata__"]["format"]).startswith("curvireg_torch.")
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False
-
-
-def _mark_used(path: Path) -> None:
-    try:
-        os.utime(path)
-    except OSError:  # a read-only cache
-        return

@@ -50,10 +50,8 @@ class ViewDescriber:
 
     Args:
         mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
-        settings: how views are rendered and described.
-        renderer: "auto", "embree", "pyrender" or a :class:`DepthRenderer` of this mesh.
+        settings, renderer, device: see :meth:`curvireg_torch.ViewBank.build`.
         coloured: whether :meth:`shaded` adds the mesh's colours; default: if it has any.
-        device: where views are filtered and described.
     """
 
     def __init__(
@@ -67,11 +65,9 @@ class ViewDescriber:
     ) -> None:
         self.settings, self._mesh = settings, mesh
         self._coloured = has_colours(mesh) if coloured is None else coloured
-        self.centre = mesh_centre(mesh)
         self.renderer = make_renderer(mesh, renderer, device=device)
-        self.hull = extreme_points(mesh)
+        self.centre, self.radius, self.hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
         self._orthographic = settings.camera == "orthographic"
-        self.radius = mesh_radius(mesh)
         self._filter, self.descriptor = depth_filter(settings), hog_layer(settings)
         self._device = device
 
@@ -79,8 +75,8 @@ class ViewDescriber:
         """Cameras that look at the object's centre, cropped to its box as a photograph is.
 
         Args:
-            rotations: (N, 3, 3) model -> camera.
-            distances: (N,) of the object's centre, in model units.
+            rotations: (N, 3, 3) model -> camera, as in all methods.
+            distances: (N,) of the object's centre, in model units, as in all methods.
 
         Returns:
             T (N, 4, 4), K (N, 3, 3) of the crops, and boxes (N, 4), see :class:`DescribedViews`. All float64.
@@ -93,17 +89,10 @@ class ViewDescriber:
         return T, crop_transforms(square_boxes(boxes, self.settings.margin), self.settings.image_size), boxes
 
     def cameras_of_boxes(self, rotations: Tensor, distances: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
-        """Perspective cameras that look straight at the object and project it into the photographs' boxes.
+        """Perspective cameras that look straight at the object and project it into the photographs' (N, 4) boxes.
 
-        They replace unknown cameras of photographs. For orthographic views the camera is far away.
-
-        Args:
-            rotations: (N, 3, 3).
-            distances: (N,) of the object's centre, in model units.
-            boxes: (N, 4) x0, y0, x1, y1 in px of the photographs.
-
-        Returns:
-            T_cam_from_model (N, 4, 4) and camera matrices (N, 3, 3) in px of the photographs, float64.
+        They replace unknown cameras of photographs. For orthographic views the camera is far away. Returns
+        T_cam_from_model (N, 4, 4) and camera matrices (N, 3, 3) in px of the photographs, float64.
         """
         T, K, _ = self.cameras(rotations, distances)
         if self._orthographic:
@@ -143,16 +132,13 @@ class ViewDescriber:
 
     @torch.no_grad()
     def descriptors(self, rotations: Tensor, distances: Tensor) -> Tensor:
-        """(N, D) of (N, 3, 3) rotations at (N,) distances of the object's centre, in model units."""
+        """(N, D) descriptors of the framed views."""
         chunks = zip(rotations.split(CHUNK), distances.split(CHUNK), strict=True)
         return torch.cat([self.descriptor(self.fields(R, z)) for R, z in chunks])
 
     @torch.no_grad()
     def __call__(self, rotations: Tensor, distances: Tensor) -> DescribedViews:
-        """Describe (N, 3, 3) rotations at (N,) distances of the object's centre, in model units.
-
-        Views that differ by a multiple of 90 degrees about the optical axis are rendered and filtered once.
-        """
+        """Describe views; those that differ by a multiple of 90 degrees about the optical axis are rendered once."""
         source, quarters = quarter_turns(rotations, distances)
         rendered = source == torch.arange(len(source))
         depth, boxes = self.depth(rotations[rendered], distances[rendered])
@@ -164,9 +150,8 @@ class ViewDescriber:
             sideways = self.descriptor(torch.stack([-field[:, 1], field[:, 0]], dim=1).rot90(-1, (2, 3)))
             halves = (self.descriptor.rotated_by_180(x) for x in (descriptors, sideways))
             descriptors = torch.stack([descriptors, sideways, *halves])[selected]
-            points, silhouettes = (
-                torch.stack([x.rot90(-k, (1, 2)) for k in range(4)])[selected] for x in (points, silhouettes)
-            )
+            masks = torch.stack([points, silhouettes])
+            points, silhouettes = torch.stack([masks.rot90(-k, (2, 3)) for k in range(4)], dim=1)[:, *selected]
             x0, y0, x1, y1 = boxes.T
             clockwise = [x0, y0, x1, y1, -y1, x0, -y0, x1, -x1, -y1, -x0, -y0, y0, -x1, y1, -x0]
             boxes = torch.stack(clockwise, dim=1).view(-1, 4, 4).transpose(0, 1)[selected]
@@ -176,9 +161,8 @@ class ViewDescriber:
 def quarter_turns(rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
     """Group views that are the same picture rotated in the plane by a multiple of 90 degrees.
 
-    Returns:
-        For each of the (N, 3, 3) views the index (N,) of the first view of its group, and the number (N,) of clockwise
-        90 degree rotations, 0 to 3, from that view to this one; on the CPU.
+    Returns, on the CPU, the index (N,) of the first view of each view's group, and the number (N,) of clockwise 90
+    degree rotations, 0 to 3, from that view to this one.
     """
     x, y, z = rotations[:, 0].double().cpu(), rotations[:, 1].double().cpu(), distances.double().cpu()
     frames = [torch.cat(pair, dim=1) for pair in ((x, y), (-y, x), (-x, -y), (y, -x))]

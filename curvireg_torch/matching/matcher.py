@@ -59,7 +59,6 @@ class ViewMatcher(nn.Module):
 
     Raises:
         BankError: the bank was built with other settings or for another pose prior than the pipeline's.
-        InvalidInputError: an option out of range.
 
     Example:
         >>> import trimesh
@@ -165,16 +164,13 @@ class ViewMatcher(nn.Module):
         if log_prior is None:
             scores = log.exp()
             return Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), {**terms, **reranked})
-        log_prior = log_prior.to(log)
         without = log.amax(dim=1)
-        log, reranked = self._reranked(query, first_log + log_prior)
-        scores = log.exp()
+        log, reranked = self._reranked(query, first_log + log_prior.to(log))
         order = log.argsort(dim=1, descending=True, stable=True)
         ratio = (log.amax(dim=1) - without).clamp(max=0.0).exp()
-        return Ranking(scores, order, {**terms, **reranked}, log_prior > -torch.inf, ratio)
+        return Ranking(log.exp(), order, {**terms, **reranked}, log_prior.to(log) > -torch.inf, ratio)
 
     def _reranked(self, query: QueryFeatures, log: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """(B, N) log scores with all reranking terms, and the raw scores of these terms."""
         raw: dict[str, Tensor] = {}
         for term in self.pipeline.terms:
             if isinstance(term, RerankingTerm):
@@ -238,8 +234,7 @@ class ViewMatcher(nn.Module):
 
         Args:
             name: of the term.
-            query: B photographs.
-            ranking: of these photographs.
+            query, ranking: of B photographs.
             pictures: (H, C, S, S), of :meth:`pictures`.
             image_index: (H,) photograph that each picture is compared with.
         """
@@ -253,7 +248,6 @@ class ViewMatcher(nn.Module):
         return out
 
     def _shaded(self, views: Tensor) -> Tensor:
-        """Pictures of (U,) views of the bank, see :meth:`ViewDescriber.shaded`."""
         return self.pictures(self.bank.model[views], self.bank.rotations[views], self.bank.distances[views])
 
     def pictures(self, model: Tensor, rotations: Tensor, distances: Tensor) -> Tensor:
@@ -267,7 +261,7 @@ class ViewMatcher(nn.Module):
 
     @cached_property
     def describers(self) -> tuple[ViewDescriber, ...]:
-        """One describer per model, which renders and describes further views as the bank's; built on first use."""
+        """One per model, which renders and describes further views as the bank's; built on first use."""
         coloured = any(has_colours(mesh) for mesh in self.bank.meshes)
         return tuple(
             ViewDescriber(mesh, self.bank.settings, renderer=self._renderer, coloured=coloured, device=self.device)

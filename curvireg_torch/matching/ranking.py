@@ -101,17 +101,12 @@ def distinct_views(
         >>> distinct_views(torch.tensor([1, 0]), R, count=2, symmetries=R).tolist()
         [1]
     """
-    if symmetries is None:
-        symmetries = torch.eye(3)[None]
-    else:
-        check_symmetries(symmetries)
+    symmetries = torch.eye(3)[None] if symmetries is None else symmetries
+    check_symmetries(symmetries)
     symmetries = symmetries[:, :3, :3].to(rotations)
     selected: list[int] = []
     available = torch.ones(len(rotations), dtype=torch.bool, device=order.device)
-    while len(selected) < count:
-        candidates = order[available[order]]
-        if len(candidates) == 0:
-            break
+    while len(selected) < count and len(candidates := order[available[order]]):
         best = int(candidates[0])
         selected.append(best)
         equivalent = rotations[best] @ symmetries

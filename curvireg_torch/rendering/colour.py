@@ -33,21 +33,10 @@ def render_colour(
     """Pictures of a mesh in its colours before white: the colour times :func:`shade`, four samples per pixel.
 
     A mesh without colours (:func:`has_colours`) is white. So is every mesh with a renderer that does not report which
-    face a pixel shows; only "embree" does.
-
-    Args:
-        mesh: a mesh, a scene or the path of one.
-        T_cam_from_model: (N, 4, 4) or (4, 4), model to OpenCV camera.
-        camera_matrix: (N, 3, 3) or (3, 3) in px, without skew.
-        size: (H, W).
-        renderer: a name, or a renderer of this mesh, which is then not built in every call.
-        orthographic: parallel projection; fx, fy are then px per model unit.
+    face a pixel shows; only "embree" does. Arguments and errors are those of :func:`render_depth`.
 
     Returns:
         (N, 3, H, W) float32 RGB in [0, 1] on the CPU.
-
-    Raises:
-        InvalidInputError, MeshError, MissingFileError, RenderingError.
 
     Example:
         >>> box = trimesh.creation.box()
@@ -60,20 +49,18 @@ def render_colour(
     """
     mesh = as_mesh(mesh)
     T, K = check_render_arguments(T_cam_from_model.view(-1, 4, 4), camera_matrix, size)
-    zoom = torch.tensor(
-        [[1.0, 0, 0.5 - 0.5 / SUPERSAMPLING], [0, 1, 0.5 - 0.5 / SUPERSAMPLING], [0, 0, 1 / SUPERSAMPLING]]
-    )
+    shift = 0.5 - 0.5 / SUPERSAMPLING
+    zoom = torch.tensor([[1.0, 0, shift], [0, 1, shift], [0, 0, 1 / SUPERSAMPLING]])
     K = SUPERSAMPLING * zoom.double() @ K
     fine = SUPERSAMPLING * size[0], SUPERSAMPLING * size[1]
     backend = make_renderer(mesh, renderer)
     colours, faces_at = surface_colours(mesh), getattr(backend, "faces_at", None)
+    albedo = np.ones((len(T), *fine, 3), np.float32)
     if colours is None or faces_at is None:
         depth = backend.render(T, K, fine, orthographic=orthographic).cpu()
-        picture = shade(depth, K, orthographic=orthographic).expand(-1, 3, -1, -1)
     else:
         face, u, v, depth = faces_at(T, K, fine, orthographic=orthographic)
-        albedo = np.ones((*face.shape, 3), np.float32)
         visible = face >= 0
         albedo[visible] = colours.at(face[visible], u[visible], v[visible])
-        picture = shade(depth, K, orthographic=orthographic) * torch.from_numpy(albedo).permute(0, 3, 1, 2)
+    picture = shade(depth, K, orthographic=orthographic) * torch.from_numpy(albedo).permute(0, 3, 1, 2)
     return F.avg_pool2d(picture.contiguous(), SUPERSAMPLING)

@@ -21,12 +21,7 @@ _MAX_COORDINATE = 16000  # px; OpenCV draws no polygons beyond
 
 
 class RayScene:
-    """Triangles for ray casting.
-
-    Args:
-        vertices: (V, 3).
-        faces: (F, 3).
-    """
+    """Triangles for ray casting: (V, 3) vertices and (F, 3) faces; rays have (N, 3) origins and directions."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self._scene = EmbreeScene()
@@ -34,26 +29,24 @@ class RayScene:
         self.distance(np.zeros((1, 3)), np.ones((1, 3)))  # builds embree's tree, which is not thread-safe
 
     def distance(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(N,) float32 distances along rays to the first hit, in units of the directions; inf without a hit.
-
-        Args:
-            origins: (N, 3).
-            directions: (N, 3), or (1, 3) for all rays.
-        """
+        """(N,) float32 distances to the first hit, in units of the directions, which may be (1, 3); inf without one."""
         distance: np.ndarray = self._scene.run(_float32(origins), _float32(directions), query="DISTANCE")
         distance[distance >= _MISS] = np.inf
         return distance
 
     def hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """:meth:`distance`, the triangle hit (N,), and its normal (N, 3) of arbitrary length and sign."""
-        found = self._scene.run(_float32(origins), _float32(directions), query="INTERSECT", output=True)
-        return np.where(found["tfar"] < _MISS, found["tfar"], np.inf), found["primID"], found["Ng"]
+        found, distance = self._intersect(origins, directions)
+        return distance, found["primID"], found["Ng"]
 
     def barycentric_hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
         """The first triangle hit (N,), -1 for none; barycentric u, v (N,) of its corners 2 and 3; the distance."""
+        found, distance = self._intersect(origins, directions)
+        return np.where(np.isfinite(distance), found["primID"], -1), found["u"], found["v"], distance
+
+    def _intersect(self, origins: np.ndarray, directions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
         found = self._scene.run(_float32(origins), _float32(directions), query="INTERSECT", output=True)
-        hit = found["tfar"] < _MISS
-        return np.where(hit, found["primID"], -1), found["u"], found["v"], np.where(hit, found["tfar"], np.inf)
+        return found, np.where(found["tfar"] < _MISS, found["tfar"], np.inf)
 
     def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """(N,) bool: rays that hit anything."""
@@ -87,7 +80,13 @@ class EmbreeRenderer:
     ) -> Tensor:
         T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
         out = np.zeros((len(T), 1, *size), dtype=np.float32)
-        for_each(len(T), lambda i: self._render_view(T[i], K[i], out[i, 0], orthographic))
+
+        def cast(i: int) -> None:
+            if rays := self._rays(T[i], K[i], size, orthographic):
+                mask, starts, directions, near = rays
+                out[i, 0][mask] = self._depth(self._scene.distance(starts, directions), near)
+
+        for_each(len(T), cast)
         return torch.from_numpy(out)
 
     def faces_at(
@@ -95,29 +94,21 @@ class EmbreeRenderer:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tensor]:
         """The face that each pixel shows, the point on that face, and the depth of :meth:`render`.
 
-        Returns:
-            (N, H, W) int32 face indices, -1 for none; (N, H, W) float32 u and v: the point is
-            (1 - u - v) a + u b + v c, with the face's corners a, b, c; (N, 1, H, W) depth.
+        (N, H, W) int32 face indices, -1 for none; (N, H, W) float32 u and v of the point (1 - u - v) a + u b + v c,
+        with the face's corners a, b, c; (N, 1, H, W) depth.
         """
         T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
         face = np.full((len(T), *size), -1, dtype=np.int32)
         u, v, depth = (np.zeros(face.shape, np.float32) for _ in range(3))
 
         def cast(i: int) -> None:
-            rays = self._rays(T[i], K[i], size, orthographic)
-            if rays is not None:
+            if rays := self._rays(T[i], K[i], size, orthographic):
                 mask, starts, directions, near = rays
                 face[i][mask], u[i][mask], v[i][mask], along = self._scene.barycentric_hits(starts, directions)
                 depth[i][mask] = self._depth(along, near)
 
         for_each(len(T), cast)
         return face, u, v, torch.from_numpy(depth)[:, None]
-
-    def _render_view(self, T: np.ndarray, K: np.ndarray, out: np.ndarray, orthographic: bool) -> None:
-        rays = self._rays(T, K, out.shape, orthographic)
-        if rays is not None:
-            mask, starts, directions, near = rays
-            out[mask] = self._depth(self._scene.distance(starts, directions), near)
 
     def _depth(self, along: np.ndarray, near: float) -> np.ndarray:
         z = (along + np.float32(near)) * np.float32(self._radius)

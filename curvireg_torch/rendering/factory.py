@@ -18,7 +18,9 @@ from .protocol import DepthRenderer, check_render_arguments
 
 __all__ = ["BACKENDS", "make_renderer", "render_depth"]
 
-BACKENDS: Registry[Callable[..., DepthRenderer]] = Registry("renderer")
+BACKENDS: Registry[Callable[..., DepthRenderer]] = Registry(
+    "renderer", {"torch": "curvireg_torch.rendering.zbuffer:TorchRenderer"}
+)
 """Renderers by name: functions or classes that are called as ``(mesh, device=device)``."""
 
 AUTOMATIC = ("embree", "pyrender", "torch")
@@ -43,12 +45,9 @@ def make_renderer(
         device: where "torch" renders.
 
     Raises:
-        InvalidInputError: unknown name.
         RenderingError, MissingDependencyError: the backend does not work here.
     """
-    if not isinstance(backend, str):
-        return backend
-    return BACKENDS[backend](mesh, device=device)
+    return BACKENDS[backend](mesh, device=device) if isinstance(backend, str) else backend
 
 
 @BACKENDS.register("auto")
@@ -60,7 +59,6 @@ class _FirstThatWorks:
         self._untried = [b for b in AUTOMATIC if b != "embree" or importlib.util.find_spec("embreex")]
         self._lock = threading.Lock()
         self._renderer = self._next()
-        self.name = self._renderer.name
 
     def _next(self) -> DepthRenderer:
         while True:
@@ -69,6 +67,10 @@ class _FirstThatWorks:
             except (RenderingError, MissingDependencyError):
                 if not self._untried:
                     raise
+
+    @property
+    def name(self) -> str:
+        return self._renderer.name
 
     @property
     def faces_at(self) -> Any:
@@ -90,12 +92,8 @@ class _FirstThatWorks:
                         if not self._untried:
                             raise
                         self._renderer = self._next()
-                        self.name = self._renderer.name
-                        warnings.warn(
-                            f"renderer {used.name!r} failed ({type(error).__name__}: {error}); "
-                            f"continuing with {self.name!r}",
-                            stacklevel=2,
-                        )
+                        reason = f"renderer {used.name!r} failed ({type(error).__name__}: {error})"
+                        warnings.warn(f"{reason}; continuing with {self.name!r}", stacklevel=2)
 
 
 @BACKENDS.register("embree")
@@ -115,9 +113,6 @@ def _pyrender(mesh: trimesh.Trimesh, **_: Any) -> DepthRenderer:
     return PyrenderRenderer(mesh)
 
 
-BACKENDS.register("torch", "curvireg_torch.rendering.zbuffer:TorchRenderer")
-
-
 def render_depth(
     mesh: "trimesh.Trimesh | trimesh.Scene | str | PathLike[str]",
     T_cam_from_model: Tensor,
@@ -132,9 +127,9 @@ def render_depth(
     Args:
         mesh: a mesh, a scene (all its parts, placed by their transforms) or the path of one.
         T_cam_from_model: (N, 4, 4) or (4, 4), rigid, model to OpenCV camera.
-        camera_matrix: (N, 3, 3) or (3, 3) in px; pixel (0, 0) is the centre of the top-left pixel.
+        camera_matrix: (N, 3, 3) or (3, 3) in px, no skew; pixel (0, 0) is the centre of the top-left pixel.
         size: (H, W).
-        renderer: a name for :func:`make_renderer`, or a :class:`DepthRenderer` of this mesh.
+        renderer: a name for :func:`make_renderer`, or a renderer of this mesh, which is then not built in every call.
         orthographic: parallel projection; fx, fy are then px per model unit.
 
     Returns:
@@ -150,14 +145,12 @@ def render_depth(
         >>> depth.shape, round(float(depth[0, 0, 32, 32]), 4)
         (torch.Size([1, 1, 64, 64]), 3.5)
     """
-    if T_cam_from_model.ndim == 2:
-        T_cam_from_model = T_cam_from_model[None]
+    T = T_cam_from_model[None] if T_cam_from_model.ndim == 2 else T_cam_from_model
     backend = make_renderer(as_mesh(mesh), renderer)
     try:
-        return backend.render(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
+        return backend.render(T, camera_matrix, size, orthographic=orthographic)
     except (InvalidInputError, RenderingError):
         raise
     except Exception as error:  # drivers raise anything
-        raise RenderingError(
-            f"renderer {backend.name!r} failed: {type(error).__name__}: {error}; try another renderer"
-        ) from error
+        reason = f"renderer {backend.name!r} failed: {type(error).__name__}: {error}"
+        raise RenderingError(f"{reason}; try another renderer") from error

@@ -42,10 +42,8 @@ def _offscreen() -> Any:
             _context = (os.getpid(), pyrender.OffscreenRenderer(64, 64))
             atexit.register(_release)
         except Exception as error:  # PyOpenGL raises anything
-            raise RenderingError(
-                f"renderer 'pyrender' needs OpenGL through EGL ({type(error).__name__}: {error}); "
-                "install the system's libegl1, or use renderer='embree'"
-            ) from error
+            reason = f"renderer 'pyrender' needs OpenGL through EGL ({type(error).__name__}: {error})"
+            raise RenderingError(f"{reason}; install the system's libegl1, or use renderer='embree'") from error
     return _context[1]
 
 
@@ -83,18 +81,14 @@ class PyrenderRenderer:
 
     It works around defects of pyrender 0.1.45. The framebuffer takes four samples per pixel and resolves depth to one
     that is off the centre; segmentation mode avoids that, but always culls back faces, so faces are drawn in both
-    orientations. Orthographic depth is returned through the perspective formula, which is inverted here. The EGL
-    context stays bound to the last thread that used it, so it is unbound here.
-
-    Depth has 24 bits, distributed by perspective: for a camera inside the object's box, the far end is less exact than
-    with the other backends.
+    orientations. Orthographic depth is returned through the perspective formula, which is inverted here. Depth has 24
+    bits: for a camera inside the object's box, the far end is less exact than with the other backends.
     """
 
     name = "pyrender"
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
-        self._centre = mesh_centre(mesh)
-        self._radius = mesh_radius(mesh)
+        self._centre, self._radius = mesh_centre(mesh), mesh_radius(mesh)
         self._corners = (box_corners(mesh) - self._centre) / self._radius
         with _lock:
             _unbind(_offscreen())
@@ -131,8 +125,7 @@ class PyrenderRenderer:
         near, far = max(float(z.min()) - 1e-3, NEAREST), float(z.max()) + 1e-3
         if far - 1e-3 <= near:
             return  # entirely behind the camera
-        K = K.clone()
-        shift = 0.0
+        K, shift = K.clone(), 0.0
         if orthographic:
             # Pyrender treats depth as perspective, 2 f n / (f + n - ndc (f - n)). Move the object to where the inverse
             # of that formula is precise.

@@ -22,27 +22,15 @@ class DepthRenderer(Protocol):
     def render(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
     ) -> Tensor:
-        """Render N views.
+        """Render N views, with the arguments of :func:`render_depth`, into (N, 1, H, W) float32 z-depth.
 
-        Args:
-            T_cam_from_model: (N, 4, 4) rigid transforms into the OpenCV camera.
-            camera_matrix: (N, 3, 3) or (3, 3), without skew; see :func:`curvireg_torch.geometry.project_points`.
-            size: (H, W) in px.
-            orthographic: parallel projection along z; fx, fy are then px per model unit.
-
-        Returns:
-            (N, 1, H, W) float32 z-depth at pixel centres, in model units; 0 = background. On the renderer's device,
-            which is the CPU except for "torch".
+        The depth is on the renderer's device, which is the CPU except for "torch".
         """
         ...
 
 
 def check_render_arguments(T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Rigid poses (N, 4, 4) and cameras (N, 3, 3) as float64 on the CPU.
-
-    Raises:
-        InvalidInputError: wrong shapes, a pose that is not rigid, an unusable camera matrix or size.
-    """
+    """Rigid poses (N, 4, 4) and cameras (N, 3, 3), checked, as float64 on the CPU."""
     if T.ndim != 3 or T.shape[1:] != (4, 4):
         raise InvalidInputError(f"T_cam_from_model: expected shape (N, 4, 4), got {tuple(T.shape)}")
     if len(size) != 2 or min(size) < 1:

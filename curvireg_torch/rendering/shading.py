@@ -18,15 +18,9 @@ def shade(depth: Tensor, camera_matrix: Tensor, *, orthographic: bool = False) -
     in depth is used, so that creases and contours stay sharp.
 
     Args:
-        depth: (N, 1, H, W) z-depth, 0 = background.
+        depth: (N, 1, H, W) z-depth, 0 = background; the result has its shape and dtype.
         camera_matrix: (N, 3, 3) or (3, 3) in px, without skew.
         orthographic: parallel projection; fx, fy are then px per unit of depth.
-
-    Returns:
-        (N, 1, H, W) in [0, 1], dtype of ``depth``.
-
-    Raises:
-        InvalidInputError: wrong shapes or dtypes.
 
     Example:
         >>> K = torch.tensor([[100.0, 0, 15.5], [0, 100.0, 15.5], [0, 0, 1]])
@@ -49,12 +43,8 @@ def shade(depth: Tensor, camera_matrix: Tensor, *, orthographic: bool = False) -
         x, y, n = fx * su, fy * sv, torch.ones_like(s)
         cosine = n / (x * x + y * y + n).sqrt()
     else:
-        v, u = torch.meshgrid(
-            torch.arange(z.shape[-2], device=z.device, dtype=z.dtype),
-            torch.arange(z.shape[-1], device=z.device, dtype=z.dtype),
-            indexing="ij",
-        )
-        u, v = u - cx, v - cy
+        u = torch.arange(z.shape[-1], device=z.device, dtype=z.dtype) - cx
+        v = torch.arange(z.shape[-2], device=z.device, dtype=z.dtype)[:, None] - cy
         x, y, n = fx * su, fy * sv, s - u * su - v * sv
         # The product of the normal (x, y, n) with the pixel's ray (u / fx, v / fy, 1) is s.
         ray = ((u / fx).square() + (v / fy).square() + 1.0).sqrt()

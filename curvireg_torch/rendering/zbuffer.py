@@ -25,10 +25,6 @@ class TorchRenderer:
 
     Thread-safe. In a forked process torch hangs with more than one thread: call ``torch.set_num_threads(1)`` there
     first, as the workers of a ``DataLoader`` do.
-
-    Args:
-        mesh: a clean mesh.
-        device: where views are rendered and depth is returned.
     """
 
     name = "torch"
@@ -57,33 +53,25 @@ class TorchRenderer:
         R, t, K = (x.to(self.device, self._setup_dtype) for x in (R, t, K))
         H, W = size
         depth = torch.full((len(T), H * W), torch.inf, device=self.device)
-        views = self._views
 
         @torch.no_grad()  # threads do not inherit it
         def draw(i: int) -> None:
-            for j in range(0, len(self._faces), self._triangles):
-                faces = self._faces[j : j + self._triangles]
-                block = depth[i : i + views].view(-1)
-                self._draw(block, faces, R[i : i + views], t[i : i + views], K[i : i + views], size, orthographic)
+            part = slice(i, i + self._views)
+            for faces in self._faces.split(self._triangles):
+                self._draw(depth[part].view(-1), faces, R[part], t[part], K[part], size, orthographic)
 
+        starts = range(0, len(T), self._views)
         if self.device.type == "cpu" and available_threads() > 1:
             with single_threaded_pool() as pool:
-                list(pool.map(draw, range(0, len(T), views)))
+                list(pool.map(draw, starts))
         else:
-            for i in range(0, len(T), views):
+            for i in starts:
                 draw(i)
         depth = torch.where(depth.isfinite(), (depth + t[:, 2:].float()) * self._radius, 0.0)
         return depth.view(-1, 1, H, W)
 
     def _draw(
-        self,
-        depth: Tensor,
-        faces: Tensor,
-        R: Tensor,
-        t: Tensor,
-        K: Tensor,
-        size: tuple[int, int],
-        orthographic: bool,
+        self, depth: Tensor, faces: Tensor, R: Tensor, t: Tensor, K: Tensor, size: tuple[int, int], orthographic: bool
     ) -> None:
         """Draw faces as n views see them: lower (n * H * W,) depths, which are relative to the z of t."""
         H, W = size
@@ -105,13 +93,30 @@ class TorchRenderer:
         # One row per triangle: three edge functions as (value at the window's corner, step per column, step per row)
         # and three relative depths.
         table = torch.cat([edges.flatten(1), z], 1).float()
-        near = NEAREST - t[:, 2].float()
-        view = used // len(faces)
-        ends = count.cumsum(0)
-        total = int(ends[-1])
-        for start in range(0, total, self._pairs):
-            stop = min(start + self._pairs, total)
-            self._draw_pairs(depth, table, ends, count, extent[:, 0], first, near[view], W, start, stop)
+        near = (NEAREST - t[:, 2].float())[used // len(faces)]
+        width, ends = extent[:, 0], count.cumsum(0)
+        pairs = int(ends[-1])
+        for start in range(0, pairs, self._pairs):
+            stop = min(start + self._pairs, pairs)
+            a = int(torch.searchsorted(ends, start, right=True))
+            b = int(torch.searchsorted(ends, stop, right=False)) + 1
+            repeats = ends[a:b].clamp(max=stop) - (ends[a:b] - count[a:b]).clamp(min=start)
+            chunk = torch.arange(a, b, device=depth.device)
+            triangle = torch.repeat_interleave(chunk, repeats, output_size=stop - start)
+            offset = torch.arange(start, stop, device=depth.device) - (ends - count)[triangle]
+            column, row = offset % width[triangle], torch.div(offset, width[triangle], rounding_mode="floor")
+            values = table[triangle]
+            x, y = column.float(), row.float()
+            e = [values[:, 3 * i] + values[:, 3 * i + 1] * x + values[:, 3 * i + 2] * y for i in range(3)]
+            total = e[0] + e[1] + e[2]
+            inside = (torch.minimum(torch.minimum(e[0], e[1]), e[2]) >= -_TOLERANCE * total) & (total > 0)
+            hit = inside.nonzero()[:, 0]
+            triangle = triangle[hit]
+            z = sum((e[i][hit] * values[hit, 9 + i] for i in range(3)), start=torch.zeros_like(total[hit]))
+            z = z / total[hit]
+            visible = z >= near[triangle]
+            pixel = first[triangle] + row[hit] * W + column[hit]
+            depth.scatter_reduce_(0, pixel[visible], z[visible], "amin")
 
     def _windows(self, q: Tensor, z: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """First and one past the last pixel (n, F, 2) x, y that each triangle can cover."""
@@ -141,37 +146,3 @@ class TorchRenderer:
         normal = normal * (facing / scale)[:, None, None]
         edges: Tensor = normal[..., [2, 0, 1]]
         return edges
-
-    @staticmethod
-    def _draw_pairs(
-        depth: Tensor,
-        table: Tensor,
-        ends: Tensor,
-        count: Tensor,
-        width: Tensor,
-        first: Tensor,
-        near: Tensor,
-        W: int,
-        start: int,
-        stop: int,
-    ) -> None:
-        """Draw the (triangle, pixel) pairs ``start`` to ``stop`` of all pairs."""
-        a = int(torch.searchsorted(ends, start, right=True))
-        b = int(torch.searchsorted(ends, stop, right=False)) + 1
-        begins = (ends[a:b] - count[a:b]).clamp(min=start)
-        repeats = ends[a:b].clamp(max=stop) - begins
-        triangle = torch.repeat_interleave(torch.arange(a, b, device=depth.device), repeats, output_size=stop - start)
-        offset = torch.arange(start, stop, device=depth.device) - (ends - count)[triangle]
-        column, row = offset % width[triangle], torch.div(offset, width[triangle], rounding_mode="floor")
-        values = table[triangle]
-        x, y = column.float(), row.float()
-        e = [values[:, 3 * i] + values[:, 3 * i + 1] * x + values[:, 3 * i + 2] * y for i in range(3)]
-        total = e[0] + e[1] + e[2]
-        inside = (torch.minimum(torch.minimum(e[0], e[1]), e[2]) >= -_TOLERANCE * total) & (total > 0)
-        hit = inside.nonzero()[:, 0]
-        triangle = triangle[hit]
-        z = sum((e[i][hit] * values[hit, 9 + i] for i in range(3)), start=torch.zeros_like(total[hit]))
-        z = z / total[hit]
-        visible = z >= near[triangle]
-        pixel = first[triangle] + row[hit] * W + column[hit]
-        depth.scatter_reduce_(0, pixel[visible], z[visible], "amin")

@@ -1,4 +1,4 @@
-"""What a ranking term is: it compares photographs with views and turns the result into a score."""
+"""Ranking terms compare photographs with views and turn the result into a score."""
 
 import math
 from abc import ABC, abstractmethod
@@ -16,30 +16,17 @@ __all__ = ["RerankingModule", "RerankingTerm", "Term", "Views"]
 
 
 class Views(Protocol):
-    """N described views: a bank, or views that were rendered for one call."""
+    """N described views, for instance a :class:`curvireg_torch.ViewBank`, which documents the attributes."""
 
     @property
     def settings(self) -> BankSettings: ...
-
     @property
-    def descriptors(self) -> Tensor:
-        """(N, D) float32."""
-        ...
-
+    def descriptors(self) -> Tensor: ...
     @property
-    def boxes(self) -> Tensor:
-        """(N, 4) boxes of the object in normalised image coordinates."""
-        ...
-
+    def boxes(self) -> Tensor: ...
     def __len__(self) -> int: ...
-
-    def points_at(self, index: Tensor | slice) -> Tensor:
-        """(K, S, S) bool feature points of the selected views."""
-        ...
-
-    def silhouettes_at(self, index: Tensor | slice) -> Tensor:
-        """(K, S, S) bool: pixels that show the object."""
-        ...
+    def points_at(self, index: Tensor | slice) -> Tensor: ...
+    def silhouettes_at(self, index: Tensor | slice) -> Tensor: ...
 
 
 @dataclass(frozen=True)

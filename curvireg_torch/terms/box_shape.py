@@ -30,11 +30,7 @@ def box_shapes(boxes: Tensor) -> Tensor:
 
 
 def whole_box_shapes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
-    """(B,) shapes of boxes; NaN for boxes that reach their image's border, where the object may be cut off.
-
-    Args:
-        boxes: (B, 4) x0, y0, x1, y1 in px.
-        sizes: (H, W) of each image.
+    """(B,) shapes of (B, 4) boxes in px in images of ``sizes`` (H, W); NaN if the border may cut the object off.
 
     Example:
         >>> whole_box_shapes(torch.tensor([[9.0, 9, 19, 19], [-0.5, 9, 19, 19]]), [(48, 64)] * 2).tolist()
@@ -56,12 +52,6 @@ def box_shape_score(queries: Tensor, views: Tensor, *, sigma: float = 0.2) -> Te
         views: (N,) shapes of the views' boxes, finite.
         sigma: 0.2 corresponds to a box that is a fifth too wide.
 
-    Returns:
-        (B, N).
-
-    Raises:
-        InvalidInputError: wrong shape, dtype or sigma; a NaN or infinite view shape; an infinite query.
-
     Example:
         >>> box_shape_score(torch.tensor([0.0, float("nan")]), torch.tensor([0.0, 0.2])).round(decimals=2)
         tensor([[1.0000, 0.6100],
@@ -77,8 +67,7 @@ def box_shape_score(queries: Tensor, views: Tensor, *, sigma: float = 0.2) -> Te
 
 
 def _check_views(shapes: Tensor) -> None:
-    bad = int((~shapes.isfinite()).sum())
-    if bad:
+    if bad := int((~shapes.isfinite()).sum()):
         raise InvalidInputError(
             f"views: expected finite shapes, got {bad} of {len(shapes)} NaN or infinite; their boxes have no area"
         )
@@ -91,11 +80,7 @@ def _score(queries: Tensor, views: Tensor, sigma: float) -> Tensor:
 
 @dataclass(frozen=True)
 class BoxShape(Term):
-    """S_box: the box has the view's aspect ratio; 1 for all views if the box reaches the image's border.
-
-    Attributes:
-        sigma: of :func:`box_shape_score`.
-    """
+    """S_box: :func:`box_shape_score` with ``sigma``; 1 for all views if the box reaches the image's border."""
 
     name: ClassVar[str] = "box"
     sigma: float = 0.2

@@ -16,14 +16,7 @@ __all__ = ["Correlation", "normalized_correlation", "unit_score"]
 
 
 def normalized_correlation(queries: Tensor, views: Tensor) -> Tensor:
-    """Cosine of every query with every view.
-
-    Args:
-        queries: (B, D).
-        views: (N, D), any length; a zero descriptor scores 0.
-
-    Returns:
-        (B, N) in [-1, 1]; [0, 1] for HOG, whose entries are not negative.
+    """(B, N) cosines of (B, D) queries with (N, D) views; a zero descriptor scores 0.
 
     Example:
         >>> normalized_correlation(torch.tensor([[1.0, 0.0]]), torch.tensor([[2.0, 0.0], [0.0, 3.0]])).tolist()
@@ -35,10 +28,7 @@ def normalized_correlation(queries: Tensor, views: Tensor) -> Tensor:
 
 
 def unit_score(similarity: Tensor) -> Tensor:
-    """Map similarities to (0, 1] per query, best view 1: ``exp((s - max s) / std s)``, a softmax of z-scores.
-
-    Args:
-        similarity: (B, N).
+    """Map (B, N) similarities to (0, 1] per query, best view 1: ``exp((s - max s) / std s)``, a softmax of z-scores.
 
     Example:
         >>> unit_score(torch.tensor([[1.0, 1.0, 1.0]])).tolist()

@@ -18,7 +18,6 @@ __all__ = ["QueryFeatures", "crop_regions", "jittered_boxes", "photograph_field"
 _JITTER = ((0, 0, 0), (-0.75, 0, 0), (0.75, 0, 0), (0, -0.75, 0), (0, 0.75, 0), (0, 0, -1), (0, 0, 1))
 """Shifts in x and y in units of the box jitter, and the exponent of the scale."""
 
-
 _BATCHED = ("regions", "field", "descriptors", "points", "shapes")
 
 
@@ -69,11 +68,9 @@ def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
 
 
 def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:
-    """(B, K, 4) each box, four copies shifted by 3/4 ``box_jitter`` of its longer side, and two scaled ones.
+    """(B, K, 4) of (B, 4) boxes: each box, four copies shifted by 3/4 ``box_jitter`` of its longer side, two scaled.
 
-    Args:
-        boxes: (B, 4) x0, y0, x1, y1 in px.
-        box_jitter: fraction in [0, 0.45]; K = 7, or 1 for ``box_jitter`` = 0.
+    ``box_jitter`` is a fraction in [0, 0.45]; K = 7, or 1 for ``box_jitter`` = 0.
 
     Example:
         >>> jittered_boxes(torch.tensor([[0.0, 0.0, 100.0, 50.0]]), 0.1)[0, 1].tolist()
@@ -97,15 +94,9 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
     Args:
         images: (B, C, H, W), or a list of (C, H, W), floating in [0, 1] or uint8; if channel counts differ, grey images
             get three channels.
-        boxes: (B, K, 4) x0, y0, x1, y1 in px, from :func:`jittered_boxes`; a box entirely outside its image is replaced
-            by the first box.
+        boxes: (B, K, 4) in px, from :func:`jittered_boxes`. A box entirely outside its image is replaced by the first
+            box, which must not be outside.
         size, margin: see :func:`crop_images`.
-
-    Returns:
-        Floating crops; (0, K, 3, S, S) for an empty batch.
-
-    Raises:
-        InvalidInputError: wrong shapes, or a first box that is empty or entirely outside its image.
     """
     for image in images:
         check_photograph(image)

@@ -20,18 +20,7 @@ MODES = ("monotone", "paper")
 
 
 def dilate_points(points: Tensor, eps: float) -> Tensor:
-    """Pixels within ``eps`` px (Euclidean) of a point.
-
-    Args:
-        points: (N, H, W) bool.
-        eps: px, >= 0.
-
-    Returns:
-        (N, H, W) bool.
-
-    Raises:
-        InvalidInputError: masks of another shape or dtype, or a bad radius.
-    """
+    """Pixels within ``eps`` >= 0 px (Euclidean) of a point: (N, H, W) bool -> (N, H, W) bool."""
     check_masks(points, "points")
     check_positive(eps, "eps", zero_ok=True)
     radius = int(eps)
@@ -45,14 +34,13 @@ def dilate_points(points: Tensor, eps: float) -> Tensor:
 
 
 def repeatability(query_points: Tensor, dilated_view_points: Tensor) -> Tensor:
-    """Fraction of each query's points that have a view's point within eps (the paper's Rep, view -> query).
+    """(B, N) fraction of each query's points that have a view's point within eps (the paper's Rep, view -> query).
+
+    It is 0 for a query without points.
 
     Args:
         query_points: (B, H, W) bool, or the number of points in each cell.
         dilated_view_points: (N, H, W) bool, from :func:`dilate_points`, or the fraction of each cell within eps.
-
-    Returns:
-        (B, N) float32 in [0, 1]; 0 for a query without points.
 
     Example:
         >>> query = torch.zeros(1, 8, 8, dtype=torch.bool); query[0, 2, 2] = query[0, 6, 6] = True
@@ -76,10 +64,7 @@ def repeatability_score(rep: Tensor, *, mode: str = "monotone", sigma: float = 0
     - ``"monotone"``: :math:`\exp(-(R - \min R)^2 / (2\sigma^2))`: the most repeatable view scores 1;
     - ``"paper"``: :math:`\exp(-(R - \mathrm{mean} R)^2 / (2\sigma^2))`, which favours average views.
 
-    Args:
-        rep: (B, N) in [0, 1].
-        mode: "monotone" or "paper".
-        sigma: the paper's :math:`\sigma_r`.
+    ``rep`` is (B, N) in [0, 1]; ``sigma`` is the paper's :math:`\sigma_r`.
 
     Example:
         >>> repeatability_score(torch.tensor([[0.5, 0.4]]))[0].tolist()[0]

@@ -12,12 +12,7 @@ __all__ = ["Whitening", "ledoit_wolf"]
 class Whitening(nn.Module):
     r"""x -> L^-1 (x - mean), where Sigma = L L^T: inner products become :math:`(x - \mu)^T \Sigma^{-1} (y - \mu)`.
 
-    Args:
-        mean: (D,).
-        covariance: (D, D), symmetric, positive definite.
-
-    Raises:
-        InvalidInputError: wrong shapes or a covariance that is not positive definite.
+    ``mean`` is (D,), ``covariance`` (D, D), symmetric, positive definite.
 
     Example:
         >>> whiten = Whitening(torch.zeros(2), torch.diag(torch.tensor([4.0, 1.0])))

@@ -136,9 +136,7 @@ def test_join_concatenates_banks(small_bank):
         assert torch.equal(getattr(both, name), torch.cat([getattr(small_bank, name), getattr(second, name)]))
     points = torch.stack([second.points[2], small_bank.points[1]])
     assert torch.equal(both.points_at(torch.tensor([n + 2, 1])), points)
-    assert [both.locate(i) for i in (0, n - 1, n, n + 6)] == [(0, 0), (0, n - 1), (1, 0), (1, 6)]
-    with pytest.raises(InvalidInputError, match="index"):
-        both.locate(len(both))
+    assert both.model.tolist() == [0] * n + [1] * 7
 
 
 def test_join_of_joined_banks_numbers_all_models():
@@ -166,7 +164,7 @@ def test_matcher_finds_the_model_in_a_joined_bank(small_bank):
     picture = small_bank.silhouettes[5].float()[None, None].repeat(1, 3, 1, 1)
     edges = torch.tensor([[-0.5, -0.5, 63.5, 63.5]])
     ranking = ViewMatcher(both)(picture, edges / 1.2 + 63.0 * (1 - 1 / 1.2) / 2)  # with its margin, the whole view
-    assert (1, 5) in [both.locate(int(i)) for i in ranking.top(3)[0]]
+    assert len(box) + 5 in ranking.top(3)[0]
 
 
 def test_save_and_load(small_bank, tmp_path):

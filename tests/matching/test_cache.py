@@ -143,7 +143,8 @@ def test_trim_cache_removes_the_least_recently_used(tmp_path, monkeypatch):
     first, second, third = sorted(list_cache(tmp_path), key=lambda file: file.used)
     cached_box(tmp_path, 1.0)  # used again
     assert list_cache(tmp_path)[0].path == first.path
-    assert trim_cache(tmp_path, limit=2 * first.size + 100) == 1
+    monkeypatch.setenv("CURVIREG_CACHE_LIMIT", str(2 * first.size + 100))
+    assert trim_cache(tmp_path) == 1
     assert {file.path for file in list_cache(tmp_path)} == {first.path, third.path}
     monkeypatch.setenv("CURVIREG_CACHE_LIMIT", "10")  # less than one bank: the newest stays
     cached_box(tmp_path, 5.0)
@@ -190,8 +191,8 @@ def test_cache_never_touches_foreign_files(tmp_path, monkeypatch):
         path.write_bytes(data)
         os.utime(path, (1000.0, 1000.0))
     assert [file.path for file in list_cache(tmp_path)] == [bank.path]
-    assert trim_cache(tmp_path, limit=0) == 1
     monkeypatch.setenv("CURVIREG_CACHE_LIMIT", "0")
+    assert trim_cache(tmp_path) == 1
     cached_box(tmp_path, 2.0)
     assert clear_cache(tmp_path) == 1
     bank.path.write_bytes(foreign[other])  # under the bank's name

@@ -7,14 +7,7 @@ import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.terms import (
-    BoxShape,
-    Correlation,
-    Repeatability,
-    dilate_points,
-    repeatability,
-    repeatability_score,
-)
+from curvireg_torch.terms import BoxShape, Correlation, Repeatability, dilate_points, repeatability, repeatability_score
 from curvireg_torch.terms.repeatability import cell_fractions
 
 
