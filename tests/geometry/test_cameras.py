@@ -1,5 +1,3 @@
-"""Cameras and projections, against values by hand and OpenCV."""
-
 import cv2
 import numpy as np
 import pytest

@@ -78,9 +78,7 @@ def test_rotation_error_agrees_with_scipy() -> None:
 
 @pytest.mark.parametrize("bad", [torch.eye(4), torch.eye(3).long(), torch.zeros(3)])
 def test_rotation_functions_refuse_other_matrices(bad: torch.Tensor) -> None:
-    with pytest.raises(InvalidInputError, match="R: expected"):
-        g.viewpoint_from_rotation(bad)
-    with pytest.raises(InvalidInputError, match="R1: expected"):
-        g.rotation_error(bad, torch.eye(3))
-    with pytest.raises(InvalidInputError, match="R2: expected"):
-        g.rotation_error(torch.eye(3), bad)
+    calls = {"R": (g.viewpoint_from_rotation, bad), "R1": (g.rotation_error, bad, bad)}
+    for name, (call, *given) in (calls | {"R2": (g.rotation_error, torch.eye(3), bad)}).items():
+        with pytest.raises(InvalidInputError, match=f"{name}: expected"):
+            call(*given)

@@ -1,5 +1,3 @@
-"""View sets: number, density, range and duplicates."""
-
 import math
 
 import pytest

@@ -16,6 +16,7 @@ import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset, read_bop_csv
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError
 from curvireg_torch.io import images, json_files, read_photo
+from curvireg_torch.io.image_headers import read_header
 from curvireg_torch.io.mat_files import read_mat
 from tests._support.matlab import element, file
 from tests._support.miniature import write_bop, write_image
@@ -79,11 +80,10 @@ def test_read_photo_bounds_scans_and_bytes(tmp_path: Path, monkeypatch: pytest.M
         read_photo(tmp_path / "a.jpg")
 
 
-def test_read_header_takes_linear_time(tmp_path: Path) -> None:
-    (tmp_path / "a.jpg").write_bytes(b"\xff\xd8" + b"\xff" * 20_000_000)
+def test_read_header_takes_linear_time() -> None:
     start = time.perf_counter()
-    with pytest.raises(ImageError, match="truncated"):
-        read_photo(tmp_path / "a.jpg")
+    with pytest.raises(ValueError, match="truncated"):
+        read_header(b"\xff\xd8" + b"\xff" * 20_000_000)
     assert time.perf_counter() - start < 5
 
 

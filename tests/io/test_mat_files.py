@@ -1,5 +1,3 @@
-"""The reader of annotation files: equal to scipy's on valid files, an error on others."""
-
 import contextlib
 import struct
 

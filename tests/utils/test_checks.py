@@ -1,5 +1,3 @@
-"""Checks of cameras, poses, photographs, boxes and masks, in every public function that takes them."""
-
 import math
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Errors with a subject."""
-
 import pickle
 
 import pytest

@@ -1,5 +1,3 @@
-"""Atomic writes under every kind of interruption, and folders that cannot be written to."""
-
 import errno
 import os
 import resource

@@ -1,5 +1,3 @@
-"""Checks of the files that a command names."""
-
 from argparse import Namespace
 from pathlib import Path
 from unittest.mock import Mock

@@ -1,5 +1,3 @@
-"""Lazy imports: help is fast, names are imported on first use."""
-
 import subprocess
 import sys
 from importlib import import_module
@@ -33,11 +31,8 @@ def test_help_imports_nothing_heavy(words):
     assert not imported_by(f"from curvireg_torch.cli import main; main({words!r})") & HEAVY
 
 
-def test_importing_the_package_imports_nothing_heavy():
+def test_imports_are_only_those_of_what_is_used():
     assert not imported_by("import curvireg_torch; curvireg_torch.CurviregError") & HEAVY
-
-
-def test_commands_import_only_what_they_use():
     loaded = imported_by("import curvireg_torch.evaluation.opening")
     assert {"torch", "trimesh"} <= loaded
     assert not loaded & UNUSED

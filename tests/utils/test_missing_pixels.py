@@ -1,5 +1,3 @@
-"""Photographs with missing pixels (NaN or infinite), and with values beyond [0, 1]."""
-
 import math
 from typing import Any
 
@@ -14,6 +12,8 @@ from curvireg_torch.models.appearance import describe
 from curvireg_torch.models.backbone import Backbone
 from tests.utils.conftest import CAMERA, Entries, refused
 
+MATCHING = ("Registrar", "localize", "ViewMatcher", "Locator", "locate")
+
 
 def holes(image: Tensor, where: tuple[slice, slice], value: float) -> Tensor:
     image = image.clone()
@@ -21,23 +21,27 @@ def holes(image: Tensor, where: tuple[slice, slice], value: float) -> Tensor:
     return image
 
 
+def hole_in_the_middle(image: Tensor, box: Tensor, value: float) -> Tensor:
+    x, y = (int(v) for v in 0.5 * (box[:2] + box[2:]))
+    return holes(image, (slice(y, y + 1), slice(x, x + 1)), value)
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_check_pixels_refuses_missing_pixels_in_the_box(
     entries: Entries, photograph: tuple[Tensor, Tensor], value: float
 ) -> None:
     image, box = photograph
-    x, y = (int(v) for v in 0.5 * (box[:2] + box[2:]))
-    for lost in (holes(image, (slice(y, y + 1), slice(x, x + 1)), value), torch.full_like(image, value)):
-        for name in ("Registrar", "localize", "ViewMatcher", "Locator", "locate"):
+    for lost in (hole_in_the_middle(image, box, value), torch.full_like(image, value)):
+        for name in MATCHING:
             assert isinstance(refused(name, entries.photographs[name], lost, "NaN or inf in the pixels"), ImageError)
         fit: Any = entries.photographs["fit_contours"](lost)  # fills them
         assert bool(fit.transform.isfinite().all())
 
 
 def test_check_pixels_refuses_values_beyond_0_to_1(entries: Entries, photograph: tuple[Tensor, Tensor]) -> None:
-    for name in ("Registrar", "localize", "ViewMatcher", "Locator", "locate"):
-        refused(name, entries.photographs[name], 255.0 * photograph[0], r"outside \[0, 1\].*255")
-        refused(name, entries.photographs[name], photograph[0] - 0.6, r"outside \[0, 1\].*255")
+    for name in MATCHING:
+        for image in (255.0 * photograph[0], photograph[0] - 0.6):
+            refused(name, entries.photographs[name], image, r"outside \[0, 1\].*255")
 
 
 def test_matcher_ignores_missing_pixels_beside_the_box(
@@ -87,8 +91,7 @@ def test_query_fills_missing_pixels_before_a_custom_field(
             return torch.ones_like(x).expand(-1, 2, -1, -1)
 
     matcher = cr.ViewMatcher(registrar.bank, field=Ones())
-    x, y = (int(v) for v in 0.5 * (box[:2] + box[2:]))
-    query = matcher.query([holes(image, (slice(y, y + 4), slice(x, x + 4)), math.nan)], box[None])
+    query = matcher.query([hole_in_the_middle(image, box, math.nan)], box[None])
     assert bool(seen[0].isfinite().all())
     lost = query.crops.isnan().any(dim=1, keepdim=True).expand_as(query.field)
     assert 0 < int(lost.sum()) < lost.numel()

@@ -1,5 +1,3 @@
-"""Jobs on the threads of the process."""
-
 import contextlib
 import os
 import threading
@@ -132,9 +130,6 @@ def test_map_on_threads_leaves_threads_to_for_each() -> None:
 
 
 def test_map_on_threads_raises_errors_and_restores_threads() -> None:
-    def job(number: int) -> None:
-        raise ValueError(f"job {number}")
-
-    with pytest.raises(ValueError, match="job 0"):
-        map_on_threads(job, [0, 1, 2])
+    with pytest.raises(ZeroDivisionError):
+        map_on_threads(lambda number: 1 // number, [0, 1, 2])
     assert torch.get_num_threads() == 2

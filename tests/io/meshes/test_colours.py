@@ -1,5 +1,3 @@
-"""Colours of surface points, from textures and corners."""
-
 import numpy as np
 import pytest
 

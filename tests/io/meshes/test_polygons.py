@@ -1,5 +1,3 @@
-"""Concave faces become triangles that cover them, in every format that has them."""
-
 import struct
 import time
 
