@@ -154,10 +154,10 @@ def test_independent_units_of_both_formats(pascal, bop):
     meshes = [item.meshes for item in benchmark.items]
     units = quality.independent_units(benchmark)
     assert [units[i] == units[k] for i in range(5) for k in range(5)] == [a == b for a in meshes for b in meshes]
-    path = bop.root / "test" / "000001"
     for name in ("scene_gt", "scene_gt_info", "scene_camera"):
-        content = json.loads((path / f"{name}.json").read_text())
-        (path / f"{name}.json").write_text(json.dumps({"0": content["0"], "3": content["0"]}))
+        path = bop.root / "test" / "000001" / f"{name}.json"
+        content = json.loads(path.read_text())
+        path.write_text(json.dumps({"0": content["0"], "3": content["0"]}))
     benchmark = BOPBenchmark(BOPDataset(bop.root, targets=False), Protocol(pose="any"))
     assert [i.key for i in benchmark.items] == ["1/0/0", "1/0/1", "1/0/2", "1/3/0", "1/3/1", "1/3/2", "2/7/0"]
     assert quality.independent_units(benchmark) == [0, 1, 2, 0, 1, 2, 3]
@@ -194,10 +194,7 @@ def test_features_of_match_the_registration(camera, monkeypatch):
     image, box, _ = scene(0)
     result = Registrar(truck_bank())([image], box[None], camera)[0]
     assert int(result.candidates[0]) != int(result.ranking.order[0, 0])
-    stored = {
-        "form": "sibling" if camera is None else "exact",
-        "evidence": [dict(h.evidence) for h in result.hypotheses],
-        "ranking": ranking_evidence(result.ranking, truck_bank().rotations)[0].tolist(),
-        "errors": [0.0],
-    }
+    stored = {"form": "sibling" if camera is None else "exact", "errors": [0.0]}
+    stored["evidence"] = [dict(h.evidence) for h in result.hypotheses]
+    stored["ranking"] = ranking_evidence(result.ranking, truck_bank().rotations)[0].tolist()
     assert calibrate.features_of(stored)[0] == pytest.approx(result.confidence_features)

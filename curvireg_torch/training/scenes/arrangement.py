@@ -109,7 +109,7 @@ def _beside(other: Shape, R: Array, centre: Array, floor: float | None, K: Array
             return other._replace(vertices=points)
     front = rng.random() < 0.25
     z = centre[2] + (-1.3 if front else rng.uniform(0.5, 4.0))
-    scale = scale * (0.3 if front else 1.0)
+    scale *= 0.3 if front else 1.0
     pixel = rng.uniform(-0.1, 1.1, 2) * size
     if front:  # near the border, so that it hides only a part of the object
         pixel[rng.integers(2)] = size * rng.choice([0.1, 0.9])

@@ -35,15 +35,14 @@ def _grid(points: Array, *, close: bool = True, caps: bool = True) -> Surface:
     i, j = np.meshgrid(np.arange(m - 1), np.arange(n if close else n - 1), indexing="ij")
     a, b = i * n + j, i * n + (j + 1) % n
     c, d = a + n, b + n
-    faces = [np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)]
+    faces = [np.stack(corners, -1).reshape(-1, 3) for corners in ((a, b, d), (a, d, c))]
     vertices = points.reshape(-1, 3)
     if caps and close:
-        ring = np.arange(n)
-        middles = points[[0, -1]].mean(axis=1)
-        following, last = (ring + 1) % n, (m - 1) * n
+        ring, last = np.arange(n), (m - 1) * n
+        following = (ring + 1) % n
         faces.append(np.stack([following, ring, np.full(n, m * n)], -1))
         faces.append(np.stack([last + ring, last + following, np.full(n, m * n + 1)], -1))
-        vertices = np.concatenate([vertices, middles])
+        vertices = np.concatenate([vertices, points[[0, -1]].mean(axis=1)])
     return Surface(vertices, np.concatenate(faces))
 
 

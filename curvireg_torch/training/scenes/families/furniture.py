@@ -78,8 +78,7 @@ def sofa(rng: Rng) -> list[Part]:
         side = rounded_box(rng, (arm, d + deep, h + rise))
         parts.append((side.moved((s * 0.5 * (w + arm), 0.3 * deep, 0.5 * (h + rise) + 0.05)), 0))
     n = int(rng.integers(1, 4))
-    for k in range(n):
-        x = w * ((k + 0.5) / n - 0.5)
+    for x in w * ((np.arange(n) + 0.5) / n - 0.5):
         parts.append((superquadric((0.48 * w / n, 0.45 * d, 0.08), (0.4, 0.3)).moved((x, -0.05, h + 0.08)), 1))
         if rng.random() < 0.6:
             cushion = superquadric((0.46 * w / n, 0.08, 0.4 * back), (0.4, 0.4))

@@ -33,8 +33,7 @@ def _piece(rng: Rng) -> Surface:
 def compound(rng: Rng) -> list[Part]:
     """Overlapping pieces, often mirrored in x."""
     parts: list[Part] = []
-    centre = np.zeros(3)
-    mirrored = rng.random() < 0.5
+    centre, mirrored = np.zeros(3), rng.random() < 0.5
     for k in range(int(rng.integers(2, 8))):
         any_angle = rng.random() < 0.3
         R = random_rotation(rng) if any_angle else rotation(int(rng.integers(3)), 0.5 * np.pi * rng.integers(4))

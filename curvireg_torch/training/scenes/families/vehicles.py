@@ -14,12 +14,12 @@ def _wheels(rng: Rng, length: float, width: float, radius: float) -> list[Part]:
     heights = np.array([0.0, -0.35, -0.5, -0.3, 0.3, 0.5]) * radius * 0.5
     tyre = lathe(radius * np.array([0.55, 0.6, 0.95, 1, 1, 0.95]), heights)
     hub = lathe(np.full(2, 0.55 * radius), np.array([-0.24, 0.24]) * radius)
-    where = [
-        (s * 0.5 * width, y * length, radius)
-        for s in (-1, 1)
-        for y in (-rng.uniform(0.27, 0.36), rng.uniform(0.25, 0.35))
-    ]
-    return [(part.moved(at, across), number) for at in where for part, number in ((tyre, 7), (hub, 8))]
+    parts: list[Part] = []
+    for s in (-1, 1):
+        for y in (-rng.uniform(0.27, 0.36), rng.uniform(0.25, 0.35)):
+            at = (s * 0.5 * width, y * length, radius)
+            parts += [(tyre.moved(at, across), 7), (hub.moved(at, across), 8)]
+    return parts
 
 
 def car(rng: Rng) -> list[Part]:
@@ -102,8 +102,9 @@ def bicycle(rng: Rng) -> list[Part]:
         parts.append((superquadric((0.12, 0.28, 0.1), (0.8, 0.8)).moved((0, -0.1, 0.75)), 0))
         parts.append((rounded_box(rng, (0.2, 0.5, 0.1)).moved((0, 0.3, 0.75)), 4))
     else:
-        parts.append((superquadric((0.05, 0.13, 0.03), (0.6, 0.8)).moved(seat + np.array((0, 0, 0.08))), 4))
-        parts.append((bar(seat, seat + np.array([0, 0, 0.08]), rod), 0))
+        saddle = seat + np.array((0, 0, 0.08))
+        parts.append((superquadric((0.05, 0.13, 0.03), (0.6, 0.8)).moved(saddle), 4))
+        parts.append((bar(seat, saddle, rod), 0))
         parts.append((torus(0.08, 0.01).moved(crank, across), 2))
     grip, wide = head + np.array((0, -0.03, rng.uniform(0.1, 0.25))), rng.uniform(0.2, 0.35)
     parts.append((bar(head, grip, rod), 0))
@@ -130,9 +131,9 @@ def aircraft(rng: Rng) -> list[Part]:
     fin, _ = wings(0.25, 0.12, rng.uniform(0.2, 0.35), 0.15, (0, 0.85, 0), 0.0)[1]
     parts.append((fin.moved((0, 0, 0.5 * r), rotation(1, -np.pi / 2)), 2))
     n = int(rng.integers(0, 3))
+    pod = lathe(0.4 * r * np.array([0.7, 1, 1, 0.6]), [-0.15, -0.1, 0.05, 0.15])
     for k in range(n):
         for s in (-1, 1):
-            pod = lathe(0.4 * r * np.array([0.7, 1, 1, 0.6]), np.array([-0.15, -0.1, 0.05, 0.15]))
             at = (s * span * (k + 1) / (n + 1.5), 0.5 * sweep * (k + 1) / n - 0.2, height - 0.5 * r)
             parts.append((pod.moved(at, rotation(0, np.pi / 2)), 3))
     if n == 0 and rng.random() < 0.6:
@@ -179,11 +180,9 @@ def train(rng: Rng) -> list[Part]:
         length = rng.uniform(0.9, 1.3)
         ends = np.stack([outline * (0.9, nose if k == 0 else 1.0), outline, outline])
         solid = loft(ends, np.array([-0.5, -0.5 + rng.uniform(0.05, 0.3), 0.5]) * length)
-        body = Surface(solid.vertices[:, [0, 2, 1]] + (0, 1.2 * k, 0.12), solid.faces)
-        parts.append((body, 0))
-        for s in (-1, 1):
-            band = box((0.01, 0.7 * length, 0.22 * height)).moved((s * 0.5 * width, 1.2 * k, 0.12 + 0.6 * height))
-            parts.append((band, 1))
+        parts.append((Surface(solid.vertices[:, [0, 2, 1]] + (0, 1.2 * k, 0.12), solid.faces), 0))
+        band = box((0.01, 0.7 * length, 0.22 * height))
+        parts += [(band.moved((s * 0.5 * width, 1.2 * k, 0.12 + 0.6 * height)), 1) for s in (-1, 1)]
         parts += [(box((0.8 * width, 0.25, 0.12)).moved((0, 1.2 * k + y * length, 0.06)), 2) for y in (-0.3, 0.3)]
     parts.append((box((0.7 * width, 0.01, 0.25 * height)).moved((0, -0.52, 0.12 + 0.6 * nose * height)), 1))
     return parts
