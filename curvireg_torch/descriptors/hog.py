@@ -10,14 +10,7 @@ from ..errors import InvalidInputError
 from ..filters.blocks import Planes, apply_in_blocks
 from ..filters.inputs import zero_nonfinite_vectors
 from ..filters.learnable import OptionsModule, Positive
-from ..filters.numerics import (
-    at_least_float32,
-    full_precision,
-    image_maximum,
-    is_host_readable,
-    safe_eps,
-    safe_sqrt,
-)
+from ..filters.numerics import at_least_float32, full_precision, image_maximum, is_host_readable, safe_eps, safe_sqrt
 from ..utils.checks import check_field, check_option, check_positive, check_tensor
 
 VOTINGS = ("linear", "hard")
@@ -78,10 +71,7 @@ def hog(
             raise InvalidInputError(f"bin_weights: expected factors >= 0, got {bin_weights.tolist()}")
 
     def layer(field: Tensor) -> Planes:
-        votes = _orientation_votes(zero_nonfinite_vectors(field), bins, voting)
-        rows, columns = _cell_weights(H, grid, voting, votes), _cell_weights(W, grid, voting, votes)
-        with full_precision(votes):
-            cells = rows @ (votes @ columns.T)  # (B, bins, grid, grid)
+        cells = _cell_histograms(field, (grid, grid), bins, voting)
         if bin_weights is not None:
             cells = cells * bin_weights.to(cells.dtype).view(1, -1, 1, 1)
         return (_normalised_blocks(cells, block, clip),)
@@ -108,14 +98,18 @@ def orientation_cells(field: Tensor, *, grid: tuple[int, int], bins: int = 9) ->
     H, W = field.shape[-2:]
     if grid[0] > H or grid[1] > W:
         raise InvalidInputError(f"field: expected at least {grid[0]} x {grid[1]} px for {grid=}, got {H} x {W}")
-    votes = _orientation_votes(zero_nonfinite_vectors(at_least_float32(field)), bins, "linear")
-    rows, columns = (_cell_weights(n, cells, "linear", votes) for n, cells in zip((H, W), grid, strict=True))
+    return _cell_histograms(at_least_float32(field), grid, bins, "linear").to(field.dtype)
+
+
+def _cell_histograms(field: Tensor, grid: tuple[int, int], bins: int, voting: str) -> Tensor:
+    """Mean votes per cell, (B, bins, rows, columns)."""
+    votes = _orientation_votes(zero_nonfinite_vectors(field), bins, voting)
+    rows, columns = (_cell_weights(n, cells, voting, votes) for n, cells in zip(field.shape[-2:], grid, strict=True))
     with full_precision(votes):
-        return (rows @ (votes @ columns.T)).to(field.dtype)
+        return rows @ (votes @ columns.T)
 
 
 def _check_options(grid: int, bins: int, block: int, clip: float, voting: str) -> float:
-    """Check the options; return clip."""
     check_option(voting, VOTINGS, "voting")
     if not 0 < clip <= 1:
         raise InvalidInputError(f"clip: expected 0 < clip <= 1, got {clip}")

@@ -40,7 +40,7 @@ class OptionsModule(nn.Module):
 
     @property
     def options(self) -> dict[str, Any]:
-        """The options with their present values, as keyword arguments of the function."""
+        """The present values, as keyword arguments of the function."""
         return {name: getattr(self, name) for name in self._names}
 
     def extra_repr(self) -> str:

@@ -45,7 +45,7 @@ def principal_curvature_image(
     sign = 1.0 if eigenvalue == "largest" else -1.0
 
     def layer(image: Tensor) -> Planes:
-        best, vx, vy = torch.zeros_like(image), torch.zeros_like(image), torch.zeros_like(image)
+        best = vx = vy = torch.zeros_like(image)
         for sigma in scales:
             xx, yy, xy = (sign * sigma**2 * h for h in central_derivatives(smooth(image, sigma))[2:])
             x, y, half_gap = dominant_eigenvector(xx, xy, xy, yy, sign=1.0)

@@ -83,7 +83,7 @@ def batched_camera(camera_matrix: Tensor | None, depth: Tensor) -> Tensor | None
     """(B, 3, 3) in the dtype that ``depth`` is computed in; None stays None."""
     if camera_matrix is None:
         return None
-    if camera_matrix.ndim == 2 or (camera_matrix.ndim == 3 and camera_matrix.shape[0] == 1):
+    if camera_matrix.ndim == 2 or len(camera_matrix) == 1:
         camera_matrix = camera_matrix.expand(depth.shape[0], -1, -1)
     check_tensor(camera_matrix, "camera_matrix", (depth.shape[0], 3, 3))
     check_same_device(camera_matrix, depth, "camera_matrix")

@@ -119,17 +119,15 @@ class LearnedCurvilinearSaliency(nn.Module):
         weights: safetensors file of another training; None is the packaged file.
 
     Shape:
-        Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 2, H, W) without unit, x >= 0. The image is resampled to
-        a shorter side of ``WORK_SIZE`` and the field back to H x W. Missing pixels (NaN or infinite) are filled from
-        their surroundings, and the field is 0 there. dtype kept. Differentiable.
+        Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 2, H, W) without unit, x >= 0. Computed at a shorter
+        side of ``WORK_SIZE`` px. Missing pixels (NaN or infinite) give 0. dtype kept. Differentiable.
 
     Raises:
         InvalidInputError: wrong shape or dtype, or a file whose weights do not fit this network.
         MissingFileError: the file does not exist.
 
     Example:
-        >>> import curvireg_torch as cr
-        >>> cr.LearnedCurvilinearSaliency()(torch.rand(2, 3, 64, 64)).shape
+        >>> LearnedCurvilinearSaliency()(torch.rand(2, 3, 64, 64)).shape
         torch.Size([2, 2, 64, 64])
     """
 
@@ -145,9 +143,9 @@ class LearnedCurvilinearSaliency(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         field = halved_angle(self._network_output(image)[:, :2]).to(image.dtype)
-        return (
-            field.masked_fill(missing_mask(image).any(dim=1, keepdim=True), 0.0) if may_have_missing(image) else field
-        )
+        if not may_have_missing(image):
+            return field
+        return field.masked_fill(missing_mask(image).any(dim=1, keepdim=True), 0.0)
 
     def mask(self, image: Tensor) -> Tensor:
         """(B, 1, H, W) probability that a pixel belongs to the central object, including its occluded parts."""
