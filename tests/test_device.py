@@ -91,12 +91,11 @@ def test_detectors_on_a_device(name):
 
 
 def test_rotation_from_viewpoint_mixes_numbers_and_device_tensors():
+    azimuth = torch.tensor([10.0, 20.0])
     with pretended_gpu() as device:
-        azimuth = torch.tensor([10.0, 20.0], device=device)
-        assert torch.equal(
-            cr.rotation_from_viewpoint(azimuth, 30.0, 5.0).cpu(), cr.rotation_from_viewpoint(azimuth.cpu(), 30.0, 5.0)
-        )
-        assert cr.rotation_from_viewpoint(0.0, azimuth).device == device
+        R = cr.rotation_from_viewpoint(azimuth.to(device), 30.0, 5.0)
+        assert torch.equal(R.cpu(), cr.rotation_from_viewpoint(azimuth, 30.0, 5.0))
+        assert cr.rotation_from_viewpoint(0.0, azimuth.to(device)).device == R.device == device
 
 
 def test_build_on_a_device(bank):

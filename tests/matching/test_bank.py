@@ -13,7 +13,6 @@ from safetensors.torch import load_file, save_file
 
 from curvireg_torch.errors import BankError, InvalidInputError, MissingFileError
 from curvireg_torch.geometry import uniform_views
-from curvireg_torch.io.meshes.up import mesh_up
 from curvireg_torch.matching import ViewBank, ViewMatcher
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import Registrar
@@ -39,6 +38,12 @@ def upright(truck) -> ViewBank:
 def saved(small_bank, tmp_path):
     small_bank.save(tmp_path / "bank.safetensors")
     return tmp_path / "bank.safetensors"
+
+
+def rewrite(path, tensors, **metadata):
+    with safe_open(path, framework="pt") as file:
+        original = file.metadata()
+    save_file(tensors, path, {**original, **metadata})
 
 
 def assert_same(a: ViewBank, b: ViewBank, *, atol: float = 0.0) -> None:
@@ -72,15 +77,19 @@ def test_build_stops_at_the_first_error(truck):
     assert torch.get_num_threads() == before
 
 
-def test_bank_refuses_bad_arguments(truck, small_bank):
-    with pytest.raises(InvalidInputError, match="views: expected at least one"):
-        build(truck, small_bank.views[:0])
-    with pytest.raises(InvalidInputError, match="chunk_size"):
-        build(truck, chunk_size=0)
-    with pytest.raises(InvalidInputError, match="chunk_size"):
-        ViewMatcher(small_bank, chunk_size=0)
-    with pytest.raises(InvalidInputError, match=r"choose one of bank\.meshes"):
-        _ = ViewBank.join([small_bank, small_bank]).mesh
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda bank: build(bank.mesh, bank.views[:0]), "views: expected at least one"),
+        (lambda bank: build(bank.mesh, chunk_size=0), "chunk_size"),
+        (lambda bank: ViewMatcher(bank, chunk_size=0), "chunk_size"),
+        (lambda bank: ViewBank.join([bank, bank]).mesh, r"choose one of bank\.meshes"),
+        (lambda _: ViewBank.join([]), "at least one bank"),
+    ],
+)
+def test_bank_refuses_bad_arguments(small_bank, call, message):
+    with pytest.raises(InvalidInputError, match=message):
+        call(small_bank)
 
 
 def test_bank_unpacks_selected_masks(small_bank):
@@ -89,13 +98,6 @@ def test_bank_unpacks_selected_masks(small_bank):
     assert torch.equal(small_bank.silhouettes_at(slice(2, 5)), small_bank.silhouettes[2:5])
     assert small_bank.silhouettes.dtype == torch.bool
     assert 0.1 < float(small_bank.silhouettes.float().mean()) < 0.6
-
-
-def test_bank_moves_to_a_device(small_bank):
-    for device in ["cpu"] + (["cuda"] if torch.cuda.is_available() else []):
-        moved = small_bank.to(device)
-        assert moved.device.type == moved.rotations.device.type == moved.points.device.type == device
-        assert torch.equal(moved.silhouettes.cpu(), small_bank.silhouettes)
 
 
 def test_check_compatible_refuses_other_bank_settings(small_bank):
@@ -154,8 +156,6 @@ def test_join_refuses_banks_that_differ(small_bank, upright, truck):
         ViewBank.join([small_bank, coarse])
     with pytest.raises(InvalidInputError, match=r"one view policy, but bank 1 has .*upright.* and bank 0 .*given"):
         ViewBank.join([small_bank, upright])
-    with pytest.raises(InvalidInputError, match="at least one bank"):
-        ViewBank.join([])
 
 
 def test_matcher_finds_the_model_in_a_joined_bank(small_bank):
@@ -180,14 +180,6 @@ def test_save_and_load(small_bank, tmp_path):
         mask = os.umask(0)
         os.umask(mask)
         assert stat.S_IMODE(path.stat().st_mode) == 0o666 & ~mask
-
-
-@pytest.mark.parametrize("up", ["y", "z"])
-def test_load_restores_the_up_axis(truck, up, tmp_path):
-    mesh = truck.copy()
-    mesh.metadata["up"] = up
-    build(mesh, uniform_views(2)).save(tmp_path / "bank.safetensors")
-    assert mesh_up(ViewBank.load(tmp_path / "bank.safetensors").mesh) == up
 
 
 def test_float16_storage_changes_no_ranking(small_bank, saved):
@@ -230,59 +222,44 @@ def test_load_detects_changed_bits(saved):
         ({"version": "0"}, "bank format 0"),
         ({"pipeline": "{"}, "incomplete"),
         ({"pipeline": '{"bank": {"image_size": 64, "colour": 1}}'}, "incomplete"),
-        (
-            {"pipeline": Pipeline(bank=replace(SETTINGS, image_size=128)).to_json()},
-            "points, silhouettes: not of the shape",
-        ),
+        ({"pipeline": Pipeline().to_json()}, "points, silhouettes: not of the shape"),
     ],
 )
 def test_load_refuses_other_metadata(saved, metadata, message):
-    with safe_open(saved, framework="pt") as file:
-        original = file.metadata()
-    save_file(load_file(saved), saved, {**original, **metadata})
+    rewrite(saved, load_file(saved), **metadata)
     with pytest.raises(BankError, match=message):
         ViewBank.load(saved)
 
 
-def _with_nan(x):
-    x = x.clone()
+def with_nan(x):
     x[3, 1] = torch.nan
     return x
-
-
-def _infinite(x):
-    return torch.full_like(x, torch.inf)
 
 
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("descriptors", _with_nan, "not finite"),
+        ("descriptors", with_nan, "not finite"),
         ("descriptors", torch.zeros_like, "all zero"),
         ("boxes", lambda x: x[:, [2, 1, 0, 3]], "empty"),
         ("boxes", lambda x: x * torch.tensor([1.0, 0.0, 1.0, 0.0]), "empty"),
-        ("boxes", _with_nan, "not finite"),
+        ("boxes", with_nan, "not finite"),
         ("boxes", lambda x: x[1:], "boxes: not of the shape"),
         ("points", lambda x: x[:, 1:], "points: not of the shape"),
-        ("views.distance", _infinite, "viewpoints that are not finite"),
+        ("views.distance", lambda x: x / 0.0, "viewpoints that are not finite"),
         ("model", lambda x: x + 1, "meshes that do not exist"),
         ("model", lambda x: x - 1, "meshes that do not exist"),
         ("reranking.appearance", lambda x: x[1:], "appearance that do not fit"),
-        ("reranking.appearance", _with_nan, "appearance that do not fit"),
+        ("reranking.appearance", with_nan, "appearance that do not fit"),
         ("mesh0.faces", lambda x: x + 10**6, "mesh 0 is not a mesh"),
     ],
 )
-def test_load_refuses_contents_that_no_bank_has(small_bank, tmp_path, name, change, message):
-    """The checksum of these files is correct."""
-    path = tmp_path / "bank"
-    small_bank.save(path)
-    with safe_open(path, framework="pt") as file:
-        metadata = file.metadata()
-    tensors = load_file(path)
+def test_load_refuses_contents_that_no_bank_has(saved, name, change, message):
+    tensors = load_file(saved)
     tensors[name] = change(tensors[name]).contiguous()
-    save_file(tensors, path, {**metadata, "checksum": tensor_digest(tensors, size=16)})
+    rewrite(saved, tensors, checksum=tensor_digest(tensors, size=16))
     with pytest.raises(BankError, match=message):
-        ViewBank.load(path)
+        ViewBank.load(saved)
 
 
 def test_load_refuses_truncated_and_missing_files(saved):

@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,15 +8,10 @@ from torch.utils.data import DataLoader
 
 from curvireg_torch import ViewBank, ViewMatcher
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.matching import Ranking
-from curvireg_torch.terms import (
-    Correlation,
-    dilate_points,
-    normalized_correlation,
-    repeatability,
-    repeatability_score,
-    unit_score,
-)
+from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.matching import Ranking, distinct_views
+from curvireg_torch.terms import Correlation, dilate_points, normalized_correlation, unit_score
+from curvireg_torch.terms.repeatability import repeatability, repeatability_score
 from tests._support.scenes import scene
 
 
@@ -28,12 +24,11 @@ def batch(*seeds: int) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.stack([scene(s)[0] for s in seeds]), torch.stack([scene(s)[1] for s in seeds])
 
 
-@pytest.mark.parametrize("view", [0, 7, 60])
-def test_view_of_the_bank_matches_itself(bank, view):
-    similarity = normalized_correlation(bank.descriptors[view : view + 1], bank.descriptors)
-    rep = repeatability(bank.points[view : view + 1], dilate_points(bank.points, 0.02 * bank.settings.image_size))
-    assert int(similarity.argmax()) == view
-    assert float(rep[0, view]) == 1.0
+def test_views_of_the_bank_match_themselves(bank):
+    views = [0, 7, 60]
+    rep = repeatability(bank.points_at(views), dilate_points(bank.points, 0.02 * bank.settings.image_size))
+    assert normalized_correlation(bank.descriptors[views], bank.descriptors).argmax(dim=1).tolist() == views
+    assert rep[:, views].diag().tolist() == [1.0] * 3
 
 
 def test_ranking_is_sorted_bounded_and_a_product(bank, matcher):
@@ -113,19 +108,16 @@ def test_ranking_slice_owns_its_memory(matcher):
         assert x.untyped_storage().nbytes() == x.numel() * x.element_size()
 
 
-@pytest.mark.parametrize(("colour", "channels"), [(True, 3), (False, 1)])
-def test_matcher_passes_colours_to_colour_fields(bank, colour, channels):
-    seen = set()
-
+@pytest.mark.parametrize("channels", [3, 1])
+def test_matcher_passes_colours_to_colour_fields(bank, channels):
     class Field(torch.nn.Module):
-        def forward(self, image):
-            seen.add(image.shape[1])
-            return torch.cat([image[:, :1], image[:, :1]], dim=1)
+        colour = channels == 3
 
-    field = Field()
-    field.colour = colour
-    ViewMatcher(bank, field=field)(*batch(0))
-    assert seen == {channels}
+        def forward(self, image):
+            assert image.shape[1] == channels
+            return image[:, :1].expand(-1, 2, -1, -1)
+
+    ViewMatcher(bank, field=Field())(*batch(0))
 
 
 def test_matcher_weights_terms(bank):
@@ -158,3 +150,13 @@ def test_matcher_in_half_precision(bank):
         assert half.scores.dtype == torch.float32
         torch.testing.assert_close(half.hog, single.hog, rtol=0, atol=4e-3)
         torch.testing.assert_close(half.repeatability, single.repeatability, rtol=0, atol=4e-3)
+
+
+def test_distinct_views_applies_symmetries_to_the_model():
+    R = rotation_from_axis_angle(torch.tensor([0.9, -0.4, 0.7], dtype=torch.float64))
+    quarter = rotation_from_axis_angle(torch.tensor([0.0, 0.0, math.pi / 2], dtype=torch.float64))
+    symmetries = torch.stack([torch.eye(3, dtype=torch.float64), quarter, quarter @ quarter, quarter.T])
+    views = torch.stack([R, R @ quarter, quarter @ R, R @ quarter.T])
+    assert distinct_views(torch.arange(4), views, count=4, symmetries=symmetries).tolist() == [0, 2]
+    assert distinct_views(torch.tensor([3, 2, 1, 0]), views, count=4, symmetries=symmetries).tolist() == [3, 2]
+    assert distinct_views(torch.arange(4), views, count=4).tolist() == [0, 1, 2, 3]

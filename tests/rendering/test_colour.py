@@ -1,6 +1,5 @@
 """Meshes with colours: loading and rendering."""
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +26,12 @@ def camera(azimuth: float, elevation: float, theta: float = 0.0, distance: float
 
 
 def textured_box() -> trimesh.Trimesh:
-    """A box whose six sides show six stripes of one texture; the left half of each is darker."""
+    """A box whose six sides show six stripes of one texture; the left and the lower half of each are darker."""
     picture = np.zeros((16, 6 * 32, 3), np.uint8)
     for i, colour in enumerate(COLOURS):
         picture[:, 32 * i : 32 * (i + 1)] = colour
         picture[:, 32 * i : 32 * i + 16] //= 2
+    picture[8:] //= 2
     vertices, faces, uv = [], [], []
     for i in range(6):
         axis, sign = i // 2, 1 if i % 2 else -1
@@ -45,12 +45,12 @@ def textured_box() -> trimesh.Trimesh:
 
 
 def expected_albedo(points: np.ndarray) -> np.ndarray:
-    """Colour of points on the box, from their side and half."""
-    side = np.abs(points).argmax(axis=1)
-    sign = points[np.arange(len(points)), side] > 0
-    colour = np.array(COLOURS)[2 * side + sign] / 255
-    first = points[np.arange(len(points)), (side + 1) % 3]
-    return np.where(first[:, None] < 0, colour // (2 / 255) / 255, colour)
+    """Colour of points on the box, from their side and halves."""
+    side, index = np.abs(points).argmax(axis=1), np.arange(len(points))
+    colour = np.array(COLOURS)[2 * side + (points[index, side] > 0)]
+    for k in (1, 2):
+        colour = np.where(points[index, (side + k) % 3, None] < 0, colour // 2, colour)
+    return colour / 255
 
 
 @pytest.mark.parametrize("view", [(20.0, 30.0, 0.0), (140.0, -40.0, 25.0), (260.0, 10.0, -70.0)])
@@ -68,10 +68,9 @@ def test_render_colour_shows_the_texture_of_every_side(view: tuple[float, float,
     points = np.c_[rays[:, :2], z[v, u]] if orthographic else rays * z[v, u, None]
     points = (points - T[0, :3, 3].numpy()) @ T[0, :3, :3].numpy()
     order = np.sort(np.abs(points), axis=1)
-    middle = np.abs(points[np.arange(len(points)), (np.abs(points).argmax(axis=1) + 1) % 3])
-    clear = (order[:, 1] < 0.38) & (middle > 0.12)  # away from edges and from the line between the halves
+    clear = (order[:, 1] < 0.38) & (order[:, 0] > 0.12)  # away from edges and from the lines between the halves
     sides = np.unique(np.abs(points).argmax(axis=1)[clear])
-    assert clear.sum() > 300
+    assert clear.sum() > 200
     assert len(sides) >= 2
     expected = expected_albedo(points) * grey[v, u, None]
     correct = np.abs(picture[v, u] - expected).max(axis=1) < 0.02
@@ -79,34 +78,6 @@ def test_render_colour_shows_the_texture_of_every_side(view: tuple[float, float,
     for side in sides:
         assert correct[clear & (np.abs(points).argmax(axis=1) == side)].mean() > 0.8
     assert picture[0, 0].tolist() == [1.0, 1.0, 1.0]
-
-
-def can() -> trimesh.Trimesh:
-    """A cylinder with a printed band near its top."""
-    print_ = np.full((64, 64, 3), 255, np.uint8)
-    print_[8:24] = (200, 0, 0)
-    angle = np.linspace(0, 2 * math.pi, 33)
-    ring = np.stack([np.cos(angle), np.sin(angle)], 1)
-    vertices = np.concatenate([np.c_[ring, np.full(33, z)] for z in (-1.2, 1.2)])
-    uv = np.concatenate([np.c_[angle / (2 * math.pi), np.full(33, v)] for v in (0.0, 1.0)])
-    i = np.arange(32)
-    faces = np.concatenate([np.stack([i, i + 1, i + 34], 1), np.stack([i, i + 34, i + 33], 1)])
-    material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(print_))
-    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-    return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
-
-
-def test_render_colour_distinguishes_a_can_from_the_same_can_upside_down() -> None:
-    mesh = can()
-    up, down = camera(0.0, 0.0, distance=12.0), camera(0.0, 0.0, 180.0, distance=12.0)
-    a, b = (render_colour(mesh, T, K, SIZE) for T in (up, down))
-    plain = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    grey = [render_colour(plain, T, K, SIZE) for T in (up, down)]
-    assert float((grey[0] - grey[1]).abs().max()) < 0.05
-    assert float((a - b).abs().mean()) > 0.02
-    red = (a[0, 0] - a[0, 1] > 0.3).nonzero()[:, 0].float().mean()
-    assert float(red) < SIZE[0] / 2 - 3  # the band is near the top, which is up
-    assert float((b[0, 0] - b[0, 1] > 0.3).nonzero()[:, 0].float().mean()) > SIZE[0] / 2 + 3
 
 
 def test_render_colour_is_grey_without_colours_or_faces() -> None:

@@ -7,7 +7,6 @@ import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, MeshError, RenderingError
-from curvireg_torch.io.meshes.mesh import as_mesh
 from curvireg_torch.rendering import BACKENDS, factory, make_renderer, opengl
 from curvireg_torch.rendering.embree import EmbreeRenderer
 
@@ -63,14 +62,6 @@ def test_render_places_the_parts_of_a_scene(backend: str) -> None:
     scene.add_geometry(part, node_name="b", parent_node_name="a", transform=T)  # relative to a
     whole = trimesh.util.concatenate([part.copy().apply_transform(T), part.copy().apply_transform(T @ T)])
     assert torch.equal(render(scene, backend), render(whole, backend))
-
-
-def test_render_ignores_textures() -> None:
-    plain = trimesh.creation.box()
-    textured = plain.copy()
-    textured.visual = trimesh.visual.TextureVisuals(uv=np.random.default_rng(0).random((len(plain.vertices), 2)))
-    assert torch.equal(render(textured, "embree"), render(plain, "embree"))
-    assert not hasattr(as_mesh(textured).visual, "uv")
 
 
 def test_render_with_the_camera_inside_and_the_object_behind(backend: str, orthographic: bool) -> None:

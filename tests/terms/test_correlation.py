@@ -27,9 +27,8 @@ def test_normalized_correlation_is_the_cosine():
 
 
 def test_unit_score_is_an_exponential_of_standard_deviations():
-    """0, 0, 0 and 1 have a standard deviation of sqrt(3) / 4 (N in the denominator), so 0 is 4 / sqrt(3) below 1."""
     score = unit_score(torch.tensor([[0.0, 0.0, 0.0, 1.0], [3.0, 3.0, 3.0, 5.0]]))
-    low = math.exp(-4.0 / math.sqrt(3.0))
+    low = math.exp(-4.0 / math.sqrt(3.0))  # the standard deviation of 0, 0, 0, 1 is sqrt(3) / 4
     torch.testing.assert_close(score, torch.tensor([[low, low, low, 1.0]] * 2))
 
 
