@@ -12,7 +12,7 @@ from curvireg_torch.registration import Hypothesis, Localization
 from curvireg_torch.registration.document import correction, localization_document, result_document
 
 
-def registration(covariance=None, confidence=0.9, localization=None, distance=2.0):
+def registration(covariance=None, confidence=0.9, localization=None):
     """A registration to a bank of two views, the second of which one term did not compare."""
     terms = {"hog": torch.tensor([[0.5, 0.4]]), "appearance": torch.tensor([[0.3, torch.nan]])}
     ranking = Ranking(torch.tensor([[0.9, 0.8]]), torch.tensor([[0, 1]]), terms)
@@ -20,14 +20,13 @@ def registration(covariance=None, confidence=0.9, localization=None, distance=2.
     hypotheses = tuple(
         Hypothesis(
             rotation=eye,
-            translation=torch.tensor([0.0, 0.0, distance], dtype=torch.float64),
+            translation=2.0 * eye[2],
             score=0.7 - 0.1 * view,
             evidence={"rank": 0.0},
             allocentric_rotation=eye,
-            distance=distance,
+            distance=2.0,
             projection=(torch.eye(4, dtype=torch.float64), eye),
             view=view,
-            edge_support=0.5,
             covariance=covariance,
         )
         for view in (0, 1)

@@ -22,14 +22,8 @@ pytestmark = pytest.mark.data
 
 @dataclass(frozen=True)
 class Case:
-    """Photographs of one mesh, and the largest errors of their poses.
-
-    Attributes:
-        name: of the set.
-        keys: of the benchmark's objects.
-        rotation: degrees, up to the object's symmetries.
-        sideways, depth: across and along the optical axis, as fractions of the distance.
-    """
+    """Photographs of one mesh by set and keys, and the largest errors: degrees up to symmetries, and fractions of the
+    distance across and along the optical axis."""
 
     name: str
     keys: tuple[str, ...]

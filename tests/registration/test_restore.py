@@ -7,12 +7,10 @@ import pytest
 import torch
 
 from curvireg_torch import Registrar, Registration, ViewBank, rotation_error, sample_views
-from curvireg_torch.geometry import rotation_from_viewpoint
+from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.io.meshes import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import Hypothesis
-from curvireg_torch.registration.contours import contour_support
-from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE
 
@@ -30,9 +28,8 @@ def coarse_bank() -> ViewBank:
 def photographs() -> tuple[list[torch.Tensor], torch.Tensor]:
     mesh, images, boxes = example_mesh(), [], []
     for azimuth in AZIMUTHS:
-        T = torch.eye(4, dtype=torch.float64)
-        T[:3, :3] = rotation_from_viewpoint(azimuth, 20.0, 0.0)
-        T[:3, 3] = torch.tensor([0.0, 0.0, 3.5 * mesh_radius(mesh)]) - T[:3, :3] @ mesh_centre(mesh)
+        R = rotation_from_viewpoint(azimuth, 20.0, 0.0).double()
+        T = transform(R, torch.tensor([0.0, 0.0, 3.5 * mesh_radius(mesh)]) - R @ mesh_centre(mesh))
         image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, torch.Generator().manual_seed(1))
         images.append(image)
         boxes.append(box)
@@ -70,19 +67,9 @@ def test_restored_hypotheses_come_last(results):
     assert higher >= 2
 
 
-def test_edge_support_of_restored_hypotheses_is_that_of_the_view(results):
-    images, boxes = photographs()
-    options = {"centre": mesh_centre(example_mesh()), "radius": mesh_radius(example_mesh())}
-    for result, image, box in zip(results, images, boxes, strict=True):
-        assert restored(result)
-        for h in restored(result):
-            T, K = h.projection
-            support = contour_support(make_renderer(example_mesh()), image, box, K, T[None], **options)
-            assert h.evidence["edge_support"] == h.edge_support == pytest.approx(float(support), abs=0.02)
-
-
 def test_restored_hypotheses_have_no_covariance(results):
     for result in results:
+        assert restored(result)
         assert result.reliable
         assert result.covariance is not None
         assert all(h.covariance is None for h in restored(result))

@@ -73,16 +73,7 @@ class Locator(nn.Module):
     standard deviations above its mean over the photograph. Peaks over position, size and view are boxes.
 
     Args:
-        matcher: of the bank; ``locate`` of its pipeline holds the settings.
-
-    Example:
-        >>> import trimesh
-        >>> from curvireg_torch.geometry import sample_views
-        >>> bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), sample_views(azimuth_step=45, elevations=[20]),
-        ...                       image_size=64, progress=False)
-        >>> located = Locator(ViewMatcher(bank))([torch.rand(3, 96, 128)])[0]
-        >>> located.boxes.shape == (len(located.scores), 4)
-        True
+        matcher: of the bank; ``locate`` of its pipeline holds the settings. For an example see :func:`locate`.
     """
 
     def __init__(self, matcher: ViewMatcher) -> None:

@@ -31,7 +31,6 @@ CUBE_POSE = pose([0.4, 0.5, 0.1], [0.0, 0.0, 8.0])
 
 
 def geometry(mesh: trimesh.Trimesh) -> dict[str, Any]:
-    """The options of :func:`fit_contours` that depend on the mesh."""
     return {"centre": mesh_centre(mesh), "radius": mesh_radius(mesh)}
 
 

@@ -1,12 +1,12 @@
 """Steps of the contour fit on edges at known distances along the normals."""
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 import torch.nn.functional as F
-import trimesh
 from torch import Tensor
 
 from curvireg_torch.io.meshes import mesh_centre
@@ -107,23 +107,15 @@ def test_unfinished_starts_without_gain_come_back_unchanged() -> None:
     assert 3 <= int(unchanged.sum()) < 9
 
 
-class CountingRenderer:
-    """Notes how many poses are rendered at full size at a time."""
-
-    name = "counting"
-
-    def __init__(self, mesh: trimesh.Trimesh) -> None:
-        self.inner, self.counts = make_renderer(mesh), [0]
-
-    def render(self, T: Tensor, K: Tensor, size: tuple[int, int], **options: Any) -> Tensor:
-        if size[0] == 256:
-            self.counts.append(len(T))
-        return self.inner.render(T, K, size, **options)
-
-
 @pytest.mark.parametrize(("clear", "expected"), [(True, 1), (False, 2)], ids=["silhouette", "noise"])
 def test_second_fit_continues_where_it_is_another_pose(clear, expected) -> None:
     """On a silhouette all rotations lead back to the true pose; on noise they lead elsewhere."""
-    renderer = CountingRenderer(cube())
-    fitted(silhouette(cube(), CUBE_POSE) if clear else noise(), CUBE_POSE[None], renderer=renderer)
-    assert max(renderer.counts) == expected
+    renderer, at_full_size = make_renderer(cube()), []
+
+    def render(T: Tensor, K: Tensor, size: tuple[int, int]) -> Tensor:
+        at_full_size.extend([len(T)] * (size[0] == 256))
+        return renderer.render(T, K, size)
+
+    counting = SimpleNamespace(name="counting", render=render)
+    fitted(silhouette(cube(), CUBE_POSE) if clear else noise(), CUBE_POSE[None], renderer=counting)
+    assert max(at_full_size) == expected

@@ -1,6 +1,7 @@
 """The contour fit against closed forms, automatic differentiation and scenes of known truth."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -116,14 +117,14 @@ def test_fit_contours_recovers_a_pose_three_degrees_and_three_per_cent_off(seed)
     torch.testing.assert_close(both.edge_support[:1], fit.edge_support)
 
 
-@pytest.mark.parametrize("case", ["one colour", "outside the crop", "behind the camera"])
-def test_fit_contours_without_edges_returns_the_start(case):
-    start = CUBE_POSE[None].clone()
-    if case == "outside the crop":
-        start[0, 0, 3] = 9.0
-    elif case == "behind the camera":
-        start[0, 2, 3] = -8.0
-    fit = fitted(torch.full((3, 128, 128), 0.4) if case == "one colour" else noise(), start)
+@pytest.mark.parametrize(
+    ("image", "position"),
+    [(torch.full((3, 128, 128), 0.4), [0.0, 0.0, 8.0]), (noise(), [9.0, 0.0, 8.0]), (noise(), [0.0, 0.0, -8.0])],
+    ids=["one colour", "outside the crop", "behind the camera"],
+)
+def test_fit_contours_without_edges_returns_the_start(image, position):
+    start = pose([0.4, 0.5, 0.1], position)[None]
+    fit = fitted(image, start)
     assert fit.transform.equal(start)
     assert float(fit.edge_support) == 0
     assert bool(fit.covariance.isnan().all())
@@ -150,14 +151,12 @@ def test_fit_contours_of_a_batch_equals_single_fits():
     images, boxes, cameras, starts, image_index = several()
     renderer, calls, options = make_renderer(cube()), [], geometry(cube())
 
-    class Counting:
-        name = "counting"
+    def render(*arguments):
+        calls.append(len(arguments[0]))
+        return renderer.render(*arguments)
 
-        def render(self, *arguments, **more):
-            calls.append(len(arguments[0]))
-            return renderer.render(*arguments, **more)
-
-    fit = fit_contours(Counting(), images, boxes, cameras, starts, image_index=image_index, **options)
+    counting = SimpleNamespace(name="counting", render=render)
+    fit = fit_contours(counting, images, boxes, cameras, starts, image_index=image_index, **options)
     # Whatever the number of starts: the first rounds twice, from the starts and from rotations of them.
     rounds = len(fit_module.FIRST + fit_module.FIRST + fit_module.SECOND + fit_module.FINE)
     assert len(calls) <= rounds + 4  # both beginnings; at full size the fits, and the starts themselves
@@ -217,15 +216,15 @@ def test_fit_contours_rejects_bad_input(start, box, message):
 def test_fit_contours_rejects_bad_indices_cameras_and_counts():
     two = (make_renderer(cube()), [noise(), noise()], BOX.repeat(2, 1))
     start, first, options = CUBE_POSE[None], torch.tensor([0]), geometry(cube())
-    with pytest.raises(InvalidInputError, match="image_index: got 2 images"):
-        fit_contours(*two, K, start, **options)
-    for index in (torch.tensor([2]), torch.tensor([-1]), torch.tensor([0, 1]), torch.tensor([0.0])):
-        with pytest.raises(InvalidInputError, match="image_index: expected"):
-            fit_contours(*two, K, start, image_index=index, **options)
-    with pytest.raises(InvalidInputError, match="camera_matrices: expected one or 2"):
-        fit_contours(*two, K.repeat(3, 1, 1), start, image_index=first, **options)
-    with pytest.raises(InvalidInputError, match="finish: expected"):
-        fit_contours(*two, K, start, image_index=first, finish=0, **options)
+    indices = [torch.tensor(index) for index in ([2], [-1], [0, 1], [0.0])]
+    for cameras, changed, message in (
+        (K, {"image_index": None}, "image_index: got 2 images"),
+        *((K, {"image_index": index}, "image_index: expected") for index in indices),
+        (K.repeat(3, 1, 1), {}, "camera_matrices: expected one or 2"),
+        (K, {"finish": 0}, "finish: expected"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            fit_contours(*two, cameras, start, **{"image_index": first, **options, **changed})
     none = fitted(noise(), start[:0])
     assert (none.transform.shape, none.covariance.shape, none.edge_support.shape) == ((0, 4, 4), (0, 6, 6), (0,))
 

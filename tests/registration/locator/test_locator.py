@@ -12,7 +12,6 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import box_iou, projected_boxes
 from curvireg_torch.matching import ViewDescriber, ViewMatcher
 from curvireg_torch.registration.locator import Locator
-from curvireg_torch.registration.locator.dense_features import BackboneFeatures, dense_features_for
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from tests._support.scenes import CAMERA, scene, truck_bank
 
@@ -46,10 +45,7 @@ def clutter(seed):
 
 
 def test_dense_features_reuse_the_network_of_the_appearance_term():
-    matcher = ViewMatcher(bank())
-    features = dense_features_for(matcher)
-    assert isinstance(features, BackboneFeatures)
-    assert any(features.backbone is module for module in matcher.modules())
+    assert any(locator().features.backbone is module for module in locator().matcher.modules())
 
 
 def test_locator_uses_learned_features_where_the_pipeline_has_any():
@@ -144,22 +140,18 @@ def test_distance_limits_each_box_by_its_view():
     assert float(away.max()) < high * 2.0**0.25 * 1.1
 
 
-@pytest.mark.parametrize("distance", [(0.0, 1.0), (2.0, 1.0), (-1.0, 1.0), (1.0, float("inf")), (float("nan"), 1.0)])
-def test_locator_rejects_bad_distances(distance):
-    with pytest.raises(InvalidInputError, match="distance: expected 0 < MIN <= MAX"):
-        locator()([torch.rand(3, 60, 80)], camera_matrices=[CAMERA], distance=distance)
-
-
-def test_locator_rejects_missing_cameras_bad_images_and_bad_settings():
+def test_locator_rejects_bad_distances_images_and_settings():
+    for distance in ((0.0, 1.0), (2.0, 1.0), (-1.0, 1.0), (1.0, float("inf")), (float("nan"), 1.0)):
+        with pytest.raises(InvalidInputError, match="distance: expected 0 < MIN <= MAX"):
+            locator()([torch.rand(3, 60, 80)], camera_matrices=[CAMERA], distance=distance)
     with pytest.raises(InvalidInputError, match="distance: needs the camera matrix"):
         locator()([torch.rand(3, 60, 80)], distance=(1.0, 2.0))
     for wrong in (torch.rand(2, 60, 80), torch.rand(60, 80), torch.rand(3, 0, 80)):
         with pytest.raises(InvalidInputError, match="images: expected"):
             locator()([wrong])
-    with pytest.raises(InvalidInputError, match="min_size"):
-        cr.pipeline.LocateSettings(min_size=0.0)
-    with pytest.raises(InvalidInputError, match="views, proposals"):
-        cr.pipeline.LocateSettings(views=0)
+    for settings, message in (({"min_size": 0.0}, "min_size"), ({"views": 0}, "views, proposals")):
+        with pytest.raises(InvalidInputError, match=message):
+            cr.pipeline.LocateSettings(**settings)
 
 
 def test_locate_pads_photographs_with_fewer_boxes():
