@@ -5,35 +5,24 @@ import torch
 import torch.nn.functional as F
 import trimesh
 
-from curvireg_torch import (
-    BankSettings,
-    ImageGradient,
-    MultiScaleCurvilinearSaliency,
-    MultiScaleFocusCurves,
-    ViewBank,
-    ViewMatcher,
-    camera_matrix,
-    load_mesh,
-    rotation_error,
-    sample_views,
-)
+import curvireg_torch as cr
 from curvireg_torch.geometry import pose_from_box
 from curvireg_torch.io import read_image
 from curvireg_torch.synthetic import random_pose, synthesize_photograph
 from tests._support.real_data import real_data
 
 SIZE = (360, 480)
-CAMERA = camera_matrix(600.0, 600.0, 239.5, 179.5, dtype=torch.float64)
+CAMERA = cr.camera_matrix(600.0, 600.0, 239.5, 179.5, dtype=torch.float64)
 PHOTOGRAPHS = 40
 
 
-def fraction_within_30_degrees(field: torch.nn.Module, bank: ViewBank, scenes: list) -> float:
-    matcher = ViewMatcher(bank, field=field)
+def fraction_within_30_degrees(field: torch.nn.Module, bank: cr.ViewBank, scenes: list) -> float:
+    matcher = cr.ViewMatcher(bank, field=field)
     images, boxes = [image for image, _, _ in scenes], torch.stack([box for _, box, _ in scenes])
     best = bank.rotations[matcher(images, boxes).order[:, 0]]
     points = torch.from_numpy(bank.mesh.convex_hull.vertices.copy())
     found = [pose_from_box(points, R, box, CAMERA)[0] for R, (_, box, _) in zip(best, scenes, strict=True)]
-    errors = [rotation_error(R, T[:3, :3]) for R, (_, _, T) in zip(found, scenes, strict=True)]
+    errors = [cr.rotation_error(R, T[:3, :3]) for R, (_, _, T) in zip(found, scenes, strict=True)]
     return float((torch.stack(errors) < 30).float().mean())
 
 
@@ -42,12 +31,16 @@ def fraction_within_30_degrees(field: torch.nn.Module, bank: ViewBank, scenes: l
 def test_focus_curves_rank_better_than_simpler_fields():
     folder, backgrounds = real_data("meshes"), sorted(real_data("backgrounds").glob("*.jpg"))
     pictures = [F.interpolate(read_image(p)[None], SIZE, mode="bilinear", antialias=True)[0] for p in backgrounds]
-    fields = {"MFC": MultiScaleFocusCurves(), "MCS": MultiScaleCurvilinearSaliency(), "gradient": ImageGradient()}
+    fields = {
+        "MFC": cr.MultiScaleFocusCurves(),
+        "MCS": cr.MultiScaleCurvilinearSaliency(),
+        "gradient": cr.ImageGradient(),
+    }
     fractions: dict[str, list[float]] = {name: [] for name in fields}
     for name in ("spot", "rocker-arm", "beetle"):
-        mesh = load_mesh(folder / f"{name}.obj")
+        mesh = cr.load_mesh(folder / f"{name}.obj")
         mesh.apply_transform(trimesh.transformations.rotation_matrix(torch.pi / 2, [1, 0, 0]))  # y up to z up
-        bank = ViewBank.build(mesh, sample_views(), settings=BankSettings(image_size=128), progress=False)
+        bank = cr.ViewBank.build(mesh, cr.sample_views(), settings=cr.BankSettings(image_size=128), progress=False)
         scenes = []
         for seed in range(PHOTOGRAPHS):
             generator = torch.Generator().manual_seed(seed)

@@ -174,12 +174,11 @@ class ViewBank:
 
         def describe_chunk(start: int) -> dict[str, Tensor]:
             chunk = rotations[start : start + chunk_size], distances[start : start + chunk_size]
-            tensors = {**vars(describe(*chunk))}
-            tensors |= {name: _pack(tensors[name]) for name in ("points", "silhouettes")}
-            features = {
+            described = describe(*chunk)
+            tensors = vars(described) | {n: _pack(getattr(described, n)) for n in ("points", "silhouettes")}
+            return tensors | {
                 RERANKING + n: module.describe(describe.shaded(*chunk)).half() for n, module in reranking.items()
             }
-            return {**tensors, **features}
 
         parts = []
         with (

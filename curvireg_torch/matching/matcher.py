@@ -108,8 +108,7 @@ class ViewMatcher(nn.Module):
 
         Raises:
             InvalidInputError: wrong shape or dtype, another number of boxes than of images, or an unusable box.
-            ImageError: missing (NaN or infinite) pixels in the crop of a box, or pixels outside [0, 1]. Missing pixels
-                elsewhere are ignored.
+            ImageError: pixels of the crop of a box are missing (NaN or infinite) or outside [0, 1].
         """
         boxes = as_boxes(boxes, len(images))
         parts = [
@@ -147,14 +146,9 @@ class ViewMatcher(nn.Module):
         )
 
     def rank(self, query: QueryFeatures, log_prior: Tensor | None = None) -> Ranking:
-        """Compare described photographs with all views.
+        """Compare B described photographs with all views; errors as :meth:`forward`.
 
-        Args:
-            query: B photographs.
-            log_prior: (B, N) log prior of the views, added to the log of their scores; ``-inf`` excludes a view.
-
-        Raises:
-            ImageError: missing pixels in the crop of a box, or pixels outside [0, 1].
+        ``log_prior`` (B, N) of the views is added to the log of their scores; ``-inf`` excludes a view.
         """
         check_pixels(query.crops, "of the box")
         first = [t for t in self.pipeline.terms if not isinstance(t, RerankingTerm)]

@@ -3,6 +3,7 @@
 import os
 import stat
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -40,6 +41,10 @@ def saved(small_bank, tmp_path):
     return tmp_path / "bank.safetensors"
 
 
+def interrupt(*_, **__):
+    raise KeyboardInterrupt
+
+
 def rewrite(path, tensors, **metadata):
     with safe_open(path, framework="pt") as file:
         original = file.metadata()
@@ -65,15 +70,9 @@ def test_build_does_not_depend_on_chunks_and_threads(small_bank, truck):
 
 
 def test_build_stops_at_the_first_error(truck):
-    class Broken:
-        name = "broken"
-
-        def render(self, *_, **__):
-            raise KeyboardInterrupt
-
     before = torch.get_num_threads()
     with pytest.raises(KeyboardInterrupt):
-        build(truck, uniform_views(3), renderer=Broken(), chunk_size=1)
+        build(truck, uniform_views(3), renderer=SimpleNamespace(render=interrupt), chunk_size=1)
     assert torch.get_num_threads() == before
 
 
@@ -193,9 +192,6 @@ def test_float16_storage_changes_no_ranking(small_bank, saved):
 
 
 def test_interrupted_save_leaves_the_old_file(small_bank, saved, monkeypatch):
-    def interrupt(_):
-        raise KeyboardInterrupt
-
     content = saved.read_bytes()
     monkeypatch.setattr(os, "fsync", interrupt)  # after the content is written, before the file is renamed
     for name in (saved.name, "other.safetensors"):

@@ -1,3 +1,5 @@
+from unittest.mock import Mock
+
 import pytest
 import torch
 
@@ -11,17 +13,9 @@ def test_describer_renders_quarter_turns_once(truck, camera):
     describe = ViewDescriber(truck, BankSettings(image_size=64, camera=camera))
     views = sample_views(azimuth_step=180, elevations=[20], thetas=[0, 35, 90, 180, 215, 270, 305])
     rotations, distances = views.rotations, views.distance * describe.radius
-    rendered = []
-    render = describe.renderer.render
-
-    class Counting:
-        def render(self, T, *arguments, **options):
-            rendered.append(len(T))
-            return render(T, *arguments, **options)
-
-    describe.renderer = Counting()
+    describe.renderer = Mock(wraps=describe.renderer)
     together = describe(rotations, distances)
-    assert rendered == [4]  # two directions, at 0 and 35 degrees
+    assert [len(call.args[0]) for call in describe.renderer.render.call_args_list] == [4]  # two directions, 0 and 35
     for i in range(len(rotations)):
         alone = describe(rotations[i : i + 1], distances[i : i + 1])
         assert (together.descriptors[i] - alone.descriptors[0]).norm() < 0.02 * alone.descriptors[0].norm()
