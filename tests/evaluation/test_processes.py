@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from curvireg_torch.cli import main
-from tests._support.lists import RESULTS, box_of, lines, table, write_files, written
+from tests._support.lists import box_of, lines, write_files, written
 
 REPOSITORY = Path(__file__).parents[2]
 PYTHON = (sys.executable, "-m")
@@ -100,18 +100,3 @@ def test_job_array_gives_the_same_results(case, expected, tmp_path):
     assert run([*words, "--out", out]).returncode == 0
     assert read(out) == expected
     assert not list(out.glob("results.*-of-*"))
-
-
-def test_results_have_the_columns_of_the_list(tmp_path):
-    write_files(tmp_path)
-    path = written(tmp_path / "list.csv", "photo,x0,y0,x1,y1", ["photos/0.png", *box_of(0)])
-    words = ["register", "--list", path, tmp_path / "truck.ply", "--out", tmp_path / "out"]
-    assert run(words, launcher=TORCHRUN).returncode == 0, "fewer photographs than processes"
-    assert list(table(tmp_path / "out")[0])[5:] == RESULTS
-
-
-def test_overwrite_is_refused_in_a_job_array(pascal, tmp_path):
-    words = ["evaluate", "pascal3d", pascal.root, "--out", tmp_path, "--overwrite"]
-    done = run(words, RANK=0, WORLD_SIZE=2)
-    assert done.returncode == 2
-    assert "job array" in done.stderr

@@ -92,6 +92,8 @@ def test_other_settings_are_refused(tmp_path):
     store.open({"preset": "a", "seed": 1})
     with pytest.raises(InvalidInputError, match=r"preset: 'a' there, 'b' now.*--overwrite"):
         store.open({"preset": "b", "seed": 1})
+    with pytest.raises(InvalidInputError, match="job array"):
+        ResultStore(tmp_path, Workers(0, 2)).open({}, overwrite=True)
     assert "x" in store
     store.open({"preset": "b", "seed": 1}, overwrite=True)
     assert "x" not in store
