@@ -74,6 +74,10 @@ class MissingFileError(CurviregError, FileNotFoundError):
     """A file or folder does not exist."""
 
 
+class LostObjectError(CurviregError, ValueError):
+    """The object is not near the pose that a refinement started from."""
+
+
 class OutputError(InvalidInputError, OSError):
     """A file or folder cannot be written."""
 

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InvalidInputError
+from ..errors import InvalidInputError, LostObjectError
 from ..utils.files import check_writable
 from ..utils.input_paths import check_given, is_one_photograph
 from .options import (
@@ -73,6 +73,8 @@ def add_parser(commands: Any) -> None:
         "file) or --fov; the result then has no covariance",
     )
     add("--exif", action="store_true", help=argparse.SUPPRESS)
+    start = "result.json, or any JSON with rotation and translation: refine this pose in one photograph; needs no box"
+    add("--start", type=Path, metavar="FILE", help=start)
     add_pose_prior(parser)
     add("--instances", type=int, default=1, metavar="N", help="without a box: up to N objects (default: 1)")
     distances = "without a box: range of the object's distance in the mesh's unit; needs --camera"
@@ -104,6 +106,8 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "expected one of --camera FX FY CX CY, --camera exif, --fov DEG"
     if arguments.box and (arguments.instances != 1 or arguments.distance):
         return "--instances and --distance apply only without a box; leave --box out"
+    if arguments.start is not None and (arguments.box or arguments.list is not None or len(arguments.meshes) > 1):
+        return "--start refines one mesh in one photograph; leave --box and --list out"
     if arguments.list is not None and (arguments.box or arguments.camera):
         return "the list holds boxes and cameras; leave --box and --camera out"
     return None
@@ -122,6 +126,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.list is None and is_one_photograph(options.photos):
         _register_one(options, field, arguments.out, as_json=arguments.json)
         return
+    if options.start is not None:
+        raise InvalidInputError("--start: refines one pose; give one photograph")
     if run_processes(arguments.jobs, arguments.argv):
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -143,7 +149,7 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
 
     from ..evaluation.lists import register_entry
     from ..evaluation.opening import open_registrar
-    from ..evaluation.result_files import write_result
+    from ..evaluation.result_files import write_lost, write_result
     from ..evaluation.store import to_json
     from ..io import read_photo
     from ..registration.document import used_box
@@ -156,9 +162,14 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
         check_writable(out, "--out")
     registrar = open_registrar(options, options.meshes, field)
     ready = time.perf_counter() - start
-    if options.box is None and options.progress:
+    if options.box is None and options.start is None and options.progress:
         print(f"{path}: localizing the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
-    result, document = register_entry(options.entry(path), photo, registrar, bank_seconds=ready)
+    try:
+        result, document = register_entry(options.entry(path), photo, registrar, bank_seconds=ready)
+    except LostObjectError as error:
+        if out is not None:
+            write_lost(out, str(error))
+        raise
     notes = sys.stderr if as_json else sys.stdout  # with --json, standard output holds only the result
     if out is not None:
         write_result(out, document, registrar, result, photo.image, used_box(document))

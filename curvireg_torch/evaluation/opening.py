@@ -4,16 +4,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ..errors import BankError
-from ..geometry import camera_matrix
-from ..geometry.cameras import camera_of_view
+import torch
+
+from ..errors import BankError, InvalidInputError
+from ..geometry import camera_matrix, sample_views
+from ..geometry.cameras import camera_of_view, transform
 from ..geometry.pose_prior import PosePrior
+from ..io.json_files import finite_numbers, read_json
 from ..io.meshes import load_mesh
 from ..matching import ViewBank, cached_bank
 from ..models import LearnedCurvilinearSaliency
 from ..pipeline import Pipeline, preset_named
 from ..registration import Registrar
-from ..utils.checks import check_square_pixels
+from ..utils.checks import check_rotation, check_square_pixels
 from ..utils.choices import DEFAULT
 from .lists import Entry
 
@@ -31,6 +34,7 @@ class RegisterOptions:
         guess: of an unknown camera: "exif", or the horizontal field of view in degrees.
         instances, distance: without a box, see :func:`curvireg_torch.registration.localize`.
         prior: limits on the pose.
+        start: file of a pose (``rotation`` and ``translation``, as in result.json) that is refined instead of a search.
         preset, pipeline: name of a pipeline, or its JSON file; None: the pipeline of a bank, or the default.
         pose, top: the pose prior, and the number of hypotheses; None: those of the pipeline.
         field: weights of an adapted field.
@@ -47,6 +51,7 @@ class RegisterOptions:
     instances: int = 1
     distance: tuple[float, float] | None = None
     prior: PosePrior | None = None
+    start: Path | None = None
     preset: str | None = None
     pipeline: Path | None = None
     pose: str | None = None
@@ -79,7 +84,10 @@ class RegisterOptions:
 
     def complete(self, entry: Entry) -> Entry:
         """A photograph of a list with the options that a list does not hold."""
-        return replace(entry, guess=self.guess, instances=self.instances, distance=self.distance, prior=self.prior)
+        start = None if self.start is None else read_start(self.start)
+        return replace(
+            entry, guess=self.guess, instances=self.instances, distance=self.distance, prior=self.prior, start=start
+        )
 
 
 def check_camera(camera: Sequence[float] | None, guess: str | float | None) -> None:
@@ -88,6 +96,27 @@ def check_camera(camera: Sequence[float] | None, guess: str | float | None) -> N
         check_square_pixels(camera_matrix(*camera), "--camera")
     if isinstance(guess, float):
         camera_of_view(guess, (1, 1))
+
+
+def read_start(path: Path) -> tuple[tuple[float, ...], ...]:
+    """(4, 4) pose ``T_cam_from_model`` of a JSON file that holds ``rotation`` and ``translation``, as result.json does.
+
+    Raises:
+        CurviregError: the file is missing, damaged or does not hold a rigid pose.
+    """
+    content = read_json(path, dict, "docs/guides/known-pose.md")
+    rows = content.get("rotation")
+    rotation = [finite_numbers(row, 3) for row in rows] if isinstance(rows, list) else []
+    translation = finite_numbers(content.get("translation"), 3)
+    if len(rotation) != 3 or None in rotation or translation is None:
+        raise InvalidInputError("expected rotation (3 x 3 numbers) and translation (3 numbers)", subject=path)
+    R = torch.tensor([list(row or ()) for row in rotation], dtype=torch.float64)
+    try:
+        check_rotation(R, "rotation")
+    except InvalidInputError as error:
+        raise error.with_subject(str(path)) from error
+    T = transform(R, torch.tensor(translation, dtype=torch.float64))
+    return tuple(map(tuple, T.tolist()))
 
 
 def open_registrar(
@@ -127,6 +156,9 @@ def _open_bank(
 ) -> ViewBank:
     if mesh.suffix != ".safetensors":
         loaded = load_mesh(mesh, unit=options.unit, up=options.up)
+        if options.start is not None:  # a refinement needs no views
+            views = sample_views(azimuth_step=90, elevations=[0])
+            return ViewBank.build(loaded, views, pipeline=pipeline, renderer=options.renderer, progress=False)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
     bank = ViewBank.load(mesh)
     if options.pose not in (None, bank.pipeline.views.pose):

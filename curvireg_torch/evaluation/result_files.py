@@ -4,12 +4,13 @@ from pathlib import Path
 from typing import Any
 
 from ..registration import Registrar, Registration
+from ..registration.document import SCHEMA
 from ..utils.files import write_file
 from ..visualization import pose_glb, registration_sheet
 from ..visualization.encoding import png
 from .store import to_json
 
-__all__ = ["write_result"]
+__all__ = ["write_lost", "write_result"]
 
 MAX_GLB_FACES = 300_000  # of the largest mesh that is written: viewers are slow with files above 30 MB
 
@@ -26,9 +27,20 @@ def write_result(
     """
     sheet = registration_sheet(registrar, result, image, box)
     mesh = registrar.bank.meshes[result.model]
-    for name in ("result.json", "pose.glb"):
-        (out / name).unlink(missing_ok=True)  # an older one must not stay beside the new overlay
+    _remove(out)
     write_file(out / "overlay.png", png(sheet))
     if len(mesh.faces) <= MAX_GLB_FACES:
         write_file(out / "pose.glb", pose_glb(mesh, *result.projection, image))
     write_file(out / "result.json", to_json(document).encode())
+
+
+def write_lost(out: Path, message: str) -> None:
+    """Write the ``result.json`` of a refinement that lost the object."""
+    _remove(out)
+    write_file(out / "result.json", to_json({"schema": SCHEMA, "status": "lost", "message": message}).encode())
+
+
+def _remove(out: Path) -> None:
+    """Remove an older result: none of its files may stay beside those of a new one."""
+    for name in ("result.json", "pose.glb", "overlay.png"):
+        (out / name).unlink(missing_ok=True)

@@ -6,6 +6,7 @@ from .contours import ContourFit, fit_contours
 from .hypotheses import Hypotheses, start_hypotheses
 from .localization import localize
 from .locator import Located, Locator, locate, representative_views
+from .refinement import refine
 from .registrar import Registrar
 from .rescoring import rescore
 from .results import FailedRegistration, Hypothesis, Localization, Registration
@@ -29,6 +30,7 @@ __all__ = [
     "localize",
     "locate",
     "ranking_evidence",
+    "refine",
     "representative_views",
     "rescore",
     "search",

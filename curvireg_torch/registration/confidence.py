@@ -84,6 +84,16 @@ def confidence_model(stage: str, *, with_camera: bool, with_appearance: bool) ->
     return LogisticModel(model["weights"], model["bias"])
 
 
+def refinement_confidence(features: Features) -> float:
+    """Probability that a refined pose is within 10 degrees and 10 % of the distance of the truth.
+
+    Args:
+        features: ``similarity`` and ``edge_support`` of the pose.
+    """
+    model = CALIBRATION["confidence"]["refinement"]
+    return LogisticModel(model["weights"], model["bias"])(features)
+
+
 def ranking_evidence(
     ranking: Ranking, rotations: Tensor, *, answer: Tensor | None = None, symmetries: Tensor | None = None
 ) -> Tensor:

@@ -22,7 +22,7 @@ from .rescoring import POSE_FEATURES, rank_feature, rescore, similarities
 from .results import FailedRegistration, Hypothesis, Registration
 from .search import search
 
-__all__ = ["PoseEstimator"]
+__all__ = ["PoseEstimator", "hypothesis_of"]
 
 LEAST = 3
 """Hypotheses that are refined at least, even if fewer are reported: the confidence depends on rivals. Of 15 photographs
@@ -231,7 +231,7 @@ class PoseEstimator:
             if fitted:
                 features = confidence_features(evidence[mine], scores[mine], features["concentration"])
             reported = mine[: self.pipeline.hypotheses].tolist()
-            hypotheses = tuple(_hypothesis(h, poses, evidence, with_camera=with_camera) for h in reported)
+            hypotheses = tuple(hypothesis_of(h, poses, evidence, with_camera=with_camera) for h in reported)
             registration = Registration(hypotheses, model(features), ranking[b : b + 1], features)
             if batch.priors is not None:
                 registration = batch.priors.note(registration, poses.hypotheses, int(mine[0]), poses.T)
@@ -239,7 +239,8 @@ class PoseEstimator:
         return results
 
 
-def _hypothesis(h: int, poses: Poses, evidence: Tensor, *, with_camera: bool) -> Hypothesis:
+def hypothesis_of(h: int, poses: Poses, evidence: Tensor, *, with_camera: bool) -> Hypothesis:
+    """Hypothesis ``h`` of poses with their (H, 4) :data:`POSE_FEATURES`, as it is reported."""
     hypotheses, T, fit = poses.hypotheses, poses.T[h], poses.fit
     features = dict(zip(POSE_FEATURES, evidence[h].tolist(), strict=True))
     known = fit is not None and with_camera and bool(fit.covariance[h].isfinite().all())

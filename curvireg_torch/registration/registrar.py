@@ -20,6 +20,7 @@ from .correction import corrected
 from .estimator import PoseEstimator
 from .inputs import ImageItem, image_items
 from .localization import localize
+from .refinement import refine
 from .results import FailedRegistration, Registration
 
 __all__ = ["Registrar"]
@@ -127,6 +128,12 @@ class Registrar(PoseEstimator):
         if distance is not None:
             raise InvalidInputError("distance: limits the search for objects without boxes; leave out one of the two")
         return self.map_items(image_items(images, boxes, camera_matrices, prior), self._register_boxes)
+
+    def refine(
+        self, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any
+    ) -> list[Registration | FailedRegistration]:
+        """Refine known poses, see :func:`curvireg_torch.registration.refine`."""
+        return refine(self, images, camera_matrices, poses)
 
     def _register_boxes(
         self, items: Sequence[ImageItem | CurviregError], first: int

@@ -7,6 +7,7 @@ the features of the ranking (also of the preset "fast"), the errors of the best 
 covariance. ``exact`` photographs are registered with their camera matrix, ``sibling`` ones (another object of the kind)
 without, as on PASCAL3D+. An interrupted run can be resumed. --limit takes the first photographs of the list.
 --box moves each edge of the boxes by up to that fraction of the side, as `curvireg evaluate --protocol box=FRACTION`.
+--hint gives a range around the true pose, as `curvireg evaluate --protocol hint=azimuth:45`.
 --wrong registers "exact" photographs to a mesh that they do not show: any other, or another one of the object's kind.
 """
 
@@ -24,7 +25,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import curvireg_torch as cr
-from curvireg_torch.evaluation.protocol import Protocol, perturbed_box
+from curvireg_torch.evaluation.protocol import Protocol, hint_of_truth, perturbed_box
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_towards
 from curvireg_torch.io import read_image
 from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
@@ -55,7 +56,12 @@ def allocentric(item: dict[str, Any]) -> Tensor:
 def rows_of(task: dict[str, Any]) -> list[Any]:
     """Rows of the photographs of one mesh; ``task["wrong"]`` names a mesh to register to instead."""
     torch.set_num_threads(1)
-    folder, half, pipeline, protocol = task["folder"], task["half"], task["pipeline"], Protocol(box=task["box"])
+    folder, half, pipeline, protocol = (
+        task["folder"],
+        task["half"],
+        task["pipeline"],
+        Protocol(box=task["box"], hint=task["hint"]),
+    )
     mesh = cr.load_mesh(folder / (task["wrong"] or task["items"][0]["mesh"]))
     bank = cr.ViewBank.build(mesh, pipeline=pipeline, progress=False)
     registrar = cr.Registrar(bank, pipeline=pipeline)
@@ -67,14 +73,15 @@ def rows_of(task: dict[str, Any]) -> list[Any]:
         box = perturbed_box(torch.tensor(item["box"]), protocol, str(item["id"]))[None]
         exact = item["form"] == "exact"
         K = torch.tensor(item["K"], dtype=torch.float64) if exact else None
-        result = registrar([image], box, K)[0]
+        straight = allocentric(item)
+        truth = torch.tensor(item["R"], dtype=torch.float64) if exact else straight
+        hint = hint_of_truth(truth, torch.eye(3, dtype=torch.float64), protocol, str(item["id"]))
+        result = registrar([image], box, K, prior=hint)[0]
         row = {name: item[name] for name in COPIED} | {"wrong": task["which"], "like": task["like"][item["shown"]]}
         if not result.ok:
             rows.append({**row, "failed": str(result.error)})
             continue
         symmetries = torch.tensor(item["symmetries"], dtype=torch.float64)
-        straight = allocentric(item)
-        truth = torch.tensor(item["R"], dtype=torch.float64) if exact else straight
         found = torch.stack([h.rotation for h in result.hypotheses])
         views = bank.rotations[result.ranking.order[0, :20]].double()
         row["errors"] = smallest_error(found, truth, symmetries).tolist()
@@ -88,6 +95,8 @@ def rows_of(task: dict[str, Any]) -> list[Any]:
             "error": float(smallest_error(best, straight, symmetries)),
         }
         row["confidence"] = result.confidence
+        if hint is not None:
+            row |= {"hint": task["hint"], "contradiction": result.prior_contradiction}
         row["corrected_box"] = None if result.corrected_box is None else result.corrected_box.tolist()
         answer = result.hypotheses[0]
         if answer.covariance is not None and task["wrong"] is None:
@@ -111,6 +120,7 @@ def register_benchmark(
     wrong: str | None = None,
     limit: int | None = None,
     box: float = 0.0,
+    hint: str = "none",
     pipeline: cr.Pipeline | None = None,
     jobs: int = 1,
 ) -> list[dict[str, Any]]:
@@ -139,6 +149,7 @@ def register_benchmark(
             "which": wrong,
             "like": like,
             "box": box,
+            "hint": hint,
             "pipeline": pipeline.with_pose_prior("upright" if stands == "upright" else "any"),
         }
         for (mesh, stands), group in groupby(todo, key=lambda i: (i["mesh"], i["pose"]))
@@ -184,6 +195,7 @@ def main() -> None:
     parser.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON, instead of --preset")
     parser.add_argument("--wrong", choices=("any", "kind"), help="register to another mesh, any or of the same kind")
     parser.add_argument("--box", type=float, default=0.0, metavar="FRACTION", help="error of the boxes")
+    parser.add_argument("--hint", default="none", metavar="KIND:DEGREES", help="azimuth:45 or pose:30")
     parser.add_argument("--limit", type=int)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)

@@ -1,6 +1,7 @@
 """``curvireg register`` of one photograph."""
 
 import inspect
+import json
 from dataclasses import replace
 
 import cv2
@@ -209,3 +210,43 @@ def test_register_limits_the_pose(register_one, document):
     assert result["prior"] == {"azimuth": [low, high], "elevation": [-90, 90], "contradiction": "better outside"}
     for pose in result["top"]:
         assert (pose["viewpoint"]["azimuth"] - low) % 360 <= 80 + 1e-6
+
+
+@pytest.fixture
+def start(folder):
+    def write(shift=0.0):
+        T = scene(0)[2]
+        pose = {"rotation": T[:3, :3].tolist(), "translation": [float(T[0, 3]) + shift, *T[1:3, 3].tolist()]}
+        (folder / "start.json").write_text(json.dumps(pose))
+        return "--start", str(folder / "start.json"), "--camera", *map(str, CAMERA)
+
+    return write
+
+
+def test_register_refines_a_start(register_one, document, start):
+    assert register_one(*start(), box=()) == 0
+    result = document()
+    assert float(rotation_error(rotation(result), scene(0)[2][:3, :3])) < 3.0
+    assert set(result["confidence_features"]) == {"similarity", "edge_support"}
+
+
+def test_register_writes_that_the_object_is_lost(register_one, document, start, capsys):
+    assert register_one(*start(shift=100.0), box=()) == 2
+    assert document()["status"] == "lost"
+    assert "outside the photograph" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{}", "expected rotation"),
+        ('{"rotation": [[1, 0, 0]], "translation": [0, 0, 1]}', "expected rotation"),
+        ('{"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]], "translation": [0, 0, 1]}', "rotation"),
+        ("[]", "dict"),
+    ],
+)
+def test_register_refuses_a_damaged_start(folder, register_one, start, capsys, content, message):
+    options = start()
+    (folder / "start.json").write_text(content)
+    assert register_one(*options, box=()) == 2
+    assert message in capsys.readouterr().err

@@ -33,6 +33,7 @@ class Entry:
             horizontal field of view in degrees; None: no camera.
         instances, distance: without a box, see :func:`curvireg_torch.registration.localize`.
         prior: limits on the pose.
+        start: (4, 4) pose that is refined; nothing is searched for.
         error: why the row cannot be used; "" if it can.
     """
 
@@ -46,12 +47,13 @@ class Entry:
     instances: int = 1
     distance: tuple[float, float] | None = None
     prior: PosePrior | None = None
+    start: tuple[tuple[float, ...], ...] | None = None
     error: str = ""
 
     def request(self) -> Any:
         """All that the result depends on besides the content of files."""
         prior = None if self.prior is None else self.prior.to_dict()
-        return [self.name, self.box, self.camera, self.guess, self.instances, self.distance, prior]
+        return [self.name, self.box, self.camera, self.guess, self.instances, self.distance, prior, self.start]
 
     @cached_property
     def key(self) -> str:

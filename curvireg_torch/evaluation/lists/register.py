@@ -13,6 +13,7 @@ from ...geometry import camera_matrix
 from ...geometry.cameras import camera_of_view
 from ...io import Photo, read_photo
 from ...registration import FailedRegistration, Registrar, Registration, localize
+from ...registration.correction import projected_box
 from ...registration.document import SCHEMA, localization_document, result_document, used_box
 from ...utils.files import write_file
 from ...visualization.sheet import SheetEntry, thumbnail, write_sheet
@@ -100,7 +101,11 @@ def register_entry(
     """
     start = time.perf_counter()
     K, source = _camera(entry, photo)
-    if entry.box is None:
+    if entry.start is not None:
+        if K is None:
+            raise InvalidInputError("--start: needs the camera; give --camera FX FY CX CY", subject=entry.name)
+        results = registrar.refine([photo.image], K, [entry.start])
+    elif entry.box is None:
         results = localize(
             registrar, [photo.image], K, instances=entry.instances, distance=entry.distance, prior=entry.prior
         )[0]
@@ -109,7 +114,10 @@ def register_entry(
     result = results[0]
     if isinstance(result, FailedRegistration):
         raise result.error.with_subject(entry.name)
-    box = torch.tensor(entry.box) if result.localization is None else result.localization.box
+    if entry.box is None:
+        box = projected_box(registrar, result) if result.localization is None else result.localization.box
+    else:
+        box = torch.tensor(entry.box)
     document = result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start})
     document["mesh"] = str(entry.meshes[result.model])
     for pose, hypothesis in zip(document["top"], result.hypotheses, strict=True):

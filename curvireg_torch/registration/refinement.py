@@ -1,0 +1,156 @@
+"""Refinement of known poses: search and contour fit around starts, without ranking and without boxes."""
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import CurviregError, InvalidInputError, LostObjectError
+from ..geometry.cameras import projected_boxes
+from ..matching import Ranking
+from ..utils.checks import as_numbers, check_pose
+from .confidence import refinement_confidence
+from .estimator import PoseEstimator, hypothesis_of
+from .hypotheses import Hypotheses, distinct_mask
+from .inputs import ImageItem, check_crop, image_items
+from .poses import Poses, fit_poses, lift_to_poses, to_allocentric
+from .rescoring import rescore, similarities
+from .results import FailedRegistration, Registration
+from .search import search
+
+__all__ = ["LOST", "refine"]
+
+LOST = 0.2
+"""Confidence below which the object counts as lost, see docs/guides/known-pose.md."""
+
+
+@torch.no_grad()
+def refine(
+    registrar: PoseEstimator, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any
+) -> list[Registration | FailedRegistration]:
+    """Refine poses of the first mesh of a bank in photographs, without ranking and without boxes.
+
+    Around each start runs a short search; contours are fitted from its result and from the start itself, and the better
+    pose wins. A start should lie within about 15 degrees and 15 % of the distance of the truth.
+
+    Args:
+        registrar: :class:`Registrar` of the mesh.
+        images, camera_matrices: see :class:`Registrar`; the camera is needed.
+        poses: for each photograph a (4, 4) start ``T_cam_from_model``, or (S, 4, 4) of them.
+
+    Returns:
+        For each photograph its refined poses, best first; their ``confidence`` is that of the best one to be within 10
+        degrees and 10 % of the distance. A :class:`FailedRegistration` with :class:`LostObjectError` where the object
+        is not near any start.
+
+    Raises:
+        InvalidInputError: not as many cameras or starts as photographs, or a start that is not rigid and finite.
+    """
+    if camera_matrices is None:
+        raise InvalidInputError("refine: needs the camera matrix of each photograph")
+    items = image_items(images, None, camera_matrices)
+    starts = [_starts(one) for one in poses]
+    if len(starts) != len(items):
+        raise InvalidInputError(f"refine: expected starts of {len(items)} photographs, got {len(starts)}")
+
+    def refine_some(some: Sequence[ImageItem | CurviregError], first: int) -> list[Registration | FailedRegistration]:
+        return [_refine_one(registrar, item, starts[i], f"image {i}") for i, item in enumerate(some, first)]
+
+    return list(registrar.map_items(items, refine_some))
+
+
+def _starts(poses: Any) -> Tensor:
+    T = as_numbers(poses, "poses", dtype=torch.float64).cpu()
+    T = T[None] if T.ndim == 2 else T
+    check_pose(T, "poses")
+    return T
+
+
+def _refine_one(
+    estimator: PoseEstimator, item: ImageItem | CurviregError, T: Tensor, name: str
+) -> Registration | FailedRegistration:
+    if not isinstance(item, ImageItem):
+        return FailedRegistration(item)
+    try:
+        result = _refined(estimator, item, T)
+        if result.confidence < LOST:
+            raise LostObjectError(
+                f"the object is not near the start (edge support {result.edge_support:.2f}, similarity "
+                f"{result.score:.2f}); give another start, or register it anew"
+            )
+        return result
+    except CurviregError as error:
+        return FailedRegistration(error.with_subject(name))
+
+
+def _refined(estimator: PoseEstimator, item: ImageItem, T: Tensor) -> Registration:
+    assert item.camera_matrix is not None
+    describers, images = estimator.describers, [item.image] * len(T)
+    K = item.camera_matrix.double().expand(len(T), 3, 3)
+    boxes = _boxes(estimator, item, T, K)
+    query = estimator.matcher.query(images, boxes.float())
+    check_crop(query.crops[0])
+    descriptors = describers[0].descriptor(query.field)
+    at_start = to_allocentric(describers, _hypotheses(len(T)), T)
+    poses = Poses(at_start, T, K)
+    if estimator.pipeline.search:
+        found = search(describers, descriptors, at_start, boxes=boxes, camera_matrices=K, brief=True)
+        poses = _side_by_side(poses, lift_to_poses(describers, found, boxes, K))
+    poses = fit_poses(describers, images, poses, boxes)
+    assert poses.fit is not None
+    similarity, support = similarities(describers, descriptors, poses.hypotheses), poses.fit.edge_support
+    evidence = torch.stack([torch.zeros_like(support), similarity, support, torch.zeros_like(support)], dim=1)
+    scores = rescore(evidence, with_camera=True)
+    together = replace(poses.hypotheses, image_index=torch.zeros_like(poses.hypotheses.image_index))
+    distinct = distinct_mask(together, scores, symmetries=estimator.symmetries)
+    order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]
+    hypotheses = tuple(
+        replace(hypothesis_of(h, poses, evidence, with_camera=True), view=_nearest_view(estimator, poses, h))
+        for h in order
+    )
+    features = {"similarity": float(similarity[order[0]]), "edge_support": float(support[order[0]])}
+    unranked = Ranking(torch.zeros(1, 0), torch.zeros(1, 0, dtype=torch.long), {})
+    return Registration(hypotheses, refinement_confidence(features), unranked, features)
+
+
+def _boxes(estimator: PoseEstimator, item: ImageItem, T: Tensor, K: Tensor) -> Tensor:
+    """(S, 4) boxes around the mesh at the starts, px.
+
+    Raises:
+        LostObjectError: the mesh lies behind the camera, or outside the photograph.
+    """
+    hull = estimator.describers[0].hull
+    H, W = item.image.shape[-2:]
+    depth = (hull.to(T) @ T[:, 2, :3].mT + T[:, 2, 3]).amin(dim=0)
+    boxes = projected_boxes(hull, T, K) if bool((depth > 0).all()) else torch.zeros(len(T), 4)
+    limits = torch.tensor([W, H], dtype=boxes.dtype) - 0.5
+    outside = (boxes[:, :2] >= limits) | (boxes[:, 2:] <= -0.5) | (depth <= 0)[:, None]
+    if bool(outside.any()):
+        raise LostObjectError("at the start the mesh lies outside the photograph; check pose, unit and camera matrix")
+    return boxes
+
+
+def _hypotheses(count: int) -> Hypotheses:
+    """Hypotheses of the bank's first model that come from no view."""
+    none = torch.zeros(count, dtype=torch.long)
+    ones = torch.ones(count, dtype=torch.float64)
+    eye = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
+    return Hypotheses(torch.arange(count), none, none, eye, ones, ones, ones * torch.nan)
+
+
+def _side_by_side(a: Poses, b: Poses) -> Poses:
+    """Both, in the order of their photographs."""
+    order = torch.cat([a.hypotheses.image_index, b.hypotheses.image_index]).argsort(stable=True)
+    joined = Hypotheses(
+        *(torch.cat([getattr(a.hypotheses, f.name), getattr(b.hypotheses, f.name)]) for f in fields(Hypotheses))
+    )
+    return Poses(joined[order], torch.cat([a.T, b.T])[order], torch.cat([a.cameras, b.cameras])[order])
+
+
+def _nearest_view(estimator: PoseEstimator, poses: Poses, h: int) -> int:
+    """The view of the bank that is most similar to a pose."""
+    R = estimator.bank.rotations.cpu().double()
+    traces = (R.flatten(1) @ poses.hypotheses.rotation[h].flatten()).masked_fill(estimator.bank.model.cpu() != 0, -4.0)
+    return int(traces.argmax())

@@ -1,0 +1,90 @@
+"""Refinement of known poses: a start near the truth ends at the truth, and an object that is not there is lost."""
+
+import pytest
+import torch
+
+import curvireg_torch as cr
+from curvireg_torch.errors import InvalidInputError, LostObjectError
+from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
+from curvireg_torch.synthetic import procedural_background
+from tests._support.scenes import CAMERA, scene, truck_bank
+
+
+@pytest.fixture(scope="module")
+def registrar():
+    return cr.Registrar(truck_bank())
+
+
+def moved(T, degrees=0.0, distance=0.0, axis=(0.6, 0.0, 0.8)):
+    out = T.clone()
+    vector = torch.tensor(axis, dtype=torch.float64) * torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+    out[:3, :3] = rotation_from_axis_angle(vector) @ T[:3, :3]
+    out[:3, 3] *= 1.0 + distance
+    return out
+
+
+def errors(result, T):
+    position = (result.translation - T[:3, 3]).norm() / T[:3, 3].norm()
+    return float(rotation_error(result.rotation, T[:3, :3])), float(position)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3])
+@pytest.mark.parametrize("change", [{"degrees": 10.0}, {"distance": 0.1}, {"distance": -0.1}], ids=str)
+def test_refine_ends_at_the_truth(registrar, seed, change):
+    image, _, T = scene(seed)
+    result = registrar.refine([image], CAMERA, [moved(T, **change)])[0]
+    rotation, position = errors(result, T)
+    assert rotation < 2.0
+    assert position < 0.02
+
+
+def test_refine_reports_the_best_of_several_starts(registrar):
+    image, _, T = scene(0)
+    starts = torch.stack([moved(T, degrees=170.0, axis=(0.0, 1.0, 0.0)), moved(T, degrees=5.0)])
+    result = registrar.refine([image], CAMERA, [starts])[0]
+    assert errors(result, T)[0] < 2.0
+    assert result.edge_support == max(h.edge_support for h in result.hypotheses)
+    assert float(rotation_error(result.hypotheses[-1].rotation, T[:3, :3])) > 90.0
+
+
+def test_refine_is_the_same_in_a_batch(registrar):
+    (image, _, T), (other, _, T_other) = scene(0), scene(1)
+    starts = [moved(T, degrees=8.0), moved(T_other, distance=0.05)]
+    both = registrar.refine([image, other], CAMERA, starts)
+    alone = [registrar.refine([i], CAMERA, [s])[0] for i, s in zip((image, other), starts, strict=True)]
+    for one, batched in zip(alone, both, strict=True):
+        assert torch.equal(one.rotation, batched.rotation)
+        assert one.confidence == batched.confidence
+
+
+def test_refine_loses_an_object_that_is_not_there(registrar):
+    _, _, T = scene(0)
+    empty = procedural_background((192, 256), torch.Generator().manual_seed(5))
+    result = registrar.refine([empty], CAMERA, [T])[0]
+    assert isinstance(result.error, LostObjectError)
+    assert "image 0" in str(result.error)
+
+
+@pytest.mark.parametrize("move", [(0.0, 0.0, -100.0), (50.0, 0.0, 0.0)], ids=["behind", "beside"])
+def test_refine_refuses_a_start_outside_the_photograph(registrar, move):
+    image, _, T = scene(0)
+    T = T.clone()
+    T[:3, 3] += torch.tensor(move)
+    result = registrar.refine([image], CAMERA, [T])[0]
+    assert isinstance(result.error, LostObjectError)
+    assert "outside the photograph" in str(result.error)
+
+
+@pytest.mark.parametrize(
+    ("poses", "camera", "message"),
+    [
+        ([torch.eye(4)], None, "camera matrix"),
+        ([torch.eye(4)] * 2, CAMERA, "starts of 1 photographs, got 2"),
+        ([2 * torch.eye(4)], CAMERA, "poses"),
+        ([torch.eye(3)], CAMERA, "poses"),
+    ],
+    ids=["no camera", "count", "scale", "shape"],
+)
+def test_refine_checks_its_arguments(registrar, poses, camera, message):
+    with pytest.raises(InvalidInputError, match=message):
+        registrar.refine([scene(0)[0]], camera, poses)
