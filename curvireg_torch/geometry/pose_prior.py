@@ -96,7 +96,7 @@ class PosePrior:
 
     @classmethod
     def side(cls, name: str) -> "PosePrior":
-        """The side of the object that faces the camera: one of :data:`SIDES`, 45 degrees to either side of it.
+        """The side of the object that faces the camera: one of ``SIDES``, 45 degrees to either side of it.
 
         Example:
             >>> PosePrior.side("front").azimuth

@@ -19,7 +19,7 @@ __all__ = ["read_list"]
 def read_list(path: Path, meshes: Sequence[Path] = ()) -> PhotoList:
     """Read a list of photographs.
 
-    - ``.csv``: a header and the columns of :func:`photo_list`; blank lines are ignored.
+    - ``.csv``: a header and the columns of ``photo_list``; blank lines are ignored.
     - ``.json``: a list of objects ``{"photo": "a.jpg", "box": [x0, y0, x1, y1], "camera": [fx, fy, cx, cy], "mesh":
       "part.stl"}``, all but ``photo`` optional; other keys are passed through. Or COCO annotations: one row each, with
       ``image_id``, ``annotation_id`` and ``category``; half a pixel is subtracted, as COCO measures from the corner.
