@@ -12,6 +12,7 @@ __all__ = [
     "CurviregWarning",
     "ImageError",
     "InvalidInputError",
+    "LostObjectError",
     "MeshError",
     "MissingDependencyError",
     "MissingFileError",

@@ -42,7 +42,7 @@ def refine(
 
     Returns:
         For each photograph its refined poses, best first; their ``confidence`` is that of the best one to be within 10
-        degrees and 10 % of the distance. A :class:`FailedRegistration` with :class:`~curvireg_torch.errors.LostObjectError` where the object
+        degrees and 10 % of the distance. A :class:`FailedRegistration` with :class:`LostObjectError` where the object
         is not near any start.
 
     Raises:
