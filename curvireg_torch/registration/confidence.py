@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..matching import Ranking
-from .calibration import CALIBRATION
+from .calibration import CALIBRATION, REFINEMENT
 
 __all__ = [
     "CONFIDENCE_FEATURES",
@@ -90,8 +90,7 @@ def refinement_confidence(features: Features) -> float:
     Args:
         features: ``similarity`` and ``edge_support`` of the pose.
     """
-    model = CALIBRATION["confidence"]["refinement"]
-    return LogisticModel(model["weights"], model["bias"])(features)
+    return LogisticModel(REFINEMENT["weights"], REFINEMENT["bias"])(features)
 
 
 def ranking_evidence(

@@ -5,7 +5,7 @@
 For each "exact" photograph, starts are the true pose rotated by 5 to 30 degrees about a random axis, or moved by 5 to
 20 % of the distance, and the same true pose in the photograph of another object. A row says where the refinement ended.
 --write fits the confidence (within 10 degrees and 10 % of the distance) on half of the meshes, reports it on the other
-half, stores its weights in curvireg_torch/registration/calibration.json, and the table in
+half, stores its weights in curvireg_torch/registration/refinement.json, and the table in
 scripts/results/refinement_basin.json and docs/guides/known-pose.md.
 """
 
@@ -30,7 +30,7 @@ from curvireg_torch.registration import refinement
 from scripts._shared import REPOSITORY, commit, table_lines, today, update_page, write_json
 
 ANGLES, DISTANCES = (5.0, 10.0, 15.0, 20.0, 30.0), (0.05, 0.1, 0.2)
-CALIBRATION = Path(cr.__file__).parent / "registration" / "calibration.json"
+CALIBRATION = Path(cr.__file__).parent / "registration" / "refinement.json"
 
 
 def start_of(T: Tensor, angle: float, distance: float, generator: torch.Generator) -> Tensor:
@@ -178,9 +178,7 @@ def main() -> None:
     found = report(measure(options.folder, options.out, options.half, options.limit, options.jobs))
     print(json.dumps(found, indent=2))
     if options.write:
-        calibration = json.loads(CALIBRATION.read_text(encoding="utf-8"))
-        calibration["confidence"]["refinement"] = found["model"]
-        write_json(CALIBRATION, calibration)
+        write_json(CALIBRATION, found["model"])
         write_json(REPOSITORY / "scripts" / "results" / "refinement_basin.json", found)
         update_page(REPOSITORY / "docs" / "guides" / "known-pose.md", "refinement", page_table(found))
 

@@ -1,11 +1,15 @@
 """Refinement of known poses: a start near the truth ends at the truth, and an object that is not there is lost."""
 
+import json
+from pathlib import Path
+
 import pytest
 import torch
 
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
+from curvireg_torch.registration.calibration import REFINEMENT
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, scene, truck_bank
 
@@ -26,6 +30,11 @@ def moved(T, degrees=0.0, distance=0.0, axis=(0.6, 0.0, 0.8)):
 def errors(result, T):
     position = (result.translation - T[:3, 3]).norm() / T[:3, 3].norm()
     return float(rotation_error(result.rotation, T[:3, :3])), float(position)
+
+
+def test_refinement_constants_are_the_recorded_ones():
+    record = Path(__file__).parents[2] / "scripts" / "results" / "refinement_basin.json"
+    assert json.loads(record.read_text(encoding="utf-8"))["model"] == REFINEMENT
 
 
 @pytest.mark.parametrize("seed", [0, 1, 3])
