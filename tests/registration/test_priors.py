@@ -1,14 +1,24 @@
 """Pose priors in a registration: views, search, contour fit and report keep within what is known of the pose."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import rotation_error, viewpoint_from_rotation
+from curvireg_torch.geometry import (
+    rotation_error,
+    rotation_from_axis_angle,
+    rotation_towards,
+    viewpoint_from_rotation,
+)
 from curvireg_torch.geometry.pose_prior import PosePrior
-from tests._support.scenes import CAMERA, scene, truck_registrar
+from curvireg_torch.matching import Ranking
+from curvireg_torch.registration.hypotheses import start_hypotheses
+from curvireg_torch.registration.inputs import ImageItem
+from curvireg_torch.registration.priors import BatchPriors
+from tests._support.scenes import CAMERA, scene, truck_bank, truck_registrar
 
 IMAGE, BOX, T = scene(0)
 ONE, TRUTH = ([IMAGE], BOX[None], CAMERA), T[:3, :3]
@@ -78,3 +88,41 @@ def test_prior_that_leaves_no_view_fails_that_photograph_alone(registrar):
     assert not failed.ok
     assert "no view of the bank" in str(failed.error)
     assert fine.ok
+
+
+def limits_of(prior, box=(100.0, 60.0, 140.0, 100.0)):
+    item = ImageItem(torch.rand(3, 180, 240), torch.tensor(box), CAMERA, prior)
+    return BatchPriors([item], truck_bank())
+
+
+def test_batch_priors_rotate_views_towards_the_box():
+    """The limit holds in the photograph's own camera, which sees a box at the border 25 degrees off its axis."""
+    bank, box = truck_bank(), (200.0, 20.0, 238.0, 60.0)
+    ray = torch.linalg.solve(CAMERA, torch.tensor([219.0, 40.0, 1.0], dtype=torch.float64))
+    R = rotation_towards(ray) @ bank.rotations[5].double()
+    log_prior = limits_of(PosePrior(rotation=R, within=0.1), box).log_prior(bank)[0]
+    distances = rotation_error(bank.rotations.double(), bank.rotations[5].double())
+    assert float(log_prior[5]) == 0.0
+    assert bool((log_prior[distances > 7.7] == -torch.inf).all())
+    assert bool((log_prior[distances < 7.5] == 0.0).all())
+
+
+def test_batch_priors_keep_fitted_poses_up_to_three_degrees_outside():
+    eye = torch.eye(3, dtype=torch.float64)
+    hypotheses = start_hypotheses(ranking_of(1), truck_bank(), count=1)
+    kept = []
+    for degrees in (12.9, 13.1):
+        T = torch.eye(4, dtype=torch.float64)[None].clone()
+        T[0, :3, :3] = rotation_from_axis_angle(torch.tensor([0.0, 0.0, math.radians(degrees)], dtype=torch.float64))
+        kept.append(bool(limits_of(PosePrior(rotation=eye, within=10.0)).keeps(hypotheses, T)))
+    assert kept == [True, False]
+
+
+def ranking_of(allowed):
+    """Equal scores of all views, of which the first ``allowed`` are allowed."""
+    n = len(truck_bank())
+    return Ranking(torch.zeros(1, n), torch.arange(n)[None].flip(1), {}, (torch.arange(n) < allowed)[None])
+
+
+def test_start_hypotheses_come_from_allowed_views():
+    assert start_hypotheses(ranking_of(1), truck_bank(), count=5).view.tolist() == [0]

@@ -9,6 +9,7 @@ import torch
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
+from curvireg_torch.registration import refinement
 from curvireg_torch.registration.calibration import REFINEMENT
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, scene, truck_bank
@@ -97,3 +98,16 @@ def test_refine_refuses_a_start_outside_the_photograph(registrar, move):
 def test_refine_checks_its_arguments(registrar, poses, camera, message):
     with pytest.raises(InvalidInputError, match=message):
         registrar.refine([scene(0)[0]], camera, poses)
+
+
+@pytest.mark.parametrize(("confidence", "ok"), [(0.19, False), (0.21, True)])
+def test_refine_calls_the_object_lost_below_a_fifth(registrar, monkeypatch, confidence, ok):
+    monkeypatch.setattr(refinement, "refinement_confidence", lambda _: confidence)
+    image, _, T = scene(0)
+    assert registrar.refine([image], CAMERA, [T])[0].ok is ok
+
+
+def test_refine_searches_around_a_start_that_is_20_degrees_off(registrar):
+    image, _, T = scene(2)
+    result = registrar.refine([image], CAMERA, [moved(T, degrees=20.0, axis=(0.0, 1.0, 0.0))])[0]
+    assert errors(result, T)[0] < 2.0
