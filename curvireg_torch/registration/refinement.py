@@ -124,7 +124,7 @@ def _boxes(estimator: PoseEstimator, item: ImageItem, T: Tensor, K: Tensor) -> T
     hull = estimator.describers[0].hull
     H, W = item.image.shape[-2:]
     depth = (hull.to(T) @ T[:, 2, :3].mT + T[:, 2, 3]).amin(dim=0)
-    boxes = projected_boxes(hull, T, K) if bool((depth > 0).all()) else torch.zeros(len(T), 4)
+    boxes = projected_boxes(hull, T, K)
     limits = torch.tensor([W, H], dtype=boxes.dtype) - 0.5
     outside = (boxes[:, :2] >= limits) | (boxes[:, 2:] <= -0.5) | (depth <= 0)[:, None]
     if bool(outside.any()):
