@@ -64,7 +64,7 @@ def evaluate(
     """
     pipeline = preset_named(preset) if isinstance(preset, str) else preset
     pipeline = pipeline if field is None else pipeline.with_field(field)
-    name = next((known for known, settings in PRESETS.items() if settings is pipeline), "own")
+    name = next((known for known, settings in PRESETS.items() if settings is pipeline), "custom")
     if limit is not None:
         check_positive(limit, "limit")
     settings = _settings(benchmark, name, pipeline, renderer)

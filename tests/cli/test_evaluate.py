@@ -92,4 +92,4 @@ def test_evaluate_reports_when_nothing_was_scored(pascal, evaluate, tmp_path):
 def test_evaluate_takes_a_pipeline_file(pascal, evaluate, tmp_path):
     (tmp_path / "pipeline.json").write_text(replace(SMALL, box_jitter=0.0).to_json())
     settings = evaluate("pascal3d", pascal.root, "--pipeline", tmp_path / "pipeline.json")["settings"]
-    assert (settings["preset"], settings["pipeline"]["box_jitter"]) == ("own", 0.0)
+    assert (settings["preset"], settings["pipeline"]["box_jitter"]) == ("custom", 0.0)
