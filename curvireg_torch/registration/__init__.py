@@ -3,6 +3,7 @@
 from ..matching import distinct_views
 from .confidence import RELIABLE, confidence, ranking_evidence
 from .contours import ContourFit, fit_contours
+from .following import Follower
 from .hypotheses import Hypotheses, start_hypotheses
 from .localization import localize
 from .locator import Located, Locator, locate, representative_views
@@ -16,6 +17,7 @@ __all__ = [
     "RELIABLE",
     "ContourFit",
     "FailedRegistration",
+    "Follower",
     "Hypotheses",
     "Hypothesis",
     "Localization",

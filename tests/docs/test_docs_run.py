@@ -78,8 +78,10 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         with_exif(folder / name, exif(1, 28))
     kettle = folder / "data" / "mine" / "kettle"
     kettle.mkdir(parents=True)
+    (folder / "shots").mkdir()
     for name in ("1.jpg", "2.jpg"):
         shutil.copy(folder / "photo.jpg", kettle / name)
+        shutil.copy(folder / "photo.jpg", folder / "shots" / name)
     (table,) = re.findall(r"```\n(image,.*?)```", (DOCS / "datasets.md").read_text("utf-8"), flags=re.DOTALL)
     kettle.joinpath("views.csv").write_text(table)
     mesh.export(kettle / "mesh.stl")
