@@ -9,8 +9,6 @@ from ..utils.files import check_writable
 from ..utils.input_paths import check_given
 from .options import add_box_and_camera, common_options, examples, mesh_options, pipeline_options, register_options
 
-COLUMNS = ("photo", "status", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "tx", "ty", "tz", "confidence")
-
 
 def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
@@ -43,6 +41,7 @@ def run(arguments: argparse.Namespace) -> None:
     from tqdm import tqdm
 
     from ..evaluation.lists import list_photographs
+    from ..evaluation.lists.tables import POSE_COLUMNS
     from ..evaluation.opening import check_camera, open_registrar
     from ..geometry import camera_matrix
     from ..registration.following import Follower
@@ -53,11 +52,13 @@ def run(arguments: argparse.Namespace) -> None:
     check_writable(arguments.out, "--out")
     frames = list_photographs(options.photos, options.meshes, frames=arguments.out / "frames").entries
     follow = Follower(open_registrar(options, options.meshes, options.open_field()), camera_matrix(*arguments.camera))
-    rows = [
-        _row(follow, frame.name, frame.photo, options.box if k == 0 else None)
-        for k, frame in enumerate(tqdm(frames, desc="follow", unit="frame", disable=not options.progress))
-    ]
-    write_csv(arguments.out / "results.csv", [(*COLUMNS, "edge_support"), *rows])
+    rows: list[list[Any]] = []
+    try:
+        for frame in tqdm(frames, desc="follow", unit="frame", disable=not options.progress):
+            rows.append(_row(follow, frame.name, frame.photo, None if rows else options.box))
+    finally:  # an interruption loses no pose
+        header = ["photo", "status", *POSE_COLUMNS, "confidence", "edge_support"]
+        write_csv(arguments.out / "results.csv", [header, *rows])
     counts = {status: sum(row[1] == status for row in rows) for status in ("ok", "lost", "failed")}
     summary = ", ".join(f"{count} {status}" for status, count in counts.items())
     print(f"{len(rows)} frames: {summary}; see {arguments.out}/results.csv")

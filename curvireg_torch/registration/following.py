@@ -49,9 +49,9 @@ class Follower:
         else:
             result = refine(self.registrar, [image], K, [self._predictions()])[0]
             if not result.ok:
-                anew = self.registrar([image], boxes, K)[0]
-                if isinstance(anew, Registration) and anew.reliable:
-                    result = anew
+                registered = self.registrar([image], boxes, K)[0]
+                if isinstance(registered, Registration) and registered.reliable:
+                    result = registered
                     self._poses.clear()  # the velocity is unknown
         if isinstance(result, Registration) and result.transform is not None:
             self._poses = [*self._poses[-1:], result.transform]

@@ -78,7 +78,7 @@ def _refine_one(
         if result.confidence < LOST:
             raise LostObjectError(
                 f"the object is not near the start (edge support {result.edge_support:.2f}, similarity "
-                f"{result.score:.2f}); give another start, or register it anew"
+                f"{result.score:.2f}); give another start, or register it again"
             )
         return result
     except CurviregError as error:

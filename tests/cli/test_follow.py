@@ -8,6 +8,7 @@ import torch
 
 from curvireg_torch.cli import main
 from curvireg_torch.geometry import rotation_error
+from curvireg_torch.registration import Follower
 from tests._support.lists import CAMERA
 from tests._support.scenes import truck_bank
 from tests.registration.test_following import sequence
@@ -56,3 +57,19 @@ def test_follow_refuses_a_missing_video(frames, tmp_path, capsys):
     mesh = frames[0] / "truck.safetensors"
     assert main(["follow", "nowhere.mp4", str(mesh), "--camera", *CAMERA, "--out", str(tmp_path)]) == 2
     assert "nowhere.mp4: no such folder or video" in capsys.readouterr().err
+
+
+def test_follow_keeps_the_poses_before_an_interruption(frames, tmp_path, monkeypatch):
+    call, seen = Follower.__call__, []
+
+    def interrupted(self, *args):
+        seen.append(args)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return call(self, *args)
+
+    monkeypatch.setattr(Follower, "__call__", interrupted)
+    folder, scenes = frames
+    assert run(folder, "--camera", *CAMERA, "--box", *scenes[0][1].tolist(), "--out", tmp_path) == 130
+    with (tmp_path / "results.csv").open() as file:
+        assert [row["status"] for row in csv.DictReader(file)] == ["ok"]

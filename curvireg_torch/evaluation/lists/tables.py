@@ -9,13 +9,12 @@ from ...utils.files import write_csv
 from ..bop import bop_row
 from ..store import Row
 
-__all__ = ["BEST_MESH", "RESULT_COLUMNS", "write_bop_results", "write_results"]
+__all__ = ["BEST_MESH", "POSE_COLUMNS", "RESULT_COLUMNS", "write_bop_results", "write_results"]
 
-RESULT_COLUMNS = (
-    *("status", "message", "confidence", "reliable"),
-    *("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33"),
-    *("tx", "ty", "tz"),
-)
+POSE_COLUMNS = (*("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33"), *("tx", "ty", "tz"))
+"""Columns of a pose: the rotation row by row, and the translation."""
+
+RESULT_COLUMNS = ("status", "message", "confidence", "reliable", *POSE_COLUMNS)
 """Columns of ``results.csv`` after those of the list."""
 
 BEST_MESH = "found_mesh"
