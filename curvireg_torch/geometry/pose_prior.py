@@ -31,9 +31,10 @@ _LIMITS = ("azimuth", "elevation", "theta", "up", "viewpoint", "rotation")
 class PosePrior:
     r"""Limits on the pose that hold for a photograph; all that are given must hold.
 
-    Angles are those of :func:`viewpoint_from_rotation` for an object with z up whose front is at azimuth 0. Methods
-    take rotations of the mesh file's axes and ``frame``, the rotation of these axes to the object's
-    (:func:`object_frame`); the default frame is the identity.
+    Angles are those of :func:`viewpoint_from_rotation` for an object with z up whose front is at azimuth 0. How far a
+    pose misses a limit is measured as a rotation: near the poles, a wrong azimuth hardly counts. Methods take rotations
+    of the mesh file's axes and ``frame``, the rotation of these axes to the object's (:func:`object_frame`); the
+    default frame is the identity.
 
     Attributes:
         azimuth: (low, high) in degrees, counted upwards from low to high: (300, 60) goes through 0.
@@ -119,14 +120,14 @@ class PosePrior:
         if self.azimuth or self.elevation or self.theta or self.up:
             azimuth, elevation, theta = viewpoint_from_rotation(_in_object_frame(rotations, frame))
             if self.azimuth is not None:
-                worst = torch.maximum(worst, _outside(azimuth, self.azimuth))
+                worst = torch.maximum(worst, _outside(azimuth, self.azimuth, elevation))
             if self.elevation is not None:
                 low, high = self.elevation
                 worst = worst if low == -90.0 else torch.maximum(worst, low - elevation)
                 worst = worst if high == 90.0 else torch.maximum(worst, elevation - high)
             for limits in (self.theta, self._theta_of_up):
                 if limits is not None:
-                    worst = torch.maximum(worst, _outside(theta, limits))
+                    worst = torch.maximum(worst, _outside(theta, limits, elevation))
         for R in self._centres(rotations, frame):
             worst = torch.maximum(worst, rotation_error(rotations, R) - (self.within or 0.0))
         return worst
@@ -148,9 +149,9 @@ class PosePrior:
         """(..., 3, 3) rotations moved into the limits, one limit after the other; those within them are not changed."""
         moved = rotations
         if self.azimuth or self.elevation or self.theta or self.up:
-            azimuth, elevation, theta = viewpoint_from_rotation(_in_object_frame(rotations, frame))
-            if self.azimuth is not None:
-                azimuth = _clamped(azimuth, self.azimuth)
+            R = _in_object_frame(rotations, frame)
+            R = R if self.azimuth is None else _moved_to_azimuth(R, self.azimuth)
+            azimuth, elevation, theta = viewpoint_from_rotation(R)
             if self.elevation is not None:
                 elevation = elevation.clamp(*self.elevation)
             for limits in (self.theta, self._theta_of_up):
@@ -234,14 +235,36 @@ def _position(angle: Tensor, limits: tuple[float, ...]) -> tuple[Tensor, float]:
     return (angle - low) % 360.0, width
 
 
-def _outside(angle: Tensor, limits: tuple[float, ...]) -> Tensor:
-    """Degrees to the nearer limit of a circular range, negative within it."""
+def _outside(angle: Tensor, limits: tuple[float, ...], elevation: Tensor) -> Tensor:
+    r"""Least rotation in degrees that brings an azimuth or theta to the nearer limit, negative within the range.
+
+    An azimuth :math:`\delta` degrees beyond a limit is that of a direction :math:`d` from the limit's meridian,
+    :math:`\sin d = \cos e \sin \delta`; beyond 90 degrees the nearest point is the pole. The same holds for theta and
+    the up axis, which :math:`e` tilts towards the camera.
+    """
     beyond, width = _position(angle, limits)
     if width == 360.0:
         return torch.full_like(angle, -_HALF_TURN)
-    return torch.where(
-        beyond <= width, -torch.minimum(beyond, width - beyond), torch.minimum(beyond - width, 360.0 - beyond)
-    )
+    inside = beyond <= width
+    delta = torch.where(inside, torch.minimum(beyond, width - beyond), torch.minimum(beyond - width, 360.0 - beyond))
+    e, d = torch.deg2rad(elevation), torch.deg2rad(delta.clamp(max=90.0))
+    rotation = torch.rad2deg((e.cos() * d.sin()).clamp(max=1.0).asin())
+    return torch.where(inside, -rotation, rotation)
+
+
+def _moved_to_azimuth(R: Tensor, limits: tuple[float, ...]) -> Tensor:
+    """(..., 3, 3) rotations whose camera moves on the shortest arc into a range of azimuths."""
+    azimuth, elevation, _ = viewpoint_from_rotation(R)
+    delta = torch.deg2rad(_clamped(azimuth, limits) - azimuth)
+    e = torch.deg2rad(elevation)
+    # Elevation of the nearest point of the limit's meridian; short of the pole, where the azimuth is undefined.
+    foot = torch.atan2(e.sin(), e.cos() * delta.cos().clamp(min=1e-6))
+    camera = -R[..., 2, :]
+    nearest = -rotation_from_viewpoint(_clamped(azimuth, limits), torch.rad2deg(foot))[..., 2, :]
+    axis = torch.linalg.cross(camera, nearest)
+    sine = torch.linalg.vector_norm(axis, dim=-1, keepdim=True)
+    angle = torch.atan2(sine, (camera * nearest).sum(dim=-1, keepdim=True))
+    return R @ rotation_from_axis_angle(axis / sine.clamp(min=1e-12) * angle).mT
 
 
 def _clamped(angle: Tensor, limits: tuple[float, ...]) -> Tensor:

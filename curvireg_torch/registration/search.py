@@ -28,7 +28,7 @@ FIRST_STEP, FINEST_STEP = 5.0, 1.0
 ROUNDS, BRIEF = 8, 4
 """Largest number of rounds of seven poses each, and that of a brief search."""
 
-FINALISTS, AFTER = 2, 2
+FINALISTS, AFTER = 2, 1
 """Number of hypotheses of a photograph that are searched and fitted to the end, and rounds after which they are
 selected."""
 

@@ -3,9 +3,10 @@
     python scripts/benchmark/run.py FOLDER --out rows.jsonl [--pose upright] [--form sibling] [--limit N] [--jobs 2]
 
 One JSON line per photograph: the errors of the hypotheses in degrees up to the object's symmetries, their features,
-the features of the ranking (also of the preset "fast"), the errors of the best views, and the pose error with its
-covariance. ``exact`` photographs are registered with their camera matrix, ``sibling`` ones (another object of the kind)
-without, as on PASCAL3D+. An interrupted run can be resumed. --limit takes the first photographs of the list.
+the features of the ranking, the same of unrefined results with and without the appearance term, the errors of the best
+views, and the pose error with its covariance. ``exact`` photographs are registered with their camera matrix,
+``sibling`` ones (another object of the kind) without, as on PASCAL3D+; --no-camera registers all without.
+An interrupted run can be resumed. --limit takes the first photographs of the list.
 --box moves each edge of the boxes by up to that fraction of the side, as `curvireg evaluate --protocol box=FRACTION`.
 --hint gives a range around the true pose, as `curvireg evaluate --protocol hint=azimuth:45`.
 --wrong registers "exact" photographs to a mesh that they do not show: any other, or another one of the object's kind.
@@ -15,6 +16,7 @@ import argparse
 import hashlib
 import json
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
 from itertools import groupby
 from multiprocessing import get_context
 from pathlib import Path
@@ -65,13 +67,17 @@ def rows_of(task: dict[str, Any]) -> list[Any]:
     mesh = cr.load_mesh(folder / (task["wrong"] or task["items"][0]["mesh"]))
     bank = cr.ViewBank.build(mesh, pipeline=pipeline, progress=False)
     registrar = cr.Registrar(bank, pipeline=pipeline)
-    # Ranking of the preset "fast" on the same views.
-    fast = cr.ViewMatcher(bank, pipeline=PRESETS["fast"].with_pose_prior(pipeline.views.pose))
+    unrefined = {
+        name: cr.Registrar(
+            bank, pipeline=replace(chosen.with_pose_prior(pipeline.views.pose), search=False, contours=False)
+        )
+        for name, chosen in (("appearance", pipeline), ("no appearance", PRESETS["fast"]))
+    }
     rows = []
     for item in task["items"]:
         image = read_image(folder / half / item["image"])
         box = perturbed_box(torch.tensor(item["box"]), protocol, str(item["id"]))[None]
-        exact = item["form"] == "exact"
+        exact = item["form"] == "exact" and task["camera"]
         K = torch.tensor(item["K"], dtype=torch.float64) if exact else None
         straight = allocentric(item)
         truth = torch.tensor(item["R"], dtype=torch.float64) if exact else straight
@@ -88,12 +94,15 @@ def rows_of(task: dict[str, Any]) -> list[Any]:
         row["view_errors"] = smallest_error(views, straight, symmetries).tolist()
         row["evidence"] = [dict(h.evidence) for h in result.hypotheses]
         row["ranking"] = ranking_evidence(result.ranking, bank.rotations)[0].tolist()
-        quick = fast([image], box)
-        best = bank.rotations[quick.order[0, :1]].double()
-        row["fast"] = {
-            "ranking": ranking_evidence(quick, bank.rotations)[0].tolist(),
-            "error": float(smallest_error(best, straight, symmetries)),
-        }
+        row["unrefined"] = {}
+        for name, views_alone in unrefined.items():
+            ranked = views_alone([image], box, prior=hint)[0]
+            views = torch.stack([h.rotation for h in ranked.hypotheses])
+            row["unrefined"][name] = {
+                "errors": smallest_error(views, straight, symmetries).tolist(),
+                "evidence": [dict(h.evidence) for h in ranked.hypotheses],
+                "ranking": ranking_evidence(ranked.ranking, bank.rotations)[0].tolist(),
+            }
         row["confidence"] = result.confidence
         if hint is not None:
             row |= {"hint": task["hint"], "contradiction": result.prior_contradiction}
@@ -121,6 +130,7 @@ def register_benchmark(
     limit: int | None = None,
     box: float = 0.0,
     hint: str = "none",
+    camera: bool = True,
     pipeline: cr.Pipeline | None = None,
     jobs: int = 1,
 ) -> list[dict[str, Any]]:
@@ -150,6 +160,7 @@ def register_benchmark(
             "like": like,
             "box": box,
             "hint": hint,
+            "camera": camera,
             "pipeline": pipeline.with_pose_prior("upright" if stands == "upright" else "any"),
         }
         for (mesh, stands), group in groupby(todo, key=lambda i: (i["mesh"], i["pose"]))
@@ -196,6 +207,7 @@ def main() -> None:
     parser.add_argument("--wrong", choices=("any", "kind"), help="register to another mesh, any or of the same kind")
     parser.add_argument("--box", type=float, default=0.0, metavar="FRACTION", help="error of the boxes")
     parser.add_argument("--hint", default="none", metavar="KIND:DEGREES", help="azimuth:45 or pose:30")
+    parser.add_argument("--no-camera", dest="camera", action="store_false", help="register all without camera matrix")
     parser.add_argument("--limit", type=int)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)

@@ -116,14 +116,15 @@ def test_search_places_the_object_so_that_it_fills_its_box():
 
 
 def test_search_keeps_the_distance_that_belongs_to_its_rotation():
-    """The first step of 5 degrees meets the truth and no later one is better: the distance is that of the start."""
-    start, truth = rotation(0.0, 40.0, 0.0), rotation(5.0, 0.0, 0.0) @ rotation(0.0, 40.0, 0.0)
+    """The distance is computed after the first of the two steps of 5 degrees that lead to the truth."""
+    start = rotation(0.0, 40.0, 0.0)
+    halfway, truth = rotation(5.0, 0.0, 0.0) @ start, rotation(10.0, 0.0, 0.0) @ start
     box = torch.tensor([[260.0, 150.0, 380.0, 330.0]], dtype=torch.float64)
-    at_start, at_truth = (float(pose_from_box(CORNERS, R, box[0], K)[1].norm()) for R in (start, truth))
-    assert abs(at_start / at_truth - 1.0) > 0.001
+    at_half, at_truth = (float(pose_from_box(CORNERS, R, box[0], K)[1].norm()) for R in (halfway, truth))
+    assert abs(at_half / at_truth - 1.0) > 0.001
     result = searched(truth, start, boxes=box, camera_matrices=K[None])
     torch.testing.assert_close(result.rotation[0], truth)
-    assert float(result.distance) == pytest.approx(at_start, rel=1e-9)
+    assert float(result.distance) == pytest.approx(at_half, rel=1e-9)
 
 
 def test_registrar_searches_with_box_and_camera(monkeypatch):
