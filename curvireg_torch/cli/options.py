@@ -7,12 +7,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InvalidInputError
 from ..utils.choices import DEFAULT, PRESET_NAMES, RENDERER_NAMES, SIDE_NAMES, UNITS, UP_AXES
 
 if TYPE_CHECKING:
     from ..evaluation.opening import RegisterOptions
-    from ..geometry.pose_prior import PosePrior
 
 _COUNTS = {"--box": 4, "--camera": 4, "--distance": 2, "--azimuth": 2, "--elevation": 2, "--theta": 2}
 _NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
@@ -72,7 +70,9 @@ def add_box_and_camera(
 def add_pose_prior(parser: argparse.ArgumentParser) -> None:
     """Add the options that limit the pose."""
     group = parser.add_argument_group(
-        "what is known about the pose", "limits in degrees; all that are given must hold; the result stays within them"
+        "what is known about the pose",
+        "limits in degrees; all that are given must hold; the result stays within them. Lists have columns of "
+        "these names",
     )
     limits = ("LOW", "HIGH")
     add = group.add_argument
@@ -86,26 +86,6 @@ def add_pose_prior(parser: argparse.ArgumentParser) -> None:
     add("--softness", type=float, metavar="DEG", help="soft limits: standard deviation of what exceeds them")
 
 
-def _pose_prior(arguments: argparse.Namespace) -> "PosePrior | None":
-    given = {n: getattr(arguments, n, None) for n in ("azimuth", "elevation", "theta", "front", "softness")}
-    side, near, within = (getattr(arguments, n, None) for n in ("side", "near", "within"))
-    if side is None and near is None and within is None and all(value is None for value in given.values()):
-        return None
-    from ..geometry.pose_prior import PosePrior
-
-    if side is not None:
-        if given["azimuth"] is not None:
-            raise InvalidInputError("--side: give it or --azimuth")
-        given["azimuth"] = PosePrior.side(side).azimuth
-    if near is not None:
-        if len(near) not in (2, 3):
-            raise InvalidInputError(f"--near: expected AZIMUTH ELEVATION [THETA], got {len(near)} numbers")
-        given |= {"viewpoint": (*near, 0.0)[:3], "within": 45.0 if within is None else within}
-    elif within is not None:
-        raise InvalidInputError("--within: expected --near beside it")
-    return PosePrior(**{name: value for name, value in given.items() if value is not None})
-
-
 def register_options(
     arguments: argparse.Namespace, photos: Sequence[Path] = (), meshes: Sequence[Path] = ()
 ) -> "RegisterOptions":
@@ -113,6 +93,7 @@ def register_options(
     from dataclasses import fields
 
     from ..evaluation.opening import RegisterOptions
+    from ..evaluation.prior_options import limits_from_options
 
     names = {option.name for option in fields(RegisterOptions)} - {"photos", "meshes"}
     values: dict[str, Any] = {
@@ -120,7 +101,7 @@ def register_options(
         for name, value in vars(arguments).items()
         if name in names and value is not None
     }
-    values["prior"] = _pose_prior(arguments)
+    values["limits"] = limits_from_options(vars(arguments))
     guess = "exif" if getattr(arguments, "exif", False) else getattr(arguments, "fov", None)
     return RegisterOptions(photos=tuple(photos), meshes=tuple(meshes), guess=guess, **values)
 

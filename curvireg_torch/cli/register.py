@@ -61,9 +61,9 @@ def add_parser(commands: Any) -> None:
         "--list",
         type=Path,
         metavar="LIST",
-        help="CSV with columns photo,x0,y0,x1,y1 and optionally fx,fy,cx,cy,mesh. Paths are relative to the list's "
-        "folder. Empty cells mean: localize the object, no camera, MESH. Or the same as JSON, COCO annotations, or the "
-        "folder of a BOP scene",
+        help="CSV with columns photo,x0,y0,x1,y1 and optionally fx,fy,cx,cy,mesh and azimuth,side,... (see below: what "
+        "is known about the pose). Paths are relative to the list's folder. Empty cells mean: localize the object, no "
+        "camera, MESH, what the options say. Or the same as JSON, COCO annotations, or the folder of a BOP scene",
     )
     add("--every", type=int, default=1, metavar="N", help="use every N-th frame of videos (default: 1)")
     add_box_and_camera(
@@ -117,12 +117,15 @@ def run(arguments: argparse.Namespace) -> None:
     """Register one photograph, or several."""
     check_given(arguments.photos, arguments.meshes, arguments.list)
     from ..evaluation.opening import check_camera
+    from ..evaluation.prior_options import prior_from_limits
     from ..evaluation.workers import run_processes
 
     options = register_options(arguments, arguments.photos, arguments.meshes)
     options.open_pipeline()  # errors in options come before any photograph is read
     field = options.open_field()
     check_camera(options.camera, options.guess)
+    if prior_from_limits(options.limits or {}) is None and options.limits and arguments.list is None:
+        raise InvalidInputError("--front and --softness limit nothing by themselves; give --azimuth, for instance")
     if arguments.list is None and is_one_photograph(options.photos):
         _register_one(options, field, arguments.out, as_json=arguments.json)
         return
@@ -206,12 +209,18 @@ def _photo_list(options: "RegisterOptions", path: Path | None, out: Path, *, eve
     from ..evaluation.lists import list_photographs, read_list
 
     if path is not None:
-        photos = read_list(path, options.meshes)
+        photos = read_list(path, options.meshes, options.limits)
         check_writable(out, "--out")
     else:
         check_writable(out, "--out")
         photos = list_photographs(
-            options.photos, options.meshes, box=options.box, camera=options.camera, every=every, frames=out / "frames"
+            options.photos,
+            options.meshes,
+            box=options.box,
+            camera=options.camera,
+            limits=options.limits,
+            every=every,
+            frames=out / "frames",
         )
         given = [f"--{name}" for name in ("box", "camera") if getattr(options, name) is not None]
         if given:

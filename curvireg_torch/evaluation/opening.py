@@ -1,15 +1,15 @@
 """Options of a registration, and the registrar that they ask for: shared by the command line and the viewer."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from ..errors import BankError, InvalidInputError
 from ..geometry import camera_matrix, sample_views
 from ..geometry.cameras import camera_of_view, transform
-from ..geometry.pose_prior import PosePrior
 from ..io.json_files import finite_numbers, read_json
 from ..io.meshes import load_mesh
 from ..matching import ViewBank, cached_bank
@@ -19,6 +19,7 @@ from ..registration import Registrar
 from ..utils.checks import check_rotation, check_square_pixels
 from ..utils.choices import DEFAULT
 from .lists import Entry
+from .prior_options import prior_from_limits
 
 __all__ = ["RegisterOptions", "check_camera", "open_registrar"]
 
@@ -33,7 +34,7 @@ class RegisterOptions:
         box, camera: x0, y0, x1, y1 and fx, fy, cx, cy in px; None: localized, and unknown.
         guess: of an unknown camera: "exif", or the horizontal field of view in degrees.
         instances, distance: without a box, see :func:`curvireg_torch.registration.localize`.
-        prior: limits on the pose.
+        limits: on the pose, arguments of :class:`PosePrior`.
         start: file of a pose (``rotation`` and ``translation``, as in result.json) that is refined instead of a search.
         preset, pipeline: name of a pipeline, or its JSON file; None: the pipeline of a bank, or the default.
         pose, top: the pose prior, and the number of hypotheses; None: those of the pipeline.
@@ -50,7 +51,7 @@ class RegisterOptions:
     guess: str | float | None = None
     instances: int = 1
     distance: tuple[float, float] | None = None
-    prior: PosePrior | None = None
+    limits: Mapping[str, Any] | None = None
     start: Path | None = None
     preset: str | None = None
     pipeline: Path | None = None
@@ -80,14 +81,13 @@ class RegisterOptions:
 
     def entry(self, photo: Path) -> Entry:
         """A photograph with the box, camera and meshes of these options."""
-        return self.complete(Entry((), str(photo), photo, self.meshes, self.box, self.camera))
+        prior = prior_from_limits(self.limits or {})
+        return self.complete(Entry((), str(photo), photo, self.meshes, self.box, self.camera, prior=prior))
 
     def complete(self, entry: Entry) -> Entry:
         """A photograph of a list with the options that a list does not hold."""
         start = None if self.start is None else read_start(self.start)
-        return replace(
-            entry, guess=self.guess, instances=self.instances, distance=self.distance, prior=self.prior, start=start
-        )
+        return replace(entry, guess=self.guess, instances=self.instances, distance=self.distance, start=start)
 
 
 def check_camera(camera: Sequence[float] | None, guess: str | float | None) -> None:

@@ -264,3 +264,53 @@ def test_list_refuses_unusable_options_and_foreign_results(register_list, refuse
     (tmp_path / "out").mkdir(exist_ok=True)
     (tmp_path / "out" / "results.jsonl").write_text('{"score": 1}\n')
     refused(register_list("options.csv", HEADER, row), "results.jsonl")
+
+
+LIMITED = [
+    # column, cell, part of the message or the prior in the result
+    ("azimuth", "140 220", {"azimuth": [140.0, 220.0], "elevation": [-10.0, 80.0]}),
+    ("elevation", "0 60", {"elevation": [0.0, 60.0]}),
+    ("side", "front", {"azimuth": [315.0, 45.0], "elevation": [-10.0, 80.0]}),
+    ("near", "180 20", {"viewpoint": [180.0, 20.0, 0.0], "within": 45.0, "elevation": [-10.0, 80.0]}),
+    ("", "", {"elevation": [-10.0, 80.0]}),
+    ("azimuth", "140", "azimuth: expected 2"),
+    ("azimuth", "from 140", "azimuth: expected numbers with blanks between them, got 'from 140'"),
+    ("elevation", "60 0", "elevation: expected -90 <= low"),
+    ("side", "top", "side"),
+    ("within", "10", "within: expected near"),
+    ("near", "1 2 3 4", "near: expected AZIMUTH"),
+    ("softness", "1 2", "softness: expected one number"),
+    ("front", "z", "front: expected another axis"),
+]
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_list_has_limits_of_each_row(register_list, folder, register, tmp_path, as_json):
+    """An empty cell leaves the option of the command line; a wrong one fails its row."""
+    names = ["azimuth", "elevation", "side", "near", "within", "softness", "front"]
+    rows = [[cell if name == column else "" for name in names] for column, cell, _ in LIMITED]
+    words = ["--elevation", "-10", "80", "--no-refine"]
+    if as_json:
+        box = list(map(float, box_of(0)))
+        cells = [{column: _in_json(cell)} if column else {} for column, cell, _ in LIMITED]
+        (folder / "limited.json").write_text(json.dumps([{"photo": "photos/0.png", "box": box, **c} for c in cells]))
+        assert register("--list", folder / "limited.json", folder / "truck.safetensors", *words) == 0
+    else:
+        photo = ["photos/0.png", *box_of(0)]
+        header = f"{HEADER},{','.join(names)}"
+        assert register_list("limited.csv", header, *([*photo, *row] for row in rows), words=words) == 0
+    for (*_, expected), row in zip(LIMITED, lines(tmp_path / "out"), strict=True):
+        if isinstance(expected, str):
+            assert row["status"] == "failed"
+            assert expected in row["message"]
+        else:
+            assert row["status"] == "ok"
+            assert {k: v for k, v in row["prior"].items() if k != "contradiction"} == expected
+
+
+def _in_json(cell):
+    """Numbers as a list, texts as they are."""
+    try:
+        return [float(number) for number in cell.split()]
+    except ValueError:
+        return cell

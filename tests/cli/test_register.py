@@ -115,9 +115,10 @@ def broken_files(folder):
         ({}, ["--field", "none"], ["none"]),
         ({}, ["--preset", "paper"], ["built with other settings"]),
         ({}, ["--pose", "upright"], ["--pose"]),
-        ({}, ["--near", "10"], ["--near: expected AZIMUTH ELEVATION"]),
-        ({}, ["--within", "10"], ["--within: expected --near"]),
-        ({}, ["--side", "left", "--azimuth", "0", "10"], ["--side: give it or --azimuth"]),
+        ({}, ["--near", "10"], ["near: expected AZIMUTH ELEVATION"]),
+        ({}, ["--within", "10"], ["within: expected near"]),
+        ({}, ["--side", "left", "--azimuth", "0", "10"], ["side: give it or azimuth"]),
+        ({}, ["--front", "x", "--softness", "5"], ["limit nothing"]),
         ({}, ["--elevation", "50", "10"], ["elevation: expected"]),
     ],
 )

@@ -10,13 +10,14 @@ from ...errors import InvalidInputError
 from ...geometry import camera_matrix
 from ...geometry.pose_prior import PosePrior
 from ...utils.digests import text_digest
+from ..prior_options import PRIOR_OPTIONS, limits_from_cells, prior_from_limits
 from .tables import BEST_MESH, RESULT_COLUMNS
 
 __all__ = ["BOX", "CAMERA", "Entry", "PhotoList", "photo_list"]
 
 BOX, CAMERA = ("x0", "y0", "x1", "y1"), ("fx", "fy", "cx", "cy")
 _REQUIRED = ("photo", *BOX)
-_KNOWN = (*_REQUIRED, *CAMERA, "mesh")
+_KNOWN = (*_REQUIRED, *CAMERA, "mesh", *PRIOR_OPTIONS)
 
 
 @dataclass(frozen=True)
@@ -70,18 +71,24 @@ class PhotoList:
 
 
 def photo_list(
-    name: str, columns: Sequence[str], rows: Iterable[Sequence[str]], folder: Path, meshes: Sequence[Path] = ()
+    name: str,
+    columns: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    folder: Path,
+    meshes: Sequence[Path] = (),
+    limits: Mapping[str, Any] | None = None,
 ) -> PhotoList:
     """Make a list from a table of texts.
 
-    Columns, in any order: ``photo``, ``x0``, ``y0``, ``x1``, ``y1``; optional ``fx``, ``fy``, ``cx``, ``cy``, ``mesh``;
-    others are passed through. Empty cells mean: localize the object, no camera, ``meshes``. A row that cannot be used
-    holds the reason in its ``error``.
+    Columns, in any order: ``photo``, ``x0``, ``y0``, ``x1``, ``y1``; optional ``fx``, ``fy``, ``cx``, ``cy``, ``mesh``
+    and those of :data:`.PRIOR_OPTIONS`; others are passed through. Empty cells mean: localize the object, no camera,
+    ``meshes``, ``limits``. A row that cannot be used holds the reason in its ``error``.
 
     Args:
         name, columns, rows: of the table; errors begin with the name.
         folder: to which its paths are relative.
         meshes: for rows that name none; of several the best is found.
+        limits: on the pose, arguments of :class:`PosePrior` for rows that do not give them.
 
     Raises:
         InvalidInputError: a missing, repeated or reserved column, or no rows.
@@ -103,13 +110,20 @@ def photo_list(
     if reserved := [column for column in names if column in (*RESULT_COLUMNS, BEST_MESH)]:
         raise InvalidInputError(f"{name}: {', '.join(reserved)}: names of result columns; rename those of the list")
     indices = {known: names.index(known) for known in _KNOWN if known in names}
-    entries = tuple(_entry(list(cells), len(columns), indices, folder, tuple(meshes)) for cells in rows)
+    entries = tuple(_entry(list(cells), len(columns), indices, folder, tuple(meshes), limits or {}) for cells in rows)
     if not entries:
         raise InvalidInputError(f"{name}: no photographs; give one row for each")
     return PhotoList(tuple(columns), entries)
 
 
-def _entry(cells: list[str], count: int, indices: Mapping[str, int], folder: Path, meshes: tuple[Path, ...]) -> Entry:
+def _entry(
+    cells: list[str],
+    count: int,
+    indices: Mapping[str, int],
+    folder: Path,
+    meshes: tuple[Path, ...],
+    limits: Mapping[str, Any],
+) -> Entry:
     padded = tuple((cells + [""] * count)[:count])
     values = {name: padded[index].strip() for name, index in indices.items()}
     try:
@@ -123,9 +137,11 @@ def _entry(cells: list[str], count: int, indices: Mapping[str, int], folder: Pat
         box, camera = _four_numbers(values, BOX), _four_numbers(values, CAMERA)
         if camera is not None:
             camera_matrix(*camera)  # raises if it is invalid
+        own = limits_from_cells({name: values[name] for name in PRIOR_OPTIONS if name in values})
+        prior = prior_from_limits({**limits, **own})
     except InvalidInputError as error:
         return Entry(padded, values["photo"], error=str(error))
-    return Entry(padded, values["photo"], folder / values["photo"], meshes, box, camera)
+    return Entry(padded, values["photo"], folder / values["photo"], meshes, box, camera, prior=prior)
 
 
 def _four_numbers(values: Mapping[str, str], names: tuple[str, ...]) -> tuple[float, ...] | None:

@@ -16,18 +16,19 @@ from .entries import BOX, CAMERA, PhotoList, photo_list
 __all__ = ["read_list"]
 
 
-def read_list(path: Path, meshes: Sequence[Path] = ()) -> PhotoList:
+def read_list(path: Path, meshes: Sequence[Path] = (), limits: Mapping[str, Any] | None = None) -> PhotoList:
     """Read a list of photographs.
 
     - ``.csv``: a header and the columns of ``photo_list``; blank lines are ignored.
     - ``.json``: a list of objects ``{"photo": "a.jpg", "box": [x0, y0, x1, y1], "camera": [fx, fy, cx, cy], "mesh":
-      "part.stl"}``, all but ``photo`` optional; other keys are passed through. Or COCO annotations: one row each, with
-      ``image_id``, ``annotation_id`` and ``category``; half a pixel is subtracted, as COCO measures from the corner.
+      "part.stl", "azimuth": [300, 60]}``, all but ``photo`` optional; other keys are columns. Or COCO annotations: one
+      row each, with ``image_id``, ``annotation_id`` and ``category``; half a pixel is subtracted, as COCO measures from
+      the corner.
     - a folder: a scene of a BOP dataset, with the boxes of whole objects, and the models of the dataset if present.
 
     Args:
         path: the file or folder; paths in it are relative to its folder.
-        meshes: for rows that name none; of several the best is found.
+        meshes, limits: for rows that do not give them, as in ``photo_list``.
 
     Raises:
         MissingFileError: no such file.
@@ -41,7 +42,7 @@ def read_list(path: Path, meshes: Sequence[Path] = ()) -> PhotoList:
         (1.0, 2.0, 30.0, 40.5)
     """
     if path.is_dir():
-        return _from_rows(path, _bop_rows(path), path, meshes)
+        return _from_rows(path, _bop_rows(path), path, meshes, limits)
     if not path.is_file():
         raise MissingFileError(f"{path}: no such file; check the path of the list")
     check_table_size(path)
@@ -50,22 +51,25 @@ def read_list(path: Path, meshes: Sequence[Path] = ()) -> PhotoList:
         if path.suffix.lower() != ".json":
             table = csv.reader(io.StringIO(text, newline=""), strict=True)
             columns, *rows = [cells for cells in table if any(map(str.strip, cells))] or [[]]
-            return photo_list(str(path), columns, rows, path.parent, meshes)
+            return photo_list(str(path), columns, rows, path.parent, meshes, limits)
         content = json.loads(text)
     except (UnicodeDecodeError, csv.Error) as error:
         raise InvalidInputError(f"{path}: not a table in UTF-8 ({error}); save it as CSV in UTF-8") from error
     except (ValueError, RecursionError) as error:
         raise InvalidInputError(f"{path}: not JSON ({error})") from error
     if isinstance(content, dict) and {"images", "annotations"} <= set(content):
-        return _from_rows(path, _coco_rows(path, content), path.parent, meshes)
+        return _from_rows(path, _coco_rows(path, content), path.parent, meshes, limits)
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise InvalidInputError(f"{path}: expected a list of objects with photo, box, camera, mesh; or COCO's images")
-    return _from_rows(path, [_row(entry) for entry in content], path.parent, meshes)
+    return _from_rows(path, [_row(entry) for entry in content], path.parent, meshes, limits)
 
 
-def _from_rows(path: Path, rows: Sequence[Row], folder: Path, meshes: Sequence[Path]) -> PhotoList:
+def _from_rows(
+    path: Path, rows: Sequence[Row], folder: Path, meshes: Sequence[Path], limits: Mapping[str, Any] | None
+) -> PhotoList:
     columns = list(dict.fromkeys(["photo", *BOX, *(key for row in rows for key in row)]))
-    return photo_list(str(path), columns, [[_text(row.get(name)) for name in columns] for row in rows], folder, meshes)
+    texts = [[_text(row.get(name)) for name in columns] for row in rows]
+    return photo_list(str(path), columns, texts, folder, meshes, limits)
 
 
 def _text(value: Any) -> str:

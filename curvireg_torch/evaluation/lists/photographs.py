@@ -1,8 +1,9 @@
 """Lists of photographs from files, folders, patterns and videos."""
 
 import glob
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 
@@ -22,15 +23,17 @@ def list_photographs(
     *,
     box: Sequence[float] | None = None,
     camera: Sequence[float] | None = None,
+    limits: Mapping[str, Any] | None = None,
     every: int = 1,
     frames: Path,
 ) -> PhotoList:
-    """List photographs that have the same box and camera.
+    """List photographs that have the same box, camera and limits on the pose.
 
     Args:
         paths: photographs, folders of them, patterns such as ``shots/*.jpg``, videos.
         meshes: mesh files; of several the best is found.
         box, camera: x0, y0, x1, y1 (default: the object is localized) and fx, fy, cx, cy, in px.
+        limits: arguments of :class:`PosePrior`.
         every, frames: use every n-th frame of videos; folder for these, as PNG.
 
     Raises:
@@ -41,7 +44,7 @@ def list_photographs(
         raise InvalidInputError(f"--every: expected >= 1, got {every}")
     numbers = [text for four in (box, camera) for text in (map(str, four) if four else [""] * 4)]
     rows = [[str(photo), *numbers] for path in paths for photo in _found(path, every, frames)]
-    return photo_list("photographs", ["photo", *BOX, *CAMERA], rows, Path(), meshes)
+    return photo_list("photographs", ["photo", *BOX, *CAMERA], rows, Path(), meshes, limits)
 
 
 def _found(path: Path, every: int, frames: Path) -> Iterator[Path]:
