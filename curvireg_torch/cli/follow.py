@@ -1,13 +1,32 @@
 """``curvireg follow FRAMES MESH``."""
 
 import argparse
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..errors import CurviregError, InvalidInputError, LostObjectError, MissingFileError
+from ..errors import (
+    CurviregError,
+    ImageError,
+    InvalidInputError,
+    LostObjectError,
+    MissingDependencyError,
+    MissingFileError,
+)
+from ..utils.choices import VIDEOS
 from ..utils.files import check_writable
 from ..utils.input_paths import check_given
 from .options import add_box_and_camera, common_options, examples, mesh_options, pipeline_options, register_options
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ..registration import FailedRegistration, Follower, Registration
+
+FOLDER_FPS = 10.0
+"""Frames per second of the overlay of a folder."""
 
 
 def add_parser(commands: Any) -> None:
@@ -15,9 +34,11 @@ def add_parser(commands: Any) -> None:
         "follow",
         parents=[common_options(), pipeline_options(), mesh_options()],
         help="follow an object through the frames of a video",
-        description="Registers the first frame and refines each next one from the pose before it.\nWrites "
+        description="Registers the first frame and refines each next one from the pose before it. Writes\n"
         "DIR/results.csv: photo, status (ok, lost, failed), rotation row by row, translation in the\nmesh's unit, "
-        "confidence and edge support.",
+        "confidence, edge support, and why there is no pose;\n"
+        "DIR/overlay.mp4: contours of the pose and confidence on each frame;\n"
+        "DIR/support.png: edge support and confidence over the frames.",
         **examples(
             "curvireg follow shots/ part.stl --unit mm --camera 1450 1450 960 540 --out out/follow",
             "curvireg follow turn.mp4 part.stl --camera 1450 1450 960 540 --box 410 220 890 700 --out out/follow",
@@ -32,7 +53,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Follow the object, and write its poses."""
+    """Follow the object; write its poses, and draw them."""
     check_given([arguments.frames], [arguments.mesh])
     if not arguments.frames.exists():
         raise MissingFileError("no such folder or video", subject=arguments.frames)
@@ -40,40 +61,90 @@ def run(arguments: argparse.Namespace) -> None:
         raise InvalidInputError("follow: give --camera FX FY CX CY")
     from tqdm import tqdm
 
-    from ..evaluation.lists import list_photographs
-    from ..evaluation.lists.tables import POSE_COLUMNS
     from ..evaluation.opening import check_camera, open_registrar
     from ..geometry import camera_matrix
-    from ..registration.following import Follower
-    from ..utils.files import write_csv
+    from ..registration import Follower
+    from ..visualization import OverlayVideo
 
-    options = register_options(arguments, [arguments.frames], [arguments.mesh])
+    options, out = register_options(arguments, [arguments.frames], [arguments.mesh]), arguments.out
     check_camera(options.camera, None)
-    check_writable(arguments.out, "--out")
-    frames = list_photographs(options.photos, options.meshes, frames=arguments.out / "frames").entries
-    follow = Follower(open_registrar(options, options.meshes, options.open_field()), camera_matrix(*arguments.camera))
+    check_writable(out, "--out")
+    frames, count, fps = _frames(arguments.frames, options.meshes)
+    registrar = open_registrar(options, options.meshes, options.open_field())
+    follow = Follower(registrar, camera_matrix(*arguments.camera))
     rows: list[list[Any]] = []
     try:
-        for frame in tqdm(frames, desc="follow", unit="frame", disable=not options.progress):
-            rows.append(_row(follow, frame.name, frame.photo, None if rows else options.box))
+        with closing(OverlayVideo(out / "overlay.mp4", registrar, fps=fps)) as video:
+            for name, image in tqdm(frames, desc="follow", unit="frame", total=count, disable=not options.progress):
+                result = _pose(follow, image, None if rows else options.box)
+                rows.append(_row(name, result))
+                video.add(None if isinstance(image, ImageError) else image, result)
     finally:  # an interruption loses no pose
-        header = ["photo", "status", *POSE_COLUMNS, "confidence", "edge_support"]
-        write_csv(arguments.out / "results.csv", [header, *rows])
+        if rows:
+            _write_tables(out, rows)
     counts = {status: sum(row[1] == status for row in rows) for status in ("ok", "lost", "failed")}
     summary = ", ".join(f"{count} {status}" for status, count in counts.items())
-    print(f"{len(rows)} frames: {summary}; see {arguments.out}/results.csv")
+    print(f"{len(rows)} frames: {summary}; see {out}/results.csv and {video.path}")
     if not counts["ok"]:
         raise InvalidInputError("no frame could be registered; give --box of the object in the first frame")
 
 
-def _row(follow: Any, name: str, path: Path, box: Any) -> list[Any]:
-    from ..io import read_photo
+def _pose(follow: "Follower", image: "Tensor | ImageError", box: Any) -> "Registration | FailedRegistration":
+    from ..registration import FailedRegistration
 
     try:
-        result = follow(read_photo(path).image, box)
-    except (CurviregError, OSError):
-        return [name, "failed", *[""] * 14]
-    if not result.ok:
-        return [name, "lost" if isinstance(result.error, LostObjectError) else "failed", *[""] * 14]
+        return FailedRegistration(image) if isinstance(image, ImageError) else follow(image, box)
+    except CurviregError as error:
+        return FailedRegistration(error)
+
+
+def _frames(path: Path, meshes: Sequence[Path]) -> tuple[Iterator[tuple[str, "Tensor | ImageError"]], int, float]:
+    """Names and pixels of the frames, with errors in place of unreadable ones; their number, and frames per second."""
+    from ..evaluation.lists import list_photographs
+    from ..io import Video, read_photo
+
+    if path.suffix.lower() in VIDEOS and path.is_file():
+        video = Video(path)
+        fps = video.fps if 0 < video.fps < 1000 else FOLDER_FPS
+        return ((f"{path.stem}-{number:06d}", image) for number, image in video), video.count, fps
+    photos = list_photographs([path], meshes, frames=path).entries
+
+    def read() -> Iterator[tuple[str, "Tensor | ImageError"]]:
+        for entry in photos:
+            try:
+                yield entry.name, read_photo(entry.photo).image
+            except (CurviregError, OSError) as error:
+                yield entry.name, ImageError(str(error))
+
+    return read(), len(photos), FOLDER_FPS
+
+
+def _row(name: str, result: "Registration | FailedRegistration") -> list[Any]:
+    from ..registration import FailedRegistration
+
+    if isinstance(result, FailedRegistration):
+        status = "lost" if isinstance(result.error, LostObjectError) else "failed"
+        return [name, status, *[""] * 14, str(result.error)]
+    assert result.translation is not None  # there is a camera matrix
     pose = [*result.rotation.flatten().tolist(), *result.translation.tolist()]
-    return [name, "ok", *pose, result.confidence, result.edge_support]
+    return [name, "ok", *pose, result.confidence, result.edge_support, ""]
+
+
+def _write_tables(out: Path, rows: list[list[Any]]) -> None:
+    """Write results.csv and, if matplotlib is installed, support.png."""
+    import torch
+
+    from ..evaluation.lists.tables import POSE_COLUMNS
+    from ..utils.files import write_csv, write_file
+    from ..visualization.plots import support_over_frames
+
+    header = ["photo", "status", *POSE_COLUMNS, "confidence", "edge_support", "message"]
+    write_csv(out / "results.csv", [header, *rows])
+    confidence, support = (torch.tensor([float(row[header.index(n)] or "nan") for row in rows]) for n in header[-3:-1])
+    content = BytesIO()
+    try:
+        support_over_frames(support, confidence).savefig(content, format="png", dpi=100)
+    except MissingDependencyError as error:
+        print(f"support.png is not drawn: {error}")
+        return
+    write_file(out / "support.png", content.getvalue())

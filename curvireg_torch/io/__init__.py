@@ -2,5 +2,6 @@
 
 from .images import Photo, read_image, read_photo
 from .meshes import load_mesh
+from .videos import Video
 
-__all__ = ["Photo", "load_mesh", "read_image", "read_photo"]
+__all__ = ["Photo", "Video", "load_mesh", "read_image", "read_photo"]

@@ -86,6 +86,10 @@ def draw_contours(picture: np.ndarray, depth: np.ndarray) -> int:
     """Draw outer and inner contours of (H, W) depth into an (H, W, 3 or 4) picture; returns the line width in px."""
     width = max(1, round(max(int(n) for n in depth.shape) / 500))
     opaque = (255,) * (picture.shape[2] - 3)
+    x, y, w, h = cv2.boundingRect((depth > 0).astype(np.uint8))
+    margin = width + 2  # nothing is drawn or looked at farther from the mesh
+    window = np.s_[max(0, y - margin) : y + h + margin, max(0, x - margin) : x + w + margin]
+    depth, picture = depth[window], picture[window]
     mask = (depth > 0).astype(np.uint8)
     inner = _depth_edges(depth) & (cv2.erode(mask, np.ones((3, 3), np.uint8)) > 0)
     thick = cv2.dilate(inner.astype(np.uint8), np.ones((width, width), np.uint8)) > 0

@@ -26,6 +26,7 @@ __all__ = [
     "fields",
     "reliability",
     "risk_coverage",
+    "support_over_frames",
     "view_sphere",
 ]
 
@@ -237,6 +238,29 @@ def errors_by_class(categories: Sequence[str], errors: Tensor, *, threshold_deg:
     axes.set(xlabel=f"error, degrees; beside the names: fraction below {threshold_deg:g}", xlim=(-3, _MISS + 5))
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.grid(alpha=0.3, axis="x")
+    return axes.figure
+
+
+def support_over_frames(edge_support: Tensor, confidence: Tensor) -> Any:
+    """Edge support and confidence over the frames of a video; crosses mark frames without a pose.
+
+    Both are (N,); where ``confidence`` is NaN, the object was lost or the frame could not be read.
+
+    Example:
+        >>> figure = support_over_frames(torch.tensor([0.8, torch.nan, 0.7]), torch.tensor([0.9, torch.nan, 0.9]))
+        >>> figure.axes[0].lines[-1].get_xdata().tolist()
+        [1]
+    """
+    check_tensor(confidence, "confidence", (None,))
+    check_tensor(edge_support, "edge_support", tuple(confidence.shape))
+    axes = _axes(8.0, 3.0)
+    marker = "." if len(confidence) < 100 else ""
+    for name, values in (("confidence", confidence), ("edge support", edge_support)):
+        axes.plot(values.numpy(), marker=marker, label=name)
+    lost = confidence.isnan().nonzero()[:, 0]
+    axes.plot(lost.numpy(), [0.0] * len(lost), "x", color="tab:red", clip_on=False, label="no pose")
+    axes.set(xlabel="frame", xlim=(-0.5, max(len(confidence) - 0.5, 0.5)), ylim=(0, 1.02))
+    axes.legend(fontsize="small", ncols=3, loc="lower right")
     return axes.figure
 
 

@@ -1,6 +1,7 @@
-"""``curvireg follow``: a table of poses, one row for each frame."""
+"""``curvireg follow``: poses, a video and a plot of all frames."""
 
 import csv
+import sys
 
 import cv2
 import pytest
@@ -8,6 +9,7 @@ import torch
 
 from curvireg_torch.cli import main
 from curvireg_torch.geometry import rotation_error
+from curvireg_torch.io import Video
 from curvireg_torch.registration import Follower
 from tests._support.lists import CAMERA
 from tests._support.scenes import truck_bank
@@ -45,7 +47,38 @@ def test_follow_writes_a_pose_for_each_frame(frames, tmp_path, capsys):
         assert float(rotation_error(R.view(3, 3), T[:3, :3])) < 4.0
         assert float((t - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.04
         assert 0.0 <= float(row["confidence"]) <= 1.0
-    assert (rows[3]["r11"], rows[3]["confidence"]) == ("", "")
+    assert (rows[3]["r11"], rows[3]["confidence"], rows[0]["message"]) == ("", "", "")
+    assert "3.png" in rows[3]["message"]
+    assert cv2.imread(str(tmp_path / "support.png")).shape[1] == 800
+    pictures = [image.int() for _, image in Video(tmp_path / "overlay.mp4")]
+    assert [tuple(image.shape) for image in pictures] == [(3, 180, 240)] * 4
+    assert pictures[3][:, 40:].max() < 30  # the unreadable frame is black
+    photograph = (scenes[2][0] * 255).int()
+    assert 2 < (pictures[2] - photograph).abs().float().mean() < 30  # contours and codec
+
+
+def test_follow_reads_a_video_and_keeps_its_rate(frames, tmp_path):
+    folder, scenes = frames
+    writer = cv2.VideoWriter(str(tmp_path / "turn.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (240, 180))
+    for k in range(3):
+        writer.write(cv2.imread(str(folder / "shots" / f"{k}.png")))
+    writer.release()
+    options = ("--quiet", "--camera", *CAMERA, "--box", *scenes[0][1].tolist(), "--out", tmp_path / "out")
+    assert main(["follow", str(tmp_path / "turn.avi"), str(folder / "truck.safetensors"), *map(str, options)]) == 0
+    with (tmp_path / "out" / "results.csv").open() as file:
+        assert [(row["photo"], row["status"]) for row in csv.DictReader(file)] == [
+            (f"turn-00000{k}", "ok") for k in range(3)
+        ]
+    assert Video(tmp_path / "out" / "overlay.mp4").fps == 25.0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["overlay.mp4", "results.csv", "support.png"]
+
+
+def test_follow_draws_no_plot_without_matplotlib(frames, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    folder, scenes = frames
+    assert run(folder, "--camera", *CAMERA, "--box", *scenes[0][1].tolist(), "--out", tmp_path) == 0
+    assert "support.png is not drawn: plots: matplotlib is not installed" in capsys.readouterr().out
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["overlay.mp4", "results.csv"]
 
 
 def test_follow_needs_a_camera(frames, tmp_path, capsys):
@@ -73,3 +106,5 @@ def test_follow_keeps_the_poses_before_an_interruption(frames, tmp_path, monkeyp
     assert run(folder, "--camera", *CAMERA, "--box", *scenes[0][1].tolist(), "--out", tmp_path) == 130
     with (tmp_path / "results.csv").open() as file:
         assert [row["status"] for row in csv.DictReader(file)] == ["ok"]
+    assert len(list(Video(tmp_path / "overlay.mp4"))) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["overlay.mp4", "results.csv", "support.png"]

@@ -53,6 +53,17 @@ def test_errors_by_class_sorts_by_median_and_separates_misses():
     assert [axes.lines[1].get_xdata()[0], axes.lines[3].get_xdata()[0]] == [12.5, 100]
 
 
+def test_support_over_frames_marks_frames_without_a_pose():
+    nan = torch.nan
+    axes = plots.support_over_frames(torch.tensor([0.6, 0.5, nan, nan]), torch.tensor([0.9, 0.4, nan, nan])).axes[0]
+    lines = {line.get_label(): line.get_ydata() for line in axes.lines}
+    np.testing.assert_allclose(lines["confidence"], [0.9, 0.4, nan, nan])
+    np.testing.assert_allclose(lines["edge support"], [0.6, 0.5, nan, nan])
+    assert axes.lines[-1].get_xydata().tolist() == [[2.0, 0.0], [3.0, 0.0]]
+    with pytest.raises(InvalidInputError, match="edge_support"):
+        plots.support_over_frames(torch.tensor([0.6]), torch.tensor([0.9, 0.4]))
+
+
 def test_curves_and_bars_draw_the_columns():
     axes = plots.curves(["offset", "mfc", "ig"], [[-10, 0.1, 0.2], [0, 0.5, 0.4], [10, 0.3, 0.1]]).axes[0]
     assert [line.get_label() for line in axes.lines] == ["mfc", "ig"]

@@ -5,13 +5,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
-
-from ...errors import ImageError, InvalidInputError, MissingFileError
-from ...limits import MAX_IMAGE_PIXELS
+from ...errors import InvalidInputError, MissingFileError
+from ...io import Video
 from ...utils.choices import IMAGES, VIDEOS
 from ...utils.files import write_file
 from ...utils.input_paths import is_pattern
+from ...visualization.encoding import png
+from ...visualization.overlay import to_uint8
 from .entries import BOX, CAMERA, PhotoList, photo_list
 
 __all__ = ["list_photographs"]
@@ -62,22 +62,7 @@ def _found(path: Path, every: int, frames: Path) -> Iterator[Path]:
 
 def _frames(path: Path, every: int, folder: Path) -> Iterator[Path]:
     """Write frames 0, every, 2 every, ... as files."""
-    video = cv2.VideoCapture(str(path))
-    try:
-        width, height = (int(video.get(k)) for k in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        if not video.isOpened() or not 0 < width * height <= MAX_IMAGE_PIXELS:
-            raise ImageError(f"{path}: not a video that can be read; save it as MP4 (H.264), or give its frames")
-        number = 0
-        while video.grab():
-            if number % every == 0:
-                frame = folder / f"{path.stem}-{number:06d}.png"
-                known, pixels = video.retrieve()
-                if not known:
-                    raise ImageError(f"{path}: frame {number} cannot be read; save the video again")
-                write_file(frame, cv2.imencode(".png", pixels)[1].tobytes())
-                yield frame
-            number += 1
-        if number == 0:
-            raise ImageError(f"{path}: a video without frames; save it again")
-    finally:
-        video.release()
+    for number, image in Video(path, every=every):
+        frame = folder / f"{path.stem}-{number:06d}.png"
+        write_file(frame, png(to_uint8(image)))
+        yield frame

@@ -1,0 +1,135 @@
+"""A video of the poses of a followed object."""
+
+import os
+import secrets
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import LostObjectError
+from ..registration import FailedRegistration, Registrar, Registration
+from ..utils.files import write_file
+from .encoding import jpeg, shrink
+from .overlay import draw_contours, to_uint8
+
+__all__ = ["OverlayVideo"]
+
+_LONGER_SIDE = 960  # of the frames in px; larger ones are scaled down
+_QUALITY = 85  # of JPEG files
+_SURE, _UNSURE, _NO_POSE = (90, 230, 120), (255, 190, 60), (255, 90, 80)
+
+
+class OverlayVideo:
+    """Writes frames with the contours of the mesh at the pose, and the confidence in words, to an MP4 file.
+
+    Where OpenCV cannot encode MPEG-4, the frames become JPEG files in a folder beside it, after a warning. The file is
+    complete only after :meth:`close`; as a context manager, the video closes itself, whatever happens.
+
+    Args:
+        path: of the file, which ends in ``.mp4``.
+        registrar: whose mesh is drawn.
+        fps: frames per second.
+
+    Example:
+        >>> import tempfile
+        >>> import curvireg_torch as cr
+        >>> from curvireg_torch.synthetic import example_mesh
+        >>> bank = cr.ViewBank.build(example_mesh(), cr.sample_views(azimuth_step=90), image_size=64, progress=False)
+        >>> registrar, image = cr.Registrar(bank), torch.rand(3, 120, 160)
+        >>> with OverlayVideo(Path(tempfile.mkdtemp(), "overlay.mp4"), registrar, fps=10.0) as video:
+        ...     video.add(image, registrar([image], [[40, 30, 120, 90]], cr.camera_matrix(150, 150, 79.5, 59.5))[0])
+        >>> video.path.name
+        'overlay.mp4'
+    """
+
+    def __init__(self, path: Path, registrar: Registrar, *, fps: float) -> None:
+        self.path, self.registrar, self.fps = path, registrar, fps
+        self._temporary = path.with_name(f"{path.stem}.{secrets.token_hex(4)}.tmp{path.suffix}")
+        self._writer: cv2.VideoWriter | None = None
+        self._size = (0, 0)
+        self._count = 0
+
+    def add(self, image: Tensor | None, result: Registration | FailedRegistration) -> None:
+        """Draw and write the next frame: (1 or 3, H, W), or None if it could not be read.
+
+        All frames get the size of the first one that could.
+        """
+        if image is None:
+            if self._writer is None:
+                return
+            picture = np.zeros((self._size[1], self._size[0], 3), np.uint8)
+        else:
+            picture = draw_frame(self.registrar, image, result)
+            if self._writer is None:
+                self._open(picture)
+            if picture.shape[1::-1] != self._size:
+                picture = np.asarray(cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA))
+        _write_caption(picture, result)
+        self._write(picture)
+
+    def _open(self, picture: np.ndarray) -> None:
+        height, width = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2  # the codec needs even numbers
+        self._size = (width, height)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        code = cv2.VideoWriter.fourcc(*"mp4v")
+        self._writer = cv2.VideoWriter(str(self._temporary), code, self.fps, self._size)
+        if not self._writer.isOpened():
+            self.path = self.path.with_suffix("")
+            warnings.warn(f"OpenCV has no MPEG-4 encoder; the frames are JPEG files in {self.path}", stacklevel=4)
+
+    def _write(self, picture: np.ndarray) -> None:
+        assert self._writer is not None
+        if self._writer.isOpened():
+            self._writer.write(picture[..., ::-1])
+        else:
+            write_file(self.path / f"{self._count:06d}.jpg", jpeg(picture, _QUALITY))
+        self._count += 1
+
+    def close(self) -> None:
+        """Finish the file. Nothing is written if there was no frame."""
+        if self._writer is None:
+            return
+        self._writer.release()
+        if self._temporary.exists():
+            os.replace(self._temporary, self.path)
+
+    def __enter__(self) -> "OverlayVideo":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def draw_frame(registrar: Registrar, image: Tensor, result: Registration | FailedRegistration) -> np.ndarray:
+    """(H, W, 3) uint8 of the image, of at most 960 px, with the contours of the mesh if there is a pose."""
+    whole = to_uint8(image)
+    picture = shrink(whole, _LONGER_SIDE)
+    if isinstance(result, Registration):
+        T, K = result.projection
+        sx, sy = (picture.shape[k] / whole.shape[k] for k in (1, 0))
+        scale = [[sx, 0.0, 0.5 * (sx - 1.0)], [0.0, sy, 0.5 * (sy - 1.0)], [0.0, 0.0, 1.0]]  # of pixels, not corners
+        K = torch.tensor(scale, dtype=K.dtype) @ K
+        renderer = registrar.describers[result.model].renderer
+        draw_contours(picture, renderer.render(T[None], K, picture.shape[:2])[0, 0].cpu().numpy())
+    return picture
+
+
+def caption(result: Registration | FailedRegistration) -> tuple[str, tuple[int, int, int]]:
+    """How sure the result is, in words and as a colour."""
+    if isinstance(result, FailedRegistration):
+        return "lost" if isinstance(result.error, LostObjectError) else "failed", _NO_POSE
+    if result.reliable:
+        return f"reliable, confidence {result.confidence:.2f}", _SURE
+    return f"unsure, confidence {result.confidence:.2f}", _UNSURE
+
+
+def _write_caption(picture: np.ndarray, result: Registration | FailedRegistration) -> None:
+    text, colour = caption(result)
+    scale = max(0.4, picture.shape[1] / 1200)
+    (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    cv2.rectangle(picture, (0, 0), (width + 12, height + below + 6), (0, 0, 0), cv2.FILLED)
+    cv2.putText(picture, text, (6, height + 4), cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)

@@ -1,0 +1,96 @@
+"""The overlay video: contours at the pose, captions, and what is written where OpenCV cannot encode."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from curvireg_torch.errors import InvalidInputError, LostObjectError
+from curvireg_torch.io import Video
+from curvireg_torch.registration import FailedRegistration
+from curvireg_torch.visualization import OverlayVideo
+from curvireg_torch.visualization.overlay import _CONTOUR
+from curvireg_torch.visualization.video import caption, draw_frame
+from tests._support.scenes import CAMERA, scene, truck_registrar
+
+LOST = FailedRegistration(LostObjectError("not near the start"))
+
+
+@pytest.fixture(scope="module")
+def registered():
+    image, box, _ = scene(0)
+    return image, truck_registrar()([image], box[None], CAMERA)[0]
+
+
+def outline_box(picture):
+    """Columns and rows between which the outline is drawn, 4 numbers."""
+    rows, columns = np.nonzero((picture == _CONTOUR).all(axis=2))
+    return np.array([columns.min(), rows.min(), columns.max(), rows.max()])
+
+
+def test_contours_stand_at_the_pose_in_any_size(registered):
+    image, result = registered
+    T, K = result.projection
+    depth = truck_registrar().describers[0].renderer.render(T[None], K, image.shape[-2:])[0, 0].numpy()
+    rows, columns = depth.nonzero()
+    expected = np.array([columns.min(), rows.min(), columns.max(), rows.max()])
+    grey = torch.full_like(image, 0.5)
+    assert np.abs(outline_box(draw_frame(truck_registrar(), grey, result)) - expected).max() <= 1
+    # Eight times as large, and scaled down to 960 px: four times.
+    large = grey.repeat_interleave(8, dim=1).repeat_interleave(8, dim=2)
+    S = torch.tensor([[8.0, 0.0, 3.5], [0.0, 8.0, 3.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    enlarged = replace(result, hypotheses=(replace(result.hypotheses[0], projection=(T, S @ K)),))
+    picture = draw_frame(truck_registrar(), large, enlarged)
+    assert picture.shape == (720, 960, 3)
+    corners = 4 * (expected + np.array([-0.5, -0.5, 0.5, 0.5])) + 1.5  # outer borders of the outermost pixels
+    assert np.abs(outline_box(picture) - corners).max() <= 4
+
+
+def test_caption_says_how_sure_the_pose_is(registered):
+    _, result = registered
+    assert caption(replace(result, confidence=0.95))[0] == "reliable, confidence 0.95"
+    assert caption(replace(result, confidence=0.6))[0] == "unsure, confidence 0.60"
+    assert caption(LOST)[0] == "lost"
+    assert caption(FailedRegistration(InvalidInputError("no")))[0] == "failed"
+
+
+def test_overlay_video_has_every_frame(registered, tmp_path):
+    image, result = registered
+    odd = image[:, :179, :239]
+    with OverlayVideo(tmp_path / "overlay.mp4", truck_registrar(), fps=7.0) as video:
+        video.add(None, LOST)  # nothing is known of the size yet
+        for one, found in ((odd, result), (odd, LOST), (None, LOST), (image, result)):
+            video.add(one, found)
+    assert [path.name for path in tmp_path.iterdir()] == ["overlay.mp4"]
+    written = Video(tmp_path / "overlay.mp4")
+    frames = [frame.permute(1, 2, 0).numpy().astype(int) for _, frame in written]
+    assert (written.fps, [f.shape for f in frames]) == (7.0, [(178, 238, 3)] * 4)
+    body = np.s_[40:]
+    expected = draw_frame(truck_registrar(), odd, result)[:178, :238].astype(int)
+    assert np.abs(frames[0] - expected)[body].mean() < 12  # the codec is lossy
+    assert np.abs(frames[0] - frames[1])[body].max() > 60  # contours, and none
+    assert frames[2][body].max() < 30
+    assert np.abs(frames[3] - frames[0]).mean() < 12
+
+
+def test_overlay_video_becomes_a_folder_without_an_encoder(registered, tmp_path, monkeypatch):
+    image, result = registered
+    monkeypatch.setattr(cv2.VideoWriter, "fourcc", lambda *_: 0x20202020)
+    with OverlayVideo(tmp_path / "overlay.mp4", truck_registrar(), fps=7.0) as video:
+        with pytest.warns(UserWarning, match="no MPEG-4 encoder"):
+            video.add(image, result)
+        video.add(image, LOST)
+    assert video.path == tmp_path / "overlay"
+    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*.*")) == [
+        "overlay/000000.jpg",
+        "overlay/000001.jpg",
+    ]
+    assert cv2.imread(str(tmp_path / "overlay" / "000000.jpg")).shape == (180, 240, 3)
+
+
+def test_overlay_video_without_frames_writes_nothing(tmp_path):
+    with OverlayVideo(tmp_path / "overlay.mp4", truck_registrar(), fps=7.0):
+        pass
+    assert list(tmp_path.iterdir()) == []
