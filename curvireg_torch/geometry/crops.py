@@ -9,6 +9,9 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..utils.checks import as_boxes, check_positive, check_tensor
 
+BLOCK = 16
+"""Samples that are computed by one matrix product: fewer are slow, more multiply by many zeros."""
+
 
 def whole_image_box(image: Tensor) -> Tensor:
     """(4,) box of a whole (..., H, W) image."""
@@ -108,35 +111,65 @@ def crop_images(
     check_boxes(boxes, [(int(image.shape[-2]), int(image.shape[-1])) for image in images])
     squares = square_boxes(boxes, margin)
     A = crop_transforms(squares, size)
+    crops = [crop_squares(image, square[None], size) for image, square in zip(images, squares, strict=True)]
+    if crops:
+        return torch.cat(crops).to(images[0].dtype), A
     if isinstance(images, Tensor):
-        return _resample(images, squares, size), A
-    crops = [_resample(image[None], squares[i : i + 1], size) for i, image in enumerate(images)]
-    if not crops:
-        raise InvalidInputError("images: expected at least one image in the list")
-    return torch.cat(crops), A
+        return images.new_zeros(0, images.shape[1], size, size), A
+    raise InvalidInputError("images: expected at least one image in the list")
 
 
-def _resample(images: Tensor, squares: Tensor, size: int) -> Tensor:
-    """(B, C, size, size) crops of (B, C, H, W) images, in their dtype."""
-    H, W = images.shape[-2:]
+def crop_squares(image: Tensor, squares: Tensor, size: int) -> Tensor:
+    """(K, C, size, size) crops of K squares (K, 4) in px of one image (C, H, W), floating or uint8; at least float32.
+
+    Resampled as in :func:`crop_images`; of a large image only the pixels that the crops depend on are read.
+    """
     # Half types cannot represent pixel coordinates: bfloat16 has eight bits.
-    x = images.to(torch.promote_types(images.dtype, torch.float32))
-    squares = squares.to(x)
-    rows = _triangle_weights(squares[:, 1], squares[:, 3], size, H)[:, None]
-    columns = _triangle_weights(squares[:, 0], squares[:, 2], size, W)[:, None]
-    crops = rows @ (x @ columns.mT)
+    dtype = torch.promote_types(image.dtype, torch.float32)
+    borders = squares.to("cpu", dtype)  # many small steps
+    rows, columns = (_Resampling(borders[:, i], borders[:, i + 2], size, image.shape[-1 - i]) for i in (1, 0))
+    x = image[:, rows.first : rows.end, columns.first : columns.end]
+
+    def resampled(x: Tensor) -> Tensor:
+        return torch.stack([columns(strip.mT, k).mT for k, strip in enumerate(rows(x).split(size, dim=1))])
+
+    crops = resampled(x)
     if not bool(crops.isfinite().all()):  # 0 times NaN is NaN: one missing pixel would spread along its row and column
         missing = ~x.isfinite()
-        weight = rows @ (missing.to(x) @ columns.mT)
-        crops = torch.where(weight > 0, torch.nan, rows @ (torch.where(missing, 0.0, x) @ columns.mT))
-    return crops.to(images.dtype)
+        crops = torch.where(resampled(missing.to(dtype)) > 0, torch.nan, resampled(torch.where(missing, 0.0, x)))
+    return crops
 
 
-def _triangle_weights(low: Tensor, high: Tensor, size: int, length: int) -> Tensor:
-    """(B, size, length) weights of input samples in each output sample; rows sum to 1."""
-    scale = ((high - low) / size)[:, None]
-    index = torch.arange(size, device=low.device, dtype=low.dtype) + 0.5
-    centres = (low[:, None] + index * scale).clamp(0, length - 1)[..., None]
-    samples = torch.arange(length, device=low.device, dtype=low.dtype)
-    weights = (1.0 - (samples - centres).abs() / scale.clamp(min=1.0)[..., None]).clamp(min=0.0)
-    return weights / weights.sum(dim=-1, keepdim=True)
+class _Resampling:
+    """Triangle filters, at least one pixel wide, that resample an axis of ``length`` between K pairs of borders (K,).
+
+    The input from ``first`` to ``end`` is needed. Neighbouring samples, of whichever crop, are computed together, by
+    the product of a narrow matrix with the few inputs that they depend on.
+    """
+
+    def __init__(self, low: Tensor, high: Tensor, size: int, length: int) -> None:
+        scale = ((high - low) / size)[:, None]
+        index = torch.arange(size, device=low.device, dtype=low.dtype) + 0.5
+        self._centres = (low[:, None] + index * scale).clamp(0, length - 1)
+        self._widths = scale.clamp(min=1.0).expand(-1, size)
+        self.first = max(0, int((self._centres - self._widths).amin()))
+        self.end = min(length, int((self._centres + self._widths).amax()) + 1)
+
+    def __call__(self, x: Tensor, crop: int | None = None) -> Tensor:
+        """(C, samples, W) of one crop, or of all crops in sequence, from the (C, end - first, W) input.
+
+        Pixels are converted where they are used: a copy of a photograph would take more time than its resampling.
+        """
+        which = slice(None) if crop is None else slice(crop, crop + 1)
+        centres, order = self._centres[which].flatten().sort(stable=True)
+        widths = self._widths[which].flatten()[order]
+        parts = []
+        for centre, width in zip(centres.split(BLOCK), widths.split(BLOCK), strict=True):
+            low = max(0, int((centre - width).amin()) - self.first)
+            high = int((centre + width).amax()) + 1 - self.first
+            part = x[:, low:high].to(centres.dtype)
+            part = part.div_(255.0) if x.dtype == torch.uint8 else part
+            samples = torch.arange(low, low + part.shape[1], device=centre.device, dtype=centre.dtype) + self.first
+            weights = (1.0 - (samples - centre[:, None]).abs() / width[:, None]).clamp(min=0.0)
+            parts.append((weights / weights.sum(dim=1, keepdim=True)).to(part) @ part)
+        return torch.cat(parts, dim=1)[:, order.argsort()]

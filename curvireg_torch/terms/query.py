@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ..errors import InvalidInputError
 from ..filters.inputs import fill_missing, may_have_missing, missing_mask
-from ..geometry.crops import check_boxes, crop_images, square_boxes
+from ..geometry.crops import check_boxes, crop_squares, square_boxes
 from ..utils.checks import as_numbers, check_photograph, check_tensor
 
 __all__ = ["QueryFeatures", "crop_regions", "jittered_boxes", "photograph_field"]
@@ -89,7 +89,7 @@ def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:
 
 
 def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int, margin: float) -> Tensor:
-    """(B, K, C, S, S) crops of K boxes per image, as :func:`crop_images` cuts them; converts only the pixels it needs.
+    """(B, K, C, S, S) crops of K boxes per image, as :func:`crop_images` cuts them; reads only the pixels it needs.
 
     Args:
         images: (B, C, H, W), or a list of (C, H, W), floating in [0, 1] or uint8; if channel counts differ, grey images
@@ -107,19 +107,10 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
     if not sizes:
         return boxes.new_zeros(0, boxes.shape[1], 3, size, size)
     channels = max(image.shape[0] for image in images)
-    squares = square_boxes(boxes, margin)
-    reach = 2.0 + (squares[..., 2] - squares[..., 0]).amax(dim=1) / size  # of the resampling, px
-    low = (squares[..., :2].amin(dim=1) - reach[:, None]).floor().long().clamp(min=0).tolist()
-    high = (squares[..., 2:].amax(dim=1) + reach[:, None]).ceil().long().tolist()
     crops = []
-    for image, each, (x0, y0), (x1, y1), (H, W) in zip(images, boxes, low, high, sizes, strict=True):
+    for image, each, (H, W) in zip(images, boxes, sizes, strict=True):
         end = torch.tensor([W - 0.5, H - 0.5], dtype=each.dtype, device=each.device)
         visible = (each[:, 2:] > -0.5).all(dim=1) & (each[:, :2] < end).all(dim=1)
         each = torch.where(visible[:, None], each, each[:1])
-        x0, y0 = min(x0, W - 1), min(y0, H - 1)
-        part = image[:, y0 : max(min(y1, H), y0 + 1), x0 : max(min(x1, W), x0 + 1)]
-        part = part.to(torch.float32) / 255.0 if part.dtype == torch.uint8 else part
-        part = part.expand(channels, -1, -1) if len(part) == 1 else part
-        origin = torch.tensor([x0, y0, x0, y0], dtype=each.dtype, device=each.device)
-        crops.append(crop_images(part.expand(len(each), *part.shape), each - origin, size=size, margin=margin)[0])
+        crops.append(crop_squares(image, square_boxes(each, margin), size).expand(-1, channels, -1, -1))
     return torch.stack(crops)

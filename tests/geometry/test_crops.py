@@ -5,7 +5,7 @@ import torch
 
 from curvireg_torch import geometry as g
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry.crops import check_boxes, image_transforms
+from curvireg_torch.geometry.crops import check_boxes, crop_squares, image_transforms
 from curvireg_torch.utils.checks import check_camera_matrix
 
 
@@ -52,6 +52,32 @@ def test_crop_images_agrees_with_its_transforms_on_a_ramp(side: float, size: int
     source = torch.stack([x.flatten(), y.flatten(), torch.ones(size * size)]).double()
     expected = (torch.linalg.inv(A[0].double()) @ source)[:2].view(2, size, size)
     torch.testing.assert_close(crops[0].double(), expected, rtol=0, atol=off)
+
+
+@pytest.mark.parametrize("side", [3.0, 9.5, 40.0, 200.0])
+def test_crop_squares_are_triangle_filtered(side: float) -> None:
+    image, size = torch.rand(2, 70, 90, dtype=torch.float64), 11
+    corners = torch.tensor([[40.3, 31.2], [30.1, -1.7], [88.0, 60.0]], dtype=torch.float64)
+    squares = torch.cat([corners, corners + torch.tensor([[side], [1.1 * side], [side]])], dim=1)
+    crops = crop_squares(image, squares, size)
+
+    def weights(low: float, high: float, length: int) -> torch.Tensor:
+        scale = (high - low) / size
+        centres = (low + (torch.arange(size) + 0.5).double() * scale).clamp(0, length - 1)
+        w = (1.0 - (torch.arange(length) - centres[:, None]).abs() / max(scale, 1.0)).clamp(min=0.0)
+        return w / w.sum(dim=1, keepdim=True)
+
+    for crop, (x0, y0, x1, y1) in zip(crops, squares.tolist(), strict=True):
+        torch.testing.assert_close(crop, weights(y0, y1, 70) @ image @ weights(x0, x1, 90).mT)
+
+
+def test_crop_squares_scale_bytes_to_one() -> None:
+    image = torch.randint(0, 256, (3, 50, 60), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    squares = torch.tensor([[2.0, 3.0, 30.0, 31.0], [10.5, 8.0, 52.5, 50.0]])
+    crops = crop_squares(image, squares, 16)
+    assert crops.dtype == torch.float32
+    assert torch.equal(crops, crop_squares(image / 255.0, squares, 16))
+    assert torch.equal(crop_squares(torch.full_like(image, 51), squares[:1], 64), torch.full((1, 3, 64, 64), 0.2))
 
 
 def test_crop_images_keeps_position_and_sum_of_a_single_pixel() -> None:

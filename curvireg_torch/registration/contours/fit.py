@@ -10,8 +10,9 @@ from torch import Tensor
 
 from ...errors import InvalidInputError
 from ...filters.inputs import fill_missing
-from ...geometry import crop_images
+from ...geometry.crops import crop_transforms, square_boxes
 from ...rendering import DepthRenderer
+from ...terms import crop_regions
 from ...utils.checks import (
     as_boxes,
     as_numbers,
@@ -204,8 +205,8 @@ def _full_size(
     margin: float,
 ) -> tuple[Tensor, ContourProblem]:
     """(B, C, S, S) crops without missing pixels, and the problem on them."""
-    crops, A = crop_images(images, boxes, size=SIZE, margin=margin)
-    crops, K = fill_missing(crops), A.double()[image_index] @ K
+    crops = fill_missing(crop_regions(images, boxes[:, None], size=SIZE, margin=margin)[:, 0].cpu().float())
+    K = crop_transforms(square_boxes(boxes, margin), SIZE).double()[image_index] @ K
     check_pixels(crops, "of the box")
     return crops, ContourProblem(renderer, EdgeField(crops), image_index, K, SIZE, centre, radius)
 
@@ -242,7 +243,7 @@ def _among_best(support: Tensor, image_index: Tensor, count: int) -> Tensor:
 def _checked(
     images: Tensor | Sequence[Tensor], boxes: Any, camera_matrices: Any, poses: Tensor, image_index: Tensor | None
 ) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
-    """Float images, boxes (B, 4), camera matrices (N, 3, 3) of the poses and (N,) image indices, all on the CPU."""
+    """Images, and on the CPU boxes (B, 4), camera matrices (N, 3, 3) of the poses and (N,) image indices."""
     check_tensor(poses, "starts", (None, 4, 4))
     check_pose(poses, "starts")
     if isinstance(images, Tensor) and images.ndim == 3:  # one photograph
@@ -269,6 +270,5 @@ def _checked(
     if N and not 0 <= int(image_index.min()) <= int(image_index.max()) < B:
         raise InvalidInputError(f"image_index: expected indices of {B} images, got {image_index.tolist()}")
     image_index, K = image_index.long(), K.detach().cpu()
-    floats = [image.detach().cpu().float() / (1 if image.is_floating_point() else 255) for image in images]
     K = K.expand(B, 3, 3)[image_index] if given in (1, B) else K
-    return floats, boxes.detach().cpu().float(), K, image_index
+    return [image.detach() for image in images], boxes.detach().cpu().float(), K, image_index
