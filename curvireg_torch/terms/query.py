@@ -95,7 +95,7 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
         images: (B, C, H, W), or a list of (C, H, W), floating in [0, 1] or uint8; if channel counts differ, grey images
             get three channels.
         boxes: (B, K, 4) in px, from :func:`jittered_boxes`. A box entirely outside its image is replaced by the first
-            box, which must not be outside.
+            box, which must not be outside. The crops are on the device of the boxes.
         size, margin: see :func:`crop_images`.
     """
     for image in images:
@@ -112,5 +112,6 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
         end = torch.tensor([W - 0.5, H - 0.5], dtype=each.dtype, device=each.device)
         visible = (each[:, 2:] > -0.5).all(dim=1) & (each[:, :2] < end).all(dim=1)
         each = torch.where(visible[:, None], each, each[:1])
-        crops.append(crop_squares(image, square_boxes(each, margin), size).expand(-1, channels, -1, -1))
+        cut = crop_squares(image, square_boxes(each, margin), size).to(boxes.device)
+        crops.append(cut.expand(-1, channels, -1, -1))
     return torch.stack(crops)

@@ -205,7 +205,7 @@ def _full_size(
     margin: float,
 ) -> tuple[Tensor, ContourProblem]:
     """(B, C, S, S) crops without missing pixels, and the problem on them."""
-    crops = fill_missing(crop_regions(images, boxes[:, None], size=SIZE, margin=margin)[:, 0].cpu().float())
+    crops = fill_missing(crop_regions(images, boxes[:, None], size=SIZE, margin=margin)[:, 0].float())
     K = crop_transforms(square_boxes(boxes, margin), SIZE).double()[image_index] @ K
     check_pixels(crops, "of the box")
     return crops, ContourProblem(renderer, EdgeField(crops), image_index, K, SIZE, centre, radius)
