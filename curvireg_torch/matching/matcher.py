@@ -200,9 +200,10 @@ class ViewMatcher(nn.Module):
         return module
 
     def _reranking_features(self, name: str, views: Tensor) -> Tensor:
-        """(U, D) features of (U,) views: from the bank, from the cache, or computed and cached."""
+        """(U, D) features of (U,) ascending views: from the bank, from the cache, or computed and cached."""
         if name in self.bank.reranking_features:
-            return self.bank.reranking_features[name][views.to(self.device)]
+            features = self.bank.reranking_features[name]
+            return features if len(views) == len(features) else features[views.to(self.device)]
         cache = self._feature_cache.setdefault(name, {})
         found = {view: known for view in views.tolist() if (known := cache.get(view)) is not None}
         missing = [view for view in views.tolist() if view not in found]

@@ -13,8 +13,8 @@ from .backbone import Backbone
 __all__ = ["describe", "similarity"]
 
 CHUNK = 16
-"""Images per network call on a GPU. It is 1 on a CPU, where larger batches are no faster and the rounding of
-convolutions depends on the batch size."""
+"""Views that are compared at a time, and images per network call on a GPU. The latter is 1 on a CPU, where larger
+batches are no faster and the rounding of convolutions depends on the batch size."""
 
 
 @torch.no_grad()
@@ -64,5 +64,7 @@ def similarity(photographs: Tensor, views: Tensor) -> Tensor:
     """
     check_tensor(photographs, "photographs", (None, None, None))
     check_tensor(views, "views", (None, photographs.shape[-1]))
-    scores = photographs.flatten(0, 1).float() @ views.float().T
+    crops = photographs.flatten(0, 1).float()
+    # Few views at a time: a float32 copy of all of them takes ten times as long as the product.
+    scores = torch.cat([crops @ few.float().T for few in views.split(CHUNK)], dim=1)
     return scores.view(*photographs.shape[:2], len(views)).amax(dim=1)

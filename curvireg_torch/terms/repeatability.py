@@ -1,5 +1,6 @@
 """Repeatability of feature points between a photograph and every view, as one matrix product."""
 
+import functools
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -17,6 +18,9 @@ from .query import QueryFeatures
 __all__ = ["Repeatability", "dilate_points", "repeatability", "repeatability_score"]
 
 MODES = ("monotone", "paper")
+
+CHUNK = 64
+"""Views whose points are unpacked or compared at a time."""
 
 
 def dilate_points(points: Tensor, eps: float) -> Tensor:
@@ -54,8 +58,7 @@ def repeatability(query_points: Tensor, dilated_view_points: Tensor) -> Tensor:
             f"got {tuple(query_points.shape)}"
         )
     queries = query_points.flatten(1).float()
-    matched = queries @ dilated_view_points.flatten(1).float().T
-    return matched / queries.sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    return _fraction(_products(queries, dilated_view_points.flatten(1)), queries)
 
 
 def repeatability_score(rep: Tensor, *, mode: str = "monotone", sigma: float = 0.1) -> Tensor:
@@ -109,43 +112,49 @@ class Repeatability(Term):
 
 
 def cell_counts(points: Tensor, cell: int) -> Tensor:
-    """(N, C, C) float32 number of set pixels of (N, S, S) bool in cells of ``cell`` px; the last cells may be cut."""
+    """(N, C, C) number of set pixels of (N, S, S) bool in cells of ``cell`` px, the last of which may be cut.
+
+    The integers have 8 bits if that suffices for a cell, else 16.
+    """
     over = -points.shape[-1] % cell
     count = F.pad(points.view(torch.uint8), (0, over, 0, over))
+    count = count if cell**2 < 256 else count.short()
     for dim in (1, 2):  # rows first: they are contiguous
-        parts = count.unfold(dim, cell, cell).unbind(dim=3)
-        count = parts[0].short()
-        for part in parts[1:]:
-            count = count + part
-    return count.float()
-
-
-def cell_fractions(points: Tensor, cell: int) -> Tensor:
-    """(N, C, C) float32 fraction of the pixels of each cell that are set.
-
-    Bit-identical to ``avg_pool2d`` with ``ceil_mode`` and several times as fast, because it adds integers.
-    """
-    count = cell_counts(points, cell)
-    side = torch.full((count.shape[-1],), cell, device=points.device)
-    side[-1] -= -points.shape[-1] % cell
-    return count / (side[:, None] * side)
+        count = functools.reduce(torch.add, count.unfold(dim, cell, cell).unbind(dim=3))
+    return count
 
 
 class _RepeatabilityModule(nn.Module):
+    """``near`` (N, cells) counts the pixels of each cell within eps of a view's points, ``area`` (1, cells) all."""
+
+    near: Tensor
+    area: Tensor
+
     def __init__(self, views: Views, eps: float) -> None:
         super().__init__()
         S = views.settings.image_size
         # Cells of at most eps px keep the matrix product small.
         self.cell = max(1, min(int(eps * S), S // 64))
         near = [
-            cell_fractions(dilate_points(views.points_at(slice(i, i + 64)), eps * S), self.cell).flatten(1)
-            for i in range(0, len(views), 64)
+            cell_counts(dilate_points(views.points_at(slice(i, i + CHUNK)), eps * S), self.cell).flatten(1)
+            for i in range(0, len(views), CHUNK)
         ]
-        self.near: Tensor
+        whole = torch.ones(1, S, S, dtype=torch.bool, device=near[0].device)
         self.register_buffer("near", torch.cat(near), persistent=False)
+        self.register_buffer("area", cell_counts(whole, self.cell).flatten(1), persistent=False)
 
     def forward(self, query: QueryFeatures) -> Tensor:
         B, K = query.points.shape[:2]
-        # Counts, not fractions: a point in a cut cell must count as much as any other.
-        points = cell_counts(query.points.flatten(0, 1), self.cell).flatten(1)
-        return repeatability(points, self.near).view(B, K, len(self.near)).amax(dim=1)
+        # A point in a cut cell counts as much as any other.
+        points = cell_counts(query.points.flatten(0, 1), self.cell).flatten(1).float()
+        matched = _products(points / self.area, self.near)
+        return _fraction(matched, points).view(B, K, len(self.near)).amax(dim=1)
+
+
+def _products(queries: Tensor, views: Tensor) -> Tensor:
+    """(B, N) inner products of float32 (B, D) with (N, D) of any type, which are converted a few at a time."""
+    return torch.cat([queries @ few.float().T for few in views.split(CHUNK)], dim=1)
+
+
+def _fraction(matched: Tensor, points: Tensor) -> Tensor:
+    return matched / points.sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)

@@ -35,7 +35,7 @@ def tensor_digest(tensors: Mapping[str, "Tensor"], *, size: int = 8) -> str:
     digest = hashlib.blake2b(digest_size=size)
     for name, x in sorted(tensors.items()):
         digest.update(f"{name} {x.dtype} {tuple(x.shape)}".encode())
-        digest.update(x.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
+        digest.update(x.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
     return digest.hexdigest()
 
 

@@ -55,10 +55,11 @@ def over_products(matcher: ViewMatcher, images: list[torch.Tensor], boxes: torch
     with torch.no_grad():
         query = matcher.query(images, boxes)
         descriptors = query.descriptors.flatten(0, 1).contiguous()
-        cells = torch.rand(len(descriptors), points.near.shape[1], device=descriptors.device)
+        near = points.near.float()
+        cells = torch.rand(len(descriptors), near.shape[1], device=descriptors.device)
         bare, whole = [], []
         for _ in range(10):
-            bare += timed(lambda: (descriptors @ hog.views.T, cells @ points.near.T), 1)
+            bare += timed(lambda: (descriptors @ hog.views.T, cells @ near.T), 1)
             whole += timed(lambda: matcher.rank(query), 1)
     return min(whole) / min(bare)
 

@@ -8,7 +8,7 @@ from scipy.ndimage import distance_transform_edt
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.terms import Repeatability, dilate_points, repeatability, repeatability_score
-from curvireg_torch.terms.repeatability import cell_fractions
+from curvireg_torch.terms.repeatability import cell_counts
 
 
 @pytest.mark.parametrize("eps", [0.0, 1.0, 2.0, 2.5, 2.9, 3.0, 4.0])
@@ -46,11 +46,13 @@ def test_repeatability_score_has_the_closed_form():
 
 
 @pytest.mark.parametrize(("size", "cell"), [(128, 2), (64, 1), (65, 2), (100, 3), (1030, 16)])
-def test_cell_fractions_equal_average_pooling(size, cell):
+def test_cell_counts_equal_average_pooling(size, cell):
     points = torch.rand(3, size, size, generator=torch.Generator().manual_seed(0)) < 0.3
     points[1] = True
-    expected = F.avg_pool2d(points[:, None].float(), cell, ceil_mode=True)[:, 0]
-    assert torch.equal(cell_fractions(points, cell), expected)
+    expected = F.avg_pool2d(points[:, None].double(), cell, ceil_mode=True)[:, 0]
+    counts = cell_counts(points, cell)
+    torch.testing.assert_close(counts / counts[1].double(), expected)
+    assert int(counts[1, 0, 0]) == cell**2
 
 
 class PointViews:
