@@ -71,7 +71,7 @@ def add_pose_prior(parser: argparse.ArgumentParser) -> None:
     """Add the options that limit the pose."""
     group = parser.add_argument_group(
         "what is known about the pose",
-        "limits in degrees; all that are given must hold; the result stays within them. Lists have columns of "
+        "limits, angles in degrees; all that are given must hold; the result stays within them. Lists have columns of "
         "these names",
     )
     limits = ("LOW", "HIGH")
@@ -82,6 +82,8 @@ def add_pose_prior(parser: argparse.ArgumentParser) -> None:
     add("--side", choices=SIDE_NAMES, help="side that faces the camera, 45 degrees to either side of it")
     add("--near", type=float, nargs="+", metavar="DEG", help="AZIMUTH ELEVATION [THETA] nearby")
     add("--within", type=float, metavar="DEG", help="largest angle from --near (default: 45)")
+    distance = "of the object's centre, in the mesh's unit; needs a camera"
+    add("--distance", type=float, nargs=2, metavar=("NEAR", "FAR"), help=distance)
     add("--front", choices=UP_AXES, help="axis of the mesh file that points out of its front, at azimuth 0")
     add("--softness", type=float, metavar="DEG", help="soft limits: standard deviation of what exceeds them")
 

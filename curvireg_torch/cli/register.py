@@ -77,8 +77,6 @@ def add_parser(commands: Any) -> None:
     add("--start", type=Path, metavar="FILE", help=start)
     add_pose_prior(parser)
     add("--instances", type=int, default=1, metavar="N", help="without a box: up to N objects (default: 1)")
-    distances = "without a box: range of the object's distance in the mesh's unit; needs --camera"
-    add("--distance", type=float, nargs=2, metavar=("MIN", "MAX"), help=distances)
     add("--field", type=Path, metavar="FILE", help="weights from curvireg bank --adapt")
     add("--top", type=int, metavar="K", help="hypotheses to carry and report (default: 5)")
     add("--no-refine", dest="refine", action="store_false", help="stop at the best view of the bank")
@@ -104,8 +102,8 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return f"with --list, expected at most one MESH, got {len(arguments.paths)}; give several by --mesh"
     if sum(map(bool, (arguments.camera, arguments.exif, arguments.fov))) > 1:
         return "expected one of --camera FX FY CX CY, --camera exif, --fov DEG"
-    if arguments.box and (arguments.instances != 1 or arguments.distance):
-        return "--instances and --distance apply only without a box; leave --box out"
+    if arguments.box and arguments.instances != 1:
+        return "--instances applies only without a box; leave --box out"
     if arguments.start is not None and (arguments.box or arguments.list is not None or len(arguments.meshes) > 1):
         return "--start refines one mesh in one photograph; leave --box and --list out"
     if arguments.list is not None and (arguments.box or arguments.camera):
@@ -126,6 +124,8 @@ def run(arguments: argparse.Namespace) -> None:
     check_camera(options.camera, options.guess)
     if prior_from_limits(options.limits or {}) is None and options.limits and arguments.list is None:
         raise InvalidInputError("--front and --softness limit nothing by themselves; give --azimuth, for instance")
+    if options.start is not None and options.limits:
+        raise InvalidInputError("--start: refines this pose alone; leave limits on the pose out")
     if arguments.list is None and is_one_photograph(options.photos):
         _register_one(options, field, arguments.out, as_json=arguments.json)
         return

@@ -33,7 +33,7 @@ class RegisterOptions:
         meshes: mesh files or banks; of several, each photograph is registered to the best.
         box, camera: x0, y0, x1, y1 and fx, fy, cx, cy in px; None: localized, and unknown.
         guess: of an unknown camera: "exif", or the horizontal field of view in degrees.
-        instances, distance: without a box, see :func:`curvireg_torch.registration.localize`.
+        instances: without a box, see :func:`curvireg_torch.registration.localize`.
         limits: on the pose, arguments of :class:`PosePrior`.
         start: file of a pose (``rotation`` and ``translation``, as in result.json) that is refined instead of a search.
         preset, pipeline: name of a pipeline, or its JSON file; None: the pipeline of a bank, or the default.
@@ -50,7 +50,6 @@ class RegisterOptions:
     camera: tuple[float, float, float, float] | None = None
     guess: str | float | None = None
     instances: int = 1
-    distance: tuple[float, float] | None = None
     limits: Mapping[str, Any] | None = None
     start: Path | None = None
     preset: str | None = None
@@ -87,7 +86,7 @@ class RegisterOptions:
     def complete(self, entry: Entry) -> Entry:
         """A photograph of a list with the options that a list does not hold."""
         start = None if self.start is None else read_start(self.start)
-        return replace(entry, guess=self.guess, instances=self.instances, distance=self.distance, start=start)
+        return replace(entry, guess=self.guess, instances=self.instances, start=start)
 
 
 def check_camera(camera: Sequence[float] | None, guess: str | float | None) -> None:

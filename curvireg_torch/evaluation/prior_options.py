@@ -9,7 +9,7 @@ from ..geometry.pose_prior import PosePrior
 
 __all__ = ["PRIOR_OPTIONS", "limits_from_cells", "limits_from_options", "prior_from_limits"]
 
-PRIOR_OPTIONS = ("azimuth", "elevation", "theta", "side", "near", "within", "front", "softness")
+PRIOR_OPTIONS = ("azimuth", "elevation", "theta", "side", "near", "within", "distance", "front", "softness")
 """Names of the options, and of the columns."""
 
 WITHIN = 45.0

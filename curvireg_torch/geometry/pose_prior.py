@@ -1,4 +1,4 @@
-"""What is known about the pose in advance: ranges of the viewpoint, a rotation nearby, which way is up."""
+"""What is known about the pose in advance: ranges of viewpoint and distance, a rotation nearby, which way is up."""
 
 import math
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from ..utils.choices import SIDE_NAMES, UP_AXES
 from .conversions import axis_angle_from_rotation, rotation_from_axis_angle
 from .viewpoint import rotation_error, rotation_from_viewpoint, up_rotation, viewpoint_from_rotation
 
-__all__ = ["SIDES", "PosePrior", "object_frame"]
+__all__ = ["SIDES", "PosePrior", "check_distance", "object_frame"]
 
 SIDES = {name: 45.0 * k for k, name in enumerate(SIDE_NAMES)}
 """Azimuth in degrees from which a side of the object is seen; right and left as in a photograph of its front."""
@@ -24,7 +24,7 @@ SIDE_WIDTH = 45.0
 
 _HALF_TURN = 180.0
 
-_LIMITS = ("azimuth", "elevation", "theta", "up", "viewpoint", "rotation")
+_LIMITS = ("azimuth", "elevation", "theta", "up", "viewpoint", "rotation", "distance")
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ class PosePrior:
         viewpoint: (azimuth, elevation, theta) in degrees; the pose lies within ``within`` degrees of it.
         rotation: (3, 3) from the mesh file's axes to the camera; the pose lies within ``within`` degrees of it.
         within: tolerance in degrees of ``up``, ``viewpoint`` and ``rotation``; needed by each of them.
+        distance: (near, far) of the object's centre in the mesh's unit, always a hard limit; needs a camera matrix.
         front: the mesh's axis that points out of its front, for :func:`object_frame`.
         softness: standard deviation in degrees of a soft limit: a pose that misses it by :math:`e` degrees has the log
             prior :math:`-e^2 / (2 \sigma^2)`. 0: a hard limit, no pose outside is considered.
@@ -66,17 +67,19 @@ class PosePrior:
     viewpoint: tuple[float, float, float] | None = None
     rotation: Any = None
     within: float | None = None
+    distance: tuple[float, float] | None = None
     front: str | None = None
     softness: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("azimuth", "elevation", "theta", "up"):
+        for name in ("azimuth", "elevation", "theta", "up", "distance"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _numbers(getattr(self, name), name, 2))
         if self.viewpoint is not None:
             object.__setattr__(self, "viewpoint", _numbers(self.viewpoint, "viewpoint", 3))
         if self.elevation is not None and not -90.0 <= self.elevation[0] <= self.elevation[1] <= 90.0:
             raise InvalidInputError(f"elevation: expected -90 <= low <= high <= 90, got {self.elevation}")
+        check_distance(self.distance)
         if self.up is not None and math.hypot(*self.up) == 0.0:
             raise InvalidInputError("up: expected a direction, got (0, 0)")
         if self.rotation is not None:
@@ -112,7 +115,7 @@ class PosePrior:
         return {name: value for name, value in plain.items() if value not in (None, 0.0)}
 
     def excess(self, rotations: Tensor, frame: Tensor | None = None) -> Tensor:
-        """(...) degrees by which (..., 3, 3) rotations miss the worst of the limits.
+        """(...) degrees by which (..., 3, 3) rotations miss the worst of the limits on rotations.
 
         Negative within all limits: minus the distance to the nearest of them, at least -180.
         """
@@ -212,6 +215,12 @@ def object_frame(up: str = "z", front: str | None = None) -> Tensor:
     # Rotate about z until the front points along -y, where the camera of azimuth 0 stands.
     angle = torch.tensor([0.0, 0.0, -math.pi / 2 - math.atan2(y, x)], dtype=torch.float64)
     return rotation_from_axis_angle(angle) @ R
+
+
+def check_distance(distance: tuple[float, ...] | None) -> None:
+    """Raise :class:`InvalidInputError` for a range of distances that is not 0 < NEAR <= FAR."""
+    if distance is not None and not 0.0 < distance[0] <= distance[1] < math.inf:
+        raise InvalidInputError(f"distance: expected 0 < NEAR <= FAR, got {distance[0]:g} {distance[1]:g}")
 
 
 def _in_object_frame(rotations: Tensor, frame: Tensor | None) -> Tensor:

@@ -141,7 +141,7 @@ class PoseEstimator:
         starts = start_hypotheses(batch.ranking, self.bank, count=count, symmetries=self.symmetries)
         starts = starts if batch.priors is None else batch.priors.moved_inside(starts)
         hypotheses = self._search(batch, starts) if self.pipeline.search else starts
-        poses = lift_to_poses(self.describers, hypotheses, batch.boxes, batch.camera_matrices)
+        poses = self._lift(batch, hypotheses)
         if self.pipeline.contours:
             self.report_progress("contours")
             poses = fit_poses(self.describers, batch.images, poses, batch.boxes)
@@ -180,6 +180,11 @@ class PoseEstimator:
             priors=batch.priors,
         )
 
+    def _lift(self, batch: _Batch, hypotheses: Hypotheses) -> Poses:
+        """Hypotheses as poses that fill the boxes, at distances within the priors."""
+        poses = lift_to_poses(self.describers, hypotheses, batch.boxes, batch.camera_matrices)
+        return poses if batch.priors is None else replace(poses, T=batch.priors.at_distance(hypotheses, poses.T))
+
     def _evidence(self, batch: _Batch, starts: Hypotheses, poses: Poses) -> Tensor:
         """(H, 4) :data:`POSE_FEATURES` of poses that come from the views ``starts``."""
         hypotheses = poses.hypotheses
@@ -209,7 +214,7 @@ class PoseEstimator:
             keep = keep & batch.priors.keeps(poses.hypotheses, poses.T)
         if bool(keep.all()):
             return poses, evidence
-        views, back = lift_to_poses(self.describers, starts, batch.boxes, batch.camera_matrices), ~keep
+        views, back = self._lift(batch, starts), ~keep
         evidence = evidence.clone()
         evidence[back, 1:] = self._evidence(batch, starts[back], views[back])[:, 1:]
         return poses.where(keep, views), evidence
@@ -234,7 +239,9 @@ class PoseEstimator:
             hypotheses = tuple(hypothesis_of(h, poses, evidence, with_camera=with_camera) for h in reported)
             registration = Registration(hypotheses, model(features), ranking[b : b + 1], features)
             if batch.priors is not None:
-                registration = batch.priors.note(registration, poses.hypotheses, int(mine[0]), poses.T)
+                best = poses[mine[:1]]
+                filling = lift_to_poses(self.describers, best.hypotheses, batch.boxes, batch.camera_matrices)
+                registration = batch.priors.note(registration, best.hypotheses, best.T, filling.T)
             results.append(registration)
         return results
 

@@ -55,7 +55,7 @@ def image_items(
     """Photographs with boxes (None: the whole images) and cameras, or their errors; arguments as of ``Registrar``.
 
     Raises:
-        InvalidInputError: not as many boxes, cameras or priors as images.
+        InvalidInputError: not as many boxes, cameras or priors as images, or a distance limited without cameras.
     """
     if isinstance(images, str | PathLike) or (isinstance(images, Tensor) and images.ndim != 4):
         raise InvalidInputError("images: expected a batch (B, C, H, W) or a list; put a single image into a list")
@@ -67,6 +67,8 @@ def image_items(
     priors = [prior] * n if prior is None or isinstance(prior, PosePrior) else list(prior)
     if len(priors) != n or not all(p is None or isinstance(p, PosePrior) for p in priors):
         raise InvalidInputError(f"prior: expected a PosePrior, or a list of {n} with None where there is none")
+    if camera_matrices is None and any(p is not None and p.distance is not None for p in priors):
+        raise InvalidInputError("distance: needs the camera matrix of every photograph")
     out: list[ImageItem | CurviregError] = []
     for i in range(n):
         try:

@@ -18,7 +18,7 @@ from .correction import projected_box
 from .estimator import PoseEstimator
 from .inputs import ImageItem, check_crop, image_items
 from .locator import Located
-from .locator.locator import OVERLAP, check_distance
+from .locator.locator import OVERLAP
 from .priors import BatchPriors
 from .results import FailedRegistration, Localization, Registration
 
@@ -34,7 +34,6 @@ def localize(
     camera_matrices: Any | None = None,
     *,
     instances: int = 1,
-    distance: tuple[float, float] | None = None,
     prior: PosePrior | Sequence[PosePrior | None] | None = None,
 ) -> list[list[_Result]]:
     """Find and register objects in whole photographs, the most certain first.
@@ -46,17 +45,16 @@ def localize(
         registrar: :class:`Registrar` of the meshes.
         images, camera_matrices, prior: see :class:`Registrar`.
         instances: largest number of objects in each photograph.
-        distance: range of the distance of an object's centre, in the mesh's unit; needs cameras.
 
     Returns:
         For each photograph one to ``instances`` registrations with their ``localization``; or one that failed.
 
     Raises:
-        InvalidInputError: not as many cameras as images, ``instances`` < 1, or a bad ``distance``.
+        InvalidInputError: not as many cameras or priors as images, a distance limited without cameras, or
+            ``instances`` < 1.
     """
     if instances < 1:
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
-    check_distance(distance, with_cameras=camera_matrices is not None)
     _ = registrar.locator  # create it once, before threads use it
 
     def localize_one(item: ImageItem | CurviregError, index: int) -> list[_Result]:
@@ -66,6 +64,7 @@ def localize(
         try:
             check_crop(_extremes(item.image))
             cameras = None if item.camera_matrix is None else [item.camera_matrix]
+            distance = None if item.prior is None else item.prior.distance
             located = registrar.locator([item.image], camera_matrices=cameras, distance=distance)[0]
             if not len(located.boxes):
                 raise InvalidInputError(

@@ -11,6 +11,7 @@ from ..errors import InvalidInputError
 from ..geometry.cameras import rotation_towards
 from ..geometry.pose_prior import PosePrior, object_frame
 from ..io.meshes import mesh_up
+from ..io.meshes.mesh import mesh_centre
 from ..matching import ViewBank
 from .hypotheses import Hypotheses
 from .inputs import ImageItem
@@ -27,6 +28,12 @@ TOLERANCE = 3.0
 AT_LIMIT = 1.0
 """Degrees from a limit within which a result is reported to lie at the limit."""
 
+DISTANCE_TOLERANCE, AT_DISTANCE = 0.03, 0.01
+"""The same two for the distance, as fractions of its limits."""
+
+BOX_TOLERANCE = 0.1
+"""Fraction of a limit by which the distance at which the mesh fills the box may miss it: boxes are not exact."""
+
 LOW_RATIO = 0.25
 """Ratio of the best scores with and without the prior below which the photograph contradicts the prior."""
 
@@ -40,7 +47,7 @@ class BatchPriors:
 
     def __init__(self, items: Sequence[ImageItem], bank: ViewBank) -> None:
         self._priors = [item.prior for item in items]
-        self._ups = [mesh_up(mesh) for mesh in bank.meshes]
+        self._meshes, self._ups = bank.meshes, [mesh_up(mesh) for mesh in bank.meshes]
         self._towards = torch.eye(3, dtype=torch.float64).repeat(len(items), 1, 1)
         matrices = [item.camera_matrix.double() for item in items if item.camera_matrix is not None]
         if matrices:
@@ -91,24 +98,56 @@ class BatchPriors:
             out[h] = prior.excess(rotations[h], frame)
         return out
 
+    def at_distance(self, hypotheses: Hypotheses, T: Tensor) -> Tensor:
+        """(H, 4, 4) poses moved along the ray through the object's centre, no further than limits on it ask for."""
+        moved = T.clone()
+        for h, (near, far), centre, away in self._each_distance(hypotheses, T):
+            moved[h, :3, 3] += (min(max(away, near), far) / away - 1.0) * centre
+        return moved
+
     def keeps(self, hypotheses: Hypotheses, T: Tensor) -> Tensor:
-        """(H,) bool: whether fitted (H, 4, 4) poses stay within the hard limits by ``TOLERANCE``."""
+        """(H,) bool: whether fitted (H, 4, 4) poses leave the hard limits by no more than the tolerances."""
         keep = self.excess(hypotheses, T[:, :3, :3]) <= TOLERANCE
         for h, prior, _, _ in self._each(hypotheses):
             if prior.softness > 0.0:
                 keep[h] = True
-        return keep
+        return keep & (self._distance_excess(hypotheses, T) <= DISTANCE_TOLERANCE)
 
-    def note(self, registration: Registration, hypotheses: Hypotheses, h: int, T: Tensor) -> Registration:
-        """The registration with its prior, and how hypothesis ``h``, its best, contradicts it; ``T`` (H, 4, 4)."""
-        one = hypotheses[torch.tensor([h])]
-        prior, ratio = self._priors[int(one.image_index)], registration.ranking.prior_ratio
+    def note(self, registration: Registration, best: Hypotheses, T: Tensor, T_filling: Tensor) -> Registration:
+        """The registration with its prior, and how its best hypothesis contradicts it.
+
+        Args:
+            registration: of one photograph.
+            best: its hypothesis, one.
+            T, T_filling: (1, 4, 4) its pose, and the one at which the mesh fills the box.
+        """
+        prior, ratio = self._priors[int(best.image_index)], registration.ranking.prior_ratio
+        if prior is None:
+            return registration
+        excess, distance_excess = self.excess(best, T[:, :3, :3]), self._distance_excess(best, T)
         contradiction = None
-        if prior is not None and float(self.excess(one, T[h : h + 1, :3, :3])) > -AT_LIMIT:
+        if float(excess) > -AT_LIMIT or float(distance_excess) > -AT_DISTANCE:
             contradiction = "at the limit"
-        if prior is not None and ratio is not None and float(ratio) < LOW_RATIO:
+        if (ratio is not None and float(ratio) < LOW_RATIO) or self._distance_excess(best, T_filling) > BOX_TOLERANCE:
             contradiction = "better outside"
         return replace(registration, prior=prior, prior_contradiction=contradiction)
+
+    def _distance_excess(self, hypotheses: Hypotheses, T: Tensor) -> Tensor:
+        """(H,) fractions by which the distances of (H, 4, 4) poses miss their limits, negative within."""
+        out = torch.full((len(hypotheses),), -1.0, dtype=torch.float64)
+        for h, (near, far), _, away in self._each_distance(hypotheses, T):
+            out[h] = max(1.0 - away / near, away / far - 1.0)
+        return out
+
+    def _each_distance(self, hypotheses: Hypotheses, T: Tensor) -> list[tuple[int, tuple[float, float], Tensor, float]]:
+        """Index, limits, object's centre (3,) in the camera and its distance, where the distance is limited."""
+        known = []
+        for h, prior, _, _ in self._each(hypotheses):
+            if prior.distance is not None:
+                mesh = self._meshes[int(hypotheses.model[h])]
+                centre = T[h, :3, :3] @ mesh_centre(mesh).to(T) + T[h, :3, 3]
+                known.append((h, prior.distance, centre, float(centre.norm())))
+        return known
 
     def _each(self, hypotheses: Hypotheses) -> list[tuple[int, PosePrior, Tensor, Tensor]]:
         """Index, prior, frame of the mesh and rotation towards the box of each hypothesis that has a prior."""

@@ -103,7 +103,6 @@ class Registrar(PoseEstimator):
         boxes: Any | None = None,
         camera_matrices: Any | None = None,
         *,
-        distance: tuple[float, float] | None = None,
         prior: PosePrior | Sequence[PosePrior | None] | None = None,
     ) -> list[Registration | FailedRegistration]:
         """Register a batch.
@@ -113,7 +112,6 @@ class Registrar(PoseEstimator):
                 [0, 1] or uint8.
             boxes: (B, 4) x0, y0, x1, y1 in px; None searches for the object, see :func:`localize`.
             camera_matrices: (B, 3, 3) or (3, 3) in px; None: rotations are relative to a camera that looks at the box.
-            distance: without boxes, range of the distance of the object's centre, in the mesh's unit.
             prior: what is known of the poses in advance, one for all photographs or a list.
 
         Returns:
@@ -121,12 +119,10 @@ class Registrar(PoseEstimator):
             (unreadable, box empty or outside, one colour, NaN), which raises its error on access to a pose.
 
         Raises:
-            InvalidInputError: not as many boxes or cameras as images, or ``distance`` together with boxes.
+            InvalidInputError: not as many boxes, cameras or priors as images, or a distance limited without cameras.
         """
         if boxes is None:
-            return [results[0] for results in localize(self, images, camera_matrices, distance=distance, prior=prior)]
-        if distance is not None:
-            raise InvalidInputError("distance: limits the search for objects without boxes; leave out one of the two")
+            return [results[0] for results in localize(self, images, camera_matrices, prior=prior)]
         return self.map_items(image_items(images, boxes, camera_matrices, prior), self._register_boxes)
 
     def refine(

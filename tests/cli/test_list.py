@@ -237,8 +237,7 @@ def test_list_reports_unusable_files_in_one_line(register, refused, tmp_path, na
         (["--mesh", "a.stl"], "expected PHOTO MESH"),
         (["a.jpg", "a.stl", "--bogus", "3"], "unrecognized arguments: --bogus"),
         (["a.jpg", "a.stl", "--camera", "exif", "--fov", "50"], "expected one of --camera"),
-        (["a.jpg", "a.stl", "--box", "1", "2", "3", "4", "--instances", "2"], "apply only without a box"),
-        (["a.jpg", "a.stl", "--box", "1", "2", "3", "4", "--distance", "1", "2"], "apply only without a box"),
+        (["a.jpg", "a.stl", "--box", "1", "2", "3", "4", "--instances", "2"], "applies only without a box"),
     ],
 )
 def test_parse_refuses_options_that_exclude_each_other(register, words, message, capsys):
@@ -273,6 +272,8 @@ LIMITED = [
     ("side", "front", {"azimuth": [315.0, 45.0], "elevation": [-10.0, 80.0]}),
     ("near", "180 20", {"viewpoint": [180.0, 20.0, 0.0], "within": 45.0, "elevation": [-10.0, 80.0]}),
     ("", "", {"elevation": [-10.0, 80.0]}),
+    ("distance", "1 2", "distance: needs the camera"),
+    ("distance", "2 1", "distance: expected 0 < NEAR <= FAR"),
     ("azimuth", "140", "azimuth: expected 2"),
     ("azimuth", "from 140", "azimuth: expected numbers with blanks between them, got 'from 140'"),
     ("elevation", "60 0", "elevation: expected -90 <= low"),
@@ -287,7 +288,7 @@ LIMITED = [
 @pytest.mark.parametrize("as_json", [False, True])
 def test_list_has_limits_of_each_row(register_list, folder, register, tmp_path, as_json):
     """An empty cell leaves the option of the command line; a wrong one fails its row."""
-    names = ["azimuth", "elevation", "side", "near", "within", "softness", "front"]
+    names = ["azimuth", "elevation", "side", "near", "within", "distance", "softness", "front"]
     rows = [[cell if name == column else "" for name in names] for column, cell, _ in LIMITED]
     words = ["--elevation", "-10", "80", "--no-refine"]
     if as_json:

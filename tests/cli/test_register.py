@@ -119,6 +119,8 @@ def broken_files(folder):
         ({}, ["--within", "10"], ["within: expected near"]),
         ({}, ["--side", "left", "--azimuth", "0", "10"], ["side: give it or azimuth"]),
         ({}, ["--front", "x", "--softness", "5"], ["limit nothing"]),
+        ({}, ["--distance", "1", "2"], ["distance: needs the camera"]),
+        ({"box": ()}, ["--start", "none.json", "--side", "front"], ["--start: refines"]),
         ({}, ["--elevation", "50", "10"], ["elevation: expected"]),
     ],
 )

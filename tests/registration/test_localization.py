@@ -78,7 +78,7 @@ def test_localization_with_camera_and_distance(registrar):
     result = registrar([image], camera_matrices=CAMERA)[0]
     assert (result.translation - truth[:3, 3]).norm() < 0.25 * truth[:3, 3].norm()
     far = float(truth[2, 3])
-    within = registrar([image], camera_matrices=CAMERA, distance=(0.8 * far, 1.2 * far))[0]
+    within = registrar([image], camera_matrices=CAMERA, prior=cr.PosePrior(distance=(0.8 * far, 1.2 * far)))[0]
     assert 0.75 * far < float(within.translation[2]) < 1.3 * far
 
 
@@ -176,15 +176,11 @@ def test_failures_do_not_affect_other_photographs(registrar, found):
 
 
 def test_bad_distances_raise(registrar, found):
-    for boxes, K, distance, message in (
-        (None, None, (1.0, 2.0), "needs the camera"),
-        ([[4.0, 4.0, 40.0, 40.0]], CAMERA, (1.0, 2.0), "limits the search"),
-        (None, CAMERA, (3.0, 2.0), "expected 0 < MIN"),
-    ):
-        with pytest.raises(InvalidInputError, match=f"distance: {message}"):
-            registrar([found[0]], boxes, K, distance=distance)
+    for boxes in (None, [[4.0, 4.0, 40.0, 40.0]]):
+        with pytest.raises(InvalidInputError, match="distance: needs the camera"):
+            registrar([found[0]], boxes, prior=cr.PosePrior(distance=(1.0, 2.0)))
     with pytest.raises(InvalidInputError, match="image 0: nothing of such a size fits"):
-        _ = registrar([found[0]], camera_matrices=CAMERA, distance=(1e-3, 2e-3))[0].rotation
+        _ = registrar([found[0]], camera_matrices=CAMERA, prior=cr.PosePrior(distance=(1e-3, 2e-3)))[0].rotation
 
 
 @pytest.mark.parametrize(("preset", "features"), [("learned", [7.0, 0.6]), ("classical", [0.6])])

@@ -126,3 +126,73 @@ def ranking_of(allowed):
 
 def test_start_hypotheses_come_from_allowed_views():
     assert start_hypotheses(ranking_of(1), truck_bank(), count=5).view.tolist() == [0]
+
+
+DISTANCE = float(T[:3, 3].norm())  # of the origin, which is near the centre
+
+
+def centre_distances(result, registrar):
+    centre = registrar.describers[0].centre
+    return [float((h.rotation @ centre + h.translation).norm()) for h in result.hypotheses]
+
+
+@pytest.mark.parametrize("pipeline", [{}, {"contours": False}, {"contours": False, "search": False}], ids=str)
+@pytest.mark.parametrize("factors", [(0.5, 0.7), (1.4, 2.0)])
+@pytest.mark.parametrize("softness", [0.0, 20.0])
+def test_every_hypothesis_lies_at_an_allowed_distance(pipeline, factors, softness):
+    registrar = truck_registrar(**pipeline)
+    near, far = (factor * DISTANCE for factor in factors)
+    limits = around(AZIMUTH, 90.0).azimuth if softness else None
+    result = registrar(*ONE, prior=PosePrior(azimuth=limits, distance=(near, far), softness=softness))[0]
+    for distance in centre_distances(result, registrar):
+        assert 0.97 * near <= distance <= 1.03 * far
+    assert result.prior_contradiction == "better outside"
+
+
+def test_distance_that_holds_the_truth_changes_nothing(registrar):
+    free = registrar(*ONE)[0]
+    limited = registrar(*ONE, prior=PosePrior(distance=(0.8 * DISTANCE, 1.2 * DISTANCE)))[0]
+    assert torch.equal(limited.translation, free.translation)
+    assert limited.prior_contradiction is None
+
+
+def test_distance_at_a_limit_is_reported(registrar):
+    (found, *_) = centre_distances(registrar(*ONE)[0], registrar)
+    for limits, contradiction in (
+        ((0.5 * found, 1.02 * found), None),
+        ((0.5 * found, 1.005 * found), "at the limit"),
+        ((0.98 * found, 2.0 * found), None),
+        ((0.995 * found, 2.0 * found), "at the limit"),
+    ):
+        assert registrar(*ONE, prior=PosePrior(distance=limits))[0].prior_contradiction == contradiction
+
+
+def test_batch_priors_keep_fitted_poses_up_to_three_percent_too_far():
+    hypotheses, limits = (
+        start_hypotheses(ranking_of(1), truck_bank(), count=1),
+        limits_of(PosePrior(distance=(1.0, 2.0))),
+    )
+    kept = []
+    for away in (0.969, 0.972, 2.055, 2.065):
+        pose = torch.eye(4, dtype=torch.float64)[None].clone()
+        pose[0, :3, 3] = away * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64) - truck_centre()
+        kept.append(bool(limits.keeps(hypotheses, pose)))
+    assert kept == [False, True, True, False]
+
+
+def test_batch_priors_move_poses_along_the_ray_to_an_allowed_distance():
+    hypotheses, limits = (
+        start_hypotheses(ranking_of(1), truck_bank(), count=1),
+        limits_of(PosePrior(distance=(1.0, 2.0))),
+    )
+    ray = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+    for away, expected in ((0.5, 1.0), (1.5, 1.5), (9.0, 2.0)):
+        pose = torch.eye(4, dtype=torch.float64)[None].clone()
+        pose[0, :3, 3] = away * ray - truck_centre()
+        moved = limits.at_distance(hypotheses, pose)[0]
+        torch.testing.assert_close(moved[:3, 3] + truck_centre(), expected * ray)
+        assert torch.equal(moved[:3, :3], pose[0, :3, :3])
+
+
+def truck_centre():
+    return torch.from_numpy(truck_bank().mesh.bounds.mean(axis=0))

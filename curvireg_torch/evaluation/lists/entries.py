@@ -32,7 +32,7 @@ class Entry:
         camera: fx, fy, cx, cy in px; None if unknown.
         guess: replaces an unknown camera: "exif" takes the focal length in the photograph's file, a number is the
             horizontal field of view in degrees; None: no camera.
-        instances, distance: without a box, see :func:`curvireg_torch.registration.localize`.
+        instances: without a box, see :func:`curvireg_torch.registration.localize`.
         prior: limits on the pose.
         start: (4, 4) pose that is refined; nothing is searched for.
         error: why the row cannot be used; "" if it can.
@@ -46,7 +46,6 @@ class Entry:
     camera: Sequence[float] | None = None
     guess: str | float | None = None
     instances: int = 1
-    distance: tuple[float, float] | None = None
     prior: PosePrior | None = None
     start: tuple[tuple[float, ...], ...] | None = None
     error: str = ""
@@ -54,7 +53,7 @@ class Entry:
     def request(self) -> Any:
         """All that the result depends on besides the content of files."""
         prior = None if self.prior is None else self.prior.to_dict()
-        return [self.name, self.box, self.camera, self.guess, self.instances, self.distance, prior, self.start]
+        return [self.name, self.box, self.camera, self.guess, self.instances, prior, self.start]
 
     @cached_property
     def key(self) -> str:

@@ -106,9 +106,7 @@ def register_entry(
             raise InvalidInputError("--start: needs the camera; give --camera FX FY CX CY", subject=entry.name)
         results = registrar.refine([photo.image], K, [entry.start])
     elif entry.box is None:
-        results = localize(
-            registrar, [photo.image], K, instances=entry.instances, distance=entry.distance, prior=entry.prior
-        )[0]
+        results = localize(registrar, [photo.image], K, instances=entry.instances, prior=entry.prior)[0]
     else:
         results = registrar([photo.image], torch.tensor(entry.box)[None], K, prior=entry.prior)
     result = results[0]

@@ -11,13 +11,14 @@ from torch import Tensor, nn
 
 from ...errors import InvalidInputError
 from ...geometry.crops import crop_transforms, square_boxes
+from ...geometry.pose_prior import check_distance
 from ...matching import ViewBank, ViewDescriber, ViewMatcher
 from ...pipeline import Pipeline
 from ...utils.checks import as_numbers, check_camera_matrix, check_photograph, check_pixels, check_square_pixels
 from .dense_features import DenseFeatures, dense_features_for
 from .representatives import representative_views
 
-__all__ = ["OVERLAP", "Located", "Locator", "check_distance", "locate"]
+__all__ = ["OVERLAP", "Located", "Locator", "locate"]
 
 SIDE = 96
 """Side of the template views in px."""
@@ -98,11 +99,12 @@ class Locator(nn.Module):
             distance: range of the distance of the object's centre, in the mesh's unit.
 
         Raises:
-            InvalidInputError: wrong shape or dtype, or a ``distance`` without cameras or not 0 < MIN <= MAX.
+            InvalidInputError: wrong shape or dtype, or a ``distance`` without cameras or not 0 < NEAR <= FAR.
             ImageError: missing pixels (NaN or infinite), or pixels outside [0, 1].
         """
-        known = camera_matrices is not None and all(K is not None for K in camera_matrices)
-        check_distance(distance, with_cameras=known)
+        check_distance(distance)
+        if distance is not None and (camera_matrices is None or any(K is None for K in camera_matrices)):
+            raise InvalidInputError("distance: needs the camera matrix of every photograph")
         out = []
         for i, image in enumerate(images):
             K = None if camera_matrices is None else camera_matrices[i]
@@ -182,17 +184,6 @@ class Locator(nn.Module):
         box, view = torch.cat(boxes)[index], torch.cat(views)[index.cpu()]
         kept = nms(box, score[:PEAKS], OVERLAP)[: self.settings.proposals]
         return Located(box[kept].cpu(), score[kept].cpu(), view[kept.cpu()])
-
-
-def check_distance(distance: tuple[float, float] | None, *, with_cameras: bool) -> None:
-    """Raise :class:`InvalidInputError` for distances that are not 0 < MIN <= MAX, or that come without cameras."""
-    if distance is None:
-        return
-    low, high = distance
-    if not 0.0 < low <= high < float("inf"):
-        raise InvalidInputError(f"distance: expected 0 < MIN <= MAX, got {low:g} {high:g}")
-    if not with_cameras:
-        raise InvalidInputError("distance: needs the camera matrix of every photograph")
 
 
 def _templates(features: DenseFeatures, matcher: ViewMatcher, count: int) -> _Templates:

@@ -142,7 +142,7 @@ def test_distance_limits_each_box_by_its_view():
 
 def test_locator_rejects_bad_distances_images_and_settings():
     for distance in ((0.0, 1.0), (2.0, 1.0), (-1.0, 1.0), (1.0, float("inf")), (float("nan"), 1.0)):
-        with pytest.raises(InvalidInputError, match="distance: expected 0 < MIN <= MAX"):
+        with pytest.raises(InvalidInputError, match="distance: expected 0 < NEAR <= FAR"):
             locator()([torch.rand(3, 60, 80)], camera_matrices=[CAMERA], distance=distance)
     with pytest.raises(InvalidInputError, match="distance: needs the camera matrix"):
         locator()([torch.rand(3, 60, 80)], distance=(1.0, 2.0))
