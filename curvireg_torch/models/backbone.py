@@ -99,9 +99,9 @@ class Backbone(nn.Module):
             self.stem = _Conv(3, 32, 3, 2)
             blocks = [_Block(inputs, *block) for inputs, block in zip(widths, _BLOCKS, strict=False)]
         self.blocks = nn.ModuleList(blocks)
-        self.to_empty(device=torch.get_default_device())
-        weights = _read_weights(_weights_path())
-        self.load_state_dict(_fold_batch_norm(weights))
+        weights, device = _read_weights(_weights_path()), torch.get_default_device()
+        # Not by to_empty, which imports sympy: that takes a second.
+        self.load_state_dict({name: x.to(device) for name, x in _fold_batch_norm(weights).items()}, assign=True)
         for i, indices in enumerate(_OUTPUT_BLOCKS):
             scales = torch.stack([weights[f"_blocks.{k}._bn2.weight"] for k in indices])
             self.register_buffer(f"_spread{i}", torch.linalg.vector_norm(scales, dim=0), persistent=False)

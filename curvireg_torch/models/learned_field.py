@@ -136,9 +136,11 @@ class LearnedCurvilinearSaliency(nn.Module):
 
     def __init__(self, *, weights: Path | str | None = None) -> None:
         super().__init__()
-        self.network = _network_on_meta().to_empty(device=torch.get_default_device())
         self.weights = None if weights is None else str(weights)
-        self.network.load_state_dict(_read_weights(Path(weights or WEIGHTS), packaged=weights is None))
+        state, device = _read_weights(Path(weights or WEIGHTS), packaged=weights is None), torch.get_default_device()
+        self.network = _network_on_meta()
+        # Not by to_empty, which imports sympy: that takes a second.
+        self.network.load_state_dict({name: x.to(device) for name, x in state.items()}, assign=True)
         self.eval()
 
     def forward(self, image: Tensor) -> Tensor:
