@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from kornia.geometry.bbox import nms
 from torch import Tensor
 
@@ -64,8 +65,10 @@ def localize(
         try:
             check_crop(_extremes(item.image))
             cameras = None if item.camera_matrix is None else [item.camera_matrix]
-            distance = None if item.prior is None else item.prior.distance
-            located = registrar.locator([item.image], camera_matrices=cameras, distance=distance)[0]
+            limits: dict[str, Any] = {}
+            if item.prior is not None:
+                limits = {"distance": item.prior.distance, "allowed": _allowed_views(registrar, item)}
+            located = registrar.locator([item.image], camera_matrices=cameras, **limits)[0]
             if not len(located.boxes):
                 raise InvalidInputError(
                     "nothing of such a size fits into the photograph; give other distances, or the box"
@@ -78,6 +81,17 @@ def localize(
         image_items(images, None, camera_matrices, prior),
         lambda items, first: [localize_one(item, i) for i, item in enumerate(items, first)],
     )
+
+
+def _allowed_views(estimator: PoseEstimator, item: ImageItem) -> Tensor:
+    """(N,) bool: views of the bank that the prior does not exclude everywhere in the photograph, which is the box."""
+    off_centre = 0.0
+    if item.camera_matrix is not None:
+        x0, y0, x1, y1 = item.box.double().tolist()
+        points = torch.tensor([((x0 + x1) / 2, (y0 + y1) / 2, 1), (x0, y0, 1), (x1, y0, 1), (x0, y1, 1), (x1, y1, 1)])
+        rays = F.normalize(torch.linalg.solve(item.camera_matrix.double(), points.double().T), dim=0)
+        off_centre = float(torch.rad2deg(torch.acos((rays[:, :1] * rays[:, 1:]).sum(dim=0).clamp(-1, 1).min())))
+    return BatchPriors([item], estimator.bank).log_prior(estimator.bank, off_centre=off_centre)[0].isfinite()
 
 
 def _register_candidates(

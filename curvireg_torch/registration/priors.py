@@ -56,8 +56,8 @@ class BatchPriors:
             rays = torch.linalg.solve(torch.stack(matrices), F.pad(centres, (0, 1), value=1.0))
             self._towards = rotation_towards(rays)
 
-    def log_prior(self, bank: ViewBank) -> Tensor:
-        """(B, N) of the views of a bank.
+    def log_prior(self, bank: ViewBank, *, off_centre: float = 0.0) -> Tensor:
+        """(B, N) of the views of a bank; objects may lie ``off_centre`` degrees from the rays through their boxes.
 
         Raises:
             InvalidInputError: the limits of a photograph leave no view.
@@ -70,7 +70,7 @@ class BatchPriors:
             for m in model.unique().tolist():
                 mine = model == m
                 frame = object_frame(self._ups[m], prior.front)
-                out[b, mine] = prior.log_prior(self._towards[b] @ views[mine], frame, margin=VIEW_SPACING)
+                out[b, mine] = prior.log_prior(self._towards[b] @ views[mine], frame, margin=VIEW_SPACING + off_centre)
             if bool((out[b] == -torch.inf).all()):
                 raise InvalidInputError(f"prior: no view of the bank lies within {prior}; widen it, or leave it out")
         return out

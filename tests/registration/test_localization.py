@@ -11,12 +11,12 @@ import torch
 
 import curvireg_torch as cr
 from curvireg_torch.errors import CurviregError, InvalidInputError
-from curvireg_torch.geometry import box_iou, rotation_error
+from curvireg_torch.geometry import PosePrior, box_iou, rotation_error, viewpoint_from_rotation
 from curvireg_torch.registration import localization as localization_module
 from curvireg_torch.registration import localize
 from curvireg_torch.registration.confidence import presence
 from curvireg_torch.registration.inputs import ImageItem
-from curvireg_torch.registration.localization import ScoredCandidates
+from curvireg_torch.registration.localization import ScoredCandidates, _allowed_views
 from curvireg_torch.registration.locator import Located
 from tests._support.scenes import CAMERA, scene, unrefined
 from tests.registration.locator.test_locator import bank, clutter, pasted_scene
@@ -204,3 +204,27 @@ def test_presence_uses_the_locator_score_of_learned_features_only(preset, count)
     )
     assert len(low.evidence[0]) == len(high.evidence[0]) == count
     assert float(low.presence[0]) < float(high.presence[0]) if count == 2 else low.presence.equal(high.presence)
+
+
+def test_locator_does_not_compare_views_that_the_prior_excludes(registrar, found):
+    image, azimuth = found[0], 200.0
+    prior = PosePrior(azimuth=(azimuth - 20, azimuth + 20))
+    result = registrar([image], prior=prior)[0]
+    allowed = _allowed_views(registrar, ImageItem(image, torch.tensor([0.0, 0.0, 9.0, 9.0]), None, prior))
+    assert sorted(viewpoint_from_rotation(bank().rotations[allowed])[0].round().unique().tolist()) == [180.0, 210.0]
+    located = registrar.locator([image], allowed=allowed)[0]
+    assert bool(allowed[located.views].all()), "each view of this small bank is its own template"
+    assert set(result.localization.scores.tolist()) <= set(located.scores.tolist())
+    everything = registrar.locator([image], allowed=torch.ones_like(allowed))[0]
+    assert torch.equal(everything.boxes, registrar.locator([image])[0].boxes)
+    assert not bool(allowed[everything.views].all())
+
+
+def test_allowed_views_are_those_of_any_place_in_the_photograph(registrar):
+    """Half of the diagonal is 30 degrees wide; 7.5 more are the spacing of views."""
+    image, prior = scene(0)[0], PosePrior(rotation=bank().rotations[0], within=1.0)
+    item = ImageItem(image, torch.tensor([-0.5, -0.5, 239.5, 179.5]), CAMERA, prior)
+    degrees = rotation_error(bank().rotations, bank().rotations[0])
+    half = math.degrees(math.atan(150 / 260))
+    assert torch.equal(_allowed_views(registrar, item), degrees <= 8.5 + half)
+    assert torch.equal(_allowed_views(registrar, replace(item, camera_matrix=None)), degrees <= 8.5)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -16,7 +17,7 @@ from ...matching import ViewBank, ViewDescriber, ViewMatcher
 from ...pipeline import Pipeline
 from ...utils.checks import as_numbers, check_camera_matrix, check_photograph, check_pixels, check_square_pixels
 from .dense_features import DenseFeatures, dense_features_for
-from .representatives import representative_views
+from .representatives import nearest_representatives, representative_views
 
 __all__ = ["OVERLAP", "Located", "Locator", "locate"]
 
@@ -83,6 +84,11 @@ class Locator(nn.Module):
         self.features = dense_features_for(matcher)
         self._templates = _templates(self.features, matcher, self.settings.views)
 
+    @cached_property
+    def _template_of_view(self) -> Tensor:
+        """(N,) template that stands for each view of the bank."""
+        return nearest_representatives(self.matcher.bank, self._templates.views)
+
     @torch.no_grad()
     def forward(
         self,
@@ -90,6 +96,7 @@ class Locator(nn.Module):
         *,
         camera_matrices: Sequence[Tensor | None] | None = None,
         distance: tuple[float, float] | None = None,
+        allowed: Tensor | None = None,
     ) -> list[Located]:
         """Boxes of each photograph, independent of the others.
 
@@ -97,6 +104,7 @@ class Locator(nn.Module):
             images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, floating in [0, 1] or uint8.
             camera_matrices: (3, 3) of each in px, for ``distance``.
             distance: range of the distance of the object's centre, in the mesh's unit.
+            allowed: (N,) bool; views that stand for none of these views of the bank are not compared.
 
         Raises:
             InvalidInputError: wrong shape or dtype, or a ``distance`` without cameras or not 0 < NEAR <= FAR.
@@ -112,12 +120,17 @@ class Locator(nn.Module):
                 K = as_numbers(K, "camera_matrices", dtype=torch.float64)
                 check_camera_matrix(K)
                 check_square_pixels(K)
-            out.append(self._locate(image, None if K is None else float(K[0, 0]), distance))
+            out.append(self._locate(image, None if K is None else float(K[0, 0]), distance, allowed))
         return out
 
-    def _locate(self, image: Tensor, focal: float | None, distance: tuple[float, float] | None) -> Located:
+    def _locate(
+        self, image: Tensor, focal: float | None, distance: tuple[float, float] | None, views: Tensor | None
+    ) -> Located:
         check_photograph(image)
         templates = self._templates
+        usable = torch.ones(len(templates.views), dtype=torch.bool)
+        if views is not None:
+            usable = torch.zeros_like(usable).index_fill(0, self._template_of_view[views.cpu()], True)
         side = (templates.boxes[:, 2:] - templates.boxes[:, :2]).amax(dim=1)
         scales = self._scales(image, focal, distance, float(side.quantile(0.5)))
         maps, allowed, ratios = [], [], []
@@ -129,10 +142,10 @@ class Locator(nn.Module):
                 check_pixels(largest, "of the photograph")  # on the resized copy, which missing pixels spread to
             maps.append(self._similarity(_resized(largest, (h, w))[None]))
             ratios.append((w / image.shape[-1], h / image.shape[-2]))
-            fits = torch.ones_like(side, dtype=torch.bool)
+            fits = usable.to(side.device)
             if distance is not None and focal is not None:
                 away = templates.unit * focal * scale
-                fits = (away >= distance[0] / STEP**0.5) & (away <= distance[1] * STEP**0.5)
+                fits = fits & (away >= distance[0] / STEP**0.5) & (away <= distance[1] * STEP**0.5)
             allowed.append(fits)
         if not maps:
             return Located(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, dtype=torch.long))

@@ -7,7 +7,7 @@ from torch import Tensor
 from ...errors import InvalidInputError
 from ...matching import ViewBank
 
-__all__ = ["representative_views"]
+__all__ = ["nearest_representatives", "representative_views"]
 
 SAMPLE = 1500
 """Largest number of views of a model, evenly spread over the bank, whose pairwise distances are computed."""
@@ -42,16 +42,30 @@ def representative_views(bank: ViewBank, count: int) -> Tensor:
     """
     if count < 1:
         raise InvalidInputError(f"count: expected >= 1, got {count}")
-    sides = bank.boxes[:, 2:] - bank.boxes[:, :2]
-    ratios = (sides[:, :1] / sides[:, 1:]).log().float()
     chosen = []
     for model in bank.model.unique():
         views = (bank.model == model).nonzero()[:, 0]
         if len(views) > SAMPLE:
             views = views[torch.arange(SAMPLE, device=views.device) * len(views) // SAMPLE]
-        features = torch.cat([F.normalize(bank.descriptors[views].float(), dim=1), ratios[views]], dim=1)
+        features = _features(bank, views)
         chosen.append(views[_medoids(torch.cdist(features, features).square(), count)])
     return torch.cat(chosen).cpu().sort().values
+
+
+def nearest_representatives(bank: ViewBank, chosen: Tensor) -> Tensor:
+    """(N,) index into ``chosen``, views of all models, of the most similar one of each view's model; on the CPU."""
+    nearest = torch.zeros(len(bank), dtype=torch.long)
+    for model in bank.model.unique():
+        mine, views = (bank.model == model).nonzero()[:, 0].cpu(), (bank.model.cpu()[chosen] == model).nonzero()[:, 0]
+        distances = torch.cdist(_features(bank, mine), _features(bank, chosen[views]))
+        nearest[mine] = views[distances.argmin(dim=1).cpu()]
+    return nearest
+
+
+def _features(bank: ViewBank, views: Tensor) -> Tensor:
+    sides = (bank.boxes[:, 2:] - bank.boxes[:, :2])[views]
+    ratios = (sides[:, :1] / sides[:, 1:]).log().float()
+    return torch.cat([F.normalize(bank.descriptors[views].float(), dim=1), ratios.to(bank.descriptors.device)], dim=1)
 
 
 def _medoids(distances: Tensor, count: int) -> Tensor:

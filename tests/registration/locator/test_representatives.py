@@ -8,7 +8,7 @@ import torch
 from curvireg_torch import ViewBank
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.registration.locator import representative_views, representatives
-from curvireg_torch.registration.locator.representatives import _medoids
+from curvireg_torch.registration.locator.representatives import _medoids, nearest_representatives
 from tests._support.scenes import truck_bank
 
 
@@ -68,3 +68,20 @@ def test_representative_views_differ_by_logarithms_of_aspect_ratios() -> None:
     three = torch.ones(n, dtype=dtype)
     three[:2], three[2:12] = 1.0 / 8.0, 3.0
     assert sorted(three[representative_views(bank_of_ratios(three), 2)].tolist()) == [0.125, 1.0]
+
+
+def test_nearest_representatives_are_the_most_similar_of_the_same_model() -> None:
+    bank = ViewBank.join([truck_bank(), truck_bank()])
+    n, chosen = len(truck_bank()), representative_views(bank, 7)
+    nearest = nearest_representatives(bank, chosen)
+    assert torch.equal(nearest[chosen], torch.arange(14))
+    assert torch.equal(bank.model[chosen[nearest]], bank.model)
+    assert torch.equal(nearest[:n] + 7, nearest[n:])
+
+
+def test_nearest_representatives_compare_descriptors_and_ratios() -> None:
+    bank = bank_of_ratios(torch.linspace(0.5, 2.0, len(truck_bank()), dtype=torch.float64))
+    n = len(bank)
+    assert nearest_representatives(bank, torch.tensor([0, n - 1])).diff().tolist().index(1) + 1 == pytest.approx(
+        n / 3, abs=1
+    )
