@@ -11,7 +11,6 @@ raise :class:`InvalidInputError` for other shapes and dtypes and for what is no 
 """
 
 import torch
-from kornia.geometry import conversions as kornia_conversions
 from torch import Tensor
 
 from ..errors import InvalidInputError
@@ -107,7 +106,9 @@ def opencv_from_pytorch3d(R: Tensor, T: Tensor) -> Tensor:
 def quaternion_from_rotation(R: Tensor) -> Tensor:
     """(..., 3, 3) rotations to (..., 4) unit quaternions (w, x, y, z); q and -q are the same rotation."""
     check_rotation(R, "R")
-    quaternion: Tensor = kornia_conversions.rotation_matrix_to_quaternion(R.contiguous())
+    from kornia.geometry import conversions  # here, because its import takes 0.3 s
+
+    quaternion: Tensor = conversions.rotation_matrix_to_quaternion(R.contiguous())
     return quaternion
 
 
@@ -119,17 +120,43 @@ def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
         [-1.0, -1.0, 1.0]
     """
     check_last_axes(quaternion, "quaternion", (4,))
-    R: Tensor = kornia_conversions.quaternion_to_rotation_matrix(quaternion)
+    from kornia.geometry import conversions
+
+    R: Tensor = conversions.quaternion_to_rotation_matrix(quaternion)
     return R
 
 
 def axis_angle_from_rotation(R: Tensor) -> Tensor:
     """(..., 3, 3) rotations to (..., 3) axis x angle, the angle in radians, at most pi."""
-    axis_angle: Tensor = kornia_conversions.quaternion_to_axis_angle(quaternion_from_rotation(R))
+    from kornia.geometry import conversions
+
+    axis_angle: Tensor = conversions.quaternion_to_axis_angle(quaternion_from_rotation(R))
     return axis_angle
 
 
 def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
-    """(..., 3) axis x angle in radians to (..., 3, 3) rotations."""
+    """(..., 3) axis x angle in radians to (..., 3, 3) rotations, by Rodrigues' formula.
+
+    Example:
+        >>> rotation_from_axis_angle(torch.tensor([0.0, 0.0, torch.pi / 2])).round(decimals=3).abs().tolist()
+        [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
     check_last_axes(axis_angle, "axis_angle", (3,))
-    return rotation_from_quaternion(kornia_conversions.axis_angle_to_quaternion(axis_angle))
+    angle = torch.linalg.vector_norm(axis_angle, dim=-1)[..., None, None]
+    W = cross_matrix(axis_angle)
+    # sin(a) / a and (1 - cos(a)) / a^2; sinc does not divide by zero.
+    first, second = torch.sinc(angle / torch.pi), 0.5 * torch.sinc(angle / (2.0 * torch.pi)).square()
+    R: Tensor = torch.eye(3, dtype=W.dtype, device=W.device) + first * W + second * (W @ W)
+    return R
+
+
+def cross_matrix(vector: Tensor) -> Tensor:
+    """(..., 3) vectors to the (..., 3, 3) matrices [v]x whose product with x is the cross product v x x.
+
+    Example:
+        >>> cross_matrix(torch.tensor([1.0, 2.0, 3.0])).tolist()
+        [[0.0, -3.0, 2.0], [3.0, 0.0, -1.0], [-2.0, 1.0, 0.0]]
+    """
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(*vector.shape, 3)

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from kornia.geometry import vector_to_skew_symmetric_matrix
 from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_fraction, check_positive, check_symmetries
+from .conversions import rotation_from_axis_angle
 from .views import ViewSphere
 
 
@@ -96,9 +96,8 @@ def _axis_rotations(axis: Tensor, offset: Tensor, count: int) -> Tensor:
     length = torch.linalg.vector_norm(axis)
     if not bool(length > 0):
         raise InvalidInputError(f"axis: expected a direction of length > 0, got {axis.tolist()}")
-    cross: Tensor = vector_to_skew_symmetric_matrix(axis / length)
-    angles = (torch.arange(1, count, dtype=torch.float64) * (2.0 * math.pi / count)).view(-1, 1, 1)
+    angles = (torch.arange(1, count, dtype=torch.float64) * (2.0 * math.pi / count))[:, None]
     transforms = torch.eye(4, dtype=torch.float64).repeat(count - 1, 1, 1)
-    transforms[:, :3, :3] += angles.sin() * cross + (1.0 - angles.cos()) * (cross @ cross)
+    transforms[:, :3, :3] = rotation_from_axis_angle(angles * axis / length)
     transforms[:, :3, 3] = offset - transforms[:, :3, :3] @ offset
     return transforms

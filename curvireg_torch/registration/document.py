@@ -2,11 +2,10 @@
 
 import platform
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from typing import Any
 
-import kornia
 import torch
-import trimesh
 
 from ..io.meshes.mesh import mesh_unit
 from ..version import __version__
@@ -55,8 +54,8 @@ def result_document(result: Registration, registrar: Registrar, seconds: Mapping
             "curvireg_torch": __version__,
             "python": platform.python_version(),
             "torch": torch.__version__,
-            "kornia": kornia.__version__,
-            "trimesh": trimesh.__version__,
+            "kornia": version("kornia"),
+            "trimesh": version("trimesh"),
         },
         "conventions": CONVENTIONS,
     }

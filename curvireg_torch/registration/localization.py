@@ -6,11 +6,10 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from kornia.geometry.bbox import nms
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError
-from ..geometry.crops import box_iou
+from ..geometry.crops import box_iou, non_maximum_suppression
 from ..geometry.pose_prior import PosePrior
 from ..matching import Ranking
 from ..terms import QueryFeatures
@@ -101,7 +100,7 @@ def _register_candidates(
     count = max(estimator.pipeline.locate.candidates, instances + 1)
     candidates = ScoredCandidates.score_boxes(estimator, item, located.boxes[:count], located.scores[:count])
     results: list[Registration] = []
-    for k in nms(candidates.boxes, candidates.presence, OVERLAP).tolist():
+    for k in non_maximum_suppression(candidates.boxes, candidates.presence, OVERLAP).tolist():
         if len(results) < instances:
             _add(results, _refined(estimator, item, candidates.register(estimator, item, k)))
     return sorted(results, key=_presence, reverse=True)
@@ -111,7 +110,7 @@ def _with_proposals(results: list[Registration], located: Located) -> list[Regis
     """Results with all proposals, their own boxes first, and with ``presence`` as a factor of their confidence."""
     boxes = torch.cat([torch.stack([localization_of(r).box for r in results]), located.boxes.double()])
     scores = torch.cat([torch.tensor([localization_of(r).score for r in results]), located.scores])
-    kept = nms(boxes, -torch.arange(len(boxes)), OVERLAP)  # in their present order
+    kept = non_maximum_suppression(boxes, -torch.arange(len(boxes)), OVERLAP)  # in their present order
     return [
         replace(
             result,

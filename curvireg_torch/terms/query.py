@@ -5,11 +5,10 @@ from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 
 import torch
-from kornia.color import rgb_to_grayscale
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError
-from ..filters.inputs import fill_missing, may_have_missing, missing_mask
+from ..filters.inputs import fill_missing, may_have_missing, missing_mask, to_grey
 from ..geometry.crops import check_boxes, crop_squares, square_boxes
 from ..utils.checks import as_numbers, check_photograph, check_tensor
 
@@ -63,7 +62,7 @@ def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
     grey = crops.shape[1] == 3 and not getattr(field, "colour", False)
     holes = missing_mask(crops) if may_have_missing(crops) else None
     crops = crops if holes is None else fill_missing(crops, holes)
-    out: Tensor = field(rgb_to_grayscale(crops) if grey else crops)
+    out: Tensor = field(to_grey(crops) if grey else crops)
     return out if holes is None else out.masked_fill(holes.any(dim=1, keepdim=True), 0.0)
 
 

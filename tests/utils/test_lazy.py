@@ -38,6 +38,19 @@ def test_imports_are_only_those_of_what_is_used():
     assert not loaded & UNUSED
 
 
+def test_a_registration_imports_no_slow_library_that_it_hardly_uses():
+    """kornia takes 0.3 s, sympy a second: torch imports it where it emulates an operation."""
+    loaded = imported_by(
+        "import numpy, trimesh, curvireg_torch as cr; from curvireg_torch.geometry import sample_views; "
+        "views = sample_views(azimuth_step=90, elevations=[20]); "
+        "bank = cr.ViewBank.build(trimesh.creation.box((1, 2, 3)), views, progress=False); "
+        "picture = numpy.random.default_rng(0).random((48, 64, 3)); K = cr.camera_matrix(60, 60, 32, 24); "
+        "assert cr.Registrar(bank)([picture], [[4, 4, 40, 30]], K)[0].ok"
+    )
+    assert {"torch", "trimesh"} <= loaded
+    assert not loaded & (UNUSED | {"kornia", "sympy"})
+
+
 @pytest.mark.parametrize("package", [curvireg_torch, evaluation], ids=lambda p: p.__name__)
 def test_every_lazy_name_can_be_imported(package):
     for name in package.__all__:

@@ -3,9 +3,9 @@
 import math
 
 import torch
-from kornia.geometry.conversions import vector_to_skew_symmetric_matrix
 from torch import Tensor
 
+from ...geometry.conversions import cross_matrix
 from ..calibration import COVARIANCE_SCALE
 from .descent import Matches, project
 from .points import ContourPoints
@@ -88,7 +88,7 @@ def pose_covariance(
     C = C + unknown @ unknown.mT
     # From the translation e of the centre to that of the origin, e - w x (R centre).
     lever = torch.eye(6, dtype=C.dtype).repeat(len(C), 1, 1)
-    lever[:, 3:, :3] = vector_to_skew_symmetric_matrix(T[:, :3, :3] @ centre)
+    lever[:, 3:, :3] = cross_matrix(T[:, :3, :3] @ centre)
     C = lever @ C @ lever.mT
     enough = W.sum(dim=(1, 2)) > 6.0
     return torch.where(enough[:, None, None], 0.5 * (C + C.mT), torch.nan), known.sum(dim=1) * enough

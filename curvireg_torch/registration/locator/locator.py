@@ -7,11 +7,10 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from kornia.geometry.bbox import nms
 from torch import Tensor, nn
 
 from ...errors import InvalidInputError
-from ...geometry.crops import crop_transforms, square_boxes
+from ...geometry.crops import crop_transforms, non_maximum_suppression, square_boxes
 from ...geometry.pose_prior import check_distance
 from ...matching import ViewBank, ViewDescriber, ViewMatcher
 from ...pipeline import Pipeline
@@ -195,7 +194,7 @@ class Locator(nn.Module):
         score, index = torch.cat(scores).sort(descending=True, stable=True)
         index = index[:PEAKS]
         box, view = torch.cat(boxes)[index], torch.cat(views)[index.cpu()]
-        kept = nms(box, score[:PEAKS], OVERLAP)[: self.settings.proposals]
+        kept = non_maximum_suppression(box, score[:PEAKS], OVERLAP)[: self.settings.proposals]
         return Located(box[kept].cpu(), score[kept].cpu(), view[kept.cpu()])
 
 
