@@ -176,6 +176,8 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
     notes = sys.stderr if as_json else sys.stdout  # with --json, standard output holds only the result
     if out is not None:
         write_result(out, document, registrar, result, photo.image, used_box(document))
+    for warning in document["warnings"]:
+        print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
     if document["inputs"]["camera_source"] in ("exif", "fov"):
         focal = document["inputs"]["camera"][0]
         note = f"camera guessed, focal length {focal:.0f} px; distances are off by the same factor"

@@ -28,7 +28,8 @@ CONVENTIONS = {
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth; times presence for an "
     "object without a given box",
     "presence": "estimated probability that the photograph shows the object in that box",
-    "reliable": f"confidence of at least {RELIABLE:g}; false = no reliable match, the pose is a guess",
+    "reliable": f"confidence of at least {RELIABLE:g}, and no warnings; false = no reliable match, the pose is a guess",
+    "warnings": "what is questionable about the box and the camera",
     "confidence_features": "features that the confidence is computed from; lead: score of the best pose above that of "
     "its best rival, null where the bank has no rival view, which bounds the confidence",
     "edge_support": "how strongly image edges lie under the projected contours, 0 to 1",

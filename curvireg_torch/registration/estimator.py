@@ -148,7 +148,8 @@ class PoseEstimator:
         evidence = self._evidence(batch, starts, poses)
         distinct = distinct_mask(poses.hypotheses, batch.scores(evidence), symmetries=self.symmetries)
         poses, evidence = self._restore(batch, starts, poses, evidence, distinct)
-        return self._results(batch, poses, evidence, distinct)
+        results = self._results(batch, poses, evidence, distinct)
+        return [replace(result, warnings=item.warnings) for result, item in zip(results, items, strict=True)]
 
     def _rank(self, items: Sequence[ImageItem], query: QueryFeatures, ranking: Ranking | None) -> _Batch:
         self.report_progress("ranking")

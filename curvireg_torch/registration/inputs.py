@@ -21,6 +21,7 @@ from ..utils.checks import (
     check_pixels,
     check_square_pixels,
 )
+from .plausibility import check_box_side, input_warnings
 
 __all__ = ["ImageItem", "check_crop", "image_items"]
 
@@ -40,10 +41,20 @@ class ImageItem:
 
     def __post_init__(self) -> None:
         check_photograph(self.image, "photograph")
-        check_boxes(self.box[None], [(int(self.image.shape[-2]), int(self.image.shape[-1]))])
+        check_boxes(self.box[None], [self.size])
         if self.camera_matrix is not None:
             check_camera_matrix(self.camera_matrix)
             check_square_pixels(self.camera_matrix)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W) of the photograph."""
+        return int(self.image.shape[-2]), int(self.image.shape[-1])
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is questionable about box and camera, see :mod:`.plausibility`."""
+        return input_warnings(self.box, self.camera_matrix, self.size)
 
 
 def image_items(
@@ -53,6 +64,8 @@ def image_items(
     prior: PosePrior | Sequence[PosePrior | None] | None = None,
 ) -> list[ImageItem | CurviregError]:
     """Photographs with boxes (None: the whole images) and cameras, or their errors; arguments as of ``Registrar``.
+
+    A box of which too little lies inside its photograph is refused, see :func:`.plausibility.check_box_side`.
 
     Raises:
         InvalidInputError: not as many boxes, cameras or priors as images, or a distance limited without cameras.
@@ -74,7 +87,9 @@ def image_items(
         try:
             pixels = _pixels(images[i])
             box = (whole_image_box(pixels) if boxes is None else boxes[i].detach()).cpu()
-            out.append(ImageItem(pixels, box if boxes is None else box.float(), cameras[i], priors[i]))
+            item = ImageItem(pixels, box if boxes is None else box.float(), cameras[i], priors[i])
+            check_box_side(item.box, item.size)
+            out.append(item)
         except CurviregError as error:
             out.append(error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])])))
     return out

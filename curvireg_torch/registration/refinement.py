@@ -112,7 +112,7 @@ def _refined(estimator: PoseEstimator, item: ImageItem, T: Tensor) -> Registrati
     )
     features = {"similarity": float(similarity[order[0]]), "edge_support": float(support[order[0]])}
     unranked = Ranking(torch.zeros(1, 0), torch.zeros(1, 0, dtype=torch.long), {})
-    return Registration(hypotheses, refinement_confidence(features), unranked, features)
+    return Registration(hypotheses, refinement_confidence(features), unranked, features, warnings=item.warnings)
 
 
 def _boxes(estimator: PoseEstimator, item: ImageItem, T: Tensor, K: Tensor) -> Tensor:

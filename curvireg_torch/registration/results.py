@@ -125,6 +125,7 @@ class Registration:
         prior: the limits on the pose that were given.
         prior_contradiction: "better outside": views outside the limits match much better; "at the limit": the pose lies
             within a degree of a limit. None otherwise.
+        warnings: what is questionable about the box and the camera, in words; a result with one is not reliable.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -135,14 +136,15 @@ class Registration:
     corrected_box: Tensor | None = None
     prior: PosePrior | None = None
     prior_contradiction: str | None = None
+    warnings: tuple[str, ...] = ()
 
     ok = True
     """False of a :class:`FailedRegistration`."""
 
     @property
     def reliable(self) -> bool:
-        """Whether the confidence is at least ``RELIABLE``; if False, the pose is a guess."""
-        return self.confidence >= RELIABLE
+        """Whether the confidence is at least ``RELIABLE``, without ``warnings``; if False, the pose is a guess."""
+        return self.confidence >= RELIABLE and not self.warnings
 
     @property
     def candidates(self) -> Tensor:
@@ -210,6 +212,7 @@ class Registration:
             "score": self.score,
             "confidence": self.confidence,
             "reliable": self.reliable,
+            "warnings": list(self.warnings),
             "confidence_features": dict(self.confidence_features),
             "edge_support": self.edge_support,
             "standard_deviations": None

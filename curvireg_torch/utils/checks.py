@@ -190,12 +190,20 @@ def check_camera_matrix(K: Tensor, name: str = "camera matrix") -> None:
 
 def check_square_pixels(K: Tensor, name: str = "camera matrix") -> None:
     """The focal lengths of valid (..., 3, 3) cameras are at most 10 % apart: views are rendered with square pixels."""
-    ratio = K[..., 0, 0] / K[..., 1, 1]
-    if not bool(((ratio <= MAX_PIXEL_ASPECT) & (ratio >= 1.0 / MAX_PIXEL_ASPECT)).all()):
-        raise InvalidInputError(
-            f"{name}: expected square pixels, FX and FY at most 10 % apart; resize the image's width by FY / FX, "
-            "and FX, CX and the box with it"
-        )
+    for camera in K.reshape(-1, 3, 3).tolist():
+        fx, fy, cx, cy = camera[0][0], camera[1][1], camera[0][2], camera[1][2]
+        if not are_nearly_equal(fx, fy):
+            advice = "resize the image's width by FY / FX, and FX, CX and the box with it"
+            if are_nearly_equal(cx, cy):
+                advice = f"if the order was CX CY FX FY, swap the halves: {cx:g} {cy:g} {fx:g} {fy:g}"
+            raise InvalidInputError(
+                f"{name}: expected square pixels, FX and FY at most 10 % apart, got {fx:g} and {fy:g}; {advice}"
+            )
+
+
+def are_nearly_equal(a: float, b: float) -> bool:
+    """Whether two lengths > 0 are at most 10 % apart, as the focal lengths of square pixels."""
+    return a > 0 and b > 0 and 1.0 / MAX_PIXEL_ASPECT <= a / b <= MAX_PIXEL_ASPECT
 
 
 def as_numbers(values: Any, name: str, *, dtype: torch.dtype = torch.float32) -> Tensor:

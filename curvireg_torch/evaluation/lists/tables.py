@@ -36,7 +36,8 @@ def _result_cells(row: Row) -> list[str]:
     rotation = [v for line in row["rotation"] for v in line]
     translation = row["translation"] or [""] * 3
     reliable = "true" if row["reliable"] else "false"
-    return ["ok", "", str(row["confidence"]), reliable, *map(str, rotation), *map(str, translation)]
+    message = "; ".join(row["warnings"])
+    return ["ok", message, str(row["confidence"]), reliable, *map(str, rotation), *map(str, translation)]
 
 
 def write_bop_results(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
