@@ -198,6 +198,8 @@ class ViewBank:
     def join(cls, banks: "Sequence[ViewBank]") -> "ViewBank":
         """Concatenate one or more banks of equal settings, view policies and devices into one of several models.
 
+        A single bank is returned as it is.
+
         Example:
             >>> from curvireg_torch.geometry import sample_views
             >>> views = sample_views(azimuth_step=90, elevations=[20])
@@ -217,6 +219,8 @@ class ViewBank:
             ):
                 if mine != theirs:
                     raise InvalidInputError(f"banks: expected one {what}, but bank {i} has {mine} and bank 0 {theirs}")
+        if len(banks) == 1:
+            return first
         names = [name for name in first.tensors if all(name in bank.tensors for bank in banks)]
         tensors = {name: _concatenate([bank.tensors[name] for bank in banks]) for name in names}
         shift = torch.tensor([0, *(len(bank.meshes) for bank in banks)]).cumsum(0)[:-1].tolist()

@@ -14,6 +14,7 @@ from ..matching.fields import depth_filter
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import ImageItem, image_items
 from ..rendering.protocol import DepthRenderer
+from ..terms import crop_regions, photograph_field
 from ..utils.checks import as_numbers, check_camera_matrix
 
 __all__ = ["contour_overlay", "registration_sheet", "side_pictures"]
@@ -156,13 +157,15 @@ def side_pictures(
     Arguments as for :func:`contour_overlay`.
     """
     item = _item(image, box)
-    query = registrar.matcher.query([item.image], item.box[None])
+    settings = registrar.bank.settings
+    crop = crop_regions([item.image], item.box[None, None], size=settings.image_size, margin=settings.margin)[0]
+    field = photograph_field(registrar.matcher.field, crop.to(registrar.bank.device))
     depth = _depth(registrar, result)
     return {
-        "photograph": to_uint8(query.crops[0]),
-        "photograph field": _field_picture(query.field[0]),
+        "photograph": to_uint8(crop[0]),
+        "photograph field": _field_picture(field[0]),
         "pose": depth_picture(depth[0, 0]),
-        "view field": _field_picture(depth_filter(registrar.bank.settings)(depth)[0]),
+        "view field": _field_picture(depth_filter(settings)(depth)[0]),
     }
 
 

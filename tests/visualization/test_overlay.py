@@ -187,7 +187,7 @@ def test_registration_sheet_enlarges_small_objects(with_camera):
     assert other.shape == sheet.shape
     overlay = np.s_[: 2 * TILE, : sheet.shape[1] - 2 * TILE]
     assert is_contour(sheet[overlay]).any()
-    assert np.array_equal(other[overlay], sheet[overlay])
+    assert (other[overlay] != sheet[overlay]).mean() < 1e-4  # a ray through an edge may hit either side
 
 
 def test_pictures_take_photographs_as_the_registrar_does(with_camera):
