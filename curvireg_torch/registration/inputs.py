@@ -1,9 +1,9 @@
 """Photographs, boxes and cameras in the forms that callers have them, checked one by one."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -62,10 +62,11 @@ def image_items(
     boxes: Any,
     camera_matrices: Any | None,
     prior: PosePrior | Sequence[PosePrior | None] | None = None,
-) -> list[ImageItem | CurviregError]:
+) -> Sequence[ImageItem | CurviregError]:
     """Photographs with boxes (None: the whole images) and cameras, or their errors; arguments as of ``Registrar``.
 
-    A box of which too little lies inside its photograph is refused, see :func:`.plausibility.check_box_side`.
+    Each is read and checked whenever it is asked for, so that many large files need the memory of few. A box of which
+    too little lies inside its photograph is refused, see :func:`.plausibility.check_box_side`.
 
     Raises:
         InvalidInputError: not as many boxes, cameras or priors as images, or a distance limited without cameras.
@@ -82,17 +83,36 @@ def image_items(
         raise InvalidInputError(f"prior: expected a PosePrior, or a list of {n} with None where there is none")
     if camera_matrices is None and any(p is not None and p.distance is not None for p in priors):
         raise InvalidInputError("distance: needs the camera matrix of every photograph")
-    out: list[ImageItem | CurviregError] = []
-    for i in range(n):
+
+    def item(i: int) -> ImageItem | CurviregError:
         try:
             pixels = _pixels(images[i])
             box = (whole_image_box(pixels) if boxes is None else boxes[i].detach()).cpu()
             item = ImageItem(pixels, box if boxes is None else box.float(), cameras[i], priors[i])
             check_box_side(item.box, item.size)
-            out.append(item)
+            return item
         except CurviregError as error:
-            out.append(error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])])))
-    return out
+            return error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])]))
+
+    return _OnDemand(item, n)
+
+
+class _OnDemand(Sequence[ImageItem | CurviregError]):
+    """``item(0)`` to ``item(count - 1)``, computed at each access."""
+
+    def __init__(self, item: Callable[[int], ImageItem | CurviregError], count: int) -> None:
+        self._item, self._indices = item, range(count)
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    @overload
+    def __getitem__(self, index: int) -> ImageItem | CurviregError: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[ImageItem | CurviregError]: ...
+    def __getitem__(self, index: int | slice) -> Any:
+        found = self._indices[index]
+        return self._item(found) if isinstance(found, int) else [self._item(i) for i in found]
 
 
 def _pixels(image: Any) -> Tensor:

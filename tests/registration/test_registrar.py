@@ -8,13 +8,13 @@ import torch
 import trimesh
 
 from curvireg_torch import ImageGradient, Registrar, ViewBank, ViewMatcher, project_points, rotation_error, sample_views
-from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError
+from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, MissingFileError
 from curvireg_torch.geometry import rotation_from_viewpoint, symmetry_transforms, transform
 from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import RELIABLE, FailedRegistration, fit_contours
 from curvireg_torch.registration import results as results_module
-from curvireg_torch.registration.inputs import check_crop
+from curvireg_torch.registration.inputs import check_crop, image_items
 from curvireg_torch.rendering import make_renderer, render_depth
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import CAMERA, SIZE, scene, truck_bank, truck_registrar, unrefined
@@ -122,6 +122,17 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
         assert isinstance(result, FailedRegistration)
         with pytest.raises(CurviregError, match=f"image {i}: .*{message}"):
             _ = result.rotation
+
+
+def test_image_items_are_read_one_at_a_time(tmp_path):
+    """Of 32 photographs of 12 megapixels, all together would take 1.2 GB."""
+    path = tmp_path / "photo.png"
+    items = image_items([path, path], [[1.0, 2.0, 20.0, 21.0]] * 2, None)
+    assert (len(items), type(items[1])) == (2, MissingFileError)
+    cv2.imwrite(str(path), torch.randint(0, 256, (30, 40, 3), dtype=torch.uint8).numpy())
+    first, second = items[0:2]
+    assert first.image.equal(second.image)
+    assert first.image is not second.image
 
 
 def test_registrar_accepts_tensors_arrays_and_paths(tmp_path):
