@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..registration.document import corners, correction
+from ..registration.document import corners, remarks
 
 __all__ = ["print_result"]
 
@@ -17,7 +17,7 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
         print(f"no reliable match: take the pose as a guess; {_advice(document)}")
     if ", " in document.get("inputs", {}).get("mesh", ""):
         print(f"mesh: {document['mesh']}")
-    for line in correction(document):
+    for line in remarks(document):
         print(line)
     for instance in document.get("localization", {}).get("instances", []):
         print(f"found in box {corners(instance['box'])}: there with probability {instance['presence']:.2f}")

@@ -6,7 +6,15 @@ from typing import Any
 
 from ..errors import MissingDependencyError
 from ..utils.input_paths import check_given
-from .options import add_box_and_camera, common_options, examples, mesh_options, pipeline_options, register_options
+from .options import (
+    add_box_and_camera,
+    add_pose_prior,
+    common_options,
+    examples,
+    mesh_options,
+    pipeline_options,
+    register_options,
+)
 
 LOCAL = "127.0.0.1"
 
@@ -22,6 +30,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("photo", type=Path, nargs="?", metavar="PHOTO")
     parser.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help="a mesh or a bank; both can be added later")
     add_box_and_camera(parser, box="px; can be drawn")
+    add_pose_prior(parser)
     hosts = f"who may connect: {LOCAL}, only this machine (default), or 0.0.0.0, everyone"
     parser.add_argument("--host", default=LOCAL, help=hosts)
     parser.add_argument("--port", type=int, default=0, help="default: a free one")

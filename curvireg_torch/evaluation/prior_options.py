@@ -7,7 +7,7 @@ from typing import Any
 from ..errors import InvalidInputError
 from ..geometry.pose_prior import PosePrior
 
-__all__ = ["PRIOR_OPTIONS", "limits_from_cells", "limits_from_options", "prior_from_limits"]
+__all__ = ["PRIOR_OPTIONS", "QUALIFIERS", "limits_from_cells", "limits_from_options", "prior_from_limits"]
 
 PRIOR_OPTIONS = ("azimuth", "elevation", "theta", "side", "near", "within", "distance", "front", "softness")
 """Names of the options, and of the columns."""
@@ -15,7 +15,9 @@ PRIOR_OPTIONS = ("azimuth", "elevation", "theta", "side", "near", "within", "dis
 WITHIN = 45.0
 """Degrees of ``within`` beside ``near`` if none are given."""
 
-_QUALIFIERS = {"front", "softness"}  # limit nothing by themselves
+QUALIFIERS = {"front", "softness"}
+"""Arguments that limit nothing by themselves."""
+
 _TEXTS = ("side", "front")
 _SINGLE = ("within", "softness")
 
@@ -32,6 +34,7 @@ def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
         {'azimuth': (315.0, 45.0), 'viewpoint': (10, 20, 0.0), 'within': 45.0}
     """
     given = {name: options[name] for name in PRIOR_OPTIONS if options.get(name) is not None}
+    given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
     side, near, within = (given.pop(name, None) for name in ("side", "near", "within"))
     if side is not None:
         if "azimuth" in given:
@@ -72,4 +75,4 @@ def _value(name: str, text: str) -> Any:
 
 def prior_from_limits(limits: Mapping[str, Any]) -> PosePrior | None:
     """The prior with these arguments; None if they limit nothing."""
-    return PosePrior(**limits) if limits.keys() - _QUALIFIERS else None
+    return PosePrior(**limits) if limits.keys() - QUALIFIERS else None

@@ -13,7 +13,7 @@ from .confidence import RELIABLE
 from .registrar import Registrar
 from .results import Registration
 
-__all__ = ["SCHEMA", "corners", "correction", "localization_document", "result_document", "used_box"]
+__all__ = ["SCHEMA", "corners", "localization_document", "remarks", "result_document", "used_box"]
 
 SCHEMA = 2
 """Version of ``result.schema.json``; raised when a key is removed or changes its meaning."""
@@ -87,7 +87,12 @@ def corners(box: Sequence[float]) -> str:
     return " ".join(f"{v:.0f}" for v in box)
 
 
-def correction(document: Mapping[str, Any]) -> list[str]:
-    """One line that reports the replaced box; no line where the given box was kept."""
-    box = document["corrected_box"]
-    return [] if box is None else [f"the box did not fit the pose; one that does: {corners(box)}"]
+def remarks(document: Mapping[str, Any]) -> list[str]:
+    """Lines about given numbers that did not fit: a box that was replaced, limits that the photograph contradicts."""
+    box, contradiction = document["corrected_box"], document.get("prior", {}).get("contradiction")
+    lines = [] if box is None else [f"the box did not fit the pose; one that does: {corners(box)}"]
+    if contradiction == "better outside":
+        lines.append("the photograph fits much better outside the limits on the pose; check them")
+    elif contradiction is not None:
+        lines.append("the pose lies at one of its limits; widen it to see whether it stays")
+    return lines

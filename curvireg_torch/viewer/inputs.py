@@ -1,4 +1,4 @@
-"""The left side of the page: photograph, mesh, options, box and camera."""
+"""The left side of the page: photograph, mesh, options, box, camera and what is known about the pose."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -11,6 +11,7 @@ from ..limits import MAX_IMAGE_BYTES, MAX_MESH_BYTES
 from ..utils.choices import MESHES_AND_BANKS, PRESET_NAMES, UNITS, UP_AXES
 from .drawing import BoxDrawing
 from .host import Host
+from .known import KnownPose
 
 __all__ = ["Inputs"]
 
@@ -46,6 +47,7 @@ class Inputs:
             ui.button("no camera", on_click=lambda: self.set_camera(None)).props("flat dense no-caps")
             self.exif = ui.button("guess from EXIF", on_click=lambda: self.set_camera(self.session.exif_camera()))
             self.exif.props("flat dense no-caps data-testid=exif").set_visibility(False)
+        KnownPose(host)
 
     def _caption(self, test_id: str = "") -> Any:
         return ui.label().classes("text-caption leading-tight").props(f"data-testid={test_id}" if test_id else "")

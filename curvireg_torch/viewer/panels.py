@@ -11,7 +11,7 @@ from nicegui import ui
 from ..geometry import rotation_error
 from ..io.meshes.mesh import mesh_unit
 from ..limits import MAX_VIEWER_FACES
-from ..registration.document import correction
+from ..registration.document import remarks
 from ..utils.choices import UNITS
 from ..visualization import contour_overlay, side_pictures
 from ..visualization.encoding import png
@@ -130,7 +130,7 @@ class Panels:
         if not result.document["reliable"]:
             confidence += ": no reliable match; take the pose as a guess"
         rival = f"hypothesis {displayed.number + 1}, a rival; of the first: " if displayed.number else ""
-        lines += [rival + confidence, *correction(result.document)]
+        lines += [rival + confidence, *remarks(result.document)]
         if displayed.edits:
             lines.append(f"by hand: {'; '.join(displayed.edits)}; the command line gives the result before that")
         return "\n".join(lines)

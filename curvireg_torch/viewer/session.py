@@ -15,6 +15,7 @@ from torch import Tensor
 from ..errors import CurviregError, CurviregWarning, InvalidInputError
 from ..evaluation.lists import register_entry
 from ..evaluation.opening import RegisterOptions, check_camera, open_registrar
+from ..evaluation.prior_options import QUALIFIERS
 from ..evaluation.store import to_json
 from ..io import read_photo
 from ..io.images import Photo
@@ -53,7 +54,7 @@ class Session:
     """The state of one page. Methods that compute may take minutes: call them in a thread.
 
     Attributes:
-        options: of ``curvireg view``; replace them to change unit, up, pose or preset.
+        options: of ``curvireg view``; replace them to change unit, up, pose or preset, call ``set_limits`` for limits.
         names: what the user calls the files, for messages and the command line.
         box, camera, fov: as ``--box``, ``--camera`` and ``--fov``, or None; a camera takes precedence over ``fov``.
         result, displayed: the last result and the pose on the page, or None.
@@ -125,6 +126,11 @@ class Session:
         if self.camera is None:
             return self.fov
         return "exif" if self.camera == self.exif_camera() else None
+
+    def set_limits(self, **limits: Any) -> None:
+        """Change what is known of the pose: arguments of :class:`PosePrior`; None removes a limit."""
+        known = {**(self.options.limits or {}), **limits}
+        self.options = replace(self.options, limits={n: value for n, value in known.items() if value is not None})
 
     def request(self) -> RegisterOptions:
         """The registration that the inputs describe."""
@@ -232,7 +238,7 @@ class Session:
 
     def _open_registrar(self, mesh: Path, report_progress: Callable[[str, int, int], None]) -> Registrar:
         """The registrar of a mesh and the present options; the last one is reused."""
-        key = replace(self.options, meshes=(mesh,))
+        key = replace(self.options, meshes=(mesh,), limits=None)
         if self._registrar is None or self._registrar[0] != key:
             self._registrar = key, open_registrar(key, key.meshes, progress=report_progress)
         return self._registrar[1]
@@ -257,11 +263,23 @@ def _command_line(options: RegisterOptions, names: Mapping[Path, str]) -> str:
         words += ["--fov", _number(options.guess)]
     elif options.guess is not None:
         words += ["--camera", options.guess]
+    words += _limit_words(options.limits or {})
     for name in _OPTIONS:
         value = getattr(options, name)
         if value != _DEFAULTS[name]:
             words += [f"--{name}={value}"] if str(value).startswith("-") else [f"--{name}", str(value)]
     return shlex.join([*words, "--out", "result"])
+
+
+def _limit_words(limits: Mapping[str, Any]) -> list[str]:
+    words: list[str] = []
+    for name, value in limits.items() if limits.keys() - QUALIFIERS else ():
+        if isinstance(value, str):
+            words.append(f"--{name}={value}")
+        else:
+            numbers = value if isinstance(value, tuple) else (value,)
+            words += ["--near" if name == "viewpoint" else f"--{name}", *map(_number, numbers)]
+    return words
 
 
 def _number(value: float) -> str:

@@ -9,7 +9,7 @@ import torch
 from curvireg_torch import Registration
 from curvireg_torch.matching import Ranking
 from curvireg_torch.registration import Hypothesis, Localization
-from curvireg_torch.registration.document import correction, localization_document, result_document
+from curvireg_torch.registration.document import localization_document, remarks, result_document
 
 
 def registration(covariance=None, confidence=0.9, localization=None):
@@ -70,7 +70,17 @@ def test_localization_document_reports_the_presence_of_the_most_certain_instance
     assert [one["score"] for one in document["proposals"]] == [7.0, 6.5]
 
 
-def test_correction_prints_whole_pixels():
-    assert correction({"corrected_box": None}) == []
-    (line,) = correction({"corrected_box": [1.4, 2.6, 30.49, 40.51]})
+@pytest.mark.parametrize(
+    ("contradiction", "words"),
+    [(None, ""), ("better outside", "much better outside"), ("at the limit", "at one of")],
+)
+def test_remarks_name_a_contradicted_prior(contradiction, words):
+    lines = remarks({"corrected_box": None, "prior": {"azimuth": [0, 9], "contradiction": contradiction}})
+    assert len(lines) == bool(words)
+    assert words in "".join(lines)
+
+
+def test_remarks_print_the_replaced_box_in_whole_pixels():
+    assert remarks({"corrected_box": None}) == []
+    (line,) = remarks({"corrected_box": [1.4, 2.6, 30.49, 40.51]})
     assert line.endswith(": 1 3 30 41")

@@ -229,6 +229,35 @@ def test_command_contains_inputs_and_options(folder):
         session.register()
 
 
+def test_command_contains_the_limits_on_the_pose(folder):
+    words = ["--near", "10", "-20.5", "--within", "30", "--front=-x", "--distance", "0.5", "2"]
+    session = new_session("photo.png", "truck.ply", *words)
+    session.load()
+    session.set_limits(azimuth=(315.0, 45.0), elevation=(-10.0, 40.0))
+    again = register_options(parse(shlex.split(session.command())[1:]))
+    assert again.limits == session.request().limits
+    assert session.request().entry(folder / "photo.png").prior.to_dict() == {
+        "azimuth": (315.0, 45.0),
+        "elevation": (-10.0, 40.0),
+        "distance": (0.5, 2.0),
+        "viewpoint": (10.0, -20.5, 0.0),
+        "within": 30.0,
+        "front": "-x",
+    }
+    session.set_limits(**{**dict.fromkeys(session.options.limits), "front": "y"})
+    assert "--front" not in session.command(), "it limits nothing by itself"
+
+
+def test_limits_do_not_open_the_mesh_again(session):
+    registrar = session.result.registrar
+    session.set_limits(elevation=(60.0, 90.0))
+    session.register()
+    session.set_limits(elevation=None)
+    assert session.result.registrar is registrar
+    assert session.document()["prior"]["elevation"] == [60.0, 90.0]
+    assert session.displayed.pose.viewpoint[1] > 57.0
+
+
 @pytest.mark.usefixtures("folder")
 def test_register_is_cancelled_by_the_limit_and_by_the_user(monkeypatch):
     box = map(str, scene(0)[1].tolist())
