@@ -72,7 +72,9 @@ class BatchPriors:
                 frame = object_frame(self._ups[m], prior.front)
                 out[b, mine] = prior.log_prior(self._towards[b] @ views[mine], frame, margin=VIEW_SPACING + off_centre)
             if bool((out[b] == -torch.inf).all()):
-                raise InvalidInputError(f"prior: no view of the bank lies within {prior}; widen it, or leave it out")
+                raise InvalidInputError(
+                    f"prior: no view of the bank lies within {prior.to_dict()}; widen it, or leave it out"
+                )
         return out
 
     def moved_inside(self, hypotheses: Hypotheses) -> Hypotheses:

@@ -250,12 +250,12 @@ def test_command_contains_the_limits_on_the_pose(folder):
 
 def test_limits_do_not_open_the_mesh_again(session):
     registrar = session.result.registrar
-    session.set_limits(elevation=(60.0, 90.0))
+    session.set_limits(elevation=(35.0, 90.0))
     session.register()
     session.set_limits(elevation=None)
     assert session.result.registrar is registrar
-    assert session.document()["prior"]["elevation"] == [60.0, 90.0]
-    assert session.displayed.pose.viewpoint[1] > 57.0
+    assert session.document()["prior"]["elevation"] == [35.0, 90.0]
+    assert session.displayed.pose.viewpoint[1] > 32.0
 
 
 @pytest.mark.usefixtures("folder")
