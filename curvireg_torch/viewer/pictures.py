@@ -1,15 +1,14 @@
 """Pictures of the page, as files in memory."""
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..registration import Hypothesis, Registrar
 from ..rendering.shading import shade
+from ..visualization.contours import contour_layer
 from ..visualization.encoding import jpeg, png, shrink
-from ..visualization.overlay import depth_picture, draw_contours, to_uint8
+from ..visualization.overlay import to_uint8, view_picture
 
 __all__ = ["photograph_jpeg", "pose_layers", "view_pictures"]
 
@@ -36,16 +35,13 @@ def pose_layers(registrar: Registrar, pose: Hypothesis, size: tuple[int, int], s
     solid = np.zeros((*size, 4), np.uint8)
     solid[mask, :3] = (grey[mask, None] * np.array([255, 235, 190])).round().astype(np.uint8)
     solid[mask, 3] = 255
-    lines = np.zeros((*size, 4), np.uint8)
-    draw_contours(lines, depth.numpy())
-    return png(solid), png(lines)
+    return png(solid), png(contour_layer(depth, K))
 
 
 def view_pictures(registrar: Registrar, views: Tensor) -> list[bytes]:
-    """A depth picture of each of (K,) views of the bank."""
-    bank, out = registrar.bank, []
-    for view in views.tolist():
-        describer: Any = registrar.matcher.describers[int(bank.model[view])]
-        depth = describer.depth(bank.rotations[view : view + 1], bank.distances[view : view + 1])[0]
-        out.append(png(depth_picture(depth[0, 0].cpu())))
-    return out
+    """A shaded picture of each of (K,) views of the bank."""
+    bank = registrar.bank
+    return [
+        png(view_picture(registrar, int(bank.model[view]), bank.rotations[view], float(bank.distances[view])))
+        for view in views.tolist()
+    ]

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ..rendering.protocol import DepthRenderer
 from ..utils.files import write_file
+from .contours import draw_pose
 from .encoding import jpeg
-from .overlay import draw_pose
 
 __all__ = ["SheetEntry", "thumbnail", "write_sheet"]
 

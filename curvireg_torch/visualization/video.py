@@ -13,8 +13,9 @@ from torch import Tensor
 from ..errors import LostObjectError
 from ..registration import FailedRegistration, Registrar, Registration
 from ..utils.files import write_file
+from .contours import draw_pose
 from .encoding import jpeg, shrink
-from .overlay import draw_contours, to_uint8
+from .overlay import to_uint8
 
 __all__ = ["OverlayVideo"]
 
@@ -113,8 +114,7 @@ def draw_frame(registrar: Registrar, image: Tensor, result: Registration | Faile
         sx, sy = (picture.shape[k] / whole.shape[k] for k in (1, 0))
         scale = [[sx, 0.0, 0.5 * (sx - 1.0)], [0.0, sy, 0.5 * (sy - 1.0)], [0.0, 0.0, 1.0]]  # of pixels, not corners
         K = torch.tensor(scale, dtype=K.dtype) @ K
-        renderer = registrar.describers[result.model].renderer
-        draw_contours(picture, renderer.render(T[None], K, picture.shape[:2])[0, 0].cpu().numpy())
+        draw_pose(picture, registrar.describers[result.model].renderer, (T, K))
     return picture
 
 

@@ -8,16 +8,15 @@ import torch
 import trimesh
 from scipy.ndimage import binary_erosion, distance_transform_edt
 
-from curvireg_torch import Pipeline, Registrar, ViewBank, camera_matrix, rotation_error, sample_views
+from curvireg_torch import Pipeline, Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.rendering import make_renderer, render_depth
 from curvireg_torch.settings import BankSettings
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
-from curvireg_torch.visualization import contour_overlay, registration_sheet
+from curvireg_torch.visualization import contour_overlay
 from tests._support.scenes import CAMERA, SIZE, scene, truck_bank, unrefined
 
 GREEN = (0, 255, 80)
-TILE = 192
 
 
 def silhouette(T, K=CAMERA, mesh=None, size=SIZE):
@@ -150,46 +149,6 @@ def test_contour_overlay_draws_the_mesh_of_the_hypothesis():
         assert fraction_near(is_contour(picture), silhouette(T, mesh=mesh), 1) == 1.0
 
 
-def tile(sheet, number):
-    """The picture of a hypothesis below the overlay, without its caption."""
-    return sheet[2 * TILE + 20 :, TILE * (number - 1) : TILE * number]
-
-
-def test_registration_sheet_draws_hypotheses_at_their_poses_and_distances(with_camera):
-    registrar, result, image, box, _ = with_camera
-    sheet = registration_sheet(registrar, result, image, box)
-    assert sheet.shape[0] == 3 * TILE
-    first, second, *others = result.hypotheses
-    nearer = replace(second, distance=second.distance / 3)
-    other = registration_sheet(registrar, replace(result, hypotheses=(first, nearer, *others)), image, box)
-    for number in range(1, len(result.hypotheses) + 1):
-        assert np.array_equal(tile(sheet, number), tile(other, number)) == (number != 2)
-    # The pose is drawn, not the view of the bank from which it started.
-    rotated = replace(second, allocentric_rotation=first.allocentric_rotation)
-    assert float(rotation_error(rotated.allocentric_rotation, second.allocentric_rotation)) > 15
-    other = registration_sheet(registrar, replace(result, hypotheses=(rotated, rotated)), image, box)
-    assert np.array_equal(tile(other, 1), tile(other, 2))
-
-
-def test_registration_sheet_enlarges_small_objects(with_camera):
-    """The surroundings of the box fill the same part of the sheet in a photograph four times as wide and high."""
-    registrar, result, image, box, _ = with_camera
-    sheet = registration_sheet(registrar, result, image, box)
-    H, W = SIZE
-    canvas = torch.nn.functional.pad(image, (W, 2 * W, H, 2 * H))
-    shift = torch.tensor([W, H], dtype=torch.float64)
-    first, *others = result.hypotheses
-    T, K = first.projection
-    K = K.clone()
-    K[:2, 2] += shift
-    moved = replace(result, hypotheses=(replace(first, projection=(T, K)), *others))
-    other = registration_sheet(registrar, moved, canvas, box + shift.repeat(2))
-    assert other.shape == sheet.shape
-    overlay = np.s_[: 2 * TILE, : sheet.shape[1] - 2 * TILE]
-    assert is_contour(sheet[overlay]).any()
-    assert (other[overlay] != sheet[overlay]).mean() < 1e-4  # a ray through an edge may hit either side
-
-
 def test_pictures_take_photographs_as_the_registrar_does(with_camera):
     registrar, result, image, box, _ = with_camera
     pixels = (image * 255).round().byte()
@@ -198,8 +157,6 @@ def test_pictures_take_photographs_as_the_registrar_does(with_camera):
     for same in (pixels / 255.0, pixels.permute(1, 2, 0).numpy()):
         assert np.array_equal(contour_overlay(registrar, result, same, box.tolist()), expected)
     assert contour_overlay(registrar, result, image[:1], box).shape == (*SIZE, 3)
-    sheets = [registration_sheet(registrar, result, p, box).astype(int) for p in (pixels, pixels / 255.0)]
-    assert np.abs(sheets[0] - sheets[1]).max() <= 1
     with pytest.raises(InvalidInputError, match="channels"):
         contour_overlay(registrar, result, torch.zeros(4, 9, 9), box)
     with pytest.raises(InvalidInputError, match="X0 < X1"):

@@ -11,7 +11,7 @@ from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.io import Video
 from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.visualization import OverlayVideo
-from curvireg_torch.visualization.overlay import _CONTOUR
+from curvireg_torch.visualization.contours import OUTLINE
 from curvireg_torch.visualization.video import caption, draw_frame
 from tests._support.scenes import CAMERA, scene, truck_registrar
 
@@ -26,7 +26,7 @@ def registered():
 
 def outline_box(picture):
     """Columns and rows between which the outline is drawn, 4 numbers."""
-    rows, columns = np.nonzero((picture == _CONTOUR).all(axis=2))
+    rows, columns = np.nonzero((picture == OUTLINE).all(axis=2))
     return np.array([columns.min(), rows.min(), columns.max(), rows.max()])
 
 

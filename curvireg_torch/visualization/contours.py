@@ -1,0 +1,135 @@
+"""Contours of a rendered mesh as anti-aliased lines with a dark rim, which show on any background."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from ..rendering.protocol import DepthRenderer
+
+__all__ = ["contour_layer", "draw_box", "draw_pose", "line_width"]
+
+OUTLINE, CREASE, BOX, RIM = (0, 255, 80), (255, 170, 0), (255, 255, 255), (0, 0, 0)
+RIM_OPACITY = 0.7  # of the black rim
+JUMP = 0.03  # step at an occluding edge inside the outline, as a fraction of the depth range
+CREASE_ANGLE = np.deg2rad(25.0)  # least angle between the faces at a crease, in the section along a row or a column
+SMOOTH, SHORT = 0.01, 0.06  # fractions of the object's size: over which faces are averaged; of the shortest inner edge
+
+
+def line_width(size: Sequence[int]) -> float:
+    """Width of the outline in px in a picture of ``size`` (H, W)."""
+    return max(1.5, max(size) / 350)
+
+
+def draw_pose(
+    picture: np.ndarray, renderer: DepthRenderer, projection: tuple[Tensor, Tensor], box: Sequence[float] | None = None
+) -> None:
+    """Draw a mesh's contours, and a box below them, into (H, W, 3) uint8; ``projection`` is pose and camera matrix."""
+    T, K = projection
+    if box is not None:
+        draw_box(picture, box)
+    layer = contour_layer(renderer.render(T[None], K, picture.shape[:2])[0, 0], K)
+    drawn = layer[..., 3] > 0
+    alpha = layer[drawn][:, 3:] / 255.0
+    picture[drawn] = np.round(alpha * layer[drawn][:, :3] + (1.0 - alpha) * picture[drawn])
+
+
+def draw_box(picture: np.ndarray, box: Sequence[float]) -> None:
+    """Draw a thin white box with a dark rim into (H, W, 3) uint8."""
+    x0, y0, x1, y1 = (round(v) for v in box)
+    width = max(1, round(line_width(picture.shape[:2]) / 3))
+    for colour, thickness in ((RIM, width + 2), (BOX, width)):
+        cv2.rectangle(picture, (x0, y0), (x1, y1), colour, thickness)
+
+
+def contour_layer(depth: Tensor, camera_matrix: Tensor) -> np.ndarray:
+    """Outline (green), occluding edges and creases (orange) of a depth view, on a transparent layer.
+
+    Args:
+        depth: (H, W) z-depth, 0 = background.
+        camera_matrix: (3, 3) of the view, in px.
+
+    Returns:
+        (H, W, 4) uint8 RGBA.
+
+    Example:
+        >>> import torch
+        >>> depth = torch.zeros(40, 40)
+        >>> depth[10:30, 10:30] = 5.0
+        >>> layer = contour_layer(depth, torch.eye(3))
+        >>> layer[10, 20].tolist(), layer[20, 20].tolist()
+        ([0, 255, 80, 255], [0, 0, 0, 0])
+    """
+    z = depth.cpu().float().numpy()
+    layer = np.zeros((*z.shape, 4), np.uint8)
+    rows, columns = np.nonzero(z.any(axis=1))[0], np.nonzero(z.any(axis=0))[0]
+    if len(rows) == 0:
+        return layer
+    width = line_width(z.shape)
+    margin = int(3 * width) + 2
+    near = np.s_[
+        max(0, rows[0] - margin) : rows[-1] + margin + 1, max(0, columns[0] - margin) : columns[-1] + margin + 1
+    ]
+    outline, inner = _edges(z[near], camera_matrix.diagonal()[:2].tolist())
+    to_outline, to_inner = _distance(outline), _distance(inner)
+    green, orange = _coverage(to_outline, width / 2), _coverage(to_inner, max(0.75, width / 3))
+    dark = RIM_OPACITY * np.maximum(_coverage(to_outline, width), _coverage(to_inner, 0.85 * width))
+    colour, alpha = np.zeros((*outline.shape, 3), np.float32), dark
+    for paint, cover in ((CREASE, orange), (OUTLINE, green)):
+        colour += cover[..., None] * (np.array(paint, np.float32) - colour)
+        alpha = cover + (1 - cover) * alpha
+    layer[near][..., :3] = np.round(colour / np.maximum(alpha, 1e-6)[..., None])
+    layer[near][..., 3] = np.round(255 * alpha)
+    return layer
+
+
+def _distance(lines: np.ndarray) -> np.ndarray:
+    """Distance of each pixel to the nearest pixel of the lines, smoothed so that stairs become slopes."""
+    if not lines.any():
+        return np.full(lines.shape, np.inf, np.float32)
+    distance = cv2.distanceTransform((~lines).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    blurred = np.asarray(cv2.GaussianBlur(distance, (0, 0), 0.8))
+    return blurred - np.float32(0.5)  # about 0 on the line again
+
+
+def _coverage(distance: np.ndarray, reach: float) -> np.ndarray:
+    return np.asarray(np.clip(reach + 0.5 - distance, 0.0, 1.0))
+
+
+def _edges(z: np.ndarray, focal: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (H, W) on the outline, and on occluding edges and creases inside it."""
+    mask = z > 0
+    inside = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    size = max(mask.any(axis=0).sum(), mask.any(axis=1).sum())
+    window, limit = max(2, round(SMOOTH * size)), JUMP * float(np.ptp(z[mask]))
+    rows = _jumps(z, limit) & inside | _creases(z, focal[0], window, limit)
+    columns = _jumps(z.T, limit) & inside.T | _creases(np.ascontiguousarray(z.T), focal[1], window, limit)
+    return mask & ~inside, _long(rows | columns.T, SHORT * size)
+
+
+def _jumps(z: np.ndarray, limit: float) -> np.ndarray:
+    """Steps along the rows larger than a neighbouring one by ``limit``: on a steep face all steps are equal."""
+    step = np.abs(np.diff(z, axis=1))
+    padded = np.pad(step, [(0, 0), (1, 1)], mode="edge")
+    return np.pad(step - np.minimum(padded[:, :-2], padded[:, 2:]) > limit, [(0, 0), (0, 1)])
+
+
+def _creases(z: np.ndarray, focal: float, window: int, limit: float) -> np.ndarray:
+    """Where the surface's mean direction changes along the rows from one ``window`` of px to the next."""
+    inverse = 1.0 / np.where(z > 0, z, 1.0)  # linear in px across a plane
+    step, middle = np.diff(inverse, axis=1), 0.5 * (inverse[:, 1:] + inverse[:, :-1])
+    connected = (z[:, 1:] > 0) & (z[:, :-1] > 0) & (np.abs(np.diff(z, axis=1)) < limit)
+    direction = np.where(connected, np.arctan(focal * step / middle), 0.0)
+    kernel = np.repeat([-1.0, 1.0], window)[None] / window  # no window reaches across an occluding edge
+    whole = cv2.erode(connected.astype(np.uint8), np.ones(kernel.shape), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    change = np.abs(cv2.filter2D(direction, -1, kernel)) * whole
+    peak = cv2.dilate(change, np.ones((1, 2 * window + 1)))
+    return np.pad((change >= peak) & (change > CREASE_ANGLE), [(0, 0), (0, 1)])
+
+
+def _long(lines: np.ndarray, least: float) -> np.ndarray:
+    """Lines without their parts that are shorter than ``least`` px: bumps of rough meshes."""
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(lines.astype(np.uint8), connectivity=8)
+    extent = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
+    return np.asarray(lines & (extent >= least)[labels])

@@ -1,0 +1,40 @@
+"""Results in plain words."""
+
+import pytest
+import torch
+
+from curvireg_torch.geometry import rotation_from_viewpoint
+from curvireg_torch.geometry.viewpoint import up_rotation
+from curvireg_torch.registration.wording import pose_in_words, verdict
+
+
+@pytest.mark.parametrize(
+    ("viewpoint", "words"),
+    [
+        ((0, 0, 0), "seen from the front (azimuth 0°), level"),
+        ((359.8, 12, 0), "seen from the front (azimuth 0°), 12° above the horizon"),
+        ((88, -12, 5), "seen from the right (azimuth 88°), 12° below the horizon, tilted by 5° to the left"),
+        ((225, 30, -40), "seen from the back-left (azimuth 225°), 30° above the horizon, tilted by 40° to the right"),
+        ((340, 20, 0), "seen from the front (azimuth 340°), 20° above the horizon"),
+        ((45, 80, 0), "seen from above (azimuth 45°), 80° above the horizon"),
+        ((45, -80, 0), "seen from below (azimuth 45°), 80° below the horizon"),
+    ],
+)
+def test_pose_in_words(viewpoint, words):
+    R = rotation_from_viewpoint(*torch.tensor(viewpoint, dtype=torch.float64))
+    assert pose_in_words(R) == words
+    for up in ("y", "-x"):
+        assert pose_in_words(R @ up_rotation(up), up) == words
+
+
+def test_pose_in_words_tilts_as_the_photograph_shows():
+    """Tilted to the left: the object's up axis points to the left in the picture."""
+    R = rotation_from_viewpoint(10.0, 20.0, 30.0)
+    assert float(R[0, 2]) < 0
+    assert "to the left" in pose_in_words(R)
+
+
+def test_verdict_has_three_words():
+    assert [verdict(c) for c in (1.0, 0.9, 0.899, 0.5, 0.499, 0.0)] == ["likely"] * 2 + ["unsure"] * 2 + [
+        "no match"
+    ] * 2

@@ -1,0 +1,125 @@
+"""The picture of a result: photograph, caption, close-up, fields and rivals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from curvireg_torch import Registrar, ViewBank, sample_views
+from curvireg_torch.rendering import render_depth
+from curvireg_torch.synthetic import example_mesh
+from curvireg_torch.visualization import registration_sheet
+from curvireg_torch.visualization.result_picture import VERDICT_COLOURS
+from tests._support.scenes import CAMERA, SIZE, scene, truck_bank, unrefined
+
+GREEN = (0, 255, 80)
+SIDE = 227  # px of a small picture: four in a row of 960 px
+
+
+@pytest.fixture(scope="module")
+def registered():
+    """registrar, result at the true pose, image, box."""
+    image, box, T = scene(2)
+    registrar = Registrar(truck_bank(), pipeline=unrefined(truck_bank()))
+    result = registrar([image], box[None], CAMERA)[0]
+    truth = replace(result.hypotheses[0], projection=(T, CAMERA))
+    return registrar, replace(result, hypotheses=(truth, *result.hypotheses[1:])), image, box
+
+
+def is_outline(picture):
+    return (picture == GREEN).all(axis=2)
+
+
+def small_picture(sheet, number):
+    """One of the eight pictures below the photograph and its caption, from 0."""
+    rows = np.nonzero((sheet[720:, 20] != 255).any(axis=1))[0]  # of the first column
+    starts = [r for r in rows if r - 1 not in rows and (rows < r + 100).sum() - (rows < r).sum() == 100]
+    top, left = 720 + starts[number // 4], 10 + number % 4 * (SIDE + 10)
+    return sheet[top : top + SIDE, left : left + SIDE]
+
+
+def test_registration_sheet_shows_the_whole_photograph_with_the_contours(registered):
+    registrar, result, image, box = registered
+    photograph = registration_sheet(registrar, result, image, box)[:720]
+    assert photograph.shape == (720, 960, 3)
+    enlarged = torch.nn.functional.interpolate(image[None], (720, 960), mode="bicubic")[0].permute(1, 2, 0)
+    assert np.median(np.abs(photograph - 255 * enlarged.clamp(0, 1).numpy())) < 2
+    K = torch.tensor([[4.0, 0.0, 1.5], [0.0, 4.0, 1.5], [0.0, 0.0, 1.0]], dtype=torch.float64) @ CAMERA
+    mask = (render_depth(example_mesh(), result.projection[0], K, (720, 960))[0, 0] > 0).numpy()
+    rows, columns = np.nonzero(is_outline(photograph))
+    for drawn, seen in ((rows, np.nonzero(mask)[0]), (columns, np.nonzero(mask)[1])):
+        assert abs(drawn.min() - seen.min()) <= 2
+        assert abs(drawn.max() - seen.max()) <= 2
+
+
+def test_registration_sheet_draws_rivals_at_their_poses(registered):
+    registrar, result, image, box = registered
+    sheet = registration_sheet(registrar, result, image, box)
+    first, second, *others = result.hypotheses
+    assert len(others) == 3
+    close_up = small_picture(sheet, 0)
+    same = replace(second, projection=first.projection)
+    other = registration_sheet(registrar, replace(result, hypotheses=(first, same, *others)), image, box)
+    assert np.array_equal(small_picture(other, 4), close_up)
+    assert not np.array_equal(small_picture(sheet, 4), close_up)
+    rows, columns = np.nonzero((sheet != other).any(axis=2))
+    assert np.ptp(rows) < SIDE, "nothing else changes"
+    assert np.ptp(columns) < SIDE
+
+
+def in_larger_photograph(registered, factor):
+    """The sheet of the photograph in the midst of grey, ``factor`` times as wide and high."""
+    registrar, result, image, box = registered
+    (H, W), first = SIZE, result.hypotheses[0]
+    canvas = torch.nn.functional.pad(image, (W, (factor - 2) * W, H, (factor - 2) * H), value=0.5)
+    shift = torch.tensor([W, H], dtype=torch.float64)
+    T, K = first.projection[0], CAMERA.clone()
+    K[:2, 2] += shift
+    moved = replace(result, hypotheses=(replace(first, projection=(T, K)), *result.hypotheses[1:]))
+    return registration_sheet(registrar, moved, canvas, box + shift.repeat(2))
+
+
+def test_registration_sheet_enlarges_small_objects(registered):
+    rows, columns = np.nonzero(is_outline(small_picture(in_larger_photograph(registered, 4), 0)))
+    assert 0.6 * SIDE < max(np.ptp(rows), np.ptp(columns)) < 0.9 * SIDE
+
+
+def test_registration_sheet_shrinks_large_photographs(registered):
+    sheet = in_larger_photograph(registered, 8)
+    assert sheet.shape[1] == 1600
+    assert is_outline(sheet[200:400, 200:400]).any()
+
+
+def test_registration_sheet_of_narrow_and_flat_photographs(registered):
+    registrar, result, _, _ = registered
+    for H, W in ((600, 60), (40, 900)):
+        photograph = torch.full((3, H, W), 0.2)
+        sheet = registration_sheet(registrar, result, photograph, [5.0, 5.0, 35.0, 35.0])
+        scale = 960 / max(H, W)
+        left = (sheet.shape[1] - round(W * scale)) // 2
+        assert sheet.shape[1] == max(720, round(W * scale))
+        assert tuple(sheet[round(H * scale) - 3, left + 3]) == (51, 51, 51)
+
+
+def test_registration_sheet_has_the_verdict_in_its_colour(registered):
+    registrar, result, image, box = registered
+    for confidence, verdict in ((0.95, "likely"), (0.899, "unsure"), (0.5, "unsure"), (0.2, "no match")):
+        sheet = registration_sheet(registrar, replace(result, confidence=confidence), image, box)
+        found = [word for word, colour in VERDICT_COLOURS.items() if (sheet[720:] == colour).all(axis=2).sum() > 500]
+        assert found == [verdict]
+
+
+def test_registration_sheet_of_several_meshes(registered):
+    views = sample_views(azimuth_step=30, elevations=[0, 30])
+    options = {"pipeline": truck_bank().pipeline, "progress": False}
+    meshes = trimesh.creation.box((0.02, 0.02, 0.3)), example_mesh()
+    bank = ViewBank.join([ViewBank.build(mesh, views, **options) for mesh in meshes])
+    registrar, (_, _, image, box) = Registrar(bank, pipeline=unrefined(bank)), registered
+    result = registrar([image], box[None])[0]
+    first, second, *others = result.hypotheses
+    result = replace(result, hypotheses=(first, replace(second, model=1 - first.model), *others))
+    sheet = registration_sheet(registrar, result, image, box)
+    other = registration_sheet(registrar, result, (255 * image).round().byte(), box)
+    assert np.array_equal(sheet[:720], other[:720]), "bytes and floats are the same photograph"
