@@ -254,7 +254,7 @@ def test_limits_do_not_open_the_mesh_again(session):
     session.register()
     session.set_limits(elevation=None)
     assert session.result.registrar is registrar
-    assert session.document()["prior"]["elevation"] == [35.0, 90.0]
+    assert session.document()["prior"]["elevation"] == (35.0, 90.0)
     assert session.displayed.pose.viewpoint[1] > 32.0
 
 
