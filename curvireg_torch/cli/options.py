@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..utils.choices import DEFAULT, PRESET_NAMES, RENDERER_NAMES, SIDE_NAMES, UNITS, UP_AXES
+from ..utils.choices import DEFAULT, MESH_KINDS, PRESET_NAMES, RENDERER_NAMES, SIDE_NAMES, UNITS, UP_AXES
 
 if TYPE_CHECKING:
     from ..evaluation.opening import RegisterOptions
@@ -55,6 +55,16 @@ def mesh_options() -> argparse.ArgumentParser:
         "--up", choices=UP_AXES, help="axis of the mesh file that points up, as --up=-y; default: y for glTF, else z"
     )
     return parser
+
+
+def add_mesh_is(parser: argparse.ArgumentParser) -> None:
+    """Add ``--mesh-is``."""
+    parser.add_argument(
+        "--mesh-is",
+        choices=MESH_KINDS,
+        help="exact: the mesh of this very object. similar: of another one of its kind; answers are then less certain "
+        "(default: exact with a camera, similar without)",
+    )
 
 
 def add_box_and_camera(

@@ -14,6 +14,7 @@ from ..utils.files import check_writable
 from ..utils.input_paths import check_given, is_one_photograph
 from .options import (
     add_box_and_camera,
+    add_mesh_is,
     add_pose_prior,
     common_options,
     examples,
@@ -76,6 +77,7 @@ def add_parser(commands: Any) -> None:
     start = "result.json, or any JSON with rotation and translation: refine this pose in one photograph; needs no box"
     add("--start", type=Path, metavar="FILE", help=start)
     add_pose_prior(parser)
+    add_mesh_is(parser)
     add("--instances", type=int, default=1, metavar="N", help="without a box: up to N objects (default: 1)")
     add("--field", type=Path, metavar="FILE", help="weights from curvireg bank --adapt")
     add("--top", type=int, metavar="K", help="hypotheses to carry and report (default: 5)")
@@ -196,7 +198,7 @@ def _register_several(options: "RegisterOptions", field: Any, photos: "PhotoList
     from ..evaluation.opening import open_registrar
     from ..pipeline import field_digest
 
-    names = ("bank_decides", "pose", "unit", "up", "top", "refine", "renderer", "device")
+    names = ("bank_decides", "pose", "mesh_is", "unit", "up", "top", "refine", "renderer", "device")
     settings = {
         "pipeline": options.open_pipeline().describe(),
         "field": None if field is None else field_digest(field),

@@ -15,6 +15,7 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
     print(f"viewpoint: {angles} degrees   score {document['score']:.3f}   confidence {document['confidence']:.2f}")
     if not document["reliable"]:
         print(f"no reliable match: take the pose as a guess; {_advice(document)}")
+    print_alternatives(document)
     if ", " in document.get("inputs", {}).get("mesh", ""):
         print(f"mesh: {document['mesh']}")
     for line in remarks(document):
@@ -33,6 +34,19 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
         print(f"standard deviations: {values}   (about and along the camera's axes)")
     seconds = document["seconds"]
     print(f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see {out}/overlay.png")
+
+
+def print_alternatives(document: Mapping[str, Any]) -> None:
+    """Print the other members of the answer set, if there are any."""
+    answers = document["answer_set"]
+    for member in answers["members"][1:]:
+        viewpoint = document["top"][member]["viewpoint"]
+        angles = ", ".join(f"{name} {value:.1f}" for name, value in viewpoint.items())
+        print(f"could also be: {angles} degrees   probability {answers['probabilities'][member]:.2f}")
+    if document["ambiguous"] is not None:
+        words = {"half turn": "differ by a half turn", "mirror": "are mirror images", "several": "differ"}
+        none = f"; none of them: {answers['none']:.2f}" if answers["holds_none"] else ""
+        print(f"the poses {words[document['ambiguous']]}{none}; a hint decides: --side, --azimuth or --near")
 
 
 def _advice(document: Mapping[str, Any]) -> str:

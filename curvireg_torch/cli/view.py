@@ -8,6 +8,7 @@ from ..errors import MissingDependencyError
 from ..utils.input_paths import check_given
 from .options import (
     add_box_and_camera,
+    add_mesh_is,
     add_pose_prior,
     common_options,
     examples,
@@ -35,6 +36,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--host", default=LOCAL, help=hosts)
     parser.add_argument("--port", type=int, default=0, help="default: a free one")
     parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
+    add_mesh_is(parser)
     parser.set_defaults(run=run)
 
 

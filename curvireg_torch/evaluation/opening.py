@@ -40,6 +40,7 @@ class RegisterOptions:
         pose, top: the pose prior, and the number of hypotheses; None: those of the pipeline.
         field: weights of an adapted field.
         refine: False stops at the best view of the bank.
+        mesh_is: "exact" or "similar", see :class:`Registrar`.
         unit, up: of mesh files, see :func:`curvireg_torch.load_mesh`.
         renderer, device: where views are rendered, and where the search runs.
     """
@@ -58,6 +59,7 @@ class RegisterOptions:
     field: Path | None = None
     top: int | None = None
     refine: bool = True
+    mesh_is: str | None = None
     unit: str = "m"
     up: str | None = None
     renderer: str = "auto"
@@ -147,7 +149,7 @@ def open_registrar(
         pipeline = replace(pipeline, search=False, contours=False)
     if options.top is not None:
         pipeline = replace(pipeline, hypotheses=options.top)
-    return Registrar(bank, pipeline=pipeline, field=field, renderer=options.renderer)
+    return Registrar(bank, pipeline=pipeline, field=field, renderer=options.renderer, mesh_is=options.mesh_is)
 
 
 def _open_bank(

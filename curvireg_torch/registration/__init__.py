@@ -1,6 +1,7 @@
 """From a ranking of views to poses: stages as functions over photographs x hypotheses, joined by the registrar."""
 
 from ..matching import distinct_views
+from .answer_set import AnswerSet
 from .confidence import RELIABLE, confidence, ranking_evidence
 from .contours import ContourFit, fit_contours
 from .following import Follower
@@ -15,6 +16,7 @@ from .search import coherent_views, search
 
 __all__ = [
     "RELIABLE",
+    "AnswerSet",
     "ContourFit",
     "FailedRegistration",
     "Follower",

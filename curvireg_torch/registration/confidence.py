@@ -22,6 +22,7 @@ __all__ = [
     "confidence",
     "confidence_features",
     "confidence_model",
+    "model_name",
     "presence",
     "presence_features",
     "ranking_evidence",
@@ -70,16 +71,19 @@ class LogisticModel:
         return probability if None not in features.values() else min(probability, UNCOMPARED)
 
 
-def confidence_model(stage: str, *, with_camera: bool, with_appearance: bool) -> LogisticModel:
-    """The model for a kind of result.
+def model_name(stage: str, *, exact: bool, with_appearance: bool) -> str:
+    """The key of the calibrated constants for a kind of result.
 
     Args:
         stage: "ranking" for views, "contours" for fitted poses.
-        with_camera: ignored for a ranking.
+        exact: whether the mesh is that of this very object, or only of a similar one.
         with_appearance: whether the pipeline has the appearance term.
     """
-    camera = [] if stage == "ranking" else ["camera" if with_camera else "no camera"]
-    name = ", ".join([stage, *camera, "appearance" if with_appearance else "no appearance"])
+    return f"{stage}, {'exact' if exact else 'similar'}, {'appearance' if with_appearance else 'no appearance'}"
+
+
+def confidence_model(name: str) -> LogisticModel:
+    """The logistic model of :func:`model_name`."""
     model = CALIBRATION["confidence"][name]
     return LogisticModel(model["weights"], model["bias"])
 
@@ -130,8 +134,12 @@ def ranking_features(evidence: Tensor) -> dict[str, float | None]:
     return {n: None if math.isnan(v) else v for n, v in zip(RANKING_FEATURES, evidence.tolist(), strict=True)}
 
 
-def confidence(ranking: Ranking, rotations: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
+def confidence(ranking: Ranking, rotations: Tensor, *, exact: bool = False, symmetries: Tensor | None = None) -> Tensor:
     """Probability that the best view is within 30 degrees of the truth, from :func:`ranking_evidence`.
+
+    Args:
+        ranking, rotations, symmetries: see :func:`ranking_evidence`.
+        exact: whether the mesh is that of this very object, or only of a similar one.
 
     Returns:
         (B,) in (0, 1).
@@ -143,7 +151,7 @@ def confidence(ranking: Ranking, rotations: Tensor, *, symmetries: Tensor | None
         >>> bool(confidence(clear, R) > confidence(tied, R))
         True
     """
-    model = confidence_model("ranking", with_camera=False, with_appearance="appearance" in ranking.terms)
+    model = confidence_model(model_name("ranking", exact=exact, with_appearance="appearance" in ranking.terms))
     evidence = ranking_evidence(ranking, rotations, symmetries=symmetries)
     return torch.tensor([model(ranking_features(one)) for one in evidence])
 

@@ -27,6 +27,10 @@ CONVENTIONS = {
     "score": "normalised correlation of photograph and view, 0 to 1",
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth; times presence for an "
     "object without a given box",
+    "answer_set": "probabilities of the poses of top in their order and of none of them; members: numbers, from 0, of "
+    "the poses in the smallest set that holds the truth with probability level, together with none of them if "
+    "holds_none",
+    "ambiguous": "how the members differ: half turn, mirror or several; null for one member",
     "presence": "estimated probability that the photograph shows the object in that box",
     "reliable": f"confidence of at least {RELIABLE:g}, and no warnings; false = no reliable match, the pose is a guess",
     "warnings": "what is questionable about the box and the camera",

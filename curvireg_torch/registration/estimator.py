@@ -11,8 +11,12 @@ from torch import Tensor
 from ..errors import CurviregError
 from ..matching import Ranking, ViewDescriber, ViewMatcher
 from ..terms import QueryFeatures
+from ..utils.checks import check_option
+from ..utils.choices import MESH_KINDS
 from ..utils.threads import map_on_threads
-from .confidence import confidence_features, confidence_model, ranking_evidence, ranking_features
+from .answer_set import answer_set
+from .calibration import CALIBRATION
+from .confidence import confidence_features, confidence_model, model_name, ranking_evidence, ranking_features
 from .hypotheses import Hypotheses, distinct_mask, start_hypotheses
 from .inputs import ImageItem, check_crop
 from .locator import Locator
@@ -40,9 +44,10 @@ class _Batch:
     ranking: Ranking
     descriptors: Tensor
     priors: BatchPriors | None
+    exact: bool
 
     def scores(self, evidence: Tensor) -> Tensor:
-        return rescore(evidence, with_camera=self.camera_matrices is not None)
+        return rescore(evidence, exact=self.exact)
 
 
 class PoseEstimator:
@@ -50,6 +55,7 @@ class PoseEstimator:
 
     Args:
         matcher: of the bank; its pipeline decides all results.
+        mesh_is: "exact" or "similar", see :class:`Registrar`.
         symmetries: (S, 4, 4) of the mesh; hypotheses that differ by one of them are reported once.
         progress: called with (stage, done, total) if it is a function.
     """
@@ -58,10 +64,14 @@ class PoseEstimator:
         self,
         matcher: ViewMatcher,
         *,
+        mesh_is: str | None = None,
         symmetries: Tensor | None = None,
         progress: bool | Callable[[str, int, int], object] = False,
     ) -> None:
         self.matcher, self.bank, self.pipeline = matcher, matcher.bank, matcher.pipeline
+        if mesh_is is not None:
+            check_option(mesh_is, MESH_KINDS, "mesh_is")
+        self.mesh_is = mesh_is
         self.symmetries, self.progress = symmetries, progress
 
     @cached_property
@@ -165,6 +175,7 @@ class PoseEstimator:
             ranking=ranking,
             descriptors=self.describers[0].descriptor(query.field),
             priors=priors,
+            exact=self.mesh_is == "exact" if self.mesh_is else bool(matrices),
         )
 
     def _search(self, batch: _Batch, starts: Hypotheses) -> Hypotheses:
@@ -208,8 +219,8 @@ class PoseEstimator:
     ) -> tuple[Poses, Tensor]:
         """Put hypotheses that merged, or whose fit is not trusted, back to the views that they started from."""
         keep = distinct
-        # Without a camera the mesh is often another object: where contours do not fit, the view has the smaller error.
-        if poses.fit is not None and batch.camera_matrices is None:
+        # Where the contours of a similar object do not fit, the view has the smaller error.
+        if poses.fit is not None and not batch.exact:
             keep = distinct & poses.fit.trustworthy
         if batch.priors is not None:
             keep = keep & batch.priors.keeps(poses.hypotheses, poses.T)
@@ -229,8 +240,9 @@ class PoseEstimator:
         # The confidence of a fitted pose was calibrated on the ranking's best view; without fit, on the result's view.
         views = None if fitted else poses.hypotheses.view[torch.stack([mine[0] for mine in of_image])]
         ranked = ranking_evidence(ranking, self.bank.rotations, answer=views, symmetries=self.symmetries)
-        stage, with_appearance = "contours" if fitted else "ranking", "appearance" in ranking.terms
-        model = confidence_model(stage, with_camera=with_camera, with_appearance=with_appearance)
+        with_appearance = "appearance" in ranking.terms
+        name = model_name("contours" if fitted else "ranking", exact=batch.exact, with_appearance=with_appearance)
+        confidence, constants = confidence_model(name), CALIBRATION["answer_set"][name]
         results = []
         for b, mine in enumerate(of_image):
             features = ranking_features(ranked[b])
@@ -238,7 +250,9 @@ class PoseEstimator:
                 features = confidence_features(evidence[mine], scores[mine], features["concentration"])
             reported = mine[: self.pipeline.hypotheses].tolist()
             hypotheses = tuple(hypothesis_of(h, poses, evidence, with_camera=with_camera) for h in reported)
-            registration = Registration(hypotheses, model(features), ranking[b : b + 1], features)
+            rivals = rescore(evidence[mine], exact=fitted and batch.exact)  # as calibrated
+            answers = answer_set(confidence(features), rivals, constants, reported=len(reported))
+            registration = Registration(hypotheses, answers, ranking[b : b + 1], features)
             if batch.priors is not None:
                 best = poses[mine[:1]]
                 filling = lift_to_poses(self.describers, best.hypotheses, batch.boxes, batch.camera_matrices)

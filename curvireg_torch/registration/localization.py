@@ -107,7 +107,7 @@ def _register_candidates(
 
 
 def _with_proposals(results: list[Registration], located: Located) -> list[Registration]:
-    """Results with all proposals, their own boxes first, and with ``presence`` as a factor of their confidence."""
+    """Results with all proposals, their own boxes first, and with ``presence`` as a factor of their probabilities."""
     boxes = torch.cat([torch.stack([localization_of(r).box for r in results]), located.boxes.double()])
     scores = torch.cat([torch.tensor([localization_of(r).score for r in results]), located.scores])
     kept = non_maximum_suppression(boxes, -torch.arange(len(boxes)), OVERLAP)  # in their present order
@@ -115,7 +115,7 @@ def _with_proposals(results: list[Registration], located: Located) -> list[Regis
         replace(
             result,
             localization=replace(localization_of(result), boxes=boxes[kept], scores=scores[kept]),
-            confidence=result.confidence * _presence(result),
+            answer_set=result.answer_set.scaled(_presence(result)),
         )
         for result in results
     ]

@@ -11,6 +11,7 @@ from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..geometry.cameras import projected_boxes
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose
+from .answer_set import AnswerSet
 from .confidence import refinement_confidence
 from .estimator import PoseEstimator, hypothesis_of
 from .hypotheses import Hypotheses, distinct_mask
@@ -102,7 +103,7 @@ def _refined(estimator: PoseEstimator, item: ImageItem, T: Tensor) -> Registrati
     assert poses.fit is not None
     similarity, support = similarities(describers, descriptors, poses.hypotheses), poses.fit.edge_support
     evidence = torch.stack([torch.zeros_like(support), similarity, support, torch.zeros_like(support)], dim=1)
-    scores = rescore(evidence, with_camera=True)
+    scores = rescore(evidence, exact=True)
     together = replace(poses.hypotheses, image_index=torch.zeros_like(poses.hypotheses.image_index))
     distinct = distinct_mask(together, scores, symmetries=estimator.symmetries)
     order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]
@@ -112,7 +113,8 @@ def _refined(estimator: PoseEstimator, item: ImageItem, T: Tensor) -> Registrati
     )
     features = {"similarity": float(similarity[order[0]]), "edge_support": float(support[order[0]])}
     unranked = Ranking(torch.zeros(1, 0), torch.zeros(1, 0, dtype=torch.long), {})
-    return Registration(hypotheses, refinement_confidence(features), unranked, features, warnings=item.warnings)
+    answers = AnswerSet((refinement_confidence(features), *[0.0] * (len(hypotheses) - 1)))
+    return Registration(hypotheses, answers, unranked, features, warnings=item.warnings)
 
 
 def _boxes(estimator: PoseEstimator, item: ImageItem, T: Tensor, K: Tensor) -> Tensor:

@@ -41,6 +41,9 @@ class Registrar(PoseEstimator):
         views, settings: custom viewpoints and bank settings, for a mesh.
         field: custom photograph filter, see :class:`ViewMatcher`.
         renderer: for search, contour fit and a bank that is built; a custom renderer knows one mesh.
+        mesh_is: "exact" for the mesh of this very object, "similar" for that of another one of its kind. It decides how
+            far fitted contours are trusted, and the probabilities of the answers. Default: exact for photographs with a
+            camera matrix, similar for others.
         symmetries: (S, 4, 4) of the mesh, from :func:`curvireg_torch.geometry.symmetry_transforms`; hypotheses that
             differ by one of them are reported once.
         device: of modules, bank and search.
@@ -67,6 +70,7 @@ class Registrar(PoseEstimator):
         settings: BankSettings | None = None,
         field: nn.Module | None = None,
         renderer: str | DepthRenderer = "auto",
+        mesh_is: str | None = None,
         symmetries: Tensor | None = None,
         device: torch.device | str | None = None,
         progress: bool | Callable[[str, int, int], object] = False,
@@ -94,7 +98,7 @@ class Registrar(PoseEstimator):
             raise InvalidInputError(f"renderer: a custom renderer knows one mesh, the bank has {n}; give a name")
         if symmetries is not None:
             check_symmetries(symmetries)
-        super().__init__(matcher, symmetries=symmetries, progress=progress)
+        super().__init__(matcher, mesh_is=mesh_is, symmetries=symmetries, progress=progress)
 
     @torch.no_grad()
     def __call__(

@@ -17,7 +17,7 @@ pose's view with the photograph; edge support (0 without the contour fit); log a
 that term)."""
 
 WEIGHTS, RANK_ALONE = (1.0, 5.0, 10.0, 1.0), (1.0, 0.0, 0.0, 0.0)
-"""Weights of the features with and without a camera, see docs/accuracy.md."""
+"""Weights of the features with an exact mesh and with a similar one, see docs/accuracy.md."""
 
 
 def rank_feature(starts: Hypotheses) -> Tensor:
@@ -28,13 +28,13 @@ def rank_feature(starts: Hypotheses) -> Tensor:
     return log - best[starts.image_index]
 
 
-def rescore(evidence: Tensor, *, with_camera: bool) -> Tensor:
+def rescore(evidence: Tensor, *, exact: bool) -> Tensor:
     """(H,) scores of hypotheses, higher is better, from their (H, 4) :data:`POSE_FEATURES`.
 
-    With a known camera the mesh is assumed to be that of this very object, and all features count (:data:`WEIGHTS`).
-    Without, the mesh is often another object of the category, and the order of the ranking is kept.
+    With the exact mesh, that of this very object, all features count (:data:`WEIGHTS`). With the mesh of a similar
+    object, the order of the ranking is kept.
     """
-    return evidence @ torch.tensor(WEIGHTS if with_camera else RANK_ALONE, dtype=evidence.dtype)
+    return evidence @ torch.tensor(WEIGHTS if exact else RANK_ALONE, dtype=evidence.dtype)
 
 
 def similarities(describers: Sequence[ViewDescriber], descriptors: Tensor, hypotheses: Hypotheses) -> Tensor:

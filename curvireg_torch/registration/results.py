@@ -13,6 +13,7 @@ from ..geometry.cameras import transform
 from ..geometry.pose_prior import PosePrior
 from ..geometry.viewpoint import viewpoint_from_rotation
 from ..matching import Ranking
+from .answer_set import AnswerSet, ambiguity
 from .calibration import SQUARED_RADIUS
 from .confidence import RELIABLE
 
@@ -115,8 +116,8 @@ class Registration:
 
     Attributes:
         hypotheses: distinct poses, best first; all but the first are rivals, such as the pose seen from behind.
-        confidence: probability that the best pose is within 30 degrees of the truth; times ``localization.presence``
-            for an object without a box.
+        answer_set: probability of each hypothesis to be within 30 degrees of the truth, times ``localization.presence``
+            for an object without a box; and the smallest set of them that holds the truth nine times in ten.
         ranking: scores of the bank's views for this photograph (B = 1).
         confidence_features: what the confidence is computed from, see :func:`.confidence.confidence_features` and
             :func:`.confidence.ranking_evidence`; ``lead`` is None where the bank has no rival view.
@@ -129,7 +130,7 @@ class Registration:
     """
 
     hypotheses: tuple[Hypothesis, ...]
-    confidence: float
+    answer_set: AnswerSet
     ranking: Ranking
     confidence_features: Mapping[str, float | None] = field(default_factory=dict)
     localization: Localization | None = None
@@ -140,6 +141,17 @@ class Registration:
 
     ok = True
     """False of a :class:`FailedRegistration`."""
+
+    @property
+    def confidence(self) -> float:
+        """Probability of the best pose, the first of ``answer_set.probabilities``."""
+        return self.answer_set.probabilities[0]
+
+    @property
+    def ambiguous(self) -> str | None:
+        """How the poses of the answer set differ: "half turn", "mirror" or "several"; None if it holds one pose."""
+        members = [self.hypotheses[member].allocentric_rotation for member in self.answer_set.members]
+        return ambiguity(torch.stack(members))
 
     @property
     def reliable(self) -> bool:
@@ -213,6 +225,8 @@ class Registration:
             "confidence": self.confidence,
             "reliable": self.reliable,
             "warnings": list(self.warnings),
+            "answer_set": self.answer_set.to_dict(),
+            "ambiguous": self.ambiguous,
             "confidence_features": dict(self.confidence_features),
             "edge_support": self.edge_support,
             "standard_deviations": None

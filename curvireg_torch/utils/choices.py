@@ -18,6 +18,9 @@ MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 MESHES_AND_BANKS = (*MESHES, ".safetensors")
 """Suffixes of file names, in lower case."""
 
+MESH_KINDS = ("exact", "similar")
+"""Whether a mesh is that of the photographed object itself, or of another one of its kind."""
+
 SIDE_NAMES = ("front", "front-right", "right", "back-right", "back", "back-left", "left", "front-left")
 """Sides of an object, every 45 degrees of azimuth from 0."""
 

@@ -33,7 +33,7 @@ MAX_PROPOSALS = 5  # proposed boxes that are drawn where the object was localize
 
 Numbers = tuple[float, float, float, float]
 
-_OPTIONS = ("unit", "up", "pose", "preset", "pipeline", "renderer", "device")
+_OPTIONS = ("unit", "up", "pose", "mesh_is", "preset", "pipeline", "renderer", "device")
 _DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
 
 
@@ -265,9 +265,9 @@ def _command_line(options: RegisterOptions, names: Mapping[Path, str]) -> str:
         words += ["--camera", options.guess]
     words += _limit_words(options.limits or {})
     for name in _OPTIONS:
-        value = getattr(options, name)
+        value, option = getattr(options, name), name.replace("_", "-")
         if value != _DEFAULTS[name]:
-            words += [f"--{name}={value}"] if str(value).startswith("-") else [f"--{name}", str(value)]
+            words += [f"--{option}={value}"] if str(value).startswith("-") else [f"--{option}", str(value)]
     return shlex.join([*words, "--out", "result"])
 
 

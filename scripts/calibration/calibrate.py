@@ -19,7 +19,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 from scipy.stats import chi2
@@ -31,10 +30,12 @@ from curvireg_torch.registration.confidence import (
     RELIABLE,
     LogisticModel,
     confidence_features,
+    model_name,
 )
 from curvireg_torch.registration.rescoring import POSE_FEATURES, WEIGHTS, rescore
 from scripts._shared import REPOSITORY, commit, today, update_page, write_json
 from scripts.benchmark.run import register_benchmark
+from scripts.calibration.answer_sets import evidence_of, fit_answer_sets, unrefined
 from scripts.calibration.quality import (
     LEVELS,
     REAL_SETS,
@@ -64,33 +65,33 @@ WRONG_FRACTION = 0.1
 
 def features_of(row: Row, *, with_appearance: bool = True) -> tuple[dict[str, float | None], float]:
     """Features of the best hypothesis of a row, optionally without the appearance term, and its error in degrees."""
-    evidence = torch.tensor([[one[name] for name in POSE_FEATURES] for one in row["evidence"]], dtype=torch.float64)
-    if not with_appearance:
-        evidence[:, POSE_FEATURES.index("appearance")] = 0.0
+    evidence = evidence_of(row, with_appearance=with_appearance)
     concentration = row["ranking"][RANKING_FEATURES.index("concentration")]
-    features = confidence_features(evidence, rescore(evidence, with_camera=row["form"] == "exact"), concentration)
+    features = confidence_features(evidence, rescore(evidence, exact=row["form"] == "exact"), concentration)
     return features, row["errors"][0]
 
 
 def ranking_case(row: Row, *, with_appearance: bool = True) -> tuple[dict[str, float | None], float]:
     """Features of a row's ranking, and the error of its best view in degrees."""
-    ranking = row["ranking"] if with_appearance else row["fast"]["ranking"]
-    error = row["view_errors"][0] if with_appearance else row["fast"]["error"]
-    return dict(zip(RANKING_FEATURES, ranking, strict=True)), error
+    found = unrefined(row, with_appearance=with_appearance)
+    return dict(zip(RANKING_FEATURES, found["ranking"], strict=True)), found["errors"][0]
 
 
 Case = Callable[..., tuple[dict[str, float | None], float]]
-MODELS: dict[str, tuple[Case, bool, str | None, tuple[str, ...]]] = {
-    f"{stage}, {appearance}": (case, appearance == "appearance", form, names)
-    for stage, case, form, names in (
-        ("contours, camera", features_of, "exact", CONFIDENCE_FEATURES),
-        ("contours, no camera", features_of, "sibling", CONFIDENCE_FEATURES),
-        ("ranking", ranking_case, None, RANKING_FEATURES),
+FORMS = {"exact": "exact", "similar": "sibling"}
+"""Kinds of meshes, and the form of the benchmark's photographs that are registered to them."""
+
+MODELS: dict[str, tuple[Case, bool, str, tuple[str, ...]]] = {
+    model_name(stage, exact=kind == "exact", with_appearance=with_appearance): (case, with_appearance, form, names)
+    for stage, case, names in (
+        ("contours", features_of, CONFIDENCE_FEATURES),
+        ("ranking", ranking_case, RANKING_FEATURES),
     )
-    for appearance in ("appearance", "no appearance")
+    for kind, form in FORMS.items()
+    for with_appearance in (True, False)
 }
 """Of each confidence model: the function that gives its cases, whether the appearance term is used, the form of the
-photographs (None: all), and its features."""
+photographs, and its features."""
 
 
 def folds_of(rows: Sequence[Row]) -> np.ndarray:
@@ -132,13 +133,12 @@ def fit_transfer(exact: LogisticModel, X: np.ndarray, y: np.ndarray) -> Logistic
 def fit_confidence(rows: Sequence[Row], name: str) -> tuple[LogisticModel, list[Row], np.ndarray, np.ndarray]:
     """The model, its rows, their confidences by models of the other folds, and whether they are right."""
     case, with_appearance, form, names = MODELS[name]
-    training_form = "exact" if form == "sibling" else form
-    rows = [row for row in rows if form is None or row["form"] in (form, training_form)]
+    rows = [row for row in rows if row["form"] in (form, "exact")]
     cases = [case(row, with_appearance=with_appearance) for row in rows]
     X = np.array([[features[n] or 0.0 for n in names] for features, _ in cases])
     y = np.array([is_right(row, error) for row, (_, error) in zip(rows, cases, strict=True)])
     wrong, fold = np.array([bool(row["wrong"]) for row in rows]), folds_of(rows)
-    trains, evaluated = (np.array([f in (None, row["form"]) for row in rows]) for f in (training_form, form))
+    trains, evaluated = (np.array([row["form"] == f for row in rows]) for f in ("exact", form))
     weight = np.ones(len(rows))
     if wrong.any():
         weight[wrong] = WRONG_FRACTION / (1.0 - WRONG_FRACTION) * (~wrong & trains).sum() / wrong.sum()
@@ -146,7 +146,7 @@ def fit_confidence(rows: Sequence[Row], name: str) -> tuple[LogisticModel, list[
     def fit(train: np.ndarray) -> LogisticModel:
         used = train & trains
         model = fit_logistic(X[used], y[used], weight[used], names)
-        if form == training_form:
+        if form == "exact":
             return model
         return fit_transfer(model, X[train & evaluated], y[train & evaluated])
 
@@ -199,16 +199,21 @@ def fit_rescoring(rows: Sequence[Row]) -> list[float]:
 
 def calibrate(rows: Sequence[Row]) -> tuple[Row, Row]:
     """Constants, and their quality on held-out folds."""
-    constants: Row = {"confidence": {}, "covariance": {}}
+    constants: Row = {"confidence": {}, "answer_set": {}, "covariance": {}}
     held_out: dict[str, Row] = {}
+    answer_sets: dict[str, Row] = {}
     covariance_held_out: Row = {}
     for name in MODELS:
         model, used, sure, right = fit_confidence(rows, name)
         constants["confidence"][name] = {"weights": dict(model.weights), "bias": model.bias, "n": len(used)}
         held_out |= quality_by_subset(used, sure, right, name)
-        if name == "contours, camera, appearance":
+        own = np.flatnonzero([not row["wrong"] for row in used])
+        own_rows, fold = [used[k] for k in own], folds_of(used)[own]
+        constants["answer_set"][name], answer_sets[name] = fit_answer_sets(own_rows, name, sure[own], fold)
+        if name == "contours, exact, appearance":
             constants["covariance"], covariance_held_out = fit_covariance(used, sure)
-    return constants, {"held_out": held_out, "covariance_held_out": covariance_held_out}
+    quality = {"held_out": held_out, "answer_sets": answer_sets, "covariance_held_out": covariance_held_out}
+    return constants, quality
 
 
 def main() -> None:

@@ -211,7 +211,7 @@ def quality_by_subset(rows: Sequence[Row], sure: np.ndarray, right: np.ndarray, 
     """Quality of a model on all photographs, in clutter, and for wrong meshes."""
     correct = np.array([not row["wrong"] for row in rows])
     out = {name: quality(sure[correct], right[correct], [group_of(r) for r, c in zip(rows, correct, strict=True) if c])}
-    if name.startswith("contours, camera"):
+    if name.startswith("contours, exact"):
         crowd = correct & np.array([row["clutter"] >= 3 for row in rows])
         units = [group_of(r) for r, c in zip(rows, crowd, strict=True) if c]
         out[f"{name}, in clutter"] = quality(sure[crowd], right[crowd], units)
@@ -258,5 +258,10 @@ def page(record: Row) -> str:
         for name, found in record["shares"].items()
     ]
     where = f"`python scripts/calibration/calibrate.py`, {record['date']}, commit {record['commit']}."
-    tables = (table_lines(rows) for rows in (right, lines, ellipsoid))
+    answers = [["answer sets", "N", "hold the truth", "mean number of answers", 'hold "none of them"']]
+    answers += [
+        [name, str(found["n"]), *(f"{found[m]:.2f}" for m in ("coverage", "mean_size", "none"))]
+        for name, found in {**record["answer_sets"], **record.get("real_answer_sets", {})}.items()
+    ]
+    tables = (table_lines(rows) for rows in (right, lines, answers, ellipsoid))
     return "\n".join([*(line for table in tables for line in [*table, ""]), where, ""])

@@ -197,6 +197,7 @@ def test_print_result_advises_when_not_reliable(pose, changes, expected, unexpec
     document = {
         "viewpoint": {"azimuth": 1.0}, "score": 0.2, "confidence": 0.1, "reliable": False, "translation": None,
         "standard_deviations": None, "seconds": {"bank": 1.0, "register": 2.0}, "corrected_box": None,
+        "ambiguous": None, "answer_set": {"members": [0]},
         "pipeline": Pipeline().with_pose_prior(pose).describe(), **changes,
     }  # fmt: skip
     print_result(document, tmp_path)

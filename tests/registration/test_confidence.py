@@ -22,6 +22,7 @@ from curvireg_torch.registration.confidence import (
     LogisticModel,
     confidence_features,
     confidence_model,
+    model_name,
 )
 from curvireg_torch.registration.contours import contour_support
 from curvireg_torch.synthetic import procedural_background
@@ -105,7 +106,7 @@ def test_logistic_model():
 
 @pytest.mark.parametrize("with_appearance", [True, False])
 def test_confidence_model_of_contours(with_appearance):
-    model = confidence_model("contours", with_camera=True, with_appearance=with_appearance)
+    model = confidence_model(model_name("contours", exact=True, with_appearance=with_appearance))
     tied = {"similarity": 0.7, "lead": 0.0, "edge_support": 0.5, "appearance_lead": 0.0, "concentration": 0.3}
     clear = {**tied, "lead": 5.0, "appearance_lead": 3.0, "concentration": 0.9}
     assert model(tied) < RELIABLE < model(clear)
@@ -123,10 +124,10 @@ def test_confidence_features():
     assert alone["lead"] is alone["appearance_lead"] is None
 
 
-def test_rescore_uses_pose_features_only_with_a_camera():
+def test_rescore_uses_pose_features_only_for_the_exact_mesh():
     evidence = torch.tensor([[0.0, 0.5, 0.3, 0.0], [-0.5, 0.6, 0.6, 0.1]], dtype=torch.float64)
-    assert rescore(evidence, with_camera=True).tolist() == pytest.approx([2.5 + 3.0, -0.5 + 3.0 + 6.0 + 0.1])
-    assert rescore(evidence, with_camera=False).tolist() == [0.0, -0.5]
+    assert rescore(evidence, exact=True).tolist() == pytest.approx([2.5 + 3.0, -0.5 + 3.0 + 6.0 + 0.1])
+    assert rescore(evidence, exact=False).tolist() == [0.0, -0.5]
 
 
 def test_confidence_is_higher_for_the_object_than_for_clutter():
@@ -158,9 +159,9 @@ def test_confidence_is_computed_from_the_reported_hypotheses(seed, camera):
     result = truck_registrar()([image], box[None], camera)[0]
     evidence = torch.tensor([list(h.evidence.values()) for h in result.hypotheses], dtype=torch.float64)
     concentration = float(ranking_evidence(result.ranking, truck_bank().rotations)[0, 2])
-    features = confidence_features(evidence, rescore(evidence, with_camera=camera is not None), concentration)
+    features = confidence_features(evidence, rescore(evidence, exact=camera is not None), concentration)
     assert result.confidence_features == pytest.approx(features)
-    model = confidence_model("contours", with_camera=camera is not None, with_appearance=False)
+    model = confidence_model(model_name("contours", exact=camera is not None, with_appearance=False))
     assert result.confidence == pytest.approx(model(features))
 
 
@@ -169,7 +170,7 @@ def test_confidence_without_contours_is_that_of_the_reported_view(monkeypatch):
     registrar = truck_registrar(search=False, contours=False)
     result = registrar([image], box[None], CAMERA)[0]
     assert tuple(result.confidence_features) == RANKING_FEATURES
-    assert result.confidence == pytest.approx(float(confidence(result.ranking, truck_bank().rotations)))
+    assert result.confidence == pytest.approx(float(confidence(result.ranking, truck_bank().rotations, exact=True)))
     monkeypatch.setattr(estimator_module, "rescore", lambda evidence, **_: evidence[:, 0].neg())  # another order
     other = registrar([image], box[None], CAMERA)[0]
     view = int(other.candidates[0])

@@ -9,6 +9,7 @@ import torch
 from curvireg_torch import Registration
 from curvireg_torch.matching import Ranking
 from curvireg_torch.registration import Hypothesis, Localization
+from curvireg_torch.registration.answer_set import AnswerSet
 from curvireg_torch.registration.document import localization_document, remarks, result_document
 
 
@@ -31,7 +32,7 @@ def registration(covariance=None, confidence=0.9, localization=None):
         )
         for view in (0, 1)
     )
-    return Registration(hypotheses, confidence, ranking, localization=localization)
+    return Registration(hypotheses, AnswerSet((confidence, 0.0)), ranking, localization=localization)
 
 
 class Bank(list):

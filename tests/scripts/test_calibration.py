@@ -19,7 +19,7 @@ from tests._support.scenes import CAMERA, scene, truck_bank
 pytest.importorskip("sklearn", reason="scikit-learn is not installed")
 from scripts.calibration import calibrate, quality
 
-MODEL = "contours, camera, appearance"
+MODEL = "contours, exact, appearance"
 
 
 def row(number, *, right=True, form="exact", kind=None, wrong=None, lead=3.0, similarity=0.7, **more):
@@ -30,7 +30,8 @@ def row(number, *, right=True, form="exact", kind=None, wrong=None, lead=3.0, si
     known = {"id": number, "form": form, "pose": "upright", "kind": kind, "like": mesh, "mesh": mesh, "wrong": wrong}
     known |= {"clutter": 3, "errors": [error, 120.0], "view_errors": [error], "ranking": ranking}
     known["evidence"] = [dict(zip(names, one, strict=True)) for one in evidence]
-    return known | {"fast": {"ranking": ranking, "error": error}} | more
+    unrefined = {name: known[name] for name in ("errors", "evidence", "ranking")}
+    return known | {"unrefined": {"appearance": unrefined, "no appearance": unrefined}} | more
 
 
 def logistic_rows(count, seed=0):
@@ -177,7 +178,7 @@ def test_page_has_a_line_for_each_model_and_set():
     constants, found = calibrate.calibrate(rows)
     record = {"date": "today", "commit": "abc", **constants, **found, "shares": quality.success_rates(rows)}
     covariance = {"n": 2, "inside": {"0.5": 1, "0.9": 1, "0.95": 2}}
-    record["real"] = {"lm": {**found["held_out"]["ranking, appearance"], "covariance": covariance}}
+    record["real"] = {"lm": {**found["held_out"]["ranking, exact, appearance"], "covariance": covariance}}
     text = quality.page(record)
     assert constants["confidence"].keys() == calibrate.MODELS.keys()
     for name in (*calibrate.MODELS, f"{MODEL}, in clutter", "lm"):
