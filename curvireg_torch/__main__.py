@@ -1,5 +1,20 @@
+"""The entry of the command line: ``curvireg`` and ``python -m curvireg_torch``."""
+
+import signal
 import sys
 
-from .cli import main
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # while modules are imported, Ctrl-C ends the process without a trace
 
-sys.exit(main())
+from .cli import main as run
+
+
+def main() -> int:
+    """Run one command, see :func:`curvireg_torch.cli.main`."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    return run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

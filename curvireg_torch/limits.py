@@ -13,6 +13,9 @@ MAX_IMAGE_PIXELS = 1 << 27
 MAX_IMAGE_SCANS = 64
 """Scans of a progressive JPEG. Encoders write about ten, and each takes as long to decode as the whole picture."""
 
+MAX_BOX_COORDINATE = 1e6
+"""Distance of a box's corner from the origin, px; no image is that wide."""
+
 MAX_MESH_BYTES = 1 << 29
 """Bytes of a mesh file, and of all the buffers of a glTF file together."""
 
@@ -24,6 +27,9 @@ MAX_MESH_LINES = 50_000_000
 
 MAX_MESH_COORDINATE = 1e12
 """Distance of a vertex from the origin along an axis, in the file's unit; squares and products stay finite."""
+
+MIN_MESH_EXTENT = 1e-6
+"""Longest side of a mesh's box, in the file's unit; of smaller ones single precision computes no views."""
 
 MAX_MESH_PARTS = 10_000
 """Nodes with a mesh in a glTF scene."""

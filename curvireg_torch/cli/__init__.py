@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import CurviregError
+from ..errors import CurviregError, CurviregWarning
 from ..utils.files import terminable
 from ..version import __version__
 from . import bank, cache, completion, demo, evaluate, follow, plot, register, schema, view
@@ -32,6 +32,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         try:
             return _run(parse(sys.argv[1:] if argv is None else argv))
+        except KeyboardInterrupt:
+            print("curvireg: interrupted", file=sys.stderr)
+            return 130
         finally:
             print(end="", flush=True)  # a closed pipe shows here and not at interpreter exit
     except BrokenPipeError:
@@ -75,11 +78,10 @@ def _run(arguments: argparse.Namespace) -> int:
             advice = "" if isinstance(error, CurviregError) else "; check that it exists and can be read"
             print(f"curvireg: error: {error}{advice}", file=sys.stderr)
             return 2
-        except KeyboardInterrupt:
-            print("curvireg: interrupted", file=sys.stderr)
-            return 130
     return 0
 
 
-def _show_warning(message: Any, *_: Any, **__: Any) -> None:
-    print(f"curvireg: warning: {message}", file=sys.stderr)
+def _show_warning(message: Any, category: type[Warning], *_: Any, **__: Any) -> None:
+    """Print a warning of ours; those of libraries, such as numpy's about division by zero, are for --debug."""
+    if category is UserWarning or issubclass(category, CurviregWarning):
+        print(f"curvireg: warning: {message}", file=sys.stderr)

@@ -5,10 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..errors import InvalidInputError
+from ..errors import InvalidInputError, MissingFileError
 from ..evaluation.registry import DATASETS
 from ..utils.choices import DEFAULT, PRESET_NAMES
-from .options import common_options, examples
+from ..utils.files import check_writable
+from .options import common_options, examples, whole_number
 
 PROTOCOL = (
     "cad=annotated|any|fused: the annotated CAD model, the best of the class, or one vote of all of the class; "
@@ -39,8 +40,14 @@ def add_parser(commands: Any) -> None:
         add("--protocol", nargs="+", default=[], metavar="KEY=VALUE", help=protocol)
         add("--preset", choices=sorted(PRESET_NAMES), default=DEFAULT, help=f"default: {DEFAULT}")
         add("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
-        add("--jobs", type=int, default=1, metavar="N", help="processes that divide the objects (default: 1)")
-        add("--limit", type=int, metavar="N", help="only N objects, spread evenly over the set")
+        add(
+            "--jobs",
+            type=whole_number(1),
+            default=1,
+            metavar="N",
+            help="processes that share the objects (default: 1)",
+        )
+        add("--limit", type=whole_number(1), metavar="N", help="only N objects, spread evenly over the set")
         add("--overwrite", action="store_true", help="replace the predictions of other settings")
         add("--out", type=Path, required=True, metavar="DIR")
         dataset.set_defaults(run=run, dataset=name)
@@ -48,6 +55,8 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Evaluate a dataset and print the headline."""
+    if not Path(arguments.root).is_dir():
+        raise MissingFileError("no such folder; datasets/README.md shows the layout", subject=arguments.root)
     from ..evaluation.workers import run_processes
 
     if run_processes(arguments.jobs, arguments.argv):
@@ -58,10 +67,13 @@ def run(arguments: argparse.Namespace) -> None:
 
     kind = DATASETS[arguments.dataset]
     dataset = kind.open(arguments.root, **kind.chosen(arguments))
+    benchmark = kind.scored(dataset, Protocol.parse(arguments.protocol, pose=kind.pose))
+    preset = arguments.preset if arguments.pipeline is None else Pipeline.read(arguments.pipeline)
+    check_writable(arguments.out, "--out")
     summary = evaluate(
-        kind.scored(dataset, Protocol.parse(arguments.protocol, pose=kind.pose)),
+        benchmark,
         arguments.out,
-        preset=arguments.preset if arguments.pipeline is None else Pipeline.read(arguments.pipeline),
+        preset=preset,
         limit=arguments.limit,
         renderer=arguments.renderer,
         overwrite=arguments.overwrite,

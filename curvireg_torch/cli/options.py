@@ -2,7 +2,7 @@
 
 import argparse
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,19 @@ def examples(*lines: str) -> dict[str, Any]:
     """Arguments for ``add_parser`` that show these command lines below the help."""
     epilog = "\n  ".join(["examples:", *lines])
     return {"epilog": epilog, "formatter_class": argparse.RawDescriptionHelpFormatter}
+
+
+def whole_number(low: int, high: int | None = None) -> Callable[[str], int]:
+    """A type of options: a whole number from ``low`` to ``high``."""
+    limits = f"of at least {low}" if high is None else f"from {low} to {high}"
+
+    def read(text: str) -> int:
+        number = int(text) if re.fullmatch(r"[-+]?\d{1,18}", text) else None
+        if number is None or number < low or (high is not None and number > high):
+            raise argparse.ArgumentTypeError(f"expected a whole number {limits}, got {text!r}")
+        return number
+
+    return read
 
 
 def common_options() -> argparse.ArgumentParser:
@@ -106,6 +119,7 @@ def register_options(
 
     from ..evaluation.opening import RegisterOptions
     from ..evaluation.prior_options import limits_from_options
+    from ..utils.checks import check_device
 
     names = {option.name for option in fields(RegisterOptions)} - {"photos", "meshes"}
     values: dict[str, Any] = {
@@ -114,6 +128,7 @@ def register_options(
         if name in names and value is not None
     }
     values["limits"] = limits_from_options(vars(arguments))
+    check_device(values.get("device", "cpu"), "--device")
     guess = "exif" if getattr(arguments, "exif", False) else getattr(arguments, "fov", None)
     return RegisterOptions(photos=tuple(photos), meshes=tuple(meshes), guess=guess, **values)
 
@@ -136,8 +151,13 @@ def split_numbers(words: Sequence[str]) -> list[str]:
         parts = re.split(r"[,\s]+", word.strip(", "))
         are_numbers = len(parts) <= expected and all(re.fullmatch(_NUMBER, part) for part in parts)
         expected = expected - len(parts) if are_numbers else 0
-        out += parts if are_numbers else [word]
+        out += map(_plain, parts) if are_numbers else [word]
     if ("--camera", "exif") in pairwise(out):
         place = out.index("--camera")
         out[place : place + 2] = ["--exif"]
     return out
+
+
+def _plain(number: str) -> str:
+    """A number as argparse takes it: it reads -1e3 as an option."""
+    return f"{float(number):f}" if re.match("-.*[eE]", number) else number

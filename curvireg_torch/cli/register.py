@@ -21,11 +21,15 @@ from .options import (
     mesh_options,
     pipeline_options,
     register_options,
+    whole_number,
 )
 
 if TYPE_CHECKING:
     from ..evaluation.lists import PhotoList
     from ..evaluation.opening import RegisterOptions
+
+MAX_FAILURES = 10
+"""Photographs of a list that could not be registered, of which the command prints the reason."""
 
 
 def add_parser(commands: Any) -> None:
@@ -66,7 +70,7 @@ def add_parser(commands: Any) -> None:
         "is known about the pose). Paths are relative to the list's folder. Empty cells mean: localize the object, no "
         "camera, MESH, what the options say. Or the same as JSON, COCO annotations, or the folder of a BOP scene",
     )
-    add("--every", type=int, default=1, metavar="N", help="use every N-th frame of videos (default: 1)")
+    add("--every", type=whole_number(1), default=1, metavar="N", help="use every N-th frame of videos (default: 1)")
     add_box_and_camera(
         parser,
         box="px; default: the object is localized",
@@ -78,11 +82,17 @@ def add_parser(commands: Any) -> None:
     add("--start", type=Path, metavar="FILE", help=start)
     add_pose_prior(parser)
     add_mesh_is(parser)
-    add("--instances", type=int, default=1, metavar="N", help="without a box: up to N objects (default: 1)")
+    add("--instances", type=whole_number(1), default=1, metavar="N", help="without a box: up to N objects (default: 1)")
     add("--field", type=Path, metavar="FILE", help="weights from curvireg bank --adapt")
-    add("--top", type=int, metavar="K", help="hypotheses to carry and report (default: 5)")
+    add("--top", type=whole_number(1), metavar="K", help="hypotheses to carry and report (default: 5)")
     add("--no-refine", dest="refine", action="store_false", help="stop at the best view of the bank")
-    add("--jobs", type=int, default=1, metavar="N", help="processes that divide several photographs (default: 1)")
+    add(
+        "--jobs",
+        type=whole_number(1),
+        default=1,
+        metavar="N",
+        help="processes for several photographs (default: 1)",
+    )
     add("--json", action="store_true", help="print only the results as JSON; --out is optional")
     add("--out", type=Path, metavar="DIR")
     parser.set_defaults(run=run)
@@ -143,8 +153,13 @@ def run(arguments: argparse.Namespace) -> None:
             return
         if arguments.json:
             print((out / "results.jsonl").read_text(encoding="utf-8"), end="")
+    notes = sys.stderr if arguments.json else sys.stdout
+    for failure in counts.failures[:MAX_FAILURES]:
+        print(f"failed: {failure}", file=notes)
+    if (more := len(counts.failures) - MAX_FAILURES) > 0:
+        print(f"failed: {more} more", file=notes)
     table = "" if arguments.out is None else f"; see {out}/results.csv"
-    print(f"{counts}{table}", file=sys.stderr if arguments.json else sys.stdout)
+    print(f"{counts}{table}", file=notes)
     if not counts.ok:
         raise InvalidInputError("no photograph could be registered; the message of each gives the reason")
 
@@ -152,7 +167,7 @@ def run(arguments: argparse.Namespace) -> None:
 def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, as_json: bool) -> None:
     import torch
 
-    from ..evaluation.lists import register_entry
+    from ..evaluation.lists import check_entry, register_entry
     from ..evaluation.opening import open_registrar
     from ..evaluation.result_files import write_lost, write_result
     from ..evaluation.store import to_json
@@ -162,7 +177,8 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
 
     start = time.perf_counter()
     path = options.photos[0]
-    photo = read_photo(path, dtype=torch.uint8)
+    photo, entry = read_photo(path, dtype=torch.uint8), options.entry(path)
+    check_entry(entry, photo)
     if out is not None:
         check_writable(out, "--out")
     registrar = open_registrar(options, options.meshes, field)
@@ -170,7 +186,7 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
     if options.box is None and options.start is None and options.progress:
         print(f"{path}: localizing the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
     try:
-        result, document = register_entry(options.entry(path), photo, registrar, bank_seconds=ready)
+        result, document = register_entry(entry, photo, registrar, bank_seconds=ready)
     except LostObjectError as error:
         if out is not None:
             write_lost(out, str(error))

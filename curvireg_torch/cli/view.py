@@ -15,6 +15,7 @@ from .options import (
     mesh_options,
     pipeline_options,
     register_options,
+    whole_number,
 )
 
 LOCAL = "127.0.0.1"
@@ -34,7 +35,7 @@ def add_parser(commands: Any) -> None:
     add_pose_prior(parser)
     hosts = f"who may connect: {LOCAL}, only this machine (default), or 0.0.0.0, everyone"
     parser.add_argument("--host", default=LOCAL, help=hosts)
-    parser.add_argument("--port", type=int, default=0, help="default: a free one")
+    parser.add_argument("--port", type=whole_number(0, 65535), default=0, help="default: a free one")
     parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
     add_mesh_is(parser)
     parser.set_defaults(run=run)

@@ -25,13 +25,12 @@ def write_result(
     Raises:
         OutputError: a file cannot be written.
     """
-    sheet = registration_sheet(registrar, result, image, box)
     mesh = registrar.bank.meshes[result.model]
     _remove(out)
-    write_file(out / "overlay.png", png(sheet))
+    write_file(out / "result.json", to_json(document).encode())  # first: no failure to draw it loses the result
+    write_file(out / "overlay.png", png(registration_sheet(registrar, result, image, box)))
     if len(mesh.faces) <= MAX_GLB_FACES:
         write_file(out / "pose.glb", pose_glb(mesh, *result.projection, image))
-    write_file(out / "result.json", to_json(document).encode())
 
 
 def write_lost(out: Path, message: str) -> None:

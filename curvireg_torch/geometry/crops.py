@@ -1,5 +1,6 @@
 """Boxes, and square crops of fixed size with their camera matrices."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -7,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
+from ..limits import MAX_BOX_COORDINATE
 from ..utils.checks import as_boxes, check_positive, check_tensor
 
 BLOCK = 16
@@ -26,8 +28,12 @@ def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
         x0, y0, x1, y1 = box
         number = f" {i}" if len(sizes) > 1 else ""
         name = f"box{number} ({x0:g}, {y0:g}, {x1:g}, {y1:g})"
-        if not all(abs(v) < 1e9 for v in box):
+        if not all(map(math.isfinite, box)):
             raise InvalidInputError(f"{name}: expected finite coordinates in px")
+        if max(map(abs, box)) > MAX_BOX_COORDINATE:
+            raise InvalidInputError(
+                f"{name}: coordinates beyond {MAX_BOX_COORDINATE:g} px; give pixel coordinates of the {W} x {H} image"
+            )
         if x1 <= x0 or y1 <= y0:
             raise InvalidInputError(f"{name}: expected X0 < X1 and Y0 < Y1; give corners, not width and height")
         if x1 <= -0.5 or y1 <= -0.5 or x0 >= W - 0.5 or y0 >= H - 0.5:

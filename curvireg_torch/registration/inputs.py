@@ -23,7 +23,7 @@ from ..utils.checks import (
 )
 from .plausibility import check_box_side, input_warnings
 
-__all__ = ["ImageItem", "check_crop", "image_items"]
+__all__ = ["ImageItem", "check_crop", "image_item", "image_items"]
 
 
 @dataclass(frozen=True)
@@ -86,15 +86,22 @@ def image_items(
 
     def item(i: int) -> ImageItem | CurviregError:
         try:
-            pixels = _pixels(images[i])
-            box = (whole_image_box(pixels) if boxes is None else boxes[i].detach()).cpu()
-            item = ImageItem(pixels, box if boxes is None else box.float(), cameras[i], priors[i])
+            item = image_item(images[i], None if boxes is None else boxes[i], cameras[i], priors[i])
             check_box_side(item.box, item.size)
             return item
         except CurviregError as error:
             return error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])]))
 
     return _OnDemand(item, n)
+
+
+def image_item(
+    image: Any, box: Tensor | None, camera_matrix: Tensor | None = None, prior: PosePrior | None = None
+) -> ImageItem:
+    """One photograph in any form, with its (4,) box (None: the whole image), however small that is."""
+    pixels = _pixels(image)
+    box = whole_image_box(pixels) if box is None else box.detach().float()
+    return ImageItem(pixels, box.cpu(), camera_matrix, prior)
 
 
 class _OnDemand(Sequence[ImageItem | CurviregError]):

@@ -34,9 +34,9 @@ def check_box_side(box: Tensor, size: tuple[int, int]) -> None:
     """Refuse a box of which less than ``MIN_BOX_SIDE`` px lie inside the (H, W) photograph in a direction."""
     side = _visible_side(box, size)
     if side < MIN_BOX_SIDE:
+        where = "the photograph has" if min(size) < MIN_BOX_SIDE else "the part of the photograph in the box has"
         raise InvalidInputError(
-            f"the box shows {side:.1f} px of the photograph on its shorter side, and at least {MIN_BOX_SIDE} are "
-            "needed; draw it around the object, or use a larger picture"
+            f"{where} {side:.1f} px on its shorter side, at least {MIN_BOX_SIDE} are needed; use a larger picture"
         )
 
 

@@ -45,10 +45,21 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 def write_csv(path: Path, rows: Iterable[Sequence[object]]) -> None:
-    """:func:`write_file` of rows of comma-separated cells."""
+    """:func:`write_file` of rows of comma-separated cells; an apostrophe precedes what a spreadsheet would compute."""
     text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows(rows)
+    csv.writer(text, lineterminator="\n").writerows(map(_inert, row) for row in rows)
     write_file(path, text.getvalue().encode())
+
+
+def _inert(cell: object) -> object:
+    """The cell, as a text that no spreadsheet takes for a formula; numbers are none."""
+    if not isinstance(cell, str) or not cell.startswith(("=", "+", "-", "@", "\t", "\r")):
+        return cell
+    try:
+        float(cell)
+        return cell
+    except ValueError:
+        return f"'{cell}"
 
 
 def check_writable(folder: Path, name: str) -> None:

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import CurviregError, InvalidInputError
+from ..errors import InvalidInputError
 from ..matching.fields import depth_filter
 from ..registration import Hypothesis, Registrar, Registration
-from ..registration.inputs import ImageItem, image_items
+from ..registration.inputs import ImageItem, image_item
 from ..terms import crop_regions, photograph_field
 from ..utils.checks import as_numbers, check_camera_matrix
 from .contours import draw_pose
@@ -75,10 +75,7 @@ def draw_window(
 
 
 def photograph_item(image: Any, box: Any) -> ImageItem:
-    item = image_items([image], as_numbers(box, "box")[None], None)[0]
-    if isinstance(item, CurviregError):
-        raise item
-    return item
+    return image_item(image, as_numbers(box, "box"))
 
 
 @torch.no_grad()

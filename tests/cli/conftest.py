@@ -14,13 +14,14 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def refused(capsys):
-    """Check that a command was refused with code 2 and one line that contains these texts."""
+    """Check that a command was refused with code 2 and one line that contains these texts; returns the line."""
 
     def check(code, *messages):
         (error,) = capsys.readouterr().err.splitlines()
         assert code == 2
         for message in messages:
             assert message in error
+        return error
 
     return check
 

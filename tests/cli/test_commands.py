@@ -1,8 +1,10 @@
 """``curvireg demo``, ``bank``, ``cache`` and ``--help``."""
 
 import json
+import signal
 import subprocess
 import sys
+import warnings
 
 import cv2
 import pytest
@@ -10,6 +12,7 @@ import torch
 import trimesh
 
 from curvireg_torch.cli import main
+from curvireg_torch.errors import CurviregWarning
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.models import LearnedCurvilinearSaliency
@@ -76,6 +79,31 @@ def test_demo_runs_as_a_module(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "demo" / "result.json").read_text())["rotation_error_deg"] < 15
     assert "error against the truth" in done.stdout
     assert (tmp_path / "demo" / "overlay.png").stat().st_size > 10_000
+
+
+def test_interruption_while_modules_are_imported_prints_nothing():
+    script = """
+import os, signal, sys
+class Interrupt:
+    def find_spec(name, *_):
+        if name == "curvireg_torch.cli":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupt)
+import curvireg_torch.__main__
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
+def test_main_prints_our_warnings_and_not_those_of_numpy(monkeypatch, capsys):
+    def warn(_):
+        warnings.simplefilter("always")
+        warnings.warn("of ours", CurviregWarning, stacklevel=1)
+        warnings.warn("of theirs", RuntimeWarning, stacklevel=1)
+
+    monkeypatch.setattr("curvireg_torch.cli.cache.run", warn)
+    assert main(["cache"]) == 0
+    assert capsys.readouterr().err == "curvireg: warning: of ours\n"
 
 
 def test_demo_files_agree_with_its_truth(tmp_path, monkeypatch, capsys):

@@ -97,7 +97,7 @@ def test_list_reports_every_row_in_order(register_list, tmp_path, capsys):
     assert documents[0]["columns"] == dict(zip(names, ROWS[0][0], strict=True))
     reliable = sum(row["reliable"] == "true" for row in rows)
     printed = capsys.readouterr().out.strip()
-    assert printed == f"15 photographs: 4 ok, 11 failed, {reliable} reliable; see {out}/results.csv"
+    assert printed.splitlines()[-1] == f"15 photographs: 4 ok, 11 failed, {reliable} reliable; see {out}/results.csv"
 
 
 def test_list_equals_single_photographs_bit_by_bit(folder, tmp_path):
@@ -200,6 +200,17 @@ def test_list_without_any_result_ends_with_code_2(register_list, refused, tmp_pa
     assert "no such file" in table(tmp_path / "out")[0]["message"]
 
 
+def test_list_names_what_failed(register_list, capsys, monkeypatch):
+    monkeypatch.setattr("curvireg_torch.cli.register.MAX_FAILURES", 1)
+    assert register_list("some.csv", HEADER, ["photos/0.png", *box_of(0)], ["a.png", *EMPTY], ["b.png", *EMPTY]) == 0
+    first, second, last = capsys.readouterr().out.splitlines()
+    assert first.startswith("failed: row 2: ")
+    assert first.count("a.png") == 1
+    assert "no such file" in first
+    assert second == "failed: 1 more"
+    assert last.startswith("3 photographs: 1 ok, 2 failed")
+
+
 @pytest.mark.parametrize(
     ("name", "content", "messages"),
     [
@@ -212,7 +223,9 @@ def test_list_without_any_result_ends_with_code_2(register_list, refused, tmp_pa
         ("csv", b"photo,x0,y0,x1,y1,x0\na.png,1,2,3,4,5\n", ["two columns x0"]),
         ("csv", b"photo,x0,y0,x1,y1,status\na.png,1,2,3,4,5\n", ["status", "rename"]),
         ("csv", b"photo,x0,y0,x1,y1\n\xff.png,1,2,3,4\n", ["UTF-8"]),
-        ("csv", b'photo,x0,y0,x1,y1\n"a.png,1,2,3,4\n', ["CSV"]),
+        ("csv", b'photo,x0,y0,x1,y1\n"a.png,1,2,3,4\n', ["not CSV"]),
+        ("csv", b"photo,x0,y0,x1,y1\n" + b"a" * 140_000 + b",1,2,3,4\n", ["not CSV", "field larger"]),
+        ("json", b"photo,x0,y0,x1,y1\na.png,1,2,3,4\n", ["not JSON", "named .csv"]),
         ("json", b"[1, 2]", ["list of objects"]),
         ("json", b"{", ["not JSON"]),
         ("json", b"[" * 100_000, ["not JSON"]),
@@ -225,7 +238,8 @@ def test_list_reports_unusable_files_in_one_line(register, refused, tmp_path, na
     path = tmp_path / f"list.{name}"
     if content is not None:
         path.write_bytes(content)
-    refused(register("--list", path, "truck.ply"), path.name, *messages)
+    line = refused(register("--list", path, "truck.ply"), path.name, *messages)
+    assert ("not JSON" in line) == ("not JSON" in messages)
 
 
 @pytest.mark.parametrize(
@@ -258,7 +272,7 @@ def test_parse_takes_options_between_photograph_and_mesh(folder, register):
 
 def test_list_refuses_unusable_options_and_foreign_results(register_list, refused, tmp_path):
     row = ["photos/0.png", *box_of(0)]
-    refused(register_list("options.csv", HEADER, row, words=["--top", "0"]), "hypotheses")
+    refused(register_list("options.csv", HEADER, row, words=["--field", "none.safetensors"]), "none.safetensors")
     assert not (tmp_path / "out" / "results.csv").exists()
     (tmp_path / "out").mkdir(exist_ok=True)
     (tmp_path / "out" / "results.jsonl").write_text('{"score": 1}\n')

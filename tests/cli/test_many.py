@@ -139,4 +139,3 @@ def test_register_every_nth_frame_of_a_video(folder, register, refused, tmp_path
         assert np.abs(cv2.imread(row["photo"]).astype(int) - expected).mean() < 6  # MJPG is lossy
     (folder / "none.mp4").write_bytes(b"not a video")
     refused(register(folder / "none.mp4", bank, out="none"), "none.mp4: not a video")
-    refused(register(folder / "turn.avi", bank, "--every", "0", out="none"), "--every")

@@ -93,6 +93,7 @@ def test_register_upright_mesh_with_another_up_axis(folder, register_one, docume
 def broken_files(folder):
     (folder / "empty.obj").write_text("")
     (folder / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
+    cv2.imwrite(str(folder / "dot.png"), np.zeros((1, 1, 3), np.uint8))
     (folder / "nan.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 nan\n0 1 0\n3 0 1 2\n")
     (folder / "broken.safetensors").write_bytes((folder / "truck.safetensors").read_bytes()[:1000])
 
@@ -111,7 +112,13 @@ def broken_files(folder):
         ({"mesh": "broken.safetensors"}, [], ["broken.safetensors", "build"]),
         ({"box": ["5", "5", "5", "9"]}, [], ["X0 < X1"]),
         ({"box": ["900", "5", "950", "9"]}, [], ["entirely outside"]),
-        ({}, ["--top", "0"], ["hypotheses"]),
+        ({"box": ["5", "5", "16.9", "90"]}, [], ["0.png", "11.9 px", "at least 12"]),
+        ({"box": ["-1e9", "5", "2e9", "90"]}, [], ["coordinates beyond 1e+06 px"]),
+        ({"photo": "dot.png", "box": ()}, [], ["dot.png", "the photograph has 1.0 px"]),
+        ({}, ["--device", "gpu"], ["--device: torch cannot use 'gpu' on this machine; choose from cpu"]),
+        ({}, ["--device", "meta"], ["--device: torch cannot use 'meta'"]),
+        ({}, ["--camera", "325", "242", "572", "573"], ["swap the halves: 572 573 325 242"]),
+        ({}, ["--camera", *CAMERA, "--distance", "2", "1"], ["distance: expected 0 < NEAR <= FAR"]),
         ({}, ["--field", "none"], ["none"]),
         ({}, ["--preset", "paper"], ["built with other settings"]),
         ({}, ["--pose", "upright"], ["--pose"]),
@@ -127,6 +134,45 @@ def broken_files(folder):
 @pytest.mark.usefixtures("broken_files")
 def test_register_reports_bad_input_in_one_line(register_one, refused, files, options, messages):
     refused(register_one(*options, "--no-refine", **files), *messages)
+
+
+def test_register_checks_box_and_camera_before_it_opens_a_bank(register_one, refused, monkeypatch):
+    monkeypatch.setattr("curvireg_torch.evaluation.opening.open_registrar", lambda *_: pytest.fail("opened"))
+    refused(register_one(box=["900", "5", "950", "90"]), "0.png: box", "entirely outside")
+    refused(register_one("--camera", "exif"), "0.png", "no focal length")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["register", "a.jpg", "b.stl", "--json", "--top", "-3"], "--top: expected a whole number of at least 1"),
+        (["register", "a.jpg", "b.stl", "--json", "--instances", "0"], "--instances: expected a whole number"),
+        (["register", "a.jpg", "b.stl", "--json", "--jobs", "1.5"], "at least 1, got '1.5'"),
+        (["register", "a.jpg", "b.stl", "--json", "--every", "0"], "--every: expected a whole number of at least 1"),
+        (["evaluate", "bop", "a", "--out", "b", "--limit", "0"], "--limit: expected a whole number of at least 1"),
+        (["view", "--port", "65536"], "--port: expected a whole number from 0 to 65535, got '65536'"),
+        (["view", "--port", "-1"], "--port: expected a whole number from 0 to 65535, got '-1'"),
+    ],
+)
+def test_whole_number_names_the_option_and_its_limits(capsys, words, message):
+    with pytest.raises(SystemExit, match="2"):
+        main(words)
+    assert message in capsys.readouterr().err
+
+
+def test_register_warns_of_a_questionable_camera(register_one, document, capsys):
+    assert register_one("--no-refine", "--camera", "119", "119", "260", "260") == 0
+    (line,) = document()["warnings"]
+    assert "FX FY and CX CY seem to be swapped" in line
+    assert f"0.png: {line}" in capsys.readouterr().err
+    assert document()["reliable"] is False
+
+
+def test_register_keeps_the_result_of_a_tiny_picture(folder, register_one, document):
+    picture = np.random.default_rng(0).integers(0, 255, (12, 12, 3)).astype(np.uint8)
+    cv2.imwrite(str(folder / "tiny.png"), picture)
+    assert register_one("--no-refine", photo="tiny.png", box=()) == 0
+    assert document()["warnings"]
 
 
 def test_register_debug_shows_the_traceback(register_one):

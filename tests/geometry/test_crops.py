@@ -117,7 +117,8 @@ def test_crop_images_is_batch_independent() -> None:
     ("box", "match"),
     [
         ([float("nan"), 0.0, 5.0, 5.0], "finite"),
-        ([0.0, 0.0, 1e9, 5.0], "finite"),
+        ([0.0, 0.0, float("inf"), 5.0], "finite"),
+        ([0.0, 0.0, 1e9, 5.0], r"beyond 1e\+06 px; give pixel coordinates of the 30 x 20"),
         ([5.0, 0.0, 5.0, 5.0], "X0 < X1"),
         ([0.0, 6.0, 5.0, 5.0], "X0 < X1"),
         ([-9.0, 0.0, -0.5, 5.0], "entirely outside the 30 x 20 image"),

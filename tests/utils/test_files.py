@@ -1,3 +1,4 @@
+import csv
 import errno
 import os
 import resource
@@ -10,7 +11,7 @@ import pytest
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregError, OutputError
-from curvireg_torch.utils.files import check_writable, write_file
+from curvireg_torch.utils.files import check_writable, write_csv, write_file
 
 OLD, NEW = b"a" * 1000, b"b" * 5_000_000
 
@@ -121,3 +122,11 @@ def test_write_file_keeps_the_old_content_if_killed(path: Path, monkeypatch: pyt
     assert path.read_bytes() == OLD
     (temporary,) = (other.name for other in path.parent.iterdir() if other != path)
     assert temporary.endswith(".tmp")
+
+
+def test_write_csv_leaves_nothing_to_a_spreadsheet_to_compute(tmp_path: Path) -> None:
+    cells = ["=1+1", "+cmd", "-2+3", "@sum", "\tx", "-1.5", "+2e-3", "a=b", "", -0.5]
+    write_csv(tmp_path / "t.csv", [cells])
+    with (tmp_path / "t.csv").open(newline="") as file:
+        (row,) = csv.reader(file)
+    assert row == ["'=1+1", "'+cmd", "'-2+3", "'@sum", "'\tx", "-1.5", "+2e-3", "a=b", "", "-0.5"]

@@ -46,17 +46,22 @@ def read_list(path: Path, meshes: Sequence[Path] = (), limits: Mapping[str, Any]
     if not path.is_file():
         raise MissingFileError(f"{path}: no such file; check the path of the list")
     check_table_size(path)
+    is_json = path.suffix.lower() == ".json"
     try:
         text = path.read_text(encoding="utf-8-sig")
-        if path.suffix.lower() != ".json":
+        if is_json:
+            content = json.loads(text)
+        else:
             table = csv.reader(io.StringIO(text, newline=""), strict=True)
             columns, *rows = [cells for cells in table if any(map(str.strip, cells))] or [[]]
-            return photo_list(str(path), columns, rows, path.parent, meshes, limits)
-        content = json.loads(text)
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InvalidInputError(f"{path}: not a table in UTF-8 ({error}); save it as CSV in UTF-8") from error
+    except UnicodeDecodeError as error:
+        raise InvalidInputError(f"{path}: not a text in UTF-8 ({error}); save it as CSV in UTF-8") from error
+    except csv.Error as error:
+        raise InvalidInputError(f"{path}: not CSV ({error}); save it as CSV in UTF-8") from error
     except (ValueError, RecursionError) as error:
-        raise InvalidInputError(f"{path}: not JSON ({error})") from error
+        raise InvalidInputError(f"{path}: not JSON ({error}); a table of commas is named .csv") from error
+    if not is_json:
+        return photo_list(str(path), columns, rows, path.parent, meshes, limits)
     if isinstance(content, dict) and {"images", "annotations"} <= set(content):
         return _from_rows(path, _coco_rows(path, content), path.parent, meshes, limits)
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):

@@ -15,6 +15,7 @@ from ...io import Photo, read_photo
 from ...registration import FailedRegistration, Registrar, Registration, localize
 from ...registration.correction import projected_box
 from ...registration.document import SCHEMA, localization_document, result_document, used_box
+from ...registration.inputs import image_items
 from ...utils.files import write_file
 from ...visualization.sheet import SheetEntry, thumbnail, write_sheet
 from ..runner import OpenRegistrar, run_items
@@ -22,19 +23,20 @@ from ..store import ResultStore, Row
 from .entries import Entry, PhotoList
 from .tables import write_bop_results, write_results
 
-__all__ = ["Counts", "register_entry", "register_list"]
+__all__ = ["Counts", "check_entry", "register_entry", "register_list"]
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Numbers of rows with a pose, without one, and with a reliable one."""
+    """Numbers of rows with a pose, and with a reliable one; ``failures``: number, name and reason of each other row."""
 
     ok: int
-    failed: int
     reliable: int
+    failures: tuple[str, ...]
 
     def __str__(self) -> str:
-        return f"{self.ok + self.failed} photographs: {self.ok} ok, {self.failed} failed, {self.reliable} reliable"
+        failed = len(self.failures)
+        return f"{self.ok + failed} photographs: {self.ok} ok, {failed} failed, {self.reliable} reliable"
 
 
 def register_list(
@@ -88,6 +90,19 @@ def _prepare(store: ResultStore) -> None:
         (store.folder / name).unlink(missing_ok=True)
 
 
+def check_entry(entry: Entry, photo: Photo) -> tuple[str, ...]:
+    """Refuse a box or camera that cannot be used, before meshes are opened; returns what is questionable about them.
+
+    Raises:
+        CurviregError: as :func:`register_entry`.
+    """
+    K, _ = _camera(entry, photo)
+    item = image_items([photo.image], None if entry.box is None else [entry.box], K, entry.prior)[0]
+    if isinstance(item, CurviregError):
+        raise item.with_subject(entry.name)
+    return item.warnings
+
+
 def register_entry(
     entry: Entry, photo: Photo, registrar: Registrar, *, bank_seconds: float
 ) -> tuple[Registration, Row]:
@@ -102,8 +117,6 @@ def register_entry(
     start = time.perf_counter()
     K, source = _camera(entry, photo)
     if entry.start is not None:
-        if K is None:
-            raise InvalidInputError("--start: needs the camera; give --camera FX FY CX CY", subject=entry.name)
         results = registrar.refine([photo.image], K, [entry.start])
     elif entry.box is None:
         results = localize(registrar, [photo.image], K, instances=entry.instances, prior=entry.prior)[0]
@@ -140,6 +153,8 @@ def _camera(entry: Entry, photo: Photo) -> tuple[torch.Tensor | None, str | None
     if entry.camera is not None:
         return camera_matrix(*entry.camera, dtype=torch.float64), "given"
     if entry.guess is None:
+        if entry.start is not None:
+            raise InvalidInputError("--start: needs the camera; give --camera FX FY CX CY", subject=entry.name)
         return None, None
     if isinstance(entry.guess, float):
         H, W = photo.image.shape[-2:]
@@ -177,8 +192,13 @@ def _thumbnail_path(out: Path, digests: Row) -> Path:
 
 def _write_tables(photos: PhotoList, out: Path, store: ResultStore) -> Counts:
     sheet = [_sheet_entry(entry, row, out) for entry, row in zip(photos.entries, _rows(photos, store), strict=True)]
-    kinds = [shown.kind for shown, _ in sheet]
-    counts = Counts(len(kinds) - kinds.count("failed"), kinds.count("failed"), kinds.count("reliable"))
+    failures = tuple(
+        f"row {shown.number}: " + ("" if shown.name in shown.caption else f"{shown.name}: ") + shown.caption
+        for shown, _ in sheet
+        if shown.kind == "failed"
+    )
+    reliable = sum(shown.kind == "reliable" for shown, _ in sheet)
+    counts = Counts(len(sheet) - len(failures), reliable, failures)
     sheet.sort(key=lambda pair: pair[1])
     several = any(len(entry.meshes) > 1 for entry in photos.entries)
     write_sheet(out / "index.html", str(counts), [shown for shown, _ in sheet], table="results.csv")

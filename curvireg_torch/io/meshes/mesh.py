@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...errors import CurviregWarning, MeshError, MissingFileError
-from ...limits import MAX_MESH_COORDINATE, MAX_MESH_FACES
+from ...limits import MAX_MESH_COORDINATE, MAX_MESH_FACES, MIN_MESH_EXTENT
 from ...utils.checks import check_option
 from ...utils.choices import MESHES, UNITS, UP_AXES
 from .colours import SurfaceColours, surface_colours
@@ -108,6 +108,9 @@ def _checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[NDArray[np.int
         raise MeshError(f"{count} faces have NaN or infinite vertices; repair the mesh", subject=name)
     if float(np.abs(corners).max()) > MAX_MESH_COORDINATE:
         raise MeshError(f"vertices farther than {MAX_MESH_COORDINATE:g} from the origin; repair the mesh", subject=name)
+    extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
+    if 0 < extent < MIN_MESH_EXTENT:
+        raise MeshError(f"only {extent:.1g} units across; scale it up, or export it in a smaller unit", subject=name)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     if not (area > 0).any():
         raise MeshError("every face is degenerate (area 0); repair the mesh", subject=name)

@@ -159,6 +159,7 @@ PLY += b"property list uchar int vertex_indices\nend_header\n"
         ("a.gltf", b'{"asset": ' + b"[" * 1_000_000, "JSON is damaged"),
         ("a.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", r"\(3, 2\)"),
         ("a.obj", b"v 0 0 0\nv 1e300 0 0\nv 0 1 0\nf 1 2 3\n", r"1e\+12"),
+        ("a.obj", b"v 0 0 0\nv 9e-7 0 0\nv 0 1e-9 0\nf 1 2 3\n", "only 9e-07 units across; scale it up"),
         ("a.obj", b"v 0 0 0\n" * 9 + b"f " + b"1 2 3 " * 2_000 + b"\n", "degenerate"),
     ],
 )
