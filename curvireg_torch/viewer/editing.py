@@ -16,11 +16,15 @@ __all__ = ["DisplayedPose", "fit_displayed", "move_displayed"]
 
 @dataclass(frozen=True)
 class DisplayedPose:
-    """The pose on the page: a hypothesis with its number from 0, and what the user did to it in words."""
+    """The pose on the page: a hypothesis with its number from 0, and what the user did to it in words.
+
+    ``chosen``: the user picked it as the answer among those that may be right.
+    """
 
     pose: Hypothesis
     number: int
     edits: tuple[str, ...] = ()
+    chosen: bool = False
 
 
 def move_displayed(

@@ -130,6 +130,8 @@ class Panels:
         if not result.document["reliable"]:
             confidence += ": no reliable match; take the pose as a guess"
         rival = f"hypothesis {displayed.number + 1}, a rival; of the first: " if displayed.number else ""
+        if displayed.chosen:
+            rival = f"hypothesis {displayed.number + 1}, picked by you; of the first: "
         lines += [rival + confidence, *remarks(result.document)]
         if displayed.edits:
             lines.append(f"by hand: {'; '.join(displayed.edits)}; the command line gives the result before that")
@@ -149,6 +151,7 @@ class Panels:
     async def _draw_hypotheses(self) -> None:
         result, _ = self.session.require_result()
         registrar, hypotheses = result.registrar, result.registration.hypotheses
+        answers = result.registration.answer_set
 
         def make() -> Any:
             cards = []
@@ -159,20 +162,25 @@ class Panels:
                 evidence = ", ".join(f"{name} {value:.2f}" for name, value in pose.evidence.items())
                 renderer = registrar.describers[pose.model].renderer
                 picture = thumbnail(renderer, pose.projection, result.image, result.box.tolist())
-                cards.append((picture, f"{number}: score {pose.score:.2f}{away}\n{support}{evidence}"))
+                probability = f"{number}: probability {answers.probabilities[number - 1]:.2f}{away}"
+                cards.append((picture, f"{probability}\nscore {pose.score:.2f}, {support}{evidence}"))
             return cards
 
         cards = await self.host.run(make)
         for number, card in enumerate(await self._draw_cards("answer", cards or [], 240, "jpeg")):
             with card:
-                ui.button("show", on_click=lambda number=number: self._display(number)).props(
-                    f"flat dense no-caps data-testid=show-{number + 1}"
-                )
+                self._build_display_button("show", number, chosen=False)
+                if len(answers.members) > 1 and number in answers.members:
+                    self._build_display_button("could be this: pick it", number, chosen=True)
 
-    async def _display(self, number: int) -> None:
-        if not self.host.busy:
-            self.session.display(number)
-            await self.host.show_pose()
+    def _build_display_button(self, text: str, number: int, *, chosen: bool) -> None:
+        async def display() -> None:
+            if not self.host.busy:
+                self.session.display(number, chosen=chosen)
+                await self.host.show_pose()
+
+        name = f"{'pick' if chosen else 'show'}-{number + 1}"
+        ui.button(text, on_click=display).props(f"flat dense no-caps data-testid={name}")
 
     async def _draw_fields(self) -> None:
         result, displayed = self.session.require_result()

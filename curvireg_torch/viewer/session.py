@@ -182,10 +182,10 @@ class Session:
         localization = {} if self.result is None else self.result.document.get("localization", {})
         return [proposal["box"] for proposal in localization.get("proposals", [])[:MAX_PROPOSALS]]
 
-    def display(self, number: int) -> None:
-        """Put a hypothesis on the page, by its number from 0."""
+    def display(self, number: int, *, chosen: bool = False) -> None:
+        """Put a hypothesis on the page, by its number from 0; ``chosen`` if the user picks it as the answer."""
         assert self.result is not None
-        self.displayed = DisplayedPose(self.result.registration.hypotheses[number], number)
+        self.displayed = DisplayedPose(self.result.registration.hypotheses[number], number, chosen=chosen)
 
     def move(self, *, rotation: Sequence[float] = (0, 0, 0), translation: Sequence[float] = (0, 0, 0)) -> None:
         """Change the displayed pose, see :func:`~curvireg_torch.viewer.editing.move_displayed`."""
@@ -201,7 +201,7 @@ class Session:
     def document(self) -> dict[str, Any]:
         """``result.json`` of the command line; ``viewer`` holds that command line and the displayed pose."""
         result, displayed = self.require_result()
-        edits = {"hypothesis": displayed.number, "by_hand": list(displayed.edits)}
+        edits = {"hypothesis": displayed.number, "chosen": displayed.chosen, "by_hand": list(displayed.edits)}
         return {**result.document, "viewer": {"command": result.command, **edits, **displayed.pose.pose_dict()}}
 
     def json(self) -> bytes:

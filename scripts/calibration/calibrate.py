@@ -15,6 +15,7 @@ sets in DATA, with the predictions that ``curvireg evaluate --out RUNS/NAME`` wr
 """
 
 import argparse
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -234,6 +235,8 @@ def main() -> None:
     record |= {"shares": success_rates(rows), "verdict": {"used": list(WEIGHTS), "fitted": fit_rescoring(rows)}}
     if arguments.real:
         record["real"] = {name: real_set(*arguments.real, name, constants["covariance"]) for name in REAL_SETS}
+        summaries = {name: (arguments.real[1] / name / "summary.json").read_text() for name in REAL_SETS}
+        record["real_answer_sets"] = {name: json.loads(text)["answer_set"] for name, text in summaries.items()}
     write_json(RECORD, record)
     update_page(PAGE, "calibration", page(record))
     print(page(record))

@@ -280,3 +280,10 @@ def test_register_is_cancelled_by_the_limit_and_by_the_user(monkeypatch):
     monkeypatch.setattr(session, "_progress_callback", cancel_first)
     with pytest.raises(CurviregError, match=r"^stopped$"):
         session.register()
+
+
+def test_a_picked_hypothesis_is_recorded_as_the_users_choice(session):
+    session.display(1, chosen=True)
+    assert session.document()["viewer"]["chosen"]
+    session.display(0)
+    assert not session.document()["viewer"]["chosen"]
