@@ -9,7 +9,7 @@ import torch
 
 from curvireg_torch import Pipeline, Registrar, ViewMatcher
 from curvireg_torch.settings import BankSettings, ViewPolicy
-from scripts.speed import filters, pipeline
+from scripts.speed import filters, paired, pipeline
 from tests._support.pretended import PRETENDING, pretended_gpu
 from tests._support.scenes import scene, truck_bank
 
@@ -38,6 +38,29 @@ def test_pipeline_times_are_of_the_device(on_gpu, monkeypatch):
     assert set(times) == set(json.loads(PIPELINE_RECORD.read_text())["times"])
     assert all(value > 0.0 for value in times.values())
     assert used[-3:] == [device.type] * 3  # the earlier banks are read from disk
+
+
+def test_paired_steps_keep_the_least_of_each_checkout(tmp_path, monkeypatch, capsys):
+    """Megabytes rise with each call, seconds fall; the earlier checkout takes twice as long."""
+    calls = []
+
+    def measured(step, checkout, *others):
+        calls.append((step, checkout.name, others[1].name))
+        return {"seconds": (2.0 if checkout == tmp_path else 1.0) / len(calls), "megabytes": float(len(calls))}
+
+    monkeypatch.setattr(paired, "measured", measured)
+    monkeypatch.setattr(paired, "run", lambda *inputs: (inputs[2] / "case.json").write_text('{"faces": 9}'))
+    out = tmp_path / "paired.json"
+    words = ["--faces", "1", "9", "--megapixels", "0.3", "2", "--rounds", "2", "--out", str(out)]
+    paired.main(["--against", str(tmp_path), *words])
+    record = json.loads(out.read_text())
+    assert [(case["faces"], case["megapixels"]) for case in record["cases"]] == [(9, 0.3), (9, 0.3), (9, 2.0)]
+    assert calls[:2] == [("one", tmp_path.name, "before"), ("one", paired.ROOT.name, "now")]
+    assert calls[2:4] == [("cold", tmp_path.name, "before"), ("cold", paired.ROOT.name, "now")]
+    first = record["cases"][0]
+    assert first["now"]["cold"] == {"seconds": 1.0 / 16, "megabytes": 4.0}
+    assert first["before"]["cold"] == {"seconds": 2.0 / 15, "megabytes": 3.0}
+    assert "| 9 | 0.3 | cold | 0.13 s, 3 MB | 0.06 s, 4 MB | 0.47 |" in capsys.readouterr().out
 
 
 def row(number, *, right, preset="learned", linemod=False):
