@@ -12,12 +12,12 @@ from scipy.stats import chi2
 from curvireg_torch import Registrar
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol
-from curvireg_torch.registration import ranking_evidence, rescoring
+from curvireg_torch.registration import AnswerSet, ranking_evidence, rescoring
 from tests._support.real_data import real_data
 from tests._support.scenes import CAMERA, scene, truck_bank
 
 pytest.importorskip("sklearn", reason="scikit-learn is not installed")
-from scripts.calibration import calibrate, quality
+from scripts.calibration import answer_sets, calibrate, quality
 
 MODEL = "contours, exact, appearance"
 
@@ -199,3 +199,35 @@ def test_features_of_match_the_registration(camera, monkeypatch):
     stored["evidence"] = [dict(h.evidence) for h in result.hypotheses]
     stored["ranking"] = ranking_evidence(result.ranking, truck_bank().rotations)[0].tolist()
     assert calibrate.features_of(stored)[0] == pytest.approx(result.confidence_features)
+
+
+def test_fit_answers_recovers_the_probabilities_of_rivals():
+    """Where the first of three answers is wrong, the rivals are right in proportion to exp(0.5 lead), none to e."""
+    rng = np.random.default_rng(0)
+    cases = []
+    for lead in rng.uniform(0, 4, 3000):
+        logits = np.array([0.0, -0.5 * lead, 1.0])
+        p = np.exp(logits) / np.exp(logits).sum()
+        right = np.zeros(4, dtype=bool)
+        right[1 + rng.choice(3, p=p)] = True
+        cases.append((torch.tensor([9.0, lead, 0.0]), right))
+    constants = answer_sets.fit_answers(cases)
+    assert constants["slope"] == pytest.approx(0.5, abs=0.06)
+    assert constants["none"] == pytest.approx(1.0, abs=0.1)
+
+
+def test_fit_answer_sets_covers_nine_of_ten_held_out_photographs():
+    rows = logistic_rows(2000)
+    _, used, confidence, _ = calibrate.fit_confidence(rows, MODEL)
+    fold = calibrate.folds_of(used)
+    constants, found = answer_sets.fit_answer_sets(used, MODEL, confidence, fold)
+    assert found["n"] == 2000
+    assert found["coverage"] == pytest.approx(0.9, abs=0.03)
+    assert 1.0 <= found["mean_size"] <= 3.0
+    assert 0.0 < constants["threshold"] <= 1.0
+
+
+def test_probability_before_the_first_right_answer():
+    answers = AnswerSet((0.5, 0.12, 0.3))
+    for right, before in {0: 0.0, 2: 0.5, 1: 0.8, 3: 0.92}.items():
+        assert answer_sets.probability_before(answers, np.arange(4) == right) == pytest.approx(before)
