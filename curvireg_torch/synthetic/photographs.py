@@ -1,4 +1,4 @@
-"""Synthetic photographs with known pose, for the demo and for tests."""
+"""Synthetic photographs of a mesh before clutter, with known pose."""
 
 import math
 
@@ -7,37 +7,16 @@ import torch.nn.functional as F
 import trimesh
 from torch import Tensor
 
-from .errors import InvalidInputError
-from .filters import gaussian_smooth
-from .geometry.cameras import rotation_towards, transform
-from .geometry.viewpoint import rotation_from_viewpoint
-from .io.meshes.mesh import mesh_centre, mesh_radius
-from .rendering import render_depth
+from ..errors import InvalidInputError
+from ..filters import gaussian_smooth
+from ..geometry.cameras import rotation_towards, transform
+from ..geometry.viewpoint import rotation_from_viewpoint
+from ..io.meshes.mesh import mesh_centre, mesh_radius
+from ..rendering import render_depth
 
-__all__ = ["example_mesh", "procedural_background", "random_pose", "synthesize_photograph"]
+__all__ = ["procedural_background", "random_pose", "synthesize_photograph"]
 
 DEFOCUS = 1.5  # blur of the background in px
-
-
-def example_mesh() -> trimesh.Trimesh:
-    """A toy truck, 0.25 m long, without symmetries; z up, front along -y, in metres."""
-    box, cylinder = trimesh.creation.box, trimesh.creation.cylinder
-    shift = trimesh.transformations.translation_matrix
-    across = trimesh.transformations.rotation_matrix(math.pi / 2, [0, 1, 0])
-    parts = [
-        box((0.09, 0.25, 0.02), transform=shift((0, 0, 0.045))),  # frame
-        box((0.09, 0.06, 0.075), transform=shift((0, -0.09, 0.09))),  # cabin
-        box((0.085, 0.03, 0.03), transform=shift((0, -0.133, 0.07))),  # bonnet
-        box((0.1, 0.15, 0.012), transform=shift((0, 0.045, 0.06))),  # bed
-        box((0.008, 0.15, 0.035), transform=shift((0.046, 0.045, 0.08))),  # one high side
-        box((0.1, 0.008, 0.05), transform=shift((0, 0.118, 0.085))),  # tailgate
-        cylinder(0.008, 0.1, transform=shift((-0.035, -0.05, 0.13))),  # chimney
-    ]
-    for x in (-0.05, 0.05):
-        parts += [cylinder(0.03, 0.02, transform=shift((x, y, 0.03)) @ across) for y in (-0.085, 0.055, 0.1)]
-    mesh = trimesh.util.concatenate(parts)
-    mesh.units = "m"
-    return mesh
 
 
 def procedural_background(size: tuple[int, int], generator: torch.Generator) -> Tensor:
