@@ -32,8 +32,8 @@ def registration_sheet(
 ) -> np.ndarray:
     """The photograph with the pose's contours and a caption; below it a close-up, the compared fields and the rivals.
 
-    The photograph's longer side becomes 960 to 1600 px. The caption of a rival is its rotation from the answer and its
-    score. Arguments as for :func:`contour_overlay`.
+    The photograph's longer side becomes 960 to 1600 px. Below a rival stand its rotation from the answer and its
+    probability, and "could be" if it is in the answer set. Arguments as for :func:`contour_overlay`.
 
     Returns:
         (H', W', 3) uint8 RGB.
@@ -66,13 +66,14 @@ def _draw_caption(
 ) -> None:
     """Verdict and pose in words, and the meaning of the colours."""
     x, y = corner
-    word, font = verdict(result.confidence), ImageFont.load_default(size)
+    word, font = verdict(result.confidence, result.reliable), ImageFont.load_default(size)
     badge = f"{word}: confidence {math.floor(100 * result.confidence) / 100:.2f}"  # 0.896 is not yet 0.90, reliable
     right = x + draw.textlength(badge, font) + size
     draw.rounded_rectangle((x, y, right, y + 1.6 * size), 0.5 * size, VERDICT_COLOURS[word])
     draw.text((x + size / 2, y + 0.8 * size), badge, PAPER, font, anchor="lm")
     mesh = registrar.bank.meshes[result.model]
-    pose = pose_in_words(result.rotation, mesh_up(mesh))
+    front = None if result.prior is None else result.prior.front
+    pose = pose_in_words(result.rotation, up=mesh_up(mesh), front=front)
     if result.translation is not None:
         pose += f", {float(f'{result.distance:.3g}'):g} {mesh_unit(mesh) or 'units'} away"
     if len(registrar.bank.meshes) > 1:
@@ -102,15 +103,16 @@ def _small_pictures(
     found = [
         (text, cv2.resize(sides[name], (side, side), interpolation=cv2.INTER_CUBIC)) for name, text in names.items()
     ]
-    rivals = [(_rival(result, number), draw(h)) for number, h in enumerate(result.hypotheses[1:], start=2)]
+    rivals = [(_rival(result, index), draw(h)) for index, h in enumerate(result.hypotheses) if index]
     return [("close-up", draw(result)), *found, *rivals]
 
 
-def _rival(result: Registration, number: int) -> str:
-    this = result.hypotheses[number - 1]
-    if this.model != result.model:
-        return f"rival {number}: mesh {this.model}, score {this.score:.2f}"
-    return f"rival {number}: {float(rotation_error(this.rotation, result.rotation)):.0f}° away, score {this.score:.2f}"
+def _rival(result: Registration, index: int) -> str:
+    this, answers = result.hypotheses[index], result.answer_set
+    word = "could be" if index in answers.members else "rival"
+    angle = f"{float(rotation_error(this.rotation, result.rotation)):.0f}° away"
+    where = angle if this.model == result.model else f"mesh {this.model}"
+    return f"{word}: {where} ({answers.probabilities[index]:.2f})"
 
 
 def _close_up(item: ImageItem) -> Window:

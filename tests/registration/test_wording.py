@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from curvireg_torch.geometry import rotation_from_viewpoint
-from curvireg_torch.geometry.viewpoint import up_rotation
+from curvireg_torch.geometry.pose_prior import object_frame
 from curvireg_torch.registration.wording import pose_in_words, verdict
 
 
@@ -23,8 +23,8 @@ from curvireg_torch.registration.wording import pose_in_words, verdict
 def test_pose_in_words(viewpoint, words):
     R = rotation_from_viewpoint(*torch.tensor(viewpoint, dtype=torch.float64))
     assert pose_in_words(R) == words
-    for up in ("y", "-x"):
-        assert pose_in_words(R @ up_rotation(up), up) == words
+    for up, front in (("y", None), ("-x", None), ("z", "x")):
+        assert pose_in_words(R @ object_frame(up, front), up=up, front=front) == words
 
 
 def test_pose_in_words_tilts_as_the_photograph_shows():
@@ -35,6 +35,6 @@ def test_pose_in_words_tilts_as_the_photograph_shows():
 
 
 def test_verdict_has_three_words():
-    assert [verdict(c) for c in (1.0, 0.9, 0.899, 0.5, 0.499, 0.0)] == ["likely"] * 2 + ["unsure"] * 2 + [
-        "no match"
-    ] * 2
+    """A high confidence that is not reliable, because of a questionable camera, is no reason to be sure."""
+    cases = {(0.95, True): "likely", (0.95, False): "unsure", (0.5, False): "unsure", (0.499, False): "no match"}
+    assert {case: verdict(*case) for case in cases} == cases
