@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from curvireg_torch.rendering.embree import RayScene
-from curvireg_torch.training.scenes.light import random_light, shade_points
+from curvireg_torch.training.scenes.light import Light, random_light, shade_points
 from curvireg_torch.training.scenes.materials import random_picture
 from curvireg_torch.training.scenes.rotations import random_rotation
 
@@ -205,9 +205,20 @@ def appearance_symmetries(
 
 
 def render(
-    shapes: list[TexturedMesh], R, t, K, size: tuple[int, int], rng: np.random.Generator
+    shapes: list[TexturedMesh],
+    R,
+    t,
+    K,
+    size: tuple[int, int],
+    rng: np.random.Generator,
+    *,
+    light: Light | None = None,
+    background: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Linear picture (H, W, 3), mask of the first shape in it, and mask of that shape without the others."""
+    """Linear picture (H, W, 3), mask of the first shape in it, and mask of that shape without the others.
+
+    ``light`` and ``background``, a square linear picture of any size behind everything, are random unless given.
+    """
     H, W = size
     h, w = round(SUPERSAMPLING * H), round(SUPERSAMPLING * W)
     zoom = np.array([[w / W, 0, 0.5 * (w / W - 1)], [0, h / H, 0.5 * (h / H - 1)], [0, 0, 1.0]])
@@ -233,10 +244,12 @@ def render(
         gloss[mask] *= rng.uniform(0, 1.5)
     view = -points / np.linalg.norm(points, axis=1, keepdims=True)
     normal *= np.sign((normal * view).sum(axis=1, keepdims=True) + 1e-12)
-    light = shade_points(scene, points, normal, colour, np.clip(gloss, 0, 1), shine, random_light(R[:, 2], rng))
+    light = random_light(R[:, 2], rng) if light is None else light
+    lit = shade_points(scene, points, normal, colour, np.clip(gloss, 0, 1), shine, light)
     side = max(h, w)
-    picture = random_picture(rng, side)[:h, :w].reshape(-1, 3).astype(np.float32)
-    picture[hit] = light
+    background = random_picture(rng, side) if background is None else cv2.resize(background, (side, side))
+    picture = background[:h, :w].reshape(-1, 3).astype(np.float32)
+    picture[hit] = lit
     seen = np.zeros(h * w, np.float32)
     seen[hit[owner == 0]] = 1.0
     flat = placed[0].hull_points() @ (zoom @ K).T

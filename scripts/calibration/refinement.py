@@ -3,7 +3,8 @@
     python scripts/calibration/refinement.py BENCH --out ROWS.jsonl [--half held-out] [--limit 150] [--jobs 2] [--write]
 
 For each "exact" photograph, starts are the true pose rotated by 5 to 30 degrees about a random axis, or moved by 5 to
-20 % of the distance, and the same true pose in the photograph of another object. A row says where the refinement ended.
+20 % of the distance, and the same true pose in the photograph of another object. A row says where the refinement ended,
+and where cv2.rapid ended from the same start (skipped where it is absent, see scripts/_rapid.py).
 --write fits the confidence (within 10 degrees and 10 % of the distance) on half of the meshes, reports it on the other
 half, stores its weights in curvireg_torch/registration/refinement.json, and the table in
 scripts/results/refinement_basin.json and docs/guides/known-pose.md.
@@ -27,6 +28,7 @@ import curvireg_torch as cr
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.io import read_image
 from curvireg_torch.registration import refinement
+from scripts._rapid import AVAILABLE, Rapid
 from scripts._shared import REPOSITORY, commit, table_lines, today, update_page, write_json
 
 ANGLES, DISTANCES = (5.0, 10.0, 15.0, 20.0, 30.0), (0.05, 0.1, 0.2)
@@ -51,6 +53,7 @@ def rows_of(task: dict[str, Any]) -> list[Any]:
     mesh = cr.load_mesh(task["folder"] / task["items"][0]["mesh"])
     views = cr.sample_views(azimuth_step=90, elevations=[0])
     registrar = cr.Registrar(cr.ViewBank.build(mesh, views, progress=False))
+    rapid = Rapid(mesh, steps=100) if AVAILABLE else None
     rows = []
     for item in task["items"]:
         T = torch.eye(4, dtype=torch.float64)
@@ -61,15 +64,25 @@ def rows_of(task: dict[str, Any]) -> list[Any]:
         kinds.append(("absent", 0.0, 0.0))
         for kind, angle, distance in kinds:
             shown = read_image(folder / item["other"]) if kind == "absent" else image
-            result = registrar.refine([shown], K, [start_of(T, angle, distance, generator)])[0]
+            start = start_of(T, angle, distance, generator)
+            result = registrar.refine([shown], K, [start])[0]
             row = {"id": item["id"], "mesh": item["mesh"], "kind": kind, "angle": angle, "distance": distance}
             row |= {"visible": item["visible"], "clutter": item["clutter"], "lost": not result.ok}
             if result.ok:
-                row |= dict(result.confidence_features)
-                row["rotation_error"] = float(cr.rotation_error(result.rotation, T[:3, :3] @ symmetries).min())
-                row["position_error"] = float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm())
+                row |= dict(result.confidence_features) | errors(result.transform, T, symmetries)
+            if rapid and kind != "absent":
+                ended = rapid((shown * 255).round().byte(), K, start)
+                row["rapid"] = {"lost": True} if ended is None else {"lost": False} | errors(ended, T, symmetries)
             rows.append(row)
     return rows
+
+
+def errors(ended: Tensor, T: Tensor, symmetries: Tensor) -> dict[str, float]:
+    """Error of the rotation in degrees, and of the translation as a fraction of the distance."""
+    return {
+        "rotation_error": float(cr.rotation_error(ended[:3, :3], T[:3, :3] @ symmetries).min()),
+        "position_error": float((ended[:3, 3] - T[:3, 3]).norm() / T[:3, 3].norm()),
+    }
 
 
 def measure(folder: Path, out: Path, half: str, limit: int, jobs: int) -> list[dict[str, Any]]:
@@ -96,7 +109,7 @@ def measure(folder: Path, out: Path, half: str, limit: int, jobs: int) -> list[d
 
 def is_right(row: dict[str, Any], degrees: float, fraction: float) -> bool:
     """Whether a refinement ended near the truth."""
-    ended = row["kind"] != "absent" and not row["lost"]
+    ended = row.get("kind") != "absent" and not row["lost"]
     return ended and row["rotation_error"] <= degrees and row["position_error"] <= fraction
 
 
@@ -120,11 +133,9 @@ def report(rows: list[dict[str, Any]]) -> dict[str, Any]:
     for kind, size in [*(("rotation", a) for a in ANGLES), *(("distance", d) for d in DISTANCES)]:
         mine = [row for row in rows if row["kind"] == kind and size in (row["angle"], row["distance"])]
         name = f"{size:g}°" if kind == "rotation" else f"{100 * size:g} % of the distance"
-        basin[name] = {
-            "n": len(mine),
-            "within 2 degrees and 2 %": sum(is_right(row, 2.0, 0.02) for row in mine) / len(mine),
-            "within 5 degrees and 5 %": sum(is_right(row, 5.0, 0.05) for row in mine) / len(mine),
-        }
+        basin[name] = fractions_right(mine)
+        if rapid := [row["rapid"] for row in mine if "rapid" in row]:
+            basin[name]["cv2.rapid"] = fractions_right(rapid)
     confidence = model.predict_proba(X)[:, 1]
     lost = confidence < refinement.LOST
     return {
@@ -141,6 +152,13 @@ def report(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def fractions_right(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Number of rows, and the fractions of them that ended near the truth."""
+    limits = {"within 2 degrees and 2 %": (2.0, 0.02), "within 5 degrees and 5 %": (5.0, 0.05)}
+    right = {name: sum(is_right(row, *limit) for row in rows) / len(rows) for name, limit in limits.items()}
+    return {"n": len(rows), **right}
+
+
 def fraction_of(chosen: Any, among: list[bool]) -> float:
     """Fraction of the marked rows that are chosen, to three digits."""
     return round(float(chosen[among].mean()), 3)
@@ -149,12 +167,17 @@ def fraction_of(chosen: Any, among: list[bool]) -> float:
 def page_table(found: dict[str, Any]) -> str:
     """The table of docs/guides/known-pose.md."""
     columns = ("within 2 degrees and 2 %", "within 5 degrees and 5 %")
-    rows = [[name, *(f"{row[column]:.2f}" for column in columns)] for name, row in found["basin"].items()]
-    n = next(iter(found["basin"].values()))["n"]
+    first = next(iter(found["basin"].values()))
+    n, beside = first["n"], "cv2.rapid" in first
+    rows = []
+    for name, row in found["basin"].items():
+        both = [row, row["cv2.rapid"]] if beside else [row]
+        rows.append([name, *(f"{one[column]:.2f}" for one in both for column in columns)])
+    header = [*columns, *(f"`cv2.rapid`: {column}" for column in columns if beside)]
     lost = found["lost"]
     return "\n".join(
         [
-            *table_lines([["start is off by", *columns], *rows]),
+            *table_lines([["start is off by", *header], *rows]),
             "",
             f"N = {n} generated photographs of held-out meshes in clutter, {found['occluded']:.0%} of them at least "
             f"5 % hidden; {found['date']}, commit {found['commit']}.",

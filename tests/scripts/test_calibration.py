@@ -17,7 +17,7 @@ from tests._support.real_data import real_data
 from tests._support.scenes import CAMERA, scene, truck_bank
 
 pytest.importorskip("sklearn", reason="scikit-learn is not installed")
-from scripts.calibration import answer_sets, calibrate, quality
+from scripts.calibration import answer_sets, calibrate, quality, refinement
 
 MODEL = "contours, exact, appearance"
 
@@ -231,3 +231,24 @@ def test_probability_before_the_first_right_answer():
     answers = AnswerSet((0.5, 0.12, 0.3))
     for right, before in {0: 0.0, 2: 0.5, 1: 0.8, 3: 0.92}.items():
         assert answer_sets.probability_before(answers, np.arange(4) == right) == pytest.approx(before)
+
+
+def test_basin_counts_refined_poses_and_those_of_rapid():
+    near = {"lost": False, "rotation_error": 3.0, "position_error": 0.01}
+    exact = {"lost": False, "rotation_error": 1.0, "position_error": 0.01}
+    assert refinement.fractions_right([exact, near, {"lost": True}, {**exact, "position_error": 0.1}]) == {
+        "n": 4,
+        "within 2 degrees and 2 %": 0.25,
+        "within 5 degrees and 5 %": 0.5,
+    }
+
+
+def test_basin_page_has_the_recorded_table():
+    record = json.loads((calibrate.REPOSITORY / "scripts/results/refinement_basin.json").read_text())
+    page = (calibrate.REPOSITORY / "docs/guides/known-pose.md").read_text(encoding="utf-8")
+    assert f"<!-- refinement:begin -->\n{refinement.page_table(record)}<!-- refinement:end -->" in page
+    for row in record["basin"].values():
+        row["cv2.rapid"] = {**row, "within 5 degrees and 5 %": 0.123}
+    lines = refinement.page_table(record).splitlines()
+    assert lines[0].endswith("| `cv2.rapid`: within 5 degrees and 5 % |")
+    assert lines[2].endswith("| 0.12 |")

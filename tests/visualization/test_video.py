@@ -9,7 +9,7 @@ import torch
 
 from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.io import Video
-from curvireg_torch.registration import FailedRegistration
+from curvireg_torch.registration import FailedRegistration, Registration
 from curvireg_torch.visualization import OverlayVideo
 from curvireg_torch.visualization.contours import OUTLINE
 from curvireg_torch.visualization.video import caption, draw_frame
@@ -48,10 +48,15 @@ def test_contours_stand_at_the_pose_in_any_size(registered):
     assert np.abs(outline_box(picture) - corners).max() <= 4
 
 
-def test_caption_says_how_sure_the_pose_is(registered):
-    _, result = registered
-    assert caption(replace(result, confidence=0.95))[0] == "reliable, confidence 0.95"
-    assert caption(replace(result, confidence=0.6))[0] == "unsure, confidence 0.60"
+@pytest.mark.parametrize(
+    ("confidence", "expected"), [(0.95, "reliable, confidence 0.95"), (0.6, "unsure, confidence 0.60")]
+)
+def test_caption_says_how_sure_the_pose_is(registered, monkeypatch, confidence, expected):
+    monkeypatch.setattr(Registration, "confidence", confidence)
+    assert caption(registered[1])[0] == expected
+
+
+def test_caption_of_frames_without_a_pose():
     assert caption(LOST)[0] == "lost"
     assert caption(FailedRegistration(InvalidInputError("no")))[0] == "failed"
 
