@@ -146,12 +146,13 @@ def row_of(kind: str, video: Video) -> Row:
     if AVAILABLE:
         trackers["cv2.rapid"] = rapid_tracker(video)
     steps = cr.rotation_error(video.poses[1:, :3, :3], video.poses[:-1, :3, :3])
-    return {"set": kind, "name": video.name, "steps": steps.tolist(), "methods": follow_video(video, trackers)}
+    row = {"set": kind, "name": video.name, "threads": torch.get_num_threads(), "steps": steps.tolist()}
+    return row | {"methods": follow_video(video, trackers)}
 
 
 def record_of(rows: list[Row]) -> Row:
     """Counts, steps, and the results of each method for each set."""
-    record: Row = {"commit": commit(), "date": today(), "threads": torch.get_num_threads(), "sets": {}}
+    record: Row = {"commit": commit(), "date": today(), "threads": max(row["threads"] for row in rows), "sets": {}}
     for kind in SETS:
         mine = [row for row in rows if row["set"] == kind]
         if not mine:

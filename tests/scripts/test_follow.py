@@ -107,7 +107,7 @@ def test_table_of_known_rows():
         one = {"degrees": degrees, "fraction": fraction, "seconds": [0.1] * len(degrees)}
         other = {"degrees": [6.0] * len(degrees), "fraction": [0.0] * len(degrees), "seconds": [0.05] * len(degrees)}
         methods = {"curvireg": one, **({"cv2.rapid": other} if rapid else {})}
-        return {"set": kind, "name": name, "steps": [2.0, 3.0, 4.0], "methods": methods}
+        return {"set": kind, "name": name, "threads": 2, "steps": [2.0, 3.0, 4.0], "methods": methods}
 
     rows = [
         row("generated", "a", [4.9, 5.1, 4.9], [0.04, 0.0, 0.06]),
@@ -123,6 +123,7 @@ def test_table_of_known_rows():
     assert lines[2] == "| generated | `curvireg` | 6 | 0.50 | 0.17 | 0.50 | 10.0 |"
     assert lines[5].startswith("| dino photographs | `cv2.rapid` | 3 |")
     assert "generated: 2 sequences, steps of 3.0° (median) to 4.0°" in lines[-1]
+    assert "Threads of torch: 2;" in lines[-1]
 
 
 def test_page_has_the_recorded_table():
