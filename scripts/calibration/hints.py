@@ -4,8 +4,8 @@
 
 ROWS holds the rows of scripts/benchmark/run.py: right.jsonl without a hint, and hint_90.jsonl, hint_45.jsonl and
 hint_30.jsonl with ``--hint azimuth:90`` and so on. RUNS holds folders none, azimuth:90, azimuth:45 and azimuth:30, each
-with what ``curvireg evaluate --out RUNS/HINT/SET`` wrote. Benchmark photographs that have not all four rows are left
-out; so are sets that have not been evaluated.
+with what ``curvireg evaluate --out RUNS/HINT/SET`` wrote. Photographs that are missing in one of the files are left
+out; a hint or a set that was not measured has "-".
 """
 
 import argparse
@@ -62,6 +62,8 @@ def main() -> None:
     arguments = parser.parse_args()
     rows = {}
     for hint, name in HINTS.items():
+        if not (arguments.rows / f"{name}.jsonl").is_file():
+            continue
         found = [json.loads(line) for line in (arguments.rows / f"{name}.jsonl").read_text().splitlines()]
         rows[hint] = {row["id"]: row for row in found if "errors" in row}
     sets = {**benchmark_rates(rows), **real_rates(arguments.runs)}
