@@ -11,7 +11,7 @@ from ..errors import InvalidInputError
 from ..geometry.cameras import rotation_towards
 from ..geometry.pose_prior import PosePrior, object_frame
 from ..io.meshes import mesh_up
-from ..io.meshes.mesh import mesh_centre
+from ..io.meshes.mesh import mesh_centre, mesh_radius
 from ..matching import ViewBank
 from .hypotheses import Hypotheses
 from .inputs import ImageItem
@@ -60,13 +60,19 @@ class BatchPriors:
         """(B, N) of the views of a bank; objects may lie ``off_centre`` degrees from the rays through their boxes.
 
         Raises:
-            InvalidInputError: the limits of a photograph leave no view.
+            InvalidInputError: the limits of a photograph leave no view, or all distances are inside the object.
         """
+        least = min(map(mesh_radius, self._meshes))
         views, model = bank.rotations.cpu().double(), bank.model.cpu()
         out = torch.zeros(len(self._priors), len(views), dtype=torch.float64)
         for b, prior in enumerate(self._priors):
             if prior is None:
                 continue
+            if prior.distance is not None and prior.distance[1] < least:
+                raise InvalidInputError(
+                    f"distance: at most {prior.distance[1]:g} from the centre, the camera is inside the object, "
+                    f"whose radius is {least:.3g}; give distances in the mesh's unit"
+                )
             for m in model.unique().tolist():
                 mine = model == m
                 frame = object_frame(self._ups[m], prior.front)

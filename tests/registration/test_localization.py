@@ -179,8 +179,14 @@ def test_bad_distances_raise(registrar, found):
     for boxes in (None, [[4.0, 4.0, 40.0, 40.0]]):
         with pytest.raises(InvalidInputError, match="distance: needs the camera"):
             registrar([found[0]], boxes, prior=cr.PosePrior(distance=(1.0, 2.0)))
-    with pytest.raises(InvalidInputError, match="image 0: nothing of such a size fits"):
-        _ = registrar([found[0]], camera_matrices=CAMERA, prior=cr.PosePrior(distance=(1e-3, 2e-3)))[0].rotation
+    near, far = cr.PosePrior(distance=(1e-3, 2e-3)), cr.PosePrior(distance=(500.0, 900.0))
+    for boxes, prior, message in (
+        (None, far, "nothing of such a size fits"),
+        (None, near, "distance: at most 0.002 from the centre, the camera is inside the object, whose radius is 0.176"),
+        ([[4.0, 4.0, 40.0, 40.0]], near, "distance: at most 0.002 from the centre"),
+    ):
+        with pytest.raises(InvalidInputError, match=f"image 0: {message}"):
+            _ = registrar([found[0]], boxes, CAMERA, prior=prior)[0].rotation
 
 
 @pytest.mark.parametrize(("preset", "features"), [("learned", [7.0, 0.6]), ("classical", [0.6])])
