@@ -32,7 +32,8 @@ CONVENTIONS = {
     "holds_none",
     "ambiguous": "how the members differ: half turn, mirror or several; null for one member",
     "presence": "estimated probability that the photograph shows the object in that box",
-    "reliable": f"confidence of at least {RELIABLE:g}, and no warnings; false = no reliable match, the pose is a guess",
+    "reliable": f"confidence of at least {RELIABLE:g}, no warnings, and no better match outside the prior; false = no "
+    "reliable match, the pose is a guess",
     "warnings": "what is questionable about the box and the camera",
     "confidence_features": "features that the confidence is computed from; lead: score of the best pose above that of "
     "its best rival, null where the bank has no rival view, which bounds the confidence",

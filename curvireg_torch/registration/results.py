@@ -124,8 +124,9 @@ class Registration:
         localization: where the object was found; None if its box was given.
         corrected_box: (4,) float64, the box that replaced a given one that did not fit the pose; else None.
         prior: the limits on the pose that were given.
-        prior_contradiction: "better outside": views outside the limits match much better; "at the limit": the pose lies
-            within a degree of a limit. None otherwise.
+        prior_contradiction: "better outside": views outside the limits match much better, or the box asks for a
+            distance outside; "at the limit": the pose lies within a degree, or 1 % of the distance, of a limit. None
+            otherwise.
         warnings: what is questionable about the box and the camera, in words; a result with one is not reliable.
     """
 
@@ -155,8 +156,9 @@ class Registration:
 
     @property
     def reliable(self) -> bool:
-        """Whether the confidence is at least ``RELIABLE``, without ``warnings``; if False, the pose is a guess."""
-        return self.confidence >= RELIABLE and not self.warnings
+        """Whether the confidence is at least ``RELIABLE``, without ``warnings``, and the photograph does not contradict
+        the prior by a better match outside; if False, the pose is a guess."""
+        return self.confidence >= RELIABLE and not self.warnings and self.prior_contradiction != "better outside"
 
     @property
     def candidates(self) -> Tensor:

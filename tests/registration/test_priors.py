@@ -147,6 +147,8 @@ def test_every_hypothesis_lies_at_an_allowed_distance(pipeline, factors, softnes
     for distance in centre_distances(result, registrar):
         assert 0.97 * near <= distance <= 1.03 * far
     assert result.prior_contradiction == "better outside"
+    assert result.confidence >= 0.9 or pipeline == {}
+    assert not result.reliable
 
 
 def test_distance_that_holds_the_truth_changes_nothing(registrar):
