@@ -7,7 +7,8 @@ venv=${CURVIREG_VENV:-$root/.venv}
 python=${PYTHON:-python3}
 die() { echo "curvireg_torch: $*" >&2; exit 1; }
 new_enough() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; }
-pip() { "$venv/bin/python" -m pip --quiet --disable-pip-version-check "$@"; }
+quiet=--quiet # but not for the first installation, which takes minutes
+pip() { "$venv/bin/python" -m pip $quiet --disable-pip-version-check "$@"; }
 
 if [ ! -x "$venv/bin/python" ]; then
     new_enough "$python" ||
@@ -27,7 +28,10 @@ if ! "$venv/bin/python" -c 'import torch' 2>/dev/null; then
             grep -o '[0-9][0-9.]*+cpu' | head -n 1 || true) # the newest; a tenth of a CUDA build and its libraries
         [ "$build" ] && reason="no GPU here" || reason="no GPU here, but no +cpu build in any index either"
     fi
-    echo "installing torch${build:+==$build} ($reason)"
+    size="up to 6 GB on disk, for CUDA"
+    [ -z "$build" ] || size="1.4 GB on disk"
+    echo "installing torch${build:+==$build} ($reason) and what else the library needs into $venv: some minutes, $size"
+    quiet=
     pip install ${build:+--extra-index-url "$index"} "torch${build:+==$build}"
 fi
 pip install -e ".$1"

@@ -21,7 +21,7 @@ def add_parser(commands: Any) -> None:
         ),
     )
     parser.add_argument("mesh", type=Path, metavar="MESH")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the bank, as .safetensors")
     adapt = "also fine-tune the learned field on generated photographs (minutes); its weights, for register --field"
     parser.add_argument("--adapt", type=Path, metavar="FILE", help=adapt)
     parser.set_defaults(run=run)

@@ -7,6 +7,7 @@ from typing import Any
 
 from ..utils.files import check_writable, write_file
 from .options import common_options, examples, pipeline_options, register_options
+from .stages import show_stages
 
 
 def add_parser(commands: Any) -> None:
@@ -17,7 +18,7 @@ def add_parser(commands: Any) -> None:
         **examples("curvireg demo --out out/demo", "curvireg demo --seed 7 --preset fast --out out/demo"),
     )
     parser.add_argument("--seed", type=int, default=2, help="number of the scene (default: 2)")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the results")
     parser.set_defaults(run=run, pose="upright")
 
 
@@ -43,11 +44,14 @@ def run(arguments: argparse.Namespace) -> None:
     image, box = photograph_tabletop(example_mesh(painted=True), truth, K, size, generator)
     options = register_options(arguments)
     pipeline = options.open_pipeline()
-    start = time.perf_counter()
-    bank = cached_bank(mesh, pipeline=pipeline, renderer=options.renderer, progress=options.progress)
-    ready = time.perf_counter()
-    registrar = Registrar(bank, pipeline=pipeline, renderer=options.renderer, device=options.device)
-    result = registrar([image], box[None], K)[0]
+    with show_stages(enabled=options.progress) as progress:
+        start = time.perf_counter()
+        bank = cached_bank(mesh, pipeline=pipeline, renderer=options.renderer, progress=progress or options.progress)
+        ready = time.perf_counter()
+        registrar = Registrar(
+            bank, pipeline=pipeline, renderer=options.renderer, device=options.device, progress=progress or False
+        )
+        result = registrar([image], box[None], K)[0]
     assert isinstance(result, Registration)
     assert result.translation is not None
     seconds = {"bank": ready - start, "register": time.perf_counter() - ready}

@@ -9,7 +9,7 @@ from ..errors import InvalidInputError, MissingFileError
 from ..evaluation.registry import DATASETS
 from ..utils.choices import DEFAULT, PRESET_NAMES
 from ..utils.files import check_writable
-from .options import common_options, examples, whole_number
+from .options import PRESETS_HELP, common_options, examples, whole_number
 
 PROTOCOL = (
     "cad=annotated|any|fused: the annotated CAD model, the best of the class, or one vote of all of the class; "
@@ -38,7 +38,7 @@ def add_parser(commands: Any) -> None:
         add = dataset.add_argument
         protocol = f"{PROTOCOL} (default: cad=annotated pose={kind.pose} box=annotated)"
         add("--protocol", nargs="+", default=[], metavar="KEY=VALUE", help=protocol)
-        add("--preset", choices=sorted(PRESET_NAMES), default=DEFAULT, help=f"default: {DEFAULT}")
+        add("--preset", choices=PRESET_NAMES, default=DEFAULT, help=f"{PRESETS_HELP} (default: {DEFAULT})")
         add("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
         add(
             "--jobs",
@@ -49,7 +49,7 @@ def add_parser(commands: Any) -> None:
         )
         add("--limit", type=whole_number(1), metavar="N", help="only N objects, spread evenly over the set")
         add("--overwrite", action="store_true", help="replace the predictions of other settings")
-        add("--out", type=Path, required=True, metavar="DIR")
+        add("--out", type=Path, required=True, metavar="DIR", help="folder of the results; made if it does not exist")
         dataset.set_defaults(run=run, dataset=name)
 
 

@@ -12,6 +12,11 @@ from ..utils.choices import DEFAULT, MESH_KINDS, PRESET_NAMES, RENDERER_NAMES, S
 if TYPE_CHECKING:
     from ..evaluation.opening import RegisterOptions
 
+PRESETS_HELP = (
+    "learned: with networks, the most accurate. classical: nothing learned. fast: the best view, without search and "
+    "contour fit. paper: the published method"
+)
+
 _COUNTS = {"--box": 4, "--camera": 4, "--distance": 2, "--azimuth": 2, "--elevation": 2, "--theta": 2}
 _NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
@@ -47,8 +52,8 @@ def common_options() -> argparse.ArgumentParser:
 def pipeline_options() -> argparse.ArgumentParser:
     """Parent parser: ``--preset --pipeline --device``."""
     parser = argparse.ArgumentParser(add_help=False)
-    default = f"default: the pipeline of a bank, else {DEFAULT}"
-    parser.add_argument("--preset", choices=sorted(PRESET_NAMES), help=default)
+    default = f"{PRESETS_HELP} (default: that of a bank, else {DEFAULT})"
+    parser.add_argument("--preset", choices=PRESET_NAMES, help=default)
     parser.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
     parser.add_argument("--device", default="cpu", help="device of modules, bank and search (default: cpu)")
     return parser
@@ -57,7 +62,11 @@ def pipeline_options() -> argparse.ArgumentParser:
 def mesh_options() -> argparse.ArgumentParser:
     """Parent parser: ``--unit --pose --up``."""
     parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--unit", choices=sorted(UNITS), help="unit of the mesh file (default: m; for a BOP scene mm)")
+    parser.add_argument(
+        "--unit",
+        choices=sorted(UNITS),
+        help="unit of the mesh file, and of lengths in and out (default: m; for a BOP scene mm)",
+    )
     parser.add_argument(
         "--pose",
         choices=("any", "upright"),
@@ -81,7 +90,11 @@ def add_mesh_is(parser: argparse.ArgumentParser) -> None:
 
 
 def add_box_and_camera(
-    parser: argparse.ArgumentParser, *, box: str = "px", camera: str = "px", fov: bool = True
+    parser: argparse.ArgumentParser,
+    *,
+    box: str = "in px of the photograph",
+    camera: str = "in px; gives the translation",
+    fov: bool = True,
 ) -> None:
     """Add ``--box`` and ``--camera`` with these help texts, and ``--fov``."""
     parser.add_argument("--box", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help=box)

@@ -23,6 +23,7 @@ from .options import (
     register_options,
     whole_number,
 )
+from .stages import show_stages
 
 if TYPE_CHECKING:
     from ..evaluation.lists import PhotoList
@@ -73,9 +74,9 @@ def add_parser(commands: Any) -> None:
     add("--every", type=whole_number(1), default=1, metavar="N", help="use every N-th frame of videos (default: 1)")
     add_box_and_camera(
         parser,
-        box="px; default: the object is localized",
-        camera="px; gives the translation. For an unknown camera give --camera exif (focal length in the photograph's "
-        "file) or --fov; the result then has no covariance",
+        box="in px; default: the object is localized",
+        camera="in px; gives the translation. For an unknown camera give --camera exif (focal length of the "
+        "photograph's file) or --fov; the result then has no covariance",
     )
     add("--exif", action="store_true", help=argparse.SUPPRESS)
     start = "result.json, or any JSON with rotation and translation: refine this pose in one photograph; needs no box"
@@ -94,7 +95,7 @@ def add_parser(commands: Any) -> None:
         help="processes for several photographs (default: 1)",
     )
     add("--json", action="store_true", help="print only the results as JSON; --out is optional")
-    add("--out", type=Path, metavar="DIR")
+    add("--out", type=Path, metavar="DIR", help="folder of the results; made if it does not exist")
     parser.set_defaults(run=run)
 
 
@@ -181,16 +182,20 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
     check_entry(entry, photo)
     if out is not None:
         check_writable(out, "--out")
-    registrar = open_registrar(options, options.meshes, field)
-    ready = time.perf_counter() - start
     if options.box is None and options.start is None and options.progress:
         print(f"{path}: localizing the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
-    try:
-        result, document = register_entry(entry, photo, registrar, bank_seconds=ready)
-    except LostObjectError as error:
-        if out is not None:
-            write_lost(out, str(error))
-        raise
+    with show_stages(enabled=options.progress) as progress:
+        if progress is not None:
+            progress("reading the mesh", 0, 1)
+        registrar = open_registrar(options, options.meshes, field, progress=progress)
+        registrar.progress = progress or False
+        ready = time.perf_counter() - start
+        try:
+            result, document = register_entry(entry, photo, registrar, bank_seconds=ready)
+        except LostObjectError as error:
+            if out is not None:
+                write_lost(out, str(error))
+            raise
     notes = sys.stderr if as_json else sys.stdout  # with --json, standard output holds only the result
     if out is not None:
         write_result(out, document, registrar, result, photo.image, used_box(document))

@@ -31,7 +31,7 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("photo", type=Path, nargs="?", metavar="PHOTO")
     parser.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help="a mesh or a bank; both can be added later")
-    add_box_and_camera(parser, box="px; can be drawn")
+    add_box_and_camera(parser, box="in px; can be drawn")
     add_pose_prior(parser)
     hosts = f"who may connect: {LOCAL}, only this machine (default), or 0.0.0.0, everyone"
     parser.add_argument("--host", default=LOCAL, help=hosts)

@@ -233,9 +233,29 @@ def test_pipeline_is_the_default_everywhere(monkeypatch):
 @pytest.mark.parametrize(
     ("pose", "changes", "expected", "unexpected"),
     [
-        ("any", {}, "the box is tight and the mesh is the object's\n", "no box"),
+        ("any", {}, "the box is tight and that the mesh is the object's\n", "no box"),
         ("upright", {}, "(--pose upright, --up)\n", "no box"),
-        ("any", {"localization": {"instances": []}}, "no box was given: add --box, and check that the mesh", "tight"),
+        ("any", {"edge_support": 0.34}, "its contours hardly show", "tight"),
+        ("any", {"edge_support": None}, "the box is tight", "contours"),
+        ("any", {"warnings": ["small"], "edge_support": 0.1}, "correct what the warning names", "contours"),
+        (
+            "any",
+            {"prior": {"distance": [1, 2], "contradiction": None}},
+            "check --distance, --unit and --camera",
+            "tight",
+        ),
+        (
+            "any",
+            {"localization": {"presence": 0.4, "instances": []}},
+            "may not be in the photograph: add --box",
+            "tight",
+        ),
+        (
+            "any",
+            {"localization": {"presence": 0.5, "instances": []}},
+            "seems to be there, at an unsure pose",
+            "may not",
+        ),
         ("any", {"corrected_box": [1.2, 2.0, 30.6, 40.0]}, "did not fit the pose; one that does: 1 2 31 40\n", "found"),
     ],
 )
@@ -243,7 +263,7 @@ def test_print_result_advises_when_not_reliable(pose, changes, expected, unexpec
     document = {
         "viewpoint": {"azimuth": 1.0}, "score": 0.2, "confidence": 0.1, "reliable": False, "translation": None,
         "standard_deviations": None, "seconds": {"bank": 1.0, "register": 2.0}, "corrected_box": None,
-        "ambiguous": None, "answer_set": {"members": [0]},
+        "ambiguous": None, "answer_set": {"members": [0]}, "warnings": [], "edge_support": 0.36,
         "pipeline": Pipeline().with_pose_prior(pose).describe(), **changes,
     }  # fmt: skip
     print_result(document, tmp_path)

@@ -97,7 +97,10 @@ def test_register_list_json_prints_one_line_per_row(folder, capsys, check):
     assert [document["status"] for document in documents] == ["ok", "failed", "failed"]
     for document in documents:
         check(document)
-    assert re.fullmatch("3 photographs: 1 ok, 2 failed, [01] reliable", found.err.strip())
+    first, second, last = found.err.splitlines()
+    assert first.startswith("failed: row 2: ")
+    assert second.startswith("failed: row 3: ")
+    assert re.fullmatch("3 photographs: 1 ok, 2 failed, [01] reliable", last)
     assert sorted(found.name for found in folder.iterdir()) == before
 
 
