@@ -5,23 +5,21 @@ from torch import Tensor
 from ..geometry.pose_prior import object_frame
 from ..geometry.viewpoint import viewpoint_from_rotation
 from ..utils.choices import SIDE_NAMES
+from .answer_set import AnswerSet
 
-__all__ = ["UNSURE", "pose_in_words", "verdict"]
+__all__ = ["pose_in_words", "verdict"]
 
 STEEP = 70  # degrees of elevation beyond which an object is seen from above or below
 
-UNSURE = 0.5
-"""Least confidence of an answer that is more probably right than wrong."""
 
-
-def verdict(confidence: float, reliable: bool) -> str:
-    """ "likely" if an answer is reliable, otherwise "unsure" from ``UNSURE``, below it "no match".
+def verdict(answers: AnswerSet, reliable: bool) -> str:
+    """ "likely" if an answer is reliable, "no match" if "none of them" is more probable than it, otherwise "unsure".
 
     Example:
-        >>> verdict(0.95, True), verdict(0.6, False), verdict(0.1, False)
-        ('likely', 'unsure', 'no match')
+        >>> verdict(AnswerSet((0.95, 0.02)), True), verdict(AnswerSet((0.6, 0.3)), False)
+        ('likely', 'unsure')
     """
-    return "likely" if reliable else "unsure" if confidence >= UNSURE else "no match"
+    return "likely" if reliable else "no match" if answers.none > answers.probabilities[0] else "unsure"
 
 
 def pose_in_words(rotation: Tensor, *, up: str = "z", front: str | None = None) -> str:

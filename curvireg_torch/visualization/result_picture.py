@@ -66,7 +66,7 @@ def _draw_caption(
 ) -> None:
     """Verdict and pose in words, and the meaning of the colours."""
     x, y = corner
-    word, font = verdict(result.confidence, result.reliable), ImageFont.load_default(size)
+    word, font = verdict(result.answer_set, result.reliable), ImageFont.load_default(size)
     badge = f"{word}: confidence {math.floor(100 * result.confidence) / 100:.2f}"  # 0.896 is not yet 0.90, reliable
     right = x + draw.textlength(badge, font) + size
     draw.rounded_rectangle((x, y, right, y + 1.6 * size), 0.5 * size, VERDICT_COLOURS[word])

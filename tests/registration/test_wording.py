@@ -5,6 +5,7 @@ import torch
 
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import object_frame
+from curvireg_torch.registration import AnswerSet
 from curvireg_torch.registration.wording import pose_in_words, verdict
 
 
@@ -36,5 +37,10 @@ def test_pose_in_words_tilts_as_the_photograph_shows():
 
 def test_verdict_has_three_words():
     """A high confidence that is not reliable, because of a questionable camera, is no reason to be sure."""
-    cases = {(0.95, True): "likely", (0.95, False): "unsure", (0.5, False): "unsure", (0.499, False): "no match"}
-    assert {case: verdict(*case) for case in cases} == cases
+    cases = {
+        ((0.95, 0.02), True): "likely",
+        ((0.95, 0.02), False): "unsure",
+        ((0.4, 0.3), False): "unsure",
+        ((0.4, 0.1), False): "no match",
+    }
+    assert {case: verdict(AnswerSet(case[0]), case[1]) for case in cases} == cases

@@ -106,7 +106,7 @@ def test_registration_sheet_of_narrow_and_flat_photographs(registered):
 
 def test_registration_sheet_has_the_verdict_in_its_colour(registered):
     registrar, result, image, box = registered
-    for confidence, verdict in ((0.95, "likely"), (0.899, "unsure"), (0.5, "unsure"), (0.2, "no match")):
+    for confidence, verdict in ((0.95, "likely"), (0.899, "unsure"), (0.49, "unsure"), (0.45, "no match")):
         answers = AnswerSet((confidence, *[0.01] * (len(result.hypotheses) - 1)))
         sheet = registration_sheet(registrar, replace(result, answer_set=answers), image, box)
         found = [word for word, colour in VERDICT_COLOURS.items() if (sheet[720:] == colour).all(axis=2).sum() > 500]
