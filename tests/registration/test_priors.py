@@ -176,10 +176,22 @@ def test_batch_priors_keep_fitted_poses_up_to_three_percent_too_far():
     )
     kept = []
     for away in (0.969, 0.972, 2.055, 2.065):
-        pose = torch.eye(4, dtype=torch.float64)[None].clone()
-        pose[0, :3, 3] = away * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64) - truck_centre()
-        kept.append(bool(limits.keeps(hypotheses, pose)))
+        kept.append(bool(limits.keeps(hypotheses, pose_at(away))))
     assert kept == [False, True, True, False]
+
+
+def pose_at(away):
+    """(1, 4, 4) pose whose centre is so far away, off the optical axis."""
+    pose = torch.eye(4, dtype=torch.float64)[None].clone()
+    pose[0, :3, 3] = away * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64) - truck_centre()
+    return pose
+
+
+@pytest.mark.parametrize(("away", "outside"), [(0.89, True), (0.92, False), (2.19, False), (2.21, True)])
+def test_box_that_asks_for_a_distance_far_outside_is_reported(registrar, away, outside):
+    limits, best = limits_of(PosePrior(distance=(1.0, 2.0))), start_hypotheses(ranking_of(1), truck_bank(), count=1)
+    noted = limits.note(registrar(*ONE)[0], best, pose_at(1.5), pose_at(away))
+    assert noted.prior_contradiction == ("better outside" if outside else None)
 
 
 def test_batch_priors_move_poses_along_the_ray_to_an_allowed_distance():
@@ -187,13 +199,8 @@ def test_batch_priors_move_poses_along_the_ray_to_an_allowed_distance():
         start_hypotheses(ranking_of(1), truck_bank(), count=1),
         limits_of(PosePrior(distance=(1.0, 2.0))),
     )
-    ray = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
     for away, expected in ((0.5, 1.0), (1.5, 1.5), (9.0, 2.0)):
-        pose = torch.eye(4, dtype=torch.float64)[None].clone()
-        pose[0, :3, 3] = away * ray - truck_centre()
-        moved = limits.at_distance(hypotheses, pose)[0]
-        torch.testing.assert_close(moved[:3, 3] + truck_centre(), expected * ray)
-        assert torch.equal(moved[:3, :3], pose[0, :3, :3])
+        torch.testing.assert_close(limits.at_distance(hypotheses, pose_at(away)), pose_at(expected))
 
 
 def truck_centre():
