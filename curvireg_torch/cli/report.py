@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from ..registration.document import corners, remarks
-from ..registration.wording import UNSURE
 
 __all__ = ["print_result"]
 
@@ -66,7 +65,7 @@ def _advice(document: Mapping[str, Any]) -> str:
     if "distance" in document.get("prior", {}):
         return f"check --distance, --unit and --camera, and {mesh}"
     if localization is not None:
-        if localization["presence"] < UNSURE:
+        if localization["presence"] < 0.5:
             return f"the object may not be in the photograph: add --box, and check {mesh}"
         return f"the object seems to be there, at an unsure pose: add --box, and check {mesh}"
     if support is not None and support < WEAK_CONTOURS:

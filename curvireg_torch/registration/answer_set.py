@@ -96,7 +96,7 @@ def answer_set(
     Args:
         confidence: probability that the first hypothesis is right.
         scores: (H,) of :func:`rescore`, the first hypothesis first.
-        constants: ``slope`` a, ``none`` b and ``threshold``, calibrated for each :func:`.confidence.model_name`.
+        constants: ``slope`` a, ``none`` b and ``threshold``, calibrated for each ``model_name``.
         reported: number of hypotheses that are reported; the others count as none of them.
     """
     rivals = scores[1:].double()

@@ -83,7 +83,7 @@ def model_name(stage: str, *, exact: bool, with_appearance: bool) -> str:
 
 
 def confidence_model(name: str) -> LogisticModel:
-    """The logistic model of :func:`model_name`."""
+    """The logistic model for a kind of result, by its ``model_name``."""
     model = CALIBRATION["confidence"][name]
     return LogisticModel(model["weights"], model["bias"])
 

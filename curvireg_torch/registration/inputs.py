@@ -53,7 +53,7 @@ class ImageItem:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is questionable about box and camera, see :mod:`.plausibility`."""
+        """What is questionable about box and camera, see ``plausibility``."""
         return input_warnings(self.box, self.camera_matrix, self.size)
 
 
