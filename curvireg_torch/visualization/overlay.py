@@ -107,11 +107,11 @@ def view_picture(registrar: Registrar, model: int, rotation: Tensor, distance: f
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
-    """(H, W, 3) uint8 RGB of a (1 or 3, H, W) image, floating in [0, 1] or uint8; black for NaN."""
+    """(H, W, 3) uint8 RGB, always a copy, of a (1 or 3, H, W) image, floating in [0, 1] or uint8; black for NaN."""
     pixels = image.detach().cpu()
     if pixels.is_floating_point():
         pixels = (pixels.float().nan_to_num(0.0, 0.0, 0.0).clamp(0, 1) * 255).round().byte()
-    return np.ascontiguousarray(pixels.expand(3, -1, -1).permute(1, 2, 0).numpy())
+    return np.array(pixels.expand(3, -1, -1).permute(1, 2, 0).numpy(), order="C")
 
 
 def _field_picture(field: Tensor) -> np.ndarray:

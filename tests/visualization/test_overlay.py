@@ -154,8 +154,11 @@ def test_pictures_take_photographs_as_the_registrar_does(with_camera):
     pixels = (image * 255).round().byte()
     expected = contour_overlay(registrar, result, pixels, box)
     assert is_contour(expected).any()
-    for same in (pixels / 255.0, pixels.permute(1, 2, 0).numpy()):
+    array = pixels.permute(1, 2, 0).contiguous().numpy()
+    before = array.copy()
+    for same in (pixels / 255.0, array):
         assert np.array_equal(contour_overlay(registrar, result, same, box.tolist()), expected)
+    assert np.array_equal(array, before), "the photograph itself is not drawn on"
     assert contour_overlay(registrar, result, image[:1], box).shape == (*SIZE, 3)
     with pytest.raises(InvalidInputError, match="channels"):
         contour_overlay(registrar, result, torch.zeros(4, 9, 9), box)
