@@ -56,10 +56,10 @@ def _inert(cell: object) -> object:
     if not isinstance(cell, str) or not cell.startswith(("=", "+", "-", "@", "\t", "\r")):
         return cell
     try:
-        float(cell)
-        return cell
+        numbers = [float(word) for word in cell.split()]  # a vector is one cell of BOP's tables
     except ValueError:
-        return f"'{cell}"
+        numbers = []
+    return cell if numbers else f"'{cell}"
 
 
 def check_writable(folder: Path, name: str) -> None:

@@ -172,7 +172,7 @@ def test_page_runs_skips_few_commands() -> None:
     assert counts.pop(None) >= 30
     assert counts == {
         "download": 10,
-        "long measurement": 6,
+        "long measurement": 7,
         "placeholder": 3,
         "test suite": 7,
         "writes into the project": 3,

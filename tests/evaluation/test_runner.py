@@ -8,6 +8,7 @@ from unittest.mock import patch
 import pytest
 import torch
 
+from curvireg_torch import PosePrior
 from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.evaluation import runner
 from curvireg_torch.evaluation.benchmark import BenchmarkItem
@@ -144,7 +145,7 @@ def moved(tensor, place):
         (ENTRY, {"guess": "exif"}),
         (ENTRY, {"guess": 50.0}),
         (ENTRY, {"instances": 2}),
-        (ENTRY, {"distance": (1.0, 2.0)}),
+        (ENTRY, {"prior": PosePrior(distance=(1.0, 2.0))}),
         (OBJECT, {"camera_matrix": None}),
         *[(OBJECT, {"box": moved(OBJECT.box, place)}) for place in range(4)],
         *[(OBJECT, {"camera_matrix": moved(OBJECT.camera_matrix, place)}) for place in (0, 2, 4, 5)],
