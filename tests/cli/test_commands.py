@@ -84,6 +84,7 @@ def test_demo_runs_as_a_module(tmp_path, monkeypatch):
 def test_interruption_while_modules_are_imported_prints_nothing():
     script = """
 import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs inherit that it is ignored
 class Interrupt:
     def find_spec(name, *_):
         if name == "curvireg_torch.cli":

@@ -35,7 +35,7 @@ class Case:
 EXACT = [
     Case("dino", ("1/55/0", "1/235/0"), rotation=2.0, sideways=0.002, depth=0.02),
     Case("lm", ("6/0/0", "6/500/0"), rotation=8.0, sideways=0.006, depth=0.08),
-    Case("hope", ("8/0/0", "8/0/2"), rotation=8.0, sideways=0.01, depth=0.03),
+    Case("hope", ("8/0/0", "8/0/2"), rotation=8.0, sideways=0.02, depth=0.04),
     Case("buddha", ("1/13/0", "1/61/0"), rotation=4.0, sideways=0.006, depth=0.02),
 ]
 SIMILAR = [
