@@ -96,7 +96,10 @@ def table(results: Path) -> str:
         if chosen:
             lines = [columns, ["---"] * len(columns), *(cells(r["name"], r["summary"]) for r in chosen)]
             body = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-            notes = "\n".join(f"- {note(r)}" for r in chosen)
+            sets: dict[str, list[str]] = {}
+            for r in chosen:
+                sets.setdefault(note(r), []).append(r["name"])
+            notes = "\n".join(f"- {', '.join(names)}: {conditions}" for conditions, names in sets.items())
             parts.append(f"**{title}.** {definition}\n\n{body}\n\n{notes}\n")
     return "\n".join(parts)
 
@@ -108,7 +111,7 @@ def note(record: dict[str, Any]) -> str:
     limit = "" if summary["limit"] is None else f", limited to {summary['limit']} objects"
     skipped = sum(summary["skipped"].values())
     return (
-        f"{record['name']}: split {settings['split']}{limit}; {summary['protocol']}; "
+        f"split {settings['split']}{limit}; {summary['protocol']}; "
         f"preset {settings['preset']}; {summary['failed']} failed, {skipped} skipped; "
         f"{record['date']}, commit {record['commit']}"
     )

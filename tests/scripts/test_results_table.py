@@ -55,6 +55,9 @@ def test_results_table_from_summaries(run, repository, pascal, bop, tmp_path, mo
     assert set(widths[3:]) == {widths[3]}
     assert run() == 0
     assert (repository / "README.md").read_text() == text
+    run("--record", tmp_path / "cubes" / "summary.json", "more")
+    run()
+    assert "- cubes, more: split test; cad=annotated" in (repository / "README.md").read_text()
 
 
 def test_counted_names_views_and_lightings():
