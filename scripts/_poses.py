@@ -4,6 +4,7 @@ import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import pairwise
 from unittest.mock import patch
 
 import torch
@@ -46,7 +47,7 @@ class PoseRecord:
         mine = int(rotation_error(lifted[-1][:, :3, :3], fitted[0][:3, :3]).argmin())
         searched = [("search", state[mine]) for state in lifted[1:]]
         steps = [("view", lifted[0][mine]), *searched, *(("contours", pose) for pose in fitted)]
-        changes = [not torch.equal(a[1], b[1]) for a, b in zip(steps, steps[1:], strict=False)]
+        changes = [not torch.equal(a[1], b[1]) for a, b in pairwise(steps)]
         return [steps[0], *(step for step, changed in zip(steps[1:], changes, strict=True) if changed)]
 
     def _before(self, T: Tensor, end: int) -> list[Tensor]:
