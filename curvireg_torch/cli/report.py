@@ -12,6 +12,9 @@ WEAK_CONTOURS = 0.35
 """Edge support of a right pose that hardly occurs: 24 generated scenes of the example mesh had 0.47 to 0.64, after a
 blur of 4 px 0.26 to 0.39, and with the meshes of a sphere and of a cuboid 0.14 to 0.43."""
 
+DOUBTFUL_PRESENCE = 0.5
+"""Probability below which the object is more likely absent from a localized box than there."""
+
 
 def print_result(document: Mapping[str, Any], out: Path) -> None:
     """Print a :func:`~curvireg_torch.registration.document.result_document`; ``out`` is the folder of its files."""
@@ -65,7 +68,7 @@ def _advice(document: Mapping[str, Any]) -> str:
     if "distance" in document.get("prior", {}):
         return f"check --distance, --unit and --camera, and {mesh}"
     if localization is not None:
-        if localization["presence"] < 0.5:
+        if localization["presence"] < DOUBTFUL_PRESENCE:
             return f"the object may not be in the photograph: add --box, and check {mesh}"
         return f"the object seems to be there, at an unsure pose: add --box, and check {mesh}"
     if support is not None and support < WEAK_CONTOURS:

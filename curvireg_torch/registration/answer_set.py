@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate
 from typing import Any
 
 import torch
@@ -59,16 +60,20 @@ class AnswerSet:
         return len(self.probabilities) in self._answers
 
     @cached_property
-    def _answers(self) -> list[int]:
-        """Indices of the answers in the set; "none of them" comes after the last hypothesis."""
+    def candidates(self) -> tuple[tuple[int, float], ...]:
+        """All answers in the order in which they enter the set, each with the sum of the probabilities before it.
+
+        "None of them" has the index after that of the last hypothesis.
+        """
         probabilities = [*self.probabilities, self.none]
-        chosen, total = [0], probabilities[0]
-        for answer in sorted(range(1, len(probabilities)), key=lambda a: -probabilities[a]):
-            if total >= self.threshold:
-                break
-            chosen.append(answer)
-            total += probabilities[answer]
-        return chosen
+        order = [0, *sorted(range(1, len(probabilities)), key=lambda a: -probabilities[a])]
+        before = accumulate((probabilities[answer] for answer in order), initial=0.0)
+        return tuple(zip(order, before, strict=False))
+
+    @cached_property
+    def _answers(self) -> list[int]:
+        """Indices of the answers in the set."""
+        return [answer for answer, before in self.candidates if answer == 0 or before < self.threshold]
 
     def scaled(self, factor: float) -> "AnswerSet":
         """The answers if the object is there with probability ``factor``."""

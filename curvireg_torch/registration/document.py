@@ -26,7 +26,7 @@ CONVENTIONS = {
     "boxes": "x0, y0, x1, y1 in those pixels",
     "score": "normalised correlation of photograph and view, 0 to 1",
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth; times presence for an "
-    "object without a given box",
+    "object without a given box; of a pose refined from a start: that it is within 10 degrees and 10 % of the distance",
     "answer_set": "probabilities of the poses of top in their order and of none of them; members: numbers, from 0, of "
     "the poses in the smallest set that holds the truth with probability level, together with none of them if "
     "holds_none",

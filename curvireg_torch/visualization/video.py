@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..errors import LostObjectError
 from ..registration import FailedRegistration, Registrar, Registration
+from ..registration.wording import verdict
 from ..utils.files import write_file
 from .contours import draw_pose
 from .encoding import jpeg, shrink
@@ -21,7 +22,8 @@ __all__ = ["OverlayVideo"]
 
 _LONGER_SIDE = 960  # of the frames in px; larger ones are scaled down
 _QUALITY = 85  # of JPEG files
-_SURE, _UNSURE, _NO_POSE = (90, 230, 120), (255, 190, 60), (255, 90, 80)
+_NO_POSE = (255, 90, 80)
+_COLOURS = {"likely": (90, 230, 120), "unsure": (255, 190, 60), "no match": _NO_POSE}
 
 
 class OverlayVideo:
@@ -122,9 +124,8 @@ def caption(result: Registration | FailedRegistration) -> tuple[str, tuple[int, 
     """How sure the result is, in words and as a colour."""
     if isinstance(result, FailedRegistration):
         return "lost" if isinstance(result.error, LostObjectError) else "failed", _NO_POSE
-    if result.reliable:
-        return f"reliable, confidence {result.confidence:.2f}", _SURE
-    return f"unsure, confidence {result.confidence:.2f}", _UNSURE
+    word = verdict(result.answer_set, result.reliable)
+    return f"{word}, confidence {result.confidence:.2f}", _COLOURS[word]
 
 
 def _write_caption(picture: np.ndarray, result: Registration | FailedRegistration) -> None:

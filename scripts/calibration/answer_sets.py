@@ -51,10 +51,7 @@ def fit_answers(cases: Sequence[tuple[torch.Tensor, np.ndarray]]) -> dict[str, f
 
 def probability_before(answers: AnswerSet, right: np.ndarray) -> float:
     """Sum of the probabilities of the answers that enter the set before the first right one."""
-    probabilities = np.append(answers.probabilities, answers.none)
-    order = [0, *(1 + np.argsort(-probabilities[1:], kind="stable"))]
-    first = int(np.flatnonzero(right[order])[0])
-    return float(probabilities[order[:first]].sum())
+    return next(before for answer, before in answers.candidates if right[answer])
 
 
 def fit_answer_sets(rows: Sequence[Row], name: str, sure: np.ndarray, fold: np.ndarray) -> tuple[Row, Row]:

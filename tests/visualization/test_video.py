@@ -9,7 +9,8 @@ import torch
 
 from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.io import Video
-from curvireg_torch.registration import FailedRegistration, Registration
+from curvireg_torch.registration import FailedRegistration
+from curvireg_torch.registration.answer_set import AnswerSet
 from curvireg_torch.visualization import OverlayVideo
 from curvireg_torch.visualization.contours import OUTLINE
 from curvireg_torch.visualization.video import caption, draw_frame
@@ -48,12 +49,10 @@ def test_contours_stand_at_the_pose_in_any_size(registered):
     assert np.abs(outline_box(picture) - corners).max() <= 4
 
 
-@pytest.mark.parametrize(
-    ("confidence", "expected"), [(0.95, "reliable, confidence 0.95"), (0.6, "unsure, confidence 0.60")]
-)
-def test_caption_says_how_sure_the_pose_is(registered, monkeypatch, confidence, expected):
-    monkeypatch.setattr(Registration, "confidence", confidence)
-    assert caption(registered[1])[0] == expected
+@pytest.mark.parametrize(("confidence", "expected"), [(0.95, "likely"), (0.6, "unsure"), (0.4, "no match")])
+def test_caption_says_how_sure_the_pose_is(registered, confidence, expected):
+    result = replace(registered[1], answer_set=AnswerSet((confidence,)))
+    assert caption(result)[0] == f"{expected}, confidence {confidence:.2f}"
 
 
 def test_caption_of_frames_without_a_pose():
