@@ -31,6 +31,7 @@ CONVENTIONS = {
     "the poses in the smallest set that holds the truth with probability level, together with none of them if "
     "holds_none",
     "ambiguous": "how the members differ: half turn, mirror or several; null for one member",
+    "symmetries": "number of orientations in which the mesh looks the same; poses that differ by them count as one",
     "presence": "estimated probability that the photograph shows the object in that box",
     "reliable": f"confidence of at least {RELIABLE:g}, no warnings, and no better match outside the prior; false = no "
     "reliable match, the pose is a guess",
@@ -48,11 +49,13 @@ CONVENTIONS = {
 def result_document(result: Registration, registrar: Registrar, seconds: Mapping[str, float]) -> dict[str, Any]:
     """:meth:`Registration.to_dict` and how the result was computed, with the seconds of ``bank`` and ``register``."""
     bank = registrar.bank
+    symmetries = registrar.symmetries_of(exact=registrar.is_exact(with_camera=result.translation is not None))
     return {
         "schema": SCHEMA,
         **result.pose_dict(),
         "unit": mesh_unit(bank.meshes[result.model]),
         **result.to_dict(),
+        "symmetries": 1 if symmetries is None else len(symmetries),
         "views": len(bank),
         "pipeline": registrar.pipeline.describe(),
         "seconds": dict(seconds),
@@ -93,11 +96,13 @@ def corners(box: Sequence[float]) -> str:
 
 
 def remarks(document: Mapping[str, Any]) -> list[str]:
-    """Lines about given numbers that did not fit: a box that was replaced, limits that the photograph contradicts."""
+    """Lines about numbers that did not fit, a replaced box or contradicted limits, and about a symmetric mesh."""
     box, contradiction = document["corrected_box"], document.get("prior", {}).get("contradiction")
     lines = [] if box is None else [f"the box did not fit the pose; one that does: {corners(box)}"]
     if contradiction == "better outside":
         lines.append("the photograph fits much better outside the limits on the pose; check them")
     elif contradiction is not None:
         lines.append("the pose lies at one of its limits; widen it to see whether it stays")
+    if (count := document.get("symmetries", 1)) > 1:
+        lines.append(f"the mesh looks the same in {count} orientations: the pose is one of as many")
     return lines

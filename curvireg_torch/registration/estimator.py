@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import CurviregError
+from ..io.meshes import has_colours, mesh_symmetries
 from ..matching import Ranking, ViewDescriber, ViewMatcher
 from ..terms import QueryFeatures
 from ..utils.checks import check_option
@@ -45,6 +46,7 @@ class _Batch:
     descriptors: Tensor
     priors: BatchPriors | None
     exact: bool
+    symmetries: Tensor | None
 
     def scores(self, evidence: Tensor) -> Tensor:
         return rescore(evidence, exact=self.exact)
@@ -56,7 +58,7 @@ class PoseEstimator:
     Args:
         matcher: of the bank; its pipeline decides all results.
         mesh_is: "exact" or "similar", see :class:`Registrar`.
-        symmetries: (S, 4, 4) of the mesh; hypotheses that differ by one of them are reported once.
+        symmetries: (S, 4, 4) of the mesh, see :class:`Registrar`.
         progress: called with (stage, done, total) if it is a function.
     """
 
@@ -73,6 +75,19 @@ class PoseEstimator:
             check_option(mesh_is, MESH_KINDS, "mesh_is")
         self.mesh_is = mesh_is
         self.symmetries, self.progress = symmetries, progress
+
+    def is_exact(self, *, with_camera: bool) -> bool:
+        """Whether the mesh counts as that of this very object."""
+        return self.mesh_is == "exact" if self.mesh_is else with_camera
+
+    def symmetries_of(self, *, exact: bool) -> Tensor | None:
+        """(S, 4, 4) that were given, or those of the shape of an exact mesh; None if there are none."""
+        return self._shape_symmetries if exact and self.symmetries is None else self.symmetries
+
+    @cached_property
+    def _shape_symmetries(self) -> Tensor | None:
+        meshes = self.bank.meshes
+        return None if len(meshes) > 1 or has_colours(meshes[0]) else mesh_symmetries(meshes[0])
 
     @cached_property
     def describers(self) -> tuple[ViewDescriber, ...]:
@@ -148,7 +163,7 @@ class PoseEstimator:
         """
         batch = self._rank(items, query, ranking)
         count = max(LEAST, self.pipeline.hypotheses)
-        starts = start_hypotheses(batch.ranking, self.bank, count=count, symmetries=self.symmetries)
+        starts = start_hypotheses(batch.ranking, self.bank, count=count, symmetries=batch.symmetries)
         starts = starts if batch.priors is None else batch.priors.moved_inside(starts)
         hypotheses = self._search(batch, starts) if self.pipeline.search else starts
         poses = self._lift(batch, hypotheses)
@@ -156,7 +171,7 @@ class PoseEstimator:
             self.report_progress("contours")
             poses = fit_poses(self.describers, batch.images, poses, batch.boxes)
         evidence = self._evidence(batch, starts, poses)
-        distinct = distinct_mask(poses.hypotheses, batch.scores(evidence), symmetries=self.symmetries)
+        distinct = distinct_mask(poses.hypotheses, batch.scores(evidence), symmetries=batch.symmetries)
         poses, evidence = self._restore(batch, starts, poses, evidence, distinct)
         results = self._results(batch, poses, evidence, distinct)
         return [replace(result, warnings=item.warnings) for result, item in zip(results, items, strict=True)]
@@ -167,6 +182,7 @@ class PoseEstimator:
         priors = BatchPriors(items, self.bank) if any(item.prior is not None for item in items) else None
         if ranking is None:
             ranking = self.matcher.rank(query, None if priors is None else priors.log_prior(self.bank))
+        exact = self.is_exact(with_camera=bool(matrices))
         return _Batch(
             images=[item.image for item in items],
             boxes=torch.stack([item.box for item in items]).double(),
@@ -175,7 +191,8 @@ class PoseEstimator:
             ranking=ranking,
             descriptors=self.describers[0].descriptor(query.field),
             priors=priors,
-            exact=self.mesh_is == "exact" if self.mesh_is else bool(matrices),
+            exact=exact,
+            symmetries=self.symmetries_of(exact=exact),
         )
 
     def _search(self, batch: _Batch, starts: Hypotheses) -> Hypotheses:
@@ -239,7 +256,7 @@ class PoseEstimator:
         of_image = [order[poses.hypotheses.image_index[order] == b] for b in range(len(batch.images))]
         # The confidence of a fitted pose was calibrated on the ranking's best view; without fit, on the result's view.
         views = None if fitted else poses.hypotheses.view[torch.stack([mine[0] for mine in of_image])]
-        ranked = ranking_evidence(ranking, self.bank.rotations, answer=views, symmetries=self.symmetries)
+        ranked = ranking_evidence(ranking, self.bank.rotations, answer=views, symmetries=batch.symmetries)
         with_appearance = "appearance" in ranking.terms
         name = model_name("contours" if fitted else "ranking", exact=batch.exact, with_appearance=with_appearance)
         confidence, constants = confidence_model(name), CALIBRATION["answer_set"][name]

@@ -105,7 +105,7 @@ def _refined(estimator: PoseEstimator, item: ImageItem, T: Tensor) -> Registrati
     evidence = torch.stack([torch.zeros_like(support), similarity, support, torch.zeros_like(support)], dim=1)
     scores = rescore(evidence, exact=True)
     together = replace(poses.hypotheses, image_index=torch.zeros_like(poses.hypotheses.image_index))
-    distinct = distinct_mask(together, scores, symmetries=estimator.symmetries)
+    distinct = distinct_mask(together, scores, symmetries=estimator.symmetries_of(exact=True))
     order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]
     hypotheses = tuple(
         replace(hypothesis_of(h, poses, evidence, with_camera=True), view=_nearest_view(estimator, poses, h))

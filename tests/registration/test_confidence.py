@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
+import trimesh
 
 from curvireg_torch import Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
 from curvireg_torch.geometry import symmetry_transforms
+from curvireg_torch.io.meshes import mesh_symmetries
 from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
 from curvireg_torch.matching import Ranking
 from curvireg_torch.registration import confidence, ranking_evidence, rescore
@@ -139,6 +141,22 @@ def test_confidence_is_higher_for_the_object_than_for_clutter():
     assert float(absent.mean()) < 0.5
     registrar = truck_registrar(search=False, contours=False)
     assert not registrar([background(0)], torch.tensor([[60.0, 40, 180, 140]]), CAMERA)[0].reliable
+
+
+def test_symmetries_of_an_exact_grey_mesh_are_found():
+    views = sample_views(azimuth_step=30, elevations=[0, 30])
+    cuboid = ViewBank.build(trimesh.creation.box((1, 2, 3)), views, image_size=64, progress=False)
+    assert len(Registrar(cuboid).symmetries_of(exact=True)) == 4
+    assert Registrar(cuboid).symmetries_of(exact=False) is None
+    assert len(Registrar(cuboid, symmetries=torch.eye(4)[None]).symmetries_of(exact=True)) == 1
+    assert Registrar(ViewBank.join([cuboid, cuboid])).symmetries_of(exact=True) is None
+    result = Registrar(cuboid)(torch.rand(1, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30]]), CAMERA)[0]
+    turned = (
+        torch.stack([h.rotation for h in result.hypotheses])[:, None] @ mesh_symmetries(cuboid.meshes[0])[:, :3, :3]
+    )
+    for h, hypothesis in enumerate(result.hypotheses):
+        others = torch.cat([turned[:h], turned[h + 1 :]])
+        assert not len(others) or float(rotation_error(hypothesis.rotation, others).min()) > 10
 
 
 def test_hypotheses_differ_by_more_than_symmetries():

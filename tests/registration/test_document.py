@@ -39,7 +39,12 @@ class Bank(list):
     meshes = (SimpleNamespace(units="mm"),)
 
 
-REGISTRAR = SimpleNamespace(bank=Bank([0, 1]), pipeline=SimpleNamespace(describe=dict))
+REGISTRAR = SimpleNamespace(
+    bank=Bank([0, 1]),
+    pipeline=SimpleNamespace(describe=dict),
+    is_exact=lambda with_camera: with_camera,
+    symmetries_of=lambda exact: torch.eye(4).repeat(3, 1, 1) if exact else None,
+)
 
 
 def test_to_dict_replaces_unbounded_deviations_by_null():
@@ -58,6 +63,8 @@ def test_result_document_leaves_out_terms_that_did_not_compare_a_view():
     assert [list(pose["terms"]) for pose in document["top"]] == [["hog", "appearance"], ["hog"]]
     assert [pose["score"] for pose in document["top"]] == pytest.approx([0.7, 0.6])
     assert (document["views"], document["unit"], document["seconds"]) == (2, "mm", {"bank": 1.0})
+    assert document["symmetries"] == 3
+    assert "3 orientations" in remarks(document)[0]
     json.dumps(document, allow_nan=False)
 
 

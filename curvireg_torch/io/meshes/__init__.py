@@ -2,6 +2,7 @@
 
 from .colours import SurfaceColours, has_colours, surface_colours
 from .mesh import as_mesh, load_mesh, mesh_centre, mesh_radius, mesh_unit, normalization_transform
+from .symmetry import mesh_symmetries
 from .up import mesh_up, with_z_up
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "load_mesh",
     "mesh_centre",
     "mesh_radius",
+    "mesh_symmetries",
     "mesh_unit",
     "mesh_up",
     "normalization_transform",
