@@ -14,7 +14,8 @@ from .options import PRESETS_HELP, common_options, examples, whole_number
 PROTOCOL = (
     "cad=annotated|any|fused: the annotated CAD model, the best of the class, or one vote of all of the class; "
     "pose=upright|any: whether objects are known to stand upright; "
-    "box=annotated|none|FRACTION: as annotated; localized; or each edge moved by up to FRACTION of the side (seed=N)"
+    "box=annotated|none|FRACTION: as annotated; localized; or each edge moved by up to FRACTION of the side (seed=N); "
+    "hint=none|azimuth:DEG|pose:DEG: azimuth or rotation known to lie within DEG of a value that is off by up to DEG"
 )
 
 
