@@ -41,13 +41,20 @@ class Browser:
         options.add_experimental_option("prefs", {"download.default_directory": str(folder / "downloads")})
         self.driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(PROGRAMS[1]))
         self.folder = folder
+        self.open(address)
+
+    def open(self, address):
         self.driver.get(address)
+        self.wait(lambda: self.part("register"), "the page")
 
     def part(self, name):
         return self.driver.find_element("css selector", f'[data-testid="{name}"]')
 
     def text(self, name):
         return self.part(name).get_attribute("value") or self.part(name).text
+
+    def messages(self):
+        return [part.text for part in self.driver.find_elements("css selector", '[data-testid="message"]')]
 
     def wait(self, condition, what, seconds=90):
         deadline, error = time.monotonic() + seconds, None
@@ -57,7 +64,7 @@ class Browser:
                     return value
             except Exception as caught:  # the page is not ready
                 error = caught
-            assert time.monotonic() < deadline, f"{what}; page says {self.text('message')!r}; {error}"
+            assert time.monotonic() < deadline, f"{what}; page says {self.messages()!r}; {error}"
             time.sleep(0.1)
 
     def click(self, name):

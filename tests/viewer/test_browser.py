@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from curvireg_torch.limits import MAX_VIEWER_PAGES
 from curvireg_torch.viewer.session import MAX_PROPOSALS
 from tests._support.exif import exif, with_exif
 from tests.viewer.browser import MISSING, Browser, wait_for
@@ -73,8 +74,11 @@ def test_server_requires_the_token_and_limits_uploads(address):
     host, port = re.search(r"//([\d.]+):(\d+)/", address).groups()
     token = address.rstrip("/").rsplit("/", 1)[1]
     assert len(token) >= 20
-    with urllib.request.urlopen(address) as answer:
-        assert answer.status == 200
+    for _ in range(MAX_VIEWER_PAGES + 1):  # they take no place: the tests below open a page
+        with urllib.request.urlopen(address) as answer:
+            assert answer.status == 200
+            assert answer.headers["x-frame-options"] == "DENY"
+            assert answer.headers["server"] is None
     for path in ("/", f"/{token[:-1]}/", f"/{token}/file/none/photograph.jpg"):
         connection = http.client.HTTPConnection(host, int(port))
         connection.request("GET", path)
@@ -83,7 +87,7 @@ def test_server_requires_the_token_and_limits_uploads(address):
     # Bodies that are too large or have no length are refused before they are read.
     for headers in ({"Content-Length": str(1 << 40)}, {"Transfer-Encoding": "chunked"}):
         connection = http.client.HTTPConnection(host, int(port))
-        connection.putrequest("POST", "/_nicegui/client/none/upload/1")
+        connection.putrequest("POST", f"/{token}/_nicegui/client/none/upload/1")
         for name, value in headers.items():
             connection.putheader(name, value)
         connection.endheaders()
