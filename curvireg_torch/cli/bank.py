@@ -35,13 +35,14 @@ def run(arguments: argparse.Namespace) -> None:
         check_writable(arguments.adapt.parent, "--adapt")
     from ..io.meshes import load_mesh
     from ..matching import ViewBank
+    from ..utils.threads import one_torch_thread
 
     start, options = time.perf_counter(), register_options(arguments)
     pipeline = options.open_pipeline()
     mesh = load_mesh(arguments.mesh, unit=options.unit, up=options.up)
-    bank = ViewBank.build(
-        mesh, pipeline=pipeline, renderer=options.renderer, progress=options.progress, device=options.device
-    )
+    settings: dict[str, Any] = {"renderer": options.renderer, "progress": options.progress, "device": options.device}
+    with one_torch_thread():
+        bank = ViewBank.build(mesh, pipeline=pipeline, **settings)
     bank.save(arguments.out)
     size = arguments.out.stat().st_size / 1e6
     print(f"{arguments.out}: {len(bank)} views, {size:.1f} MB, {time.perf_counter() - start:.1f} s")

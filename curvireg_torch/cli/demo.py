@@ -25,6 +25,13 @@ def add_parser(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Generate a photograph of the example mesh, register it and print the error."""
     check_writable(arguments.out, "--out")
+    from ..utils.threads import one_torch_thread
+
+    with one_torch_thread():
+        _register_scene(arguments)
+
+
+def _register_scene(arguments: argparse.Namespace) -> None:
     import torch
 
     from ..evaluation.result_files import write_result

@@ -65,21 +65,23 @@ def run(arguments: argparse.Namespace) -> None:
     from ..evaluation.datasets import evaluate
     from ..evaluation.protocol import Protocol
     from ..pipeline import Pipeline
+    from ..utils.threads import one_torch_thread
 
     kind = DATASETS[arguments.dataset]
     dataset = kind.open(arguments.root, **kind.chosen(arguments))
     benchmark = kind.scored(dataset, Protocol.parse(arguments.protocol, pose=kind.pose))
     preset = arguments.preset if arguments.pipeline is None else Pipeline.read(arguments.pipeline)
     check_writable(arguments.out, "--out")
-    summary = evaluate(
-        benchmark,
-        arguments.out,
-        preset=preset,
-        limit=arguments.limit,
-        renderer=arguments.renderer,
-        overwrite=arguments.overwrite,
-        progress=arguments.progress,
-    )
+    with one_torch_thread():
+        summary = evaluate(
+            benchmark,
+            arguments.out,
+            preset=preset,
+            limit=arguments.limit,
+            renderer=arguments.renderer,
+            overwrite=arguments.overwrite,
+            progress=arguments.progress,
+        )
     if summary is None:  # another process writes it
         return
     if summary["n"] == 0:

@@ -23,6 +23,7 @@ from .options import add_box_and_camera, common_options, examples, mesh_options,
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from ..evaluation.opening import RegisterOptions
     from ..registration import FailedRegistration, Follower, Registration
 
 FOLDER_FPS = 10.0
@@ -59,19 +60,34 @@ def run(arguments: argparse.Namespace) -> None:
         raise MissingFileError("no such folder or video", subject=arguments.frames)
     if arguments.camera is None:
         raise InvalidInputError("follow: give --camera FX FY CX CY")
-    from tqdm import tqdm
-
-    from ..evaluation.opening import check_camera, open_registrar
-    from ..geometry import camera_matrix
-    from ..registration import Follower
-    from ..visualization import OverlayVideo
+    from ..evaluation.opening import check_camera
+    from ..utils.threads import one_torch_thread
 
     options, out = register_options(arguments, [arguments.frames], [arguments.mesh]), arguments.out
     check_camera(options.camera, None)
     check_writable(out, "--out")
-    frames, count, fps = _frames(arguments.frames, options.meshes)
+    with one_torch_thread():
+        rows, video = _follow(options, out)
+    counts = {status: sum(row[1] == status for row in rows) for status in ("ok", "lost", "failed")}
+    summary = ", ".join(f"{count} {status}" for status, count in counts.items())
+    print(f"{len(rows)} frames: {summary}; see {out}/results.csv and {video}")
+    if not counts["ok"]:
+        raise InvalidInputError("no frame could be registered; give --box of the object in the first frame")
+
+
+def _follow(options: "RegisterOptions", out: Path) -> tuple[list[list[Any]], Path]:
+    """Rows of ``out / "results.csv"``, which is also written after an interruption, and path of the overlay."""
+    from tqdm import tqdm
+
+    from ..evaluation.opening import open_registrar
+    from ..geometry import camera_matrix
+    from ..registration import Follower
+    from ..visualization import OverlayVideo
+
+    assert options.camera is not None
+    frames, count, fps = _frames(options.photos[0], options.meshes)
     registrar = open_registrar(options, options.meshes, options.open_field())
-    follow = Follower(registrar, camera_matrix(*arguments.camera))
+    follow = Follower(registrar, camera_matrix(*options.camera))
     rows: list[list[Any]] = []
     try:
         with closing(OverlayVideo(out / "overlay.mp4", registrar, fps=fps)) as video:
@@ -79,14 +95,10 @@ def run(arguments: argparse.Namespace) -> None:
                 result = _pose(follow, image, None if rows else options.box)
                 rows.append(_row(name, result))
                 video.add(None if isinstance(image, ImageError) else image, result)
-    finally:  # an interruption loses no pose
+    finally:
         if rows:
             _write_tables(out, rows)
-    counts = {status: sum(row[1] == status for row in rows) for status in ("ok", "lost", "failed")}
-    summary = ", ".join(f"{count} {status}" for status, count in counts.items())
-    print(f"{len(rows)} frames: {summary}; see {out}/results.csv and {video.path}")
-    if not counts["ok"]:
-        raise InvalidInputError("no frame could be registered; give --box of the object in the first frame")
+    return rows, video.path
 
 
 def _pose(follow: "Follower", image: "Tensor | ImageError", box: Any) -> "Registration | FailedRegistration":

@@ -108,12 +108,14 @@ def _registration_figure(kind: str, options: "RegisterOptions") -> Any:
     from ..evaluation.opening import check_camera, open_registrar
     from ..io import read_photo
     from ..registration.document import used_box
+    from ..utils.threads import one_torch_thread
     from ..visualization import plots
 
     check_camera(options.camera, options.guess)
     photo = read_photo(options.photos[0], dtype=torch.uint8)
-    registrar = open_registrar(options, options.meshes)
-    result, document = register_entry(options.entry(options.photos[0]), photo, registrar, bank_seconds=0.0)
+    with one_torch_thread():
+        registrar = open_registrar(options, options.meshes)
+        result, document = register_entry(options.entry(options.photos[0]), photo, registrar, bank_seconds=0.0)
     if kind == "sphere":
         return plots.view_sphere(registrar.bank, result)
     return plots.fields(registrar, result, photo.image, torch.tensor(used_box(document)))

@@ -130,6 +130,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..evaluation.opening import check_camera
     from ..evaluation.prior_options import prior_from_limits
     from ..evaluation.workers import run_processes
+    from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, arguments.photos, arguments.meshes)
     options.open_pipeline()  # errors in options come before any photograph is read
@@ -140,13 +141,14 @@ def run(arguments: argparse.Namespace) -> None:
     if options.start is not None and options.limits:
         raise InvalidInputError("--start: refines this pose alone; leave limits on the pose out")
     if arguments.list is None and is_one_photograph(options.photos):
-        _register_one(options, field, arguments.out, as_json=arguments.json)
+        with one_torch_thread():
+            _register_one(options, field, arguments.out, as_json=arguments.json)
         return
     if options.start is not None:
         raise InvalidInputError("--start: refines one pose; give one photograph")
     if run_processes(arguments.jobs, arguments.argv):
         return
-    with tempfile.TemporaryDirectory() as folder:
+    with one_torch_thread(), tempfile.TemporaryDirectory() as folder:
         out = Path(folder) if arguments.out is None else arguments.out
         photos = _photo_list(options, arguments.list, out, every=arguments.every)
         counts = _register_several(options, field, photos, out)

@@ -1,4 +1,4 @@
-"""Many small jobs on the threads that torch may use, one job per thread."""
+"""Many small jobs on as many threads as torch may use, one job per thread."""
 
 import itertools
 import os
@@ -15,6 +15,31 @@ Result = TypeVar("Result")
 
 _pool_of_process: tuple[int, ThreadPoolExecutor] | None = None
 _this_thread = threading.local()
+_threads_for_jobs = 1
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Within, torch computes on one thread in each job, and as many jobs run at a time as torch had threads before.
+
+    Threads that divide an operation of torch wait for the slowest of them, in a loop that occupies a core. Where
+    another program takes a core from one of them, every operation waits until it returns. Threads that each have a job
+    of their own wait once, at the end. Commands compute like this; for its caller, a library changes nothing.
+
+    Example:
+        >>> with one_torch_thread():
+        ...     torch.get_num_threads()
+        1
+    """
+    global _threads_for_jobs
+    threads, before = torch.get_num_threads(), _threads_for_jobs
+    _threads_for_jobs = available_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        _threads_for_jobs = before
+        torch.set_num_threads(threads)
 
 
 def for_each(count: int, job: Callable[[int], object]) -> None:
@@ -53,13 +78,13 @@ def _pool() -> ThreadPoolExecutor:
     """The threads of this process for short jobs; a forked process has none and starts its own."""
     global _pool_of_process
     if _pool_of_process is None or _pool_of_process[0] != os.getpid():
-        _pool_of_process = os.getpid(), ThreadPoolExecutor(max(os.cpu_count() or 1, torch.get_num_threads()))
+        _pool_of_process = os.getpid(), ThreadPoolExecutor(max(os.cpu_count() or 1, available_threads()))
     return _pool_of_process[1]
 
 
 def available_threads() -> int:
-    """Threads that a job may use here: those of torch, and in :func:`map_on_threads` those left over."""
-    return max(getattr(_this_thread, "threads", 1), torch.get_num_threads())
+    """Threads that jobs may use here: those of torch or :func:`one_torch_thread`, in a job those left over."""
+    return max(getattr(_this_thread, "threads", _threads_for_jobs), torch.get_num_threads())
 
 
 def map_on_threads(
@@ -70,7 +95,7 @@ def map_on_threads(
     A result depends neither on the number of items nor on the number of threads, which would change its rounding.
     Threads that are left over help with :func:`for_each`. For other devices than the CPU, jobs run in sequence here.
     """
-    threads = torch.get_num_threads()
+    threads = available_threads()
     if threads == 1 or torch.device(device).type != "cpu":
         return [job(item) for item in items]
     threads_each = max(1, threads // max(1, len(items)))
@@ -90,7 +115,7 @@ def single_threaded_pool() -> Iterator[ThreadPoolExecutor]:
     Operations on a few images are too short to divide. After an error, jobs that have not started are cancelled.
     """
     threads = torch.get_num_threads()
-    with ThreadPoolExecutor(available_threads(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
+    with ThreadPoolExecutor(available_threads(), initializer=_compute_single_threaded) as pool:
         try:
             yield pool
         except BaseException:
@@ -98,3 +123,8 @@ def single_threaded_pool() -> Iterator[ThreadPoolExecutor]:
             raise
         finally:
             torch.set_num_threads(threads)  # some libraries count threads for the whole process
+
+
+def _compute_single_threaded() -> None:
+    _this_thread.threads = 1
+    torch.set_num_threads(1)

@@ -1,6 +1,7 @@
 """``curvireg demo``, ``bank``, ``cache`` and ``--help``."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -12,13 +13,15 @@ import torch
 import trimesh
 
 from curvireg_torch.cli import main
-from curvireg_torch.errors import CurviregWarning
+from curvireg_torch.errors import CurviregWarning, InvalidInputError
 from curvireg_torch.evaluation.opening import RegisterOptions
+from curvireg_torch.evaluation.registry import DatasetSpec
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.models import LearnedCurvilinearSaliency
 from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline
 from curvireg_torch.settings import BankSettings, ViewPolicy
 from curvireg_torch.training import adapt
+from curvireg_torch.utils.threads import available_threads
 from tests._support.scenes import truck_bank
 
 
@@ -94,6 +97,43 @@ import curvireg_torch.__main__
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
+@pytest.mark.parametrize(
+    ("words", "work"),
+    [
+        ("register PHOTO MESH --box 1 1 40 40 --out OUT", "evaluation.opening.open_registrar"),
+        ("register PHOTO PHOTO MESH --box 1 1 40 40 --out OUT", "evaluation.lists.register_list"),
+        ("follow PHOTOS MESH --camera 300 300 119.5 89.5 --out OUT", "evaluation.opening.open_registrar"),
+        ("plot sphere PHOTO MESH --box 1 1 40 40 --out OUT.png", "evaluation.opening.open_registrar"),
+        ("bank MESH --out OUT.safetensors", "matching.ViewBank.build"),
+        ("demo --out OUT", "synthetic.photograph_tabletop"),
+        ("evaluate web ROOT --out OUT", "evaluation.datasets.evaluate"),
+        ("view", "viewer.server.serve"),
+    ],
+)
+def test_commands_compute_with_one_thread_of_torch_for_each_job(words, work, folder, tmp_path, monkeypatch):
+    if words == "view":
+        pytest.importorskip("nicegui")
+    seen = []
+
+    def stop(*_, **__):
+        seen.append((torch.get_num_threads(), available_threads()))
+        raise InvalidInputError("seen")
+
+    monkeypatch.setattr(f"curvireg_torch.{work}", stop)
+    for name in ("open", "scored"):
+        monkeypatch.setattr(DatasetSpec, name, lambda *_: None)
+    places = {"PHOTOS": folder / "photos", "PHOTO": folder / "photos" / "0.png", "MESH": folder / "truck.ply"}
+    places["OUT"] = places["ROOT"] = tmp_path
+    command = re.sub("[A-Z]{3,}", lambda name: str(places[name[0]]), words)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        assert main(command.split()) == 2
+        assert (seen, torch.get_num_threads()) == ([(1, 2)], 2)
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_main_prints_our_warnings_and_not_those_of_numpy(monkeypatch, capsys):

@@ -9,6 +9,7 @@ import torch
 from curvireg_torch import Pipeline, Registrar, ViewBank, sample_views
 from curvireg_torch.registration import Registration
 from curvireg_torch.synthetic import example_mesh
+from curvireg_torch.utils.threads import one_torch_thread
 from tests._support.scenes import CAMERA, scene
 
 IMAGES, BOXES = [scene(seed)[0] for seed in (0, 1)], torch.stack([scene(seed)[1] for seed in (0, 1)])
@@ -44,7 +45,9 @@ def test_registration_is_bit_identical_in_any_company(bank: ViewBank) -> None:
     together = Registrar(bank)(IMAGES, BOXES, CAMERA)
     registrar = Registrar(bank)
     later = [registrar([IMAGES[k]], BOXES[k : k + 1], CAMERA)[0] for k in (1, 0)][::-1]
-    for one, *others in zip(alone, together, later, strict=True):
+    with one_torch_thread():
+        command = [Registrar(bank)([i], b[None], CAMERA)[0] for i, b in zip(IMAGES, BOXES, strict=True)]
+    for one, *others in zip(alone, together, later, command, strict=True):
         for other in others:
             assert all(map(torch.equal, numbers(one), numbers(other)))
 

@@ -9,7 +9,7 @@ import torch
 
 from curvireg_torch import Pipeline, Registrar, ViewMatcher
 from curvireg_torch.settings import BankSettings, ViewPolicy
-from scripts.speed import filters, paired, pipeline
+from scripts.speed import filters, load, paired, pipeline
 from tests._support.pretended import PRETENDING, pretended_gpu
 from tests._support.scenes import scene, truck_bank
 
@@ -111,3 +111,35 @@ def test_filters_script_compares_equal_functions(tmp_path):
     text = page.read_text(encoding="utf-8")
     assert "old" not in text
     assert all(f"| {name} |" in text for name in (*filters.BLOCKS, *filters.LAYERS))
+
+
+def test_load_runs_the_variants_alternately_beside_busy_loops(tmp_path, monkeypatch, capsys):
+    started, running, runs = [], [], []
+
+    class Loop:
+        def __init__(self, words):
+            started.append(words)
+            running.append(self)
+
+        def kill(self):
+            running.remove(self)
+
+        def wait(self):
+            assert self not in running
+
+    def run_demo(checkout, folder, environment):
+        runs.append((checkout.name, folder.name, bool(environment), len(running)))
+        return {"command": float(len(runs)), "registration": 0.5, "processor": 2.0}
+
+    monkeypatch.setattr(load, "run_demo", run_demo)
+    monkeypatch.setattr(load.subprocess, "Popen", Loop)
+    monkeypatch.setattr(load, "commit", lambda *_: "abc")
+    out = tmp_path / "load.json"
+    load.main(["--against", str(tmp_path), "--loads", "0", "3", "--rounds", "2", "--out", str(out)])
+    before, here = tmp_path.name, load.REPOSITORY.name
+    turn = [(before, "before", False), (before, "passive", True), (here, "now", False)]
+    assert runs == [(*each, loops) for loops, rounds in ((0, 3), (3, 2)) for each in turn * rounds]
+    assert (len(started), running) == (3, [])
+    rows = json.loads(out.read_text())["rows"]
+    assert rows[1]["seconds"]["passive"]["command"] == [11.0, 14.0]
+    assert "| 3 | 11.5 (13.0) | 12.5 (14.0) | 13.5 (15.0) | 0.5 (0.5) |" in capsys.readouterr().out

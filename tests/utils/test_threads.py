@@ -6,7 +6,13 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from curvireg_torch.utils.threads import for_each, map_on_threads, single_threaded_pool
+from curvireg_torch.utils.threads import (
+    available_threads,
+    for_each,
+    map_on_threads,
+    one_torch_thread,
+    single_threaded_pool,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -133,3 +139,38 @@ def test_map_on_threads_raises_errors_and_restores_threads() -> None:
     with pytest.raises(ZeroDivisionError):
         map_on_threads(lambda number: 1 // number, [0, 1, 2])
     assert torch.get_num_threads() == 2
+
+
+def test_one_torch_thread_gives_the_threads_of_torch_to_jobs() -> None:
+    both = threading.Barrier(2, timeout=20)  # times out unless two jobs run at the same time
+
+    def threads_in_job(_: int) -> tuple[int, int]:
+        both.wait()
+        return torch.get_num_threads(), available_threads()
+
+    assert (torch.get_num_threads(), available_threads()) == (2, 2)
+    with one_torch_thread(), one_torch_thread():
+        assert (torch.get_num_threads(), available_threads()) == (1, 2)
+        for_each(2, lambda _: both.wait())
+        assert map_on_threads(threads_in_job, [0, 1]) == [(1, 1)] * 2
+        assert map_on_threads(lambda _: (torch.get_num_threads(), available_threads()), [0]) == [(1, 2)]
+        with single_threaded_pool() as pool:
+            assert list(pool.map(threads_in_job, [0, 1])) == [(1, 1)] * 2
+        assert (torch.get_num_threads(), available_threads()) == (1, 2)
+    assert (torch.get_num_threads(), available_threads()) == (2, 2)
+    torch.set_num_threads(1)
+    assert available_threads() == 1, "outside, the setting of the caller holds"
+
+
+def test_one_torch_thread_restores_the_threads_after_an_error() -> None:
+    with pytest.raises(ZeroDivisionError), one_torch_thread():
+        raise ZeroDivisionError
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(1)
+    assert available_threads() == 1
+
+
+def test_threads_left_over_divide_the_work_of_a_single_job() -> None:
+    both = threading.Barrier(2, timeout=20)
+    with one_torch_thread():
+        assert map_on_threads(lambda _: len(map_on_threads(lambda _: both.wait(), [0, 1])), [0]) == [2]
