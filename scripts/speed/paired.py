@@ -1,7 +1,7 @@
 """Time each step from process start to pose in this checkout and in another one, alternately, with peak memory.
 
     git worktree add ../before 9b0fb33
-    python scripts/speed/paired.py --against ../before            # writes scripts/results/paired.json, prints a table
+    python scripts/speed/paired.py --against ../before     # scripts/results/paired.json; plot and table of the docs
 
 Every measurement has a process of its own; each step counts with its least time and memory. On an idle machine only.
 
@@ -138,7 +138,7 @@ def case(checkouts: dict[str, Path], faces: int, megapixels: float, photographs:
 
 
 def table(record: dict[str, Any]) -> str:
-    """Seconds (MB) of each step, before and now."""
+    """Seconds (MB) of each step, before and now, in Markdown."""
     from scripts._shared import table_lines
 
     rows = [["faces", "megapixels", "step", *record["commits"], "ratio"]]
@@ -147,12 +147,33 @@ def table(record: dict[str, Any]) -> str:
             both = [row[name][step] for name in record["commits"]]
             cells = [f"{each['seconds']:.2f} s, {each['megabytes']:.0f} MB" for each in both]
             ratio = f"{both[-1]['seconds'] / both[0]['seconds']:.2f}"
-            rows.append([str(row["faces"]), f"{row['megapixels']:g}", step, *cells, ratio])
-    return "\n".join(table_lines(rows))
+            rows.append([str(row["faces"]), f"{row['megapixels']:g}", f"`{step}`", *cells, ratio])
+    commits = ", ".join(f"{name} {commit}" for name, commit in record["commits"].items())
+    many = f"{record['photographs']} photographs in `many_1` and `many_2`"
+    return "\n".join([*table_lines(rows), "", f"{many}; {record['processor']}, {record['date']}; {commits}.", ""])
+
+
+def plot(record: dict[str, Any], path: Path) -> None:
+    """Draw the seconds of each step, before and now, for the mesh and photograph of the first case."""
+    from matplotlib import pyplot as plt
+
+    row, names = record["cases"][0], list(record["commits"])
+    figure, axes = plt.subplots(figsize=(7.0, 2.6), layout="constrained")
+    for k, name in enumerate(names):
+        seconds = [row[name][step]["seconds"] for step in STEPS]
+        places = [i + 0.8 * (k - 0.5 * (len(names) - 1)) / len(names) for i in range(len(STEPS))]
+        bars = axes.bar(places, seconds, width=0.8 / len(names), label=f"{name} ({record['commits'][name]})")
+        axes.bar_label(bars, fmt="%.2f", fontsize=8)
+    axes.set_xticks(range(len(STEPS)), STEPS)
+    axes.set_ylabel("seconds")
+    axes.legend()
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    from scripts._shared import RESULTS, commit, today, write_json
+    from scripts._shared import REPOSITORY, RESULTS, commit, processor, today, update_page, write_json
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout of this repository")
@@ -170,11 +191,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "date": today(),
         "commits": {name: commit(root) for name, root in checkouts.items()},
         "photographs": options.photographs,
-        "cores": os.cpu_count(),
+        "processor": processor(),
         "cases": [case(checkouts, *each, options.photographs, options.rounds) for each in cases],
     }
     write_json(options.out, record)
     print(table(record))
+    if options.out == RESULTS / "paired.json":
+        update_page(REPOSITORY / "docs" / "performance.md", "paired", table(record))
+        plot(record, REPOSITORY / "docs" / "images" / "paired.png")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ views in alternation, the object filling the image, and the best of three rounds
 
 import argparse
 import json
-import platform
 import statistics
 import tempfile
 import time
@@ -32,7 +31,7 @@ from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.settings import BankSettings
 from curvireg_torch.synthetic import random_pose, synthesize_photograph
-from scripts._shared import REPOSITORY, RESULTS, commit, timed, today, update_page, write_json
+from scripts._shared import REPOSITORY, RESULTS, commit, processor, timed, today, update_page, write_json
 
 
 def dented_sphere(faces: int) -> trimesh.Trimesh:
@@ -169,7 +168,7 @@ def main() -> None:
         "photographs": photographs,
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
-        "machine": platform.machine() if device == "cpu" else torch.cuda.get_device_name(device),
+        "machine": processor() if device == "cpu" else torch.cuda.get_device_name(device),
         "times": pipeline_times(mesh, Pipeline(), photographs, device),
     }
     print(pipeline_table(record))

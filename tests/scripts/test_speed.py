@@ -60,7 +60,7 @@ def test_paired_steps_keep_the_least_of_each_checkout(tmp_path, monkeypatch, cap
     first = record["cases"][0]
     assert first["now"]["cold"] == {"seconds": 1.0 / 16, "megabytes": 4.0}
     assert first["before"]["cold"] == {"seconds": 2.0 / 15, "megabytes": 3.0}
-    assert "| 9 | 0.3 | cold | 0.13 s, 3 MB | 0.06 s, 4 MB | 0.47 |" in capsys.readouterr().out
+    assert "| 9 | 0.3 | `cold` | 0.13 s, 3 MB | 0.06 s, 4 MB | 0.47 |" in capsys.readouterr().out
 
 
 def row(number, *, right, preset="learned", linemod=False):
