@@ -18,7 +18,9 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
     "myst_parser",
+    "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
 ]
 exclude_patterns = ["_build", "gallery"]
@@ -30,6 +32,9 @@ html_title = "curvireg_torch"
 html_copy_source = False
 
 myst_heading_anchors = 4  # the same anchors as on GitHub
+
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
 
 autodoc_member_order = "bysource"
 autodoc_inherit_docstrings = False  # torch repeats one docstring for every forward()
@@ -68,7 +73,7 @@ def site_links(text: str, file: Path) -> str:
 
     def site_link(match: re.Match[str]) -> str:
         path = (file.parent / match[1]).resolve().relative_to(ROOT).as_posix()
-        path = re.sub(r"^docs/gallery/(\w+)\.py$", r"docs/auto_gallery/\1.rst", path)
+        path = re.sub(r"^docs/gallery/([\w/]+)\.py$", r"docs/auto_gallery/\1.rst", path)
         if path == "README.md":
             path = "docs/index.md"
         elif path in COPIED_PAGES:

@@ -1,14 +1,14 @@
 """Draw the pictures of real photographs, and of the demo, in docs/images.
 
 python scripts/docs_pictures.py demo cup
-python scripts/docs_pictures.py buddha known-pose --buddha data/bop/buddha
+python scripts/docs_pictures.py buddha buddha-all known-pose --buddha data/bop/buddha
 
 docs/images/SOURCES.txt names the photographers and licences.
 """
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,9 @@ OFF, AXIS = 10.0, (1.0, 1.0, 1.0)
 
 CUP_BOX, CUP_VIEW, CUP_WINDOW = (172.0, 18.0, 409.0, 308.0), 40.0, (120, 0, 460, 340)
 """Box of the cup in px, horizontal field of view in degrees, and the part of the photograph that is shown."""
+
+TILE, COLUMNS = 184, 7
+"""Side of a photograph among all of them in px, and how many of them stand in a row."""
 
 STAGES = {"view": "best of the bank's views", "search": "search", "contours": "contour fit"}
 PAPER, INK = (255, 255, 255), (30, 30, 30)
@@ -90,7 +93,7 @@ def save(picture: Image.Image, name: str, **options: Any) -> None:
     print(f"{name}: {picture.width} x {picture.height} px, {path.stat().st_size / 1000:.0f} kB")
 
 
-def demo() -> None:
+def draw_demo() -> None:
     """The overlay of ``curvireg demo``."""
     out = REPOSITORY / "out" / "demo"
     curvireg(["demo", "--out", str(out)])
@@ -125,14 +128,21 @@ def draw_cup() -> None:
     save(side_by_side(panels), "cup.webp")
 
 
+def buddha_samples(root: Path) -> tuple[cr.Registrar, list[dict[str, Any]]]:
+    """The registrar of the plaster head, and the samples of all photographs with their (4, 4) true poses as "truth"."""
+    samples = list(BOPDataset(root))
+    for sample in samples:
+        sample["truth"] = torch.eye(4, dtype=torch.float64)
+        sample["truth"][:3, :3], sample["truth"][:3, 3] = sample["rotation"], sample["translation"]
+    bank = cached_bank(cr.load_mesh(samples[0]["model_path"], unit="mm"), progress=False)
+    return cr.Registrar(bank), samples
+
+
 def buddha_sample(root: Path) -> tuple[cr.Registrar, dict[str, Any], Tensor]:
-    """The registrar of the plaster head, the photograph's sample, and its (4, 4) true pose."""
-    dataset = BOPDataset(root)
-    sample = next(s for s in dataset if s["image_id"] == BUDDHA)
-    truth = torch.eye(4, dtype=torch.float64)
-    truth[:3, :3], truth[:3, 3] = sample["rotation"].double(), sample["translation"].double()
-    bank = cached_bank(cr.load_mesh(sample["model_path"], unit="mm"), progress=False)
-    return cr.Registrar(bank), sample, truth
+    """The registrar, the sample of the photograph ``BUDDHA``, and its true pose."""
+    registrar, samples = buddha_samples(root)
+    sample = next(s for s in samples if s["image_id"] == BUDDHA)
+    return registrar, sample, sample["truth"]
 
 
 def rotation_off(T: Tensor, truth: Tensor) -> float:
@@ -161,6 +171,28 @@ def draw_buddha(root: Path) -> None:
     save(frames[0], "closing-in.webp", **options)
 
 
+def draw_all(root: Path) -> None:
+    """All photographs of the set with the contours of their poses, in the order of their numbers."""
+    registrar, samples = buddha_samples(root)
+    tiles = []
+    for sample in samples:
+        image, box, K = sample["image"], sample["box"], sample["camera_matrix"]
+        result = registrar([image], box[None], K)[0]
+        error = rotation_off(result.projection[0], sample["truth"])
+        print(f"{sample['image_id']}: {error:.1f} degrees off, confidence {result.confidence:.2f}")
+        T, K = result.projection
+        H, W = image.shape[-2:]
+        (x, y), half = ((box[:2] + box[2:]) / 2).round().int().tolist(), min(H, W) // 2
+        x, y = min(max(x, half), W - half), min(max(y, half), H - half)
+        picture = shrink(drawn(registrar, (T, K), image, (x - half, y - half, x + half, y + half)), TILE)
+        tiles.append(captioned(picture, f"{error:.1f}° ({math.floor(100 * result.confidence) / 100:.2f})"))
+    rows = [side_by_side(tiles[k : k + COLUMNS], gap=4) for k in range(0, len(tiles), COLUMNS)]
+    sheet = Image.new("RGB", (rows[0].width, sum(row.height for row in rows)), PAPER)
+    for k, row in enumerate(rows):
+        sheet.paste(row, (0, k * row.height))
+    save(sheet, "buddha-all.webp")
+
+
 def draw_known_pose(root: Path) -> None:
     """A start that is 10 degrees off, and the refined pose."""
     registrar, sample, truth = buddha_sample(root)
@@ -180,18 +212,23 @@ def draw_known_pose(root: Path) -> None:
 
 
 def main() -> None:
-    pictures = ("demo", "cup", "buddha", "known-pose")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pictures", nargs="+", choices=pictures)
+    generated: dict[str, Callable[[], None]] = {"demo": draw_demo, "cup": draw_cup}
+    real: dict[str, Callable[[Path], None]] = {
+        "buddha": draw_buddha,
+        "buddha-all": draw_all,
+        "known-pose": draw_known_pose,
+    }
+    parser.add_argument("pictures", nargs="+", choices=[*generated, *real])
     parser.add_argument("--buddha", type=Path, metavar="DIR", help="BOP folder of the plaster head")
     arguments = parser.parse_args()
-    if arguments.buddha is None and {"buddha", "known-pose"} & {*arguments.pictures}:
-        parser.error("buddha and known-pose need --buddha DIR")
+    if arguments.buddha is None and not real.keys().isdisjoint(arguments.pictures):
+        parser.error(f"{', '.join(real)} need --buddha DIR")
     for name in arguments.pictures:
-        if name in ("demo", "cup"):
-            {"demo": demo, "cup": draw_cup}[name]()
+        if name in generated:
+            generated[name]()
         else:
-            {"buddha": draw_buddha, "known-pose": draw_known_pose}[name](arguments.buddha)
+            real[name](arguments.buddha)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from curvireg_torch import cli
 
 from .._support.pages import BUILT, DOCS, PAGES, ROOT, split_command, steps
 
-SOURCES = [*PAGES, *DOCS.glob("gallery/*.py")]
+SOURCES = [*PAGES, *DOCS.rglob("gallery/**/*.py")]
 PATHS = r"(?<![\w/.])((?:curvireg_torch|scripts|tests|docs|datasets)/[\w./-]*\.(?:py|sh|md|png|csv))\b"
 
 GENERATED = r"<!-- ([\w ]+):begin -->.*?<!-- \1:end -->"

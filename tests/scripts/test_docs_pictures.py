@@ -118,4 +118,4 @@ def test_photographs_of_others_are_credited():
             assert (IMAGES / name).is_file()
             shown = [page.read_text("utf-8") for page in PAGES if f"images/{name})" in page.read_text("utf-8")]
             assert any(licence in page and author in page for page in shown), name
-    assert text.count(".webp") == 4
+    assert text.count(".webp") == 5

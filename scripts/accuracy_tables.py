@@ -1,0 +1,129 @@
+"""Write the three tables at the top of docs/accuracy.md from the records in scripts/results.
+
+    python scripts/accuracy_tables.py             write the tables
+    python scripts/accuracy_tables.py --check     exit 1 if the page differs from the records
+
+Run it after any of the measurements that it shows was recorded again.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from scripts._shared import REPOSITORY, RESULTS, replace_between, table_lines
+
+PAGE = REPOSITORY / "docs" / "accuracy.md"
+BEGIN, END = "<!-- accuracy:begin -->", "<!-- accuracy:end -->"
+
+Record = dict[str, Any]
+
+SETS = {
+    "benchmark, exact, upright": ("generated, exact mesh", "yes", "contours, exact, appearance"),
+    "benchmark, sibling, upright": ("generated, similar mesh", "no", "contours, similar, appearance"),
+    "pascal3d_mini": ("PASCAL3D+ (part), similar mesh", "no", "pascal3d_mini"),
+    "hope": ("hope, exact mesh, in clutter (16 views x 5 lightings)", "yes", "hope"),
+    "lm": ("LINEMOD (part), exact mesh", "yes", "lm"),
+    "dino": ("dino, exact mesh", "yes", "dino"),
+    "buddha": ("buddha, exact mesh", "yes", "buddha"),
+}
+"""For each set of hints.json: its name on the page, whether the camera is known, and its name in calibration.json."""
+
+STAGES = {"view": "best view of the bank", "search": "after the search", "contours": "after the contours"}
+
+
+def record(name: str) -> Record:
+    found: Record = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+    return found
+
+
+def share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def measured(found: Record) -> str:
+    return f"Measured on {found['date']}, commit {found['commit']}."
+
+
+def right_answers(hints: Record, evaluations: dict[str, Record]) -> list[list[str]]:
+    """How often the first answer is right, without a hint and with one."""
+    rows = [["photographs", "camera known", "N", "right", "right, azimuth known to 45°", "median error"]]
+    for key, (name, camera, _) in SETS.items():
+        found = hints["sets"][key]
+        rates = [share(found.get(hint, [None])[0]) for hint in ("none", "azimuth:45")]
+        error = evaluations[key]["summary"]["med_err_deg"] if key in evaluations else None
+        rows.append([name, camera, str(found["n"]), *rates, "-" if error is None else f"{error:.1f}°"])
+    return rows
+
+
+def trust(calibration: Record) -> list[list[str]]:
+    """What confidence and answer sets are worth."""
+    rows = [["photographs", "N", "called reliable", "right of them", "answer set holds the truth", "answers in it"]]
+    confidences = calibration["held_out"] | calibration["real"]
+    sets = calibration["answer_sets"] | calibration["real_answer_sets"]
+    for name, _, key in SETS.values():
+        found, answers = confidences[key], sets[key]
+        counts = [str(found[k]) for k in ("n", "reliable", "reliable_and_right")]
+        rows.append([name, *counts, share(answers["coverage"]), f"{answers['mean_size']:.1f}"])
+    return rows
+
+
+def precision(refinement: Record) -> list[list[str]]:
+    """How exact poses are after each stage."""
+    found = refinement["boxes"]["0.05"]["all"]
+    rows = [["stage", "rotation, median", "90 %", "translation, of the distance", "seconds of one core"]]
+    for key, name in STAGES.items():
+        median, most, shift, seconds = (
+            found[f"{key}: {what}"] for what in ("rotation median", "rotation 90 %", "translation median %", "seconds")
+        )
+        rows.append([name, f"{median:.2g}°", f"{most:.2g}°", f"{shift:.2g} %", f"{seconds:.1f}"])
+    return rows
+
+
+def tables() -> str:
+    """The three tables, each with its question and its records."""
+    hints, calibration, refinement = record("hints"), record("calibration"), record("refinement")
+    evaluations = {
+        path.stem.removeprefix("evaluation_"): json.loads(path.read_text(encoding="utf-8"))
+        for path in sorted(RESULTS.glob("evaluation_*.json"))
+    }
+    n, right = (refinement["boxes"]["0.05"]["all"][key] for key in ("n", "right"))
+    parts = [
+        (
+            "How often is the first answer right?",
+            right_answers(hints, evaluations),
+            "Right: within 30°, up to symmetries. The hint is the true azimuth, moved at random by up to 45°. The "
+            "median error of PASCAL3D+ counts symmetries as errors. " + measured(hints),
+        ),
+        (
+            "How far can it be trusted?",
+            trust(calibration),
+            'Reliable: a confidence of at least 0.9. An answer set should hold the truth, or "none of them" where no '
+            "answer is right, for 0.90 of the photographs. " + measured(calibration),
+        ),
+        (
+            "How exact is it?",
+            precision(refinement),
+            f"{n} generated photographs with exact mesh and known camera; of the {right} whose best view is within 30°.",
+        ),
+    ]
+    return "\n".join("\n".join([f"## {title}", "", *table_lines(rows), "", note, ""]) for title, rows, note in parts)
+
+
+def main(page: Path = PAGE) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing; exit 1 if the page is out of date")
+    check = parser.parse_args().check
+    text = page.read_text(encoding="utf-8")
+    expected = replace_between(text, BEGIN, END, "\n" + tables())
+    if check:
+        if expected != text:
+            print(f"accuracy_tables: {page.name} is out of date; run scripts/accuracy_tables.py", file=sys.stderr)
+        return int(expected != text)
+    page.write_text(expected, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

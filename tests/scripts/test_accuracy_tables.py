@@ -1,0 +1,53 @@
+"""scripts/accuracy_tables.py: the three tables of docs/accuracy.md from the records."""
+
+import sys
+
+import pytest
+
+from scripts import accuracy_tables
+from scripts.accuracy_tables import BEGIN, END, PAGE, SETS, precision, right_answers, trust
+
+
+def test_page_has_the_recorded_numbers(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["accuracy_tables.py", "--check"])
+    assert accuracy_tables.main() == 0, "run python scripts/accuracy_tables.py"
+
+
+def test_writes_between_the_markers_and_reports_old_tables(tmp_path, monkeypatch, capsys):
+    page = tmp_path / "page.md"
+    page.write_text(f"# Title\n{BEGIN}\nold\n{END}\nend\n")
+    monkeypatch.setattr(sys, "argv", ["accuracy_tables.py", "--check"])
+    assert accuracy_tables.main(page) == 1
+    assert "page.md is out of date" in capsys.readouterr().err
+    monkeypatch.setattr(sys, "argv", ["accuracy_tables.py"])
+    assert accuracy_tables.main(page) == 0
+    text = page.read_text()
+    assert text.startswith(f"# Title\n{BEGIN}\n\n## How often")
+    assert text.endswith(f"{END}\nend\n")
+    assert "old" not in text
+    assert text.count("\n## ") == 3
+
+
+def test_tables_take_each_number_from_its_record():
+    hints = {"sets": {key: {"n": k, "none": [0.125 * k], "azimuth:45": [1.0]} for k, key in enumerate(SETS)}}
+    del hints["sets"]["lm"]["azimuth:45"]
+    rows = right_answers(hints, {"dino": {"summary": {"med_err_deg": 12.34}}})
+    assert rows[4] == ["hope, exact mesh, in clutter (16 views x 5 lightings)", "yes", "3", "0.38", "1.00", "-"]
+    assert rows[5][3:] == ["0.50", "-", "-"]
+    assert rows[6][5] == "12.3°"
+    names = [key for _, _, key in SETS.values()]
+    confidence = {name: {"n": 9, "reliable": k, "reliable_and_right": 0} for k, name in enumerate(names)}
+    sets = {name: {"coverage": 0.901, "mean_size": 2.04} for name in names}
+    split = [{name: part[name] for name in some} for part in (confidence, sets) for some in (names[:2], names[2:])]
+    keys = ("held_out", "real", "answer_sets", "real_answer_sets")
+    assert trust(dict(zip(keys, split, strict=True)))[7] == ["buddha, exact mesh", "9", "6", "0", "0.90", "2.0"]
+    numbers = {"rotation median": 6.09, "rotation 90 %": 10.94, "translation median %": 0.155, "seconds": 1.26}
+    found = {f"{stage}: {name}": value for stage in ("view", "search", "contours") for name, value in numbers.items()}
+    table = precision({"boxes": {"0.05": {"all": found | {"search: seconds": 3.0}}}})
+    assert table[1] == ["best view of the bank", "6.1°", "11°", "0.15 %", "1.3"]
+    assert table[2][4] == "3.0"
+
+
+@pytest.mark.parametrize("value", [None, 0.0, 0.995])
+def test_share(value):
+    assert accuracy_tables.share(value) == {None: "-", 0.0: "0.00", 0.995: "0.99"}[value]
