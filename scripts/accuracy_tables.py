@@ -105,7 +105,7 @@ def tables() -> str:
         (
             "How exact is it?",
             precision(refinement),
-            f"{n} generated photographs with exact mesh and known camera; of the {right} whose best view is within 30°.",
+            f"Of {n} generated photographs (exact mesh, known camera), the {right} whose best view is within 30°.",
         ),
     ]
     return "\n".join("\n".join([f"## {title}", "", *table_lines(rows), "", note, ""]) for title, rows, note in parts)

@@ -19,7 +19,6 @@ from curvireg_torch.synthetic import example_mesh, procedural_background, random
 from curvireg_torch.training.scenes import random_shape
 from curvireg_torch.visualization import contour_overlay
 
-torch.set_grad_enabled(False)
 mesh, size = example_mesh(), (360, 480)
 K = cr.camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
 upright = cr.Pipeline().with_pose_prior("upright")

@@ -22,7 +22,6 @@ from curvireg_torch.io.meshes import mesh_radius
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from curvireg_torch.visualization import contour_overlay
 
-torch.set_grad_enabled(False)
 mesh, size = example_mesh(), (360, 480)
 K = cr.camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
 generator = torch.Generator().manual_seed(1)
@@ -51,7 +50,7 @@ plt.show()
 
 crop = cr.crop_images([photograph], box[None], size=128)[0]
 focus = cr.MultiScaleFocusCurves()(crop)
-learned = cr.LearnedCurvilinearSaliency()(crop)
+learned = cr.LearnedCurvilinearSaliency()(crop).detach()
 
 _, axes = plt.subplots(1, 3, figsize=(9, 3.3), layout="constrained")
 show(axes[0], crop[0].permute(1, 2, 0), "crop")

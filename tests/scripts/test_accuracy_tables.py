@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from scripts import accuracy_tables
-from scripts.accuracy_tables import BEGIN, END, PAGE, SETS, precision, right_answers, trust
+from scripts.accuracy_tables import BEGIN, END, SETS, precision, right_answers, trust
 
 
 def test_page_has_the_recorded_numbers(monkeypatch):
@@ -24,7 +24,7 @@ def test_writes_between_the_markers_and_reports_old_tables(tmp_path, monkeypatch
     text = page.read_text()
     assert text.startswith(f"# Title\n{BEGIN}\n\n## How often")
     assert text.endswith(f"{END}\nend\n")
-    assert "old" not in text
+    assert "\nold\n" not in text
     assert text.count("\n## ") == 3
 
 
