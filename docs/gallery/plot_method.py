@@ -88,7 +88,8 @@ plt.show()
 # The drawing shows the directions *along* the edges in each cell, for the photograph and for the right view.
 
 query = registrar.matcher.query([photograph], box[None])
-ranking = registrar.matcher.rank(query)
+with torch.no_grad():
+    ranking = registrar.matcher.rank(query)
 right = int(cr.rotation_error(bank.rotations, truth[:3, :3].to(bank.rotations)).argmin())
 view_field = cr.DepthCurvilinearSaliency(sigma=0.8)(describer.depth(bank.rotations[[right]], distances[[right]])[0])
 
