@@ -25,7 +25,10 @@ class Page(HTMLParser):
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
         found = dict(attributes)
         self.anchors |= {value for name in ("id", "name") if (value := found.get(name))}
-        self.links += [value for name in ("href", "src") if (value := found.get(name))]
+        links = [value for name in ("href", "src") if (value := found.get(name))]
+        if found.get("class") == "viewcode-back":  # one package for each file, even if two document parts of it
+            links = [link.partition("#")[0] for link in links]
+        self.links += links
         if tag == "img" and not (found.get("alt") or "").strip() and "_thumb." not in (found.get("src") or ""):
             self.undescribed.append(found.get("src") or "?")
 
