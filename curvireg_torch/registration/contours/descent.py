@@ -80,11 +80,11 @@ class ContourProblem:
         for reach in reaches:
             T = state.T
             for _ in range(STEPS):
-                T = apply_twist(T, self._bounded(self._step(state.points, T, reach), T), self.centre)
-            state = self._rendered_again(replace(state, T=T))
+                T = self.step(state.points, T, reach)
+            state = self.rendered_again(replace(state, T=T))
         return state
 
-    def _rendered_again(self, state: ContourState) -> ContourState:
+    def rendered_again(self, state: ContourState) -> ContourState:
         # Decided for each pose separately: a result must not depend on the rest of the batch.
         stale = self.mean_shift(state.points, state.rendered, state.T) > STALE
         if not bool(stale.any()):
@@ -100,7 +100,18 @@ class ContourProblem:
         mean: Tensor = length.sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
         return mean
 
-    def _step(self, points: ContourPoints, T: Tensor, reach: float) -> Tensor:
+    def step(
+        self, points: ContourPoints, T: Tensor, reach: float, others: tuple[Tensor, Tensor] | None = None
+    ) -> Tensor:
+        """(N, 4, 4) poses after a least-squares step towards edges within ``reach`` px.
+
+        ``others``, (N, 6, 6) and (N, 6), are normal equations of further measurements, which are added.
+        """
+        return apply_twist(T, self._bounded(self._solve(points, T, reach, others), T), self.centre)
+
+    def _solve(
+        self, points: ContourPoints, T: Tensor, reach: float, others: tuple[Tensor, Tensor] | None
+    ) -> Tensor:
         """(N, 6) rotation about the centre and translation of it."""
         uv, du = project(points.model, T, self.K, self.centre)
         J = (points.normals[..., None, :] @ du)[..., 0, :]
@@ -113,6 +124,8 @@ class ContourProblem:
             W = strength.gather(-1, index) * tukey
             A = J.mT @ (W * J)
             b = J.mT @ (W * distance.gather(-1, index))
+            if others is not None:
+                A, b = A + others[0], b + others[1][..., None]
             damping = DAMPING * A.diagonal(dim1=-2, dim2=-1)
             least = 1e-12 * damping.amax(dim=-1, keepdim=True) + 1e-12  # without matches the step is 0
             step = torch.linalg.solve(A + torch.diag_embed(damping + least), b)[..., 0]
