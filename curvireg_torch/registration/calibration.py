@@ -1,15 +1,19 @@
-"""Constants that scripts/calibration fitted on photographs of the benchmark: calibrate.py and refinement.py."""
+"""Constants that scripts/calibration fitted on photographs of the benchmark: calibrate.py, refinement.py and
+tracking.py."""
 
 import json
 from pathlib import Path
 from typing import Any
 
-__all__ = ["CALIBRATION", "COVARIANCE_SCALE", "REFINEMENT", "SQUARED_RADIUS"]
+__all__ = ["CALIBRATION", "COVARIANCE_SCALE", "REFINEMENT", "SQUARED_RADIUS", "TRACKING"]
 
 CALIBRATION: dict[str, Any] = json.loads(Path(__file__).with_name("calibration.json").read_text(encoding="utf-8"))
 
 REFINEMENT: dict[str, Any] = json.loads(Path(__file__).with_name("refinement.json").read_text(encoding="utf-8"))
 """Weights and bias of :func:`curvireg_torch.registration.confidence.refinement_confidence`."""
+
+TRACKING: dict[str, Any] = json.loads(Path(__file__).with_name("tracking.json").read_text(encoding="utf-8"))
+"""Weights and bias of :func:`curvireg_torch.registration.confidence.tracking_confidence`."""
 
 COVARIANCE_SCALE: float = CALIBRATION["covariance"]["scale"]
 """Factor of the least-squares covariance, which ignores edges that do not belong to the object."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..matching import Ranking
-from .calibration import CALIBRATION, REFINEMENT
+from .calibration import CALIBRATION, REFINEMENT, TRACKING
 
 __all__ = [
     "CONFIDENCE_FEATURES",
@@ -95,6 +95,15 @@ def refinement_confidence(features: Features) -> float:
         features: ``similarity`` and ``edge_support`` of the pose.
     """
     return LogisticModel(REFINEMENT["weights"], REFINEMENT["bias"])(features)
+
+
+def tracking_confidence(features: Features) -> float:
+    """Probability that a tracked pose is within 10 degrees and 10 % of the distance of the truth.
+
+    Args:
+        features: of :class:`.tracking.TrackedPose`.
+    """
+    return LogisticModel(TRACKING["weights"], TRACKING["bias"])({name: features[name] for name in TRACKING["weights"]})
 
 
 def ranking_evidence(

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError, LostObjectError
-from ..geometry.cameras import projected_boxes
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose
 from .answer_set import AnswerSet
@@ -20,6 +19,7 @@ from .poses import Poses, fit_poses, lift_to_poses, to_allocentric
 from .rescoring import rescore, similarities
 from .results import FailedRegistration, Registration
 from .search import search
+from .tracking.window import boxes_at
 
 __all__ = ["LOST", "refine"]
 
@@ -90,7 +90,7 @@ def _refined(estimator: PoseEstimator, item: ImageItem, T: Tensor) -> Registrati
     assert item.camera_matrix is not None
     describers, images = estimator.describers, [item.image] * len(T)
     K = item.camera_matrix.double().expand(len(T), 3, 3)
-    boxes = _boxes(estimator, item, T, K)
+    boxes = boxes_at(describers[0].hull, T, K, item.size)
     query = estimator.matcher.query(images, boxes.float())
     check_crop(query.crops[0])
     descriptors = describers[0].descriptor(query.field)
@@ -108,30 +108,13 @@ def _refined(estimator: PoseEstimator, item: ImageItem, T: Tensor) -> Registrati
     distinct = distinct_mask(together, scores, symmetries=estimator.symmetries_of(exact=True))
     order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]
     hypotheses = tuple(
-        replace(hypothesis_of(h, poses, evidence, with_camera=True), view=_nearest_view(estimator, poses, h))
+        replace(hypothesis_of(h, poses, evidence, with_camera=True), view=nearest_view(estimator, poses.hypotheses.rotation[h]))
         for h in order
     )
     features = {"similarity": float(similarity[order[0]]), "edge_support": float(support[order[0]])}
     unranked = Ranking(torch.zeros(1, 0), torch.zeros(1, 0, dtype=torch.long), {})
     answers = AnswerSet((refinement_confidence(features), *[0.0] * (len(hypotheses) - 1)))
     return Registration(hypotheses, answers, unranked, features, warnings=item.warnings)
-
-
-def _boxes(estimator: PoseEstimator, item: ImageItem, T: Tensor, K: Tensor) -> Tensor:
-    """(S, 4) boxes around the mesh at the starts, px.
-
-    Raises:
-        LostObjectError: the mesh lies behind the camera, or outside the photograph.
-    """
-    hull = estimator.describers[0].hull
-    H, W = item.image.shape[-2:]
-    depth = (hull.to(T) @ T[:, 2, :3].mT + T[:, 2, 3]).amin(dim=0)
-    boxes = projected_boxes(hull, T, K)
-    limits = torch.tensor([W, H], dtype=boxes.dtype) - 0.5
-    outside = (boxes[:, :2] >= limits) | (boxes[:, 2:] <= -0.5) | (depth <= 0)[:, None]
-    if bool(outside.any()):
-        raise LostObjectError("at the start the mesh lies outside the photograph; check pose, unit and camera matrix")
-    return boxes
 
 
 def _hypotheses(count: int) -> Hypotheses:
@@ -151,8 +134,8 @@ def _side_by_side(a: Poses, b: Poses) -> Poses:
     return Poses(joined[order], torch.cat([a.T, b.T])[order], torch.cat([a.cameras, b.cameras])[order])
 
 
-def _nearest_view(estimator: PoseEstimator, poses: Poses, h: int) -> int:
-    """The view of the bank that is most similar to a pose."""
+def nearest_view(estimator: PoseEstimator, rotation: Tensor) -> int:
+    """The view of the bank's first model that is most similar to an allocentric rotation (3, 3)."""
     R = estimator.bank.rotations.cpu().double()
-    traces = (R.flatten(1) @ poses.hypotheses.rotation[h].flatten()).masked_fill(estimator.bank.model.cpu() != 0, -4.0)
+    traces = (R.flatten(1) @ rotation.flatten()).masked_fill(estimator.bank.model.cpu() != 0, -4.0)
     return int(traces.argmax())

@@ -1,4 +1,4 @@
-"""Points on the object's surface, tracked from an earlier frame by optical flow."""
+"""Points on the object's surface, found in a new frame by optical flow from an earlier one."""
 
 from dataclasses import dataclass
 
@@ -10,28 +10,35 @@ from torch import Tensor
 from ..contours.descent import apply_twist, pixels, project
 from .window import Window
 
-__all__ = ["Flow", "Keyframe", "make_keyframe", "pose_from_flow", "track_points"]
+__all__ = ["Flow", "Keyframe", "flow_equations", "flow_share", "make_keyframe", "pose_from_flow", "track_points"]
 
 POINTS, APART, QUALITY = 160, 5, 0.01
-"""Corners of a keyframe: most of them, smallest distance in px, and strength as a fraction of the strongest."""
+"""Corners of a keyframe: how many at most, how many px apart at least, and the least strength as a fraction of the
+strongest one's."""
 
 INSIDE = 3
-"""Smallest distance in px of a corner from the outline, beyond which the background moves otherwise."""
+"""Distance in px of a corner from the outline: nearer to it, patches show the background."""
 
-PATCH, LEVELS = 15, 3
-"""Side of the patches of the optical flow in px, and levels of its pyramid above the first."""
+PATCH = 15
+"""Side of the patches of the optical flow in px."""
 
 RETURN = 1.5
-"""Largest distance in px between a point and where the flow back from its match ends."""
+"""Largest distance in px between a corner and where the flow back from its match ends."""
 
 SCALES = (24.0, 12.0, 6.0, 3.0, 2.0, 2.0, 2.0)
-"""Of the Geman-McClure weights in px, one for each least-squares step: from a convex problem to a robust one."""
+"""Scale of the weights in px in each least-squares step: at first all matches count, in the end those that agree."""
+
+LEAST = 8
+"""Matches that a pose from flow needs."""
+
+FITS = 2.0
+"""Scale of the weights in px of matches that fit a pose."""
 
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A frame with a known pose ``T`` (1, 4, 4): its window, and corners ``uv`` (P, 2) on the surface at the model
-    points ``model`` (P, 3)."""
+    """A frame with a known pose ``T`` (1, 4, 4): its window, and corners ``uv`` (P, 2) px, float32, at the points
+    ``model`` (1, P, 3) of the surface."""
 
     window: Window
     T: Tensor
@@ -41,10 +48,16 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class Flow:
-    """Model points (1, P, 3) and where optical flow found them, ``uv`` (1, P, 2) px of the new window."""
+    """The ``model`` points (1, P, 3) that optical flow found at ``uv`` (1, P, 2) px of a window, of ``corners``."""
 
     model: Tensor
     uv: Tensor
+    corners: int
+
+    def moved(self, before: Tensor, after: Tensor) -> "Flow":
+        """The same in another window of the photograph: ``before`` and ``after`` are the windows' cameras (1, 3, 3)."""
+        A = (after @ torch.linalg.inv(before))[0]
+        return Flow(self.model, self.uv @ A[:2, :2].mT + A[:2, 2], self.corners)
 
 
 def make_keyframe(window: Window, T: Tensor, depth: Tensor) -> Keyframe:
@@ -55,53 +68,72 @@ def make_keyframe(window: Window, T: Tensor, depth: Tensor) -> Keyframe:
         T: (1, 4, 4) pose in it.
         depth: (1, 1, S, S) of the mesh at that pose.
     """
-    inside = (depth[0, 0] > 0).to(torch.uint8).numpy()
-    inside = cv2.erode(inside, np.ones((2 * INSIDE + 1, 2 * INSIDE + 1), np.uint8), borderValue=0)
+    side = 2 * INSIDE + 1
+    inside = cv2.erode((depth[0, 0] > 0).to(torch.uint8).numpy(), np.ones((side, side), np.uint8), borderValue=0)
     found = cv2.goodFeaturesToTrack(window.grey, POINTS, QUALITY, APART, mask=inside)
     uv = np.zeros((0, 2), np.float32) if found is None else found[:, 0]
     pixel = torch.from_numpy(uv).double()
-    z = depth[0, 0, pixel[:, 1].round().long(), pixel[:, 0].round().long()].double()
+    column, row = pixel.round().long().unbind(-1)
     rays = torch.cat([pixel, torch.ones_like(pixel[:, :1])], dim=1) @ torch.linalg.inv(window.K[0]).mT
-    model = (rays * z[:, None] - T[0, :3, 3]) @ T[0, :3, :3]
-    return Keyframe(window, T, uv, model)
+    z = depth[0, 0, row, column].double()
+    return Keyframe(window, T, uv, ((rays * z[:, None] - T[0, :3, 3]) @ T[0, :3, :3])[None])
 
 
-def track_points(keyframe: Keyframe, window: Window, T: Tensor, centre: Tensor, *, levels: int = LEVELS) -> Flow:
-    """Corners of a keyframe in a new window, where a pose ``T`` (1, 4, 4) predicts them.
+def track_points(keyframe: Keyframe, window: Window, T: Tensor, centre: Tensor, *, levels: int) -> Flow:
+    """Corners of a keyframe in a new window, searched where the pose ``T`` (1, 4, 4) projects them.
 
-    A match whose flow back does not return to its corner is dropped.
+    Matches from which the flow does not lead back to the corner are dropped. A pyramid of ``levels`` halvings lets the
+    search reach further.
     """
-    if len(keyframe.uv) == 0:
-        return Flow(torch.zeros(1, 0, 3, dtype=torch.float64), torch.zeros(1, 0, 2, dtype=torch.float64))
-    guess = pixels(keyframe.model[None], T, window.K, centre)[0].float().numpy()
+    corners = len(keyframe.uv)
+    if corners == 0:
+        return Flow(keyframe.model, torch.zeros(1, 0, 2, dtype=torch.float64), 0)
+    guess = pixels(keyframe.model, T, window.K, centre)[0].float().numpy()
     options = {"winSize": (PATCH, PATCH), "maxLevel": levels, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
     before, after = keyframe.window.grey, window.grey
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, keyframe.uv, guess.copy(), **options)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, keyframe.uv, guess, **options)
     back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, keyframe.uv.copy(), **options)
     near = np.linalg.norm(back - keyframe.uv, axis=1) < RETURN
     kept = torch.from_numpy((found[:, 0] > 0) & (returned[:, 0] > 0) & near)
-    return Flow(keyframe.model[kept][None], torch.from_numpy(there).double()[kept][None])
+    return Flow(keyframe.model[:, kept], torch.from_numpy(there).double()[None, kept], corners)
 
 
 def pose_from_flow(flow: Flow, T: Tensor, K: Tensor, centre: Tensor) -> Tensor:
-    """(1, 4, 4) pose of most matches, from a start ``T`` (1, 4, 4), by graduated robust least squares."""
+    """(1, 4, 4) pose that most matches agree on, by robust least squares from ``T`` (1, 4, 4); ``T`` if there are few.
+
+    Example:
+        >>> K = torch.tensor([[[200.0, 0, 128], [0, 200.0, 128], [0, 0, 1]]], dtype=torch.float64)
+        >>> start, zero = torch.eye(4, dtype=torch.float64)[None], torch.zeros(3, dtype=torch.float64)
+        >>> start[0, 2, 3] = 5.0
+        >>> truth = apply_twist(start, torch.tensor([[0.05, -0.04, 0.03, 0.1, -0.1, 0.2]]).double(), zero)
+        >>> points = torch.rand(1, 40, 3, dtype=torch.float64) - 0.5
+        >>> uv = pixels(points, truth, K, zero)
+        >>> uv[:, :12] += 30.0                                                        # matches of something else
+        >>> bool((pose_from_flow(Flow(points, uv, 40), start, K, zero) - truth).abs().max() < 1e-3)
+        True
+    """
+    if flow.uv.shape[1] < LEAST:
+        return T
     for scale in SCALES:
-        A, b = flow_equations(flow, T, K, centre, scale)
+        A, b = flow_equations(flow, T, K, centre, scale=scale)
         A = A + torch.diag_embed(1e-6 * A.diagonal(dim1=-2, dim2=-1) + 1e-9)
         T = apply_twist(T, torch.linalg.solve(A, b), centre)
     return T
 
 
-def flow_equations(flow: Flow, T: Tensor, K: Tensor, centre: Tensor, scale: float) -> tuple[Tensor, Tensor]:
-    """Normal equations A (1, 6, 6), b (1, 6) of the matches with Geman-McClure weights."""
+def flow_equations(flow: Flow, T: Tensor, K: Tensor, centre: Tensor, *, scale: float = FITS) -> tuple[Tensor, Tensor]:
+    """Normal equations (1, 6, 6) and (1, 6) of the matches at a pose, with Geman-McClure weights of ``scale`` px."""
     uv, J = project(flow.model, T, K, centre)
     residual = flow.uv - uv
-    weight = flow_weights(residual, scale)
-    WJ = (weight[..., None, None] * J).flatten(1, 2)
-    J = J.flatten(1, 2)
-    return WJ.mT @ J, (WJ.mT @ residual.flatten(1)[..., None])[..., 0]
+    WJ = (_weights(residual, scale)[..., None, None] * J).flatten(1, 2)
+    return WJ.mT @ J.flatten(1, 2), (WJ.mT @ residual.flatten(1)[..., None])[..., 0]
 
 
-def flow_weights(residual: Tensor, scale: float) -> Tensor:
-    """(..., P) weights in (0, 1] of residuals (..., P, 2) px."""
+def flow_share(flow: Flow, T: Tensor, K: Tensor, centre: Tensor) -> float:
+    """Share of the corners, in [0, 1], whose matches fit the pose ``T`` (1, 4, 4)."""
+    return float(_weights(flow.uv - pixels(flow.model, T, K, centre), FITS).sum()) / max(flow.corners, 1)
+
+
+def _weights(residual: Tensor, scale: float) -> Tensor:
+    """(1, P) weights in (0, 1] of residuals (1, P, 2) px."""
     return (1.0 + residual.square().sum(dim=-1) / scale**2) ** -2

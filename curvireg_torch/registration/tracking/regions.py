@@ -1,125 +1,136 @@
-"""Colours on both sides of an outline: where along its normals does the object end?"""
+"""Colours of the object and of the background along its outline, and where they say that the object ends."""
 
 import math
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-__all__ = ["Lines", "RegionModel", "colour_bins", "line_posterior"]
+__all__ = ["RegionModel", "colour_bins", "line_posterior"]
 
 LEVELS = 8
 """Levels of each colour channel in a histogram."""
 
 SECTORS = 12
-"""Histograms around the object, one for each direction from its centre in the image."""
+"""Directions from the object's centre in the image, each with its own histograms."""
 
+LOCAL = 0.7
+"""Weight of a sector's own histogram; the rest is the mean of all sectors."""
 
-@dataclass(frozen=True)
-class Lines:
-    """Lines across an outline (P,): ``uv`` (P, 2) px and unit ``normals`` (P, 2) that point out of the object."""
+FLOOR = 0.3 / LEVELS**3
+"""Added to probabilities, so that a colour never seen is not proof."""
 
-    uv: Tensor
-    normals: Tensor
+CONFLICT = 4.0
+"""Largest log ratio of one pixel."""
 
-    def samples(self, offsets: Tensor) -> Tensor:
-        """(P, L, 2) px at offsets (L,) px along the normals."""
-        return self.uv[:, None] + offsets[:, None] * self.normals[:, None]
+TEMPER = 0.3
+"""Factor of log ratios: neighbouring pixels are not independent."""
+
+ENOUGH = 20.0
+"""Pixels of a sector with which it learns at half of the rate."""
 
 
 def colour_bins(colours: Tensor) -> Tensor:
     """(S, S) int64 histogram bin of each pixel of (1, 3, S, S) colours in [0, 1]."""
-    levels = (colours[0] * LEVELS).long().clamp(0, LEVELS - 1)
-    return (levels[0] * LEVELS + levels[1]) * LEVELS + levels[2]
+    red, green, blue = (colours[0] * LEVELS).long().clamp(0, LEVELS - 1)
+    return (red * LEVELS + green) * LEVELS + blue
 
 
 def line_posterior(log_ratio: Tensor, reach: int) -> tuple[Tensor, Tensor]:
-    """Mean and variance in px of where lines cross the outline, from the colours along them.
+    """Mean and variance of where lines leave the object, from the colours along them.
 
-    If the outline crosses at offset d, the pixels before d show the object and those behind it the background. With
+    If a line leaves the object at d, its pixels before d show the object and those behind it the background. With
     r(l) = log p(colour at l | object) - log p(colour at l | background), the logarithm of the likelihood of d is, but
-    for a constant, the sum of r(l) over l < d. The prior is uniform over the offsets from -reach to reach.
+    for a constant, the sum of r(l) over l < d. The prior is uniform from -reach to reach.
 
     Args:
-        log_ratio: (P, L) r at the offsets -h to h, L = 2 h + 1.
-        reach: at most h px.
+        log_ratio: (P, L) r at the offsets -h to h px along lines that point out of the object, L = 2 h + 1.
+        reach: in px, at most h.
 
     Returns:
-        (P,) and (P,).
+        Offsets (P,) in px and their variance (P,) in px².
 
     Example:
-        >>> sharp = torch.tensor([[2.0, 2.0, 2.0, 2.0, -2.0, -2.0, -2.0]])           # the object ends after offset 0
-        >>> mean, variance = line_posterior(sharp, 3)
-        >>> round(float(mean), 2), float(variance) < 0.4
-        (0.5, True)
+        >>> ends = torch.tensor([[2.0, 2.0, 2.0, 2.0, 2.0, -2.0, -2.0]])              # after the pixel at offset 1
+        >>> mean, variance = line_posterior(ends, 3)
+        >>> round(float(mean), 1), bool(variance < 0.5)
+        (1.4, True)
     """
     half = log_ratio.shape[-1] // 2
-    # The boundary lies half-way between two samples: after the sample at l, at d = l + 1/2.
     log_likelihood = log_ratio.cumsum(dim=-1)[..., half - reach : half + reach]
-    d = torch.arange(-reach, reach, dtype=log_ratio.dtype) + 0.5
+    d = torch.arange(-reach, reach, dtype=log_ratio.dtype) + 0.5  # between two pixels
     p = log_likelihood.softmax(dim=-1)
     mean = (p * d).sum(dim=-1)
     return mean, (p * (d - mean[..., None]).square()).sum(dim=-1)
 
 
 class RegionModel:
-    """Colour histograms of the object and of the background around it, one pair for each sector."""
+    """Colour histograms of the object and of the background, a pair for each direction from the object's centre.
 
-    def __init__(self, rate: float, temper: float) -> None:
-        self.rate, self.temper = rate, temper
-        self._counts = torch.zeros(2, SECTORS, LEVELS**3)
-        self._table = torch.zeros(SECTORS, LEVELS**3)
+    Directions are angles in rad of the image's x, y axes; between the middles of two sectors both count.
+    """
 
-    def learn(self, bins: Tensor, samples: Tensor, sectors: Tensor, inside: Tensor, valid: Tensor, rate: float) -> None:
-        """Move the histograms towards the colours of samples (M, 2) px, ``inside`` (M,) the object or not."""
-        x, y = samples.round().long().unbind(-1)
-        S = bins.shape[-1]
-        valid = valid & (x >= 0) & (x < S) & (y >= 0) & (y < S)
-        colour = bins[y[valid], x[valid]]
-        low, fraction = _sector_of(sectors[valid])
-        new = torch.zeros_like(self._counts)
-        side = (~inside[valid]).long()
-        for sector, weight in ((low, 1.0 - fraction), ((low + 1) % SECTORS, fraction)):
-            index = (side * SECTORS + sector) * LEVELS**3 + colour
-            new.view(-1).index_add_(0, index, weight.float())
-        total = new.sum(dim=-1, keepdim=True)
-        new = new / total.clamp(min=1e-6)
-        # A sector in which nothing was seen keeps its colours.
-        step = rate * (total / (total + 20.0))
-        known = self._counts.sum(dim=-1, keepdim=True) > 0
-        self._counts = torch.where(known, (1.0 - step) * self._counts + step * new, new)
-        smooth = self._smoothed(self._counts)
-        p = smooth / smooth.sum(dim=-1, keepdim=True).clamp(min=1e-9)
-        p = 0.7 * p + 0.3 * p.mean(dim=1, keepdim=True)
-        floor = 0.3 / LEVELS**3
-        self._table = self.temper * ((p[0] + floor).log() - (p[1] + floor).log()).clamp(-4.0, 4.0)
+    def __init__(self) -> None:
+        self._histograms = torch.zeros(2, SECTORS, LEVELS**3)
+        self._log_ratio = torch.zeros(SECTORS * LEVELS**3)
 
-    @staticmethod
-    def _smoothed(counts: Tensor) -> Tensor:
-        kernel = torch.tensor([0.2, 0.6, 0.2])
-        cube = counts.view(-1, 1, LEVELS, LEVELS, LEVELS)
-        for shape, pad in (((1, 1, 3), (1, 1, 0, 0, 0, 0)), ((1, 3, 1), (0, 0, 1, 1, 0, 0)), ((3, 1, 1), (0, 0, 0, 0, 1, 1))):
-            cube = F.conv3d(F.pad(cube, pad, mode="replicate"), kernel.view(1, 1, *shape))
-        return cube.view_as(counts)
+    def learn(self, bins: Tensor, uv: Tensor, directions: Tensor, inside: Tensor, *, rate: float) -> None:
+        """Move the histograms towards the colours of some pixels.
 
-    def log_ratio(self, bins: Tensor, samples: Tensor, sectors: Tensor) -> Tensor:
-        """(P, L) tempered log p(colour | object) - log p(colour | background) of samples (P, L, 2) on lines with
-        directions ``sectors`` (P,) rad; 0 outside the window."""
-        x, y = samples.round().long().unbind(-1)
-        S = bins.shape[-1]
-        seen = (x >= 0) & (x < S) & (y >= 0) & (y < S)
-        colour = bins[y.clamp(0, S - 1), x.clamp(0, S - 1)]
-        low, fraction = _sector_of(sectors)
-        flat = self._table.view(-1)
-        n = LEVELS**3
-        a = flat[low[:, None] * n + colour]
-        b = flat[((low + 1) % SECTORS)[:, None] * n + colour]
-        f = fraction[:, None].to(a.dtype)
-        return ((1.0 - f) * a + f * b) * seen
+        Args:
+            bins: (S, S) of :func:`colour_bins`.
+            uv: (M, 2) px; those outside the window are left out.
+            directions: (M,) rad from the object's centre.
+            inside: (M,) bool, whether a pixel shows the object.
+            rate: in [0, 1], the weight of these pixels; histograms that are empty take all of them.
+        """
+        index, seen = _indices(bins, uv)
+        colour = bins.view(-1)[index[seen]]
+        low, high, fraction = _sectors(directions[seen])
+        side = (~inside[seen]).long()
+        new = torch.zeros_like(self._histograms)
+        for sector, weight in ((low, 1.0 - fraction), (high, fraction)):
+            new.view(-1).index_add_(0, (side * SECTORS + sector) * LEVELS**3 + colour, weight.float())
+        count = new.sum(dim=-1, keepdim=True)
+        new = new / count.clamp(min=1e-9)
+        step = rate * count / (count + ENOUGH)
+        empty = self._histograms.sum(dim=-1, keepdim=True) == 0
+        self._histograms = torch.where(empty, new, (1.0 - step) * self._histograms + step * new)
+        p = _smoothed(self._histograms)
+        p = LOCAL * p + (1.0 - LOCAL) * p.mean(dim=1, keepdim=True) + FLOOR
+        self._log_ratio = TEMPER * (p[0] / p[1]).log().clamp(-CONFLICT, CONFLICT).view(-1)
+
+    def log_ratio(self, bins: Tensor, uv: Tensor, directions: Tensor) -> Tensor:
+        """(P, L) log p(colour | object) - log p(colour | background), times ``TEMPER``, at (P, L, 2) px of lines in
+        ``directions`` (P,); 0 outside the window."""
+        index, seen = _indices(bins, uv)
+        colour = bins.view(-1)[index]
+        low, high, fraction = (x[:, None] for x in _sectors(directions))
+        of_low, of_high = (self._log_ratio[sector * LEVELS**3 + colour] for sector in (low, high))
+        return torch.lerp(of_low, of_high, fraction.to(of_low.dtype)) * seen
 
 
-def _sector_of(angle: Tensor) -> tuple[Tensor, Tensor]:
-    place = (angle / (2.0 * math.pi) % 1.0) * SECTORS
+def _indices(bins: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+    """Indices (...) of the flattened pixels nearest to ``uv`` (..., 2), and whether they lie in the window."""
+    side = bins.shape[-1]
+    x, y = uv.round().long().unbind(-1)
+    seen = (x >= 0) & (x < side) & (y >= 0) & (y < side)
+    return y.clamp(0, side - 1) * side + x.clamp(0, side - 1), seen
+
+
+def _sectors(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The two sectors beside each direction, and the weight of the second."""
+    place = (directions / (2.0 * math.pi) % 1.0) * SECTORS
     low = place.floor()
-    return low.long() % SECTORS, place - low
+    return low.long() % SECTORS, (low.long() + 1) % SECTORS, place - low
+
+
+def _smoothed(histograms: Tensor) -> Tensor:
+    """Histograms (2, SECTORS, LEVELS^3) after a binomial-like filter along each colour channel."""
+    kernel = torch.tensor([0.2, 0.6, 0.2])
+    cube = histograms.view(-1, 1, LEVELS, LEVELS, LEVELS)
+    for axis in range(3):
+        shape, pad = [1, 1, 1], [0] * 6
+        shape[axis], pad[4 - 2 * axis], pad[5 - 2 * axis] = 3, 1, 1
+        cube = F.conv3d(F.pad(cube, pad, mode="replicate"), kernel.view(1, 1, *shape))
+    return cube.view_as(histograms)

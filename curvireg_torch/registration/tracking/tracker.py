@@ -1,4 +1,4 @@
-"""The pose in the next frame, from three kinds of measurement: tracked points, colours beside the outline, edges."""
+"""The pose in the next frame, from three kinds of measurement: points that move, colours beside the outline, edges."""
 
 import math
 import os
@@ -6,198 +6,276 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from ...geometry.cameras import projected_boxes
+from ...errors import LostObjectError
+from ...geometry.cameras import transform
 from ...rendering import DepthRenderer
-from ..contours.descent import ContourProblem, ContourState, project
+from ..confidence import RELIABLE, tracking_confidence
+from ..contours.covariance import pose_covariance
+from ..contours.descent import STALE, ContourProblem, ContourState, pixels, project
 from ..contours.points import EdgeField
-from .flow import Flow, Keyframe, flow_equations, flow_weights, make_keyframe, pose_from_flow, track_points
-from .regions import Lines, RegionModel, colour_bins, line_posterior
+from .flow import Flow, Keyframe, flow_equations, flow_share, make_keyframe, pose_from_flow, track_points
+from .outline import Outline, render_outline
+from .regions import RegionModel, colour_bins, line_posterior
 from .window import SIZE, Window, cut_window
 
-__all__ = ["TRACKING_FEATURES", "TrackedPose", "Tracker"]
-
-TRACKING_FEATURES = ("edge_support", "region", "flow", "agreement")
+__all__ = ["TrackedPose", "Tracker"]
 
 
-def P(name, default):
-    return type(default)(os.environ.get(name, default)) if not isinstance(default, tuple) else tuple(
-        float(x) for x in os.environ[name].split(",")) if name in os.environ else default
+def _env(name, default):
+    if name not in os.environ:
+        return default
+    v = os.environ[name]
+    return tuple(float(x) for x in v.split(",")) if isinstance(default, tuple) else float(v)
 
 
-REACHES = P("REACHES", (10.0, 6.0, 4.0, 2.5))
-W_EDGE, W_REGION, W_FLOW, W_KEY = P("W_EDGE", 1.0), P("W_REGION", 1.0), P("W_FLOW", 0.3), P("W_KEY", 0.5)
-RATE, TEMPER = P("RATE", 0.2), P("TEMPER", 0.3)
-KEY_ANGLE = P("KEY_ANGLE", 8.0)
+REACHES = _env("REACHES", (6.0, 4.0, 2.5))
+"""Search distance in px of edges and of the end of the object's colours, one a round."""
+
+STEPS = int(_env("STEPS", 2))
+"""Least-squares steps per round."""
+
+EDGES, REGIONS, POINTS, KEYFRAME = _env("W_EDGE", 1.0), _env("W_REGION", 1.0), _env("W_FLOW", 0.3), _env("W_KEY", 0.5)
+"""Weights of the measurements: of edges, colours, and points from the last frame and from a keyframe."""
+
+BLUR = 0.5
+"""Variance in px² added to that of the end of the object's colours."""
+
+RATE = _env("RATE", 0.2)
+"""Weight of a new frame in the colour histograms."""
+
+BESIDE = (2, 24)
+"""Nearest and farthest distance in px from the outline at which colours are learned."""
+
+NEAR = 8
+"""Reach in px of the posterior from which :attr:`TrackedPose.features` are computed."""
+
+KEYFRAMES, KEYFRAME_ANGLE = 30, _env("KEY_ANGLE", 8.0)
+"""Keyframes that are kept, and the rotation in degrees from the nearest one at which a frame becomes another."""
+
+LONG, SHORT = 3, 1
+"""Levels of the pyramid of optical flow from the last frame, and from a keyframe, whose points are nearly in place."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A window of a frame and what is measured in it: histogram bins (S, S) and edges."""
+
+    window: Window
+    bins: Tensor
+    problem: ContourProblem
+
+    @property
+    def K(self) -> Tensor:
+        """(1, 3, 3) camera matrix of the window."""
+        return self.window.K
 
 
 @dataclass(frozen=True)
 class TrackedPose:
+    """A pose in a frame.
+
+    Attributes:
+        T: (1, 4, 4) float64 ``T_cam_from_model``.
+        features: what the confidence is computed from, all in [0, 1]: ``edge_support`` as of a contour fit; ``region``,
+            how clearly and how near to the outline the object's colours end; ``flow`` and ``keyframe``, the shares of
+            the corners of the last frame and of a keyframe that are found where the pose has them.
+        frame, outline: what the features were measured in.
+    """
+
     T: Tensor
     features: Mapping[str, float]
+    frame: Frame
+    outline: Outline
+
+    @property
+    def confidence(self) -> float:
+        """Probability that the pose is within 10 degrees and 10 % of the distance of the truth."""
+        return tracking_confidence(self.features)
 
 
 class Tracker:
-    def __init__(self, renderer: DepthRenderer, hull: Tensor, centre: Tensor, radius: float) -> None:
+    """Follows an object from a known pose.
+
+    Each frame is searched around the pose that a constant velocity predicts, and if that is not convincing, around the
+    last pose. Optical flow of corners on the surface gives a first pose; robust least squares then fits jointly edges
+    near the contours, the end of the object's colours along lines across its silhouette, and the corners of the last
+    frame and of the keyframe that was seen from the most similar direction.
+
+    A pose that is found counts as known, to predict and to learn colours from, only after :meth:`accept`.
+
+    Args:
+        renderer: of the mesh.
+        hull: (V, 3) points of the mesh that span its convex hull.
+        centre, radius: of the object, (3,) and model units.
+    """
+
+    def __init__(self, renderer: DepthRenderer, hull: Tensor, *, centre: Tensor, radius: float) -> None:
         self.renderer, self.hull, self.centre, self.radius = renderer, hull.double(), centre.double(), radius
-        self.last: Keyframe | None = None
-        self.poses: list[Tensor] = []
-        self.keyframes: list[Keyframe] = []
+        self._poses: list[Tensor] = []
+        self._keyframes: list[Keyframe] = []
+        self._last: Keyframe | None = None
+        self._regions = RegionModel()
 
-    def start(self, image: Tensor, K: Tensor, T: Tensor) -> None:
-        T = T.double()[None]
-        self.regions = RegionModel(RATE, TEMPER)
-        self.keyframes, self.poses = [], [T]
-        window = self._window(image, T, K)
-        problem = self._problem(window)
-        depth = self.renderer.render(T, window.K, (SIZE, SIZE)).cpu()
-        self._learn(window, problem.state(T), depth, T, 1.0)
-        self._remember(window, T, depth)
+    def start(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
+        """Begin, or begin anew, from the pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3).
 
-    def predictions(self) -> list[Tensor]:
-        last = self.poses[-1]
-        if len(self.poses) < 2:
-            return [last]
-        before = self.poses[-2]
-        # the centre moves on, and the object turns on
-        R = last[:, :3, :3] @ before[:, :3, :3].mT @ last[:, :3, :3]
-        c0, c1 = (T[:, :3, :3] @ self.centre + T[:, :3, 3] for T in (before, last))
-        out = last.clone()
-        out[:, :3, :3] = R
-        out[:, :3, 3] = 2 * c1 - c0 - R @ self.centre
-        return [out, last]
+        Raises:
+            LostObjectError: at that pose the mesh lies behind the camera, or outside the image.
+        """
+        T = T.detach().cpu().double()[None]
+        frame = self._frame(image, K, T)
+        outline = self._render(frame, T)
+        self._poses, self._keyframes, self._regions = [], [], RegionModel()
+        self._learn(frame, outline, rate=1.0)
+        self._remember(frame, outline)
+        self._poses = [T]
+        return TrackedPose(T, self._features(frame, outline, T, []), frame, outline)
 
     def track(self, image: Tensor, K: Tensor) -> TrackedPose:
-        best = None
-        for T in self.predictions():
-            window = self._window(image, T, K)
-            flow = track_points(self.last, window, T, self.centre)
-            T = pose_from_flow(flow, T, window.K, self.centre) if flow.uv.shape[1] >= 8 else T
-            res = flow.uv - project(flow.model, T, window.K, self.centre)[0]
-            n = float(flow_weights(res, 3.0).sum()) / max(len(self.last.uv), 1)
-            if best is None or n > best[0] + 0.1:
-                best = (n, T, window, flow)
-            if n > 0.5:
-                break
-        share, T, window, flow = best
-        # a window around the pose
-        new = self._window(image, T, K)
-        A = new.K[0] @ torch.linalg.inv(window.K[0])
-        flow = Flow(flow.model, flow.uv * A.diagonal()[:2] + A[:2, 2])
-        window = new
-        key = self._nearest(T)
-        keyflow = track_points(key, window, T, self.centre, levels=1)
-        problem = self._problem(window)
-        bins = colour_bins(window.colours)
-        state = problem.state(T)
-        depth = self.renderer.render(state.rendered, window.K, (SIZE, SIZE)).cpu()
-        for reach in REACHES:
-            for _ in range(2):
-                lines, index = self._lines(state, T, window, depth)
-                A, b = (W_FLOW * x for x in flow_equations(flow, T, window.K, self.centre, 2.0))
-                A2, b2 = (W_KEY * x for x in flow_equations(keyflow, T, window.K, self.centre, 2.0))
-                A3, b3 = self._region_equations(lines, index, state, T, window, bins, int(reach))
-                others = (A + A2 + W_REGION * A3, b + b2 + W_REGION * b3)
-                others = tuple(x / W_EDGE for x in others)
-                T = problem.step(state.points, T, reach, others)
-            rendered = state.rendered
-            state = problem.rendered_again(replace(state, T=T))
-            if state.rendered is not rendered:
-                depth = self.renderer.render(state.rendered, window.K, (SIZE, SIZE)).cpu()
-        U, _, V = torch.linalg.svd(T[:, :3, :3])
-        T = T.clone()
-        T[:, :3, :3] = U @ V
-        # features
-        lines, index = self._lines(state, T, window, depth)
-        mean, var = self._posteriors(lines, T, window, bins, 8)
-        good = torch.exp(-0.5 * (mean / 2.0) ** 2) * (1 - var / (64 / 3)).clamp(min=0)
-        res = keyflow.uv - project(keyflow.model, T, window.K, self.centre)[0]
-        res0 = flow.uv - project(flow.model, T, window.K, self.centre)[0]
-        features = {
-            "edge_support": float(problem.edge_support(state)),
-            "region": float(good.mean()) if len(good) else 0.0,
-            "flow": float(flow_weights(res0, 2.0).sum()) / max(len(self.last.uv), 1),
-            "agreement": float(flow_weights(res, 2.0).sum()) / max(len(key.uv), 1),
-            "n_flow": len(self.last.uv), "n_key": len(key.uv),
-        }
-        self._T, self._update = T, (window, state, depth)
-        return TrackedPose(T[0], features)
+        """The pose in the next frame (C, H, W) with camera matrix ``K`` (3, 3).
 
-    def accept(self) -> None:
-        window, state, depth = self._update
-        self.poses = [self.poses[-1], self._T]
-        self._learn(window, state, depth, self._T, RATE)
-        self._remember(window, self._T, depth)
+        Raises:
+            LostObjectError: the object has left the image.
+        """
+        found: list[TrackedPose] = []
+        for T in self.predictions():
+            try:
+                found.append(self._fit(image, K, T))
+            except LostObjectError:
+                continue
+            if found[-1].confidence >= RELIABLE:
+                break
+        if not found:
+            raise LostObjectError("the object has left the photograph")
+        return max(found, key=lambda pose: pose.confidence)
+
+    def accept(self, pose: TrackedPose) -> None:
+        """Go on from a pose of :meth:`track`, and learn from its frame."""
+        self._poses = [*self._poses[-1:], pose.T]
+        self._learn(pose.frame, pose.outline, rate=RATE)
+        self._remember(pose.frame, pose.outline)
+
+    def covariance(self, pose: TrackedPose) -> Tensor:
+        """(6, 6) of a pose, see :func:`curvireg_torch.registration.fit_contours`."""
+        frame = pose.frame
+        matches = frame.problem.matches(ContourState(pose.T, pose.outline.T, pose.outline.points), REACHES[-1])
+        return pose_covariance(
+            matches, pose.outline.points, pose.T, frame.K, self.centre, radius=self.radius
+        )[0][0]
+
+    def predictions(self) -> list[Tensor]:
+        """Starts (1, 4, 4) for the next frame: the last pose, turned and moved on as before, and the last pose."""
+        last = self._poses[-1]
+        if len(self._poses) < 2:
+            return [last]
+        (R0, c0), (R1, c1) = (
+            (T[:, :3, :3], T[:, :3, :3] @ self.centre + T[:, :3, 3]) for T in self._poses
+        )
+        R = R1 @ R0.mT @ R1
+        return [transform(R, 2.0 * c1 - c0 - R @ self.centre), last]
+
+    def _fit(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
+        """The pose around a start (1, 4, 4)."""
+        assert self._last is not None
+        first = cut_window(image, K, self.hull, T)
+        flow = track_points(self._last, first, T, self.centre, levels=LONG)
+        T = pose_from_flow(flow, T, first.K, self.centre)
+        frame = self._frame(image, K, T)
+        flows = [(POINTS, flow.moved(first.K, frame.K))]
+        keyframe = self._nearest(T)
+        if keyframe is not self._last:
+            flows.append((KEYFRAME, track_points(keyframe, frame.window, T, self.centre, levels=SHORT)))
+        outline = self._render(frame, T)
+        for reach in REACHES:
+            for _ in range(STEPS):
+                others = self._equations(frame, outline, T, flows, reach)
+                T = frame.problem.step(outline.points, T, reach, others)
+            T = _orthonormal(T)
+            if float(frame.problem.mean_shift(outline.points, outline.T, T)) > STALE:
+                outline = self._render(frame, T)
+        return TrackedPose(T, self._features(frame, outline, T, [flow for _, flow in flows]), frame, outline)
+
+    def _equations(
+        self, frame: Frame, outline: Outline, T: Tensor, flows: list[tuple[float, Flow]], reach: float
+    ) -> tuple[Tensor, Tensor]:
+        """Normal equations (1, 6, 6) and (1, 6) of colours and points, relative to the weight of edges."""
+        mean, variance = self._ends(frame, outline, T, math.ceil(reach))
+        flat = math.ceil(reach) ** 2 / 3.0  # variance of lines along which colours say nothing
+        information = (1.0 / (variance + BLUR) - 1.0 / flat).clamp(min=0.0)
+        J = (outline.normals[..., None, :] @ project(outline.model, T, frame.K, self.centre)[1])[..., 0, :]
+        WJ = REGIONS * information[None, :, None] * J
+        A, b = WJ.mT @ J, WJ.mT @ mean
+        for weight, flow in flows:
+            of_points = flow_equations(flow, T, frame.K, self.centre)
+            A, b = A + weight * of_points[0], b + weight * of_points[1]
+        return A / EDGES, b / EDGES
+
+    def _ends(self, frame: Frame, outline: Outline, T: Tensor, reach: int) -> tuple[Tensor, Tensor]:
+        """Mean and variance (Q,) of where the object's colours end along the normals of its silhouette."""
+        uv = pixels(outline.model, T, frame.K, self.centre)[0]
+        offsets = torch.arange(-reach, reach + 1, dtype=torch.float64)
+        samples = uv[:, None] + offsets[:, None] * outline.normals[0][:, None]
+        log_ratio = self._regions.log_ratio(frame.bins, samples, self._directions(frame, T, uv))
+        mean, variance = line_posterior(log_ratio.double(), reach)
+        return mean, variance
+
+    def _features(self, frame: Frame, outline: Outline, T: Tensor, flows: list[Flow]) -> dict[str, float]:
+        """Features of a pose with its ``flows`` from the last frame and, if that is another one, a keyframe."""
+        mean, variance = self._ends(frame, outline, T, NEAR)
+        clear = torch.exp(-0.125 * mean.square()) * (1.0 - 3.0 * variance / NEAR**2).clamp(min=0.0)
+        shares = [flow_share(flow, T, frame.K, self.centre) for flow in flows] or [1.0]
+        return {
+            "edge_support": float(frame.problem.edge_support(ContourState(T, outline.T, outline.points))),
+            "region": float(clear.sum()) / max(len(clear), 1),
+            "flow": shares[0],
+            "keyframe": shares[-1],
+        }
+
+    def _learn(self, frame: Frame, outline: Outline, *, rate: float) -> None:
+        """Learn the colours beside the outline; where the mesh hides the background again, they are the object's."""
+        uv = pixels(outline.model, outline.T, frame.K, self.centre)[0]
+        distance = torch.arange(BESIDE[0], BESIDE[1] + 1, dtype=torch.float64)
+        samples = uv[:, None] + torch.cat([-distance, distance])[:, None] * outline.normals[0][:, None]
+        x, y = samples.round().long().clamp(0, SIZE - 1).unbind(-1)
+        inside = outline.depth[0, 0, y, x] > 0
+        directions = self._directions(frame, outline.T, uv)[:, None].expand(inside.shape)
+        self._regions.learn(
+            frame.bins, samples.flatten(0, 1), directions.flatten(), inside.flatten(), rate=rate
+        )
+
+    def _remember(self, frame: Frame, outline: Outline) -> None:
+        """Keep the frame as the last one, and if none from a similar direction is kept, as a keyframe."""
+        self._last = make_keyframe(frame.window, outline.T, outline.depth)
+        if not self._keyframes or _angle(self._nearest(outline.T).T, outline.T) > KEYFRAME_ANGLE:
+            self._keyframes = [*self._keyframes[1 - KEYFRAMES :], self._last]
 
     def _nearest(self, T: Tensor) -> Keyframe:
-        R = torch.cat([k.T[:, :3, :3] for k in self.keyframes])
-        cos = 0.5 * ((R * T[:, :3, :3]).sum(dim=(1, 2)) - 1)
-        return self.keyframes[int(cos.argmax())]
+        return min(self._keyframes, key=lambda keyframe: _angle(keyframe.T, T))
 
-    def _remember(self, window: Window, T: Tensor, depth: Tensor) -> None:
-        self.last = make_keyframe(window, T, depth)
-        if self.keyframes:
-            R = self._nearest(T).T[:, :3, :3]
-            cos = 0.5 * (float((R * T[:, :3, :3]).sum()) - 1)
-            if cos > math.cos(math.radians(KEY_ANGLE)):
-                return
-        self.keyframes = [*self.keyframes[-29:], self.last]
+    def _directions(self, frame: Frame, T: Tensor, uv: Tensor) -> Tensor:
+        """(Q,) rad of pixels (Q, 2) from the object's centre."""
+        x, y = (uv - pixels(self.centre[None, None], T, frame.K, self.centre)[0]).unbind(-1)
+        return torch.atan2(y, x)
 
-    def _window(self, image: Tensor, T: Tensor, K: Tensor) -> Window:
-        return cut_window(image, projected_boxes(self.hull, T, K[None])[0], K)
+    def _frame(self, image: Tensor, K: Tensor, T: Tensor) -> Frame:
+        window = cut_window(image, K, self.hull, T)
+        index, edges = torch.zeros(1, dtype=torch.long), EdgeField(window.colours)
+        problem = ContourProblem(self.renderer, edges, index, window.K, SIZE, self.centre, self.radius)
+        return Frame(window, colour_bins(window.colours), problem)
 
-    def _problem(self, window: Window) -> ContourProblem:
-        zero = torch.zeros(1, dtype=torch.long)
-        return ContourProblem(self.renderer, EdgeField(window.colours), zero, window.K, SIZE, self.centre, self.radius)
+    def _render(self, frame: Frame, T: Tensor) -> Outline:
+        return render_outline(self.renderer, frame.window, T, self.centre, self.radius)
 
-    def _lines(self, state: ContourState, T: Tensor, window: Window, depth: Tensor) -> tuple[Lines, Tensor]:
-        """Lines across the silhouette, at T, and the indices of their points. depth is that of state.rendered."""
-        points = state.points
-        n_occ = points.model.shape[1]
-        uv0, _ = project(points.model, state.rendered, window.K, self.centre)
-        n = points.normals
-        mask = depth[0, 0] > 0
 
-        def at(x):
-            x = x[0].round().long().clamp(0, SIZE - 1)
-            return mask[x[:, 1], x[:, 0]]
+def _angle(a: Tensor, b: Tensor) -> float:
+    """Degrees between the rotations of two poses (1, 4, 4)."""
+    cosine = 0.5 * (float((a[:, :3, :3] * b[:, :3, :3]).sum()) - 1.0)
+    return math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
 
-        plus, minus = at(uv0 + 2.5 * n), at(uv0 - 2.5 * n)
-        keep = (plus ^ minus) & points.valid[0]
-        keep[256:] = False
-        index = keep.nonzero()[:, 0]
-        sign = torch.where(plus, -1.0, 1.0).double()[index, None]
-        uv, _ = project(points.model[:, index], T, window.K, self.centre)
-        return Lines(uv[0], sign * n[0, index]), index
 
-    def _sectors(self, lines: Lines, T: Tensor, window: Window) -> Tensor:
-        c, _ = project(self.centre[None, None], T, window.K, self.centre)
-        d = lines.uv - c[0]
-        return torch.atan2(d[:, 1], d[:, 0])
-
-    def _posteriors(self, lines: Lines, T: Tensor, window: Window, bins: Tensor, reach: int) -> tuple[Tensor, Tensor]:
-        offsets = torch.arange(-reach, reach + 1, dtype=torch.float64)
-        ratio = self.regions.log_ratio(bins, lines.samples(offsets), self._sectors(lines, T, window))
-        return tuple(x.double() for x in line_posterior(ratio, reach))
-
-    def _region_equations(self, lines, index, state, T, window, bins, reach):
-        mean, var = self._posteriors(lines, T, window, bins, reach)
-        info = (1.0 / (var + 0.5) - 3.0 / reach**2).clamp(min=0.0)
-        # posterior mean is shrunk: undo
-        _, du = project(state.points.model[:, index], T, window.K, self.centre)
-        J = (lines.normals[:, None] @ du[0])[:, 0]
-        WJ = info[:, None] * J
-        return (WJ.mT @ J)[None], (WJ.mT @ mean)[None]
-
-    def _learn(self, window: Window, state: ContourState, depth: Tensor, T: Tensor, rate: float) -> None:
-        lines, _ = self._lines(state, T, window, depth)
-        bins = colour_bins(window.colours)
-        offsets = torch.cat([torch.arange(-24.0, -1.0), torch.arange(2.0, 25.0)]).double()
-        samples = lines.samples(offsets)
-        x, y = samples.round().long().clamp(0, SIZE - 1).unbind(-1)
-        inside = depth[0, 0][y, x] > 0
-        sectors = self._sectors(lines, T, window)[:, None].expand(inside.shape)
-        valid = torch.ones_like(inside)
-        self.regions.learn(bins, samples.flatten(0, 1), sectors.flatten(), inside.flatten(), valid.flatten(), rate)
+def _orthonormal(T: Tensor) -> Tensor:
+    """The poses (1, 4, 4) with the nearest rotations: predictions would let rounding grow from frame to frame."""
+    U, _, V = torch.linalg.svd(T[:, :3, :3])
+    return transform(U @ V, T[:, :3, 3])
