@@ -35,7 +35,7 @@ def add_parser(commands: Any) -> None:
         "follow",
         parents=[common_options(), pipeline_options(), mesh_options()],
         help="follow an object through the frames of a video",
-        description="Registers the first frame and refines each next one from the pose before it. Writes\n"
+        description="Registers the first frame and tracks the object from frame to frame. Writes\n"
         "DIR/results.csv: photo, status (ok, lost, failed), rotation row by row, translation in the\nmesh's unit, "
         "confidence, edge support, and why there is no pose;\n"
         "DIR/overlay.mp4: contours of the pose and confidence on each frame;\n"

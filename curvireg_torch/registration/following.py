@@ -5,18 +5,33 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .refinement import refine
+from ..errors import LostObjectError
+from ..geometry.cameras import rotation_towards
+from ..matching import Ranking
+from ..utils.checks import as_numbers, check_pose, check_tensor
+from ..utils.threads import map_on_threads
+from .answer_set import AnswerSet
+from .inputs import ImageItem, image_items
+from .refinement import LOST, nearest_view, refine
 from .registrar import Registrar
-from .results import FailedRegistration, Registration
+from .results import FailedRegistration, Hypothesis, Registration
+from .tracking import TrackedPose, Tracker
 
 __all__ = ["Follower"]
 
+TRUSTED = 0.5
+"""Confidence from which a tracked pose stands without a search."""
+
 
 class Follower:
-    """Registers frames one after the other: each starts from the pose of the frame before, at constant velocity.
+    """Registers frames one after the other: each starts from the pose of the frame before.
 
-    The first frame is registered; so is a frame in which the object is lost, and its pose is used only if it is
-    reliable.
+    The first frame is registered, unless :meth:`start` gives its pose. Every further frame is tracked (docs/method.md).
+    Where tracking is not trusted, a search around its pose follows (:func:`refine`), and the more certain pose counts;
+    where neither finds the object, the frame is registered, and that pose is used only if it is reliable.
+
+    The ``confidence`` of a tracked frame is the probability that its pose is within 10 degrees and 10 % of the distance
+    of the truth: the tracker's own, times that of the pose from which tracking began.
 
     Args:
         registrar: of the mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
@@ -34,8 +49,40 @@ class Follower:
     def __init__(self, registrar: Any, camera_matrix: Tensor) -> None:
         self.registrar = registrar if isinstance(registrar, Registrar) else Registrar(registrar)
         self.camera_matrix = camera_matrix
-        self._poses: list[Tensor] = []
+        describer = self.registrar.describers[0]
+        self._tracker = Tracker(describer.renderer, describer.hull, centre=describer.centre, radius=describer.radius)
+        self._known = 0.0  # confidence of the pose from which tracking began; 0: there is none
 
+    def start(self, image: Any, pose: Any) -> None:
+        """Begin from a known pose, in place of registering the first frame.
+
+        Args:
+            image: the frame, see :class:`Registrar`.
+            pose: (4, 4) rigid ``T_cam_from_model``.
+
+        Raises:
+            InvalidInputError: ``pose`` is not rigid and finite, or the frame cannot be used.
+            LostObjectError: at ``pose`` the mesh lies behind the camera, or outside the frame.
+
+        Example:
+            >>> import curvireg_torch as cr
+            >>> from curvireg_torch.synthetic import example_mesh
+            >>> bank = cr.ViewBank.build(example_mesh(), cr.sample_views(azimuth_step=90), progress=False)
+            >>> follow = Follower(cr.Registrar(bank), cr.camera_matrix(150.0, 150.0, 79.5, 59.5))
+            >>> pose = torch.eye(4)
+            >>> pose[2, 3] = 8.0
+            >>> follow.start(torch.rand(3, 120, 160), pose)
+        """
+        T = as_numbers(pose, "pose", dtype=torch.float64)
+        check_tensor(T, "pose", (4, 4))
+        check_pose(T, "pose")
+        item = image_items([image], None, self.camera_matrix)[0]
+        if not isinstance(item, ImageItem):
+            raise item
+        map_on_threads(lambda T: self._tracker.start(item.image, _camera(item), T), [T])
+        self._known = 1.0
+
+    @torch.no_grad()
     def __call__(self, image: Any, box: Any = None) -> Registration | FailedRegistration:
         """The pose in the next frame, or why there is none.
 
@@ -43,23 +90,88 @@ class Follower:
             image: see :class:`Registrar`.
             box: x0, y0, x1, y1 in px of the object, for a frame that is registered; None localizes it.
         """
-        K, boxes = self.camera_matrix, None if box is None else [box]
-        if not self._poses:
-            result = self.registrar([image], boxes, K)[0]
-        else:
-            result = refine(self.registrar, [image], K, [self._predictions()])[0]
-            if not result.ok:
-                registered = self.registrar([image], boxes, K)[0]
-                if isinstance(registered, Registration) and registered.reliable:
-                    result = registered
-                    self._poses.clear()  # the velocity is unknown
-        if isinstance(result, Registration) and result.transform is not None:
-            self._poses = [*self._poses[-1:], result.transform]
+        item = image_items([image], None, self.camera_matrix)[0]
+        if not isinstance(item, ImageItem):
+            return FailedRegistration(item)
+        boxes = None if box is None else [box]
+        if not self._known:
+            result = self.registrar([item.image], boxes, self.camera_matrix)[0]
+            if isinstance(result, Registration):
+                self._begin(item, result)
+            return result
+        tracked = map_on_threads(lambda item: self._track(item), [item])[0]
+        found = None if tracked is None else self._registration(tracked, item)
+        if tracked and found and found.confidence >= TRUSTED:
+            self._tracker.accept(tracked)
+            return found
+        return self._search(item, boxes, tracked, found)
+
+    def _begin(self, item: ImageItem, result: Registration) -> None:
+        """Track from a registered pose."""
+        map_on_threads(lambda T: self._tracker.start(item.image, _camera(item), T), [_pose(result)])
+        self._known = result.confidence
+
+    def _continue(self, item: ImageItem, result: Registration) -> None:
+        """Track on from a pose that the search found."""
+        pose = map_on_threads(lambda T: self._tracker.measure(item.image, _camera(item), T), [_pose(result)])[0]
+        self._tracker.accept(pose)
+        self._known = result.confidence
+
+    def _track(self, item: ImageItem) -> TrackedPose | None:
+        try:
+            return self._tracker.track(item.image, _camera(item))
+        except LostObjectError:
+            return None
+
+    def _search(
+        self, item: ImageItem, boxes: Any, tracked: TrackedPose | None, found: Registration | None
+    ) -> Registration | FailedRegistration:
+        """The pose in a frame in which tracking ``found`` a doubtful one, or none."""
+        starts = [self._tracker.last_pose] if tracked is None else [tracked.T, self._tracker.last_pose]
+        K = self.camera_matrix
+        result = refine(self.registrar, [item.image], K, [torch.cat(starts)])[0]
+        if isinstance(result, Registration) and (found is None or result.confidence > found.confidence):
+            self._continue(item, result)
+            return result
+        if tracked and found and found.confidence >= LOST:
+            self._tracker.accept(tracked)
+            return found
+        registered = self.registrar([item.image], boxes, K)[0]
+        if isinstance(registered, Registration) and registered.reliable:
+            self._begin(item, registered)
+            return registered
         return result
 
-    def _predictions(self) -> Tensor:
-        """(S, 4, 4) starts: the last pose moved as it moved before, and the last pose."""
-        last = self._poses[-1]
-        if len(self._poses) < 2:
-            return last[None]
-        return torch.stack([last @ torch.linalg.inv(self._poses[-2]) @ last, last])
+    def _registration(self, tracked: TrackedPose, item: ImageItem) -> Registration:
+        """The result of a tracked pose, without ranking and without rivals."""
+        T, support = tracked.T[0], tracked.features["edge_support"]
+        rotation, position = T[:3, :3], T[:3, :3] @ self._tracker.centre + T[:3, 3]
+        allocentric = rotation_towards(position).mT @ rotation
+        covariance = self._tracker.covariance(tracked)
+        hypothesis = Hypothesis(
+            rotation=rotation.clone(),
+            translation=T[:3, 3].clone(),
+            score=tracked.features["region"],
+            evidence=tracked.features,
+            allocentric_rotation=allocentric,
+            distance=float(torch.linalg.vector_norm(position)),
+            projection=(T.clone(), _camera(item)),
+            view=nearest_view(self.registrar, allocentric),
+            edge_support=support,
+            covariance=covariance if bool(covariance.isfinite().all()) else None,
+        )
+        answers = AnswerSet((self._known * tracked.confidence,))
+        unranked = Ranking(torch.zeros(1, 0), torch.zeros(1, 0, dtype=torch.long), {})
+        return Registration((hypothesis,), answers, unranked, dict(tracked.features), warnings=item.warnings)
+
+
+def _camera(item: ImageItem) -> Tensor:
+    """(3, 3) float64."""
+    assert item.camera_matrix is not None
+    return item.camera_matrix.double()
+
+
+def _pose(result: Registration) -> Tensor:
+    """(4, 4) of a result with a camera matrix."""
+    assert result.transform is not None
+    return result.transform

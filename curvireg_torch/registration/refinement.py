@@ -108,7 +108,10 @@ def _refined(estimator: PoseEstimator, item: ImageItem, T: Tensor) -> Registrati
     distinct = distinct_mask(together, scores, symmetries=estimator.symmetries_of(exact=True))
     order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]
     hypotheses = tuple(
-        replace(hypothesis_of(h, poses, evidence, with_camera=True), view=nearest_view(estimator, poses.hypotheses.rotation[h]))
+        replace(
+            hypothesis_of(h, poses, evidence, with_camera=True),
+            view=nearest_view(estimator, poses.hypotheses.rotation[h]),
+        )
         for h in order
     )
     features = {"similarity": float(similarity[order[0]]), "edge_support": float(support[order[0]])}

@@ -30,8 +30,10 @@ class Hypothesis:
     Attributes:
         rotation: (3, 3) float64, ``x_cam = R x_model + t``, OpenCV camera.
         translation: (3,) float64 in model units, None without a camera matrix.
-        score: normalised correlation of photograph and rendered view in [0, 1].
-        evidence: the features that the hypotheses are ordered by, see :data:`.rescoring.POSE_FEATURES`.
+        score: normalised correlation of photograph and rendered view in [0, 1]; of a tracked pose, how clearly and how
+            near to its outline the object's colours end.
+        evidence: the features that the hypotheses are ordered by, see :data:`.rescoring.POSE_FEATURES`; of a tracked
+            pose, those of its confidence.
         allocentric_rotation: (3, 3) float64, relative to a camera that looks straight at the object.
         distance: distance of the object's centre in model units.
         projection: (4, 4) ``T_cam_from_model`` and (3, 3) camera matrix in px, float64, which project the mesh onto

@@ -36,7 +36,8 @@ from scripts.benchmark.sequences import make_sequence
 
 Row = dict[str, Any]
 Tracker = Callable[[Tensor], Tensor | None]
-"""Takes the next (3, H, W) uint8 frame and returns its (4, 4) pose, or None if the object is lost."""
+"""Takes the next (3, H, W) uint8 frame and returns its (4, 4) pose, or None if the object is lost; in the first frame
+it begins from the true pose."""
 
 RECORD = RESULTS / "follow.json"
 PAGE = REPOSITORY / "docs" / "guides" / "follow.md"
@@ -97,10 +98,14 @@ def chains(rotations: Tensor, largest: float) -> list[list[int]]:
 
 
 def curvireg_tracker(video: Video, registrar: cr.Registrar) -> Tracker:
-    follow = Follower(registrar, video.K)
-    follow._poses = [video.poses[0]]  # instead of registering the first frame
+    follow, started = Follower(registrar, video.K), False
 
     def track(frame: Tensor) -> Tensor | None:
+        nonlocal started
+        if not started:
+            follow.start(frame, video.poses[0])
+            started = True
+            return video.poses[0]
         result = follow(frame)
         return result.transform if result.ok else None
 
@@ -108,11 +113,15 @@ def curvireg_tracker(video: Video, registrar: cr.Registrar) -> Tracker:
 
 
 def rapid_tracker(video: Video) -> Tracker:
-    rapid, last = Rapid(video.mesh), [video.poses[0]]
+    rapid, last = Rapid(video.mesh), None
 
     def track(frame: Tensor) -> Tensor | None:
-        T = rapid(frame, video.K, last[0])
-        last[0] = last[0] if T is None else T
+        nonlocal last
+        if last is None:
+            last = video.poses[0]
+            return last
+        T = rapid(frame, video.K, last)
+        last = last if T is None else T
         return T
 
     return track
@@ -125,11 +134,11 @@ def follow_video(video: Video, trackers: dict[str, Tracker]) -> dict[str, Row]:
     centre = mesh_centre(video.mesh)
     for number, (frame, truth) in enumerate(zip(video.frames, video.poses, strict=True)):
         for method, track in trackers.items():
-            if number == 0:
-                continue
             start = time.perf_counter()
             T = track(frame)
             seconds = time.perf_counter() - start
+            if number == 0:
+                continue
             errors: tuple[float | None, float | None] = (None, None)
             if T is not None:
                 turn = cr.rotation_error(T[:3, :3], truth[:3, :3] @ video.symmetries).min()

@@ -109,9 +109,7 @@ class ContourProblem:
         """
         return apply_twist(T, self._bounded(self._solve(points, T, reach, others), T), self.centre)
 
-    def _solve(
-        self, points: ContourPoints, T: Tensor, reach: float, others: tuple[Tensor, Tensor] | None
-    ) -> Tensor:
+    def _solve(self, points: ContourPoints, T: Tensor, reach: float, others: tuple[Tensor, Tensor] | None) -> Tensor:
         """(N, 6) rotation about the centre and translation of it."""
         uv, du = project(points.model, T, self.K, self.centre)
         J = (points.normals[..., None, :] @ du)[..., 0, :]

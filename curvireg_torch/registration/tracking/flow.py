@@ -89,13 +89,27 @@ def track_points(keyframe: Keyframe, window: Window, T: Tensor, centre: Tensor, 
     if corners == 0:
         return Flow(keyframe.model, torch.zeros(1, 0, 2, dtype=torch.float64), 0)
     guess = pixels(keyframe.model, T, window.K, centre)[0].float().numpy()
-    options = {"winSize": (PATCH, PATCH), "maxLevel": levels, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
     before, after = keyframe.window.grey, window.grey
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, keyframe.uv, guess, **options)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, keyframe.uv.copy(), **options)
-    near = np.linalg.norm(back - keyframe.uv, axis=1) < RETURN
-    kept = torch.from_numpy((found[:, 0] > 0) & (returned[:, 0] > 0) & near)
+    there, found = _optical_flow(before, after, keyframe.uv, guess, levels)
+    back, returned = _optical_flow(after, before, there, keyframe.uv, levels)
+    kept = torch.from_numpy(found & returned & (np.linalg.norm(back - keyframe.uv, axis=1) < RETURN))
     return Flow(keyframe.model[:, kept], torch.from_numpy(there).double()[None, kept], corners)
+
+
+def _optical_flow(
+    before: np.ndarray, after: np.ndarray, points: np.ndarray, guess: np.ndarray, levels: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where points (P, 2) of one picture are in another, searched at ``guess`` (P, 2); and (P,) whether found."""
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        before,
+        after,
+        points,
+        guess.copy(),
+        winSize=(PATCH, PATCH),
+        maxLevel=levels,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    return there, found[:, 0] > 0
 
 
 def pose_from_flow(flow: Flow, T: Tensor, K: Tensor, centre: Tensor) -> Tensor:

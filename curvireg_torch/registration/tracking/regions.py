@@ -33,7 +33,8 @@ ENOUGH = 20.0
 def colour_bins(colours: Tensor) -> Tensor:
     """(S, S) int64 histogram bin of each pixel of (1, 3, S, S) colours in [0, 1]."""
     red, green, blue = (colours[0] * LEVELS).long().clamp(0, LEVELS - 1)
-    return (red * LEVELS + green) * LEVELS + blue
+    bins: Tensor = (red * LEVELS + green) * LEVELS + blue
+    return bins
 
 
 def line_posterior(log_ratio: Tensor, reach: int) -> tuple[Tensor, Tensor]:

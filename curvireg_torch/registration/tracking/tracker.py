@@ -1,9 +1,8 @@
 """The pose in the next frame, from three kinds of measurement: points that move, colours beside the outline, edges."""
 
 import math
-import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -22,27 +21,19 @@ from .window import SIZE, Window, cut_window
 
 __all__ = ["TrackedPose", "Tracker"]
 
-
-def _env(name, default):
-    if name not in os.environ:
-        return default
-    v = os.environ[name]
-    return tuple(float(x) for x in v.split(",")) if isinstance(default, tuple) else float(v)
-
-
-REACHES = _env("REACHES", (6.0, 4.0, 2.5))
+REACHES = (6.0, 4.0, 2.5)
 """Search distance in px of edges and of the end of the object's colours, one a round."""
 
-STEPS = int(_env("STEPS", 2))
+STEPS = 2
 """Least-squares steps per round."""
 
-EDGES, REGIONS, POINTS, KEYFRAME = _env("W_EDGE", 1.0), _env("W_REGION", 1.0), _env("W_FLOW", 0.3), _env("W_KEY", 0.5)
+EDGES, REGIONS, POINTS, KEYFRAME = 1.0, 1.0, 0.3, 0.5
 """Weights of the measurements: of edges, colours, and points from the last frame and from a keyframe."""
 
 BLUR = 0.5
 """Variance in px² added to that of the end of the object's colours."""
 
-RATE = _env("RATE", 0.2)
+RATE = 0.2
 """Weight of a new frame in the colour histograms."""
 
 BESIDE = (2, 24)
@@ -51,7 +42,7 @@ BESIDE = (2, 24)
 NEAR = 8
 """Reach in px of the posterior from which :attr:`TrackedPose.features` are computed."""
 
-KEYFRAMES, KEYFRAME_ANGLE = 30, _env("KEY_ANGLE", 8.0)
+KEYFRAMES, KEYFRAME_ANGLE = 30, 8.0
 """Keyframes that are kept, and the rotation in degrees from the nearest one at which a frame becomes another."""
 
 LONG, SHORT = 3, 1
@@ -65,11 +56,6 @@ class Frame:
     window: Window
     bins: Tensor
     problem: ContourProblem
-
-    @property
-    def K(self) -> Tensor:
-        """(1, 3, 3) camera matrix of the window."""
-        return self.window.K
 
 
 @dataclass(frozen=True)
@@ -118,20 +104,26 @@ class Tracker:
         self._last: Keyframe | None = None
         self._regions = RegionModel()
 
-    def start(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
+    def start(self, image: Tensor, K: Tensor, T: Tensor) -> None:
         """Begin, or begin anew, from the pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3).
 
         Raises:
             LostObjectError: at that pose the mesh lies behind the camera, or outside the image.
         """
-        T = T.detach().cpu().double()[None]
-        frame = self._frame(image, K, T)
-        outline = self._render(frame, T)
+        first = self.measure(image, K, T)
         self._poses, self._keyframes, self._regions = [], [], RegionModel()
-        self._learn(frame, outline, rate=1.0)
-        self._remember(frame, outline)
-        self._poses = [T]
-        return TrackedPose(T, self._features(frame, outline, T, []), frame, outline)
+        self.accept(first)
+
+    def measure(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
+        """The pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3), as it is.
+
+        Raises:
+            LostObjectError: at that pose the mesh lies behind the camera, or outside the image.
+        """
+        start = T.detach().cpu().double()[None]
+        frame = self._frame(image, K, start)
+        outline = self._render(frame, start)
+        return TrackedPose(start, self._features(frame, outline, start, []), frame, outline)
 
     def track(self, image: Tensor, K: Tensor) -> TrackedPose:
         """The pose in the next frame (C, H, W) with camera matrix ``K`` (3, 3).
@@ -152,7 +144,7 @@ class Tracker:
         return max(found, key=lambda pose: pose.confidence)
 
     def accept(self, pose: TrackedPose) -> None:
-        """Go on from a pose of :meth:`track`, and learn from its frame."""
+        """Go on from a pose of :meth:`track` or :meth:`measure`, and learn from its frame."""
         self._poses = [*self._poses[-1:], pose.T]
         self._learn(pose.frame, pose.outline, rate=RATE)
         self._remember(pose.frame, pose.outline)
@@ -161,18 +153,21 @@ class Tracker:
         """(6, 6) of a pose, see :func:`curvireg_torch.registration.fit_contours`."""
         frame = pose.frame
         matches = frame.problem.matches(ContourState(pose.T, pose.outline.T, pose.outline.points), REACHES[-1])
-        return pose_covariance(
-            matches, pose.outline.points, pose.T, frame.K, self.centre, radius=self.radius
-        )[0][0]
+        return pose_covariance(matches, pose.outline.points, pose.T, frame.window.K, self.centre, radius=self.radius)[
+            0
+        ][0]
+
+    @property
+    def last_pose(self) -> Tensor:
+        """(1, 4, 4) of the last frame."""
+        return self._poses[-1]
 
     def predictions(self) -> list[Tensor]:
         """Starts (1, 4, 4) for the next frame: the last pose, turned and moved on as before, and the last pose."""
         last = self._poses[-1]
         if len(self._poses) < 2:
             return [last]
-        (R0, c0), (R1, c1) = (
-            (T[:, :3, :3], T[:, :3, :3] @ self.centre + T[:, :3, 3]) for T in self._poses
-        )
+        (R0, c0), (R1, c1) = ((T[:, :3, :3], T[:, :3, :3] @ self.centre + T[:, :3, 3]) for T in self._poses)
         R = R1 @ R0.mT @ R1
         return [transform(R, 2.0 * c1 - c0 - R @ self.centre), last]
 
@@ -183,7 +178,7 @@ class Tracker:
         flow = track_points(self._last, first, T, self.centre, levels=LONG)
         T = pose_from_flow(flow, T, first.K, self.centre)
         frame = self._frame(image, K, T)
-        flows = [(POINTS, flow.moved(first.K, frame.K))]
+        flows = [(POINTS, flow.moved(first.K, frame.window.K))]
         keyframe = self._nearest(T)
         if keyframe is not self._last:
             flows.append((KEYFRAME, track_points(keyframe, frame.window, T, self.centre, levels=SHORT)))
@@ -204,17 +199,17 @@ class Tracker:
         mean, variance = self._ends(frame, outline, T, math.ceil(reach))
         flat = math.ceil(reach) ** 2 / 3.0  # variance of lines along which colours say nothing
         information = (1.0 / (variance + BLUR) - 1.0 / flat).clamp(min=0.0)
-        J = (outline.normals[..., None, :] @ project(outline.model, T, frame.K, self.centre)[1])[..., 0, :]
+        J = (outline.normals[..., None, :] @ project(outline.model, T, frame.window.K, self.centre)[1])[..., 0, :]
         WJ = REGIONS * information[None, :, None] * J
         A, b = WJ.mT @ J, WJ.mT @ mean
         for weight, flow in flows:
-            of_points = flow_equations(flow, T, frame.K, self.centre)
+            of_points = flow_equations(flow, T, frame.window.K, self.centre)
             A, b = A + weight * of_points[0], b + weight * of_points[1]
         return A / EDGES, b / EDGES
 
     def _ends(self, frame: Frame, outline: Outline, T: Tensor, reach: int) -> tuple[Tensor, Tensor]:
         """Mean and variance (Q,) of where the object's colours end along the normals of its silhouette."""
-        uv = pixels(outline.model, T, frame.K, self.centre)[0]
+        uv = pixels(outline.model, T, frame.window.K, self.centre)[0]
         offsets = torch.arange(-reach, reach + 1, dtype=torch.float64)
         samples = uv[:, None] + offsets[:, None] * outline.normals[0][:, None]
         log_ratio = self._regions.log_ratio(frame.bins, samples, self._directions(frame, T, uv))
@@ -225,7 +220,7 @@ class Tracker:
         """Features of a pose with its ``flows`` from the last frame and, if that is another one, a keyframe."""
         mean, variance = self._ends(frame, outline, T, NEAR)
         clear = torch.exp(-0.125 * mean.square()) * (1.0 - 3.0 * variance / NEAR**2).clamp(min=0.0)
-        shares = [flow_share(flow, T, frame.K, self.centre) for flow in flows] or [1.0]
+        shares = [flow_share(flow, T, frame.window.K, self.centre) for flow in flows] or [0.0]
         return {
             "edge_support": float(frame.problem.edge_support(ContourState(T, outline.T, outline.points))),
             "region": float(clear.sum()) / max(len(clear), 1),
@@ -235,15 +230,13 @@ class Tracker:
 
     def _learn(self, frame: Frame, outline: Outline, *, rate: float) -> None:
         """Learn the colours beside the outline; where the mesh hides the background again, they are the object's."""
-        uv = pixels(outline.model, outline.T, frame.K, self.centre)[0]
+        uv = pixels(outline.model, outline.T, frame.window.K, self.centre)[0]
         distance = torch.arange(BESIDE[0], BESIDE[1] + 1, dtype=torch.float64)
         samples = uv[:, None] + torch.cat([-distance, distance])[:, None] * outline.normals[0][:, None]
         x, y = samples.round().long().clamp(0, SIZE - 1).unbind(-1)
         inside = outline.depth[0, 0, y, x] > 0
         directions = self._directions(frame, outline.T, uv)[:, None].expand(inside.shape)
-        self._regions.learn(
-            frame.bins, samples.flatten(0, 1), directions.flatten(), inside.flatten(), rate=rate
-        )
+        self._regions.learn(frame.bins, samples.flatten(0, 1), directions.flatten(), inside.flatten(), rate=rate)
 
     def _remember(self, frame: Frame, outline: Outline) -> None:
         """Keep the frame as the last one, and if none from a similar direction is kept, as a keyframe."""
@@ -256,7 +249,7 @@ class Tracker:
 
     def _directions(self, frame: Frame, T: Tensor, uv: Tensor) -> Tensor:
         """(Q,) rad of pixels (Q, 2) from the object's centre."""
-        x, y = (uv - pixels(self.centre[None, None], T, frame.K, self.centre)[0]).unbind(-1)
+        x, y = (uv - pixels(self.centre[None, None], T, frame.window.K, self.centre)[0]).unbind(-1)
         return torch.atan2(y, x)
 
     def _frame(self, image: Tensor, K: Tensor, T: Tensor) -> Frame:
