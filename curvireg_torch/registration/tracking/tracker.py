@@ -27,7 +27,7 @@ REACHES = (6.0, 4.0, 2.5)
 STEPS = 2
 """Least-squares steps per round."""
 
-EDGES, REGIONS, POINTS, KEYFRAME = 1.0, 1.0, 0.3, 0.5
+EDGES, REGIONS, POINTS, KEYFRAME = 1.0, 2.0, 0.3, 0.5
 """Weights of the measurements: of edges, colours, and points from the last frame and from a keyframe."""
 
 BLUR = 0.5
