@@ -1,6 +1,6 @@
 """Confidence of tracked poses, measured on sequences of scripts/benchmark/sequences.py.
 
-    python scripts/calibration/tracking.py BENCH --rows ROWS.jsonl [--half train] [--sequences 20] [--frames 30] [--write]
+    python scripts/calibration/tracking.py BENCH --rows ROWS.jsonl [--half train] [--sequences 20] [--write]
 
 Each sequence is tracked from its first true pose, by every frame, by every second and by every third, without search;
 and every fifth pose is tracked in a frame of another sequence too, where the object is absent. A row holds the features
