@@ -95,7 +95,7 @@ def fitted(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def report(rows: list[dict[str, Any]], model: dict[str, Any]) -> dict[str, Any]:
-    """How well a model tells right from wrong poses."""
+    """How well a model separates right from wrong poses."""
     from sklearn.metrics import roc_auc_score
 
     confidence = LogisticModel(model["weights"], model["bias"])

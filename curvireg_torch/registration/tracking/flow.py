@@ -144,7 +144,7 @@ def flow_equations(flow: Flow, T: Tensor, K: Tensor, centre: Tensor, *, scale: f
 
 
 def flow_share(flow: Flow, T: Tensor, K: Tensor, centre: Tensor) -> float:
-    """Share of the corners, in [0, 1], whose matches fit the pose ``T`` (1, 4, 4)."""
+    """Fraction of the corners, in [0, 1], whose matches fit the pose ``T`` (1, 4, 4)."""
     return float(_weights(flow.uv - pixels(flow.model, T, K, centre), FITS).sum()) / max(flow.corners, 1)
 
 

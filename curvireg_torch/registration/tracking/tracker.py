@@ -65,7 +65,7 @@ class TrackedPose:
     Attributes:
         T: (1, 4, 4) float64 ``T_cam_from_model``.
         features: what the confidence is computed from, all in [0, 1]: ``edge_support`` as of a contour fit; ``region``,
-            how clearly and how near to the outline the object's colours end; ``flow`` and ``keyframe``, the shares of
+            how clearly and how near to the outline the object's colours end; ``flow`` and ``keyframe``, the fractions of
             the corners of the last frame and of a keyframe that are found where the pose has them.
         frame, outline: what the features were measured in.
     """
@@ -105,7 +105,7 @@ class Tracker:
         self._regions = RegionModel()
 
     def start(self, image: Tensor, K: Tensor, T: Tensor) -> None:
-        """Begin, or begin anew, from the pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3).
+        """Begin, or begin again, from the pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3).
 
         Raises:
             LostObjectError: at that pose the mesh lies behind the camera, or outside the image.
