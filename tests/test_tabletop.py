@@ -6,7 +6,7 @@ import torch
 
 from curvireg_torch import Registrar, camera_matrix, rotation_error
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import transform
+from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import example_mesh, photograph_tabletop, random_pose, tabletop
@@ -111,3 +111,23 @@ def test_demo_scenes_are_registered():
         result = registrar([image], box[None], K)[0]
         assert float(rotation_error(result.rotation, T[:3, :3])) < 2, seed
         assert result.reliable, seed
+
+
+def test_several_poses_show_one_scene(magenta):
+    _, _, first = magenta
+    mesh = example_mesh()
+    mesh.visual.face_colors = np.tile(np.array(MAGENTA, np.uint8), (len(mesh.faces), 1))
+    turned = first.clone()
+    turned[:3, :3] = first[:3, :3] @ rotation_from_axis_angle(torch.tensor([0.0, 0.0, 0.2], dtype=torch.float64))
+    poses = torch.stack([first, turned, first])
+    images, boxes = photograph_tabletop(mesh, poses, CAMERA, SIZE, torch.Generator().manual_seed(5))
+    alone, box = photograph_tabletop(mesh, first, CAMERA, SIZE, torch.Generator().manual_seed(5))
+    assert images.shape == (3, 3, *SIZE)
+    assert torch.equal(images[0], alone)
+    assert torch.equal(boxes[0], box)
+    for image, pose in zip(images, poses, strict=True):
+        drawn, expected = is_magenta(image), silhouette(pose)
+        assert int((drawn & expected).sum()) / int((drawn | expected).sum()) > 0.95
+    again = (images[2] - images[0]).abs()
+    assert 0.0 < float(again.mean()) < 0.02, "the same but for the noise"
+    assert float((images[1] - images[0]).abs().mean()) > 0.04

@@ -44,10 +44,11 @@ def photograph_tabletop(
 
     Args:
         mesh, T_cam_from_model, camera_matrix, size: the scene; (4, 4), (3, 3) and (H, W). The camera is above the
-            table.
+            table. (N, 4, 4) poses are photographs of one scene; it is furnished behind the object as the first camera
+            sees it, so the others should be within about 45 degrees of azimuth.
 
     Returns:
-        image (3, H, W) in [0, 1] and the object's box (4,) in px.
+        image (3, H, W) in [0, 1] and the object's box (4,) in px; (N, 3, H, W) and (N, 4) for (N, 4, 4) poses.
 
     Raises:
         InvalidInputError: the camera is below the table.
@@ -60,27 +61,35 @@ def photograph_tabletop(
         >>> tuple(image.shape)
         (3, 90, 120)
     """
-    R, t = (x.double().numpy() for x in (T_cam_from_model[:3, :3], T_cam_from_model[:3, 3]))
+    poses = T_cam_from_model.double().reshape(-1, 4, 4)
     rng = np.random.default_rng(int(torch.randint(2**31, (1,), generator=generator)))
-    eye = -R.T @ t
-    if eye[2] <= mesh.bounds[0, 2]:
+    eyes = -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0].numpy()
+    if (eyes[:, 2] <= mesh.bounds[0, 2]).any():
         raise InvalidInputError("T_cam_from_model: expected a camera above the table, on which the mesh stands")
-    scene = _Scene(mesh, eye, rng)
-    K = np.linalg.inv(camera_matrix.double().numpy())
+    scene = _Scene(mesh, eyes[0], rng)
     light = _Light(scene.away, rng)
+    K = np.linalg.inv(camera_matrix.double().numpy())
+    images = []
+    for pose, eye in zip(poses.numpy(), eyes, strict=True):
+        picture = _exposed(scene, light, pose, eye, K, size)
+        images.append(torch.from_numpy(_develop(picture, rng)).permute(2, 0, 1).contiguous())
+    vertices = torch.from_numpy(np.array(mesh.vertices, dtype=float))
+    boxes = projected_boxes(vertices, poses, camera_matrix.double().expand(len(poses), 3, 3))
+    return (images[0], boxes[0]) if T_cam_from_model.ndim == 2 else (torch.stack(images), boxes)
+
+
+def _exposed(scene: "_Scene", light: "_Light", pose: Array, eye: Array, K: Array, size: tuple[int, int]) -> Array:
+    """(H, W, 3) linear light through a lens; ``K`` is the inverse of the camera matrix."""
     pictures: list[Any] = [None] * PASSES
 
     def trace(k: int) -> None:
         v, u = np.mgrid[0.0 : size[0], 0.0 : size[1]].reshape(2, -1) + np.array([[k // 2], [k % 2]]) / 2 - 0.25
-        rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ (K.T @ R)  # of length 1 along the optical axis
+        rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ (K.T @ pose[:3, :3])  # of length 1 along the optical axis
         pictures[k] = scene.trace(eye, rays.astype(np.float32), light, k)
 
     for_each(PASSES, trace)
     colour, depth, cover = (np.mean([p[i] for p in pictures], axis=0).reshape(*size, -1) for i in range(3))
-    picture = _defocus(colour, depth[..., 0], cover[..., 0], distance=float(t[2]), radius=scene.radius)
-    image = torch.from_numpy(_develop(picture, rng)).permute(2, 0, 1).contiguous()
-    vertices = torch.from_numpy(np.array(mesh.vertices, dtype=float))
-    return image, projected_boxes(vertices, T_cam_from_model.double(), camera_matrix.double())
+    return _defocus(colour, depth[..., 0], cover[..., 0], distance=float(pose[2, 3]), radius=scene.radius)
 
 
 class _Light:

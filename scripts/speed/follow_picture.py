@@ -3,23 +3,24 @@
 python scripts/speed/follow_picture.py
 """
 
+import math
 import tempfile
 from pathlib import Path
 
-import numpy as np
 import torch
+import trimesh
 from PIL import Image
 from torch import Tensor
 
 import curvireg_torch as cr
 from curvireg_torch.io import Video
+from curvireg_torch.io.meshes import mesh_centre, mesh_radius
 from curvireg_torch.matching import cached_bank
 from curvireg_torch.registration import Follower
-from curvireg_torch.synthetic import example_mesh, procedural_background, random_pose, synthesize_photograph
+from curvireg_torch.synthetic import example_mesh, photograph_tabletop
 from curvireg_torch.visualization import OverlayVideo
 from curvireg_torch.visualization.encoding import shrink
 from scripts._shared import REPOSITORY
-from scripts.benchmark.sequences import camera_path
 
 PICTURE = REPOSITORY / "docs" / "images" / "follow.webp"
 SIZE, FRAMES, FPS = (480, 640), 40, 10.0
@@ -27,24 +28,26 @@ SEED = 3
 POST, WIDTH = 40, 400  # of the post, and of the drawn picture, px
 
 
-def video(seed: int) -> tuple[list[Tensor], Tensor, Tensor]:
-    """The (3, H, W) frames, the box in the first one, and the camera matrix."""
-    mesh, K = example_mesh(), cr.camera_matrix(840.0, 840.0, 319.5, 239.5, dtype=torch.float64)
-    T = random_pose(mesh, K, SIZE, torch.Generator().manual_seed(seed), elevations=(15.0, 40.0), fill=(0.6, 0.7))
-    rng = np.random.default_rng(seed)
-    centre = torch.from_numpy(mesh.bounds.mean(axis=0))
-    start = (T[:3, :3] @ centre + T[:3, 3]).numpy()
-    background = procedural_background(SIZE, torch.Generator().manual_seed(seed))
-    frames, boxes = [], []
-    for number, (R, place) in enumerate(camera_path(T[:3, :3].numpy(), start, K.numpy(), FRAMES, rng)):
-        T[:3, :3] = torch.from_numpy(R)
-        T[:3, 3] = torch.from_numpy(place) - T[:3, :3] @ centre
-        generator = torch.Generator().manual_seed(seed)  # the same light and texture in every frame
-        frame, box = synthesize_photograph(mesh, T, K, SIZE, generator, background=background)
+def poses(mesh: trimesh.Trimesh) -> Tensor:
+    """(FRAMES, 4, 4) of a camera that swings around the truck, comes closer and leaves again."""
+    centre, radius = mesh_centre(mesh), mesh_radius(mesh)
+    time = torch.linspace(0.0, 2.0 * math.pi, FRAMES, dtype=torch.float64)
+    R = cr.rotation_from_viewpoint(320.0 + 35.0 * time.sin(), 24.0 + 8.0 * (2.0 * time).sin(), 4.0 * (3.0 * time).sin())
+    distance = radius * (7.0 - 1.2 * time.cos())
+    centred = torch.stack([0.15 * radius * time.sin(), 0.1 * radius * (2.0 * time).cos(), distance], dim=-1)
+    T = torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)
+    T[:, :3, :3], T[:, :3, 3] = R, centred - R @ centre
+    return T
+
+
+def video(seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The (FRAMES, 3, H, W) frames, the box in the first one, and the camera matrix."""
+    K = cr.camera_matrix(840.0, 840.0, 319.5, 239.5, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(seed)
+    frames, boxes = photograph_tabletop(example_mesh(painted=True), poses(example_mesh()), K, SIZE, generator)
+    for number, frame in enumerate(frames):
         left = SIZE[1] * (number + 1) // FRAMES - POST
         frame[:, :, max(left, 0) : left + POST] = torch.tensor([0.35, 0.3, 0.25])[:, None, None]
-        frames.append(frame)
-        boxes.append(box)
     return frames, boxes[0], K
 
 

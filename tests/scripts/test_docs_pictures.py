@@ -50,6 +50,11 @@ def test_path_leads_from_the_best_view_to_the_result(registration):
     assert torch.equal(path[0][1], starts[mine])
     assert torch.equal(path[-1][1], result.projection[0])
     poses = torch.stack([T for _, T in path])
+    fine = record.fits[-1]  # the last part of the fit, at full size, ends with the result
+    mine = (fine[-1] == poses[-1]).flatten(1).all(dim=1).nonzero()[0, 0]
+    last = list(dict.fromkeys(tuple(T[mine].flatten().tolist()) for T in fine[1:]))
+    assert len(last) >= 3
+    assert [tuple(T.flatten().tolist()) for T in poses[-len(last) :]] == last
     steps = rotation_error(poses[1:, :3, :3], poses[:-1, :3, :3])
     assert float(steps.max()) < 25.0
     assert not any(torch.equal(a, b) for a, b in zip(poses[1:], poses[:-1], strict=True))
