@@ -52,7 +52,7 @@ def video(seed: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def main() -> None:
-    frames, box, K = video(SEED)
+    truths, (frames, box, K) = poses(example_mesh()), video(SEED)
     pipeline = cr.Pipeline().with_pose_prior("upright")
     registrar = cr.Registrar(cached_bank(example_mesh(), pipeline=pipeline, progress=False), pipeline=pipeline)
     follow = Follower(registrar, K)
@@ -61,7 +61,11 @@ def main() -> None:
             for number, frame in enumerate(frames):
                 result = follow(frame, None if number else box)
                 overlay.add(frame, result)
-                print(number, result.confidence if result.ok else result.error)
+                if result.ok:
+                    error = float(cr.rotation_error(result.rotation, truths[number, :3, :3]))
+                    print(f"{number}: {error:.1f} degrees off, confidence {result.confidence:.2f}")
+                else:
+                    print(f"{number}: {result.error}")
         pictures = [Image.fromarray(shrink(frame.permute(1, 2, 0).numpy(), WIDTH)) for _, frame in Video(overlay.path)]
     first, *others = pictures
     first.save(PICTURE, save_all=True, append_images=others, duration=round(1000 / FPS), loop=0, quality=70)
