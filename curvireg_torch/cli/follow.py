@@ -1,6 +1,7 @@
 """``curvireg follow FRAMES MESH``."""
 
 import argparse
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from io import BytesIO
@@ -67,16 +68,19 @@ def run(arguments: argparse.Namespace) -> None:
     check_camera(options.camera, None)
     check_writable(out, "--out")
     with one_torch_thread():
-        rows, video = _follow(options, out)
+        rows, seconds, video = _follow(options, out)
     counts = {status: sum(row[1] == status for row in rows) for status in ("ok", "lost", "failed")}
     summary = ", ".join(f"{count} {status}" for status, count in counts.items())
-    print(f"{len(rows)} frames: {summary}; see {out}/results.csv and {video}")
+    after_first = seconds[1:]  # the first frame is registered
+    rate = f", {len(after_first) / sum(after_first):.1f} frames per second" if after_first else ""
+    print(f"{len(rows)} frames: {summary}{rate}; see {out}/results.csv and {video}")
     if not counts["ok"]:
         raise InvalidInputError("no frame could be registered; give --box of the object in the first frame")
 
 
-def _follow(options: "RegisterOptions", out: Path) -> tuple[list[list[Any]], Path]:
-    """Rows of ``out / "results.csv"``, which is also written after an interruption, and path of the overlay."""
+def _follow(options: "RegisterOptions", out: Path) -> tuple[list[list[Any]], list[float], Path]:
+    """Rows of ``out / "results.csv"``, which is also written after an interruption, seconds that the pose of each frame
+    took, and path of the overlay."""
     from tqdm import tqdm
 
     from ..evaluation.opening import open_registrar
@@ -89,16 +93,19 @@ def _follow(options: "RegisterOptions", out: Path) -> tuple[list[list[Any]], Pat
     registrar = open_registrar(options, options.meshes, options.open_field())
     follow = Follower(registrar, camera_matrix(*options.camera))
     rows: list[list[Any]] = []
+    seconds: list[float] = []
     try:
         with closing(OverlayVideo(out / "overlay.mp4", registrar, fps=fps)) as video:
             for name, image in tqdm(frames, desc="follow", unit="frame", total=count, disable=not options.progress):
+                start = time.perf_counter()
                 result = _pose(follow, image, None if rows else options.box)
+                seconds.append(time.perf_counter() - start)
                 rows.append(_row(name, result))
                 video.add(None if isinstance(image, ImageError) else image, result)
     finally:
         if rows:
             _write_tables(out, rows)
-    return rows, video.path
+    return rows, seconds, video.path
 
 
 def _pose(follow: "Follower", image: "Tensor | ImageError", box: Any) -> "Registration | FailedRegistration":

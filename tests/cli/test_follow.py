@@ -1,6 +1,7 @@
 """``curvireg follow``: poses, a video and a plot of all frames."""
 
 import csv
+import re
 import sys
 
 import cv2
@@ -37,7 +38,11 @@ def test_follow_writes_a_pose_for_each_frame(frames, tmp_path, capsys):
     folder, scenes = frames
     box = scenes[0][1].tolist()
     assert run(folder, "--camera", *CAMERA, "--box", *box, "--out", tmp_path) == 0
-    assert "4 frames: 3 ok, 0 lost, 1 failed" in capsys.readouterr().out
+    closing = capsys.readouterr().out
+    assert "4 frames: 3 ok, 0 lost, 1 failed" in closing
+    rate = re.search(r", ([\d.]+) frames per second; see", closing)
+    assert rate is not None
+    assert float(rate[1]) > 0.0
     with (tmp_path / "results.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["status"] for row in rows] == ["ok", "ok", "ok", "failed"]
