@@ -65,8 +65,8 @@ class TrackedPose:
     Attributes:
         T: (1, 4, 4) float64 ``T_cam_from_model``.
         features: what the confidence is computed from, all in [0, 1]: ``edge_support`` as of a contour fit; ``region``,
-            how clearly and how near to the outline the object's colours end; ``flow`` and ``keyframe``, the fractions of
-            the corners of the last frame and of a keyframe that are found where the pose has them.
+            how clearly and how near to the outline the object's colours end; ``flow`` and ``keyframe``, the fraction
+            of the corners of the last frame, and of a keyframe, that are found where the pose has them.
         frame, outline: what the features were measured in.
     """
 
