@@ -59,7 +59,17 @@ MAX_VIEWER_FACES = 300_000
 """Triangles that the viewer sends to the browser, 96 bytes each; for larger meshes it shows a notice."""
 
 MAX_VIEWER_PAGES = 8
-"""Open pages of the viewer, each with a photograph, a mesh and a bank in memory."""
+"""Pages of the viewer, open or left, each with a photograph, a mesh and a bank in memory; a new one replaces the page
+that was left first."""
+
+MAX_VIEWER_BYTES = 1 << 30
+"""Bytes of the files of a page of the viewer, those on their way included."""
+
+MAX_VIEWER_UPLOADS = 8
+"""Files that a page of the viewer receives at a time."""
+
+MAX_ARCHIVE_FILES = 1000
+"""Files in a zip archive with a mesh and its parts."""
 
 MAX_VIEWER_SECONDS = 600.0
 """Time limit of a registration in the viewer."""

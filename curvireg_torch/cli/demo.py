@@ -32,23 +32,18 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _register_scene(arguments: argparse.Namespace) -> None:
-    import torch
-
     from ..evaluation.result_files import write_result
-    from ..geometry import camera_matrix, rotation_error
+    from ..geometry import rotation_error
     from ..matching import cached_bank
     from ..registration import Registrar, Registration
     from ..registration.document import result_document
-    from ..synthetic import example_mesh, photograph_tabletop, random_pose
+    from ..synthetic import demo_scene
     from ..visualization.encoding import png
     from ..visualization.overlay import to_uint8
     from .report import print_result
 
-    generator = torch.Generator().manual_seed(arguments.seed)
-    mesh, size = example_mesh(), (720, 960)
-    K = camera_matrix(1040.0, 1040.0, 479.5, 359.5, dtype=torch.float64)
-    truth = random_pose(mesh, K, size, generator, elevations=(12.0, 45.0), fill=(0.75, 0.95))
-    image, box = photograph_tabletop(example_mesh(painted=True), truth, K, size, generator)
+    scene = demo_scene(arguments.seed)
+    mesh, image, box, K, truth = scene.mesh, scene.image, scene.box, scene.camera_matrix, scene.truth
     options = register_options(arguments)
     pipeline = options.open_pipeline()
     with show_stages(enabled=options.progress) as progress:

@@ -1,11 +1,12 @@
 """A box drawn and corrected with the mouse."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 __all__ = ["BoxDrawing"]
 
 Box = tuple[float, float, float, float]
 
+MAX_UNDO = 100  # changes that are kept
 MIN_SIDE = 3.0  # px of a new box; a smaller one was a click
 
 
@@ -28,6 +29,8 @@ class BoxDrawing:
     _corners: Box | None = None  # while dragged; x0 may exceed x1
     _dragged: tuple[int | None, int | None] = (None, None)  # indices of the x and the y that follow the mouse
     _origin: tuple[float, float] | None = None  # where the drag of the whole box began
+    _undone: list[Box | None] = field(default_factory=list)
+    _done: list[Box | None] = field(default_factory=list)  # earlier boxes
 
     @property
     def active(self) -> bool:
@@ -76,6 +79,54 @@ class BoxDrawing:
             x0, y0, x1, y1 = (round(v, 1) for v in self.box)
             self.box = (x0, y0, x1, y1)
         self._corners = None
+        self._remember(self._before)
+
+    def cancel(self) -> None:
+        """End the drag and forget it."""
+        if self._corners is not None:
+            self.box, self._corners = self._before, None
+
+    def set(self, box: Box | None) -> None:
+        """Replace the box."""
+        before, self.box, self._corners = self.box, box, None
+        self._remember(before)
+
+    def nudge(self, dx: float, dy: float, *, resize: bool = False) -> None:
+        """Move the box by px, or only its right and lower edges."""
+        if self.box is None:
+            return
+        x0, y0, x1, y1 = self.box
+        if resize:
+            self.set((x0, y0, max(x1 + dx, x0 + MIN_SIDE), max(y1 + dy, y0 + MIN_SIDE)))
+        else:
+            self.set((x0 + dx, y0 + dy, x1 + dx, y1 + dy))
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether :meth:`undo` changes the box."""
+        return bool(self._done)
+
+    @property
+    def can_redo(self) -> bool:
+        """Whether :meth:`redo` changes the box."""
+        return bool(self._undone)
+
+    def undo(self) -> None:
+        """Bring back the box before the last change."""
+        if self._done:
+            self._undone.append(self.box)
+            self.box = self._done.pop()
+
+    def redo(self) -> None:
+        """Repeat the change that :meth:`undo` took back."""
+        if self._undone:
+            self._done.append(self.box)
+            self.box = self._undone.pop()
+
+    def _remember(self, before: Box | None) -> None:
+        if self.box != before:
+            self._done = [*self._done[1 - MAX_UNDO :], before]
+            self._undone = []
 
 
 def _near_edge(at: float, low: float, high: float, reach: float, index: int) -> int | None:

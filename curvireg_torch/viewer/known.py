@@ -8,7 +8,8 @@ from ..geometry.pose_prior import SIDES, PosePrior
 from ..utils.choices import UP_AXES
 from .directions import HEIGHT, WIDTH, limits_of_box, map_svg
 from .drawing import BoxDrawing
-from .host import Host
+from .session import Session
+from .widgets import button, region, text
 
 __all__ = ["KnownPose"]
 
@@ -18,35 +19,34 @@ RANGES = ("azimuth", "elevation")
 class KnownPose:
     """Input fields; what is chosen, typed or drawn becomes limits of the session."""
 
-    def __init__(self, host: Host) -> None:
-        self.host, self.session, self.drawing = host, host.session, BoxDrawing()
-        with ui.expansion("what is known about the pose").classes("w-full").props("dense data-testid=known"):
-            with ui.row().classes("gap-0"):
-                for name in SIDES:
-                    self._button(name, azimuth=PosePrior.side(name).azimuth)
-                self._button("anything", azimuth=None, elevation=None)
-            self.map = ui.interactive_image(
-                size=(WIDTH, HEIGHT),
-                on_mouse=self._handle_mouse,
-                events=["mousedown", "mousemove", "mouseup"],
-                sanitize=False,
-            ).props("data-testid=directions")
-            with ui.row().classes("w-full no-wrap gap-1"):
-                self.numbers = {name: [self._number(f"{name} {end}") for end in ("low", "high")] for name in RANGES}
-            axes: dict[str | None, str] = {None: "default", **{axis: axis for axis in UP_AXES}}
-            front = ui.select(axes, label="front of the mesh")
-            front.value = (self.session.options.limits or {}).get("front")
-            front.on_value_change(lambda event: self.session.set_limits(front=event.value))
-            front.classes("w-full").props("dense options-dense data-testid=front")
+    def __init__(self, session: Session) -> None:
+        self.session, self.drawing = session, BoxDrawing()
+        text("p", "Seen from its", "facts")
+        with region("div", "row"):
+            for name in SIDES:
+                self._button(name, azimuth=PosePrior.side(name).azimuth)
+            self._button("anything", azimuth=None, elevation=None)
+        text("p", "or from the part of this map that you mark with the mouse", "facts")
+        self.map = ui.interactive_image(
+            size=(WIDTH, HEIGHT),
+            on_mouse=self._handle_mouse,
+            events=["mousedown", "mousemove", "mouseup"],
+            sanitize=False,
+        ).props("data-testid=directions")
+        with region("div", "numbers"):
+            self.numbers = {name: [self._number(f"{name} {end}") for end in ("low", "high")] for name in RANGES}
+        axes: dict[str | None, str] = {None: "default", **{axis: axis for axis in UP_AXES}}
+        front = ui.select(axes, label="front of the mesh")
+        front.value = (self.session.options.limits or {}).get("front")
+        front.on_value_change(lambda event: self.session.set_limits(front=event.value))
+        front.props("dense options-dense data-testid=front")
         self._show()
 
     def _button(self, name: str, **limits: Any) -> None:
-        button = ui.button(name, on_click=lambda: self._set(**limits))
-        button.props(f"flat dense no-caps size=sm data-testid=known-{name}")
+        button(name, lambda: self._set(**limits), f"known-{name}", "quiet")
 
     def _number(self, name: str) -> Any:
-        number = ui.number(name, on_change=self._typed).classes("w-20")
-        return number.props(f"dense data-testid={name.replace(' ', '-')}")
+        return ui.number(name, on_change=self._typed).props(f"dense data-testid={name.replace(' ', '-')}")
 
     def _set(self, **limits: Any) -> None:
         self.session.set_limits(**limits)

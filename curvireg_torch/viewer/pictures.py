@@ -12,27 +12,27 @@ from ..visualization.overlay import to_uint8, view_picture
 
 __all__ = ["photograph_jpeg", "pose_layers", "view_pictures"]
 
-SIDE = 1400  # longer side of the displayed photograph in px
+PHOTO_SIDE = 2400  # longer side of the displayed photograph in px: it can be zoomed
+LAYER_SIDE = 1400  # longer side of the layers over it
 
 
-def photograph_jpeg(image: Tensor) -> tuple[bytes, float]:
-    """A JPEG of a (3, H, W) photograph with at most 1400 px on the longer side, and its scale to the photograph."""
-    pixels = shrink(to_uint8(image), SIDE)
-    return jpeg(pixels, 92), pixels.shape[1] / image.shape[-1]
+def photograph_jpeg(image: Tensor) -> bytes:
+    """A JPEG of a (3, H, W) photograph with at most 2400 px on the longer side."""
+    return jpeg(shrink(to_uint8(image), PHOTO_SIDE), 92)
 
 
-def pose_layers(registrar: Registrar, pose: Hypothesis, size: tuple[int, int], scale: float) -> tuple[bytes, bytes]:
-    """Two transparent PNGs of ``size`` (H, W), that of the displayed photograph: the shaded mesh, and its contours.
-
-    ``scale`` is that of the displayed photograph to the photograph.
-    """
+def pose_layers(registrar: Registrar, pose: Hypothesis, size: tuple[int, int]) -> tuple[bytes, bytes]:
+    """Two transparent PNGs over a photograph of ``size`` (H, W): the shaded mesh, and its contours."""
     T, K = pose.projection
-    half = 0.5 * scale - 0.5
-    K = torch.tensor([[scale, 0.0, half], [0.0, scale, half], [0.0, 0.0, 1.0]], dtype=torch.float64) @ K
-    depth = registrar.describers[pose.model].renderer.render(T[None], K, size)[0, 0].cpu().float()
+    scale = min(1.0, LAYER_SIDE / max(size))
+    small = max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+    sy, sx = small[0] / size[0], small[1] / size[1]
+    to_layer = torch.tensor([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
+    K = to_layer.double() @ K
+    depth = registrar.describers[pose.model].renderer.render(T[None], K, small)[0, 0].cpu().float()
     mask = (depth > 0).numpy()
     grey = shade(depth[None, None], K[None])[0, 0].numpy()
-    solid = np.zeros((*size, 4), np.uint8)
+    solid = np.zeros((*small, 4), np.uint8)
     solid[mask, :3] = (grey[mask, None] * np.array([255, 235, 190])).round().astype(np.uint8)
     solid[mask, 3] = 255
     return png(solid), png(contour_layer(depth, K))

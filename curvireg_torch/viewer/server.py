@@ -1,51 +1,44 @@
-"""The server of the viewer: its secret address, its limits on requests and its files."""
+"""The server of the viewer: its secret address, its pages, their files and uploads."""
 
 import errno
 import os
+import re
 import secrets
-import shutil
 import socket
 import sys
 import tempfile
 import threading
 import warnings
 import webbrowser
-from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
+from urllib.parse import unquote
 
 import uvicorn
 from fastapi import FastAPI
 from nicegui import app, ui
-from starlette.responses import PlainTextResponse, Response
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
 
 from ..errors import InvalidInputError
 from ..evaluation.opening import RegisterOptions
-from ..limits import MAX_MESH_BYTES, MAX_VIEWER_PAGES
+from ..limits import MAX_VIEWER_PAGES
 from .guard import Guard, allowed_hosts, public_addresses
-from .page import Page
+from .page import Page, add_assets
 from .session import Session
+from .uploads import file_name, size_limit
+from .workspace import Workspaces, show_warning
 
 __all__ = ["serve"]
 
-_FORM_BYTES = 1 << 16  # of an upload, besides the file
-_RECONNECT_SECONDS = 60.0
+_RECONNECT_SECONDS = 5.0  # a reload takes less; the work is kept longer
+_SWEEP_SECONDS = 10.0
 _CONNECT_SECONDS = 20.0
-
-
-class _UploadLimit:
-    """Refuse a request body without a length, or longer than any file may be, before it is read."""
-
-    def __init__(self, inner: Callable[..., Awaitable[None]]) -> None:
-        self.inner = inner
-
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        if scope["type"] == "http" and scope["method"] not in ("GET", "HEAD", "OPTIONS"):
-            length = dict(scope["headers"]).get(b"content-length", b"")
-            if not length.isdigit() or int(length) > MAX_MESH_BYTES + _FORM_BYTES:
-                await PlainTextResponse("too large", status_code=413)(scope, receive, send)
-                return
-        await self.inner(scope, receive, send)
+_NAME_BYTES = 12
+_PAGE_NAME = re.compile(r"[-\w]{16}")  # of token_urlsafe
+_ICON = (
+    "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 16 16'><path d='M8 1l6 3.5v7L8 15l-6-3.5v-7z' "
+    "fill='none' stroke='#0a7d3c' stroke-width='2'/></svg>"
+)
 
 
 def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> None:
@@ -61,9 +54,16 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
         token = secrets.token_urlsafe(16)
         prefix = f"/{token}"
         site = FastAPI(openapi_url=None)
-        add_pages(options)
+        add_pages(Workspaces(options, Path(tempfile.mkdtemp(prefix="curvireg-view-"))))
         ui.run_with(
-            site, mount_path=prefix, title="curvireg", language="en-US", tailwind=True, show_welcome_message=False
+            site,
+            mount_path=prefix,
+            title="curvireg",
+            favicon=_ICON,
+            language="en-US",
+            dark=None,
+            tailwind=False,
+            show_welcome_message=False,
         )
         addresses = [f"http://{name}{prefix}/" for name in public_addresses(host, listener.getsockname()[1])]
         guard = Guard(site, prefix=prefix, hosts=allowed_hosts(host))
@@ -77,7 +77,7 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
             threading.Timer(0.5, webbrowser.open, (addresses[-1],)).start()
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
-            warnings.showwarning = Page.show_warning
+            warnings.showwarning = show_warning
             server.run(sockets=[listener])
 
 
@@ -101,35 +101,56 @@ def listen(host: str, port: int) -> socket.socket:
     return listener
 
 
-def add_pages(options: RegisterOptions) -> None:
-    """Add the page and its files to the application of NiceGUI."""
-    pages: dict[str, Page] = {}
+def add_pages(spaces: Workspaces) -> None:
+    """Add the page, its files and its uploads to the application of NiceGUI."""
 
-    async def build() -> None:
+    async def build(page: str) -> Response | None:
+        if _PAGE_NAME.fullmatch(page) is None:
+            return PlainTextResponse("not found", status_code=404)
+        add_assets()
         client = ui.context.client
         await client.connected(timeout=_CONNECT_SECONDS)  # a request without a browser takes no place
-        if len(pages) >= MAX_VIEWER_PAGES:
-            ui.label(f"{MAX_VIEWER_PAGES} pages are open already; close one and load this again")
-            return
-        name, folder = secrets.token_urlsafe(16), Path(tempfile.mkdtemp(prefix="curvireg-view-"))
-        page = pages[name] = Page(Session(options), folder, f"file/{name}")
+        workspace = spaces.join(page)
+        if workspace is None:
+            ui.label(f"{MAX_VIEWER_PAGES} pages are open already; close one and load this again").classes("full")
+            return None
+        client.on_delete(lambda: spaces.leave(page))
+        Page(workspace).build()
+        if not workspace.loaded:
+            await workspace.load()
+        return None
 
-        def close() -> None:
-            page.session.cancel()
-            pages.pop(name, None)
-            shutil.rmtree(folder, ignore_errors=True)
+    def new_page() -> Response:
+        return RedirectResponse(secrets.token_urlsafe(_NAME_BYTES))
 
-        client.on_delete(close)
-        app.on_shutdown(lambda: shutil.rmtree(folder, ignore_errors=True))
-        page.build()
-
-    def file(page: str, name: str) -> Response:
-        content, media_type = pages[page].files.get(name, (b"", "")) if page in pages else (b"", "")
+    def send_file(page: str, name: str) -> Response:
+        content, media_type = spaces.items[page].files.get(name, (b"", "")) if page in spaces.items else (b"", "")
         if not media_type:
             return PlainTextResponse("no such file", status_code=404)
         return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
 
-    ui.page("/", reconnect_timeout=_RECONNECT_SECONDS)(build)
-    app.get("/file/{page}/{name}")(file)
-    app.add_middleware(_UploadLimit)
+    async def receive_file(page: str, request: Request) -> Response:
+        workspace = spaces.items.get(page)
+        if workspace is None or workspace.pages == 0:
+            return PlainTextResponse("no such page", status_code=404)
+        name = file_name(unquote(request.headers.get("x-file-name", "")))
+        length = request.headers.get("content-length", "")
+        try:
+            kind, limit = size_limit(name)
+            if not length.isdigit() or int(length) > limit:
+                raise InvalidInputError(f"{name}: a {kind} may have {limit:,} bytes")
+            await workspace.receive(name, int(length), request.stream())
+        except InvalidInputError as error:
+            workspace.messages["file"] = str(error)
+            return PlainTextResponse(str(error), status_code=413)
+        except ClientDisconnect:
+            workspace.messages["file"] = f"{name}: it did not arrive; send it again"
+        return Response(status_code=204)
+
+    app.get("/", include_in_schema=False)(new_page)
+    ui.page("/{page}", reconnect_timeout=_RECONNECT_SECONDS)(build)
+    app.get("/{page}/file/{name}")(send_file)
+    app.post("/{page}/upload")(receive_file)
     app.add_exception_handler(404, lambda *_: PlainTextResponse("not found", status_code=404))
+    app.timer(_SWEEP_SECONDS, spaces.sweep)
+    app.on_shutdown(spaces.close)

@@ -157,15 +157,24 @@ class Session:
         if photo is None or not request.meshes:
             raise InvalidInputError("register: choose a photograph and a mesh first")
         check_camera(request.camera, request.guess)
-        self.cancelled, report_progress = False, self._progress_callback(start)
+        report_progress = self._progress_callback(start)
         names = {path: Path(name) for path, name in self.names.items()}
-        with self._user_names():
-            registrar = self._open_registrar(request.meshes[0], report_progress)
-            registrar.progress = report_progress
-            entry = request.entry(request.photos[0])
-            entry = replace(entry, name=self.names[entry.photo], meshes=tuple(names[p] for p in entry.meshes))
-            ready = time.perf_counter() - start
-            registration, document = register_entry(entry, photo, registrar, bank_seconds=ready)
+        try:
+            with self._user_names():
+                registrar = self._open_registrar(request.meshes[0], report_progress)
+                registrar.progress = report_progress
+                entry = request.entry(request.photos[0])
+                entry = replace(entry, name=self.names[entry.photo], meshes=tuple(names[p] for p in entry.meshes))
+                ready = time.perf_counter() - start
+                registration, document = register_entry(entry, photo, registrar, bank_seconds=ready)
+            if self.cancelled:  # too late for the last step
+                raise CurviregError("stopped")
+        except CurviregError:
+            if self.cancelled:
+                raise CurviregError("stopped") from None
+            raise
+        finally:
+            self.cancelled = False
         box, command = torch.tensor(used_box(document)), _command_line(request, self.names)
         self.result = Result(registrar, registration, document, photo.image, box, command)
         self.display(0)

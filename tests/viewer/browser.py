@@ -1,9 +1,14 @@
 """A headless browser that shows a page of the viewer."""
 
 import importlib.util
+import os
 import shutil
 import time
 import urllib.request
+from pathlib import Path
+
+import cv2
+import numpy as np
 
 __all__ = ["MISSING", "Browser", "wait_for"]
 
@@ -47,6 +52,11 @@ class Browser:
         self.driver.get(address)
         self.wait(lambda: self.part("register"), "the page")
 
+    @property
+    def page(self):
+        """The name of the page in its address."""
+        return self.driver.current_url.rsplit("/", 1)[1]
+
     def part(self, name):
         return self.driver.find_element("css selector", f'[data-testid="{name}"]')
 
@@ -54,7 +64,8 @@ class Browser:
         return self.part(name).get_attribute("value") or self.part(name).text
 
     def messages(self):
-        return [part.text for part in self.driver.find_elements("css selector", '[data-testid="message"]')]
+        parts = self.driver.find_elements("css selector", '[data-testid^="message-"]')
+        return [part.text for part in parts if part.text]
 
     def wait(self, condition, what, seconds=90):
         deadline, error = time.monotonic() + seconds, None
@@ -72,8 +83,44 @@ class Browser:
         self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
         self.wait(lambda: button.click() or True, f"click {name}", 20)
 
-    def upload(self, what, path):
-        self.part(f"upload-{what}").find_element("css selector", "input[type=file]").send_keys(str(path))
+    def unfold(self, name):
+        self.driver.execute_script("arguments[0].open = true", self.part(f"fold-{name}"))
+
+    def upload(self, what, *paths):
+        self.part(f"upload-{what}").send_keys("\n".join(map(str, paths)))
+
+    def drop(self, *paths):
+        """Drop files on the window, as a file manager does."""
+        import base64
+
+        files = [[path.name, base64.b64encode(path.read_bytes()).decode()] for path in paths]
+        script = """
+            const transfer = new DataTransfer();
+            for (const [name, data] of arguments[0])
+              transfer.items.add(new File([Uint8Array.from(atob(data), c => c.charCodeAt(0))], name));
+            for (const type of ["dragover", "drop"])
+              document.querySelector("footer, main").dispatchEvent(
+                new DragEvent(type, {dataTransfer: transfer, bubbles: true, cancelable: true}))"""
+        self.driver.execute_script(script, files)
+
+    def emulate(self, width, height, *, dark=False):
+        """Show the page as a screen of that size does, until it is called with a width of 0."""
+        command = self.driver.execute_cdp_cmd
+        if width:
+            metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
+            command("Emulation.setDeviceMetricsOverride", metrics)
+        else:
+            command("Emulation.clearDeviceMetricsOverride", {})
+        value = "dark" if dark else "light"
+        command("Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": value}]})
+
+    def picture(self, name):
+        """Write a picture for the documentation into the folder that CURVIREG_PICTURES names, if it does."""
+        if folder := os.environ.get("CURVIREG_PICTURES"):
+            time.sleep(1)
+            self.driver.execute_script("document.activeElement.blur(); scrollTo(0, 0)")
+            pixels = cv2.imdecode(np.frombuffer(self.driver.get_screenshot_as_png(), np.uint8), cv2.IMREAD_COLOR)
+            cv2.imwrite(str(Path(folder) / f"{name}.webp"), pixels, [cv2.IMWRITE_WEBP_QUALITY, 80])
 
     def drag(self, start, end, size):
         """Drag the mouse between pixels of the photograph, whose width is ``size`` px."""

@@ -55,7 +55,7 @@ def known():
 
     session = Session(RegisterOptions(limits={"front": "-x", "theta": (-10.0, 10.0)}))
     with Client(page(""), request=None):
-        yield KnownPose(SimpleNamespace(session=session))
+        yield KnownPose(session)
 
 
 def event(kind, x, y):

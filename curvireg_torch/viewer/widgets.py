@@ -1,0 +1,56 @@
+"""Plain HTML elements of the page: text, buttons, choosers of files, and terms with an explanation."""
+
+from collections.abc import Callable
+from html import escape
+from typing import Any
+
+from nicegui import ui
+
+from ..utils.choices import IMAGES, MESHES_AND_BANKS
+
+__all__ = ["attributes", "button", "file_chooser", "region", "set_enabled", "set_text", "term", "text"]
+
+
+def attributes(**values: str) -> str:
+    """HTML attributes as ``Element.props`` takes them; ``_`` stands for ``-``."""
+    return " ".join(f'{name.replace("_", "-")}="{escape(value)}"' for name, value in values.items())
+
+
+def region(tag: str, classes: str = "", **values: str) -> Any:
+    """An element that holds others."""
+    return ui.element(tag).classes(classes).props(attributes(**values))
+
+
+def text(tag: str, content: str = "", classes: str = "", **values: str) -> Any:
+    """An element with text."""
+    return ui.html(escape(content), tag=tag, sanitize=False).classes(classes).props(attributes(**values))
+
+
+def set_text(element: Any, content: str) -> None:
+    """Replace the text of an element."""
+    element.set_content(escape(content))
+
+
+def button(label: str, on_click: Callable[..., Any], test_id: str, classes: str = "", **values: str) -> Any:
+    """A button; symbols need an ``aria_label``."""
+    element = text("button", label, f"button {classes}", type="button", data_testid=test_id, **values)
+    return element.on("click", lambda: on_click())
+
+
+def set_enabled(element: Any, enabled: bool) -> None:
+    """Let a button be pressed or not."""
+    element.props(remove="disabled") if enabled else element.props("disabled")
+
+
+def file_chooser(label: str, test_id: str) -> None:
+    """A button that opens the dialogue for files; ``page.js`` sends them."""
+    with region("label", "button file"):
+        ui.label(label)
+        accept = ",".join((*IMAGES, *MESHES_AND_BANKS, ".zip"))
+        region("input", "hidden-text", type="file", data_testid=test_id, accept=accept).props("multiple")
+
+
+def term(word: str, explanation: str) -> str:
+    """HTML of a word whose explanation shows under the mouse, on focus and on a tap."""
+    tip = f'<span class="tip" role="tooltip">{escape(explanation)}</span>'
+    return f'<span class="term" tabindex="0">{escape(word)}{tip}</span>'

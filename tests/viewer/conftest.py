@@ -1,0 +1,61 @@
+"""A viewer and a browser that shows it."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests._support.exif import exif, with_exif
+from tests.viewer.browser import Browser, wait_for
+from tests.viewer.test_session import write_scene
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("browser")
+    folder.joinpath("box.json").write_text(json.dumps(write_scene(folder)[0]))
+    with_exif(folder / "photo.png", exif(1, 37))
+    (folder / "broken.png").write_bytes((folder / "photo.png").read_bytes()[:3000])
+    (folder / "hostile.obj").write_text("v 0 0 0\nv 1 0 nan\nv 0 1 0\nf 1 2 3\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def address(folder, request):
+    """Address of a viewer that was started without a photograph."""
+    command = [sys.executable, "-m", "curvireg_torch", "view", *request.module.OPTIONS, "--no-browser"]
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    environment |= {"CURVIREG_CACHE": str(folder / "cache"), "PYTHONPATH": str(Path.cwd())}
+    with (folder / "log").open("w") as log:
+        server = subprocess.Popen(
+            command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=log, text=True, bufsize=1
+        )
+    try:
+        line = server.stdout.readline()
+        assert "http://127.0.0.1:" in line, (folder / "log").read_text()
+        address = re.search(r"http://\S+", line)[0]
+        wait_for(address)
+        yield address
+    finally:
+        server.send_signal(signal.SIGTERM)
+        try:
+            server.wait(20)
+        except subprocess.TimeoutExpired:
+            server.kill()
+            server.wait()
+        server.stdout.close()
+    assert "Traceback" not in (folder / "log").read_text()
+
+
+@pytest.fixture(scope="module")
+def browser(folder, address):
+    browser = Browser(folder, address)
+    yield browser
+    errors = [entry for entry in browser.driver.get_log("browser") if entry["level"] == "SEVERE"]
+    browser.driver.quit()
+    assert not errors

@@ -1,0 +1,187 @@
+"""The page as people use it: dropped files, mistakes, a reload, keys, small screens, and readers of screens."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.viewer.browser import MISSING, Browser
+
+OPTIONS = []  # of the command that starts the viewer
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}"),
+]
+
+AXE = os.environ.get("CURVIREG_AXE", "")
+
+
+def serious(browser):
+    """What axe-core finds that hinders people, with the elements."""
+    browser.driver.execute_script(Path(AXE).read_text())
+    found = browser.driver.execute_async_script("axe.run().then(arguments[0])")
+    return [
+        (rule["id"], [node["html"][:160] for node in rule["nodes"]][:4])
+        for rule in found["violations"]
+        if rule["impact"] in ("serious", "critical")
+    ]
+
+
+def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browser):
+    assert browser.driver.find_element("css selector", "html").get_attribute("lang") == "en-US"
+    assert [browser.text(name) for name in ("sample", "register")] == ["Try the sample", "Find the pose"]
+    assert browser.part("register").get_attribute("disabled")
+    browser.emulate(1280, 800)
+    browser.picture("viewer-empty")
+    browser.click("sample")
+    browser.wait(lambda: browser.text("photograph-facts").startswith("sample.png: 960 x 720 px"), "photograph")
+    browser.wait(lambda: "done" in browser.part("step-box").get_attribute("class"), "box")
+    browser.wait(lambda: not browser.part("register").get_attribute("disabled"), "ready")
+
+
+def test_a_search_can_be_stopped_and_started_again(browser):
+    browser.click("register")
+    browser.wait(lambda: browser.text("seconds") == "1 s", "seconds")
+    assert browser.text("stage")
+    browser.picture("viewer-search")
+    browser.click("stop")
+    browser.wait(lambda: browser.messages() == ["stopped"], "stopped", 20)
+    browser.wait(lambda: not browser.part("stop").is_displayed(), "nothing to stop")
+    browser.click("register")
+    browser.wait(lambda: browser.text("stage") == "done", "result")
+    assert browser.messages() == []
+
+
+def test_a_reload_keeps_photograph_mesh_box_and_answer(browser):
+    names = ("photograph-facts", "mesh-facts", "box-facts", "verdict", "facts")
+    browser.wait(lambda: browser.text("facts"), "answer")
+    before = [browser.text(name) for name in names]
+    browser.driver.refresh()
+    browser.wait(lambda: [browser.text(name) for name in names] == before, "everything again")
+    images = browser.part("photograph").find_elements("css selector", "img")
+    browser.wait(lambda: [int(image.get_attribute("naturalWidth")) for image in images] == [960] * 3, "layers")
+    browser.wait(lambda: len(browser.part("panel-answer").find_elements("css selector", "img")) > 1, "cards")
+    assert browser.text("stage") == "done"
+    browser.emulate(1280, 1000)
+    browser.picture("viewer")
+
+
+def test_another_page_has_its_own_work(browser, folder, address):
+    other = Browser(folder / "other", address)
+    try:
+        assert other.page != browser.page
+        assert other.part("sample").is_displayed()
+        assert "sample.png" in browser.text("photograph-facts")
+    finally:
+        other.driver.quit()
+
+
+def test_axe_finds_nothing_serious(browser):
+    if not AXE:
+        pytest.skip("CURVIREG_AXE does not name axe.min.js of axe-core")
+    for dark in (False, True):
+        browser.emulate(1280, 1000, dark=dark)
+        browser.wait(lambda d=dark: browser.driver.execute_script(
+            "return document.body.classList.contains('body--dark')") == d, "colours")  # fmt: skip
+        for name in ("camera", "box-numbers", "known", "command-line", "by-hand"):
+            browser.unfold(name)
+        assert serious(browser) == []
+
+
+def test_dark_colours_follow_the_system(browser):
+    browser.emulate(1280, 1000, dark=True)
+    body = browser.driver.find_element("css selector", "body")
+    browser.wait(lambda: body.value_of_css_property("background-color") == "rgba(20, 23, 26, 1)", "dark")
+    browser.picture("viewer-dark")
+    browser.click("theme")
+    browser.wait(lambda: body.value_of_css_property("background-color") == "rgba(246, 247, 248, 1)", "light")
+    browser.emulate(0, 0)
+
+
+def test_a_small_screen_stacks_everything(browser):
+    browser.emulate(390, 844)
+    wide = "return [...document.querySelectorAll('*')].filter(e => e.getBoundingClientRect().right > 391).length"
+    browser.wait(lambda: browser.driver.execute_script("return document.documentElement.scrollWidth") == 390, "narrow")
+    assert browser.driver.execute_script(f"{wide} - document.querySelectorAll('.panels *').length") <= 0
+    parts = [browser.part(name).rect for name in ("step-photograph", "step-mesh", "register", "photograph", "verdict")]
+    assert [part["y"] for part in parts] == sorted(part["y"] for part in parts)
+    assert browser.part("photograph").rect["width"] > 300
+    browser.picture("viewer-phone")
+    browser.emulate(0, 0)
+
+
+def test_keys_undo_and_zoom_change_the_box(browser):
+    from selenium.webdriver import ActionChains, Keys
+
+    browser.unfold("box-numbers")
+    x0, y0, x1, y1 = browser.box()
+    viewport = browser.driver.find_element("css selector", ".viewport")
+
+    def press(*keys, held=()):
+        browser.driver.execute_script("arguments[0].focus()", viewport)
+        chain = ActionChains(browser.driver)
+        for key in held:
+            chain.key_down(key)
+        chain.send_keys(*keys)
+        for key in held:
+            chain.key_up(key)
+        chain.perform()
+
+    def becomes(*box):
+        browser.wait(lambda: browser.box() == pytest.approx(box, abs=0.01), f"{box}", 20)
+
+    press(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_UP)
+    becomes(x0 + 2, y0 - 1, x1 + 2, y1 - 1)
+    press(Keys.ARROW_LEFT, held=[Keys.SHIFT])
+    becomes(x0 - 8, y0 - 1, x1 - 8, y1 - 1)
+    press("z", held=[Keys.CONTROL])
+    becomes(x0 + 2, y0 - 1, x1 + 2, y1 - 1)
+    browser.click("redo")
+    becomes(x0 - 8, y0 - 1, x1 - 8, y1 - 1)
+    press(Keys.DELETE)
+    browser.wait(lambda: browser.text("box-x0") == "", "no box")
+    browser.click("undo")
+    becomes(x0 - 8, y0 - 1, x1 - 8, y1 - 1)
+
+    # The wheel zooms at the mouse; a box that is drawn then is where the mouse was.
+    image = browser.part("photograph")
+    width = image.size["width"]
+    ActionChains(browser.driver).scroll_from_origin(origin_at(image), 0, -300).perform()
+    browser.wait(lambda: image.size["width"] > 1.5 * width, "zoomed")
+    assert browser.driver.execute_script("return arguments[0].scrollLeft", viewport) > 100
+    browser.driver.find_element("css selector", "[data-zoom=fit]").click()
+    browser.wait(lambda: image.size["width"] == width, "as before")
+    browser.drag((100, 500), (300, 650), 960)
+    browser.wait(lambda: browser.box() == pytest.approx([100, 500, 300, 650], abs=2), "drawn box")
+
+
+def origin_at(element):
+    from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
+
+    return ScrollOrigin.from_element(element)
+
+
+def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(browser, folder):
+    browser.drop(folder / "truck.ply", folder / "photo.png")
+    browser.wait(lambda: browser.text("photograph-facts") == "photo.png: 240 x 180 px", "photograph")
+    browser.wait(lambda: browser.text("mesh-facts").startswith("truck.ply: "), "mesh")
+    (folder / "other.png").write_bytes((folder / "photo.png").read_bytes())
+    for name in ("other.png", "photo.png"):  # photo.png for the second time
+        browser.upload("photograph", folder / name)
+        browser.wait(lambda name=name: browser.text("photograph-facts").startswith(f"{name}: "), name)
+    assert browser.messages() == []
+    (folder / "notes.txt").write_text("nothing to see")
+    browser.drop(folder / "broken.png", folder / "hostile.obj", folder / "notes.txt")
+    browser.wait(lambda: len(browser.messages()) == 3, "three messages")
+    for part, name in (("photograph", "broken.png"), ("mesh", "hostile.obj"), ("file", "notes.txt")):
+        assert browser.text(f"message-{part}").startswith(f"{name}: ")
+        assert str(folder) not in browser.text(f"message-{part}")
+    assert browser.text("photograph-facts") == "photo.png: 240 x 180 px", "the former one stays"
+    browser.emulate(1280, 800)
+    browser.picture("viewer-mistakes")
+    browser.emulate(0, 0)
+    browser.drop(folder / "photo.png")
+    browser.wait(lambda: browser.text("message-photograph") == "", "gone")
+    browser.upload("mesh", folder / "truck.ply")
+    browser.wait(lambda: browser.messages() == [], "all gone")
