@@ -17,7 +17,7 @@ from .workspace import Workspace
 
 __all__ = ["Answers"]
 
-STEPS = {1.0: "fine", 4.0: "middle", 15.0: "coarse"}
+STEPS = {"fine": 1.0, "middle": 4.0, "coarse": 15.0}  # degrees, and hundredths of the radius
 ROTATIONS = {"tilt": (1, 0, 0), "turn": (0, 1, 0), "roll": (0, 0, 1)}
 TRANSLATIONS = {"right": (1, 0, 0), "down": (0, 1, 0), "away": (0, 0, 1)}
 VERDICTS = {
@@ -43,6 +43,7 @@ class Answers:
         self.workspace, self.session = workspace, workspace.session
         self.shown_result: Any = None
         self.shown_pose: Any = None
+        self.step = STEPS["middle"]
         with region("section", "answers", aria_label="answer", data_testid="answers") as self.section:
             with region("div", "verdict"):
                 self.word = text("h2", "", data_testid="verdict")
@@ -58,7 +59,11 @@ class Answers:
                     button(label, lambda kind=kind: self._download(kind), f"download-{kind}", "quiet")
 
     def _build_tools(self) -> None:
-        self.step = ui.toggle(STEPS, value=4.0).props("dense no-caps unelevated aria-label='size of a step'")
+        with region("label", "row"):
+            text("span", "Size of a step")
+            with region("select", "button", data_testid="step").on("change", self._set_step, args=["target.value"]):
+                for name in STEPS:
+                    text("option", name, value=name).props("selected" if STEPS[name] == self.step else "")
         with region("div", "pairs"):
             for name, axis in ROTATIONS.items():
                 self._build_pair(name, "rotation", axis, 1.0)
@@ -70,13 +75,16 @@ class Answers:
         """Two buttons that rotate about an axis or move along it, in steps of ``unit`` degrees or radii."""
 
         async def move(sign: int) -> None:
-            step = {kind: [sign * v * float(self.step.value) * unit for v in axis]}
+            step = {kind: [sign * v * self.step * unit for v in axis]}
             await self.workspace.run("pose", lambda: self.session.move(**step))
 
         with region("div", "pair", role="group", aria_label=name):
             button("−", lambda: move(-1), f"-{name}", "quiet", aria_label=f"{name} back")
             text("span", name)
             button("+", lambda: move(1), f"+{name}", "quiet", aria_label=f"{name} on")
+
+    def _set_step(self, event: Any) -> None:
+        self.step = STEPS[event.args]
 
     async def _fit(self) -> None:
         await self.workspace.run("pose", self.session.fit)

@@ -22,6 +22,7 @@ from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from ..errors import InvalidInputError
 from ..evaluation.opening import RegisterOptions
 from ..limits import MAX_VIEWER_PAGES
+from ..utils.threads import one_torch_thread
 from .guard import Guard, allowed_hosts, public_addresses
 from .page import Page, add_assets
 from .session import Session
@@ -75,7 +76,7 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
             )
         if browser:
             threading.Timer(0.5, webbrowser.open, (addresses[-1],)).start()
-        with warnings.catch_warnings():
+        with one_torch_thread(), warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = show_warning
             server.run(sockets=[listener])

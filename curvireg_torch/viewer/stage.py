@@ -43,7 +43,7 @@ class Stage:
     def _build_empty(self) -> None:
         with region("div", "empty") as self.empty:
             text("p", "Drop a photograph and a mesh anywhere on this page", "large")
-            text("p", "The two may come together and in any order. They stay on this machine.")
+            text("p", "The two may come together and in any order. Nothing is sent to the internet.")
             with region("div", "row"):
                 file_chooser("Choose files", "upload-any")
                 button("Try the sample", self.workspace.load_sample, "sample", "primary")

@@ -86,7 +86,7 @@ def test_axe_finds_nothing_serious(browser):
             "return document.body.classList.contains('body--dark')") == d, "colours")  # fmt: skip
         for name in ("camera", "box-numbers", "known", "command-line", "by-hand"):
             browser.unfold(name)
-        assert serious(browser) == []
+        assert not (found := serious(browser)), found
 
 
 def test_dark_colours_follow_the_system(browser):

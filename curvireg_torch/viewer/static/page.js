@@ -147,9 +147,13 @@
     emitEvent("stage", what);
   });
 
-  // --- Sliders that only change how the layers look, and the colours of the page.
+  // --- Sliders that only change how the layers look.
   addEventListener("input", (event) => {
     const property = event.target.dataset?.property;
     if (property) document.querySelector(".canvas").style.setProperty(property, event.target.value / 100);
   });
+
+  // --- The map of directions has fields beside it; its picture, which NiceGUI leaves without a text, says nothing more.
+  const describe = () => document.querySelectorAll("img:not([alt])").forEach((image) => (image.alt = ""));
+  new MutationObserver(describe).observe(document, { childList: true, subtree: true });
 })();
