@@ -73,6 +73,7 @@ class Browser:
             try:
                 if value := condition():
                     return value
+                error = None
             except Exception as caught:  # the page is not ready
                 error = caught
             assert time.monotonic() < deadline, f"{what}; page says {self.messages()!r}; {error}"
