@@ -147,6 +147,9 @@ class Pipeline:
             raise InvalidInputError(f"pipeline: expected a JSON object, got {type(data).__name__}")
         if data.pop("version", VERSION) != VERSION:
             raise InvalidInputError(f"pipeline: this library reads version {VERSION}; write the file again")
+        for name in ("views", "bank", "locate", "terms"):
+            if not isinstance(data.get(name, {}), dict):
+                raise InvalidInputError(f"pipeline: {name}: expected a JSON object; compare with Pipeline().to_json()")
         try:
             for name, settings in (("views", ViewPolicy), ("bank", BankSettings), ("locate", LocateSettings)):
                 if name in data:

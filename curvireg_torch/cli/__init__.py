@@ -70,6 +70,7 @@ def _run(arguments: argparse.Namespace) -> int:
     with warnings.catch_warnings(), terminable():
         if not arguments.debug:
             warnings.showwarning = _show_warning
+            os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # of videos it cannot read, our message is enough
         try:
             arguments.run(arguments)
         except (CurviregError, OSError) as error:

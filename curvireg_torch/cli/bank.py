@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from ..errors import InvalidInputError
 from ..utils.files import check_writable
 from ..utils.input_paths import check_given
 from .options import common_options, examples, mesh_options, pipeline_options, register_options
@@ -30,9 +31,13 @@ def add_parser(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Build and save a bank."""
     check_given([], [arguments.mesh])
-    check_writable(arguments.out.parent, "--out")
-    if arguments.adapt is not None:
-        check_writable(arguments.adapt.parent, "--adapt")
+    for path, name in ((arguments.out, "--out"), (arguments.adapt, "--adapt")):
+        if path is not None:
+            if path.suffix != ".safetensors" or path.is_dir():
+                raise InvalidInputError(f"{name} {path}: expected the name of a file that ends in .safetensors")
+            check_writable(path.parent, name)
+    if arguments.mesh.suffix == ".safetensors":
+        raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
     from ..io.meshes import load_mesh
     from ..matching import ViewBank
     from ..utils.threads import one_torch_thread

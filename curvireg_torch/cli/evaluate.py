@@ -58,19 +58,19 @@ def run(arguments: argparse.Namespace) -> None:
     """Evaluate a dataset and print the headline."""
     if not Path(arguments.root).is_dir():
         raise MissingFileError("no such folder; datasets/README.md shows the layout", subject=arguments.root)
-    from ..evaluation.workers import run_processes
-
-    if run_processes(arguments.jobs, arguments.argv):
-        return
     from ..evaluation.datasets import evaluate
     from ..evaluation.protocol import Protocol
+    from ..evaluation.workers import run_processes
     from ..pipeline import Pipeline
     from ..utils.threads import one_torch_thread
 
     kind = DATASETS[arguments.dataset]
-    dataset = kind.open(arguments.root, **kind.chosen(arguments))
-    benchmark = kind.scored(dataset, Protocol.parse(arguments.protocol, pose=kind.pose))
+    protocol = Protocol.parse(arguments.protocol, pose=kind.pose)
     preset = arguments.preset if arguments.pipeline is None else Pipeline.read(arguments.pipeline)
+    if run_processes(arguments.jobs, arguments.argv):
+        return
+    dataset = kind.open(arguments.root, **kind.chosen(arguments))
+    benchmark = kind.scored(dataset, protocol)
     check_writable(arguments.out, "--out")
     with one_torch_thread():
         summary = evaluate(

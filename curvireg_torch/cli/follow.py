@@ -75,7 +75,9 @@ def run(arguments: argparse.Namespace) -> None:
     rate = f", {len(after_first) / sum(after_first):.1f} frames per second" if after_first else ""
     print(f"{len(rows)} frames: {summary}{rate}; see {out}/results.csv and {video}")
     if not counts["ok"]:
-        raise InvalidInputError("no frame could be registered; give --box of the object in the first frame")
+        reason = f"; the first: {rows[0][-1]}" if rows else ""
+        message = f"no frame could be registered{reason}; give frames that can be read, and --box of the object"
+        raise InvalidInputError(message, subject=arguments.frames)
 
 
 def _follow(options: "RegisterOptions", out: Path) -> tuple[list[list[Any]], list[float], Path]:

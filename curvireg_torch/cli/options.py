@@ -18,7 +18,7 @@ PRESETS_HELP = (
 )
 
 _COUNTS = {"--box": 4, "--camera": 4, "--distance": 2, "--azimuth": 2, "--elevation": 2, "--theta": 2}
-_NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
+NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
 
 def examples(*lines: str) -> dict[str, Any]:
@@ -130,8 +130,9 @@ def register_options(
     """The options of ``register``, ``plot`` and ``view``; an option that a command lacks has its default."""
     from dataclasses import fields
 
+    from ..errors import InvalidInputError
     from ..evaluation.opening import RegisterOptions
-    from ..evaluation.prior_options import limits_from_options
+    from ..evaluation.prior_options import limits_from_options, prior_from_limits
     from ..utils.checks import check_device
 
     names = {option.name for option in fields(RegisterOptions)} - {"photos", "meshes"}
@@ -140,7 +141,11 @@ def register_options(
         for name, value in vars(arguments).items()
         if name in names and value is not None
     }
-    values["limits"] = limits_from_options(vars(arguments))
+    try:
+        values["limits"] = limits_from_options(vars(arguments))
+        prior_from_limits(values["limits"])
+    except InvalidInputError as error:
+        raise InvalidInputError(f"--{error}".replace("--viewpoint:", "--near:", 1)) from error
     check_device(values.get("device", "cpu"), "--device")
     guess = "exif" if getattr(arguments, "exif", False) else getattr(arguments, "fov", None)
     return RegisterOptions(photos=tuple(photos), meshes=tuple(meshes), guess=guess, **values)
@@ -162,7 +167,7 @@ def split_numbers(words: Sequence[str]) -> list[str]:
             if not equals:
                 continue
         parts = re.split(r"[,\s]+", word.strip(", "))
-        are_numbers = len(parts) <= expected and all(re.fullmatch(_NUMBER, part) for part in parts)
+        are_numbers = len(parts) <= expected and all(re.fullmatch(NUMBER, part) for part in parts)
         expected = expected - len(parts) if are_numbers else 0
         out += map(_plain, parts) if are_numbers else [word]
     if ("--camera", "exif") in pairwise(out):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInputError, MissingFileError
-from ..utils.files import write_file
+from ..utils.files import check_writable, write_file
 from ..utils.input_paths import check_given
 from .options import add_box_and_camera, common_options, examples, mesh_options, pipeline_options, register_options
 
@@ -79,6 +79,7 @@ def run(arguments: argparse.Namespace) -> None:
         check_given([arguments.photo], [arguments.mesh])
     if out.suffix.lower() not in formats:
         raise InvalidInputError(f"--out {out}: expected a name that ends in {', '.join(formats)}")
+    check_writable(out.parent, "--out")
     if kind == "sheet":
         from ..evaluation import contact_sheet
 
@@ -153,9 +154,10 @@ class _Table:
         check_table_size(path)
         self.path = path
         try:
-            self.columns, *self.rows = csv.reader(StringIO(path.read_text(encoding="utf-8")))
+            self.columns, *self.rows = list(csv.reader(StringIO(path.read_text(encoding="utf-8")))) or [[]]
         except (ValueError, csv.Error) as error:
-            raise InvalidInputError(f"{path}: not a table of comma-separated values ({error})") from error
+            message = f"{path}: not a table of comma-separated values in UTF-8 ({error}); give a .csv file"
+            raise InvalidInputError(message) from error
         if not self.rows or any(len(row) != len(self.columns) for row in self.rows):
             raise InvalidInputError(f"{path}: expected a header, and rows of as many cells")
 

@@ -1,6 +1,7 @@
 """``curvireg register PHOTO... MESH``."""
 
 import argparse
+import re
 import sys
 import tempfile
 import time
@@ -13,6 +14,7 @@ from ..errors import InvalidInputError, LostObjectError
 from ..utils.files import check_writable
 from ..utils.input_paths import check_given, is_one_photograph
 from .options import (
+    NUMBER,
     add_box_and_camera,
     add_mesh_is,
     add_pose_prior,
@@ -105,6 +107,8 @@ def complete(arguments: argparse.Namespace) -> str | None:
     arguments.meshes = [*arguments.paths[len(arguments.photos) :], *arguments.mesh]
     if arguments.unit is None and arguments.list is not None and arguments.list.is_dir():
         arguments.unit = "mm"  # of the models in a BOP set
+    if numbers := [str(path) for path in arguments.paths if re.fullmatch(NUMBER, str(path))]:
+        return f"{' '.join(numbers)}: numbers where a file is expected; --box and --camera take four, --distance two"
     if arguments.list is None and not (arguments.photos and arguments.meshes):
         return "expected PHOTO MESH, PHOTO ... --mesh MESH, or --list FILE MESH"
     if arguments.out is None and not arguments.json:
@@ -138,6 +142,8 @@ def run(arguments: argparse.Namespace) -> None:
     check_camera(options.camera, options.guess)
     if prior_from_limits(options.limits or {}) is None and options.limits and arguments.list is None:
         raise InvalidInputError("--front and --softness limit nothing by themselves; give --azimuth, for instance")
+    if "distance" in (options.limits or {}) and arguments.list is None and not (options.camera or options.guess):
+        raise InvalidInputError("--distance: needs a camera; give --camera FX FY CX CY, --camera exif or --fov DEG")
     if options.start is not None and options.limits:
         raise InvalidInputError("--start: refines this pose alone; leave limits on the pose out")
     if arguments.list is None and is_one_photograph(options.photos):
@@ -164,7 +170,9 @@ def run(arguments: argparse.Namespace) -> None:
     table = "" if arguments.out is None else f"; see {out}/results.csv"
     print(f"{counts}{table}", file=notes)
     if not counts.ok:
-        raise InvalidInputError("no photograph could be registered; the message of each gives the reason")
+        subject = {} if arguments.list is None else {"subject": arguments.list}
+        message = "no photograph could be registered; the message of each gives the reason"
+        raise InvalidInputError(message, **subject)
 
 
 def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, as_json: bool) -> None:

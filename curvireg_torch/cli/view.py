@@ -51,9 +51,11 @@ def run(arguments: argparse.Namespace) -> None:
     except ImportError as error:
         message = f"curvireg view: {error.name} is not installed; pip install 'curvireg_torch[viewer]'"
         raise MissingDependencyError(message) from error
+    from ..evaluation.opening import check_camera
     from ..utils.threads import one_torch_thread
     from ..viewer.server import serve
 
     options = register_options(arguments, photos, meshes)
+    check_camera(options.camera, options.guess)
     with one_torch_thread():
         serve(options, host=arguments.host, port=arguments.port, browser=arguments.browser)

@@ -94,9 +94,15 @@ class RegisterOptions:
 def check_camera(camera: Sequence[float] | None, guess: str | float | None) -> None:
     """Refuse a camera (fx, fy, cx, cy) or field of view that cannot be used, before any file is read."""
     if camera is not None:
-        check_square_pixels(camera_matrix(*camera), "--camera")
+        try:
+            check_square_pixels(camera_matrix(*camera), "--camera")
+        except InvalidInputError as error:
+            raise InvalidInputError(f"--camera: {str(error).partition(': ')[2]}") from error
     if isinstance(guess, float):
-        camera_of_view(guess, (1, 1))
+        try:
+            camera_of_view(guess, (1, 1))
+        except InvalidInputError as error:
+            raise InvalidInputError(f"--{error}") from error
 
 
 def read_start(path: Path) -> tuple[tuple[float, ...], ...]:
@@ -163,6 +169,7 @@ def _open_bank(
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
     bank = ViewBank.load(mesh)
     if options.pose not in (None, bank.pipeline.views.pose):
-        message = f"built for --pose {bank.pipeline.views.pose}, not for --pose {options.pose}; leave --pose out, or "
+        built = "given views" if bank.pipeline.views.pose == "given" else f"--pose {bank.pipeline.views.pose}"
+        message = f"built for {built}, not for --pose {options.pose}; leave --pose out, or "
         raise BankError(f"{message}build it again with 'curvireg bank'", subject=mesh)
     return bank

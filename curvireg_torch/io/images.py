@@ -133,7 +133,7 @@ def _decode(path: Path) -> tuple[ImageHeader, NDArray[Any]]:
             subject=path,
         )
     if pixels.dtype not in (np.uint8, np.uint16):
-        raise ImageError(f"expected 8 or 16 bits per channel, got {pixels.dtype}", subject=path)
+        raise ImageError(f"expected 8 or 16 bits per channel, got {pixels.dtype}; save it as PNG", subject=path)
     return header, pixels
 
 

@@ -18,9 +18,10 @@ def read_json(path: Path, kind: type[Any], readme: str) -> Any:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise InvalidInputError(f"damaged ({error})", subject=path) from error
+        raise InvalidInputError(f"damaged, or not JSON ({error}); {readme} shows the layout", subject=path) from error
     if not isinstance(content, kind):
-        raise InvalidInputError(f"expected a {kind.__name__}, got a {type(content).__name__}", subject=path)
+        expected = "an object" if kind is dict else "a list"
+        raise InvalidInputError(f"expected {expected} of JSON; {readme} shows the layout", subject=path)
     return content
 
 

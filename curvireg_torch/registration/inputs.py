@@ -126,6 +126,8 @@ def _pixels(image: Any) -> Tensor:
     if isinstance(image, str | PathLike):
         return read_photo(image).image
     if isinstance(image, np.ndarray):
+        if not (np.issubdtype(image.dtype, np.number) or image.dtype == bool):
+            raise InvalidInputError(f"photograph: expected an array of numbers, got {image.dtype}")
         image = torch.from_numpy(np.ascontiguousarray(image))
         image = image[None] if image.ndim == 2 else image.movedim(-1, 0) if image.ndim == 3 else image
     if not isinstance(image, Tensor):

@@ -14,7 +14,7 @@ from ..matching import ViewBank, ViewMatcher, cached_bank
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..settings import BankSettings
-from ..utils.checks import check_symmetries
+from ..utils.checks import check_device, check_symmetries
 from ..utils.threads import map_on_threads
 from .correction import corrected
 from .estimator import PoseEstimator
@@ -77,6 +77,8 @@ class Registrar(PoseEstimator):
         progress: bool | Callable[[str, int, int], object] = False,
     ) -> None:
         options: dict[str, Any]
+        if device is not None:
+            check_device(device)
         if isinstance(bank_or_mesh, ViewBank | ViewMatcher):
             if views is not None or settings is not None:
                 raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
@@ -84,6 +86,8 @@ class Registrar(PoseEstimator):
             pipeline = pipeline or Pipeline()
             pipeline = replace(pipeline, bank=settings or pipeline.bank)
             meshes = list(bank_or_mesh) if isinstance(bank_or_mesh, list | tuple) else [bank_or_mesh]
+            if not meshes:
+                raise InvalidInputError("Registrar: expected a mesh or several, got an empty list")
             options = {"pipeline": pipeline, "renderer": renderer, "progress": progress, "device": device or "cpu"}
             bank_or_mesh = ViewBank.join([cached_bank(mesh, views, **options) for mesh in meshes])
         if isinstance(bank_or_mesh, ViewMatcher):

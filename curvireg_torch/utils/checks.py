@@ -105,13 +105,15 @@ def check_same_device(x: Tensor, like: Tensor, name: str) -> None:
         raise InvalidInputError(f"{name}: expected device {like.device}, got {x.device}")
 
 
-def check_device(name: str, option: str = "device") -> None:
+def check_device(name: torch.device | str, option: str = "device") -> None:
     """``name`` is a device on which torch computes on this machine."""
     try:
         torch.zeros(1, device=name).item()
     except (RuntimeError, AssertionError) as error:  # builds of torch without CUDA raise the second
         usable = ", ".join(["cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))])
-        raise InvalidInputError(f"{option}: torch cannot use {name!r} on this machine; choose from {usable}") from error
+        raise InvalidInputError(
+            f"{option}: torch cannot use {str(name)!r} on this machine; choose from {usable}"
+        ) from error
 
 
 def check_option(value: str, options: Iterable[str], name: str) -> None:

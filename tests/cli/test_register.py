@@ -126,7 +126,7 @@ def broken_files(folder):
         ({}, ["--within", "10"], ["within: expected near"]),
         ({}, ["--side", "left", "--azimuth", "0", "10"], ["side: give it or azimuth"]),
         ({}, ["--front", "x", "--softness", "5"], ["limit nothing"]),
-        ({}, ["--distance", "1", "2"], ["distance: needs the camera"]),
+        ({}, ["--distance", "1", "2"], ["--distance: needs a camera"]),
         ({"box": ()}, ["--start", "none.json", "--side", "front"], ["--start: refines"]),
         ({}, ["--elevation", "50", "10"], ["elevation: expected"]),
     ],
@@ -312,7 +312,7 @@ def test_register_writes_that_the_object_is_lost(register_one, document, start, 
         ("{}", "expected rotation"),
         ('{"rotation": [[1, 0, 0]], "translation": [0, 0, 1]}', "expected rotation"),
         ('{"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]], "translation": [0, 0, 1]}', "rotation"),
-        ("[]", "dict"),
+        ("[]", "an object"),
     ],
 )
 def test_register_refuses_a_damaged_start(folder, register_one, start, capsys, content, message):

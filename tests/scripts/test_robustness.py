@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from curvireg_torch.errors import ImageError
-from scripts.robustness import fuzz, soak, worst_cases
+from scripts.robustness import bad_calls, bad_files, bad_inputs, fuzz, soak, worst_cases
 from tests._support.scripts import ROOT
 
 COUNTS = {"images": 150, "meshes": 100, "mat": 150, "tables": 20, "banks": 20, "boxes": 60, "cameras": 60}
@@ -123,3 +123,68 @@ def test_worst_cases_record_is_within_its_limits():
     found = {"outcome": "read", "seconds": 1.0, "megabytes": 500.0}
     for change in ({"seconds": 1e4}, {"megabytes": 1e6}, {"outcome": "died: killed"}):
         assert not worst_cases.within("mat", {**found, **change})
+
+
+@pytest.fixture(scope="module")
+def bad_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bad")
+    bad_files.write_files(folder)
+    return folder
+
+
+GROUPS = [*dict.fromkeys(group for group, _ in bad_inputs.read_cases())]
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("group", GROUPS)
+def test_answers_to_bad_command_lines_are_clear(group, bad_folder, tmp_path, monkeypatch):
+    """Every fourth case of a group; the record has all."""
+    if "view" in group:
+        pytest.importorskip("nicegui")
+    monkeypatch.chdir(bad_folder)
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+    cases = [text for name, text in bad_inputs.read_cases() if name == group and "TAKEN" not in text]
+    for text in cases[::4]:
+        line, _, names = text.removeprefix("? ").partition(" => ")
+        answer = bad_inputs.run_line(line, tmp_path)
+        answer["seconds"] = 0.0
+        assert bad_inputs.judge_line(answer, names.split(), used=text.startswith("? ")) == [], (line, answer)
+
+
+def test_answers_to_bad_calls_are_clear(bad_folder, monkeypatch):
+    monkeypatch.chdir(bad_folder)
+    answers = {name: bad_inputs.judge_call(call, names) for name, call, names in bad_calls.CALLS}
+    assert {name: answer for name, answer in answers.items() if answer["wrong"]} == {}
+
+
+@pytest.mark.parametrize(
+    ("code", "err", "wrong"),
+    [
+        (2, "curvireg: error: a.png: lost; find it\n", []),
+        (2, "usage: curvireg register\n       more\ncurvireg register: error: a.png: lost\n", []),
+        (1, "curvireg: error: a.png: lost\n", ["code 1"]),
+        (2, "curvireg: error: a.png\ncurvireg: error: a.png\n", ["2 errors of ours"]),
+        (2, "curvireg: error: b.png\n", ["does not name a.png"]),
+        (2, "curvireg: error: a.png: KeyError: 3\n", ["a message that is not ours"]),
+        (
+            2,
+            "[ERROR:0] png\ncurvireg: error: a.png\n",
+            ["a message that is not ours", "unexpected line '[ERROR:0] png'"],
+        ),
+    ],
+)
+def test_judge_of_bad_command_lines(code, err, wrong):
+    answer = {"code": code, "out": "", "err": err, "seconds": 0.1}
+    assert bad_inputs.judge_line(answer, ["a.png"], used=False) == wrong
+    late = bad_inputs.judge_line({**answer, "seconds": 7.0}, ["a.png"], used=False)
+    assert late == [*wrong, "7.0 s"]
+
+
+def test_record_of_bad_inputs_has_every_case_and_all_are_clear():
+    record = json.loads(bad_inputs.RESULT.read_text())
+    names = {line.removeprefix("? ").partition(" => ")[0] for _, line in bad_inputs.read_cases()}
+    names |= {name for name, *_ in bad_calls.CALLS}
+    assert len(names) >= 180
+    assert names <= {row["case"] for row in record["cases"]}
+    assert record["clear"] == [len(record["cases"])] * 2
+    assert [row for row in record["cases"] if row["wrong"]] == []

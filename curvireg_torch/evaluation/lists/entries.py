@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -106,6 +107,9 @@ def photo_list(
         )
     if twice := sorted({column for column in names if names.count(column) > 1}):
         raise InvalidInputError(f"{name}: two columns {', '.join(twice)}; keep one of each")
+    for column in set(names) - set(_KNOWN):
+        if meant := get_close_matches(column, PRIOR_OPTIONS, 1, 0.8):
+            raise InvalidInputError(f"{name}: unknown column {column!r}; rename it to {meant[0]}, or otherwise")
     if reserved := [column for column in names if column in (*RESULT_COLUMNS, BEST_MESH)]:
         raise InvalidInputError(f"{name}: {', '.join(reserved)}: names of result columns; rename those of the list")
     indices = {known: names.index(known) for known in _KNOWN if known in names}

@@ -86,7 +86,7 @@ def _row(entry: Mapping[str, Any]) -> Row:
     row: Row = {"photo": entry.get("photo")}
     for key, names in (("box", BOX), ("camera", CAMERA)):
         if (values := entry.get(key)) is not None:
-            four = values if isinstance(values, list) and len(values) == 4 else [values] * 4
+            four = values if isinstance(values, list) and len(values) == 4 else [f"{key} {values}"] * 4
             row |= dict(zip(names, four, strict=True))
     return row | {key: value for key, value in entry.items() if key not in ("photo", "box", "camera")}
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import trimesh
 
-from ...errors import MeshError
+from ...errors import CurviregWarning, MeshError
 from ...limits import MAX_MESH_BYTES
 from ...utils.digests import file_digest, text_digest
 from . import obj, off, ply
@@ -41,8 +41,16 @@ def mesh_digest(path: Path) -> str:
 
 
 def read_mesh(path: Path) -> Any:
-    """Read a mesh file, and the files that it names, with trimesh; :class:`MeshError` if that fails."""
-    return _read(path, _Folder(path))
+    """Read a mesh file, and the files that it names, with trimesh; :class:`MeshError` if that fails.
+
+    Missing material files and textures are a :class:`CurviregWarning`.
+    """
+    folder = _Folder(path)
+    content = _read(path, folder)
+    if missing := sorted(file.name for file in folder.requested if not file.is_file()):
+        message = f"{path}: {', '.join(missing)} is missing beside it; the mesh is shown without these colours"
+        warnings.warn(message, CurviregWarning, stacklevel=3)
+    return content
 
 
 def with_triangles(data: bytes, suffix: str) -> bytes:
@@ -69,6 +77,9 @@ def _read(path: Path, folder: "_Folder") -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numpy warns of values that as_mesh reports
             return trimesh.load(BytesIO(data), file_type=suffix[1:], resolver=folder, process=False)
+    except IndexError as error:
+        message = "cannot be read as a mesh (a face names a vertex that the file lacks); re-export the file"
+        raise MeshError(message, subject=path) from error
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".removeprefix("ValueError: ").split())[:300]
         raise MeshError(f"cannot be read as a mesh ({reason}); re-export the file", subject=path) from error
