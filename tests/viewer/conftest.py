@@ -31,6 +31,8 @@ def address(folder, request):
     command = [sys.executable, "-m", "curvireg_torch", "view", *request.module.OPTIONS, "--no-browser"]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
     environment |= {"CURVIREG_CACHE": str(folder / "cache"), "PYTHONPATH": str(Path.cwd())}
+    (folder / "temporary").mkdir()
+    environment["TMPDIR"] = str(folder / "temporary")
     with (folder / "log").open("w") as log:
         server = subprocess.Popen(
             command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=log, text=True, bufsize=1
@@ -50,6 +52,7 @@ def address(folder, request):
             server.wait()
         server.stdout.close()
     assert "Traceback" not in (folder / "log").read_text()
+    assert not list((folder / "temporary").glob("curvireg-view-*")), "the server removes its folder"
 
 
 @pytest.fixture(scope="module")
