@@ -5,7 +5,6 @@ import shutil
 import struct
 import zipfile
 from pathlib import Path, PurePosixPath
-from typing import IO
 
 from ..errors import InvalidInputError
 from ..limits import MAX_ARCHIVE_FILES, MAX_IMAGE_BYTES, MAX_MESH_BYTES
@@ -118,7 +117,7 @@ def unpack(archive: Path, folder: Path, name: str) -> Path:
                 target = _inside(folder, member.filename, name)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with content.open(member) as source, target.open("wb") as file:
-                    _copy(source, file, member.file_size)
+                    shutil.copyfileobj(source, file)  # at most the bytes that the header claims
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, OSError) as error:
         shutil.rmtree(folder, ignore_errors=True)
         if isinstance(error, InvalidInputError):
@@ -141,12 +140,3 @@ def _inside(folder: Path, member: str, name: str) -> Path:
     if path.is_absolute() or ".." in path.parts or ":" in member or not path.parts:
         raise InvalidInputError(f"{name}: it names a file outside the archive, {member[:60]!r}")
     return folder.joinpath(*path.parts)
-
-
-def _copy(source: IO[bytes], target: IO[bytes], size: int) -> None:
-    """Copy a member, whose header claims ``size`` bytes."""
-    while block := source.read(1 << 20):
-        size -= len(block)
-        if size < 0:
-            raise ValueError("a member is larger than its header claims")
-        target.write(block)

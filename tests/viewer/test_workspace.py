@@ -196,6 +196,8 @@ def test_a_new_photograph_ends_the_search_in_the_former_one(two, scene):
         running = asyncio.create_task(first.register())
         await asyncio.to_thread(one.begun.wait, 10)
         await asyncio.wait_for(upload(first, scene / "photo.png"), 10)
+        assert running.done() or not first.searching
+        one.released.set()
         await running
 
     asyncio.run(work())
