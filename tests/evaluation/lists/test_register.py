@@ -78,6 +78,7 @@ def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entr
 
     class Certain:
         bank, pipeline = registrar.bank, registrar.pipeline
+        is_exact, symmetries_of = registrar.is_exact, registrar.symmetries_of
         __call__ = staticmethod(with_covariance)
 
     photo = read_photo(entry.photo)
