@@ -107,7 +107,7 @@ import curvireg_torch.__main__
         ("follow PHOTOS MESH --camera 300 300 119.5 89.5 --out OUT", "evaluation.opening.open_registrar"),
         ("plot sphere PHOTO MESH --box 1 1 40 40 --out OUT.png", "evaluation.opening.open_registrar"),
         ("bank MESH --out OUT.safetensors", "matching.ViewBank.build"),
-        ("demo --out OUT", "synthetic.photograph_tabletop"),
+        ("demo --out OUT", "synthetic.demo_scene"),
         ("evaluate web ROOT --out OUT", "evaluation.datasets.evaluate"),
         ("view", "viewer.server.serve"),
     ],
