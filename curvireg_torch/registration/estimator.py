@@ -11,6 +11,7 @@ from torch import Tensor
 from ..errors import CurviregError
 from ..io.meshes import has_colours, mesh_symmetries
 from ..matching import Ranking, ViewDescriber, ViewMatcher
+from ..models.learned_field import LearnedCurvilinearSaliency
 from ..terms import QueryFeatures
 from ..utils.checks import check_option
 from ..utils.choices import MESH_KINDS
@@ -169,7 +170,7 @@ class PoseEstimator:
         poses = self._lift(batch, hypotheses)
         if self.pipeline.contours:
             self.report_progress("contours")
-            poses = fit_poses(self.describers, batch.images, poses, batch.boxes)
+            poses = fit_poses(self.describers, batch.images, poses, batch.boxes, self._object_mask(query))
         evidence = self._evidence(batch, starts, poses)
         distinct = distinct_mask(poses.hypotheses, batch.scores(evidence), symmetries=batch.symmetries)
         poses, evidence = self._restore(batch, starts, poses, evidence, distinct)
@@ -213,6 +214,11 @@ class PoseEstimator:
         """Hypotheses as poses that fill the boxes, at distances within the priors."""
         poses = lift_to_poses(self.describers, hypotheses, batch.boxes, batch.camera_matrices)
         return poses if batch.priors is None else replace(poses, T=batch.priors.at_distance(hypotheses, poses.T))
+
+    def _object_mask(self, query: QueryFeatures) -> Tensor | None:
+        """(B, 1, S, S) probability that pixels of the crops belong to the object, if the field predicts it."""
+        field = self.matcher.field
+        return field.mask(query.crops) if isinstance(field, LearnedCurvilinearSaliency) else None
 
     def _evidence(self, batch: _Batch, starts: Hypotheses, poses: Poses) -> Tensor:
         """(H, 4) :data:`POSE_FEATURES` of poses that come from the views ``starts``."""

@@ -73,12 +73,18 @@ def to_allocentric(describers: Sequence[ViewDescriber], hypotheses: Hypotheses, 
     return replace(hypotheses, rotation=rotation, distance=distance)
 
 
-def fit_poses(describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor) -> Poses:
+def fit_poses(
+    describers: Sequence[ViewDescriber],
+    images: Sequence[Tensor],
+    poses: Poses,
+    boxes: Tensor,
+    object_mask: Tensor | None = None,
+) -> Poses:
     """Fit the contours of poses of all models, see :func:`fit_contours`."""
     parts, index = [], []
     for model, mine in poses.hypotheses.by_model():
         args, options = _contour_arguments(describers[model], images, poses, boxes, mine)
-        parts.append(fit_contours(*args, **options, finish=FINALISTS))
+        parts.append(fit_contours(*args, **options, finish=FINALISTS, object_mask=object_mask))
         index.append(mine)
     back = torch.cat(index).argsort()
     fit = ContourFit(*(torch.cat([getattr(part, f.name) for part in parts])[back] for f in fields(ContourFit)))

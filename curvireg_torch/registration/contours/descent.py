@@ -9,6 +9,7 @@ from torch import Tensor
 from ...geometry import rotation_from_axis_angle
 from ...geometry.cameras import transform
 from ...rendering import DepthRenderer
+from .mask import ObjectMask
 from .points import ContourPoints, EdgeField, contour_points
 
 __all__ = ["ContourProblem", "ContourState", "Matches", "apply_twist", "project"]
@@ -56,7 +57,8 @@ class ContourState:
 
 @dataclass(frozen=True)
 class ContourProblem:
-    """N poses of a mesh, fitted to ``edges`` of crops of ``size`` px with indices (N,) and cameras ``K`` (N, 3, 3)."""
+    """N poses of a mesh, fitted to ``edges`` of crops of ``size`` px with indices (N,) and cameras ``K`` (N, 3, 3); a
+    ``mask`` weights the edges."""
 
     renderer: DepthRenderer
     edges: EdgeField
@@ -65,6 +67,7 @@ class ContourProblem:
     size: int
     centre: Tensor
     radius: float
+    mask: ObjectMask | None = None
 
     def __getitem__(self, index: Tensor) -> "ContourProblem":
         return replace(self, image_index=self.image_index[index], K=self.K[index])
@@ -114,6 +117,8 @@ class ContourProblem:
         uv, du = project(points.model, T, self.K, self.centre)
         J = (points.normals[..., None, :] @ du)[..., 0, :]
         distance, strength = self._candidates(uv, points, reach)
+        if self.mask is not None:
+            strength = strength * self.mask.weights(uv, points, _offsets(reach)[1:-1], self.image_index, self.size)
         step = torch.zeros(len(T), 6, dtype=torch.float64)
         for _ in range(SELECTIONS):
             residual = distance - (J @ step[..., None])
@@ -131,8 +136,7 @@ class ContourProblem:
 
     def _candidates(self, uv: Tensor, points: ContourPoints, reach: float) -> tuple[Tensor, Tensor]:
         """Distances in px along the normals and strengths, both (N, P, L); the strength is 0 where there is no edge."""
-        far = round(1.5 * reach) + 1
-        offsets = torch.arange(-far, far + 1, dtype=torch.float64)
+        offsets = _offsets(reach)
         profile = self.edges.strength(uv, points.normals, offsets, self.image_index)
         before, here, behind = profile[..., :-2], profile[..., 1:-1], profile[..., 2:]
         is_peak = (here > before) & (here >= behind) & points.valid[..., None]
@@ -148,10 +152,19 @@ class ContourProblem:
 
     def edge_support(self, state: ContourState) -> Tensor:
         """(N,) mean strength of the edges within about 1 px of the contour points."""
+        return self._support(state, None)
+
+    def weighted_support(self, state: ContourState) -> Tensor:
+        """(N,) the same of edges weighted by the mask if there is one: what poses are compared by."""
+        return self._support(state, self.mask)
+
+    def _support(self, state: ContourState, mask: ObjectMask | None) -> Tensor:
         points = state.points
         uv = pixels(points.model, state.T, self.K, self.centre)
         offsets = torch.arange(-3, 4, dtype=torch.float64)
         near = self.edges.strength(uv, points.normals, offsets, self.image_index) * torch.exp(-0.5 * offsets**2)
+        if mask is not None:
+            near = near * mask.weights(uv, points, offsets, self.image_index, self.size)
         return (near.amax(dim=-1) * points.valid).sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
 
     def matches(self, state: ContourState, reach: float) -> Matches:
@@ -163,6 +176,12 @@ class ContourProblem:
         d = distance.gather(-1, index)
         W = strength.gather(-1, index) * (1.0 - (d / reach) ** 2).clamp(min=0.0) ** 2
         return Matches((points.normals[..., None, :] @ du)[..., 0, :], d, W)
+
+
+def _offsets(reach: float) -> Tensor:
+    """Offsets in px at which edges are searched within ``reach`` of a predicted position."""
+    far = round(1.5 * reach) + 1
+    return torch.arange(-far, far + 1, dtype=torch.float64)
 
 
 def project(points: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:

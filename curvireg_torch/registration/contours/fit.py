@@ -1,7 +1,7 @@
 """Contour fit: the continuous stage of the refinement, which pulls projected contours onto image edges."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -25,6 +25,7 @@ from ...utils.checks import (
 )
 from .covariance import pose_covariance
 from .descent import ContourProblem, ContourState, apply_twist
+from .mask import ObjectMask
 from .points import EdgeField
 
 __all__ = ["ContourFit", "contour_support", "fit_contours"]
@@ -84,6 +85,7 @@ def fit_contours(
     radius: float,
     margin: float = 0.1,
     finish: int | None = None,
+    object_mask: Tensor | None = None,
 ) -> ContourFit:
     """Poses whose contours lie on a photograph's edges, by robust least squares over SE(3).
 
@@ -98,6 +100,10 @@ def fit_contours(
     contours have moved. The fit begins at half size from each start and from four poses rotated away from it; the best
     (by edge support) and the next best that differs from it continue, and end at full size. The start is returned where
     no fit has more support. All starts of all photographs are rendered together.
+
+    Prints, shadows and clutter have edges too. With an ``object_mask``, an edge counts for the outline as far as the
+    object lies on its inner side alone, and for creases and inner contours as far as the object lies on both sides
+    (:class:`ObjectMask`); this weights the least squares and the choice among the fits, not the reported support.
 
     The covariance is of rotation (rad) about the camera's x, y, z, then translation (model units) along them: with the
     true pose R, t,
@@ -118,6 +124,8 @@ def fit_contours(
         margin: added around the box, as a fraction of its longer side.
         finish: number of starts of each photograph that are fitted to the end, those with the most support after the
             first rounds; None: all, each as if alone.
+        object_mask: (B, 1, s, s) probability that pixels of the square crops, the boxes with their margin, belong to
+            the object, for instance of :meth:`LearnedCurvilinearSaliency.mask`.
 
     Raises:
         InvalidInputError: wrong shapes, a pose that is not rigid and finite, an unusable box or camera matrix.
@@ -145,24 +153,28 @@ def fit_contours(
         none = T0.new_zeros(0)
         return ContourFit(T0, T0.new_zeros(0, 6, 6), none, none, none.long())
     crops, full = _full_size(renderer, images, boxes, K, image_index, centre, radius, margin)
+    if object_mask is not None:
+        check_tensor(object_mask, "object_mask", (len(images), 1, None, None))
+        full = replace(full, mask=ObjectMask(object_mask))
     K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ full.K
-    half = ContourProblem(renderer, EdgeField(F.avg_pool2d(crops, 2)), image_index, K, SIZE // 2, centre, radius)
+    half = replace(full, edges=EdgeField(F.avg_pool2d(crops, 2)), K=K, size=SIZE // 2)
     start = half.state(T0)
-    before = half.edge_support(start)
+    before, weighted_before = half.edge_support(start), half.weighted_support(start)
     first = half.descend(start, FIRST)
-    support = half.edge_support(first)
+    support = half.weighted_support(first)
     chosen = torch.ones(N, dtype=torch.bool) if finish is None else _among_best(support, image_index, finish)
     index, others = chosen.nonzero()[:, 0], (~chosen).nonzero()[:, 0]
     source, T = _fit_around(half[index], T0[index], first[index], support[index])
     # Candidates: the starts, the half-size fits of unfinished starts, and the full-size fits. Ties go to the first.
     owner = torch.cat([index, others, index[source]])
-    unfinished = torch.where((support > before)[others, None, None], first.T[others], T0[others])
+    unfinished = torch.where((support > weighted_before)[others, None, None], first.T[others], T0[others])
     fixed = torch.cat([T0[index], unfinished])
     fitted = full[index[source]]
     state = ContourState.cat([full[owner[: len(fixed)]].state(fixed), fitted.descend(fitted.state(T), FINE)])
     support = full[owner].edge_support(state)
     before[index] = support[: len(index)]
-    best = torch.where(owner == torch.arange(N)[:, None], support, -1.0).argmax(dim=1)
+    weighted = support if full.mask is None else full[owner].weighted_support(state)
+    best = torch.where(owner == torch.arange(N)[:, None], weighted, -1.0).argmax(dim=1)
     state, support = state[best], support[best]
     matches = full.matches(state, FINE[-1])
     covariance, observable = pose_covariance(matches, state.points, state.T, full.K, centre, radius=radius)
@@ -222,7 +234,7 @@ def _fit_around(half: ContourProblem, T0: Tensor, first: ContourState, support: 
     four = half[every.repeat_interleave(4)]
     rotated = apply_twist(T0.repeat_interleave(4, 0), offsets.repeat(N, 1), half.centre)
     fits = four.descend(four.state(rotated), FIRST)
-    supports = torch.cat([support[:, None], four.edge_support(fits).view(-1, 4)], dim=1)
+    supports = torch.cat([support[:, None], four.weighted_support(fits).view(-1, 4)], dim=1)
     five = torch.cat([every[:, None], N + torch.arange(4 * N).view(-1, 4)], dim=1)
     states, best = ContourState.cat([first, fits]), supports.argmax(dim=1)
     other, reference = states[five.flatten()], states[five[every, best].repeat_interleave(5)]

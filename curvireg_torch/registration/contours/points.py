@@ -31,14 +31,16 @@ CREASE = 0.1
 @dataclass(frozen=True)
 class ContourPoints:
     """Points (N, P, 3) on the contours of N views, float64 in model units, with unit ``normals`` (N, P, 2) across the
-    contour in the image, of either sign; False in ``valid`` (N, P) marks padding."""
+    contour in the image; False in ``valid`` (N, P) marks padding. ``outline`` (N, P) marks points with the background
+    beside them, whose normals point outward; other normals have either sign."""
 
     model: Tensor
     normals: Tensor
     valid: Tensor
+    outline: Tensor
 
     def __getitem__(self, index: Tensor) -> "ContourPoints":
-        return ContourPoints(self.model[index], self.normals[index], self.valid[index])
+        return ContourPoints(*(getattr(self, f.name)[index] for f in fields(ContourPoints)))
 
     @staticmethod
     def cat(parts: Sequence["ContourPoints"]) -> "ContourPoints":
@@ -90,11 +92,12 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
         _sample(torch.cat(jumps, dim=1), torch.cat(neighbours, dim=1), z, slope, OCCLUDING),
         _sample(creases.flatten(1), pixel.view(1, -1), z, field, CREASES),
     ]
-    uv, z, n, valid = (torch.cat(parts, dim=1) for parts in zip(*samples, strict=True))
+    uv, z, n, valid, outline = (torch.cat(parts, dim=1) for parts in zip(*samples, strict=True))
     rays = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1) @ torch.linalg.inv(K).mT
     model = (rays * z[..., None] - T_cam_from_model[:, None, :3, 3]) @ T_cam_from_model[:, :3, :3]
     length = torch.linalg.vector_norm(n, dim=-1)
-    return ContourPoints(model, n / length.clamp(min=1e-12)[..., None], valid & (length > 0))
+    valid = valid & (length > 0)
+    return ContourPoints(model, n / length.clamp(min=1e-12)[..., None], valid, valid & outline)
 
 
 def _ends(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
@@ -115,12 +118,15 @@ def _dilated(mask: Tensor) -> Tensor:
 
 
 def _sample(mask: Tensor, pixels: Tensor, depth: Tensor, normals: Tensor, count: int) -> tuple[Tensor, ...]:
-    """uv, nearer depth, normal and valid, (N, P, ...), of ``count`` entries of ``mask`` (N, M), means of ``pixels``."""
+    """uv, nearer depth, normal, valid and whether the background is beside it, (N, P, ...), of ``count`` entries of
+    ``mask`` (N, M), means of ``pixels``."""
     best, index = torch.where(mask, _random(mask.shape[1]), -1.0).topk(min(count, mask.shape[1]), dim=1)
     of, W = pixels[:, index], depth.shape[-1]  # (k, N, P)
-    z = torch.stack([depth.flatten(1).gather(1, i) for i in of]).amin(dim=0)
+    ends = torch.stack([depth.flatten(1).gather(1, i) for i in of])
+    outline = (ends == depth.amax(dim=(1, 2, 3))[:, None]).any(dim=0)
     n = torch.stack([normals.flatten(2).gather(2, i[:, None].expand(-1, 2, -1)) for i in of]).mean(dim=0)
-    return torch.stack([of % W, of // W], dim=-1).double().mean(dim=0), z.double(), n.mT.double(), best >= 0
+    uv = torch.stack([of % W, of // W], dim=-1).double().mean(dim=0)
+    return uv, ends.amin(dim=0).double(), n.mT.double(), best >= 0, outline
 
 
 @functools.cache
