@@ -22,7 +22,8 @@ def cloud(count: int) -> tuple[ContourPoints, torch.Tensor, torch.Tensor, torch.
     model = centre + 2.0 * torch.rand(1, count, 3, generator=generator, dtype=torch.float64) - 1.0
     normals = F.normalize(torch.randn(1, count, 2, generator=generator, dtype=torch.float64), dim=-1)
     J = (normals[..., None, :] @ project(model, T, K[None], centre)[1])[..., 0, :]
-    return ContourPoints(model, normals, torch.ones(1, count, dtype=torch.bool)), T, centre, J
+    everywhere = torch.ones(1, count, dtype=torch.bool)
+    return ContourPoints(model, normals, everywhere, everywhere), T, centre, J
 
 
 def test_covariance_in_closed_form():
@@ -56,7 +57,7 @@ def test_covariance_covers_injected_noise():
     T400 = T.expand(400, 4, 4)
     ends = apply_twist(T400, estimates, centre)
     off = torch.cat([axis_angle_from_rotation(ends[:, :3, :3] @ T[:, :3, :3].mT), ends[:, :3, 3] - T[:, :3, 3]], dim=1)
-    several = ContourPoints(*(x.expand(400, *x.shape[1:]) for x in (points.model, points.normals, points.valid)))
+    several = points[torch.zeros(400, dtype=torch.long)]
     matches = Matches(J.expand(400, -1, -1), d - J @ estimates[..., None], torch.ones_like(d))
     C, _ = pose_covariance(matches, several, T400, K.expand(400, 3, 3), centre, radius=1.7)
     # The mean covariance is the spread times the allowance for correlated errors.

@@ -40,7 +40,7 @@ def state(count: int, valid: int | None = None) -> ContourState:
     model = CENTRE + 2.0 * torch.rand(1, count, 3, generator=generator, dtype=torch.float64) - 1.0
     normals = F.normalize(torch.randn(1, count, 2, generator=generator, dtype=torch.float64), dim=-1)
     mask = torch.arange(count)[None] < (count if valid is None else valid)
-    return ContourState(T, T, ContourPoints(model, normals, mask))
+    return ContourState(T, T, ContourPoints(model, normals, mask, mask))
 
 
 def at(count: int, *distances: float) -> Tensor:

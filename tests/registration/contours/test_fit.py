@@ -52,8 +52,10 @@ def test_contour_points_of_a_sphere():
     assert float((torch.linalg.vector_norm(rim, dim=1) - 1).abs().max()) < 0.03
     assert float((rim[:, 2] + 1 / D).abs().median()) < 0.15  # depth varies fast at the rim
     offset = (project_points(rim, T, K) - K[:2, 2]) / K.diagonal()[:2]
-    cosine = (F.normalize(offset, dim=1) * points.normals[points.valid]).sum(dim=1).abs()
+    cosine = (F.normalize(offset, dim=1) * points.normals[points.valid]).sum(dim=1)  # outward
     assert float(cosine.median()) > 0.995
+    assert bool(points.outline[points.valid].all())
+    assert not bool(points.outline[~points.valid].any())
     radius, exact = torch.linalg.vector_norm(offset, dim=1), math.tan(math.asin(1 / D))
     assert abs(float(radius.mean()) - exact) * 300 < 0.1  # px: half-way between pixels, without bias
     assert float((radius - exact).abs().max()) * 300 < 1.0
@@ -68,6 +70,10 @@ def test_contour_points_lie_on_the_nearer_surface():
     to_far = distance_to_box(points, (2.2, 2.2, 0.2), (0.0, 0.0, 0.0))
     assert float(torch.minimum(to_near, to_far).max()) < 0.03  # a pixel is 0.027 wide
     assert int((to_near < 0.03).sum()) > 60
+    of_small = (to_near < 0.03) & (to_far > 0.1)
+    assert not bool(found.outline[found.valid][of_small].any())
+    # Only the large box has the background beside it.
+    assert int(found.outline.sum()) > 60
     # Around the small box its own contour is found, not the points behind it on the large one.
     assert int(((points[:, :2].abs().amax(dim=1) < 0.8) & (to_far < 0.03)).sum()) == 0
 
