@@ -76,8 +76,8 @@ def test_steps_and_comparison_weight_edges_and_reports_do_not():
     assert float(steps[1]) < 0.2 * float(steps[0])
     torch.testing.assert_close(weighted.matches(points, 4.0).weight, plain.matches(points, 4.0).weight)
     assert float(weighted.edge_support(points)) == float(plain.edge_support(points))
-    # The edges at 3 px contribute exp(-4.5) of what they would at the contour.
-    by_hand = 0.6 * (40 * 1.5 + 80 * 0.1 * math.exp(-4.5)) / 120
+    # Of the edges at 3 px, the flank at 2 px counts most.
+    by_hand = 0.6 * (40 * 1.5 + 80 * 0.1 * (1 - 1 / 2.25) * math.exp(-2.0)) / 120
     assert float(weighted.weighted_support(points)) == pytest.approx(by_hand)
     assert float(plain.weighted_support(points)) == float(plain.edge_support(points))
 
