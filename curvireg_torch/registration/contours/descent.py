@@ -155,7 +155,7 @@ class ContourProblem:
         return self._support(state, None)
 
     def weighted_support(self, state: ContourState) -> Tensor:
-        """(N,) the same of edges weighted by the mask if there is one: what poses are compared by."""
+        """(N,) the same with the weights of the mask, if there is one: what fits are compared by."""
         return self._support(state, self.mask)
 
     def _support(self, state: ContourState, mask: ObjectMask | None) -> Tensor:
@@ -163,9 +163,11 @@ class ContourProblem:
         uv = pixels(points.model, state.T, self.K, self.centre)
         offsets = torch.arange(-3, 4, dtype=torch.float64)
         near = self.edges.strength(uv, points.normals, offsets, self.image_index) * torch.exp(-0.5 * offsets**2)
-        if mask is not None:
-            near = near * mask.weights(uv, points, offsets, self.image_index, self.size)
-        return (near.amax(dim=-1) * points.valid).sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
+        if mask is None:
+            return (near.amax(dim=-1) * points.valid).sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
+        near = near * mask.weights(uv, points, offsets, self.image_index, self.size)
+        most: Tensor = mask.largest_weights(points) * points.valid  # a long outline alone is no support
+        return (near.amax(dim=-1) * points.valid).sum(dim=1) / most.sum(dim=1).clamp(min=1)
 
     def matches(self, state: ContourState, reach: float) -> Matches:
         """The edges that a least-squares step would use."""

@@ -52,4 +52,9 @@ class ObjectMask:
         outline, within = (inside - outside).clamp(min=0.0), torch.minimum(inside, outside)
         is_outline = points.outline[..., None]
         agreement = 1.0 - TRUST + TRUST * torch.where(is_outline, outline, within)
-        return torch.where(is_outline, OUTLINE * agreement, agreement)
+        return agreement * self.largest_weights(points)[..., None]
+
+    @staticmethod
+    def largest_weights(points: ContourPoints) -> Tensor:
+        """(N, P) float64 weights of edges that agree with the mask: 2 for the outline, else 1."""
+        return torch.where(points.outline, OUTLINE, 1.0).double()

@@ -69,7 +69,8 @@ def test_steps_and_comparison_weight_edges_and_reports_do_not():
     wrong = torch.arange(120) % 3 > 0
     distances = torch.where(wrong, 3.0, 0.0).double()[None]
     plain = problem(distances, [0.6])
-    mask: Any = SimpleNamespace(weights=lambda *_: torch.where(wrong, 0.1, 1.5).double()[None, :, None])
+    weights = torch.where(wrong, 0.1, 1.5).double()[None]
+    mask: Any = SimpleNamespace(weights=lambda *_: weights[..., None], largest_weights=lambda _: 2.0 * weights)
     weighted = replace(plain, mask=mask)
     points = state(120)
     steps = [torch.linalg.vector_norm(one._step(points.points, T, 6.0)[0]) for one in (plain, weighted)]
@@ -77,7 +78,7 @@ def test_steps_and_comparison_weight_edges_and_reports_do_not():
     torch.testing.assert_close(weighted.matches(points, 4.0).weight, plain.matches(points, 4.0).weight)
     assert float(weighted.edge_support(points)) == float(plain.edge_support(points))
     # Of the edges at 3 px, the flank at 2 px counts most.
-    by_hand = 0.6 * (40 * 1.5 + 80 * 0.1 * (1 - 1 / 2.25) * math.exp(-2.0)) / 120
+    by_hand = 0.6 * (40 * 1.5 + 80 * 0.1 * (1 - 1 / 2.25) * math.exp(-2.0)) / (2 * (40 * 1.5 + 80 * 0.1))
     assert float(weighted.weighted_support(points)) == pytest.approx(by_hand)
     assert float(plain.weighted_support(points)) == float(plain.edge_support(points))
 
