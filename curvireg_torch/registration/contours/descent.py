@@ -170,7 +170,7 @@ class ContourProblem:
         return (near.amax(dim=-1) * points.valid).sum(dim=1) / most.sum(dim=1).clamp(min=1)
 
     def matches(self, state: ContourState, reach: float) -> Matches:
-        """The edges that a least-squares step would use."""
+        """The edges that a least-squares step without a mask would use."""
         points = state.points
         uv, du = project(points.model, state.T, self.K, self.centre)
         distance, strength = self._candidates(uv, points, reach)

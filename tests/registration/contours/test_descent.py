@@ -79,12 +79,12 @@ def test_step_undoes_a_motion_despite_stronger_wrong_edges():
     assert float(distance.abs().max()) > 1.5
     sides = torch.where(torch.arange(120) % 2 == 0, 4.0, -4.0)
     wrong = torch.where(torch.arange(120) % 3 == 0, distance + sides, 90.0)
-    step = problem(torch.cat([distance, wrong]), [0.5, 0.6])._step(points, T, 6.0)[0]
+    step = problem(torch.cat([distance, wrong]), [0.5, 0.6])._solve(points, T, 6.0, None)[0]
     torch.testing.assert_close(step, motion, rtol=0.03, atol=1e-4)
 
 
 def test_step_without_edges_is_zero():
-    assert problem(at(30, 90.0), [1.0])._step(state(30).points, T, 6.0)[0].tolist() == [0.0] * 6
+    assert problem(at(30, 90.0), [1.0])._solve(state(30).points, T, 6.0, None)[0].tolist() == [0.0] * 6
 
 
 @pytest.mark.parametrize(

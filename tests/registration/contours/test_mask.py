@@ -8,9 +8,11 @@ from typing import Any
 import pytest
 import torch
 
+from curvireg_torch import LearnedCurvilinearSaliency, MultiScaleFocusCurves
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.registration.contours.mask import ObjectMask
 from curvireg_torch.registration.contours.points import ContourPoints
+from curvireg_torch.registration.estimator import PoseEstimator
 from tests.registration.contours.common import CUBE_POSE, cube, fitted, silhouette
 from tests.registration.contours.test_descent import T, problem, state
 
@@ -73,7 +75,7 @@ def test_steps_and_comparison_weight_edges_and_reports_do_not():
     mask: Any = SimpleNamespace(weights=lambda *_: weights[..., None], largest_weights=lambda _: 2.0 * weights)
     weighted = replace(plain, mask=mask)
     points = state(120)
-    steps = [torch.linalg.vector_norm(one._step(points.points, T, 6.0)[0]) for one in (plain, weighted)]
+    steps = [torch.linalg.vector_norm(one._solve(points.points, T, 6.0, None)[0]) for one in (plain, weighted)]
     assert float(steps[1]) < 0.2 * float(steps[0])
     torch.testing.assert_close(weighted.matches(points, 4.0).weight, plain.matches(points, 4.0).weight)
     assert float(weighted.edge_support(points)) == float(plain.edge_support(points))
@@ -87,3 +89,13 @@ def test_mask_of_another_number_of_photographs_is_refused():
     image = silhouette(cube(), CUBE_POSE)
     with pytest.raises(InvalidInputError, match="object_mask"):
         fitted(image, CUBE_POSE[None], object_mask=torch.ones(2, 1, 8, 8))
+
+
+def test_only_the_learned_field_has_a_mask():
+    crops = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    estimator, query = object.__new__(PoseEstimator), SimpleNamespace(crops=crops)
+    learned: Any = LearnedCurvilinearSaliency()
+    for field, expected in ((learned, learned.mask(crops)), (MultiScaleFocusCurves(), None)):
+        estimator.matcher = SimpleNamespace(field=field)
+        mask = estimator._object_mask(query)
+        assert mask is None if expected is None else torch.equal(mask, expected)
