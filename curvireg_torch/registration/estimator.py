@@ -22,13 +22,13 @@ from .confidence import confidence_features, confidence_model, model_name, ranki
 from .hypotheses import Hypotheses, distinct_mask, start_hypotheses
 from .inputs import ImageItem, check_crop
 from .locator import Locator
-from .poses import Poses, edge_supports, fit_poses, lift_to_poses
+from .poses import Poses, edge_supports, fit_poses, hypothesis_of, lift_to_poses
 from .priors import BatchPriors
-from .rescoring import POSE_FEATURES, rank_feature, rescore, similarities
-from .results import FailedRegistration, Hypothesis, Registration
+from .rescoring import rank_feature, rescore, similarities
+from .results import FailedRegistration, Registration
 from .search import search
 
-__all__ = ["PoseEstimator", "hypothesis_of"]
+__all__ = ["PoseEstimator"]
 
 LEAST = 3
 """Hypotheses that are refined at least, even if fewer are reported: the confidence depends on rivals. Of 15 photographs
@@ -282,23 +282,3 @@ class PoseEstimator:
                 registration = batch.priors.note(registration, best.hypotheses, best.T, filling.T)
             results.append(registration)
         return results
-
-
-def hypothesis_of(h: int, poses: Poses, evidence: Tensor, *, with_camera: bool) -> Hypothesis:
-    """Hypothesis ``h`` of poses with their (H, 4) :data:`POSE_FEATURES`, as it is reported."""
-    hypotheses, T, fit = poses.hypotheses, poses.T[h], poses.fit
-    features = dict(zip(POSE_FEATURES, evidence[h].tolist(), strict=True))
-    known = fit is not None and with_camera and bool(fit.covariance[h].isfinite().all())
-    return Hypothesis(
-        rotation=T[:3, :3].clone() if with_camera else hypotheses.rotation[h].clone(),
-        translation=T[:3, 3].clone() if with_camera else None,
-        score=features["similarity"],
-        evidence=features,
-        allocentric_rotation=hypotheses.rotation[h].clone(),
-        distance=float(hypotheses.distance[h]),
-        projection=(T.clone(), poses.cameras[h].clone()),
-        view=int(hypotheses.view[h]),
-        model=int(hypotheses.model[h]),
-        edge_support=None if fit is None else features["edge_support"],
-        covariance=fit.covariance[h].clone() if fit is not None and known else None,
-    )

@@ -12,9 +12,11 @@ from ..geometry.translation import pose_from_box
 from ..matching import ViewDescriber
 from .contours import ContourFit, contour_support, fit_contours
 from .hypotheses import Hypotheses
+from .rescoring import POSE_FEATURES
+from .results import Hypothesis
 from .search import FINALISTS
 
-__all__ = ["Poses", "edge_supports", "fit_poses", "lift_to_poses"]
+__all__ = ["Poses", "edge_supports", "fit_poses", "hypothesis_of", "lift_to_poses"]
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,26 @@ def edge_supports(describers: Sequence[ViewDescriber], images: Sequence[Tensor],
         args, options = _contour_arguments(describers[model], images, poses, boxes, mine)
         out[mine] = contour_support(*args, **options)
     return out
+
+
+def hypothesis_of(h: int, poses: Poses, evidence: Tensor, *, with_camera: bool) -> Hypothesis:
+    """Hypothesis ``h`` of poses with their (H, 4) :data:`POSE_FEATURES`, as it is reported."""
+    hypotheses, T, fit = poses.hypotheses, poses.T[h], poses.fit
+    features = dict(zip(POSE_FEATURES, evidence[h].tolist(), strict=True))
+    known = fit is not None and with_camera and bool(fit.covariance[h].isfinite().all())
+    return Hypothesis(
+        rotation=T[:3, :3].clone() if with_camera else hypotheses.rotation[h].clone(),
+        translation=T[:3, 3].clone() if with_camera else None,
+        score=features["similarity"],
+        evidence=features,
+        allocentric_rotation=hypotheses.rotation[h].clone(),
+        distance=float(hypotheses.distance[h]),
+        projection=(T.clone(), poses.cameras[h].clone()),
+        view=int(hypotheses.view[h]),
+        model=int(hypotheses.model[h]),
+        edge_support=None if fit is None else features["edge_support"],
+        covariance=fit.covariance[h].clone() if fit is not None and known else None,
+    )
 
 
 def _contour_arguments(

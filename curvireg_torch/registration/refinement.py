@@ -12,10 +12,10 @@ from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose
 from .answer_set import AnswerSet
 from .confidence import refinement_confidence
-from .estimator import PoseEstimator, hypothesis_of
+from .estimator import PoseEstimator
 from .hypotheses import Hypotheses, distinct_mask
 from .inputs import ImageItem, check_crop, image_items
-from .poses import Poses, fit_poses, lift_to_poses, to_allocentric
+from .poses import Poses, fit_poses, hypothesis_of, lift_to_poses, to_allocentric
 from .rescoring import rescore, similarities
 from .results import FailedRegistration, Registration
 from .search import search
