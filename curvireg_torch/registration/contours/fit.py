@@ -103,7 +103,7 @@ def fit_contours(
 
     Prints, shadows and clutter have edges too. With an ``object_mask``, an edge counts for the outline as far as the
     object lies on its inner side alone, and for creases and inner contours as far as the object lies on both sides
-    (:class:`ObjectMask`); this weights the least squares and the choice among the fits, not the reported support.
+    (:class:`.ObjectMask`); this weights the least squares and the choice among the fits, not the reported support.
 
     The covariance is of rotation (rad) about the camera's x, y, z, then translation (model units) along them: with the
     true pose R, t,
