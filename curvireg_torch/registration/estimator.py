@@ -218,7 +218,9 @@ class PoseEstimator:
     def _object_mask(self, query: QueryFeatures) -> Tensor | None:
         """(B, 1, S, S) probability that pixels of the crops belong to the object, if the field predicts it."""
         field = self.matcher.field
-        return field.mask(query.crops) if isinstance(field, LearnedCurvilinearSaliency) else None
+        if not isinstance(field, LearnedCurvilinearSaliency):
+            return None
+        return torch.cat([field.mask(crop) for crop in query.crops.split(1)])  # rounding is that of a photograph alone
 
     def _evidence(self, batch: _Batch, starts: Hypotheses, poses: Poses) -> Tensor:
         """(H, 4) :data:`POSE_FEATURES` of poses that come from the views ``starts``."""

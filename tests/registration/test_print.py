@@ -68,7 +68,7 @@ def test_texture_tells_top_from_bottom(cans, upright):
     T = transform(R[None], torch.tensor([[0.1, -0.05, 7.0]], dtype=torch.float64))
     image, box = photograph(cans["printed"], T), projected_boxes(extreme_points(cans["printed"]), T, CAMERA)
     printed, grey = (
-        Registrar(cans[name], views=VIEWS, pipeline=pipeline)([image], box, CAMERA)[0]
+        Registrar(cans[name], views=VIEWS, pipeline=pipeline, symmetries=torch.eye(4)[None])([image], box, CAMERA)[0]
         for name, pipeline in (("printed", PIPELINE), ("grey", UNREFINED))
     )
     assert float(rotation_error(printed.rotation, R)) < 15

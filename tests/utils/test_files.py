@@ -77,7 +77,11 @@ def test_check_writable_leaves_nothing_and_names_the_option(tmp_path: Path) -> N
 
 
 BANK = "bank {folder}/mesh.ply"
-COMMANDS = "demo --out {blocked}/out", f"{BANK} --out {{blocked}}/a", f"{BANK} --out {{folder}}/a --adapt {{blocked}}/b"
+COMMANDS = (
+    "demo --out {blocked}/out",
+    f"{BANK} --out {{blocked}}/a",
+    f"{BANK} --out {{folder}}/a.safetensors --adapt {{blocked}}/b",
+)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
