@@ -46,12 +46,12 @@ def real_rates(runs: Path) -> dict[str, Row]:
 
 def page(record: Row) -> str:
     """The table, one line for each set."""
-    lines = [["within 30 degrees", "N", "no hint", "90 degrees", "45 degrees", "30 degrees"]]
+    lines = [["within 30 degrees", "N", "no hint", "90 degrees", "45 degrees", "30 degrees", "commit"]]
     for name, found in record["sets"].items():
         known = (found.get(hint, [None]) for hint in HINTS)
         rates = (format_interval(rate[0], rate[1:] or None) for rate in known)
-        lines.append([name, str(found["n"]), *rates])
-    where = f"`python scripts/calibration/hints.py`, {record['date']}, commit {record['commit']}."
+        lines.append([name, str(found["n"]), *rates, found["commit"]])
+    where = f"`python scripts/calibration/hints.py`, {record['date']}."
     return "\n".join([*table_lines(lines), "", where, ""])
 
 
@@ -67,6 +67,7 @@ def main() -> None:
         found = [json.loads(line) for line in (arguments.rows / f"{name}.jsonl").read_text().splitlines()]
         rows[hint] = {row["id"]: row for row in found if "errors" in row}
     sets = {**benchmark_rates(rows), **real_rates(arguments.runs)}
+    sets = {name: {**found, "commit": commit()} for name, found in sets.items()}
     record = {"date": today(), "commit": commit(), "sets": sets}
     write_json(RESULTS / "hints.json", record)
     update_page(REPOSITORY / "docs" / "guides" / "pose-prior.md", "hints", page(record))
