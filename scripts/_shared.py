@@ -3,7 +3,9 @@
 import datetime
 import json
 import os
+import resource
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -62,6 +64,27 @@ def processor() -> str:
     lines = info.read_text().splitlines() if info.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return f"{names[0] if names else 'unknown processor'}, {os.cpu_count()} cores"
+
+
+def run_process(
+    words: Sequence[str], folder: Path, environment: dict[str, str]
+) -> tuple[float, resource.struct_rusage, str]:
+    """Seconds, resources and output of a Python process in a folder; the script ends if the process fails.
+
+    Args:
+        words: arguments of the interpreter.
+    """
+    start = time.perf_counter()
+    with (folder / "output").open("w+") as output, (folder / "errors").open("w+") as errors:
+        process = subprocess.Popen([sys.executable, *words], env=environment, stdout=output, stderr=errors, cwd=folder)
+        _, status, usage = os.wait4(process.pid, 0)
+        seconds = time.perf_counter() - start
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            errors.seek(0)
+            raise SystemExit(f"{' '.join(words)} failed with PYTHONPATH={environment['PYTHONPATH']}: {errors.read()}")
+        output.seek(0)
+        return seconds, usage, output.read()
 
 
 def timed(call: Callable[[], object], repeats: int) -> list[float]:

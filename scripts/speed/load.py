@@ -15,7 +15,6 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,7 +23,7 @@ from typing import Any
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, update_page, write_json
+from scripts._shared import REPOSITORY, RESULTS, commit, run_process, table_lines, today, update_page, write_json
 
 RESULT = RESULTS / "load.json"
 PAGE = REPOSITORY / "docs" / "performance.md"
@@ -48,17 +47,8 @@ def run_demo(checkout: Path, folder: Path, environment: dict[str, str]) -> dict[
     """Seconds of the whole command and of the registration in it, both as a clock shows them, and processor seconds."""
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_", "MKL_"))}
     paths = {"PYTHONPATH": str(checkout), "CURVIREG_CACHE": str(folder / "cache")}
-    words = [sys.executable, "-m", "curvireg_torch", "demo", "--quiet", "--out", str(folder / "out")]
-    start = time.perf_counter()
-    with (folder / "errors").open("w+") as errors:
-        options: dict[str, Any] = {"env": {**inherited, **paths, **environment}, "cwd": folder, "stderr": errors}
-        process = subprocess.Popen(words, stdout=subprocess.DEVNULL, **options)
-        _, status, usage = os.wait4(process.pid, 0)
-        seconds = time.perf_counter() - start
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode:
-            errors.seek(0)
-            raise SystemExit(f"the demo failed in {checkout}: {errors.read()}")
+    words = ["-m", "curvireg_torch", "demo", "--quiet", "--out", str(folder / "out")]
+    seconds, usage, _ = run_process(words, folder, {**inherited, **paths, **environment})
     registration = json.loads((folder / "out" / "result.json").read_text())["seconds"]["register"]
     return {"command": seconds, "registration": registration, "processor": usage.ru_utime + usage.ru_stime}
 

@@ -14,8 +14,6 @@ Every measurement has a process of its own; each step counts with its least time
 import argparse
 import json
 import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -85,19 +83,12 @@ def measure(step: str, folder: str, megapixels: float, photographs: int) -> floa
 
 def run(words: Sequence[str], checkout: Path, folder: Path, cache: Path, threads: int = 2) -> tuple[float, float, str]:
     """Seconds, peak memory in MB and output of a process that imports ``checkout``."""
+    from scripts._shared import run_process
+
     environment = {**os.environ, "PYTHONPATH": str(checkout), "CURVIREG_CACHE": str(cache)}
     environment["OMP_NUM_THREADS"] = str(threads)
-    start = time.perf_counter()
-    with (folder / "output").open("w+") as output, (folder / "errors").open("w+") as errors:
-        process = subprocess.Popen([sys.executable, *words], env=environment, stdout=output, stderr=errors, cwd=folder)
-        _, status, usage = os.wait4(process.pid, 0)
-        seconds = time.perf_counter() - start
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode:
-            errors.seek(0)
-            raise SystemExit(f"{' '.join(words)} failed in {checkout}: {errors.read()}")
-        output.seek(0)
-        return seconds, usage.ru_maxrss / 1024, output.read()
+    seconds, usage, output = run_process(words, folder, environment)
+    return seconds, usage.ru_maxrss / 1024, output
 
 
 def measured(

@@ -144,14 +144,20 @@ def two(tmp_path, monkeypatch):
     pool.shutdown()
 
 
+async def running_and_waiting(first, search, second):
+    """Tasks of the first page's search, which has begun, and of the second's, which waits for it."""
+    running = asyncio.create_task(first.register())
+    await asyncio.to_thread(search.begun.wait, 10)
+    waiting = asyncio.create_task(second.register())
+    await asyncio.sleep(0.05)
+    return running, waiting
+
+
 def test_a_search_waits_for_others_and_holds_up_no_other_job(two, scene):
     (first, second), (one, other) = two
 
     async def work():
-        running = asyncio.create_task(first.register())
-        await asyncio.to_thread(one.begun.wait, 10)
-        waiting = asyncio.create_task(second.register())
-        await asyncio.sleep(0.05)
+        running, waiting = await running_and_waiting(first, one, second)
         assert (first.searching, first.waiting_for) == (True, 0)
         assert (second.searching, second.waiting_for) == (True, 1)
         assert not await second.register(), "one search of a page at a time"
@@ -172,10 +178,7 @@ def test_stop_ends_a_running_and_a_waiting_search(two):
     (first, second), (one, other) = two
 
     async def work():
-        running = asyncio.create_task(first.register())
-        await asyncio.to_thread(one.begun.wait, 10)
-        waiting = asyncio.create_task(second.register())
-        await asyncio.sleep(0.05)
+        running, waiting = await running_and_waiting(first, one, second)
         second.stop()
         assert not await asyncio.wait_for(waiting, 5), "at once, although the other goes on"
         assert first.searching

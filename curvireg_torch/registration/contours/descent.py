@@ -152,22 +152,21 @@ class ContourProblem:
 
     def edge_support(self, state: ContourState) -> Tensor:
         """(N,) mean strength of the edges within about 1 px of the contour points."""
-        return self._support(state, None)
+        return self.supports(state)[0]
 
-    def weighted_support(self, state: ContourState) -> Tensor:
-        """(N,) the same with the weights of the mask, if there is one: what fits are compared by."""
-        return self._support(state, self.mask)
-
-    def _support(self, state: ContourState, mask: ObjectMask | None) -> Tensor:
+    def supports(self, state: ContourState) -> tuple[Tensor, Tensor]:
+        """(N,) :meth:`edge_support`, and the same with the weights of the mask, if there is one: what fits are compared
+        by."""
         points = state.points
         uv = pixels(points.model, state.T, self.K, self.centre)
         offsets = torch.arange(-3, 4, dtype=torch.float64)
         near = self.edges.strength(uv, points.normals, offsets, self.image_index) * torch.exp(-0.5 * offsets**2)
-        if mask is None:
-            return (near.amax(dim=-1) * points.valid).sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
-        near = near * mask.weights(uv, points, offsets, self.image_index, self.size)
-        most: Tensor = mask.largest_weights(points) * points.valid  # a long outline alone is no support
-        return (near.amax(dim=-1) * points.valid).sum(dim=1) / most.sum(dim=1).clamp(min=1)
+        plain = (near.amax(dim=-1) * points.valid).sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
+        if self.mask is None:
+            return plain, plain
+        near = near * self.mask.weights(uv, points, offsets, self.image_index, self.size)
+        most = self.mask.largest_weights(points) * points.valid  # a long outline alone is no support
+        return plain, (near.amax(dim=-1) * points.valid).sum(dim=1) / most.sum(dim=1).clamp(min=1)
 
     def matches(self, state: ContourState, reach: float) -> Matches:
         """The edges that a least-squares step without a mask would use."""

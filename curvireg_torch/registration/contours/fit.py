@@ -159,9 +159,9 @@ def fit_contours(
     K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ full.K
     half = replace(full, edges=EdgeField(F.avg_pool2d(crops, 2)), K=K, size=SIZE // 2)
     start = half.state(T0)
-    before, weighted_before = half.edge_support(start), half.weighted_support(start)
+    before, weighted_before = half.supports(start)
     first = half.descend(start, FIRST)
-    support = half.weighted_support(first)
+    _, support = half.supports(first)
     chosen = torch.ones(N, dtype=torch.bool) if finish is None else _among_best(support, image_index, finish)
     index, others = chosen.nonzero()[:, 0], (~chosen).nonzero()[:, 0]
     source, T = _fit_around(half[index], T0[index], first[index], support[index])
@@ -171,9 +171,8 @@ def fit_contours(
     fixed = torch.cat([T0[index], unfinished])
     fitted = full[index[source]]
     state = ContourState.cat([full[owner[: len(fixed)]].state(fixed), fitted.descend(fitted.state(T), FINE)])
-    support = full[owner].edge_support(state)
+    support, weighted = full[owner].supports(state)
     before[index] = support[: len(index)]
-    weighted = support if full.mask is None else full[owner].weighted_support(state)
     best = torch.where(owner == torch.arange(N)[:, None], weighted, -1.0).argmax(dim=1)
     state, support = state[best], support[best]
     matches = full.matches(state, FINE[-1])
@@ -234,7 +233,7 @@ def _fit_around(half: ContourProblem, T0: Tensor, first: ContourState, support: 
     four = half[every.repeat_interleave(4)]
     rotated = apply_twist(T0.repeat_interleave(4, 0), offsets.repeat(N, 1), half.centre)
     fits = four.descend(four.state(rotated), FIRST)
-    supports = torch.cat([support[:, None], four.weighted_support(fits).view(-1, 4)], dim=1)
+    supports = torch.cat([support[:, None], four.supports(fits)[1].view(-1, 4)], dim=1)
     five = torch.cat([every[:, None], N + torch.arange(4 * N).view(-1, 4)], dim=1)
     states, best = ContourState.cat([first, fits]), supports.argmax(dim=1)
     other, reference = states[five.flatten()], states[five[every, best].repeat_interleave(5)]

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ...errors import LostObjectError
+from ...geometry import rotation_error
 from ...geometry.cameras import transform
 from ...rendering import DepthRenderer
 from ..confidence import RELIABLE, tracking_confidence
@@ -241,11 +242,15 @@ class Tracker:
     def _remember(self, frame: Frame, outline: Outline) -> None:
         """Keep the frame as the last one, and if none from a similar direction is kept, as a keyframe."""
         self._last = make_keyframe(frame.window, outline.T, outline.depth)
-        if not self._keyframes or _angle(self._nearest(outline.T).T, outline.T) > KEYFRAME_ANGLE:
+        if not self._keyframes or float(self._angles(outline.T).min()) > KEYFRAME_ANGLE:
             self._keyframes = [*self._keyframes[1 - KEYFRAMES :], self._last]
 
     def _nearest(self, T: Tensor) -> Keyframe:
-        return min(self._keyframes, key=lambda keyframe: _angle(keyframe.T, T))
+        return self._keyframes[int(self._angles(T).argmin())]
+
+    def _angles(self, T: Tensor) -> Tensor:
+        """(K,) degrees between the rotations of a pose (1, 4, 4) and of the keyframes."""
+        return rotation_error(torch.cat([keyframe.T for keyframe in self._keyframes])[:, :3, :3], T[:, :3, :3])
 
     def _directions(self, frame: Frame, T: Tensor, uv: Tensor) -> Tensor:
         """(Q,) rad of pixels (Q, 2) from the object's centre."""
@@ -260,12 +265,6 @@ class Tracker:
 
     def _render(self, frame: Frame, T: Tensor) -> Outline:
         return render_outline(self.renderer, frame.window, T, self.centre, self.radius)
-
-
-def _angle(a: Tensor, b: Tensor) -> float:
-    """Degrees between the rotations of two poses (1, 4, 4)."""
-    cosine = 0.5 * (float((a[:, :3, :3] * b[:, :3, :3]).sum()) - 1.0)
-    return math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
 
 
 def _orthonormal(T: Tensor) -> Tensor:

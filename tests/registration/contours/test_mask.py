@@ -81,8 +81,8 @@ def test_steps_and_comparison_weight_edges_and_reports_do_not():
     assert float(weighted.edge_support(points)) == float(plain.edge_support(points))
     # Of the edges at 3 px, the flank at 2 px counts most.
     by_hand = 0.6 * (40 * 1.5 + 80 * 0.1 * (1 - 1 / 2.25) * math.exp(-2.0)) / (2 * (40 * 1.5 + 80 * 0.1))
-    assert float(weighted.weighted_support(points)) == pytest.approx(by_hand)
-    assert float(plain.weighted_support(points)) == float(plain.edge_support(points))
+    assert float(weighted.supports(points)[1]) == pytest.approx(by_hand)
+    assert float(plain.supports(points)[1]) == float(plain.edge_support(points))
 
 
 def test_mask_of_another_number_of_photographs_is_refused():
