@@ -21,9 +21,10 @@ from torch import Tensor
 
 from curvireg_torch import descriptors, filters
 from curvireg_torch.detectors.edges import sobel_gradient
+from curvireg_torch.filters import blocks
 from curvireg_torch.filters.derivatives import central_derivatives, central_gradient, replicate_pad, smooth
 from curvireg_torch.filters.inputs import to_grey
-from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, update_page, write_json
+from scripts._shared import REPOSITORY, RESULTS, commit, processor, table_lines, today, update_page, write_json
 from scripts.paper.figures import scene, silhouette
 
 PAGE = REPOSITORY / "docs" / "performance.md"
@@ -79,6 +80,8 @@ BLOCKS: dict[str, tuple[Function, Function]] = {
 }
 """Ours and kornia's function for each building block."""
 
+
+BLOCK_SIZES = [2**k for k in range(14, 23)]
 
 LAYERS: dict[str, Function] = {
     "depth CS": filters.depth_curvilinear_saliency,
@@ -162,6 +165,20 @@ def mcs_smoothing(repetitions: int) -> dict[str, dict[str, float]]:
     return rows
 
 
+def block_size_times(size: int, repetitions: int) -> dict[str, float]:
+    """Milliseconds of depth CS on 64 images, by the pixels that are computed at a time (``filters.blocks.BLOCK``)."""
+    x, used = torch.rand(64, 1, size, size, generator=torch.Generator().manual_seed(0)) + 0.5, blocks.BLOCK
+
+    def layer(pixels: int) -> None:
+        blocks.BLOCK = pixels
+        filters.depth_curvilinear_saliency(x)
+
+    try:
+        return fastest({str(pixels): lambda n=pixels: layer(n) for pixels in BLOCK_SIZES}, repetitions)
+    finally:
+        blocks.BLOCK = used
+
+
 def write_tables(record: dict, page: Path = PAGE) -> None:
     """Write the tables of the page from a record."""
     lines = table_lines(
@@ -185,9 +202,13 @@ def write_tables(record: dict, page: Path = PAGE) -> None:
     ]
     note = (
         f"{' x '.join(map(str, record['input']))} float32, {record['threads']} thread(s), {record['clock']} time, "
-        f"torch {record['torch']}, kornia {record['kornia']}, {record['date']}, commit {record['commit']}."
+        f"torch {record['torch']}, kornia {record['kornia']}, {record['processor']}, {record['date']}, "
+        f"commit {record['commit']}."
     )
-    tables = [*lines, "", *table_lines([["layer", "eager, ms", "compiled, ms"], *layers]), "", note, ""]
+    sizes = [["pixels at a time", *record["block_sizes"]]]
+    sizes += [["depth CS of 64 images, ms", *(f"{ms:.0f}" for ms in record["block_sizes"].values())]]
+    tables = [*lines, "", *table_lines([["layer", "eager, ms", "compiled, ms"], *layers]), ""]
+    tables += [*table_lines(sizes), "", note, ""]
     update_page(page, "layers", "\n".join(tables))
 
 
@@ -214,9 +235,11 @@ def main(arguments: list[str] | None = None) -> None:
                 "kornia": kornia.__version__,
                 "date": today(),
                 "commit": commit(),
+                "processor": processor(),
                 "load_average": os.getloadavg()[0],
                 "blocks": block_times(x, options.repetitions),
                 "layers": layer_times(x, options.repetitions, compiled=not options.no_compile),
+                "block_sizes": block_size_times(options.size, options.repetitions),
                 "mcs_smoothing": mcs_smoothing(options.repetitions),
             }
         write_json(options.out, record)

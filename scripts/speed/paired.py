@@ -9,6 +9,7 @@ Every measurement has a process of its own; each step counts with its least time
 - bank: ``ViewBank.build`` of all views
 - one: a further photograph by the same ``Registrar`` (the first call of all builds the bank, which is then cached)
 - many_1, many_2: each of many photographs in one call, on one and on two threads
+- follow: each frame of a video in which the photograph moves by 2 px (not in checkouts without ``Follower``)
 """
 
 import argparse
@@ -21,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-STEPS = ("cold", "warm", "bank", "one", "many_1", "many_2")
+STEPS = ("cold", "warm", "bank", "one", "many_1", "many_2", "follow")
+FRAMES = 12
 FOCAL, CENTRE, MEGAPIXELS = 900.0, (319.5, 239.5), 0.3072
 """Camera of a photograph of 640 x 480 px."""
 
@@ -78,7 +80,28 @@ def measure(step: str, folder: str, megapixels: float, photographs: int) -> floa
         return (time.perf_counter() - start) / n
 
     register(1)
+    if step == "follow":
+        return follow(registrar, str(Path(folder, "photo.jpg")), box, K)
     return register(count) if count > 1 else min(register(1) for _ in range(3))
+
+
+def follow(registrar: Any, photograph: str, box: list[float], K: Any) -> float:
+    """Seconds of each frame after the first of a video of a photograph that moves to the right."""
+    from curvireg_torch import Follower
+    from curvireg_torch.io import read_image
+
+    first, follower = read_image(photograph), Follower(registrar, K)
+    assert follower(first, box).ok
+    frames = [first.roll(2 * k, dims=-1) for k in range(1, FRAMES)]
+    start = time.perf_counter()
+    assert all(follower(frame).ok for frame in frames)
+    return (time.perf_counter() - start) / len(frames)
+
+
+def steps_of(checkout: Path) -> tuple[str, ...]:
+    """The steps that a checkout knows."""
+    follows = (checkout / "curvireg_torch" / "registration" / "following.py").is_file()
+    return tuple(step for step in STEPS if step != "follow" or follows)
 
 
 def run(words: Sequence[str], checkout: Path, folder: Path, cache: Path, threads: int = 2) -> tuple[float, float, str]:
@@ -121,6 +144,8 @@ def case(checkouts: dict[str, Path], faces: int, megapixels: float, photographs:
         found: dict[str, Any] = {name: {} for name in checkouts}
         for step in ("one", *STEPS) + STEPS * (rounds - 1):
             for name, checkout in checkouts.items():
+                if step not in steps_of(checkout):
+                    continue
                 new = measured(step, checkout, folder, folder / name, megapixels, photographs)
                 old = found[name].get(step, new)
                 found[name][step] = {key: min(old[key], value) for key, value in new.items()}
@@ -135,9 +160,9 @@ def table(record: dict[str, Any]) -> str:
     rows = [["faces", "megapixels", "step", *record["commits"], "ratio"]]
     for row in record["cases"]:
         for step in STEPS:
-            both = [row[name][step] for name in record["commits"]]
-            cells = [f"{each['seconds']:.2f} s, {each['megabytes']:.0f} MB" for each in both]
-            ratio = f"{both[-1]['seconds'] / both[0]['seconds']:.2f}"
+            both = [row[name].get(step) for name in record["commits"]]
+            cells = [f"{each['seconds']:.2f} s, {each['megabytes']:.0f} MB" if each else "-" for each in both]
+            ratio = f"{both[-1]['seconds'] / both[0]['seconds']:.2f}" if all(both) else "-"
             rows.append([str(row["faces"]), f"{row['megapixels']:g}", f"`{step}`", *cells, ratio])
     commits = ", ".join(f"{name} {commit}" for name, commit in record["commits"].items())
     many = f"{record['photographs']} photographs in `many_1` and `many_2`"
@@ -151,8 +176,10 @@ def plot(record: dict[str, Any], path: Path) -> None:
     row, names = record["cases"][0], list(record["commits"])
     figure, axes = plt.subplots(figsize=(7.0, 2.6), layout="constrained")
     for k, name in enumerate(names):
-        seconds = [row[name][step]["seconds"] for step in STEPS]
-        places = [i + 0.8 * (k - 0.5 * (len(names) - 1)) / len(names) for i in range(len(STEPS))]
+        seconds = [row[name][step]["seconds"] for step in STEPS if step in row[name]]
+        places = [
+            i + 0.8 * (k - 0.5 * (len(names) - 1)) / len(names) for i, step in enumerate(STEPS) if step in row[name]
+        ]
         bars = axes.bar(places, seconds, width=0.8 / len(names), label=f"{name} ({record['commits'][name]})")
         axes.bar_label(bars, fmt="%.2f", fontsize=8)
     axes.set_xticks(range(len(STEPS)), STEPS)
