@@ -1,6 +1,7 @@
 """Both sides of the contour fit: 3D contour points of a rendered mesh, and edges of a photograph."""
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
@@ -20,6 +21,9 @@ OCCLUDING, CREASES = 256, 128
 
 JUMP = 0.05
 """Depth discontinuity at an occluding contour, in object radii."""
+
+BESIDE = 8
+"""Pixels beside the object that its contours depend on, by smoothing and differences: 5, and some to spare."""
 
 CREASE_FRACTION = 0.02
 """Largest fraction of the pixels that are creases."""
@@ -68,8 +72,10 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
         >>> int(points.valid.sum()), points.model[points.valid][:, :2].abs().amax(dim=1).unique().tolist()
         (64, [1.25])
     """
-    H, W = depth.shape[-2:]
-    K = camera_matrix.expand(len(depth), 3, 3)
+    size, (rows, columns) = depth.shape[-2:], _window(depth > 0)
+    depth = depth[..., rows, columns]
+    K = camera_matrix.expand(len(depth), 3, 3).clone()
+    K[:, :2, 2] -= torch.tensor([columns.start, rows.start]).to(K)
     seen = depth > 0
     z = torch.where(seen, depth, depth.amax(dim=(1, 2, 3), keepdim=True) + 4.0 * radius)
     slope = torch.cat(central_gradient(smooth(fill_depth(depth, None, None), 1.0)), dim=1)
@@ -85,12 +91,15 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
     # With depth in px, saliency is a curvature in 1 / px, to which a fixed threshold applies.
     scale = K[:, 0, 0].view(-1, 1, 1, 1) / z.amax(dim=(1, 2, 3), keepdim=True)
     field = depth_curvilinear_saliency(depth * scale.float(), depth_scale=1.0)
-    creases = field_points(field * ~(_dilated(beside) | ~seen), fraction=CREASE_FRACTION, threshold=CREASE)
-    pixel = torch.arange(H * W).view(H, W)
+    pixel = torch.arange(depth[0].numel()).view(depth.shape[-2:])
+    fraction = min(1.0, CREASE_FRACTION * math.prod(size) / pixel.numel())
+    creases = field_points(field * ~(_dilated(beside) | ~seen), fraction=fraction, threshold=CREASE)
     neighbours = [torch.stack([x.flatten() for x in _ends(pixel, dim)]) for dim in (-1, -2)]
+    at_pixels, between = _random(*size)
+    order = torch.cat([_ends(x[rows, columns], dim)[0].flatten() for x, dim in zip(between, (-1, -2), strict=True)])
     samples = [
-        _sample(torch.cat(jumps, dim=1), torch.cat(neighbours, dim=1), z, slope, OCCLUDING),
-        _sample(creases.flatten(1), pixel.view(1, -1), z, field, CREASES),
+        _sample(torch.cat(jumps, dim=1), torch.cat(neighbours, dim=1), order, z, slope, OCCLUDING),
+        _sample(creases.flatten(1), pixel.view(1, -1), at_pixels[rows, columns].flatten(), z, field, CREASES),
     ]
     uv, z, n, valid, outline = (torch.cat(parts, dim=1) for parts in zip(*samples, strict=True))
     rays = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1) @ torch.linalg.inv(K).mT
@@ -98,6 +107,18 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
     length = torch.linalg.vector_norm(n, dim=-1)
     valid = valid & (length > 0)
     return ContourPoints(model, n / length.clamp(min=1e-12)[..., None], valid, valid & outline)
+
+
+def _window(seen: Tensor) -> tuple[slice, slice]:
+    """Rows and columns of (N, 1, H, W) masks that hold all True pixels, and the background that filters see there."""
+    if not bool(seen.any()):
+        return slice(0, seen.shape[-2]), slice(0, seen.shape[-1])
+    ends = []
+    for dim in (-2, -1):
+        where = seen.any(dim=0)[0].any(dim=-3 - dim).nonzero()[:, 0]
+        ends.append((max(0, int(where[0]) - BESIDE), min(seen.shape[dim], int(where[-1]) + BESIDE + 1)))
+    rows, columns = (slice(*each) for each in ends)
+    return rows, columns
 
 
 def _ends(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
@@ -117,10 +138,14 @@ def _dilated(mask: Tensor) -> Tensor:
     return mask
 
 
-def _sample(mask: Tensor, pixels: Tensor, depth: Tensor, normals: Tensor, count: int) -> tuple[Tensor, ...]:
-    """uv, nearer depth, normal, valid and whether the background is beside it, (N, P, ...), of ``count`` entries of
-    ``mask`` (N, M), means of ``pixels``."""
-    best, index = torch.where(mask, _random(mask.shape[1]), -1.0).topk(min(count, mask.shape[1]), dim=1)
+def _sample(
+    mask: Tensor, pixels: Tensor, order: Tensor, depth: Tensor, normals: Tensor, count: int
+) -> tuple[Tensor, ...]:
+    """uv, nearer depth, normal, valid and whether the background is beside it, (N, P, ...), of the ``count`` entries of
+    ``mask`` (N, M) that come first by ``order`` (M,), means of ``pixels``."""
+    if (missing := count - mask.shape[1]) > 0:  # all views have as many points
+        mask, pixels, order = (F.pad(x, (0, missing)) for x in (mask, pixels, order))
+    best, index = torch.where(mask, order, -1.0).topk(count, dim=1)
     of, W = pixels[:, index], depth.shape[-1]  # (k, N, P)
     ends = torch.stack([depth.flatten(1).gather(1, i) for i in of])
     outline = (ends == depth.amax(dim=(1, 2, 3))[:, None]).any(dim=0)
@@ -130,9 +155,14 @@ def _sample(mask: Tensor, pixels: Tensor, depth: Tensor, normals: Tensor, count:
 
 
 @functools.cache
-def _random(count: int) -> Tensor:
-    """(count,) the same random numbers in every call."""
-    return torch.rand(count, generator=torch.Generator().manual_seed(0))
+def _random(H: int, W: int) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """Numbers (H, W) of the pixels, and of the gaps to the right of them and below; the same in every call."""
+
+    def numbers(count: int) -> Tensor:
+        return torch.rand(count, generator=torch.Generator().manual_seed(0))
+
+    right, below = numbers(H * (W - 1) + (H - 1) * W).split([H * (W - 1), (H - 1) * W])
+    return numbers(H * W).view(H, W), (F.pad(right.view(H, W - 1), (0, 1)), F.pad(below.view(H - 1, W), (0, 0, 0, 1)))
 
 
 class EdgeField:
