@@ -16,7 +16,7 @@ POSE_FEATURES = ("rank", "similarity", "edge_support", "appearance")
 pose's view with the photograph; edge support (0 without the contour fit); log appearance score of the pose (0 without
 that term)."""
 
-WEIGHTS, RANK_ALONE = (1.0, 5.0, 10.0, 1.0), (1.0, 0.0, 0.0, 0.0)
+WEIGHTS, RANK_ALONE = (1.0, 10.0, 10.0, 2.5), (1.0, 0.0, 0.0, 0.0)
 """Weights of the features with an exact mesh and with a similar one, see docs/accuracy.md."""
 
 

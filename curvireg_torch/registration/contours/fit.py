@@ -33,7 +33,7 @@ __all__ = ["ContourFit", "contour_support", "fit_contours"]
 SIZE = 256
 """Side of the crop in px; the first rounds use half of it."""
 
-FIRST, SECOND, FINE = (6.0, 4.0), (3.0, 2.0), (6.0, 4.0, 3.0, 2.0, 2.0)
+FIRST, SECOND, FINE = (6.0, 4.0), (3.0, 2.0), (4.0, 2.0, 2.0)
 """Search distance for edges in px, one a round: from all starting rotations and then from the best at half size, and
 at full size."""
 
@@ -85,6 +85,7 @@ def fit_contours(
     radius: float,
     margin: float = 0.1,
     finish: int | None = None,
+    turned: bool = True,
     object_mask: Tensor | None = None,
 ) -> ContourFit:
     """Poses whose contours lie on a photograph's edges, by robust least squares over SE(3).
@@ -97,9 +98,9 @@ def fit_contours(
 
     where W is the strength of the edge times Tukey's weight of the residual. Within a step, edges are selected again
     near the predicted position; the search distance shrinks from round to round, and the mesh is rendered again where
-    contours have moved. The fit begins at half size from each start and from four poses rotated away from it; the best
-    (by edge support) and the next best that differs from it continue, and end at full size. The start is returned where
-    no fit has more support. All starts of all photographs are rendered together.
+    contours have moved. The fit begins at half size from each start and, if ``turned``, from four poses rotated away
+    from it; the best (by edge support) and the next best that differs from it continue, and end at full size. The start
+    is returned where no fit has more support. All starts of all photographs are rendered together.
 
     Prints, shadows and clutter have edges too. With an ``object_mask``, an edge counts for the outline as far as the
     object lies on its inner side alone, and for creases and inner contours as far as the object lies on both sides
@@ -124,6 +125,7 @@ def fit_contours(
         margin: added around the box, as a fraction of its longer side.
         finish: number of starts of each photograph that are fitted to the end, those with the most support after the
             first rounds; None: all, each as if alone.
+        turned: whether poses 8 degrees away are further starts. Poses that a search found do not need them.
         object_mask: (B, 1, s, s) probability that pixels of the square crops, the boxes with their margin, belong to
             the object, for instance of :meth:`LearnedCurvilinearSaliency.mask`.
 
@@ -164,7 +166,10 @@ def fit_contours(
     _, support = half.supports(first)
     chosen = torch.ones(N, dtype=torch.bool) if finish is None else _among_best(support, image_index, finish)
     index, others = chosen.nonzero()[:, 0], (~chosen).nonzero()[:, 0]
-    source, T = _fit_around(half[index], T0[index], first[index], support[index])
+    if turned:
+        source, T = _fit_around(half[index], T0[index], first[index], support[index])
+    else:
+        source, T = torch.arange(len(index)), half[index].descend(first[index], SECOND).T
     # Candidates: the starts, the half-size fits of unfinished starts, and the full-size fits. Ties go to the first.
     owner = torch.cat([index, others, index[source]])
     unfinished = torch.where((support > weighted_before)[others, None, None], first.T[others], T0[others])
