@@ -15,6 +15,7 @@ from curvireg_torch.geometry.cameras import project_points
 from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.registration.contours import fit as fit_module
+from curvireg_torch.registration.contours import points as points_module
 from curvireg_torch.registration.contours.descent import apply_twist, project
 from curvireg_torch.registration.contours.points import EdgeField, contour_points
 from curvireg_torch.rendering import make_renderer
@@ -81,6 +82,26 @@ def test_contour_points_lie_on_the_nearer_surface():
 def distance_to_box(points: torch.Tensor, sides: tuple[float, ...], centre: tuple[float, ...]) -> torch.Tensor:
     beyond = (points - torch.tensor(centre)).abs() - 0.5 * torch.tensor(sides)
     return torch.linalg.vector_norm(beyond.clamp(min=0), dim=1) + beyond.amax(dim=1).clamp(max=0).abs()
+
+
+@pytest.mark.parametrize(("row", "column", "side"), [(40, 70, 24), (0, 0, 24), (127, 60, 1)])
+def test_contour_points_need_only_the_surroundings_of_the_object(monkeypatch, row, column, side):
+    """A roof of ``side`` px, in the middle or cut off by the border: the same points as from the whole view."""
+    depth, T, K = (
+        torch.zeros(1, 1, 128, 128),
+        torch.eye(4, dtype=torch.float64)[None],
+        camera_matrix(100.0, 100.0, 64.0, 64.0),
+    )
+    roof = 5.0 + 0.05 * (torch.arange(side) - side // 2).abs()
+    depth[..., row : row + side, column : column + side] = roof
+    found = contour_points(depth, T, K.double(), radius=1.0)
+    monkeypatch.setattr(points_module, "_window", lambda _: (slice(0, 128), slice(0, 128)))
+    whole = contour_points(depth, T, K.double(), radius=1.0)
+    assert torch.equal(found.valid, whole.valid)
+    assert torch.equal(found.outline, whole.outline)
+    assert bool((found.valid & ~found.outline).any()) == (side > 1)  # the ridge of the roof
+    for name in ("model", "normals"):
+        torch.testing.assert_close(getattr(found, name)[found.valid], getattr(whole, name)[found.valid])
 
 
 def test_edge_strength_peaks_on_a_slanted_edge():
