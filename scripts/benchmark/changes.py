@@ -1,0 +1,126 @@
+"""Compare two runs of run.py on the same photographs, with pictures of the ten largest gains and losses.
+
+    python scripts/benchmark/changes.py FOLDER BEFORE.jsonl AFTER.jsonl [--pictures PATTERN]
+
+Prints, for photographs with their exact mesh: how many poses are within some limits before and after, how many were won
+and lost, and the two-sided sign test. PATTERN, such as ``docs/images/changes-{}.webp``, gets "gains" and "losses": the
+pose before on the left, after on the right, ordered by the ratio of the errors.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from scipy.stats import binomtest
+
+import curvireg_torch as cr
+from curvireg_torch.geometry import transform
+from curvireg_torch.io import read_image
+from curvireg_torch.rendering import make_renderer
+from curvireg_torch.visualization.contours import draw_pose
+from curvireg_torch.visualization.overlay import to_uint8
+from scripts._shared import table_lines
+from scripts.docs_pictures import captioned, side_by_side
+
+LIMITS = {"2°": (2.0, 1.0), "5°": (5.0, 1.0), "15°": (15.0, 1.0), "30°": (30.0, 1.0), "5° and 5 %": (5.0, 0.05)}
+"""Largest rotation error in degrees, and of the translation as a fraction of the distance."""
+
+LEAST, RATIO = 5.0, 1.5
+"""Of a change: the larger error in degrees, and the ratio of both errors."""
+
+Row = dict[str, Any]
+
+
+def errors_of(row: Row, item: Row) -> tuple[float, float]:
+    """Rotation error of the first pose in degrees, and of its translation as a fraction of the distance."""
+    if "pose" not in row:  # a failed photograph
+        return 180.0, 1.0
+    true = np.array(item["t"])
+    return row["errors"][0], float(np.linalg.norm(np.array(row["pose"][1]) - true) / np.linalg.norm(true))
+
+
+def paired_table(items: Sequence[Row], before: Sequence[Row], after: Sequence[Row]) -> str:
+    """Shares within each limit before and after, won and lost, and the p value, in Markdown."""
+    lines = [["photographs", "N", "within", "before", "after", "won, lost", "p"]]
+    for pose in sorted({item["pose"] for item in items}, reverse=True):
+        mine = [k for k, item in enumerate(items) if item["pose"] == pose]
+        pairs = [[errors_of(rows[k], items[k]) for rows in (before, after)] for k in mine]
+        for name, limits in LIMITS.items():
+            inside = np.array([[all(np.array(e) < limits) for e in pair] for pair in pairs])
+            won, lost = (int((inside[:, a] & ~inside[:, b]).sum()) for a, b in ((1, 0), (0, 1)))
+            p = binomtest(won, won + lost).pvalue if won + lost else 1.0
+            shares = [f"{share:.3f}" for share in inside.mean(axis=0)]
+            lines.append([f"exact, {pose}", str(len(mine)), name, *shares, f"{won}, {lost}", f"{p:.2g}"])
+    return "\n".join(table_lines(lines))
+
+
+def largest_changes(pairs: Sequence[tuple[float, float]], count: int = 10) -> tuple[list[int], list[int]]:
+    """Indices of the largest gains and losses among (before, after) errors in degrees, largest first."""
+    change = {k: np.log(max(b, 0.1) / max(a, 0.1)) for k, (b, a) in enumerate(pairs) if max(a, b) >= LEAST}
+    gains = sorted((k for k in change if change[k] >= np.log(RATIO)), key=lambda k: -change[k])
+    losses = sorted((k for k in change if change[k] <= -np.log(RATIO)), key=lambda k: change[k])
+    return gains[:count], losses[:count]
+
+
+def picture(folder: Path, item: Row, rows: Sequence[Row]) -> Image.Image:
+    """The object with its contours in the pose of each row, side by side."""
+    image = read_image(folder / "held-out" / item["image"])
+    renderer = make_renderer(cr.load_mesh(folder / item["mesh"]))
+    x0, y0, x1, y1 = item["box"]
+    margin = 0.15 * max(x1 - x0, y1 - y0)
+    left, top = max(0, int(x0 - margin)), max(0, int(y0 - margin))
+    window = (slice(top, int(y1 + margin)), slice(left, int(x1 + margin)))
+    tiles = []
+    for row in rows:
+        drawn = to_uint8(image).copy()
+        R, t = (torch.tensor(part, dtype=torch.float64) for part in row["pose"])
+        draw_pose(drawn, renderer, (transform(R, t), torch.tensor(item["K"], dtype=torch.float64)))
+        tile = Image.fromarray(drawn[window])
+        tile = tile.resize((round(tile.width * 220 / tile.height), 220), Image.Resampling.LANCZOS)
+        tiles.append(captioned(np.asarray(tile), f"{row['errors'][0]:.1f}°"))
+    return side_by_side(tiles)
+
+
+def sheet(pictures: Sequence[Image.Image], columns: int = 2) -> Image.Image:
+    """Pictures in columns, on white."""
+    width, height = (max(getattr(p, side) for p in pictures) for side in ("width", "height"))
+    lines = -(-len(pictures) // columns)
+    out = Image.new("RGB", (columns * width + (columns - 1) * 24, lines * (height + 8)), "white")
+    for k, one in enumerate(pictures):
+        out.paste(one, ((k % columns) * (width + 24), (k // columns) * (height + 8)))
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("before", type=Path)
+    parser.add_argument("after", type=Path)
+    parser.add_argument("--pictures", metavar="PATTERN")
+    arguments = parser.parse_args()
+    lines = (arguments.folder / "held-out" / "items.jsonl").read_text().splitlines()
+    items = {item["id"]: item for item in map(json.loads, lines) if item["form"] == "exact"}
+    runs = [
+        {row["id"]: row for row in map(json.loads, path.read_text().splitlines()) if row["id"] in items}
+        for path in (arguments.before, arguments.after)
+    ]
+    both = sorted(runs[0].keys() & runs[1].keys())
+    before, after = ([run[k] for k in both] for run in runs)
+    print(paired_table([items[k] for k in both], before, after))
+    if arguments.pictures:
+        known = [k for k in range(len(both)) if "pose" in before[k] and "pose" in after[k]]
+        pairs = [(before[k]["errors"][0], after[k]["errors"][0]) for k in known]
+        for name, chosen in zip(("gains", "losses"), largest_changes(pairs), strict=True):
+            cases = [known[k] for k in chosen]
+            drawn = [picture(arguments.folder, items[both[k]], (before[k], after[k])) for k in cases]
+            if drawn:
+                sheet(drawn).save(arguments.pictures.format(name), quality=80)
+
+
+if __name__ == "__main__":
+    main()

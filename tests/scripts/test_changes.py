@@ -1,0 +1,33 @@
+"""Two runs of the benchmark side by side."""
+
+import pytest
+
+from scripts.benchmark.changes import errors_of, largest_changes, paired_table
+
+ITEM = {"pose": "upright", "t": [0.0, 3.0, 4.0]}
+
+
+def row(error: float, shift: float = 0.0) -> dict:
+    return {"errors": [error, 0.0], "pose": [None, [shift, 3.0, 4.0]]}
+
+
+def test_errors_are_those_of_the_first_pose_and_a_failure_is_the_worst():
+    assert errors_of(row(7.0, shift=0.5), ITEM) == pytest.approx((7.0, 0.1))
+    assert errors_of({"failed": "no edges"}, ITEM) == (180.0, 1.0)
+
+
+def test_paired_table_counts_won_and_lost_photographs():
+    before = [row(3.0), row(40.0), row(40.0), row(4.0), row(4.0, shift=1.0)]
+    after = [row(3.0), row(1.0), row(4.0), row(90.0), row(4.0)]
+    lines = paired_table([ITEM] * 5, before, after).splitlines()
+    found = {line.split("|")[3].strip(): [cell.strip() for cell in line.split("|")[4:7]] for line in lines[2:]}
+    assert found["5°"] == ["0.600", "0.800", "2, 1"]
+    assert found["5° and 5 %"] == ["0.400", "0.800", "3, 1"]
+    assert found["2°"] == ["0.000", "0.200", "1, 0"]
+
+
+def test_largest_changes_are_ordered_and_exclude_small_ones():
+    """Not counted: below 5 degrees before and after, and errors that differ by less than half."""
+    pairs = [(90.0, 45.0), (90.0, 1.0), (1.0, 60.0), (2.0, 10.0), (4.0, 0.2), (30.0, 25.0)]
+    assert largest_changes(pairs) == ([1, 0], [2, 3])
+    assert largest_changes(pairs, count=1) == ([1], [2])
