@@ -5,7 +5,7 @@
 ROWS holds the rows of scripts/benchmark/run.py: right.jsonl without a hint, and hint_90.jsonl, hint_45.jsonl and
 hint_30.jsonl with ``--hint azimuth:90`` and so on. RUNS holds folders none, azimuth:90, azimuth:45 and azimuth:30, each
 with what ``curvireg evaluate --out RUNS/HINT/SET`` wrote. Photographs that are missing in one of the files are left
-out; a hint or a set that was not measured has "-".
+out; a hint that was not measured has "-". Sets that are not measured again keep their lines, with their commits.
 """
 
 import argparse
@@ -14,6 +14,8 @@ from pathlib import Path
 
 from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, update_page, write_json
 from scripts.calibration.quality import REAL_SETS, RIGHT, Row, format_interval, group_of, interval
+
+RECORD = RESULTS / "hints.json"
 
 HINTS = {"none": "right", "azimuth:90": "hint_90", "azimuth:45": "hint_45", "azimuth:30": "hint_30"}
 """Hints, and the files of their rows."""
@@ -66,10 +68,11 @@ def main() -> None:
             continue
         found = [json.loads(line) for line in (arguments.rows / f"{name}.jsonl").read_text().splitlines()]
         rows[hint] = {row["id"]: row for row in found if "errors" in row}
-    sets = {**benchmark_rates(rows), **real_rates(arguments.runs)}
+    sets = {**(benchmark_rates(rows) if len(rows) > 1 else {}), **real_rates(arguments.runs)}
     sets = {name: {**found, "commit": commit()} for name, found in sets.items()}
-    record = {"date": today(), "commit": commit(), "sets": sets}
-    write_json(RESULTS / "hints.json", record)
+    earlier = json.loads(RECORD.read_text(encoding="utf-8"))["sets"] if RECORD.is_file() else {}
+    record = {"date": today(), "commit": commit(), "sets": {**earlier, **sets}}
+    write_json(RECORD, record)
     update_page(REPOSITORY / "docs" / "guides" / "pose-prior.md", "hints", page(record))
     print(page(record))
 

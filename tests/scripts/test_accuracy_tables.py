@@ -29,12 +29,21 @@ def test_writes_between_the_markers_and_reports_old_tables(tmp_path, monkeypatch
 
 
 def test_tables_take_each_number_from_its_record():
-    hints = {"sets": {key: {"n": k, "none": [0.125 * k], "azimuth:45": [1.0]} for k, key in enumerate(SETS)}}
+    hints = {"sets": {key: {"azimuth:45": [0.01 * k]} for k, key in enumerate(SETS)}}
     del hints["sets"]["lm"]["azimuth:45"]
-    rows = right_answers(hints, {"dino": {"summary": {"med_err_deg": 12.34}}})
-    assert rows[4] == ["hope, exact mesh, in clutter (16 views x 5 lightings)", "yes", "3", "0.38", "1.00", "-"]
-    assert rows[5][3:] == ["0.50", "-", "-"]
-    assert rows[6][5] == "12.3°"
+    shares = {
+        "exact upright": {"n": 7, "answer": [0.751, 0.6, 0.9]},
+        "sibling upright": {"n": 8, "answer": [0.5, 0, 1]},
+    }
+    summaries = {name: {"n": k, "acc_30_deg": 0.125 * k, "med_err_deg": 12.34} for k, name in enumerate(list(SETS)[2:])}
+    summaries["pascal3d_mini"] |= {"acc_pi_6": 0.4, "symmetry_aware": {"acc_pi_6": 0.625}}
+    evaluations = {name: {"summary": summary} for name, summary in summaries.items()}
+    rows = right_answers(hints, {"shares": shares}, evaluations)
+    assert rows[1] == ["generated, upright, exact mesh", "yes", "7", "0.75", "0.00", "-"]
+    assert rows[2][2:] == ["8", "0.50", "0.01", "-"]
+    assert rows[3][2:] == ["0", "0.62", "0.02", "12.3°"]
+    assert rows[4] == ["hope, exact mesh, in clutter (16 views x 5 lightings)", "yes", "1", "0.12", "0.03", "12.3°"]
+    assert rows[5][3:] == ["0.25", "-", "12.3°"]
     names = [key for _, _, key in SETS.values()]
     confidence = {name: {"n": 9, "reliable": k, "reliable_and_right": 0} for k, name in enumerate(names)}
     sets = {name: {"coverage": 0.901, "mean_size": 2.04} for name in names}
