@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from scripts._shared import REPOSITORY, RESULTS, replace_between, table_lines
+from scripts._shared import REPOSITORY, RESULTS, replace_between, right_share, table_lines
 
 PAGE = REPOSITORY / "docs" / "accuracy.md"
 BEGIN, END = "<!-- accuracy:begin -->", "<!-- accuracy:end -->"
@@ -29,6 +29,12 @@ SETS = {
     "buddha": ("buddha, exact mesh", "yes", "buddha"),
 }
 """For each set of hints.json: its name on the page, whether the camera is known, and its name in calibration.json."""
+
+UPRIGHT = {
+    "benchmark, exact, upright": ("generated, upright, exact mesh", "exact upright"),
+    "benchmark, sibling, upright": ("generated, upright, similar mesh", "sibling upright"),
+}
+"""For each generated set of hints.json: its name on the page, and its shares in calibration.json."""
 
 STAGES = {"view": "best view of the bank", "search": "after the search", "contours": "after the contours"}
 
@@ -51,14 +57,13 @@ def right_answers(hints: Record, calibration: Record, evaluations: dict[str, Rec
     rows = [["photographs", "camera known", "N", "right", "right, azimuth known to 45°", "median error"]]
     for key, (name, camera, _) in SETS.items():
         hinted = share(hints["sets"][key].get("azimuth:45", [None])[0])
-        if key in evaluations:
-            found = evaluations[key]["summary"]
-            scores = found.get("symmetry_aware", found)
-            right, error = scores.get("acc_pi_6", scores.get("acc_30_deg")), f"{found['med_err_deg']:.1f}°"
-        else:
-            found = calibration["shares"][" ".join(key.split(", ")[1:])]
+        if key in UPRIGHT:
+            name, of_shares = UPRIGHT[key]
+            found = calibration["shares"][of_shares]
             right, error = found["answer"][0], "-"
-            name = name.replace("generated", "generated, upright")
+        else:
+            found = evaluations[key]["summary"]
+            right, error = right_share(found), f"{found['med_err_deg']:.1f}°"
         rows.append([name, camera, str(found["n"]), share(right), hinted, error])
     return rows
 
@@ -94,14 +99,16 @@ def tables() -> str:
         path.stem.removeprefix("evaluation_"): json.loads(path.read_text(encoding="utf-8"))
         for path in sorted(RESULTS.glob("evaluation_*.json"))
     }
+    commits = ", ".join(sorted({found["commit"] for key, found in evaluations.items() if key in SETS}))
     n, right = (refinement["boxes"]["0.05"]["all"][key] for key in ("n", "right"))
     parts = [
         (
             "How often is the first answer right?",
             right_answers(hints, calibration, evaluations),
             "Right: within 30°, up to symmetries. The hint is the true azimuth, moved at random by up to 45° "
-            "([all hints](guides/pose-prior.md); on generated photographs on 150 of these). The median error of "
-            "PASCAL3D+ counts symmetries as errors. " + measured(evaluations["hope"]),
+            "([all hints](guides/pose-prior.md), with N and commits). The median error of PASCAL3D+ counts symmetries "
+            f"as errors. Measured on {calibration['date']}, commits {calibration['commit']} (generated photographs), "
+            f"{commits} (the others).",
         ),
         (
             "How far can it be trusted?",

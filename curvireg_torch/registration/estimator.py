@@ -170,7 +170,7 @@ class PoseEstimator:
         poses = self._lift(batch, hypotheses)
         if self.pipeline.contours:
             self.report_progress("contours")
-            mask, searched = self._object_mask(query), self.pipeline.search
+            mask, searched = self.object_mask(query), self.pipeline.search
             poses = fit_poses(self.describers, batch.images, poses, batch.boxes, turned=not searched, object_mask=mask)
         evidence = self._evidence(batch, starts, poses)
         distinct = distinct_mask(poses.hypotheses, batch.scores(evidence), symmetries=batch.symmetries)
@@ -216,7 +216,7 @@ class PoseEstimator:
         poses = lift_to_poses(self.describers, hypotheses, batch.boxes, batch.camera_matrices)
         return poses if batch.priors is None else replace(poses, T=batch.priors.at_distance(hypotheses, poses.T))
 
-    def _object_mask(self, query: QueryFeatures) -> Tensor | None:
+    def object_mask(self, query: QueryFeatures) -> Tensor | None:
         """(B, 1, S, S) probability that pixels of the crops belong to the object, if the field predicts it."""
         field = self.matcher.field
         if not isinstance(field, LearnedCurvilinearSaliency):

@@ -17,7 +17,8 @@ pose's view with the photograph; edge support (0 without the contour fit); log a
 that term)."""
 
 WEIGHTS, RANK_ALONE = (1.0, 10.0, 10.0, 2.5), (1.0, 0.0, 0.0, 0.0)
-"""Weights of the features with an exact mesh and with a similar one, see docs/accuracy.md."""
+"""Weights of the features with an exact mesh and with a similar one, measured in docs/experiments.md under "Which
+hypothesis comes first"."""
 
 
 def rank_feature(starts: Hypotheses) -> Tensor:

@@ -5,14 +5,15 @@
 ROWS holds the rows of scripts/benchmark/run.py: right.jsonl without a hint, and hint_90.jsonl, hint_45.jsonl and
 hint_30.jsonl with ``--hint azimuth:90`` and so on. RUNS holds folders none, azimuth:90, azimuth:45 and azimuth:30, each
 with what ``curvireg evaluate --out RUNS/HINT/SET`` wrote. Photographs that are missing in one of the files are left
-out; a hint that was not measured has "-". Sets that are not measured again keep their lines, with their commits.
+out; a hint that was not measured has "-". A set that is measured again gets a new line; the others keep theirs, with
+their commits. Without hint_*.jsonl, ROWS is not looked at.
 """
 
 import argparse
 import json
 from pathlib import Path
 
-from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, update_page, write_json
+from scripts._shared import REPOSITORY, RESULTS, commit, right_share, table_lines, today, update_page, write_json
 from scripts.calibration.quality import REAL_SETS, RIGHT, Row, format_interval, group_of, interval
 
 RECORD = RESULTS / "hints.json"
@@ -39,8 +40,7 @@ def real_rates(runs: Path) -> dict[str, Row]:
     for name in REAL_SETS:
         files = {hint: runs / hint / name / "summary.json" for hint in HINTS}
         summaries = {hint: json.loads(file.read_text()) for hint, file in files.items() if file.is_file()}
-        scores = {hint: found.get("symmetry_aware", found) for hint, found in summaries.items()}
-        rates = {hint: [found.get("acc_pi_6", found.get("acc_30_deg"))] for hint, found in scores.items()}
+        rates = {hint: [right_share(found)] for hint, found in summaries.items()}
         if "none" in summaries:
             out[name] = {"n": summaries["none"]["n"], **rates}
     return out
@@ -53,7 +53,7 @@ def page(record: Row) -> str:
         known = (found.get(hint, [None]) for hint in HINTS)
         rates = (format_interval(rate[0], rate[1:] or None) for rate in known)
         lines.append([name, str(found["n"]), *rates, found["commit"]])
-    where = f"`python scripts/calibration/hints.py`, {record['date']}."
+    where = "`python scripts/calibration/hints.py`; each line was measured at its commit."
     return "\n".join([*table_lines(lines), "", where, ""])
 
 

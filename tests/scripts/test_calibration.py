@@ -190,7 +190,7 @@ def test_page_has_a_line_for_each_model_and_set():
 @pytest.mark.parametrize("camera", [CAMERA, None])
 def test_features_of_match_the_registration(camera, monkeypatch):
     """Also where the final pose does not come from the best-ranked view."""
-    monkeypatch.setattr(rescoring, "WEIGHTS", (-1.0, 5.0, 10.0, 1.0))  # prefers the view that ranks last
+    monkeypatch.setattr(rescoring, "WEIGHTS", (-1.0, *rescoring.WEIGHTS[1:]))  # prefers the view that ranks last
     monkeypatch.setattr(rescoring, "RANK_ALONE", (-1.0, 0.0, 0.0, 0.0))
     image, box, _ = scene(0)
     result = Registrar(truck_bank())([image], box[None], camera)[0]

@@ -23,7 +23,7 @@ JUMP = 0.05
 """Depth discontinuity at an occluding contour, in object radii."""
 
 BESIDE = 8
-"""Pixels beside the object that its contours depend on, by smoothing and differences: 5, and some to spare."""
+"""Pixels around the object that are looked at: more than its contours depend on, by smoothing and differences."""
 
 CREASE_FRACTION = 0.02
 """Largest fraction of the pixels that are creases."""
@@ -74,8 +74,7 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
     """
     size, (rows, columns) = depth.shape[-2:], _window(depth > 0)
     depth = depth[..., rows, columns]
-    K = camera_matrix.expand(len(depth), 3, 3).clone()
-    K[:, :2, 2] -= torch.tensor([columns.start, rows.start]).to(K)
+    K = camera_matrix.expand(len(depth), 3, 3)
     seen = depth > 0
     z = torch.where(seen, depth, depth.amax(dim=(1, 2, 3), keepdim=True) + 4.0 * radius)
     slope = torch.cat(central_gradient(smooth(fill_depth(depth, None, None), 1.0)), dim=1)
@@ -91,7 +90,7 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
     # With depth in px, saliency is a curvature in 1 / px, to which a fixed threshold applies.
     scale = K[:, 0, 0].view(-1, 1, 1, 1) / z.amax(dim=(1, 2, 3), keepdim=True)
     field = depth_curvilinear_saliency(depth * scale.float(), depth_scale=1.0)
-    pixel = torch.arange(depth[0].numel()).view(depth.shape[-2:])
+    pixel = torch.arange(depth.shape[-2:].numel()).view(depth.shape[-2:])
     fraction = min(1.0, CREASE_FRACTION * math.prod(size) / pixel.numel())
     creases = field_points(field * ~(_dilated(beside) | ~seen), fraction=fraction, threshold=CREASE)
     neighbours = [torch.stack([x.flatten() for x in _ends(pixel, dim)]) for dim in (-1, -2)]
@@ -102,6 +101,7 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
         _sample(creases.flatten(1), pixel.view(1, -1), at_pixels[rows, columns].flatten(), z, field, CREASES),
     ]
     uv, z, n, valid, outline = (torch.cat(parts, dim=1) for parts in zip(*samples, strict=True))
+    uv += torch.tensor([columns.start, rows.start])
     rays = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1) @ torch.linalg.inv(K).mT
     model = (rays * z[..., None] - T_cam_from_model[:, None, :3, 3]) @ T_cam_from_model[:, :3, :3]
     length = torch.linalg.vector_norm(n, dim=-1)
@@ -110,15 +110,16 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
 
 
 def _window(seen: Tensor) -> tuple[slice, slice]:
-    """Rows and columns of (N, 1, H, W) masks that hold all True pixels, and the background that filters see there."""
+    """Rows and columns of (N, 1, H, W) masks with all True pixels and ``BESIDE`` px around; all if there are none."""
+    H, W = seen.shape[-2:]
     if not bool(seen.any()):
-        return slice(0, seen.shape[-2]), slice(0, seen.shape[-1])
-    ends = []
-    for dim in (-2, -1):
-        where = seen.any(dim=0)[0].any(dim=-3 - dim).nonzero()[:, 0]
-        ends.append((max(0, int(where[0]) - BESIDE), min(seen.shape[dim], int(where[-1]) + BESIDE + 1)))
-    rows, columns = (slice(*each) for each in ends)
-    return rows, columns
+        return slice(0, H), slice(0, W)
+    any_view = seen.any(dim=0)[0]
+    rows, columns = (any_view.any(dim=dim).nonzero()[:, 0] for dim in (1, 0))
+    return (
+        slice(max(0, int(rows[0]) - BESIDE), min(H, int(rows[-1]) + BESIDE + 1)),
+        slice(max(0, int(columns[0]) - BESIDE), min(W, int(columns[-1]) + BESIDE + 1)),
+    )
 
 
 def _ends(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:

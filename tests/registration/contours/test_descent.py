@@ -123,7 +123,7 @@ def test_second_fit_continues_where_it_is_another_pose(clear, expected) -> None:
 
 
 @pytest.mark.parametrize(("turned", "together"), [(True, 4), (False, 1)])
-def test_fit_starts_from_turned_poses_on_request(turned, together) -> None:
+def test_fit_starts_from_turned_poses_unless_told_otherwise(turned, together) -> None:
     """Four turned poses are rendered together; a start 4 degrees off does not need them."""
     renderer, rendered = make_renderer(cube()), []
 

@@ -84,24 +84,29 @@ def distance_to_box(points: torch.Tensor, sides: tuple[float, ...], centre: tupl
     return torch.linalg.vector_norm(beyond.clamp(min=0), dim=1) + beyond.amax(dim=1).clamp(max=0).abs()
 
 
-@pytest.mark.parametrize(("row", "column", "side"), [(40, 70, 24), (0, 0, 24), (127, 60, 1)])
+@pytest.mark.parametrize(("row", "column", "side"), [(40, 70, 24), (0, 0, 24), (127, 60, 1), (127, 127, 1), (9, 9, 0)])
 def test_contour_points_need_only_the_surroundings_of_the_object(monkeypatch, row, column, side):
-    """A roof of ``side`` px, in the middle or cut off by the border: the same points as from the whole view."""
-    depth, T, K = (
-        torch.zeros(1, 1, 128, 128),
-        torch.eye(4, dtype=torch.float64)[None],
-        camera_matrix(100.0, 100.0, 64.0, 64.0),
-    )
+    """A roof of ``side`` px, in the middle, cut off by the border, in a corner, and none: as from the whole view."""
+    depth, T = torch.zeros(2, 1, 128, 128), torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
+    K = camera_matrix(100.0, 100.0, 64.0, 64.0, dtype=torch.float64)
     roof = 5.0 + 0.05 * (torch.arange(side) - side // 2).abs()
-    depth[..., row : row + side, column : column + side] = roof
-    found = contour_points(depth, T, K.double(), radius=1.0)
+    depth[0, 0, row : row + side, column : column + side] = roof
+    alone = contour_points(depth[:1], T[:1], K, radius=1.0)
+    depth[1, 0, 100:110, 20:90] = 3.0
+    both = contour_points(depth, T, K, radius=1.0)
     monkeypatch.setattr(points_module, "_window", lambda _: (slice(0, 128), slice(0, 128)))
-    whole = contour_points(depth, T, K.double(), radius=1.0)
-    assert torch.equal(found.valid, whole.valid)
-    assert torch.equal(found.outline, whole.outline)
-    assert bool((found.valid & ~found.outline).any()) == (side > 1)  # the ridge of the roof
-    for name in ("model", "normals"):
-        torch.testing.assert_close(getattr(found, name)[found.valid], getattr(whole, name)[found.valid])
+    whole = contour_points(depth[:1], T[:1], K, radius=1.0)
+    assert bool((whole.valid & ~whole.outline).any()) == (side > 1)  # the ridge of the roof
+    for found in (alone, both):
+        assert torch.equal(found.outline[:1], whole.outline)
+        assert torch.equal(found.valid[:1], whole.valid)
+        for name in ("model", "normals"):
+            assert torch.equal(getattr(found, name)[:1][whole.valid], getattr(whole, name)[whole.valid])
+
+
+def test_contour_points_of_no_views():
+    none = contour_points(torch.zeros(0, 1, 64, 64), torch.zeros(0, 4, 4).double(), torch.eye(3).double(), radius=1.0)
+    assert none.model.shape == (0, 384, 3)
 
 
 def test_edge_strength_peaks_on_a_slanted_edge():

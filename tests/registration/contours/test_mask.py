@@ -98,5 +98,5 @@ def test_only_the_learned_field_has_a_mask():
     alone = torch.cat([learned.mask(crops[:1]), learned.mask(crops[1:])])  # batches round differently
     for field, expected in ((learned, alone), (MultiScaleFocusCurves(), None)):
         estimator.matcher = SimpleNamespace(field=field)
-        mask = estimator._object_mask(query)
+        mask = estimator.object_mask(query)
         assert mask is None if expected is None else torch.equal(mask, expected)
