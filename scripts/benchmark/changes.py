@@ -40,6 +40,8 @@ LIMITS = {
 LEAST, RATIO = 5.0, 1.5
 """Of a change: the larger error in degrees, and the ratio of both errors."""
 
+HEIGHT = 180  # of a picture in px
+
 Row = dict[str, Any]
 
 
@@ -88,18 +90,24 @@ def picture(folder: Path, item: Row, rows: Sequence[Row]) -> Image.Image:
         R, t = (torch.tensor(part, dtype=torch.float64) for part in row["pose"])
         draw_pose(drawn, renderer, (transform(R, t), torch.tensor(item["K"], dtype=torch.float64)))
         tile = Image.fromarray(drawn[window])
-        tile = tile.resize((round(tile.width * 220 / tile.height), 220), Image.Resampling.LANCZOS)
+        tile = tile.resize((round(tile.width * HEIGHT / tile.height), HEIGHT), Image.Resampling.LANCZOS)
         tiles.append(captioned(np.asarray(tile), f"{row['errors'][0]:.1f}°"))
     return side_by_side(tiles)
 
 
-def sheet(pictures: Sequence[Image.Image], columns: int = 2) -> Image.Image:
-    """Pictures in columns, on white."""
-    width, height = (max(getattr(p, side) for p in pictures) for side in ("width", "height"))
-    lines = -(-len(pictures) // columns)
-    out = Image.new("RGB", (columns * width + (columns - 1) * 24, lines * (height + 8)), "white")
-    for k, one in enumerate(pictures):
-        out.paste(one, ((k % columns) * (width + 24), (k // columns) * (height + 8)))
+def sheet(pictures: Sequence[Image.Image], width: int = 1200, gap: int = 30) -> Image.Image:
+    """Pictures in lines of at most ``width`` px, on white."""
+    lines: list[list[Image.Image]] = [[]]
+    for one in pictures:
+        if lines[-1] and sum(p.width + gap for p in lines[-1]) + one.width > width:
+            lines.append([])
+        lines[-1].append(one)
+    rows = [side_by_side(line, gap=gap) for line in lines]
+    out = Image.new("RGB", (max(row.width for row in rows), sum(row.height + 8 for row in rows)), "white")
+    top = 0
+    for row in rows:
+        out.paste(row, (0, top))
+        top += row.height + 8
     return out
 
 

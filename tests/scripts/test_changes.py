@@ -1,8 +1,9 @@
 """Two runs of the benchmark side by side."""
 
 import pytest
+from PIL import Image
 
-from scripts.benchmark.changes import errors_of, largest_changes, paired_table
+from scripts.benchmark.changes import errors_of, largest_changes, paired_table, sheet
 
 ITEM = {"pose": "upright", "t": [0.0, 3.0, 4.0]}
 
@@ -31,3 +32,11 @@ def test_largest_changes_are_ordered_and_exclude_small_ones():
     pairs = [(90.0, 45.0), (90.0, 1.0), (1.0, 60.0), (2.0, 10.0), (4.0, 0.2), (30.0, 25.0)]
     assert largest_changes(pairs) == ([1, 0], [2, 3])
     assert largest_changes(pairs, count=1) == ([1], [2])
+
+
+def test_sheet_breaks_lines_at_its_width():
+    pictures = [Image.new("RGB", (w, 50), "black") for w in (100, 80, 90, 250)]
+    out = sheet(pictures, width=220, gap=10)
+    assert out.size == (250, 3 * 58)  # 100 + 80, 90, and a picture that is wider than the sheet
+    assert out.getpixel((99, 49)) == (0, 0, 0)
+    assert out.getpixel((105, 20)) == (255, 255, 255)
