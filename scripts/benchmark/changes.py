@@ -50,7 +50,7 @@ def errors_of(row: Row, item: Row) -> tuple[float, float]:
     if "failed" in row:
         return 180.0, math.inf
     true = np.array(item["t"])
-    return row["errors"][0], float(np.linalg.norm(np.array(row["pose"][1]) - true) / np.linalg.norm(true))
+    return row["errors"][0], float(np.linalg.norm(np.array(row["answer"][1]) - true) / np.linalg.norm(true))
 
 
 def paired_table(items: Sequence[Row], before: Sequence[Row], after: Sequence[Row]) -> str:
@@ -87,7 +87,7 @@ def picture(folder: Path, item: Row, rows: Sequence[Row]) -> Image.Image:
     tiles = []
     for row in rows:
         drawn = to_uint8(image).copy()
-        R, t = (torch.tensor(part, dtype=torch.float64) for part in row["pose"])
+        R, t = (torch.tensor(part, dtype=torch.float64) for part in row["answer"])
         draw_pose(drawn, renderer, (transform(R, t), torch.tensor(item["K"], dtype=torch.float64)))
         tile = Image.fromarray(drawn[window])
         tile = tile.resize((round(tile.width * HEIGHT / tile.height), HEIGHT), Image.Resampling.LANCZOS)
@@ -126,11 +126,11 @@ def main() -> None:
     ]
     both = sorted(runs[0].keys() & runs[1].keys())
     before, after = ([run[k] for k in both] for run in runs)
-    if strange := [row["id"] for row in before + after if row.get("wrong") or not ("pose" in row or "failed" in row)]:
+    if strange := [row["id"] for row in before + after if row.get("wrong") or not ("answer" in row or "failed" in row)]:
         parser.error(f"photograph {strange[0]}: register it to its own mesh, with its camera, by run.py of today")
     print(paired_table([items[k] for k in both], before, after))
     if arguments.pictures:
-        known = [k for k in range(len(both)) if "pose" in before[k] and "pose" in after[k]]
+        known = [k for k in range(len(both)) if "answer" in before[k] and "answer" in after[k]]
         pairs = [(before[k]["errors"][0], after[k]["errors"][0]) for k in known]
         for name, chosen in zip(("gains", "losses"), largest_changes(pairs), strict=True):
             cases = [known[k] for k in chosen]

@@ -3,7 +3,7 @@
     python scripts/benchmark/run.py FOLDER --out rows.jsonl [--pose upright] [--form sibling] [--limit N] [--jobs 2]
 
 One JSON line per photograph: the errors of the hypotheses in degrees up to the object's symmetries, their features,
-the pose of the first (rotation, translation), the features of the ranking, the same of unrefined results with and
+the pose of the first (``answer``: rotation, translation), the features of the ranking, the same of unrefined results with and
 without the appearance term, the errors of the best views, and the pose error with its covariance. ``exact`` photographs
 are registered with their camera matrix, ``sibling`` ones (another object of the kind) without, as on PASCAL3D+;
 --no-camera registers all without.
@@ -110,7 +110,7 @@ def rows_of(task: dict[str, Any]) -> list[Any]:
         row["corrected_box"] = None if result.corrected_box is None else result.corrected_box.tolist()
         answer = result.hypotheses[0]
         if answer.translation is not None:
-            row["pose"] = [answer.rotation.tolist(), answer.translation.tolist()]
+            row["answer"] = [answer.rotation.tolist(), answer.translation.tolist()]
         if answer.covariance is not None and task["wrong"] is None:
             nearest = truth @ symmetries[symmetric_errors(found[:1], truth, symmetries)[0].argmin()]
             rotation_error = axis_angle_from_rotation(nearest @ answer.rotation.T)

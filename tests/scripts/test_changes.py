@@ -9,7 +9,7 @@ ITEM = {"pose": "upright", "t": [0.0, 3.0, 4.0]}
 
 
 def row(error: float, shift: float = 0.0) -> dict:
-    return {"errors": [error, 0.0], "pose": [None, [shift, 3.0, 4.0]]}
+    return {"errors": [error, 0.0], "answer": [None, [shift, 3.0, 4.0]]}
 
 
 def test_errors_are_those_of_the_first_pose_and_a_failure_is_the_worst():
