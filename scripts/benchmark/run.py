@@ -3,7 +3,7 @@
     python scripts/benchmark/run.py FOLDER --out rows.jsonl [--pose upright] [--form sibling] [--limit N] [--jobs 2]
 
 One JSON line per photograph: the errors of the hypotheses in degrees up to the object's symmetries, their features,
-the pose of the first (``answer``: rotation, translation), the features of the ranking, the same of unrefined results with and
+rotation and translation of the first (``answer``), the features of the ranking, the same of unrefined results with and
 without the appearance term, the errors of the best views, and the pose error with its covariance. ``exact`` photographs
 are registered with their camera matrix, ``sibling`` ones (another object of the kind) without, as on PASCAL3D+;
 --no-camera registers all without.

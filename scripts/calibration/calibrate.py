@@ -1,10 +1,11 @@
 """Fit the constants of confidence and covariance on registered photographs, and measure their quality.
 
-    python scripts/calibration/calibrate.py BENCHMARK --rows ROWS [--jobs 2] [--real DATA RUNS]
+    python scripts/calibration/calibrate.py BENCHMARK --rows ROWS [--jobs 2 | --registered] [--real DATA RUNS]
 
 BENCHMARK is the folder of scripts/benchmark/make.py --count 2000. Photographs that are not in ROWS yet are registered
 first, as by scripts/benchmark/run.py (an interrupted run can be resumed): each to its object's mesh or, for siblings,
-to that of another object of the kind, and some to wrong meshes. Then the script writes
+to that of another object of the kind, and some to wrong meshes; --registered does with the rows that there are. Then the
+script writes
 
 - curvireg_torch/registration/calibration.json, the constants,
 - scripts/results/calibration.json, the constants with their quality on held-out objects,
@@ -222,11 +223,15 @@ def main() -> None:
     parser.add_argument("benchmark", type=Path)
     parser.add_argument("--rows", type=Path, required=True, metavar="FOLDER")
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--registered", action="store_true", help="register no further photographs")
     parser.add_argument("--real", type=Path, nargs=2, metavar=("DATA", "RUNS"))
     arguments = parser.parse_args()
     rows: list[Row] = []
     for part, (wrong, limit) in PARTS.items():
         path = arguments.rows / f"{part}.jsonl"
+        if arguments.registered:
+            rows += map(json.loads, path.read_text(encoding="utf-8").splitlines())
+            continue
         rows += register_benchmark(arguments.benchmark, path, wrong=wrong, limit=limit, jobs=arguments.jobs)
     rows = [row for row in rows if "errors" in row]
     constants, held_out = calibrate(rows)
