@@ -4,8 +4,8 @@
 
 BENCHMARK is the folder of scripts/benchmark/make.py --count 2000. Photographs that are not in ROWS yet are registered
 first, as by scripts/benchmark/run.py (an interrupted run can be resumed): each to its object's mesh or, for siblings,
-to that of another object of the kind, and some to wrong meshes; --registered does with the rows that there are. Then the
-script writes
+to that of another object of the kind, and some to wrong meshes; --registered does with the rows that there are. Then
+the script writes
 
 - curvireg_torch/registration/calibration.json, the constants,
 - scripts/results/calibration.json, the constants with their quality on held-out objects,
@@ -235,8 +235,8 @@ def main() -> None:
         rows += register_benchmark(arguments.benchmark, path, wrong=wrong, limit=limit, jobs=arguments.jobs)
     rows = [row for row in rows if "errors" in row]
     constants, held_out = calibrate(rows)
-    write_json(CONSTANTS, constants)
     record = {"date": today(), "commit": commit(), "n": len(rows), **constants, **held_out}
+    write_json(CONSTANTS, constants)
     record |= {"shares": success_rates(rows), "verdict": {"used": list(WEIGHTS), "fitted": fit_rescoring(rows)}}
     if arguments.real:
         record["real"] = {name: real_set(*arguments.real, name, constants["covariance"]) for name in REAL_SETS}
