@@ -12,15 +12,15 @@ from ..utils.checks import as_numbers, check_pose, check_tensor
 from ..utils.threads import map_on_threads
 from .answer_set import AnswerSet
 from .inputs import ImageItem, image_items
-from .refinement import LOST, nearest_view, refine
+from .refinement import nearest_view, refine
 from .registrar import Registrar
 from .results import FailedRegistration, Hypothesis, Registration
 from .tracking import TrackedPose, Tracker
 
 __all__ = ["Follower"]
 
-TRUSTED = 0.5
-"""Confidence from which a tracked pose stands without a search."""
+TRUSTED, KEPT = 0.5, 0.2
+"""Confidence from which a tracked pose stands without a search, and after a search that found no better one."""
 
 
 class Follower:
@@ -133,7 +133,7 @@ class Follower:
         if isinstance(result, Registration) and (found is None or result.confidence > found.confidence):
             self._continue(item, result)
             return result
-        if tracked and found and found.confidence >= LOST:
+        if tracked and found and found.confidence >= KEPT:
             self._tracker.accept(tracked)
             return found
         registered = self.registrar([item.image], boxes, K)[0]

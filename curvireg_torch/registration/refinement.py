@@ -23,7 +23,7 @@ from .tracking.window import boxes_at
 
 __all__ = ["LOST", "refine"]
 
-LOST = 0.2
+LOST = 0.35
 """Confidence below which the object counts as lost, see docs/guides/known-pose.md."""
 
 

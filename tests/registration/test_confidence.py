@@ -27,6 +27,7 @@ from curvireg_torch.registration.confidence import (
     model_name,
 )
 from curvireg_torch.registration.contours import contour_support
+from curvireg_torch.registration.rescoring import WEIGHTS
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, SIZE, scene, truck_bank, truck_registrar, unrefined
 
@@ -88,6 +89,10 @@ def test_confidence_grows_with_the_evidence():
     low = float(confidence(ranking(torch.ones(1, 30), 0.5), R30))
     high = float(confidence(ranking(scores_of({3: 1.0}, 0.01)), R30))
     assert 0 < low < 0.5 < high < 1
+
+
+def test_confidence_was_calibrated_with_the_weights_in_use():
+    assert json.loads(RECORD.read_text(encoding="utf-8"))["verdict"]["used"] == list(WEIGHTS)
 
 
 def test_confidence_constants_are_the_recorded_ones():
