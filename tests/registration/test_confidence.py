@@ -133,7 +133,7 @@ def test_confidence_features():
 
 def test_rescore_uses_pose_features_only_for_the_exact_mesh():
     evidence = torch.tensor([[0.0, 0.5, 0.3, 0.0], [-0.5, 0.6, 0.6, 0.1]], dtype=torch.float64)
-    assert rescore(evidence, exact=True).tolist() == pytest.approx([2.5 + 3.0, -0.5 + 3.0 + 6.0 + 0.1])
+    assert rescore(evidence, exact=True).tolist() == pytest.approx([5.0 + 3.0, -0.5 + 6.0 + 6.0 + 0.25])
     assert rescore(evidence, exact=False).tolist() == [0.0, -0.5]
 
 

@@ -113,8 +113,8 @@ def test_refine_checks_its_arguments(registrar, poses, camera, message):
         registrar.refine([scene(0)[0]], camera, poses)
 
 
-@pytest.mark.parametrize(("confidence", "ok"), [(0.19, False), (0.21, True)])
-def test_refine_calls_the_object_lost_below_a_fifth(registrar, monkeypatch, confidence, ok):
+@pytest.mark.parametrize(("confidence", "ok"), [(0.34, False), (0.36, True)])
+def test_refine_calls_the_object_lost_below_its_limit(registrar, monkeypatch, confidence, ok):
     monkeypatch.setattr(refinement, "refinement_confidence", lambda _: confidence)
     image, _, T = scene(0)
     assert registrar.refine([image], CAMERA, [T])[0].ok is ok
