@@ -170,8 +170,7 @@ class PoseEstimator:
         poses = self._lift(batch, hypotheses)
         if self.pipeline.contours:
             self.report_progress("contours")
-            mask, searched = self.object_mask(query), self.pipeline.search
-            poses = fit_poses(self.describers, batch.images, poses, batch.boxes, turned=not searched, object_mask=mask)
+            poses = fit_poses(self.describers, batch.images, poses, batch.boxes, self.object_mask(query))
         evidence = self._evidence(batch, starts, poses)
         distinct = distinct_mask(poses.hypotheses, batch.scores(evidence), symmetries=batch.symmetries)
         poses, evidence = self._restore(batch, starts, poses, evidence, distinct)

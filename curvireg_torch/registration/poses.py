@@ -80,15 +80,13 @@ def fit_poses(
     images: Sequence[Tensor],
     poses: Poses,
     boxes: Tensor,
-    *,
-    turned: bool = True,
     object_mask: Tensor | None = None,
 ) -> Poses:
     """Fit the contours of poses of all models, see :func:`fit_contours`."""
     parts, index = [], []
     for model, mine in poses.hypotheses.by_model():
         args, options = _contour_arguments(describers[model], images, poses, boxes, mine)
-        parts.append(fit_contours(*args, **options, finish=FINALISTS, turned=turned, object_mask=object_mask))
+        parts.append(fit_contours(*args, **options, finish=FINALISTS, object_mask=object_mask))
         index.append(mine)
     back = torch.cat(index).argsort()
     fit = ContourFit(*(torch.cat([getattr(part, f.name) for part in parts])[back] for f in fields(ContourFit)))

@@ -99,7 +99,7 @@ def _refined(estimator: PoseEstimator, item: ImageItem, T: Tensor) -> Registrati
     if estimator.pipeline.search:
         found = search(describers, descriptors, at_start, boxes=boxes, camera_matrices=K, brief=True)
         poses = _side_by_side(poses, lift_to_poses(describers, found, boxes, K))
-    poses = fit_poses(describers, images, poses, boxes, object_mask=estimator.object_mask(query))
+    poses = fit_poses(describers, images, poses, boxes, estimator.object_mask(query))
     assert poses.fit is not None
     similarity, support = similarities(describers, descriptors, poses.hypotheses), poses.fit.edge_support
     evidence = torch.stack([torch.zeros_like(support), similarity, support, torch.zeros_like(support)], dim=1)

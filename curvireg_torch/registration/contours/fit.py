@@ -85,7 +85,6 @@ def fit_contours(
     radius: float,
     margin: float = 0.1,
     finish: int | None = None,
-    turned: bool = True,
     object_mask: Tensor | None = None,
 ) -> ContourFit:
     """Poses whose contours lie on a photograph's edges, by robust least squares over SE(3).
@@ -98,9 +97,9 @@ def fit_contours(
 
     where W is the strength of the edge times Tukey's weight of the residual. Within a step, edges are selected again
     near the predicted position; the search distance shrinks from round to round, and the mesh is rendered again where
-    contours have moved. The fit begins at half size and ends at full size. If ``turned``, it begins from four poses
-    rotated away from each start, too; then the best (by edge support) and the next best that differs from it continue.
-    The start is returned where no fit has more support. All starts of all photographs are rendered together.
+    contours have moved. The fit begins at half size from each start and from four poses rotated away from it; the best
+    (by edge support) and the next best that differs from it continue, and end at full size. The start is returned where
+    no fit has more support. All starts of all photographs are rendered together.
 
     Prints, shadows and clutter have edges too. With an ``object_mask``, an edge counts for the outline as far as the
     object lies on its inner side alone, and for creases and inner contours as far as the object lies on both sides
@@ -119,13 +118,12 @@ def fit_contours(
             Missing pixels (NaN or infinite) are filled from their neighbours.
         boxes: (B, 4) x0, y0, x1, y1 in px, which need not be exact; (4,) for one photograph.
         camera_matrices: (B, 3, 3) or (3, 3) in px; or (N, 3, 3), one for each start.
-        starts: (N, 4, 4) rigid poses, within about 15 degrees; closer if not ``turned``.
+        starts: (N, 4, 4) rigid poses, within about 15 degrees.
         image_index: (N,) the photograph of each start; optional for one photograph.
         centre, radius: of the object, (3,) and model units.
         margin: added around the box, as a fraction of its longer side.
         finish: number of starts of each photograph that are fitted to the end, those with the most support after the
             first rounds; None: all, each as if alone.
-        turned: whether poses 8 degrees away are further starts. A registration does without where a search precedes.
         object_mask: (B, 1, s, s) probability that pixels of the square crops, the boxes with their margin, belong to
             the object, for instance of :meth:`LearnedCurvilinearSaliency.mask`.
 
@@ -166,10 +164,7 @@ def fit_contours(
     _, support = half.supports(first)
     chosen = torch.ones(N, dtype=torch.bool) if finish is None else _among_best(support, image_index, finish)
     index, others = chosen.nonzero()[:, 0], (~chosen).nonzero()[:, 0]
-    if turned:
-        source, T = _fit_around(half[index], T0[index], first[index], support[index])
-    else:
-        source, T = torch.arange(len(index)), half[index].descend(first[index], SECOND).T
+    source, T = _fit_around(half[index], T0[index], first[index], support[index])
     # Candidates: the starts, the half-size fits of unfinished starts, and the full-size fits. Ties go to the first.
     owner = torch.cat([index, others, index[source]])
     unfinished = torch.where((support > weighted_before)[others, None, None], first.T[others], T0[others])

@@ -9,7 +9,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from curvireg_torch import rotation_error
 from curvireg_torch.io.meshes import mesh_centre
 from curvireg_torch.registration.contours.descent import ContourProblem, ContourState, apply_twist, project
 from curvireg_torch.registration.contours.points import ContourPoints
@@ -120,20 +119,3 @@ def test_second_fit_continues_where_it_is_another_pose(clear, expected) -> None:
     counting = SimpleNamespace(name="counting", render=render)
     fitted(silhouette(cube(), CUBE_POSE) if clear else noise(), CUBE_POSE[None], renderer=counting)
     assert max(at_full_size) == expected
-
-
-@pytest.mark.parametrize(("turned", "together"), [(True, 4), (False, 1)])
-def test_fit_starts_from_turned_poses_unless_told_otherwise(turned, together) -> None:
-    """Four turned poses are rendered together; a start 4 degrees off does not need them."""
-    renderer, rendered = make_renderer(cube()), []
-
-    def render(T: Tensor, K: Tensor, size: tuple[int, int]) -> Tensor:
-        rendered.append(len(T))
-        return renderer.render(T, K, size)
-
-    twist = torch.tensor([[0.0, math.radians(4.0), 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
-    start = apply_twist(CUBE_POSE[None], twist, mesh_centre(cube()))
-    options = {"renderer": SimpleNamespace(name="counting", render=render), "turned": turned}
-    found = fitted(silhouette(cube(), CUBE_POSE), start, **options).transform
-    assert float(rotation_error(found[0, :3, :3], CUBE_POSE[:3, :3])) < 2.0
-    assert max(rendered) == together
