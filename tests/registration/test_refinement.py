@@ -9,10 +9,10 @@ import torch
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
-from curvireg_torch.registration import poses, refinement
+from curvireg_torch.registration import refinement
 from curvireg_torch.registration.calibration import REFINEMENT
 from curvireg_torch.synthetic import procedural_background
-from tests._support.scenes import CAMERA, scene, truck_bank, truck_registrar
+from tests._support.scenes import CAMERA, scene, truck_bank
 
 
 @pytest.fixture(scope="module")
@@ -55,18 +55,6 @@ def test_refine_reports_the_best_of_several_starts(registrar):
     assert errors(result, T)[0] < 2.0
     assert result.edge_support == max(h.edge_support for h in result.hypotheses)
     assert float(rotation_error(result.hypotheses[-1].rotation, T[:3, :3])) > 90.0
-
-
-@pytest.mark.parametrize(
-    ("search", "refined", "turned"), [(True, False, False), (False, False, True), (True, True, True)]
-)
-def test_registrations_without_a_search_and_refinements_fit_turned_poses(monkeypatch, search, refined, turned):
-    seen, fit = [], poses.fit_contours
-    monkeypatch.setattr(poses, "fit_contours", lambda *args, **o: seen.append(o["turned"]) or fit(*args, **o))
-    image, box, T = scene(0)
-    registrar = truck_registrar(search=search)
-    _ = registrar.refine([image], CAMERA, [T]) if refined else registrar([image], box[None], CAMERA)
-    assert set(seen) == {turned}
 
 
 def test_refine_is_the_same_in_a_batch(registrar):
