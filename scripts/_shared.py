@@ -98,6 +98,6 @@ def timed(call: Callable[[], object], repeats: int) -> list[float]:
 
 
 def right_share(summary: dict[str, Any]) -> float:
-    """Share of answers within 30 degrees, up to symmetries, of a summary of ``curvireg evaluate``."""
+    """Fraction of answers within 30 degrees, up to symmetries, of a summary of ``curvireg evaluate``."""
     scores = summary.get("symmetry_aware", summary)
     return float(scores["acc_pi_6"] if "acc_pi_6" in scores else scores["acc_30_deg"])

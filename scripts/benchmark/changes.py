@@ -2,7 +2,7 @@
 
     python scripts/benchmark/changes.py FOLDER BEFORE.jsonl AFTER.jsonl [--pictures PATTERN]
 
-Prints the shares of poses within some limits before and after, of photographs with their exact mesh, how many were won
+Prints the fractions of poses within some limits before and after, of photographs with their exact mesh, how many were won
 and lost, and the two-sided sign test. PATTERN, such as ``docs/images/changes-{}.webp``, gets "gains" and "losses": the
 pose before on the left, after on the right, ordered by the ratio of the errors.
 """
@@ -54,7 +54,7 @@ def errors_of(row: Row, item: Row) -> tuple[float, float]:
 
 
 def paired_table(items: Sequence[Row], before: Sequence[Row], after: Sequence[Row]) -> str:
-    """Shares within each limit before and after, won and lost, and the p value, in Markdown."""
+    """Fractions within each limit before and after, won and lost, and the p value, in Markdown."""
     lines = [["photographs", "N", "within", "before", "after", "won, lost", "p"]]
     for pose in sorted({item["pose"] for item in items}, reverse=True):
         mine = [k for k, item in enumerate(items) if item["pose"] == pose]
