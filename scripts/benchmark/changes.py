@@ -3,8 +3,8 @@
     python scripts/benchmark/changes.py FOLDER BEFORE.jsonl AFTER.jsonl [--pictures PATTERN]
 
 Prints the fractions of poses within some limits before and after, of photographs with their exact mesh, how many were
-won and lost, and the two-sided sign test. PATTERN, such as ``docs/images/changes-{}.webp``, gets "gains" and "losses": the
-pose before on the left, after on the right, ordered by the ratio of the errors.
+won and lost, and the two-sided sign test. PATTERN, such as ``docs/images/changes-{}.webp``, gets "gains" and "losses":
+the pose before on the left, after on the right, ordered by the ratio of the errors.
 """
 
 import argparse
