@@ -202,13 +202,14 @@ def write_tables(record: dict, page: Path = PAGE) -> None:
     ]
     note = (
         f"{' x '.join(map(str, record['input']))} float32, {record['threads']} thread(s), {record['clock']} time, "
-        f"torch {record['torch']}, kornia {record['kornia']}, {record['processor']}, {record['date']}, "
-        f"commit {record['commit']}."
+        f"torch {record['torch']}, kornia {record['kornia']}, "
+        f"{record.get('processor', 'processor not recorded')}, {record['date']}, commit {record['commit']}."
     )
-    sizes = [["pixels at a time", *record["block_sizes"]]]
-    sizes += [["depth CS of 64 images, ms", *(f"{ms:.0f}" for ms in record["block_sizes"].values())]]
     tables = [*lines, "", *table_lines([["layer", "eager, ms", "compiled, ms"], *layers]), ""]
-    tables += [*table_lines(sizes), "", note, ""]
+    if sizes := record.get("block_sizes"):  # not in older records
+        times = ["depth CS of 64 images, ms", *(f"{ms:.0f}" for ms in sizes.values())]
+        tables += [*table_lines([["pixels at a time", *sizes], times]), ""]
+    tables += [note, ""]
     update_page(page, "layers", "\n".join(tables))
 
 
