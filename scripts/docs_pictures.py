@@ -22,6 +22,7 @@ from curvireg_torch.cli import main as curvireg
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.matching import cached_bank
+from curvireg_torch.rendering import DepthRenderer
 from curvireg_torch.visualization.contours import draw_pose
 from curvireg_torch.visualization.encoding import shrink
 from curvireg_torch.visualization.overlay import to_uint8
@@ -51,7 +52,7 @@ PAPER, INK = (255, 255, 255), (30, 30, 30)
 
 
 def drawn(
-    registrar: cr.Registrar,
+    renderer: DepthRenderer,
     pose: tuple[Tensor, Tensor],
     image: Tensor,
     window: tuple[int, int, int, int],
@@ -63,7 +64,7 @@ def drawn(
     shift = torch.tensor([[0.0, 0.0, x0], [0.0, 0.0, y0], [0.0, 0.0, 0.0]], dtype=torch.float64)
     picture = to_uint8(image[:, y0:y1, x0:x1])
     inside = None if box is None else (box[0] - x0, box[1] - y0, box[2] - x0, box[3] - y0)
-    draw_pose(picture, registrar.describers[0].renderer, (T, K.double() - shift), inside)
+    draw_pose(picture, renderer, (T, K.double() - shift), inside)
     return picture
 
 
@@ -84,6 +85,15 @@ def side_by_side(pictures: Sequence[Image.Image], gap: int = 8) -> Image.Image:
     for picture in pictures:
         sheet.paste(picture, (x, 0))
         x += picture.width + gap
+    return sheet
+
+
+def stacked(rows: Sequence[Image.Image], gap: int = 0) -> Image.Image:
+    sheet = Image.new("RGB", (max(row.width for row in rows), sum(row.height + gap for row in rows) - gap), PAPER)
+    y = 0
+    for row in rows:
+        sheet.paste(row, (0, y))
+        y += row.height + gap
     return sheet
 
 
@@ -123,7 +133,7 @@ def draw_cup() -> None:
         ("with --azimuth 0 90", hinted, 0),
     ):
         hypothesis, probability = result.hypotheses[index], result.answer_set.probabilities[index]
-        picture = drawn(registrar, hypothesis.projection, photograph, CUP_WINDOW)
+        picture = drawn(registrar.describers[0].renderer, hypothesis.projection, photograph, CUP_WINDOW)
         panels.append(captioned(picture, f"{words}: {math.floor(100 * probability) / 100:.2f}"))
     save(side_by_side(panels), "cup.webp")
 
@@ -156,14 +166,14 @@ def draw_buddha(root: Path) -> None:
     with recorded() as record:
         result = registrar([image], box[None], K)[0]
     print(f"confidence {result.confidence:.2f}, {rotation_off(result.projection[0], truth):.2f} degrees off")
-    overlay = drawn(registrar, result.projection, image, WINDOW, box.tolist())
+    overlay = drawn(registrar.describers[0].renderer, result.projection, image, WINDOW, box.tolist())
     save(Image.fromarray(overlay), "buddha.webp")
     steps = record.path(registrar, result, box)
     chosen = np.unique(np.linspace(0, len(steps) - 1, FRAMES).round().astype(int))
     frames = []
     for k in chosen:
         stage, T = steps[k]
-        picture = drawn(registrar, (T, K), image, WINDOW)
+        picture = drawn(registrar.describers[0].renderer, (T, K), image, WINDOW)
         print(f"{k:2d} {stage}: {rotation_off(T, truth):.1f} degrees off")
         frames.append(captioned(shrink(picture, 640), f"{STAGES[stage]}: {rotation_off(T, truth):.1f}° off"))
     durations = [HOLD, *[STEP] * (len(frames) - 2), 2 * HOLD]
@@ -184,13 +194,12 @@ def draw_all(root: Path) -> None:
         H, W = image.shape[-2:]
         (x, y), half = ((box[:2] + box[2:]) / 2).round().int().tolist(), min(H, W) // 2
         x, y = min(max(x, half), W - half), min(max(y, half), H - half)
-        picture = shrink(drawn(registrar, (T, K), image, (x - half, y - half, x + half, y + half)), TILE)
+        picture = shrink(
+            drawn(registrar.describers[0].renderer, (T, K), image, (x - half, y - half, x + half, y + half)), TILE
+        )
         tiles.append(captioned(picture, f"{error:.1f}° ({math.floor(100 * result.confidence) / 100:.2f})"))
     rows = [side_by_side(tiles[k : k + COLUMNS], gap=4) for k in range(0, len(tiles), COLUMNS)]
-    sheet = Image.new("RGB", (rows[0].width, sum(row.height for row in rows)), PAPER)
-    for k, row in enumerate(rows):
-        sheet.paste(row, (0, k * row.height))
-    save(sheet, "buddha-all.webp")
+    save(stacked(rows), "buddha-all.webp")
 
 
 def draw_known_pose(root: Path) -> None:
@@ -206,7 +215,7 @@ def draw_known_pose(root: Path) -> None:
     result = registrar.refine([image], K, [start])[0]
     panels = []
     for words, T in (("start", start), ("refined", result.projection[0])):
-        picture = drawn(registrar, (T, K), image, WINDOW)
+        picture = drawn(registrar.describers[0].renderer, (T, K), image, WINDOW)
         panels.append(captioned(shrink(picture, 476), f"{words}: {rotation_off(T, truth):.1f}° off"))
     save(side_by_side(panels), "known-pose.webp")
 

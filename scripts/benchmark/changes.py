@@ -23,10 +23,8 @@ import curvireg_torch as cr
 from curvireg_torch.geometry import transform
 from curvireg_torch.io import read_image
 from curvireg_torch.rendering import make_renderer
-from curvireg_torch.visualization.contours import draw_pose
-from curvireg_torch.visualization.overlay import to_uint8
 from scripts._shared import table_lines
-from scripts.docs_pictures import captioned, side_by_side
+from scripts.docs_pictures import captioned, drawn, side_by_side, stacked
 
 LIMITS = {
     "2°": (2.0, math.inf),
@@ -81,15 +79,13 @@ def picture(folder: Path, item: Row, rows: Sequence[Row]) -> Image.Image:
     image = read_image(folder / "held-out" / item["image"])
     renderer = make_renderer(cr.load_mesh(folder / item["mesh"]))
     x0, y0, x1, y1 = item["box"]
-    margin = 0.15 * max(x1 - x0, y1 - y0)
-    left, top = max(0, int(x0 - margin)), max(0, int(y0 - margin))
-    window = (slice(top, int(y1 + margin)), slice(left, int(x1 + margin)))
+    margin, (H, W) = 0.15 * max(x1 - x0, y1 - y0), image.shape[-2:]
+    window = (max(0, int(x0 - margin)), max(0, int(y0 - margin)), min(W, int(x1 + margin)), min(H, int(y1 + margin)))
     tiles = []
     for row in rows:
-        drawn = to_uint8(image).copy()
         R, t = (torch.tensor(part, dtype=torch.float64) for part in row["answer"])
-        draw_pose(drawn, renderer, (transform(R, t), torch.tensor(item["K"], dtype=torch.float64)))
-        tile = Image.fromarray(drawn[window])
+        pose = transform(R, t), torch.tensor(item["K"], dtype=torch.float64)
+        tile = Image.fromarray(drawn(renderer, pose, image, window))
         tile = tile.resize((round(tile.width * HEIGHT / tile.height), HEIGHT), Image.Resampling.LANCZOS)
         tiles.append(captioned(np.asarray(tile), f"{row['errors'][0]:.1f}°"))
     return side_by_side(tiles)
@@ -102,13 +98,7 @@ def sheet(pictures: Sequence[Image.Image], width: int = 1200, gap: int = 30) -> 
         if lines[-1] and sum(p.width + gap for p in lines[-1]) + one.width > width:
             lines.append([])
         lines[-1].append(one)
-    rows = [side_by_side(line, gap=gap) for line in lines]
-    out = Image.new("RGB", (max(row.width for row in rows), sum(row.height + 8 for row in rows)), "white")
-    top = 0
-    for row in rows:
-        out.paste(row, (0, top))
-        top += row.height + 8
-    return out
+    return stacked([side_by_side(line, gap=gap) for line in lines], gap=8)
 
 
 def main() -> None:

@@ -6,7 +6,7 @@ ROWS holds the rows of scripts/benchmark/run.py: right.jsonl without a hint, and
 hint_30.jsonl with ``--hint azimuth:90`` and so on. RUNS holds folders none, azimuth:90, azimuth:45 and azimuth:30, each
 with what ``curvireg evaluate --out RUNS/HINT/SET`` wrote. Photographs that are missing in one of the files are left
 out; a hint that was not measured has "-". A set that is measured again gets a new line; the others keep theirs, with
-their commits. Without hint_*.jsonl, ROWS is not looked at.
+their commits. Without right.jsonl or hint_*.jsonl, ROWS is not looked at.
 """
 
 import argparse
@@ -68,7 +68,7 @@ def main() -> None:
             continue
         found = [json.loads(line) for line in (arguments.rows / f"{name}.jsonl").read_text().splitlines()]
         rows[hint] = {row["id"]: row for row in found if "errors" in row}
-    sets = {**(benchmark_rates(rows) if len(rows) > 1 else {}), **real_rates(arguments.runs)}
+    sets = {**(benchmark_rates(rows) if "none" in rows and len(rows) > 1 else {}), **real_rates(arguments.runs)}
     sets = {name: {**found, "commit": commit()} for name, found in sets.items()}
     earlier = json.loads(RECORD.read_text(encoding="utf-8"))["sets"] if RECORD.is_file() else {}
     record = {"date": today(), "commit": commit(), "sets": {**earlier, **sets}}
