@@ -141,6 +141,7 @@ class LearnedCurvilinearSaliency(nn.Module):
         self.network = _network_on_meta()
         # Not by to_empty, which imports sympy: that takes a second.
         self.network.load_state_dict({name: x.to(device) for name, x in state.items()}, assign=True)
+        self.network.to(memory_format=torch.channels_last)  # a quarter less time on a CPU
         self.eval()
 
     def forward(self, image: Tensor) -> Tensor:
@@ -161,7 +162,8 @@ class LearnedCurvilinearSaliency(nn.Module):
         x = fill_missing(image.to(self.network.head.weight.dtype)).expand(-1, 3, -1, -1)
         if size != [H, W]:
             x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=True)
-        return F.interpolate(self.network(x), (H, W), mode="bilinear", align_corners=False)
+        x = self.network(x.contiguous(memory_format=torch.channels_last))
+        return F.interpolate(x.contiguous(), (H, W), mode="bilinear", align_corners=False)
 
     def save(self, path: Path | str) -> None:
         """Write the weights in half precision as a file for ``weights``."""
