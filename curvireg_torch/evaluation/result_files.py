@@ -6,6 +6,7 @@ from typing import Any
 from ..registration import Registrar, Registration
 from ..registration.document import SCHEMA
 from ..utils.files import write_file
+from ..utils.threads import map_on_threads
 from ..visualization import pose_glb, registration_sheet
 from ..visualization.encoding import png
 from .store import to_json
@@ -28,9 +29,15 @@ def write_result(
     mesh = registrar.bank.meshes[result.model]
     _remove(out)
     write_file(out / "result.json", to_json(document).encode())  # first: no failure to draw it loses the result
-    write_file(out / "overlay.png", png(registration_sheet(registrar, result, image, box)))
-    if len(mesh.faces) <= MAX_GLB_FACES:
-        write_file(out / "pose.glb", pose_glb(mesh, *result.projection, image))
+
+    def write_sheet() -> None:
+        write_file(out / "overlay.png", png(registration_sheet(registrar, result, image, box)))
+
+    def write_scene() -> None:
+        if len(mesh.faces) <= MAX_GLB_FACES:
+            write_file(out / "pose.glb", pose_glb(mesh, *result.projection, image))
+
+    map_on_threads(lambda write: write(), [write_sheet, write_scene])
 
 
 def write_lost(out: Path, message: str) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_masks, check_option, check_positive
+from ..utils.threads import map_on_threads
 from .base import Term, Views
 from .query import QueryFeatures
 
@@ -135,10 +136,11 @@ class _RepeatabilityModule(nn.Module):
         S = views.settings.image_size
         # Cells of at most eps px keep the matrix product small.
         self.cell = max(1, min(int(eps * S), S // 64))
-        near = [
-            cell_counts(dilate_points(views.points_at(slice(i, i + CHUNK)), eps * S), self.cell).flatten(1)
-            for i in range(0, len(views), CHUNK)
-        ]
+
+        def count(i: int) -> Tensor:
+            return cell_counts(dilate_points(views.points_at(slice(i, i + CHUNK)), eps * S), self.cell).flatten(1)
+
+        near = map_on_threads(count, range(0, len(views), CHUNK))
         whole = torch.ones(1, S, S, dtype=torch.bool, device=near[0].device)
         self.register_buffer("near", torch.cat(near), persistent=False)
         self.register_buffer("area", cell_counts(whole, self.cell).flatten(1), persistent=False)
