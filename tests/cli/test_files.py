@@ -18,6 +18,7 @@ import trimesh
 
 from curvireg_torch import camera_matrix
 from curvireg_torch.data import read_bop_csv
+from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.io.meshes import load_mesh
 from curvireg_torch.visualization import sheet
 from tests._support.lists import CAMERA, box_of, lines, table, written
@@ -68,6 +69,16 @@ def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkey
     monkeypatch.setattr("curvireg_torch.evaluation.result_files.MAX_GLB_FACES", 10)
     assert register(*words) == 0
     assert not (tmp_path / "out" / "pose.glb").exists()
+
+
+def test_a_scene_that_cannot_be_written_loses_no_other_file(folder, register, tmp_path, monkeypatch):
+    def fail(*_):
+        raise InvalidInputError("the object is behind the camera")
+
+    monkeypatch.setattr("curvireg_torch.evaluation.result_files.pose_glb", fail)
+    words = [folder / "photos" / "0.png", folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA]
+    assert register(*words) == 2
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "overlay.png"}
 
 
 def test_list_writes_bop_csv(folder, register, tmp_path):
