@@ -36,8 +36,6 @@ UPRIGHT = {
 }
 """For each generated set of hints.json: its name on the page, and its shares in calibration.json."""
 
-STAGES = {"view": "best view of the bank", "search": "after the search", "contours": "after the contours"}
-
 
 def record(name: str) -> Record:
     found: Record = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
@@ -49,7 +47,7 @@ def share(value: float | None) -> str:
 
 
 def measured(found: Record) -> str:
-    return f"Measured on {found['date']}, commit {found['commit']}."
+    return f"Measured on {found['date']}, commit {found['registered']}."
 
 
 def right_answers(hints: Record, calibration: Record, evaluations: dict[str, Record]) -> list[list[str]]:
@@ -80,34 +78,32 @@ def trust(calibration: Record) -> list[list[str]]:
     return rows
 
 
-def precision(refinement: Record) -> list[list[str]]:
-    """How exact poses are after each stage."""
-    found = refinement["boxes"]["0.05"]["all"]
-    rows = [["stage", "rotation, median", "90 %", "translation, of the distance", "seconds of one core"]]
-    for key, name in STAGES.items():
-        median, most, shift, seconds = (
-            found[f"{key}: {what}"] for what in ("rotation median", "rotation 90 %", "translation median %", "seconds")
-        )
-        rows.append([name, f"{median:.2g}°", f"{most:.2g}°", f"{shift:.2g} %", f"{seconds:.1f}"])
+def precision(calibration: Record) -> list[list[str]]:
+    """How exact right answers are."""
+    head = ["photographs", "right", "best view, median", "rotation, median", "90 %", "translation, median", "90 %"]
+    rows = [head]
+    for pose, found in calibration["exactness"].items():
+        degrees = [f"{found[key]:.2g}°" for key in ("best view", "rotation median", "rotation 90 %")]
+        shifts = [f"{100 * found[key]:.2g} %" for key in ("translation median", "translation 90 %")]
+        rows.append([f"generated, {pose}, exact mesh", str(found["n"]), *degrees, *shifts])
     return rows
 
 
 def tables() -> str:
     """The three tables, each with its question and its records."""
-    hints, calibration, refinement = record("hints"), record("calibration"), record("refinement")
+    hints, calibration = record("hints"), record("calibration")
     evaluations = {
         path.stem.removeprefix("evaluation_"): json.loads(path.read_text(encoding="utf-8"))
         for path in sorted(RESULTS.glob("evaluation_*.json"))
     }
     commits = ", ".join(sorted({found["commit"] for key, found in evaluations.items() if key in SETS}))
-    n, right = (refinement["boxes"]["0.05"]["all"][key] for key in ("n", "right"))
     parts = [
         (
             "How often is the first answer right?",
             right_answers(hints, calibration, evaluations),
             "Right: within 30°, up to symmetries. The hint is the true azimuth, moved at random by up to 45° "
-            "([all hints](guides/pose-prior.md), with N and commits). The median error of PASCAL3D+ counts symmetries "
-            f"as errors. Measured on {calibration['date']}, commits {calibration['commit']} (generated photographs), "
+            "([all hints](guides/pose-prior.md), with their own N and commits, some of them older). The median error of PASCAL3D+ counts symmetries "
+            f"as errors. Measured on {calibration['date']}, commits {calibration['registered']} (generated photographs), "
             f"{commits} (the others).",
         ),
         (
@@ -118,8 +114,8 @@ def tables() -> str:
         ),
         (
             "How exact is it?",
-            precision(refinement),
-            f"Of {n} generated photographs (exact mesh, known camera), the {right} whose best view is within 30°.",
+            precision(calibration),
+            "With a camera. Translation as a fraction of the distance. " + measured(calibration),
         ),
     ]
     return "\n".join("\n".join([f"## {title}", "", *table_lines(rows), "", note, ""]) for title, rows, note in parts)

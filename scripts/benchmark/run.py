@@ -4,7 +4,7 @@
 
 One JSON line per photograph: the errors of the hypotheses in degrees up to the object's symmetries, their features,
 rotation and translation of the first (``answer``), the features of the ranking, the same of unrefined results with and
-without the appearance term, the errors of the best views, and the pose error with its covariance. ``exact`` photographs
+without the appearance term, the errors of the best views, the pose error with its covariance, and the commit. ``exact`` photographs
 are registered with their camera matrix, ``sibling`` ones (another object of the kind) without, as on PASCAL3D+;
 --no-camera registers all without.
 An interrupted run can be resumed. --limit takes the first photographs of the list.
@@ -34,6 +34,7 @@ from curvireg_torch.io import read_image
 from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
 from curvireg_torch.registration.calibration import COVARIANCE_SCALE
 from curvireg_torch.registration.confidence import ranking_evidence
+from scripts._shared import commit
 
 COPIED = ("id", "form", "pose", "kind", "mesh", "visible", "clutter", "bare")
 
@@ -57,7 +58,7 @@ def allocentric(item: dict[str, Any]) -> Tensor:
 
 
 def rows_of(task: dict[str, Any]) -> list[Any]:
-    """Rows of the photographs of one mesh; ``task["wrong"]`` names a mesh to register to instead."""
+    """Rows of the photographs of one mesh; ``task["other_mesh"]`` is one to register to instead."""
     torch.set_num_threads(1)
     folder, half, pipeline, protocol = (
         task["folder"],
@@ -65,7 +66,7 @@ def rows_of(task: dict[str, Any]) -> list[Any]:
         task["pipeline"],
         Protocol(box=task["box"], hint=task["hint"]),
     )
-    mesh = cr.load_mesh(folder / (task["wrong"] or task["items"][0]["mesh"]))
+    mesh = cr.load_mesh(folder / (task["other_mesh"] or task["items"][0]["mesh"]))
     bank = cr.ViewBank.build(mesh, pipeline=pipeline, progress=False)
     registrar = cr.Registrar(bank, pipeline=pipeline)
     unrefined = {
@@ -84,7 +85,8 @@ def rows_of(task: dict[str, Any]) -> list[Any]:
         truth = torch.tensor(item["R"], dtype=torch.float64) if exact else straight
         hint = hint_of_truth(truth, torch.eye(3, dtype=torch.float64), protocol, str(item["id"]))
         result = registrar([image], box, K, prior=hint)[0]
-        row = {name: item[name] for name in COPIED} | {"wrong": task["which"], "like": task["like"][item["shown"]]}
+        row = {name: item[name] for name in COPIED} | {name: task[name] for name in ("commit", "wrong")}
+        row["like"] = task["like"][item["shown"]]
         if not result.ok:
             rows.append({**row, "failed": str(result.error)})
             continue
@@ -158,8 +160,9 @@ def register_benchmark(
             "folder": folder,
             "half": half,
             "items": list(group),
-            "wrong": meshes[mesh],
-            "which": wrong,
+            "other_mesh": meshes[mesh],
+            "wrong": wrong,
+            "commit": commit(),
             "like": like,
             "box": box,
             "hint": hint,

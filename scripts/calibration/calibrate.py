@@ -44,6 +44,7 @@ from scripts.calibration.quality import (
     RIGHT,
     Row,
     count_inside,
+    exactness,
     group_of,
     page,
     quality_by_subset,
@@ -235,9 +236,11 @@ def main() -> None:
         rows += register_benchmark(arguments.benchmark, path, wrong=wrong, limit=limit, jobs=arguments.jobs)
     rows = [row for row in rows if "errors" in row]
     constants, held_out = calibrate(rows)
-    record = {"date": today(), "commit": commit(), "n": len(rows), **constants, **held_out}
+    registered = ", ".join(sorted({row["commit"] for row in rows}))
+    record = {"date": today(), "commit": commit(), "registered": registered, "n": len(rows), **constants, **held_out}
     write_json(CONSTANTS, constants)
-    record |= {"shares": success_rates(rows), "verdict": {"used": list(WEIGHTS), "fitted": fit_rescoring(rows)}}
+    record |= {"shares": success_rates(rows), "exactness": exactness(rows)}
+    record |= {"verdict": {"used": list(WEIGHTS), "fitted": fit_rescoring(rows)}}
     if arguments.real:
         record["real"] = {name: real_set(*arguments.real, name, constants["covariance"]) for name in REAL_SETS}
         summaries = {name: (arguments.real[1] / name / "summary.json").read_text() for name in REAL_SETS}

@@ -185,6 +185,25 @@ def success_rates(rows: Sequence[Row]) -> dict[str, Row]:
     return out
 
 
+def exactness(rows: Sequence[Row]) -> dict[str, Row]:
+    """Errors of right answers with the exact mesh, by pose: degrees, and fractions of the distance."""
+    out = {}
+    for pose in ("upright", "free"):
+        some = [r for r in rows if (r["form"], r["pose"], r["wrong"]) == ("exact", pose, None) and "pose_error" in r]
+        if some := [r for r in some if r["errors"][0] < RIGHT]:
+            errors = [r["errors"][0] for r in some]
+            shifts = [float(np.linalg.norm(r["pose_error"][3:])) / r["distance"] for r in some]
+            out[pose] = {
+                "n": len(some),
+                "best view": float(np.median([r["view_errors"][0] for r in some])),
+                "rotation median": float(np.median(errors)),
+                "rotation 90 %": float(np.quantile(errors, 0.9)),
+                "translation median": float(np.median(shifts)),
+                "translation 90 %": float(np.quantile(shifts, 0.9)),
+            }
+    return out
+
+
 def real_set(data: Path, runs: Path, name: str, covariance: Row) -> Row:
     """Quality of the stored predictions for a real set."""
     objects, store = open_real_set(data, name), ResultStore(runs / name)
@@ -257,7 +276,7 @@ def page(record: Row) -> str:
         [name, str(found["n"]), *(format_interval(found[m][0], found[m][1:]) for m in measures)]
         for name, found in record["shares"].items()
     ]
-    where = f"`python scripts/calibration/calibrate.py`, {record['date']}, commit {record['commit']}."
+    where = f"`python scripts/calibration/calibrate.py`, {record['date']}; registered by {record['registered']}, fitted by {record['commit']}."
     answers = [["answer sets", "N", "hold the truth", "mean number of answers", 'hold "none of them"']]
     answers += [
         [name, str(found["n"]), *(f"{found[m]:.2f}" for m in ("coverage", "mean_size", "none"))]

@@ -50,11 +50,11 @@ def test_tables_take_each_number_from_its_record():
     split = [{name: part[name] for name in some} for part in (confidence, sets) for some in (names[:2], names[2:])]
     keys = ("held_out", "real", "answer_sets", "real_answer_sets")
     assert trust(dict(zip(keys, split, strict=True)))[7] == ["buddha, exact mesh", "9", "6", "0", "0.90", "2.0"]
-    numbers = {"rotation median": 6.09, "rotation 90 %": 10.94, "translation median %": 0.155, "seconds": 1.26}
-    found = {f"{stage}: {name}": value for stage in ("view", "search", "contours") for name, value in numbers.items()}
-    table = precision({"boxes": {"0.05": {"all": found | {"search: seconds": 3.0}}}})
-    assert table[1] == ["best view of the bank", "6.1°", "11°", "0.15 %", "1.3"]
-    assert table[2][4] == "3.0"
+    degrees = {"n": 5, "best view": 6.09, "rotation median": 0.324, "rotation 90 %": 10.94}
+    found = degrees | {"translation median": 0.00155, "translation 90 %": 0.026}
+    table = precision({"exactness": {"upright": found, "free": found | {"n": 4}}})
+    assert table[1] == ["generated, upright, exact mesh", "5", "6.1°", "0.32°", "11°", "0.15 %", "2.6 %"]
+    assert table[2][:2] == ["generated, free, exact mesh", "4"]
 
 
 @pytest.mark.parametrize("value", [None, 0.0, 0.995])

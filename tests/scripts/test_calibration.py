@@ -176,7 +176,14 @@ def test_page_has_a_line_for_each_model_and_set():
     for r in rows[:300]:
         r |= {"pose_error": [0.01] * 6, "covariance": np.diag([1e-4] * 6).tolist(), "scale": 1.0, "distance": 2.0}
     constants, found = calibrate.calibrate(rows)
-    record = {"date": "today", "commit": "abc", **constants, **found, "shares": quality.success_rates(rows)}
+    record = {
+        "date": "today",
+        "commit": "abc",
+        "registered": "def",
+        **constants,
+        **found,
+        "shares": quality.success_rates(rows),
+    }
     covariance = {"n": 2, "inside": {"0.5": 1, "0.9": 1, "0.95": 2}}
     record["real"] = {"lm": {**found["held_out"]["ranking, exact, appearance"], "covariance": covariance}}
     text = quality.page(record)

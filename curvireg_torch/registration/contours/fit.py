@@ -98,8 +98,8 @@ def fit_contours(
     where W is the strength of the edge times Tukey's weight of the residual. Within a step, edges are selected again
     near the predicted position; the search distance shrinks from round to round, and the mesh is rendered again where
     contours have moved. The fit begins at half size from each start and from four poses rotated away from it; the best
-    (by edge support) and the next best that differs from it continue, and end at full size. The start is returned where
-    no fit has more support. All starts of all photographs are rendered together.
+    (by edge support, with a mask weighted as below) and the next best that differs from it continue, and end at full
+    size. The start is returned where no fit has more of it. All starts of all photographs are rendered together.
 
     Prints, shadows and clutter have edges too. With an ``object_mask``, an edge counts for the outline as far as the
     object lies on its inner side alone, and for creases and inner contours as far as the object lies on both sides
