@@ -102,9 +102,9 @@ def tables() -> str:
             "How often is the first answer right?",
             right_answers(hints, calibration, evaluations),
             "Right: within 30°, up to symmetries. The hint is the true azimuth, moved at random by up to 45° "
-            "([all hints](guides/pose-prior.md), with their own N and commits, some of them older). The median error of PASCAL3D+ counts symmetries "
-            f"as errors. Measured on {calibration['date']}, commits {calibration['registered']} (generated photographs), "
-            f"{commits} (the others).",
+            "([all hints](guides/pose-prior.md), with their own N and commits, some of them older). The median error of"
+            f" PASCAL3D+ counts symmetries as errors. Measured on {calibration['date']}, commits "
+            f"{calibration['registered']} (generated photographs), {commits} (the others).",
         ),
         (
             "How far can it be trusted?",

@@ -1,5 +1,6 @@
 """The files of one result: ``result.json``, ``overlay.png`` and ``pose.glb``."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ def write_result(
 ) -> None:
     """Write the files of a result into the folder ``out``; ``document`` is the content of ``result.json``.
 
+    The picture and the scene are drawn beside each other, on threads.
+
     The other arguments are those of :func:`curvireg_torch.visualization.registration_sheet`.
 
     Raises:
@@ -30,6 +33,13 @@ def write_result(
     _remove(out)
     write_file(out / "result.json", to_json(document).encode())  # first: no failure to draw it loses the result
 
+    def attempt(write: Callable[[], None]) -> Exception | None:
+        try:
+            write()
+        except Exception as error:  # it must not cost the other file
+            return error
+        return None
+
     def write_sheet() -> None:
         write_file(out / "overlay.png", png(registration_sheet(registrar, result, image, box)))
 
@@ -37,7 +47,9 @@ def write_result(
         if len(mesh.faces) <= MAX_GLB_FACES:
             write_file(out / "pose.glb", pose_glb(mesh, *result.projection, image))
 
-    map_on_threads(lambda write: write(), [write_sheet, write_scene])
+    for error in map_on_threads(attempt, [write_sheet, write_scene]):
+        if error is not None:
+            raise error
 
 
 def write_lost(out: Path, message: str) -> None:

@@ -31,6 +31,11 @@ class Ranking:
     allowed: Tensor | None = None
     prior_ratio: Tensor | None = None
 
+    @staticmethod
+    def none() -> "Ranking":
+        """That of a photograph which was compared with no view."""
+        return Ranking(torch.zeros(1, 0), torch.zeros(1, 0, dtype=torch.long), {})
+
     def __len__(self) -> int:
         return self.scores.shape[0]
 

@@ -18,6 +18,7 @@ CHUNK = 16
 batches are no faster and the rounding of convolutions depends on the batch size."""
 
 
+@torch.no_grad()
 def describe(images: Tensor, backbone: Backbone) -> Tensor:
     """Appearance descriptors of photograph crops and of shaded views; their inner product is the appearance score.
 
@@ -37,12 +38,11 @@ def describe(images: Tensor, backbone: Backbone) -> Tensor:
         >>> describe(torch.rand(2, 3, 64, 64), Backbone()).shape
         torch.Size([2, 4352])
     """
-    chunks = images.split(1 if images.device.type == "cpu" else CHUNK) or [images]
+    chunks = images.split(1 if images.device.type == "cpu" else CHUNK)
     parts = map_on_threads(lambda chunk: _describe_chunk(chunk, backbone), chunks, device=images.device)
     return torch.cat(parts)
 
 
-@torch.no_grad()  # threads do not inherit it
 def _describe_chunk(images: Tensor, backbone: Backbone) -> Tensor:
     levels = []
     for features, spread in zip(backbone(images), backbone.spreads, strict=True):

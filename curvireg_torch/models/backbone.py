@@ -107,8 +107,7 @@ class Backbone(nn.Module):
             self.register_buffer(f"_spread{i}", torch.linalg.vector_norm(scales, dim=0), persistent=False)
         self.requires_grad_(False)
         self.eval()
-        for weight in (p for p in self.parameters() if p.ndim == 4):
-            weight.data = weight.data.to(memory_format=torch.channels_last)
+        filters_channels_last(self)
 
     @property
     def spreads(self) -> tuple[Tensor, Tensor]:
@@ -125,6 +124,12 @@ class Backbone(nn.Module):
             if i in (_OUTPUT_BLOCKS[0][-1], _OUTPUT_BLOCKS[1][-1]):
                 outputs.append(x)
         return outputs[0], outputs[1]
+
+
+def filters_channels_last(module: nn.Module) -> None:
+    """Store the filters of convolutions in the order of memory in which a CPU computes them a quarter faster."""
+    for weight in (p for p in module.parameters() if p.ndim == 4):
+        weight.data = weight.data.to(memory_format=torch.channels_last)
 
 
 def _fold_batch_norm(weights: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -120,8 +120,10 @@ class PoseEstimator:
         """
         size = 1 if self.bank.device.type == "cpu" else self.matcher.chunk_size
         _ = self.describers, self.matcher.describers  # create them once, before threads use them
+        given = [item for item in items if isinstance(item, ImageItem)]
+        if any(self.is_exact(with_camera=item.camera_matrix is not None) for item in given):
+            self.symmetries_of(exact=True)  # the same
 
-        @torch.no_grad()  # threads do not inherit it
         def run(first: int) -> list[Any]:
             return function(items[first : first + size], first)
 

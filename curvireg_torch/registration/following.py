@@ -1,5 +1,6 @@
 """Following an object through the frames of a video."""
 
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -79,8 +80,7 @@ class Follower:
         item = image_items([image], None, self.camera_matrix)[0]
         if not isinstance(item, ImageItem):
             raise item
-        map_on_threads(lambda T: self._tracker.start(item.image, _camera(item), T), [T])
-        self._known = 1.0
+        self._start(item, T, 1.0)
 
     @torch.no_grad()
     def __call__(self, image: Any, box: Any = None) -> Registration | FailedRegistration:
@@ -107,15 +107,21 @@ class Follower:
         return self._search(item, boxes, tracked, found)
 
     def _begin(self, item: ImageItem, result: Registration) -> None:
-        """Track from a registered pose."""
-        map_on_threads(lambda T: self._tracker.start(item.image, _camera(item), T), [_pose(result)])
-        self._known = result.confidence
+        """Track from a registered pose, if it lies within the frame."""
+        with suppress(LostObjectError):
+            self._start(item, _pose(result), result.confidence)
+
+    @torch.no_grad()
+    def _start(self, item: ImageItem, T: Tensor, confidence: float) -> None:
+        map_on_threads(lambda T: self._tracker.start(item.image, _camera(item), T), [T])
+        self._known = confidence
 
     def _continue(self, item: ImageItem, result: Registration) -> None:
-        """Track on from a pose that the search found."""
-        pose = map_on_threads(lambda T: self._tracker.measure(item.image, _camera(item), T), [_pose(result)])[0]
-        self._tracker.accept(pose)
-        self._known = result.confidence
+        """Track on from a pose that the search found, if it lies within the frame."""
+        with suppress(LostObjectError):
+            pose = map_on_threads(lambda T: self._tracker.measure(item.image, _camera(item), T), [_pose(result)])[0]
+            self._tracker.accept(pose)
+            self._known = result.confidence
 
     def _track(self, item: ImageItem) -> TrackedPose | None:
         try:
@@ -161,8 +167,7 @@ class Follower:
             covariance=covariance if bool(covariance.isfinite().all()) else None,
         )
         answers = AnswerSet((self._known * tracked.confidence,))
-        unranked = Ranking(torch.zeros(1, 0), torch.zeros(1, 0, dtype=torch.long), {})
-        return Registration((hypothesis,), answers, unranked, dict(tracked.features), warnings=item.warnings)
+        return Registration((hypothesis,), answers, Ranking.none(), dict(tracked.features), warnings=item.warnings)
 
 
 def _camera(item: ImageItem) -> Tensor:

@@ -19,7 +19,7 @@ from .poses import Poses, fit_poses, hypothesis_of, lift_to_poses, to_allocentri
 from .rescoring import rescore, similarities
 from .results import FailedRegistration, Registration
 from .search import search
-from .tracking.window import boxes_at
+from .tracking.window import OUTSIDE, boxes_at
 
 __all__ = ["LOST", "refine"]
 
@@ -33,8 +33,9 @@ def refine(
 ) -> list[Registration | FailedRegistration]:
     """Refine poses of the first mesh of a bank in photographs, without ranking and without boxes.
 
-    Around each start runs a short search; contours are fitted from its result and from the start itself, and the better
-    pose wins. A start should lie within about 15 degrees and 15 % of the distance of the truth.
+    Around each start that shows the mesh in the photograph runs a short search; contours are fitted from its result and
+    from the start itself, and the better pose wins. A start should lie within about 15 degrees and 15 % of the distance
+    of the truth.
 
     Args:
         registrar: :class:`Registrar` of the mesh.
@@ -88,9 +89,12 @@ def _refine_one(
 
 def _refined(estimator: PoseEstimator, item: ImageItem, T: Tensor) -> Registration:
     assert item.camera_matrix is not None
-    describers, images = estimator.describers, [item.image] * len(T)
-    K = item.camera_matrix.double().expand(len(T), 3, 3)
-    boxes = boxes_at(describers[0].hull, T, K, item.size)
+    describers, K = estimator.describers, item.camera_matrix.double()
+    boxes, visible = boxes_at(describers[0].hull, T, K, item.size)
+    if not bool(visible.any()):
+        raise LostObjectError(OUTSIDE)
+    T, boxes = T[visible], boxes[visible]
+    images, K = [item.image] * len(T), K.expand(len(T), 3, 3)
     query = estimator.matcher.query(images, boxes.float())
     check_crop(query.crops[0])
     descriptors = describers[0].descriptor(query.field)
@@ -115,9 +119,8 @@ def _refined(estimator: PoseEstimator, item: ImageItem, T: Tensor) -> Registrati
         for h in order
     )
     features = {"similarity": float(similarity[order[0]]), "edge_support": float(support[order[0]])}
-    unranked = Ranking(torch.zeros(1, 0), torch.zeros(1, 0, dtype=torch.long), {})
     answers = AnswerSet((refinement_confidence(features), *[0.0] * (len(hypotheses) - 1)))
-    return Registration(hypotheses, answers, unranked, features, warnings=item.warnings)
+    return Registration(hypotheses, answers, Ranking.none(), features, warnings=item.warnings)
 
 
 def _hypotheses(count: int) -> Hypotheses:

@@ -6,7 +6,7 @@ import trimesh
 from torch import Tensor
 
 from ..io.meshes.mesh import mesh_centre, mesh_radius
-from ..utils.threads import available_threads, single_threaded_pool
+from ..utils.threads import map_on_threads
 from .protocol import NEAREST, check_render_arguments
 
 __all__ = ["TorchRenderer"]
@@ -54,19 +54,13 @@ class TorchRenderer:
         H, W = size
         depth = torch.full((len(T), H * W), torch.inf, device=self.device)
 
-        @torch.no_grad()  # threads do not inherit it
+        @torch.no_grad()
         def draw(i: int) -> None:
             part = slice(i, i + self._views)
             for faces in self._faces.split(self._triangles):
                 self._draw(depth[part].view(-1), faces, R[part], t[part], K[part], size, orthographic)
 
-        starts = range(0, len(T), self._views)
-        if self.device.type == "cpu" and available_threads() > 1:
-            with single_threaded_pool() as pool:
-                list(pool.map(draw, starts))
-        else:
-            for i in starts:
-                draw(i)
+        map_on_threads(draw, range(0, len(T), self._views), device=self.device)
         depth = torch.where(depth.isfinite(), (depth + t[:, 2:].float()) * self._radius, 0.0)
         return depth.view(-1, 1, H, W)
 

@@ -140,7 +140,7 @@ class _RepeatabilityModule(nn.Module):
         def count(i: int) -> Tensor:
             return cell_counts(dilate_points(views.points_at(slice(i, i + CHUNK)), eps * S), self.cell).flatten(1)
 
-        near = map_on_threads(count, range(0, len(views), CHUNK))
+        near = map_on_threads(count, range(0, len(views), CHUNK), device=views.descriptors.device)
         whole = torch.ones(1, S, S, dtype=torch.bool, device=near[0].device)
         self.register_buffer("near", torch.cat(near), persistent=False)
         self.register_buffer("area", cell_counts(whole, self.cell).flatten(1), persistent=False)

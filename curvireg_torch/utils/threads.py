@@ -98,11 +98,12 @@ def map_on_threads(
     threads = available_threads()
     if threads == 1 or torch.device(device).type != "cpu":
         return [job(item) for item in items]
-    threads_each = max(1, threads // max(1, len(items)))
+    threads_each, with_gradients = max(1, threads // max(1, len(items))), torch.is_grad_enabled()
 
     def run(item: Item) -> Result:
         _this_thread.threads = threads_each
-        return job(item)
+        with torch.set_grad_enabled(with_gradients):  # threads do not inherit it
+            return job(item)
 
     with single_threaded_pool() as pool:
         return list(pool.map(run, items))

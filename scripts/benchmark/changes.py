@@ -74,9 +74,9 @@ def largest_changes(pairs: Sequence[tuple[float, float]], count: int = 10) -> tu
     return gains[:count], losses[:count]
 
 
-def picture(folder: Path, item: Row, rows: Sequence[Row]) -> Image.Image:
+def picture(folder: Path, half: Path, item: Row, rows: Sequence[Row]) -> Image.Image:
     """The object with its contours in the pose of each row, side by side."""
-    image = read_image(folder / "held-out" / item["image"])
+    image = read_image(half / item["image"])
     renderer = make_renderer(cr.load_mesh(folder / item["mesh"]))
     x0, y0, x1, y1 = item["box"]
     margin, (H, W) = 0.15 * max(x1 - x0, y1 - y0), image.shape[-2:]
@@ -106,15 +106,23 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("before", type=Path)
     parser.add_argument("after", type=Path)
+    parser.add_argument("--half", default="held-out", help="of run.py")
     parser.add_argument("--pictures", metavar="PATTERN")
     arguments = parser.parse_args()
-    lines = (arguments.folder / "held-out" / "items.jsonl").read_text().splitlines()
+    if arguments.pictures and "{}" not in arguments.pictures:
+        parser.error("--pictures: the pattern needs {}, which becomes gains or losses")
+    half = arguments.folder / arguments.half
+    lines = (half / "items.jsonl").read_text().splitlines()
     items = {item["id"]: item for item in map(json.loads, lines) if item["form"] == "exact"}
     runs = [
         {row["id"]: row for row in map(json.loads, path.read_text().splitlines()) if row["id"] in items}
         for path in (arguments.before, arguments.after)
     ]
     both = sorted(runs[0].keys() & runs[1].keys())
+    if not both:
+        parser.error("no photograph is in both runs")
+    if alone := len(runs[0].keys() ^ runs[1].keys()):
+        print(f"{alone} photographs are in one of the runs only and left out")
     before, after = ([run[k] for k in both] for run in runs)
     if strange := [row["id"] for row in before + after if row.get("wrong") or not ("answer" in row or "failed" in row)]:
         parser.error(f"photograph {strange[0]}: register it to its own mesh, with its camera, by run.py of today")
@@ -124,10 +132,10 @@ def main() -> None:
         pairs = [(before[k]["errors"][0], after[k]["errors"][0]) for k in known]
         for name, chosen in zip(("gains", "losses"), largest_changes(pairs), strict=True):
             cases = [known[k] for k in chosen]
-            drawn = [picture(arguments.folder, items[both[k]], (before[k], after[k])) for k in cases]
-            print(f"{len(drawn)} {name}")
-            if drawn:
-                sheet(drawn).save(arguments.pictures.format(name), quality=80)
+            pictures = [picture(arguments.folder, half, items[both[k]], (before[k], after[k])) for k in cases]
+            print(f"{len(pictures)} {name}")
+            if pictures:
+                sheet(pictures).save(arguments.pictures.format(name), quality=80)
 
 
 if __name__ == "__main__":

@@ -4,9 +4,9 @@
 
 One JSON line per photograph: the errors of the hypotheses in degrees up to the object's symmetries, their features,
 rotation and translation of the first (``answer``), the features of the ranking, the same of unrefined results with and
-without the appearance term, the errors of the best views, the pose error with its covariance, and the commit. ``exact`` photographs
-are registered with their camera matrix, ``sibling`` ones (another object of the kind) without, as on PASCAL3D+;
---no-camera registers all without.
+without the appearance term, the errors of the best views, the pose error with its covariance, the options and the
+commit. ``exact`` photographs are registered with their camera matrix, ``sibling`` ones (another object of the kind)
+without, as on PASCAL3D+; --no-camera registers all without.
 An interrupted run can be resumed. --limit takes the first photographs of the list.
 --box moves each edge of the boxes by up to that fraction of the side, as `curvireg evaluate --protocol box=FRACTION`.
 --hint gives a range around the true pose, as `curvireg evaluate --protocol hint=azimuth:45`.
@@ -85,7 +85,7 @@ def rows_of(task: dict[str, Any]) -> list[Any]:
         truth = torch.tensor(item["R"], dtype=torch.float64) if exact else straight
         hint = hint_of_truth(truth, torch.eye(3, dtype=torch.float64), protocol, str(item["id"]))
         result = registrar([image], box, K, prior=hint)[0]
-        row = {name: item[name] for name in COPIED} | {name: task[name] for name in ("commit", "wrong")}
+        row = {name: item[name] for name in COPIED} | {name: task[name] for name in ("commit", "options", "wrong")}
         row["like"] = task["like"][item["shown"]]
         if not result.ok:
             rows.append({**row, "failed": str(result.error)})
@@ -149,6 +149,9 @@ def register_benchmark(
     wanted = {i["id"] for i in items}
     out.parent.mkdir(parents=True, exist_ok=True)
     done = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+    options = {"box": box, "hint": hint, "camera": camera}
+    if any(row.get("options", options) != options for row in done):
+        raise SystemExit(f"{out} holds registrations with other options than {options}; give another file")
     rows = [row for row in done if row["id"] in wanted]
     known = {row["id"] for row in rows}
     # The order is independent of the names, so that an interrupted run is a fair sample.
@@ -163,6 +166,7 @@ def register_benchmark(
             "other_mesh": meshes[mesh],
             "wrong": wrong,
             "commit": commit(),
+            "options": options,
             "like": like,
             "box": box,
             "hint": hint,

@@ -29,6 +29,8 @@ def benchmark_rates(rows: dict[str, dict[int, Row]]) -> dict[str, Row]:
     for form in ("exact", "sibling"):
         ids = [i for i in common if rows["none"][i]["form"] == form]
         units = [group_of(rows["none"][i]) for i in ids]
+        if not ids:
+            continue
         rates = {hint: interval([found[i]["errors"][0] < RIGHT for i in ids], units) for hint, found in rows.items()}
         out[f"benchmark, {form}, upright"] = {"n": len(ids), **rates}
     return out
@@ -44,6 +46,14 @@ def real_rates(runs: Path) -> dict[str, Row]:
         if "none" in summaries:
             out[name] = {"n": summaries["none"]["n"], **rates}
     return out
+
+
+def with_commit(found: Row, recorded: Row | None) -> Row:
+    """The numbers with the commit of today; digit for digit the recorded ones, they were not measured again."""
+    found = json.loads(json.dumps(found))
+    return (
+        recorded if recorded == {**found, "commit": (recorded or {}).get("commit")} else {**found, "commit": commit()}
+    )
 
 
 def page(record: Row) -> str:
@@ -69,8 +79,8 @@ def main() -> None:
         found = [json.loads(line) for line in (arguments.rows / f"{name}.jsonl").read_text().splitlines()]
         rows[hint] = {row["id"]: row for row in found if "errors" in row}
     sets = {**(benchmark_rates(rows) if "none" in rows and len(rows) > 1 else {}), **real_rates(arguments.runs)}
-    sets = {name: {**found, "commit": commit()} for name, found in sets.items()}
     earlier = json.loads(RECORD.read_text(encoding="utf-8"))["sets"] if RECORD.is_file() else {}
+    sets = {name: with_commit(found, earlier.get(name)) for name, found in sets.items()}
     record = {"date": today(), "commit": commit(), "sets": {**earlier, **sets}}
     write_json(RECORD, record)
     update_page(REPOSITORY / "docs" / "guides" / "pose-prior.md", "hints", page(record))

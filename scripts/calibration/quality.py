@@ -276,7 +276,10 @@ def page(record: Row) -> str:
         [name, str(found["n"]), *(format_interval(found[m][0], found[m][1:]) for m in measures)]
         for name, found in record["shares"].items()
     ]
-    where = f"`python scripts/calibration/calibrate.py`, {record['date']}; registered by {record['registered']}, fitted by {record['commit']}."
+    where = (
+        f"`python scripts/calibration/calibrate.py`, {record['date']}; registered by commit {record['registered']}, "
+    )
+    where += f"fitted by {record['commit']}."
     answers = [["answer sets", "N", "hold the truth", "mean number of answers", 'hold "none of them"']]
     answers += [
         [name, str(found["n"]), *(f"{found[m]:.2f}" for m in ("coverage", "mean_size", "none"))]

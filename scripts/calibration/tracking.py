@@ -11,6 +11,7 @@ and the errors. The rows of the half "train" fit the confidence (within 10 degre
 import argparse
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -47,10 +48,11 @@ def rows_of(
         tracker = Tracker(make_renderer(mesh), extreme_points(mesh), centre=centre, radius=mesh_radius(mesh))
         tracker.start(frames[0], K, poses[0])
         for number in range(stride, len(frames), stride):
-            try:
-                if stride == 1 and number % ABSENT_EVERY == 0:
+            if stride == 1 and number % ABSENT_EVERY == 0:
+                with suppress(LostObjectError):
                     absent = tracker.track(others[number], K)
                     rows.append({"kind": "absent", "frame": number, "right": False, **absent.features})
+            try:
                 found = tracker.track(frames[number], K)
             except LostObjectError:
                 break

@@ -196,15 +196,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     from scripts._shared import REPOSITORY, RESULTS, commit, processor, today, update_page, write_json
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout of this repository")
+    help_ = "another checkout of this repository"
+    parser.add_argument("--against", type=Path, required=True, metavar="CHECKOUT", help=help_)
     parser.add_argument("--faces", type=int, nargs="+", default=[1_000, 40_000, 1_000_000], help="at the least size")
     parser.add_argument("--megapixels", type=float, nargs="+", default=[0.3, 2.0, 12.0], help="at the middle mesh")
     parser.add_argument("--photographs", type=int, default=32)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--out", type=Path, default=RESULTS / "paired.json")
     options = parser.parse_args(arguments)
-    roots = {"before": options.against.resolve()} if options.against else {}
-    checkouts = {**roots, "now": ROOT}
+    checkouts = {"before": options.against.resolve(), "now": ROOT}
     middle, least = options.faces[len(options.faces) // 2], options.megapixels[0]
     cases = [(faces, least) for faces in options.faces] + [(middle, size) for size in options.megapixels[1:]]
     record = {

@@ -71,14 +71,20 @@ def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkey
     assert not (tmp_path / "out" / "pose.glb").exists()
 
 
-def test_a_scene_that_cannot_be_written_loses_no_other_file(folder, register, tmp_path, monkeypatch):
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize(("draws", "file"), [("pose_glb", "pose.glb"), ("registration_sheet", "overlay.png")])
+def test_a_file_that_cannot_be_drawn_costs_no_other(folder, register, tmp_path, monkeypatch, draws, file, threads):
     def fail(*_):
-        raise InvalidInputError("the object is behind the camera")
+        raise InvalidInputError("it cannot be drawn")
 
-    monkeypatch.setattr("curvireg_torch.evaluation.result_files.pose_glb", fail)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    monkeypatch.setattr(f"curvireg_torch.evaluation.result_files.{draws}", fail)
     words = [folder / "photos" / "0.png", folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA]
-    assert register(*words) == 2
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "overlay.png"}
+    status = register(*words)
+    torch.set_num_threads(before)
+    assert status == 2
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "overlay.png", "pose.glb"} - {file}
 
 
 def test_list_writes_bop_csv(folder, register, tmp_path):

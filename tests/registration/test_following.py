@@ -54,6 +54,32 @@ def test_follower_starts_from_a_known_pose_without_registering(monkeypatch):
         json.dumps(result.to_dict(), allow_nan=False)
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+def test_follower_takes_frames_with_gradients_on_any_threads(threads):
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    frames = sequence(3)
+    follow = Follower(truck_registrar(), CAMERA)
+    follow.start(frames[0][0].requires_grad_(), frames[0][2])
+    results = [follow(image.requires_grad_()) for image, _, _ in frames[1:]]
+    torch.set_num_threads(before)
+    assert all(result.ok and not result.rotation.requires_grad for result in results)
+
+
+def test_a_registered_pose_outside_the_frame_is_returned_and_not_followed(monkeypatch):
+    image, box, T = sequence(1)[0]
+    registrar = truck_registrar()
+    result = registrar([image], box[None], CAMERA)[0]
+    follow = Follower(registrar, CAMERA)
+    behind = torch.eye(4, dtype=torch.float64)
+    behind[2, 3] = -9.0
+    monkeypatch.setattr(following, "_pose", lambda _: behind)
+    found = follow(image, box)
+    assert torch.equal(found.rotation, result.rotation)
+    monkeypatch.undo()
+    assert float(rotation_error(follow(image, box).rotation, T[:3, :3])) < 4.0  # registered again
+
+
 def test_confidence_is_at_most_that_of_the_first_pose():
     frames = sequence(2)
     results = []

@@ -86,6 +86,14 @@ def test_refine_refuses_a_start_outside_the_photograph(registrar, move):
     assert "outside the photograph" in str(result.error)
 
 
+def test_refine_leaves_out_a_start_outside_the_photograph(registrar):
+    image, _, T = scene(0)
+    start, behind = moved(T, degrees=8.0), T.clone()
+    behind[2, 3] -= 100.0
+    found = registrar.refine([image], CAMERA, [torch.stack([behind, start])])[0]
+    assert torch.equal(found.rotation, registrar.refine([image], CAMERA, [start])[0].rotation)
+
+
 @pytest.mark.parametrize(
     ("poses", "camera", "message"),
     [

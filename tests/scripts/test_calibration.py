@@ -170,6 +170,26 @@ def test_independent_units_of_hope_are_views_in_five_lightings():
     assert (len(counts), set(counts.values())) == (16, {5})
 
 
+def test_exactness_is_that_of_right_answers_with_the_exact_mesh():
+    rows = [
+        row(k, right=k < 3)
+        | {"errors": [e], "view_errors": [6.0 * e], "pose_error": [9, 9, 9, 0, 3 * e, 4 * e], "distance": 100.0}
+        for k, e in enumerate((1.0, 2.0, 3.0, 40.0))
+    ]
+    rows += [{**rows[0], "errors": [29.0], "form": "sibling"}, {**rows[0], "errors": [29.0], "wrong": "any"}]
+    (found,) = quality.exactness(rows).values()
+    assert found == pytest.approx(
+        {
+            "n": 3,
+            "best view": 12.0,
+            "rotation median": 2.0,
+            "rotation 90 %": 2.8,
+            "translation median": 0.1,
+            "translation 90 %": 0.14,
+        }
+    )
+
+
 def test_page_has_a_line_for_each_model_and_set():
     rows = logistic_rows(300) + [row(400 + k, form="sibling", kind="chair", right=k % 2 == 0) for k in range(40)]
     rows += [row(500 + k, form="sibling", kind="car", right=k % 3 == 0) for k in range(40)]

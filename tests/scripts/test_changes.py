@@ -37,6 +37,6 @@ def test_largest_changes_are_ordered_and_exclude_small_ones():
 def test_sheet_breaks_lines_at_its_width():
     pictures = [Image.new("RGB", (w, 50), "black") for w in (100, 80, 90, 250)]
     out = sheet(pictures, width=220, gap=10)
-    assert out.size == (250, 3 * 58)  # 100 + 80, 90, and a picture that is wider than the sheet
+    assert out.size == (250, 3 * 50 + 2 * 8)  # 100 + 80, 90, and a picture that is wider than the sheet
     assert out.getpixel((99, 49)) == (0, 0, 0)
     assert out.getpixel((105, 20)) == (255, 255, 255)

@@ -92,7 +92,7 @@ def test_cup_has_its_handle_in_front():
 def test_drawn_window_shows_the_pose_where_the_photograph_does(registration):
     registrar, _, _, box, truth = registration
     window = (30, 20, 230, 170)
-    picture = docs_pictures.drawn(registrar, (truth, K), torch.zeros(3, 180, 240), window)
+    picture = docs_pictures.drawn(registrar.describers[0].renderer, (truth, K), torch.zeros(3, 180, 240), window)
     assert picture.shape == (150, 200, 3)
     rows, columns = np.nonzero(picture[..., 1] > 200)
     expected = box.numpy() - np.array([30, 20, 30, 20])

@@ -6,6 +6,11 @@ import sys
 from scripts.calibration import hints
 
 
+def test_forms_without_photographs_get_no_line():
+    rows = {hint: {0: {"form": "exact", "kind": None, "like": "a", "errors": [3.0]}} for hint in ("none", "azimuth:45")}
+    assert list(hints.benchmark_rates(rows)) == ["benchmark, exact, upright"]
+
+
 def test_sets_that_are_not_measured_again_keep_their_lines(tmp_path, monkeypatch):
     old = {name: {"n": 9, "none": [0.5], "azimuth:90": [0.6], "commit": "old"} for name in ("lm", "hope")}
     record, page = tmp_path / "hints.json", tmp_path / "docs" / "guides" / "pose-prior.md"
@@ -23,5 +28,8 @@ def test_sets_that_are_not_measured_again_keep_their_lines(tmp_path, monkeypatch
     hints.main()
     found = json.loads(record.read_text())["sets"]
     assert found["hope"] == old["hope"]
+    monkeypatch.setattr(hints, "commit", lambda: "newer")
+    hints.main()  # the same runs: nothing was measured again
+    assert json.loads(record.read_text())["sets"] == found
     assert found["lm"] == {"n": 8, "none": [0.625], "azimuth:45": [0.75], "commit": "new"}
     assert "| lm | 8 | 0.62 | - | 0.75 | - | new |" in page.read_text()

@@ -8,7 +8,7 @@ from scipy.ndimage import distance_transform_edt
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.terms import Repeatability, dilate_points, repeatability, repeatability_score
-from curvireg_torch.terms.repeatability import cell_counts
+from curvireg_torch.terms.repeatability import CHUNK, cell_counts
 
 
 @pytest.mark.parametrize("eps", [0.0, 1.0, 2.0, 2.5, 2.9, 3.0, 4.0])
@@ -60,7 +60,7 @@ class PointViews:
 
     def __init__(self, size, *points):
         self.settings = SimpleNamespace(image_size=size)
-        self.points = torch.zeros(len(points), size, size, dtype=torch.bool)
+        self.points, self.descriptors = torch.zeros(len(points), size, size, dtype=torch.bool), torch.zeros(1)
         for view, (rows, columns) in zip(self.points, points, strict=True):
             view[rows, columns] = True
 
@@ -91,6 +91,15 @@ def test_repeatability_resolves_eps_with_64_cells_per_side(size):
     assert term.near.shape == (2, 64**2)
     query = PointViews(size, (middle, middle)).points[None]
     assert term(SimpleNamespace(points=query)).tolist() == [[1.0, 0.0]]
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_repeatability_keeps_views_of_several_chunks_in_order(threads):
+    views, before = PointViews(64, *((i // 64, i % 64) for i in range(2 * CHUNK + 3))), torch.get_num_threads()
+    torch.set_num_threads(threads)
+    near = Repeatability(eps=0.016).build(views).near
+    torch.set_num_threads(before)
+    assert torch.equal(near, dilate_points(views.points, 1.0).flatten(1).to(near.dtype))
 
 
 @pytest.mark.parametrize(("eps", "side"), [(0.016, 64), (0.008, 128)])

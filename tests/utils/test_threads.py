@@ -37,6 +37,12 @@ def test_for_each_runs_every_job_once_and_two_at_a_time() -> None:
         assert sorted(done) == list(range(6))
 
 
+@pytest.mark.parametrize("enabled", [True, False])
+def test_jobs_have_the_gradient_mode_of_their_caller(enabled: bool) -> None:
+    with torch.set_grad_enabled(enabled):
+        assert map_on_threads(lambda _: torch.is_grad_enabled(), range(3)) == [enabled] * 3
+
+
 def test_for_each_reuses_its_threads() -> None:
     seen = set()
     for _ in range(20):

@@ -8,7 +8,7 @@ from .points import ContourPoints
 
 __all__ = ["ObjectMask"]
 
-BESIDE = 6.0 / 256.0
+ASIDE = 6.0 / 256.0
 """Distance from an edge at which the mask is read on both sides, as a fraction of the crop's side: about 1.5 px of the
 learned mask."""
 
@@ -39,8 +39,8 @@ class ObjectMask:
         Returns:
             (N, P, L) float64, at most 2.
         """
-        beside = BESIDE * size
-        at = torch.cat([offsets - beside, offsets + beside])
+        aside = ASIDE * size
+        at = torch.cat([offsets - aside, offsets + aside])
         grid = ((2.0 * (uv[:, :, None] + at[:, None] * points.normals[:, :, None]) + 1.0) / size - 1.0).float()
         probability = grid.new_empty(grid.shape[:3])
         for b in image_index.unique().tolist():  # an expanded mask is not copied for every pose

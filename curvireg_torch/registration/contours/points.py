@@ -22,7 +22,7 @@ OCCLUDING, CREASES = 256, 128
 JUMP = 0.05
 """Depth discontinuity at an occluding contour, in object radii."""
 
-BESIDE = 8
+SURROUNDINGS = 8
 """Pixels around the object that are looked at: more than its contours depend on, by smoothing and differences."""
 
 CREASE_FRACTION = 0.02
@@ -76,7 +76,8 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
     depth = depth[..., rows, columns]
     K = camera_matrix.expand(len(depth), 3, 3)
     seen = depth > 0
-    z = torch.where(seen, depth, depth.amax(dim=(1, 2, 3), keepdim=True) + 4.0 * radius)
+    background = depth.amax(dim=(1, 2, 3), keepdim=True) + 4.0 * radius
+    z = torch.where(seen, depth, background)
     slope = torch.cat(central_gradient(smooth(fill_depth(depth, None, None), 1.0)), dim=1)
     beside, jumps = torch.zeros_like(seen), []
     for dim in (-1, -2):
@@ -95,10 +96,11 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
     creases = field_points(field * ~(_dilated(beside) | ~seen), fraction=fraction, threshold=CREASE)
     neighbours = [torch.stack([x.flatten() for x in _ends(pixel, dim)]) for dim in (-1, -2)]
     at_pixels, between = _random(*size)
+    at_pixels = at_pixels[rows, columns].flatten()
     order = torch.cat([_ends(x[rows, columns], dim)[0].flatten() for x, dim in zip(between, (-1, -2), strict=True)])
     samples = [
-        _sample(torch.cat(jumps, dim=1), torch.cat(neighbours, dim=1), order, z, slope, OCCLUDING),
-        _sample(creases.flatten(1), pixel.view(1, -1), at_pixels[rows, columns].flatten(), z, field, CREASES),
+        _sample(torch.cat(jumps, dim=1), torch.cat(neighbours, dim=1), order, z, background, slope, OCCLUDING),
+        _sample(creases.flatten(1), pixel.view(1, -1), at_pixels, z, background, field, CREASES),
     ]
     uv, z, n, valid, outline = (torch.cat(parts, dim=1) for parts in zip(*samples, strict=True))
     uv += torch.tensor([columns.start, rows.start])
@@ -110,15 +112,15 @@ def contour_points(depth: Tensor, T_cam_from_model: Tensor, camera_matrix: Tenso
 
 
 def _window(seen: Tensor) -> tuple[slice, slice]:
-    """Rows and columns of (N, 1, H, W) masks with all True pixels and ``BESIDE`` px around; all if there are none."""
+    """Rows and columns of (N, 1, H, W) masks with all True pixels and what surrounds them; all if there are none."""
     H, W = seen.shape[-2:]
     if not bool(seen.any()):
         return slice(0, H), slice(0, W)
     any_view = seen.any(dim=0)[0]
     rows, columns = (any_view.any(dim=dim).nonzero()[:, 0] for dim in (1, 0))
     return (
-        slice(max(0, int(rows[0]) - BESIDE), min(H, int(rows[-1]) + BESIDE + 1)),
-        slice(max(0, int(columns[0]) - BESIDE), min(W, int(columns[-1]) + BESIDE + 1)),
+        slice(max(0, int(rows[0]) - SURROUNDINGS), min(H, int(rows[-1]) + SURROUNDINGS + 1)),
+        slice(max(0, int(columns[0]) - SURROUNDINGS), min(W, int(columns[-1]) + SURROUNDINGS + 1)),
     )
 
 
@@ -140,16 +142,16 @@ def _dilated(mask: Tensor) -> Tensor:
 
 
 def _sample(
-    mask: Tensor, pixels: Tensor, order: Tensor, depth: Tensor, normals: Tensor, count: int
+    mask: Tensor, pixels: Tensor, order: Tensor, depth: Tensor, background: Tensor, normals: Tensor, count: int
 ) -> tuple[Tensor, ...]:
-    """uv, nearer depth, normal, valid and whether the background is beside it, (N, P, ...), of the ``count`` entries of
-    ``mask`` (N, M) that come first by ``order`` (M,), means of ``pixels``."""
+    """uv, nearer depth, normal, valid and whether the ``background`` (N, 1, 1, 1) is beside it, (N, P, ...), of the
+    ``count`` entries of ``mask`` (N, M) that come first by ``order`` (M,), means of ``pixels``."""
     if (missing := count - mask.shape[1]) > 0:  # all views have as many points
         mask, pixels, order = (F.pad(x, (0, missing)) for x in (mask, pixels, order))
     best, index = torch.where(mask, order, -1.0).topk(count, dim=1)
     of, W = pixels[:, index], depth.shape[-1]  # (k, N, P)
     ends = torch.stack([depth.flatten(1).gather(1, i) for i in of])
-    outline = (ends == depth.amax(dim=(1, 2, 3))[:, None]).any(dim=0)
+    outline = (ends == background.view(-1, 1)).any(dim=0)
     n = torch.stack([normals.flatten(2).gather(2, i[:, None].expand(-1, 2, -1)) for i in of]).mean(dim=0)
     uv = torch.stack([of % W, of // W], dim=-1).double().mean(dim=0)
     return uv, ends.amin(dim=0).double(), n.mT.double(), best >= 0, outline

@@ -62,6 +62,21 @@ def test_contour_points_of_a_sphere():
     assert float((radius - exact).abs().max()) * 300 < 1.0
 
 
+@pytest.mark.parametrize("background", [False, True])
+def test_the_farthest_surface_is_no_background(background):
+    """A plate before a wall that fills the view, and the same with the sky above them."""
+    depth = torch.full((1, 1, 64, 64), 5.0)
+    depth[..., 20:44, 20:44] = 4.0
+    if background:
+        depth[..., :8, :] = 0.0
+    points = contour_points(depth, torch.eye(4).double()[None], K, radius=1.0)
+    assert bool(points.valid.any())
+    assert bool(points.outline.any()) == background
+    if background:
+        sky, plate = points.outline, points.valid & ~points.outline
+        assert float(points.model[sky][:, 1].max()) < float(points.model[plate][:, 1].min())
+
+
 def test_contour_points_lie_on_the_nearer_surface():
     near, far = trimesh.creation.box((1, 1, 0.2)), trimesh.creation.box((2.2, 2.2, 0.2))
     near.apply_translation((0, 0, -1))
