@@ -119,10 +119,11 @@ class PoseEstimator:
         whatever else is registered. On a GPU the matcher's ``chunk_size`` are registered at a time.
         """
         size = 1 if self.bank.device.type == "cpu" else self.matcher.chunk_size
-        _ = self.describers, self.matcher.describers  # create them once, before threads use them
+        # Create once what threads share, before they use it.
+        _ = self.describers, self.matcher.describers
         given = [item for item in items if isinstance(item, ImageItem)]
         if any(self.is_exact(with_camera=item.camera_matrix is not None) for item in given):
-            self.symmetries_of(exact=True)  # the same
+            self.symmetries_of(exact=True)
 
         def run(first: int) -> list[Any]:
             return function(items[first : first + size], first)

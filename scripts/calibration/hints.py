@@ -50,10 +50,10 @@ def real_rates(runs: Path) -> dict[str, Row]:
 
 def with_commit(found: Row, recorded: Row | None) -> Row:
     """The numbers with the commit of today; digit for digit the recorded ones, they were not measured again."""
-    found = json.loads(json.dumps(found))
-    return (
-        recorded if recorded == {**found, "commit": (recorded or {}).get("commit")} else {**found, "commit": commit()}
-    )
+    found = json.loads(json.dumps(found))  # tuples become lists
+    if recorded is not None and recorded == {**found, "commit": recorded["commit"]}:
+        return recorded
+    return {**found, "commit": commit()}
 
 
 def page(record: Row) -> str:
