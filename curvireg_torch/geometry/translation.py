@@ -9,6 +9,7 @@ from ..utils.checks import check_camera_matrix, check_finite, check_rotation
 from .cameras import boxes_around, projected, rotation_towards, transform
 
 _ITERATIONS = 20
+_CONVERGED = 1e-9  # change of the position in an iteration, relative to the position
 
 
 def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor) -> Tensor:
@@ -69,12 +70,19 @@ def _fill_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor, *, alloc
     # Start far enough away for every point to be in front of the camera.
     z = torch.maximum(2.0 * extent * K[..., 0, 0] / size.amax(dim=-1), 2.0 * extent)
     position = (inverse @ F.pad(middle, (0, 1), value=1.0)[..., None])[..., 0] * z[..., None]
+    R, moving = view, torch.ones_like(z, dtype=torch.bool)
     for _ in range(_ITERATIONS):
-        R = rotation_towards(position) @ view if allocentric else view
+        # Each pose stops on its own: it does not depend on the others.
+        R = torch.where(moving[..., None, None], rotation_towards(position) @ view, R) if allocentric else view
         low, high = boxes_around(projected(points - centre, transform(R, position), K)).split(2, dim=-1)
         zoom = ((high - low) * size).sum(dim=-1, keepdim=True) / (size * size).sum(dim=-1, keepdim=True)
         offset = F.pad(middle - 0.5 * (low + high), (0, 1))
         # Move sideways at the object's depth, then along its ray; never closer than its own extent.
-        position = position + (inverse @ offset[..., None])[..., 0] * position[..., 2:]
-        position = position * torch.maximum(zoom, 1.05 * extent / position[..., 2:])
+        moved = position + (inverse @ offset[..., None])[..., 0] * position[..., 2:]
+        moved = moved * torch.maximum(zoom, 1.05 * extent / moved[..., 2:])
+        step = torch.linalg.vector_norm(moved - position, dim=-1)
+        position = torch.where(moving[..., None], moved, position)
+        moving = moving & (step > _CONVERGED * torch.linalg.vector_norm(position, dim=-1))
+        if not bool(moving.any()):
+            break
     return R, position - R @ centre

@@ -16,7 +16,6 @@ __all__ = ["EmbreeRenderer", "RayScene"]
 
 _MISS = 1e30  # embreex returns 1e37 where a ray hits nothing
 _MAX_HULL_VERTICES = 200_000  # above, a convex hull takes more time than it saves
-_MAX_OUTLINE = 4096  # above, projecting the hull in every view costs more than it saves
 _MAX_COORDINATE = 16000  # px; OpenCV draws no polygons beyond
 
 
@@ -71,7 +70,6 @@ class EmbreeRenderer:
         self._radius = mesh_radius(mesh)
         vertices = (np.asarray(mesh.vertices) - self._centre) / self._radius
         outline = extreme_points(mesh) if len(vertices) <= _MAX_HULL_VERTICES else box_corners(mesh)
-        outline = outline if len(outline) <= _MAX_OUTLINE else box_corners(mesh)
         self._outline = (outline.numpy() - self._centre) / self._radius
         self._scene = RayScene(vertices, mesh.faces)
 

@@ -38,6 +38,18 @@ def test_translation_from_box_and_pose_from_box_recover_the_true_pose(spread: fl
         assert float((found_R @ centre + found_t - R @ centre - t).norm() / distance) < 1e-4
 
 
+def test_pose_from_box_does_not_depend_on_the_rest_of_the_batch() -> None:
+    """One of the boxes is so wide that the steps do not converge."""
+    poses = true_poses(0.3, 4)
+    views, boxes = torch.stack([pose[2] for pose in poses]), torch.stack([pose[5] for pose in poses])
+    boxes[1] = torch.tensor([-2000.0, 100.0, 2600.0, 130.0])
+    batch = g.pose_from_box(poses[0][0], views, boxes, K.expand(4, 3, 3))
+    for i in range(4):
+        alone = g.pose_from_box(poses[0][0], views[i : i + 1], boxes[i : i + 1], K[None])
+        assert torch.equal(alone[0][0], batch[0][i])
+        assert torch.equal(alone[1][0], batch[1][i])
+
+
 def test_pose_from_box_scales_with_the_model() -> None:
     hull, _, view, _, _, box = true_poses(0.3, 1)[0]
     R, t = g.pose_from_box(hull, view, box, K)

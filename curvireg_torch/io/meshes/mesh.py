@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from ...errors import CurviregWarning, MeshError, MissingFileError
@@ -85,6 +87,8 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
         mesh.metadata["colours"] = colours[~is_degenerate]
     return mesh
 
+
+_MANY_POINTS = 4096  # of a hull: to project more of them in every view costs more than to cast the rays
 
 _NO_FACES = "expected a mesh with faces, got none; point clouds and curves cannot be rendered"
 
@@ -178,12 +182,20 @@ def _concatenate(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 
 def extreme_points(mesh: trimesh.Trimesh) -> Tensor:
-    """(P, 3) float64 vertices of the convex hull, which determine projected boxes."""
-    try:
-        points = mesh.convex_hull.vertices
-    except Exception:  # qhull refuses flat objects
-        points = mesh.vertices
-    return torch.from_numpy(np.array(points, dtype=np.float64))
+    """(P, 3) float64 vertices of the convex hull, which determine projected boxes.
+
+    Of more than 4096 of them, those that are outermost in one of 2562 directions of the object scaled to equal extents:
+    sides of boxes move by about 0.1 % of their length at most.
+    """
+    points = np.array(mesh.vertices, dtype=np.float64)
+    with suppress(QhullError, ValueError):  # flat objects, and fewer than four points
+        points = points[ConvexHull(points).vertices]
+    if len(points) > _MANY_POINTS:
+        directions = trimesh.creation.icosphere(subdivisions=4).vertices
+        scaled, _, _ = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+        outermost = [(scaled @ some.T).argmax(axis=0) for some in np.array_split(directions, 32)]  # bounded memory
+        points = points[np.unique(np.concatenate(outermost))]
+    return torch.from_numpy(points)
 
 
 def box_corners(mesh: trimesh.Trimesh) -> Tensor:

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 import trimesh
@@ -5,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from curvireg_torch import geometry as g
 from curvireg_torch.io.meshes import normalization_transform
+from curvireg_torch.io.meshes.mesh import extreme_points
 from curvireg_torch.matching import ViewBank
 from curvireg_torch.settings import BankSettings
 
@@ -60,3 +62,23 @@ def test_in_model_frame_keeps_poses_in_the_frame_of_the_file(truck: trimesh.Trim
         directions.append(R @ T[:3, :3].T / scale)  # what the views see of the normalised object
     torch.testing.assert_close(*directions, rtol=0, atol=1e-5)
     torch.testing.assert_close(directions[0], views.rotations.double(), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [(1.0, 1.0, 1.0), (1.0, 0.9, 0.02), (1.0, 0.05, 0.05)])
+def test_extreme_points_of_a_large_hull_keep_the_boxes(scale: tuple[float, float, float]) -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=5)  # 10 242 vertices, all on the hull
+    mesh.apply_scale(scale)
+    points = extreme_points(mesh)
+    assert len(points) <= 2562
+    assert {tuple(p) for p in points.tolist()} <= {tuple(p) for p in mesh.vertices.tolist()}
+    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    whole, few = (x @ directions.double().T for x in (torch.from_numpy(np.array(mesh.vertices)), points))
+    width = whole.amax(dim=0) - whole.amin(dim=0)
+    assert float(((whole.amax(dim=0) - few.amax(dim=0)) / width).max()) < 0.0015
+
+
+def test_extreme_points_are_the_hull_of_a_small_mesh_and_all_of_a_flat_one() -> None:
+    box = trimesh.creation.box().subdivide()
+    assert len(extreme_points(box)) == 8
+    flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+    assert len(extreme_points(flat)) == 4
