@@ -20,5 +20,5 @@ COVARIANCE_SCALE: float = CALIBRATION["covariance"]["scale"]
 
 SQUARED_RADIUS: dict[float, float] = {float(k): v for k, v in CALIBRATION["covariance"]["squared_radius"].items()}
 """For the probabilities 0.5, 0.9 and 0.95: the true pose lies in the ellipsoid e^T C^-1 e <= squared radius that often,
-C being the covariance of a reliable result. The value of 0.95 is a Gaussian's; as errors have heavier tails, the others
+C being the covariance of a reliable result. The value of 0.9 is a Gaussian's; as errors have heavier tails, the others
 are not."""

@@ -169,8 +169,8 @@ def fit_covariance(rows: Sequence[Row], sure: np.ndarray) -> tuple[Row, Row]:
     raw = np.array([r["scale"] * squared_distance(r["pose_error"], r["covariance"], r["distance"]) for r in reliable])
 
     def fit(index: np.ndarray) -> Row:
-        """The scale is such that the 95 % ellipsoid has a Gaussian's radius."""
-        scale = round(radii(raw[index])["0.95"] / float(chi2.ppf(0.95, 6)), 3)
+        """The scale is such that the 90 % ellipsoid has a Gaussian's radius: few wrong answers are among them."""
+        scale = round(radii(raw[index])["0.9"] / float(chi2.ppf(0.9, 6)), 3)
         return {"scale": scale, "squared_radius": radii(raw[index] / scale)}
 
     fold, inside = folds_of(reliable), dict.fromkeys((f"{level:g}" for level in LEVELS), 0)

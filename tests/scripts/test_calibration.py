@@ -103,7 +103,7 @@ def test_fit_covariance_ellipsoids_contain_their_levels():
     constants, found = calibrate.fit_covariance(rows, np.full(2000, 0.95))
     assert found["n"] == 2000
     assert [k / 2000 for k in found["inside"].values()] == pytest.approx([0.5, 0.9, 0.95], abs=0.02)
-    assert constants["squared_radius"]["0.95"] == pytest.approx(chi2.ppf(0.95, 6), rel=1e-3)
+    assert constants["squared_radius"]["0.9"] == pytest.approx(chi2.ppf(0.9, 6), rel=1e-3)
     squares = np.array([quality.squared_distance(e, constants["scale"] * C, 3.0) for e in errors])
     inside = quality.count_inside(squares, constants["squared_radius"])
     assert inside["0.9"] / 2000 == pytest.approx(0.9, abs=0.01)
