@@ -1,5 +1,6 @@
 """Views of one mesh: framed as a photograph's crop is, rendered, filtered and described."""
 
+from copy import copy
 from dataclasses import dataclass
 
 import torch
@@ -63,13 +64,22 @@ class ViewDescriber:
         coloured: bool | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.settings, self._mesh = settings, mesh
+        self._mesh = mesh
         self._coloured = has_colours(mesh) if coloured is None else coloured
         self.renderer = make_renderer(mesh, renderer, device=device)
         self.centre, self.radius, self.hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
-        self._orthographic = settings.camera == "orthographic"
-        self._filter, self.descriptor = depth_filter(settings), hog_layer(settings)
         self._device = device
+        self._set(settings)
+
+    def _set(self, settings: BankSettings) -> None:
+        self.settings, self._orthographic = settings, settings.camera == "orthographic"
+        self._filter, self.descriptor = depth_filter(settings), hog_layer(settings)
+
+    def with_settings(self, settings: BankSettings) -> "ViewDescriber":
+        """The same mesh and renderer with other settings; convex hulls of large meshes take seconds."""
+        other = copy(self)
+        other._set(settings)
+        return other
 
     def cameras(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cameras that look at the object's centre, cropped to its box as a photograph is.

@@ -94,10 +94,7 @@ class PoseEstimator:
     def describers(self) -> tuple[ViewDescriber, ...]:
         """Renderer and descriptor of each model, on a grid twice as fine as the bank's."""
         fine = replace(self.bank.settings, grid=min(2 * self.bank.settings.grid, self.bank.settings.image_size))
-        return tuple(
-            ViewDescriber(mesh, fine, renderer=coarse.renderer, device=self.bank.device)
-            for mesh, coarse in zip(self.bank.meshes, self.matcher.describers, strict=True)
-        )
+        return tuple(coarse.with_settings(fine) for coarse in self.matcher.describers)
 
     @cached_property
     def locator(self) -> Locator:

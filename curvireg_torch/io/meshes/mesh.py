@@ -193,7 +193,7 @@ def extreme_points(mesh: trimesh.Trimesh) -> Tensor:
     if len(points) > _MANY_POINTS:
         directions = trimesh.creation.icosphere(subdivisions=4).vertices
         scaled, _, _ = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
-        outermost = [(scaled @ some.T).argmax(axis=0) for some in np.array_split(directions, 32)]  # bounded memory
+        outermost = [(some @ scaled.T).argmax(axis=1) for some in np.array_split(directions, 32)]  # bounded memory
         points = points[np.unique(np.concatenate(outermost))]
     return torch.from_numpy(points)
 
