@@ -134,6 +134,15 @@ class ViewDescriber:
         colour = render_colour(self._mesh, T, K, (S, S), renderer=self.renderer, **projection)
         return torch.cat([grey, colour.to(grey)], dim=1)
 
+    @property
+    def draws_colours(self) -> bool:
+        """Whether the mesh has colours, and :meth:`draw` can show them."""
+        return hasattr(self.renderer, "faces_at") and has_colours(self._mesh)
+
+    def draw(self, T: Tensor, K: Tensor, size: tuple[int, int]) -> Tensor:
+        """(N, 3, H, W) of :func:`curvireg_torch.rendering.render_colour`."""
+        return render_colour(self._mesh, T, K, size, renderer=self.renderer)
+
     @torch.no_grad()
     def fields(self, rotations: Tensor, distances: Tensor) -> Tensor:
         """(N, 2, S, S) fields of the framed views."""

@@ -22,7 +22,7 @@ from .confidence import confidence_features, confidence_model, model_name, ranki
 from .hypotheses import Hypotheses, distinct_mask, start_hypotheses
 from .inputs import ImageItem, check_crop
 from .locator import Locator
-from .poses import Poses, edge_supports, fit_poses, hypothesis_of, lift_to_poses
+from .poses import Poses, edge_supports, fit_poses, fit_texture_of, hypothesis_of, lift_to_poses
 from .priors import BatchPriors
 from .rescoring import rank_feature, rescore, similarities
 from .results import FailedRegistration, Registration
@@ -172,6 +172,8 @@ class PoseEstimator:
             self.report_progress("contours")
             poses = fit_poses(self.describers, batch.images, poses, batch.boxes, self.object_mask(query))
         evidence = self._evidence(batch, starts, poses)
+        if self.pipeline.contours and batch.exact:
+            poses, evidence = self._fit_textures(batch, starts, poses, evidence)
         distinct = distinct_mask(poses.hypotheses, batch.scores(evidence), symmetries=batch.symmetries)
         poses, evidence = self._restore(batch, starts, poses, evidence, distinct)
         results = self._results(batch, poses, evidence, distinct)
@@ -238,6 +240,24 @@ class PoseEstimator:
             options = (batch.query, batch.ranking, pictures, hypotheses.image_index)
             appearance = self.matcher.reranking_score("appearance", *options)
         return torch.stack([rank_feature(starts), similarity, support, appearance], dim=1)
+
+    def _fit_textures(self, batch: _Batch, starts: Hypotheses, poses: Poses, evidence: Tensor) -> tuple[Poses, Tensor]:
+        """Fit the best hypothesis of each photograph to the mesh's colours as well."""
+        order, image_index = batch.scores(evidence).argsort(descending=True, stable=True), poses.hypotheses.image_index
+        changed = []
+        for b in range(len(batch.images)):
+            best = int(order[image_index[order] == b][0])
+            fitted = fit_texture_of(self.describers, batch.images, poses, batch.boxes, best)
+            allows = fitted is not None and (
+                batch.priors is None or bool(batch.priors.keeps(fitted.hypotheses, fitted.T)[best])
+            )
+            if fitted is not None and allows:
+                poses = fitted
+                changed.append(best)
+        if changed:
+            index, evidence = torch.tensor(changed), evidence.clone()
+            evidence[index, 1:] = self._evidence(batch, starts[index], poses[index])[:, 1:]
+        return poses, evidence
 
     def _restore(
         self, batch: _Batch, starts: Hypotheses, poses: Poses, evidence: Tensor, distinct: Tensor

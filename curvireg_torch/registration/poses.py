@@ -10,13 +10,13 @@ from torch import Tensor
 from ..geometry.cameras import rotation_towards
 from ..geometry.translation import pose_from_box
 from ..matching import ViewDescriber
-from .contours import ContourFit, contour_support, fit_contours
+from .contours import ContourFit, contour_support, fit_contours, fit_texture, turned
 from .hypotheses import Hypotheses
 from .rescoring import POSE_FEATURES
 from .results import Hypothesis
 from .search import FINALISTS
 
-__all__ = ["Poses", "edge_supports", "fit_poses", "hypothesis_of", "lift_to_poses"]
+__all__ = ["Poses", "edge_supports", "fit_poses", "fit_texture_of", "hypothesis_of", "lift_to_poses"]
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,25 @@ def fit_poses(
     return Poses(to_allocentric(describers, poses.hypotheses, fit.transform), fit.transform, poses.cameras, fit)
 
 
+def fit_texture_of(
+    describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor, h: int
+) -> Poses | None:
+    """The poses with pose ``h`` fitted to the colours of its mesh too, see :func:`fit_texture`; None without a fit."""
+    assert poses.fit is not None
+    describer, b = describers[int(poses.hypotheses.model[h])], int(poses.hypotheses.image_index[h])
+    if not describer.draws_colours:
+        return None
+    one = torch.tensor([h])
+    args, options = _contour_arguments(describer, [images[b]], poses, boxes[b : b + 1], one)
+    options |= {"image_index": torch.zeros_like(one), "starts": turned(poses.fit[one], describer.centre)}
+    fit = fit_texture(describer.draw, *args[:4], **options)
+    if fit is None:
+        return None
+    parts = (getattr(poses.fit, f.name).index_copy(0, one, getattr(fit, f.name)) for f in fields(ContourFit))
+    fits = ContourFit(*parts)
+    return Poses(to_allocentric(describers, poses.hypotheses, fits.transform), fits.transform, poses.cameras, fits)
+
+
 def edge_supports(describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor) -> Tensor:
     """(H,) edge support of poses of all models that are not fitted, see :func:`contour_support`."""
     out = torch.zeros(len(poses.hypotheses), dtype=torch.float64)
@@ -124,9 +143,9 @@ def hypothesis_of(h: int, poses: Poses, evidence: Tensor, *, with_camera: bool) 
 
 def _contour_arguments(
     describer: ViewDescriber, images: Sequence[Tensor], poses: Poses, boxes: Tensor, mine: Tensor
-) -> tuple[tuple[Any, ...], dict[str, Any]]:
+) -> tuple[list[Any], dict[str, Any]]:
     """Arguments of the contour functions for the poses ``mine``, all of one model."""
-    return (describer.renderer, images, boxes, poses.cameras[mine], poses.T[mine]), {
+    return [describer.renderer, images, boxes, poses.cameras[mine], poses.T[mine]], {
         "image_index": poses.hypotheses.image_index[mine],
         "centre": describer.centre,
         "radius": describer.radius,

@@ -15,7 +15,7 @@ from .confidence import refinement_confidence
 from .estimator import PoseEstimator
 from .hypotheses import Hypotheses, distinct_mask
 from .inputs import ImageItem, check_crop, image_items
-from .poses import Poses, fit_poses, hypothesis_of, lift_to_poses, to_allocentric
+from .poses import Poses, fit_poses, fit_texture_of, hypothesis_of, lift_to_poses, to_allocentric
 from .rescoring import rescore, similarities
 from .results import FailedRegistration, Registration
 from .search import search
@@ -104,9 +104,10 @@ def _refined(estimator: PoseEstimator, item: ImageItem, T: Tensor) -> Registrati
         found = search(describers, descriptors, at_start, boxes=boxes, camera_matrices=K, brief=True)
         poses = _side_by_side(poses, lift_to_poses(describers, found, boxes, K))
     poses = fit_poses(describers, images, poses, boxes, estimator.object_mask(query))
-    assert poses.fit is not None
-    similarity, support = similarities(describers, descriptors, poses.hypotheses), poses.fit.edge_support
-    evidence = torch.stack([torch.zeros_like(support), similarity, support, torch.zeros_like(support)], dim=1)
+    evidence = _evidence(estimator, descriptors, poses)
+    best = int(rescore(evidence, exact=True).argmax())
+    if (fitted := fit_texture_of(describers, images, poses, boxes, best)) is not None:
+        poses, evidence = fitted, _evidence(estimator, descriptors, fitted)
     scores = rescore(evidence, exact=True)
     together = replace(poses.hypotheses, image_index=torch.zeros_like(poses.hypotheses.image_index))
     distinct = distinct_mask(together, scores, symmetries=estimator.symmetries_of(exact=True))
@@ -118,9 +119,16 @@ def _refined(estimator: PoseEstimator, item: ImageItem, T: Tensor) -> Registrati
         )
         for h in order
     )
-    features = {"similarity": float(similarity[order[0]]), "edge_support": float(support[order[0]])}
+    features = {name: hypotheses[0].evidence[name] for name in ("similarity", "edge_support")}
     answers = AnswerSet((refinement_confidence(features), *[0.0] * (len(hypotheses) - 1)))
     return Registration(hypotheses, answers, Ranking.none(), features, warnings=item.warnings)
+
+
+def _evidence(estimator: PoseEstimator, descriptors: Tensor, poses: Poses) -> Tensor:
+    """(H, 4) :data:`POSE_FEATURES` of fitted poses, without ranking and appearance."""
+    assert poses.fit is not None
+    similarity, support = similarities(estimator.describers, descriptors, poses.hypotheses), poses.fit.edge_support
+    return torch.stack([torch.zeros_like(support), similarity, support, torch.zeros_like(support)], dim=1)
 
 
 def _hypotheses(count: int) -> Hypotheses:

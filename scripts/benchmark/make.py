@@ -65,7 +65,7 @@ class Meshes:
 
     def texture(self, rng: np.random.Generator) -> np.ndarray:
         """(T, T, 3) linear colours: a texture of the half's meshes, or a random picture."""
-        if rng.random() < 0.12:
+        if rng.random() < 0.12 or not self.textures:
             return random_picture(rng, 128)
         while True:
             picture = cv2.imread(str(self.textures[rng.integers(len(self.textures))]))
@@ -83,6 +83,7 @@ def proportion_gap(one: list[float], other: list[float]) -> float:
 def plan(meshes: Meshes, seed: int, index: int) -> dict:
     """Choose the object, the CAD model to register and the form of picture ``index``."""
     cad, pose = FORMS[index % 4]
+    cad = cad if meshes.kinds else "exact"
     rng = np.random.default_rng((seed, index))
     if cad == "exact":
         order = np.random.default_rng((seed, 1)).permutation(len(meshes.good))
@@ -257,7 +258,7 @@ def _one(task: tuple[int, int, Path]) -> dict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--half", choices=("held-out", "train"), default="held-out")
+    parser.add_argument("--half", choices=("held-out", "train", "printed"), default="held-out")
     parser.add_argument("--count", type=int, default=1200)
     parser.add_argument("--seed", type=int, default=15)
     parser.add_argument("--jobs", type=int, default=1)

@@ -14,6 +14,9 @@ from ...limits import MAX_IMAGE_PIXELS
 TEXTURE_SIDE = 512
 """Textures are reduced to this longer side in px; views are smaller."""
 
+ROW = 1024
+"""Samples in a row of the map that OpenCV is given, whose sides are limited."""
+
 _UNSET = (102, 102, 102)  # trimesh's colour for a material without one
 _PLAIN = 255
 
@@ -70,9 +73,10 @@ class SurfaceColours:
 
     def at(self, face: NDArray[np.int32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
         """(N, 3) RGB in [0, 1] at the points (1 - u - v) a + u b + v c of faces with corners a, b, c."""
-        weights = np.stack([1.0 - u - v, u, v], axis=1)[..., None].astype(np.float32)
-        colour: NDArray[np.float32] = (self.corners[face] * weights).sum(axis=1) / np.float32(255)
-        uv = (self.uv[face] * weights).sum(axis=1)
+        weights = np.stack([1.0 - u - v, u, v], axis=1).astype(np.float32)
+        colour: NDArray[np.float32] = np.einsum("nc,ncd->nd", weights, self.corners[face].astype(np.float32))
+        colour /= np.float32(255)
+        uv = np.einsum("nc,ncd->nd", weights, self.uv[face])
         texture = self.texture[face]
         for k in np.unique(texture[texture >= 0]):
             mask = texture == k
@@ -134,11 +138,9 @@ def _texture(image: Any) -> NDArray[np.uint8] | None:
 
 def _sample(texture: NDArray[np.uint8], uv: NDArray[np.float32]) -> NDArray[np.float32]:
     """(N, 3) in [0, 1]: bilinear, repeating."""
-    h, w = texture.shape[:2]
-    x, y = (uv[:, 0] % 1.0) * w - 0.5, (-uv[:, 1] % 1.0) * h - 0.5
-    left, top = np.floor(x), np.floor(y)
-    a, b = (x - left)[:, None], (y - top)[:, None]
-    columns, rows = [(left.astype(int) + i) % w for i in (0, 1)], [(top.astype(int) + i) % h for i in (0, 1)]
-    above = texture[rows[0], columns[0]] * (1 - a) + texture[rows[0], columns[1]] * a
-    below = texture[rows[1], columns[0]] * (1 - a) + texture[rows[1], columns[1]] * a
-    return np.asarray((above * (1 - b) + below * b) / 255, np.float32)
+    (h, w), count = texture.shape[:2], len(uv)
+    places = np.zeros((2, -(-count // ROW) * ROW), np.float32)
+    places[:, :count] = (uv[:, 0] % 1.0) * w - 0.5, (-uv[:, 1] % 1.0) * h - 0.5
+    x, y = places.reshape(2, -1, ROW)
+    colours = cv2.remap(texture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return np.asarray(colours.reshape(-1, 3)[:count] / np.float32(255), np.float32)

@@ -1,7 +1,7 @@
 """Contour fit: the continuous stage of the refinement, which pulls projected contours onto image edges."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -65,6 +65,9 @@ class ContourFit:
     edge_support: Tensor
     start_support: Tensor
     observable: Tensor
+
+    def __getitem__(self, index: Tensor) -> "ContourFit":
+        return ContourFit(*(getattr(self, f.name)[index] for f in fields(ContourFit)))
 
     @property
     def trustworthy(self) -> Tensor:
@@ -152,7 +155,7 @@ def fit_contours(
     if (N := len(T0)) == 0:
         none = T0.new_zeros(0)
         return ContourFit(T0, T0.new_zeros(0, 6, 6), none, none, none.long())
-    crops, full = _full_size(renderer, images, boxes, K, image_index, centre, radius, margin)
+    crops, full = full_size_problem(renderer, images, boxes, K, image_index, centre, radius, margin)
     if object_mask is not None:
         check_tensor(object_mask, "object_mask", (len(images), 1, None, None))
         full = replace(full, mask=ObjectMask(object_mask))
@@ -201,11 +204,11 @@ def contour_support(
     if len(poses) == 0:
         return torch.zeros(0, dtype=torch.float64)
     centre = centre.detach().cpu().double()
-    _, problem = _full_size(renderer, images, boxes, K, image_index, centre, radius, margin)
+    _, problem = full_size_problem(renderer, images, boxes, K, image_index, centre, radius, margin)
     return problem.edge_support(problem.state(poses.detach().cpu().double()))
 
 
-def _full_size(
+def full_size_problem(
     renderer: DepthRenderer,
     images: Sequence[Tensor],
     boxes: Tensor,

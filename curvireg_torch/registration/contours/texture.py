@@ -1,0 +1,241 @@
+"""Texture fit: pulls poses to where the photograph shows the mesh's own colours.
+
+The contours of a can do not tell how far it is turned about its axis; its label does.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...rendering import DepthRenderer
+from .covariance import pose_covariance
+from .descent import ContourProblem, ContourState, Matches, apply_twist, pixels, project
+from .fit import FINE, ContourFit, full_size_problem
+from .points import ContourPoints
+
+__all__ = ["fit_texture", "turned"]
+
+CORNERS, APART, QUALITY = 160, 5, 0.005
+"""Corners of a view: how many at most, how many px apart at least, and the least strength as a fraction of the
+strongest one's."""
+
+HALF = 7
+"""Patches around corners are 15 px wide, and lie within the silhouette."""
+
+CORRELATED = 0.4
+"""Least normalised correlation of matching patches, which have weight 0 there and 1 where they are equal."""
+
+FAR, NEAR = (30, (32.0, 16.0, 8.0, 4.0)), (6, (6.0, 4.0, 2.0))
+"""Of the two rounds: the search distance in px, and the scales of robust weights in px, one a step."""
+
+PROMISING, ENOUGH = 0.1, 0.3
+"""Fractions of the corners that must be in place after the two rounds."""
+
+TURN = 16.0
+"""Degrees by which poses are turned both ways about an axis that contours do not determine: within them, the search of
+the first round reaches."""
+
+LEAST = 8
+"""Matches that a fit needs."""
+
+IN_PLACE = 2.0
+"""Distance in px within which a corner is where the pose has it."""
+
+WEIGHT, JOINT_STEPS = 1.0, 3
+"""Weight of a match beside that of an edge, and steps of the fit to both."""
+
+LOST = 0.03
+"""Edge support that a fit may lose."""
+
+
+Draw = Callable[[Tensor, Tensor, tuple[int, int]], Tensor]
+
+
+@dataclass(frozen=True)
+class _Patches:
+    """Corners of a view: ``model`` points (1, C, 3), where the photograph shows them, ``uv`` (1, C, 2) px, and the
+    ``weight`` (1, C) in [0, 1] of that match."""
+
+    model: Tensor
+    uv: Tensor
+    weight: Tensor
+
+    def equations(self, T: Tensor, problem: ContourProblem, scale: float) -> tuple[Tensor, Tensor]:
+        """Normal equations (1, 6, 6) and (1, 6) at a pose (1, 4, 4), with Geman-McClure weights of ``scale`` px."""
+        matches = self.matches(T, problem, scale)
+        WJ = matches.weight * matches.J
+        return WJ.mT @ matches.J, (WJ.mT @ matches.distance)[..., 0]
+
+    def matches(self, T: Tensor, problem: ContourProblem, scale: float) -> Matches:
+        """Two equations for each corner, along x and y."""
+        uv, J = project(self.model, T, problem.K, problem.centre)
+        residual = self.uv - uv
+        weight = self.weight * (1.0 + residual.square().sum(dim=-1) / scale**2) ** -2
+        return Matches(J.flatten(1, 2), residual.flatten(1)[..., None], weight.repeat_interleave(2, 1)[..., None])
+
+    def in_place(self, T: Tensor, problem: ContourProblem) -> float:
+        """Fraction of the corners that are found where the pose has them."""
+        gap = torch.linalg.vector_norm(self.uv - pixels(self.model, T, problem.K, problem.centre), dim=-1)
+        return float(((self.weight > 0) & (gap < IN_PLACE)).double().mean())
+
+
+@torch.no_grad()
+def fit_texture(
+    draw: Draw,
+    renderer: DepthRenderer,
+    images: Sequence[Tensor],
+    boxes: Tensor,
+    camera_matrices: Tensor,
+    starts: Tensor,
+    *,
+    image_index: Tensor,
+    centre: Tensor,
+    radius: float,
+    margin: float,
+) -> ContourFit | None:
+    """Fit one pose to the mesh's colours and to contours together.
+
+    The coloured mesh is drawn at the pose, and patches around its corners are searched in the photograph by normalised
+    correlation, which the strength of the light does not change. Robust least squares move the pose to where most of
+    them are found, then to the edges as well; a second round searches nearer. The fit counts if in the end more corners
+    are in place than at the start, three in ten of them at least, and the edge support is as before.
+
+    Args:
+        draw: (N, 3, H, W) pictures of the mesh from poses (N, 4, 4), cameras (N, 3, 3) and a size (H, W).
+        starts: (N, 4, 4) the pose whose contours are fitted, and others that may be better (:func:`turned`).
+
+    Returns:
+        The fit, with the covariance from edges and patches; None where it does not count.
+    """
+    crops, problem = full_size_problem(renderer, images, boxes, camera_matrices, image_index, centre, radius, margin)
+    photograph, support = _pixels_of(crops[0]), problem.edge_support(problem.state(starts[:1]))
+    rounds = [_round(draw, problem, photograph, start, *FAR) for start in starts.split(1)]
+    coarse = max((one for one in rounds if one is not None), key=lambda one: one.after, default=None)
+    if coarse is None or coarse.after < PROMISING:
+        return None
+    fine = _round(draw, problem, photograph, coarse.T, *NEAR)
+    before = 0.0 if rounds[0] is None else rounds[0].before
+    if fine is None or fine.after < ENOUGH or fine.after <= before:
+        return None
+    state = problem.state(fine.T)
+    after = problem.edge_support(state)
+    if bool(after < support - LOST):
+        return None
+    covariance, observable = _covariance(problem, state, fine.patches)
+    return ContourFit(fine.T, covariance, edge_support=after, start_support=support, observable=observable)
+
+
+def turned(fit: ContourFit, centre: Tensor) -> Tensor:
+    """(1, 4, 4) or (3, 4, 4): the pose of a fit, then turned both ways about the axis that contours do not determine,
+    if there is one."""
+    T = fit.transform
+    if int(fit.observable) == 6 or not bool(fit.covariance.isfinite().all()):
+        return T
+    axis = torch.linalg.eigh(fit.covariance[0, :3, :3])[1][:, -1]
+    twists = torch.zeros(3, 6, dtype=torch.float64)
+    twists[1:, :3] = math.radians(TURN) * torch.stack([axis, -axis])
+    return apply_twist(T.expand(3, 4, 4), twists, centre)
+
+
+@dataclass(frozen=True)
+class _Round:
+    """A pose after a round, what it was fitted to, and the fractions of the corners in place before and after."""
+
+    T: Tensor
+    patches: _Patches
+    before: float
+    after: float
+
+
+def _round(
+    draw: Draw, problem: ContourProblem, photograph: np.ndarray, start: Tensor, reach: int, scales: tuple[float, ...]
+) -> _Round | None:
+    """None where the view has few corners, or the photograph few of them."""
+    view, T = _pixels_of(draw(start, problem.K, (problem.size, problem.size))[0]), start
+    patches = _search(view, photograph, problem, T, reach)
+    if patches is None:
+        return None
+    for scale in scales:
+        A, b = patches.equations(T, problem, scale)
+        A = A + torch.diag_embed(1e-4 * A.diagonal(dim1=-2, dim2=-1) + 1e-9)
+        T = apply_twist(T, torch.linalg.solve(A, b), problem.centre)
+    edges = problem.state(T).points
+    for _ in range(JOINT_STEPS):
+        A, b = patches.equations(T, problem, scales[-1])
+        T = problem.step(edges, T, FINE[0], (WEIGHT * A, WEIGHT * b))
+    return _Round(T, patches, patches.in_place(start, problem), patches.in_place(T, problem))
+
+
+def _pixels_of(picture: Tensor) -> np.ndarray:
+    """(S, S, 3) float32 of (C, S, S), C = 1 or 3."""
+    return np.ascontiguousarray(picture.expand(3, -1, -1).permute(1, 2, 0).float().numpy())
+
+
+def _search(
+    view: np.ndarray, photograph: np.ndarray, problem: ContourProblem, T: Tensor, reach: int
+) -> _Patches | None:
+    """Corners of a view and where they are in the photograph, within ``reach`` px; None if there are few."""
+    size = (problem.size, problem.size)
+    depth = problem.renderer.render(T, problem.K, size).cpu()[0, 0]
+    kernel = np.ones((2 * HALF + 1, 2 * HALF + 1), np.uint8)
+    inside = cv2.erode((depth > 0).to(torch.uint8).numpy(), kernel, borderValue=0)
+    grey = (255.0 * view.mean(axis=2)).round().astype(np.uint8)
+    corners = cv2.goodFeaturesToTrack(grey, CORNERS, QUALITY, APART, mask=inside)
+    if corners is None or len(corners) < LEAST:
+        return None
+    x, y = (axis.astype(int) for axis in corners[:, 0].round().T)
+    offset, correlation = _match(view, photograph, x, y, reach)
+    weight = torch.from_numpy((correlation - CORRELATED) / (1.0 - CORRELATED)).clamp(min=0.0)
+    if int((weight > 0).sum()) < LEAST:
+        return None
+    pixel = torch.from_numpy(np.stack([x, y, np.ones_like(x)], axis=1)).double()
+    rays = pixel @ torch.linalg.inv(problem.K[0]).mT
+    model = (rays * depth[y, x].double()[:, None] - T[0, :3, 3]) @ T[0, :3, :3]
+    return _Patches(model[None], (pixel[:, :2] + torch.from_numpy(offset))[None], weight[None])
+
+
+def _match(
+    view: np.ndarray, photograph: np.ndarray, x: np.ndarray, y: np.ndarray, reach: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets (C, 2) in px to where patches correlate most, and the correlations (C,)."""
+    border = HALF + reach
+    padded = cv2.copyMakeBorder(photograph, border, border, border, border, cv2.BORDER_REFLECT)
+    offset, correlation = np.zeros((len(x), 2)), np.zeros(len(x))
+    for i, (column, row) in enumerate(zip(x, y, strict=True)):
+        patch = view[row - HALF : row + HALF + 1, column - HALF : column + HALF + 1]
+        around = padded[row : row + 2 * border + 1, column : column + 2 * border + 1]
+        scores = np.nan_to_num(cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED), posinf=0.0, neginf=0.0)
+        v, u = np.unravel_index(scores.argmax(), scores.shape)
+        correlation[i] = scores[v, u]
+        offset[i] = u - reach + _vertex(scores[v], u), v - reach + _vertex(scores[:, u], v)
+    return offset, correlation
+
+
+def _vertex(values: np.ndarray, k: int) -> float:
+    """Offset in [-0.5, 0.5] of the peak of the parabola through three values around the largest."""
+    if not 0 < k < len(values) - 1:
+        return 0.0
+    before, here, behind = values[k - 1 : k + 2].tolist()
+    curvature = before - 2.0 * here + behind
+    return 0.5 * (before - behind) / curvature if curvature < -1e-9 else 0.0
+
+
+def _covariance(problem: ContourProblem, state: ContourState, patches: _Patches) -> tuple[Tensor, Tensor]:
+    """:func:`pose_covariance` of edges and of the matches of a texture, as points with normals along x and y."""
+    edges = problem.matches(state, FINE[-1])
+    texture = patches.matches(state.T, problem, NEAR[1][-1])
+    count = patches.model.shape[1]
+    seen = torch.ones(1, 2 * count, dtype=torch.bool)
+    axes = torch.eye(2, dtype=torch.float64).repeat(count, 1)[None]
+    points = ContourPoints(patches.model.repeat_interleave(2, 1), axes, seen, ~seen)
+    parts = (("J", texture.J), ("distance", texture.distance), ("weight", WEIGHT * texture.weight))
+    both = Matches(*(torch.cat([getattr(edges, name), value], dim=1) for name, value in parts))
+    joined = ContourPoints(
+        *(torch.cat([getattr(some, f.name) for some in (state.points, points)], dim=1) for f in fields(ContourPoints))
+    )
+    return pose_covariance(both, joined, state.T, problem.K, problem.centre, radius=problem.radius)
