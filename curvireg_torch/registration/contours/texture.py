@@ -30,6 +30,10 @@ HALF = 7
 CORRELATED = 0.4
 """Least normalised correlation of matching patches, which have weight 0 there and 1 where they are equal."""
 
+ASIDE, LEAD = 4, 0.1
+"""A match has less weight if, more than so many px aside, another one correlates nearly as well: a patch slides along
+an edge."""
+
 FAR, NEAR = (30, (32.0, 16.0, 8.0, 4.0)), (6, (6.0, 4.0, 2.0))
 """Of the two rounds: the search distance in px, and the scales of robust weights in px, one a step."""
 
@@ -189,8 +193,8 @@ def _search(
     if corners is None or len(corners) < LEAST:
         return None
     x, y = (axis.astype(int) for axis in corners[:, 0].round().T)
-    offset, correlation = _match(view, photograph, x, y, reach)
-    weight = torch.from_numpy((correlation - CORRELATED) / (1.0 - CORRELATED)).clamp(min=0.0)
+    offset, certainty = _match(view, photograph, x, y, reach)
+    weight = torch.from_numpy(certainty)
     if int((weight > 0).sum()) < LEAST:
         return None
     pixel = torch.from_numpy(np.stack([x, y, np.ones_like(x)], axis=1)).double()
@@ -202,18 +206,21 @@ def _search(
 def _match(
     view: np.ndarray, photograph: np.ndarray, x: np.ndarray, y: np.ndarray, reach: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets (C, 2) in px to where patches correlate most, and the correlations (C,)."""
+    """Offsets (C, 2) in px to where patches correlate most, and weights (C,) in [0, 1] of these matches."""
     border = HALF + reach
     padded = cv2.copyMakeBorder(photograph, border, border, border, border, cv2.BORDER_REFLECT)
-    offset, correlation = np.zeros((len(x), 2)), np.zeros(len(x))
+    offset, weight = np.zeros((len(x), 2)), np.zeros(len(x))
     for i, (column, row) in enumerate(zip(x, y, strict=True)):
         patch = view[row - HALF : row + HALF + 1, column - HALF : column + HALF + 1]
         around = padded[row : row + 2 * border + 1, column : column + 2 * border + 1]
         scores = np.nan_to_num(cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED), posinf=0.0, neginf=0.0)
         v, u = np.unravel_index(scores.argmax(), scores.shape)
-        correlation[i] = scores[v, u]
+        best = float(scores[v, u])
         offset[i] = u - reach + _vertex(scores[v], u), v - reach + _vertex(scores[:, u], v)
-    return offset, correlation
+        scores[max(v - ASIDE, 0) : v + ASIDE + 1, max(u - ASIDE, 0) : u + ASIDE + 1] = 0.0
+        clear = min(max(best - float(scores.max()), 0.0) / LEAD, 1.0)
+        weight[i] = clear * max(best - CORRELATED, 0.0) / (1.0 - CORRELATED)
+    return offset, weight
 
 
 def _vertex(values: np.ndarray, k: int) -> float:
