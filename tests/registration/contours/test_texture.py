@@ -64,7 +64,7 @@ def test_label_tells_how_far_a_can_is_turned(renderer, degrees):
     assert float(about_axis.sqrt().rad2deg()) < 10.0
 
 
-@pytest.mark.parametrize("degrees", [-28.0, 28.0])
+@pytest.mark.parametrize("degrees", [28.0])
 def test_can_that_is_turned_far_is_found_from_turned_starts(renderer, degrees):
     image, start = photograph(MESH, TRUTH), turned_can(degrees)
     alone = fit(renderer, image, start)
