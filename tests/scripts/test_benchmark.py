@@ -1,12 +1,14 @@
 """scripts/benchmark: textured meshes, their symmetries, photographs with known poses, wrong meshes."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
 import curvireg_torch as cr
-from scripts.benchmark import make, meshes
+from scripts.benchmark import make, meshes, printed
 from scripts.benchmark.run import wrong_meshes
 from scripts.benchmark.textured import TexturedMesh, appearance_symmetries
 
@@ -111,3 +113,19 @@ def test_wrong_meshes_are_no_copies_and_of_the_kind_on_request():
     assert wrong_meshes(None, items, like) == dict.fromkeys(kinds)
     assert wrong_meshes("any", items, like) == dict(zip("abcdef", "ccdefa", strict=True))
     assert wrong_meshes("kind", items, like) == {"a": "d", "b": "d", "d": "a"}, "there is no second car"
+
+
+def test_printed_packages_are_exact_and_textured(tmp_path):
+    rows = [printed.make_package(tmp_path, f"printed-{k:03d}", np.random.default_rng((29, k))) for k in range(4)]
+    assert printed.make_package(tmp_path / "again", "printed-000", np.random.default_rng((29, 0))) == rows[0]
+    turns = [np.eye(3).tolist()]
+    (tmp_path / "meshes.json").write_text(json.dumps({"turns": turns, "meshes": rows}))
+    for row in rows:
+        assert cr.io.meshes.has_colours(cr.load_mesh(tmp_path / row["path"]))
+        assert TexturedMesh.load(tmp_path / row["path"]).pictures[0] is not None
+    catalogue = make.Meshes(tmp_path, "printed")
+    assert len(catalogue.good) == 4
+    image, item = make.make(catalogue, 15, 2)  # its form would be that of a sibling
+    assert item["form"] == "exact"
+    assert item["mesh"] == item["shown"]
+    assert image.shape == (*item["size"], 3)

@@ -74,9 +74,9 @@ class SurfaceColours:
     def at(self, face: NDArray[np.int32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
         """(N, 3) RGB in [0, 1] at the points (1 - u - v) a + u b + v c of faces with corners a, b, c."""
         weights = np.stack([1.0 - u - v, u, v], axis=1).astype(np.float32)
-        colour: NDArray[np.float32] = np.einsum("nc,ncd->nd", weights, self.corners[face].astype(np.float32))
+        colour: NDArray[np.float32] = np.einsum("ij,ijk->ik", weights, self.corners[face].astype(np.float32))
         colour /= np.float32(255)
-        uv = np.einsum("nc,ncd->nd", weights, self.uv[face])
+        uv = np.einsum("ij,ijk->ik", weights, self.uv[face])
         texture = self.texture[face]
         for k in np.unique(texture[texture >= 0]):
             mask = texture == k
