@@ -1,6 +1,6 @@
 """Texture fit: pulls poses to where the photograph shows the mesh's own colours.
 
-The contours of a can do not tell how far it is turned about its axis; its label does.
+The contours of a can do not determine its rotation about the axis; its label does.
 """
 
 import math

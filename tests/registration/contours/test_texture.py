@@ -1,4 +1,4 @@
-"""Texture fit: a label tells how far a can is turned, and a pose without the label in the photograph stays."""
+"""Texture fit: a label determines the rotation of a can, and a pose without the label in the photograph stays."""
 
 import cv2
 import numpy as np
@@ -54,7 +54,7 @@ def error(found: ContourFit) -> float:
 
 
 @pytest.mark.parametrize("degrees", [-12.0, -5.0, 5.0, 12.0])
-def test_label_tells_how_far_a_can_is_turned(renderer, degrees):
+def test_label_determines_the_rotation_about_the_axis(renderer, degrees):
     found = fit(renderer, photograph(MESH, TRUTH), turned_can(degrees))
     assert found is not None
     assert error(found) < 1.0
