@@ -248,10 +248,9 @@ class PoseEstimator:
         for b in range(len(batch.images)):
             best = int(order[image_index[order] == b][0])
             fitted = fit_texture_of(self.describers, batch.images, poses, batch.boxes, best)
-            allows = fitted is not None and (
-                batch.priors is None or bool(batch.priors.keeps(fitted.hypotheses, fitted.T)[best])
-            )
-            if fitted is not None and allows:
+            if fitted is None:
+                continue
+            if batch.priors is None or bool(batch.priors.keeps(fitted.hypotheses, fitted.T)[best]):
                 poses = fitted
                 changed.append(best)
         if changed:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ...rendering import DepthRenderer
+from .corners import surface_corners
 from .covariance import pose_covariance
 from .descent import ContourProblem, ContourState, Matches, apply_twist, pixels, project
 from .fit import FINE, ContourFit, full_size_problem
@@ -185,22 +186,18 @@ def _search(
 ) -> _Patches | None:
     """Corners of a view and where they are in the photograph, within ``reach`` px; None if there are few."""
     size = (problem.size, problem.size)
-    depth = problem.renderer.render(T, problem.K, size).cpu()[0, 0]
-    kernel = np.ones((2 * HALF + 1, 2 * HALF + 1), np.uint8)
-    inside = cv2.erode((depth > 0).to(torch.uint8).numpy(), kernel, borderValue=0)
+    depth = problem.renderer.render(T, problem.K, size).cpu()
     grey = (255.0 * view.mean(axis=2)).round().astype(np.uint8)
-    corners = cv2.goodFeaturesToTrack(grey, CORNERS, QUALITY, APART, mask=inside)
-    if corners is None or len(corners) < LEAST:
+    corners, model = surface_corners(
+        grey, depth, T, problem.K, count=CORNERS, apart=APART, quality=QUALITY, inside=HALF
+    )
+    if len(corners) < LEAST:
         return None
-    x, y = (axis.astype(int) for axis in corners[:, 0].round().T)
-    offset, certainty = _match(view, photograph, x, y, reach)
+    offset, certainty = _match(view, photograph, corners[:, 0].astype(int), corners[:, 1].astype(int), reach)
     weight = torch.from_numpy(certainty)
     if int((weight > 0).sum()) < LEAST:
         return None
-    pixel = torch.from_numpy(np.stack([x, y, np.ones_like(x)], axis=1)).double()
-    rays = pixel @ torch.linalg.inv(problem.K[0]).mT
-    model = (rays * depth[y, x].double()[:, None] - T[0, :3, 3]) @ T[0, :3, :3]
-    return _Patches(model[None], (pixel[:, :2] + torch.from_numpy(offset))[None], weight[None])
+    return _Patches(model, torch.from_numpy(corners + offset)[None], weight[None])
 
 
 def _match(

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..contours.corners import surface_corners
 from ..contours.descent import apply_twist, pixels, project
 from .window import Window
 
@@ -68,15 +69,10 @@ def make_keyframe(window: Window, T: Tensor, depth: Tensor) -> Keyframe:
         T: (1, 4, 4) pose in it.
         depth: (1, 1, S, S) of the mesh at that pose.
     """
-    side = 2 * INSIDE + 1
-    inside = cv2.erode((depth[0, 0] > 0).to(torch.uint8).numpy(), np.ones((side, side), np.uint8), borderValue=0)
-    found = cv2.goodFeaturesToTrack(window.grey, POINTS, QUALITY, APART, mask=inside)
-    uv = np.zeros((0, 2), np.float32) if found is None else found[:, 0]
-    pixel = torch.from_numpy(uv).double()
-    column, row = pixel.round().long().unbind(-1)
-    rays = torch.cat([pixel, torch.ones_like(pixel[:, :1])], dim=1) @ torch.linalg.inv(window.K[0]).mT
-    z = depth[0, 0, row, column].double()
-    return Keyframe(window, T, uv, ((rays * z[:, None] - T[0, :3, 3]) @ T[0, :3, :3])[None])
+    uv, model = surface_corners(
+        window.grey, depth, T, window.K, count=POINTS, apart=APART, quality=QUALITY, inside=INSIDE
+    )
+    return Keyframe(window, T, uv, model)
 
 
 def track_points(keyframe: Keyframe, window: Window, T: Tensor, centre: Tensor, *, levels: int) -> Flow:
