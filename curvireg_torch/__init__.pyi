@@ -1,17 +1,15 @@
 # ruff: noqa: I001 (one import for all modules)
 from . import (
     data as data,
-    descriptors as descriptors,
     detectors as detectors,
     errors as errors,
     evaluation as evaluation,
     filters as filters,
     geometry as geometry,
-    io as io,
-    limits as limits,
+    mesh as mesh,
     matching as matching,
     metrics as metrics,
-    models as models,
+    features as features,
     pipeline as pipeline,
     registration as registration,
     rendering as rendering,
@@ -26,7 +24,7 @@ from .data import (
     Pascal3DPlus as Pascal3DPlus,
     WebCollection as WebCollection,
 )
-from .descriptors import (
+from .features import (
     HOG as HOG,
     field_points as field_points,
     hog as hog,
@@ -71,15 +69,13 @@ from .geometry import (
     uniform_views as uniform_views,
     viewpoint_from_rotation as viewpoint_from_rotation,
 )
-from .io import (
-    load_mesh as load_mesh,
-)
+from .mesh import load_mesh as load_mesh
 from .matching import (
     Ranking as Ranking,
     ViewBank as ViewBank,
     ViewMatcher as ViewMatcher,
 )
-from .models import (
+from .features import (
     LearnedCurvilinearSaliency as LearnedCurvilinearSaliency,
 )
 from .pipeline import (

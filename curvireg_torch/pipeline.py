@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from .errors import InvalidInputError, MissingFileError
-from .models.learned_field import SHA256
+from .features.learned_field import SHA256
 from .settings import BankSettings, LocateSettings, ViewPolicy
 from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, RerankingTerm, Term, jittered_boxes
 from .utils.checks import check_option
@@ -28,7 +28,7 @@ VERSION = 1
 FIELDS: Registry[Callable[[], nn.Module]] = Registry(
     "field",
     {
-        "learned": "curvireg_torch.models:LearnedCurvilinearSaliency",
+        "learned": "curvireg_torch.features:LearnedCurvilinearSaliency",
         "focus": "curvireg_torch.filters:MultiScaleFocusCurves",
         "saliency": "curvireg_torch.filters:MultiScaleCurvilinearSaliency",
         "gradient": "curvireg_torch.filters:ImageGradient",

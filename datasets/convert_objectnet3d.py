@@ -19,8 +19,8 @@ from collections import Counter
 from pathlib import Path
 
 from curvireg_torch.data._base import is_plain_name
+from curvireg_torch.data.mat_files import read_mat
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.io.mat_files import read_mat
 
 
 def place(source: Path, target: Path) -> None:

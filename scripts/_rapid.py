@@ -10,7 +10,7 @@ import trimesh
 from torch import Tensor
 from trimesh.remesh import subdivide_to_size
 
-from curvireg_torch.io.meshes.mesh import mesh_centre
+from curvireg_torch.mesh.mesh import mesh_centre
 
 AVAILABLE = hasattr(cv2, "rapid")
 ABSENT = "cv2.rapid is absent (it comes with opencv-contrib-python-headless), so it is not measured"

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import SIDES, object_frame
-from curvireg_torch.io.meshes.mesh import mesh_radius
 from curvireg_torch.matching import ViewDescriber
+from curvireg_torch.mesh.mesh import mesh_radius
 from curvireg_torch.settings import BankSettings
 from curvireg_torch.synthetic import example_mesh
 from scripts._shared import REPOSITORY

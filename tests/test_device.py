@@ -11,7 +11,7 @@ import torch
 
 import curvireg_torch as cr
 from curvireg_torch.detectors import DETECTORS
-from curvireg_torch.models import appearance
+from curvireg_torch.features import appearance
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import localize
 from curvireg_torch.synthetic import example_mesh

@@ -6,8 +6,8 @@ import torch.nn.functional as F
 import trimesh
 
 import curvireg_torch as cr
+from curvireg_torch.data import read_image
 from curvireg_torch.geometry import pose_from_box
-from curvireg_torch.io import read_image
 from curvireg_torch.synthetic import random_pose, synthesize_photograph
 from tests._support.real_data import real_data
 

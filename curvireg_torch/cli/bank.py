@@ -38,8 +38,8 @@ def run(arguments: argparse.Namespace) -> None:
             check_writable(path.parent, name)
     if arguments.mesh.suffix == ".safetensors":
         raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
-    from ..io.meshes import load_mesh
     from ..matching import ViewBank
+    from ..mesh import load_mesh
     from ..utils.threads import one_torch_thread
 
     start, options = time.perf_counter(), register_options(arguments)

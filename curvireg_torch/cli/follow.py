@@ -121,8 +121,8 @@ def _pose(follow: "Follower", image: "Tensor | ImageError", box: Any) -> "Regist
 
 def _frames(path: Path, meshes: Sequence[Path]) -> tuple[Iterator[tuple[str, "Tensor | ImageError"]], int, float]:
     """Names and pixels of the frames, with errors in place of unreadable ones; their number, and frames per second."""
+    from ..data import Video, read_photo
     from ..evaluation.lists import list_photographs
-    from ..io import Video, read_photo
 
     if path.suffix.lower() in VIDEOS and path.is_file():
         video = Video(path)

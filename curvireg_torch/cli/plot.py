@@ -105,9 +105,9 @@ def _formats(kind: str) -> tuple[str, ...]:
 def _registration_figure(kind: str, options: "RegisterOptions") -> Any:
     import torch
 
+    from ..data import read_photo
     from ..evaluation.lists import register_entry
     from ..evaluation.opening import check_camera, open_registrar
-    from ..io import read_photo
     from ..registration.document import used_box
     from ..utils.threads import one_torch_thread
     from ..visualization import plots
@@ -147,7 +147,7 @@ class _Table:
     """A CSV file with a header."""
 
     def __init__(self, path: Path) -> None:
-        from ..io.json_files import check_table_size
+        from ..utils.json_files import check_table_size
 
         if not path.is_file():
             raise MissingFileError(f"{path}: no such table; curvireg evaluate writes predictions.csv")

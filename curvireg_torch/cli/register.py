@@ -178,11 +178,11 @@ def run(arguments: argparse.Namespace) -> None:
 def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, as_json: bool) -> None:
     import torch
 
+    from ..data import read_photo
     from ..evaluation.lists import check_entry, register_entry
     from ..evaluation.opening import open_registrar
     from ..evaluation.result_files import write_lost, write_result
     from ..evaluation.store import to_json
-    from ..io import read_photo
     from ..registration.document import used_box
     from .report import print_result
 

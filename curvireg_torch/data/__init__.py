@@ -4,13 +4,14 @@ A sample is a dict, one per object. Every dataset reports skipped objects with t
 ``skipped_items``), and ``annotation(index)`` returns a sample without its photograph. Nothing is downloaded.
 """
 
-from ..io.images import Photo, read_image, read_photo
 from ._base import ObjectDataset
 from .bop import BOPDataset
 from .bop_csv import BOPRow, read_bop_csv, write_bop_csv
 from .collate import collate
+from .images import Photo, read_image, read_photo
 from .pascal3d import Pascal3DPlus
 from .transforms import CropBox
+from .videos import Video
 from .web import WebCollection
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "ObjectDataset",
     "Pascal3DPlus",
     "Photo",
+    "Video",
     "WebCollection",
     "collate",
     "read_bop_csv",

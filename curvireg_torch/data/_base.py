@@ -11,7 +11,7 @@ from torch.utils.data import Dataset
 
 from ..errors import MissingFileError
 from ..geometry import rotation_from_viewpoint
-from ..io.images import read_image
+from .images import read_image
 
 Sample = dict[str, Any]
 Transform = Callable[[Sample], Sample]

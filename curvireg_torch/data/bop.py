@@ -8,8 +8,8 @@ from typing import Any
 import torch
 
 from ..errors import InvalidInputError, MissingFileError
-from ..io.json_files import finite_numbers, read_json
 from ..utils.checks import check_camera_matrix, check_positive, check_rotation
+from ..utils.json_files import finite_numbers, read_json
 from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name
 
 _README = "datasets/bop/README.md"

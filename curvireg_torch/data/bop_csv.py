@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError, MissingFileError
-from ..io.json_files import check_table_size, finite_numbers
 from ..utils.checks import check_tensor
 from ..utils.files import write_csv
+from ..utils.json_files import check_table_size, finite_numbers
 
 _HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InvalidInputError, MissingFileError
-from ..io.mat_files import MatStruct, MatValue, read_mat
 from ..utils.checks import check_option, check_positive
 from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name, pose_fields
+from .mat_files import MatStruct, MatValue, read_mat
 
 _README = "datasets/pascal3d/README.md"
 _VOC_LISTS = Path("PASCAL", "VOCdevkit", "VOC2012", "ImageSets", "Main")

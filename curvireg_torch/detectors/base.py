@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..descriptors.points import field_points, strongest_points
+from ..features.points import field_points, strongest_points
 from ..filters.inputs import fill_missing, may_have_missing, missing_mask, to_grey
 from ..filters.numerics import at_least_float32, full_precision, safe_sqrt
 from ..utils.checks import check_colour_image

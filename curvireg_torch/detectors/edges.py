@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..descriptors.points import strongest_points
+from ..features.points import strongest_points
 from ..filters import image_gradient
 from ..filters.derivatives import central_derivatives, replicate_pad, smooth
 from ..filters.numerics import image_maximum, safe_sqrt

@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..descriptors.points import strongest_points
+from ..features.points import strongest_points
 from ..utils.checks import check_positive
 from .base import Detection, detector
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..data import BOPDataset, BOPRow, write_bop_csv
 from ..geometry import symmetry_transforms
 from ..geometry.cameras import transform
-from ..io.meshes import load_mesh
+from ..mesh import load_mesh
 from ..metrics import (
     add_error,
     add_recall,

@@ -8,16 +8,16 @@ from typing import Any
 import torch
 
 from ..errors import BankError, InvalidInputError
+from ..features import LearnedCurvilinearSaliency
 from ..geometry import camera_matrix, sample_views
 from ..geometry.cameras import camera_of_view, transform
-from ..io.json_files import finite_numbers, read_json
-from ..io.meshes import load_mesh
 from ..matching import ViewBank, cached_bank
-from ..models import LearnedCurvilinearSaliency
+from ..mesh import load_mesh
 from ..pipeline import Pipeline, preset_named
 from ..registration import Registrar
 from ..utils.checks import check_rotation, check_square_pixels
 from ..utils.choices import DEFAULT
+from ..utils.json_files import finite_numbers, read_json
 from .lists import Entry
 from .prior_options import prior_from_limits
 

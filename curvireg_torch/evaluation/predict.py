@@ -6,10 +6,10 @@ from pathlib import Path
 
 from torch import Tensor, nn
 
+from ..data import read_image
 from ..errors import ImageError, MeshError, MissingFileError
-from ..io import read_image
-from ..io.meshes import load_mesh
 from ..matching import Ranking, ViewBank, ViewMatcher, cached_bank
+from ..mesh import load_mesh
 from ..pipeline import Pipeline
 from ..registration import FailedRegistration, Registrar
 from ..registration.document import localization_document

@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeVar
 
 from tqdm import tqdm
 
-from ..io.meshes.files import mesh_digest
+from ..mesh.files import mesh_digest
 from ..registration import Registrar
 from ..utils.digests import code_digest, file_digest, text_digest
 from ..utils.threads import map_on_threads

@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 
+from ..data import read_image
 from ..errors import CurviregError, InvalidInputError
-from ..io import read_image
-from ..io.meshes import load_mesh
+from ..mesh import load_mesh
 from ..rendering import make_renderer
 from ..visualization.sheet import SheetEntry, thumbnail, write_sheet
 from .benchmark import Benchmark, BenchmarkItem, Row

@@ -7,8 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..errors import InvalidInputError
-from ..limits import MAX_BOX_COORDINATE
+from ..errors import MAX_BOX_COORDINATE, InvalidInputError
 from ..utils.checks import as_boxes, check_positive, check_tensor
 
 BLOCK = 16

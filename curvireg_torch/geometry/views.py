@@ -82,7 +82,7 @@ class ViewSphere:
     def in_model_frame(self, T_views_from_model: Tensor) -> "ViewSphere":
         """Views of another frame of the model, expressed in the model's frame.
 
-        With :func:`curvireg_torch.io.meshes.normalization_transform`, a (4, 4) similarity, views follow the principal
+        With :func:`curvireg_torch.mesh.normalization_transform`, a (4, 4) similarity, views follow the principal
         axes of an object while poses stay in the frame of the file.
         """
         check_tensor(T_views_from_model, "T_views_from_model", (4, 4))

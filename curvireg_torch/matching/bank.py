@@ -14,8 +14,8 @@ from tqdm import tqdm
 
 from ..errors import BankError, InvalidInputError
 from ..geometry.views import ViewSphere
-from ..io.meshes.mesh import as_mesh, mesh_radius
-from ..io.meshes.up import mesh_up
+from ..mesh.mesh import as_mesh, mesh_radius
+from ..mesh.up import mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..settings import BankSettings

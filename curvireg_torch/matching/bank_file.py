@@ -13,9 +13,9 @@ from torch import Tensor
 
 from ..errors import BankError, CurviregError, MissingFileError
 from ..geometry.views import ViewSphere
-from ..io.meshes.colours import SurfaceColours, surface_colours
-from ..io.meshes.mesh import mesh_unit
-from ..io.meshes.up import mesh_up
+from ..mesh.colours import SurfaceColours, surface_colours
+from ..mesh.mesh import mesh_unit
+from ..mesh.up import mesh_up
 from ..pipeline import Pipeline
 from ..settings import BankSettings
 from ..utils.digests import tensor_digest

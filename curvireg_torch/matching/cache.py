@@ -18,8 +18,8 @@ import trimesh
 
 from ..errors import BankError
 from ..geometry.views import ViewSphere
-from ..io.meshes.mesh import as_mesh, mesh_unit
-from ..io.meshes.up import mesh_up
+from ..mesh.mesh import as_mesh, mesh_unit
+from ..mesh.up import mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..utils.digests import code_digest, tensor_digest, text_digest
@@ -46,11 +46,10 @@ _BANK = re.compile(r"bank-[0-9a-f]{32}\.safetensors")
 _INCOMPLETE = re.compile(_BANK.pattern + r"\.[0-9a-f]{8}\.tmp")
 
 _SOURCES = (
-    "descriptors",
+    "features",
     "filters",
     "geometry",
-    "io/meshes",
-    "models",
+    "mesh",
     "rendering",
     "terms",
     "settings.py",

@@ -7,11 +7,11 @@ import torch
 import trimesh
 from torch import Tensor
 
-from ..descriptors import field_points
+from ..features import field_points
 from ..geometry.cameras import projected_boxes, transform
 from ..geometry.crops import crop_transforms, image_transforms, square_boxes
-from ..io.meshes.colours import has_colours
-from ..io.meshes.mesh import extreme_points, mesh_centre, mesh_radius
+from ..mesh.colours import has_colours
+from ..mesh.mesh import extreme_points, mesh_centre, mesh_radius
 from ..rendering import DepthRenderer, make_renderer, render_colour
 from ..rendering.shading import shade
 from ..settings import BankSettings

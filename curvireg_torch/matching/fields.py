@@ -2,7 +2,7 @@
 
 from torch import nn
 
-from ..descriptors import HOG
+from ..features import HOG
 from ..settings import DEPTH_FIELDS, BankSettings
 
 __all__ = ["depth_filter", "hog_layer"]

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..descriptors import field_points
 from ..errors import InvalidInputError
-from ..io.meshes.colours import has_colours
+from ..features import field_points
+from ..mesh.colours import has_colours
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..terms import (

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from ..io.meshes.mesh import mesh_unit
+from ..mesh.mesh import mesh_unit
 from ..version import __version__
 from .confidence import RELIABLE
 from .registrar import Registrar

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from ..errors import CurviregError
-from ..io.meshes import has_colours, mesh_symmetries
+from ..features.learned_field import LearnedCurvilinearSaliency
 from ..matching import Ranking, ViewDescriber, ViewMatcher
-from ..models.learned_field import LearnedCurvilinearSaliency
+from ..mesh import has_colours, mesh_symmetries
 from ..terms import QueryFeatures
 from ..utils.checks import check_option
 from ..utils.choices import MESH_KINDS

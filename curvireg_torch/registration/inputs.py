@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..data.images import read_photo
 from ..errors import CurviregError, ImageError, InvalidInputError
 from ..geometry.crops import check_boxes, whole_image_box
 from ..geometry.pose_prior import PosePrior
-from ..io.images import read_photo
 from ..utils.checks import (
     as_boxes,
     as_camera_matrices,

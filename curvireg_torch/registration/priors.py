@@ -10,9 +10,9 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..geometry.cameras import rotation_towards
 from ..geometry.pose_prior import PosePrior, object_frame
-from ..io.meshes import mesh_up
-from ..io.meshes.mesh import mesh_centre, mesh_radius
 from ..matching import ViewBank
+from ..mesh import mesh_up
+from ..mesh.mesh import mesh_centre, mesh_radius
 from .hypotheses import Hypotheses
 from .inputs import ImageItem
 from .results import Registration

@@ -46,7 +46,7 @@ class Registrar(PoseEstimator):
             camera matrix, similar for others.
         symmetries: (S, 4, 4) of the mesh, from :func:`curvireg_torch.geometry.symmetry_transforms`; hypotheses that
             differ by one of them are reported once. Default: those of the shape of a single exact mesh without colours,
-            see :func:`curvireg_torch.io.meshes.mesh_symmetries`; ``torch.eye(4)[None]`` for none.
+            see :func:`curvireg_torch.mesh.mesh_symmetries`; ``torch.eye(4)[None]`` for none.
         device: of modules, bank and search.
         progress: True shows bars. A callback gets (stage, done, total), with the stages "localization" (without a box),
             "bank", "ranking", "search" and "contours"; it may raise to cancel. On a CPU photographs are registered in

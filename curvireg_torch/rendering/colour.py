@@ -8,8 +8,8 @@ import torch.nn.functional as F
 import trimesh
 from torch import Tensor
 
-from ..io.meshes.colours import surface_colours
-from ..io.meshes.mesh import as_mesh
+from ..mesh.colours import surface_colours
+from ..mesh.mesh import as_mesh
 from .factory import make_renderer
 from .protocol import DepthRenderer, check_render_arguments
 from .shading import shade

@@ -8,7 +8,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from torch import Tensor
 
-from ..io.meshes.mesh import box_corners, extreme_points, mesh_centre, mesh_radius
+from ..mesh.mesh import box_corners, extreme_points, mesh_centre, mesh_radius
 from ..utils.threads import for_each
 from .protocol import NEAREST, check_render_arguments
 

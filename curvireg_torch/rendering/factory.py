@@ -12,7 +12,7 @@ import trimesh
 from torch import Tensor
 
 from ..errors import InvalidInputError, MissingDependencyError, RenderingError
-from ..io.meshes.mesh import as_mesh
+from ..mesh.mesh import as_mesh
 from ..utils.registry import Registry
 from .protocol import DepthRenderer, check_render_arguments
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..errors import RenderingError
 from ..geometry.conversions import opencv_from_opengl, opengl_projection
-from ..io.meshes.mesh import box_corners, mesh_centre, mesh_radius
+from ..mesh.mesh import box_corners, mesh_centre, mesh_radius
 from .protocol import NEAREST, check_render_arguments
 
 __all__ = ["PyrenderRenderer"]

@@ -5,7 +5,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from ..io.meshes.mesh import mesh_centre, mesh_radius
+from ..mesh.mesh import mesh_centre, mesh_radius
 from ..utils.threads import map_on_threads
 from .protocol import NEAREST, check_render_arguments
 

@@ -11,7 +11,7 @@ from ..errors import InvalidInputError
 from ..filters import gaussian_smooth
 from ..geometry.cameras import rotation_towards, transform
 from ..geometry.viewpoint import rotation_from_viewpoint
-from ..io.meshes.mesh import mesh_centre, mesh_radius
+from ..mesh.mesh import mesh_centre, mesh_radius
 from ..rendering import render_depth
 
 __all__ = ["procedural_background", "random_pose", "synthesize_photograph"]

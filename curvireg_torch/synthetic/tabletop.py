@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..geometry import projected_boxes
-from ..io.meshes.mesh import mesh_centre, mesh_radius
+from ..mesh.mesh import mesh_centre, mesh_radius
 from ..rendering.embree import RayScene
 from ..utils.threads import for_each
 

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..models.appearance import describe, similarity
-from ..models.backbone import SHA256, Backbone
+from ..features.appearance import describe, similarity
+from ..features.backbone import SHA256, Backbone
 from .base import RerankingModule, RerankingTerm, Views
 from .query import QueryFeatures
 
@@ -21,7 +21,7 @@ class Appearance(RerankingTerm):
 
     A mesh with colours is rendered twice, in grey and in its colours, and the better match counts for each view: a
     print distinguishes top from bottom, and the grey picture remains where the print misleads. Raw scores are mean
-    cosines (:func:`curvireg_torch.models.appearance.similarity`) in [-1, 1]; log S_look = (raw - max raw) / std raw,
+    cosines (:func:`curvireg_torch.features.appearance.similarity`) in [-1, 1]; log S_look = (raw - max raw) / std raw,
     over the compared views.
 
     Attributes:

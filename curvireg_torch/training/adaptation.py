@@ -6,9 +6,9 @@ import torch
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
-from ..io.meshes.mesh import as_mesh
-from ..io.meshes.up import with_z_up
-from ..models.learned_field import LearnedCurvilinearSaliency
+from ..features.learned_field import LearnedCurvilinearSaliency
+from ..mesh.mesh import as_mesh
+from ..mesh.up import with_z_up
 from ..utils.checks import check_positive
 from .field_dataset import FieldDataset, augment, losses
 from .scenes import GeneratedScenes

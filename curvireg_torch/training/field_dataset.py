@@ -5,10 +5,10 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from ..features.learned_field import WORK_SIZE, doubled_angle, halved_angle
 from ..geometry import rotation_from_axis_angle
 from ..matching import ViewDescriber
 from ..matching.fields import depth_filter, hog_layer
-from ..models.learned_field import WORK_SIZE, doubled_angle, halved_angle
 from ..settings import BankSettings
 from ..terms import normalized_correlation
 from .scenes import GeneratedScenes

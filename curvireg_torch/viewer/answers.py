@@ -5,7 +5,7 @@ from typing import Any
 from nicegui import ui
 
 from ..geometry import rotation_error
-from ..io.meshes import mesh_unit, mesh_up
+from ..mesh import mesh_unit, mesh_up
 from ..registration.confidence import RELIABLE
 from ..registration.document import remarks
 from ..registration.wording import pose_in_words, verdict

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
-from ..io.meshes.mesh import mesh_unit
-from ..limits import MAX_VIEWER_FACES
+from ..errors import MAX_VIEWER_FACES
+from ..mesh.mesh import mesh_unit
 from ..utils.choices import UNITS
 from ..visualization import side_pictures
 from ..visualization.encoding import png

@@ -19,9 +19,8 @@ from nicegui import app, ui
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 
-from ..errors import InvalidInputError
+from ..errors import MAX_VIEWER_PAGES, InvalidInputError
 from ..evaluation.opening import RegisterOptions
-from ..limits import MAX_VIEWER_PAGES
 from ..utils.threads import one_torch_thread
 from .guard import Guard, allowed_hosts, public_addresses
 from .page import Page, add_assets

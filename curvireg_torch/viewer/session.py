@@ -12,16 +12,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..errors import CurviregError, CurviregWarning, InvalidInputError
+from ..data import read_photo
+from ..data.images import Photo
+from ..errors import MAX_VIEWER_SECONDS, CurviregError, CurviregWarning, InvalidInputError
 from ..evaluation.lists import register_entry
 from ..evaluation.opening import RegisterOptions, check_camera, open_registrar
 from ..evaluation.prior_options import QUALIFIERS
 from ..evaluation.store import to_json
-from ..io import read_photo
-from ..io.images import Photo
-from ..io.meshes import has_colours, load_mesh
-from ..limits import MAX_VIEWER_SECONDS
 from ..matching import ViewBank
+from ..mesh import has_colours, load_mesh
 from ..registration import Registrar, Registration
 from ..registration.document import used_box
 from ..visualization import pose_glb

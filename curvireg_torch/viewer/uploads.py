@@ -6,8 +6,7 @@ import struct
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from ..errors import InvalidInputError
-from ..limits import MAX_ARCHIVE_FILES, MAX_IMAGE_BYTES, MAX_MESH_BYTES
+from ..errors import MAX_ARCHIVE_FILES, MAX_IMAGE_BYTES, MAX_MESH_BYTES, InvalidInputError
 from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS
 
 __all__ = ["HEAD_BYTES", "file_name", "identify", "size_limit", "unpack"]

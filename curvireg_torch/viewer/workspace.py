@@ -12,9 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import CurviregError, InvalidInputError
+from ..errors import MAX_VIEWER_BYTES, MAX_VIEWER_PAGES, MAX_VIEWER_UPLOADS, CurviregError, InvalidInputError
 from ..evaluation.opening import RegisterOptions
-from ..limits import MAX_VIEWER_BYTES, MAX_VIEWER_PAGES, MAX_VIEWER_UPLOADS
 from ..synthetic import demo_scene
 from ..utils.files import write_file
 from ..visualization.encoding import png
@@ -243,7 +242,7 @@ class Workspace:
 
 
 class Workspaces:
-    """The workspaces of a server, at most :data:`~curvireg_torch.limits.MAX_VIEWER_PAGES`, and their folder."""
+    """The workspaces of a server, at most :data:`~curvireg_torch.errors.MAX_VIEWER_PAGES`, and their folder."""
 
     def __init__(self, options: RegisterOptions, folder: Path) -> None:
         self.options, self.folder, self.items = options, folder, dict[str, Workspace]()

@@ -11,8 +11,8 @@ from PIL import Image
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..io.meshes.colours import surface_colours
-from ..io.meshes.mesh import mesh_centre, mesh_radius, mesh_unit
+from ..mesh.colours import surface_colours
+from ..mesh.mesh import mesh_centre, mesh_radius, mesh_unit
 from ..utils.checks import check_camera_matrix, check_photograph, check_pose, check_tensor
 from ..utils.choices import UNITS
 from .encoding import jpeg, shrink

@@ -9,7 +9,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from ..geometry import rotation_error
-from ..io.meshes import mesh_unit, mesh_up
+from ..mesh import mesh_unit, mesh_up
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import ImageItem
 from ..registration.wording import pose_in_words, verdict

@@ -13,7 +13,7 @@ import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.geometry import transform
-from curvireg_torch.io.meshes import mesh_centre, mesh_radius
+from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 

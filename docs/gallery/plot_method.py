@@ -18,7 +18,7 @@ import matplotlib.pyplot as plt
 import torch
 
 import curvireg_torch as cr
-from curvireg_torch.io.meshes import mesh_radius
+from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.synthetic import example_mesh, photograph_tabletop, random_pose
 from curvireg_torch.visualization import contour_overlay
 

@@ -20,8 +20,8 @@ from PIL import Image
 from scipy.stats import binomtest
 
 import curvireg_torch as cr
+from curvireg_torch.data import read_image
 from curvireg_torch.geometry import transform
-from curvireg_torch.io import read_image
 from curvireg_torch.rendering import make_renderer
 from scripts._shared import table_lines
 from scripts.docs_pictures import captioned, drawn, side_by_side, stacked

@@ -19,13 +19,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 import curvireg_torch as cr
+from curvireg_torch.data import read_image
+from curvireg_torch.features.learned_field import LearnedCurvilinearSaliency, doubled_angle
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import rotation_towards, transform
 from curvireg_torch.geometry.crops import crop_transforms, square_boxes
 from curvireg_torch.geometry.translation import pose_from_box
-from curvireg_torch.io import read_image
-from curvireg_torch.io.meshes.mesh import extreme_points, mesh_centre, mesh_radius
-from curvireg_torch.models.learned_field import LearnedCurvilinearSaliency, doubled_angle
+from curvireg_torch.mesh.mesh import extreme_points, mesh_centre, mesh_radius
 from curvireg_torch.registration import fit_contours
 from curvireg_torch.registration.contours.descent import ContourProblem, pixels
 from curvireg_torch.registration.contours.fit import SIZE

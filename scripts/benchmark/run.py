@@ -28,9 +28,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 import curvireg_torch as cr
+from curvireg_torch.data import read_image
 from curvireg_torch.evaluation.protocol import Protocol, hint_of_truth, perturbed_box
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_towards
-from curvireg_torch.io import read_image
 from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
 from curvireg_torch.registration.calibration import COVARIANCE_SCALE
 from curvireg_torch.registration.confidence import ranking_evidence

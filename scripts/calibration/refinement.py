@@ -25,8 +25,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 import curvireg_torch as cr
+from curvireg_torch.data import read_image
 from curvireg_torch.geometry import rotation_from_axis_angle
-from curvireg_torch.io import read_image
 from curvireg_torch.registration import refinement
 from scripts._rapid import AVAILABLE, Rapid
 from scripts._shared import REPOSITORY, commit, table_lines, today, update_page, write_json

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 import curvireg_torch as cr
 from curvireg_torch.errors import LostObjectError
-from curvireg_torch.io.meshes.mesh import extreme_points, mesh_centre, mesh_radius
+from curvireg_torch.mesh.mesh import extreme_points, mesh_centre, mesh_radius
 from curvireg_torch.registration.confidence import LogisticModel
 from curvireg_torch.registration.tracking import Tracker
 from curvireg_torch.rendering import make_renderer

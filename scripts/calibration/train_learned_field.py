@@ -21,12 +21,12 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
+from curvireg_torch.features import FieldNetwork, halved_angle
+from curvireg_torch.features.learned_field import save_weights
 from curvireg_torch.filters import MultiScaleFocusCurves
 from curvireg_torch.geometry import rotation_error, sample_views
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.matching.fields import depth_filter, hog_layer
-from curvireg_torch.models import FieldNetwork, halved_angle
-from curvireg_torch.models.learned_field import save_weights
 from curvireg_torch.terms import normalized_correlation
 from curvireg_torch.training import FieldDataset, ReplayBuffer, augment, losses
 from curvireg_torch.training.field_dataset import SETTINGS

@@ -22,13 +22,12 @@ from kornia.color import rgb_to_grayscale
 from torch import Tensor
 
 from curvireg_torch import filters
-from curvireg_torch.data import Pascal3DPlus
+from curvireg_torch.data import Pascal3DPlus, read_image
+from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.geometry import crop_images
-from curvireg_torch.io import read_image
-from curvireg_torch.io.meshes import load_mesh
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.matching.fields import depth_filter
-from curvireg_torch.models import LearnedCurvilinearSaliency
+from curvireg_torch.mesh import load_mesh
 from curvireg_torch.training.field_dataset import SETTINGS
 from curvireg_torch.training.scenes import GeneratedScenes
 

@@ -10,9 +10,8 @@ import torch
 import trimesh
 
 import curvireg_torch as cr
-from curvireg_torch.data import BOPDataset, Pascal3DPlus, WebCollection
+from curvireg_torch.data import BOPDataset, Pascal3DPlus, WebCollection, read_photo
 from curvireg_torch.geometry.pose_prior import PosePrior
-from curvireg_torch.io import read_photo
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import Registration
 

@@ -32,7 +32,7 @@ from hypothesis import strategies as st
 from curvireg_torch.errors import CurviregError
 from curvireg_torch.geometry import camera_matrix, crop_images, pose_from_box, square_boxes, translation_from_box
 from curvireg_torch.geometry.crops import check_boxes
-from curvireg_torch.io.meshes.mesh import extreme_points
+from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.terms import crop_regions, jittered_boxes
 from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, update_page
 from scripts.robustness.fuzz_inputs import INPUTS

@@ -19,10 +19,9 @@ import trimesh
 from safetensors.torch import load, save
 
 import curvireg_torch as cr
-from curvireg_torch.data import BOPDataset, WebCollection, read_bop_csv
+from curvireg_torch.data import BOPDataset, WebCollection, read_bop_csv, read_photo
+from curvireg_torch.data.mat_files import read_mat
 from curvireg_torch.errors import CurviregError
-from curvireg_torch.io import read_photo
-from curvireg_torch.io.mat_files import read_mat
 from curvireg_torch.matching.bank_file import tensor_digest
 from curvireg_torch.synthetic import example_mesh
 

@@ -27,7 +27,7 @@ from typing import Any, BinaryIO
 import cv2
 import numpy as np
 
-from curvireg_torch import limits
+from curvireg_torch import errors as limits
 from curvireg_torch.errors import CurviregError
 from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, update_page, write_json
 

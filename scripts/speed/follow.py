@@ -24,10 +24,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 import curvireg_torch as cr
-from curvireg_torch.data import BOPDataset
-from curvireg_torch.io import read_image
-from curvireg_torch.io.meshes.mesh import mesh_centre
+from curvireg_torch.data import BOPDataset, read_image
 from curvireg_torch.matching import cached_bank
+from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.registration import Follower
 from scripts._rapid import ABSENT, AVAILABLE, Rapid
 from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, update_page, write_json

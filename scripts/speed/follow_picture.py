@@ -13,9 +13,9 @@ from PIL import Image
 from torch import Tensor
 
 import curvireg_torch as cr
-from curvireg_torch.io import Video
-from curvireg_torch.io.meshes import mesh_centre, mesh_radius
+from curvireg_torch.data import Video
 from curvireg_torch.matching import cached_bank
+from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import Follower
 from curvireg_torch.synthetic import example_mesh, photograph_tabletop
 from curvireg_torch.visualization import OverlayVideo

@@ -30,8 +30,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 import curvireg_torch as cr
+from curvireg_torch.data import read_image
 from curvireg_torch.geometry import box_iou
-from curvireg_torch.io import read_image
 from curvireg_torch.matching import cached_bank
 from curvireg_torch.pipeline import DEFAULT, PRESETS, preset_named
 from curvireg_torch.registration.confidence import presence

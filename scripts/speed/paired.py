@@ -87,7 +87,7 @@ def measure(step: str, folder: str, megapixels: float, photographs: int) -> floa
 
 def follow(registrar: Any, photograph: str, box: list[float], K: Any) -> float:
     """Seconds of each tracked frame of a video of a photograph that moves to the right, and comes back on the left."""
-    from curvireg_torch.io import read_image
+    from curvireg_torch.data import read_image
     from curvireg_torch.registration import Follower
 
     first, follower = read_image(photograph), Follower(registrar, K)

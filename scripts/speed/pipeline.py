@@ -26,8 +26,8 @@ import trimesh
 from curvireg_torch import Pipeline, Registrar, ViewBank, ViewMatcher, camera_matrix
 from curvireg_torch.errors import RenderingError
 from curvireg_torch.geometry import uniform_views
-from curvireg_torch.io.meshes import mesh_radius
 from curvireg_torch.matching import ViewDescriber
+from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.settings import BankSettings
 from curvireg_torch.synthetic import random_pose, synthesize_photograph

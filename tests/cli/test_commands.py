@@ -16,8 +16,8 @@ from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregWarning, InvalidInputError
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.evaluation.registry import DatasetSpec
+from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.geometry import rotation_error
-from curvireg_torch.models import LearnedCurvilinearSaliency
 from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline
 from curvireg_torch.settings import BankSettings, ViewPolicy
 from curvireg_torch.training import adapt

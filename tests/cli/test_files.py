@@ -19,7 +19,7 @@ import trimesh
 from curvireg_torch import camera_matrix
 from curvireg_torch.data import read_bop_csv
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.io.meshes import load_mesh
+from curvireg_torch.mesh import load_mesh
 from curvireg_torch.visualization import sheet
 from tests._support.lists import CAMERA, box_of, lines, table, written
 

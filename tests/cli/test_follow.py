@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from curvireg_torch.cli import main
+from curvireg_torch.data import Video
 from curvireg_torch.geometry import rotation_error
-from curvireg_torch.io import Video
 from curvireg_torch.registration import Follower
 from tests._support.lists import CAMERA
 from tests._support.scenes import truck_bank

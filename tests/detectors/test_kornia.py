@@ -9,8 +9,8 @@ from kornia.feature import LAFDescriptor, ScaleSpaceDetector, laf_from_center_sc
 from torch import Tensor, nn
 
 from curvireg_torch import detectors, filters
-from curvireg_torch.descriptors import HOG
 from curvireg_torch.detectors import Response
+from curvireg_torch.features import HOG
 
 from ..filters.layer_cases import colour_photos, photos
 

@@ -6,11 +6,11 @@ import pytest
 import torch
 import trimesh
 
+from curvireg_torch.data import read_image
 from curvireg_torch.evaluation import Pascal3DBenchmark, Protocol, predict
 from curvireg_torch.geometry import rotation_error
-from curvireg_torch.io import read_image
-from curvireg_torch.io.meshes import load_mesh
 from curvireg_torch.matching import ViewBank, ViewMatcher
+from curvireg_torch.mesh import load_mesh
 
 from .helpers import rows_of, run
 from .small import SMALL

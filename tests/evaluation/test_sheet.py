@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from curvireg_torch.cli import main
+from curvireg_torch.data import read_image
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, WebBenchmark, contact_sheet, evaluate
 from curvireg_torch.evaluation.store import ResultStore
-from curvireg_torch.io import read_image
-from curvireg_torch.io.meshes import load_mesh
+from curvireg_torch.mesh import load_mesh
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.visualization.sheet import thumbnail
 

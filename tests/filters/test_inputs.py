@@ -7,7 +7,7 @@ import torch
 from kornia.color import rgb_to_grayscale
 
 from curvireg_torch import filters
-from curvireg_torch.descriptors import field_points, hog
+from curvireg_torch.features import field_points, hog
 from curvireg_torch.filters.inputs import fill_missing, to_grey
 
 from .._support.layer_contract import LayerCase

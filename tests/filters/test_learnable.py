@@ -7,8 +7,8 @@ import torch
 from torch import nn
 
 from curvireg_torch import filters
-from curvireg_torch.descriptors import HOG
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.features import HOG
 
 from .layer_cases import depths, photos
 

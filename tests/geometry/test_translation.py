@@ -3,8 +3,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from curvireg_torch import geometry as g
-from curvireg_torch.io.meshes import mesh_centre, mesh_radius
-from curvireg_torch.io.meshes.mesh import extreme_points
+from curvireg_torch.mesh import mesh_centre, mesh_radius
+from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.synthetic import example_mesh
 
 K = g.camera_matrix(800.0, 820.0, 310.0, 255.0, dtype=torch.float64)

@@ -6,8 +6,8 @@ import trimesh
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import up_rotation
-from curvireg_torch.io.meshes import mesh_up, with_z_up
-from curvireg_torch.io.meshes.mesh import as_mesh
+from curvireg_torch.mesh import mesh_up, with_z_up
+from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.settings import ViewPolicy
 from curvireg_torch.utils.choices import UP_AXES

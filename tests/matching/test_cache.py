@@ -18,10 +18,10 @@ import trimesh
 from PIL import Image
 
 from curvireg_torch.geometry import sample_views
-from curvireg_torch.io.meshes.colours import SurfaceColours
-from curvireg_torch.io.meshes.mesh import as_mesh
 from curvireg_torch.matching import ViewBank, bank_key, cache, cache_folder, cached_bank, list_cache
 from curvireg_torch.matching.cache import clear_cache, trim_cache
+from curvireg_torch.mesh.colours import SurfaceColours
+from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.settings import BankSettings

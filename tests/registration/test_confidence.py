@@ -10,9 +10,9 @@ import trimesh
 
 from curvireg_torch import Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
 from curvireg_torch.geometry import symmetry_transforms
-from curvireg_torch.io.meshes import mesh_symmetries
-from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
 from curvireg_torch.matching import Ranking
+from curvireg_torch.mesh import mesh_symmetries
+from curvireg_torch.mesh.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import confidence, ranking_evidence, rescore
 from curvireg_torch.registration import estimator as estimator_module
 from curvireg_torch.registration.confidence import (

@@ -9,7 +9,7 @@ import trimesh
 from curvireg_torch import Pipeline, Registrar, load_mesh, rotation_error, rotation_from_viewpoint, sample_views
 from curvireg_torch.geometry import transform, up_rotation
 from curvireg_torch.geometry.cameras import projected_boxes
-from curvireg_torch.io.meshes.mesh import extreme_points
+from curvireg_torch.mesh.mesh import extreme_points
 from tests._support.cans import can, photograph
 from tests._support.scenes import CAMERA
 

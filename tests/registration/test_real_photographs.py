@@ -10,10 +10,9 @@ import pytest
 import torch
 
 import curvireg_torch as cr
-from curvireg_torch.data import BOPDataset, Pascal3DPlus
+from curvireg_torch.data import BOPDataset, Pascal3DPlus, read_image
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol
 from curvireg_torch.geometry import rotation_error, symmetry_transforms
-from curvireg_torch.io import read_image
 from curvireg_torch.metrics import symmetric_rotation_error
 from tests._support.real_data import real_data
 

@@ -10,7 +10,7 @@ import trimesh
 from curvireg_torch import ImageGradient, Registrar, ViewBank, ViewMatcher, project_points, rotation_error, sample_views
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, MissingFileError
 from curvireg_torch.geometry import rotation_from_viewpoint, symmetry_transforms, transform
-from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
+from curvireg_torch.mesh.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import RELIABLE, FailedRegistration, fit_contours
 from curvireg_torch.registration import results as results_module

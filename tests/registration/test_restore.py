@@ -8,7 +8,7 @@ import torch
 
 from curvireg_torch import Registrar, Registration, ViewBank, rotation_error, sample_views
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
-from curvireg_torch.io.meshes import mesh_centre, mesh_radius
+from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import Hypothesis
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph

@@ -7,7 +7,7 @@ import torch
 
 import curvireg_torch as cr
 from curvireg_torch.geometry import projected_boxes
-from curvireg_torch.io.meshes.mesh import extreme_points
+from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.rendering import make_renderer
 
 from .._support.real_data import real_data

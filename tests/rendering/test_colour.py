@@ -10,7 +10,7 @@ from PIL import Image
 from torch import Tensor
 
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
-from curvireg_torch.io.meshes import has_colours, load_mesh, surface_colours
+from curvireg_torch.mesh import has_colours, load_mesh, surface_colours
 from curvireg_torch.rendering import make_renderer, render_colour
 from curvireg_torch.rendering.embree import EmbreeRenderer
 from curvireg_torch.rendering.shading import shade

@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 from curvireg_torch.geometry import project_points
-from curvireg_torch.io.meshes import mesh_centre, mesh_radius
+from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.zbuffer import TorchRenderer
 from curvireg_torch.synthetic import example_mesh

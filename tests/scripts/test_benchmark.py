@@ -121,7 +121,7 @@ def test_printed_packages_are_exact_and_textured(tmp_path):
     turns = [np.eye(3).tolist()]
     (tmp_path / "meshes.json").write_text(json.dumps({"turns": turns, "meshes": rows}))
     for row in rows:
-        assert cr.io.meshes.has_colours(cr.load_mesh(tmp_path / row["path"]))
+        assert cr.mesh.has_colours(cr.load_mesh(tmp_path / row["path"]))
         assert TexturedMesh.load(tmp_path / row["path"]).pictures[0] is not None
     catalogue = make.Meshes(tmp_path, "printed")
     assert len(catalogue.good) == 4

@@ -4,12 +4,12 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from curvireg_torch.features.learned_field import LearnedCurvilinearSaliency
 from curvireg_torch.geometry import rotation_error, rotation_towards
 from curvireg_torch.geometry.cameras import projected_boxes
 from curvireg_torch.geometry.crops import crop_transforms, square_boxes
-from curvireg_torch.io.meshes import mesh_centre, mesh_radius
-from curvireg_torch.io.meshes.mesh import extreme_points
-from curvireg_torch.models.learned_field import LearnedCurvilinearSaliency
+from curvireg_torch.mesh import mesh_centre, mesh_radius
+from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.registration.contours.descent import ContourProblem, apply_twist
 from curvireg_torch.registration.contours.points import EdgeField
 from curvireg_torch.rendering import make_renderer

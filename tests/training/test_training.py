@@ -9,8 +9,8 @@ import torch
 import trimesh
 
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.features import FieldNetwork, LearnedCurvilinearSaliency, doubled_angle
 from curvireg_torch.matching.fields import depth_filter, hog_layer
-from curvireg_torch.models import FieldNetwork, LearnedCurvilinearSaliency, doubled_angle
 from curvireg_torch.training import FieldDataset, ReplayBuffer, adapt, augment, losses
 from curvireg_torch.training.field_dataset import SETTINGS
 from curvireg_torch.training.scenes import GeneratedScenes

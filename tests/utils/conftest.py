@@ -13,8 +13,8 @@ import curvireg_torch as cr
 from curvireg_torch import geometry, metrics
 from curvireg_torch.errors import CurviregError
 from curvireg_torch.geometry.cameras import transform
-from curvireg_torch.io.meshes import mesh_centre, mesh_radius
 from curvireg_torch.matching import distinct_views
+from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import fit_contours, localize
 from curvireg_torch.rendering import make_renderer, render_colour
 from curvireg_torch.rendering.shading import shade

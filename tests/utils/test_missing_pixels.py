@@ -8,8 +8,8 @@ from torch import Tensor
 import curvireg_torch as cr
 from curvireg_torch import filters, geometry
 from curvireg_torch.errors import ImageError
-from curvireg_torch.models.appearance import describe
-from curvireg_torch.models.backbone import Backbone
+from curvireg_torch.features.appearance import describe
+from curvireg_torch.features.backbone import Backbone
 from tests.utils.conftest import CAMERA, Entries, refused
 
 MATCHING = ("Registrar", "localize", "ViewMatcher", "Locator", "locate")

@@ -7,7 +7,7 @@ import urllib.request
 
 import pytest
 
-from curvireg_torch.limits import MAX_VIEWER_PAGES
+from curvireg_torch.errors import MAX_VIEWER_PAGES
 from curvireg_torch.viewer.session import MAX_PROPOSALS
 from tests.viewer.browser import MISSING
 from tests.viewer.test_session import run_command

@@ -9,8 +9,7 @@ import pytest
 
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.limits import MAX_VIEWER_PAGES
+from curvireg_torch.errors import MAX_VIEWER_PAGES, InvalidInputError
 from curvireg_torch.viewer.guard import SECURITY_HEADERS, public_addresses
 from curvireg_torch.viewer.server import listen
 

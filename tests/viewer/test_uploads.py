@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.limits import MAX_IMAGE_BYTES, MAX_MESH_BYTES
+from curvireg_torch.errors import MAX_IMAGE_BYTES, MAX_MESH_BYTES, InvalidInputError
 from curvireg_torch.viewer import uploads
 from curvireg_torch.viewer.uploads import file_name, identify, size_limit, unpack
 

@@ -6,9 +6,8 @@ import warnings
 
 import pytest
 
-from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError
+from curvireg_torch.errors import MAX_VIEWER_PAGES, CurviregError, CurviregWarning, InvalidInputError
 from curvireg_torch.evaluation.opening import RegisterOptions
-from curvireg_torch.limits import MAX_VIEWER_PAGES
 from curvireg_torch.viewer import workspace as module
 from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.workspace import Workspace, Workspaces, show_warning

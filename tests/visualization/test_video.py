@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from curvireg_torch.data import Video
 from curvireg_torch.errors import InvalidInputError, LostObjectError
-from curvireg_torch.io import Video
 from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.registration.answer_set import AnswerSet
 from curvireg_torch.visualization import OverlayVideo

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ...data import Video
 from ...errors import InvalidInputError, MissingFileError
-from ...io import Video
 from ...utils.choices import IMAGES, VIDEOS
 from ...utils.files import write_file
 from ...utils.input_paths import is_pattern

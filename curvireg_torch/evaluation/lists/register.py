@@ -8,10 +8,10 @@ from typing import Any
 
 import torch
 
+from ...data import Photo, read_photo
 from ...errors import BankError, CurviregError, ImageError, InvalidInputError, MeshError
 from ...geometry import camera_matrix
 from ...geometry.cameras import camera_of_view
-from ...io import Photo, read_photo
 from ...registration import FailedRegistration, Registrar, Registration, localize
 from ...registration.correction import projected_box
 from ...registration.document import SCHEMA, localization_document, result_document, used_box

@@ -12,11 +12,11 @@ import trimesh
 from torch import Tensor
 from tqdm import tqdm
 
+from ...data import read_image
 from ...errors import InvalidInputError
 from ...geometry import crop_images, rotation_towards
 from ...geometry.views import DEFAULT_DISTANCE
-from ...io import read_image
-from ...io.meshes import load_mesh, mesh_centre, mesh_radius
+from ...mesh import load_mesh, mesh_centre, mesh_radius
 from ...settings import BankSettings
 from ..bop import UNOCCLUDED
 from ..registry import DATASETS, DatasetSpec

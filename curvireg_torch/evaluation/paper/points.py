@@ -11,8 +11,8 @@ import torch
 from kornia.color import rgb_to_grayscale
 from torch import Tensor, nn
 
-from ...descriptors import field_points
 from ...detectors import DETECTORS
+from ...features import field_points
 from ...filters import ImageGradient, MultiScaleCurvilinearSaliency, MultiScaleFocusCurves
 from ...matching import ViewDescriber
 from ...matching.fields import depth_filter

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ...descriptors import field_points
+from ...features import field_points
 from ...filters import depth_curvilinear_saliency
 from ...filters.curvilinear import fill_depth
 from ...filters.derivatives import central_gradient, smooth

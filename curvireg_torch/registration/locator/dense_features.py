@@ -5,9 +5,9 @@ from abc import ABC, abstractmethod
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ...descriptors import orientation_cells
+from ...features import orientation_cells
+from ...features.backbone import STRIDES, Backbone
 from ...matching import ViewDescriber, ViewMatcher
-from ...models.backbone import STRIDES, Backbone
 from ...terms import photograph_field
 
 __all__ = ["BackboneFeatures", "DenseFeatures", "dense_features_for"]

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from curvireg_torch import Registrar, ViewBank, sample_views
+from curvireg_torch.data import read_photo
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation.lists import Entry, PhotoList, register
-from curvireg_torch.io import read_photo
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import AnswerSet, Registration
 from curvireg_torch.synthetic import example_mesh

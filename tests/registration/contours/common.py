@@ -9,7 +9,7 @@ from torch import Tensor
 from curvireg_torch import camera_matrix
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
-from curvireg_torch.io.meshes import mesh_centre, mesh_radius
+from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering import make_renderer
 

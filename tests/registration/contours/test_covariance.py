@@ -7,7 +7,7 @@ import trimesh
 
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import project_points, transform
-from curvireg_torch.io.meshes.mesh import mesh_centre
+from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.registration.calibration import COVARIANCE_SCALE as SCALE
 from curvireg_torch.registration.contours.covariance import CELL, POINT, SHARED, pose_covariance
 from curvireg_torch.registration.contours.descent import Matches, apply_twist, project

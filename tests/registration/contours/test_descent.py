@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from curvireg_torch.io.meshes import mesh_centre
+from curvireg_torch.mesh import mesh_centre
 from curvireg_torch.registration.contours.descent import ContourProblem, ContourState, apply_twist, project
 from curvireg_torch.registration.contours.points import ContourPoints
 from curvireg_torch.rendering import make_renderer

@@ -12,7 +12,7 @@ from curvireg_torch import camera_matrix, rotation_error
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_towards
 from curvireg_torch.geometry.cameras import project_points
-from curvireg_torch.io.meshes.mesh import mesh_centre, mesh_radius
+from curvireg_torch.mesh.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.registration.contours import fit as fit_module
 from curvireg_torch.registration.contours import points as points_module

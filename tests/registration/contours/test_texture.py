@@ -10,7 +10,7 @@ import curvireg_torch as cr
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.geometry.cameras import projected_boxes, transform
 from curvireg_torch.geometry.viewpoint import rotation_from_viewpoint, up_rotation
-from curvireg_torch.io.meshes.mesh import extreme_points, mesh_centre, mesh_radius
+from curvireg_torch.mesh.mesh import extreme_points, mesh_centre, mesh_radius
 from curvireg_torch.registration.contours import ContourFit, fit_contours, fit_texture, turned
 from curvireg_torch.registration.contours.descent import apply_twist
 from curvireg_torch.registration.contours.texture import _match

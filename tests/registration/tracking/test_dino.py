@@ -4,9 +4,8 @@ import pytest
 import torch
 
 import curvireg_torch as cr
-from curvireg_torch.data import BOPDataset
+from curvireg_torch.data import BOPDataset, read_image
 from curvireg_torch.geometry import rotation_error
-from curvireg_torch.io import read_image
 from curvireg_torch.registration import Follower
 from scripts.speed.follow import LARGEST_GAP, chains
 from tests._support.real_data import real_data

@@ -8,7 +8,7 @@ from curvireg_torch import camera_matrix
 from curvireg_torch.errors import LostObjectError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
-from curvireg_torch.io.meshes.mesh import extreme_points, mesh_centre, mesh_radius
+from curvireg_torch.mesh.mesh import extreme_points, mesh_centre, mesh_radius
 from curvireg_torch.registration.tracking import Tracker, tracker
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from curvireg_torch.io.meshes import load_mesh
+from curvireg_torch.mesh import load_mesh
 from curvireg_torch.rendering.embree import RayScene
 from curvireg_torch.training.scenes import FAMILIES, random_shape, shape_from_mesh
 from curvireg_torch.training.scenes.surfaces import bar, box, lathe, superquadric, torus

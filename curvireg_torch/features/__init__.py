@@ -1,0 +1,21 @@
+"""Fields to descriptors and point masks, and networks: the learned field and the ImageNet backbone.
+
+Descriptors keep the dtype (half types compute in float32). Wrong shapes, dtypes and options raise
+:class:`~curvireg_torch.errors.InvalidInputError`.
+"""
+
+from .hog import HOG, hog, hog_length, orientation_cells
+from .learned_field import FieldNetwork, LearnedCurvilinearSaliency, doubled_angle, halved_angle
+from .points import field_points
+
+__all__ = [
+    "HOG",
+    "FieldNetwork",
+    "LearnedCurvilinearSaliency",
+    "doubled_angle",
+    "field_points",
+    "halved_angle",
+    "hog",
+    "hog_length",
+    "orientation_cells",
+]

@@ -1,0 +1,146 @@
+"""Surface colours of a mesh, from its textures, materials, faces or vertices."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import MAX_IMAGE_PIXELS
+
+TEXTURE_SIDE = 512
+"""Textures are reduced to this longer side in px; views are smaller."""
+
+ROW = 1024
+"""Samples in a row of the map that OpenCV is given, whose sides are limited."""
+
+_UNSET = (102, 102, 102)  # trimesh's colour for a material without one
+_PLAIN = 255
+
+
+@dataclass(frozen=True)
+class SurfaceColours:
+    """Colours of F faces, stored by corner: interpolated between the corners and multiplied by a texture.
+
+    Attributes:
+        corners: (F, 3, 3) uint8 RGB.
+        uv: (F, 3, 2) float32 texture coordinates; (0, 0) is the bottom left, and textures repeat.
+        texture: (F,) int32 index of the texture, -1 for none.
+        textures: (h, w, 3) uint8 RGB each.
+    """
+
+    corners: NDArray[np.uint8]
+    uv: NDArray[np.float32]
+    texture: NDArray[np.int32]
+    textures: tuple[NDArray[np.uint8], ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.corners)
+
+    def __getitem__(self, faces: Any) -> "SurfaceColours":
+        return SurfaceColours(self.corners[faces], self.uv[faces], self.texture[faces], self.textures)
+
+    def check(self, faces: int) -> None:
+        """Raise ValueError unless these are valid colours of ``faces`` faces."""
+        parts = (self.corners, (faces, 3, 3), np.uint8), (self.uv, (faces, 3, 2), np.float32)
+        valid = all(x.shape == shape and x.dtype == dtype for x, shape, dtype in parts)
+        valid = valid and self.texture.shape == (faces,) and self.texture.dtype == np.int32
+        valid = valid and all(t.ndim == 3 and t.shape[2] == 3 and t.size and t.dtype == np.uint8 for t in self.textures)
+        valid = valid and bool(np.isfinite(self.uv).all())
+        if not (valid and -1 <= self.texture.min() <= self.texture.max() < len(self.textures)):
+            raise ValueError("colours that do not match the mesh")
+
+    @classmethod
+    def plain(cls, faces: int, colour: Sequence[int] = (_PLAIN,) * 3) -> "SurfaceColours":
+        """One colour everywhere, white by default."""
+        corners = np.broadcast_to(np.array(colour, np.uint8), (faces, 3, 3))
+        return cls(corners, np.zeros((faces, 3, 2), np.float32), np.full(faces, -1, np.int32))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["SurfaceColours"]) -> "SurfaceColours":
+        """The colours of a mesh that is made of several."""
+        first = np.cumsum([0] + [len(part.textures) for part in parts])
+        texture = [np.where(part.texture < 0, -1, part.texture + k) for part, k in zip(parts, first, strict=False)]
+        return cls(
+            np.concatenate([part.corners for part in parts]),
+            np.concatenate([part.uv for part in parts]),
+            np.concatenate(texture).astype(np.int32),
+            tuple(texture for part in parts for texture in part.textures),
+        )
+
+    def at(self, face: NDArray[np.int32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(N, 3) RGB in [0, 1] at the points (1 - u - v) a + u b + v c of faces with corners a, b, c."""
+        weights = np.stack([1.0 - u - v, u, v], axis=1).astype(np.float32)
+        colour: NDArray[np.float32] = np.einsum("ij,ijk->ik", weights, self.corners[face].astype(np.float32))
+        colour /= np.float32(255)
+        uv = np.einsum("ij,ijk->ik", weights, self.uv[face])
+        texture = self.texture[face]
+        for k in np.unique(texture[texture >= 0]):
+            mask = texture == k
+            colour[mask] *= _sample(self.textures[k], uv[mask])
+        return colour
+
+
+def has_colours(mesh: Any) -> bool:
+    """Whether a mesh has colours, see :func:`surface_colours`."""
+    return surface_colours(mesh) is not None
+
+
+def surface_colours(mesh: Any) -> SurfaceColours | None:
+    """The colours of a ``trimesh.Trimesh``, or None where it has none; transparent texels are white.
+
+    They come from ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else from ``mesh.visual``.
+    """
+    colours = mesh.metadata.get("colours")
+    if isinstance(colours, SurfaceColours) and len(colours) == len(mesh.faces):
+        return colours
+    visual, faces = mesh.visual, np.asarray(mesh.faces)
+    plain = SurfaceColours.plain(len(faces))
+    if visual.kind == "face":
+        corners = np.repeat(np.asarray(visual.face_colors, np.uint8)[:, None, :3], 3, axis=1)
+        return replace(plain, corners=corners)
+    if visual.kind == "vertex":
+        return replace(plain, corners=np.asarray(visual.vertex_colors, np.uint8)[faces][..., :3])
+    if visual.kind != "texture":
+        return None
+    material = visual.material
+    factor = getattr(material, "baseColorFactor", None)
+    image = getattr(material, "image", None)  # beside an image, exporters of OBJ write any colour
+    image = getattr(material, "baseColorTexture", None) if image is None else image
+    texture = None if image is None or visual.uv is None else _texture(image)
+    if texture is not None:
+        tint = SurfaceColours.plain(len(faces), (_PLAIN,) * 3 if factor is None else factor[:3])
+        uv = np.nan_to_num(np.asarray(visual.uv, np.float32), posinf=0.0, neginf=0.0)[faces][..., :2]
+        return SurfaceColours(tint.corners, uv, np.zeros(len(faces), np.int32), (texture,))
+    colour = tuple(int(c) for c in np.asarray(material.main_color)[:3])
+    return None if colour == _UNSET else SurfaceColours.plain(len(faces), colour)
+
+
+def _texture(image: Any) -> NDArray[np.uint8] | None:
+    """(h, w, 3) uint8 of a PIL image, transparent texels white; None, with a warning, if it cannot be used."""
+    try:
+        if image.width * image.height > MAX_IMAGE_PIXELS:
+            raise ValueError(f"{image.width} x {image.height} px are too many")
+        rgba = np.asarray(image.convert("RGBA"), np.uint8)
+    except Exception as error:  # decoders raise anything
+        warnings.warn(f"a texture cannot be read ({error}); its faces are drawn in their plain colour", stacklevel=2)
+        return None
+    shrink = TEXTURE_SIDE / max(rgba.shape[:2])
+    if shrink < 1:
+        size = max(1, round(rgba.shape[1] * shrink)), max(1, round(rgba.shape[0] * shrink))
+        rgba = cv2.resize(rgba, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    alpha = rgba[..., 3:].astype(np.float32) / 255
+    return np.asarray((rgba[..., :3] * alpha + 255 * (1 - alpha)).round(), np.uint8)
+
+
+def _sample(texture: NDArray[np.uint8], uv: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, 3) in [0, 1]: bilinear, repeating."""
+    (h, w), count = texture.shape[:2], len(uv)
+    places = np.zeros((2, -(-count // ROW) * ROW), np.float32)
+    places[:, :count] = (uv[:, 0] % 1.0) * w - 0.5, (-uv[:, 1] % 1.0) * h - 0.5
+    x, y = places.reshape(2, -1, ROW)
+    colours = cv2.remap(texture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return np.asarray(colours.reshape(-1, 3)[:count] / np.float32(255), np.float32)

@@ -1,0 +1,47 @@
+"""Frames of videos: their numbers, colours and sizes, and files that are none."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from curvireg_torch.data import Video
+from curvireg_torch.errors import ImageError
+
+
+@pytest.fixture(scope="module")
+def five(tmp_path_factory):
+    """A video whose frame k is red of brightness 40 k."""
+    file = tmp_path_factory.mktemp("videos") / "five.avi"
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 12.5, (64, 48))
+    for k in range(5):
+        writer.write(np.full((48, 64, 3), (0, 0, 40 * k), np.uint8))
+    writer.release()
+    return file
+
+
+def test_video_yields_rgb_frames_and_their_numbers(five):
+    video = Video(five)
+    assert (video.fps, video.count) == (12.5, 5)
+    frames = dict(video)
+    assert list(frames) == [0, 1, 2, 3, 4]
+    assert len(list(video)) == 5  # again from the start
+    for k, image in frames.items():
+        assert (tuple(image.shape), image.dtype) == ((3, 48, 64), torch.uint8)
+        assert abs(float(image[0].float().mean()) - 40 * k) < 4
+        assert float(image[1:].float().mean()) < 4
+
+
+def test_video_skips_frames(five):
+    frames = dict(Video(five, every=2))
+    assert list(frames) == [0, 2, 4]
+    assert abs(float(frames[4][0].float().mean()) - 160) < 4
+
+
+def test_video_refuses_other_files_and_too_many_pixels(five, tmp_path, monkeypatch):
+    (tmp_path / "no.mp4").write_bytes(b"not a video")
+    with pytest.raises(ImageError, match=r"no\.mp4: not a video"):
+        Video(tmp_path / "no.mp4")
+    monkeypatch.setattr("curvireg_torch.data.videos.MAX_IMAGE_PIXELS", 64 * 48 - 1)
+    with pytest.raises(ImageError, match="not a video"):
+        Video(five)

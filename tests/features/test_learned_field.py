@@ -1,0 +1,143 @@
+"""The learned field: the layer contract, its weights, and its output on a simple image."""
+
+import math
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from curvireg_torch.errors import InvalidInputError, MissingFileError
+from curvireg_torch.features import FieldNetwork, LearnedCurvilinearSaliency, doubled_angle, halved_angle
+from curvireg_torch.features.backbone import Backbone
+from curvireg_torch.features.learned_field import WEIGHTS
+
+from .._support.layer_contract import LayerCase, LayerContract
+from ..filters.layer_cases import colour_photos, equal_up_to_sign, photos
+
+
+@pytest.fixture(scope="module")
+def field():
+    return LearnedCurvilinearSaliency()
+
+
+class TestLearnedField(LayerContract):
+    network = LearnedCurvilinearSaliency()
+    cases = (
+        LayerCase("grey", network, photos, constant_gives_zero=False),
+        LayerCase("colour", network, colour_photos, constant_gives_zero=False),
+    )
+    test_gradcheck = test_function_transforms = None  # the network computes in float32
+    test_autocast_changes_nothing = test_onnx_export = None
+
+    def test_batched_equals_one_by_one(self, case: LayerCase) -> None:
+        x = case.inputs(3, 48)
+        assert equal_up_to_sign(case(x), torch.cat([case(image[None]) for image in x]), atol=1e-3)
+
+
+def test_doubled_angle_ignores_sign_and_halved_angle_inverts_it():
+    t = torch.linspace(-3, 3, 25, dtype=torch.float64)
+    m = torch.linspace(0.1, 4, 25, dtype=torch.float64)
+    vectors = torch.stack([m * t.cos(), m * t.sin()])[None, :, :, None]
+    code = doubled_angle(vectors)
+    assert torch.allclose(code, doubled_angle(-vectors))
+    assert torch.allclose(code[0, :, :, 0], m.sqrt() * torch.stack([(2 * t).cos(), (2 * t).sin()]))
+    restored = halved_angle(code)
+    assert torch.allclose(restored, torch.where(vectors[:, :1] < 0, -vectors, vectors), atol=1e-9)
+
+
+def test_halved_angle_has_finite_gradients():
+    code = torch.tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, -1.0]]).T[None, :, :, None].requires_grad_()
+    halved_angle(code).square().sum().backward()
+    assert code.grad.isfinite().all()
+    generic = torch.randn(1, 2, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    assert torch.autograd.gradcheck(halved_angle, (generic,))
+
+
+def test_size_of_network_and_file():
+    assert sum(p.numel() for p in FieldNetwork().parameters()) <= 2_000_000
+    assert WEIGHTS.stat().st_size <= 8_000_000
+
+
+@pytest.mark.parametrize("make", [LearnedCurvilinearSaliency, Backbone])
+def test_networks_do_not_advance_the_random_generator(make):
+    before = torch.get_rng_state()
+    network = make()
+    assert torch.equal(torch.get_rng_state(), before)
+    assert {p.device.type for p in network.parameters()} == {"cpu"}
+    assert not network.training
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 128, 128), (2, 3, 256, 256), (1, 3, 60, 90), (1, 1, 1, 1)])
+def test_learned_field_and_mask_of_any_size(field, shape):
+    x = torch.rand(shape)
+    out = field(x)
+    assert out.shape == (shape[0], 2, *shape[2:])
+    assert out.isfinite().all()
+    assert out.dtype == torch.float32
+    mask = field.mask(x)
+    assert mask.shape == (shape[0], 1, *shape[2:])
+    assert mask.min() >= 0
+    assert mask.max() <= 1
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e3])
+def test_halved_angle_inverts_doubled_angle_in_every_dtype(dtype, size):
+    t = torch.linspace(-3.1, 3.1, 63, dtype=torch.float64)
+    vectors = (size * torch.stack([t.cos(), t.sin()])[None, :, :, None]).to(dtype)
+    restored = halved_angle(doubled_angle(vectors))
+    assert restored.dtype == doubled_angle(vectors).dtype == dtype
+    off = torch.minimum((restored - vectors).abs(), (restored + vectors).abs()).amax(dim=1)
+    # 1e-6 in float16 has only 4 bits.
+    precision = 0.5 if (dtype, size) == (torch.float16, 1e-6) else 16 * torch.finfo(dtype).eps
+    assert off.max() < precision * size
+
+
+def test_save_and_load_weights(field, tmp_path):
+    field.save(tmp_path / "weights.safetensors")
+    loaded = LearnedCurvilinearSaliency(weights=tmp_path / "weights.safetensors")
+    x = torch.rand(1, 3, 128, 128)
+    assert torch.equal(loaded(x), field(x))
+
+
+def test_learned_field_rejects_bad_weights(tmp_path):
+    missing, corrupt, other = (tmp_path / f"{name}.safetensors" for name in ("missing", "corrupt", "other"))
+    corrupt.write_bytes(b"not weights")
+    save_file({"a": torch.zeros(2)}, other)
+    with pytest.raises(MissingFileError, match="does not exist"):
+        LearnedCurvilinearSaliency(weights=missing)
+    for path, message in ((corrupt, "not a safetensors file"), (other, "FieldNetwork")):
+        with pytest.raises(InvalidInputError, match=message):
+            LearnedCurvilinearSaliency(weights=path)
+
+
+def test_learned_field_rejects_damaged_packaged_weights(tmp_path, monkeypatch):
+    content = bytearray(WEIGHTS.read_bytes())
+    content[-1] ^= 1
+    (tmp_path / "damaged.safetensors").write_bytes(content)
+    monkeypatch.setattr("curvireg_torch.features.learned_field.WEIGHTS", tmp_path / "damaged.safetensors")
+    with pytest.raises(InvalidInputError, match="install curvireg_torch again"):
+        LearnedCurvilinearSaliency()
+
+
+def test_learned_field_of_a_square_is_its_outline(field):
+    x = torch.full((1, 3, 128, 128), 0.3)
+    x[:, :, 24:104, 24:104] = 0.8
+    out = field(x)[0]
+    length = out.norm(dim=0)
+    left = out[:, 40:88, 20:29]
+    assert length[40:88, 20:29].mean() > 3 * length[40:88, 50:80].mean()
+    strong = left.norm(dim=0) > 0.3 * length.max()
+    angle = torch.atan2(left[1], left[0])[strong]
+    assert strong.any()
+    assert angle.abs().median() < math.radians(20)
+    mask = field.mask(x)[0, 0]
+    assert mask[40:88, 40:88].mean() > 0.8
+    assert mask[:8].mean() < 0.2
+
+
+def test_field_network_normalises_images_to_plus_minus_2():
+    network, inputs = FieldNetwork((8, 8, 8, 8)).eval(), []
+    network.down[0].register_forward_pre_hook(lambda _module, arguments: inputs.append(arguments[0]))
+    network(torch.linspace(0, 1, 3 * 32 * 32).view(1, 3, 32, 32))
+    assert torch.allclose(inputs[0], torch.linspace(-2, 2, 3 * 32 * 32).view(1, 3, 32, 32), atol=1e-6)

@@ -1,0 +1,230 @@
+"""Malicious mesh files end in a one-line error, soon and in little memory."""
+
+import base64
+import json
+import math
+import struct
+import time
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import curvireg_torch as cr
+from curvireg_torch.errors import MeshError
+from curvireg_torch.mesh import files as mesh_files
+from curvireg_torch.mesh import gltf, polygons
+from curvireg_torch.mesh import mesh as mesh_module
+
+POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
+
+
+def tree(**changes: Any) -> dict[str, Any]:
+    """A triangle as glTF."""
+    whole = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "buffers": [{"byteLength": 36, "uri": "data:;base64," + base64.b64encode(POINTS).decode()}],
+    }
+    return {**whole, **changes}
+
+
+def glb(content: dict[str, Any]) -> bytes:
+    text = json.dumps({**content, "buffers": [{"byteLength": 36}]}).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", 36, b"BIN\0") + POINTS
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def refused(path: Path, content: bytes, match: str, *, seconds: float = 5.0, megabytes: float = 100.0) -> None:
+    path.write_bytes(content)
+    tracemalloc.start()
+    start = time.perf_counter()
+    with pytest.raises(MeshError, match=match) as caught:
+        cr.load_mesh(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert time.perf_counter() - start < seconds
+    assert peak < megabytes * 1e6
+    assert len(str(caught.value).splitlines()) == 1
+    assert path.name in str(caught.value)
+
+
+def test_load_mesh_reads_the_valid_gltf_and_glb(tmp_path: Path) -> None:
+    (tmp_path / "a.gltf").write_text(json.dumps(tree()))
+    (tmp_path / "a.glb").write_bytes(glb(tree()))
+    assert cr.load_mesh(tmp_path / "a.gltf").area == cr.load_mesh(tmp_path / "a.glb").area == 0.5
+
+
+CHAIN = [{"children": [i + 1]} for i in range(1000)] + [{"mesh": 0}]
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]}, "circle"),
+        ({"nodes": [{"children": [0], "mesh": 0}]}, "circle"),
+        ({"nodes": [{"children": [1, 1]}, {"mesh": 0}]}, "child of several"),
+        ({"nodes": [{"children": [7], "mesh": 0}]}, "missing"),
+        ({"nodes": CHAIN}, "200 deep"),
+        ({"nodes": [{"mesh": 0}] * 20_000}, "10,000 parts"),
+        ({"accessors": [{"componentType": 5126, "count": 10**9, "type": "VEC3"}]}, "1000000000 values"),
+        ({"accessors": [{"bufferView": 0, "componentType": 5126, "count": 10**6, "type": "VEC3"}]}, "view holds"),
+        ({"accessors": [{"bufferView": 0, "componentType": 5126, "count": -3, "type": "VEC3"}]}, "-3"),
+        ({"bufferViews": [{"buffer": 0, "byteLength": 10**12}]}, "beyond its buffer"),
+        ({"buffers": [{"byteLength": 10**12, "uri": "data:;base64,AAAA"}]}, "claims 1000000000000 bytes, 3 are there"),
+        ({"buffers": [{"byteLength": 36}]}, "a buffer without content"),
+        ({"buffers": [{"byteLength": 36, "uri": "data:text/plain,abc"}]}, "not base64"),
+        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "KHR_draco_mesh_compression.*export without it"),
+        ({"extensionsRequired": ["EXT_meshopt_compression"]}, "EXT_meshopt_compression"),
+        ({"asset": {"version": "1.0"}}, "version 2"),
+        ({"meshes": 5}, "valid glTF"),
+    ],
+)
+def test_check_gltf_refuses_false_claims(tmp_path: Path, changes: dict[str, Any], match: str) -> None:
+    refused(tmp_path / "a.gltf", json.dumps(tree(**changes)).encode(), match)
+    if "buffers" not in changes:
+        refused(tmp_path / "a.glb", glb(tree(**changes)), match)
+
+
+BINARY = struct.pack("<4sII", b"glTF", 2, 100)
+
+
+@pytest.mark.parametrize(
+    ("data", "match"),
+    [
+        (b"glTF", "ends too early"),
+        (struct.pack("<4sII", b"glTG", 2, 20) + struct.pack("<I4s", 2, b"JSON") + b"{}", "not a GLB file"),
+        (BINARY + struct.pack("<I4s", 2, b"BIN\0") + b"{}", "not a GLB file"),
+        (struct.pack("<4sII", b"glTF", 1, 20) + struct.pack("<I4s", 2, b"JSON") + b"{}", "version 1 is not read"),
+        (BINARY + struct.pack("<I4s", 3, b"JSON") + b"{}", "ends too early"),
+        (BINARY + struct.pack("<I4s", 2, b"JSON") + b"{}" + struct.pack("<I4s", 1, b"BIN\0"), "ends too early"),
+        (BINARY + struct.pack("<I4s", 2, b"JSON") + b"[]", "JSON is no object"),
+    ],
+)
+def test_check_gltf_refuses_damaged_glb(tmp_path: Path, data: bytes, match: str) -> None:
+    refused(tmp_path / "a.glb", data, match)
+
+
+def test_check_gltf_counts_every_copy_of_a_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gltf, "MAX_MESH_FACES", 100)
+    refused(tmp_path / "a.gltf", json.dumps(tree(nodes=[{"mesh": 0}] * 200)).encode(), "more than 100 faces")
+
+
+OUTSIDE = ["../b.bin", "/etc/passwd", "file:///etc/passwd", "http://127.0.0.1:9/b.bin", "%2e%2e/b.bin"]
+
+
+@pytest.mark.parametrize("uri", [*OUTSIDE, "link.bin", "no.bin"])
+def test_load_mesh_opens_no_file_outside_the_folder(tmp_path: Path, uri: str) -> None:
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    (tmp_path / "b.bin").write_bytes(POINTS)
+    (folder / "link.bin").symlink_to(tmp_path / "b.bin")
+    content = tree(buffers=[{"byteLength": 36, "uri": uri}])
+    refused(folder / "a.gltf", json.dumps(content).encode(), "no file of its folder")
+
+
+def test_load_mesh_opens_files_of_the_folder_and_ignores_others(tmp_path: Path) -> None:
+    (tmp_path / "b c.bin").write_bytes(POINTS)
+    (tmp_path / "a.gltf").write_text(json.dumps(tree(buffers=[{"byteLength": 36, "uri": "b%20c.bin"}])))
+    assert cr.load_mesh(tmp_path / "a.gltf").area == 0.5
+    (tmp_path / "a.obj").write_text("mtllib ../../secret.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl x\nf 1 2 3\n")
+    assert cr.load_mesh(tmp_path / "a.obj").area == 0.5
+
+
+AXES = b"".join(b"property float %c\n" % axis for axis in b"xyz")
+PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"element face 9000000\n"
+PLY += b"property list uchar int vertex_indices\nend_header\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "match"),
+    [
+        ("a.off", b"OFF\n1000000000 1000000000 0\n0 0 0\n", "too early"),
+        ("a.off", b"OFF\n-1 1 0\n0 0 0\n", "too early"),
+        ("a.ply", PLY % (b"binary_little_endian", 10**9) + b"\0\0", "early"),
+        ("a.ply", PLY % (b"binary_big_endian", 0), "early"),
+        ("a.ply", PLY % (b"ascii", 0), "early"),
+        ("a.ply", PLY.replace(b"9000000", b"10000001") % (b"ascii", 0), "more than 10,000,000 faces"),
+        ("a.off", b"OFF\n3 10000001 0\n" + b"\n".join([b"0 0 0"] * 3), "early"),
+        ("a.stl", b"\0" * 80 + struct.pack("<I", 10**9) + b"\0" * 50, "got none"),
+        ("a.gltf", b'{"asset": ' + b"[" * 1_000_000, "JSON is damaged"),
+        ("a.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", r"\(3, 2\)"),
+        ("a.obj", b"v 0 0 0\nv 1e300 0 0\nv 0 1 0\nf 1 2 3\n", r"1e\+12"),
+        ("a.obj", b"v 0 0 0\nv 9e-7 0 0\nv 0 1e-9 0\nf 1 2 3\n", "only 9e-07 units across; scale it up"),
+        ("a.obj", b"v 0 0 0\n" * 9 + b"f " + b"1 2 3 " * 2_000 + b"\n", "degenerate"),
+    ],
+)
+def test_load_mesh_refuses_false_claims(tmp_path: Path, name: str, content: bytes, match: str) -> None:
+    refused(tmp_path / name, content, match)
+
+
+def test_load_mesh_bounds_faces_and_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trimesh.creation.icosphere(3).export(tmp_path / "a.stl")
+    content = (tmp_path / "a.stl").read_bytes()
+    monkeypatch.setattr(mesh_module, "MAX_MESH_FACES", 1000)
+    refused(tmp_path / "a.stl", content, "1,280 faces")
+    monkeypatch.setattr(mesh_files, "MAX_MESH_BYTES", 1000)
+    refused(tmp_path / "a.stl", content, "larger than 1,000 bytes")
+
+
+def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path: Path) -> None:
+    """trimesh alone multiplies the whole chain again for each part."""
+    half_degree = {"rotation": [0.0, 0.0, math.sin(math.radians(0.25)), math.cos(math.radians(0.25))]}
+    chain = [{"children": [i + 1], "translation": [0.01, 0, 0], **half_degree} for i in range(179)]
+    leaves = [{"mesh": 0, "translation": [0, 0, 0.1 * i]} for i in range(500)]
+    nodes = [*chain, {"children": list(range(180, 680))}, *leaves]
+    (tmp_path / "a.gltf").write_text(json.dumps(tree(nodes=nodes)))
+    start = time.process_time()
+    mesh = cr.load_mesh(tmp_path / "a.gltf")
+    assert time.process_time() - start < 10
+    assert len(mesh.faces) == 500
+    at = 0.01 * np.exp(1j * np.radians(0.5 * np.arange(179))).sum()  # the chain's end, in the complex plane
+    far = at + np.exp(1j * np.radians(0.5 * 179))  # the corner at x = 1 of a part
+    vertices = mesh.vertices[np.isclose(mesh.vertices[:, 2], 0.7)]
+    for point in (at, far):
+        assert np.abs(vertices - [point.real, point.imag, 0.7]).max(axis=1).min() < 1e-6
+
+
+def test_as_mesh_places_parts_above_the_base_frame() -> None:
+    scene = trimesh.Scene()
+    moved = trimesh.transformations.translation_matrix([2, 0, 0])
+    scene.add_geometry(trimesh.creation.box(), node_name="a", transform=moved)
+    scene.add_geometry(trimesh.creation.box(), node_name="b", parent_node_name="a")
+    scene.graph.base_frame = "b"
+    found = mesh_module.as_mesh(scene)
+    expected = trimesh.util.concatenate(scene.dump())
+    assert np.allclose(np.sort(found.vertices, axis=0), np.sort(expected.vertices, axis=0))
+
+
+def test_divide_faces_counts_before_it_divides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dart = b"OFF\n4 %d 0\n0 0 0\n1 2 0\n0 1 0\n-1 2 0\n" + b"4 0 1 2 3\n" * 10
+    ply = PLY.replace(b"9000000", b"10") % (b"ascii", 4) + dart.split(b"\n", 2)[2]
+    obj = b"v 0 0 0\nv 1 2 0\nv 0 1 0\nv -1 2 0\n" + b"f 1 2 3 4\n" * 10
+    for name, content in (("a.off", dart % 10), ("a.ply", ply), ("a.obj", obj)):
+        monkeypatch.undo()
+        (tmp_path / name).write_bytes(content)
+        assert len(cr.load_mesh(tmp_path / name).faces) == 20
+        monkeypatch.setattr(polygons, "MAX_POLYGON_WORK", 159)
+        refused(tmp_path / name, content, "not convex have too many corners")
+        monkeypatch.setattr(polygons, "MAX_MESH_FACES", 19)
+        refused(tmp_path / name, content, "more than 19 faces")
+        monkeypatch.setattr(polygons, "MAX_MESH_LINES", 9)
+        refused(tmp_path / name, content, "more than 9 lines")
+    monkeypatch.undo()
+    monkeypatch.setattr(polygons, "MAX_POLYGON_WORK", 160)
+    assert len(cr.load_mesh(tmp_path / "a.off").faces) == 20
+
+
+def test_as_mesh_refuses_a_part_with_malformed_vertices():
+    malformed = trimesh.Trimesh(np.zeros((3, 1)), [[0, 1, 2]], process=False)
+    with pytest.raises(MeshError, match="put together"):
+        mesh_module.as_mesh(trimesh.Scene([trimesh.creation.box(), malformed]))

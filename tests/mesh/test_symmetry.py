@@ -1,0 +1,57 @@
+"""Symmetries of the shape of meshes."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from curvireg_torch.mesh import mesh_symmetries
+from curvireg_torch.synthetic import example_mesh
+
+ROTATED = trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.9]))
+BOTTLE = trimesh.creation.revolve([[0, 0], [0.04, 0], [0.04, 0.15], [0.015, 0.2], [0.015, 0.25], [0, 0.25]])
+
+
+def moved(mesh):
+    mesh = mesh.copy()
+    mesh.apply_transform(ROTATED)
+    mesh.apply_translation([3.0, -1.0, 0.5])
+    return mesh
+
+
+def prism(sides):
+    return trimesh.creation.cylinder(1.0, 3.0, sections=sides)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "count"),
+    [
+        (trimesh.creation.box((1, 2, 3)), 4),
+        (trimesh.creation.box((1, 1, 3)), 8),
+        (trimesh.creation.box((1, 1, 1)), 24),
+        (prism(3), 6),
+        (prism(5), 10),
+        (prism(64), 72),
+        (BOTTLE, 36),
+        (moved(BOTTLE), 36),
+        (moved(trimesh.creation.box((1, 2, 3))), 4),
+        (example_mesh(), 1),
+    ],
+)
+def test_symmetries_map_the_shape_to_itself(mesh, count):
+    symmetries = mesh_symmetries(mesh)
+    assert symmetries.shape == (count, 4, 4)
+    assert torch.equal(symmetries[0, :3, :3], torch.eye(3, dtype=torch.float64))
+    vertices = torch.from_numpy(mesh.vertices.copy())
+    size = float(np.linalg.norm(mesh.extents))
+    for S in symmetries:
+        turned = vertices @ S[:3, :3].T + S[:3, 3]
+        _, distance, _ = trimesh.proximity.closest_point_naive(mesh, turned.numpy()[:100])
+        assert distance.max() < 0.03 * size
+
+
+def test_a_handle_breaks_the_symmetry():
+    handle = trimesh.creation.torus(0.03, 0.006)
+    handle.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+    handle.apply_translation([0.04, 0.0, 0.08])
+    assert len(mesh_symmetries(trimesh.util.concatenate([BOTTLE, handle]))) == 1
