@@ -40,7 +40,7 @@ class Item(Protocol):
 ItemT = TypeVar("ItemT", bound=Item)
 
 POSE_SOURCES = (
-    *("data", "descriptors", "filters", "geometry", "io", "matching", "models", "registration", "rendering", "terms"),
+    *("data", "filters", "geometry", "matching", "features", "mesh", "registration", "rendering", "terms"),
     *("utils", "errors.py", "limits.py", "pipeline.py", "settings.py"),
 )
 """Parts of the package that results depend on."""
