@@ -19,7 +19,7 @@ import torch
 from kornia.filters import box_blur, filter2d, gaussian_blur2d, guided_blur, spatial_gradient
 from torch import Tensor
 
-from curvireg_torch import descriptors, filters
+from curvireg_torch import features, filters
 from curvireg_torch.detectors.edges import sobel_gradient
 from curvireg_torch.filters import blocks
 from curvireg_torch.filters.derivatives import central_derivatives, central_gradient, replicate_pad, smooth
@@ -96,7 +96,7 @@ LAYERS: dict[str, Function] = {
     "edge blur": filters.edge_blur,
     "MFC": filters.multiscale_focus_curves,
     "PCI": filters.principal_curvature_image,
-    "HOG of a gradient": lambda x: descriptors.hog(filters.image_gradient(x)),
+    "HOG of a gradient": lambda x: features.hog(filters.image_gradient(x)),
 }
 
 
@@ -156,7 +156,7 @@ def mcs_smoothing(repetitions: int) -> dict[str, dict[str, float]]:
         def layer(name: str = name) -> Tensor:
             return filters.multiscale_curvilinear_saliency(photo, smoothing=name)
 
-        points = descriptors.field_points(layer(), fraction=0.013)
+        points = features.field_points(layer(), fraction=0.013)
         rows[name] = {
             **fastest({"ms": layer}, repetitions),
             "near_contour": float(dilate(contour)[points].float().mean()),

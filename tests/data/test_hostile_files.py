@@ -13,10 +13,11 @@ import pytest
 import torch
 
 import curvireg_torch as cr
-from curvireg_torch.data import BOPDataset, images, json_files, read_bop_csv, read_photo
+from curvireg_torch.data import BOPDataset, images, read_bop_csv, read_photo
 from curvireg_torch.data.image_headers import read_header
 from curvireg_torch.data.mat_files import read_mat
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError
+from curvireg_torch.utils import json_files
 from tests._support.matlab import element, file
 from tests._support.miniature import write_bop, write_image
 

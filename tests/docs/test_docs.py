@@ -123,7 +123,7 @@ def test_glossary_names_occur_in_the_package() -> None:
 LAYERS = sorted(
     {
         found
-        for package in ("filters", "descriptors", "detectors", "models")
+        for package in ("filters", "features", "detectors")
         for name in import_module(f"curvireg_torch.{package}").__all__
         if inspect.isclass(found := getattr(import_module(f"curvireg_torch.{package}"), name))
         and issubclass(found, nn.Module)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from skimage.feature import hog as skimage_hog
 
-from curvireg_torch import descriptors, filters
+from curvireg_torch import features, filters
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.features import hog
 
@@ -92,7 +92,7 @@ def test_hog_length_and_layout() -> None:
     field = torch.zeros(1, 2, 64, 64)
     field[0, 0, 24:32, 40:48] = 1.0  # cell (3, 5), along x: bins 0 and 8 equally
     out = hog(field, voting="linear").view(7, 7, 2, 2, 9)
-    assert out.numel() == descriptors.hog_length() == descriptors.HOG().length == 1764
+    assert out.numel() == features.hog_length() == features.HOG().length == 1764
     assert set(map(tuple, out.sum(-1).nonzero()[:, :2].tolist())) <= {(r, c) for r in range(1, 5) for c in range(3, 7)}
     best = out[3, 5, 0, 0]  # the block whose first cell it is
     assert best.nonzero().flatten().tolist() == [0, 8]
@@ -103,13 +103,13 @@ def test_hog_bin_weights_scale_votes_and_stay_positive_when_learnt() -> None:
     field = torch.randn(2, 2, 32, 32, generator=torch.Generator().manual_seed(1))
     without = hog(field, bin_weights=torch.tensor([0.0, *[1.0] * 8]))
     assert float(without.view(2, -1, 9)[..., 0].abs().max()) == 0.0
-    module = descriptors.HOG(learnable=True)
+    module = features.HOG(learnable=True)
     torch.testing.assert_close(module(field), hog(field))
     module(field)[:, ::9].sum().backward()
     (logarithms,) = module.parameters()
     assert logarithms.grad is not None
     assert float(logarithms.grad[0]) > 0.0
-    assert descriptors.HOG().state_dict() == {}
+    assert features.HOG().state_dict() == {}
     optimizer = torch.optim.SGD(module.parameters(), lr=0.1)
     for _ in range(3):
         optimizer.zero_grad()

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from curvireg_torch import descriptors, filters
+from curvireg_torch import filters
 
 from .._support.layer_contract import LayerCase
 
