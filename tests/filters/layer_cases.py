@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from curvireg_torch import filters
+from curvireg_torch import features, filters
 
 from .._support.layer_contract import LayerCase
 
@@ -75,7 +75,7 @@ PAIRS = {
     "blur": (filters.edge_blur, photos, filters.EdgeBlur),
     "mfc": (filters.multiscale_focus_curves, photos, filters.MultiScaleFocusCurves),
     "pci": (filters.principal_curvature_image, photos, filters.PrincipalCurvatureImage),
-    "hog": (descriptors.hog, fields, descriptors.HOG),
+    "hog": (features.hog, fields, features.HOG),
 }
 """Function, inputs and module of every layer."""
 
