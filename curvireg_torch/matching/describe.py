@@ -2,6 +2,7 @@
 
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 import trimesh
@@ -13,6 +14,7 @@ from ..geometry.crops import crop_transforms, image_transforms, square_boxes
 from ..mesh.colours import has_colours
 from ..mesh.mesh import extreme_points, mesh_centre, mesh_radius
 from ..rendering import DepthRenderer, make_renderer, render_colour
+from ..rendering.contours import MeshContours
 from ..rendering.shading import shade
 from ..settings import BankSettings
 from .fields import depth_filter, hog_layer
@@ -74,6 +76,11 @@ class ViewDescriber:
     def _set(self, settings: BankSettings) -> None:
         self.settings, self._orthographic = settings, settings.camera == "orthographic"
         self._filter, self.descriptor = depth_filter(settings), hog_layer(settings)
+
+    @cached_property
+    def contours(self) -> MeshContours:
+        """Occluding contours and creases at any pose."""
+        return MeshContours(self._mesh)
 
     def with_settings(self, settings: BankSettings) -> "ViewDescriber":
         """The same mesh and renderer with other settings; convex hulls of large meshes take seconds."""

@@ -117,7 +117,7 @@ class PoseEstimator:
         """
         size = 1 if self.bank.device.type == "cpu" else self.matcher.chunk_size
         # Create once what threads share, before they use it.
-        _ = self.describers, self.matcher.describers
+        _ = self.matcher.describers, [describer.contours for describer in self.describers]
         given = [item for item in items if isinstance(item, ImageItem)]
         if any(self.is_exact(with_camera=item.camera_matrix is not None) for item in given):
             self.symmetries_of(exact=True)

@@ -51,7 +51,7 @@ class Follower:
         self.registrar = registrar if isinstance(registrar, Registrar) else Registrar(registrar)
         self.camera_matrix = camera_matrix
         describer = self.registrar.describers[0]
-        self._tracker = Tracker(describer.renderer, describer.hull, centre=describer.centre, radius=describer.radius)
+        self._tracker = Tracker(describer.renderer, describer.contours, describer.hull)
         self._known = 0.0  # confidence of the pose from which tracking began; 0: there is none
 
     def start(self, image: Any, pose: Any) -> None:

@@ -104,7 +104,7 @@ def fit_texture_of(
     one = torch.tensor([h])
     args, options = _contour_arguments(describer, [images[b]], poses, boxes[b : b + 1], one)
     options |= {"image_index": torch.zeros_like(one), "starts": turned(poses.fit[one], describer.centre)}
-    fit = fit_texture(describer.draw, *args[:4], **options)
+    fit = fit_texture(describer.draw, describer.renderer, *args[:4], **options)
     if fit is None:
         return None
     parts = (getattr(poses.fit, f.name).index_copy(0, one, getattr(fit, f.name)) for f in fields(ContourFit))
@@ -145,9 +145,7 @@ def _contour_arguments(
     describer: ViewDescriber, images: Sequence[Tensor], poses: Poses, boxes: Tensor, mine: Tensor
 ) -> tuple[list[Any], dict[str, Any]]:
     """Arguments of the contour functions for the poses ``mine``, all of one model."""
-    return [describer.renderer, images, boxes, poses.cameras[mine], poses.T[mine]], {
+    return [describer.contours, images, boxes, poses.cameras[mine], poses.T[mine]], {
         "image_index": poses.hypotheses.image_index[mine],
-        "centre": describer.centre,
-        "radius": describer.radius,
         "margin": describer.settings.margin,
     }

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from ...geometry.conversions import cross_matrix
+from ...rendering.contours import ContourPoints
 from ..calibration import COVARIANCE_SCALE
 from .descent import Matches, project
-from .points import ContourPoints
 
 __all__ = ["pose_covariance"]
 

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from ...geometry import rotation_from_axis_angle
 from ...geometry.cameras import transform
-from ...rendering import DepthRenderer
+from ...rendering.contours import ContourPoints, MeshContours
 from .mask import ObjectMask
-from .points import ContourPoints, EdgeField, contour_points
+from .points import EdgeField
 
 __all__ = ["ContourProblem", "ContourState", "Matches", "apply_twist", "project"]
 
@@ -60,23 +60,24 @@ class ContourProblem:
     """N poses of a mesh, fitted to ``edges`` of crops of ``size`` px with indices (N,) and cameras ``K`` (N, 3, 3); a
     ``mask`` weights the edges."""
 
-    renderer: DepthRenderer
+    contours: MeshContours
     edges: EdgeField
     image_index: Tensor
     K: Tensor
     size: int
-    centre: Tensor
-    radius: float
     mask: ObjectMask | None = None
+
+    @property
+    def centre(self) -> Tensor:
+        """(3,) of the object, about which poses rotate."""
+        return self.contours.centre
 
     def __getitem__(self, index: Tensor) -> "ContourProblem":
         return replace(self, image_index=self.image_index[index], K=self.K[index])
 
     def state(self, T: Tensor) -> ContourState:
-        """Poses (N, 4, 4) with the contour points that are rendered there."""
-        size = (self.size, self.size)
-        depth = self.renderer.render(T, self.K, size).cpu() if len(T) else torch.zeros(0, 1, *size)
-        return ContourState(T, T, contour_points(depth, T, self.K, radius=self.radius))
+        """Poses (N, 4, 4) with the mesh's contour points there."""
+        return ContourState(T, T, self.contours.points(T, self.K, self.size))
 
     def descend(self, state: ContourState, reaches: tuple[float, ...]) -> ContourState:
         """One round for each search distance in px; afterwards the mesh is rendered again where contours moved."""

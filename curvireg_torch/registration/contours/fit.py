@@ -11,7 +11,7 @@ from torch import Tensor
 from ...errors import InvalidInputError
 from ...filters.inputs import fill_missing
 from ...geometry.crops import crop_transforms, square_boxes
-from ...rendering import DepthRenderer
+from ...rendering.contours import MeshContours
 from ...terms import crop_regions
 from ...utils.checks import (
     as_boxes,
@@ -20,7 +20,6 @@ from ...utils.checks import (
     check_photograph,
     check_pixels,
     check_pose,
-    check_positive,
     check_tensor,
 )
 from .covariance import pose_covariance
@@ -77,23 +76,21 @@ class ContourFit:
 
 @torch.no_grad()
 def fit_contours(
-    renderer: DepthRenderer,
+    contours: MeshContours,
     images: Tensor | Sequence[Tensor],
     boxes: Any,
     camera_matrices: Any,
     starts: Tensor,
     *,
     image_index: Tensor | None = None,
-    centre: Tensor,
-    radius: float,
     margin: float = 0.1,
     finish: int | None = None,
     object_mask: Tensor | None = None,
 ) -> ContourFit:
     """Poses whose contours lie on a photograph's edges, by robust least squares over SE(3).
 
-    At each start the mesh is rendered; its occluding contours and creases become 3D points X_i with image normals n_i
-    (:func:`contour_points`), and edges of similar direction are searched along n_i. With d_i the distance to the
+    At each start, occluding contours and creases of the mesh become 3D points X_i with image normals n_i
+    (:class:`.MeshContours`), and edges of similar direction are searched along n_i. With d_i the distance to the
     selected edge and J_i = n_i^T du_i/dxi, every step solves
 
         (J^T W J + lambda diag(J^T W J)) xi = J^T W d,
@@ -116,14 +113,13 @@ def fit_contours(
     see :func:`pose_covariance`; it is scaled by the errors of reliable results on photographs. Computed on the CPU.
 
     Args:
-        renderer: of the mesh.
+        contours: of the mesh.
         images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, in [0, 1] or uint8; or one photograph (C, H, W).
             Missing pixels (NaN or infinite) are filled from their neighbours.
         boxes: (B, 4) x0, y0, x1, y1 in px, which need not be exact; (4,) for one photograph.
         camera_matrices: (B, 3, 3) or (3, 3) in px; or (N, 3, 3), one for each start.
         starts: (N, 4, 4) rigid poses, within about 15 degrees.
         image_index: (N,) the photograph of each start; optional for one photograph.
-        centre, radius: of the object, (3,) and model units.
         margin: added around the box, as a fraction of its longer side.
         finish: number of starts of each photograph that are fitted to the end, those with the most support after the
             first rounds; None: all, each as if alone.
@@ -135,27 +131,26 @@ def fit_contours(
 
     Example:
         >>> import curvireg_torch as cr, trimesh
-        >>> from curvireg_torch.rendering import make_renderer
+        >>> from curvireg_torch.rendering.contours import MeshContours
         >>> K = torch.tensor([[200.0, 0, 63.5], [0, 200.0, 63.5], [0, 0, 1]], dtype=torch.float64)
         >>> T = torch.eye(4, dtype=torch.float64); T[2, 3] = 5.0
         >>> T[:3, :3] = cr.rotation_from_viewpoint(30.0, 20.0, 5.0)
-        >>> renderer = make_renderer(trimesh.creation.box((1, 1.5, 2)))
-        >>> image = (renderer.render(T[None], K, (128, 128))[0] > 0).float()
+        >>> mesh = trimesh.creation.box((1, 1.5, 2))
+        >>> image = (cr.render_depth(mesh, T[None], K, (128, 128))[0] > 0).float()
         >>> start = T.clone(); start[0, 3] = 0.1                                              # 2 % to the right
         >>> box = torch.tensor([24.0, 18, 102, 110])
-        >>> fit = fit_contours(renderer, image, box, K, start[None], centre=torch.zeros(3), radius=1.4)
+        >>> fit = fit_contours(MeshContours(mesh), image, box, K, start[None])
         >>> abs(float(fit.transform[0, 0, 3])) < 0.01
         True
     """
     images, boxes, K, image_index = _checked(images, boxes, camera_matrices, starts, image_index)
-    check_positive(radius, "radius")
     if finish is not None and not finish >= 1:
         raise InvalidInputError(f"finish: expected a whole number >= 1 or None, got {finish}")
-    T0, centre = starts.detach().cpu().double(), centre.detach().cpu().double()
+    T0 = starts.detach().cpu().double()
     if (N := len(T0)) == 0:
         none = T0.new_zeros(0)
         return ContourFit(T0, T0.new_zeros(0, 6, 6), none, none, none.long())
-    crops, full = full_size_problem(renderer, images, boxes, K, image_index, centre, radius, margin)
+    crops, full = full_size_problem(contours, images, boxes, K, image_index, margin)
     if object_mask is not None:
         check_tensor(object_mask, "object_mask", (len(images), 1, None, None))
         full = replace(full, mask=ObjectMask(object_mask))
@@ -179,21 +174,21 @@ def fit_contours(
     best = torch.where(owner == torch.arange(N)[:, None], weighted, -1.0).argmax(dim=1)
     state, support = state[best], support[best]
     matches = full.matches(state, FINE[-1])
-    covariance, observable = pose_covariance(matches, state.points, state.T, full.K, centre, radius=radius)
+    covariance, observable = pose_covariance(
+        matches, state.points, state.T, full.K, contours.centre, radius=contours.radius
+    )
     return ContourFit(state.T, covariance, edge_support=support, start_support=before, observable=observable)
 
 
 @torch.no_grad()
 def contour_support(
-    renderer: DepthRenderer,
+    contours: MeshContours,
     images: Tensor | Sequence[Tensor],
     boxes: Tensor,
     camera_matrices: Tensor,
     poses: Tensor,
     *,
     image_index: Tensor | None = None,
-    centre: Tensor,
-    radius: float,
     margin: float = 0.1,
 ) -> Tensor:
     """(N,) edge support of poses that are not fitted, as :attr:`ContourFit.edge_support` is of fitted ones.
@@ -203,26 +198,23 @@ def contour_support(
     images, boxes, K, image_index = _checked(images, boxes, camera_matrices, poses, image_index)
     if len(poses) == 0:
         return torch.zeros(0, dtype=torch.float64)
-    centre = centre.detach().cpu().double()
-    _, problem = full_size_problem(renderer, images, boxes, K, image_index, centre, radius, margin)
+    _, problem = full_size_problem(contours, images, boxes, K, image_index, margin)
     return problem.edge_support(problem.state(poses.detach().cpu().double()))
 
 
 def full_size_problem(
-    renderer: DepthRenderer,
+    contours: MeshContours,
     images: Sequence[Tensor],
     boxes: Tensor,
     K: Tensor,
     image_index: Tensor,
-    centre: Tensor,
-    radius: float,
     margin: float,
 ) -> tuple[Tensor, ContourProblem]:
     """(B, C, S, S) crops without missing pixels, and the problem on them."""
     crops = fill_missing(crop_regions(images, boxes[:, None], size=SIZE, margin=margin)[:, 0].float())
     K = crop_transforms(square_boxes(boxes, margin), SIZE).double()[image_index] @ K
     check_pixels(crops, "of the box")
-    return crops, ContourProblem(renderer, EdgeField(crops), image_index, K, SIZE, centre, radius)
+    return crops, ContourProblem(contours, EdgeField(crops), image_index, K, SIZE)
 
 
 def _fit_around(half: ContourProblem, T0: Tensor, first: ContourState, support: Tensor) -> tuple[Tensor, Tensor]:

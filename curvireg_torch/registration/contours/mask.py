@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .points import ContourPoints
+from ...rendering.contours import ContourPoints
 
 __all__ = ["ObjectMask"]
 

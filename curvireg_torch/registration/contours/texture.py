@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from ...rendering import DepthRenderer
+from ...rendering.contours import ContourPoints, MeshContours
 from .corners import surface_corners
 from .covariance import pose_covariance
 from .descent import ContourProblem, ContourState, Matches, apply_twist, pixels, project
 from .fit import FINE, ContourFit, full_size_problem
-from .points import ContourPoints
 
 __all__ = ["fit_texture", "turned"]
 
@@ -93,14 +93,13 @@ class _Patches:
 def fit_texture(
     draw: Draw,
     renderer: DepthRenderer,
+    contours: MeshContours,
     images: Sequence[Tensor],
     boxes: Tensor,
     camera_matrices: Tensor,
     starts: Tensor,
     *,
     image_index: Tensor,
-    centre: Tensor,
-    radius: float,
     margin: float,
 ) -> ContourFit | None:
     """Fit one pose to the mesh's colours and to contours together.
@@ -117,13 +116,13 @@ def fit_texture(
     Returns:
         The fit, with the covariance from edges and patches; None where it does not count.
     """
-    crops, problem = full_size_problem(renderer, images, boxes, camera_matrices, image_index, centre, radius, margin)
+    crops, problem = full_size_problem(contours, images, boxes, camera_matrices, image_index, margin)
     photograph, support = _pixels_of(crops[0]), problem.edge_support(problem.state(starts[:1]))
-    rounds = [_round(draw, problem, photograph, start, *FAR) for start in starts.split(1)]
+    rounds = [_round(draw, renderer, problem, photograph, start, *FAR) for start in starts.split(1)]
     coarse = max((one for one in rounds if one is not None), key=lambda one: one.after, default=None)
     if coarse is None or coarse.after < PROMISING:
         return None
-    fine = _round(draw, problem, photograph, coarse.T, *NEAR)
+    fine = _round(draw, renderer, problem, photograph, coarse.T, *NEAR)
     before = 0.0 if rounds[0] is None else rounds[0].before
     if fine is None or fine.after < ENOUGH or fine.after <= before:
         return None
@@ -158,11 +157,17 @@ class _Round:
 
 
 def _round(
-    draw: Draw, problem: ContourProblem, photograph: np.ndarray, start: Tensor, reach: int, scales: tuple[float, ...]
+    draw: Draw,
+    renderer: DepthRenderer,
+    problem: ContourProblem,
+    photograph: np.ndarray,
+    start: Tensor,
+    reach: int,
+    scales: tuple[float, ...],
 ) -> _Round | None:
     """None where the view has few corners, or the photograph few of them."""
     view, T = _pixels_of(draw(start, problem.K, (problem.size, problem.size))[0]), start
-    patches = _search(view, photograph, problem, T, reach)
+    patches = _search(renderer, view, photograph, problem, T, reach)
     if patches is None:
         return None
     for scale in scales:
@@ -182,11 +187,11 @@ def _pixels_of(picture: Tensor) -> np.ndarray:
 
 
 def _search(
-    view: np.ndarray, photograph: np.ndarray, problem: ContourProblem, T: Tensor, reach: int
+    renderer: DepthRenderer, view: np.ndarray, photograph: np.ndarray, problem: ContourProblem, T: Tensor, reach: int
 ) -> _Patches | None:
     """Corners of a view and where they are in the photograph, within ``reach`` px; None if there are few."""
     size = (problem.size, problem.size)
-    depth = problem.renderer.render(T, problem.K, size).cpu()
+    depth = renderer.render(T, problem.K, size).cpu()
     grey = (255.0 * view.mean(axis=2)).round().astype(np.uint8)
     corners, model = surface_corners(
         grey, depth, T, problem.K, count=CORNERS, apart=APART, quality=QUALITY, inside=HALF
@@ -242,4 +247,4 @@ def _covariance(problem: ContourProblem, state: ContourState, patches: _Patches)
     joined = ContourPoints(
         *(torch.cat([getattr(some, f.name) for some in (state.points, points)], dim=1) for f in fields(ContourPoints))
     )
-    return pose_covariance(both, joined, state.T, problem.K, problem.centre, radius=problem.radius)
+    return pose_covariance(both, joined, state.T, problem.K, problem.centre, radius=problem.contours.radius)

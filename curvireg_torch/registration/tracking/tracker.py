@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -11,12 +12,12 @@ from ...errors import LostObjectError
 from ...geometry import rotation_error
 from ...geometry.cameras import transform
 from ...rendering import DepthRenderer
+from ...rendering.contours import ContourPoints, MeshContours
 from ..confidence import RELIABLE, tracking_confidence
 from ..contours.covariance import pose_covariance
 from ..contours.descent import STALE, ContourProblem, ContourState, pixels, project
 from ..contours.points import EdgeField
 from .flow import Flow, Keyframe, flow_equations, flow_share, make_keyframe, pose_from_flow, track_points
-from .outline import Outline, render_outline
 from .regions import RegionModel, colour_bins, line_posterior
 from .window import SIZE, Window, cut_window
 
@@ -60,6 +61,23 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class Outline:
+    """The contour ``points`` of the mesh at a pose ``T`` (1, 4, 4), and of those that have the background beside them,
+    ``model`` (1, Q, 3) and unit ``normals`` (1, Q, 2) that point there."""
+
+    T: Tensor
+    points: ContourPoints
+
+    @cached_property
+    def model(self) -> Tensor:
+        return self.points.model[self.points.outline][None]
+
+    @cached_property
+    def normals(self) -> Tensor:
+        return self.points.normals[self.points.outline][None]
+
+
+@dataclass(frozen=True)
 class TrackedPose:
     """A pose in a frame.
 
@@ -93,13 +111,13 @@ class Tracker:
     A pose that is found counts as known, to predict and to learn colours from, only after :meth:`accept`.
 
     Args:
-        renderer: of the mesh.
+        renderer, contours: of the mesh.
         hull: (V, 3) points of the mesh that span its convex hull.
-        centre, radius: of the object, (3,) and model units.
     """
 
-    def __init__(self, renderer: DepthRenderer, hull: Tensor, *, centre: Tensor, radius: float) -> None:
-        self.renderer, self.hull, self.centre, self.radius = renderer, hull.double(), centre.double(), radius
+    def __init__(self, renderer: DepthRenderer, contours: MeshContours, hull: Tensor) -> None:
+        self.renderer, self.contours, self.hull = renderer, contours, hull.double()
+        self.centre, self.radius = contours.centre, contours.radius
         self._poses: list[Tensor] = []
         self._keyframes: list[Keyframe] = []
         self._last: Keyframe | None = None
@@ -123,7 +141,7 @@ class Tracker:
         """
         start = T.detach().cpu().double()[None]
         frame = self._frame(image, K, start)
-        outline = self._render(frame, start)
+        outline = self._outline(frame, start)
         return TrackedPose(start, self._features(frame, outline, start, []), frame, outline)
 
     def track(self, image: Tensor, K: Tensor) -> TrackedPose:
@@ -147,8 +165,9 @@ class Tracker:
     def accept(self, pose: TrackedPose) -> None:
         """Go on from a pose of :meth:`track` or :meth:`measure`, and learn from its frame."""
         self._poses = [*self._poses[-1:], pose.T]
-        self._learn(pose.frame, pose.outline, rate=RATE)
-        self._remember(pose.frame, pose.outline)
+        depth = self.renderer.render(pose.outline.T, pose.frame.window.K, (SIZE, SIZE)).cpu()
+        self._learn(pose.frame, pose.outline, depth, rate=RATE)
+        self._remember(pose.frame, pose.outline, depth)
 
     def covariance(self, pose: TrackedPose) -> Tensor:
         """(6, 6) of a pose, see :func:`curvireg_torch.registration.fit_contours`."""
@@ -183,14 +202,14 @@ class Tracker:
         keyframe = self._nearest(T)
         if keyframe is not self._last:
             flows.append((KEYFRAME, track_points(keyframe, frame.window, T, self.centre, levels=SHORT)))
-        outline = self._render(frame, T)
+        outline = self._outline(frame, T)
         for reach in REACHES:
             for _ in range(STEPS):
                 others = self._equations(frame, outline, T, flows, reach)
                 T = frame.problem.step(outline.points, T, reach, others)
             T = _orthonormal(T)
             if float(frame.problem.mean_shift(outline.points, outline.T, T)) > STALE:
-                outline = self._render(frame, T)
+                outline = self._outline(frame, T)
         return TrackedPose(T, self._features(frame, outline, T, [flow for _, flow in flows]), frame, outline)
 
     def _equations(
@@ -229,19 +248,19 @@ class Tracker:
             "keyframe": shares[-1],
         }
 
-    def _learn(self, frame: Frame, outline: Outline, *, rate: float) -> None:
+    def _learn(self, frame: Frame, outline: Outline, depth: Tensor, *, rate: float) -> None:
         """Learn the colours beside the outline; where the mesh hides the background again, they are the object's."""
         uv = pixels(outline.model, outline.T, frame.window.K, self.centre)[0]
         distance = torch.arange(BESIDE[0], BESIDE[1] + 1, dtype=torch.float64)
         samples = uv[:, None] + torch.cat([-distance, distance])[:, None] * outline.normals[0][:, None]
         x, y = samples.round().long().clamp(0, SIZE - 1).unbind(-1)
-        inside = outline.depth[0, 0, y, x] > 0
+        inside = depth[0, 0, y, x] > 0
         directions = self._directions(frame, outline.T, uv)[:, None].expand(inside.shape)
         self._regions.learn(frame.bins, samples.flatten(0, 1), directions.flatten(), inside.flatten(), rate=rate)
 
-    def _remember(self, frame: Frame, outline: Outline) -> None:
+    def _remember(self, frame: Frame, outline: Outline, depth: Tensor) -> None:
         """Keep the frame as the last one, and if none from a similar direction is kept, as a keyframe."""
-        self._last = make_keyframe(frame.window, outline.T, outline.depth)
+        self._last = make_keyframe(frame.window, outline.T, depth)
         if not self._keyframes or float(self._angles(outline.T).min()) > KEYFRAME_ANGLE:
             self._keyframes = [*self._keyframes[1 - KEYFRAMES :], self._last]
 
@@ -260,11 +279,11 @@ class Tracker:
     def _frame(self, image: Tensor, K: Tensor, T: Tensor) -> Frame:
         window = cut_window(image, K, self.hull, T)
         index, edges = torch.zeros(1, dtype=torch.long), EdgeField(window.colours)
-        problem = ContourProblem(self.renderer, edges, index, window.K, SIZE, self.centre, self.radius)
+        problem = ContourProblem(self.contours, edges, index, window.K, SIZE)
         return Frame(window, colour_bins(window.colours), problem)
 
-    def _render(self, frame: Frame, T: Tensor) -> Outline:
-        return render_outline(self.renderer, frame.window, T, self.centre, self.radius)
+    def _outline(self, frame: Frame, T: Tensor) -> Outline:
+        return Outline(T, self.contours.points(T, frame.window.K, SIZE))
 
 
 def _orthonormal(T: Tensor) -> Tensor:

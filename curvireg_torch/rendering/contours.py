@@ -1,0 +1,187 @@
+"""Contours of a mesh at poses, from its edges and a few hundred rays instead of a rendered picture."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from ..mesh.edges import MeshEdges
+from ..mesh.mesh import mesh_centre, mesh_radius
+from .embree import RayScene
+
+__all__ = ["ContourPoints", "MeshContours"]
+
+MAX_OCCLUDING, MAX_CREASES = 256, 128
+"""Points per pose on occluding contours and on creases."""
+
+OCCLUDING_CANDIDATES, CREASE_CANDIDATES = 640, 256
+"""Places per pose at which visibility is tested; some are hidden."""
+
+ASIDE = 1.0
+"""Distance in px from the contour, on the outer side, at which a ray looks past the object."""
+
+OCCLUSION_JUMP = 0.05
+"""Least step in depth at an occluding contour, in object radii; smaller ones are dents of the surface."""
+
+VISIBLE_TOLERANCE = 0.02
+"""Depth, in object radii, by which a crease may lie behind the surface that its ray hits."""
+
+CREASE_SCALE = 1.0 / 64.0
+"""Distance from a crease, as a fraction of the crop's side, at which the surface is looked up on both sides."""
+
+CREASE_BEND = 0.36
+"""Least change of the surface's slope across a crease at that distance: a fold of 20 degrees seen from the front."""
+
+NEAR_PLANE = 1e-3
+"""Depth in object radii below which points are not projected."""
+
+
+@dataclass(frozen=True)
+class ContourPoints:
+    """Points (N, P, 3) on the contours of N views, float64 in model units, with unit ``normals`` (N, P, 2) across the
+    contour in the image; False in ``valid`` (N, P) marks padding. ``outline`` (N, P) marks points with the background
+    beside them. Normals of occluding contours point outward, those of creases have either sign."""
+
+    model: Tensor
+    normals: Tensor
+    valid: Tensor
+    outline: Tensor
+
+    def __getitem__(self, index: Tensor) -> "ContourPoints":
+        return ContourPoints(*(getattr(self, f.name)[index] for f in fields(ContourPoints)))
+
+    @staticmethod
+    def cat(parts: Sequence["ContourPoints"]) -> "ContourPoints":
+        return ContourPoints(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(ContourPoints)))
+
+
+class MeshContours:
+    """Occluding contours and creases of a mesh, at any pose.
+
+    An edge of the mesh lies on an occluding contour where all of its faces are on one side of it, seen from the camera;
+    creases are edges between faces that meet at an angle (:class:`.MeshEdges`). Points are placed along these edges,
+    evenly in the image. A ray one pixel outside an occluding contour tells the outline (nothing hit), an inner
+    occluding contour (hit far behind) and what is hidden (hit in front); one at each crease tells whether it is seen.
+
+    Args:
+        mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
+
+    Example:
+        >>> K = torch.tensor([[100.0, 0, 63.5], [0, 100.0, 63.5], [0, 0, 1]], dtype=torch.float64)
+        >>> T = torch.eye(4, dtype=torch.float64)[None]; T[0, 2, 3] = 4.0
+        >>> points = MeshContours(trimesh.creation.box((2, 2, 2))).points(T, K[None], 128)
+        >>> points.model[points.outline].abs().amax(dim=0).tolist()      # the outline is that of the face in front
+        [1.0, 1.0, 1.0]
+    """
+
+    def __init__(self, mesh: trimesh.Trimesh) -> None:
+        self.centre, self.radius = mesh_centre(mesh), mesh_radius(mesh)
+        self.edges = MeshEdges(mesh, self.centre.numpy())
+        self._scene = RayScene(self.edges.vertices / self.radius, self.edges.faces)
+
+    def points(self, T_cam_from_model: Tensor, camera_matrices: Tensor, size: int) -> ContourPoints:
+        """Contour points of N poses (N, 4, 4) in square crops of ``size`` px with cameras (N, 3, 3); float64, CPU."""
+        T, K = T_cam_from_model.numpy(), camera_matrices.expand(len(T_cam_from_model), 3, 3).numpy()
+        R, edges = T[:, :3, :3], self.edges
+        position = R @ self.centre.numpy() + T[:, :3, 3]
+        eye = -(position[:, None] @ R)[:, 0]
+        camera = edges.vertices @ R.transpose(0, 2, 1) + position[:, None]
+        z = np.maximum(camera[..., 2:], NEAR_PLANE * self.radius)
+        uv = camera @ K[:, :2].transpose(0, 2, 1) / z
+        on_contour, side = edges.sides(eye)
+        length = _length_inside(uv, camera[..., 2] > NEAR_PLANE * self.radius, edges.edges, size)
+        parts = []
+        for weights, count, most, occluding in (
+            (length * on_contour, OCCLUDING_CANDIDATES, MAX_OCCLUDING, True),
+            (length * (edges.is_crease & ~on_contour), CREASE_CANDIDATES, MAX_CREASES, False),
+        ):
+            index, fraction, valid = _spread(weights, count)
+            ends = edges.edges[index]  # (N, M, 2)
+            rows = np.arange(len(T))[:, None]
+            a, b = camera[rows, ends[..., 0]], camera[rows, ends[..., 1]]
+            at = a + fraction[..., None] * (b - a)
+            normal = _across(np.cross(a, b), K) * -side[rows, index][..., None]
+            if occluding:
+                smooth = self._smooth_normals(index, fraction, ends, R, K)
+                smooth *= np.where((smooth * normal).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
+                agree = edges.is_smooth[index] & ((smooth * normal).sum(axis=-1) > 0.5)
+                normal = np.where(agree[..., None], smooth, normal)
+            pixel = at @ K[:, :2].transpose(0, 2, 1) / np.maximum(at[..., 2:], NEAR_PLANE * self.radius)
+            if occluding:
+                hit = self._depth_at(pixel + ASIDE * normal, K, R, eye)
+                valid &= hit - at[..., 2] > OCCLUSION_JUMP * self.radius
+                outline = valid & np.isinf(hit)
+            else:
+                step = CREASE_SCALE * size
+                beside = np.concatenate([pixel, pixel + step * normal, pixel - step * normal], axis=1)
+                here, ahead, back = np.split(self._depth_at(beside, K, R, eye), 3, axis=1)
+                z = at[..., 2]
+                valid &= here > z - VISIBLE_TOLERANCE * self.radius
+                with np.errstate(invalid="ignore"):
+                    bend = np.abs(ahead - 2.0 * z + back) / step * K[:, :1, 0] / z
+                    flat = np.maximum(np.abs(ahead - z), np.abs(back - z)) < 2.0 * OCCLUSION_JUMP * self.radius
+                valid &= (bend > CREASE_BEND) & flat
+                outline = np.zeros_like(valid)
+            model = (at - T[:, None, :3, 3]) @ R
+            chosen, valid = _evenly(valid, most)
+            parts.append((model[rows, chosen], normal[rows, chosen], valid, outline[rows, chosen] & valid))
+        return ContourPoints(*(torch.from_numpy(np.concatenate(each, axis=1)) for each in zip(*parts, strict=True)))
+
+    def _smooth_normals(
+        self, index: np.ndarray, fraction: np.ndarray, ends: np.ndarray, R: np.ndarray, K: np.ndarray
+    ) -> np.ndarray:
+        """Normals (N, M, 2) across the contour of a smooth surface, whose vertices' normals are interpolated."""
+        n = self.edges.normals
+        normal = n[ends[..., 0]] + fraction[..., None] * (n[ends[..., 1]] - n[ends[..., 0]])
+        return _across(normal @ R.transpose(0, 2, 1), K)
+
+    def _depth_at(self, uv: np.ndarray, K: np.ndarray, R: np.ndarray, eye: np.ndarray) -> np.ndarray:
+        """Depth (N, M) of the mesh at pixels (N, M, 2); inf where it is not seen."""
+        xy = (uv - K[:, None, :2, 2]) / np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)[:, None]
+        rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1) @ R
+        origins = np.broadcast_to((eye / self.radius)[:, None], rays.shape)
+        depth = self._scene.distance(origins.reshape(-1, 3), rays.reshape(-1, 3)).reshape(rays.shape[:2])
+        return depth * self.radius
+
+
+def _across(plane: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Unit normals (N, M, 2) of the image lines in which planes through the camera, with normals (N, M, 3), appear."""
+    n = plane[..., :2] / np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)[:, None]
+    unit: np.ndarray = n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-300)
+    return unit
+
+
+def _length_inside(uv: np.ndarray, in_front: np.ndarray, edges: np.ndarray, size: int) -> np.ndarray:
+    """(N, E) lengths in px of edges with (N, V, 2) projected vertices; 0 outside the crop and behind the camera."""
+    a, b = uv[:, edges[:, 0]], uv[:, edges[:, 1]]
+    inside = (np.maximum(a, b) > -0.5).all(axis=-1) & (np.minimum(a, b) < size - 0.5).all(axis=-1)
+    inside &= in_front[:, edges[:, 0]] & in_front[:, edges[:, 1]]
+    length: np.ndarray = np.linalg.norm(b - a, axis=-1) * inside
+    return length
+
+
+def _spread(weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """``count`` places along edges of lengths (N, E), evenly: the edge, the fraction of its length, and whether there
+    is one."""
+    index = np.zeros((len(weights), count), np.int64)
+    fraction = np.zeros((len(weights), count))
+    total = weights.cumsum(axis=1)
+    for row, (weight, end) in enumerate(zip(weights, total, strict=True)):
+        if len(end) and end[-1] > 0:
+            target = (np.arange(count) + 0.5) * (end[-1] / count)
+            index[row] = np.minimum(np.searchsorted(end, target), len(end) - 1)
+            fraction[row] = 1.0 - (end[index[row]] - target) / np.maximum(weight[index[row]], 1e-300)
+    there = np.broadcast_to((total[:, -1:] > 0) if total.shape[1] else np.zeros((len(weights), 1), bool), index.shape)
+    return index, fraction.clip(0.0, 1.0), there.copy()
+
+
+def _evenly(valid: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (N, most) of valid entries (N, M), evenly chosen where there are more, and which are not padding."""
+    order = np.argsort(~valid, axis=1, kind="stable")
+    count = valid.sum(axis=1, keepdims=True)
+    k = np.arange(most)[None]
+    rank = np.where(count > most, (k * np.maximum(count, 1)) // most, k)
+    return np.take_along_axis(order, np.minimum(rank, valid.shape[1] - 1), axis=1), k < count
