@@ -39,9 +39,9 @@ at full size."""
 SAME = 0.5
 """Mean shift in px at half size below which two fits count as one."""
 
-START_ANGLE = 8.0
-"""Degrees by which the pose is rotated left, right, up and down for further starts: half the width of the basin of
-attraction, and about the error of a coarse view."""
+START_ANGLE, START_ROLL = 8.0, 6.0
+"""Degrees by which the pose is rotated left, right, up and down, and about the line of sight, for further starts: about
+half the spacing of a bank's views."""
 
 SUPPORTED, GAINED = 0.5, 0.2
 """Edge support, or gain of it over the start, from which a fit is trusted; chosen on generated scenes."""
@@ -156,13 +156,17 @@ def fit_contours(
         full = replace(full, mask=ObjectMask(object_mask))
     K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ full.K
     half = replace(full, edges=EdgeField(F.avg_pool2d(crops, 2)), K=K, size=SIZE // 2)
-    start = half.state(T0)
-    before, weighted_before = half.supports(start)
-    first = half.descend(start, FIRST)
-    _, support = half.supports(first)
+    before, weighted_before = half.supports(half.state(T0))
+    around = _turned(T0, half.centre)
+    M = around.shape[1]
+    every = torch.arange(N).repeat_interleave(M)
+    fits = half[every].descend(half[every].state(around.flatten(0, 1)), FIRST)
+    supports = half[every].supports(fits)[1].view(N, M)
+    support, best = supports.max(dim=1)
+    first = fits[torch.arange(N) * M + best]
     chosen = torch.ones(N, dtype=torch.bool) if finish is None else _among_best(support, image_index, finish)
     index, others = chosen.nonzero()[:, 0], (~chosen).nonzero()[:, 0]
-    source, T = _fit_around(half[index], T0[index], first[index], support[index])
+    source, T = _two_best(half, fits, supports, index)
     # Candidates: the starts, the half-size fits of unfinished starts, and the full-size fits. Ties go to the first.
     owner = torch.cat([index, others, index[source]])
     unfinished = torch.where((support > weighted_before)[others, None, None], first.T[others], T0[others])
@@ -217,26 +221,30 @@ def full_size_problem(
     return crops, ContourProblem(contours, EdgeField(crops), image_index, K, SIZE)
 
 
-def _fit_around(half: ContourProblem, T0: Tensor, first: ContourState, support: Tensor) -> tuple[Tensor, Tensor]:
-    """Fit from four rotations of each start too, at half size; refine the best and the next best that is another pose.
+def _turned(T: Tensor, centre: Tensor) -> Tensor:
+    """(N, M, 4, 4) poses: each of (N, 4, 4), then turned about the camera's x and y axes and about its z axis."""
+    angles = torch.tensor([START_ANGLE, -START_ANGLE, START_ANGLE, -START_ANGLE, START_ROLL, -START_ROLL])
+    twists = torch.zeros(7, 6, dtype=torch.float64)
+    twists[torch.arange(1, 7), torch.tensor([0, 0, 1, 1, 2, 2])] = torch.deg2rad(angles.double())
+    N = len(T)
+    return apply_twist(T.repeat_interleave(7, 0), twists.repeat(N, 1), centre).view(N, 7, 4, 4)
 
-    Returns the index of the start that each pose belongs to, and the poses.
+
+def _two_best(half: ContourProblem, fits: ContourState, supports: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+    """Refine the best fit of each start ``index`` and the next best that is another pose.
+
+    Returns the number within ``index`` of the start that each pose belongs to, and the poses.
     """
-    N, every = len(T0), torch.arange(len(T0))
-    offsets = torch.zeros(4, 6, dtype=torch.float64)
-    offsets[:, :2] = torch.deg2rad(START_ANGLE * torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]))
-    four = half[every.repeat_interleave(4)]
-    rotated = apply_twist(T0.repeat_interleave(4, 0), offsets.repeat(N, 1), half.centre)
-    fits = four.descend(four.state(rotated), FIRST)
-    supports = torch.cat([support[:, None], four.supports(fits)[1].view(-1, 4)], dim=1)
-    five = torch.cat([every[:, None], N + torch.arange(4 * N).view(-1, 4)], dim=1)
-    states, best = ContourState.cat([first, fits]), supports.argmax(dim=1)
-    other, reference = states[five.flatten()], states[five[every, best].repeat_interleave(5)]
-    gap = half[every.repeat_interleave(5)].mean_shift(reference.points, reference.T, other.T).view(-1, 5)
+    n, M = len(index), supports.shape[1]
+    each, supports = half[index], supports[index]
+    of_start = index[:, None] * M + torch.arange(M)
+    best, rows = supports.argmax(dim=1), torch.arange(n)
+    other, reference = fits[of_start.flatten()], fits[of_start[rows, best].repeat_interleave(M)]
+    gap = each[rows.repeat_interleave(M)].mean_shift(reference.points, reference.T, other.T).view(n, M)
     rival, second = torch.where(gap > SAME, supports, -1.0).max(dim=1)
-    source = torch.cat([every, every[rival >= 0]])
-    chosen = five[source, torch.cat([best, second[rival >= 0]])]
-    return source, half[source].descend(states[chosen], SECOND).T
+    source = torch.cat([rows, rows[rival >= 0]])
+    chosen = of_start[source, torch.cat([best, second[rival >= 0]])]
+    return source, each[source].descend(fits[chosen], SECOND).T
 
 
 def _among_best(support: Tensor, image_index: Tensor, count: int) -> Tensor:
