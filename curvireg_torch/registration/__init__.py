@@ -3,7 +3,7 @@
 from ..matching import distinct_views
 from .answer_set import AnswerSet
 from .confidence import RELIABLE, confidence, ranking_evidence
-from .contours import ContourFit, fit_contours
+from .contour_fit import ContourFit, fit_contours
 from .following import Follower
 from .hypotheses import Hypotheses, start_hypotheses
 from .localization import localize

@@ -16,7 +16,7 @@ from .inputs import ImageItem, image_items
 from .refinement import nearest_view, refine
 from .registrar import Registrar
 from .results import FailedRegistration, Hypothesis, Registration
-from .tracking import TrackedPose, Tracker
+from .tracker import TrackedPose, Tracker
 
 __all__ = ["Follower"]
 

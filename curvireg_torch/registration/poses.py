@@ -10,11 +10,12 @@ from torch import Tensor
 from ..geometry.cameras import rotation_towards
 from ..geometry.translation import pose_from_box
 from ..matching import ViewDescriber
-from .contours import ContourFit, contour_support, fit_contours, fit_texture, turned
+from .contour_fit import ContourFit, contour_support, fit_contours
 from .hypotheses import Hypotheses
 from .rescoring import POSE_FEATURES
 from .results import Hypothesis
 from .search import FINALISTS
+from .texture_fit import fit_texture, turned
 
 __all__ = ["Poses", "edge_supports", "fit_poses", "fit_texture_of", "hypothesis_of", "lift_to_poses"]
 

@@ -19,7 +19,7 @@ from .poses import Poses, fit_poses, fit_texture_of, hypothesis_of, lift_to_pose
 from .rescoring import rescore, similarities
 from .results import FailedRegistration, Registration
 from .search import search
-from .tracking.window import OUTSIDE, boxes_at
+from .tracker import OUTSIDE, boxes_at
 
 __all__ = ["LOST", "refine"]
 

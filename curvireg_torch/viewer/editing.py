@@ -53,13 +53,11 @@ def fit_displayed(registrar: Registrar, displayed: DisplayedPose, image: Tensor,
     describer = registrar.describers[displayed.pose.model]
     T, K = displayed.pose.projection
     fit = fit_contours(
-        describer.renderer,
+        describer.contours,
         image,
         box,
         K,
         T[None],
-        centre=describer.centre,
-        radius=describer.radius,
         margin=registrar.bank.settings.margin,
     )
     degrees = float(rotation_error(fit.transform[0, :3, :3], T[:3, :3]))

@@ -8,45 +8,45 @@ from torch import Tensor
 
 __all__ = ["RegionModel", "colour_bins", "line_posterior"]
 
-LEVELS = 8
+COLOUR_LEVELS = 8
 """Levels of each colour channel in a histogram."""
 
 SECTORS = 12
 """Directions from the object's centre in the image, each with its own histograms."""
 
-LOCAL = 0.7
+LOCAL_WEIGHT = 0.7
 """Weight of a sector's own histogram; the rest is the mean of all sectors."""
 
-FLOOR = 0.3 / LEVELS**3
+MIN_PROBABILITY = 0.3 / COLOUR_LEVELS**3
 """Added to probabilities, so that a colour never seen is not proof."""
 
-CONFLICT = 4.0
+MAX_LOG_RATIO = 4.0
 """Largest log ratio of one pixel."""
 
-TEMPER = 0.3
+LOG_RATIO_FACTOR = 0.3
 """Factor of log ratios: neighbouring pixels are not independent."""
 
-ENOUGH = 20.0
+HALF_RATE_COUNT = 20.0
 """Pixels of a sector with which it learns at half of the rate."""
 
 
 def colour_bins(colours: Tensor) -> Tensor:
     """(S, S) int64 histogram bin of each pixel of (1, 3, S, S) colours in [0, 1]."""
-    red, green, blue = (colours[0] * LEVELS).long().clamp(0, LEVELS - 1)
-    bins: Tensor = (red * LEVELS + green) * LEVELS + blue
+    red, green, blue = (colours[0] * COLOUR_LEVELS).long().clamp(0, COLOUR_LEVELS - 1)
+    bins: Tensor = (red * COLOUR_LEVELS + green) * COLOUR_LEVELS + blue
     return bins
 
 
-def line_posterior(log_ratio: Tensor, reach: int) -> tuple[Tensor, Tensor]:
+def line_posterior(log_ratio: Tensor, radius: int) -> tuple[Tensor, Tensor]:
     """Mean and variance of where lines leave the object, from the colours along them.
 
     If a line leaves the object at d, its pixels before d show the object and those behind it the background. With
     r(l) = log p(colour at l | object) - log p(colour at l | background), the logarithm of the likelihood of d is, but
-    for a constant, the sum of r(l) over l < d. The prior is uniform from -reach to reach.
+    for a constant, the sum of r(l) over l < d. The prior is uniform from -radius to radius.
 
     Args:
         log_ratio: (P, L) r at the offsets -h to h px along lines that point out of the object, L = 2 h + 1.
-        reach: in px, at most h.
+        radius: in px, at most h.
 
     Returns:
         Offsets (P,) in px and their variance (P,) in px².
@@ -58,8 +58,8 @@ def line_posterior(log_ratio: Tensor, reach: int) -> tuple[Tensor, Tensor]:
         (True, True)
     """
     half = log_ratio.shape[-1] // 2
-    log_likelihood = log_ratio.cumsum(dim=-1)[..., half - reach : half + reach]
-    d = torch.arange(-reach, reach, dtype=log_ratio.dtype) + 0.5  # between two pixels
+    log_likelihood = log_ratio.cumsum(dim=-1)[..., half - radius : half + radius]
+    d = torch.arange(-radius, radius, dtype=log_ratio.dtype) + 0.5  # between two pixels
     p = log_likelihood.softmax(dim=-1)
     mean = (p * d).sum(dim=-1)
     return mean, (p * (d - mean[..., None]).square()).sum(dim=-1)
@@ -72,8 +72,8 @@ class RegionModel:
     """
 
     def __init__(self) -> None:
-        self._histograms = torch.zeros(2, SECTORS, LEVELS**3)
-        self._log_ratio = torch.zeros(SECTORS * LEVELS**3)
+        self._histograms = torch.zeros(2, SECTORS, COLOUR_LEVELS**3)
+        self._log_ratio = torch.zeros(SECTORS * COLOUR_LEVELS**3)
 
     def learn(self, bins: Tensor, uv: Tensor, directions: Tensor, inside: Tensor, *, rate: float) -> None:
         """Move the histograms towards the colours of some pixels.
@@ -91,23 +91,23 @@ class RegionModel:
         side = (~inside[seen]).long()
         new = torch.zeros_like(self._histograms)
         for sector, weight in ((low, 1.0 - fraction), (high, fraction)):
-            new.view(-1).index_add_(0, (side * SECTORS + sector) * LEVELS**3 + colour, weight.float())
+            new.view(-1).index_add_(0, (side * SECTORS + sector) * COLOUR_LEVELS**3 + colour, weight.float())
         count = new.sum(dim=-1, keepdim=True)
         new = new / count.clamp(min=1e-9)
-        step = rate * count / (count + ENOUGH)
+        step = rate * count / (count + HALF_RATE_COUNT)
         empty = self._histograms.sum(dim=-1, keepdim=True) == 0
         self._histograms = torch.where(empty, new, (1.0 - step) * self._histograms + step * new)
         p = _smoothed(self._histograms)
-        p = LOCAL * p + (1.0 - LOCAL) * p.mean(dim=1, keepdim=True) + FLOOR
-        self._log_ratio = TEMPER * (p[0] / p[1]).log().clamp(-CONFLICT, CONFLICT).view(-1)
+        p = LOCAL_WEIGHT * p + (1.0 - LOCAL_WEIGHT) * p.mean(dim=1, keepdim=True) + MIN_PROBABILITY
+        self._log_ratio = LOG_RATIO_FACTOR * (p[0] / p[1]).log().clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO).view(-1)
 
     def log_ratio(self, bins: Tensor, uv: Tensor, directions: Tensor) -> Tensor:
-        """(P, L) log p(colour | object) - log p(colour | background), times ``TEMPER``, at (P, L, 2) px of lines in
+        """(P, L) log p(colour | object) - log p(colour | background), times ``LOG_RATIO_FACTOR``, at (P, L, 2) px of lines in
         ``directions`` (P,); 0 outside the window."""
         index, seen = _indices(bins, uv)
         colour = bins.view(-1)[index]
         low, high, fraction = (x[:, None] for x in _sectors(directions))
-        of_low, of_high = (self._log_ratio[sector * LEVELS**3 + colour] for sector in (low, high))
+        of_low, of_high = (self._log_ratio[sector * COLOUR_LEVELS**3 + colour] for sector in (low, high))
         return torch.lerp(of_low, of_high, fraction.to(of_low.dtype)) * seen
 
 
@@ -127,9 +127,9 @@ def _sectors(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _smoothed(histograms: Tensor) -> Tensor:
-    """Histograms (2, SECTORS, LEVELS^3) after a binomial-like filter along each colour channel."""
+    """Histograms (2, SECTORS, COLOUR_LEVELS^3) after a binomial-like filter along each colour channel."""
     kernel = torch.tensor([0.2, 0.6, 0.2])
-    cube = histograms.view(-1, 1, LEVELS, LEVELS, LEVELS)
+    cube = histograms.view(-1, 1, COLOUR_LEVELS, COLOUR_LEVELS, COLOUR_LEVELS)
     for axis in range(3):
         shape, pad = [1, 1, 1], [0] * 6
         shape[axis], pad[4 - 2 * axis], pad[5 - 2 * axis] = 3, 1, 1

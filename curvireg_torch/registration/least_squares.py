@@ -1,0 +1,257 @@
+"""Robust least squares over rigid poses: projection, its derivative, and the measurements that pull on a pose."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from ..geometry import rotation_from_axis_angle
+from ..geometry.cameras import transform
+from ..geometry.conversions import cross_matrix
+from ..rendering.contours import ContourPoints
+from .calibration import COVARIANCE_SCALE
+
+__all__ = [
+    "Measurements",
+    "PointMatches",
+    "apply_twist",
+    "fit_points",
+    "least_squares_step",
+    "nearest_rigid",
+    "pixels",
+    "pose_covariance",
+    "project",
+]
+
+MAX_ROTATION, MAX_TRANSLATION = 0.2, 0.1
+"""Longest step: radians, and fraction of the object's distance."""
+
+INLIER_SCALE = 2.0
+"""Distance in px at which a point match counts a quarter."""
+
+MIN_MATCHES = 8
+"""Point matches that a pose needs."""
+
+POINT_DAMPING = 1e-5
+"""Levenberg-Marquardt damping of a fit to points alone, a fraction of the diagonal of J^T W J."""
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """What N poses are fitted to: derivatives ``J`` (N, P, 6) of distances in px by rotation about the object's centre
+    (rad) and translation, these distances and their weights, (N, P, 1)."""
+
+    J: Tensor
+    distance: Tensor
+    weight: Tensor
+
+    def equations(self) -> tuple[Tensor, Tensor]:
+        """Normal equations J^T W J (N, 6, 6) and J^T W d (N, 6, 1)."""
+        WJ = self.weight * self.J
+        return WJ.mT @ self.J, WJ.mT @ self.distance
+
+    def scaled(self, factor: float) -> "Measurements":
+        """The same with weights times ``factor``."""
+        return Measurements(self.J, self.distance, factor * self.weight)
+
+    @staticmethod
+    def cat(parts: Sequence["Measurements"]) -> "Measurements":
+        """All measurements of the same poses together."""
+        return Measurements(*(torch.cat([getattr(p, f.name) for p in parts], dim=1) for f in fields(Measurements)))
+
+
+@dataclass(frozen=True)
+class PointMatches:
+    """Points of a mesh ``model`` (1, C, 3) that were found at ``uv`` (1, C, 2) px with ``weight`` (1, C) in [0, 1]; 0
+    marks a point that was not found."""
+
+    model: Tensor
+    uv: Tensor
+    weight: Tensor
+
+    def measurements(self, T: Tensor, K: Tensor, centre: Tensor, scale: float) -> Measurements:
+        """Two for each point, along x and y, with Geman-McClure weights of ``scale`` px."""
+        uv, J = project(self.model, T, K, centre)
+        residual = self.uv - uv
+        weight = (self.weight * _geman_mcclure(residual, scale)).repeat_interleave(2, dim=1)
+        return Measurements(J.flatten(1, 2), residual.flatten(1)[..., None], weight[..., None])
+
+    def inlier_ratio(self, T: Tensor, K: Tensor, centre: Tensor) -> float:
+        """Fraction of all points, in [0, 1], that were found where the pose has them."""
+        near = _geman_mcclure(self.uv - pixels(self.model, T, K, centre), INLIER_SCALE)
+        return float((near * (self.weight > 0)).sum()) / max(self.weight.shape[1], 1)
+
+    def moved(self, before: Tensor, after: Tensor) -> "PointMatches":
+        """The same in another crop of the photograph: ``before`` and ``after`` are the crops' cameras (1, 3, 3)."""
+        A = (after @ torch.linalg.inv(before))[0]
+        return PointMatches(self.model, self.uv @ A[:2, :2].mT + A[:2, 2], self.weight)
+
+
+def _geman_mcclure(residual: Tensor, scale: float) -> Tensor:
+    """(N, C) weights in (0, 1] of residuals (N, C, 2) px."""
+    return (1.0 + residual.square().sum(dim=-1) / scale**2) ** -2
+
+
+def fit_points(matches: PointMatches, T: Tensor, K: Tensor, centre: Tensor, scales: Sequence[float]) -> Tensor:
+    """(1, 4, 4) pose that most matches agree on, by robust least squares from ``T`` (1, 4, 4); ``T`` if there are few.
+
+    Args:
+        matches: points and where they were found.
+        T, K, centre: start, camera (1, 3, 3) in px, and centre (3,) of the object.
+        scales: of the robust weights in px, one a step: at first all matches count, in the end those that agree.
+
+    Example:
+        >>> K = torch.tensor([[[200.0, 0, 128], [0, 200.0, 128], [0, 0, 1]]], dtype=torch.float64)
+        >>> start, zero = torch.eye(4, dtype=torch.float64)[None], torch.zeros(3, dtype=torch.float64)
+        >>> start[0, 2, 3] = 5.0
+        >>> truth = apply_twist(start, torch.tensor([[0.05, -0.04, 0.03, 0.1, -0.1, 0.2]]).double(), zero)
+        >>> points = torch.rand(1, 40, 3, dtype=torch.float64) - 0.5
+        >>> uv = pixels(points, truth, K, zero)
+        >>> uv[:, :12] += 30.0                                                        # matches of something else
+        >>> found = fit_points(PointMatches(points, uv, torch.ones(1, 40)), start, K, zero, (24, 12, 6, 3, 2, 2, 2))
+        >>> bool((found - truth).abs().max() < 1e-3)
+        True
+    """
+    if int((matches.weight > 0).sum()) < MIN_MATCHES:
+        return T
+    for scale in scales:
+        A, b = matches.measurements(T, K, centre, scale).equations()
+        T = apply_twist(T, least_squares_step(A, b, T, centre, POINT_DAMPING), centre)
+    return T
+
+
+def least_squares_step(A: Tensor, b: Tensor, T: Tensor, centre: Tensor, damping: float) -> Tensor:
+    """(N, 6) Levenberg-Marquardt steps of poses ``T`` (N, 4, 4) from normal equations, of bounded length."""
+    step = damped_solution(A, b, damping)
+    z = (T[:, :3, :3] @ centre + T[:, :3, 3])[:, 2].clamp(min=0.0)
+    w, t = (torch.linalg.vector_norm(part, dim=1).clamp(min=1e-12) for part in step.split(3, dim=1))
+    fraction = torch.minimum(MAX_ROTATION / w, MAX_TRANSLATION * z / t).clamp(max=1.0)
+    return step * fraction[:, None]
+
+
+def damped_solution(A: Tensor, b: Tensor, damping: float) -> Tensor:
+    """(N, 6) solutions of (A + damping diag A) x = b, for (N, 6, 6) and (N, 6, 1); 0 without measurements."""
+    diagonal = damping * A.diagonal(dim1=-2, dim2=-1)
+    least = 1e-12 * diagonal.amax(dim=-1, keepdim=True) + 1e-12
+    solution: Tensor = torch.linalg.solve(A + torch.diag_embed(diagonal + least), b)[..., 0]
+    return solution
+
+
+def project(points: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (N, P, 2) of model points, and their derivative (N, P, 2, 6) by rotation about and translation of the
+    centre."""
+    K = K.expand(len(T), 3, 3)
+    arms = (points - centre) @ T[:, :3, :3].mT
+    cam = arms + (T[:, :3, :3] @ centre + T[:, :3, 3])[:, None]
+    z = cam[..., 2:].clamp(min=1e-9)
+    uv = cam @ K[:, :2].mT / z
+    by_cam = (K[:, None, :2] - uv[..., None] * K[:, None, 2:]) / z[..., None]
+    by_rotation = torch.linalg.cross(arms[..., None, :].expand_as(by_cam), by_cam)  # b . (w x a) = w . (a x b)
+    return uv, torch.cat([by_rotation, by_cam], dim=-1)
+
+
+def pixels(points: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> Tensor:
+    """The pixels of :func:`project` without their derivative."""
+    cam = (points - centre) @ T[:, :3, :3].mT + (T[:, :3, :3] @ centre + T[:, :3, 3])[:, None]
+    return cam @ K[:, :2].mT / cam[..., 2:].clamp(min=1e-9)
+
+
+def apply_twist(T: Tensor, step: Tensor, centre: Tensor) -> Tensor:
+    """(N, 4, 4) poses, rotated by ``step[:, :3]`` rad about the centre, which is then translated by ``step[:, 3:]``."""
+    R = rotation_from_axis_angle(step[:, :3]) @ T[:, :3, :3]
+    position = T[:, :3, :3] @ centre + T[:, :3, 3] + step[:, 3:]
+    return transform(R, position - R @ centre)
+
+
+def nearest_rigid(T: Tensor) -> Tensor:
+    """The poses (N, 4, 4) with the nearest rotations: products of many rotations lose their orthogonality."""
+    U, _, V = torch.linalg.svd(T[:, :3, :3])
+    return transform(U @ V, T[:, :3, 3])
+
+
+CELL_SIDE, CELLS_PER_SIDE = 32.0, 16
+"""Side in px of the square cells within which errors of contour points are correlated, and cells per side."""
+
+NORMAL_ERROR, SIGHT_ERROR = 0.05, 0.05
+"""Errors of contour points: of the normals in rad, and along the line of sight in object radii (at an occluding contour
+the surface turns away)."""
+
+POINT_ERROR, SHARED_ERROR = 0.6, 6.0
+"""Variance of each distance: (0.6 px)^2, plus six times the mean squared residual for what points have in common."""
+
+OBSERVABLE_FRACTION = 0.75
+"""A direction counts as known if this fraction of its information does not come from such errors."""
+
+UNKNOWN_ROTATION = math.pi
+"""Standard deviation in rad of an unknown rotation; that of an unknown translation is the distance."""
+
+MIN_TOTAL_WEIGHT = 6.0
+"""Sum of weights that a covariance needs."""
+
+
+def pose_covariance(
+    measured: Measurements, points: ContourPoints, T: Tensor, K: Tensor, centre: Tensor, *, radius: float
+) -> tuple[Tensor, Tensor]:
+    """Covariance of poses by least squares over contour points, and the number of directions that they determine.
+
+    With J the derivatives, W the weights, A = J^T W J and r the residuals, the covariance is
+    ``COVARIANCE_SCALE`` A^-1 B A^-1 with
+
+        B = sum_c g_c g_c^T + (0.36 px^2 + 6 s^2) J^T W^2 J,
+
+    where g_c is the sum of r_i w_i J_i over a cell of 32 px, whose points have correlated errors, and s^2 the mean of
+    r_i^2.
+
+    Errors produce information as well: normals that are off by 0.05 rad and points that are off by 0.05 radii along
+    the line of sight produce E. Directions x with x^T A x < 0.75 x^T (A + E) x count as unknown: the rotations of a
+    sphere, or that of a cylinder about its axis. Their standard deviation is pi (rotation) or the distance.
+
+    Args:
+        measured: edges near the contour ``points`` of N poses.
+        T, K: (N, 4, 4) and (N, 3, 3) of the crops.
+        centre, radius: of the object, (3,) and model units.
+
+    Returns:
+        (N, 6, 6) of (rotation, translation of the model's origin), NaN where too few edges were matched; (N,) number
+        of known directions, 0 to 6.
+    """
+    uv, du = project(points.model, T, K, centre)
+    n, W = points.normals, measured.weight
+    along = (torch.stack([-n[..., 1], n[..., 0]], dim=-1)[..., None, :] @ du)[..., 0, :]
+    cam = (points.model - centre) @ T[:, :3, :3].mT + (T[:, :3, :3] @ centre + T[:, :3, 3])[:, None]
+    ray = cam / torch.linalg.vector_norm(cam, dim=-1, keepdim=True).clamp(min=1e-12)
+    sight = torch.zeros_like(along)
+    sight[..., :3] = torch.linalg.cross(ray, measured.J[..., 3:])
+    A = measured.J.mT @ (W * measured.J)
+    E = NORMAL_ERROR**2 * along.mT @ (W * along) + (SIGHT_ERROR * radius) ** 2 * sight.mT @ (W * sight)
+    # Basis of directions in which A + E is the identity and A is diagonal; first normalise the units.
+    unit = (A + E).diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
+    total = unit[:, :, None] * (A + E) * unit[:, None] + 1e-9 * torch.eye(6, dtype=A.dtype)
+    lower = torch.linalg.cholesky(total)
+    half = torch.linalg.solve_triangular(lower, unit[:, :, None] * A * unit[:, None], upper=False)
+    fraction, vectors = torch.linalg.eigh(torch.linalg.solve_triangular(lower, half.mT, upper=False))
+    basis = unit[:, :, None] * torch.linalg.solve_triangular(lower.mT, vectors, upper=True)
+    known = fraction > OBSERVABLE_FRACTION
+
+    cell = (uv / CELL_SIDE).floor().long().clamp(0, CELLS_PER_SIDE - 1)
+    cell = (cell * torch.tensor([1, CELLS_PER_SIDE])).sum(dim=-1)
+    g = torch.zeros(len(T), CELLS_PER_SIDE**2, 6, dtype=A.dtype)
+    g.scatter_add_(1, cell[..., None].expand(-1, -1, 6), W * measured.distance * measured.J)
+    square = (W * measured.distance**2).sum(dim=1, keepdim=True) / W.sum(dim=1, keepdim=True).clamp(min=1e-12)
+    B = g.mT @ g + (POINT_ERROR**2 + SHARED_ERROR * square) * (measured.J.mT @ (W * W * measured.J))
+    inverse = basis * (known / fraction.clamp(min=1e-12))[:, None]
+    C = COVARIANCE_SCALE * inverse @ (basis.mT @ B @ basis) @ inverse.mT
+    position = T[:, :3, :3] @ centre + T[:, :3, 3]
+    rotation, translation = (torch.linalg.vector_norm(part, dim=1).clamp(min=1e-300) for part in basis.split(3, dim=1))
+    distance = torch.linalg.vector_norm(position, dim=1)[:, None]
+    size = torch.minimum(UNKNOWN_ROTATION / rotation, distance / translation)
+    unknown = basis * (~known * size)[:, None]
+    C = C + unknown @ unknown.mT
+    # From the translation e of the centre to that of the origin, e - w x (R centre).
+    lever = torch.eye(6, dtype=C.dtype).repeat(len(C), 1, 1)
+    lever[:, 3:, :3] = cross_matrix(T[:, :3, :3] @ centre)
+    C = lever @ C @ lever.mT
+    enough = W.sum(dim=(1, 2)) > MIN_TOTAL_WEIGHT
+    return torch.where(enough[:, None, None], 0.5 * (C + C.mT), torch.nan), known.sum(dim=1) * enough

@@ -1,0 +1,241 @@
+"""Texture fit: pulls poses to where the photograph shows the mesh's own colours.
+
+The contours of a can do not determine its rotation about the axis; its label does.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..rendering import DepthRenderer
+from ..rendering.contours import ContourPoints, MeshContours
+from .contour_fit import FULL_SIZE_RADII, ContourFit, ContourProblem, ContourState, full_size_problem
+from .least_squares import MIN_MATCHES, Measurements, PointMatches, apply_twist, fit_points, pose_covariance
+
+__all__ = ["fit_texture", "surface_corners", "turned"]
+
+MAX_CORNERS, CORNER_SPACING, CORNER_QUALITY = 160, 5, 0.005
+"""Corners of a view: how many at most, how many px apart at least, and the least strength as a fraction of the
+strongest one's."""
+
+HALF_PATCH = 7
+"""Patches around corners are 15 px wide, and lie within the silhouette."""
+
+MIN_CORRELATION = 0.4
+"""Least normalised correlation of matching patches, which have weight 0 there and 1 where they are equal."""
+
+RIVAL_DISTANCE, CLEAR_MARGIN = 4, 0.1
+"""A match has less weight if, more than so many px aside, another one correlates nearly as well: a patch slides along
+an edge."""
+
+FAR_ROUND, NEAR_ROUND = (30, (32.0, 16.0, 8.0, 4.0)), (6, (6.0, 4.0, 2.0))
+"""Of the two rounds: the search radius in px, and the scales of robust weights in px, one a step."""
+
+PROMISING_RATIO, CONVINCING_RATIO = 0.07, 0.2
+"""Inlier ratios of the corners that a pose needs after the first round, and after the second."""
+
+TURN = 16.0
+"""Degrees by which poses are turned both ways about an axis that contours do not determine: within them, the search of
+the first round reaches."""
+
+JOINT_STEPS = 3
+"""Steps of the fit to both corners and edges."""
+
+MAX_SUPPORT_LOSS = 0.03
+"""Edge support that a fit may lose."""
+
+Draw = Callable[[Tensor, Tensor, tuple[int, int]], Tensor]
+
+
+def surface_corners(
+    grey: np.ndarray, depth: Tensor, T: Tensor, K: Tensor, *, quality: float, inside: int
+) -> tuple[np.ndarray, Tensor]:
+    """Corners inside the object's outline, and the points of the surface that they show.
+
+    Args:
+        grey: (S, S) uint8.
+        depth: (1, 1, S, S) of the mesh at the pose.
+        T, K: (1, 4, 4) pose and (1, 3, 3) camera.
+        quality: least strength as a fraction of the strongest corner's.
+        inside: least distance from the outline in px.
+
+    Returns:
+        uv (C, 2) px, whole numbers in float32, and points of the model (1, C, 3).
+    """
+    side = 2 * inside + 1
+    mask = cv2.erode((depth[0, 0] > 0).to(torch.uint8).numpy(), np.ones((side, side), np.uint8), borderValue=0)
+    found = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, quality, CORNER_SPACING, mask=mask)
+    uv = np.zeros((0, 2), np.float32) if found is None else found[:, 0]
+    pixel = torch.from_numpy(uv).double()
+    column, row = pixel.round().long().unbind(-1)
+    rays = torch.cat([pixel, torch.ones_like(pixel[:, :1])], dim=1) @ torch.linalg.inv(K[0]).mT
+    z = depth[0, 0, row, column].double()
+    return uv, ((rays * z[:, None] - T[0, :3, 3]) @ T[0, :3, :3])[None]
+
+
+@torch.no_grad()
+def fit_texture(
+    draw: Draw,
+    renderer: DepthRenderer,
+    contours: MeshContours,
+    images: Sequence[Tensor],
+    boxes: Tensor,
+    camera_matrices: Tensor,
+    starts: Tensor,
+    *,
+    image_index: Tensor,
+    margin: float,
+) -> ContourFit | None:
+    """Fit one pose to the mesh's colours and to contours together.
+
+    The coloured mesh is drawn at the pose, and patches around its corners are searched in the photograph by normalised
+    correlation, which the strength of the light does not change. Robust least squares move the pose to where most of
+    them are found, then to the edges as well; a second round searches nearer. The fit counts if in the end more corners
+    are in place than at the start, and enough of them, and the edge support is as before.
+
+    Args:
+        draw: (N, 3, H, W) pictures of the mesh from poses (N, 4, 4), cameras (N, 3, 3) and a size (H, W).
+        renderer, contours: of the mesh.
+        images, boxes, camera_matrices, image_index, margin: see :func:`fit_contours`; one photograph.
+        starts: (N, 4, 4) the pose whose contours are fitted, and others that may be better (:func:`turned`).
+
+    Returns:
+        The fit, with the covariance from edges and patches; None where it does not count.
+    """
+    crops, _, problem = full_size_problem(contours, images, boxes, camera_matrices, image_index, margin)
+    texture = _TextureRounds(draw, renderer, problem, _as_array(crops[0]))
+    support = problem.edge_support(problem.state(starts[:1]))
+    rounds = [texture.round(start, *FAR_ROUND) for start in starts.split(1)]
+    coarse = max((one for one in rounds if one is not None), key=lambda one: one.after, default=None)
+    if coarse is None or coarse.after < PROMISING_RATIO:
+        return None
+    fine = texture.round(coarse.T, *NEAR_ROUND)
+    before = 0.0 if rounds[0] is None else rounds[0].before
+    if fine is None or fine.after < CONVINCING_RATIO or fine.after <= before:
+        return None
+    state = problem.state(fine.T)
+    after = problem.edge_support(state)
+    if bool(after < support - MAX_SUPPORT_LOSS):
+        return None
+    covariance, observable = _covariance(problem, state, fine.matches)
+    return ContourFit(fine.T, covariance, edge_support=after, start_support=support, observable=observable)
+
+
+def turned(fit: ContourFit, centre: Tensor) -> Tensor:
+    """(1, 4, 4) or (3, 4, 4): the pose of a fit, then turned both ways about the axis that contours do not determine,
+    if there is one."""
+    T = fit.transform
+    if int(fit.observable) == 6 or not bool(fit.covariance.isfinite().all()):
+        return T
+    axis = torch.linalg.eigh(fit.covariance[0, :3, :3])[1][:, -1]
+    twists = torch.zeros(3, 6, dtype=torch.float64)
+    twists[1:, :3] = math.radians(TURN) * torch.stack([axis, -axis])
+    return apply_twist(T.expand(3, 4, 4), twists, centre)
+
+
+@dataclass(frozen=True)
+class _Round:
+    """A pose after a round, what it was fitted to, and the inlier ratios before and after."""
+
+    T: Tensor
+    matches: PointMatches
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class _TextureRounds:
+    """One ``photograph`` (S, S, 3) float32 of a contour problem, and the means to draw the mesh into it."""
+
+    draw: Draw
+    renderer: DepthRenderer
+    problem: ContourProblem
+    photograph: np.ndarray
+
+    def round(self, start: Tensor, radius: int, scales: tuple[float, ...]) -> _Round | None:
+        """None where the view has few corners, or the photograph few of them."""
+        K, centre = self.problem.K, self.problem.centre
+        matches = self._search(start, radius)
+        if matches is None:
+            return None
+        T = fit_points(matches, start, K, centre, scales)
+        contour_points = self.problem.state(T).points
+        for _ in range(JOINT_STEPS):
+            points = matches.measurements(T, K, centre, scales[-1])
+            T = self.problem.step(contour_points, T, FULL_SIZE_RADII[0], [points])
+        return _Round(T, matches, matches.inlier_ratio(start, K, centre), matches.inlier_ratio(T, K, centre))
+
+    def _search(self, T: Tensor, radius: int) -> PointMatches | None:
+        """Corners of the view at a pose and where they are in the photograph; None if there are few."""
+        problem, size = self.problem, (self.problem.size, self.problem.size)
+        view = _as_array(self.draw(T, problem.K, size)[0])
+        depth = self.renderer.render(T, problem.K, size).cpu()
+        grey = (255.0 * view.mean(axis=2)).round().astype(np.uint8)
+        corners, model = surface_corners(grey, depth, T, problem.K, quality=CORNER_QUALITY, inside=HALF_PATCH)
+        if len(corners) < MIN_MATCHES:
+            return None
+        offset, weight = match_patches(view, self.photograph, corners.astype(int), radius)
+        if int((weight > 0).sum()) < MIN_MATCHES:
+            return None
+        return PointMatches(model, torch.from_numpy(corners + offset)[None], torch.from_numpy(weight)[None])
+
+
+def _as_array(picture: Tensor) -> np.ndarray:
+    """(S, S, 3) float32 of (C, S, S), C = 1 or 3."""
+    return np.ascontiguousarray(picture.expand(3, -1, -1).permute(1, 2, 0).float().numpy())
+
+
+def match_patches(
+    view: np.ndarray, photograph: np.ndarray, corners: np.ndarray, radius: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets (C, 2) in px to where patches of a view correlate most, and weights (C,) in [0, 1] of these matches.
+
+    Args:
+        view, photograph: (S, S, 3) float32.
+        corners: (C, 2) whole numbers, x and y of the middles of the patches, which lie within the view.
+        radius: of the search in px.
+    """
+    border = HALF_PATCH + radius
+    padded = cv2.copyMakeBorder(photograph, border, border, border, border, cv2.BORDER_REFLECT)
+    offset, weight = np.zeros((len(corners), 2)), np.zeros(len(corners))
+    for i, (x, y) in enumerate(corners):
+        patch = view[y - HALF_PATCH : y + HALF_PATCH + 1, x - HALF_PATCH : x + HALF_PATCH + 1]
+        around = padded[y : y + 2 * border + 1, x : x + 2 * border + 1]
+        scores = np.nan_to_num(cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED), posinf=0.0, neginf=0.0)
+        v, u = np.unravel_index(scores.argmax(), scores.shape)
+        best = float(scores[v, u])
+        offset[i] = u - radius + _vertex(scores[v], u), v - radius + _vertex(scores[:, u], v)
+        near_v, near_u = (slice(max(k - RIVAL_DISTANCE, 0), k + RIVAL_DISTANCE + 1) for k in (v, u))
+        scores[near_v, near_u] = 0.0
+        clear = min(max(best - float(scores.max()), 0.0) / CLEAR_MARGIN, 1.0)
+        weight[i] = clear * max(best - MIN_CORRELATION, 0.0) / (1.0 - MIN_CORRELATION)
+    return offset, weight
+
+
+def _vertex(values: np.ndarray, k: int) -> float:
+    """Offset in [-0.5, 0.5] of the peak of the parabola through three values around the largest."""
+    if not 0 < k < len(values) - 1:
+        return 0.0
+    before, here, behind = values[k - 1 : k + 2].tolist()
+    curvature = before - 2.0 * here + behind
+    return 0.5 * (before - behind) / curvature if curvature < -1e-9 else 0.0
+
+
+def _covariance(problem: ContourProblem, state: ContourState, matches: PointMatches) -> tuple[Tensor, Tensor]:
+    """:func:`pose_covariance` of edges and of the matches of a texture, as points with normals along x and y."""
+    edges = problem.measured_edges(state, FULL_SIZE_RADII[-1])
+    texture = matches.measurements(state.T, problem.K, problem.centre, NEAR_ROUND[1][-1])
+    count = matches.model.shape[1]
+    seen = torch.ones(1, 2 * count, dtype=torch.bool)
+    axes = torch.eye(2, dtype=torch.float64).repeat(count, 1)[None]
+    points = ContourPoints(matches.model.repeat_interleave(2, 1), axes, seen, ~seen)
+    joined = ContourPoints(
+        *(torch.cat([getattr(some, f.name) for some in (state.points, points)], dim=1) for f in fields(ContourPoints))
+    )
+    both, radius = Measurements.cat([edges, texture]), problem.contours.radius
+    return pose_covariance(both, joined, state.T, problem.K, problem.centre, radius=radius)

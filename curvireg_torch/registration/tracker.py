@@ -1,0 +1,417 @@
+"""Tracking: the pose in the next frame, from points that move, colours beside the outline, and edges."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import LostObjectError
+from ..filters.inputs import fill_missing
+from ..geometry import rotation_error
+from ..geometry.cameras import projected_boxes, transform
+from ..geometry.crops import crop_transforms, square_boxes
+from ..rendering import DepthRenderer
+from ..rendering.contours import ContourPoints, MeshContours
+from ..terms import crop_regions
+from .confidence import RELIABLE, tracking_confidence
+from .contour_fit import STALE_SHIFT, ContourProblem, ContourState, EdgeField, inside_photographs
+from .least_squares import (
+    INLIER_SCALE,
+    Measurements,
+    PointMatches,
+    fit_points,
+    nearest_rigid,
+    pixels,
+    pose_covariance,
+    project,
+)
+from .region_colours import RegionModel, colour_bins, line_posterior
+from .texture_fit import surface_corners
+
+__all__ = ["OUTSIDE", "TrackedPose", "Tracker", "boxes_at"]
+
+WINDOW_SIZE = 256
+"""Side in px of the part of a frame around the object, which all measurements share."""
+
+WINDOW_MARGIN = 0.3
+"""Added around the object's box, as a fraction of its longer side: room for motion that was not predicted."""
+
+OUTSIDE = "at the start the mesh lies outside the photograph; check pose, unit and camera matrix"
+"""Message of a :class:`LostObjectError`."""
+
+SEARCH_RADII = (6.0, 4.0, 2.5)
+"""Search radius in px of edges and of the end of the object's colours, one a round."""
+
+STEPS_PER_ROUND = 2
+"""Least-squares steps per round."""
+
+REGION_WEIGHT, POINT_WEIGHT, KEYFRAME_WEIGHT = 2.0, 0.3, 0.5
+"""Weights, relative to edges, of colours and of points from the last frame and from a keyframe."""
+
+REGION_VARIANCE = 0.5
+"""Variance in px² added to that of the end of the object's colours."""
+
+LEARNING_RATE = 0.2
+"""Weight of a new frame in the colour histograms."""
+
+LEARNED_BAND = (2, 24)
+"""Nearest and farthest distance in px from the outline at which colours are learned."""
+
+REGION_FEATURE_RADIUS = 8
+"""Radius in px of the posterior from which :attr:`TrackedPose.features` are computed."""
+
+MAX_KEYFRAMES, KEYFRAME_ANGLE = 30, 8.0
+"""Keyframes that are kept, and the rotation in degrees from the nearest one at which a frame becomes another."""
+
+PYRAMID_LAST, PYRAMID_KEYFRAME = 3, 1
+"""Levels of the pyramid of optical flow from the last frame, and from a keyframe, whose points are nearly in place."""
+
+FLOW_PATCH = 15
+"""Side of the patches of the optical flow in px."""
+
+MAX_RETURN_ERROR = 1.5
+"""Largest distance in px between a corner and where the flow back from its match ends."""
+
+FLOW_SCALES = (24.0, 12.0, 6.0, 3.0, 2.0, 2.0, 2.0)
+"""Scale of the weights in px in each least-squares step: at first all matches count, in the end those that agree."""
+
+CORNER_QUALITY, CORNER_INSET = 0.01, 3
+"""Least strength of a keyframe's corners, as a fraction of the strongest one's, and their least distance in px from the
+outline: nearer to it, patches show the background."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """The part of a frame around the object: ``colours`` (1, 3, S, S) in [0, 1], their mean ``grey`` (S, S) uint8, the
+    camera ``K`` (1, 3, 3), and ``inside`` (1, 1, S, S), 0 beyond the border of the frame."""
+
+    colours: Tensor
+    grey: np.ndarray
+    K: Tensor
+    inside: Tensor
+
+
+def cut_window(image: Tensor, K: Tensor, hull: Tensor, T: Tensor) -> Window:
+    """The square window around an object, ``WINDOW_SIZE`` px wide.
+
+    Args:
+        image: (C, H, W), C = 1 or 3, in [0, 1] or uint8; missing pixels are filled from their neighbours.
+        K: (3, 3) float64 camera matrix in px.
+        hull: (V, 3) float64 points of the mesh.
+        T: (1, 4, 4) float64 pose.
+
+    Raises:
+        LostObjectError: the mesh lies behind the camera, or outside the image.
+    """
+    boxes, visible = boxes_at(hull, T, K[None], (int(image.shape[-2]), int(image.shape[-1])))
+    if not bool(visible):
+        raise LostObjectError(OUTSIDE)
+    box = boxes.float()
+    crop = crop_regions([image], box[:, None], size=WINDOW_SIZE, margin=WINDOW_MARGIN)[:, 0].float()
+    colours = fill_missing(crop).expand(-1, 3, -1, -1)
+    grey = (255.0 * colours[0].mean(dim=0)).round().clamp(0, 255).to(torch.uint8).numpy()
+    inside = inside_photographs([image], box, WINDOW_SIZE, WINDOW_MARGIN)
+    return Window(colours, grey, crop_transforms(square_boxes(box, WINDOW_MARGIN), WINDOW_SIZE).double() @ K, inside)
+
+
+def boxes_at(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """(N, 4) boxes in px around a mesh with ``hull`` (V, 3) at poses (N, 4, 4), in an image of ``size`` (H, W).
+
+    And (N,) bool, False where the mesh lies behind the camera, or outside the image: there the box means nothing.
+    """
+    depth = (hull.to(T) @ T[:, 2, :3].mT + T[:, 2, 3]).amin(dim=0)
+    boxes = projected_boxes(hull, T, K)
+    limits = torch.tensor([size[1], size[0]], dtype=boxes.dtype) - 0.5
+    outside = (boxes[:, :2] >= limits) | (boxes[:, 2:] <= -0.5) | (depth <= 0)[:, None]
+    return boxes, ~outside.any(dim=1)
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A frame with a known pose ``T`` (1, 4, 4): its window, and corners ``uv`` (P, 2) px, float32, at the points
+    ``model`` (1, P, 3) of the surface."""
+
+    window: Window
+    T: Tensor
+    uv: np.ndarray
+    model: Tensor
+
+
+def track_points(keyframe: Keyframe, window: Window, T: Tensor, centre: Tensor, *, levels: int) -> PointMatches:
+    """Corners of a keyframe in a new window, searched where the pose ``T`` (1, 4, 4) projects them.
+
+    Matches from which the flow does not lead back to the corner have weight 0. A pyramid of ``levels`` halvings lets
+    the search reach further.
+    """
+    if len(keyframe.uv) == 0:
+        return PointMatches(keyframe.model, torch.zeros(1, 0, 2).double(), torch.zeros(1, 0).double())
+    guess = pixels(keyframe.model, T, window.K, centre)[0].float().numpy()
+    before, after = keyframe.window.grey, window.grey
+    there, found = _optical_flow(before, after, keyframe.uv, guess, levels)
+    back, returned = _optical_flow(after, before, there, keyframe.uv, levels)
+    kept = found & returned & (np.linalg.norm(back - keyframe.uv, axis=1) < MAX_RETURN_ERROR)
+    return PointMatches(keyframe.model, torch.from_numpy(there).double()[None], torch.from_numpy(kept).double()[None])
+
+
+def _optical_flow(
+    before: np.ndarray, after: np.ndarray, points: np.ndarray, guess: np.ndarray, levels: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where points (P, 2) of one picture are in another, searched at ``guess`` (P, 2); and (P,) whether found."""
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        before,
+        after,
+        points,
+        guess.copy(),
+        winSize=(FLOW_PATCH, FLOW_PATCH),
+        maxLevel=levels,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    return there, found[:, 0] > 0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A window of a frame and what is measured in it: histogram bins (S, S) and edges."""
+
+    window: Window
+    bins: Tensor
+    problem: ContourProblem
+
+
+@dataclass(frozen=True)
+class Outline:
+    """The contour ``points`` of the mesh at a pose ``T`` (1, 4, 4), and of those that have the background beside them,
+    ``model`` (1, Q, 3) and unit ``normals`` (1, Q, 2) that point there."""
+
+    T: Tensor
+    points: ContourPoints
+
+    @cached_property
+    def model(self) -> Tensor:
+        return self.points.model[self.points.outline][None]
+
+    @cached_property
+    def normals(self) -> Tensor:
+        return self.points.normals[self.points.outline][None]
+
+
+@dataclass(frozen=True)
+class TrackedPose:
+    """A pose in a frame.
+
+    Attributes:
+        T: (1, 4, 4) float64 ``T_cam_from_model``.
+        features: what the confidence is computed from, all in [0, 1]: ``edge_support`` as of a contour fit; ``region``,
+            how clearly and how near to the outline the object's colours end; ``flow`` and ``keyframe``, the fraction
+            of the corners of the last frame, and of a keyframe, that are found where the pose has them.
+        frame, outline: what the features were measured in.
+    """
+
+    T: Tensor
+    features: Mapping[str, float]
+    frame: Frame
+    outline: Outline
+
+    @property
+    def confidence(self) -> float:
+        """Probability that the pose is within 10 degrees and 10 % of the distance of the truth."""
+        return tracking_confidence(self.features)
+
+
+class Tracker:
+    """Follows an object from a known pose.
+
+    Each frame is searched around the pose that a constant velocity predicts, and if that is not convincing, around the
+    last pose. Optical flow of corners on the surface gives a first pose; robust least squares then fits jointly edges
+    near the contours, the end of the object's colours along lines across its silhouette, and the corners of the last
+    frame and of the keyframe that was seen from the most similar direction.
+
+    A pose that is found counts as known, to predict and to learn colours from, only after :meth:`accept`.
+
+    Args:
+        renderer, contours: of the mesh.
+        hull: (V, 3) points of the mesh that span its convex hull.
+    """
+
+    def __init__(self, renderer: DepthRenderer, contours: MeshContours, hull: Tensor) -> None:
+        self.renderer, self.contours, self.hull = renderer, contours, hull.double()
+        self.centre, self.radius = contours.centre, contours.radius
+        self._poses: list[Tensor] = []
+        self._keyframes: list[Keyframe] = []
+        self._last: Keyframe | None = None
+        self._regions = RegionModel()
+
+    def start(self, image: Tensor, K: Tensor, T: Tensor) -> None:
+        """Begin, or begin again, from the pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3).
+
+        Raises:
+            LostObjectError: at that pose the mesh lies behind the camera, or outside the image.
+        """
+        first = self.measure(image, K, T)
+        self._poses, self._keyframes, self._regions = [], [], RegionModel()
+        self.accept(first)
+
+    def measure(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
+        """The pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3), as it is.
+
+        Raises:
+            LostObjectError: at that pose the mesh lies behind the camera, or outside the image.
+        """
+        start = T.detach().cpu().double()[None]
+        frame = self._frame(image, K, start)
+        outline = self._outline(frame, start)
+        return TrackedPose(start, self._features(frame, outline, start, []), frame, outline)
+
+    def track(self, image: Tensor, K: Tensor) -> TrackedPose:
+        """The pose in the next frame (C, H, W) with camera matrix ``K`` (3, 3).
+
+        Raises:
+            LostObjectError: the object has left the image.
+        """
+        found: list[TrackedPose] = []
+        for T in self.predictions():
+            try:
+                found.append(self._fit(image, K, T))
+            except LostObjectError:
+                continue
+            if found[-1].confidence >= RELIABLE:
+                break
+        if not found:
+            raise LostObjectError("the object has left the photograph")
+        return max(found, key=lambda pose: pose.confidence)
+
+    def accept(self, pose: TrackedPose) -> None:
+        """Go on from a pose of :meth:`track` or :meth:`measure`, and learn from its frame."""
+        self._poses = [*self._poses[-1:], pose.T]
+        depth = self.renderer.render(pose.outline.T, pose.frame.window.K, (WINDOW_SIZE, WINDOW_SIZE)).cpu()
+        self._learn(pose.frame, pose.outline, depth, rate=LEARNING_RATE)
+        self._remember(pose.frame, pose.outline, depth)
+
+    def covariance(self, pose: TrackedPose) -> Tensor:
+        """(6, 6) of a pose, see :func:`curvireg_torch.registration.fit_contours`."""
+        frame = pose.frame
+        measured = frame.problem.measured_edges(
+            ContourState(pose.T, pose.outline.T, pose.outline.points), SEARCH_RADII[-1]
+        )
+        points, K = pose.outline.points, frame.window.K
+        return pose_covariance(measured, points, pose.T, K, self.centre, radius=self.radius)[0][0]
+
+    @property
+    def last_pose(self) -> Tensor:
+        """(1, 4, 4) of the last frame."""
+        return self._poses[-1]
+
+    def predictions(self) -> list[Tensor]:
+        """Starts (1, 4, 4) for the next frame: the last pose, turned and moved on as before, and the last pose."""
+        last = self._poses[-1]
+        if len(self._poses) < 2:
+            return [last]
+        (R0, c0), (R1, c1) = ((T[:, :3, :3], T[:, :3, :3] @ self.centre + T[:, :3, 3]) for T in self._poses)
+        R = R1 @ R0.mT @ R1
+        return [transform(R, 2.0 * c1 - c0 - R @ self.centre), last]
+
+    def _fit(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
+        """The pose around a start (1, 4, 4)."""
+        assert self._last is not None
+        first = cut_window(image, K, self.hull, T)
+        flow = track_points(self._last, first, T, self.centre, levels=PYRAMID_LAST)
+        T = fit_points(flow, T, first.K, self.centre, FLOW_SCALES)
+        frame = self._frame(image, K, T)
+        flows = [(POINT_WEIGHT, flow.moved(first.K, frame.window.K))]
+        keyframe = self._nearest(T)
+        if keyframe is not self._last:
+            flows.append(
+                (KEYFRAME_WEIGHT, track_points(keyframe, frame.window, T, self.centre, levels=PYRAMID_KEYFRAME))
+            )
+        outline = self._outline(frame, T)
+        for radius in SEARCH_RADII:
+            for _ in range(STEPS_PER_ROUND):
+                others = self._measurements(frame, outline, T, flows, radius)
+                T = frame.problem.step(outline.points, T, radius, others)
+            T = nearest_rigid(T)
+            if float(frame.problem.mean_shift(outline.points, outline.T, T)) > STALE_SHIFT:
+                outline = self._outline(frame, T)
+        return TrackedPose(T, self._features(frame, outline, T, [flow for _, flow in flows]), frame, outline)
+
+    def _measurements(
+        self, frame: Frame, outline: Outline, T: Tensor, flows: list[tuple[float, PointMatches]], radius: float
+    ) -> list[Measurements]:
+        """Colours and points, beside the edges."""
+        mean, variance = self._ends(frame, outline, T, math.ceil(radius))
+        flat = math.ceil(radius) ** 2 / 3.0  # variance of lines along which colours say nothing
+        information = (1.0 / (variance + REGION_VARIANCE) - 1.0 / flat).clamp(min=0.0)
+        J = (outline.normals[..., None, :] @ project(outline.model, T, frame.window.K, self.centre)[1])[..., 0, :]
+        colours = Measurements(J, mean[None, :, None], REGION_WEIGHT * information[None, :, None])
+        points = [flow.measurements(T, frame.window.K, self.centre, INLIER_SCALE).scaled(w) for w, flow in flows]
+        return [colours, *points]
+
+    def _ends(self, frame: Frame, outline: Outline, T: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+        """Mean and variance (Q,) of where the object's colours end along the normals of its silhouette."""
+        uv = pixels(outline.model, T, frame.window.K, self.centre)[0]
+        offsets = torch.arange(-radius, radius + 1, dtype=torch.float64)
+        samples = uv[:, None] + offsets[:, None] * outline.normals[0][:, None]
+        log_ratio = self._regions.log_ratio(frame.bins, samples, self._directions(frame, T, uv))
+        mean, variance = line_posterior(log_ratio.double(), radius)
+        return mean, variance
+
+    def _features(self, frame: Frame, outline: Outline, T: Tensor, flows: list[PointMatches]) -> dict[str, float]:
+        """Features of a pose with its ``flows`` from the last frame and, if that is another one, a keyframe."""
+        mean, variance = self._ends(frame, outline, T, REGION_FEATURE_RADIUS)
+        clear = torch.exp(-0.125 * mean.square()) * (1.0 - 3.0 * variance / REGION_FEATURE_RADIUS**2).clamp(min=0.0)
+        shares = [flow.inlier_ratio(T, frame.window.K, self.centre) for flow in flows] or [0.0]
+        return {
+            "edge_support": float(frame.problem.edge_support(ContourState(T, outline.T, outline.points))),
+            "region": float(clear.sum()) / max(len(clear), 1),
+            "flow": shares[0],
+            "keyframe": shares[-1],
+        }
+
+    def _learn(self, frame: Frame, outline: Outline, depth: Tensor, *, rate: float) -> None:
+        """Learn the colours beside the outline; where the mesh hides the background again, they are the object's."""
+        uv = pixels(outline.model, outline.T, frame.window.K, self.centre)[0]
+        distance = torch.arange(LEARNED_BAND[0], LEARNED_BAND[1] + 1, dtype=torch.float64)
+        samples = uv[:, None] + torch.cat([-distance, distance])[:, None] * outline.normals[0][:, None]
+        x, y = samples.round().long().clamp(0, WINDOW_SIZE - 1).unbind(-1)
+        inside = depth[0, 0, y, x] > 0
+        directions = self._directions(frame, outline.T, uv)[:, None].expand(inside.shape)
+        self._regions.learn(frame.bins, samples.flatten(0, 1), directions.flatten(), inside.flatten(), rate=rate)
+
+    def _remember(self, frame: Frame, outline: Outline, depth: Tensor) -> None:
+        """Keep the frame as the last one, and if none from a similar direction is kept, as a keyframe."""
+        window, T = frame.window, outline.T
+        uv, model = surface_corners(window.grey, depth, T, window.K, quality=CORNER_QUALITY, inside=CORNER_INSET)
+        self._last = Keyframe(window, T, uv, model)
+        if not self._keyframes or float(self._angles(outline.T).min()) > KEYFRAME_ANGLE:
+            self._keyframes = [*self._keyframes[1 - MAX_KEYFRAMES :], self._last]
+
+    def _nearest(self, T: Tensor) -> Keyframe:
+        return self._keyframes[int(self._angles(T).argmin())]
+
+    def _angles(self, T: Tensor) -> Tensor:
+        """(K,) degrees between the rotations of a pose (1, 4, 4) and of the keyframes."""
+        return rotation_error(torch.cat([keyframe.T for keyframe in self._keyframes])[:, :3, :3], T[:, :3, :3])
+
+    def _directions(self, frame: Frame, T: Tensor, uv: Tensor) -> Tensor:
+        """(Q,) rad of pixels (Q, 2) from the object's centre."""
+        x, y = (uv - pixels(self.centre[None, None], T, frame.window.K, self.centre)[0]).unbind(-1)
+        return torch.atan2(y, x)
+
+    def _frame(self, image: Tensor, K: Tensor, T: Tensor) -> Frame:
+        window = cut_window(image, K, self.hull, T)
+        index, edges = torch.zeros(1, dtype=torch.long), EdgeField(window.colours, window.inside)
+        problem = ContourProblem(self.contours, edges, index, window.K, WINDOW_SIZE)
+        return Frame(window, colour_bins(window.colours), problem)
+
+    def _outline(self, frame: Frame, T: Tensor) -> Outline:
+        return Outline(T, self.contours.points(T, frame.window.K, WINDOW_SIZE))
+
+
+def _orthonormal(T: Tensor) -> Tensor:
+    """The poses (1, 4, 4) with the nearest rotations: predictions would let rounding grow from frame to frame."""
+    U, _, V = torch.linalg.svd(T[:, :3, :3])
+    return transform(U @ V, T[:, :3, 3])
