@@ -272,7 +272,7 @@ class ContourProblem:
         """The edges that a least-squares step without a mask would use."""
         points = state.points
         uv, du = project(points.model, state.T, self.K, self.centre)
-        distance, strength = self._candidates(uv, points, reach)
+        distance, strength = self._candidates(uv, points, radius)
         index = (strength * torch.exp(-0.5 * distance**2)).argmax(dim=-1, keepdim=True)
         d = distance.gather(-1, index)
         W = strength.gather(-1, index) * (1.0 - (d / radius) ** 2).clamp(min=0.0) ** 2

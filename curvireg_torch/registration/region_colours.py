@@ -102,8 +102,8 @@ class RegionModel:
         self._log_ratio = LOG_RATIO_FACTOR * (p[0] / p[1]).log().clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO).view(-1)
 
     def log_ratio(self, bins: Tensor, uv: Tensor, directions: Tensor) -> Tensor:
-        """(P, L) log p(colour | object) - log p(colour | background), times ``LOG_RATIO_FACTOR``, at (P, L, 2) px of lines in
-        ``directions`` (P,); 0 outside the window."""
+        """(P, L) log p(colour | object) - log p(colour | background), times ``LOG_RATIO_FACTOR``, at (P, L, 2) px of
+        lines in ``directions`` (P,); 0 outside the window."""
         index, seen = _indices(bins, uv)
         colour = bins.view(-1)[index]
         low, high, fraction = (x[:, None] for x in _sectors(directions))
