@@ -79,10 +79,10 @@ class EdgeField:
 
     def __init__(self, crops: Tensor, inside: Tensor | None = None) -> None:
         gx, gy = central_gradient(smooth(crops, 1.0))
-        self._gradient = torch.stack([gx, gy], dim=2).flatten(1, 2)
-        if inside is not None:
-            self._gradient = self._gradient * inside
-        self._level = self._gradient.square().sum(dim=1).mean(dim=(1, 2)).sqrt().clamp(min=1e-6)
+        self._inside = torch.ones_like(crops[:, :1]) if inside is None else inside.to(crops)
+        self._gradient = torch.stack([gx, gy], dim=2).flatten(1, 2) * self._inside
+        energy, area = self._gradient.square().sum(dim=(1, 2, 3)), self._inside.sum(dim=(1, 2, 3))
+        self._level = (energy / area.clamp(min=1)).sqrt().clamp(min=1e-6)
 
     def strength(self, uv: Tensor, normals: Tensor, offsets: Tensor, image_index: Tensor) -> Tensor:
         """Strength of the image gradient across a contour, at offsets along its normals.
@@ -111,6 +111,15 @@ class EdgeField:
         cosine = across * (gx * gx + gy * gy).clamp(min=1e-20).rsqrt()
         r = (across * cosine.square().square()).amax(dim=1)
         return (r / (r + self._level[image_index, None, None])).double()
+
+    def counts(self, uv: Tensor, valid: Tensor, image_index: Tensor) -> Tensor:
+        """(N, P) bool: ``valid`` points that count when the support of a pose is averaged, all but those outside the
+        photograph; but then half of the points at least."""
+        S = self._inside.shape[-1]
+        x, y = uv.round().long().clamp(0, S - 1).unbind(-1)
+        here = valid & (self._inside[image_index[:, None], 0, y, x] > 0)
+        enough = 2 * here.sum(dim=1, keepdim=True) >= valid.sum(dim=1, keepdim=True)
+        return torch.where(enough, here, valid)
 
 
 class ObjectMask:
@@ -260,13 +269,14 @@ class ContourProblem:
         points = state.points
         uv = pixels(points.model, state.T, self.K, self.centre)
         offsets = torch.arange(-3, 4, dtype=torch.float64)
+        counts = self.edges.counts(uv, points.valid, self.image_index)
         near = self.edges.strength(uv, points.normals, offsets, self.image_index) * torch.exp(-0.5 * offsets**2)
-        plain = (near.amax(dim=-1) * points.valid).sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
+        plain = (near.amax(dim=-1) * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1)
         if self.mask is None:
             return plain, plain
         near = near * self.mask.weights(uv, points, offsets, self.image_index, self.size)
-        most = self.mask.largest_weights(points) * points.valid  # a long outline alone is no support
-        return plain, (near.amax(dim=-1) * points.valid).sum(dim=1) / most.sum(dim=1).clamp(min=1)
+        most = self.mask.largest_weights(points) * counts  # a long outline alone is no support
+        return plain, (near.amax(dim=-1) * counts).sum(dim=1) / most.sum(dim=1).clamp(min=1)
 
     def measured_edges(self, state: ContourState, radius: float) -> Measurements:
         """The edges that a least-squares step without a mask would use."""
