@@ -63,14 +63,17 @@ class MeshEdges:
         first = np.searchsorted(edge[order], np.arange(len(self.edges)))
         count = np.bincount(edge, minlength=len(self.edges))
         slot = first[:, None] + np.minimum(np.arange(MAX_EDGE_FACES), count[:, None] - 1)
-        self._edge_faces, self._edge_signs = owner[order][slot], sign[order][slot]  # (E, 4), the last one repeated
+        self._edge_faces, signs = owner[order][slot], sign[order][slot]  # (E, 4), the last one repeated
+        depth = min(MAX_EDGE_FACES, max(2, int(count.max(initial=1))))  # closed meshes have two faces at every edge
+        self._edge_faces, signs = self._edge_faces[:, :depth], signs[:, :depth]
+        self._flips = (signs < 0).T
         self.is_boundary = count == 1
         # Unit vectors within the faces, away from the edge: they do not depend on the orientation of faces.
         along = vertices[self.edges[:, 1]] - vertices[self.edges[:, 0]]
         normal = self._plane / np.maximum(np.linalg.norm(self._plane, axis=1), 1e-300)[:, None]
-        inward = np.cross(normal[self._edge_faces] * self._edge_signs[..., None], along[:, None])
+        inward = np.cross(normal[self._edge_faces] * signs[..., None], along[:, None])
         inward /= np.maximum(np.linalg.norm(inward, axis=2), 1e-300)[..., None]
-        cosine = (inward[:, 0] * inward[:, np.minimum(1, MAX_EDGE_FACES - 1)]).sum(axis=1)
+        cosine = (inward[:, 0] * inward[:, 1]).sum(axis=1)
         self.angle = np.where(self.is_boundary, 0.0, np.pi - np.arccos(np.clip(cosine, -1.0, 1.0)))
         many = count > 2
         self.is_crease = (self.angle > math.radians(CREASE_ANGLE)) | many
@@ -93,10 +96,12 @@ class MeshEdges:
         Returns:
             (N, E) bool, and (N, E) the sign of that side: of ((a - eye) x (b - eye)) . (corner - eye).
         """
-        seen = self._offset - eye @ self._plane.T  # (N, F): positive where the camera is behind the face
-        side = seen[:, self._edge_faces] * self._edge_signs > 0
-        all_same = side.all(axis=2) | ~side.any(axis=2)
-        return all_same, np.where(side[..., 0], 1.0, -1.0)
+        behind = self._offset > eye @ self._plane.T  # (N, F): whether the camera is behind the face
+        first, *others = (behind[:, faces] ^ flip for faces, flip in zip(self._edge_faces.T, self._flips, strict=True))
+        all_same = np.ones_like(first)
+        for other in others:
+            all_same &= first == other
+        return all_same, np.where(first, 1.0, -1.0)
 
 
 def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

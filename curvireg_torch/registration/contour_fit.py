@@ -41,6 +41,9 @@ CROP_SIZE = 256
 FIRST_RADII, SECOND_RADII, FULL_SIZE_RADII = (6.0, 4.0), (3.0, 2.0), (4.0, 2.0, 2.0)
 """Search radius for edges in px, one a round: from all starts and then from the best at half size, and at full size."""
 
+HALF_SIZE_DENSITY = 0.5
+"""Contour points at half size, as a fraction of those at full size."""
+
 SAME_POSE_SHIFT = 0.5
 """Mean shift in px at half size below which two fits count as one."""
 
@@ -98,13 +101,7 @@ class EdgeField:
         Returns:
             (N, P, L) float64 in [0, 1).
         """
-        S = self._gradient.shape[-1]
-        grid = ((2.0 * (uv[:, :, None] + offsets[:, None] * normals[:, :, None]) + 1.0) / S - 1.0).float()
-        gradient = grid.new_empty(len(uv), self._gradient.shape[1], *grid.shape[1:3])
-        for b in image_index.unique().tolist():  # an expanded crop is not copied for every pose
-            mine = (image_index == b).nonzero()[:, 0]
-            crop = self._gradient[b].expand(len(mine), -1, -1, -1)
-            gradient[mine] = F.grid_sample(crop, grid[mine], align_corners=False)
+        gradient = _sampled_lines(self._gradient, uv, normals, offsets, image_index)
         gx, gy = gradient[:, 0::2], gradient[:, 1::2]
         nx, ny = normals.to(gx.dtype)[:, None, :, None].unbind(-1)
         across = (gx * nx + gy * ny).abs()
@@ -144,23 +141,44 @@ class ObjectMask:
         """
         aside = MASK_DISTANCE * size
         at = torch.cat([offsets - aside, offsets + aside])
-        grid = ((2.0 * (uv[:, :, None] + at[:, None] * points.normals[:, :, None]) + 1.0) / size - 1.0).float()
-        probability = grid.new_empty(grid.shape[:3])
-        for b in image_index.unique().tolist():  # an expanded mask is not copied for every pose
-            mine = (image_index == b).nonzero()[:, 0]
-            mask = self._probability[b].expand(len(mine), -1, -1, -1)
-            sampled = F.grid_sample(mask, grid[mine], padding_mode="border", align_corners=False)
-            probability[mine] = sampled[:, 0]
-        inside, outside = probability.double().chunk(2, dim=-1)
+        probability = _sampled_lines(
+            self._probability, uv, points.normals, at, image_index, size=size, padding="border"
+        )
+        inside, outside = probability[:, 0].chunk(2, dim=-1)
         outline, within = (inside - outside).clamp(min=0.0), torch.minimum(inside, outside)
         is_outline = points.outline[..., None]
         agreement = 1.0 - MASK_TRUST + MASK_TRUST * torch.where(is_outline, outline, within)
-        return agreement * self.largest_weights(points)[..., None]
+        return agreement.double() * self.largest_weights(points)[..., None]
 
     @staticmethod
     def largest_weights(points: ContourPoints) -> Tensor:
         """(N, P) float64 weights of edges that agree with the mask: 2 for the outline, else 1."""
         return torch.where(points.outline, OUTLINE_WEIGHT, 1.0).double()
+
+
+def _sampled_lines(
+    pictures: Tensor,
+    uv: Tensor,
+    normals: Tensor,
+    offsets: Tensor,
+    image_index: Tensor,
+    *,
+    size: int | None = None,
+    padding: str = "zeros",
+) -> Tensor:
+    """(N, C, P, L) float32 values of pictures (B, C, S, S) at offsets (L,) px from points (N, P, 2) along normals.
+
+    ``size`` is the side of the crop in px, to which points and offsets refer, if it is not S.
+    """
+    scale = 2.0 / (size or pictures.shape[-1])
+    start, along = (scale * uv + (0.5 * scale - 1.0)).float(), (scale * normals).float()
+    grid = torch.addcmul(start[:, :, None], offsets.float()[:, None], along[:, :, None])
+    out = grid.new_empty(len(uv), pictures.shape[1], *grid.shape[1:3])
+    for b in image_index.unique().tolist():  # an expanded picture is not copied for every pose
+        mine = (image_index == b).nonzero()[:, 0]
+        picture = pictures[b].expand(len(mine), -1, -1, -1)
+        out[mine] = F.grid_sample(picture, grid[mine], padding_mode=padding, align_corners=False)
+    return out
 
 
 @dataclass(frozen=True)
@@ -192,6 +210,7 @@ class ContourProblem:
     K: Tensor
     size: int
     mask: ObjectMask | None = None
+    density: float = 1.0
 
     @property
     def centre(self) -> Tensor:
@@ -203,7 +222,7 @@ class ContourProblem:
 
     def state(self, T: Tensor) -> ContourState:
         """Poses (N, 4, 4) with the mesh's contour points there."""
-        return ContourState(T, T, self.contours.points(T, self.K, self.size))
+        return ContourState(T, T, self.contours.points(T, self.K, self.size, density=self.density))
 
     def descend(self, state: ContourState, radii: Sequence[float]) -> ContourState:
         """Poses after one round for each search radius in px; contours are found again where they moved."""

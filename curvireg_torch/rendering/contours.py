@@ -80,28 +80,31 @@ class MeshContours:
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self.centre, self.radius = mesh_centre(mesh), mesh_radius(mesh)
         self.edges = MeshEdges(mesh, self.centre.numpy())
+        self._vertices = _float32(self.edges.vertices)
         self._scene = RayScene(self.edges.vertices / self.radius, self.edges.faces)
 
-    def points(self, T_cam_from_model: Tensor, camera_matrices: Tensor, size: int) -> ContourPoints:
-        """Contour points of N poses (N, 4, 4) in square crops of ``size`` px with cameras (N, 3, 3); float64, CPU."""
+    def points(
+        self, T_cam_from_model: Tensor, camera_matrices: Tensor, size: int, *, density: float = 1.0
+    ) -> ContourPoints:
+        """Contour points of N poses (N, 4, 4) in square crops of ``size`` px with cameras (N, 3, 3); float64, CPU.
+
+        ``density`` is a fraction of the usual number of points.
+        """
         T, K = T_cam_from_model.numpy(), camera_matrices.expand(len(T_cam_from_model), 3, 3).numpy()
         R, edges = T[:, :3, :3], self.edges
         position = R @ self.centre.numpy() + T[:, :3, 3]
         eye = -(position[:, None] @ R)[:, 0]
-        camera = edges.vertices @ R.transpose(0, 2, 1) + position[:, None]
-        z = np.maximum(camera[..., 2:], NEAR_PLANE * self.radius)
-        uv = camera @ K[:, :2].transpose(0, 2, 1) / z
         on_contour, side = edges.sides(eye)
-        length = _length_inside(uv, camera[..., 2] > NEAR_PLANE * self.radius, edges.edges, size)
+        length = self._lengths(R, position, K, size)
         parts = []
         for weights, count, most, occluding in (
             (length * on_contour, OCCLUDING_CANDIDATES, MAX_OCCLUDING, True),
             (length * (edges.is_crease & ~on_contour), CREASE_CANDIDATES, MAX_CREASES, False),
         ):
-            index, fraction, valid = _spread(weights, count)
+            index, fraction, valid = _spread(weights, round(density * count))
             ends = edges.edges[index]  # (N, M, 2)
             rows = np.arange(len(T))[:, None]
-            a, b = camera[rows, ends[..., 0]], camera[rows, ends[..., 1]]
+            a, b = (edges.vertices[ends[..., k]] @ R.transpose(0, 2, 1) + position[:, None] for k in (0, 1))
             at = a + fraction[..., None] * (b - a)
             normal = _across(np.cross(a, b), K) * -side[rows, index][..., None]
             if occluding:
@@ -126,9 +129,23 @@ class MeshContours:
                 valid &= (bend > CREASE_BEND) & flat
                 outline = np.zeros_like(valid)
             model = (at - T[:, None, :3, 3]) @ R
-            chosen, valid = _evenly(valid, most)
+            chosen, valid = _evenly(valid, round(density * most))
             parts.append((model[rows, chosen], normal[rows, chosen], valid, outline[rows, chosen] & valid))
         return ContourPoints(*(torch.from_numpy(np.concatenate(each, axis=1)) for each in zip(*parts, strict=True)))
+
+    def _lengths(self, R: np.ndarray, position: np.ndarray, K: np.ndarray, size: int) -> np.ndarray:
+        """(N, E) float32 lengths of the edges in px; 0 for those outside the crop and behind the camera."""
+        x, y, z = np.moveaxis(self._vertices @ _float32(R.transpose(0, 2, 1)) + _float32(position)[:, None], -1, 0)
+        behind = z <= NEAR_PLANE * self.radius
+        z = np.maximum(z, np.float32(NEAR_PLANE * self.radius))
+        fx, fy, cx, cy = (_float32(K[:, i, j])[:, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        u, v = fx * x / z + cx, fy * y / z + cy
+        beyond = (u < -0.5) + 2 * (v < -0.5) + 4 * (u > size - 0.5) + 8 * (v > size - 0.5) + 16 * behind
+        a, b = self.edges.edges.T
+        beyond = beyond.astype(np.uint8)
+        outside = (beyond[:, a] & beyond[:, b]) | ((beyond[:, a] | beyond[:, b]) & 16)
+        length: np.ndarray = np.hypot(u[:, b] - u[:, a], v[:, b] - v[:, a]) * (outside == 0)
+        return length
 
     def _smooth_normals(
         self, index: np.ndarray, fraction: np.ndarray, ends: np.ndarray, R: np.ndarray, K: np.ndarray
@@ -147,20 +164,15 @@ class MeshContours:
         return depth * self.radius
 
 
+def _float32(x: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(x, np.float32)
+
+
 def _across(plane: np.ndarray, K: np.ndarray) -> np.ndarray:
     """Unit normals (N, M, 2) of the image lines in which planes through the camera, with normals (N, M, 3), appear."""
     n = plane[..., :2] / np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)[:, None]
     unit: np.ndarray = n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-300)
     return unit
-
-
-def _length_inside(uv: np.ndarray, in_front: np.ndarray, edges: np.ndarray, size: int) -> np.ndarray:
-    """(N, E) lengths in px of edges with (N, V, 2) projected vertices; 0 outside the crop and behind the camera."""
-    a, b = uv[:, edges[:, 0]], uv[:, edges[:, 1]]
-    inside = (np.maximum(a, b) > -0.5).all(axis=-1) & (np.minimum(a, b) < size - 0.5).all(axis=-1)
-    inside &= in_front[:, edges[:, 0]] & in_front[:, edges[:, 1]]
-    length: np.ndarray = np.linalg.norm(b - a, axis=-1) * inside
-    return length
 
 
 def _spread(weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
