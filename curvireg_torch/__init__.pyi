@@ -13,7 +13,6 @@ from . import (
     pipeline as pipeline,
     registration as registration,
     rendering as rendering,
-    settings as settings,
     synthetic as synthetic,
     terms as terms,
     training as training,
@@ -89,7 +88,7 @@ from .registration import (
 from .rendering import (
     render_depth as render_depth,
 )
-from .settings import (
+from .pipeline import (
     BankSettings as BankSettings,
 )
 from .version import (

@@ -1,43 +1,178 @@
 """Everything that decides a result, in one frozen value: the only source of defaults."""
 
 import json
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from dataclasses import field as dataclass_field
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
 
 from .errors import InvalidInputError, MissingFileError
-from .features.learned_field import SHA256
-from .settings import BankSettings, LocateSettings, ViewPolicy
+from .features.learned_field import SHA256, LearnedCurvilinearSaliency
+from .filters import (
+    ApparentRidges,
+    AverageShadingGradient,
+    DepthCurvilinearSaliency,
+    HessianFrobeniusNorm,
+    ImageGradient,
+    MultiScaleCurvilinearSaliency,
+    MultiScaleFocusCurves,
+)
+from .geometry import ViewSphere, sample_views, uniform_views
+from .geometry.views import DEFAULT_DISTANCE
 from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, RerankingTerm, Term, jittered_boxes
-from .utils.checks import check_option
+from .utils.checks import check_option, check_positive
 from .utils.choices import DEFAULT
 from .utils.digests import tensor_digest
-from .utils.registry import Registry
 
-__all__ = ["DEFAULT", "FIELDS", "PRESETS", "Pipeline", "field_digest", "preset_named"]
+__all__ = [
+    "DEFAULT",
+    "DEPTH_FIELDS",
+    "FIELDS",
+    "PRESETS",
+    "BankSettings",
+    "LocateSettings",
+    "Pipeline",
+    "ViewPolicy",
+    "field_digest",
+    "preset_named",
+]
 
 VERSION = 1
 """Of the JSON form."""
 
-FIELDS: Registry[Callable[[], nn.Module]] = Registry(
-    "field",
-    {
-        "learned": "curvireg_torch.features:LearnedCurvilinearSaliency",
-        "focus": "curvireg_torch.filters:MultiScaleFocusCurves",
-        "saliency": "curvireg_torch.filters:MultiScaleCurvilinearSaliency",
-        "gradient": "curvireg_torch.filters:ImageGradient",
-    },
-)
+FIELDS: dict[str, Callable[[], nn.Module]] = {
+    "learned": LearnedCurvilinearSaliency,
+    "focus": MultiScaleFocusCurves,
+    "saliency": MultiScaleCurvilinearSaliency,
+    "gradient": ImageGradient,
+}
 """Photograph filters by name: modules that are built without arguments."""
+
+DEPTH_FIELDS: dict[str, Callable[..., nn.Module]] = {
+    "CS": DepthCurvilinearSaliency,
+    "ASG": AverageShadingGradient,
+    "HFN": HessianFrobeniusNorm,
+    "AR": ApparentRidges,
+}
+"""Depth filters by the paper's names: modules (N, 1, S, S) -> (N, 2, S, S) that are built without arguments."""
 
 CUSTOM = "custom:"
 """Prefix of the name of a field that is passed with each call."""
+
+Settings = TypeVar("Settings")
+
+
+@dataclass(frozen=True)
+class ViewPolicy:
+    """Which viewpoints a bank contains.
+
+    Attributes:
+        pose: "any": nothing is known. "upright": the object stands upright and is not seen from far below. "given": the
+            views were passed by the caller.
+        directions, theta_step: of "any": number of viewing directions on the sphere, and degrees between in-plane
+            rotations.
+        azimuth_step, elevations: of "upright", degrees.
+        distance: of the camera from the object's centre, in object radii.
+
+    Example:
+        >>> len(ViewPolicy().sphere()), len(ViewPolicy(pose="upright").sphere())
+        (7200, 288)
+    """
+
+    pose: str = "any"
+    directions: int = 300
+    theta_step: float = 15.0
+    azimuth_step: float = 10.0
+    elevations: tuple[float, ...] = (-10.0, 0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
+    distance: float = DEFAULT_DISTANCE
+
+    def __post_init__(self) -> None:
+        check_option(self.pose, ("any", "upright", "given"), "pose")
+        check_positive(self.theta_step, "theta_step")
+        object.__setattr__(self, "elevations", tuple(float(e) for e in self.elevations))
+
+    def key_fields(self) -> dict[str, Any]:
+        """The attributes that decide the viewpoints; the others belong to another ``pose``."""
+        names = {"any": ("directions", "theta_step", "distance"), "upright": ("azimuth_step", "elevations", "distance")}
+        return {name: getattr(self, name) for name in ("pose", *names.get(self.pose, ()))}
+
+    def sphere(self, up: str = "z") -> ViewSphere:
+        """The viewpoints; ``up`` is the axis of the mesh that points up, for "upright"."""
+        if self.pose == "given":
+            raise InvalidInputError("views: the views of this pipeline were passed by the caller; pass them again")
+        if self.pose == "upright":
+            grid = sample_views(azimuth_step=self.azimuth_step, elevations=self.elevations, distances=[self.distance])
+            return grid.for_up(up)
+        count = max(1, round(360.0 / self.theta_step))
+        thetas = [360.0 * i / count for i in range(count)]
+        return uniform_views(self.directions, thetas=thetas, distances=[self.distance])
+
+
+@dataclass(frozen=True)
+class BankSettings:
+    """How views are rendered and described. Photographs are cropped and described in the same way.
+
+    Attributes:
+        image_size: side of views and crops in px.
+        camera: "perspective" or "orthographic".
+        margin: space around the object's box, as a fraction of its longer side.
+        depth_field: name in :data:`DEPTH_FIELDS`. "CS" is :func:`depth_curvilinear_saliency` with ``sigma`` and
+            ``formula``; the others, with which the paper compares it, use their defaults.
+        grid, bins, block, clip: of :func:`hog`.
+        point_fraction: of :func:`field_points`.
+    """
+
+    image_size: int = 128
+    camera: str = "perspective"
+    margin: float = 0.1
+    depth_field: str = "CS"
+    sigma: float = 0.8
+    formula: str = "geometric"
+    grid: int = 8
+    bins: int = 9
+    block: int = 2
+    clip: float = 0.2
+    point_fraction: float = 0.04
+
+    def __post_init__(self) -> None:
+        check_option(self.camera, ("perspective", "orthographic"), "camera")
+        check_option(self.depth_field, DEPTH_FIELDS, "depth_field")
+        check_positive(self.margin, "margin", zero_ok=True)
+        if self.image_size < self.grid:
+            raise InvalidInputError(f"image_size: expected at least grid = {self.grid}, got {self.image_size}")
+        check_option(self.formula, ("geometric", "paper"), "formula")
+        check_positive(self.sigma, "sigma", zero_ok=True)
+        if not 1 <= self.block <= self.grid or self.bins < 1 or not 0.0 < self.clip <= 1.0:
+            raise InvalidInputError(f"hog: expected 1 <= block <= grid, bins >= 1 and clip in (0, 1], got {self}")
+
+
+@dataclass(frozen=True)
+class LocateSettings:
+    """How an object without a box is searched for, see :class:`curvireg_torch.registration.Locator`.
+
+    Attributes:
+        views: of each model, that represent all of its views.
+        min_size: longer side of the smallest object that is searched for, as a fraction of the photograph's.
+        proposals: boxes that are proposed.
+        candidates: the best proposals, which are ranked against all views; the most confident one is registered.
+    """
+
+    views: int = 96
+    min_size: float = 0.08
+    proposals: int = 20
+    candidates: int = 5
+
+    def __post_init__(self) -> None:
+        if min(self.views, self.proposals, self.candidates) < 1:
+            raise InvalidInputError(f"locate: expected views, proposals and candidates >= 1, got {self}")
+        if not 0.02 <= self.min_size <= 1.0:
+            raise InvalidInputError(f"locate: min_size: expected a fraction in [0.02, 1], got {self.min_size}")
 
 
 @dataclass(frozen=True)
@@ -75,18 +210,19 @@ class Pipeline:
     terms: tuple[Term, ...] = dataclass_field(default=(Correlation(), Repeatability(), BoxShape(), Appearance()))
     box_jitter: float = 0.1
     hypotheses: int = 5
-    search: bool = True
+    search: bool = False
     contours: bool = True
     locate: LocateSettings = LocateSettings()
 
     def __post_init__(self) -> None:
         if not self.field.startswith(CUSTOM):
-            FIELDS.check(self.field)
+            check_option(self.field, FIELDS, "field")
         if self.field == "learned" and not self.weights:
             object.__setattr__(self, "weights", SHA256[:16])
         names = [term.name for term in self.terms]
-        if len(set(names)) < len(names) or all(isinstance(term, RerankingTerm) for term in self.terms):
-            raise InvalidInputError(f"terms: expected one or more that compare all views, each once, got {names}")
+        if len(set(names)) < len(names) or not any(t.name == Correlation.name and t.weight > 0 for t in self.terms):
+            message = f"expected each term once, and {Correlation.name!r}, which all results are scored by, got {names}"
+            raise InvalidInputError(f"terms: {message}")
         if self.hypotheses < 1:
             raise InvalidInputError(f"hypotheses: expected >= 1, got {self.hypotheses}")
         jittered_boxes(torch.ones(0, 4), self.box_jitter)  # checks box_jitter
@@ -143,22 +279,18 @@ class Pipeline:
             data = json.loads(text)
         except (ValueError, RecursionError) as error:
             raise InvalidInputError(f"pipeline: not JSON ({error})") from error
-        if not isinstance(data, dict):
-            raise InvalidInputError(f"pipeline: expected a JSON object, got {type(data).__name__}")
+        data = _object(data, "pipeline")
         if data.pop("version", VERSION) != VERSION:
             raise InvalidInputError(f"pipeline: this library reads version {VERSION}; write the file again")
-        for name in ("views", "bank", "locate", "terms"):
-            if not isinstance(data.get(name, {}), dict):
-                raise InvalidInputError(f"pipeline: {name}: expected a JSON object; compare with Pipeline().to_json()")
-        try:
-            for name, settings in (("views", ViewPolicy), ("bank", BankSettings), ("locate", LocateSettings)):
-                if name in data:
-                    data[name] = settings(**data[name])
-            if "terms" in data:
-                data["terms"] = tuple(TERMS[name](**options) for name, options in data["terms"].items())
-            return cls(**data)
-        except (TypeError, AttributeError) as error:
-            raise InvalidInputError(f"pipeline: {error}; compare with Pipeline().to_json()") from error
+        for name, settings in (("views", ViewPolicy), ("bank", BankSettings), ("locate", LocateSettings)):
+            if name in data:
+                data[name] = _settings(settings, data[name], f"pipeline: {name}")
+        if "terms" in data:
+            options = _object(data["terms"], "pipeline: terms")
+            for name in options:
+                check_option(name, TERMS, "term")
+            data["terms"] = tuple(_settings(TERMS[n], given, f"pipeline: terms: {n}") for n, given in options.items())
+        return _settings(cls, data, "pipeline")
 
     @classmethod
     def read(cls, path: str | PathLike[str]) -> "Pipeline":
@@ -170,6 +302,37 @@ class Pipeline:
             return cls.from_json(path.read_text(encoding="utf-8"))
         except (InvalidInputError, UnicodeDecodeError) as error:
             raise InvalidInputError(f"{path}: {error}") from error
+
+
+def _object(data: Any, name: str) -> dict[str, Any]:
+    if not isinstance(data, dict):
+        raise InvalidInputError(f"{name}: expected a JSON object, got {data!r}; compare with Pipeline().to_json()")
+    return dict(data)
+
+
+def _settings(kind: type[Settings], data: Any, name: str) -> Settings:
+    """A dataclass from a JSON object, whose values must have the types of the defaults."""
+    defaults: Mapping[str, Any] = {f.name: getattr(kind(), f.name) for f in fields(kind)}  # type: ignore[arg-type]
+    values = _object(data, name)
+    for key, value in values.items():
+        if key not in defaults:
+            raise InvalidInputError(f"{name}: unknown key {key!r}; expected one of {', '.join(defaults)}")
+        default = defaults[key]
+        if is_dataclass(default) or key == "terms":
+            continue
+        if not _fits(value, default):
+            raise InvalidInputError(f"{name}: {key}: expected a value like {default!r}, got {value!r}")
+    return kind(**values)
+
+
+def _fits(value: Any, default: Any) -> bool:
+    """Whether a value from JSON has the type of a default: a flag, a finite number, a text, or a list of numbers."""
+    if isinstance(default, bool | str):
+        return isinstance(value, type(default))
+    if isinstance(default, tuple):
+        return isinstance(value, list) and all(_fits(one, 0.0) for one in value)
+    number = int if isinstance(default, int) else int | float
+    return isinstance(value, number) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def field_digest(field: nn.Module) -> str:
@@ -187,7 +350,7 @@ PRESETS: dict[str, Pipeline] = {
     "paper": Pipeline(
         bank=BankSettings(image_size=256, sigma=1.0, formula="paper", camera="orthographic"),
         field="focus",
-        terms=(Correlation(whitening="bank"), Repeatability(mode="paper"), BoxShape(weight=0.0)),
+        terms=(Correlation(whitening="bank"), Repeatability(mode="paper")),
         box_jitter=0.0,
     ),
 }

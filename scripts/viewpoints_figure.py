@@ -15,7 +15,7 @@ from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import SIDES, object_frame
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.mesh.mesh import mesh_radius
-from curvireg_torch.settings import BankSettings
+from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.synthetic import example_mesh
 from scripts._shared import REPOSITORY
 

@@ -12,7 +12,7 @@ from curvireg_torch.filters import MultiScaleFocusCurves
 from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching.fields import depth_filter
 from curvireg_torch.pipeline import DEFAULT, FIELDS, PRESETS, preset_named
-from curvireg_torch.settings import DEPTH_FIELDS, BankSettings, ViewPolicy
+from curvireg_torch.pipeline import DEPTH_FIELDS, BankSettings, ViewPolicy
 from curvireg_torch.terms import TERMS, BoxShape, Correlation, Repeatability
 
 

@@ -1,6 +1,6 @@
-"""A bank of rendered views of one or several meshes, described once and matched many times."""
+"""A bank of rendered views of a mesh, described once, stored as safetensors, and matched many times."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields, replace
 from os import PathLike
 from pathlib import Path
@@ -9,29 +9,36 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from tqdm import tqdm
 
-from ..errors import BankError, InvalidInputError
+from ..errors import BankError, CurviregError, InvalidInputError, MissingFileError
 from ..geometry.views import ViewSphere
-from ..mesh.mesh import as_mesh, mesh_radius
+from ..mesh.colours import SurfaceColours, surface_colours
+from ..mesh.mesh import as_mesh, mesh_radius, mesh_unit
 from ..mesh.up import mesh_up
-from ..pipeline import Pipeline
+from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
-from ..settings import BankSettings
+from ..utils.digests import tensor_digest
+from ..utils.files import write_tensors
 from ..utils.threads import single_threaded_pool
-from .bank_file import RERANKING, read_bank, write_bank
-from .describe import ViewDescriber
+from .describe import ViewDescriber, hog_layer
 
-__all__ = ["ViewBank"]
+__all__ = ["FORMAT", "FORMAT_VERSION", "ViewBank", "colour_arrays"]
+
+FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 5
+RERANKING = "reranking."
+"""Prefix of the names of reranking features among a bank's tensors."""
+
+REBUILD = "build it again with 'curvireg bank MESH --out FILE'"
 
 
 class ViewBank:
-    """N views of one mesh, or of several: descriptors, feature points, silhouettes and cameras.
+    """N views of a mesh: descriptors, feature points, silhouettes and cameras.
 
     Attributes:
-        meshes: the meshes, in their files' own frames and units.
-        model: (N,) int64: which of the meshes each view shows.
+        mesh: in its file's own frame and unit.
         views: the N viewpoints.
         pipeline: the pipeline that the bank was built for.
         descriptors: (N, D) float32.
@@ -43,11 +50,11 @@ class ViewBank:
     """
 
     def __init__(
-        self, meshes: Sequence[trimesh.Trimesh], views: ViewSphere, pipeline: Pipeline, tensors: dict[str, Tensor]
+        self, mesh: trimesh.Trimesh, views: ViewSphere, pipeline: Pipeline, tensors: Mapping[str, Tensor]
     ) -> None:
-        self.meshes, self.views, self.pipeline = tuple(meshes), views, pipeline
+        self.mesh, self.views, self.pipeline = mesh, views, pipeline
         self.descriptors = tensors["descriptors"].float()
-        self.boxes, self.model = tensors["boxes"], tensors["model"]
+        self.boxes = tensors["boxes"]
         self._points, self._silhouettes = tensors["points"], tensors["silhouettes"]
         reranking = (name for name in tensors if name.startswith(RERANKING))
         self.reranking_features = {name.removeprefix(RERANKING): tensors[name] for name in reranking}
@@ -56,15 +63,7 @@ class ViewBank:
         return len(self.views)
 
     def __repr__(self) -> str:
-        faces = sum(len(mesh.faces) for mesh in self.meshes)
-        return f"ViewBank({len(self)} views of {len(self.meshes)} meshes, {faces} faces, {self.settings})"
-
-    @property
-    def mesh(self) -> trimesh.Trimesh:
-        """The mesh of a bank of one mesh; an error if there are several."""
-        if len(self.meshes) != 1:
-            raise InvalidInputError(f"bank: has {len(self.meshes)} meshes; choose one of bank.meshes")
-        return self.meshes[0]
+        return f"ViewBank({len(self)} views of a mesh of {len(self.mesh.faces)} faces, {self.settings})"
 
     @property
     def settings(self) -> BankSettings:
@@ -77,14 +76,13 @@ class ViewBank:
 
     @property
     def rotations(self) -> Tensor:
-        """(N, 3, 3) rotations model -> camera, each in its own model's frame."""
+        """(N, 3, 3) rotations model -> camera."""
         return self.views.rotations.to(self.device)
 
     @property
     def distances(self) -> Tensor:
-        """(N,) float64 distances of the object's centre, in the unit of each view's mesh."""
-        radii = torch.tensor([mesh_radius(mesh) for mesh in self.meshes], dtype=torch.float64, device=self.device)
-        return self.views.distance.to(radii) * radii[self.model]
+        """(N,) float64 distances of the object's centre, in the mesh's unit."""
+        return self.views.distance.to(self.device, torch.float64) * mesh_radius(self.mesh)
 
     @property
     def points(self) -> Tensor:
@@ -191,46 +189,11 @@ class ViewBank:
                 if callable(progress):
                     progress("bank", min(chunk_size * len(parts), len(views)), len(views))
         tensors = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-        tensors["model"] = torch.zeros(len(views), dtype=torch.long, device=tensors["boxes"].device)
-        return cls([mesh], views, pipeline, tensors)
-
-    @classmethod
-    def join(cls, banks: "Sequence[ViewBank]") -> "ViewBank":
-        """Concatenate one or more banks of equal settings, view policies and devices into one of several models.
-
-        A single bank is returned as it is.
-
-        Example:
-            >>> from curvireg_torch.geometry import sample_views
-            >>> views = sample_views(azimuth_step=90, elevations=[20])
-            >>> meshes = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 1, 3))
-            >>> both = ViewBank.join([ViewBank.build(m, views, image_size=64, progress=False) for m in meshes])
-            >>> len(both), both.model.tolist()
-            (8, [0, 0, 0, 0, 1, 1, 1, 1])
-        """
-        if not banks:
-            raise InvalidInputError("banks: expected at least one bank, got none")
-        first = banks[0]
-        for i, bank in enumerate(banks):
-            for what, mine, theirs in (
-                ("set of settings", bank.settings, first.settings),
-                ("view policy", bank.pipeline.views.key_fields(), first.pipeline.views.key_fields()),
-                ("device", bank.device, first.device),
-            ):
-                if mine != theirs:
-                    raise InvalidInputError(f"banks: expected one {what}, but bank {i} has {mine} and bank 0 {theirs}")
-        if len(banks) == 1:
-            return first
-        names = [name for name in first.tensors if all(name in bank.tensors for bank in banks)]
-        tensors = {name: _concatenate([bank.tensors[name] for bank in banks]) for name in names}
-        shift = torch.tensor([0, *(len(bank.meshes) for bank in banks)]).cumsum(0)[:-1].tolist()
-        tensors["model"] = torch.cat([bank.model + n for bank, n in zip(banks, shift, strict=True)])
-        views = ViewSphere(*(torch.cat([getattr(b.views, f.name) for b in banks]) for f in fields(ViewSphere)))
-        return cls([mesh for bank in banks for mesh in bank.meshes], views, first.pipeline, tensors)
+        return cls(mesh, views, pipeline, tensors)
 
     def to(self, device: torch.device | str) -> "ViewBank":
         """The same bank on another device."""
-        return ViewBank(self.meshes, self.views, self.pipeline, {k: v.to(device) for k, v in self.tensors.items()})
+        return ViewBank(self.mesh, self.views, self.pipeline, {k: v.to(device) for k, v in self.tensors.items()})
 
     @property
     def tensors(self) -> dict[str, Tensor]:
@@ -240,13 +203,28 @@ class ViewBank:
             "boxes": self.boxes,
             "points": self._points,
             "silhouettes": self._silhouettes,
-            "model": self.model,
             **{RERANKING + name: features for name, features in self.reranking_features.items()},
         }
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write a safetensors file atomically. Descriptors in float16 change cosines by less than 1e-4."""
-        write_bank(Path(path), self.meshes, self.views, self.pipeline, self.tensors)
+        contents = {**self.tensors, "descriptors": self.descriptors.half()}
+        contents |= {f"views.{f.name}": getattr(self.views, f.name) for f in fields(ViewSphere)}
+        arrays: dict[str, np.ndarray] = {
+            "vertices": np.array(self.mesh.vertices, np.float64),
+            "faces": np.array(self.mesh.faces, np.int32),
+            **colour_arrays(self.mesh),
+        }
+        contents |= {f"mesh.{name}": torch.from_numpy(x.copy()) for name, x in arrays.items()}
+        metadata = {
+            "format": FORMAT,
+            "version": str(FORMAT_VERSION),
+            "pipeline": self.pipeline.to_json(),
+            "unit": mesh_unit(self.mesh) or "",
+            "up": mesh_up(self.mesh),
+            "checksum": tensor_digest(contents, size=16),
+        }
+        write_tensors(Path(path), contents, metadata)
 
     @classmethod
     def load(cls, path: str | PathLike[str], *, device: torch.device | str = "cpu") -> "ViewBank":
@@ -256,13 +234,93 @@ class ViewBank:
             MissingFileError: no such file.
             BankError: truncated, changed, not a bank, or written by another version of the format.
         """
-        return cls(*read_bank(Path(path))).to(device)
+        path = Path(path)
+        metadata, tensors = _read(path)
+        try:
+            if metadata["checksum"] != tensor_digest(tensors, size=16):
+                raise BankError(f"changed since it was written (its checksum differs); {REBUILD}", subject=path)
+            pipeline = Pipeline.from_json(metadata["pipeline"])
+            views = ViewSphere(**{f.name: tensors[f"views.{f.name}"] for f in fields(ViewSphere)})
+            mesh = _mesh(tensors, metadata["unit"], metadata["up"])
+            _check_contents(views, pipeline.bank, tensors)
+        except BankError:
+            raise
+        except (KeyError, TypeError, ValueError, CurviregError) as error:
+            raise BankError(f"incomplete bank ({error!r}); {REBUILD}", subject=path) from error
+        return cls(mesh, views, pipeline, tensors).to(device)
 
 
-def _concatenate(parts: list[Tensor]) -> Tensor:
-    """Concatenate; beside coloured meshes, the grey features of meshes without colours are repeated."""
-    widest = max(part.shape[1:].numel() for part in parts)
-    return torch.cat([p.repeat(1, widest // p.shape[1]) if p.ndim == 2 else p for p in parts])
+def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Metadata and tensors of a file of this format and version."""
+    if not path.is_file():
+        raise MissingFileError(f"no such bank; build one with 'curvireg bank MESH --out {path}'", subject=path)
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise BankError("not a view bank; build one with 'curvireg bank MESH --out FILE'", subject=path)
+            if (version := metadata.get("version")) != str(FORMAT_VERSION):
+                message = f"bank format {version}, this library reads {FORMAT_VERSION}; {REBUILD}"
+                raise BankError(message, subject=path)
+            return metadata, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError) as error:
+        raise BankError(f"truncated or not a safetensors file ({error}); {REBUILD}", subject=path) from error
+
+
+def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:
+    arrays = {n.removeprefix("mesh."): x.numpy() for n, x in tensors.items() if n.startswith("mesh.")}
+    vertices, faces = arrays.pop("vertices"), arrays.pop("faces")
+    if faces.size == 0 or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
+        raise ValueError("not a mesh")
+    mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+    if unit:
+        mesh.units = unit
+    mesh.metadata["up"] = up
+    if arrays:
+        colours: dict[str, Any] = {n.removeprefix("colours."): x for n, x in arrays.items()}
+        textures = tuple(colours[f"picture{k}"] for k in range(len(colours) - 3))
+        surface = SurfaceColours(colours["corners"], colours["uv"].astype(np.float32), colours["texture"], textures)
+        surface.check(len(faces))
+        mesh.metadata["colours"] = surface
+    return mesh
+
+
+def colour_arrays(mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
+    """The mesh's colours as arrays, without loss; empty for a mesh without colours."""
+    colours = surface_colours(mesh)
+    if colours is None:
+        return {}
+    arrays: dict[str, np.ndarray] = {"corners": colours.corners, "uv": colours.uv, "texture": colours.texture}
+    arrays |= {f"picture{k}": texture for k, texture in enumerate(colours.textures)}
+    return {f"colours.{name}": x for name, x in arrays.items()}
+
+
+def _check_contents(views: ViewSphere, settings: BankSettings, tensors: Mapping[str, Tensor]) -> None:
+    """Raise ValueError for contents that no bank has: a checksum only shows that the file was not changed."""
+    N, S = len(views), settings.image_size
+    packed = (N, -(-(S**2) // 8))
+    descriptors, boxes = tensors["descriptors"], tensors["boxes"]
+    shapes = {"descriptors": (N, hog_layer(settings).length), "boxes": (N, 4), "points": packed, "silhouettes": packed}
+    wrong = [name for name, shape in shapes.items() if tuple(tensors[name].shape) != shape]
+    if wrong:
+        raise ValueError(f"{', '.join(wrong)}: not of the shape that the settings say")
+    viewpoints = torch.stack([getattr(views, f.name).double() for f in fields(ViewSphere)])
+    valid: dict[str, Tensor | bool] = {
+        "viewpoints that are not finite": viewpoints.isfinite().all(),
+        "descriptors that are not finite, or all zero": _is_finite(descriptors) and descriptors.any(),
+        "boxes that are empty or not finite": boxes.isfinite().all() and (boxes[:, 2:] > boxes[:, :2]).all(),
+    }
+    for name in (name for name in tensors if name.startswith(RERANKING)):
+        x, message = tensors[name], f"features of {name} that do not fit the views, or are not finite"
+        valid[message] = _is_finite(x) and x.ndim == 2 and len(x) == N
+    for message, passed in valid.items():
+        if not bool(passed):
+            raise ValueError(message)
+
+
+def _is_finite(x: Tensor) -> Tensor:
+    """Whether all half-precision values are finite: their sum in float32 cannot overflow otherwise, and is fast."""
+    return x.sum(dtype=torch.float32).isfinite()
 
 
 def _pack(mask: Tensor) -> Tensor:

@@ -23,8 +23,7 @@ from ..mesh.up import mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..utils.digests import code_digest, tensor_digest, text_digest
-from .bank import ViewBank
-from .bank_file import FORMAT_VERSION, colour_arrays
+from .bank import FORMAT_VERSION, ViewBank, colour_arrays
 
 __all__ = [
     "CACHE_LIMIT",
@@ -54,7 +53,6 @@ _SOURCES = (
     "terms",
     "settings.py",
     "matching/describe.py",
-    "matching/fields.py",
 )
 """Code that turns a mesh into described views: a bank that another version of it built is not found."""
 

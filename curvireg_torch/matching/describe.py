@@ -6,29 +6,50 @@ from functools import cached_property
 
 import torch
 import trimesh
-from torch import Tensor
+from torch import Tensor, nn
 
-from ..features import field_points
+from ..features import HOG, field_points
 from ..geometry.cameras import projected_boxes, transform
 from ..geometry.crops import crop_transforms, image_transforms, square_boxes
 from ..mesh.colours import has_colours
 from ..mesh.mesh import extreme_points, mesh_centre, mesh_radius
+from ..pipeline import DEPTH_FIELDS, BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_colour
 from ..rendering.contours import MeshContours
 from ..rendering.shading import shade
-from ..settings import BankSettings
-from .fields import depth_filter, hog_layer
 
-__all__ = ["DescribedViews", "ViewDescriber"]
+__all__ = ["DescribedViews", "ViewDescriber", "depth_filter", "hog_layer"]
 
-CHUNK = 64
+VIEWS_AT_A_TIME = 64
 """Views in memory at a time."""
 
-SAME = 1e-6
+EQUAL_VIEWS = 1e-6
 """Tolerance of equal rotations (entries) and distances (relative): 1e-4 px in a view."""
 
-FAR = 20.0
+PARALLEL_DISTANCE = 20.0
 """Distances to step back so that a perspective view approximates parallel projection to a few per mille."""
+
+
+def depth_filter(settings: BankSettings) -> nn.Module:
+    """The filter that turns rendered depth into vector fields.
+
+    Example:
+        >>> type(depth_filter(BankSettings(depth_field="HFN"))).__name__
+        'HessianFrobeniusNorm'
+    """
+    options = {"sigma": settings.sigma, "formula": settings.formula} if settings.depth_field == "CS" else {}
+    layer: nn.Module = DEPTH_FIELDS[settings.depth_field](**options)
+    return layer
+
+
+def hog_layer(settings: BankSettings) -> HOG:
+    """The descriptor of views and photographs.
+
+    Example:
+        >>> hog_layer(BankSettings()).length
+        1764
+    """
+    return HOG(grid=settings.grid, bins=settings.bins, block=settings.block, clip=settings.clip)
 
 
 @dataclass(frozen=True)
@@ -54,7 +75,6 @@ class ViewDescriber:
     Args:
         mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
         settings, renderer, device: see :meth:`curvireg_torch.ViewBank.build`.
-        coloured: whether :meth:`shaded` adds the mesh's colours; default: if it has any.
     """
 
     def __init__(
@@ -63,11 +83,10 @@ class ViewDescriber:
         settings: BankSettings,
         *,
         renderer: str | DepthRenderer = "auto",
-        coloured: bool | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         self._mesh = mesh
-        self._coloured = has_colours(mesh) if coloured is None else coloured
+        self._coloured = has_colours(mesh)
         self.renderer = make_renderer(mesh, renderer, device=device)
         self.centre, self.radius, self.hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
         self._device = device
@@ -115,8 +134,8 @@ class ViewDescriber:
         if self._orthographic:
             z = distances.double().cpu()
             T, K = T.clone(), K.clone()
-            T[:, 2, 3] += FAR * z
-            K[:, :2, :2] *= (1.0 + FAR) * z[:, None, None]
+            T[:, 2, 3] += PARALLEL_DISTANCE * z
+            K[:, :2, :2] *= (1.0 + PARALLEL_DISTANCE) * z[:, None, None]
         squares = square_boxes(boxes.double().cpu(), self.settings.margin)
         return T, image_transforms(squares, self.settings.image_size) @ K
 
@@ -159,7 +178,7 @@ class ViewDescriber:
     @torch.no_grad()
     def descriptors(self, rotations: Tensor, distances: Tensor) -> Tensor:
         """(N, D) descriptors of the framed views."""
-        chunks = zip(rotations.split(CHUNK), distances.split(CHUNK), strict=True)
+        chunks = zip(rotations.split(VIEWS_AT_A_TIME), distances.split(VIEWS_AT_A_TIME), strict=True)
         return torch.cat([self.descriptor(self.fields(R, z)) for R, z in chunks])
 
     @torch.no_grad()
@@ -193,7 +212,7 @@ def quarter_turns(rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]
     x, y, z = rotations[:, 0].double().cpu(), rotations[:, 1].double().cpu(), distances.double().cpu()
     frames = [torch.cat(pair, dim=1) for pair in ((x, y), (-y, x), (-x, -y), (y, -x))]
     apart = torch.cdist(torch.stack(frames), frames[0], compute_mode="donot_use_mm_for_euclid_dist")
-    close = (apart < SAME) & ((z[:, None] - z).abs() <= SAME * z)
+    close = (apart < EQUAL_VIEWS) & ((z[:, None] - z).abs() <= EQUAL_VIEWS * z)
     grouped = close.any(dim=0)
     first = (grouped * torch.arange(len(x), 0, -1)[:, None]).argmax(dim=0)
     return first, close.int().argmax(dim=0).gather(0, first[None])[0]

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from ..errors import InvalidInputError
 from ..features import field_points
-from ..mesh.colours import has_colours
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..terms import (
@@ -25,16 +24,18 @@ from ..terms import (
 from ..utils.checks import as_boxes, check_photograph, check_pixels
 from ..utils.threads import map_on_threads
 from .bank import ViewBank
-from .describe import ViewDescriber
-from .fields import hog_layer
+from .describe import ViewDescriber, hog_layer
 from .ranking import Ranking, distinct_views
 
 __all__ = ["ViewMatcher"]
 
-CACHED = 2048
+MAX_CACHED_VIEWS = 2048
 """Views whose reranking features are cached, 35 kB each at 128 px."""
 
-CHUNK = 16
+NEAR_TRACE = 1.0 + 3.0**0.5
+"""Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it."""
+
+FEATURES_AT_A_TIME = 16
 """Views whose reranking features are computed at a time."""
 
 
@@ -48,7 +49,7 @@ class ViewMatcher(nn.Module):
     change scores by rounding, relatively by about 1e-5; :class:`curvireg_torch.Registrar` prevents that.
 
     Args:
-        bank: the views of one or several models.
+        bank: the views of a mesh.
         pipeline: field, terms and box jitter; default the bank's. Its bank settings and view policy must be those of
             the bank, unless the bank's views were passed by the caller.
         field: custom photograph filter (B, 1, S, S) -> (B, 2, S, S). With an attribute ``colour = True`` it gets colour
@@ -92,7 +93,8 @@ class ViewMatcher(nn.Module):
         self.pipeline = pipeline if field is None else pipeline.with_field(field)
         self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
         self.descriptor = hog_layer(bank.settings)
-        self._terms = nn.ModuleDict({term.name: term.build(bank) for term in pipeline.terms}).to(bank.device)
+        self.terms = tuple(term for term in pipeline.terms if term.weight > 0)
+        self._terms = nn.ModuleDict({term.name: term.build(bank) for term in self.terms}).to(bank.device)
 
     @property
     def device(self) -> torch.device:
@@ -145,28 +147,31 @@ class ViewMatcher(nn.Module):
             shapes=shapes.to(regions),
         )
 
-    def rank(self, query: QueryFeatures, log_prior: Tensor | None = None) -> Ranking:
+    def rank(self, query: QueryFeatures, allowed: Tensor | None = None) -> Ranking:
         """Compare B described photographs with all views; errors as :meth:`forward`.
 
-        ``log_prior`` (B, N) of the views is added to the log of their scores; ``-inf`` excludes a view.
+        ``allowed`` (B, N) bool leaves views out, whose score is 0.
         """
         check_pixels(query.crops, "of the box")
-        first = [t for t in self.pipeline.terms if not isinstance(t, RerankingTerm)]
+        first = [t for t in self.terms if not isinstance(t, RerankingTerm)]
         terms = {t.name: self._terms[t.name](query) for t in first}
         first_log = torch.stack([t.weight * t.log_score(terms[t.name]) for t in first]).sum(dim=0)
         log, reranked = self._reranked(query, first_log)
-        if log_prior is None:
-            scores = log.exp()
-            return Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), {**terms, **reranked})
-        without = log.amax(dim=1)
-        log, reranked = self._reranked(query, first_log + log_prior.to(log))
+        if allowed is None:
+            order = log.argsort(dim=1, descending=True, stable=True)
+            return Ranking(log.exp(), order, {**terms, **reranked})
+        allowed = allowed.to(log.device)
+        without, (log, reranked) = log, self._reranked(query, first_log.masked_fill(~allowed, -torch.inf))
         order = log.argsort(dim=1, descending=True, stable=True)
-        ratio = (log.amax(dim=1) - without).clamp(max=0.0).exp()
-        return Ranking(log.exp(), order, {**terms, **reranked}, log_prior.to(log) > -torch.inf, ratio)
+        R = self.bank.rotations
+        near = R[order[:, 0]].flatten(1) @ R.flatten(1).T >= NEAR_TRACE
+        best, outside = without.masked_fill(allowed | near, -torch.inf).max(dim=1)
+        outside = outside.masked_fill(best == -torch.inf, -1)
+        return Ranking(log.exp(), order, {**terms, **reranked}, allowed, outside)
 
     def _reranked(self, query: QueryFeatures, log: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         raw: dict[str, Tensor] = {}
-        for term in self.pipeline.terms:
+        for term in self.terms:
             if isinstance(term, RerankingTerm):
                 raw[term.name], log_score = self._rerank(term, query, log)
                 log = log + term.weight * log_score
@@ -181,16 +186,15 @@ class ViewMatcher(nn.Module):
         if len(self.bank) <= term.exhaustive_limit:
             raw = module.compare(query, self._reranking_features(term.name, torch.arange(len(self.bank)))).to(log)
             return raw, term.log_score(raw)
-        R, model = self.bank.rotations, self.bank.model
+        R = self.bank.rotations
         order = log.argsort(dim=1, descending=True, stable=True)
-        selected = [distinct_views(o, R, count=term.top, angle=term.min_angle, model=model) for o in order]
+        selected = [distinct_views(o, R, count=term.top, angle=term.min_angle) for o in order]
         selected = [index[row[index] > -torch.inf] for index, row in zip(selected, log, strict=True)]
         compared = torch.cat(selected).unique()
         similarity = module.compare(query, self._reranking_features(term.name, compared)).to(log)
         for b, index in enumerate(selected):
             raw[b, index] = similarity[b, torch.searchsorted(compared, index)]
-            # The trace of the relative rotation grows as its angle falls; -4 is below every trace.
-            traces = (R.flatten(1) @ R[index].flatten(1).T).masked_fill(model[:, None] != model[index], -4.0)
+            traces = R.flatten(1) @ R[index].flatten(1).T  # the trace of the relative rotation grows as its angle falls
             score[b] = term.log_score(raw[b : b + 1, index])[0, traces.argmax(dim=1)]
         return raw, score
 
@@ -213,10 +217,10 @@ class ViewMatcher(nn.Module):
             return module.describe(self._shaded(torch.tensor(chunk, device=self.device)))
 
         # One thread per chunk, so that rounding does not depend on which photograph came first.
-        chunks = [missing[k : k + CHUNK] for k in range(0, len(missing), CHUNK)]
+        chunks = [missing[k : k + FEATURES_AT_A_TIME] for k in range(0, len(missing), FEATURES_AT_A_TIME)]
         parts = map_on_threads(describe, chunks, device=self.device)
         new = dict(zip(missing, (feature for part in parts for feature in part), strict=True))
-        if len(cache) + len(new) > CACHED:
+        if len(cache) + len(new) > MAX_CACHED_VIEWS:
             cache.clear()
         cache.update(new)
         found.update(new)
@@ -230,10 +234,10 @@ class ViewMatcher(nn.Module):
         Args:
             name: of the term.
             query, ranking: of B photographs.
-            pictures: (H, C, S, S), of :meth:`pictures`.
+            pictures: (H, C, S, S), of :meth:`ViewDescriber.shaded`.
             image_index: (H,) photograph that each picture is compared with.
         """
-        module, term = self._reranking_module(name), next(t for t in self.pipeline.terms if t.name == name)
+        module, term = self._reranking_module(name), next(t for t in self.terms if t.name == name)
         raw = module.compare(query, module.describe(pictures)).cpu().double()
         out = torch.zeros(len(pictures), dtype=torch.float64)
         for h, b in enumerate(image_index.tolist()):
@@ -243,22 +247,9 @@ class ViewMatcher(nn.Module):
         return out
 
     def _shaded(self, views: Tensor) -> Tensor:
-        return self.pictures(self.bank.model[views], self.bank.rotations[views], self.bank.distances[views])
-
-    def pictures(self, model: Tensor, rotations: Tensor, distances: Tensor) -> Tensor:
-        """(N, C, S, S) pictures of views of (N,) models, see :meth:`ViewDescriber.shaded`."""
-        parts, index = [], []
-        for m in model.unique().tolist():
-            mine = (model == m).nonzero()[:, 0]
-            parts.append(self.describers[m].shaded(rotations[mine], distances[mine]))
-            index.append(mine)
-        return torch.cat(parts)[torch.cat(index).argsort().to(parts[0].device)]
+        return self.describer.shaded(self.bank.rotations[views], self.bank.distances[views])
 
     @cached_property
-    def describers(self) -> tuple[ViewDescriber, ...]:
-        """One per model, which renders and describes further views as the bank's; built on first use."""
-        coloured = any(has_colours(mesh) for mesh in self.bank.meshes)
-        return tuple(
-            ViewDescriber(mesh, self.bank.settings, renderer=self._renderer, coloured=coloured, device=self.device)
-            for mesh in self.bank.meshes
-        )
+    def describer(self) -> ViewDescriber:
+        """Render and describe further views as the bank's; built on first use."""
+        return ViewDescriber(self.bank.mesh, self.bank.settings, renderer=self._renderer, device=self.device)

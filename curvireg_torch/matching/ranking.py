@@ -22,14 +22,15 @@ class Ranking:
             [-1, 1] if they are whitened; "repeatability": fraction of the photograph's points found in the view; "box":
             S_box in [0, 1], similarity of the boxes' aspect ratios, best view 1.
         allowed: (B, N) bool, which views a pose prior leaves; None without one.
-        prior_ratio: (B,) best score under the pose prior divided by the best score without it; None without one.
+        outside: (B,) best of the other views more than 30 degrees from the best view, -1 if there are none; None
+            without a prior.
     """
 
     scores: Tensor
     order: Tensor
     terms: Mapping[str, Tensor]
     allowed: Tensor | None = None
-    prior_ratio: Tensor | None = None
+    outside: Tensor | None = None
 
     @staticmethod
     def none() -> "Ranking":
@@ -43,8 +44,8 @@ class Ranking:
         """Rankings of some photographs, as copies that do not keep the batch in memory."""
         terms = {name: raw[index].clone() for name, raw in self.terms.items()}
         allowed = None if self.allowed is None else self.allowed[index].clone()
-        ratio = None if self.prior_ratio is None else self.prior_ratio[index].clone()
-        return Ranking(self.scores[index].clone(), self.order[index].clone(), terms, allowed, ratio)
+        outside = None if self.outside is None else self.outside[index].clone()
+        return Ranking(self.scores[index].clone(), self.order[index].clone(), terms, allowed, outside)
 
     @property
     def hog(self) -> Tensor:
@@ -70,13 +71,13 @@ class Ranking:
         """Concatenate rankings of the same views."""
         terms = {name: torch.cat([part.terms[name] for part in parts]) for name in parts[0].terms}
         allowed = [p.allowed for p in parts if p.allowed is not None]
-        ratios = [p.prior_ratio for p in parts if p.prior_ratio is not None]
+        outside = [p.outside for p in parts if p.outside is not None]
         return Ranking(
             torch.cat([p.scores for p in parts]),
             torch.cat([p.order for p in parts]),
             terms,
             torch.cat(allowed) if allowed else None,
-            torch.cat(ratios) if ratios else None,
+            torch.cat(outside) if outside else None,
         )
 
 
@@ -87,7 +88,6 @@ def distinct_views(
     count: int,
     angle: float = 30.0,
     symmetries: Tensor | None = None,
-    model: Tensor | None = None,
 ) -> Tensor:
     """Best views that are more than ``angle`` degrees from every better selected one.
 
@@ -96,7 +96,6 @@ def distinct_views(
         rotations: (N, 3, 3) of the views.
         symmetries: (S, 3, 3) or (S, 4, 4) of the model, from :func:`curvireg_torch.geometry.symmetry_transforms`: views
             that differ by one of them count as the same.
-        model: (N,) which model each view shows: views of two models are always distinct.
 
     Returns:
         (K,) view indices, best first, K <= count.
@@ -117,6 +116,6 @@ def distinct_views(
         equivalent = rotations[best] @ symmetries
         traces = (equivalent.flatten(1) @ rotations.flatten(1).T).amax(dim=0)
         near = torch.rad2deg(torch.acos((0.5 * (traces - 1.0)).clamp(-1.0, 1.0))) <= angle
-        available &= ~near if model is None else ~(near & (model == model[best]))
+        available &= ~near
         available[best] = False
     return torch.tensor(selected, dtype=torch.long, device=order.device)

@@ -1,57 +1,63 @@
-"""Probabilities that a ranking, a pose or a localization is right: logistic models of measured features.
+"""Probabilities that a pose or a detection is right: logistic models of measured features.
 
-Their constants come from :mod:`curvireg_torch.registration.calibration`; docs/accuracy.md has their accuracy on
-photographs that were not used for calibration.
+Two models serve registrations: "instance", for the mesh of this very object and a known camera, and "category", for the
+mesh of another object of its kind, or without a camera. Their constants, and those of refinement, tracking and
+detection, were fitted by scripts/calibration on generated photographs; docs/accuracy.md has their accuracy on others.
 """
 
+import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..matching import Ranking
-from .calibration import CALIBRATION, REFINEMENT, TRACKING
+from ..pipeline import BankSettings, Pipeline
+from ..terms import Correlation
 
 __all__ = [
+    "CALIBRATION",
     "CONFIDENCE_FEATURES",
-    "PRESENCE_FEATURES",
+    "COVARIANCE_SCALE",
     "RELIABLE",
     "LogisticModel",
-    "confidence",
+    "concentration",
     "confidence_features",
-    "confidence_model",
+    "detection_probability",
+    "hypothesis_probabilities",
+    "is_calibrated",
     "model_name",
-    "presence",
-    "presence_features",
-    "ranking_evidence",
-    "ranking_features",
+    "refinement_confidence",
+    "registration_confidence",
+    "tracking_confidence",
 ]
+
+CALIBRATION: dict[str, Any] = json.loads(Path(__file__).with_name("calibration.json").read_text(encoding="utf-8"))
+"""For each model its ``weights`` and ``bias``; for "instance" and "category" also ``slope`` and ``none``, see
+:func:`hypothesis_probabilities`."""
+
+COVARIANCE_SCALE: float = CALIBRATION["covariance_scale"]
+"""Factor of the least-squares covariance, which ignores edges that do not belong to the object: with it, nine in ten
+true poses lie in the 90 % ellipsoid of a reliable result, on generated photographs."""
 
 RELIABLE = 0.9
 """Confidence from which a registration is called reliable."""
 
-RANKING_FEATURES = ("similarity", "margin", "concentration")
-"""Columns of :func:`ranking_evidence`."""
+CONFIDENCE_FEATURES = ("similarity", "margin", "edge_support", "concentration")
+"""Features of the confidence, see :func:`confidence_features`."""
 
-CONFIDENCE_FEATURES = ("similarity", "lead", "edge_support", "appearance_lead", "concentration")
-"""Features of the confidence in a fitted pose, see :func:`confidence_features`."""
+MAX_MARGIN = 5.0
+"""Margins are clamped to +- this value."""
 
-PRESENCE_FEATURES = ("proposal", "similarity")
-"""Values of :func:`presence_features`; only the similarity for pipelines without anything learned."""
-
-_PRESENCE = {2: ((1.128, 7.819), -16.897), 1: ((16.756,), -14.856)}
-"""Weights and bias for two features and for one: logistic regressions on mosaics of photographs of textured meshes, by
-scripts/speed/location.py."""
-
-MARGIN = 5.0
-"""Leads are clamped to +- this value."""
-
-UNCOMPARED = 0.5
+UNCOMPARED_CONFIDENCE = 0.5
 """Largest confidence in a result without rival views."""
 
-_APART = 30.0  # degrees beyond which two views are rivals
+RIVAL_ANGLE = 30.0
+"""Degrees beyond which two views are rivals."""
 
 Features = Mapping[str, float | None]
 """Features by name; None where there is no rival view to compare with."""
@@ -64,145 +70,141 @@ class LogisticModel:
     weights: Mapping[str, float]
     bias: float
 
+    @classmethod
+    def named(cls, name: str) -> "LogisticModel":
+        """A model of :data:`CALIBRATION`."""
+        return cls(CALIBRATION[name]["weights"], CALIBRATION[name]["bias"])
+
     def __call__(self, features: Features) -> float:
-        """Probability in (0, 1); at most ``UNCOMPARED`` if a feature is None, which counts as 0, as in a tie."""
+        """Probability in (0, 1); at most ``UNCOMPARED_CONFIDENCE`` if a feature is None, which counts as 0, a tie."""
         logit = self.bias + sum(weight * (features[name] or 0.0) for name, weight in self.weights.items())
         probability = 0.5 * (1.0 + math.tanh(0.5 * logit))  # the logistic function, which overflows nowhere
-        return probability if None not in features.values() else min(probability, UNCOMPARED)
+        return probability if None not in features.values() else min(probability, UNCOMPARED_CONFIDENCE)
 
 
-def model_name(stage: str, *, exact: bool, with_appearance: bool) -> str:
-    """The key of the calibrated constants for a kind of result.
+def model_name(*, exact: bool) -> str:
+    """Which model serves: "instance" for the mesh of this very object and a known camera, else "category"."""
+    return "instance" if exact else "category"
 
-    Args:
-        stage: "ranking" for views, "contours" for fitted poses.
-        exact: whether the mesh is that of this very object, or only of a similar one.
-        with_appearance: whether the pipeline has the appearance term.
+
+def is_calibrated(pipeline: Pipeline) -> bool:
+    """Whether the models were fitted for such a pipeline: learned field, default terms, contour fit, default views.
+
+    The number of hypotheses, the box jitter, the size of the views and their spacing may differ.
     """
-    return f"{stage}, {'exact' if exact else 'similar'}, {'appearance' if with_appearance else 'no appearance'}"
+    default, bank = Pipeline(), pipeline.bank
+    usual = BankSettings(image_size=bank.image_size)
+    plain = all(term.whitening == "none" for term in pipeline.terms if isinstance(term, Correlation))
+    same_field = (pipeline.field, pipeline.weights) == (default.field, default.weights)
+    return same_field and bank == usual and plain and pipeline.contours
 
 
-def confidence_model(name: str) -> LogisticModel:
-    """The logistic model for a kind of result, by its ``model_name``."""
-    model = CALIBRATION["confidence"][name]
-    return LogisticModel(model["weights"], model["bias"])
+def registration_confidence(features: Features, *, exact: bool) -> float:
+    """Probability that a fitted pose is within 30 degrees of the truth, from :func:`confidence_features`."""
+    return LogisticModel.named(model_name(exact=exact))(features)
 
 
 def refinement_confidence(features: Features) -> float:
-    """Probability that a refined pose is within 10 degrees and 10 % of the distance of the truth.
+    """Probability that a pose refined from a good start is within 10 degrees and 10 % of the distance of the truth.
 
     Args:
         features: ``similarity`` and ``edge_support`` of the pose.
     """
-    return LogisticModel(REFINEMENT["weights"], REFINEMENT["bias"])(features)
+    return LogisticModel.named("refinement")(features)
 
 
 def tracking_confidence(features: Features) -> float:
-    """Probability that a tracked pose is within 10 degrees and 10 % of the distance of the truth.
+    """Probability that a tracked pose is within 10 degrees and 10 % of the distance of the truth, if it was before.
 
     Args:
-        features: of :class:`.tracking.TrackedPose`.
+        features: of :class:`.tracker.TrackedPose`.
     """
-    return LogisticModel(TRACKING["weights"], TRACKING["bias"])({name: features[name] for name in TRACKING["weights"]})
+    model = LogisticModel.named("tracking")
+    return model({name: features[name] for name in model.weights})
 
 
-def ranking_evidence(
-    ranking: Ranking, rotations: Tensor, *, answer: Tensor | None = None, symmetries: Tensor | None = None
-) -> Tensor:
-    """(B, 3) features that separate right from wrong results, in the order of ``RANKING_FEATURES``.
+def detection_probability(score: float, similarity: float, *, learned: bool) -> float:
+    """Probability that a photograph shows the object in a box.
 
-    similarity: normalised correlation of the result's view, in [0, 1]. margin: log S - log S' to the best view more
-    than 30 degrees away, clamped to +-5. concentration: the fraction of the sum of S^4 over all views that lies within
-    30 degrees of the result. The last two are NaN where no view is that far away.
+    Args:
+        score: the detector's, of the box.
+        similarity: normalised correlation of the box's best view.
+        learned: whether the detector's features are; without, only the similarity counts.
+
+    Example:
+        >>> detection_probability(8.0, 0.9, learned=True) > detection_probability(4.0, 0.6, learned=True)
+        True
+    """
+    if not learned:
+        return LogisticModel.named("detection without networks")({"similarity": similarity})
+    return LogisticModel.named("detection")({"score": score, "similarity": similarity})
+
+
+def concentration(ranking: Ranking, rotations: Tensor, symmetries: Tensor | None = None) -> Tensor:
+    """(B,) float64 fraction of the sum of S^4 over all views that lies within 30 degrees of the best view.
+
+    It is NaN where no view is further away.
 
     Args:
         ranking: of N views for B photographs.
         rotations: (N, 3, 3) of the views.
-        answer: (B,) views that are the results; default the best of each ranking.
         symmetries: (K, 4, 4) or (K, 3, 3) of the mesh: views that differ by one of them count as the same.
-    """
-    scores = ranking.scores.double()
-    best = ranking.order[:, :1] if answer is None else answer.to(ranking.order)[:, None]
-    group = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
-    equivalent = rotations[best] @ group.to(rotations)  # (B, K, 3, 3)
-    traces = (equivalent.flatten(2) @ rotations.flatten(1).T).amax(dim=1)
-    near = traces >= 1.0 + 2.0 * math.cos(math.radians(_APART)) - 1e-5
-    tiny = 1e-300  # all scores may be 0
-    leader = scores.gather(1, best).clamp(min=tiny)
-    rival = scores.masked_fill(near, 0.0).amax(dim=1, keepdim=True)
-    margin = (leader / rival.clamp(min=tiny)).log().clamp(-MARGIN, MARGIN)
-    weights = (scores / scores.amax(dim=1, keepdim=True).clamp(min=tiny)) ** 4
-    concentration = (weights * near).sum(dim=1, keepdim=True) / weights.sum(dim=1, keepdim=True).clamp(min=tiny)
-    alone = near.all(dim=1, keepdim=True)
-    parts = [ranking.hog.gather(1, best), *(x.masked_fill(alone, torch.nan) for x in (margin, concentration))]
-    return torch.cat([part.double() for part in parts], dim=1).float()
-
-
-def ranking_features(evidence: Tensor) -> dict[str, float | None]:
-    """Features by name of one ranking, from (3,) :func:`ranking_evidence`; None instead of NaN."""
-    return {n: None if math.isnan(v) else v for n, v in zip(RANKING_FEATURES, evidence.tolist(), strict=True)}
-
-
-def confidence(ranking: Ranking, rotations: Tensor, *, exact: bool = False, symmetries: Tensor | None = None) -> Tensor:
-    """Probability that the best view is within 30 degrees of the truth, from :func:`ranking_evidence`.
-
-    Args:
-        ranking, rotations, symmetries: see :func:`ranking_evidence`.
-        exact: whether the mesh is that of this very object, or only of a similar one.
-
-    Returns:
-        (B,) in (0, 1).
 
     Example:
-        >>> one = torch.tensor([[1.0, 0.0]])
         >>> R = torch.stack([torch.eye(3), torch.diag(torch.tensor([1.0, -1.0, -1.0]))])
-        >>> clear, tied = (Ranking(s, torch.tensor([[0, 1]]), {"hog": 0.9 * s}) for s in (one, torch.ones(1, 2)))
-        >>> bool(confidence(clear, R) > confidence(tied, R))
-        True
+        >>> concentration(Ranking(torch.tensor([[1.0, 0.5]]), torch.tensor([[0, 1]]), {}), R).tolist()
+        [0.9411764705882353]
     """
-    model = confidence_model(model_name("ranking", exact=exact, with_appearance="appearance" in ranking.terms))
-    evidence = ranking_evidence(ranking, rotations, symmetries=symmetries)
-    return torch.tensor([model(ranking_features(one)) for one in evidence])
+    scores = ranking.scores.double()
+    group = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
+    equivalent = rotations[ranking.order[:, :1]] @ group.to(rotations)  # (B, K, 3, 3)
+    traces = (equivalent.flatten(2) @ rotations.flatten(1).T).amax(dim=1)
+    near = traces >= 1.0 + 2.0 * math.cos(math.radians(RIVAL_ANGLE)) - 1e-5
+    tiny = 1e-300  # all scores may be 0
+    weights = (scores / scores.amax(dim=1, keepdim=True).clamp(min=tiny)) ** 4
+    share = (weights * near).sum(dim=1) / weights.sum(dim=1).clamp(min=tiny)
+    return share.masked_fill(near.all(dim=1), torch.nan)
 
 
-def confidence_features(evidence: Tensor, scores: Tensor, concentration: float | None) -> dict[str, float | None]:
+def confidence_features(evidence: Tensor, scores: Tensor, share: float) -> dict[str, float | None]:
     """``CONFIDENCE_FEATURES`` of the best hypothesis of one photograph.
 
-    similarity, edge_support: of the best hypothesis. lead, appearance_lead: its score, and its appearance score, minus
-    the largest of its rivals, clamped to +-5; None without rivals. concentration: see :func:`ranking_evidence`.
+    similarity, edge_support: of the best hypothesis. margin: its score minus the largest of its rivals, clamped to
+    +-5; None without rivals. concentration: of the ranking; None without views that are far from the best.
 
     Args:
         evidence: (H, 4) :data:`POSE_FEATURES` of the hypotheses, the best first.
-        scores: (H,) of :func:`rescore`.
-        concentration: of the ranking.
+        scores: (H,) by which they are ordered.
+        share: of :func:`concentration`.
     """
     _, similarity, edge_support, _ = evidence[0].tolist()
-    values = (similarity, _lead(scores), edge_support, _lead(evidence[:, 3]), concentration)
-    return dict(zip(CONFIDENCE_FEATURES, values, strict=True))
+    rivals = scores[1:]
+    margin = min(max(float(scores[0] - rivals.max()), -MAX_MARGIN), MAX_MARGIN) if len(rivals) else None
+    return {
+        "similarity": similarity,
+        "margin": margin,
+        "edge_support": edge_support,
+        "concentration": None if math.isnan(share) else share,
+    }
 
 
-def _lead(values: Tensor) -> float | None:
-    """The first value minus the largest of the others, clamped to +-``MARGIN``."""
-    return float((values[0] - values[1:].max()).clamp(-MARGIN, MARGIN)) if len(values) > 1 else None
+def hypothesis_probabilities(confidence: float, scores: Tensor, *, exact: bool) -> tuple[float, ...]:
+    r"""Probability of each hypothesis of one photograph to be within 30 degrees of the truth.
 
+    If the first is wrong, rival :math:`k` is right with a probability in proportion to :math:`e^{a (s_k - s_1)}`, s_1
+    being the score of the best rival, and none of them in proportion to :math:`e^b`.
 
-def presence_features(score: float, ranking: Ranking, *, learned: bool) -> list[float]:
-    """``PRESENCE_FEATURES`` of a box: the locator's score, and the best correlation of its ranking (B = 1).
-
-    The score of a locator that is not ``learned`` is not informative, and left out.
-    """
-    similarity = float(ranking.hog.detach().max())
-    return [score, similarity] if learned else [similarity]
-
-
-def presence(evidence: Sequence[float]) -> float:
-    """Probability that the photograph shows the object, from :func:`presence_features`.
+    Args:
+        confidence: probability of the first hypothesis.
+        scores: (H,) by which hypotheses are ordered, the first hypothesis first.
+        exact: see :func:`model_name`.
 
     Example:
-        >>> presence([8.0, 0.9]) > presence([4.0, 0.6])
-        True
+        >>> [round(p, 2) for p in hypothesis_probabilities(0.6, torch.tensor([3.0, 1.0, 1.0]), exact=True)]
+        [0.6, 0.12, 0.12]
     """
-    weights, bias = _PRESENCE[len(evidence)]
-    names = PRESENCE_FEATURES[-len(evidence) :]
-    model = LogisticModel(dict(zip(names, weights, strict=True)), bias)
-    return model(dict(zip(names, evidence, strict=True)))
+    constants = CALIBRATION[model_name(exact=exact)]
+    rivals = scores[1:].double()
+    rivals = constants["slope"] * (rivals - rivals.max()) if len(rivals) else rivals
+    logits = torch.cat([rivals, torch.tensor([constants["none"]], dtype=torch.float64)])
+    return confidence, *((1.0 - confidence) * logits.softmax(dim=0))[:-1].tolist()

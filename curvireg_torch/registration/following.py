@@ -6,37 +6,43 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..errors import LostObjectError
+from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..geometry.cameras import rotation_towards
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_tensor
 from ..utils.threads import map_on_threads
-from .answer_set import AnswerSet
 from .inputs import ImageItem, image_items
-from .refinement import nearest_view, refine
+from .refinement import nearest_view, refine_item
 from .registrar import Registrar
-from .results import FailedRegistration, Hypothesis, Registration
+from .result import FailedRegistration, Hypothesis, Registration
 from .tracker import TrackedPose, Tracker
 
 __all__ = ["Follower"]
 
-TRUSTED, KEPT = 0.5, 0.2
-"""Confidence from which a tracked pose stands without a search, and after a search that found no better one."""
+TRUSTED_CONFIDENCE, KEPT_CONFIDENCE = 0.5, 0.2
+"""Tracking confidence from which a tracked pose stands without a refinement, and after one that was no better."""
+
+BELIEVED_CONFIDENCE = 0.5
+"""Confidence of a registration from which it is followed; below, the next frame is registered again."""
 
 
 class Follower:
     """Registers frames one after the other: each starts from the pose of the frame before.
 
-    The first frame is registered, unless :meth:`start` gives its pose. Every further frame is tracked (docs/method.md).
-    Where tracking is not trusted, a search around its pose follows (:func:`refine`), and the more certain pose counts;
-    where neither finds the object, the frame is registered, and that pose is used only if it is reliable.
+    The first frame is registered, unless :meth:`start` gives its pose, and so is every further one until a pose is
+    believed. From then on frames are tracked (docs/method.md). Where tracking is not trusted, contours are fitted
+    around its pose (:func:`refine`), and the more certain pose counts; where neither finds the object, the frame is
+    registered, and that pose is used only if it is reliable.
 
     The ``confidence`` of a tracked frame is the probability that its pose is within 10 degrees and 10 % of the distance
-    of the truth: the tracker's own, times that of the pose from which tracking began.
+    of the truth: the tracker's own, times that of the pose from which tracking began. It never exceeds the latter.
 
     Args:
-        registrar: of the mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
+        registrar: of one mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
         camera_matrix: (3, 3) in px, of all frames.
+
+    Raises:
+        InvalidInputError: a registrar of several meshes.
 
     Example:
         >>> import curvireg_torch as cr
@@ -49,10 +55,12 @@ class Follower:
 
     def __init__(self, registrar: Any, camera_matrix: Tensor) -> None:
         self.registrar = registrar if isinstance(registrar, Registrar) else Registrar(registrar)
+        if self.registrar.others:
+            raise InvalidInputError("Follower: expected a registrar of one mesh, which is followed, got several")
         self.camera_matrix = camera_matrix
-        describer = self.registrar.describers[0]
+        describer = self.registrar.describer
         self._tracker = Tracker(describer.renderer, describer.contours, describer.hull)
-        self._known = 0.0  # confidence of the pose from which tracking began; 0: there is none
+        self._start_confidence = 0.0  # of the pose from which tracking began; 0: there is none
 
     def start(self, image: Any, pose: Any) -> None:
         """Begin from a known pose, in place of registering the first frame.
@@ -94,14 +102,14 @@ class Follower:
         if not isinstance(item, ImageItem):
             return FailedRegistration(item)
         boxes = None if box is None else [box]
-        if not self._known:
+        if not self._start_confidence:
             result = self.registrar([item.image], boxes, self.camera_matrix)[0]
-            if isinstance(result, Registration):
+            if isinstance(result, Registration) and (result.confidence or 0.0) >= BELIEVED_CONFIDENCE:
                 self._begin(item, result)
             return result
         tracked = map_on_threads(lambda item: self._track(item), [item])[0]
         found = None if tracked is None else self._registration(tracked, item)
-        if tracked and found and found.confidence >= TRUSTED:
+        if tracked and found and tracked.confidence >= TRUSTED_CONFIDENCE:
             self._tracker.accept(tracked)
             return found
         return self._search(item, boxes, tracked, found)
@@ -109,19 +117,18 @@ class Follower:
     def _begin(self, item: ImageItem, result: Registration) -> None:
         """Track from a registered pose, if it lies within the frame."""
         with suppress(LostObjectError):
-            self._start(item, _pose(result), result.confidence)
+            self._start(item, _pose(result), result.confidence or 0.0)
 
     @torch.no_grad()
     def _start(self, item: ImageItem, T: Tensor, confidence: float) -> None:
         map_on_threads(lambda T: self._tracker.start(item.image, _camera(item), T), [T])
-        self._known = confidence
+        self._start_confidence = confidence
 
     def _continue(self, item: ImageItem, result: Registration) -> None:
         """Track on from a pose that the search found, if it lies within the frame."""
         with suppress(LostObjectError):
             pose = map_on_threads(lambda T: self._tracker.measure(item.image, _camera(item), T), [_pose(result)])[0]
             self._tracker.accept(pose)
-            self._known = result.confidence
 
     def _track(self, item: ImageItem) -> TrackedPose | None:
         try:
@@ -134,15 +141,24 @@ class Follower:
     ) -> Registration | FailedRegistration:
         """The pose in a frame in which tracking ``found`` a doubtful one, or none."""
         starts = [self._tracker.last_pose] if tracked is None else [tracked.T, self._tracker.last_pose]
-        K = self.camera_matrix
-        result = refine(self.registrar, [item.image], K, [torch.cat(starts)])[0]
-        if isinstance(result, Registration) and (found is None or result.confidence > found.confidence):
+        limit = self._start_confidence
+        result: Registration | FailedRegistration
+        try:
+            result = map_on_threads(
+                lambda T: refine_item(self.registrar, item, T, limit=limit, check=False), [torch.cat(starts)]
+            )[0]
+        except CurviregError as error:
+            result = FailedRegistration(error)
+        better = isinstance(result, Registration) and (
+            found is None or (result.confidence or 0.0) > (found.confidence or 0.0)
+        )
+        if better and isinstance(result, Registration):
             self._continue(item, result)
             return result
-        if tracked and found and found.confidence >= KEPT:
+        if tracked and found and tracked.confidence >= KEPT_CONFIDENCE:
             self._tracker.accept(tracked)
             return found
-        registered = self.registrar([item.image], boxes, K)[0]
+        registered = self.registrar([item.image], boxes, self.camera_matrix)[0]
         if isinstance(registered, Registration) and registered.reliable:
             self._begin(item, registered)
             return registered
@@ -166,8 +182,9 @@ class Follower:
             edge_support=support,
             covariance=covariance if bool(covariance.isfinite().all()) else None,
         )
-        answers = AnswerSet((self._known * tracked.confidence,))
-        return Registration((hypothesis,), answers, Ranking.none(), dict(tracked.features), warnings=item.warnings)
+        probabilities = (self._start_confidence * tracked.confidence,)
+        warnings = item.warnings + self.registrar.mesh_warnings
+        return Registration((hypothesis,), probabilities, Ranking.none(), dict(tracked.features), warnings=warnings)
 
 
 def _camera(item: ImageItem) -> Tensor:

@@ -1,48 +1,97 @@
-"""Localization: objects are registered in photographs that come without a box."""
+"""Localization: objects are found and registered in photographs that come without a box.
 
+A few representative views are compared with every position of the photograph; the best boxes are ranked as given boxes
+are, and the most certain ones are registered.
+"""
+
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..errors import CurviregError, InvalidInputError
-from ..geometry.crops import box_iou, non_maximum_suppression
-from ..geometry.pose_prior import PosePrior
-from ..matching import Ranking
-from ..terms import QueryFeatures
-from .confidence import presence, presence_features
-from .correction import projected_box
-from .estimator import PoseEstimator
+from ..features import orientation_cells
+from ..features.backbone import STRIDES, Backbone
+from ..geometry.crops import box_iou, crop_transforms, non_maximum_suppression, square_boxes
+from ..geometry.pose_prior import PosePrior, check_distance
+from ..matching import Ranking, ViewBank, ViewDescriber, ViewMatcher
+from ..pipeline import Pipeline
+from ..terms import Appearance, QueryFeatures, photograph_field
+from ..utils.checks import as_numbers, check_camera_matrix, check_photograph, check_pixels, check_square_pixels
+from .confidence import detection_probability
 from .inputs import ImageItem, check_crop, image_items
-from .locator import Located
-from .locator.locator import OVERLAP
+from .poses import projected_box
 from .priors import BatchPriors
-from .results import FailedRegistration, Localization, Registration
+from .result import FailedRegistration, Localization, Registration
 
-__all__ = ["ScoredCandidates", "localize"]
+if TYPE_CHECKING:
+    from .registrar import Registrar
 
-_Result = Registration | FailedRegistration
+__all__ = ["Located", "Locator", "localize", "locate", "representative_views"]
+
+EMPTY_CELL_ENERGY = 0.01
+"""Fraction of the strongest edges' energy below which a cell counts as without edges."""
+
+TEMPLATE_SIDE = 96
+"""Side of the template views in px."""
+
+SIZE_STEP = 2.0**0.5
+"""Factor between successive sizes of the object."""
+
+SAME_OBJECT_OVERLAP = 0.5
+"""Intersection over union from which boxes show the same object."""
+
+MIN_OBJECT_SIDE = 32.0
+"""Longer side in px of the smallest object that can be recognised."""
+
+MAX_PEAKS = 500
+"""Best peaks of a photograph that boxes are selected from."""
+
+MAX_COMPARED_VIEWS = 1500
+"""Largest number of views, evenly spread over the bank, whose pairwise distances are computed."""
+
+MEDOID_ROUNDS = 10
+"""Largest number of rounds of k-medoids."""
+
+Results = list[Registration | FailedRegistration]
+
+
+@dataclass(frozen=True)
+class Located:
+    """Boxes of one photograph, best first.
+
+    Attributes:
+        boxes: (P, 4) x0, y0, x1, y1 in px, of the whole object: they may extend beyond the image.
+        scores: (P,) similarity, in standard deviations above the view's mean over the photograph.
+        views: (P,) int64 view of the bank.
+    """
+
+    boxes: Tensor
+    scores: Tensor
+    views: Tensor
 
 
 @torch.no_grad()
 def localize(
-    registrar: PoseEstimator,
+    registrar: "Registrar",
     images: Tensor | Sequence[Any],
     camera_matrices: Any | None = None,
     *,
     instances: int = 1,
     prior: PosePrior | Sequence[PosePrior | None] | None = None,
-) -> list[list[_Result]]:
+) -> list[Results]:
     """Find and register objects in whole photographs, the most certain first.
 
     The locator's best proposals are ranked as given boxes are, which yields the probability that each shows the object;
     the most certain are registered. The box around each pose is ranked too, and registered where it is more certain.
 
     Args:
-        registrar: :class:`Registrar` of the meshes.
+        registrar: :class:`Registrar` of the mesh.
         images, camera_matrices, prior: see :class:`Registrar`.
         instances: largest number of objects in each photograph.
 
@@ -55,9 +104,9 @@ def localize(
     """
     if instances < 1:
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
-    _ = registrar.locator  # create it once, before threads use it
+    locator = registrar.locator  # created once, before threads use it
 
-    def localize_one(item: ImageItem | CurviregError, index: int) -> list[_Result]:
+    def localize_one(item: ImageItem | CurviregError, index: int) -> Results:
         if not isinstance(item, ImageItem):
             return [FailedRegistration(item)]
         registrar.report_progress("localization")
@@ -67,7 +116,7 @@ def localize(
             limits: dict[str, Any] = {}
             if item.prior is not None:
                 limits = {"distance": item.prior.distance, "allowed": _allowed_views(registrar, item)}
-            located = registrar.locator([item.image], camera_matrices=cameras, **limits)[0]
+            located = locator([item.image], camera_matrices=cameras, **limits)[0]
             if not len(located.boxes):
                 raise InvalidInputError(
                     "nothing of such a size fits into the photograph; give other distances, or the box"
@@ -82,7 +131,7 @@ def localize(
     )
 
 
-def _allowed_views(estimator: PoseEstimator, item: ImageItem) -> Tensor:
+def _allowed_views(registrar: "Registrar", item: ImageItem) -> Tensor:
     """(N,) bool: views of the bank that the prior does not exclude everywhere in the photograph, which is the box."""
     off_centre = 0.0
     if item.camera_matrix is not None:
@@ -90,19 +139,31 @@ def _allowed_views(estimator: PoseEstimator, item: ImageItem) -> Tensor:
         points = torch.tensor([((x0 + x1) / 2, (y0 + y1) / 2, 1), (x0, y0, 1), (x1, y0, 1), (x0, y1, 1), (x1, y1, 1)])
         rays = F.normalize(torch.linalg.solve(item.camera_matrix.double(), points.double().T), dim=0)
         off_centre = float(torch.rad2deg(torch.acos((rays[:, :1] * rays[:, 1:]).sum(dim=0).clamp(-1, 1).min())))
-    return BatchPriors([item], estimator.bank).log_prior(estimator.bank, off_centre=off_centre)[0].isfinite()
+    return BatchPriors([item], registrar.bank).allowed(registrar.bank, off_centre=off_centre)[0]
 
 
 def _register_candidates(
-    estimator: PoseEstimator, item: ImageItem, located: Located, instances: int
+    registrar: "Registrar", item: ImageItem, located: Located, instances: int
 ) -> list[Registration]:
-    """The most certain objects, at most ``instances``, whose boxes do not overlap."""
-    count = max(estimator.pipeline.locate.candidates, instances + 1)
-    candidates = ScoredCandidates.score_boxes(estimator, item, located.boxes[:count], located.scores[:count])
+    """The most certain objects, at most ``instances``, whose boxes do not overlap.
+
+    Raises:
+        CurviregError: of the best candidate, if none can be registered.
+    """
+    count = max(registrar.pipeline.locate.candidates, instances + 1)
+    candidates, failed = [], None
+    for box, score in zip(located.boxes[:count], located.scores[:count].tolist(), strict=True):
+        try:
+            candidates.append(Candidate.ranked(registrar, item, box, score))
+        except CurviregError as error:  # such as limits on the pose that leave no view here
+            failed = failed or error
+    if not candidates and failed is not None:
+        raise failed
+    boxes, presence = torch.stack([c.box for c in candidates]), torch.tensor([c.presence for c in candidates])
     results: list[Registration] = []
-    for k in non_maximum_suppression(candidates.boxes, candidates.presence, OVERLAP).tolist():
+    for k in non_maximum_suppression(boxes, presence, SAME_OBJECT_OVERLAP).tolist():
         if len(results) < instances:
-            _add(results, _refined(estimator, item, candidates.register(estimator, item, k)))
+            _add(results, _refined(registrar, item, candidates[k].register(registrar, item)))
     return sorted(results, key=_presence, reverse=True)
 
 
@@ -110,12 +171,12 @@ def _with_proposals(results: list[Registration], located: Located) -> list[Regis
     """Results with all proposals, their own boxes first, and with ``presence`` as a factor of their probabilities."""
     boxes = torch.cat([torch.stack([localization_of(r).box for r in results]), located.boxes.double()])
     scores = torch.cat([torch.tensor([localization_of(r).score for r in results]), located.scores])
-    kept = non_maximum_suppression(boxes, -torch.arange(len(boxes)), OVERLAP)  # in their present order
+    kept = non_maximum_suppression(boxes, -torch.arange(len(boxes)), SAME_OBJECT_OVERLAP)  # in their present order
     return [
         replace(
             result,
             localization=replace(localization_of(result), boxes=boxes[kept], scores=scores[kept]),
-            answer_set=result.answer_set.scaled(_presence(result)),
+            probabilities=tuple(p * _presence(result) for p in result.probabilities),
         )
         for result in results
     ]
@@ -125,56 +186,51 @@ def _add(results: list[Registration], new: Registration) -> None:
     """Add a result. Of results whose boxes overlap the most certain is kept: proposals may lead to the same object."""
     boxes = torch.stack([localization_of(new).box, *(localization_of(result).box for result in results)])
     overlap = box_iou(boxes[:1], boxes[1:])[0].tolist()
-    same = [result for result, iou in zip(results, overlap, strict=True) if iou > OVERLAP]
+    same = [result for result, iou in zip(results, overlap, strict=True) if iou > SAME_OBJECT_OVERLAP]
     if all(_presence(new) > _presence(result) for result in same):
         results[:] = [result for result in results if not any(result is other for other in same)]
         results.append(new)
 
 
 @dataclass(frozen=True)
-class ScoredCandidates:
-    """P boxes of one photograph, described and ranked, with the probability that each shows the object."""
+class Candidate:
+    """A box (4,) of a photograph, described and ranked, with the detector's ``score`` and the probability ``presence``
+    that it shows the object."""
 
-    boxes: Tensor
-    scores: Tensor
+    box: Tensor
+    score: float
     query: QueryFeatures
     ranking: Ranking
-    evidence: list[list[float]]
-    presence: Tensor
+    presence: float
 
     @classmethod
-    def score_boxes(
-        cls, estimator: PoseEstimator, item: ImageItem, boxes: Tensor, scores: Tensor
-    ) -> "ScoredCandidates":
-        """Rank P boxes (P, 4) with the locator's ``scores`` (P,)."""
-        query = estimator.matcher.query([item.image] * len(boxes), boxes)
-        log_prior = None
+    def ranked(cls, registrar: "Registrar", item: ImageItem, box: Tensor, score: float) -> "Candidate":
+        """Rank a box (4,) with the detector's score."""
+        query = registrar.matcher.query([item.image], box[None].float())
+        allowed = None
         if item.prior is not None:
-            each = [replace(item, box=box) for box in boxes.float()]
-            log_prior = BatchPriors(each, estimator.bank).log_prior(estimator.bank)
-        ranking = estimator.matcher.rank(query, log_prior)
-        learned, numbers = estimator.locator.features.learned, scores.tolist()
-        evidence = [presence_features(s, ranking[k : k + 1], learned=learned) for k, s in enumerate(numbers)]
-        probability = torch.tensor([presence(features) for features in evidence], dtype=torch.float64)
-        return cls(boxes, scores, query, ranking, evidence, probability)
+            allowed = BatchPriors([replace(item, box=box.float())], registrar.bank).allowed(registrar.bank)
+        ranking = registrar.matcher.rank(query, allowed)
+        similarity = float(ranking.hog[0, ranking.order[0, 0]])
+        learned = registrar.locator.features.learned
+        return cls(box, score, query, ranking, detection_probability(score, similarity, learned=learned))
 
-    def register(self, estimator: PoseEstimator, item: ImageItem, k: int) -> Registration:
-        """Register box ``k``; the result's box is the one around its pose."""
-        one = slice(k, k + 1)
-        result = estimator.register([replace(item, box=self.boxes[k])], self.query[one], self.ranking[one])[0]
-        box, none = projected_box(estimator, result), (self.boxes[:0].double(), self.scores[:0])
-        where = Localization(box, float(self.presence[k]), float(self.scores[k]), *none)
-        return replace(result, localization=where)
+    def register(self, registrar: "Registrar", item: ImageItem) -> Registration:
+        """Register the box; the result's box is the one around its pose."""
+        result = registrar.register([replace(item, box=self.box.float())], self.query, self.ranking)[0]
+        box = projected_box(registrar.describer, result.projection)
+        none = torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0)
+        return replace(result, localization=Localization(box, self.presence, self.score, *none))
 
 
-def _refined(estimator: PoseEstimator, item: ImageItem, result: Registration) -> Registration:
+def _refined(registrar: "Registrar", item: ImageItem, result: Registration) -> Registration:
     """The more certain one of a result and of the registration of the box around its pose."""
     where = localization_of(result)
     try:
-        candidates = ScoredCandidates.score_boxes(estimator, item, where.box[None].float(), torch.tensor([where.score]))
+        candidate = Candidate.ranked(registrar, item, where.box, where.score)
     except InvalidInputError:  # the projected mesh lies outside the photograph: nothing there supports the pose
         return replace(result, localization=replace(where, presence=0.0))
-    return result if float(candidates.presence[0]) <= where.presence else candidates.register(estimator, item, 0)
+    return result if candidate.presence <= where.presence else candidate.register(registrar, item)
 
 
 def _extremes(image: Tensor) -> Tensor:
@@ -191,3 +247,350 @@ def localization_of(result: Registration) -> Localization:
 
 def _presence(result: Registration) -> float:
     return localization_of(result).presence
+
+
+class DenseFeatures(nn.Module, ABC):
+    """Feature maps at one stride, or at two, the second twice the first.
+
+    Attributes:
+        strides: px of a cell.
+        learned: whether a network computes them.
+    """
+
+    strides: tuple[int, ...]
+    learned: bool
+
+    def comparable(self, cells: Tensor, common: Tensor) -> Tensor:
+        """(B, C, h, w) unit features without what they have in common: (C, 1, 1) means over photograph or object."""
+        return F.normalize(cells - common, dim=1)
+
+    @abstractmethod
+    def of_photograph(self, image: Tensor) -> list[Tensor]:
+        """(1, C, H / stride, W / stride) for each stride, of a (1, 1 or 3, H, W) image in [0, 1]."""
+
+    @abstractmethod
+    def of_views(self, describer: ViewDescriber, rotations: Tensor, distances: Tensor, side: int) -> list[list[Tensor]]:
+        """(K, C, side / stride, side / stride) for each shading of K views of a mesh and each stride."""
+
+
+class BackboneFeatures(DenseFeatures):
+    """Features of the appearance term's network. Views are shaded grey, and in colour where the mesh has colours."""
+
+    strides = STRIDES
+    learned = True
+
+    def __init__(self, backbone: Backbone) -> None:
+        super().__init__()
+        self.backbone = backbone
+
+    def of_photograph(self, image: Tensor) -> list[Tensor]:
+        return [f / s[:, None, None] for f, s in zip(self.backbone(image), self.backbone.spreads, strict=True)]
+
+    def of_views(self, describer: ViewDescriber, rotations: Tensor, distances: Tensor, side: int) -> list[list[Tensor]]:
+        pictures = describer.shaded(rotations, distances)
+        small = F.interpolate(pictures, size=(side, side), mode="bilinear", antialias=True, align_corners=False)
+        return [self.of_photograph(shaded) for shaded in (small[:, :1], small[:, 1:]) if shaded.shape[1]]
+
+
+class FieldFeatures(DenseFeatures):
+    """Orientation histograms of the photograph's field and of depth fields, for classical pipelines."""
+
+    strides = (8,)
+    learned = False
+
+    def __init__(self, field: nn.Module) -> None:
+        super().__init__()
+        self.field = field
+
+    def comparable(self, cells: Tensor, common: Tensor) -> Tensor:
+        """Divided by the norm of the surrounding cells, as blocks of HOG are; cells without edges are near 0."""
+        around = F.avg_pool2d(cells.square().sum(dim=1, keepdim=True), 3, stride=1, padding=1)
+        return cells / (around + EMPTY_CELL_ENERGY * around.amax(dim=(2, 3), keepdim=True)).clamp(min=1e-12).sqrt()
+
+    def of_photograph(self, image: Tensor) -> list[Tensor]:
+        H, W = image.shape[-2:]
+        return [orientation_cells(photograph_field(self.field, image), grid=(H // 8, W // 8))]
+
+    def of_views(self, describer: ViewDescriber, rotations: Tensor, distances: Tensor, side: int) -> list[list[Tensor]]:
+        return [[orientation_cells(describer.fields(rotations, distances), grid=(side // 8, side // 8))]]
+
+
+def dense_features_for(matcher: ViewMatcher) -> DenseFeatures:
+    """Features of the backbone, or of fields for pipelines without anything learned."""
+    pipeline = matcher.pipeline
+    if pipeline.field == "learned" or any(term.name == Appearance.name for term in pipeline.terms):
+        networks = (module for module in matcher.modules() if isinstance(module, Backbone))
+        return BackboneFeatures(next(networks, None) or Backbone()).to(matcher.device)
+    return FieldFeatures(matcher.field).to(matcher.device)
+
+
+@dataclass(frozen=True)
+class _Templates:
+    """K views of a bank, and their weights (K, C, h, w) for each stride and each shading.
+
+    ``boxes`` (K, 4) are in px of the templates, from the outer border; at the distances ``unit`` (K,) a camera with a
+    focal length of 1 px sees the object at this size.
+    """
+
+    views: Tensor
+    weights: list[list[Tensor]]
+    boxes: Tensor
+    unit: Tensor
+
+
+class Locator(nn.Module):
+    r"""Searches whole photographs for a bank's objects, in place of a detector.
+
+    A few representative views (:func:`representative_views`) are compared with every position of the photograph, at
+    sizes in steps of :math:`\sqrt 2`. A view's similarity is the mean cosine of its dense features
+    (:class:`.DenseFeatures`) and the photograph's over the cells that it covers; its score is the similarity in
+    standard deviations above its mean over the photograph. Peaks over position, size and view are boxes.
+
+    Args:
+        matcher: of the bank; ``locate`` of its pipeline holds the settings. For an example see :func:`locate`.
+    """
+
+    def __init__(self, matcher: ViewMatcher) -> None:
+        super().__init__()
+        self.matcher, self.settings = matcher, matcher.pipeline.locate
+        self.features = dense_features_for(matcher)
+        self._templates = _templates(self.features, matcher, self.settings.views)
+
+    @cached_property
+    def _template_of_view(self) -> Tensor:
+        """(N,) template that stands for each view of the bank."""
+        return _nearest_representatives(self.matcher.bank, self._templates.views)
+
+    @torch.no_grad()
+    def forward(
+        self,
+        images: Tensor | Sequence[Tensor],
+        *,
+        camera_matrices: Sequence[Tensor | None] | None = None,
+        distance: tuple[float, float] | None = None,
+        allowed: Tensor | None = None,
+    ) -> list[Located]:
+        """Boxes of each photograph, independent of the others.
+
+        Args:
+            images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, floating in [0, 1] or uint8.
+            camera_matrices: (3, 3) of each in px, for ``distance``.
+            distance: range of the distance of the object's centre, in the mesh's unit.
+            allowed: (N,) bool; views that stand for none of these views of the bank are not compared.
+
+        Raises:
+            InvalidInputError: wrong shape or dtype, or a ``distance`` without cameras or not 0 < NEAR <= FAR.
+            ImageError: missing pixels (NaN or infinite), or pixels outside [0, 1].
+        """
+        check_distance(distance)
+        if distance is not None and (camera_matrices is None or any(K is None for K in camera_matrices)):
+            raise InvalidInputError("distance: needs the camera matrix of every photograph")
+        out = []
+        for i, image in enumerate(images):
+            K = None if camera_matrices is None else camera_matrices[i]
+            if K is not None:
+                K = as_numbers(K, "camera_matrices", dtype=torch.float64)
+                check_camera_matrix(K)
+                check_square_pixels(K)
+            out.append(self._locate(image, None if K is None else float(K[0, 0]), distance, allowed))
+        return out
+
+    def _locate(
+        self, image: Tensor, focal: float | None, distance: tuple[float, float] | None, views: Tensor | None
+    ) -> Located:
+        check_photograph(image)
+        templates = self._templates
+        usable = torch.ones(len(templates.views), dtype=torch.bool)
+        if views is not None:
+            usable = torch.zeros_like(usable).index_fill(0, self._template_of_view[views.cpu()], True)
+        side = (templates.boxes[:, 2:] - templates.boxes[:, :2]).amax(dim=1)
+        scales = self._scales(image, focal, distance, float(side.quantile(0.5)))
+        maps, allowed, ratios = [], [], []
+        largest: Tensor | None = None  # comes first; the smaller copies are resized from it
+        for scale in scales:
+            h, w = (max(1, round(s * scale / 16)) * 16 for s in image.shape[-2:])
+            if largest is None:
+                largest = _resized(image, (h, w)).to(self.matcher.device)
+                check_pixels(largest, "of the photograph")  # on the resized copy, which missing pixels spread to
+            maps.append(self._similarity(_resized(largest, (h, w))[None]))
+            ratios.append((w / image.shape[-1], h / image.shape[-2]))
+            fits = usable.to(side.device)
+            if distance is not None and focal is not None:
+                away = templates.unit * focal * scale
+                fits = fits & (away >= distance[0] / SIZE_STEP**0.5) & (away <= distance[1] * SIZE_STEP**0.5)
+            allowed.append(fits)
+        if not maps:
+            return Located(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, dtype=torch.long))
+        return self._peaks(maps, allowed, ratios)
+
+    def _scales(
+        self, image: Tensor, focal: float | None, distance: tuple[float, float] | None, side: float
+    ) -> list[float]:
+        """Factors by which the photograph is resized, so that objects of all sizes match templates of ``side`` px."""
+        longer = float(max(image.shape[-2:]))
+        small, large = min(max(self.settings.min_size * longer, MIN_OBJECT_SIDE), longer), longer
+        if focal is not None and distance is not None:
+            extent = side * focal * self._templates.unit  # px at distance 1
+            small = max(small, float(extent.min()) / distance[1])
+            large = min(large, float(extent.max()) / distance[0])
+        scales, size = [], small
+        while size <= large * SIZE_STEP**0.5:
+            scales.append(side / size)
+            size *= SIZE_STEP
+        return scales
+
+    def _similarity(self, image: Tensor) -> Tensor:
+        """(K, h, w) mean cosines; position (i, j) is that of a view whose centre is at px 8 i, 8 j."""
+        cosines: list[Tensor] = []
+        for cells, weights in zip(self.features.of_photograph(image), self._templates.weights, strict=True):
+            cells = self.features.comparable(cells, cells.mean(dim=(0, 2, 3))[:, None, None])
+            padded = F.pad(cells, (weights[0].shape[-1] // 2,) * 4)
+            cosines.append(torch.stack([F.conv2d(padded, shading)[0] for shading in weights]).amax(dim=0))
+        size = cosines[0].shape[1:]
+        fine = [F.interpolate(c[None], size=size, mode="bilinear", align_corners=True)[0] for c in cosines[1:]]
+        return sum(fine, cosines[0]) / len(cosines)
+
+    def _peaks(self, maps: list[Tensor], allowed: list[Tensor], ratios: list[tuple[float, float]]) -> Located:
+        templates = self._templates
+        every = torch.cat([m.flatten(1) for m in maps], dim=1)
+        mean, spread = every.mean(dim=1), every.std(dim=1).clamp(min=1e-6)
+        boxes, scores, views = [], [], []
+        for similarity, fits, ratio in zip(maps, allowed, ratios, strict=True):
+            z = (similarity - mean[:, None, None]) / spread[:, None, None]
+            best, view = z.masked_fill(~fits[:, None, None], -torch.inf).max(dim=0)
+            peak = (best == F.max_pool2d(best[None], 3, stride=1, padding=1)[0]) & best.isfinite()
+            i, j = peak.nonzero(as_tuple=True)
+            corner = torch.stack([j, i], dim=1).repeat(1, 2) * 8.0 - TEMPLATE_SIDE / 2.0
+            boxes.append((templates.boxes[view[i, j]] + corner) / best.new_tensor([*ratio, *ratio]) - 0.5)
+            scores.append(best[i, j])
+            views.append(templates.views[view[i, j].cpu()])
+        score, index = torch.cat(scores).sort(descending=True, stable=True)
+        index = index[:MAX_PEAKS]
+        box, view = torch.cat(boxes)[index], torch.cat(views)[index.cpu()]
+        kept = non_maximum_suppression(box, score[:MAX_PEAKS], SAME_OBJECT_OVERLAP)[: self.settings.proposals]
+        return Located(box[kept].cpu(), score[kept].cpu(), view[kept.cpu()])
+
+
+def _templates(features: DenseFeatures, matcher: ViewMatcher, count: int) -> _Templates:
+    bank = matcher.bank
+    views = representative_views(bank, count)
+    R, z, boxes = bank.rotations[views], bank.distances[views], bank.boxes[views].double()
+    masks = bank.silhouettes_at(views)[:, None].float()
+    weights: list[list[Tensor]] = [[] for _ in features.strides]
+    for maps in features.of_views(matcher.describer, R, z, TEMPLATE_SIDE):
+        for stride, cells, templates in zip(features.strides, maps, weights, strict=True):
+            mask = F.interpolate(masks, size=(TEMPLATE_SIDE // stride, TEMPLATE_SIDE // stride), mode="area")
+            common = (cells * mask).sum(dim=(0, 2, 3)) / mask.sum()
+            unit = features.comparable(cells, common[:, None, None]) * mask
+            templates.append(unit / mask.sum(dim=(2, 3), keepdim=True).clamp(min=1e-6))
+    A = crop_transforms(square_boxes(boxes, bank.settings.margin), TEMPLATE_SIDE)
+    scale, shift = A[:, 0, 0, None], A[:, :2, 2]
+    corners = boxes * scale + shift.repeat(1, 2) + 0.5
+    away = torch.ones_like(z) if bank.settings.camera == "orthographic" else z
+    return _Templates(views.cpu(), weights, corners.float(), (away.to(scale) / scale[:, 0]).float())
+
+
+def _resized(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """(C, h, w) float32 in [0, 1]."""
+    if tuple(image.shape[-2:]) == size and image.is_floating_point():
+        return image.float()
+    options: dict[str, Any] = {"size": size, "mode": "bilinear", "antialias": True, "align_corners": False}
+    # One channel at a time to save memory: photographs are large.
+    small = torch.cat([F.interpolate(channel[None, None].float(), **options)[0] for channel in image])
+    return small / 255.0 if image.dtype == torch.uint8 else small
+
+
+def locate(
+    pipeline: Pipeline,
+    bank: ViewBank,
+    images: Tensor | Sequence[Tensor],
+    *,
+    camera_matrices: Sequence[Tensor | None] | None = None,
+    distance: tuple[float, float] | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Boxes in which photographs may show a bank's object; for many calls, :class:`Locator` is faster.
+
+    Arguments and errors are those of :meth:`Locator.forward`; ``pipeline.locate`` holds the settings.
+
+    Returns:
+        boxes (B, P, 4) x0, y0, x1, y1 in px, and scores (B, P), best first; NaN and -inf where there are fewer than P.
+
+    Example:
+        >>> import trimesh
+        >>> from curvireg_torch.geometry import sample_views
+        >>> bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), sample_views(azimuth_step=45, elevations=[20]),
+        ...                       image_size=64, progress=False)
+        >>> boxes, scores = locate(bank.pipeline, bank, [torch.rand(3, 96, 128)])
+        >>> boxes.shape[:2] == scores.shape
+        True
+    """
+    located = Locator(ViewMatcher(bank, pipeline=pipeline))(images, camera_matrices=camera_matrices, distance=distance)
+    most = max((len(one.scores) for one in located), default=0)
+    boxes = torch.full((len(located), most, 4), torch.nan)
+    scores = torch.full((len(located), most), -torch.inf)
+    for b, one in enumerate(located):
+        boxes[b, : len(one.boxes)], scores[b, : len(one.scores)] = one.boxes, one.scores
+    return boxes, scores
+
+
+def representative_views(bank: ViewBank, count: int) -> Tensor:
+    """Return the k-medoids of a bank's views.
+
+    The distance of two views is the squared distance of their unit descriptors plus that of the logarithms of their
+    boxes' aspect ratios. The first medoid is the most central view, each further one the farthest from those before;
+    views are then assigned to their nearest medoid, and medoids recomputed, until nothing changes.
+
+    Args:
+        bank: of the mesh.
+        count: of medoids; a smaller bank returns all its views.
+
+    Returns:
+        (K,) ascending indices of the bank's views, on the CPU.
+
+    Raises:
+        InvalidInputError: ``count`` < 1.
+
+    Example:
+        >>> import trimesh
+        >>> from curvireg_torch.geometry import sample_views
+        >>> bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), sample_views(azimuth_step=45, elevations=[20]),
+        ...                       image_size=64, progress=False)
+        >>> len(representative_views(bank, 3))
+        3
+    """
+    if count < 1:
+        raise InvalidInputError(f"count: expected >= 1, got {count}")
+    views = torch.arange(len(bank))
+    if len(views) > MAX_COMPARED_VIEWS:
+        views = torch.arange(MAX_COMPARED_VIEWS) * len(bank) // MAX_COMPARED_VIEWS
+    features = _view_features(bank, views)
+    return views[_medoids(torch.cdist(features, features).square(), count).cpu()].sort().values
+
+
+def _nearest_representatives(bank: ViewBank, chosen: Tensor) -> Tensor:
+    """(N,) index into ``chosen`` views of the most similar one of each view; on the CPU."""
+    every = torch.arange(len(bank))
+    return torch.cdist(_view_features(bank, every), _view_features(bank, chosen)).argmin(dim=1).cpu()
+
+
+def _view_features(bank: ViewBank, views: Tensor) -> Tensor:
+    sides = (bank.boxes[:, 2:] - bank.boxes[:, :2])[views]
+    ratios = (sides[:, :1] / sides[:, 1:]).log().float()
+    return torch.cat([F.normalize(bank.descriptors[views].float(), dim=1), ratios.to(bank.descriptors.device)], dim=1)
+
+
+def _medoids(distances: Tensor, count: int) -> Tensor:
+    """(min(count, N),) indices for (N, N) distances."""
+    medoids = distances.sum(dim=1).argmin()[None]
+    nearest = distances[medoids[0]]
+    while len(medoids) < min(count, len(distances)):
+        medoids = torch.cat([medoids, nearest.argmax()[None]])
+        nearest = torch.minimum(nearest, distances[medoids[-1]])
+    for _ in range(MEDOID_ROUNDS):
+        group = F.one_hot(distances[:, medoids].argmin(dim=1), len(medoids)).to(distances)
+        total = (distances @ group).masked_fill(group == 0, torch.inf)
+        better = torch.where(group.any(dim=0), total.argmin(dim=0), medoids)
+        if torch.equal(better, medoids):
+            break
+        medoids = better
+    return medoids

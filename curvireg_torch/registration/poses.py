@@ -1,152 +1,265 @@
-"""Hypotheses lifted to poses in front of cameras, and back; each model has its own describer."""
+"""Candidate poses under work: the best distinct views of rankings, lifted in front of cameras, fitted and judged."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from ..geometry.cameras import rotation_towards
+from ..geometry.cameras import projected_boxes, rotation_towards
 from ..geometry.translation import pose_from_box
-from ..matching import ViewDescriber
+from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
 from .contour_fit import ContourFit, contour_support, fit_contours
-from .hypotheses import Hypotheses
-from .rescoring import POSE_FEATURES
-from .results import Hypothesis
-from .search import FINALISTS
+from .result import Hypothesis
 from .texture_fit import fit_texture, turned
 
-__all__ = ["Poses", "edge_supports", "fit_poses", "fit_texture_of", "hypothesis_of", "lift_to_poses"]
+__all__ = [
+    "POSE_FEATURES",
+    "SCORE_WEIGHTS",
+    "Poses",
+    "best_views",
+    "distinct_poses",
+    "edge_supports",
+    "fit_poses",
+    "fit_texture_of",
+    "hypothesis_of",
+    "lifted",
+    "placed",
+    "projected_box",
+    "similarities",
+]
+
+SAME_POSE_ANGLE = 15.0
+"""Degrees within which two fitted hypotheses count as one."""
+
+FINISHED_FITS = 2
+"""Hypotheses of a photograph whose contours are fitted at full size."""
+
+POSE_FEATURES = ("rank", "similarity", "edge_support", "appearance")
+"""Features of a pose: log S of the view it started from, minus that of the best view; normalised correlation of the
+pose's view with the photograph; edge support (0 without the contour fit); log appearance score of the pose (0 without
+that term)."""
+
+SCORE_WEIGHTS, RANK_ALONE = (1.0, 10.0, 10.0, 2.5), (1.0, 0.0, 0.0, 0.0)
+"""Weights of the features in the score of a pose, with an exact mesh and with a similar one (docs/experiments.md)."""
 
 
 @dataclass(frozen=True)
 class Poses:
-    """H hypotheses as poses ``T`` (H, 4, 4) ``T_cam_from_model`` in front of ``cameras`` (H, 3, 3) px, after a fit."""
+    """H candidate poses of the object in photographs; those of one photograph are adjacent.
 
-    hypotheses: Hypotheses
+    Attributes:
+        image_index: (H,) int64, ascending.
+        view: (H,) int64 view of the bank that the pose started from.
+        rank: (H,) float64 log S of that view, minus that of the photograph's best view.
+        rotation: (H, 3, 3) float64 allocentric rotations.
+        distance: (H,) float64 of the object's centre, model units.
+        T: (H, 4, 4) float64 ``T_cam_from_model``.
+        cameras: (H, 3, 3) float64 in px of the photographs.
+        covariance: (H, 6, 6) of a fit, NaN without one, see :func:`fit_contours`.
+        edge_support, start_support: (H,) of a fit, NaN without one.
+        observable: (H,) number of directions that a fit determines.
+    """
+
+    image_index: Tensor
+    view: Tensor
+    rank: Tensor
+    rotation: Tensor
+    distance: Tensor
     T: Tensor
     cameras: Tensor
-    fit: ContourFit | None = None
+    covariance: Tensor
+    edge_support: Tensor
+    start_support: Tensor
+    observable: Tensor
 
-    def where(self, keep: Tensor, others: "Poses") -> "Poses":
-        """These poses where ``keep`` (H,) is True, else ``others``, whose covariance is NaN."""
-        pose = keep[:, None, None]
-        T = torch.where(pose, self.T, others.T)
-        hypotheses = replace(
-            self.hypotheses,
-            rotation=torch.where(pose, self.hypotheses.rotation, others.hypotheses.rotation),
-            distance=torch.where(keep, self.hypotheses.distance, others.hypotheses.distance),
-        )
-        fit = self.fit
-        if fit is not None:
-            fit = replace(fit, transform=T, covariance=torch.where(pose, fit.covariance, torch.nan))
-        return Poses(hypotheses, T, torch.where(pose, self.cameras, others.cameras), fit)
+    def __len__(self) -> int:
+        return len(self.view)
 
     def __getitem__(self, index: Tensor) -> "Poses":
-        """The poses without their fit."""
-        return Poses(self.hypotheses[index], self.T[index], self.cameras[index])
+        return Poses(*(getattr(self, f.name)[index] for f in fields(Poses)))
+
+    @staticmethod
+    def cat(parts: "Sequence[Poses]") -> "Poses":
+        """Return all poses, in the order of their photographs."""
+        joined = Poses(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Poses)))
+        return joined[joined.image_index.argsort(stable=True)]
+
+    def with_fit(self, fit: ContourFit, centre: Tensor) -> "Poses":
+        """Return the poses of a fit, for an object with this centre (3,)."""
+        fitted = replace(
+            self,
+            covariance=fit.covariance,
+            edge_support=fit.edge_support,
+            start_support=fit.start_support,
+            observable=fit.observable,
+        )
+        return placed(fitted, fit.transform, centre)
+
+    def replaced(self, index: Tensor, others: "Poses") -> "Poses":
+        """Return these poses with ``others`` in the places ``index``."""
+        return Poses(*(getattr(self, f.name).index_copy(0, index, getattr(others, f.name)) for f in fields(Poses)))
+
+    @property
+    def fit(self) -> ContourFit:
+        """The poses as a fit."""
+        return ContourFit(self.T, self.covariance, self.edge_support, self.start_support, self.observable)
 
 
-def lift_to_poses(
-    describers: Sequence[ViewDescriber], hypotheses: Hypotheses, boxes: Tensor, K: Tensor | None
+def best_views(
+    ranking: Ranking, bank: ViewBank, *, count: int, symmetries: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """At most ``count`` best distinct views of every photograph: image index, view and rank, each (H,), on the CPU.
+
+    Where limits on the pose leave views out, the best view outside them comes last, as a rival.
+    """
+    chosen: list[list[int]] = []
+    for b, order in enumerate(ranking.order):
+        if ranking.allowed is not None:
+            order = order[ranking.allowed[b][order]]
+        views = distinct_views(order, bank.rotations, count=count, symmetries=symmetries)
+        chosen.append(views.tolist())
+    image_index = torch.tensor([b for b, views in enumerate(chosen) for _ in views], dtype=torch.long)
+    view = torch.tensor([v for views in chosen for v in views], dtype=torch.long)
+    log = ranking.scores.cpu().double().clamp(min=torch.finfo(torch.float64).tiny).log()
+    return image_index, view, log[image_index, view] - log.amax(dim=1)[image_index]
+
+
+def lifted(
+    describer: ViewDescriber,
+    image_index: Tensor,
+    view: Tensor,
+    rank: Tensor,
+    rotation: Tensor,
+    distance: Tensor,
+    boxes: Tensor,
+    K: Tensor | None,
 ) -> Poses:
-    """Hypotheses as poses that fill (B, 4) boxes; without ``K`` (B, 3, 3) cameras look straight at the boxes."""
-    T = torch.eye(4, dtype=torch.float64).repeat(len(hypotheses), 1, 1)
-    cameras = torch.eye(3, dtype=torch.float64).repeat(len(hypotheses), 1, 1)
-    for model, mine in hypotheses.by_model():
-        describer, image = describers[model], hypotheses.image_index[mine]
-        rotation, distance = hypotheses.rotation[mine], hypotheses.distance[mine]
-        if K is None:
-            T[mine], cameras[mine] = describer.cameras_of_boxes(rotation, distance, boxes[image])
-        else:
-            cameras[mine] = K[image]
-            T[mine, :3, :3], T[mine, :3, 3] = pose_from_box(describer.hull, rotation, boxes[image], K[image])
-    return Poses(hypotheses, T, cameras)
+    """Poses of allocentric rotations (H, 3, 3) that fill the photographs' boxes (B, 4).
+
+    Without ``K`` (B, 3, 3), cameras look straight at the boxes from ``distance`` (H,).
+    """
+    if K is None:
+        T, cameras = describer.cameras_of_boxes(rotation, distance, boxes[image_index])
+    else:
+        cameras = K[image_index]
+        T = torch.eye(4, dtype=torch.float64).repeat(len(view), 1, 1)
+        T[:, :3, :3], T[:, :3, 3] = pose_from_box(describer.hull, rotation, boxes[image_index], cameras)
+    nan = torch.full((len(view),), torch.nan, dtype=torch.float64)
+    poses = Poses(
+        image_index=image_index,
+        view=view,
+        rank=rank,
+        rotation=rotation,
+        distance=distance,
+        T=T,
+        cameras=cameras,
+        covariance=nan[:, None, None].repeat(1, 6, 6),
+        edge_support=nan,
+        start_support=nan,
+        observable=torch.zeros_like(view),
+    )
+    return poses if K is None else placed(poses, T, describer.centre)
 
 
-def to_allocentric(describers: Sequence[ViewDescriber], hypotheses: Hypotheses, T: Tensor) -> Hypotheses:
-    """The hypotheses with the allocentric rotations and distances of poses (H, 4, 4)."""
-    rotation, distance = hypotheses.rotation.clone(), hypotheses.distance.clone()
-    for model, mine in hypotheses.by_model():
-        R, t = T[mine, :3, :3], T[mine, :3, 3]
-        position = R @ describers[model].centre + t
-        rotation[mine] = rotation_towards(position).mT @ R
-        distance[mine] = torch.linalg.vector_norm(position, dim=1)
-    return replace(hypotheses, rotation=rotation, distance=distance)
+def placed(poses: Poses, T: Tensor, centre: Tensor) -> Poses:
+    """Return the poses at ``T`` (H, 4, 4), with allocentric rotations and distances to match."""
+    position = T[:, :3, :3] @ centre + T[:, :3, 3]
+    rotation = rotation_towards(position).mT @ T[:, :3, :3]
+    return replace(poses, T=T, rotation=rotation, distance=torch.linalg.vector_norm(position, dim=1))
 
 
 def fit_poses(
-    describers: Sequence[ViewDescriber],
+    describer: ViewDescriber,
     images: Sequence[Tensor],
     poses: Poses,
     boxes: Tensor,
     object_mask: Tensor | None = None,
 ) -> Poses:
-    """Fit the contours of poses of all models, see :func:`fit_contours`."""
-    parts, index = [], []
-    for model, mine in poses.hypotheses.by_model():
-        args, options = _contour_arguments(describers[model], images, poses, boxes, mine)
-        parts.append(fit_contours(*args, **options, finish=FINALISTS, object_mask=object_mask))
-        index.append(mine)
-    back = torch.cat(index).argsort()
-    fit = ContourFit(*(torch.cat([getattr(part, f.name) for part in parts])[back] for f in fields(ContourFit)))
-    return Poses(to_allocentric(describers, poses.hypotheses, fit.transform), fit.transform, poses.cameras, fit)
+    """Fit the contours of all poses, see :func:`fit_contours`."""
+    fit = fit_contours(
+        describer.contours,
+        images,
+        boxes,
+        poses.cameras,
+        poses.T,
+        image_index=poses.image_index,
+        margin=describer.settings.margin,
+        finish=FINISHED_FITS,
+        object_mask=object_mask,
+    )
+    return poses.with_fit(fit, describer.centre)
 
 
 def fit_texture_of(
-    describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor, h: int
+    describer: ViewDescriber, images: Sequence[Tensor], poses: Poses, boxes: Tensor, h: int
 ) -> Poses | None:
-    """The poses with pose ``h`` fitted to the colours of its mesh too, see :func:`fit_texture`; None without a fit."""
-    assert poses.fit is not None
-    describer, b = describers[int(poses.hypotheses.model[h])], int(poses.hypotheses.image_index[h])
+    """Pose ``h``, fitted to the colours of its mesh too, see :func:`fit_texture`; None without colours or fit."""
     if not describer.draws_colours:
         return None
-    one = torch.tensor([h])
-    args, options = _contour_arguments(describer, [images[b]], poses, boxes[b : b + 1], one)
-    options |= {"image_index": torch.zeros_like(one), "starts": turned(poses.fit[one], describer.centre)}
-    fit = fit_texture(describer.draw, describer.renderer, *args[:4], **options)
-    if fit is None:
-        return None
-    parts = (getattr(poses.fit, f.name).index_copy(0, one, getattr(fit, f.name)) for f in fields(ContourFit))
-    fits = ContourFit(*parts)
-    return Poses(to_allocentric(describers, poses.hypotheses, fits.transform), fits.transform, poses.cameras, fits)
+    one = poses[torch.tensor([h])]
+    b = int(one.image_index)
+    fit = fit_texture(
+        describer.draw,
+        describer.renderer,
+        describer.contours,
+        [images[b]],
+        boxes[b : b + 1],
+        one.cameras,
+        turned(one.fit, describer.centre),
+        image_index=torch.zeros(1, dtype=torch.long),
+        margin=describer.settings.margin,
+    )
+    return None if fit is None else one.with_fit(fit, describer.centre)
 
 
-def edge_supports(describers: Sequence[ViewDescriber], images: Sequence[Tensor], poses: Poses, boxes: Tensor) -> Tensor:
-    """(H,) edge support of poses of all models that are not fitted, see :func:`contour_support`."""
-    out = torch.zeros(len(poses.hypotheses), dtype=torch.float64)
-    for model, mine in poses.hypotheses.by_model():
-        args, options = _contour_arguments(describers[model], images, poses, boxes, mine)
-        out[mine] = contour_support(*args, **options)
-    return out
+def edge_supports(describer: ViewDescriber, images: Sequence[Tensor], poses: Poses, boxes: Tensor) -> Tensor:
+    """(H,) edge support of poses that are not fitted, see :func:`contour_support`."""
+    margin = describer.settings.margin
+    given = (describer.contours, images, boxes, poses.cameras, poses.T)
+    return contour_support(*given, image_index=poses.image_index, margin=margin)
 
 
-def hypothesis_of(h: int, poses: Poses, evidence: Tensor, *, with_camera: bool) -> Hypothesis:
-    """Hypothesis ``h`` of poses with their (H, 4) :data:`POSE_FEATURES`, as it is reported."""
-    hypotheses, T, fit = poses.hypotheses, poses.T[h], poses.fit
+def similarities(describer: ViewDescriber, descriptors: Tensor, poses: Poses) -> Tensor:
+    """(H,) normalised correlations of the poses' views with their photographs, of (B, D) descriptors."""
+    queries = F.normalize(descriptors, dim=1)[poses.image_index.to(descriptors.device)]
+    views = describer.descriptors(poses.rotation, poses.distance)
+    return (F.normalize(views, dim=1) * queries).sum(dim=1).double().cpu()
+
+
+def distinct_poses(poses: Poses, score: Tensor, symmetries: Tensor | None = None) -> Tensor:
+    """(H,) bool: False where a pose is within ``SAME_POSE_ANGLE`` degrees of one with a higher ``score`` (H,)."""
+    distinct = torch.zeros(len(poses), dtype=torch.bool)
+    order = score.argsort(descending=True, stable=True)
+    for b in poses.image_index.unique():
+        own = order[poses.image_index[order] == b]
+        R, best_first = poses.rotation[own].float(), torch.arange(len(own))
+        chosen = distinct_views(best_first, R, count=len(own), angle=SAME_POSE_ANGLE, symmetries=symmetries)
+        distinct[own[chosen]] = True
+    return distinct
+
+
+def projected_box(describer: ViewDescriber, projection: tuple[Tensor, Tensor]) -> Tensor:
+    """(4,) float64 box around the projected mesh, px of the photograph."""
+    T, K = projection
+    return projected_boxes(describer.hull, T[None], K)[0]
+
+
+def hypothesis_of(poses: Poses, h: int, evidence: Tensor, *, with_camera: bool) -> Hypothesis:
+    """Pose ``h`` with its (H, 4) :data:`POSE_FEATURES`, as it is reported."""
+    T = poses.T[h]
     features = dict(zip(POSE_FEATURES, evidence[h].tolist(), strict=True))
-    known = fit is not None and with_camera and bool(fit.covariance[h].isfinite().all())
+    is_fitted, known = bool(poses.edge_support[h].isfinite()), bool(poses.covariance[h].isfinite().all())
     return Hypothesis(
-        rotation=T[:3, :3].clone() if with_camera else hypotheses.rotation[h].clone(),
+        rotation=T[:3, :3].clone() if with_camera else poses.rotation[h].clone(),
         translation=T[:3, 3].clone() if with_camera else None,
         score=features["similarity"],
         evidence=features,
-        allocentric_rotation=hypotheses.rotation[h].clone(),
-        distance=float(hypotheses.distance[h]),
+        allocentric_rotation=poses.rotation[h].clone(),
+        distance=float(poses.distance[h]),
         projection=(T.clone(), poses.cameras[h].clone()),
-        view=int(hypotheses.view[h]),
-        model=int(hypotheses.model[h]),
-        edge_support=None if fit is None else features["edge_support"],
-        covariance=fit.covariance[h].clone() if fit is not None and known else None,
+        view=int(poses.view[h]),
+        edge_support=features["edge_support"] if is_fitted else None,
+        covariance=poses.covariance[h].clone() if known and with_camera else None,
     )
-
-
-def _contour_arguments(
-    describer: ViewDescriber, images: Sequence[Tensor], poses: Poses, boxes: Tensor, mine: Tensor
-) -> tuple[list[Any], dict[str, Any]]:
-    """Arguments of the contour functions for the poses ``mine``, all of one model."""
-    return [describer.contours, images, boxes, poses.cameras[mine], poses.T[mine]], {
-        "image_index": poses.hypotheses.image_index[mine],
-        "margin": describer.settings.margin,
-    }

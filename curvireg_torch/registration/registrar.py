@@ -1,52 +1,114 @@
-"""The entry point: photographs, boxes and meshes in; poses out."""
+"""The entry point: photographs, boxes and a mesh in; poses out."""
 
+import threading
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from ..errors import CurviregError, InvalidInputError
+from ..features.learned_field import LearnedCurvilinearSaliency
+from ..geometry.crops import box_iou
 from ..geometry.pose_prior import PosePrior
 from ..geometry.views import ViewSphere
-from ..matching import ViewBank, ViewMatcher, cached_bank
-from ..pipeline import Pipeline
+from ..matching import Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
+from ..mesh import has_colours, mesh_symmetries
+from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
-from ..settings import BankSettings
-from ..utils.checks import check_device, check_symmetries
+from ..terms import Appearance, QueryFeatures
+from ..utils.checks import check_device, check_option, check_symmetries
+from ..utils.choices import MESH_KINDS
 from ..utils.threads import map_on_threads
-from .correction import corrected
-from .estimator import PoseEstimator
-from .inputs import ImageItem, image_items
-from .localization import localize
+from .confidence import (
+    concentration,
+    confidence_features,
+    hypothesis_probabilities,
+    is_calibrated,
+    registration_confidence,
+)
+from .inputs import ImageItem, check_crop, image_items
+from .localization import Locator, localize
+from .poses import (
+    RANK_ALONE,
+    SCORE_WEIGHTS,
+    Poses,
+    best_views,
+    distinct_poses,
+    edge_supports,
+    fit_poses,
+    fit_texture_of,
+    hypothesis_of,
+    lifted,
+    projected_box,
+    similarities,
+)
+from .priors import BatchPriors
 from .refinement import refine
-from .results import FailedRegistration, Registration
+from .result import FailedRegistration, Registration
+from .search import search
 
 __all__ = ["Registrar"]
 
+MIN_REFINED = 3
+"""Minimum number of hypotheses to refine, even if fewer are reported: the confidence depends on rivals. Of 15
+photographs of another object, 14 were called reliable with one hypothesis, 2 with two, none with three or five."""
 
-class Registrar(PoseEstimator):
+SAME_BOX_OVERLAP = 0.85
+"""Overlap (IoU) from which two boxes count as the same: boxes drawn by hand had at least 0.86 with the box of the pose
+on 60 generated photographs, see docs/experiments.md."""
+
+OUTSIDE_MARGIN = 1.0
+"""Score by which a pose outside the limits must be better to contradict them: 0.1 of similarity or edge support."""
+
+FLAT_EXTENT = 1e-3
+"""Thickness of a mesh, as a fraction of its radius, below which it counts as flat."""
+
+Results = list[Registration | FailedRegistration]
+
+_SHAPE_LOCK = threading.Lock()
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """B photographs, all with a camera matrix or all without: boxes (B, 4) float64 px, cameras (B, 3, 3) or None,
+    and descriptors (B, D) on a grid twice as fine as the bank's."""
+
+    images: list[Tensor]
+    boxes: Tensor
+    cameras: Tensor | None
+    query: QueryFeatures
+    ranking: Ranking
+    descriptors: Tensor
+    priors: BatchPriors | None
+    exact: bool
+    symmetries: Tensor | None
+
+
+class Registrar:
     """Registers photographs to a mesh, or to the best of several.
 
-    The views of the bank are ranked for each box; the best distinct ones become hypotheses, which a search in small
-    steps (:func:`search`) and a fit of contours (:func:`fit_contours`) refine, and whose evidence decides their order.
-    With a camera matrix the result is rotation and translation with their covariance; without, the rotation.
+    The views of the bank are ranked for each box; the best distinct ones become hypotheses, to which contours are
+    fitted (:func:`fit_contours`), and whose evidence decides their order. With a camera matrix the result is rotation
+    and translation with their covariance; without, the rotation.
 
     Args:
         bank_or_mesh: a :class:`ViewBank`, a :class:`ViewMatcher`, a mesh, its path, or a list of meshes or paths, of
-            which the best is reported; the bank of a mesh is read from the disk cache or built.
-        pipeline: all settings; default that of a bank, else ``Pipeline()``. ``replace(pipeline, search=False,
-            contours=False)`` reports views of the bank, ``replace(pipeline, hypotheses=k)`` k hypotheses.
+            which the best is reported, with its number as ``model``; the bank of a mesh is read from the disk cache or
+            built.
+        pipeline: all settings; default that of a bank, else ``Pipeline()``. ``replace(pipeline, contours=False)``
+            reports views of the bank, ``replace(pipeline, hypotheses=k)`` k hypotheses.
         views, settings: custom viewpoints and bank settings, for a mesh.
         field: custom photograph filter, see :class:`ViewMatcher`.
-        renderer: for search, contour fit and a bank that is built; a custom renderer knows one mesh.
+        renderer: for views of the mesh and a bank that is built; a custom renderer knows one mesh.
         mesh_is: "exact" for the mesh of this very object, "similar" for that of another one of its kind. It decides how
-            far fitted contours are trusted, and the probabilities of the answers. Default: exact for photographs with a
-            camera matrix, similar for others.
+            far fitted contours are trusted, and the probabilities of the hypotheses. Default: exact for photographs
+            with a camera matrix, similar for others.
         symmetries: (S, 4, 4) of the mesh, from :func:`curvireg_torch.geometry.symmetry_transforms`; hypotheses that
-            differ by one of them are reported once. Default: those of the shape of a single exact mesh without colours,
-            see :func:`curvireg_torch.mesh.mesh_symmetries`; ``torch.eye(4)[None]`` for none.
+            differ by one of them are reported once. Default: those of the shape of an exact mesh without colours, see
+            :func:`curvireg_torch.mesh.mesh_symmetries`; ``torch.eye(4)[None]`` for none.
         device: of modules, bank and search.
         progress: True shows bars. A callback gets (stage, done, total), with the stages "localization" (without a box),
             "bank", "ranking", "search" and "contours"; it may raise to cancel. On a CPU photographs are registered in
@@ -76,34 +138,26 @@ class Registrar(PoseEstimator):
         device: torch.device | str | None = None,
         progress: bool | Callable[[str, int, int], object] = False,
     ) -> None:
-        options: dict[str, Any]
         if device is not None:
             check_device(device)
-        if isinstance(bank_or_mesh, ViewBank | ViewMatcher):
-            if views is not None or settings is not None:
-                raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
-        else:
-            pipeline = pipeline or Pipeline()
-            pipeline = replace(pipeline, bank=settings or pipeline.bank)
-            meshes = list(bank_or_mesh) if isinstance(bank_or_mesh, list | tuple) else [bank_or_mesh]
-            if not meshes:
-                raise InvalidInputError("Registrar: expected a mesh or several, got an empty list")
-            options = {"pipeline": pipeline, "renderer": renderer, "progress": progress, "device": device or "cpu"}
-            bank_or_mesh = ViewBank.join([cached_bank(mesh, views, **options) for mesh in meshes])
-        if isinstance(bank_or_mesh, ViewMatcher):
-            if pipeline is not None or field is not None:
-                raise InvalidInputError("Registrar: pipeline and field belong to the matcher; give them to ViewMatcher")
-            matcher = bank_or_mesh
-        else:
-            bank = bank_or_mesh if device is None else bank_or_mesh.to(device)
-            # Built on one thread, so that rounding does not depend on the number of threads.
-            options = {"pipeline": pipeline, "field": field, "renderer": renderer}
-            matcher = map_on_threads(lambda bank: ViewMatcher(bank, **options), [bank])[0]
-        if not isinstance(renderer, str) and (n := len(matcher.bank.meshes)) != 1:
-            raise InvalidInputError(f"renderer: a custom renderer knows one mesh, the bank has {n}; give a name")
+        if mesh_is is not None:
+            check_option(mesh_is, MESH_KINDS, "mesh_is")
         if symmetries is not None:
             check_symmetries(symmetries)
-        super().__init__(matcher, mesh_is=mesh_is, symmetries=symmetries, progress=progress)
+        self.others: list[Registrar] = []
+        if isinstance(bank_or_mesh, list | tuple):
+            meshes = list(bank_or_mesh)
+            if not meshes:
+                raise InvalidInputError("Registrar: expected a mesh or several, got an empty list")
+            if len(meshes) > 1 and not isinstance(renderer, str):
+                raise InvalidInputError(f"renderer: a custom renderer knows one mesh, got {len(meshes)}; give a name")
+            same: dict[str, Any] = {"pipeline": pipeline, "views": views, "settings": settings, "field": field}
+            same |= {"renderer": renderer, "mesh_is": mesh_is, "symmetries": symmetries, "device": device}
+            self.others = [Registrar(mesh, **same, progress=progress) for mesh in meshes[1:]]
+            bank_or_mesh = meshes[0]
+        self.matcher = _matcher(bank_or_mesh, pipeline, views, settings, field, renderer, device, progress)
+        self.bank, self.pipeline = self.matcher.bank, self.matcher.pipeline
+        self.mesh_is, self.symmetries, self.progress = mesh_is, symmetries, progress
 
     @torch.no_grad()
     def __call__(
@@ -113,7 +167,7 @@ class Registrar(PoseEstimator):
         camera_matrices: Any | None = None,
         *,
         prior: PosePrior | Sequence[PosePrior | None] | None = None,
-    ) -> list[Registration | FailedRegistration]:
+    ) -> Results:
         """Register a batch.
 
         Args:
@@ -131,17 +185,341 @@ class Registrar(PoseEstimator):
             InvalidInputError: not as many boxes, cameras or priors as images, or a distance limited without cameras.
         """
         if boxes is None:
-            return [results[0] for results in localize(self, images, camera_matrices, prior=prior)]
-        return self.map_items(image_items(images, boxes, camera_matrices, prior), self._register_boxes)
+            results = [found[0] for found in localize(self, images, camera_matrices, prior=prior)]
+        else:
+            items = image_items(images, boxes, camera_matrices, prior)
+            results = self.map_items(items, self._register_items)
+        for model, other in enumerate(self.others, 1):
+            rivals = other(images, boxes, camera_matrices, prior=prior)
+            results = [_better(one, rival, model) for one, rival in zip(results, rivals, strict=True)]
+        return results
 
-    def refine(
-        self, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any
-    ) -> list[Registration | FailedRegistration]:
-        """Refine known poses, see :func:`curvireg_torch.registration.refine`."""
+    def refine(self, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any) -> Results:
+        """Refine known poses of the first mesh, see :func:`curvireg_torch.registration.refine`."""
         return refine(self, images, camera_matrices, poses)
 
-    def _register_boxes(
-        self, items: Sequence[ImageItem | CurviregError], first: int
-    ) -> list[Registration | FailedRegistration]:
-        results = self.register_items(items, first=first)
-        return corrected(self, items, results) if self.pipeline.box_jitter and self.pipeline.search else results
+    def of_model(self, model: int) -> "Registrar":
+        """Return the registrar of one of several meshes, by :attr:`Registration.model`."""
+        return self.others[model - 1] if model else self
+
+    def is_exact(self, *, with_camera: bool) -> bool:
+        """Whether the mesh counts as that of this very object."""
+        return self.mesh_is == "exact" if self.mesh_is else with_camera
+
+    def symmetries_of(self, *, exact: bool) -> Tensor | None:
+        """(S, 4, 4) that were given, or those of the shape of an exact mesh; None if there are none."""
+        if not exact or self.symmetries is not None:
+            return self.symmetries
+        with _SHAPE_LOCK:  # photographs share them
+            return self._shape_symmetries
+
+    @cached_property
+    def _shape_symmetries(self) -> Tensor | None:
+        return None if has_colours(self.bank.mesh) else mesh_symmetries(self.bank.mesh)
+
+    @cached_property
+    def mesh_warnings(self) -> tuple[str, ...]:
+        """What makes every pose of this mesh questionable, in words."""
+        vertices = torch.from_numpy(self.bank.mesh.vertices.copy()).double()
+        thickness = float(torch.linalg.svdvals(vertices - vertices.mean(dim=0))[-1]) / len(vertices) ** 0.5
+        if has_colours(self.bank.mesh) or thickness > FLAT_EXTENT * self.describer.radius:
+            return ()
+        return ("the mesh is flat and has no colours: front and back look alike",)
+
+    @cached_property
+    def describer(self) -> ViewDescriber:
+        """Renderer, contours and descriptor of the mesh, on a grid twice as fine as the bank's."""
+        settings = self.bank.settings
+        return self.matcher.describer.with_settings(replace(settings, grid=min(2 * settings.grid, settings.image_size)))
+
+    @cached_property
+    def locator(self) -> Locator:
+        """Proposes boxes where none are given."""
+        return map_on_threads(lambda _: Locator(self.matcher), [0])[0]  # one thread: rounding is always the same
+
+    def report_progress(self, stage: str) -> None:
+        """Call the progress callback, if there is one."""
+        if callable(self.progress):
+            self.progress(stage, 0, 1)
+
+    def map_items(
+        self,
+        items: Sequence[ImageItem | CurviregError],
+        function: Callable[[Sequence[ImageItem | CurviregError], int], list[Any]],
+    ) -> list[Any]:
+        """Results of ``function(some items, index of the first)`` for all items, in their order.
+
+        On a CPU each photograph has a thread, in which torch uses no further ones: its result is the same to the bit,
+        whatever else is registered. On a GPU the matcher's ``chunk_size`` are registered at a time. Items are read on
+        demand, so that few photographs are in memory.
+        """
+        size = 1 if self.bank.device.type == "cpu" else self.matcher.chunk_size
+        _ = self.describer.contours, self.mesh_warnings  # create once what threads share, before they use it
+
+        def run(first: int) -> list[Any]:
+            return function(items[first : first + size], first)
+
+        parts = map_on_threads(run, range(0, len(items), size), device=self.bank.device)
+        return [result for part in parts for result in part]
+
+    def _register_items(self, items: Sequence[ImageItem | CurviregError], first: int) -> Results:
+        """Register photographs with boxes, then again those whose pose asks for another box."""
+        results = self._register_given(items, first)
+        if not (self.pipeline.box_jitter and self.pipeline.contours):
+            return results
+        for k, (item, result) in enumerate(zip(items, results, strict=True)):
+            # Without a camera matrix, poses are derived from their boxes.
+            if not isinstance(item, ImageItem) or not isinstance(result, Registration) or item.camera_matrix is None:
+                continue
+            box = projected_box(self.describer, result.projection)
+            if _shows_other_part(box, item):
+                again = self._register_given([replace(item, box=box.float())], first + k)[0]
+                if isinstance(again, Registration) and again.score > result.score:
+                    results[k] = replace(again, corrected_box=box)
+        return results
+
+    def _register_given(self, items: Sequence[ImageItem | CurviregError], first: int) -> Results:
+        """Results of photographs or errors, the first of which has the index ``first``."""
+        results: list[Any] = [item if isinstance(item, ImageItem) else FailedRegistration(item) for item in items]
+        usable = [i for i, item in enumerate(items) if isinstance(item, ImageItem)]
+        if not usable:
+            return results
+        boxes = torch.stack([results[i].box for i in usable])
+        query = self.matcher.query([results[i].image for i in usable], boxes)
+        for row, i in enumerate(usable):
+            item, one = results[i], query[torch.tensor([row])]
+            try:
+                check_crop(one.crops[0])
+                results[i] = self.register([item], one)[0]
+            except CurviregError as error:
+                results[i] = FailedRegistration(error.with_subject(f"image {first + i}"))
+        return results
+
+    @torch.no_grad()
+    def register(
+        self, items: Sequence[ImageItem], query: QueryFeatures, ranking: Ranking | None = None
+    ) -> list[Registration]:
+        """Register described photographs: rank, fit, judge, report.
+
+        Args:
+            items: B photographs, all with a camera matrix or all without.
+            query: the same, cropped and described by the matcher.
+            ranking: of the same; default :meth:`ViewMatcher.rank`.
+        """
+        batch = self._rank(items, query, ranking)
+        poses, outside = self._starts(batch)
+        starts = poses
+        if self.pipeline.search:
+            poses = self._searched(batch, poses)
+        if self.pipeline.contours:
+            self.report_progress("contours")
+            poses = fit_poses(self.describer, batch.images, poses, batch.boxes, self.object_mask(query))
+        evidence = self._evidence(batch, poses)
+        if self.pipeline.contours and batch.exact:
+            poses, evidence = self._fit_textures(batch, poses, evidence, outside)
+        distinct, inside = outside.clone(), (~outside).nonzero()[:, 0]
+        distinct[inside] = distinct_poses(poses[inside], self._scores(batch, evidence)[inside], batch.symmetries)
+        poses, evidence = self._restore(batch, starts, poses, evidence, distinct, outside)
+        return [
+            replace(result, warnings=item.warnings + self.mesh_warnings)
+            for result, item in zip(self._results(batch, poses, evidence, distinct, outside), items, strict=True)
+        ]
+
+    def _rank(self, items: Sequence[ImageItem], query: QueryFeatures, ranking: Ranking | None) -> _Batch:
+        self.report_progress("ranking")
+        matrices = [item.camera_matrix.double() for item in items if item.camera_matrix is not None]
+        if len(matrices) not in (0, len(items)):
+            raise InvalidInputError("camera_matrices: expected one for every photograph, or none")
+        priors = BatchPriors(items, self.bank) if any(item.prior is not None for item in items) else None
+        if ranking is None:
+            ranking = self.matcher.rank(query, None if priors is None else priors.allowed(self.bank))
+        exact = self.is_exact(with_camera=bool(matrices))
+        return _Batch(
+            images=[item.image for item in items],
+            boxes=torch.stack([item.box for item in items]).double(),
+            cameras=torch.stack(matrices) if matrices else None,
+            query=query,
+            ranking=ranking,
+            descriptors=self.describer.descriptor(query.field),
+            priors=priors,
+            exact=exact,
+            symmetries=self.symmetries_of(exact=exact),
+        )
+
+    def _starts(self, batch: _Batch) -> tuple[Poses, Tensor]:
+        """Poses of the best distinct views, and (H,) bool: those outside the limits, the best one of each photograph.
+
+        The poses outside are never reported; they tell whether the limits are wrong.
+        """
+        count = max(MIN_REFINED, self.pipeline.hypotheses)
+        image_index, view, rank = best_views(batch.ranking, self.bank, count=count, symmetries=batch.symmetries)
+        rotations, distances = self.bank.rotations.cpu().double(), self.bank.distances.cpu()
+        rotation = rotations[view]
+        if batch.priors is not None:
+            rotation = batch.priors.moved_inside(image_index, rotation)
+        lifting = (batch.boxes, batch.cameras)
+        poses = lifted(self.describer, image_index, view, rank, rotation, distances[view], *lifting)
+        if batch.priors is None:
+            return poses, torch.zeros(len(poses), dtype=torch.bool)
+        poses = batch.priors.at_distance(poses)
+        assert batch.ranking.outside is not None
+        views = batch.ranking.outside.cpu()
+        index = (views >= 0).nonzero()[:, 0]
+        view = views[index]
+        none = torch.zeros(len(view), dtype=torch.float64)
+        others = lifted(self.describer, index, view, none, rotations[view], distances[view], *lifting)
+        order = torch.cat([poses.image_index, index]).argsort(stable=True)
+        return Poses.cat([poses, others]), order >= len(poses)
+
+    def _searched(self, batch: _Batch, poses: Poses) -> Poses:
+        self.report_progress("search")
+        allow = None
+        if (priors := batch.priors) is not None:
+            allow = lambda image_index, rotation: (  # noqa: E731
+                (priors.moved_inside(image_index, rotation) - rotation).abs().amax(dim=(1, 2)) < 1e-6
+            )
+        rotation = search(self.describer, batch.descriptors, poses, allow=allow)
+        found = (poses.image_index, poses.view, poses.rank, rotation, poses.distance)
+        poses = lifted(self.describer, *found, batch.boxes, batch.cameras)
+        return poses if batch.priors is None else batch.priors.at_distance(poses)
+
+    def object_mask(self, query: QueryFeatures) -> Tensor | None:
+        """(B, 1, S, S) probability that pixels of the crops belong to the object, if the field predicts it."""
+        field = self.matcher.field
+        if not isinstance(field, LearnedCurvilinearSaliency):
+            return None
+        return torch.cat([field.mask(crop) for crop in query.crops.split(1)])  # rounding is that of a photograph alone
+
+    def _evidence(self, batch: _Batch, poses: Poses) -> Tensor:
+        """(H, 4) :data:`POSE_FEATURES`."""
+        similarity = similarities(self.describer, batch.descriptors, poses)
+        support, appearance = torch.zeros_like(similarity), torch.zeros_like(similarity)
+        if self.pipeline.contours:
+            unfitted = poses.edge_support.isnan()
+            support = poses.edge_support.clone()
+            if bool(unfitted.any()):
+                support[unfitted] = edge_supports(self.describer, batch.images, poses[unfitted], batch.boxes)
+        if Appearance.name in batch.ranking.terms:
+            pictures = self.matcher.describer.shaded(poses.rotation, poses.distance)
+            compared = (batch.query, batch.ranking, pictures, poses.image_index)
+            appearance = self.matcher.reranking_score(Appearance.name, *compared)
+        return torch.stack([poses.rank, similarity, support, appearance], dim=1)
+
+    def _scores(self, batch: _Batch, evidence: Tensor) -> Tensor:
+        """(H,) scores of poses: all features with an exact mesh, the order of the ranking with a similar one."""
+        return evidence @ torch.tensor(SCORE_WEIGHTS if batch.exact else RANK_ALONE, dtype=evidence.dtype)
+
+    def _fit_textures(self, batch: _Batch, poses: Poses, evidence: Tensor, outside: Tensor) -> tuple[Poses, Tensor]:
+        """Fit the best pose of each photograph to the mesh's colours as well."""
+        order = self._scores(batch, evidence).masked_fill(outside, -torch.inf).argsort(descending=True, stable=True)
+        for b in range(len(batch.images)):
+            best = order[poses.image_index[order] == b][:1]
+            fitted = fit_texture_of(self.describer, batch.images, poses, batch.boxes, int(best))
+            if fitted is not None and (batch.priors is None or bool(batch.priors.keeps(fitted))):
+                poses = poses.replaced(best, fitted)
+                evidence = evidence.index_copy(0, best, self._evidence(batch, fitted))
+        return poses, evidence
+
+    def _restore(
+        self, batch: _Batch, starts: Poses, poses: Poses, evidence: Tensor, distinct: Tensor, outside: Tensor
+    ) -> tuple[Poses, Tensor]:
+        """Put poses that merged, or whose fit is not trusted, back to the views that they started from."""
+        keep = distinct
+        if self.pipeline.contours and not batch.exact:
+            # Where the contours of a similar object do not fit, the view has the smaller error.
+            keep = distinct & poses.fit.trustworthy
+        if batch.priors is not None:
+            keep = keep & (batch.priors.keeps(poses) | outside)
+        if bool(keep.all()):
+            return poses, evidence
+        back = (~keep).nonzero()[:, 0]
+        evidence = evidence.index_copy(0, back, self._evidence(batch, starts[back]))
+        restored = replace(starts[back], edge_support=evidence[back, 2])
+        return poses.replaced(back, restored if self.pipeline.contours else starts[back]), evidence
+
+    def _results(
+        self, batch: _Batch, poses: Poses, evidence: Tensor, distinct: Tensor, outside: Tensor
+    ) -> list[Registration]:
+        """Hypotheses of each photograph, best first, those that merged last, and their probabilities."""
+        scores = self._scores(batch, evidence)
+        order = (scores + torch.where(distinct, 0.0, -1e6)).argsort(descending=True, stable=True)
+        shares = concentration(batch.ranking, self.bank.rotations, batch.symmetries).tolist()
+        results = []
+        for b in range(len(batch.images)):
+            ours = order[poses.image_index[order] == b]
+            own, rivals = ours[~outside[ours]], ours[outside[ours]]
+            reported = own[: self.pipeline.hypotheses].tolist()
+            with_camera = batch.cameras is not None
+            hypotheses = tuple(hypothesis_of(poses, h, evidence, with_camera=with_camera) for h in reported)
+            features = confidence_features(evidence[own], scores[own], shares[b])
+            # Without the rank, which views outside the limits do not have.
+            lead = evidence[rivals, 1:] - evidence[own[:1], 1:]
+            gain = float((lead @ torch.tensor(SCORE_WEIGHTS[1:], dtype=lead.dtype)).max()) if len(rivals) else None
+            if len(own) == 1 and gain is not None:  # limits that leave no rival do not make a pose uncertain
+                features["margin"] = max(-gain, 0.0)
+                features["concentration"] = features["concentration"] or 1.0
+            probabilities: tuple[float, ...] = ()
+            if is_calibrated(self.pipeline):
+                confidence = registration_confidence(features, exact=batch.exact)
+                probabilities = hypothesis_probabilities(confidence, scores[own], exact=batch.exact)[: len(reported)]
+            result = Registration(hypotheses, probabilities, batch.ranking[b : b + 1], features)
+            if batch.priors is not None and batch.priors.limits_of(b) is not None:
+                best = poses[own[:1]]
+                views = (best.image_index, best.view, best.rank, best.rotation, best.distance)
+                filling = lifted(self.describer, *views, batch.boxes, batch.cameras)
+                better = gain is not None and gain > OUTSIDE_MARGIN
+                word = batch.priors.contradiction(best, filling, better_outside=better)
+                result = replace(result, prior=batch.priors.limits_of(b), prior_contradiction=word)
+            results.append(result)
+        return results
+
+
+def _matcher(
+    given: Any,
+    pipeline: Pipeline | None,
+    views: ViewSphere | None,
+    settings: BankSettings | None,
+    field: nn.Module | None,
+    renderer: str | DepthRenderer,
+    device: torch.device | str | None,
+    progress: bool | Callable[[str, int, int], object],
+) -> ViewMatcher:
+    """The matcher of a bank, or of the bank of a mesh, with the arguments of :class:`Registrar`."""
+    if isinstance(given, ViewMatcher):
+        if any(value is not None for value in (pipeline, field, views, settings)):
+            raise InvalidInputError("Registrar: pipeline, field, views and settings belong to the matcher")
+        return given
+    if isinstance(given, ViewBank):
+        if views is not None or settings is not None:
+            raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
+        bank = given if device is None else given.to(device)
+    else:
+        pipeline = pipeline or Pipeline()
+        pipeline = replace(pipeline, bank=settings or pipeline.bank)
+        bank = cached_bank(
+            given, views, pipeline=pipeline, renderer=renderer, progress=progress, device=device or "cpu"
+        )
+    # Built on one thread, so that rounding does not depend on the number of threads.
+    options: dict[str, Any] = {"pipeline": pipeline, "field": field, "renderer": renderer}
+    return map_on_threads(lambda bank: ViewMatcher(bank, **options), [bank])[0]
+
+
+def _better(
+    one: Registration | FailedRegistration, rival: Registration | FailedRegistration, model: int
+) -> Registration | FailedRegistration:
+    """The registration with more confidence, or with a higher score where there is none; ``model`` is the rival's."""
+    if not isinstance(rival, Registration):
+        return one
+    if not isinstance(one, Registration):
+        return replace(rival, model=model)
+    ahead = (rival.confidence or 0.0, rival.score) > (one.confidence or 0.0, one.score)
+    return replace(rival, model=model) if ahead else one
+
+
+def _shows_other_part(box: Tensor, item: ImageItem) -> bool:
+    """Whether a box is partly inside the photograph and shows another part of it than the item's box."""
+    H, W = item.image.shape[-2:]
+    pair = torch.stack([box, item.box.to(box)]).clamp(min=-0.5)
+    pair = torch.minimum(pair, torch.tensor([W, H, W, H]).to(pair) - 0.5)
+    inside = bool((pair[0, 2:] > pair[0, :2]).all()) and bool(box.isfinite().all())
+    return inside and float(box_iou(pair[:1], pair[1:])) < SAME_BOX_OVERLAP

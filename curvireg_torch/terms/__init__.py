@@ -1,13 +1,19 @@
-"""Ranking terms: each compares photographs with views, one file each; the ranking multiplies them."""
+"""Ranking terms: scores of views for photographs, and what photographs are described by."""
 
-from ..utils.registry import Registry
-from .appearance import Appearance
-from .base import RerankingModule, RerankingTerm, Term, Views
-from .box_shape import BoxShape, box_shape_score, box_shapes, whole_box_shapes
-from .correlation import Correlation, normalized_correlation, unit_score
 from .query import QueryFeatures, crop_regions, jittered_boxes, photograph_field
-from .repeatability import Repeatability, dilate_points, repeatability, repeatability_score
-from .whitening import Whitening, ledoit_wolf
+from .scores import (
+    Whitening,
+    box_shape_score,
+    box_shapes,
+    dilate_points,
+    ledoit_wolf,
+    normalized_correlation,
+    repeatability,
+    repeatability_score,
+    unit_score,
+    whole_box_shapes,
+)
+from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, RerankingModule, RerankingTerm, Term, Views
 
 __all__ = [
     "TERMS",
@@ -34,6 +40,3 @@ __all__ = [
     "unit_score",
     "whole_box_shapes",
 ]
-
-TERMS: Registry[type[Term]] = Registry("term", {t.name: t for t in (Correlation, Repeatability, BoxShape, Appearance)})
-"""Terms by the name that JSON files of pipelines use."""

@@ -9,7 +9,7 @@ from ..features.learned_field import WORK_SIZE, doubled_angle, halved_angle
 from ..geometry import rotation_from_axis_angle
 from ..matching import ViewDescriber
 from ..matching.fields import depth_filter, hog_layer
-from ..settings import BankSettings
+from ..pipeline import BankSettings
 from ..terms import normalized_correlation
 from .scenes import GeneratedScenes
 

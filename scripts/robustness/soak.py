@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from curvireg_torch import Pipeline, Registrar, camera_matrix, sample_views
 from curvireg_torch.matching import cached_bank
-from curvireg_torch.settings import BankSettings
+from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from scripts._shared import RESULTS, commit, today
 

@@ -29,7 +29,7 @@ from curvireg_torch.geometry import uniform_views
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.rendering import make_renderer
-from curvireg_torch.settings import BankSettings
+from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.synthetic import random_pose, synthesize_photograph
 from scripts._shared import REPOSITORY, RESULTS, commit, processor, timed, today, update_page, write_json
 

@@ -19,7 +19,7 @@ from curvireg_torch.evaluation.registry import DatasetSpec
 from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline
-from curvireg_torch.settings import BankSettings, ViewPolicy
+from curvireg_torch.pipeline import BankSettings, ViewPolicy
 from curvireg_torch.training import adapt
 from curvireg_torch.utils.threads import available_threads
 from tests._support.scenes import truck_bank

@@ -18,7 +18,7 @@ from curvireg_torch.evaluation import evaluate
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
 from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline, preset_named
 from curvireg_torch.registration import registrar
-from curvireg_torch.settings import ViewPolicy
+from curvireg_torch.pipeline import ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of

@@ -4,7 +4,7 @@ import pytest
 
 from curvireg_torch.data import Pascal3DPlus
 from curvireg_torch.evaluation import Pascal3DBenchmark, Protocol, evaluate, paper
-from curvireg_torch.settings import BankSettings
+from curvireg_torch.pipeline import BankSettings
 from tests._support.real_data import real_data
 
 pytestmark = pytest.mark.data

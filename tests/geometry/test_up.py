@@ -9,7 +9,7 @@ from curvireg_torch.geometry import up_rotation
 from curvireg_torch.mesh import mesh_up, with_z_up
 from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.settings import ViewPolicy
+from curvireg_torch.pipeline import ViewPolicy
 from curvireg_torch.utils.choices import UP_AXES
 
 AXES = {s + a: (-1 if s else 1) * np.eye(3)[i] for i, a in enumerate("xyz") for s in ("", "-")}

@@ -17,7 +17,7 @@ from curvireg_torch.geometry import uniform_views
 from curvireg_torch.matching import ViewBank, ViewMatcher
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import Registrar
-from curvireg_torch.settings import BankSettings, ViewPolicy
+from curvireg_torch.pipeline import BankSettings, ViewPolicy
 from curvireg_torch.terms import normalized_correlation
 from curvireg_torch.utils.digests import tensor_digest
 

@@ -24,7 +24,7 @@ from curvireg_torch.mesh.colours import SurfaceColours
 from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.rendering import make_renderer
-from curvireg_torch.settings import BankSettings
+from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.utils import digests
 
 PIPELINE = Pipeline(bank=BankSettings(image_size=64))

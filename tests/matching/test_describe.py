@@ -5,7 +5,7 @@ import torch
 
 from curvireg_torch.geometry import projected_boxes, sample_views
 from curvireg_torch.matching.describe import ViewDescriber, quarter_turns
-from curvireg_torch.settings import BankSettings
+from curvireg_torch.pipeline import BankSettings
 
 
 @pytest.mark.parametrize("camera", ["perspective", "orthographic"])

@@ -8,7 +8,7 @@ from curvireg_torch import geometry as g
 from curvireg_torch.matching import ViewBank
 from curvireg_torch.mesh import normalization_transform
 from curvireg_torch.mesh.mesh import extreme_points
-from curvireg_torch.settings import BankSettings
+from curvireg_torch.pipeline import BankSettings
 
 
 def moved(mesh: trimesh.Trimesh, rotation: torch.Tensor, scale: float, offset: list[float]) -> trimesh.Trimesh:

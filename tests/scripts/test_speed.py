@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from curvireg_torch import Pipeline, Registrar, ViewMatcher
-from curvireg_torch.settings import BankSettings, ViewPolicy
+from curvireg_torch.pipeline import BankSettings, ViewPolicy
 from scripts.speed import filters, load, paired, pipeline
 from tests._support.pretended import PRETENDING, pretended_gpu
 from tests._support.scenes import scene, truck_bank

@@ -17,7 +17,7 @@ from ...errors import InvalidInputError
 from ...geometry import crop_images, rotation_towards
 from ...geometry.views import DEFAULT_DISTANCE
 from ...mesh import load_mesh, mesh_centre, mesh_radius
-from ...settings import BankSettings
+from ...pipeline import BankSettings
 from ..bop import UNOCCLUDED
 from ..registry import DATASETS, DatasetSpec
 

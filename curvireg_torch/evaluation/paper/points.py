@@ -17,7 +17,7 @@ from ...filters import ImageGradient, MultiScaleCurvilinearSaliency, MultiScaleF
 from ...matching import ViewDescriber
 from ...matching.fields import depth_filter
 from ...metrics import hausdorff_distance, intersection_percentage, view_repeatability
-from ...settings import BankSettings
+from ...pipeline import BankSettings
 from .cases import Case, grouped
 from .tables import Cell, Table
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from ...geometry import ViewSphere, rotation_error, viewpoint_from_rotation
 from ...matching import ViewBank, ViewMatcher
 from ...metrics import accuracy, pose_parameter_errors, rank_precision
-from ...settings import BankSettings
+from ...pipeline import BankSettings
 from .cases import Case, grouped
 from .points import PHOTO_FIELDS
 from .tables import Cell, Table

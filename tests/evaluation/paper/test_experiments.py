@@ -14,7 +14,7 @@ import trimesh
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import paper
 from curvireg_torch.geometry import camera_matrix, rotation_error, rotation_from_viewpoint, sample_views
-from curvireg_torch.settings import BankSettings
+from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support.miniature import write_bop, write_pascal3d, write_web
 

@@ -8,7 +8,7 @@ import trimesh
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching import ViewDescriber
-from curvireg_torch.settings import BankSettings
+from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.training.scenes import GeneratedScenes
 from curvireg_torch.training.scenes.materials import random_picture
 from curvireg_torch.training.scenes.scene import simulate_camera

@@ -1,0 +1,473 @@
+"""The results of a registration: poses with their probabilities, as values, as JSON documents, and in words."""
+
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import CurviregError
+from ..geometry.cameras import transform
+from ..geometry.pose_prior import PosePrior, object_frame
+from ..geometry.viewpoint import rotation_error, viewpoint_from_rotation
+from ..matching import Ranking, ViewBank
+from ..mesh.mesh import mesh_unit
+from ..pipeline import Pipeline
+from ..utils.choices import SIDE_NAMES
+from ..version import __version__
+from .confidence import RELIABLE
+
+__all__ = [
+    "SCHEMA",
+    "FailedRegistration",
+    "Hypothesis",
+    "Localization",
+    "Registration",
+    "ambiguity",
+    "corners",
+    "localization_document",
+    "pose_in_words",
+    "remarks",
+    "result_document",
+    "used_box",
+    "verdict",
+]
+
+UNKNOWN_ROTATION = 1.0
+"""Radians of standard deviation from which the rotation about an axis counts as unknown."""
+
+RIVAL_FRACTION = 0.5
+"""Fraction of the first pose's probability from which another one makes the answer ambiguous."""
+
+HALF_TURN = 150.0
+"""Degrees from which the rotation between two poses counts as a half turn."""
+
+MIRROR_ANGLE = 30.0
+"""Degrees within which two directions of view count as mirror images of each other."""
+
+STEEP_ELEVATION = 70
+"""Degrees of elevation beyond which an object is seen from above or below."""
+
+SCHEMA = 3
+"""Version of the keys of ``result.json``; raised when a key is removed or changes its meaning."""
+
+CONVENTIONS = {
+    "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
+    "translation": "in the mesh file's unit; null without a camera",
+    "viewpoint": "PASCAL3D+ azimuth, elevation, theta in degrees",
+    "pixels": "(0, 0) is the centre of the top-left pixel of the picture as viewers show it (EXIF orientation applied)",
+    "boxes": "x0, y0, x1, y1 in those pixels",
+    "score": "normalised correlation of photograph and view, 0 to 1",
+    "confidence": "estimated probability that the rotation is within 30 degrees of the truth, null for pipelines that "
+    "were not calibrated; times presence for an object without a given box; of a pose refined from a start: at most "
+    "that it is within 10 degrees and 10 % of the distance",
+    "probabilities": "of the poses of top, in their order, to be within 30 degrees of the truth; none: of none of them",
+    "ambiguous": "how poses differ that are nearly as probable as the first: half turn, mirror or several; else null",
+    "symmetries": "number of orientations in which the mesh looks the same; poses that differ by them count as one",
+    "presence": "estimated probability that the photograph shows the object in that box",
+    "reliable": f"confidence of at least {RELIABLE:g}, no warnings, and no better match outside the prior; false = no "
+    "reliable match, the pose is a guess",
+    "warnings": "what is questionable about the box and the camera",
+    "confidence_features": "features that the confidence is computed from; margin: score of the best pose above that "
+    "of its best rival, null where the bank has no rival view, which bounds the confidence",
+    "edge_support": "how strongly image edges lie under the projected contours, 0 to 1",
+    "covariance": "of rotation (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
+    "t_true = t + e, if the camera matrix is right: errors of the camera are not in it; null without a camera, with a "
+    "guessed camera, and where not reliable",
+}
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One candidate pose of the object, in the mesh file's own frame and unit.
+
+    Attributes:
+        rotation: (3, 3) float64, ``x_cam = R x_model + t``, OpenCV camera.
+        translation: (3,) float64 in model units, None without a camera matrix.
+        score: normalised correlation of photograph and rendered view in [0, 1]; of a tracked pose, how clearly and how
+            near to its outline the object's colours end.
+        evidence: the features that the hypotheses are ordered by, see :data:`.poses.POSE_FEATURES`; of a tracked
+            pose, those of its confidence.
+        allocentric_rotation: (3, 3) float64, relative to a camera that looks straight at the object.
+        distance: distance of the object's centre in model units.
+        projection: (4, 4) ``T_cam_from_model`` and (3, 3) camera matrix in px, float64, which project the mesh onto
+            the photograph; without a camera matrix, those of a camera that looks straight at the object.
+        view: index of the bank's view that the hypothesis started from.
+        edge_support: strength of the image edges under the projected contours, in [0, 1]; None without contour fit.
+        covariance: (6, 6) float64 of rotation (rad) about the camera's x, y, z axes and translation (model units) along
+            them, ``R_true = exp([w]x) R``, ``t_true = t + e``, if this is the right pose; None without a camera matrix,
+            without contour fit, and where too few edges were found. It assumes that the camera matrix is right.
+    """
+
+    rotation: Tensor
+    translation: Tensor | None
+    score: float
+    evidence: Mapping[str, float]
+    allocentric_rotation: Tensor
+    distance: float
+    projection: tuple[Tensor, Tensor]
+    view: int
+    edge_support: float | None = None
+    covariance: Tensor | None = None
+
+    @property
+    def viewpoint(self) -> tuple[float, float, float]:
+        """Azimuth, elevation and theta of ``rotation`` in degrees (PASCAL3D+)."""
+        azimuth, elevation, theta = viewpoint_from_rotation(self.rotation)
+        return float(azimuth), float(elevation), float(theta)
+
+    @property
+    def standard_deviations(self) -> tuple[Tensor, Tensor] | None:
+        """(3,) degrees about and (3,) model units along the camera's axes; None without a covariance.
+
+        ``inf`` marks what the contours do not determine: deviations from a radian, or from half the distance.
+        """
+        if self.covariance is None:
+            return None
+        rotation, translation = self.covariance.diagonal().sqrt().split(3)
+        rotation = torch.where(rotation < UNKNOWN_ROTATION, torch.rad2deg(rotation), torch.inf)
+        return rotation, torch.where(translation < 0.5 * self.distance, translation, torch.inf)
+
+    @property
+    def transform(self) -> Tensor | None:
+        """(4, 4) float64 ``T_cam_from_model``, None without a camera matrix."""
+        return None if self.translation is None else transform(self.rotation, self.translation)
+
+    def pose_dict(self) -> dict[str, Any]:
+        """``rotation``, ``translation`` and ``viewpoint`` as JSON values."""
+        return {
+            "rotation": self.rotation.tolist(),
+            "translation": None if self.translation is None else self.translation.tolist(),
+            "viewpoint": dict(zip(("azimuth", "elevation", "theta"), self.viewpoint, strict=True)),
+        }
+
+
+@dataclass(frozen=True)
+class Localization:
+    """Where the object was found in a photograph that came without a box.
+
+    Attributes:
+        box: (4,) float64 x0, y0, x1, y1 in px, around the projected mesh.
+        presence: probability that the photograph shows the object there.
+        score: the detector's score of the proposal that led here.
+        boxes: (P, 4) float64, all proposals, the results' boxes first, with their ``scores`` (P,).
+    """
+
+    box: Tensor
+    presence: float
+    score: float
+    boxes: Tensor
+    scores: Tensor
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Poses of one object in one photograph, best first.
+
+    The attributes of the best :class:`Hypothesis` (``rotation``, ``translation``, ``score``, ``viewpoint``,
+    ``edge_support``, ``projection``, ...) are attributes of the registration too; ``covariance`` and
+    ``standard_deviations`` are None where it is not reliable.
+
+    Attributes:
+        hypotheses: distinct poses, best first; all but the first are rivals, such as the pose seen from behind.
+        probabilities: of each hypothesis to be within 30 degrees of the truth, times ``localization.presence`` for an
+            object without a box; empty for a pipeline that was not calibrated.
+        ranking: scores of the bank's views for this photograph (B = 1).
+        confidence_features: what the confidence is computed from, see :func:`.confidence.confidence_features`.
+        localization: where the object was found; None if its box was given.
+        corrected_box: (4,) float64, the box that replaced a given one that did not fit the pose; else None.
+        prior: the limits on the pose that were given.
+        prior_contradiction: "better outside": a pose outside the limits fits better by the same evidence, or the box
+            asks for a distance outside; "at the limit": the pose lies within a degree, or 1 % of the distance, of a
+            limit. None otherwise.
+        warnings: what is questionable about the box, the camera and the mesh, in words; a result with one is not
+            reliable.
+        model: number of the mesh, of several.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    probabilities: tuple[float, ...]
+    ranking: Ranking
+    confidence_features: Mapping[str, float | None] = field(default_factory=dict)
+    localization: Localization | None = None
+    corrected_box: Tensor | None = None
+    prior: PosePrior | None = None
+    prior_contradiction: str | None = None
+    warnings: tuple[str, ...] = ()
+    model: int = 0
+
+    ok = True
+    """False of a :class:`FailedRegistration`."""
+
+    @property
+    def rotation(self) -> Tensor:
+        return self.hypotheses[0].rotation
+
+    @property
+    def translation(self) -> Tensor | None:
+        return self.hypotheses[0].translation
+
+    @property
+    def transform(self) -> Tensor | None:
+        return self.hypotheses[0].transform
+
+    @property
+    def viewpoint(self) -> tuple[float, float, float]:
+        return self.hypotheses[0].viewpoint
+
+    @property
+    def score(self) -> float:
+        return self.hypotheses[0].score
+
+    @property
+    def edge_support(self) -> float | None:
+        return self.hypotheses[0].edge_support
+
+    @property
+    def allocentric_rotation(self) -> Tensor:
+        return self.hypotheses[0].allocentric_rotation
+
+    @property
+    def distance(self) -> float:
+        return self.hypotheses[0].distance
+
+    @property
+    def projection(self) -> tuple[Tensor, Tensor]:
+        return self.hypotheses[0].projection
+
+    @property
+    def confidence(self) -> float | None:
+        """Probability of the best pose, the first of ``probabilities``; None for pipelines without calibration."""
+        return self.probabilities[0] if self.probabilities else None
+
+    @property
+    def none(self) -> float | None:
+        """Probability that no hypothesis is right; None for pipelines without calibration."""
+        return max(0.0, 1.0 - sum(self.probabilities)) if self.probabilities else None
+
+    @property
+    def ambiguous(self) -> str | None:
+        """How poses differ that are nearly as probable as the first: "half turn", "mirror" or "several"; else None."""
+        likely = [p >= RIVAL_FRACTION * self.probabilities[0] for p in self.probabilities]
+        near = [h.allocentric_rotation for h, is_near in zip(self.hypotheses, likely, strict=False) if is_near]
+        return ambiguity(torch.stack(near)) if near else None
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the confidence is at least ``RELIABLE``, without ``warnings``, the photograph does not contradict the
+        prior by a better pose outside, and the contours determine at least one axis of rotation; if False, the pose is
+        a guess."""
+        if self.confidence is None or self.confidence < RELIABLE or self.warnings:
+            return False
+        return self.prior_contradiction != "better outside" and self._is_determined
+
+    @property
+    def _is_determined(self) -> bool:
+        """Whether a pose with a camera has a covariance, in which not all rotations are unknown."""
+        best = self.hypotheses[0]
+        deviations = best.standard_deviations
+        if best.translation is None or best.edge_support is None:
+            return True
+        return deviations is not None and bool(deviations[0].isfinite().any())
+
+    @property
+    def candidates(self) -> Tensor:
+        """(K,) view indices of the hypotheses."""
+        return torch.tensor([h.view for h in self.hypotheses])
+
+    @property
+    def covariance(self) -> Tensor | None:
+        return self.hypotheses[0].covariance if self.reliable else None
+
+    @property
+    def standard_deviations(self) -> tuple[Tensor, Tensor] | None:
+        return self.hypotheses[0].standard_deviations if self.reliable else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Pose, scores and uncertainty as JSON values, under the keys of ``result.json`` (docs/results.md)."""
+        deviations, covariance = self.standard_deviations, self.covariance
+        prior = None if self.prior is None else {**self.prior.to_dict(), "contradiction": self.prior_contradiction}
+        return {
+            **self.hypotheses[0].pose_dict(),
+            "score": self.score,
+            "confidence": self.confidence,
+            "reliable": self.reliable,
+            "warnings": list(self.warnings),
+            "probabilities": list(self.probabilities),
+            "none": self.none,
+            "ambiguous": self.ambiguous,
+            "confidence_features": dict(self.confidence_features),
+            "edge_support": self.edge_support,
+            "standard_deviations": None
+            if deviations is None
+            else {"rotation_deg": _finite(deviations[0]), "translation": _finite(deviations[1])},
+            "covariance": None if covariance is None else covariance.tolist(),
+            "corrected_box": None if self.corrected_box is None else self.corrected_box.tolist(),
+            **({} if prior is None else {"prior": prior}),
+            "top": [self._hypothesis_dict(hypothesis) for hypothesis in self.hypotheses],
+        }
+
+    def _hypothesis_dict(self, hypothesis: Hypothesis) -> dict[str, Any]:
+        terms = {name: float(raw[0, hypothesis.view]) for name, raw in self.ranking.terms.items()}
+        return {
+            **hypothesis.pose_dict(),
+            "score": hypothesis.score,
+            "evidence": dict(hypothesis.evidence),
+            "view": hypothesis.view,
+            "terms": {name: value for name, value in terms.items() if math.isfinite(value)},
+        }
+
+
+def _finite(deviations: Tensor) -> list[float | None]:
+    """JSON has no infinity: None in its place."""
+    return [None if math.isinf(v) else v for v in deviations.tolist()]
+
+
+@dataclass(frozen=True)
+class FailedRegistration:
+    """A photograph that could not be registered because of its ``error``, which access to a pose raises."""
+
+    error: CurviregError
+
+    ok = False
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise self.error
+
+
+def ambiguity(rotations: Tensor) -> str | None:
+    """How poses differ, in words; None for a single one.
+
+    "half turn": the second differs from the first by a rotation of nearly 180 degrees. "mirror": they are seen from
+    directions that are mirror images at a coordinate plane of the mesh. "several": anything else, or more than two.
+
+    Args:
+        rotations: (K, 3, 3).
+
+    Example:
+        >>> ambiguity(torch.stack([torch.eye(3), torch.diag(torch.tensor([-1.0, -1.0, 1.0]))]))
+        'half turn'
+    """
+    if len(rotations) < 2:
+        return None
+    if len(rotations) > 2:
+        return "several"
+    first, second = rotations.double()
+    if float(rotation_error(first, second)) >= HALF_TURN:
+        return "half turn"
+    mirrored = first[2] * (1.0 - 2.0 * torch.eye(3, dtype=torch.float64))  # the optical axis at the three planes
+    angles = torch.rad2deg((mirrored @ second[2]).clamp(-1.0, 1.0).acos())
+    return "mirror" if float(angles.min()) <= MIRROR_ANGLE else "several"
+
+
+def result_document(
+    result: Registration,
+    bank: ViewBank,
+    pipeline: Pipeline,
+    seconds: Mapping[str, float],
+    symmetries: Tensor | None = None,
+) -> dict[str, Any]:
+    """:meth:`Registration.to_dict` and how the result was computed, with the seconds of ``bank`` and ``register``.
+
+    ``symmetries`` (S, 4, 4) are those that hypotheses were told apart by.
+    """
+    return {
+        "schema": SCHEMA,
+        "unit": mesh_unit(bank.mesh),
+        **result.to_dict(),
+        "symmetries": 1 if symmetries is None else len(symmetries),
+        "views": len(bank),
+        "pipeline": pipeline.describe(),
+        "seconds": dict(seconds),
+        "versions": {
+            "curvireg_torch": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "kornia": version("kornia"),
+            "trimesh": version("trimesh"),
+        },
+        "conventions": CONVENTIONS,
+    }
+
+
+def localization_document(results: Sequence[Registration]) -> dict[str, Any]:
+    """The key ``localization``: the objects that :func:`localize` found in one photograph."""
+    located = [(result, result.localization) for result in results if result.localization is not None]
+    first = located[0][1]
+    return {
+        "presence": first.presence,
+        "proposals": [{"box": b.tolist(), "score": float(s)} for b, s in zip(first.boxes, first.scores, strict=True)],
+        "instances": [
+            {
+                "box": at.box.tolist(),
+                "presence": at.presence,
+                "confidence": result.confidence,
+                **result.hypotheses[0].pose_dict(),
+            }
+            for result, at in located
+        ],
+    }
+
+
+def used_box(document: Mapping[str, Any]) -> list[float]:
+    """The box that a document's pose was computed with: the given one, or the one that replaced it."""
+    box: list[float] = document["corrected_box"] or document["inputs"]["box"]
+    return box
+
+
+def corners(box: Sequence[float]) -> str:
+    """A box in whole px, as ``--box`` takes it."""
+    return " ".join(f"{v:.0f}" for v in box)
+
+
+def remarks(document: Mapping[str, Any]) -> list[str]:
+    """Lines about numbers that did not fit, a replaced box or contradicted limits, and about a symmetric mesh."""
+    box, contradiction = document["corrected_box"], document.get("prior", {}).get("contradiction")
+    lines = [] if box is None else [f"the box did not fit the pose; one that does: {corners(box)}"]
+    if contradiction == "better outside":
+        lines.append("the photograph fits much better outside the limits on the pose; check them")
+    elif contradiction is not None:
+        lines.append("the pose lies at one of its limits; widen it to see whether it stays")
+    if (count := document.get("symmetries", 1)) > 1:
+        lines.append(f"the mesh looks the same in {count} orientations: the pose is one of as many")
+    return lines
+
+
+def verdict(probability: float | None, none: float | None, reliable: bool) -> str:
+    """Return "likely" if an answer is reliable, "no match" if "none of them" is more probable than it, else "unsure".
+
+    Example:
+        >>> verdict(0.95, 0.03, True), verdict(0.6, 0.1, False), verdict(None, None, False)
+        ('likely', 'unsure', 'unsure')
+    """
+    if reliable:
+        return "likely"
+    return "no match" if probability is not None and none is not None and none > probability else "unsure"
+
+
+def pose_in_words(rotation: Tensor, *, up: str = "z", front: str | None = None) -> str:
+    """The side from which the object is seen, in degrees that the option ``--azimuth`` takes.
+
+    Args:
+        rotation: (3, 3), from the mesh file's axes to the camera.
+        up, front: axes of the mesh, see :func:`.object_frame`.
+
+    Example:
+        >>> from curvireg_torch.geometry import rotation_from_viewpoint
+        >>> pose_in_words(rotation_from_viewpoint(310.0, 20.0, 0.0))
+        'seen from the front-left (azimuth 310°), 20° above the horizon'
+    """
+    R = rotation.detach().cpu().double()
+    azimuth, elevation, theta = (round(float(v)) for v in viewpoint_from_rotation(R @ object_frame(up, front).mT))
+    side = f"the {SIDE_NAMES[round(azimuth / 45.0) % 8]}"
+    if abs(elevation) > STEEP_ELEVATION:
+        side = "above" if elevation > 0 else "below"
+    height = f"{abs(elevation)}° {'above' if elevation > 0 else 'below'} the horizon" if elevation else "level"
+    tilt = f", tilted by {abs(theta)}° to the {'left' if theta > 0 else 'right'}" if theta else ""
+    return f"seen from {side} (azimuth {azimuth % 360}°), {height}{tilt}"
