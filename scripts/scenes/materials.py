@@ -2,10 +2,10 @@
 
 import cv2
 import numpy as np
+import torch
 
-from .surfaces import Array, Rng
-
-__all__ = ["Material", "random_colour", "random_picture"]
+from curvireg_torch.geometry.conversions import rotation_from_quaternion
+from scripts.scenes.surfaces import Array, Rng
 
 
 def random_colour(rng: Rng) -> Array:
@@ -31,8 +31,8 @@ class Material:
         self.gloss = 0.0 if rng.random() < 0.5 else rng.uniform(0.1, 0.9)
         self.shininess = np.exp(rng.uniform(1.5, 5.0))
 
-    def colours(self, points: Array) -> Array:
-        """(N, 3) colours in [0, 1] of (N, 3) points in units of the object's radius."""
+    def colours(self, points: Array, uv: Array | None = None) -> Array:
+        """(N, 3) colours in [0, 1] of (N, 3) points of an object of radius 1."""
         if self._kind == "plain":
             return np.broadcast_to(self._first, points.shape)
         along = points @ self._axes + self._phases
@@ -89,3 +89,33 @@ def random_picture(rng: Rng, size: int) -> Array:
                 axes, angle = (int(a) + 1, int(b) + 1), float(rng.uniform(0, 180))
                 cv2.ellipse(picture, (x, y), axes, angle, 0, 360, colour, -1, cv2.LINE_AA)
     return np.ascontiguousarray(np.clip(picture, 0, 1), dtype=np.float32)
+
+
+def random_texture(rng: Rng, size: int = 256) -> Array:
+    """(size, size, 3) float32 linear colours that repeat: wooden boards, woven cloth, or a random picture."""
+    kind = rng.integers(3)
+    if kind == 0:
+        return random_picture(rng, size)
+    first, second = random_colour(rng), random_colour(rng)
+    y, x = np.mgrid[0:size, 0:size] / size
+    if kind == 1:  # cloth: threads above and below each other, in stripes or checks
+        threads, stripes = 2 * int(rng.integers(12, 32)), int(rng.integers(1, 6))
+        weave = 0.5 + 0.5 * np.sin(2 * np.pi * threads * x) * np.sin(2 * np.pi * threads * y)
+        bands = np.sin(2 * np.pi * stripes * x) * (np.sin(2 * np.pi * stripes * y) if rng.random() < 0.5 else 1.0) > 0
+        colour = np.where(bands[..., None], first, second) * (0.75 + 0.25 * weave[..., None])
+        return np.ascontiguousarray(colour, dtype=np.float32)
+    grain = np.zeros((size, size), np.float32)  # boards with a grain along the columns
+    for rows, columns, strength in ((8, 2, 0.5), (64, 4, 0.5), (size // 2, 16, 0.3)):
+        noise = np.pad(rng.normal(size=(rows, columns)).astype(np.float32), 1, mode="wrap")
+        high, wide = size // rows, size // columns
+        fine = cv2.resize(noise, (size + 2 * wide, size + 2 * high), interpolation=cv2.INTER_CUBIC)
+        grain += strength * fine[high : high + size, wide : wide + size]
+    grain += rng.normal(0, 0.5, 4)[np.floor(4 * y).astype(int)]
+    gap = np.abs(4 * y - np.round(4 * y)) < 0.012
+    colour = rng.uniform(0.4, 1.6) * np.array([0.42, 0.25, 0.13]) * np.exp(0.16 * grain[..., None])
+    return np.ascontiguousarray(np.where(gap[..., None], 0.35 * colour, colour).clip(0, 1), dtype=np.float32)
+
+
+def random_rotation(rng: Rng) -> Array:
+    """(3, 3) rotation, uniformly distributed because a quaternion of normal numbers has no preferred direction."""
+    return np.asarray(rotation_from_quaternion(torch.from_numpy(rng.normal(size=4))))

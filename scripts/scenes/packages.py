@@ -1,23 +1,12 @@
-"""Make printed packages for the benchmark: cans, bottles and boxes whose labels alone tell their sides apart.
-
-Add them to the catalogue of meshes.py as the half "printed"; make.py then shows them among each other.
-
-    python scripts/benchmark/printed.py --out /data/benchmark [--count 60]
-    python scripts/benchmark/make.py --out /data/benchmark --half printed --count 600
-"""
-
-import argparse
-import json
-from pathlib import Path
+"""Printed packages: cans, bottles and boxes whose labels alone tell their sides apart."""
 
 import cv2
 import numpy as np
 import trimesh
-from PIL import Image
-from trimesh.visual import TextureVisuals
-from trimesh.visual.material import SimpleMaterial
 
-from curvireg_torch.training.scenes.materials import random_colour, random_picture
+from scripts.scenes.materials import random_colour, random_picture
+from scripts.scenes.surfaces import Rng
+from scripts.scenes.textured import Texture, TexturedMesh
 
 WIDTH, HEIGHT = 512, 256
 """Size of a label in px."""
@@ -26,18 +15,18 @@ SIDES, FONTS = 72, (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_
 LETTERS = "ABCDEFGHIKLMNOPRSTUVZ"
 
 
-def label(rng: np.random.Generator) -> np.ndarray:
+def label(rng: Rng) -> np.ndarray:
     """(HEIGHT, WIDTH, 3) uint8: bands, a picture, words and small print on one colour."""
     picture = np.full((HEIGHT, WIDTH, 3), 255 * random_colour(rng), np.float32)
     for _ in range(rng.integers(0, 4)):
         top = int(rng.integers(HEIGHT))
         picture[top : top + int(rng.integers(5, 60))] = 255 * random_colour(rng)
-    for _ in range(rng.integers(1, 4)):
+    for _ in range(rng.integers(2, 5)):
         side = int(rng.integers(50, 150))
         x, y = int(rng.integers(WIDTH - side)), int(rng.integers(HEIGHT - side))
         picture[y : y + side, x : x + side] = 255 * random_picture(rng, side)
     picture = picture.clip(0, 255).round().astype(np.uint8)
-    for _ in range(rng.integers(2, 12)):
+    for _ in range(rng.integers(5, 16)):
         word = "".join(rng.choice(list(LETTERS), rng.integers(2, 9)))
         scale, place = float(rng.uniform(0.4, 2.5)), (int(rng.integers(WIDTH)), int(rng.integers(20, HEIGHT)))
         colour, font = tuple((255 * random_colour(rng)).tolist()), FONTS[rng.integers(len(FONTS))]
@@ -45,7 +34,7 @@ def label(rng: np.random.Generator) -> np.ndarray:
     return picture
 
 
-def solid_of_revolution(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+def solid_of_revolution(rng: Rng) -> tuple[np.ndarray, ...]:
     """Vertices, faces and texture coordinates of a can, or of a bottle with shoulder and neck, of height 1."""
     radius = rng.uniform(0.18, 0.5)
     if rng.random() < 0.5:
@@ -69,7 +58,7 @@ def solid_of_revolution(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     return np.concatenate(points), np.concatenate(faces), np.concatenate(uv)
 
 
-def carton(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+def carton(rng: Rng) -> tuple[np.ndarray, ...]:
     """Vertices, faces and texture coordinates of a box of height 1, with another part of the label on each side."""
     solid = trimesh.creation.box((rng.uniform(0.3, 0.9), rng.uniform(0.15, 0.6), 1.0))
     corners = solid.triangles.reshape(6, 6, 3)  # two triangles a side
@@ -82,47 +71,8 @@ def carton(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     return corners.reshape(-1, 3), np.arange(36).reshape(-1, 3), uv.reshape(-1, 2)
 
 
-def make_package(folder: Path, name: str, rng: np.random.Generator) -> dict:
-    """Write a package below ``folder``; its line of the catalogue."""
+def package(rng: Rng) -> TexturedMesh:
+    """A printed package, 8 to 25 cm high, in metres."""
     vertices, faces, uv = carton(rng) if rng.random() < 0.3 else solid_of_revolution(rng)
-    material = SimpleMaterial(image=Image.fromarray(label(rng)), specular=[60, 60, 60, 255])
-    mesh = trimesh.Trimesh(
-        vertices * rng.uniform(0.08, 0.25), faces, visual=TextureVisuals(uv, material=material), process=False
-    )
-    path = Path("meshes", name, "model.obj")
-    (folder / path).parent.mkdir(parents=True, exist_ok=True)
-    mesh.export(folder / path)
-    return {
-        "id": name,
-        "name": name,
-        "kind": None,
-        "path": str(path),
-        "faces": len(faces),
-        "extents": mesh.extents.tolist(),
-        "shape_symmetries": [0],
-        "look_symmetries": [0],
-        "half": "printed",
-        "like": name,
-        "licence": "CC0-1.0",
-    }
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--count", type=int, default=60)
-    parser.add_argument("--seed", type=int, default=29)
-    options = parser.parse_args()
-    catalogue = options.out / "meshes.json"
-    listing = json.loads(catalogue.read_text())
-    others = [mesh for mesh in listing["meshes"] if mesh["half"] != "printed"]
-    packages = [
-        make_package(options.out, f"printed-{k:03d}", np.random.default_rng((options.seed, k)))
-        for k in range(options.count)
-    ]
-    catalogue.write_text(json.dumps({**listing, "meshes": others + packages}, indent=1))
-    print(f"{len(packages)} printed packages in {options.out}")
-
-
-if __name__ == "__main__":
-    main()
+    picture = (label(rng).astype(np.float32) / 255) ** 2.2
+    return TexturedMesh.from_arrays(vertices * rng.uniform(0.08, 0.25), faces, [Texture(picture, 0.3)], uv=uv)

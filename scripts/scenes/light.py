@@ -1,21 +1,19 @@
 """Light from the sky and from lamps, with shadows and highlights."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from ...rendering.embree import RayScene
-from .materials import random_colour
-from .surfaces import Array, Rng
-
-__all__ = ["Lamp", "Light", "random_light", "shade_points"]
+from curvireg_torch.rendering.embree import RayScene
+from scripts.scenes.materials import random_colour
+from scripts.scenes.surfaces import Array, Rng
 
 SHADOW = 0.1  # fraction of a lamp's light that reaches shadowed points, as indirect light would
 
 
 class Lamp(NamedTuple):
-    """A distant lamp: unit vector (3,) to it in the camera's frame, linear light (3,), and whether it casts shadows."""
+    """A distant lamp: unit vector (3,) to it, linear light (3,), and whether it casts shadows."""
 
     towards: Array
     power: Array
@@ -24,10 +22,10 @@ class Lamp(NamedTuple):
 
 @dataclass(frozen=True)
 class Light:
-    """All light of a scene.
+    """All light of a scene, in the scene's frame or, after :meth:`seen_by`, in a camera's.
 
     Attributes:
-        up: (3,) unit vector to the zenith, in the camera's frame.
+        up: (3,) unit vector to the zenith.
         sky, tint: ambient light and the additional light from above; (3,) colour of both.
         reflection: height of the horizon and (3,) colour above it, mirrored by glossy surfaces; None for none.
     """
@@ -38,17 +36,25 @@ class Light:
     lamps: tuple[Lamp, ...]
     reflection: tuple[float, Array] | None
 
+    def seen_by(self, R: Array) -> "Light":
+        """The light in the frame of a camera with rotation R (3, 3), scene -> camera."""
+        beside = np.array([0.3, -0.4, -0.87])
+        lamps = [lamp._replace(towards=R @ lamp.towards if lamp.towards.any() else beside) for lamp in self.lamps]
+        return replace(self, up=R @ self.up, lamps=tuple(lamps))
 
-def random_light(up: Array, rng: Rng) -> Light:
-    """Random light for a scene whose z axis is ``up`` (3,) in the camera's frame."""
-    up = up if rng.random() < 0.7 else np.array([0.0, -1.0, 0.0])
+
+def random_light(rng: Rng) -> Light:
+    """Random light of a scene whose z axis points up."""
+    up = np.array([0.0, 0.0, 1.0])
     sky = (rng.uniform(0.2, 0.7), rng.uniform(0.0, 0.3))
     tint = 1 + rng.normal(0, 0.05, 3)
     lamps = []
     for _ in range(int(rng.integers(1, 3))):
-        towards = rng.normal(size=3) + up * rng.uniform(0, 2) + np.array([0, 0, -1.0]) * rng.uniform(0, 1.5)
+        towards = rng.normal(size=3) + up * rng.uniform(0, 2)
         power = rng.uniform(0.2, 1.0) * (1 + rng.normal(0, 0.08, 3))
         lamps.append(Lamp(towards / np.linalg.norm(towards), power, bool(rng.random() < 0.6)))
+    if rng.random() < 0.5:  # a lamp beside the camera
+        lamps[0] = lamps[0]._replace(towards=np.zeros(3))
     reflection = (float(rng.uniform(-0.2, 0.5)), random_colour(rng)) if rng.random() < 0.4 else None
     return Light(up, sky, tint, tuple(lamps), reflection)
 
