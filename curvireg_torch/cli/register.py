@@ -86,7 +86,7 @@ def add_parser(commands: Any) -> None:
     add_pose_prior(parser)
     add_mesh_is(parser)
     add("--instances", type=whole_number(1), default=1, metavar="N", help="without a box: up to N objects (default: 1)")
-    add("--field", type=Path, metavar="FILE", help="weights from curvireg bank --adapt")
+    add("--field", type=Path, metavar="FILE", help="weights of a learned field")
     add("--top", type=whole_number(1), metavar="K", help="hypotheses to carry and report (default: 5)")
     add("--no-refine", dest="refine", action="store_false", help="stop at the best view of the bank")
     add(

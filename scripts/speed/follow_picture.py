@@ -17,7 +17,7 @@ from curvireg_torch.data import Video
 from curvireg_torch.matching import cached_bank
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import Follower
-from curvireg_torch.synthetic import example_mesh, photograph_tabletop
+from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from curvireg_torch.visualization import OverlayVideo
 from curvireg_torch.visualization.encoding import shrink
 from scripts._shared import REPOSITORY
@@ -44,7 +44,7 @@ def video(seed: int) -> tuple[Tensor, Tensor, Tensor]:
     """The (FRAMES, 3, H, W) frames, the box in the first one, and the camera matrix."""
     K = cr.camera_matrix(840.0, 840.0, 319.5, 239.5, dtype=torch.float64)
     generator = torch.Generator().manual_seed(seed)
-    frames, boxes = photograph_tabletop(example_mesh(painted=True), poses(example_mesh()), K, SIZE, generator)
+    frames, boxes = synthesize_photograph(example_mesh(painted=True), poses(example_mesh()), K, SIZE, generator)
     for number, frame in enumerate(frames):
         left = SIZE[1] * (number + 1) // FRAMES - POST
         frame[:, :, max(left, 0) : left + POST] = torch.tensor([0.35, 0.3, 0.25])[:, None, None]

@@ -5,15 +5,13 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from ..features.learned_field import WORK_SIZE, doubled_angle, halved_angle
-from ..geometry import rotation_from_axis_angle
-from ..matching import ViewDescriber
-from ..matching.fields import depth_filter, hog_layer
-from ..settings import BankSettings
-from ..terms import normalized_correlation
-from .scenes import GeneratedScenes
-
-__all__ = ["SETTINGS", "FieldDataset", "ReplayBuffer", "augment", "losses", "mirrored_descriptors"]
+from curvireg_torch.features.learned_field import WORK_SIZE, doubled_angle, halved_angle
+from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.matching import ViewDescriber
+from curvireg_torch.matching.fields import depth_filter, hog_layer
+from curvireg_torch.settings import BankSettings
+from curvireg_torch.terms import normalized_correlation
+from scripts.training.generated import GeneratedScenes
 
 SETTINGS = BankSettings(image_size=WORK_SIZE, sigma=0.8)
 """Settings of the depth views that the network learns to imitate."""
@@ -47,7 +45,7 @@ class FieldDataset(Dataset[dict[str, Tensor]]):
         field = self._filter(sample["depth"][None])
         code = F.avg_pool2d(doubled_angle(field), 2)
         length = code.norm(dim=1)
-        describe = ViewDescriber(self.scenes.shape(index).mesh(), SETTINGS)
+        describe = ViewDescriber(self.scenes.mesh(index), SETTINGS)
         rotations = sample["rotation"] @ _view_rotations(torch.Generator().manual_seed(index))
         views = self._filter(describe.depth(rotations, sample["distance"].expand(len(rotations)))[0])
         return {

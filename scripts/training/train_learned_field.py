@@ -1,9 +1,9 @@
 """Train the learned field on generated scenes, without photographs, annotations or pretrained weights.
 
-    python scripts/calibration/train_learned_field.py --out runs/field --minutes 90
+    python scripts/training/train_learned_field.py --out runs/field --minutes 90
 
 A batch consists of fresh scenes and of earlier ones, with new colours and mirrored. For the losses see
-curvireg_torch.training.losses; one of them is backpropagated through HOG. A second start with the same --out resumes.
+scripts/training/field_dataset.py; one of them is backpropagated through HOG. A second start with the same --out resumes.
 """
 
 import argparse
@@ -28,10 +28,9 @@ from curvireg_torch.geometry import rotation_error, sample_views
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.matching.fields import depth_filter, hog_layer
 from curvireg_torch.terms import normalized_correlation
-from curvireg_torch.training import FieldDataset, ReplayBuffer, augment, losses
-from curvireg_torch.training.field_dataset import SETTINGS
-from curvireg_torch.training.scenes import GeneratedScenes
 from curvireg_torch.utils.files import write_tensors
+from scripts.training.field_dataset import SETTINGS, FieldDataset, ReplayBuffer, augment, losses
+from scripts.training.generated import GeneratedScenes
 
 VALIDATION_SEED = 1_000_003
 
@@ -45,7 +44,7 @@ class Validation:
         self.images, self.depths, self.errors, self.banks = [], [], [], []
         for i in tqdm(range(count), desc="validation banks", mininterval=10):
             sample = scenes[i]
-            describe = ViewDescriber(scenes.shape(i).mesh(), SETTINGS)
+            describe = ViewDescriber(scenes.mesh(i), SETTINGS)
             bank = describe(views.rotations, torch.full((len(views),), 5.0))
             self.images.append(sample["image"])
             self.depths.append(sample["depth"])
