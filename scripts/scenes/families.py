@@ -81,36 +81,6 @@ def stack(rng: Rng) -> list[Part]:
     return parts
 
 
-def bracket(rng: Rng) -> list[Part]:
-    """Machine parts: plates, ribs, rims of holes, bolts and gears."""
-    w, d, t = rng.uniform((0.6, 0.3, 0.05), (1.2, 0.8, 0.15))
-    parts: list[Part] = [(box((w, d, t)), 0)]
-    parts.append((box((t, d, rng.uniform(0.3, 0.9))).moved((0.5 * w * rng.choice([-1, 0, 1]), 0, 0.25)), 0))
-    for k in range(int(rng.integers(1, 5))):
-        at = (*(rng.uniform(-0.4, 0.4, 2) * (w, d)), 0.5 * t)
-        r, h = rng.uniform(0.04, 0.15), rng.uniform(0.02, 0.4)
-        if rng.random() < 0.4:
-            teeth = 2 * int(rng.integers(6, 14))
-            a = 2 * np.pi * np.arange(2 * teeth) / (2 * teeth)
-            radius = 2 * r * np.where(np.arange(2 * teeth) % 4 < 2, 1.0, 0.8)
-            parts.append((extrude(radius[:, None] * np.stack([np.cos(a), np.sin(a)], -1), h).moved(at), 1))
-        else:
-            parts.append((lathe(np.array([r, r, 0.7 * r, 0.7 * r]), np.array([0, h, h, 0.5 * h])).moved(at), k % 2))
-    return parts
-
-
-def lump(rng: Rng) -> list[Part]:
-    """Smooth bumpy bodies: stones, fruit, soft toys."""
-    parts: list[Part] = []
-    for k in range(int(rng.integers(1, 4))):
-        ball = superquadric(rng.uniform(0.5, 1.0, 3), (1.0, 1.0))
-        waves, phases = rng.normal(0, rng.uniform(1, 4), (3, 6)), rng.uniform(0, 6.3, 6)
-        bumps = np.sin(ball.vertices @ waves + phases).mean(axis=1, keepdims=True)
-        lump = Surface(ball.vertices * (1 + rng.uniform(0.1, 0.7) * bumps), ball.faces)
-        parts.append((lump.moved(rng.normal(0, 0.6, 3) * (k > 0), scale=rng.uniform(0.4, 1) if k else 1.0), k))
-    return parts
-
-
 def vessel(rng: Rng) -> list[Part]:
     """Bottles, jars, vases, lamps: surfaces of revolution, with a lid and at times a handle."""
     n = int(rng.integers(3, 7))
@@ -128,48 +98,6 @@ def vessel(rng: Rng) -> list[Part]:
     if rng.random() < 0.3:
         parts.append((torus(0.15, 0.02).moved((radii.max(), 0, 0.5), rotation(0, np.pi / 2)), 3))
     return parts
-
-
-def creature(rng: Rng) -> list[Part]:
-    """Body, neck, head and limbs of ellipsoids: animals, toys, figures."""
-    body = np.array([rng.uniform(0.15, 0.3), rng.uniform(0.3, 0.5), rng.uniform(0.15, 0.35)])
-    high = rng.uniform(0.2, 0.6) + body[2]
-    ball = (1.0, 1.0)
-    parts: list[Part] = [(superquadric(body, ball).moved((0, 0, high), rotation(0, rng.uniform(-0.6, 0.6))), 0)]
-    head = np.array([0, -body[1] - rng.uniform(0, 0.2), high + rng.uniform(0, 0.5)])
-    parts.append((bar((0, -0.7 * body[1], high), head, rng.uniform(0.05, 0.12)), 0))
-    size = rng.uniform((0.1, 0.1, 0.1), (0.2, 0.28, 0.2))
-    parts.append((superquadric(size, ball).moved(head), 0))
-    for s in (-1, 1):
-        ear = superquadric((0.03, 0.05, rng.uniform(0.05, 0.2)), ball)
-        at = head + np.array((s * 0.7 * size[0], 0.03, size[2]))
-        parts.append((ear.moved(at, rotation(1, s * rng.uniform(0, 0.5))), 1))
-        for y in (-0.6, 0.6):
-            foot = (s * rng.uniform(0.8, 1.1) * body[0], y * body[1] + rng.normal(0, 0.05), 0)
-            parts.append((bar((s * 0.7 * body[0], y * body[1], high), foot, rng.uniform(0.03, 0.08)), 0))
-    if rng.random() < 0.6:
-        y, tip = body[1], high + rng.uniform(-0.2, 0.4)
-        parts.append((tube(np.array([(0, y, high), (0, y + 0.2, high + 0.1), (0, y + 0.3, tip)]), 0.03), 1))
-    return parts
-
-
-def package(rng: Rng) -> list[Part]:
-    """Cartons, tins, tubs and bottles with a print: simple bodies that differ mainly in texture."""
-    w, d, h = rng.uniform((0.3, 0.15, 0.3), (0.8, 0.5, 1.0))
-    kind = rng.integers(4)
-    if kind == 0:
-        return [(box((w, d, h)), 0)]
-    if kind == 1:
-        r = 0.4 * w
-        return [(lathe([0.9 * r, r, r, 0.9 * r], np.array([0, 0.03, 0.97, 1]) * h), 0)]
-    if kind == 2:  # flat bottle with shoulders
-        e = (rng.uniform(0.2, 0.6), rng.uniform(0.4, 1.0))
-        parts = [(superquadric((0.5 * w, 0.5 * d, 0.5 * h), e), 0)]
-        neck = rng.uniform(0.1, 0.3) * w
-        top = lathe(np.array([neck, neck, 0.7 * neck]), np.array([0.4, 0.55, 0.7]) * h)
-        return [*parts, (top, 1)]
-    parts = [(box((w, d, h), top=rng.uniform(0.75, 1.3)), 0)]
-    return [*parts, (box((1.05 * w, 1.05 * d, 0.08 * h)).moved((0, 0, 0.52 * h)), 1)]
 
 
 def chair(rng: Rng) -> list[Part]:
@@ -261,24 +189,6 @@ def screen(rng: Rng) -> list[Part]:
     parts.append((bar((0, 0.05, 0), (0, 0.05, up), rng.uniform(0.02, 0.06)), 2))
     base = lathe(np.full(2, 0.2), np.array([0, 0.03])) if rng.random() < 0.5 else box((0.5, 0.25, 0.03))
     parts.append((base.moved((0, 0.03, 0)), 2))
-    return parts
-
-
-def frame(rng: Rng) -> list[Part]:
-    """Shelves, scaffolds, lamps on legs: rods between random corners, with some panels."""
-    w, d, h = rng.uniform((0.4, 0.3, 0.5), (1.0, 0.8, 1.5))
-    rod = rng.uniform(0.01, 0.04)
-    corners = [(sx * w / 2, sy * d / 2) for sx in (-1, 1) for sy in (-1, 1)]
-    parts: list[Part] = [(bar((x, y, 0), (x, y, h), rod, sides=4), 0) for x, y in corners]
-    for z in np.linspace(0.1, 1, int(rng.integers(2, 6))) * h:
-        if rng.random() < 0.6:
-            parts.append((box((w, d, 0.02)).moved((0, 0, z)), 1))
-        else:
-            edges = ((0, 1), (1, 3), (3, 2), (2, 0))
-            parts += [(bar((*corners[i], z), (*corners[j], z), rod, sides=4), 0) for i, j in edges]
-    for _ in range(int(rng.integers(0, 4))):
-        a, b = rng.uniform(-0.5, 0.5, (2, 3)) * (w, d, h) + (0, 0, 0.5 * h)
-        parts.append((bar(a, b, rod), 0))
     return parts
 
 
@@ -414,59 +324,8 @@ def aircraft(rng: Rng) -> list[Part]:
     return parts
 
 
-def boat(rng: Rng) -> list[Part]:
-    length, width, depth = rng.uniform((1.6, 0.35, 0.2), (2.2, 0.7, 0.4))
-    y = np.linspace(0, 1, 9)
-    half = 0.5 * width * np.minimum(1, 2.2 * y ** rng.uniform(0.5, 0.9)) * np.where(y > 0.8, 0.95, 1)
-    keel = -depth * np.minimum(1, 3 * y) ** 0.7
-    sheer = 0.15 * depth * (1 - y) ** 2 * rng.uniform(0, 3)
-    ring = [
-        np.stack([s * half * w, (y - 0.5) * length, sheer * (1 - z) + keel * z], -1)
-        for s, w, z in ((-1, 1.0, 0.0), (-1, 0.85, 0.6), (-1, 0.02, 1.0), (1, 0.02, 1.0), (1, 0.85, 0.6), (1, 1.0, 0.0))
-    ]
-    hull = np.stack(ring, 1)
-    from_grid = loft(np.zeros((9, 6, 2)), np.zeros(9))
-    vertices = np.concatenate([hull.reshape(-1, 3), hull[[0, -1]].mean(axis=1)])
-    parts: list[Part] = [(Surface(vertices, from_grid.faces), 0)]
-    top = 0.0
-    for k in range(int(rng.integers(0, 4))):
-        size = np.array([rng.uniform(0.4, 0.8) * width, rng.uniform(0.15, 0.5) * length, rng.uniform(0.08, 0.25)])
-        deck = rounded_box(rng, size)
-        parts.append((deck.moved((0, rng.uniform(-0.1, 0.2) * length, top + 0.5 * size[2])), 1 + k % 2))
-        top += size[2]
-    if rng.random() < 0.5:
-        mast, high = np.array([0, -0.1 * length, 0]), rng.uniform(0.8, 2.2)
-        parts.append((bar(mast, mast + np.array((0, 0, high)), 0.015), 3))
-        if rng.random() < 0.7:
-            sail = mast + np.array([(0, 0.02, 0.15), (0, 0.4 * length, 0.15), (0.02, 0.02, high)])
-            for corners in (sail, sail * (1, -0.9, 1) + (0, 2 * mast[1] * 0.95, 0)):
-                parts.append((Surface(corners, np.array([[0, 1, 2]])), 4))
-    return parts
-
-
-def train(rng: Rng) -> list[Part]:
-    width, height, cars = rng.uniform(0.28, 0.4), rng.uniform(0.35, 0.5), int(rng.integers(1, 4))
-    parts: list[Part] = []
-    outline = np.array([(-0.5, 0), (0.5, 0), (0.5, 0.75), (0.35, 1), (-0.35, 1), (-0.5, 0.75)]) * (width, height)
-    nose = rng.uniform(0.3, 1.0)
-    for k in range(cars):
-        length = rng.uniform(0.9, 1.3)
-        ends = np.stack([outline * (0.9, nose if k == 0 else 1.0), outline, outline])
-        solid = loft(ends, np.array([-0.5, -0.5 + rng.uniform(0.05, 0.3), 0.5]) * length)
-        parts.append((Surface(solid.vertices[:, [0, 2, 1]] + (0, 1.2 * k, 0.12), solid.faces), 0))
-        band = box((0.01, 0.7 * length, 0.22 * height))
-        parts += [(band.moved((s * 0.5 * width, 1.2 * k, 0.12 + 0.6 * height)), 1) for s in (-1, 1)]
-        parts += [(box((0.8 * width, 0.25, 0.12)).moved((0, 1.2 * k + y * length, 0.06)), 2) for y in (-0.3, 0.3)]
-    parts.append((box((0.7 * width, 0.01, 0.25 * height)).moved((0, -0.52, 0.12 + 0.6 * nose * height)), 1))
-    return parts
-
-
 FAMILIES: dict[str, Callable[[Rng], list[Part]]] = {
-    family.__name__: family
-    for family in (
-        *(compound, stack, vessel, chair, table, sofa, car, bicycle, aircraft, boat, screen, train, creature),
-        *(bracket, frame, lump, package),
-    )
+    family.__name__: family for family in (compound, stack, vessel, chair, table, sofa, screen, car, bicycle, aircraft)
 }
 
 

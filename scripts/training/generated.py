@@ -1,6 +1,7 @@
 """Generated scenes as a dataset: crops of procedural objects, with the depth of the object alone."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -81,6 +82,8 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
         R, t = straight @ R, straight @ t
         K, (x0, y0, x1, y1) = _crop_camera(target, R, t, rng, self._size)
         picture = scene.render((R, t, K), (self._size, self._size))
+        if picture.seen.sum() < 0.1 * picture.whole.sum():  # hidden objects are of no use for training
+            picture = replace(scene, shapes=[target]).render((R, t, K), (self._size, self._size))
         visible = np.zeros((self._size, self._size), bool)
         visible[y0:y1, x0:x1] = picture.seen[0, y0:y1, x0:x1]
         image = np.pad(

@@ -2,8 +2,8 @@
 
     python scripts/training/train_learned_field.py --out runs/field --minutes 90
 
-A batch consists of fresh scenes and of earlier ones, with new colours and mirrored. For the losses see
-scripts/training/field_dataset.py; one of them is backpropagated through HOG. A second start with the same --out resumes.
+A batch consists of fresh scenes and of earlier ones, with new colours and mirrored. The losses are those of
+field_dataset.py; one of them is backpropagated through HOG. A second start with the same --out resumes.
 """
 
 import argparse
@@ -12,7 +12,6 @@ import math
 import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -23,7 +22,6 @@ from tqdm import tqdm
 
 from curvireg_torch.features import FieldNetwork, halved_angle
 from curvireg_torch.features.learned_field import save_weights
-from curvireg_torch.filters import MultiScaleFocusCurves
 from curvireg_torch.geometry import rotation_error, sample_views
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.matching.fields import depth_filter, hog_layer
@@ -68,21 +66,6 @@ class Validation:
             "cosine": float(np.mean(cosines)),
         }
 
-    def picture(self, network: torch.nn.Module, path: Path, count: int = 8) -> None:
-        """Write photographs, predicted fields and masks, and target fields as a picture."""
-        images, depths = torch.stack(self.images[:count]), torch.stack(self.depths[:count])
-        with torch.no_grad():
-            output = F.interpolate(network(images), scale_factor=2.0, mode="bilinear")
-        rows = [images.permute(0, 2, 3, 1).flip(3)]
-        for field in (halved_angle(output[:, :2]), depth_filter(SETTINGS)(depths)):
-            length = field.norm(dim=1).sqrt()
-            rows.append(
-                (length / length.amax(dim=(1, 2), keepdim=True).clamp(min=1e-6))[..., None].expand(-1, -1, -1, 3)
-            )
-        rows.insert(2, output[:, 2].sigmoid()[..., None].expand(-1, -1, -1, 3))
-        sheet = torch.cat([torch.cat(list(row), dim=1) for row in rows])
-        cv2.imwrite(str(path), (255 * sheet.clamp(0, 1)).byte().numpy())
-
 
 class _Field(torch.nn.Module):
     def __init__(self, network: FieldNetwork) -> None:
@@ -91,12 +74,6 @@ class _Field(torch.nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         return F.interpolate(halved_angle(self.network(image)[:, :2]), scale_factor=2.0, mode="bilinear")
-
-
-class _Grey(torch.nn.Module):
-    def forward(self, image: Tensor) -> Tensor:
-        field: Tensor = MultiScaleFocusCurves()(image.mean(dim=1, keepdim=True))
-        return field
 
 
 def save_state(
@@ -123,24 +100,15 @@ def load_state(path: Path, network: FieldNetwork, average: FieldNetwork, optimiz
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder of checkpoints, log and pictures")
-    parser.add_argument("--minutes", type=float, default=90.0, help="training time, over all starts (default 90)")
-    parser.add_argument("--batch", type=int, default=32, help="scenes in a step (default 32)")
-    parser.add_argument("--fresh", type=int, default=8, help="fresh scenes among them (default 8)")
-    parser.add_argument(
-        "--replay", type=int, default=15_000, help="scenes stored for reuse, 100 kB each (default 15000)"
-    )
-    parser.add_argument("--workers", type=int, default=1, help="processes that generate scenes (default 1)")
-    parser.add_argument("--rate", type=float, default=3e-3, help="highest learning rate (default 3e-3)")
-    parser.add_argument(
-        "--descriptor-weight", type=float, default=1.0, help="weight of the descriptor loss (default 1)"
-    )
-    parser.add_argument("--ranking-weight", type=float, default=0.1, help="weight of the ranking loss (default 0.1)")
-    parser.add_argument(
-        "--other-views-weight", type=float, default=0.2, help="weight of the loss among views (default 0.2)"
-    )
-    parser.add_argument("--validate", type=int, default=60, help="held-out scenes (default 60)")
-    parser.add_argument("--every", type=float, default=10.0, help="minutes between validations (default 10)")
+    parser.add_argument("--out", type=Path, required=True, help="folder of checkpoints and log")
+    parser.add_argument("--minutes", type=float, default=90.0, help="training time, over all starts")
+    parser.add_argument("--batch", type=int, default=32, help="scenes in a step")
+    parser.add_argument("--fresh", type=int, default=8, help="fresh scenes among them")
+    parser.add_argument("--replay", type=int, default=15_000, help="scenes stored for reuse, 100 kB each")
+    parser.add_argument("--workers", type=int, default=1, help="processes that generate scenes")
+    parser.add_argument("--rate", type=float, default=3e-3, help="highest learning rate")
+    parser.add_argument("--validate", type=int, default=60, help="held-out scenes")
+    parser.add_argument("--every", type=float, default=10.0, help="minutes between validations")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     options = parser.parse_args()
@@ -158,40 +126,29 @@ def main() -> None:
         load_state(checkpoint, network, average, optimizer)
         last = json.loads(log.read_text().splitlines()[-1])
         spent, step, scenes = last["minutes"], last["step"], last["scenes"]
-    weights = {
-        f"{name}_weight": getattr(options, f"{name}_weight") for name in ("descriptor", "ranking", "other_views")
-    }
     validation = Validation(options.validate)
-    if step == 0:
-        print("MFC for comparison:", validation(_Grey()))
-
     generated = GeneratedScenes(10**9, seed=options.seed)
     fresh = range(scenes, len(generated))
-    dataset = FieldDataset(generated)
-    loader = iter(
-        DataLoader(dataset, options.fresh, sampler=fresh, num_workers=options.workers, multiprocessing_context="spawn")
-    )
+    workers = {"num_workers": options.workers, "multiprocessing_context": "spawn" if options.workers else None}
+    loader = iter(DataLoader(FieldDataset(generated), options.fresh, sampler=fresh, **workers))
     replay = ReplayBuffer(options.replay)
     generator = torch.Generator().manual_seed(options.seed + step)
     totals: dict[str, float] = {}
-    start = marked = time.monotonic()
-    earlier, scenes_at_mark, step_at_mark = spent, scenes, step
-    bar = tqdm(total=round(options.minutes), initial=int(spent), unit="min", mininterval=10)
+    start, earlier, validated, step_at_mark = time.monotonic(), spent, spent, step
     while spent < options.minutes:
         replay.add(next(loader))
         scenes += options.fresh
         batch = augment(replay.draw(options.fresh, options.batch, generator), generator)
         batch = {name: values.to(options.device) for name, values in batch.items()}
-        progress = spent / options.minutes
+        rate = options.rate * min(1.0, (step + 1) / 200) * 0.5 * (1 + math.cos(math.pi * spent / options.minutes))
         for group in optimizer.param_groups:
-            group["lr"] = options.rate * min(1.0, (step + 1) / 200) * 0.5 * (1 + math.cos(math.pi * progress))
+            group["lr"] = rate
         network.train()
         with torch.autocast(torch.device(options.device).type, torch.bfloat16):
             output = network(batch["image"].contiguous(memory_format=torch.channels_last))
-        parts = losses(output.float(), batch, **weights)
-        loss = torch.stack(list(parts.values())).sum()
+        parts = losses(output.float(), batch)
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        torch.stack(list(parts.values())).sum().backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
         optimizer.step()
         step += 1
@@ -200,23 +157,17 @@ def main() -> None:
             if mean.is_floating_point():
                 mean.lerp_(now.float().to(mean.device), 1 - keep)
         for name, value in parts.items():
-            totals[name] = totals.get(name, 0.0) + float(value)
+            totals[name] = totals.get(name, 0.0) + float(value.detach())
         spent = earlier + (time.monotonic() - start) / 60
-        if int(spent) > bar.n:
-            bar.update(int(spent) - bar.n)
-        if time.monotonic() - marked > 60 * options.every or spent >= options.minutes:
-            seconds, steps = time.monotonic() - marked, step - step_at_mark
+        if spent - validated > options.every or spent >= options.minutes:
             entry = {"step": step, "minutes": round(spent, 2), "scenes": scenes}
-            entry |= {name: round(value / steps, 4) for name, value in totals.items()}
-            entry["scenes_per_second"] = round((scenes - scenes_at_mark) / seconds, 1)
-            entry["samples_per_second"] = round(steps * options.batch / seconds, 1)
+            entry |= {name: round(value / (step - step_at_mark), 4) for name, value in totals.items()}
             entry |= {name: round(value, 4) for name, value in validation(_Field(average)).items()}
             save_state(checkpoint, network, average, optimizer, **entry)
             with log.open("a") as lines:
                 lines.write(json.dumps(entry) + "\n")
-            validation.picture(average, options.out / f"step{step:06d}.png")
-            tqdm.write(json.dumps(entry))
-            totals, marked, scenes_at_mark, step_at_mark = {}, time.monotonic(), scenes, step
+            print(json.dumps(entry), flush=True)
+            totals, validated, step_at_mark = {}, spent, step
     save_weights(average, options.out / "field.safetensors")
     print(f"weights: {options.out / 'field.safetensors'}")
 
