@@ -16,7 +16,6 @@ from . import (
     settings as settings,
     synthetic as synthetic,
     terms as terms,
-    training as training,
     visualization as visualization,
 )
 from .data import (

@@ -181,7 +181,7 @@ def sample_points(model: TexturedMesh) -> tuple[np.ndarray, np.ndarray]:
 def symmetries(points: np.ndarray, colours: np.ndarray) -> tuple[list[int], list[int]]:
     """Candidate rotations that map the shape to itself, and those that preserve its colours too.
 
-    90 % of the points lie within 4 % of the radius of others, and 96 % have their colour, blurred over 48 neighbours.
+    90 % of the points lie within 4 % of the radius of others, and 90 % have their colour, blurred over 48 neighbours.
     """
     tree, some = cKDTree(points), slice(None, None, 16)
 
@@ -193,7 +193,7 @@ def symmetries(points: np.ndarray, colours: np.ndarray) -> tuple[list[int], list
 
     rotations, own = candidate_rotations(), blurred(np.eye(3))
     shape = [k for k, R in enumerate(rotations) if fits(R, slice(None, None, 400)) and fits(R, some)]
-    same = [k for k in shape if (np.abs(blurred(rotations[k]) - own).max(axis=1) > 0.12).mean() < 0.04]
+    same = [k for k in shape if (np.abs(blurred(rotations[k]) - own).max(axis=1) > 0.12).mean() < 0.1]
     return shape, same
 
 

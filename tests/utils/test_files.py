@@ -80,7 +80,6 @@ BANK = "bank {folder}/mesh.ply"
 COMMANDS = (
     "demo --out {blocked}/out",
     f"{BANK} --out {{blocked}}/a",
-    f"{BANK} --out {{folder}}/a.safetensors --adapt {{blocked}}/b",
 )
 
 
