@@ -43,7 +43,7 @@ PRESENCE_FEATURES = ("proposal", "similarity")
 
 _PRESENCE = {2: ((1.128, 7.819), -16.897), 1: ((16.756,), -14.856)}
 """Weights and bias for two features and for one: logistic regressions on mosaics of photographs of textured meshes, by
-scripts/speed/location.py."""
+scripts/calibration/calibrate.py."""
 
 MARGIN = 5.0
 """Leads are clamped to +- this value."""
