@@ -171,7 +171,7 @@ def sample_points(model: TexturedMesh) -> tuple[np.ndarray, np.ndarray]:
     points, face = trimesh.sample.sample_surface(mesh, 20_000, seed=0)
     points, face = np.asarray(points), np.asarray(face)
     weights = trimesh.triangles.points_to_barycentric(model.triangles[face], points)
-    uv, colours = np.einsum("nk,nkd->nd", weights, model.uv[face]), np.empty((len(points), 3))
+    uv, colours = np.einsum("ij,ijk->ik", weights, model.uv[face]), np.empty((len(points), 3))
     for number, paint in enumerate(model.paints):
         here = model.paint[face] == number
         colours[here] = paint.colours(points[here], uv[here]) ** (1 / 2.2)
