@@ -10,7 +10,15 @@ from curvireg_torch import geometry, metrics
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.terms import dilate_points
-from curvireg_torch.utils.checks import check_pose, check_rotation, check_square_pixels
+from curvireg_torch.utils.checks import (
+    check_fraction,
+    check_integer,
+    check_number,
+    check_pose,
+    check_positive,
+    check_rotation,
+    check_square_pixels,
+)
 from tests.utils.conftest import CAMERA, Entries, changed, refused
 
 BAD_CAMERAS = {
@@ -160,3 +168,17 @@ def test_check_masks_refuses_other_shapes_and_dtypes() -> None:
             cr.depth_curvilinear_saliency(depth, bad)
     with pytest.raises(InvalidInputError, match="photo: expected bool"):
         metrics.intersection_percentage(mask.float(), mask)
+
+
+@pytest.mark.parametrize("wrong", ["1", None, True, math.nan, math.inf, 10**400, [1.0], torch.ones(2)])
+def test_numbers_of_the_wrong_type_are_refused(wrong: object) -> None:
+    for check in (check_number, check_positive, check_fraction):
+        with pytest.raises(InvalidInputError, match="value: expected"):
+            check(wrong, "value")
+
+
+@pytest.mark.parametrize("wrong", [2.5, 2.0, "2", None, True, 0, -1, torch.tensor(3)])
+def test_integers_of_the_wrong_type_are_refused(wrong: object) -> None:
+    with pytest.raises(InvalidInputError, match="scales: expected an integer >= 1, got"):
+        check_integer(wrong, "scales")
+    assert check_integer(np.int64(3), "scales") == 3
