@@ -8,7 +8,8 @@ from typing import Any
 import torch
 
 from ..errors import InvalidInputError, MissingFileError
-from ..utils.checks import check_camera_matrix, check_positive, check_rotation
+from ..geometry import symmetry_transforms
+from ..utils.checks import check_camera_matrix, check_positive, check_rotation, check_symmetries
 from ..utils.json_files import finite_numbers, read_json
 from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name
 
@@ -69,10 +70,7 @@ class BOPDataset(ObjectDataset):
             raise MissingFileError(f"no such folder; {_README} shows the layout", subject=scenes)
         camera = self.root / "camera.json"
         self.camera: dict[str, Any] = read_json(camera, dict, _README) if camera.is_file() else {}
-        info = read_json(self.root / "models" / "models_info.json", dict, _README)
-        self.models_info: dict[int, dict[str, Any]] = {
-            int(key): value for key, value in info.items() if key.isdecimal() and isinstance(value, dict)
-        }
+        self.models_info = _models_info(self.root / "models" / "models_info.json")
         self._models = {path.name for path in (self.root / "models").glob("obj_*.ply")}
         target_file = self.root / "test_targets_bop19.json"
         if targets is None:
@@ -165,6 +163,24 @@ class BOPDataset(ObjectDataset):
             "model_path": str(self.root / "models" / model),
             "model_info": self.models_info[obj_id],
         }
+
+
+def _models_info(path: Path) -> dict[int, dict[str, Any]]:
+    """obj_id -> entry, each with a diameter and symmetries that metrics can use."""
+    entries = {}
+    for key, entry in read_json(path, dict, _README).items():
+        name = f"entry {key[:20]!r}"
+        if not (key.isdecimal() and len(key) < 10 and isinstance(entry, dict)):
+            raise InvalidInputError(f"{name}: expected an object's number and its values; {_README}", subject=path)
+        diameter = finite_numbers([entry.get("diameter")], 1)
+        if diameter is None or diameter[0] <= 0:
+            raise InvalidInputError(f"{name}: expected a diameter > 0 in mm; {_README}", subject=path)
+        try:
+            check_symmetries(symmetry_transforms(entry, max_step_fraction=1.0))
+        except InvalidInputError as error:
+            raise InvalidInputError(f"{name}: {error}", subject=path) from None
+        entries[int(key)] = entry
+    return entries
 
 
 def bop_box(values: object) -> tuple[float, ...] | None:

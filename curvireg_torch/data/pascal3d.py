@@ -4,14 +4,13 @@ import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.checks import check_option, check_positive
 from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name, pose_fields
-from .mat_files import read_mat
+from .mat_files import MatStruct, MatValue, read_mat
 
 _README = "datasets/pascal3d/README.md"
 _VOC_LISTS = Path("PASCAL", "VOCdevkit", "VOC2012", "ImageSets", "Main")
@@ -136,9 +135,9 @@ class Pascal3DPlus(ObjectDataset):
                     ids = {"image_path": str(image), "image_id": image_id, "object_index": index}
                     self._items.append({**ids, **parsed})
 
-    def _parse(self, entry: object, category: str) -> Sample | str:
+    def _parse(self, entry: MatStruct, category: str) -> Sample | str:
         """The sample of one object, or the reason to skip it."""
-        if not isinstance(entry, dict) or entry.get("class") != category:
+        if entry.get("class") != category:
             return "other_class"
         flags = {name: bool(_number(entry.get(name)) or 0) for name in self._excluded}
         for name, excluded in self._excluded.items():
@@ -149,8 +148,8 @@ class Pascal3DPlus(ObjectDataset):
             return "bad_box"
         if min(box[2] - box[0], box[3] - box[1]) < self._min_size:
             return "small"
-        views = _structs(entry.get("viewpoint"))
-        if not views:
+        views = entry.get("viewpoint")
+        if not isinstance(views, list) or not views:
             return "no_viewpoint"
         azimuth, elevation, distance = (_number(views[0].get(key)) for key in ("azimuth", "elevation", "distance"))
         if azimuth is None or elevation is None or not distance:
@@ -172,41 +171,30 @@ class Pascal3DPlus(ObjectDataset):
         }
 
 
-def _structs(value: Any) -> list[dict[str, Any]] | None:
-    """The structs of a struct array, which SciPy reduces to the struct if there is one; None for anything else."""
-    values = [value] if isinstance(value, dict) else list(value) if isinstance(value, list | np.ndarray) else None
-    return values if values is not None and all(isinstance(v, dict) for v in values) else None
-
-
-def _objects(record: Any) -> list[dict[str, Any]]:
-    records = _structs(record)
-    objects = _structs(records[0].get("objects")) if records else None
-    if objects is None:
+def _objects(record: MatValue) -> list[MatStruct]:
+    objects = record[0].get("objects") if isinstance(record, list) and record else None
+    if isinstance(objects, np.ndarray) and objects.size == 0:
+        return []
+    if not isinstance(objects, list):
         raise InvalidInputError("record: holds no struct array 'objects'")
     return objects
 
 
-def _numbers(value: Any) -> list[float]:
-    """All numbers of ``value`` if they are finite and real, else none."""
-    values = np.asarray([] if isinstance(value, list) else value).flatten()
-    valid = values.dtype.kind in "biuf" and bool(np.isfinite(values).all())
-    return [float(v) for v in values] if valid else []
-
-
-def _number(value: Any) -> float | None:
-    return next(iter(_numbers(value)), None)
-
-
-def _box(value: Any, origin: int) -> tuple[float, float, float, float] | None:
-    numbers = [v - origin for v in _numbers(value)]
-    if len(numbers) != 4 or not (numbers[2] > numbers[0] and numbers[3] > numbers[1]):
+def _number(value: MatValue) -> float | None:
+    """The first number of ``value`` if it is finite, else None."""
+    if not isinstance(value, np.ndarray) or value.size == 0 or not math.isfinite(value[0]):
         return None
-    return numbers[0], numbers[1], numbers[2], numbers[3]
+    return float(value[0])
 
 
-def _camera(
-    view: dict[str, Any], box: tuple[float, float, float, float], origin: int
-) -> tuple[tuple[float, ...], ...]:
+def _box(value: MatValue, origin: int) -> tuple[float, float, float, float] | None:
+    if not isinstance(value, np.ndarray) or value.size != 4 or not np.isfinite(value).all():
+        return None
+    x0, y0, x1, y1 = (float(v) - origin for v in value)
+    return (x0, y0, x1, y1) if x1 > x0 and y1 > y0 else None
+
+
+def _camera(view: MatStruct, box: tuple[float, float, float, float], origin: int) -> tuple[tuple[float, ...], ...]:
     """K of the annotation. Defaults: focal 1, viewport 3000, principal point at the centre of the box."""
     focal = (_number(view.get("focal")) or 1.0) * (_number(view.get("viewport")) or 3000.0)
     px, py = _number(view.get("px")), _number(view.get("py"))

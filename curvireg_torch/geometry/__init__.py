@@ -23,7 +23,7 @@ from .conversions import (
 )
 from .crops import box_iou, crop_images, crop_transforms, square_boxes, whole_image_box
 from .pose_prior import PosePrior, object_frame
-from .symmetry import symmetry_transforms, views_without_symmetric
+from .symmetry import symmetry_transforms
 from .translation import pose_from_box, translation_from_box
 from .viewpoint import rotation_error, rotation_from_viewpoint, up_rotation, viewpoint_from_rotation
 from .views import ViewSphere, paper_views, sample_views, uniform_views
@@ -60,6 +60,5 @@ __all__ = [
     "uniform_views",
     "up_rotation",
     "viewpoint_from_rotation",
-    "views_without_symmetric",
     "whole_image_box",
 ]

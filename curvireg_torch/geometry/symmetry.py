@@ -1,16 +1,15 @@
-"""Symmetries of BOP objects, and view sets without symmetric duplicates."""
+"""Symmetries of BOP objects."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import check_fraction, check_positive, check_symmetries
+from ..utils.checks import as_numbers, check_fraction
 from .conversions import rotation_from_axis_angle
-from .views import ViewSphere
 
 
 def symmetry_transforms(info: Mapping[str, Any], *, max_step_fraction: float = 0.01) -> Tensor:
@@ -36,58 +35,30 @@ def symmetry_transforms(info: Mapping[str, Any], *, max_step_fraction: float = 0
         torch.Size([315, 4, 4])
     """
     check_fraction(max_step_fraction, "max_step_fraction")
-    identity = torch.eye(4, dtype=torch.float64)
-    matrices = [_numbers(matrix, 16, "symmetries_discrete") for matrix in info.get("symmetries_discrete", ())]
-    discrete = torch.stack([identity, *(matrix.view(4, 4) for matrix in matrices)])
-    rotations = [identity[None]]
-    for symmetry in info.get("symmetries_continuous", ()):
-        axis = _numbers(symmetry["axis"], 3, "axis")
+    matrices = [_numbers(matrix, 16, "symmetries_discrete") for matrix in _list(info, "symmetries_discrete")]
+    discrete = torch.stack([torch.eye(4, dtype=torch.float64), *(matrix.view(4, 4) for matrix in matrices)])
+    rotations = [discrete[:1]]
+    for symmetry in _list(info, "symmetries_continuous"):
+        if not isinstance(symmetry, Mapping):
+            raise InvalidInputError(f"symmetries_continuous: expected axis and offset, got {symmetry!r:.80}")
+        axis = _numbers(symmetry.get("axis"), 3, "axis")
         offset = _numbers(symmetry.get("offset", (0.0, 0.0, 0.0)), 3, "offset")
         rotations.append(_axis_rotations(axis, offset, math.ceil(math.pi / max_step_fraction)))
     # (C, 1, 4, 4) @ (D, 4, 4): the discrete symmetry acts first.
     return (torch.cat(rotations).unsqueeze(1) @ discrete).flatten(0, 1)
 
 
-def views_without_symmetric(views: ViewSphere, symmetries: Tensor, *, tolerance: float = 1.0) -> ViewSphere:
-    """The views, in their order, without those that an earlier one at the same distance shows up to a symmetry.
-
-    Args:
-        symmetries: (S, 4, 4) or (S, 3, 3) of the model, from :func:`symmetry_transforms`.
-        tolerance: degrees within which two views count as the same. For a regular grid half a step of the symmetries
-            suffices (0.6 degrees for BOP's 315 steps); for a scattered sampling use its covering radius.
-
-    Raises:
-        InvalidInputError: symmetries of another shape or not rigid, or a negative tolerance.
-
-    Example:
-        >>> from curvireg_torch.geometry import sample_views
-        >>> about_z = symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1]}]})
-        >>> len(views_without_symmetric(sample_views(elevations=[0, 30]), about_z))
-        2
-    """
-    check_positive(tolerance, "tolerance", zero_ok=True)
-    check_symmetries(symmetries)
-    R = views.rotations.double()
-    S = symmetries[:, :3, :3].to(R)
-    # |A - B|_F = 2 sqrt(2) sin(angle / 2); float32 angles carry about 1e-5 degrees.
-    limit = 3.0 - 4.0 * math.sin(math.radians(tolerance + 1e-3) / 2.0) ** 2
-    kept: list[int] = []
-    remaining = torch.ones(len(views), dtype=torch.bool)
-    for i in range(len(views)):
-        if not remaining[i]:
-            continue
-        kept.append(i)
-        later = remaining.nonzero()[:, 0]
-        traces = (R[i] @ S).flatten(1) @ R[later].flatten(1).T  # (S, L) traces of (R_i S)^T R_j
-        same = (traces.amax(dim=0) >= limit) & (views.distance[later] == views.distance[i]).cpu()
-        remaining[later[same]] = False
-    return views[torch.tensor(kept)]
+def _list(info: Mapping[str, Any], key: str) -> Sequence[Any]:
+    values = info.get(key, ())
+    if not isinstance(values, list | tuple):
+        raise InvalidInputError(f"{key}: expected a list, got {values!r:.80}")
+    return values
 
 
 def _numbers(values: Any, count: int, name: str) -> Tensor:
-    numbers = torch.as_tensor(values, dtype=torch.float64).flatten()
+    numbers = as_numbers(values, name, dtype=torch.float64).flatten()
     if len(numbers) != count or not bool(numbers.isfinite().all()):
-        raise InvalidInputError(f"{name}: expected {count} finite numbers, got {values}")
+        raise InvalidInputError(f"{name}: expected {count} finite numbers, got {values!r:.80}")
     return numbers
 
 

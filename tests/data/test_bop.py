@@ -110,6 +110,35 @@ def test_bop_dataset_refuses_damaged_target_lists(tree, content):
         BOPDataset(tree[0])
 
 
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda info: info["1"].pop("diameter"), "entry '1': expected a diameter > 0"),
+        (lambda info: info["1"].update(diameter="100"), "diameter"),
+        (lambda info: info["1"].update(diameter=0), "diameter"),
+        (lambda info: info.update({"1": "text"}), "entry '1'"),
+        (lambda info: info["1"].update(symmetries_discrete=None), "symmetries_discrete: expected a list"),
+        (lambda info: info["1"].update(symmetries_discrete=[[0] * 16]), "expected rigid"),
+        (lambda info: info["1"].update(symmetries_continuous=[{}]), "axis: expected"),
+        (lambda info: info["1"].update(symmetries_continuous=[7]), "symmetries_continuous"),
+        (lambda info: info.update({"1" * 5000: info["1"]}), "entry '11111111111111111111'"),
+    ],
+)
+def test_damaged_models_info_is_refused_when_the_dataset_is_opened(tree, change, match):
+    path = tree[0] / "models" / "models_info.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(InvalidInputError, match=rf"models_info\.json: .*{match}") as caught:
+        BOPDataset(tree[0])
+    assert len(str(caught.value)) < 500
+
+
+def test_targets_take_instances_of_unknown_visibility_last(tree):
+    edit(tree, "scene_gt_info.json", lambda content: content["0"][2].pop("visib_fract"))
+    assert ids(BOPDataset(tree[0]))[0] == (1, 0, 1, 0)  # of two instances, the one that is 0.8 visible
+
+
 MIRRORED = [-1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]
 
 
