@@ -119,6 +119,7 @@ def test_guessed_camera_matrix_uses_the_exif_focal_length(tmp_path):
     assert K[:2, 2].tolist() == [14.5, 19.5]
 
 
+@pytest.mark.filterwarnings("ignore:Corrupt EXIF")
 def test_read_photo_keeps_the_orientation_if_the_rest_of_exif_is_damaged(tmp_path):
     path = tmp_path / "a.jpg"
     write_image(path)
