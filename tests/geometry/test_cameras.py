@@ -13,8 +13,8 @@ K = torch.tensor([[240.0, 0.0, 70.3], [0, 260.0, 51.8], [0, 0, 1]], dtype=torch.
 
 def test_camera_matrix_by_hand() -> None:
     assert g.camera_matrix(1.0, 2.0, 3.0, 4.0).tolist() == [[1, 0, 3], [0, 2, 4], [0, 0, 1]]
-    assert g.camera_matrix(1.0, 2.0, 3.0, 4.0).dtype == torch.float32
-    assert g.camera_matrix(1.0, 2.0, 3.0, 4.0, dtype=torch.float64).dtype == torch.float64
+    assert g.camera_matrix(1.0, 2.0, 3.0, 4.0).dtype == torch.float64
+    assert g.camera_matrix(1.0, 2.0, 3.0, 4.0, dtype=torch.float32).dtype == torch.float32
 
 
 def test_transform_joins_rotation_and_translation() -> None:

@@ -48,18 +48,6 @@ def test_opengl_projection_maps_near_and_far_planes() -> None:
             assert float(clip[2] / clip[3]) == pytest.approx(expected)
 
 
-def test_pytorch3d_screen_coordinates_agree_with_project_points() -> None:
-    # The formulas of PyTorch3D's documentation: x_view = x R + T; screen = principal point - focal x / z, where +x is
-    # left, +y is up and the first pixel covers [0, 1].
-    T, X = poses(), points()
-    R, t = g.pytorch3d_from_opencv(T)
-    view = X @ R + t[:, None]
-    focal, principal = K.diagonal()[:2], K[:2, 2] + 0.5
-    pixels = principal - focal * view[..., :2] / view[..., 2:] - 0.5
-    torch.testing.assert_close(pixels, g.project_points(X, T, K), rtol=0, atol=1e-9)
-    torch.testing.assert_close(g.opencv_from_pytorch3d(R, t), T, rtol=0, atol=1e-15)
-
-
 def test_rotation_from_viewpoint_agrees_with_the_definition_of_pascal3d() -> None:
     # p = diag(f, f, -1) Rx(e - 90) Rz(-a) (X - C), rotated by theta; v = py - y.
     X, f, (px, py) = points().numpy(), 3000.0, (70.3, 51.8)
@@ -102,8 +90,7 @@ def test_conversions_keep_batch_shapes_and_refuse_invalid_input() -> None:
     assert g.opengl_projection(K.expand(2, 5, 3, 3), SIZE, near=1.0, far=2.0).shape == (2, 5, 4, 4)
     for call in (
         lambda: g.opengl_from_opencv(torch.eye(3)),
-        lambda: g.pytorch3d_from_opencv(torch.eye(4, dtype=torch.long)),
-        lambda: g.opencv_from_pytorch3d(R, torch.zeros(2, 3)),
+        lambda: g.opengl_from_opencv(torch.eye(4, dtype=torch.long)),
         lambda: g.quaternion_from_rotation(torch.zeros(4)),
         lambda: g.rotation_from_quaternion(torch.zeros(3)),
         lambda: g.rotation_from_axis_angle(torch.zeros(4)),

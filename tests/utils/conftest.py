@@ -102,7 +102,6 @@ class Entries:
             "projected_boxes": lambda T: geometry.projected_boxes(points, T, CAMERA),
             "opengl_from_opencv": geometry.opengl_from_opencv,
             "opencv_from_opengl": geometry.opencv_from_opengl,
-            "pytorch3d_from_opencv": geometry.pytorch3d_from_opencv,
             "pose_glb": lambda T: pose_glb(mesh, T, CAMERA, image),
             "add_error": lambda T: metrics.add_error(pose[None], T[None], points),
             "adds_error": lambda T: metrics.adds_error(pose[None], T[None], points),
@@ -111,7 +110,6 @@ class Entries:
             "mssd_error, symmetries": lambda T: metrics.mssd_error(pose[None], pose[None], points, symmetries=T[None]),
             "Registrar, symmetries": lambda T: cr.Registrar(bank, symmetries=torch.cat([symmetries, T[None]])),
             "distinct_views": lambda T: distinct_views(torch.arange(4), views.rotations, count=2, symmetries=T[None]),
-            "views_without_symmetric": lambda T: geometry.views_without_symmetric(views, T[None]),
         }
         self.rotations: dict[str, Callable[[Tensor], object]] = {
             "rotation_error": lambda R: cr.rotation_error(pose[:3, :3], R),
@@ -119,7 +117,6 @@ class Entries:
             "viewpoint_from_rotation": cr.viewpoint_from_rotation,
             "quaternion_from_rotation": geometry.quaternion_from_rotation,
             "axis_angle_from_rotation": geometry.axis_angle_from_rotation,
-            "opencv_from_pytorch3d": lambda R: geometry.opencv_from_pytorch3d(R, torch.zeros(3).double()),
             "translation_from_box": lambda R: geometry.translation_from_box(points, R, box, CAMERA),
             "pose_from_box": lambda R: geometry.pose_from_box(points, R, box, CAMERA),
             "symmetric_rotation_error": lambda R: metrics.symmetric_rotation_error(R, pose[:3, :3], pose[None, :3, :3]),
