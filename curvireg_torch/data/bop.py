@@ -20,8 +20,7 @@ from ..utils.checks import (
     check_symmetries,
     check_tensor,
 )
-from ..utils.files import write_csv
-from ..utils.json_files import check_table_size, finite_numbers, read_json
+from ..utils.files import check_table_size, finite_numbers, read_json, write_csv
 from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name
 
 _README = "datasets/bop/README.md"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.choices import MESHES
-from ..utils.json_files import check_table_size
+from ..utils.files import check_table_size
 from ._base import ObjectDataset, Sample, Transform, existing_root, is_plain_name, pose_fields
 
 _README = "datasets/web/README.md"

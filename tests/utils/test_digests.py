@@ -5,8 +5,8 @@ import torch
 
 from curvireg_torch.evaluation.runner import POSE_SOURCES
 from curvireg_torch.matching import cache
-from curvireg_torch.utils import digests
-from curvireg_torch.utils.digests import code_digest, tensor_digest
+from curvireg_torch.utils import files
+from curvireg_torch.utils.files import code_digest, tensor_digest
 
 
 def test_tensor_digest_depends_on_name_dtype_shape_and_values() -> None:
@@ -20,7 +20,7 @@ def test_tensor_digest_depends_on_name_dtype_shape_and_values() -> None:
 
 
 def test_code_digest_changes_with_any_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(digests, "_PACKAGE", tmp_path)
+    monkeypatch.setattr(files, "_PACKAGE", tmp_path)
     (tmp_path / "room" / "deep").mkdir(parents=True)
     sources = [tmp_path / "room" / "a.py", tmp_path / "room" / "deep" / "b.py", tmp_path / "c.py"]
     seen = set()
