@@ -10,41 +10,6 @@ folder.
 
 from typing import Self
 
-__all__ = [
-    "MAX_ARCHIVE_FILES",
-    "MAX_BOX_COORDINATE",
-    "MAX_IMAGE_BYTES",
-    "MAX_IMAGE_PIXELS",
-    "MAX_IMAGE_SCANS",
-    "MAX_MAT_BYTES",
-    "MAX_MESH_BYTES",
-    "MAX_MESH_COORDINATE",
-    "MAX_MESH_DEPTH",
-    "MAX_MESH_FACES",
-    "MAX_MESH_LINES",
-    "MAX_MESH_PARTS",
-    "MAX_POLYGON_CORNERS",
-    "MAX_POLYGON_WORK",
-    "MAX_TABLE_BYTES",
-    "MAX_VIEWER_BYTES",
-    "MAX_VIEWER_FACES",
-    "MAX_VIEWER_PAGES",
-    "MAX_VIEWER_SECONDS",
-    "MAX_VIEWER_UPLOADS",
-    "MIN_MESH_EXTENT",
-    "BankError",
-    "CurviregError",
-    "CurviregWarning",
-    "ImageError",
-    "InvalidInputError",
-    "LostObjectError",
-    "MeshError",
-    "MissingDependencyError",
-    "MissingFileError",
-    "OutputError",
-    "RenderingError",
-]
-
 
 class _SubjectError(Exception):
     """Message and subject of errors and warnings."""
