@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +15,16 @@ from ..geometry import rotation_from_viewpoint
 from .images import read_image
 
 Sample = dict[str, Any]
-Transform = Callable[[Sample], Sample]
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".JPEG", ".JPG", ".PNG", ".tif", ".tiff")
 
 
 class ObjectDataset(Dataset[Sample]):
     """One dict per annotated object. The index is built once, photographs are read on access.
 
-    ``skipped_items`` maps reasons to names of skipped objects and files; ``transforms`` is applied last to a sample.
+    ``skipped_items`` maps reasons to names of skipped objects and files.
     """
 
-    def __init__(self, transforms: Transform | None) -> None:
-        self.transforms = transforms
+    def __init__(self) -> None:
         self.skipped_items: dict[str, list[str]] = {}
         # Numbers instead of tensors: thousands of small tensors exhaust file handles when a worker is spawned.
         self._items: list[Sample] = []
@@ -43,7 +41,7 @@ class ObjectDataset(Dataset[Sample]):
         return len(self._items)
 
     def annotation(self, index: int) -> Sample:
-        """Sample ``index`` without its ``image``, and without ``transforms``."""
+        """Sample ``index`` without its ``image``."""
         return {
             key: torch.tensor(value, dtype=torch.float32) if isinstance(value, tuple) else value
             for key, value in self._items[index].items()
@@ -52,7 +50,7 @@ class ObjectDataset(Dataset[Sample]):
     def __getitem__(self, index: int) -> Sample:
         sample = self.annotation(index)
         sample["image"] = read_image(sample["image_path"])
-        return sample if self.transforms is None else self.transforms(sample)
+        return sample
 
 
 def existing_root(root: str | os.PathLike[str], readme: str) -> Path:

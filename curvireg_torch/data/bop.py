@@ -14,14 +14,13 @@ from ..errors import InvalidInputError, MissingFileError
 from ..geometry import symmetry_transforms
 from ..utils.checks import (
     check_camera_matrix,
-    check_fraction,
     check_integer,
     check_rotation,
     check_symmetries,
     check_tensor,
 )
 from ..utils.files import check_table_size, finite_numbers, read_json, write_csv
-from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name
+from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, existing_root, is_plain_name
 
 _README = "datasets/bop/README.md"
 _UNKNOWN_BOX = (math.nan,) * 4
@@ -36,11 +35,8 @@ class BOPDataset(ObjectDataset):
         split: folder of the scenes, such as ``"test"`` or ``"train_pbr"``.
         targets: True selects the instances of ``test_targets_bop19.json``, for each image and object the ``inst_count``
             most visible ones; False selects all; None is True for ``split="test"`` if the file exists.
-        min_visib: least visible fraction, in [0, 1]; above 0, instances of unknown visibility are skipped too.
-        transforms: applied to every sample, ``sample -> sample``.
 
     Attributes:
-        camera: content of ``camera.json``, empty if it is missing.
         models_info: obj_id -> entry of ``models/models_info.json``, symmetries included.
 
     Samples are dicts (tensors are float32):
@@ -51,15 +47,15 @@ class BOPDataset(ObjectDataset):
         - ``scene_id``, ``image_id``, ``obj_id`` int; ``instance_index`` int: index in the image's list of ``scene_gt``
         - ``visib_fract`` float in [0, 1], NaN if unknown; ``model_path`` str; ``model_info`` dict
 
-    Reasons in ``skipped``: ``no_target``, ``not_visible``, ``bad_box`` (no area: the object is outside the image),
+    Reasons in ``skipped``: ``no_target``, ``bad_box`` (no area: the object is outside the image),
     ``missing_annotation``, ``corrupt_annotation``, ``missing_image``, ``missing_mesh``, ``missing_model_info``.
 
     Raises:
         MissingFileError: the root, the split's folder, ``models_info.json`` or a required target list does not exist.
-        InvalidInputError: ``min_visib`` out of range, or one of those files is damaged.
+        InvalidInputError: one of those files is damaged.
 
     Example:
-        >>> BOPDataset("data/bop/lm", min_visib=0.1)[0]["translation"]  # doctest: +SKIP
+        >>> BOPDataset("data/bop/lm")[0]["translation"]  # doctest: +SKIP
     """
 
     def __init__(
@@ -68,18 +64,12 @@ class BOPDataset(ObjectDataset):
         split: str = "test",
         *,
         targets: bool | None = None,
-        min_visib: float = 0.0,
-        transforms: Transform | None = None,
     ) -> None:
-        super().__init__(transforms)
-        if min_visib != 0:
-            check_fraction(min_visib, "min_visib")
+        super().__init__()
         self.root, self.split = existing_root(root, _README), split
         scenes = self.root / split
         if not is_plain_name(split) or not scenes.is_dir():
             raise MissingFileError(f"no such folder; {_README} shows the layout", subject=scenes)
-        camera = self.root / "camera.json"
-        self.camera: dict[str, Any] = read_json(camera, dict, _README) if camera.is_file() else {}
         self.models_info = _models_info(self.root / "models" / "models_info.json")
         self._models = {path.name for path in (self.root / "models").glob("obj_*.ply")}
         target_file = self.root / "test_targets_bop19.json"
@@ -87,12 +77,12 @@ class BOPDataset(ObjectDataset):
             targets = split == "test" and target_file.is_file()
         counts = _targets(target_file) if targets else None
         for folder in sorted(p for p in scenes.iterdir() if p.is_dir() and p.name.isdecimal()):
-            self._index(folder, counts, min_visib)
+            self._index(folder, counts)
         if counts:  # targets that were not found
             for scene_id, image_id, obj_id in sorted(counts):
                 self._skip("missing_annotation", f"{split}/{scene_id:06d}/{image_id:06d} object {obj_id}")
 
-    def _index(self, folder: Path, counts: dict[tuple[int, int, int], int] | None, min_visib: float) -> None:
+    def _index(self, folder: Path, counts: dict[tuple[int, int, int], int] | None) -> None:
         scene = f"{self.split}/{folder.name}"
         contents: list[dict[str, Any]] = []
         for name in ("scene_gt.json", "scene_camera.json", "scene_gt_info.json"):
@@ -131,8 +121,6 @@ class BOPDataset(ObjectDataset):
                     self._skip("no_target", item_name)
                 elif image is None:
                     self._skip("missing_image", item_name)
-                elif min_visib > 0 and not sample["visib_fract"] >= min_visib:
-                    self._skip("not_visible", item_name)
                 else:
                     self._items.append(sample)
         return None

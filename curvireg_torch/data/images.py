@@ -16,7 +16,6 @@ from torch import Tensor
 
 from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, MAX_IMAGE_SCANS, ImageError, InvalidInputError, MissingFileError
 from ..geometry.cameras import camera_matrix
-from ..utils.checks import check_option
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -97,19 +96,12 @@ def read_photo(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.uint8
     return Photo(_to_tensor(_APPLY_ORIENTATION[orientation](rgb), dtype), orientation, focal, notes)
 
 
-def read_image(
-    path: str | os.PathLike[str], *, orientation: str = "stored", dtype: torch.dtype = torch.float32
-) -> Tensor:
-    """Read a photograph as (3, H, W) RGB; ``path``, ``dtype`` and errors as in :func:`read_photo`.
+def read_image(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Read a photograph as it is stored, to which the boxes of datasets refer, as (3, H, W) RGB.
 
-    Grey images get three equal channels, an alpha channel is dropped.
-
-    Args:
-        orientation: ``"stored"``, to which the boxes of datasets refer, or ``"viewed"`` to apply that of EXIF.
+    Grey images get three equal channels, an alpha channel is dropped. Arguments and errors as in :func:`read_photo`.
     """
-    check_option(orientation, ("stored", "viewed"), "orientation")
-    rgb, exif_orientation, _, _ = _decode(Path(path))
-    return _to_tensor(_APPLY_ORIENTATION[exif_orientation](rgb) if orientation == "viewed" else rgb, dtype)
+    return _to_tensor(_decode(Path(path))[0], dtype)
 
 
 def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str, ...]]:

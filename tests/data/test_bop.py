@@ -52,7 +52,6 @@ def test_bop_dataset_returns_documented_samples(tree):
     assert sample["model_path"].endswith("models/obj_000001.ply")
     assert sample["model_info"] == dataset.models_info[1]
     assert "symmetries_discrete" in sample["model_info"]
-    assert dataset.camera["width"] == 80
 
 
 def test_bop_dataset_reads_hidden_instances_and_grey_images_without_scene_gt_info(tree):
@@ -79,20 +78,9 @@ def test_targets_select_the_most_visible_instances(tree):
         BOPDataset(tree[0], targets=True)
 
 
-def test_min_visib_skips_hidden_instances(tree):
-    dataset = BOPDataset(tree[0], targets=False, min_visib=0.85)
-    assert ids(dataset) == [(1, 0, 1, 2)]
-    assert dataset.skipped["not_visible"] == 3
-    for bad in (-0.1, 1.1, float("nan")):
-        with pytest.raises(InvalidInputError, match="min_visib"):
-            BOPDataset(tree[0], min_visib=bad)
-
-
 def test_other_splits_have_no_targets_by_default(tree):
     (tree[0] / "test").rename(tree[0] / "train_pbr")
-    dataset = BOPDataset(tree[0], "train_pbr", transforms=lambda s: {"size": s["image"].shape[-2:]})
-    assert len(dataset) == 4
-    assert dataset[0]["size"] == (60, 80)
+    assert len(BOPDataset(tree[0], "train_pbr")) == 4
 
 
 def test_bop_dataset_reports_missing_files_with_advice(tree, tmp_path):
