@@ -50,21 +50,6 @@ def test_pose_from_box_does_not_depend_on_the_rest_of_the_batch() -> None:
         assert torch.equal(alone[1][0], batch[1][i])
 
 
-def test_pose_from_box_scales_with_the_model() -> None:
-    hull, _, view, _, _, box = true_poses(0.3, 1)[0]
-    R, t = g.pose_from_box(hull, view, box, K)
-    scaled = g.pose_from_box(1000.0 * hull, view, box, K)
-    torch.testing.assert_close(scaled, (R, 1000.0 * t), rtol=1e-12, atol=1e-12)
-
-
-def test_translation_from_box_is_closer_for_a_larger_box() -> None:
-    for hull, centre, _, R, t, box in true_poses(0.0, 8):
-        middle = 0.5 * (box[:2] + box[2:]).repeat(2)
-        found = g.translation_from_box(hull, R, middle + 1.01 * (box - middle), K)
-        ratio = float((R @ centre + found).norm() / (R @ centre + t).norm())
-        assert 0.985 < ratio < 0.993
-
-
 def test_rotation_towards_is_the_smallest_rotation_onto_the_ray() -> None:
     rays = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     rays[:, 2] = rays[:, 2].abs() + 0.1
