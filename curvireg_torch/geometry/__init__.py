@@ -22,7 +22,7 @@ from .conversions import (
 )
 from .crops import box_iou, crop_images, crop_transforms, square_boxes, whole_image_box
 from .pose_prior import PosePrior, object_frame
-from .translation import pose_from_box, translation_from_box
+from .translation import pose_from_box
 from .viewpoint import rotation_error, rotation_from_viewpoint, up_rotation, viewpoint_from_rotation
 from .views import ViewSphere, sample_views, uniform_views
 
@@ -51,7 +51,6 @@ __all__ = [
     "square_boxes",
     "symmetry_transforms",
     "transform",
-    "translation_from_box",
     "uniform_views",
     "up_rotation",
     "viewpoint_from_rotation",

@@ -83,7 +83,7 @@ def test_bank_key_depends_on_everything(monkeypatch):
 
 
 def test_bank_key_depends_on_code_that_exists():
-    package = Path(files.__file__).parents[1]
+    package = Path(cache.__file__).parents[1]
     assert not [part for part in cache._SOURCES if not (package / part).exists()]
 
 
