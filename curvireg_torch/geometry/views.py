@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import check_integer, check_positive
+from ..utils.checks import as_numbers, check_integer, check_positive
 from .viewpoint import rotation_from_viewpoint, up_rotation, viewpoint_from_rotation
 
 DEFAULT_DISTANCE = 5.0
@@ -56,9 +56,14 @@ class ViewSphere:
         return ViewSphere(azimuth.to(self.azimuth), elevation.to(self.azimuth), theta.to(self.azimuth), self.distance)
 
 
-def _check_elevations(values: Sequence[float], name: str) -> None:
-    if not all(-90.0 <= float(v) <= 90.0 for v in values):
-        raise InvalidInputError(f"{name}: expected degrees in [-90, 90], got {tuple(values)}")
+def _numbers(values: Sequence[float], name: str, *, largest: float = math.inf) -> Tensor:
+    """(N,) numbers, N >= 1, of at most ``largest`` from 0."""
+    numbers = as_numbers(list(values) if isinstance(values, range) else values, name, dtype=torch.float64).flatten()
+    if not len(numbers):
+        raise InvalidInputError(f"{name}: expected at least one value, got none")
+    if not bool((numbers.abs() <= largest).all()):
+        raise InvalidInputError(f"{name}: expected degrees in [-90, 90], got {numbers.tolist()}")
+    return numbers
 
 
 def sample_views(
@@ -91,13 +96,9 @@ def sample_views(
     if azimuths is None:
         count = max(1, round(360.0 / azimuth_step))
         azimuths = [360.0 * i / count for i in range(count)]
-    ranges = {"elevations": elevations, "azimuths": azimuths, "thetas": thetas, "distances": distances}
-    for name, values in ranges.items():
-        if len(values) == 0:
-            raise InvalidInputError(f"{name}: expected at least one value, got none")
-    axes = [torch.tensor([float(v) for v in values]) for values in ranges.values()]
-    _check_elevations(elevations, "elevations")
-    elevation, azimuth, theta, distance = (v.flatten() for v in torch.meshgrid(*axes, indexing="ij"))
+    ranges = {"azimuths": azimuths, "thetas": thetas, "distances": distances}
+    axes = [_numbers(elevations, "elevations", largest=90.0), *(_numbers(v, name) for name, v in ranges.items())]
+    elevation, azimuth, theta, distance = (v.flatten().float() for v in torch.meshgrid(*axes, indexing="ij"))
     return ViewSphere(azimuth, elevation, theta, distance)
 
 
@@ -127,16 +128,14 @@ def uniform_views(
         400
     """
     check_integer(count, "count")
-    _check_elevations(elevation_range, "elevation_range")
-    low, high = (math.sin(math.radians(e)) for e in elevation_range)
-    if not low <= high:
+    limits = _numbers(elevation_range, "elevation_range", largest=90.0).tolist()
+    low, high = math.sin(math.radians(limits[0])), math.sin(math.radians(limits[-1]))
+    if len(limits) != 2 or not low <= high:
         raise InvalidInputError(f"elevation_range: expected (low, high), got {elevation_range}")
     i = torch.arange(count, dtype=torch.float64)
     elevation = torch.rad2deg(torch.asin(low + (high - low) * (i + 0.5) / count))
     azimuth = (i * 180.0 * (3.0 - math.sqrt(5.0))) % 360.0
-    t, d = (torch.tensor([float(v) for v in values], dtype=torch.float64) for values in (thetas, distances))
-    if t.numel() == 0 or d.numel() == 0:
-        raise InvalidInputError("thetas, distances: expected at least one value each")
+    t, d = _numbers(thetas, "thetas"), _numbers(distances, "distances")
     repeats = t.numel() * d.numel()
     return ViewSphere(
         azimuth.repeat_interleave(repeats).float(),
