@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "PPM")
 _SCAN_OF_JPEG = re.compile(rb"\xff\xda\0[\x08\x0a\x0c\x0e][\1-\4]")
 _PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 262, 258, 254, 0x0112, 0x8769, 0xA405
+MAX_THUMBNAILS = 20
+"""Pages of a TIFF before its full picture."""
+
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _APPLY_ORIENTATION = {  # stored (H, W, C) pixels to viewed ones, for each EXIF orientation
     1: lambda x: x,
@@ -117,8 +120,8 @@ def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str
             _seek_full_image(image)
             if image.width * image.height > MAX_IMAGE_PIXELS:
                 raise Image.DecompressionBombError
-            orientation, focal = _exif(image)
-            rgb, notes = _rgb_pixels(image), _notes(image)
+            notes, (orientation, focal) = _notes(image), _exif(image)
+            rgb = _rgb_pixels(image)
             if image.format == "TIFF":  # Pillow has applied the orientation: take it back
                 rgb = _APPLY_ORIENTATION[{6: 8, 8: 6}.get(orientation, orientation)](rgb)
             return rgb, orientation, focal, notes
@@ -145,11 +148,23 @@ def _checked_scans(data: bytes) -> bytes:
 def _seek_full_image(image: "Image") -> None:
     """Go to the first picture of a TIFF that is not marked as a reduced copy of another."""
     if image.format == "TIFF":
-        for page in range(getattr(image, "n_frames", 1)):
-            image.seek(page)
-            if not int(image.tag_v2.get(_SUBFILE, 0)) & 1:  # type: ignore[attr-defined]
-                return
+        with suppress(EOFError):
+            for page in range(MAX_THUMBNAILS):
+                image.seek(page)
+                if not int(image.tag_v2.get(_SUBFILE, 0)) & 1:  # type: ignore[attr-defined]
+                    return
         raise ImageError("holds thumbnails only; export the picture as JPEG or PNG")
+
+
+def _is_one_of_several(image: "Image") -> bool:
+    if image.format != "TIFF":
+        return getattr(image, "n_frames", 1) > 1 and image.format != "MPO"  # to which phones add previews
+    page, more = image.tell(), False  # counting all pages of a TIFF may take minutes
+    with suppress(Exception):
+        image.seek(page + 1)
+        more = True
+    image.seek(page)
+    return more or page > 0
 
 
 def _exif(image: "Image") -> tuple[int, float | None]:
@@ -182,7 +197,7 @@ def _notes(image: "Image") -> tuple[str, ...]:
         "grey: three equal channels": image.mode in ("1", "L", "LA", "I") or image.mode.startswith("I;16"),
         "CMYK converted to RGB without a colour profile": image.mode == "CMYK",
         "alpha channel dropped": image.has_transparency_data,
-        "one of several pictures": getattr(image, "n_frames", 1) > 1 and image.format != "MPO",  # phones add previews
+        "one of several pictures": _is_one_of_several(image),
     }
     return tuple(text for text, applies in notes.items() if applies)
 
