@@ -17,7 +17,7 @@ from .settings import BankSettings, LocateSettings, ViewPolicy
 from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, RerankingTerm, Term, jittered_boxes
 from .utils.checks import check_option
 from .utils.choices import DEFAULT
-from .utils.digests import tensor_digest
+from .utils.files import tensor_digest
 from .utils.registry import Registry
 
 __all__ = ["DEFAULT", "FIELDS", "PRESETS", "Pipeline", "field_digest", "preset_named"]

@@ -141,7 +141,7 @@ def run(arguments: argparse.Namespace) -> None:
     field = options.open_field()
     check_camera(options.camera, options.guess)
     if prior_from_limits(options.limits or {}) is None and options.limits and arguments.list is None:
-        raise InvalidInputError("--front and --softness limit nothing by themselves; give --azimuth, for instance")
+        raise InvalidInputError("--front limits nothing by itself; give --azimuth, for instance")
     if "distance" in (options.limits or {}) and arguments.list is None and not (options.camera or options.guess):
         raise InvalidInputError("--distance: needs a camera; give --camera FX FY CX CY, --camera exif or --fov DEG")
     if options.start is not None and options.limits:

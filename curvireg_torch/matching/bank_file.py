@@ -18,8 +18,7 @@ from ..mesh.mesh import mesh_unit
 from ..mesh.up import mesh_up
 from ..pipeline import Pipeline
 from ..settings import BankSettings
-from ..utils.digests import tensor_digest
-from ..utils.files import write_tensors
+from ..utils.files import tensor_digest, write_tensors
 from .fields import hog_layer
 
 __all__ = ["FORMAT", "FORMAT_VERSION", "RERANKING", "read_bank", "write_bank"]

@@ -1,5 +1,6 @@
 """The stages of a registration, from photographs with boxes to poses."""
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -33,6 +34,8 @@ __all__ = ["PoseEstimator"]
 LEAST = 3
 """Hypotheses that are refined at least, even if fewer are reported: the confidence depends on rivals. Of 15 photographs
 of another object, 14 were called reliable with one hypothesis, 2 with two, none with three or five."""
+
+_SYMMETRIES_LOCK = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,10 @@ class PoseEstimator:
 
     def symmetries_of(self, *, exact: bool) -> Tensor | None:
         """(S, 4, 4) that were given, or those of the shape of an exact mesh; None if there are none."""
-        return self._shape_symmetries if exact and self.symmetries is None else self.symmetries
+        if not exact or self.symmetries is not None:
+            return self.symmetries
+        with _SYMMETRIES_LOCK:
+            return self._shape_symmetries
 
     @cached_property
     def _shape_symmetries(self) -> Tensor | None:
@@ -116,11 +122,9 @@ class PoseEstimator:
         whatever else is registered. On a GPU the matcher's ``chunk_size`` are registered at a time.
         """
         size = 1 if self.bank.device.type == "cpu" else self.matcher.chunk_size
-        # Create once what threads share, before they use it.
+        # Create once what threads share, before they use it; symmetries have a lock. Items are read on demand: asking
+        # for them here would decode every photograph twice, and keep all of them in memory.
         _ = self.describers, self.matcher.describers
-        given = [item for item in items if isinstance(item, ImageItem)]
-        if any(self.is_exact(with_camera=item.camera_matrix is not None) for item in given):
-            self.symmetries_of(exact=True)
 
         def run(first: int) -> list[Any]:
             return function(items[first : first + size], first)

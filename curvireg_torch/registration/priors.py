@@ -87,7 +87,7 @@ class BatchPriors:
         """Hypotheses with rotations moved into hard limits, each no further than it must be."""
         rotation = hypotheses.rotation.clone()
         for h, prior, frame, Q in self._each(hypotheses):
-            if prior.softness == 0.0 and float(prior.excess(Q @ rotation[h], frame)) > 0.0:
+            if float(prior.excess(Q @ rotation[h], frame)) > 0.0:
                 rotation[h] = Q.mT @ prior.nearest(Q @ rotation[h], frame)
         return replace(hypotheses, rotation=rotation)
 
@@ -95,8 +95,7 @@ class BatchPriors:
         """(H, C) bool: whether (H, C, 3, 3) rotations lie within the hard limits of their hypotheses' photographs."""
         allowed = torch.ones(candidates.shape[:2], dtype=torch.bool)
         for h, prior, frame, Q in self._each(hypotheses):
-            if prior.softness == 0.0:
-                allowed[h] = prior.excess(Q @ candidates[h], frame) <= 1e-3
+            allowed[h] = prior.excess(Q @ candidates[h], frame) <= 1e-3
         return allowed
 
     def excess(self, hypotheses: Hypotheses, rotations: Tensor) -> Tensor:
@@ -116,9 +115,6 @@ class BatchPriors:
     def keeps(self, hypotheses: Hypotheses, T: Tensor) -> Tensor:
         """(H,) bool: whether fitted (H, 4, 4) poses leave the hard limits by no more than the tolerances."""
         keep = self.excess(hypotheses, T[:, :3, :3]) <= TOLERANCE
-        for h, prior, _, _ in self._each(hypotheses):
-            if prior.softness > 0.0:
-                keep[h] = True
         return keep & (self._distance_excess(hypotheses, T) <= DISTANCE_TOLERANCE)
 
     def note(self, registration: Registration, best: Hypotheses, T: Tensor, T_filling: Tensor) -> Registration:

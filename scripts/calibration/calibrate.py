@@ -33,6 +33,7 @@ from tqdm import tqdm
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
+from curvireg_torch.registration import Follower
 from curvireg_torch.registration.rescoring import POSE_FEATURES, rescore
 from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
 
@@ -139,7 +140,7 @@ def refined(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
 def followed(registrar: cr.Registrar, frames: Sequence[Row]) -> Iterator[Row]:
     """Rows of a sequence tracked from its first true pose, by every frame and by every third."""
     for stride in (1, 3):
-        follow = cr.Follower(registrar, frames[0]["camera_matrix"].double())
+        follow = Follower(registrar, frames[0]["camera_matrix"].double())
         follow.start(frames[0]["image"], truth_of(frames[0]))
         for sample in frames[stride::stride]:
             result = follow(sample["image"])

@@ -82,8 +82,9 @@ def measure(step: str, folder: str, photographs: int) -> float:
     registrar = cr.Registrar(mesh, pipeline=replace(cr.Pipeline(), **changes), progress=False)
     if step == "follow":
         from curvireg_torch.data import read_image
+        from curvireg_torch.registration import Follower
 
-        first, follower = read_image(photograph), cr.Follower(registrar, K)
+        first, follower = read_image(photograph), Follower(registrar, K)
         assert follower(first, box).ok
         frames = [first.roll(2 * k, dims=-1) for k in range(1, FRAMES)]
         start = time.perf_counter()

@@ -125,7 +125,7 @@ def broken_files(folder):
         ({}, ["--near", "10"], ["near: expected AZIMUTH ELEVATION"]),
         ({}, ["--within", "10"], ["within: expected near"]),
         ({}, ["--side", "left", "--azimuth", "0", "10"], ["side: give it or azimuth"]),
-        ({}, ["--front", "x", "--softness", "5"], ["limit nothing"]),
+        ({}, ["--front", "x"], ["limits nothing"]),
         ({}, ["--distance", "1", "2"], ["--distance: needs a camera"]),
         ({"box": ()}, ["--start", "none.json", "--side", "front"], ["--start: refines"]),
         ({}, ["--elevation", "50", "10"], ["elevation: expected"]),

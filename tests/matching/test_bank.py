@@ -19,7 +19,7 @@ from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import Registrar
 from curvireg_torch.settings import BankSettings, ViewPolicy
 from curvireg_torch.terms import normalized_correlation
-from curvireg_torch.utils.digests import tensor_digest
+from curvireg_torch.utils.files import tensor_digest
 
 SETTINGS = BankSettings(image_size=64)
 UPRIGHT = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))

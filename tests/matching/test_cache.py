@@ -25,7 +25,6 @@ from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.settings import BankSettings
-from curvireg_torch.utils import digests
 
 PIPELINE = Pipeline(bank=BankSettings(image_size=64))
 VIEWS = sample_views(azimuth_step=90, elevations=[20])
@@ -84,7 +83,7 @@ def test_bank_key_depends_on_everything(monkeypatch):
 
 
 def test_bank_key_depends_on_code_that_exists():
-    package = Path(digests.__file__).parents[1]
+    package = Path(cache.__file__).parents[1]
     assert not [part for part in cache._SOURCES if not (package / part).exists()]
 
 
