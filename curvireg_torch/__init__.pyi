@@ -15,7 +15,6 @@ from . import (
     rendering as rendering,
     synthetic as synthetic,
     terms as terms,
-    training as training,
     visualization as visualization,
 )
 from .data import (
@@ -60,7 +59,6 @@ from .geometry import (
     ViewSphere as ViewSphere,
     camera_matrix as camera_matrix,
     crop_images as crop_images,
-    paper_views as paper_views,
     project_points as project_points,
     rotation_error as rotation_error,
     rotation_from_viewpoint as rotation_from_viewpoint,

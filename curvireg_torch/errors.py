@@ -10,43 +10,6 @@ folder.
 
 from typing import Self
 
-__all__ = [
-    "MAX_ARCHIVE_FILES",
-    "MAX_BOX_COORDINATE",
-    "MAX_IMAGE_BYTES",
-    "MAX_IMAGE_PIXELS",
-    "MAX_IMAGE_SCANS",
-    "MAX_MAT_BYTES",
-    "MAX_MAT_DEPTH",
-    "MAX_MAT_UNPACKED_BYTES",
-    "MAX_MESH_BYTES",
-    "MAX_MESH_COORDINATE",
-    "MAX_MESH_DEPTH",
-    "MAX_MESH_FACES",
-    "MAX_MESH_LINES",
-    "MAX_MESH_PARTS",
-    "MAX_POLYGON_CORNERS",
-    "MAX_POLYGON_WORK",
-    "MAX_TABLE_BYTES",
-    "MAX_VIEWER_BYTES",
-    "MAX_VIEWER_FACES",
-    "MAX_VIEWER_PAGES",
-    "MAX_VIEWER_SECONDS",
-    "MAX_VIEWER_UPLOADS",
-    "MIN_MESH_EXTENT",
-    "BankError",
-    "CurviregError",
-    "CurviregWarning",
-    "ImageError",
-    "InvalidInputError",
-    "LostObjectError",
-    "MeshError",
-    "MissingDependencyError",
-    "MissingFileError",
-    "OutputError",
-    "RenderingError",
-]
-
 
 class _SubjectError(Exception):
     """Message and subject of errors and warnings."""
@@ -121,8 +84,8 @@ class RenderingError(CurviregError, RuntimeError):
 MAX_IMAGE_BYTES = 1 << 28
 """Bytes of an image file."""
 
-MAX_IMAGE_PIXELS = 1 << 27
-"""Width times height in the header, before anything is decoded: 134 million."""
+MAX_IMAGE_PIXELS = 89_478_485
+"""Width times height in the header, before anything is decoded: Pillow's limit."""
 
 MAX_IMAGE_SCANS = 64
 """Scans of a progressive JPEG. Encoders write about ten, and each takes as long to decode as the whole picture."""
@@ -160,14 +123,8 @@ MAX_POLYGON_WORK = 20_000_000
 MAX_TABLE_BYTES = 1 << 25
 """Bytes of a JSON or CSV file, 32 MiB; rows of a CSV of poses take up to 60 times as much memory."""
 
-MAX_MAT_BYTES = 1 << 24
-"""Bytes of a MATLAB annotation file."""
-
-MAX_MAT_UNPACKED_BYTES = 1 << 24
-"""Bytes that all compressed variables of a MATLAB file unpack to; structs may take 60 times as much memory."""
-
-MAX_MAT_DEPTH = 16
-"""Nesting of structs in a MATLAB annotation file."""
+MAX_MAT_BYTES = 1 << 20
+"""Bytes of a MATLAB annotation file, and of what it unpacks to."""
 
 MAX_VIEWER_FACES = 300_000
 """Triangles that the viewer sends to the browser, 96 bytes each; for larger meshes it shows a notice."""

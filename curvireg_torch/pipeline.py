@@ -28,7 +28,7 @@ from .geometry.views import DEFAULT_DISTANCE
 from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, RerankingTerm, Term, jittered_boxes
 from .utils.checks import check_option, check_positive
 from .utils.choices import DEFAULT
-from .utils.digests import tensor_digest
+from .utils.files import tensor_digest
 
 __all__ = [
     "DEFAULT",

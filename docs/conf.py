@@ -1,6 +1,7 @@
 """Sphinx configuration: ``scripts/docs.sh`` builds the site from the pages, the docstrings and ``gallery``."""
 
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from sphinx.ext.napoleon.docstring import GoogleDocstring
 import curvireg_torch
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))  # the gallery imports scripts
 
 project = "curvireg_torch"
 copyright = "2026, the curvireg_torch authors; Apache-2.0"

@@ -7,7 +7,7 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -85,19 +85,3 @@ def run_process(
             raise SystemExit(f"{' '.join(words)} failed with PYTHONPATH={environment['PYTHONPATH']}: {errors.read()}")
         output.seek(0)
         return seconds, usage, output.read()
-
-
-def timed(call: Callable[[], object], repeats: int) -> list[float]:
-    """Seconds of each run in ascending order."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return sorted(times)
-
-
-def right_share(summary: dict[str, Any]) -> float:
-    """Fraction of answers within 30 degrees, up to symmetries, of a summary of ``curvireg evaluate``."""
-    scores = summary.get("symmetry_aware", summary)
-    return float(scores["acc_pi_6"] if "acc_pi_6" in scores else scores["acc_30_deg"])

@@ -17,6 +17,14 @@ from tests._support import scenes
 from tests._support.miniature import write_bop, write_pascal3d, write_web
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip tests marked ``cuda`` where there is no GPU."""
+    if not torch.cuda.is_available():
+        for item in items:
+            if item.get_closest_marker("cuda"):
+                item.add_marker(pytest.mark.skip(reason="torch finds no GPU"))
+
+
 @pytest.fixture(scope="session")
 def truck() -> trimesh.Trimesh:
     """The example mesh, in metres."""

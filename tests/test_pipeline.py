@@ -11,8 +11,7 @@ from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.filters import MultiScaleFocusCurves
 from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching.fields import depth_filter
-from curvireg_torch.pipeline import DEFAULT, FIELDS, PRESETS, preset_named
-from curvireg_torch.pipeline import DEPTH_FIELDS, BankSettings, ViewPolicy
+from curvireg_torch.pipeline import DEFAULT, DEPTH_FIELDS, FIELDS, PRESETS, BankSettings, ViewPolicy, preset_named
 from curvireg_torch.terms import TERMS, BoxShape, Correlation, Repeatability
 
 
@@ -101,27 +100,16 @@ def test_read_completes_a_partial_file_with_defaults(tmp_path):
     ("text", "message"),
     [
         ("{", "not JSON"),
-        ("[1]", "JSON object"),
         ('{"version": 99}', "version 1"),
         ('{"field": "nope"}', "field: expected one of 'learned'"),
         ('{"colour": 1}', "colour"),
-        ('{"views": {"pose": "sideways"}}', "pose"),
         ('{"views": {"theta_step": 0}}', "theta_step"),
-        ('{"views": 3}', "compare with"),
         ('{"bank": {"image_size": 4}}', "image_size"),
-        ('{"bank": {"depth_field": "XX"}}', "depth_field"),
-        ('{"bank": {"formula": "mine"}}', "formula"),
         ('{"bank": {"block": 9}}', "hog: expected 1 <= block"),
-        ('{"locate": {"min_size": 2}}', "min_size"),
-        ('{"locate": {"proposals": 0}}', "proposals"),
         ('{"terms": {"hug": {}}}', "term: expected one of 'hog'"),
-        ('{"terms": {}}', "terms"),
         *((f'{{"terms": {{"{name}": {{"weight": -1}}}}}}', f"{name}: weight") for name in TERMS),
-        ('{"terms": {"box": {"sigma": 0}}}', "sigma"),
         ('{"box_jitter": 0.6}', "box_jitter"),
-        ('{"hypotheses": 0}', "hypotheses"),
         ('{"terms": {"appearance": {}}}', "compare all views"),
-        ('{"terms": {"hog": {}, "appearance": {"top": 0}}}', "top"),
         ('{"terms": {"hog": {}, "appearance": {"weights": "0"}}}', "expected weights 0"),
     ],
 )

@@ -18,24 +18,20 @@ def add_parser(commands: Any) -> None:
         help="render and describe the views of MESH",
         **examples(
             "curvireg bank part.stl --unit mm --out part.safetensors",
-            "curvireg bank chair.glb --pose upright --out chair.safetensors --adapt chair_field.safetensors",
+            "curvireg bank chair.glb --pose upright --out chair.safetensors",
         ),
     )
     parser.add_argument("mesh", type=Path, metavar="MESH")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the bank, as .safetensors")
-    adapt = "also fine-tune the learned field on generated photographs (minutes); its weights, for register --field"
-    parser.add_argument("--adapt", type=Path, metavar="FILE", help=adapt)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Build and save a bank."""
     check_given([], [arguments.mesh])
-    for path, name in ((arguments.out, "--out"), (arguments.adapt, "--adapt")):
-        if path is not None:
-            if path.suffix != ".safetensors" or path.is_dir():
-                raise InvalidInputError(f"{name} {path}: expected the name of a file that ends in .safetensors")
-            check_writable(path.parent, name)
+    if arguments.out.suffix != ".safetensors" or arguments.out.is_dir():
+        raise InvalidInputError(f"--out {arguments.out}: expected the name of a file that ends in .safetensors")
+    check_writable(arguments.out.parent, "--out")
     if arguments.mesh.suffix == ".safetensors":
         raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
     from ..matching import ViewBank
@@ -51,10 +47,3 @@ def run(arguments: argparse.Namespace) -> None:
     bank.save(arguments.out)
     size = arguments.out.stat().st_size / 1e6
     print(f"{arguments.out}: {len(bank)} views, {size:.1f} MB, {time.perf_counter() - start:.1f} s")
-    if arguments.adapt is not None:
-        from ..training import adapt
-
-        start = time.perf_counter()
-        upright = 1.0 if options.pose == "upright" else 0.0
-        adapt(mesh, upright=upright, workers=1, progress=options.progress).save(arguments.adapt)
-        print(f"{arguments.adapt}: adapted field, {time.perf_counter() - start:.1f} s")

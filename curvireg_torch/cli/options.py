@@ -121,7 +121,6 @@ def add_pose_prior(parser: argparse.ArgumentParser) -> None:
     distance = "of the object's centre, in the mesh's unit; needs a camera"
     add("--distance", type=float, nargs=2, metavar=("NEAR", "FAR"), help=distance)
     add("--front", choices=UP_AXES, help="axis of the mesh file that points out of its front, at azimuth 0")
-    add("--softness", type=float, metavar="DEG", help="soft limits: standard deviation of what exceeds them")
 
 
 def register_options(

@@ -147,7 +147,7 @@ class _Table:
     """A CSV file with a header."""
 
     def __init__(self, path: Path) -> None:
-        from ..utils.json_files import check_table_size
+        from ..utils.files import check_table_size
 
         if not path.is_file():
             raise MissingFileError(f"{path}: no such table; curvireg evaluate writes predictions.csv")

@@ -86,7 +86,7 @@ def add_parser(commands: Any) -> None:
     add_pose_prior(parser)
     add_mesh_is(parser)
     add("--instances", type=whole_number(1), default=1, metavar="N", help="without a box: up to N objects (default: 1)")
-    add("--field", type=Path, metavar="FILE", help="weights from curvireg bank --adapt")
+    add("--field", type=Path, metavar="FILE", help="weights of a learned field")
     add("--top", type=whole_number(1), metavar="K", help="hypotheses to carry and report (default: 5)")
     add("--no-refine", dest="refine", action="store_false", help="stop at the best view of the bank")
     add(
@@ -141,7 +141,7 @@ def run(arguments: argparse.Namespace) -> None:
     field = options.open_field()
     check_camera(options.camera, options.guess)
     if prior_from_limits(options.limits or {}) is None and options.limits and arguments.list is None:
-        raise InvalidInputError("--front and --softness limit nothing by themselves; give --azimuth, for instance")
+        raise InvalidInputError("--front limits nothing by itself; give --azimuth, for instance")
     if "distance" in (options.limits or {}) and arguments.list is None and not (options.camera or options.guess):
         raise InvalidInputError("--distance: needs a camera; give --camera FX FY CX CY, --camera exif or --fov DEG")
     if options.start is not None and options.limits:

@@ -4,20 +4,16 @@ A sample is a dict, one per object. Every dataset reports skipped objects with t
 ``skipped_items``), and ``annotation(index)`` returns a sample without its photograph. Nothing is downloaded.
 """
 
-from ._base import ObjectDataset
-from .bop import BOPDataset
-from .bop_csv import BOPRow, read_bop_csv, write_bop_csv
-from .collate import collate
+from ._base import ObjectDataset, collate
+from .bop import BOPDataset, BOPRow, read_bop_csv, write_bop_csv
 from .images import Photo, read_image, read_photo
 from .pascal3d import Pascal3DPlus
-from .transforms import CropBox
 from .videos import Video
 from .web import WebCollection
 
 __all__ = [
     "BOPDataset",
     "BOPRow",
-    "CropBox",
     "ObjectDataset",
     "Pascal3DPlus",
     "Photo",

@@ -1,31 +1,30 @@
-"""Base class of the datasets: dict samples, images read on access, and a record of skipped objects."""
+"""Base class of the datasets: dict samples, images read on access, a record of skipped objects, and batches."""
 
 import os
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.utils.data import Dataset
 
-from ..errors import MissingFileError
+from ..errors import InvalidInputError, MissingFileError
 from ..geometry import rotation_from_viewpoint
 from .images import read_image
 
 Sample = dict[str, Any]
-Transform = Callable[[Sample], Sample]
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".JPEG", ".JPG", ".PNG", ".tif", ".tiff")
 
 
 class ObjectDataset(Dataset[Sample]):
     """One dict per annotated object. The index is built once, photographs are read on access.
 
-    ``skipped_items`` maps reasons to names of skipped objects and files; ``transforms`` is applied last to a sample.
+    ``skipped_items`` maps reasons to names of skipped objects and files.
     """
 
-    def __init__(self, transforms: Transform | None) -> None:
-        self.transforms = transforms
+    def __init__(self) -> None:
         self.skipped_items: dict[str, list[str]] = {}
         # Numbers instead of tensors: thousands of small tensors exhaust file handles when a worker is spawned.
         self._items: list[Sample] = []
@@ -42,7 +41,7 @@ class ObjectDataset(Dataset[Sample]):
         return len(self._items)
 
     def annotation(self, index: int) -> Sample:
-        """Sample ``index`` without its ``image``, and without ``transforms``."""
+        """Sample ``index`` without its ``image``."""
         return {
             key: torch.tensor(value, dtype=torch.float32) if isinstance(value, tuple) else value
             for key, value in self._items[index].items()
@@ -51,7 +50,7 @@ class ObjectDataset(Dataset[Sample]):
     def __getitem__(self, index: int) -> Sample:
         sample = self.annotation(index)
         sample["image"] = read_image(sample["image_path"])
-        return sample if self.transforms is None else self.transforms(sample)
+        return sample
 
 
 def existing_root(root: str | os.PathLike[str], readme: str) -> Path:
@@ -71,3 +70,29 @@ def pose_fields(*viewpoint: float) -> Sample:
 def is_plain_name(name: str) -> bool:
     """Whether ``name`` cannot lead out of the folder that it is appended to."""
     return name not in ("", ".", "..") and len(name) <= 200 and not any(c in name for c in "/\\:\0")
+
+
+def collate(samples: Sequence[Sample]) -> Sample:
+    """Join B >= 1 samples with the same keys into one batch, for ``DataLoader(..., collate_fn=collate)``.
+
+    Tensors of equal shape and dtype are stacked to (B, ...). Other values become lists of length B, photographs of
+    different sizes among them. :class:`InvalidInputError` if there is no sample, or their keys differ.
+
+    Example:
+        >>> batch = collate([{"box": torch.zeros(4), "category": "car"}, {"box": torch.ones(4), "category": "sofa"}])
+        >>> batch["box"].shape, batch["category"]
+        (torch.Size([2, 4]), ['car', 'sofa'])
+    """
+    if not samples:
+        raise InvalidInputError("samples: expected at least one")
+    for sample in samples:
+        if sample.keys() != samples[0].keys():
+            raise InvalidInputError(f"samples: expected the keys {sorted(samples[0])}, got {sorted(sample)}")
+    return {key: _join([sample[key] for sample in samples]) for key in samples[0]}
+
+
+def _join(values: list[object]) -> object:
+    tensors = [v for v in values if isinstance(v, Tensor)]
+    if len(tensors) == len(values) and len({(t.shape, t.dtype, t.device) for t in tensors}) == 1:
+        return torch.stack(tensors)
+    return values

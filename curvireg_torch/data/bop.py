@@ -1,19 +1,30 @@
-"""Datasets in the layout of the BOP challenge (scenewise)."""
+"""Datasets in the layout of the BOP challenge (scenewise), and its results files: one line per pose estimate."""
 
+import csv
 import math
 import os
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
+from torch import Tensor
 
 from ..errors import InvalidInputError, MissingFileError
-from ..utils.checks import check_camera_matrix, check_positive, check_rotation
-from ..utils.json_files import finite_numbers, read_json
-from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name
+from ..geometry import symmetry_transforms
+from ..utils.checks import (
+    check_camera_matrix,
+    check_integer,
+    check_rotation,
+    check_symmetries,
+    check_tensor,
+)
+from ..utils.files import check_table_size, finite_numbers, read_json, write_csv
+from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, existing_root, is_plain_name
 
 _README = "datasets/bop/README.md"
 _UNKNOWN_BOX = (math.nan,) * 4
+_HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
 
 
 class BOPDataset(ObjectDataset):
@@ -24,11 +35,8 @@ class BOPDataset(ObjectDataset):
         split: folder of the scenes, such as ``"test"`` or ``"train_pbr"``.
         targets: True selects the instances of ``test_targets_bop19.json``, for each image and object the ``inst_count``
             most visible ones; False selects all; None is True for ``split="test"`` if the file exists.
-        min_visib: least visible fraction, in [0, 1]; above 0, instances of unknown visibility are skipped too.
-        transforms: applied to every sample, ``sample -> sample``.
 
     Attributes:
-        camera: content of ``camera.json``, empty if it is missing.
         models_info: obj_id -> entry of ``models/models_info.json``, symmetries included.
 
     Samples are dicts (tensors are float32):
@@ -39,15 +47,15 @@ class BOPDataset(ObjectDataset):
         - ``scene_id``, ``image_id``, ``obj_id`` int; ``instance_index`` int: index in the image's list of ``scene_gt``
         - ``visib_fract`` float in [0, 1], NaN if unknown; ``model_path`` str; ``model_info`` dict
 
-    Reasons in ``skipped``: ``no_target``, ``not_visible``, ``bad_box`` (no area: the object is outside the image),
+    Reasons in ``skipped``: ``no_target``, ``bad_box`` (no area: the object is outside the image),
     ``missing_annotation``, ``corrupt_annotation``, ``missing_image``, ``missing_mesh``, ``missing_model_info``.
 
     Raises:
         MissingFileError: the root, the split's folder, ``models_info.json`` or a required target list does not exist.
-        InvalidInputError: ``min_visib`` out of range, or one of those files is damaged.
+        InvalidInputError: one of those files is damaged.
 
     Example:
-        >>> BOPDataset("data/bop/lm", min_visib=0.1)[0]["translation"]  # doctest: +SKIP
+        >>> BOPDataset("data/bop/lm")[0]["translation"]  # doctest: +SKIP
     """
 
     def __init__(
@@ -56,35 +64,25 @@ class BOPDataset(ObjectDataset):
         split: str = "test",
         *,
         targets: bool | None = None,
-        min_visib: float = 0.0,
-        transforms: Transform | None = None,
     ) -> None:
-        super().__init__(transforms)
-        check_positive(min_visib, "min_visib", zero_ok=True)
-        if min_visib > 1:
-            raise InvalidInputError(f"min_visib: expected a fraction in [0, 1], got {min_visib}")
+        super().__init__()
         self.root, self.split = existing_root(root, _README), split
         scenes = self.root / split
         if not is_plain_name(split) or not scenes.is_dir():
             raise MissingFileError(f"no such folder; {_README} shows the layout", subject=scenes)
-        camera = self.root / "camera.json"
-        self.camera: dict[str, Any] = read_json(camera, dict, _README) if camera.is_file() else {}
-        info = read_json(self.root / "models" / "models_info.json", dict, _README)
-        self.models_info: dict[int, dict[str, Any]] = {
-            int(key): value for key, value in info.items() if key.isdecimal() and isinstance(value, dict)
-        }
+        self.models_info = _models_info(self.root / "models" / "models_info.json")
         self._models = {path.name for path in (self.root / "models").glob("obj_*.ply")}
         target_file = self.root / "test_targets_bop19.json"
         if targets is None:
             targets = split == "test" and target_file.is_file()
         counts = _targets(target_file) if targets else None
         for folder in sorted(p for p in scenes.iterdir() if p.is_dir() and p.name.isdecimal()):
-            self._index(folder, counts, min_visib)
+            self._index(folder, counts)
         if counts:  # targets that were not found
             for scene_id, image_id, obj_id in sorted(counts):
                 self._skip("missing_annotation", f"{split}/{scene_id:06d}/{image_id:06d} object {obj_id}")
 
-    def _index(self, folder: Path, counts: dict[tuple[int, int, int], int] | None, min_visib: float) -> None:
+    def _index(self, folder: Path, counts: dict[tuple[int, int, int], int] | None) -> None:
         scene = f"{self.split}/{folder.name}"
         contents: list[dict[str, Any]] = []
         for name in ("scene_gt.json", "scene_camera.json", "scene_gt_info.json"):
@@ -123,8 +121,6 @@ class BOPDataset(ObjectDataset):
                     self._skip("no_target", item_name)
                 elif image is None:
                     self._skip("missing_image", item_name)
-                elif min_visib > 0 and not sample["visib_fract"] >= min_visib:
-                    self._skip("not_visible", item_name)
                 else:
                     self._items.append(sample)
         return None
@@ -167,6 +163,24 @@ class BOPDataset(ObjectDataset):
         }
 
 
+def _models_info(path: Path) -> dict[int, dict[str, Any]]:
+    """obj_id -> entry, each with a diameter and symmetries that metrics can use."""
+    entries = {}
+    for key, entry in read_json(path, dict, _README).items():
+        name = f"entry {key[:20]!r}"
+        if not (key.isdecimal() and len(key) < 10 and isinstance(entry, dict)):
+            raise InvalidInputError(f"{name}: expected an object's number and its values; {_README}", subject=path)
+        diameter = finite_numbers([entry.get("diameter")], 1)
+        if diameter is None or diameter[0] <= 0:
+            raise InvalidInputError(f"{name}: expected a diameter > 0 in mm; {_README}", subject=path)
+        try:
+            check_symmetries(symmetry_transforms(entry, max_step_fraction=1.0))
+        except InvalidInputError as error:
+            raise InvalidInputError(f"{name}: {error}", subject=path) from None
+        entries[int(key)] = entry
+    return entries
+
+
 def bop_box(values: object) -> tuple[float, ...] | None:
     """BOP's x, y, width, height as x0, y0, x1, y1; None for no box (BOP writes -1 four times)."""
     numbers = finite_numbers(values, 4)
@@ -205,3 +219,96 @@ def entry_at(infos: object, index: int) -> dict[str, Any]:
 
 def _rows(values: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
     return values[:3], values[3:6], values[6:]
+
+
+class BOPRow(TypedDict):
+    """A pose estimate: R (3, 3) and t (3,), mm, take model points into the OpenCV camera; time in seconds or -1."""
+
+    scene_id: int
+    im_id: int
+    obj_id: int
+    score: float
+    R: Tensor
+    t: Tensor
+    time: float
+
+
+def write_bop_csv(path: str | os.PathLike[str], rows: Iterable[BOPRow]) -> None:
+    """Write pose estimates in the format of the BOP challenge, atomically and with all digits.
+
+    Columns: scene_id, im_id, obj_id, score, R (9 numbers, row by row, separated by spaces), t (3 numbers, mm), time
+    (seconds for the whole image, so equal for all its rows; -1 if unknown).
+
+    Raises:
+        InvalidInputError: a row lacks a key, is not finite, or disagrees on an image's time.
+        MissingFileError: the folder does not exist.
+        OutputError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> row = BOPRow(scene_id=1, im_id=2, obj_id=3, score=0.5, R=torch.eye(3), t=torch.zeros(3), time=-1.0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_bop_csv(Path(folder, "results.csv"), [row])
+        ...     read_bop_csv(Path(folder, "results.csv"))[0]["score"]
+        0.5
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise MissingFileError("no such folder; create it before writing results", subject=path.parent)
+    lines, times = [_HEADER], dict[tuple[int, int], float]()
+    for number, row in enumerate(rows):
+        name = f"row {number}"
+        if set(row) != set(_HEADER):
+            raise InvalidInputError(f"expected the keys {', '.join(_HEADER)}, got {', '.join(row)}", subject=name)
+        check_tensor(row["R"], f"{name} R", (3, 3))
+        check_tensor(row["t"], f"{name} t", (3,))
+        ids = [check_integer(row[key], f"{name} {key}", least=0) for key in ("scene_id", "im_id", "obj_id")]
+        _check_time(row, times, name)
+        numbers = finite_numbers([row["score"], *row["R"].flatten().tolist(), *row["t"].tolist(), row["time"]], 14)
+        if numbers is None:
+            raise InvalidInputError("score, R, t and time must be finite numbers", subject=name)
+        texts = [repr(v) for v in numbers]
+        lines.append([*map(str, ids), texts[0], " ".join(texts[1:10]), " ".join(texts[10:13]), texts[13]])
+    write_csv(path, lines)
+
+
+def read_bop_csv(path: str | os.PathLike[str]) -> list[BOPRow]:
+    """Read a results file of the BOP challenge; R and t are float64.
+
+    Raises:
+        MissingFileError: the file does not exist.
+        InvalidInputError: another header, or a line with a wrong number of values or one that is not finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MissingFileError("no such file; write_bop_csv writes one", subject=path)
+    check_table_size(path)
+    rows, times = list[BOPRow](), dict[tuple[int, int], float]()
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            lines = list(csv.reader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InvalidInputError(f"not a csv file ({error})", subject=path) from error
+    if lines[:1] != [_HEADER]:
+        raise InvalidInputError(f"expected the header {','.join(_HEADER)}", subject=path)
+    for number, cells in enumerate(lines[1:], start=2):
+        name = f"{path}, line {number}"
+        try:
+            ids = dict(zip(_HEADER, map(int, cells[:3]), strict=False))
+            numbers = [float(v) for cell in cells[3:] for v in cell.split()]
+        except ValueError as error:
+            raise InvalidInputError(str(error), subject=name) from error
+        if [len(cell.split()) for cell in cells[3:]] != [1, 9, 3, 1] or not all(map(math.isfinite, numbers)):
+            raise InvalidInputError("expected ids and finite numbers: a score, 9 of R, 3 of t, a time", subject=name)
+        R, t = torch.tensor(numbers[1:10], dtype=torch.float64), torch.tensor(numbers[10:13], dtype=torch.float64)
+        rows.append(BOPRow(**ids, score=numbers[0], R=R.view(3, 3), t=t, time=numbers[13]))  # type: ignore[typeddict-item]
+        _check_time(rows[-1], times, name)
+    return rows
+
+
+def _check_time(row: BOPRow, times: dict[tuple[int, int], float], name: str) -> None:
+    first = times.setdefault((row["scene_id"], row["im_id"]), row["time"])
+    if first != row["time"]:
+        raise InvalidInputError(
+            f"time {row['time']}, but an earlier row of this image has {first}; BOP requires one", subject=name
+        )

@@ -2,11 +2,13 @@
 
 import math
 import os
+import re
+from contextlib import suppress
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -14,8 +16,15 @@ from torch import Tensor
 
 from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, MAX_IMAGE_SCANS, ImageError, InvalidInputError, MissingFileError
 from ..geometry.cameras import camera_matrix
-from ..utils.checks import check_option
-from .image_headers import ImageHeader, read_header
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "PPM")
+_SCAN_OF_JPEG = re.compile(rb"\xff\xda\0[\x08\x0a\x0c\x0e][\1-\4]")
+_PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 262, 258, 254, 0x0112, 0x8769, 0xA405
+MAX_THUMBNAILS = 20
+"""Pages of a TIFF before its full picture."""
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _APPLY_ORIENTATION = {  # stored (H, W, C) pixels to viewed ones, for each EXIF orientation
@@ -47,7 +56,7 @@ class Photo:
     notes: tuple[str, ...]
 
     def guessed_camera_matrix(self) -> Tensor | None:
-        """(3, 3) float64 camera matrix from the EXIF focal length, or None without one.
+        """Return the (3, 3) float64 camera matrix from the EXIF focal length, or None without one.
 
         The focal length is relative to the diagonal, the principal point the centre: the picture must not be cropped.
         """
@@ -55,120 +64,146 @@ class Photo:
             return None
         H, W = self.image.shape[-2:]
         focal = self.focal_35mm * math.hypot(H, W) / _DIAGONAL_35MM
-        return camera_matrix(focal, focal, (W - 1) / 2, (H - 1) / 2, dtype=torch.float64)
+        return camera_matrix(focal, focal, (W - 1) / 2, (H - 1) / 2)
 
     def facts(self) -> dict[str, Any]:
-        """All but the pixels, as plain JSON."""
-        return {
-            "width": self.image.shape[-1],
-            "height": self.image.shape[-2],
-            "orientation": self.orientation,
-            "focal_35mm": self.focal_35mm,
-            "notes": list(self.notes),
-        }
+        """Return all but the pixels, as plain JSON."""
+        H, W = self.image.shape[-2:]
+        facts = {"width": W, "height": H, "orientation": self.orientation, "focal_35mm": self.focal_35mm}
+        return {**facts, "notes": list(self.notes)}
 
 
 def read_photo(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.uint8) -> Photo:
     """Read a photograph as viewers show it: the EXIF orientation is applied, and boxes refer to the result.
 
     Args:
-        path: JPEG, PNG, TIFF, WebP, BMP, PGM or PPM with 8 or 16 bits per channel.
+        path: JPEG, PNG, TIFF, WebP, BMP, PGM or PPM with up to 16 bits per channel, which are rounded to 8.
         dtype: ``torch.uint8``, 0 to 255, or ``torch.float32``, 0 to 1.
 
     Raises:
         MissingFileError: the file does not exist.
-        ImageError: another format or bit depth, a truncated file, or one beyond :mod:`curvireg_torch.errors`.
+        ImageError: another format or bit depth, a damaged file, or one beyond :mod:`curvireg_torch.errors`.
 
     Example:
         >>> import tempfile
+        >>> from PIL import Image
         >>> file = Path(tempfile.mkdtemp(), "grey.png")
-        >>> cv2.imwrite(str(file), np.full((4, 6), 51, np.uint8))
-        True
+        >>> Image.new("L", (6, 4), 51).save(file)
         >>> photo = read_photo(file)
         >>> photo.image.shape, int(photo.image[0, 0, 0]), photo.notes
         (torch.Size([3, 4, 6]), 51, ('grey: three equal channels',))
     """
-    header, pixels = _decode(Path(path))
-    orientation = header.exif.orientation
-    notes = _notes(header, pixels.dtype, dtype)
-    return Photo(_to_tensor(_APPLY_ORIENTATION[orientation](pixels), dtype), orientation, header.exif.focal_35mm, notes)
+    rgb, orientation, focal, notes = _decode(Path(path))
+    if orientation != 1:
+        notes = (f"EXIF orientation {orientation} applied", *notes)
+    return Photo(_to_tensor(_APPLY_ORIENTATION[orientation](rgb), dtype), orientation, focal, notes)
 
 
-def read_image(
-    path: str | os.PathLike[str], *, orientation: str = "stored", dtype: torch.dtype = torch.float32
-) -> Tensor:
-    """Read a photograph as (3, H, W) RGB; ``path``, ``dtype`` and errors as in :func:`read_photo`.
+def read_image(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Read a photograph as it is stored, to which the boxes of datasets refer, as (3, H, W) RGB.
 
-    Grey images get three equal channels, an alpha channel is dropped, 16-bit images keep their precision in float32.
-
-    Args:
-        orientation: ``"stored"``, to which the boxes of datasets refer, or ``"viewed"`` to apply that of EXIF.
+    Grey images get three equal channels, an alpha channel is dropped. Arguments and errors as in :func:`read_photo`.
     """
-    check_option(orientation, ("stored", "viewed"), "orientation")
-    header, pixels = _decode(Path(path))
-    return _to_tensor(_APPLY_ORIENTATION[header.exif.orientation](pixels) if orientation == "viewed" else pixels, dtype)
+    return _to_tensor(_decode(Path(path))[0], dtype)
 
 
-def _decode(path: Path) -> tuple[ImageHeader, NDArray[Any]]:
-    """Header and (H, W, 3) BGR pixels, uint8 or uint16, as stored."""
+def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str, ...]]:
+    """(H, W, 3) RGB pixels as stored, EXIF orientation and focal length, and notes."""
     if not path.is_file():
         raise MissingFileError("no such file; check the path of the photograph", subject=path)
     if path.stat().st_size > MAX_IMAGE_BYTES:
         raise ImageError(f"larger than {MAX_IMAGE_BYTES:,} bytes; save it smaller", subject=path)
+    from PIL import Image, UnidentifiedImageError
+
     try:
-        header = read_header(path.read_bytes())
-    except ValueError as error:
-        raise ImageError(str(error), subject=path) from None
-    size = f"{header.width} x {header.height} px"
-    if header.width * header.height > MAX_IMAGE_PIXELS:
-        raise ImageError(f"{size}, more than {MAX_IMAGE_PIXELS:,} pixels; scale it down", subject=path)
-    if header.scans > MAX_IMAGE_SCANS:
-        raise ImageError(f"a JPEG of {header.scans} scans, more than {MAX_IMAGE_SCANS}; save it again", subject=path)
-    pixels = _decode_silently(header.data)
-    if pixels is None or pixels.shape != (header.height, header.width, 3):
-        raise ImageError(
-            f"not an image that can be decoded ({size}, {header.colour}, {header.bits} bits); "
-            "save it as JPEG or PNG with 8 or 16 bits per channel",
-            subject=path,
-        )
-    if pixels.dtype not in (np.uint8, np.uint16):
-        raise ImageError(f"expected 8 or 16 bits per channel, got {pixels.dtype}; save it as PNG", subject=path)
-    return header, pixels
+        with Image.open(BytesIO(_checked_scans(path.read_bytes())), formats=_FORMATS) as image:
+            _seek_full_image(image)
+            if image.width * image.height > MAX_IMAGE_PIXELS:
+                raise Image.DecompressionBombError
+            notes, (orientation, focal) = _notes(image), _exif(image)
+            rgb = _rgb_pixels(image)
+            if image.format == "TIFF":  # Pillow has applied the orientation: take it back
+                rgb = _APPLY_ORIENTATION[{6: 8, 8: 6}.get(orientation, orientation)](rgb)
+            return rgb, orientation, focal, notes
+    except ImageError as error:
+        raise error.with_subject(path) from None
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+        raise ImageError(f"more than {MAX_IMAGE_PIXELS:,} pixels; scale it down", subject=path) from None
+    except UnidentifiedImageError:
+        message = "not an image that is read (JPEG, PNG, TIFF, WebP, BMP, PGM, PPM); convert it to JPEG or PNG"
+        raise ImageError(message, subject=path) from None
+    except Exception as error:  # Pillow raises errors of any kind for damaged files
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise ImageError(f"damaged or truncated ({reason}); fetch or save the file again", subject=path) from error
 
 
-def _decode_silently(data: bytes) -> NDArray[Any] | None:
-    """OpenCV's pixels, or None; its log is off, because the caller reports the failure."""
-    log = getattr(cv2.utils, "logging", cv2)  # OpenCV 5, and 4
-    level = log.getLogLevel()
-    try:
-        log.setLogLevel(0)
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-        pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-        return pixels
-    except cv2.error:
-        return None
-    finally:
-        log.setLogLevel(level)
+def _checked_scans(data: bytes) -> bytes:
+    """Refuse a progressive JPEG of very many scans, which Pillow would decode for hours."""
+    scans = len(_SCAN_OF_JPEG.findall(data)) if data.startswith(b"\xff\xd8") else 0
+    if scans > MAX_IMAGE_SCANS:
+        raise ImageError(f"a JPEG of {scans} scans, more than {MAX_IMAGE_SCANS}; save it again")
+    return data
 
 
-def _to_tensor(bgr: NDArray[Any], dtype: torch.dtype) -> Tensor:
-    rgb = bgr[..., ::-1].transpose(2, 0, 1)
-    if dtype == torch.uint8:
-        rounded = (rgb.astype(np.uint32) + 128) // 257 if bgr.dtype == np.uint16 else rgb
-        return torch.from_numpy(np.ascontiguousarray(rounded, dtype=np.uint8))
-    if dtype != torch.float32:
-        raise InvalidInputError(f"dtype: expected torch.uint8 or torch.float32, got {dtype}")
-    return torch.from_numpy(np.ascontiguousarray(rgb, dtype=np.float32)).div_(float(np.iinfo(bgr.dtype).max))
+def _seek_full_image(image: "Image") -> None:
+    """Go to the first picture of a TIFF that is not marked as a reduced copy of another."""
+    if image.format == "TIFF":
+        with suppress(EOFError):
+            for page in range(MAX_THUMBNAILS):
+                image.seek(page)
+                if not int(image.tag_v2.get(_SUBFILE, 0)) & 1:  # type: ignore[attr-defined]
+                    return
+        raise ImageError("holds thumbnails only; export the picture as JPEG or PNG")
 
 
-def _notes(header: ImageHeader, stored: np.dtype[Any], dtype: torch.dtype) -> tuple[str, ...]:
+def _is_one_of_several(image: "Image") -> bool:
+    if image.format != "TIFF":
+        return getattr(image, "n_frames", 1) > 1 and image.format != "MPO"  # to which phones add previews
+    page, more = image.tell(), False  # counting all pages of a TIFF may take minutes
+    with suppress(Exception):
+        image.seek(page + 1)
+        more = True
+    image.seek(page)
+    return more or page > 0
+
+
+def _exif(image: "Image") -> tuple[int, float | None]:
+    """Orientation and focal length in mm of a 36 x 24 mm camera; what is damaged gives 1 and None."""
+    orientation, focal = 1, 0.0
+    with suppress(Exception):
+        exif = image.getexif()
+        orientation = exif.get(_ORIENTATION, 1)
+        focal = float(exif.get_ifd(_EXIF_DIRECTORY).get(_FOCAL_35MM, 0))
+    valid = isinstance(orientation, int) and orientation in _APPLY_ORIENTATION
+    return orientation if valid else 1, focal if 0 < focal < math.inf else None
+
+
+def _rgb_pixels(image: "Image") -> NDArray[np.uint8]:
+    """(H, W, 3); the largest value that the file's format can hold becomes 255."""
+    if image.mode.startswith("I;16") or (image.mode == "I" and image.format in ("PNG", "PPM")):
+        tags = getattr(image, "tag_v2", {})
+        largest = 2 ** tags.get(_BITS, (16,))[0] - 1
+        grey = np.asarray(image).astype(np.uint32)
+        grey = largest - grey if tags.get(_PHOTOMETRIC) == 0 else grey  # Pillow inverts 8 bits only
+        return np.repeat(((grey * 255 + largest // 2) // largest).astype(np.uint8)[..., None], 3, axis=2)
+    if image.mode in ("I", "F", "LAB", "HSV"):
+        kind = {"I": "32 bits", "F": "floating values"}.get(image.mode, f"CIE{image.mode}")
+        raise ImageError(f"expected RGB or grey of 8 or 16 bits per channel, got {kind}; save it as PNG")
+    return np.asarray(image.convert("RGB"))
+
+
+def _notes(image: "Image") -> tuple[str, ...]:
     notes = {
-        f"EXIF orientation {header.exif.orientation} applied": header.exif.orientation != 1,
-        "grey: three equal channels": header.colour == "grey",
-        "CMYK converted to RGB without a colour profile": header.colour == "CMYK",
-        "alpha channel dropped": header.alpha,
-        "16 bits rounded to 8": stored == np.uint16 and dtype == torch.uint8,
-        "first of several pictures": header.has_more_pages,
-        f"{header.surplus:,} bytes after the picture ignored": header.surplus > 0,
+        "grey: three equal channels": image.mode in ("1", "L", "LA", "I") or image.mode.startswith("I;16"),
+        "CMYK converted to RGB without a colour profile": image.mode == "CMYK",
+        "alpha channel dropped": image.has_transparency_data,
+        "one of several pictures": _is_one_of_several(image),
     }
     return tuple(text for text, applies in notes.items() if applies)
+
+
+def _to_tensor(rgb: NDArray[np.uint8], dtype: torch.dtype) -> Tensor:
+    if dtype not in (torch.uint8, torch.float32):
+        raise InvalidInputError(f"dtype: expected torch.uint8 or torch.float32, got {dtype}")
+    x = torch.from_numpy(np.array(rgb.transpose(2, 0, 1), order="C"))
+    return x if dtype == torch.uint8 else x.float().div_(255.0)

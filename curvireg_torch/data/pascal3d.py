@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InvalidInputError, MissingFileError
-from ..utils.checks import check_option, check_positive
-from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, Transform, existing_root, is_plain_name, pose_fields
+from ..utils.checks import check_option
+from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, existing_root, is_plain_name, pose_fields
 from .mat_files import MatStruct, MatValue, read_mat
 
 _README = "datasets/pascal3d/README.md"
@@ -30,10 +30,8 @@ class Pascal3DPlus(ObjectDataset):
         categories: class names; None for all that have a list for ``split``, in alphabetical order.
         part: ``"pascal"`` (photographs of VOC 2012) or ``"imagenet"``.
         occluded, truncated, difficult: False skips objects with that flag.
-        min_size: least width and height of the labelled box, px.
         pixel_origin: coordinate of the first pixel in ``bbox``, ``px`` and ``py``: 1 in the release (MATLAB), 0 in sets
             written from Python. It is subtracted.
-        transforms: applied to every sample, ``sample -> sample``.
 
     Samples are dicts (tensors are float32):
         - ``image`` (3, H, W) RGB in [0, 1]; ``image_path``, ``image_id`` str
@@ -45,7 +43,7 @@ class Pascal3DPlus(ObjectDataset):
         - ``object_index`` int: index in the annotation file; ``truncated``, ``occluded``, ``difficult`` bool
 
     Reasons in ``skipped``: ``other_class`` (a file lists all objects of the photograph), ``occluded``, ``truncated``,
-    ``difficult``, ``small``, ``no_viewpoint``, ``coarse_viewpoint`` (only coarse bins were labelled), ``bad_box`` (no
+    ``difficult``, ``no_viewpoint``, ``coarse_viewpoint`` (only coarse bins were labelled), ``bad_box`` (no
     area), ``missing_annotation``, ``corrupt_annotation``, ``missing_image``, ``missing_mesh``.
 
     Raises:
@@ -66,20 +64,17 @@ class Pascal3DPlus(ObjectDataset):
         occluded: bool = True,
         truncated: bool = True,
         difficult: bool = True,
-        min_size: float = 0,
         pixel_origin: int = 1,
-        transforms: Transform | None = None,
     ) -> None:
-        super().__init__(transforms)
+        super().__init__()
         check_option(part, ("pascal", "imagenet"), "part")
-        check_positive(min_size, "min_size", zero_ok=True)
         if pixel_origin not in (0, 1):
             raise InvalidInputError(f"pixel_origin: expected 0 or 1, got {pixel_origin}")
         if isinstance(categories, str):
             raise InvalidInputError(f"categories: expected a list of names, got the text {categories!r}")
         self.root, self.split, self.part = existing_root(root, _README), split, part
         self.categories = sorted(self._listed() if categories is None else set(categories))
-        self._pixel_origin, self._min_size = pixel_origin, min_size
+        self._pixel_origin = pixel_origin
         self._excluded = {"occluded": not occluded, "truncated": not truncated, "difficult": not difficult}
         for name in (split, *self.categories):
             if not is_plain_name(name):
@@ -146,8 +141,6 @@ class Pascal3DPlus(ObjectDataset):
         box = _box(entry.get("bbox"), self._pixel_origin)
         if box is None:
             return "bad_box"
-        if min(box[2] - box[0], box[3] - box[1]) < self._min_size:
-            return "small"
         views = entry.get("viewpoint")
         if not isinstance(views, list) or not views:
             return "no_viewpoint"

@@ -1,5 +1,6 @@
 """Frames of videos."""
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,16 +10,21 @@ import torch
 from torch import Tensor
 
 from ..errors import MAX_IMAGE_PIXELS, ImageError
+from ..utils.checks import check_integer
 
-__all__ = ["Video"]
+_CONTAINERS = re.compile(
+    rb"RIFF....AVI |....(ftyp|moov|mdat|wide|free|skip)|\x1a\x45\xdf\xa3|\0\0\1[\xba\xb3]|\x47.{187}\x47", re.DOTALL
+)
+"""Starts of AVI, MP4 and QuickTime, Matroska and WebM, and MPEG files. Text that FFmpeg reads as a playlist, such as
+``ffconcat``, would make it open other files."""
 
 
 class Video:
     """The frames of a video, decoded one after the other: pairs of a frame's number and its (3, H, W) uint8 RGB pixels.
 
     Args:
-        path: a file in a format that OpenCV decodes.
-        every: yield frames 0, ``every``, 2 ``every``, ...
+        path: an AVI, MP4, MOV, MKV, WebM or MPEG file in a format that OpenCV decodes.
+        every: step between the frames that are yielded, >= 1.
 
     Attributes:
         fps: frames per second of the file.
@@ -40,7 +46,7 @@ class Video:
     """
 
     def __init__(self, path: Path, *, every: int = 1) -> None:
-        self.path, self.every = path, every
+        self.path, self.every = path, check_integer(every, "every")
         file = self._open()
         self.fps, self.count = float(file.get(cv2.CAP_PROP_FPS)), int(file.get(cv2.CAP_PROP_FRAME_COUNT))
         file.release()
@@ -61,10 +67,17 @@ class Video:
             file.release()
 
     def _open(self) -> cv2.VideoCapture:
+        message = "not a video that can be read; save it as MP4 (H.264), or give its frames"
+        try:
+            with self.path.open("rb") as stream:
+                known = _CONTAINERS.match(stream.read(256))
+        except OSError as error:
+            raise ImageError(f"cannot be read ({error.strerror})", subject=self.path) from error
+        if known is None:
+            raise ImageError(message, subject=self.path)
         file = cv2.VideoCapture(str(self.path))
         width, height = (int(file.get(k)) for k in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if not file.isOpened() or not 0 < width * height <= MAX_IMAGE_PIXELS:
             file.release()
-            message = "not a video that can be read; save it as MP4 (H.264), or give its frames"
             raise ImageError(message, subject=self.path)
         return file

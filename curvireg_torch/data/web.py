@@ -7,8 +7,8 @@ from pathlib import Path
 
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.choices import MESHES
-from ..utils.json_files import check_table_size
-from ._base import ObjectDataset, Sample, Transform, existing_root, is_plain_name, pose_fields
+from ..utils.files import check_table_size
+from ._base import ObjectDataset, Sample, existing_root, is_plain_name, pose_fields
 
 _README = "datasets/web/README.md"
 _COLUMNS = ["image", "x0", "y0", "x1", "y1", "azimuth", "elevation", "theta", "distance"]
@@ -41,8 +41,8 @@ class WebCollection(ObjectDataset):
         >>> WebCollection("data/web")[0]["viewpoint"]  # doctest: +SKIP
     """
 
-    def __init__(self, root: str | os.PathLike[str], *, transforms: Transform | None = None) -> None:
-        super().__init__(transforms)
+    def __init__(self, root: str | os.PathLike[str]) -> None:
+        super().__init__()
         self.root = existing_root(root, _README)
         folders = sorted(p for p in self.root.iterdir() if p.is_dir() and not p.name.startswith("."))
         if not folders:

@@ -9,8 +9,7 @@ from torch import nn
 
 from ..pipeline import DEFAULT, PRESETS, Pipeline, preset_named
 from ..utils.checks import check_positive
-from ..utils.digests import code_digest
-from ..utils.files import write_file
+from ..utils.files import code_digest, write_file
 from ..version import __version__
 from .benchmark import Benchmark, Row
 from .predict import register_object, registrar_opener

@@ -17,7 +17,7 @@ from ..pipeline import Pipeline, preset_named
 from ..registration import Registrar
 from ..utils.checks import check_rotation, check_square_pixels
 from ..utils.choices import DEFAULT
-from ..utils.json_files import finite_numbers, read_json
+from ..utils.files import finite_numbers, read_json
 from .lists import Entry
 from .prior_options import prior_from_limits
 

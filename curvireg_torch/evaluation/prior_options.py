@@ -9,17 +9,16 @@ from ..geometry.pose_prior import PosePrior
 
 __all__ = ["PRIOR_OPTIONS", "QUALIFIERS", "limits_from_cells", "limits_from_options", "prior_from_limits"]
 
-PRIOR_OPTIONS = ("azimuth", "elevation", "theta", "side", "near", "within", "distance", "front", "softness")
+PRIOR_OPTIONS = ("azimuth", "elevation", "theta", "side", "near", "within", "distance", "front")
 """Names of the options, and of the columns."""
 
 WITHIN = 45.0
 """Degrees of ``within`` beside ``near`` if none are given."""
 
-QUALIFIERS = {"front", "softness"}
+QUALIFIERS = {"front"}
 """Arguments that limit nothing by themselves."""
 
 _TEXTS = ("side", "front")
-_SINGLE = ("within", "softness")
 
 
 def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -66,7 +65,7 @@ def _value(name: str, text: str) -> Any:
         numbers = tuple(map(float, re.split(r"[\s,]+", text.strip("[] "))))
     except ValueError:
         raise InvalidInputError(f"{name}: expected numbers with blanks between them, got {text[:40]!r}") from None
-    if name not in _SINGLE:
+    if name != "within":
         return numbers
     if len(numbers) != 1:
         raise InvalidInputError(f"{name}: expected one number, got {text[:40]!r}")

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from ..mesh.files import mesh_digest
 from ..registration import Registrar
-from ..utils.digests import code_digest, file_digest, text_digest
+from ..utils.files import code_digest, file_digest, text_digest
 from ..utils.threads import map_on_threads
 from .store import ResultStore, Row
 from .workers import Workers, workers

@@ -188,9 +188,7 @@ def _network_on_meta() -> FieldNetwork:
 
 def _read_weights(path: Path, *, packaged: bool) -> dict[str, Tensor]:
     if not path.is_file():
-        raise MissingFileError(
-            f"weights: {path} does not exist; train it with scripts/calibration/train_learned_field.py"
-        )
+        raise MissingFileError(f"weights: {path} does not exist; train it with scripts/training/train_learned_field.py")
     content = path.read_bytes()
     if packaged and hashlib.sha256(content).hexdigest() != SHA256:
         raise InvalidInputError(f"weights: {path} is damaged; install curvireg_torch again")

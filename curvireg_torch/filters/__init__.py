@@ -5,7 +5,7 @@ function has a module twin with the same options. The dtype is kept (half types 
 dtypes, masks and options raise :class:`~curvireg_torch.errors.InvalidInputError`.
 
 The bilateral filter is kornia's. These parts are own code, with the time of kornia's as a multiple of ours on one CPU
-thread (``scripts/speed/filters.py``): gradient 27, gradient and Hessian 26, Sobel 14, differences of neighbours in the
+thread: gradient 27, gradient and Hessian 26, Sobel 14, differences of neighbours in the
 diffusion 70, box mean 5.5, guided filter 2.8. Kornia's Gaussian blur (1.0 to 1.3) and grey conversion (0.7)
 round differently, and all stored results depend on the rounding, so ours remain.
 """

@@ -13,20 +13,18 @@ from .cameras import camera_matrix, project_points, projected_boxes, rotation_to
 from .conversions import (
     axis_angle_from_rotation,
     opencv_from_opengl,
-    opencv_from_pytorch3d,
     opengl_from_opencv,
     opengl_projection,
-    pytorch3d_from_opencv,
     quaternion_from_rotation,
     rotation_from_axis_angle,
     rotation_from_quaternion,
+    symmetry_transforms,
 )
 from .crops import box_iou, crop_images, crop_transforms, square_boxes, whole_image_box
 from .pose_prior import PosePrior, object_frame
-from .symmetry import symmetry_transforms, views_without_symmetric
-from .translation import pose_from_box, translation_from_box
+from .translation import pose_from_box
 from .viewpoint import rotation_error, rotation_from_viewpoint, up_rotation, viewpoint_from_rotation
-from .views import ViewSphere, paper_views, sample_views, uniform_views
+from .views import ViewSphere, sample_views, uniform_views
 
 __all__ = [
     "PosePrior",
@@ -38,14 +36,11 @@ __all__ = [
     "crop_transforms",
     "object_frame",
     "opencv_from_opengl",
-    "opencv_from_pytorch3d",
     "opengl_from_opencv",
     "opengl_projection",
-    "paper_views",
     "pose_from_box",
     "project_points",
     "projected_boxes",
-    "pytorch3d_from_opencv",
     "quaternion_from_rotation",
     "rotation_error",
     "rotation_from_axis_angle",
@@ -56,10 +51,8 @@ __all__ = [
     "square_boxes",
     "symmetry_transforms",
     "transform",
-    "translation_from_box",
     "uniform_views",
     "up_rotation",
     "viewpoint_from_rotation",
-    "views_without_symmetric",
     "whole_image_box",
 ]

@@ -6,11 +6,12 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import check_camera_matrix, check_pose
+from ..utils.checks import check_camera_matrix, check_number, check_pose
 
 
-def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dtype = torch.float32) -> Tensor:
-    """(3, 3) OpenCV camera matrix; all arguments in px."""
+def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Return the (3, 3) OpenCV camera matrix; all arguments in px."""
+    fx, fy, cx, cy = (check_number(v, name) for v, name in ((fx, "fx"), (fy, "fy"), (cx, "cx"), (cy, "cy")))
     K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=dtype)
     check_camera_matrix(K)
     return K
@@ -25,11 +26,11 @@ def camera_of_view(fov: float, size: tuple[int, int]) -> Tensor:
         >>> camera_of_view(90.0, (480, 640))[0].round(decimals=6).tolist()
         [320.0, 0.0, 319.5]
     """
-    if not 0.0 < fov < 180.0:
-        raise InvalidInputError(f"fov: expected 0 < degrees < 180 across the image's width, got {fov:g}")
+    if not (isinstance(fov, int | float) and 0.0 < fov < 180.0):
+        raise InvalidInputError(f"fov: expected 0 < degrees < 180 across the image's width, got {fov!r}")
     H, W = size
     focal = W / 2 / math.tan(math.radians(fov) / 2)
-    return camera_matrix(focal, focal, (W - 1) / 2, (H - 1) / 2, dtype=torch.float64)
+    return camera_matrix(focal, focal, (W - 1) / 2, (H - 1) / 2)
 
 
 def transform(R: Tensor, t: Tensor) -> Tensor:
@@ -53,8 +54,8 @@ def project_points(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, ortho
 
     Example:
         >>> K = camera_matrix(100.0, 100.0, 50.0, 50.0)
-        >>> T = transform(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
-        >>> project_points(torch.tensor([[1.0, 0.0, 0.0]]), T, K).tolist()
+        >>> T = transform(torch.eye(3), torch.tensor([0.0, 0.0, 2.0])).double()
+        >>> project_points(torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64), T, K).tolist()
         [[100.0, 50.0]]
     """
     check_pose(T_cam_from_model, "T_cam_from_model")

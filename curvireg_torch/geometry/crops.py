@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import MAX_BOX_COORDINATE, InvalidInputError
-from ..utils.checks import as_boxes, check_positive, check_tensor
+from ..utils.checks import as_boxes, check_integer, check_positive, check_tensor
 
 BLOCK = 16
 """Samples that are computed by one matrix product: fewer are slow, more multiply by many zeros."""
@@ -126,6 +126,7 @@ def crop_images(
     else:
         for image in images:
             check_tensor(image, "images", (None, None, None))
+    check_integer(size, "size")
     boxes = as_boxes(boxes, len(images))
     check_boxes(boxes, [(int(image.shape[-2]), int(image.shape[-1])) for image in images])
     squares = square_boxes(boxes, margin)

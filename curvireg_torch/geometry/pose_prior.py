@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import as_numbers, check_option, check_positive, check_rotation
+from ..utils.checks import as_numbers, check_number, check_option, check_rotation
 from ..utils.choices import SIDE_NAMES, UP_AXES
 from .conversions import axis_angle_from_rotation, rotation_from_axis_angle
 from .viewpoint import rotation_error, rotation_from_viewpoint, up_rotation, viewpoint_from_rotation
@@ -22,14 +22,15 @@ SIDES = {name: 45.0 * k for k, name in enumerate(SIDE_NAMES)}
 SIDE_WIDTH = 45.0
 """Degrees of azimuth to either side of the middle that a named side covers."""
 
-_HALF_TURN = 180.0
+MAX_ROUNDS = 20
+"""Alternating moves into limits that hold together."""
 
-_LIMITS = ("azimuth", "elevation", "theta", "up", "viewpoint", "rotation", "distance")
+_LIMITS = ("azimuth", "elevation", "theta", "viewpoint", "rotation", "distance")
 
 
 @dataclass(frozen=True)
 class PosePrior:
-    r"""Limits on the pose that hold for a photograph; all that are given must hold.
+    """Limits on the pose that hold for a photograph; all that are given must hold.
 
     Angles are those of :func:`viewpoint_from_rotation` for an object with z up whose front is at azimuth 0. How far a
     pose misses a limit is measured as a rotation: near the poles, a wrong azimuth hardly counts. Methods take rotations
@@ -40,15 +41,11 @@ class PosePrior:
         azimuth: (low, high) in degrees, counted upwards from low to high: (300, 60) goes through 0.
         elevation: (low, high) in degrees within [-90, 90].
         theta: (low, high) of the in-plane rotation in degrees, counted upwards as the azimuth is.
-        up: direction (x, y) in the photograph, y down, in which the object's up axis points, within ``within`` degrees;
-            (0, -1) for a camera that is held level.
         viewpoint: (azimuth, elevation, theta) in degrees; the pose lies within ``within`` degrees of it.
         rotation: (3, 3) from the mesh file's axes to the camera; the pose lies within ``within`` degrees of it.
-        within: tolerance in degrees of ``up``, ``viewpoint`` and ``rotation``; needed by each of them.
-        distance: (near, far) of the object's centre in the mesh's unit, always a hard limit; needs a camera matrix.
+        within: tolerance in degrees of ``viewpoint`` and ``rotation``; needed by each of them.
+        distance: (near, far) of the object's centre in the mesh's unit; needs a camera matrix.
         front: the mesh's axis that points out of its front, for :func:`object_frame`.
-        softness: standard deviation in degrees of a soft limit: a pose that misses it by :math:`e` degrees has the log
-            prior :math:`-e^2 / (2 \sigma^2)`. 0: a hard limit, no pose outside is considered.
 
     Raises:
         InvalidInputError: a range that is not two finite numbers, an empty prior, ``within`` missing or out of range.
@@ -63,16 +60,14 @@ class PosePrior:
     azimuth: tuple[float, float] | None = None
     elevation: tuple[float, float] | None = None
     theta: tuple[float, float] | None = None
-    up: tuple[float, float] | None = None
     viewpoint: tuple[float, float, float] | None = None
     rotation: Any = None
     within: float | None = None
     distance: tuple[float, float] | None = None
     front: str | None = None
-    softness: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("azimuth", "elevation", "theta", "up", "distance"):
+        for name in ("azimuth", "elevation", "theta", "distance"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _numbers(getattr(self, name), name, 2))
         if self.viewpoint is not None:
@@ -80,20 +75,17 @@ class PosePrior:
         if self.elevation is not None and not -90.0 <= self.elevation[0] <= self.elevation[1] <= 90.0:
             raise InvalidInputError(f"elevation: expected -90 <= low <= high <= 90, got {self.elevation}")
         check_distance(self.distance)
-        if self.up is not None and math.hypot(*self.up) == 0.0:
-            raise InvalidInputError("up: expected a direction, got (0, 0)")
         if self.rotation is not None:
             R = as_numbers(self.rotation, "rotation", dtype=torch.float64)
             if R.shape != (3, 3):
                 raise InvalidInputError(f"rotation: expected (3, 3), got {tuple(R.shape)}")
             check_rotation(R, "rotation")
             object.__setattr__(self, "rotation", tuple(map(tuple, R.tolist())))
-        check_positive(self.softness, "softness", zero_ok=True)
         if self.front is not None:
             check_option(self.front, UP_AXES, "front")
-        if any(v is not None for v in (self.rotation, self.viewpoint, self.up)) != (self.within is not None):
-            raise InvalidInputError("within: expected degrees beside rotation, viewpoint or up, and only there")
-        if self.within is not None and not 0.0 < self.within <= _HALF_TURN:
+        if (self.rotation is not None or self.viewpoint is not None) != (self.within is not None):
+            raise InvalidInputError("within: expected degrees beside rotation or viewpoint, and only there")
+        if self.within is not None and not 0.0 < check_number(self.within, "within") <= 180.0:
             raise InvalidInputError(f"within: expected degrees in (0, 180], got {self.within}")
         if all(getattr(self, name) is None for name in _LIMITS):
             raise InvalidInputError("prior: expected at least one limit, got none; leave the prior out")
@@ -112,15 +104,15 @@ class PosePrior:
     def to_dict(self) -> dict[str, Any]:
         """The limits that are given, as plain numbers and texts."""
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
-        return {name: value for name, value in plain.items() if value not in (None, 0.0)}
+        return {name: value for name, value in plain.items() if value is not None}
 
     def excess(self, rotations: Tensor, frame: Tensor | None = None) -> Tensor:
         """(...) degrees by which (..., 3, 3) rotations miss the worst of the limits on rotations.
 
         Negative within all limits: minus the distance to the nearest of them, at least -180.
         """
-        worst = torch.full_like(rotations[..., 0, 0], -_HALF_TURN)
-        if self.azimuth or self.elevation or self.theta or self.up:
+        worst = torch.full_like(rotations[..., 0, 0], -180.0)
+        if self.azimuth or self.elevation or self.theta:
             azimuth, elevation, theta = viewpoint_from_rotation(_in_object_frame(rotations, frame))
             if self.azimuth is not None:
                 worst = torch.maximum(worst, _outside(azimuth, self.azimuth, elevation))
@@ -128,45 +120,51 @@ class PosePrior:
                 low, high = self.elevation
                 worst = worst if low == -90.0 else torch.maximum(worst, low - elevation)
                 worst = worst if high == 90.0 else torch.maximum(worst, elevation - high)
-            for limits in (self.theta, self._theta_of_up):
-                if limits is not None:
-                    worst = torch.maximum(worst, _outside(theta, limits, elevation))
+            if self.theta is not None:
+                worst = torch.maximum(worst, _outside(theta, self.theta, elevation))
         for R in self._centres(rotations, frame):
             worst = torch.maximum(worst, rotation_error(rotations, R) - (self.within or 0.0))
         return worst
 
     def log_prior(self, rotations: Tensor, frame: Tensor | None = None, *, margin: float = 0.0) -> Tensor:
-        """(...) log prior of (..., 3, 3) rotations: 0 within the limits, less outside, ``-inf`` for hard limits.
+        """Return the (...) log prior of (..., 3, 3) rotations: 0 within the limits, ``-inf`` outside.
 
         Args:
             rotations: from the mesh file's axes to the camera.
             frame: (3, 3) of :func:`object_frame`.
             margin: degrees by which limits are widened, for views that stand for poses around them.
         """
-        excess = (self.excess(rotations, frame) - margin).clamp(min=0.0)
-        if self.softness > 0.0:
-            return -0.5 * (excess / self.softness).square()
-        return torch.zeros_like(excess).masked_fill(excess > 1e-4, -torch.inf)
+        excess = self.excess(rotations, frame)
+        return torch.zeros_like(excess).masked_fill(excess > margin + 1e-4, -torch.inf)
 
     def nearest(self, rotations: Tensor, frame: Tensor | None = None) -> Tensor:
-        """(..., 3, 3) rotations moved into the limits, one limit after the other; those within them are not changed."""
+        """Return (..., 3, 3) rotations moved into the limits; those within them are not changed.
+
+        Each round moves them into one limit after the other; limits that do not meet are missed by the least of them.
+        """
         moved = rotations
-        if self.azimuth or self.elevation or self.theta or self.up:
-            R = _in_object_frame(rotations, frame)
+        for _ in range(MAX_ROUNDS):
+            outside = self.excess(moved, frame) > 1e-6
+            if not bool(outside.any()):
+                break
+            moved = torch.where(outside[..., None, None], self._moved_once(moved, frame), moved)
+        return moved
+
+    def _moved_once(self, moved: Tensor, frame: Tensor | None) -> Tensor:
+        if self.azimuth or self.elevation or self.theta:
+            R = _in_object_frame(moved, frame)
             R = R if self.azimuth is None else _moved_to_azimuth(R, self.azimuth)
             azimuth, elevation, theta = viewpoint_from_rotation(R)
-            if self.elevation is not None:
-                elevation = elevation.clamp(*self.elevation)
-            for limits in (self.theta, self._theta_of_up):
-                theta = theta if limits is None else _clamped(theta, limits)
-            moved = rotation_from_viewpoint(azimuth, elevation, theta)
-            moved = moved if frame is None else moved @ frame.to(moved)
-        for R in self._centres(rotations, frame):
+            elevation = elevation if self.elevation is None else elevation.clamp(*self.elevation)
+            theta = theta if self.theta is None else _clamped(theta, self.theta)
+            R = rotation_from_viewpoint(azimuth, elevation, theta)
+            moved = R if frame is None else R @ frame.to(R)
+        for R in self._centres(moved, frame):
             vector = axis_angle_from_rotation(moved @ R.mT)
             angle = torch.rad2deg(torch.linalg.vector_norm(vector, dim=-1, keepdim=True))
             shorter = vector * ((self.within or 0.0) / angle.clamp(min=1e-9)).clamp(max=1.0)
             moved = torch.where((angle > (self.within or 0.0))[..., None], rotation_from_axis_angle(shorter) @ R, moved)
-        return torch.where((self.excess(rotations, frame) > 0.0)[..., None, None], moved, rotations)
+        return moved
 
     def _centres(self, like: Tensor, frame: Tensor | None) -> list[Tensor]:
         """(3, 3) rotations around which the pose lies."""
@@ -177,15 +175,6 @@ class PosePrior:
         if self.rotation is not None:
             centres.append(torch.tensor(self.rotation, dtype=torch.float64).to(like))
         return centres
-
-    @property
-    def _theta_of_up(self) -> tuple[float, float] | None:
-        """Range of the in-plane rotation that ``up`` stands for."""
-        if self.up is None or self.within is None:
-            return None
-        x, y = self.up
-        middle = math.degrees(math.atan2(-x, -y))
-        return (middle - self.within, middle + self.within) if self.within < _HALF_TURN else None
 
 
 def object_frame(up: str = "z", front: str | None = None) -> Tensor:
@@ -253,7 +242,7 @@ def _outside(angle: Tensor, limits: tuple[float, ...], elevation: Tensor) -> Ten
     """
     beyond, width = _position(angle, limits)
     if width == 360.0:
-        return torch.full_like(angle, -_HALF_TURN)
+        return torch.full_like(angle, -180.0)
     inside = beyond <= width
     delta = torch.where(inside, torch.minimum(beyond, width - beyond), torch.minimum(beyond - width, 360.0 - beyond))
     e, d = torch.deg2rad(elevation), torch.deg2rad(delta.clamp(max=90.0))

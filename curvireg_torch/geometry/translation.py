@@ -12,8 +12,10 @@ _ITERATIONS = 20
 _CONVERGED = 1e-9  # change of the position in an iteration, relative to the position
 
 
-def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor) -> Tensor:
-    """Translation with which the projected points fill a box, with the object in front of the camera.
+def pose_from_box(
+    points: Tensor, rotation: Tensor, box: Tensor, K: Tensor, *, allocentric: bool = True
+) -> tuple[Tensor, Tensor]:
+    """Estimate the pose with which the projected points fill a box, with the object in front of the camera.
 
     Fixed point of two closed-form steps: the sizes of the projected and the given box determine the distance, their
     centres the offset. With the true rotation and box it converges to the true translation; with others, to the best
@@ -21,12 +23,14 @@ def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tenso
 
     Args:
         points: (P, 3) of the model, for instance the vertices of its convex hull.
-        rotation: (..., 3, 3) model -> camera.
+        rotation: (..., 3, 3) model -> camera. Allocentric: as seen by a camera that looks straight at the object's
+            centre; every step rotates it towards the ray of the object's current centre.
         box: (..., 4) x0, y0, x1, y1 in px.
         K: (..., 3, 3).
+        allocentric: whether the rotation is; otherwise it is kept.
 
     Returns:
-        (..., 3) float64 in model units.
+        rotation (..., 3, 3) and translation (..., 3) in the photograph's camera, float64, in model units.
 
     Raises:
         InvalidInputError: a matrix is not a rotation, the box is empty, or the camera matrix is unusable.
@@ -34,29 +38,10 @@ def translation_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tenso
     Example:
         >>> cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
         >>> K = torch.tensor([[100.0, 0, 50], [0, 100.0, 50], [0, 0, 1]])
-        >>> t = translation_from_box(cube, torch.eye(3), torch.tensor([25.0, 25, 75, 75]), K)
+        >>> R, t = pose_from_box(cube, torch.eye(3), torch.tensor([25.0, 25, 75, 75]), K)
         >>> [round(v, 3) for v in t.tolist()]
         [0.0, 0.0, 5.0]
     """
-    return _fill_box(points, rotation, box, K, allocentric=False)[1]
-
-
-def pose_from_box(points: Tensor, view_rotation: Tensor, box: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    """Pose of an object from its allocentric rotation and its box.
-
-    Every step of :func:`translation_from_box` also rotates the view towards the ray of the object's current centre.
-
-    Args:
-        points, box, K: see :func:`translation_from_box`.
-        view_rotation: (..., 3, 3) as seen by a camera that looks straight at the object's centre.
-
-    Returns:
-        rotation (..., 3, 3) and translation (..., 3) in the photograph's camera, float64.
-    """
-    return _fill_box(points, view_rotation, box, K, allocentric=True)
-
-
-def _fill_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor, *, allocentric: bool) -> tuple[Tensor, Tensor]:
     check_finite(rotation, "rotation")
     check_rotation(rotation, "rotation")
     check_camera_matrix(K)

@@ -20,8 +20,7 @@ from ..mesh.mesh import as_mesh, mesh_radius, mesh_unit
 from ..mesh.up import mesh_up
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
-from ..utils.digests import tensor_digest
-from ..utils.files import write_tensors
+from ..utils.files import tensor_digest, write_tensors
 from ..utils.threads import single_threaded_pool
 from .describe import ViewDescriber, hog_layer
 

@@ -22,7 +22,7 @@ from ..mesh.mesh import as_mesh, mesh_unit
 from ..mesh.up import mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
-from ..utils.digests import code_digest, tensor_digest, text_digest
+from ..utils.files import code_digest, tensor_digest, text_digest
 from .bank import FORMAT_VERSION, ViewBank, colour_arrays
 
 __all__ = [

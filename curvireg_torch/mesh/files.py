@@ -12,7 +12,7 @@ from typing import Any
 import trimesh
 
 from ..errors import MAX_MESH_BYTES, CurviregWarning, MeshError
-from ..utils.digests import file_digest, text_digest
+from ..utils.files import file_digest, text_digest
 from . import obj, off, ply
 from .gltf import check_gltf
 

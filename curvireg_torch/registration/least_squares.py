@@ -11,7 +11,7 @@ from ..geometry import rotation_from_axis_angle
 from ..geometry.cameras import transform
 from ..geometry.conversions import cross_matrix
 from ..rendering.contours import ContourPoints
-from .calibration import COVARIANCE_SCALE
+from .confidence import COVARIANCE_SCALE
 
 __all__ = [
     "Measurements",

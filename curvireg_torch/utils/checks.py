@@ -122,19 +122,41 @@ def check_option(value: str, options: Iterable[str], name: str) -> None:
         raise InvalidInputError(f"{name}: expected one of {', '.join(map(repr, options))}, got {value!r}")
 
 
-def check_positive(value: float, name: str, *, zero_ok: bool = False) -> float:
-    """``value``, a finite number > 0 (or >= 0). In a compiled graph it is a constant: one graph per value."""
-    # torch.compile makes a float symbolic at its second value; splitting it forces the value, which kernels need.
-    value = math.ldexp(*math.frexp(value))
-    if not math.isfinite(value) or value < 0 or (value == 0 and not zero_ok):
-        raise InvalidInputError(f"{name}: expected a finite number {'>=' if zero_ok else '>'} 0, got {value}")
-    return value
+def check_number(value: Any, name: str) -> float:
+    """Return ``value`` if it is a finite number. In a compiled graph it is a constant: one graph per value."""
+    try:
+        if isinstance(value, bool | str):
+            raise TypeError
+        # torch.compile makes a float symbolic at its second value; splitting it forces the value, which kernels need.
+        number = math.ldexp(*math.frexp(value))
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InvalidInputError(f"{name}: expected a number, got {type(value).__name__} {value!r:.40}") from error
+    if not math.isfinite(number):
+        raise InvalidInputError(f"{name}: expected a finite number, got {number}")
+    return number
 
 
-def check_fraction(value: float, name: str) -> None:
-    """``value`` is a fraction in (0, 1]."""
-    if not (isinstance(value, int | float) and 0 < value <= 1):
-        raise InvalidInputError(f"{name}: expected 0 < {name} <= 1, got {value!r}")
+def check_positive(value: Any, name: str, *, zero_ok: bool = False) -> float:
+    """Return ``value`` if it is a finite number > 0 (or >= 0); otherwise as :func:`check_number`."""
+    number = check_number(value, name)
+    if number < 0 or (number == 0 and not zero_ok):
+        raise InvalidInputError(f"{name}: expected a finite number {'>=' if zero_ok else '>'} 0, got {number}")
+    return number
+
+
+def check_fraction(value: Any, name: str) -> float:
+    """Return ``value`` if it is a fraction in (0, 1]."""
+    number = check_number(value, name)
+    if not 0 < number <= 1:
+        raise InvalidInputError(f"{name}: expected 0 < {name} <= 1, got {number}")
+    return number
+
+
+def check_integer(value: Any, name: str, *, least: int = 1) -> int:
+    """Return ``value`` if it is an integer >= ``least``; 2.0 and True are none."""
+    if isinstance(value, bool) or not hasattr(type(value), "__index__") or isinstance(value, Tensor) or value < least:
+        raise InvalidInputError(f"{name}: expected an integer >= {least}, got {value!r:.40}")
+    return int(value)
 
 
 def check_finite(x: Tensor, name: str) -> None:

@@ -1,8 +1,11 @@
-"""Atomic writes of files."""
+"""Atomic writes of files, bounded reads of tables, and digests by which results and banks are found again."""
 
 import csv
 import errno
+import hashlib
 import io
+import json
+import math
 import os
 import secrets
 import signal
@@ -10,13 +13,16 @@ import sys
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from ..errors import OutputError
+from ..errors import MAX_TABLE_BYTES, InvalidInputError, MissingFileError, OutputError
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+_PACKAGE = Path(__file__).parents[1]
 
 
 def write_file(path: Path, content: bytes) -> None:
@@ -94,3 +100,77 @@ def terminable() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, previous)
+
+
+def read_json(path: Path, kind: type[Any], readme: str) -> Any:
+    """The content of a JSON file whose top level must be a ``kind`` (dict or list)."""
+    if not path.is_file():
+        raise MissingFileError(f"no such file; {readme} shows the layout", subject=path)
+    check_table_size(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise InvalidInputError(f"damaged, or not JSON ({error}); {readme} shows the layout", subject=path) from error
+    if not isinstance(content, kind):
+        expected = "an object" if kind is dict else "a list"
+        raise InvalidInputError(f"expected {expected} of JSON; {readme} shows the layout", subject=path)
+    return content
+
+
+def check_table_size(path: Path) -> None:
+    """Refuse a table that is too large to be read as a whole."""
+    if path.stat().st_size > MAX_TABLE_BYTES:
+        raise InvalidInputError(f"larger than {MAX_TABLE_BYTES:,} bytes; split the set", subject=path)
+
+
+def finite_numbers(values: object, count: int) -> tuple[float, ...] | None:
+    """``values`` as floats if they are ``count`` finite numbers, else None."""
+    if not isinstance(values, Iterable) or isinstance(values, str | dict):
+        return None
+    numbers = list(values)
+    if len(numbers) != count or any(isinstance(v, bool) or not isinstance(v, int | float) for v in numbers):
+        return None
+    try:
+        floats = tuple(float(v) for v in numbers)
+    except OverflowError:
+        return None
+    return floats if all(map(math.isfinite, floats)) else None
+
+
+def text_digest(text: str, *, size: int = 8) -> str:
+    """``2 * size`` hexadecimal digits of a text."""
+    return hashlib.blake2b(text.encode(), digest_size=size).hexdigest()
+
+
+def file_digest(path: Path) -> str:
+    """16 hexadecimal digits of a file's content; "" if it cannot be read or is not a regular file."""
+    try:
+        if not path.is_file():
+            return ""
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=8)).hexdigest()
+    except OSError:
+        return ""
+
+
+def tensor_digest(tensors: Mapping[str, "Tensor"], *, size: int = 8) -> str:
+    """``2 * size`` hexadecimal digits of named tensors: names, dtypes, shapes and values."""
+    import torch
+
+    digest = hashlib.blake2b(digest_size=size)
+    for name, x in sorted(tensors.items()):
+        digest.update(f"{name} {x.dtype} {tuple(x.shape)}".encode())
+        digest.update(x.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+@cache
+def code_digest(*parts: str) -> str:
+    """16 hexadecimal digits of ``parts`` of the package: folders with their code, weights and constants, and files."""
+    digest = hashlib.blake2b(digest_size=8)
+    for part in parts:
+        path = _PACKAGE / part
+        inside = sorted(p for p in path.rglob("*") if p.suffix in (".py", ".json", ".safetensors"))
+        for source in inside if path.is_dir() else [path]:
+            digest.update(source.read_bytes())
+    return digest.hexdigest()

@@ -13,11 +13,12 @@ guarantee, so check the overlay first.
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.synthetic import example_mesh, procedural_background, random_pose, synthesize_photograph
-from curvireg_torch.training.scenes import random_shape
 from curvireg_torch.visualization import contour_overlay
+from scripts.scenes.families import random_shape
 
 mesh, size = example_mesh(), (360, 480)
 K = cr.camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
@@ -84,7 +85,8 @@ show(
 # The mesh is a car's, with its front along -y like the truck's. A similar mesh works sometimes; here front and back are
 # confused.
 
-car = random_shape(np.random.default_rng(3), "car").mesh()
+vertices, faces, _ = random_shape(np.random.default_rng(3), "car")
+car = trimesh.Trimesh(vertices, faces, process=False)
 show(picture, box, truth, "another object's mesh", cr.Registrar(car, pipeline=upright, progress=False))
 
 # %%

@@ -1,285 +1,332 @@
-"""Render photographs of real textured meshes with known poses, from the meshes that meshes.py has fetched.
+"""Render photographs with known poses in BOP's layout, for `curvireg evaluate bop`.
 
-Picture i depends only on the seed, i and the meshes. Four forms alternate: the CAD model to register is that of the
-object itself or of another object of its kind, and the object stands upright or has any orientation. Rooms, light with
-shadows, clutter, occluders and the camera are random; a fifth of the objects have a uniform colour. An interrupted run
-can be resumed.
+    python scripts/benchmark/make.py --kind printed --count 300 --out /data/printed [--jobs 2]
+    python scripts/benchmark/make.py --kind shelf --objects 8 20 --cameras 3 --count 100 --out /data/shelf
+    python scripts/benchmark/make.py --kind furniture --meshes /data/furniture --count 300 --out /data/chairs
 
-    python scripts/benchmark/make.py --out /data/benchmark [--half held-out] [--count 1200] [--jobs 2]
-
-OUT/<half>/items.jsonl has one line per picture; OUT/README.md explains its keys.
+--kind: ``printed`` packages, whose labels alone tell their sides apart; ``furniture`` of meshes.py; ``solids``,
+procedural objects in plain colours; ``shelf``, several printed packages side by side, all annotated. A scene has one
+photograph, or one for each of --cameras, or --frames of a moving camera. --cad similar annotates furniture as another
+object of its kind, --cad wrong as any other object (to calibrate confidence). Scene i depends only on the seed and i;
+an interrupted run can be resumed. Boxes are exact: ``bbox_obj`` of the whole silhouette, ``bbox_visib`` of its visible
+part. OUT/benchmark.json holds the options, and group and form of each object for scripts/calibration.
 """
 
 import argparse
 import json
+import os
+import shutil
 from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
-from shutil import copyfile
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from tqdm import tqdm
 
-from curvireg_torch.geometry import rotation_from_viewpoint
-from curvireg_torch.geometry.cameras import rotation_towards
-from curvireg_torch.training.scenes.materials import random_colour, random_picture
-from curvireg_torch.training.scenes.rotations import random_rotation
-from curvireg_torch.training.scenes.scene import simulate_camera
-from scripts.benchmark.textured import TexturedMesh, render
+from scripts.scenes.families import random_shape
+from scripts.scenes.materials import Material, random_colour, random_texture
+from scripts.scenes.packages import package
+from scripts.scenes.scene import Scene, camera_path, shelf, simulate_camera, single
+from scripts.scenes.surfaces import Array, Rng
+from scripts.scenes.textured import Texture, TexturedMesh
 
-FORMS = [(cad, pose) for cad in ("exact", "sibling") for pose in ("upright", "free")]
-SIZES = [(320, 320), (320, 400), (360, 480), (400, 320), (400, 400)]  # rows, columns
-MIN_VISIBLE = 0.35
+KINDS = ("printed", "shelf", "furniture", "solids")
+SUFFIXES = (".jpg", ".jpeg", ".png")
+MIN_PIXELS = 400
+"""Fewer pixels of a silhouette are not annotated."""
+
 MAX_PROPORTION = 1.6
-"""Largest factor between the proportions of siblings; if no sibling is within it, the closest one is taken."""
+"""Largest factor between the proportions of similar objects; if none is within it, the closest one is taken."""
 
 FULL_TURN = 12
 """A mesh with so many symmetries about z is a body of revolution, whose azimuth is undefined. It is excluded."""
 
 
-class Meshes:
-    """Meshes of one half of the catalogue, loaded on demand."""
+class Packages:
+    """Printed packages, or procedural solids; object k depends only on the seed and k."""
 
-    def __init__(self, out: Path, half: str) -> None:
-        listing = json.loads((out / "meshes.json").read_text())
-        self.out, self.rotations = out, np.array(listing["turns"])
-        about_z = [k for k, R in enumerate(self.rotations) if R[2, 2] > 0.99]
-        self.all = [m for m in listing["meshes"] if m["half"] == half]
-        self.good = [m for m in self.all if min(m["extents"]) > 0.08 * max(m["extents"])]
-        self.good = [m for m in self.good if len(set(m["look_symmetries"]) & set(about_z)) < FULL_TURN]
-        self.clutter = [m for m in self.all if m["faces"] < 6000]
-        self.kinds = {}
-        for kind in sorted({m["kind"] for m in self.good if m["kind"]}):
-            members = [m for m in self.good if m["kind"] == kind]
-            if len({m["like"] for m in members}) > 1:
-                self.kinds[kind] = members
-        textures = [p for m in self.all for p in sorted((out / m["path"]).parent.glob("*.jpg"))]
-        self.textures = [p for p in textures if p.stat().st_size > 8000]
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.seed, self.solids = options.seed, options.kind == "solids"
+        self.ids = list(range(1, options.models + 1))
+        folder = options.photographs
+        self.photographs = sorted(p for p in folder.iterdir() if p.suffix in SUFFIXES) if folder else []
 
-    @lru_cache(maxsize=120)  # noqa: B019 (lives as long as its process)
-    def load(self, path: str) -> TexturedMesh:
-        return TexturedMesh.load(self.out / path)
+    @lru_cache(maxsize=100)  # noqa: B019 (lives as long as its process)
+    def mesh(self, obj_id: int) -> TexturedMesh:
+        rng = np.random.default_rng((self.seed, 0, obj_id))
+        if not self.solids:
+            return package(rng)
+        vertices, faces, materials = random_shape(rng)
+        colours = [Texture(random_colour(rng)[None, None].astype(np.float32)) for _ in range(materials.max() + 1)]
+        return TexturedMesh.from_arrays(0.1 * vertices, faces, colours, paint=materials)
 
-    def texture(self, rng: np.random.Generator) -> np.ndarray:
-        """(T, T, 3) linear colours: a texture of the half's meshes, or a random picture."""
-        if rng.random() < 0.12 or not self.textures:
-            return random_picture(rng, 128)
+    def symmetries(self, obj_id: int) -> Array:
+        return np.eye(3)[None]
+
+    def group(self, obj_id: int) -> str:
+        return f"{obj_id}"
+
+    def similar(self, obj_id: int, rng: Rng) -> int:
+        raise SystemExit("--cad similar: printed packages and solids have no kinds; take --kind furniture")
+
+    def clutter(self, rng: Rng) -> TexturedMesh:
+        if not self.solids:
+            return self.mesh(int(rng.choice(self.ids)))
+        vertices, faces, materials = random_shape(rng)
+        paints = [Material(rng, plain=0.5) for _ in range(materials.max() + 1)]
+        return TexturedMesh.from_arrays(vertices, faces, paints, paint=materials)
+
+    def texture(self, rng: Rng) -> Array:
+        if not self.photographs or rng.random() < 0.5:
+            return random_texture(rng)
+        picture = cv2.imread(str(self.photographs[rng.integers(len(self.photographs))]))
+        if picture is None:
+            return random_texture(rng)
+        picture = cv2.resize(picture, (512, 512), interpolation=cv2.INTER_AREA)[..., ::-1]
+        return np.asarray((picture / 255.0).astype(np.float32) ** 2.2)
+
+
+class Furniture(Packages):
+    """The meshes that meshes.py has catalogued."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        listing = json.loads((options.meshes / "meshes.json").read_text())
+        self.folder, self.turns = options.meshes, np.array(listing["turns"])
+        about_z = {k for k, R in enumerate(self.turns) if R[2, 2] > 0.99}
+        rows = [m for m in listing["meshes"] if m["half"] == options.half]
+        good = [m for m in rows if min(m["extents"]) > 0.08 * max(m["extents"])]
+        good = [m for m in good if len(set(m["look_symmetries"]) & about_z) < FULL_TURN]
+        self.surroundings = [m for m in rows if m["faces"] < 6000]
+        self.rows: dict[int, dict[str, Any]] = dict(enumerate(good, 1))
+        self.ids = list(self.rows)
+        if options.cad == "similar":
+            self.ids = [k for k in self.rows if self._siblings(k)]
+        textures = sorted(p for m in rows for p in (self.folder / m["path"]).parent.glob("*.jpg"))
+        self.photographs = [p for p in textures if p.stat().st_size > 8000]
+        self.names = "shape_symmetries" if options.cad == "similar" else "look_symmetries"
+
+    @lru_cache(maxsize=100)  # noqa: B019
+    def _load(self, path: str) -> TexturedMesh:
+        return TexturedMesh.load(self.folder / path)
+
+    def mesh(self, obj_id: int) -> TexturedMesh:
+        return self._load(self.rows[obj_id]["path"])
+
+    def symmetries(self, obj_id: int) -> Array:
+        return np.asarray(self.turns[self.rows[obj_id][self.names]], float)
+
+    def group(self, obj_id: int) -> str:
+        return self.rows[obj_id]["kind"] or self.rows[obj_id]["like"]
+
+    def _siblings(self, obj_id: int) -> list[int]:
+        row = self.rows[obj_id]
+        same = [k for k, m in self.rows.items() if row["kind"] and m["kind"] == row["kind"]]
+        return [k for k in same if self.rows[k]["like"] != row["like"]]
+
+    def similar(self, obj_id: int, rng: Rng) -> int:
+        others = self._siblings(obj_id)
+        sides = [np.array(self.rows[k]["extents"]) for k in (obj_id, *others)]
+        first, *rest = (np.log(side / np.linalg.norm(side)) for side in sides)
+        gaps = [float(np.exp(np.abs(first - other).max())) for other in rest]
+        limit = max(MAX_PROPORTION, min(gaps))
+        return int(rng.choice([k for k, gap in zip(others, gaps, strict=True) if gap <= limit]))
+
+    def clutter(self, rng: Rng) -> TexturedMesh:
         while True:
-            picture = cv2.imread(str(self.textures[rng.integers(len(self.textures))]))
-            if picture is not None:
-                picture = cv2.resize(picture, (256, 256), interpolation=cv2.INTER_AREA)[..., ::-1]
-                return (picture / 255.0).astype(np.float32) ** 2.2
+            try:
+                return self._load(self.surroundings[rng.integers(len(self.surroundings))]["path"])
+            except Exception:  # files that trimesh cannot read are not used
+                continue
 
 
-def proportion_gap(one: list[float], other: list[float]) -> float:
-    """Largest factor between the sides of two boxes scaled to equal diagonals."""
-    a, b = (np.array(side) / np.linalg.norm(side) for side in (one, other))
-    return float(np.exp(np.abs(np.log(a / b)).max()))
+def write_models(objects: Packages, folder: Path) -> None:
+    """Write BOP's ``models`` folder: PLY files in mm with one texture each, and ``models_info.json``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    info = {}
+    for obj_id in tqdm(objects.ids, desc="models"):
+        mesh, path = objects.mesh(obj_id), folder / f"obj_{obj_id:06d}.ply"
+        if not path.exists():
+            mesh.save_ply(path)
+        low, high = 1000.0 * mesh.hull.min(axis=0), 1000.0 * mesh.hull.max(axis=0)
+        row = {"diameter": 1000.0 * float(np.linalg.norm(mesh.hull[:, None] - mesh.hull[None], axis=2).max())}
+        row |= {f"min_{c}": float(x) for c, x in zip("xyz", low, strict=True)}
+        row |= {f"size_{c}": float(x) for c, x in zip("xyz", high - low, strict=True)}
+        discrete = []
+        for S in objects.symmetries(obj_id)[1:]:
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = S, 1000.0 * (mesh.centre - S @ mesh.centre)
+            discrete.append(T.round(6).ravel().tolist())
+        info[str(obj_id)] = row | ({"symmetries_discrete": discrete} if discrete else {})
+    write_json(folder / "models_info.json", info)
 
 
-def plan(meshes: Meshes, seed: int, index: int) -> dict:
-    """Choose the object, the CAD model to register and the form of picture ``index``."""
-    cad, pose = FORMS[index % 4]
-    cad = cad if meshes.kinds else "exact"
-    rng = np.random.default_rng((seed, index))
-    if cad == "exact":
-        order = np.random.default_rng((seed, 1)).permutation(len(meshes.good))
-        shown = wanted = meshes.good[order[(index // 4 + 7 * (pose == "free")) % len(order)]]
+def compose(objects: Packages, options: argparse.Namespace, index: int, attempt: int) -> tuple[Scene, dict[int, Any]]:
+    """Scene ``index``, and the mesh that each of its objects is annotated as: obj_id and mesh."""
+    rng = np.random.default_rng((options.seed, index, attempt))
+    size, ids = tuple(options.size), objects.ids
+    if options.kind == "shelf":
+        low, high = options.objects
+        chosen = rng.choice(ids, min(int(rng.integers(low, high + 1)), len(ids)), replace=False)
+        meshes = [(int(k), objects.mesh(int(k))) for k in chosen]
+        scene = shelf(meshes, objects.texture, rng, size=size, occlusion=options.occlusion, cameras=options.cameras)
+        annotated = {k: (k, mesh) for k, mesh in meshes}
     else:
-        names = list(meshes.kinds)
-        weight = np.array([min(len({m["like"] for m in meshes.kinds[n]}), 8) for n in names], float)
-        members = meshes.kinds[names[rng.choice(len(names), p=weight / weight.sum())]]
-        shown = members[rng.integers(len(members))]
-        others = [m for m in members if m["like"] != shown["like"]]
-        gaps = [proportion_gap(m["extents"], shown["extents"]) for m in others]
-        others = [m for m, gap in zip(others, gaps, strict=True) if gap <= max(MAX_PROPORTION, min(gaps))]
-        wanted = others[rng.integers(len(others))]
-    return {"cad": cad, "pose": pose, "shown": shown, "wanted": wanted, "rng": rng}
+        shown = ids[np.random.default_rng((options.seed, 1)).permutation(len(ids))[index % len(ids)]]
+        mesh = objects.mesh(shown)
+        if options.bare and rng.random() < options.bare:
+            mesh = mesh.recoloured(Texture(random_colour(rng)[None, None].astype(np.float32)))
+        upright = options.pose == "upright" or (options.pose == "mixed" and index % 2 == 0)
+        occluded = bool(rng.random() < 0.3 and attempt < 12)
+        more = {"upright": upright, "occluded": occluded, "cameras": options.cameras, "size": size}
+        scene = single(mesh, shown, objects.clutter, objects.texture, rng, **more)
+        named = shown
+        if options.cad == "similar":
+            named = objects.similar(shown, rng)
+        elif options.cad == "wrong":
+            others = [k for k in ids if objects.group(k) != objects.group(shown)]
+            named = int(rng.choice(others))
+        annotated = {shown: (named, objects.mesh(named))}
+    if options.frames > 1:
+        points = np.concatenate([shape.hull for shape in scene.shapes if shape.obj_id is not None])
+        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        scene = Scene(
+            scene.shapes, scene.light, scene.background, camera_path(scene.views[0], middle, options.frames, rng)
+        )
+    return scene, annotated
 
 
-def ground_and_walls(meshes: Meshes, toward: np.ndarray, rng: np.random.Generator) -> list[TexturedMesh]:
-    """A floor and up to two walls on the far side; ``toward`` (2,) is the horizontal direction to the camera."""
-    reach = float(rng.choice([3.0, 8.0, 40.0]))
-    floor = TexturedMesh.plane([(-reach, -reach, 0), (reach, -reach, 0), (reach, reach, 0), (-reach, reach, 0)])
-    surfaces = [floor.with_texture(meshes.texture(rng), reach / rng.uniform(0.5, 3.0))]
-    for _ in range(int(rng.choice([0, 1, 1, 2]))):
-        back = -toward + rng.normal(0, 0.5, 2)
-        back = back / np.linalg.norm(back)
-        side, far, high = np.array([-back[1], back[0]]), rng.uniform(1.2, 5.0), rng.uniform(2.0, 8.0)
-        a, b = back * far - 12 * side, back * far + 12 * side
-        wall = TexturedMesh.plane([(*a, 0), (*b, 0), (*b, high), (*a, high)])
-        surfaces.append(wall.with_texture(meshes.texture(rng), 12 / rng.uniform(0.7, 4.0)))
-    return surfaces
-
-
-def scene_camera(obj: TexturedMesh, size: tuple[int, int], rng: np.random.Generator):
-    """R and t (world -> camera) and K such that the object's box has a random size and lies in the picture."""
-    H, W = size
-    focal = 0.5 * max(H, W) / np.tan(np.radians(rng.uniform(22, 60)) / 2)
-    K = np.array([[focal, 0, (W - 1) / 2], [0, focal, (H - 1) / 2], [0, 0, 1.0]])
-    azimuth, elevation = rng.uniform(0, 360), rng.choice([rng.uniform(-4, 25), rng.uniform(5, 60)])
-    R = rotation_from_viewpoint(azimuth, elevation, rng.normal(0, 4)).numpy()
-    pixel = np.array([W * rng.uniform(0.38, 0.62), H * rng.uniform(0.4, 0.62), 1.0])
-    ray = np.linalg.inv(K) @ pixel
-    ray /= np.linalg.norm(ray)
-    R = rotation_towards(torch.from_numpy(ray)).numpy() @ R
-    side = rng.uniform(100, min(250, 0.8 * min(H, W)))
-    points = obj.hull_points()
-    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    distance = 4.0
-    for _ in range(12):
-        placed = (points - middle) @ R.T + distance * ray
-        flat = placed[:, :2] / np.maximum(placed[:, 2:], 0.05) * focal
-        distance *= np.ptp(flat, axis=0).max() / side if placed[:, 2].min() > 0.05 else 1.5
-        distance = max(distance, 1.25)
-    return R, distance * ray - R @ middle, K
-
-
-def clutter_around(
-    meshes: Meshes, reach: float, eye: np.ndarray, count: int, occluder: bool, rng
-) -> list[TexturedMesh]:
-    """Other meshes on the floor; an occluder stands between the object and the camera."""
-    clutter = []
-    for k in range(count + occluder):
-        row = meshes.clutter[rng.integers(len(meshes.clutter))]
-        try:
-            other = meshes.load(row["path"])
-        except Exception:  # unreadable files are not used as clutter
-            continue
-        scale = float(np.exp(rng.uniform(-0.9, 0.4))) * (0.6 if k >= count else 1.0)
-        rotation = random_rotation(rng) if rng.random() < 0.15 else None
-        other = other.standing(rotation, scale, rng.uniform(0, 2 * np.pi))
-        radius = 0.5 * float(np.linalg.norm(np.ptp(other.hull_points(), axis=0)[:2]))
-        if k >= count:
-            direction = eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9)
-            aside = np.array([-direction[1], direction[0]]) * rng.uniform(-0.8, 0.8)
-            position = direction * (reach + radius + rng.uniform(0.05, 0.4)) + aside
-            if np.linalg.norm(eye[:2] - position) < radius + 0.6:
-                continue
-        else:
-            angle = rng.uniform(0, 2 * np.pi)
-            direction = np.array([np.cos(angle), np.sin(angle)])
-            position = direction * (reach + radius + rng.exponential(0.7))
-            if np.linalg.norm(eye[:2] - position) < radius + 1.0:
-                continue
-        clutter.append(other.translated((*position, 0.0)))
-    return clutter
-
-
-def outline(mask: np.ndarray) -> list[float]:
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return [float(columns[0]) - 0.5, float(rows[0]) - 0.5, float(columns[-1]) + 0.5, float(rows[-1]) + 0.5]
-
-
-def make(meshes: Meshes, seed: int, index: int) -> tuple[np.ndarray, dict]:
-    chosen = plan(meshes, seed, index)
-    rng, shown, wanted, upright = chosen["rng"], chosen["shown"], chosen["wanted"], chosen["pose"] == "upright"
-    bare = bool(rng.random() < 0.2)
-    size = SIZES[rng.integers(len(SIZES))]
-    model = meshes.load(shown["path"])
-    rotation = np.eye(3) if upright else random_rotation(rng)
-    radius, centre = model.radius_and_centre()
-    obj = model.standing(rotation, 1.0, 0.0)
-    if bare:
-        obj = obj.with_colour(random_colour(rng))
+def make_scene(objects: Packages, options: argparse.Namespace, index: int) -> list[list[float]]:
+    """Write scene ``index`` unless it exists; the visible fractions of each photograph's objects."""
+    folder = options.out / "test" / f"{index:06d}"
+    if folder.exists():
+        infos = json.loads((folder / "scene_gt_info.json").read_text())
+        return [[entry["visib_fract"] for entry in infos[key]] for key in sorted(infos, key=int)]
     for attempt in range(20):
-        R, t, K = scene_camera(obj, size, rng)
-        eye = -R.T @ t
-        points = obj.hull_points()
-        reach = float(np.linalg.norm(points[:, :2], axis=1).max())
-        count, occluder = int(rng.choice([0, 1, 3, 5])), bool(rng.random() < 0.3 and attempt < 12)
-        shapes = [obj]
-        if eye[2] > 0.05 and rng.random() < 0.9:
-            shapes += ground_and_walls(meshes, eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9), rng)
-        shapes += clutter_around(meshes, 0.8 * reach, eye, count, occluder, rng)
-        picture, seen, whole = render(shapes, R, t, K, size, rng)
-        if whole.sum() < 400:
-            continue
-        visible = float(seen.sum() / whole.sum())
-        if visible >= MIN_VISIBLE:
+        scene, annotated = compose(objects, options, index, attempt)
+        pictures = [scene.render(view, tuple(options.size)) for view in scene.views]
+        wholes = np.array([p.whole.sum(axis=(1, 2)) for p in pictures])
+        fractions = np.array([p.seen.sum(axis=(1, 2)) for p in pictures]) / np.maximum(wholes, 1)
+        if (wholes[:, 0] >= MIN_PIXELS).all() and (
+            options.kind == "shelf" or fractions.min() >= 1.0 - options.occlusion
+        ):
             break
     else:
-        raise RuntimeError(f"{index}: {shown['id']} is hidden in every attempt")
-    image = simulate_camera(picture, rng)
-    exact = np.array(outline(whole))
-    side = np.tile(exact[2:] - exact[:2], 2)
-    box = np.clip(exact + rng.normal(0, 0.012, 4) * side, -0.5, [size[1] - 0.5, size[0] - 0.5] * 2)
-    # True pose, model (metres) -> camera: the object was centred, scaled to radius 1, rotated and put on the floor.
-    pose = R @ rotation
-    translation = (R @ model.floor_offset(rotation) + t) * radius - pose @ centre
-    names = "look_symmetries" if wanted is shown else "shape_symmetries"
-    symmetries = sorted(set(shown[names]) | set(wanted[names]))
-    item = {
-        "id": index,
-        "form": chosen["cad"],
-        "pose": chosen["pose"],
-        "image": f"images/{index:05d}.jpg",
-        "size": list(size),
-        "kind": shown["kind"],
-        "mesh": wanted["path"],
-        "shown": shown["path"],
-        "name": shown["name"],
-        "box": box.round(2).tolist(),
-        "box_exact": exact.tolist(),
-        "box_visible": outline(seen),
-        "K": K.tolist(),
-        "R": pose.round(9).tolist(),
-        "t": translation.round(6).tolist(),
-        "symmetries": meshes.rotations[symmetries].astype(float).round(9).tolist(),
-        "visible": round(visible, 3),
-        "clutter": len(shapes) - 1,
-        "occluded": visible < 0.9,
-        "bare": bare,
-        "seed": seed,
-    }
-    return image, item
+        raise RuntimeError(f"scene {index}: the object is hidden in every attempt")
+    part = folder.with_suffix(".part")
+    shutil.rmtree(part, ignore_errors=True)
+    (part / "rgb").mkdir(parents=True)
+    truths, cameras, infos = {}, {}, {}
+    targets = [shape for shape in scene.shapes if shape.obj_id is not None]
+    for k, ((R, t, K), picture) in enumerate(zip(scene.views, pictures, strict=True)):
+        seed = (options.seed, index, 0 if options.frames > 1 else k)  # one camera takes all frames
+        image = simulate_camera(picture.linear, np.random.default_rng(seed))
+        cv2.imwrite(str(part / "rgb" / f"{k:06d}.png"), image[..., ::-1])
+        mm = 1000.0 / targets[0].scale
+        cameras[k] = {"cam_K": K.ravel().tolist(), "depth_scale": 1.0}
+        cameras[k] |= {"cam_R_w2c": R.ravel().tolist(), "cam_t_w2c": (mm * t).tolist()}
+        truths[k], infos[k] = [], []
+        for n, shape in enumerate(targets):
+            if picture.whole[n].sum() < MIN_PIXELS:
+                continue
+            obj_id, mesh = annotated[shape.obj_id]
+            rotation, translation = shape.pose(R, t)
+            translation = translation + rotation @ (shape.mesh.centre - mesh.centre)
+            pose = {"cam_R_m2c": rotation.ravel().tolist(), "cam_t_m2c": (1000.0 * translation).tolist()}
+            truths[k].append(pose | {"obj_id": obj_id})
+            seen, whole = int(picture.seen[n].sum()), int(picture.whole[n].sum())
+            boxes = {"bbox_obj": _box(picture.whole[n]), "bbox_visib": _box(picture.seen[n])}
+            counts = {"px_count_all": whole, "px_count_visib": seen, "px_count_valid": whole}
+            infos[k].append(boxes | counts | {"visib_fract": seen / whole})
+    for name, content in (("gt", truths), ("camera", cameras), ("gt_info", infos)):
+        write_json(part / f"scene_{name}.json", content)
+    part.rename(folder)
+    return [[entry["visib_fract"] for entry in infos[k]] for k in infos]
 
 
-_meshes: Meshes | None = None
+def _box(mask: Array) -> list[int]:
+    """BOP's x, y, width, height in px between the centres of the outermost pixels; -1 four times for none."""
+    if not mask.any():
+        return [-1, -1, -1, -1]
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return [int(x) for x in (columns[0], rows[0], columns[-1] - columns[0], rows[-1] - rows[0])]
 
 
-def _start(out: Path, half: str) -> None:
-    global _meshes
+def write_targets(options: argparse.Namespace) -> int:
+    """List the instances that are visible enough in BOP's ``test_targets_bop19.json``; their number."""
+    targets = []
+    for folder in sorted(p for p in (options.out / "test").iterdir() if p.name.isdecimal()):
+        truths, infos = (json.loads((folder / f"scene_{name}.json").read_text()) for name in ("gt", "gt_info"))
+        for key in sorted(truths, key=int):
+            for truth, info in zip(truths[key], infos[key], strict=True):
+                if info["visib_fract"] >= 1.0 - options.occlusion and min(info["bbox_visib"][2:]) > 0:
+                    row = {"scene_id": int(folder.name), "im_id": int(key), "obj_id": truth["obj_id"]}
+                    targets.append(row | {"inst_count": 1})
+    write_json(options.out / "test_targets_bop19.json", targets)
+    return len(targets)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write ``content`` so that an interrupted run leaves no half of a file."""
+    part = path.with_name(f"{path.name}.{os.getpid()}")
+    part.write_text(json.dumps(content))
+    part.replace(path)
+
+
+_state: list[Any] = []
+
+
+def _start(options: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    _meshes = Meshes(out, half)
+    _state[:] = [(Furniture if options.kind == "furniture" else Packages)(options), options]
 
 
-def _one(task: tuple[int, int, Path]) -> dict:
-    seed, index, folder = task
-    image, item = make(_meshes, seed, index)
-    cv2.imwrite(str(folder / item["image"]), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
-    return item
+def _one(index: int) -> list[list[float]]:
+    return make_scene(*_state, index)
+
+
+def arguments() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kind", choices=KINDS, default="printed")
+    parser.add_argument("--count", type=int, default=300, help="scenes")
+    parser.add_argument("--seed", type=int, default=29)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--size", type=int, nargs=2, default=(480, 640), metavar=("H", "W"))
+    parser.add_argument("--models", type=int, default=60, help="printed packages or solids to choose from")
+    parser.add_argument("--meshes", type=Path, help="folder of meshes.py, for furniture")
+    parser.add_argument("--photographs", type=Path, help="folder of pictures on walls and floors")
+    parser.add_argument("--half", choices=("held-out", "train"), default="held-out", help="of the furniture")
+    parser.add_argument("--cad", choices=("exact", "similar", "wrong"), default="exact")
+    parser.add_argument("--pose", choices=("upright", "free", "mixed"), default="mixed")
+    parser.add_argument("--bare", type=float, default=0.0, help="fraction of the objects in one uniform colour")
+    parser.add_argument("--objects", type=int, nargs=2, default=(8, 20), metavar=("LOW", "HIGH"), help="on a shelf")
+    parser.add_argument("--occlusion", type=float, default=0.6, help="largest hidden fraction of a target")
+    parser.add_argument("--cameras", type=int, default=1, help="photographs of each scene, from different sides")
+    parser.add_argument("--frames", type=int, default=1, help="photographs of each scene by one moving camera")
+    parser.add_argument("--jobs", type=int, default=1)
+    return parser
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--half", choices=("held-out", "train", "printed"), default="held-out")
-    parser.add_argument("--count", type=int, default=1200)
-    parser.add_argument("--seed", type=int, default=15)
-    parser.add_argument("--jobs", type=int, default=1)
-    arguments = parser.parse_args()
-    folder = arguments.out / arguments.half
-    (folder / "images").mkdir(parents=True, exist_ok=True)
-    context = get_context("spawn")
-    listing = folder / "items.jsonl"
-    lines = listing.read_text().splitlines(keepends=True) if listing.exists() else []
-    done = {json.loads(line)["id"] for line in lines if line.endswith("\n")}  # resume an interrupted run
-    listing.write_text("".join(line for line in lines if line.endswith("\n")))
-    tasks = [(arguments.seed, index, folder) for index in range(arguments.count) if index not in done]
-    start = (arguments.out, arguments.half)
-    with (
-        ProcessPoolExecutor(arguments.jobs, mp_context=context, initializer=_start, initargs=start) as pool,
-        listing.open("a") as file,
-    ):
-        for item in tqdm(pool.map(_one, tasks), total=len(tasks), desc="photographs"):
-            file.write(json.dumps(item) + "\n")
-            file.flush()
-    copyfile(Path(__file__).with_name("FORMAT.md"), arguments.out / "README.md")
+    options = arguments().parse_args()
+    _start(options)
+    objects = _state[0]
+    (options.out / "test").mkdir(parents=True, exist_ok=True)
+    write_models(objects, options.out / "models")
+    if options.jobs == 1:
+        for index in tqdm(range(options.count), desc="scenes"):
+            make_scene(objects, options, index)
+    else:
+        with ProcessPoolExecutor(options.jobs, get_context("spawn"), initializer=_start, initargs=(options,)) as pool:
+            list(tqdm(pool.map(_one, range(options.count)), total=options.count, desc="scenes"))
+    kept = {k: str(v) if isinstance(v, Path) else v for k, v in vars(options).items() if k not in ("out", "jobs")}
+    groups = {obj_id: objects.group(obj_id) for obj_id in objects.ids}
+    write_json(options.out / "benchmark.json", kept | {"groups": groups})
+    print(f"{write_targets(options)} targets in {options.count} scenes in {options.out}")
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from scripts.benchmark.textured import TexturedMesh, appearance_symmetries
+from scripts.scenes.textured import TexturedMesh
 
 PACKAGE = "sweethome3d-furniture"
 SHA256 = "3ccb90c63f9525e887a767b9cd5c8b6933b8b6b2973a615a5359ee68a2118668"
@@ -164,22 +164,37 @@ def candidate_rotations() -> np.ndarray:
     return np.array(cube + about_z)
 
 
-def sample_points(model: TexturedMesh) -> np.ndarray:
-    """20,000 points of the surface relative to the centre of its box, in radii."""
-    radius, centre = model.radius_and_centre()
+def sample_points(model: TexturedMesh) -> tuple[np.ndarray, np.ndarray]:
+    """20,000 points of the surface relative to the centre of its box, in radii, and their colours in [0, 1]."""
     corners = model.triangles.reshape(-1, 3)
     mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
-    return (np.asarray(trimesh.sample.sample_surface(mesh, 20_000, seed=0)[0]) - centre) / radius
+    points, face = trimesh.sample.sample_surface(mesh, 20_000, seed=0)
+    points, face = np.asarray(points), np.asarray(face)
+    weights = trimesh.triangles.points_to_barycentric(model.triangles[face], points)
+    uv, colours = np.einsum("ij,ijk->ik", weights, model.uv[face]), np.empty((len(points), 3))
+    for number, paint in enumerate(model.paints):
+        here = model.paint[face] == number
+        colours[here] = paint.colours(points[here], uv[here]) ** (1 / 2.2)
+    return (points - model.centre) / model.radius, colours
 
 
-def symmetries(points: np.ndarray) -> list[int]:
-    """Candidate rotations that map the shape to itself: 90 % of its points within 4 % of the radius."""
-    tree = cKDTree(points)
+def symmetries(points: np.ndarray, colours: np.ndarray) -> tuple[list[int], list[int]]:
+    """Candidate rotations that map the shape to itself, and those that preserve its colours too.
 
-    def fits(R: np.ndarray, some: np.ndarray) -> bool:
-        return float(np.mean(np.isfinite(tree.query(some @ R.T, distance_upper_bound=0.04)[0]))) >= 0.9
+    90 % of the points lie within 4 % of the radius of others, and 90 % have their colour, blurred over 48 neighbours.
+    """
+    tree, some = cKDTree(points), slice(None, None, 16)
 
-    return [k for k, R in enumerate(candidate_rotations()) if fits(R, points[::400]) and fits(R, points[::16])]
+    def fits(R: np.ndarray, part: slice) -> bool:
+        return float(np.mean(np.isfinite(tree.query(points[part] @ R.T, distance_upper_bound=0.04)[0]))) >= 0.9
+
+    def blurred(R: np.ndarray) -> np.ndarray:
+        return np.asarray(colours[tree.query(points[some] @ R.T, k=48)[1]].mean(axis=1))
+
+    rotations, own = candidate_rotations(), blurred(np.eye(3))
+    shape = [k for k, R in enumerate(rotations) if fits(R, slice(None, None, 400)) and fits(R, some)]
+    same = [k for k in shape if (np.abs(blurred(rotations[k]) - own).max(axis=1) > 0.12).mean() < 0.1]
+    return shape, same
 
 
 def copy_of(cloud: np.ndarray, others: dict[str, tuple[np.ndarray, cKDTree]]) -> str | None:
@@ -207,16 +222,16 @@ def examine(task: tuple[dict, Path, Path]) -> tuple[dict, str | None, np.ndarray
         model = TexturedMesh.load(folder / "model.obj")
     except Exception as error:  # a malformed file may raise anything
         return row, f"unreadable ({type(error).__name__})", None
-    cloud = sample_points(model)
-    shape_symmetries = symmetries(cloud)
+    cloud, colours = sample_points(model)
+    shape_symmetries, look_symmetries = symmetries(cloud, colours)
     row = {
         **{k: row[k] for k in ("id", "name", "category", "licence", "creator", "source")},
         "kind": kind_of(row["name"]),
         "path": f"meshes/{row['id']}/model.obj",
         "faces": len(model.triangles),
-        "extents": np.ptp(model.hull_points(), axis=0).round(4).tolist(),
+        "extents": np.ptp(model.hull, axis=0).round(4).tolist(),
         "shape_symmetries": shape_symmetries,
-        "look_symmetries": appearance_symmetries(model, shape_symmetries, candidate_rotations()),
+        "look_symmetries": look_symmetries,
     }
     return row, None, cloud
 

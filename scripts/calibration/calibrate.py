@@ -1,253 +1,311 @@
-"""Fit the constants of confidence and covariance on registered photographs, and measure their quality.
+"""Fit the constants of confidence, rivals, covariance, detection, refinement and following on generated photographs.
 
-    python scripts/calibration/calibrate.py BENCHMARK --rows ROWS [--jobs 2 | --registered] [--real DATA RUNS]
+    python scripts/calibration/calibrate.py WORK --meshes FURNITURE [--count 400] [--jobs 2] [--write]
 
-BENCHMARK is the folder of scripts/benchmark/make.py --count 2000. Photographs that are not in ROWS yet are registered
-first, as by scripts/benchmark/run.py (an interrupted run can be resumed): each to its object's mesh or, for siblings,
-to that of another object of the kind, and some to wrong meshes; --registered does with the rows that there are. Then
-the script writes
-
-- curvireg_torch/registration/calibration.json, the constants,
-- scripts/results/calibration.json, the constants with their quality on held-out objects,
-- the tables of docs/accuracy.md.
-
-Folds are by object and kind: an object, its copies and all others of its kind are in one fold. --real adds the real
-sets in DATA, with the predictions that ``curvireg evaluate --out RUNS/NAME`` wrote; nothing is fitted on them.
+FURNITURE is the folder of scripts/benchmark/meshes.py. The script renders the sets that WORK lacks (make.py: the
+object's own mesh, a similar one, a wrong one, and sequences), registers, refines, follows and detects their objects
+into WORK/*.jsonl, of which finished rows are kept, and fits. Folds are by kind of object, so every measure is of kinds
+that the fit has not seen. --write stores the constants in curvireg_torch/registration/calibration.json and their
+quality in scripts/results/calibration.json.
 """
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from itertools import groupby
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
+import torch
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 from scipy.stats import chi2
 from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import roc_auc_score
+from torch import Tensor
+from tqdm import tqdm
 
-from curvireg_torch.registration.confidence import (
-    CONFIDENCE_FEATURES,
-    RANKING_FEATURES,
-    RELIABLE,
-    LogisticModel,
-    confidence_features,
-    model_name,
-)
-from curvireg_torch.registration.rescoring import POSE_FEATURES, WEIGHTS, rescore
-from scripts._shared import REPOSITORY, commit, today, update_page, write_json
-from scripts.benchmark.run import register_benchmark
-from scripts.calibration.answer_sets import evidence_of, fit_answer_sets, unrefined
-from scripts.calibration.quality import (
-    LEVELS,
-    REAL_SETS,
-    RIGHT,
-    Row,
-    count_inside,
-    exactness,
-    group_of,
-    page,
-    quality_by_subset,
-    radii,
-    real_set,
-    squared_distance,
-    success_rates,
-)
+import curvireg_torch as cr
+from curvireg_torch.data import BOPDataset
+from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
+from curvireg_torch.registration import Follower
+from curvireg_torch.registration.rescoring import POSE_FEATURES, rescore
+from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
+
+Row: TypeAlias = dict[str, Any]
 
 CONSTANTS = REPOSITORY / "curvireg_torch" / "registration" / "calibration.json"
-RECORD = REPOSITORY / "scripts" / "results" / "calibration.json"
-PAGE = REPOSITORY / "docs" / "accuracy.md"
+SETS: dict[str, list[str]] = {
+    "exact": ["--cad", "exact", "--bare", "0.2"],
+    "similar": ["--cad", "similar", "--bare", "0.2"],
+    "wrong": ["--cad", "wrong"],
+    "sequences": ["--cad", "exact", "--frames", "30"],
+}
+RIGHT = 30.0
+"""Degrees within which a registration is right."""
 
-PARTS: dict[str, tuple[str | None, int | None]] = {"right": (None, None), "any": ("any", 60), "kind": ("kind", 60)}
-"""Sets of photographs, with the options --wrong and --limit of scripts/benchmark/run.py."""
+FINE_DEGREES, FINE_FRACTION = 10.0, 0.1
+"""Degrees, and fraction of the distance, within which a refined or tracked pose is right."""
 
-FOLDS = 5
+STARTS = ((5.0, 0.0), (10.0, 0.0), (15.0, 0.0), (20.0, 0.0), (30.0, 0.0), (0.0, 0.05), (0.0, 0.1), (0.0, 0.2))
+"""Degrees and fraction of the distance by which the starts of refinements are off."""
+
 WRONG_FRACTION = 0.1
 """Weight of the wrong meshes in the fit of confidence, as if one photograph in ten came with a wrong mesh."""
 
-
-def features_of(row: Row, *, with_appearance: bool = True) -> tuple[dict[str, float | None], float]:
-    """Features of the best hypothesis of a row, optionally without the appearance term, and its error in degrees."""
-    evidence = evidence_of(row, with_appearance=with_appearance)
-    concentration = row["ranking"][RANKING_FEATURES.index("concentration")]
-    features = confidence_features(evidence, rescore(evidence, exact=row["form"] == "exact"), concentration)
-    return features, row["errors"][0]
+FOLDS = 5
+FIELDS = {"instance": ("exact", "wrong"), "category": ("similar",)}
+"""Of each confidence model: the sets that it is fitted on."""
 
 
-def ranking_case(row: Row, *, with_appearance: bool = True) -> tuple[dict[str, float | None], float]:
-    """Features of a row's ranking, and the error of its best view in degrees."""
-    found = unrefined(row, with_appearance=with_appearance)
-    return dict(zip(RANKING_FEATURES, found["ranking"], strict=True)), found["errors"][0]
+def render_sets(work: Path, meshes: Path, count: int, jobs: int) -> None:
+    """Render the sets that ``work`` lacks; finished scenes are kept."""
+    for name, options in SETS.items():
+        number = {"sequences": count // 10, "wrong": count // 4}.get(name, count)
+        words = ["--kind", "furniture", "--meshes", meshes, "--out", work / name, "--count", number, "--jobs", jobs]
+        command = [sys.executable, REPOSITORY / "scripts" / "benchmark" / "make.py", *words, *options]
+        subprocess.run([str(word) for word in command], check=True)
 
 
-Case = Callable[..., tuple[dict[str, float | None], float]]
-FORMS = {"exact": "exact", "similar": "sibling"}
-"""Kinds of meshes, and the form of the benchmark's photographs that are registered to them."""
+def errors_of(R: Tensor, sample: Row) -> Tensor:
+    """(N,) degrees between rotations (N, 3, 3) and the truth, up to the object's symmetries."""
+    listed = sample["model_info"].get("symmetries_discrete", [])
+    S = torch.stack([torch.eye(4), *(torch.tensor(values).view(4, 4) for values in listed)])[:, :3, :3].double()
+    return cr.rotation_error(R[:, None].double(), (sample["rotation"].double() @ S)[None]).amin(dim=1)
 
-MODELS: dict[str, tuple[Case, bool, str, tuple[str, ...]]] = {
-    model_name(stage, exact=kind == "exact", with_appearance=with_appearance): (case, with_appearance, form, names)
-    for stage, case, names in (
-        ("contours", features_of, CONFIDENCE_FEATURES),
-        ("ranking", ranking_case, RANKING_FEATURES),
+
+def truth_of(sample: Row) -> Tensor:
+    """(4, 4) true pose of a sample."""
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, :3], T[:3, 3] = sample["rotation"].double(), sample["translation"].double()
+    return T
+
+
+def fine(T: Tensor, sample: Row) -> bool:
+    """Whether a pose (4, 4) is near the truth."""
+    t = sample["translation"].double()
+    return bool(
+        errors_of(T[None, :3, :3], sample) <= FINE_DEGREES and (T[:3, 3] - t).norm() <= FINE_FRACTION * t.norm()
     )
-    for kind, form in FORMS.items()
-    for with_appearance in (True, False)
-}
-"""Of each confidence model: the function that gives its cases, whether the appearance term is used, the form of the
-photographs, and its features."""
+
+
+def registered(registrar: cr.Registrar, sample: Row, name: str) -> Iterator[Row]:
+    """One row: features, scores and errors of the hypotheses; with the camera unless the mesh is a similar one."""
+    K = None if name == "similar" else sample["camera_matrix"].double()
+    result = registrar([sample["image"]], sample["box"][None], K)[0]
+    if not result.ok:
+        return
+    R = torch.stack([h.rotation if K is not None else h.allocentric_rotation for h in result.hypotheses])
+    if K is None:  # compare as seen by a camera that looks straight at the object
+        ray = sample["rotation"].double() @ model_centre(sample) + sample["translation"].double()
+        sample = sample | {"rotation": cr.geometry.rotation_towards(ray).T @ sample["rotation"].double()}
+    evidence = torch.tensor([[h.evidence[name] for name in POSE_FEATURES] for h in result.hypotheses]).double()
+    row = {"features": dict(result.confidence_features), "scores": rescore(evidence, exact=K is not None).tolist()}
+    row |= {"errors": errors_of(R, sample).tolist()}
+    best = result.hypotheses[0]
+    if name == "exact" and best.covariance is not None and row["errors"][0] < RIGHT:
+        turn = axis_angle_from_rotation(sample["rotation"].double() @ best.rotation.T)
+        e = torch.cat([turn, sample["translation"].double() - best.translation])
+        row["distance2"] = float(e @ torch.linalg.solve(best.covariance.double(), e))
+    yield row
+
+
+def model_centre(sample: Row) -> Tensor:
+    """(3,) middle of the model's box, in mm."""
+    info = sample["model_info"]
+    return torch.tensor([info[f"min_{c}"] + 0.5 * info[f"size_{c}"] for c in "xyz"], dtype=torch.float64)
+
+
+def refined(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
+    """Rows of refinements from wrong starts, and in the photograph ``other``, which does not show the object."""
+    T, K = truth_of(sample), sample["camera_matrix"].double()
+    generator = torch.Generator().manual_seed(sample["scene_id"])
+    for degrees, fraction in (*STARTS, (0.0, 0.0)):
+        axis = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+        sign = 1.0 if torch.rand((), generator=generator) < 0.5 else -1.0
+        start = T.clone()
+        start[:3, :3] = rotation_from_axis_angle(axis * np.radians(degrees)) @ T[:3, :3]
+        start[:3, 3] *= 1.0 + sign * fraction
+        absent = degrees == fraction == 0.0
+        result = registrar.refine([(other if absent else sample)["image"]], K, [start])[0]
+        if result.ok:
+            yield {"features": dict(result.confidence_features), "right": not absent and fine(result.transform, sample)}
+
+
+def followed(registrar: cr.Registrar, frames: Sequence[Row]) -> Iterator[Row]:
+    """Rows of a sequence tracked from its first true pose, by every frame and by every third."""
+    for stride in (1, 3):
+        follow = Follower(registrar, frames[0]["camera_matrix"].double())
+        follow.start(frames[0]["image"], truth_of(frames[0]))
+        for sample in frames[stride::stride]:
+            result = follow(sample["image"])
+            if result.ok and "region" in result.confidence_features:
+                yield {"features": dict(result.confidence_features), "right": fine(result.transform, sample)}
+
+
+def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
+    """Rows of detections without a box, in a photograph of the object and in one without it."""
+    for shown in (sample, other):
+        result = registrar([shown["image"]], None, shown["camera_matrix"].double())[0]
+        if result.ok:
+            evidence = result.hypotheses[0].evidence
+            features = {"proposal": result.localization.score, "similarity": evidence["similarity"]}
+            x0, y0, x1, y1 = torch.cat([
+                torch.maximum(result.localization.box[:2], shown["box"][:2].double()),
+                torch.minimum(result.localization.box[2:], shown["box"][2:].double()),
+            ]).tolist()  # fmt: skip
+            area = (shown["box"][2:] - shown["box"][:2]).prod()
+            overlaps = max(0.0, x1 - x0) * max(0.0, y1 - y0) > 0.5 * float(area)
+            yield {"features": features, "right": shown is sample and overlaps}
+
+
+def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
+    """Rows of one mesh's photographs."""
+    kind, folder, pose, indices, beside = task
+    torch.set_num_threads(1)
+    data = BOPDataset(folder)
+    samples, other = [data[i] for i in indices], data[beside]
+    pipeline = cr.Pipeline().with_pose_prior(pose)
+    registrar = cr.Registrar(cr.load_mesh(samples[0]["model_path"], unit="mm"), pipeline=pipeline)
+    if kind == "sequences":
+        found = [(samples[0], row) for row in followed(registrar, samples)]
+    else:
+        methods: dict[str, Callable[[Row], Iterator[Row]]] = {
+            "refined": lambda s: refined(registrar, s, other),
+            "detected": lambda s: detected(registrar, s, other),
+        }
+        method = methods.get(kind, lambda s: registered(registrar, s, kind))
+        found = [(s, row) for s in samples for row in method(s)]
+    groups = json.loads((folder / "benchmark.json").read_text())["groups"]
+    return [{"scene": s["scene_id"], "group": groups[str(s["obj_id"])], **row} for s, row in found]
+
+
+def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[Row]:
+    """Rows of a set, or of refinements and detections in the set "exact"; finished meshes are read from the file."""
+    folder, out = work / (kind if kind in SETS else "exact"), work / f"{kind}.jsonl"
+    data = BOPDataset(folder)
+    annotations = [data.annotation(i) for i in range(len(data))]
+    listed = [(int(s["scene_id"]), int(s["obj_id"]), i) for i, s in enumerate(annotations)][:limit]
+    done = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+    known = {tuple(row["task"]) for row in done}
+
+    def mesh_and_pose(entry: tuple[int, int, int]) -> tuple[int, int]:
+        return entry[1], entry[0] % 2  # make.py alternates upright and any pose
+
+    tasks = []
+    for key, group in groupby(sorted(listed, key=mesh_and_pose), key=mesh_and_pose):
+        indices = [i for _, _, i in group]
+        if key not in known:
+            beside = next((i for _, obj_id, i in listed if obj_id != key[0]), 0)
+            tasks.append((key, (kind, folder, "any" if key[1] else "upright", indices, beside)))
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool, out.open("a") as file:
+        found = pool.map(measure, [task for _, task in tasks])
+        for (key, _), rows in zip(tasks, tqdm(found, total=len(tasks), desc=kind, unit="mesh"), strict=True):
+            done.append({"task": key, "rows": rows})
+            file.write(json.dumps(done[-1]) + "\n")
+            file.flush()
+    return [row for entry in done for row in entry["rows"]]
 
 
 def folds_of(rows: Sequence[Row]) -> np.ndarray:
     """(n,) fold of each row; groups are assigned so that folds have about equal sizes."""
-    groups, counts = np.unique([group_of(row) for row in rows], return_counts=True)
+    groups, counts = np.unique([row["group"] for row in rows], return_counts=True)
     size, fold = [0] * FOLDS, {}
     for k in np.argsort(-counts, kind="stable"):
         fold[groups[k]] = int(np.argmin(size))
         size[fold[groups[k]]] += int(counts[k])
-    return np.array([fold[group_of(row)] for row in rows])
+    return np.array([fold[row["group"]] for row in rows])
 
 
-def is_right(row: Row, error: float) -> bool:
-    """Registration to an arbitrary wrong mesh is always wrong; to one of the object's kind only if the pose is."""
-    return error < RIGHT and row["wrong"] != "any"
+def fit_logistic(rows: Sequence[Row], weight: np.ndarray | None = None) -> tuple[Row, Row]:
+    """Weights and bias of the probability that a row is ``right``, and their quality on held-out folds.
 
-
-def fit_logistic(X: np.ndarray, y: np.ndarray, weight: np.ndarray, names: Sequence[str]) -> LogisticModel:
-    """Logistic regression of features (n, F) with a unit Gaussian prior on the standardised weights."""
-    mean, spread = X.mean(axis=0), X.std(axis=0)
-    spread[spread < 1e-6] = np.inf  # a constant feature gets weight 0
-    model = LogisticRegression(max_iter=2000).fit((X - mean) / spread, y, sample_weight=weight)
-    w = model.coef_[0] / spread
-    weights = {name: round(float(value), 4) for name, value in zip(names, w, strict=True)}
-    return LogisticModel(weights, round(float(model.intercept_[0] - w @ mean), 4))
-
-
-def fit_transfer(exact: LogisticModel, X: np.ndarray, y: np.ndarray) -> LogisticModel:
-    """Adapt a model of exact meshes to similar meshes, by a factor on its weights and a new bias.
-
-    Siblings carry too little information to fit weights on them alone.
+    The standardised weights have a unit Gaussian prior.
     """
-    logit = X @ np.array(list(exact.weights.values()))
-    slope = fit_logistic(logit[:, None], y, np.ones(len(y)), ["logit"])
-    factor = max(0.0, slope.weights["logit"])
-    return LogisticModel({name: round(factor * w, 4) for name, w in exact.weights.items()}, slope.bias)
+    names = list(rows[0]["features"])
+    X = np.array([[row["features"][n] or 0.0 for n in names] for row in rows])
+    y, fold = np.array([row["right"] for row in rows]), folds_of(rows)
+    weight = np.ones(len(y)) if weight is None else weight
 
+    def fit(train: np.ndarray) -> tuple[np.ndarray, float]:
+        mean, spread = X[train].mean(axis=0), X[train].std(axis=0)
+        spread[spread < 1e-6] = np.inf  # a constant feature gets weight 0
+        model = LogisticRegression(max_iter=2000).fit((X[train] - mean) / spread, y[train], sample_weight=weight[train])
+        w = model.coef_[0] / spread
+        return w, float(model.intercept_[0] - w @ mean)
 
-def fit_confidence(rows: Sequence[Row], name: str) -> tuple[LogisticModel, list[Row], np.ndarray, np.ndarray]:
-    """The model, its rows, their confidences by models of the other folds, and whether they are right."""
-    case, with_appearance, form, names = MODELS[name]
-    rows = [row for row in rows if row["form"] in (form, "exact")]
-    cases = [case(row, with_appearance=with_appearance) for row in rows]
-    X = np.array([[features[n] or 0.0 for n in names] for features, _ in cases])
-    y = np.array([is_right(row, error) for row, (_, error) in zip(rows, cases, strict=True)])
-    wrong, fold = np.array([bool(row["wrong"]) for row in rows]), folds_of(rows)
-    trains, evaluated = (np.array([row["form"] == f for row in rows]) for f in ("exact", form))
-    weight = np.ones(len(rows))
-    if wrong.any():
-        weight[wrong] = WRONG_FRACTION / (1.0 - WRONG_FRACTION) * (~wrong & trains).sum() / wrong.sum()
-
-    def fit(train: np.ndarray) -> LogisticModel:
-        used = train & trains
-        model = fit_logistic(X[used], y[used], weight[used], names)
-        if form == "exact":
-            return model
-        return fit_transfer(model, X[train & evaluated], y[train & evaluated])
-
-    confidence = np.zeros(len(rows))
+    p = np.zeros(len(y))
     for k in range(FOLDS):
-        model = fit(fold != k)
-        for i in np.flatnonzero(fold == k):
-            confidence[i] = model(cases[i][0])
-    chosen = [row for row, e in zip(rows, evaluated, strict=True) if e]
-    return fit(np.full(len(rows), True)), chosen, confidence[evaluated], y[evaluated]
+        if len(set(y[fold != k])) == 2:
+            w, bias = fit(fold != k)
+            p[fold == k] = 1.0 / (1.0 + np.exp(-(X[fold == k] @ w + bias)))
+    w, bias = fit(np.full(len(y), True))
+    quality = {"n": len(y), "right": float(y.mean()), "said": float(np.average(p, weights=weight))}
+    quality |= {"auc": float(roc_auc_score(y, p)), "reliable": float((p >= 0.9).mean())}
+    quality["right if reliable"] = float(y[p >= 0.9].mean()) if (p >= 0.9).any() else None
+    return {"weights": dict(zip(names, w.round(4).tolist(), strict=True)), "bias": round(bias, 4), "n": len(y)}, quality
 
 
-def fit_covariance(rows: Sequence[Row], sure: np.ndarray) -> tuple[Row, Row]:
-    """Constants of the covariance from the reliable results, right or wrong, and their cross-validated quality."""
-    reliable = [row for row, p in zip(rows, sure, strict=True) if p >= RELIABLE and row.get("covariance")]
-    # Multiplied by the scale in use, these are distances under the unscaled covariance.
-    raw = np.array([r["scale"] * squared_distance(r["pose_error"], r["covariance"], r["distance"]) for r in reliable])
+def fit_rivals(rows: Sequence[Row]) -> Row:
+    """Slope of the rivals' scores and level of "none of them", where the first hypothesis is wrong."""
+    cases = []
+    for row in rows:
+        right = np.array(row["errors"]) < RIGHT
+        if not right[0] and len(right) > 1:
+            scores = np.array(row["scores"])[1:]
+            cases.append((np.append(scores - scores.max(), 0.0), np.append(right[1:], not right.any())))
 
-    def fit(index: np.ndarray) -> Row:
-        """The scale is such that the 90 % ellipsoid has a Gaussian's radius: few wrong answers are among them."""
-        scale = round(radii(raw[index])["0.9"] / float(chi2.ppf(0.9, 6)), 3)
-        return {"scale": scale, "squared_radius": radii(raw[index] / scale)}
+    def loss(p: np.ndarray) -> float:
+        logits = [np.exp(p[0]) * s + p[1] * (np.arange(len(s)) == len(s) - 1) for s, _ in cases]
+        likelihood = (logsumexp(x) - logsumexp(x[right]) for x, (_, right) in zip(logits, cases, strict=True))
+        return 0.05 * float((p**2).sum()) + sum(map(float, likelihood))
 
-    fold, inside = folds_of(reliable), dict.fromkeys((f"{level:g}" for level in LEVELS), 0)
-    for k in range(FOLDS):
-        constants = fit(np.flatnonzero(fold != k))
-        for level, count in count_inside(raw[fold == k] / constants["scale"], constants["squared_radius"]).items():
-            inside[level] += count
-    return fit(np.arange(len(reliable))), {"n": len(reliable), "inside": inside}
-
-
-def fit_rescoring(rows: Sequence[Row]) -> list[float]:
-    """Rescoring weights that maximise the softmax of right hypotheses, with a prior around the weights in use."""
-    cases = [
-        (np.array([[one[name] for name in POSE_FEATURES] for one in row["evidence"]]), np.array(row["errors"]) < RIGHT)
-        for row in rows
-        if row["form"] == "exact" and not row["wrong"]
-    ]
-    cases = [(X, right) for X, right in cases if right.any() and not right.all()]
-    prior = np.array(WEIGHTS)
-
-    def loss(w: np.ndarray) -> float:
-        return 2.0 * float((((w - prior) / prior) ** 2).sum()) + sum(
-            float(logsumexp(X @ w) - logsumexp((X @ w)[right])) for X, right in cases
-        )
-
-    found = minimize(loss, prior, method="L-BFGS-B", bounds=[(0.0, None)] * len(prior))
-    return [round(float(w), 2) for w in found.x]
+    found = minimize(loss, np.zeros(2), method="L-BFGS-B").x
+    return {"slope": round(float(np.exp(found[0])), 4), "none": round(float(found[1]), 4)}
 
 
-def calibrate(rows: Sequence[Row]) -> tuple[Row, Row]:
-    """Constants, and their quality on held-out folds."""
-    constants: Row = {"confidence": {}, "answer_set": {}, "covariance": {}}
-    held_out: dict[str, Row] = {}
-    answer_sets: dict[str, Row] = {}
-    covariance_held_out: Row = {}
-    for name in MODELS:
-        model, used, sure, right = fit_confidence(rows, name)
-        constants["confidence"][name] = {"weights": dict(model.weights), "bias": model.bias, "n": len(used)}
-        held_out |= quality_by_subset(used, sure, right, name)
-        own = np.flatnonzero([not row["wrong"] for row in used])
-        own_rows, fold = [used[k] for k in own], folds_of(used)[own]
-        constants["answer_set"][name], answer_sets[name] = fit_answer_sets(own_rows, name, sure[own], fold)
-        if name == "contours, exact, appearance":
-            constants["covariance"], covariance_held_out = fit_covariance(used, sure)
-    quality = {"held_out": held_out, "answer_sets": answer_sets, "covariance_held_out": covariance_held_out}
+def calibrate(work: Path, jobs: int, limit: int | None) -> tuple[Row, Row]:
+    """Constants, and their quality on held-out kinds of objects."""
+    constants: Row = {"confidence": {}, "rivals": {}}
+    quality: Row = {}
+    for name, sets in FIELDS.items():
+        rows = [row | {"set": s} for s in sets for row in rows_of(work, s, jobs, limit)]
+        rows = [row | {"right": row["set"] != "wrong" and row["errors"][0] < RIGHT} for row in rows]
+        wrong = np.array([row["set"] == "wrong" for row in rows])
+        weight = np.where(wrong, WRONG_FRACTION / (1 - WRONG_FRACTION) * (~wrong).sum() / max(1, wrong.sum()), 1.0)
+        constants["confidence"][name], quality[name] = fit_logistic(rows, weight)
+        constants["rivals"][name] = fit_rivals([row for row in rows if row["set"] != "wrong"])
+        distances = [row["distance2"] for row in rows if "distance2" in row]
+        if distances:
+            used = json.loads(CONSTANTS.read_text())["covariance"]["scale"]
+            scale = used * float(np.quantile(distances, 0.9)) / float(chi2.ppf(0.9, 6))
+            constants["covariance"] = {"scale": round(scale, 3)}
+    for name, kind in (("refinement", "refined"), ("tracking", "sequences"), ("presence", "detected")):
+        constants[name], quality[name] = fit_logistic(rows_of(work, kind, jobs, limit))
     return constants, quality
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("benchmark", type=Path)
-    parser.add_argument("--rows", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--meshes", type=Path, required=True, help="folder of scripts/benchmark/meshes.py")
+    parser.add_argument("--count", type=int, default=400, help="photographs of each set")
+    parser.add_argument("--limit", type=int, help="photographs to measure, fewer than there are")
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--registered", action="store_true", help="register no further photographs")
-    parser.add_argument("--real", type=Path, nargs=2, metavar=("DATA", "RUNS"))
-    arguments = parser.parse_args()
-    rows: list[Row] = []
-    for part, (wrong, limit) in PARTS.items():
-        path = arguments.rows / f"{part}.jsonl"
-        if arguments.registered:
-            rows += map(json.loads, path.read_text(encoding="utf-8").splitlines())
-            continue
-        rows += register_benchmark(arguments.benchmark, path, wrong=wrong, limit=limit, jobs=arguments.jobs)
-    rows = [row for row in rows if "errors" in row]
-    constants, held_out = calibrate(rows)
-    registered = ", ".join(sorted({row["commit"] for row in rows}))
-    record = {"date": today(), "commit": commit(), "registered": registered, "n": len(rows), **constants, **held_out}
-    write_json(CONSTANTS, constants)
-    record |= {"shares": success_rates(rows), "exactness": exactness(rows)}
-    record |= {"verdict": {"used": list(WEIGHTS), "fitted": fit_rescoring(rows)}}
-    if arguments.real:
-        record["real"] = {name: real_set(*arguments.real, name, constants["covariance"]) for name in REAL_SETS}
-        summaries = {name: (arguments.real[1] / name / "summary.json").read_text() for name in REAL_SETS}
-        record["real_answer_sets"] = {name: json.loads(text)["answer_set"] for name, text in summaries.items()}
-    write_json(RECORD, record)
-    update_page(PAGE, "calibration", page(record))
-    print(page(record))
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    render_sets(options.work, options.meshes, options.count, options.jobs)
+    constants, quality = calibrate(options.work, options.jobs, options.limit)
+    record = {"date": today(), "commit": commit(), "constants": constants, "held out": quality}
+    print(json.dumps(record, indent=2))
+    if options.write:
+        write_json(CONSTANTS, constants)
+        write_json(RESULTS / "calibration.json", record)
 
 
 if __name__ == "__main__":

@@ -28,8 +28,8 @@ from curvireg_torch.geometry import crop_images
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.matching.fields import depth_filter
 from curvireg_torch.mesh import load_mesh
-from curvireg_torch.training.field_dataset import SETTINGS
-from curvireg_torch.training.scenes import GeneratedScenes
+from scripts.training.field_dataset import SETTINGS
+from scripts.training.generated import GeneratedScenes
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 SIZE = 192

@@ -22,8 +22,7 @@ from pathlib import Path
 
 from curvireg_torch.errors import CurviregError
 from curvireg_torch.evaluation import DATASETS, paper
-from curvireg_torch.pipeline import Pipeline
-from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.pipeline import BankSettings, Pipeline
 
 RANKINGS = ("precision", "angles", "ranks")
 TABLES = ("detectors", "repeatability", "curve", *RANKINGS)

@@ -87,6 +87,6 @@ def test_guesses_apply_to_rows_without_a_camera(folder, tmp_path, capsys):
     ],
 )
 def test_check_camera_refuses_unusable_values_before_reading(folder, refused, monkeypatch, words, message):
-    monkeypatch.setattr("curvireg_torch.io.read_photo", lambda *_, **__: pytest.fail("read"))
+    monkeypatch.setattr("curvireg_torch.data.read_photo", lambda *_, **__: pytest.fail("read"))
     files = [str(folder / "photos" / "0.png"), str(folder / "truck.safetensors")]
     refused(main(["register", *files, "--json", *words]), message)

@@ -16,11 +16,7 @@ from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregWarning, InvalidInputError
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.evaluation.registry import DatasetSpec
-from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.geometry import rotation_error
-from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline
-from curvireg_torch.pipeline import BankSettings, ViewPolicy
-from curvireg_torch.training import adapt
 from curvireg_torch.utils.threads import available_threads
 from tests._support.scenes import truck_bank
 
@@ -42,26 +38,6 @@ def test_bank_is_registered_to(folder, register_one, tmp_path, capsys):
 def test_bank_refuses_an_output_that_cannot_be_written(folder, refused):
     out = folder / "flat.png" / "bank.safetensors"
     refused(main(["bank", str(folder / "truck.ply"), "--quiet", "--out", str(out)]), "flat.png", "--out")
-
-
-def test_bank_adapts_a_field_for_register(folder, register_one, document, tmp_path, monkeypatch, capsys):
-    calls = []
-
-    def quick(mesh, *, upright, workers, progress):
-        calls.append((upright, workers))
-        return adapt(mesh, scenes=16, upright=upright, progress=progress)
-
-    monkeypatch.setattr("curvireg_torch.training.adapt", quick)
-    small = Pipeline(views=ViewPolicy(azimuth_step=90, elevations=(20,)), bank=BankSettings(image_size=64))
-    monkeypatch.setitem(PRESETS, DEFAULT, small)
-    out, field = tmp_path / "bank.safetensors", tmp_path / "field.safetensors"
-    words = ["bank", str(folder / "truck.ply"), "--pose", "upright", "--out", str(out), "--adapt", str(field)]
-    assert main([*words, "--quiet"]) == 0
-    assert calls == [(1.0, 1)]
-    assert "adapted field" in capsys.readouterr().out
-    assert register_one("--field", field, "--no-refine", mesh=out) == 0
-    weights = small.with_field(LearnedCurvilinearSaliency(weights=field)).weights
-    assert document()["pipeline"]["weights"] == weights != small.weights
 
 
 def test_cache_lists_and_clears_banks(folder, capsys, tmp_path, monkeypatch):

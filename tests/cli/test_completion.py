@@ -17,7 +17,6 @@ COMPLETIONS = [
     ("curvireg register a.jpg --no-re", {"--no-refine"}),
     ("curvireg evaluate bop data --preset f", {"fast"}),
     ("curvireg evaluate bop data --spl", {"--split"}),
-    ("curvireg bank --ad", {"--adapt"}),
     ("curvireg bank pa", {"part.stl"}),
     ("curvireg register --field we", {"weights"}),
     ("curvireg completion ", {"bash", "zsh", "fish"}),

@@ -294,7 +294,7 @@ LIMITED = [
     ("side", "top", "side"),
     ("within", "10", "within: expected near"),
     ("near", "1 2 3 4", "near: expected AZIMUTH"),
-    ("softness", "1 2", "softness: expected one number"),
+    ("within", "1 2", "within: expected one number"),
     ("front", "z", "front: expected another axis"),
 ]
 
@@ -302,7 +302,7 @@ LIMITED = [
 @pytest.mark.parametrize("as_json", [False, True])
 def test_list_has_limits_of_each_row(register_list, folder, register, tmp_path, as_json):
     """An empty cell leaves the option of the command line; a wrong one fails its row."""
-    names = ["azimuth", "elevation", "side", "near", "within", "distance", "softness", "front"]
+    names = ["azimuth", "elevation", "side", "near", "within", "distance", "front"]
     rows = [[cell if name == column else "" for name in names] for column, cell, _ in LIMITED]
     words = ["--elevation", "-10", "80", "--no-refine"]
     if as_json:

@@ -16,9 +16,8 @@ from curvireg_torch.cli.report import print_result
 from curvireg_torch.errors import BankError
 from curvireg_torch.evaluation import evaluate
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
-from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline, preset_named
+from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline, ViewPolicy, preset_named
 from curvireg_torch.registration import registrar
-from curvireg_torch.pipeline import ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of
@@ -125,7 +124,7 @@ def broken_files(folder):
         ({}, ["--near", "10"], ["near: expected AZIMUTH ELEVATION"]),
         ({}, ["--within", "10"], ["within: expected near"]),
         ({}, ["--side", "left", "--azimuth", "0", "10"], ["side: give it or azimuth"]),
-        ({}, ["--front", "x", "--softness", "5"], ["limit nothing"]),
+        ({}, ["--front", "x"], ["limits nothing"]),
         ({}, ["--distance", "1", "2"], ["--distance: needs a camera"]),
         ({"box": ()}, ["--start", "none.json", "--side", "front"], ["--start: refines"]),
         ({}, ["--elevation", "50", "10"], ["elevation: expected"]),

@@ -65,4 +65,3 @@ def test_bop_visibility():
     dataset = BOPDataset(real_data("bop/hope"))
     fractions = Counter(dataset.annotation(i)["visib_fract"] for i in range(len(dataset)))
     assert fractions == {1.0: 45, 0.7: 20, 0.4: 15}
-    assert len(BOPDataset(dataset.root, min_visib=0.5)) == 65

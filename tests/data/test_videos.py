@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from curvireg_torch.data import Video
-from curvireg_torch.errors import ImageError
+from curvireg_torch.errors import ImageError, InvalidInputError
 
 
 @pytest.fixture(scope="module")
@@ -36,12 +36,38 @@ def test_video_skips_frames(five):
     frames = dict(Video(five, every=2))
     assert list(frames) == [0, 2, 4]
     assert abs(float(frames[4][0].float().mean()) - 160) < 4
+    with pytest.raises(InvalidInputError, match="every"):
+        Video(five, every=0)
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".webm", ".mov"])
+def test_video_reads_other_containers(tmp_path, suffix):
+    path, code = tmp_path / f"a{suffix}", "VP80" if suffix == ".webm" else "mp4v"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 25.0, (64, 48))
+    if not writer.isOpened():
+        pytest.skip(f"OpenCV writes no {suffix} here")
+    for _ in range(3):
+        writer.write(np.zeros((48, 64, 3), np.uint8))
+    writer.release()
+    assert len(list(Video(path))) == 3
+
+
+@pytest.mark.parametrize(
+    "text", ["ffconcat version 1.0\nfile {}\n", "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\n{}\n#EXT-X-ENDLIST\n"]
+)
+def test_video_refuses_playlists(five, text):
+    playlist = five.with_name("list.mp4")
+    playlist.write_text(text.format(five.name))
+    with pytest.raises(ImageError, match="not a video"):
+        Video(playlist)
 
 
 def test_video_refuses_other_files_and_too_many_pixels(five, tmp_path, monkeypatch):
-    (tmp_path / "no.mp4").write_bytes(b"not a video")
+    (tmp_path / "no.mp4").write_bytes(b"\0\0\0\x20ftypisom" + bytes(500))
     with pytest.raises(ImageError, match=r"no\.mp4: not a video"):
         Video(tmp_path / "no.mp4")
+    with pytest.raises(ImageError, match="cannot be read"):
+        Video(tmp_path / "nothing.mp4")
     monkeypatch.setattr("curvireg_torch.data.videos.MAX_IMAGE_PIXELS", 64 * 48 - 1)
     with pytest.raises(ImageError, match="not a video"):
         Video(five)

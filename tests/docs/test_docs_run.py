@@ -35,10 +35,10 @@ from .._support.pages import DOCS, PAGES, ROOT, python_blocks, split_command, st
 SKIPPED = {
     r"git |(\S*/)?pip |apt-get |python datasets/download|python -m zipfile|python scripts/benchmark/meshes": "download",
     r"(\S*/)?curvireg view": "browser",  # tests/viewer/test_browser.py opens it
-    r"scripts/test\.sh|python -m (coverage|mutmut)|python scripts/robustness/(fuzz|soak)\.py": "test suite",
+    r"scripts/test\.sh|python -m (coverage|mutmut)|python scripts/robustness/wrong_inputs\.py": "test suite",
     r"python scripts/results_table|python scripts/paper/figures\.py detectors$": "writes into the project",
     r".*[ /=$][A-Z]+([ ./]|$)": "placeholder",
-    r"curvireg bank .*--adapt|curvireg register .*--field": "3000 photographs",  # tests/cli/test_register.py uses fewer
+    r"curvireg register .*--field": "needs trained weights",
     r"python scripts/(?!paper/)": "long measurement",
 }
 """Commands that are not run here, and the reason."""

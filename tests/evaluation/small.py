@@ -9,8 +9,7 @@ import sys
 from pathlib import Path
 
 from curvireg_torch.cli import main
-from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline
-from curvireg_torch.pipeline import BankSettings, ViewPolicy
+from curvireg_torch.pipeline import DEFAULT, PRESETS, BankSettings, Pipeline, ViewPolicy
 
 SMALL = Pipeline(
     views=ViewPolicy(directions=18, theta_step=360.0, azimuth_step=60.0, elevations=(10.0,)),

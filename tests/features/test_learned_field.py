@@ -1,6 +1,7 @@
 """The learned field: the layer contract, its weights, and its output on a simple image."""
 
 import math
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -141,3 +142,11 @@ def test_field_network_normalises_images_to_plus_minus_2():
     network.down[0].register_forward_pre_hook(lambda _module, arguments: inputs.append(arguments[0]))
     network(torch.linspace(0, 1, 3 * 32 * 32).view(1, 3, 32, 32))
     assert torch.allclose(inputs[0], torch.linspace(-2, 2, 3 * 32 * 32).view(1, 3, 32, 32), atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(2, 600), (600, 2), (1, 1), (1, 5000)])
+def test_learned_field_does_not_enlarge_slivers(shape: tuple[int, int]) -> None:
+    field = LearnedCurvilinearSaliency()
+    field.network.forward = Mock(side_effect=lambda x: x.new_zeros(len(x), 3, x.shape[2] // 2, x.shape[3] // 2))
+    assert field(torch.rand(1, 3, *shape)).shape == (1, 2, *shape)
+    assert field.network.forward.call_args.args[0][0, 0].numel() <= 8 * 128 * 128

@@ -48,18 +48,6 @@ def test_opengl_projection_maps_near_and_far_planes() -> None:
             assert float(clip[2] / clip[3]) == pytest.approx(expected)
 
 
-def test_pytorch3d_screen_coordinates_agree_with_project_points() -> None:
-    # The formulas of PyTorch3D's documentation: x_view = x R + T; screen = principal point - focal x / z, where +x is
-    # left, +y is up and the first pixel covers [0, 1].
-    T, X = poses(), points()
-    R, t = g.pytorch3d_from_opencv(T)
-    view = X @ R + t[:, None]
-    focal, principal = K.diagonal()[:2], K[:2, 2] + 0.5
-    pixels = principal - focal * view[..., :2] / view[..., 2:] - 0.5
-    torch.testing.assert_close(pixels, g.project_points(X, T, K), rtol=0, atol=1e-9)
-    torch.testing.assert_close(g.opencv_from_pytorch3d(R, t), T, rtol=0, atol=1e-15)
-
-
 def test_rotation_from_viewpoint_agrees_with_the_definition_of_pascal3d() -> None:
     # p = diag(f, f, -1) Rx(e - 90) Rz(-a) (X - C), rotated by theta; v = py - y.
     X, f, (px, py) = points().numpy(), 3000.0, (70.3, 51.8)
@@ -102,8 +90,7 @@ def test_conversions_keep_batch_shapes_and_refuse_invalid_input() -> None:
     assert g.opengl_projection(K.expand(2, 5, 3, 3), SIZE, near=1.0, far=2.0).shape == (2, 5, 4, 4)
     for call in (
         lambda: g.opengl_from_opencv(torch.eye(3)),
-        lambda: g.pytorch3d_from_opencv(torch.eye(4, dtype=torch.long)),
-        lambda: g.opencv_from_pytorch3d(R, torch.zeros(2, 3)),
+        lambda: g.opengl_from_opencv(torch.eye(4, dtype=torch.long)),
         lambda: g.quaternion_from_rotation(torch.zeros(4)),
         lambda: g.rotation_from_quaternion(torch.zeros(3)),
         lambda: g.rotation_from_axis_angle(torch.zeros(4)),
@@ -113,3 +100,60 @@ def test_conversions_keep_batch_shapes_and_refuse_invalid_input() -> None:
     ):
         with pytest.raises(InvalidInputError, match="expected"):
             call()
+
+
+AXIS, OFFSET = [1.0, 2.0, -2.0], [10.0, -4.0, 3.0]
+CONTINUOUS = {"symmetries_continuous": [{"axis": AXIS, "offset": OFFSET}]}
+HALF_TURN = [-1, 0, 0, 8, 0, -1, 0, 6, 0, 0, 1, 0, 0, 0, 0, 1]  # about the vertical line through (4, 3)
+
+
+def test_symmetry_transforms_reads_matrices_row_by_row() -> None:
+    assert torch.equal(g.symmetry_transforms({"diameter": 3.0}), torch.eye(4, dtype=torch.float64)[None])
+    transforms = g.symmetry_transforms({"symmetries_discrete": [HALF_TURN]})
+    assert transforms.shape == (2, 4, 4)
+    np.testing.assert_array_equal(transforms[1], np.reshape(HALF_TURN, (4, 4)))
+    np.testing.assert_allclose(transforms[1] @ torch.tensor([4.0, 3.0, 7.0, 1.0]).double(), [4.0, 3.0, 7.0, 1.0])
+
+
+def test_symmetry_transforms_agrees_with_scipy_and_fixes_the_axis() -> None:
+    transforms = g.symmetry_transforms(CONTINUOUS, max_step_fraction=0.1).numpy()
+    assert len(transforms) == 32  # ceil(pi / 0.1)
+    unit = np.array(AXIS) / 3.0
+    for i, T in enumerate(transforms):
+        np.testing.assert_allclose(T[:3, :3], Rotation.from_rotvec(unit * i * 2 * np.pi / 32).as_matrix(), atol=1e-12)
+        for along in (-5.0, 0.0, 2.0):
+            point = np.array(OFFSET) + along * unit
+            np.testing.assert_allclose(T[:3, :3] @ point + T[:3, 3], point, atol=1e-12)
+
+
+def test_symmetry_transforms_bounds_the_step_of_a_vertex() -> None:
+    transforms = g.symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]})
+    vertex = transforms[:, :3, 0] * 50.0  # of a disc of diameter 100
+    steps = torch.linalg.vector_norm(vertex - vertex.roll(1, 0), dim=1)
+    assert float(steps.max()) <= 1.0
+    assert float(steps.min()) > 0.99  # and no finer than needed
+
+
+def test_symmetry_transforms_applies_discrete_symmetries_first() -> None:
+    info = {"symmetries_discrete": [HALF_TURN], **CONTINUOUS}
+    both = g.symmetry_transforms(info, max_step_fraction=0.5)
+    rotations = g.symmetry_transforms(CONTINUOUS, max_step_fraction=0.5).numpy()
+    assert len(both) == 2 * len(rotations) == 14
+    flip = np.reshape(HALF_TURN, (4, 4))
+    products = [R @ s for R in rotations for s in (np.eye(4), flip)]
+    np.testing.assert_allclose(both, products, atol=1e-12)
+    assert torch.equal(both[0], torch.eye(4, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("info", "step", "match"),
+    [
+        ({"symmetries_discrete": [[1.0] * 12]}, 0.1, "expected 16"),
+        ({"symmetries_continuous": [{"axis": [0, 0, 0], "offset": [0, 0, 0]}]}, 0.1, "length > 0"),
+        ({"symmetries_continuous": [{"axis": [0, 1], "offset": [0, 0, 0]}]}, 0.1, "axis: expected 3"),
+        *[({}, step, "max_step_fraction") for step in (0.0, 1.5, -0.1)],
+    ],
+)
+def test_symmetry_transforms_refuses_malformed_input(info: dict[str, object], step: float, match: str) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        g.symmetry_transforms(info, max_step_fraction=step)

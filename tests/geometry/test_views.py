@@ -1,15 +1,14 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import ViewSphere, paper_views, rotation_error, sample_views, uniform_views
-from curvireg_torch.geometry.symmetry import symmetry_transforms, views_without_symmetric
-
-AXIS = {"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]}
-HALF_TURN = {"symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}
+from curvireg_torch.geometry import ViewSphere, rotation_error, sample_views, uniform_views, up_rotation
+from curvireg_torch.utils.choices import UP_AXES
 
 
 def directions(views: ViewSphere) -> torch.Tensor:
@@ -33,62 +32,6 @@ def test_uniform_views_covers_rotations_with_thetas() -> None:
     assert float(error.max()) <= 157 / math.sqrt(200) + 10.0
 
 
-def test_paper_views_is_the_grid_of_the_paper() -> None:
-    views = paper_views()
-    assert len(views) == 756
-    assert sorted({round(float(d), 4) for d in views.distance}) == pytest.approx([1.5, 3.0, 4.5, 6.0, 7.5, 9.0])
-    one_shell = views[views.distance == views.distance[0]]
-    assert len(one_shell) == 126
-    R = one_shell.rotations.double()
-    assert float((rotation_error(R[:, None], R) + 9.0 * torch.eye(126)).min()) > 3.0  # no view twice
-    # Neighbours in elevation differ by 50 degrees about the camera's x axis.
-    grid = one_shell.rotations.view(7, 18, 3, 3)
-    assert torch.allclose(rotation_error(grid[1:], grid[:-1]), torch.tensor(50.0), atol=1e-3)
-    step = grid[1:] @ grid[:-1].mT
-    assert torch.allclose(step[..., 0, 0], torch.tensor(1.0), atol=1e-5)
-    with pytest.raises(InvalidInputError, match="object_radius"):
-        paper_views(object_radius=0.3)
-
-
-def test_within_selects_a_range() -> None:
-    views = sample_views(azimuth_step=10, elevations=[-20, 0, 20], thetas=[-10, 0, 10])
-    car = views.within(azimuth=(350, 10), elevation=(0, 20), theta=(0, 10))
-    assert len(car) == 3 * 2 * 2
-    assert sorted(set(car.azimuth.tolist())) == [0.0, 10.0, 350.0]
-    assert len(views.within()) == len(views)
-    assert len(views.within(azimuth=(-10, 10))) == 3 * 3 * 3
-    assert len(uniform_views(40, thetas=[350]).within(theta=(-20, 0))) == 40  # 350 is -10
-    assert len(views.within(azimuth=(20, 320))) == 31 * 9  # more than half a circle, and less than a whole
-    assert len(views.within(azimuth=(0, 359), theta=(-180, 170))) == len(views)
-    poles = sample_views(azimuth_step=180, elevations=[-90, 90], thetas=[-180, 170])
-    assert len(poles.within()) == len(poles)
-    with pytest.raises(InvalidInputError, match="none of 324 views"):
-        views.within(elevation=(30, 40))
-
-
-@pytest.mark.parametrize(("info", "expected"), [({}, 72 * 3), (HALF_TURN, 36 * 3), (AXIS, 1 * 3)])
-def test_views_without_symmetric_drops_duplicates_of_a_grid(info: dict[str, object], expected: int) -> None:
-    views = sample_views(azimuth_step=5, elevations=[-30, 0, 30])
-    assert len(views_without_symmetric(views, symmetry_transforms(info))) == expected
-
-
-def test_views_without_symmetric_keeps_one_view_of_each_appearance() -> None:
-    views = uniform_views(150, thetas=range(0, 360, 30), distances=[3, 5])
-    symmetries = symmetry_transforms(HALF_TURN)
-    kept = views_without_symmetric(views, symmetries, tolerance=12.0)
-    assert 0.2 * len(views) < len(kept) < 0.6 * len(views)
-    for distance in (3, 5):
-        R = kept[kept.distance == distance].rotations.double()
-        seen = (R[:, None] @ symmetries[:, :3, :3]).flatten(0, 1)
-        all_views = views[views.distance == distance].rotations.double()
-        nearest = (all_views.flatten(1) @ seen.flatten(1).T).argmax(dim=1)
-        assert float(rotation_error(all_views, seen[nearest]).max()) <= 12.01
-    # No two remaining views are duplicates.
-    R = kept[kept.distance == 3].rotations.double()
-    off = rotation_error(R[None], R[:, None] @ symmetries[1:, :3, :3]).fill_diagonal_(180.0)
-    assert float(off.min()) > 12.0
-
-
 def test_view_functions_refuse_invalid_options() -> None:
     one = torch.zeros(1)
     for call, match in (
@@ -98,17 +41,38 @@ def test_view_functions_refuse_invalid_options() -> None:
         (lambda: sample_views(elevations=[]), "elevations"),
         (lambda: sample_views(elevations=[91]), "elevations"),
         (lambda: uniform_views(0), "count"),
+        (lambda: uniform_views(2.5), "count: expected an integer"),
+        (lambda: uniform_views(5, distances="far"), "distances: expected numbers"),
+        (lambda: sample_views(elevations=["high"]), "elevations: expected numbers"),
+        (lambda: sample_views(azimuth_step="10"), "azimuth_step: expected a number"),
+        (lambda: cr.camera_matrix("1", 1, 1, 1), "fx: expected a number"),
+        (lambda: cr.crop_images(torch.rand(1, 1, 4, 4), [[0, 0, 3, 3]], size=8.0), "size: expected an integer"),
         (lambda: uniform_views(5, elevation_range=(10, -10)), "elevation_range"),
         (lambda: uniform_views(5, elevation_range=(-200, 90)), r"elevation_range: expected degrees in \[-90, 90\]"),
         (lambda: uniform_views(5, elevation_range=(-90, 90.1)), "elevation_range: expected degrees"),
         (lambda: uniform_views(5, elevation_range=(float("nan"), 90)), "elevation_range: expected degrees"),
         (lambda: sample_views(elevations=[float("nan")]), "elevations: expected degrees"),
         (lambda: uniform_views(5, thetas=[]), "thetas"),
-        (lambda: views_without_symmetric(uniform_views(5), torch.eye(4)), "symmetries"),
-        (lambda: views_without_symmetric(uniform_views(5), torch.eye(4)[None], tolerance=-1.0), "tolerance"),
         (lambda: sample_views(elevations=[-91]), "elevations"),
-        (lambda: uniform_views(5).in_model_frame(torch.eye(3)), "T_views_from_model"),
-        (lambda: uniform_views(5).in_model_frame(torch.diag(torch.tensor([1.0, 2, 1, 1]))), "rotation"),
     ):
         with pytest.raises(InvalidInputError, match=match):
             call()
+
+
+AXES = {s + a: (-1 if s else 1) * np.eye(3)[i] for i, a in enumerate("xyz") for s in ("", "-")}
+
+
+@pytest.mark.parametrize("up", UP_AXES)
+def test_up_rotation_takes_the_axis_to_z(up: str) -> None:
+    R = up_rotation(up).numpy()
+    assert np.linalg.det(R) == 1
+    assert np.array_equal(R @ R.T, np.eye(3))
+    assert np.array_equal(R @ AXES[up], [0, 0, 1])
+    assert (up_rotation("y").numpy() @ [0, 0, 1]).tolist() == [0, -1, 0], "from glTF's front to that of PASCAL3D+"
+
+
+@pytest.mark.parametrize("up", UP_AXES)
+def test_for_up_shows_the_same_views_of_a_rotated_object(up: str) -> None:
+    views = cr.sample_views(azimuth_step=40, elevations=[-20, 30, 90], thetas=[0, 25])
+    seen = views.for_up(up).rotations.double() @ up_rotation(up).T
+    torch.testing.assert_close(seen, views.rotations.double(), rtol=0, atol=2e-6)

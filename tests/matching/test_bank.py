@@ -15,11 +15,10 @@ from safetensors.torch import load_file, save_file
 from curvireg_torch.errors import BankError, InvalidInputError, MissingFileError
 from curvireg_torch.geometry import uniform_views
 from curvireg_torch.matching import ViewBank, ViewMatcher
-from curvireg_torch.pipeline import Pipeline
+from curvireg_torch.pipeline import BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
-from curvireg_torch.pipeline import BankSettings, ViewPolicy
 from curvireg_torch.terms import normalized_correlation
-from curvireg_torch.utils.digests import tensor_digest
+from curvireg_torch.utils.files import tensor_digest
 
 SETTINGS = BankSettings(image_size=64)
 UPRIGHT = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))

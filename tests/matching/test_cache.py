@@ -22,10 +22,8 @@ from curvireg_torch.matching import ViewBank, bank_key, cache, cache_folder, cac
 from curvireg_torch.matching.cache import clear_cache, trim_cache
 from curvireg_torch.mesh.colours import SurfaceColours
 from curvireg_torch.mesh.mesh import as_mesh
-from curvireg_torch.pipeline import Pipeline
+from curvireg_torch.pipeline import BankSettings, Pipeline
 from curvireg_torch.rendering import make_renderer
-from curvireg_torch.pipeline import BankSettings
-from curvireg_torch.utils import digests
 
 PIPELINE = Pipeline(bank=BankSettings(image_size=64))
 VIEWS = sample_views(azimuth_step=90, elevations=[20])
@@ -84,7 +82,7 @@ def test_bank_key_depends_on_everything(monkeypatch):
 
 
 def test_bank_key_depends_on_code_that_exists():
-    package = Path(digests.__file__).parents[1]
+    package = Path(cache.__file__).parents[1]
     assert not [part for part in cache._SOURCES if not (package / part).exists()]
 
 

@@ -8,10 +8,22 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+import torch
 
 from curvireg_torch.cli import main
-from curvireg_torch.errors import CurviregError, OutputError
-from curvireg_torch.utils.files import check_writable, write_csv, write_file
+from curvireg_torch.errors import CurviregError, InvalidInputError, MissingFileError, OutputError
+from curvireg_torch.evaluation.runner import POSE_SOURCES
+from curvireg_torch.matching import cache
+from curvireg_torch.utils import files
+from curvireg_torch.utils.files import (
+    check_writable,
+    code_digest,
+    finite_numbers,
+    read_json,
+    tensor_digest,
+    write_csv,
+    write_file,
+)
 
 OLD, NEW = b"a" * 1000, b"b" * 5_000_000
 
@@ -76,19 +88,11 @@ def test_check_writable_leaves_nothing_and_names_the_option(tmp_path: Path) -> N
         check_writable(tmp_path / "file", "--out")
 
 
-BANK = "bank {folder}/mesh.ply"
-COMMANDS = (
-    "demo --out {blocked}/out",
-    f"{BANK} --out {{blocked}}/a",
-    f"{BANK} --out {{folder}}/a.safetensors --adapt {{blocked}}/b",
-)
-
-
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", ["demo --out {blocked}/out", "bank {folder}/mesh.ply --out {blocked}/a"])
 def test_commands_check_the_output_folder_before_they_work(
     command: str, path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("matching.cached_bank", "io.meshes.load_mesh"):
+    for name in ("matching.cached_bank", "mesh.load_mesh"):
         monkeypatch.setattr(f"curvireg_torch.{name}", Mock(side_effect=AssertionError("work has started")))
     (path.parent / "mesh.ply").write_bytes(OLD)
     words = command.format(blocked=path, folder=path.parent).split()
@@ -134,3 +138,59 @@ def test_write_csv_leaves_nothing_to_a_spreadsheet_to_compute(tmp_path: Path) ->
     with (tmp_path / "t.csv").open(newline="") as file:
         (row,) = csv.reader(file)
     assert row == ["'=1+1", "'+cmd", "'-2+3", "'@sum", "'\tx", "-1.5", "+2e-3", "a=b", "", "-0.5"]
+
+
+@pytest.mark.parametrize("content", [b"[" * 2_000_000, b'{"0": ' + b"1" * 100_000 + b"}", b"\xff", b"[1]"])
+def test_read_json_refuses_malicious_files(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.json").write_bytes(content)
+    with pytest.raises(InvalidInputError, match=r"a\.json: .*README shows the layout") as caught:
+        read_json(tmp_path / "a.json", dict, "README")
+    assert len(str(caught.value).splitlines()) == 1
+    assert len(str(caught.value)) < 1000
+
+
+def test_check_table_size_bounds_tables(tmp_path: Path) -> None:
+    for size in (1 << 25, (1 << 25) + 1):
+        with open(tmp_path / "a.json", "wb") as file:
+            file.truncate(size)  # a sparse file
+        with pytest.raises(InvalidInputError, match="damaged" if size == 1 << 25 else "larger than 33,554,432 bytes"):
+            read_json(tmp_path / "a.json", dict, "README")
+    with pytest.raises(MissingFileError, match="no such file; README"):
+        read_json(tmp_path / "none.json", dict, "README")
+
+
+def test_finite_numbers_accepts_finite_numbers_only() -> None:
+    assert finite_numbers([1, 2.5], 2) == (1.0, 2.5)
+    for values in ([1], [1, True], [1, "2"], [1, float("nan")], [1, 10**400], "12", {"a": 1, "b": 2}, None):
+        assert finite_numbers(values, 2) is None
+
+
+def test_tensor_digest_depends_on_name_dtype_shape_and_values() -> None:
+    x = torch.arange(4.0)
+    others = [{"b": x}, {"a": x.double()}, {"a": x.view(2, 2)}, {"a": x + 1e-6}, {"a": x, "b": x}, {"a": x.bfloat16()}]
+    found = {tensor_digest(tensors) for tensors in ({"a": x}, *others)}
+    assert len(found) == 1 + len(others)
+    strided = torch.stack([x, x], dim=1)[:, 0].requires_grad_()
+    assert tensor_digest({"a": strided}) == tensor_digest({"a": x})
+    assert len(tensor_digest({"a": torch.tensor(True)}, size=16)) == 32
+
+
+def test_code_digest_changes_with_any_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "_PACKAGE", tmp_path)
+    (tmp_path / "room" / "deep").mkdir(parents=True)
+    sources = [tmp_path / "room" / "a.py", tmp_path / "room" / "deep" / "b.py", tmp_path / "c.py"]
+    seen = set()
+    for i, source in enumerate([*sources, *sources]):
+        source.write_text(f"x = {i}")
+        code_digest.cache_clear()
+        if i >= 2:
+            seen.add(code_digest("room", "c.py"))
+    assert len(seen) == 4
+    with pytest.raises(FileNotFoundError):
+        code_digest("no_such_room")
+    code_digest.cache_clear()
+
+
+@pytest.mark.parametrize("sources", [cache._SOURCES, POSE_SOURCES])
+def test_code_digest_finds_all_sources_of_banks_and_results(sources: tuple[str, ...]) -> None:
+    assert len(code_digest(*sources)) == 16

@@ -16,8 +16,7 @@ from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.options import register_options
 from curvireg_torch.errors import BankError, CurviregError, CurviregWarning, ImageError, InvalidInputError, MeshError
 from curvireg_torch.geometry import rotation_error
-from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.pipeline import BankSettings, ViewPolicy
+from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer.session import Session
 from tests._support.exif import exif, with_exif

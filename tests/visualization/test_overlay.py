@@ -10,8 +10,8 @@ from scipy.ndimage import binary_erosion, distance_transform_edt
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.rendering import make_renderer, render_depth
 from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.rendering import make_renderer, render_depth
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from curvireg_torch.visualization import contour_overlay
 from tests._support.scenes import CAMERA, SIZE, scene, truck_bank, unrefined

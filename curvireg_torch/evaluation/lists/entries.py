@@ -10,7 +10,7 @@ from typing import Any
 from ...errors import InvalidInputError
 from ...geometry import camera_matrix
 from ...geometry.pose_prior import PosePrior
-from ...utils.digests import text_digest
+from ...utils.files import text_digest
 from ..prior_options import PRIOR_OPTIONS, limits_from_cells, prior_from_limits
 from .tables import BEST_MESH, RESULT_COLUMNS
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from ...data.bop import bop_box, entry_at
 from ...errors import InvalidInputError, MissingFileError
-from ...utils.json_files import check_table_size, finite_numbers, read_json
+from ...utils.files import check_table_size, finite_numbers, read_json
 from ..store import Row
 from .entries import BOX, CAMERA, PhotoList, photo_list
 

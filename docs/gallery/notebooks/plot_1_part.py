@@ -11,14 +11,14 @@ import matplotlib.pyplot as plt
 import torch
 
 import curvireg_torch as cr
-from curvireg_torch.synthetic import example_mesh, photograph_tabletop, random_pose
+from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from curvireg_torch.visualization import contour_overlay
 
 mesh, size = example_mesh(), (360, 480)
 K = cr.camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
 generator = torch.Generator().manual_seed(2)
 truth = random_pose(mesh, K, size, generator, elevations=(12.0, 45.0), fill=(0.75, 0.95))
-photograph, box = photograph_tabletop(example_mesh(painted=True), truth, K, size, generator)
+photograph, box = synthesize_photograph(example_mesh(painted=True), truth, K, size, generator)
 
 # %%
 # Register it

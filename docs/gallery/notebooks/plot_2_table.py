@@ -15,7 +15,7 @@ import torch
 
 import curvireg_torch as cr
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.synthetic import example_mesh, photograph_tabletop, random_pose
+from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
 folder = Path(tempfile.mkdtemp())
 mesh, size = example_mesh(), (180, 240)
@@ -24,7 +24,7 @@ boxes, true_azimuths = [], []
 for seed in range(6):
     generator = torch.Generator().manual_seed(seed)
     truth = random_pose(mesh, K, size, generator, elevations=(12.0, 45.0), fill=(0.75, 0.95))
-    photograph, box = photograph_tabletop(example_mesh(painted=True), truth, K, size, generator)
+    photograph, box = synthesize_photograph(example_mesh(painted=True), truth, K, size, generator)
     plt.imsave(folder / f"{seed}.png", photograph.permute(1, 2, 0).numpy())
     boxes.append(box.tolist())
     true_azimuths.append(float(cr.viewpoint_from_rotation(truth[:3, :3])[0]))

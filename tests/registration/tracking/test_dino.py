@@ -2,12 +2,12 @@
 
 import pytest
 import torch
+from scripts.speed.follow import LARGEST_GAP, chains
 
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset, read_image
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.registration import Follower
-from scripts.speed.follow import LARGEST_GAP, chains
 from tests._support.real_data import real_data
 
 pytestmark = pytest.mark.data

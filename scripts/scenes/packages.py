@@ -1,0 +1,78 @@
+"""Printed packages: cans, bottles and boxes whose labels alone tell their sides apart."""
+
+import cv2
+import numpy as np
+import trimesh
+
+from scripts.scenes.materials import random_colour, random_picture
+from scripts.scenes.surfaces import Rng
+from scripts.scenes.textured import Texture, TexturedMesh
+
+WIDTH, HEIGHT = 512, 256
+"""Size of a label in px."""
+
+SIDES, FONTS = 72, (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX)
+LETTERS = "ABCDEFGHIKLMNOPRSTUVZ"
+
+
+def label(rng: Rng) -> np.ndarray:
+    """(HEIGHT, WIDTH, 3) uint8: bands, a picture, words and small print on one colour."""
+    picture = np.full((HEIGHT, WIDTH, 3), 255 * random_colour(rng), np.float32)
+    for _ in range(rng.integers(0, 4)):
+        top = int(rng.integers(HEIGHT))
+        picture[top : top + int(rng.integers(5, 60))] = 255 * random_colour(rng)
+    for _ in range(rng.integers(2, 5)):
+        side = int(rng.integers(50, 150))
+        x, y = int(rng.integers(WIDTH - side)), int(rng.integers(HEIGHT - side))
+        picture[y : y + side, x : x + side] = 255 * random_picture(rng, side)
+    picture = picture.clip(0, 255).round().astype(np.uint8)
+    for _ in range(rng.integers(5, 16)):
+        word = "".join(rng.choice(list(LETTERS), rng.integers(2, 9)))
+        scale, place = float(rng.uniform(0.4, 2.5)), (int(rng.integers(WIDTH)), int(rng.integers(20, HEIGHT)))
+        colour, font = tuple((255 * random_colour(rng)).tolist()), FONTS[rng.integers(len(FONTS))]
+        cv2.putText(picture, word, place, font, scale, colour, 1 + int(1.5 * scale), cv2.LINE_AA)
+    return picture
+
+
+def solid_of_revolution(rng: Rng) -> tuple[np.ndarray, ...]:
+    """Vertices, faces and texture coordinates of a can, or of a bottle with shoulder and neck, of height 1."""
+    radius = rng.uniform(0.18, 0.5)
+    if rng.random() < 0.5:
+        profile = [(0.0, 0.0), (radius, 0.0), (radius, 1.0), (0.0, 1.0)]
+    else:
+        shoulder, neck = rng.uniform(0.5, 0.75), radius * rng.uniform(0.25, 0.5)
+        waist = (radius * rng.uniform(0.8, 1.0), 0.5 * shoulder)
+        profile = [(0.0, 0.0), (radius, 0.0), waist, (radius, shoulder), (neck, 0.85), (neck, 1.0), (0.0, 1.0)]
+    r, z = np.array(profile).T
+    v = np.concatenate([[0.0], np.hypot(np.diff(r), np.diff(z)).cumsum()])
+    angle = np.linspace(0.0, 2.0 * np.pi, SIDES + 1)
+    ring = np.stack([np.sin(angle), -np.cos(angle)], axis=1)
+    points = [np.c_[radius_ * ring, np.full(SIDES + 1, height)] for radius_, height in profile]
+    uv = [np.c_[angle / (2.0 * np.pi), np.full(SIDES + 1, height)] for height in v / v[-1]]
+    k = np.arange(SIDES)
+    faces = []
+    for below in range(len(profile) - 1):
+        a = below * (SIDES + 1) + k
+        b = a + SIDES + 1
+        faces += [np.c_[a, a + 1, b + 1], np.c_[a, b + 1, b]]
+    return np.concatenate(points), np.concatenate(faces), np.concatenate(uv)
+
+
+def carton(rng: Rng) -> tuple[np.ndarray, ...]:
+    """Vertices, faces and texture coordinates of a box of height 1, with another part of the label on each side."""
+    solid = trimesh.creation.box((rng.uniform(0.3, 0.9), rng.uniform(0.15, 0.6), 1.0))
+    corners = solid.triangles.reshape(6, 6, 3)  # two triangles a side
+    uv = np.zeros((6, 6, 2))
+    for k, side in enumerate(corners):
+        flat = np.argsort(np.ptp(side, axis=0))[1:]
+        flat.sort()
+        inside = (side[:, flat] - side[:, flat].min(axis=0)) / np.ptp(side[:, flat], axis=0)
+        uv[k] = (np.array([k % 3, k // 3]) + inside) / (3.0, 2.0)
+    return corners.reshape(-1, 3), np.arange(36).reshape(-1, 3), uv.reshape(-1, 2)
+
+
+def package(rng: Rng) -> TexturedMesh:
+    """A printed package, 8 to 25 cm high, in metres."""
+    vertices, faces, uv = carton(rng) if rng.random() < 0.3 else solid_of_revolution(rng)
+    picture = (label(rng).astype(np.float32) / 255) ** 2.2
+    return TexturedMesh.from_arrays(vertices * rng.uniform(0.08, 0.25), faces, [Texture(picture, 0.3)], uv=uv)

@@ -1,0 +1,190 @@
+"""Time the steps from process start to pose, in this checkout and, in turn, in another one.
+
+    python scripts/speed/speed.py                                # this checkout alone
+    git worktree add ../before HEAD~20
+    python scripts/speed/speed.py --against ../before            # A B A B, with the ratio of each step
+
+Writes scripts/results/speed.json and, without --out, the table of docs/performance.md. Every measurement has a process
+of its own; each step counts with its least time and memory over the rounds. Ratios are fair on a busy machine, times
+only on an idle one.
+
+- cold, warm: ``curvireg register`` from process start to its files, without and with a cached bank
+- bank: ``ViewBank.build`` of all views
+- rank, search: one photograph without search and contour fit, and without the fit; one: the whole registration
+- many: each of many photographs in one call
+- follow: each frame of a video in which the photograph moves by 2 px
+"""
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+STEPS = ("cold", "warm", "bank", "rank", "search", "one", "many", "follow")
+FRAMES = 12
+CAMERA = (900.0, 900.0, 319.5, 239.5)
+"""fx, fy, cx, cy of a photograph of 640 x 480 px."""
+
+HERE = f"import sys; sys.path.append({str(Path(__file__).parent)!r}); from speed import measure, write_inputs"
+"""Import of this file in a process that imports another checkout's package."""
+
+
+def write_inputs(folder: str, faces: int) -> None:
+    """Write a dented sphere, a photograph of it and its box; runs in this checkout."""
+    import cv2
+    import numpy as np
+    import torch
+    import trimesh
+
+    from curvireg_torch.synthetic import random_pose, synthesize_photograph
+
+    rings = max(4, round((faces / 4) ** 0.5))
+    mesh = trimesh.creation.uv_sphere(count=(rings, 2 * rings))
+    waves = np.random.default_rng(0).normal(size=(3, 6)) * 3
+    bumps = np.sin(mesh.vertices @ waves).mean(axis=1)
+    mesh.vertices = mesh.vertices * (1 + 0.35 * bumps[:, None]) * [1.0, 0.7, 0.5]
+    mesh.export(Path(folder, "mesh.ply"))
+    generator, K, size = torch.Generator().manual_seed(0), camera(), (480, 640)
+    photograph, box = synthesize_photograph(mesh, random_pose(mesh, K, size, generator), K, size, generator)
+    pixels = (255 * photograph.permute(1, 2, 0).flip(2).numpy()).round().astype("uint8")
+    cv2.imwrite(str(Path(folder, "photo.png")), pixels)
+    Path(folder, "box.json").write_text(json.dumps(box.tolist()))
+
+
+def camera() -> Any:
+    """(3, 3) camera matrix."""
+    import torch
+
+    fx, fy, cx, cy = CAMERA
+    return torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def measure(step: str, folder: str, photographs: int) -> float:
+    """Seconds of a step in whichever checkout this process imports."""
+    from dataclasses import replace
+
+    import torch
+
+    import curvireg_torch as cr
+
+    mesh, photograph, K = cr.load_mesh(Path(folder, "mesh.ply")), str(Path(folder, "photo.png")), camera()
+    if step == "bank":
+        start = time.perf_counter()
+        cr.ViewBank.build(mesh, progress=False)
+        return time.perf_counter() - start
+    box = json.loads(Path(folder, "box.json").read_text())
+    changes = {"rank": {"search": False, "contours": False}, "search": {"contours": False}}.get(step, {})
+    registrar = cr.Registrar(mesh, pipeline=replace(cr.Pipeline(), **changes), progress=False)
+    if step == "follow":
+        from curvireg_torch.data import read_image
+        from curvireg_torch.registration import Follower
+
+        first, follower = read_image(photograph), Follower(registrar, K)
+        assert follower(first, box).ok
+        frames = [first.roll(2 * k, dims=-1) for k in range(1, FRAMES)]
+        start = time.perf_counter()
+        for frame in frames:
+            follower(frame)
+        return (time.perf_counter() - start) / len(frames)
+
+    def register(n: int) -> float:
+        start = time.perf_counter()
+        results = registrar([photograph] * n, torch.tensor([box] * n), K)
+        assert all(result.ok for result in results)
+        return (time.perf_counter() - start) / n
+
+    register(1)
+    return register(photographs) if step == "many" else min(register(1) for _ in range(3))
+
+
+def measured(step: str, checkout: Path, folder: Path, cache: Path, photographs: int) -> dict[str, float]:
+    """Seconds and MB of a step in a checkout."""
+    from scripts._shared import run_process
+
+    environment = {**os.environ, "PYTHONPATH": str(checkout), "CURVIREG_CACHE": str(cache)}
+    if step in ("cold", "warm"):
+        box = json.loads((folder / "box.json").read_text())
+        words = ["-m", "curvireg_torch", "register", "photo.png", "mesh.ply", "--out", "out", "--box", *map(str, box)]
+        words += ["--camera", *map(str, CAMERA)]
+        if step == "cold":
+            environment["CURVIREG_CACHE"] = tempfile.mkdtemp(dir=folder)
+        seconds, usage, _ = run_process(words, folder, environment)
+    else:
+        words = ["-c", f"{HERE}; print(measure({step!r}, {str(folder)!r}, {photographs}))"]
+        _, usage, output = run_process(words, folder, environment)
+        seconds = float(output.split()[-1])
+    return {"seconds": seconds, "megabytes": usage.ru_maxrss / 1024}
+
+
+def compare(checkouts: dict[str, Path], steps: Sequence[str], faces: int, photographs: int, rounds: int) -> Any:
+    """Least seconds and megabytes of each step in each checkout, measured in turn."""
+    from scripts._shared import run_process
+
+    found: dict[str, dict[str, Any]] = {name: {} for name in checkouts}
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        run_process(
+            ["-c", f"{HERE}; write_inputs({temporary!r}, {faces})"], folder, {**os.environ, "PYTHONPATH": str(ROOT)}
+        )
+        for name, checkout in checkouts.items():  # the first registration caches the bank
+            measured("one", checkout, folder, folder / name, photographs)
+        for step in tuple(steps) * rounds:
+            for name, checkout in checkouts.items():
+                new = measured(step, checkout, folder, folder / name, photographs)
+                old = found[name].get(step, new)
+                found[name][step] = {key: min(old[key], value) for key, value in new.items()}
+    return found
+
+
+def table(record: dict[str, Any]) -> str:
+    """Seconds and memory of each step in Markdown, with the ratio if there are two checkouts."""
+    from scripts._shared import table_lines
+
+    times = record["times"]
+    rows = [
+        ["step", *(f"{name} ({record['commits'][name]})" for name in times), *(["ratio"] if len(times) > 1 else [])]
+    ]
+    for step in next(iter(times.values())):
+        both = [found[step] for found in times.values()]
+        cells = [f"{each['seconds']:.2f} s, {each['megabytes']:.0f} MB" for each in both]
+        ratio = [f"{both[-1]['seconds'] / both[0]['seconds']:.2f}"] if len(both) > 1 else []
+        rows.append([f"`{step}`", *cells, *ratio])
+    many = f"{record['photographs']} photographs in `many`"
+    stamp = f"{record['faces']} faces, {many}; {record['processor']}, {record['date']}."
+    return "\n".join([*table_lines(rows), "", stamp, ""])
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    from scripts._shared import REPOSITORY, RESULTS, commit, processor, today, update_page, write_json
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout of this repository")
+    parser.add_argument("--steps", nargs="+", choices=STEPS, default=STEPS)
+    parser.add_argument("--faces", type=int, default=40_000)
+    parser.add_argument("--photographs", type=int, default=16)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--out", type=Path, help="another file than scripts/results/speed.json; no page is changed")
+    options = parser.parse_args(arguments)
+    checkouts = {"before": options.against.resolve()} if options.against else {}
+    checkouts["now"] = ROOT
+    record = {
+        "date": today(),
+        "commits": {name: commit(root) for name, root in checkouts.items()},
+        "processor": processor(),
+        "faces": options.faces,
+        "photographs": options.photographs,
+        "times": compare(checkouts, options.steps, options.faces, options.photographs, options.rounds),
+    }
+    write_json(options.out or RESULTS / "speed.json", record)
+    print(table(record))
+    if options.out is None:
+        update_page(REPOSITORY / "docs" / "performance.md", "speed", table(record))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,134 @@
+"""Generated scenes as a dataset: crops of procedural objects, with the depth of the object alone."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from curvireg_torch.geometry.cameras import rotation_towards
+from curvireg_torch.geometry.crops import crop_transforms, square_boxes
+from scripts.scenes.families import random_shape
+from scripts.scenes.materials import Material, random_texture
+from scripts.scenes.scene import simulate_camera, single
+from scripts.scenes.surfaces import Array, Rng
+from scripts.scenes.textured import Placed, TexturedMesh
+
+CLUTTER = 500
+"""Shapes that clutter is drawn from; each process builds them once."""
+
+MARGIN = 0.1  # around the object's box, as in BankSettings
+PHOTOGRAPH = (480, 640)  # the crop's scene is composed for a photograph of this size
+
+
+class GeneratedScenes(Dataset[dict[str, Tensor]]):
+    """Photograph-like crops of objects among clutter. Sample i depends only on ``seed`` and i.
+
+    Args:
+        length: number of samples.
+        seed: another seed gives other objects.
+        image_size: side of the crops in px.
+        upright: fraction of the objects that stand upright.
+        meshes: use these instead of procedural objects.
+
+    Items (a dict): ``image`` (3, S, S) float32 in [0, 1], ``depth`` (1, S, S) float32 in radii of the object, 0 =
+    background, ``visible`` (1, S, S) bool, ``rotation`` (3, 3) float32 of a camera that looks straight at the object,
+    ``distance`` () float32 in radii.
+    """
+
+    def __init__(
+        self,
+        length: int,
+        *,
+        seed: int = 0,
+        image_size: int = 128,
+        upright: float = 0.6,
+        meshes: Sequence[trimesh.Trimesh] = (),
+    ) -> None:
+        self._length, self._seed, self._size, self._upright, self._meshes = length, seed, image_size, upright, meshes
+
+    def __len__(self) -> int:
+        return self._length
+
+    def mesh(self, index: int) -> trimesh.Trimesh:
+        """The object of sample ``index``, of radius 1 around the origin."""
+        if self._meshes:
+            mesh = self._meshes[index % len(self._meshes)].copy()
+            mesh.apply_translation(-mesh.bounds.mean(axis=0))
+        else:
+            vertices, faces, _ = random_shape(np.random.default_rng((self._seed, index)))
+            mesh = trimesh.Trimesh(vertices, faces, process=False)
+        return mesh.apply_scale(1.0 / np.linalg.norm(0.5 * mesh.extents))
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        if not 0 <= index < self._length:
+            raise IndexError(index)
+        rng = np.random.default_rng((self._seed, index, 1))
+        if self._meshes:
+            mesh = self.mesh(index)
+            shape = TexturedMesh.from_arrays(mesh.vertices, mesh.faces, [Material(rng)])
+        else:
+            shape = _painted(np.random.default_rng((self._seed, index)), rng)
+        upright, occluded = bool(rng.random() < self._upright), bool(rng.random() < 0.3)
+        options = {"size": PHOTOGRAPH, "upright": upright, "occluded": occluded}
+        scene = single(shape, 1, _clutter, random_texture, rng, **options)
+        (R, t, _), target = scene.views[0], scene.shapes[0]
+        centre = R @ target.points(shape.centre) + t
+        straight = rotation_towards(torch.from_numpy(centre)).numpy().T
+        R, t = straight @ R, straight @ t
+        K, (x0, y0, x1, y1) = _crop_camera(target, R, t, rng, self._size)
+        picture = scene.render((R, t, K), (self._size, self._size))
+        if picture.seen.sum() < 0.1 * picture.whole.sum():  # hidden objects are of no use for training
+            picture = replace(scene, shapes=[target]).render((R, t, K), (self._size, self._size))
+        visible = np.zeros((self._size, self._size), bool)
+        visible[y0:y1, x0:x1] = picture.seen[0, y0:y1, x0:x1]
+        image = np.pad(
+            picture.linear[y0:y1, x0:x1], ((y0, self._size - y1), (x0, self._size - x1), (0, 0)), mode="edge"
+        )
+        return {
+            "image": torch.from_numpy(simulate_camera(image, rng)).permute(2, 0, 1).float() / 255.0,
+            "depth": torch.from_numpy(picture.depth)[None],
+            "visible": torch.from_numpy(visible)[None],
+            "rotation": torch.from_numpy(R @ target.rotation).float(),
+            "distance": torch.tensor(np.linalg.norm(centre), dtype=torch.float32),
+        }
+
+
+def _painted(rng: Rng, paint: Rng) -> TexturedMesh:
+    vertices, faces, materials = random_shape(rng)
+    plain = paint.uniform(0.2, 0.8)
+    paints = [Material(paint, plain=plain) for _ in range(materials.max() + 1)]
+    return TexturedMesh.from_arrays(vertices, faces, paints, paint=materials)
+
+
+def _clutter(rng: Rng) -> TexturedMesh:
+    return _numbered(int(rng.integers(CLUTTER)))
+
+
+@lru_cache(maxsize=CLUTTER)
+def _numbered(number: int) -> TexturedMesh:
+    rng = np.random.default_rng((0xC1077E12, number))
+    return _painted(rng, rng)
+
+
+def _crop_camera(target: Placed, R: Array, t: Array, rng: Rng, size: int) -> tuple[Array, tuple[int, int, int, int]]:
+    """Camera matrix of the crop around a jittered box, and the part of the crop that lies within the photograph."""
+    placed = target.hull @ R.T + t
+    flat = placed[:, :2] / np.maximum(placed[:, 2:], 0.1)
+    side = np.ptp(flat, axis=0)
+    box = np.concatenate([flat.min(axis=0), flat.max(axis=0)])
+    box += rng.normal(0, rng.choice([0.01, 0.05]), 4) * np.tile(side, 2)
+    border = np.array([-np.inf, -np.inf, np.inf, np.inf])
+    if rng.random() < 0.2:  # the photograph's border cuts the object
+        k = int(rng.integers(4))
+        box[k] += (0.5 - k // 2) * 2 * rng.uniform(0.1, 0.45) * side[k % 2]
+        border[k] = box[k]
+    A = crop_transforms(square_boxes(torch.from_numpy(box), MARGIN), size).numpy()
+    corners = np.where(np.isfinite(border), border, 0).reshape(2, 2) @ A[:2, :2] + A[:2, 2]
+    area = np.where(np.isfinite(border), np.round(corners.reshape(-1) + 0.5), np.array([0, 0, size, size]))
+    x0, y0, x1, y1 = np.clip(area, 0, size).astype(int).tolist()
+    return A, (x0, y0, x1, y1)

@@ -1,0 +1,176 @@
+"""Train the learned field on generated scenes, without photographs, annotations or pretrained weights.
+
+    python scripts/training/train_learned_field.py --out runs/field --minutes 90
+
+A batch consists of fresh scenes and of earlier ones, with new colours and mirrored. The losses are those of
+field_dataset.py; one of them is backpropagated through HOG. A second start with the same --out resumes.
+"""
+
+import argparse
+import json
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file
+from torch import Tensor
+from torch.utils.data import DataLoader
+from tqdm import tqdm
+
+from curvireg_torch.features import FieldNetwork, halved_angle
+from curvireg_torch.features.learned_field import save_weights
+from curvireg_torch.geometry import rotation_error, sample_views
+from curvireg_torch.matching import ViewDescriber
+from curvireg_torch.matching.fields import depth_filter, hog_layer
+from curvireg_torch.terms import normalized_correlation
+from curvireg_torch.utils.files import write_tensors
+from scripts.training.field_dataset import SETTINGS, FieldDataset, ReplayBuffer, augment, losses
+from scripts.training.generated import GeneratedScenes
+
+VALIDATION_SEED = 1_000_003
+
+
+class Validation:
+    """Held-out scenes of upright objects, each ranked against the views of its mesh."""
+
+    def __init__(self, count: int) -> None:
+        scenes = GeneratedScenes(count, seed=VALIDATION_SEED, upright=1.0)
+        views = sample_views()
+        self.images, self.depths, self.errors, self.banks = [], [], [], []
+        for i in tqdm(range(count), desc="validation banks", mininterval=10):
+            sample = scenes[i]
+            describe = ViewDescriber(scenes.mesh(i), SETTINGS)
+            bank = describe(views.rotations, torch.full((len(views),), 5.0))
+            self.images.append(sample["image"])
+            self.depths.append(sample["depth"])
+            self.errors.append(rotation_error(views.rotations.float(), sample["rotation"].expand(len(views), 3, 3)))
+            self.banks.append(bank.descriptors.half())
+
+    @torch.no_grad()
+    def __call__(self, field: torch.nn.Module) -> dict[str, float]:
+        descriptor = hog_layer(SETTINGS)
+        errors, cosines = [], []
+        for image, depth, error, bank in zip(self.images, self.depths, self.errors, self.banks, strict=True):
+            query = descriptor(field(image[None]))
+            errors.append(float(error[normalized_correlation(query, bank.float())[0].argmax()]))
+            target = descriptor(depth_filter(SETTINGS)(depth[None]))
+            cosines.append(float(normalized_correlation(query, target)))
+        e = np.array(errors)
+        return {
+            "accuracy_30": float((e < 30).mean()),
+            "accuracy_15": float((e < 15).mean()),
+            "median": float(np.median(e)),
+            "cosine": float(np.mean(cosines)),
+        }
+
+
+class _Field(torch.nn.Module):
+    def __init__(self, network: FieldNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Tensor) -> Tensor:
+        return F.interpolate(halved_angle(self.network(image)[:, :2]), scale_factor=2.0, mode="bilinear")
+
+
+def save_state(
+    path: Path, network: FieldNetwork, average: FieldNetwork, optimizer: torch.optim.Optimizer, **counts: float
+) -> None:
+    state = {f"network.{k}": v for k, v in network.state_dict().items()}
+    state |= {f"average.{k}": v for k, v in average.state_dict().items()}
+    for k, moments in optimizer.state_dict()["state"].items():
+        state |= {f"optimizer.{k}.{name}": value for name, value in moments.items()}
+    write_tensors(path, state, {k: str(v) for k, v in counts.items()})
+
+
+def load_state(path: Path, network: FieldNetwork, average: FieldNetwork, optimizer: torch.optim.Optimizer) -> None:
+    state = load_file(path)
+    for prefix, module in (("network.", network), ("average.", average)):
+        module.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+    moments: dict[int, dict[str, Tensor]] = {}
+    for k, v in state.items():
+        if k.startswith("optimizer."):
+            _, index, name = k.split(".")
+            moments.setdefault(int(index), {})[name] = v
+    optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder of checkpoints and log")
+    parser.add_argument("--minutes", type=float, default=90.0, help="training time, over all starts")
+    parser.add_argument("--batch", type=int, default=32, help="scenes in a step")
+    parser.add_argument("--fresh", type=int, default=8, help="fresh scenes among them")
+    parser.add_argument("--replay", type=int, default=15_000, help="scenes stored for reuse, 100 kB each")
+    parser.add_argument("--workers", type=int, default=1, help="processes that generate scenes")
+    parser.add_argument("--rate", type=float, default=3e-3, help="highest learning rate")
+    parser.add_argument("--validate", type=int, default=60, help="held-out scenes")
+    parser.add_argument("--every", type=float, default=10.0, help="minutes between validations")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+
+    torch.manual_seed(options.seed)
+    network, average = FieldNetwork(), FieldNetwork()
+    average.load_state_dict(network.state_dict())
+    average.eval().requires_grad_(False)
+    network.to(options.device, memory_format=torch.channels_last)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=options.rate, weight_decay=0.02)
+    spent, step, scenes = 0.0, 0, 0
+    checkpoint, log = options.out / "state.safetensors", options.out / "log.jsonl"
+    if checkpoint.exists():
+        load_state(checkpoint, network, average, optimizer)
+        last = json.loads(log.read_text().splitlines()[-1])
+        spent, step, scenes = last["minutes"], last["step"], last["scenes"]
+    validation = Validation(options.validate)
+    generated = GeneratedScenes(10**9, seed=options.seed)
+    fresh = range(scenes, len(generated))
+    workers = {"num_workers": options.workers, "multiprocessing_context": "spawn" if options.workers else None}
+    loader = iter(DataLoader(FieldDataset(generated), options.fresh, sampler=fresh, **workers))
+    replay = ReplayBuffer(options.replay)
+    generator = torch.Generator().manual_seed(options.seed + step)
+    totals: dict[str, float] = {}
+    start, earlier, validated, step_at_mark = time.monotonic(), spent, spent, step
+    while spent < options.minutes:
+        replay.add(next(loader))
+        scenes += options.fresh
+        batch = augment(replay.draw(options.fresh, options.batch, generator), generator)
+        batch = {name: values.to(options.device) for name, values in batch.items()}
+        rate = options.rate * min(1.0, (step + 1) / 200) * 0.5 * (1 + math.cos(math.pi * spent / options.minutes))
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        network.train()
+        with torch.autocast(torch.device(options.device).type, torch.bfloat16):
+            output = network(batch["image"].contiguous(memory_format=torch.channels_last))
+        parts = losses(output.float(), batch)
+        optimizer.zero_grad(set_to_none=True)
+        torch.stack(list(parts.values())).sum().backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
+        optimizer.step()
+        step += 1
+        keep = min(0.998, step / (step + 10))
+        for mean, now in zip(average.state_dict().values(), network.state_dict().values(), strict=True):
+            if mean.is_floating_point():
+                mean.lerp_(now.float().to(mean.device), 1 - keep)
+        for name, value in parts.items():
+            totals[name] = totals.get(name, 0.0) + float(value.detach())
+        spent = earlier + (time.monotonic() - start) / 60
+        if spent - validated > options.every or spent >= options.minutes:
+            entry = {"step": step, "minutes": round(spent, 2), "scenes": scenes}
+            entry |= {name: round(value / (step - step_at_mark), 4) for name, value in totals.items()}
+            entry |= {name: round(value, 4) for name, value in validation(_Field(average)).items()}
+            save_state(checkpoint, network, average, optimizer, **entry)
+            with log.open("a") as lines:
+                lines.write(json.dumps(entry) + "\n")
+            print(json.dumps(entry), flush=True)
+            totals, validated, step_at_mark = {}, spent, step
+    save_weights(average, options.out / "field.safetensors")
+    print(f"weights: {options.out / 'field.safetensors'}")
+
+
+if __name__ == "__main__":
+    main()
