@@ -41,7 +41,7 @@ ItemT = TypeVar("ItemT", bound=Item)
 
 POSE_SOURCES = (
     *("data", "filters", "geometry", "matching", "features", "mesh", "registration", "rendering", "terms"),
-    *("utils", "errors.py", "pipeline.py", "settings.py"),
+    *("utils", "errors.py", "pipeline.py"),
 )
 """Parts of the package that results depend on."""
 

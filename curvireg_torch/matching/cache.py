@@ -51,7 +51,7 @@ _SOURCES = (
     "mesh",
     "rendering",
     "terms",
-    "settings.py",
+    "pipeline.py",
     "matching/describe.py",
 )
 """Code that turns a mesh into described views: a bank that another version of it built is not found."""

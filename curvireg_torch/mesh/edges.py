@@ -8,8 +8,8 @@ import trimesh
 
 __all__ = ["MeshEdges"]
 
-MAX_FACES = 4000
-"""Faces to which larger meshes are simplified: at 256 px their contours move by less than a quarter of a pixel."""
+MAX_FACES = 8000
+"""Faces to which larger meshes are simplified: at 256 px their contours move by less than a fifth of a pixel."""
 
 WELD = 1e-6
 """Vertices nearer than this fraction of the mesh's longest side are one."""
