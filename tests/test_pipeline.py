@@ -10,7 +10,7 @@ from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.filters import MultiScaleFocusCurves
 from curvireg_torch.geometry import sample_views
-from curvireg_torch.matching.fields import depth_filter
+from curvireg_torch.matching.describe import depth_filter
 from curvireg_torch.pipeline import DEFAULT, DEPTH_FIELDS, FIELDS, PRESETS, BankSettings, ViewPolicy, preset_named
 from curvireg_torch.terms import TERMS, BoxShape, Correlation, Repeatability
 

@@ -36,7 +36,7 @@ def _register_scene(arguments: argparse.Namespace) -> None:
     from ..geometry import rotation_error
     from ..matching import cached_bank
     from ..registration import Registrar, Registration
-    from ..registration.document import result_document
+    from ..registration.result import result_document
     from ..synthetic import demo_scene
     from ..visualization.encoding import png
     from ..visualization.overlay import to_uint8

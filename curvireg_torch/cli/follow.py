@@ -37,7 +37,8 @@ def add_parser(commands: Any) -> None:
         parents=[common_options(), pipeline_options(), mesh_options()],
         help="follow an object through the frames of a video",
         description="Registers the first frame and tracks the object from frame to frame. Writes\n"
-        "DIR/results.csv: photo, status (ok, lost, failed), rotation row by row, translation in the\nmesh's unit, "
+        "DIR/results.csv: photo, status (ok: confidence of 0.5 or more; unsure, lost, failed),\nrotation row by row, "
+        "translation in the mesh's unit, "
         "confidence, edge support, and why there is no pose;\n"
         "DIR/overlay.mp4: contours of the pose and confidence on each frame;\n"
         "DIR/support.png: edge support and confidence over the frames.",
@@ -69,12 +70,12 @@ def run(arguments: argparse.Namespace) -> None:
     check_writable(out, "--out")
     with one_torch_thread():
         rows, seconds, video = _follow(options, out)
-    counts = {status: sum(row[1] == status for row in rows) for status in ("ok", "lost", "failed")}
-    summary = ", ".join(f"{count} {status}" for status, count in counts.items())
+    counts = {status: sum(row[1] == status for row in rows) for status in ("ok", "unsure", "lost", "failed")}
+    summary = ", ".join([f"{counts['ok']} of {len(rows)} believed", *(f"{counts[s]} {s}" for s in list(counts)[1:])])
     after_first = seconds[1:]  # the first frame is registered
     rate = f", {len(after_first) / sum(after_first):.1f} frames per second" if after_first else ""
     print(f"{len(rows)} frames: {summary}{rate}; see {out}/results.csv and {video}")
-    if not counts["ok"]:
+    if not counts["ok"] and not counts["unsure"]:
         reason = f"; the first: {rows[0][-1]}" if rows else ""
         message = f"no frame could be registered{reason}; give frames that can be read, and --box of the object"
         raise InvalidInputError(message, subject=arguments.frames)
@@ -142,13 +143,15 @@ def _frames(path: Path, meshes: Sequence[Path]) -> tuple[Iterator[tuple[str, "Te
 
 def _row(name: str, result: "Registration | FailedRegistration") -> list[Any]:
     from ..registration import FailedRegistration
+    from ..registration.following import BELIEVED_CONFIDENCE
 
     if isinstance(result, FailedRegistration):
         status = "lost" if isinstance(result.error, LostObjectError) else "failed"
         return [name, status, *[""] * 14, str(result.error)]
     assert result.translation is not None  # there is a camera matrix
     pose = [*result.rotation.flatten().tolist(), *result.translation.tolist()]
-    return [name, "ok", *pose, result.confidence, result.edge_support, ""]
+    believed = (result.confidence or 0.0) >= BELIEVED_CONFIDENCE
+    return [name, "ok" if believed else "unsure", *pose, result.confidence, result.edge_support, ""]
 
 
 def _write_tables(out: Path, rows: list[list[Any]]) -> None:

@@ -108,7 +108,7 @@ def _registration_figure(kind: str, options: "RegisterOptions") -> Any:
     from ..data import read_photo
     from ..evaluation.lists import register_entry
     from ..evaluation.opening import check_camera, open_registrar
-    from ..registration.document import used_box
+    from ..registration.result import used_box
     from ..utils.threads import one_torch_thread
     from ..visualization import plots
 

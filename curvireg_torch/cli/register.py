@@ -183,7 +183,7 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
     from ..evaluation.opening import open_registrar
     from ..evaluation.result_files import write_lost, write_result
     from ..evaluation.store import to_json
-    from ..registration.document import used_box
+    from ..registration.result import used_box
     from .report import print_result
 
     start = time.perf_counter()

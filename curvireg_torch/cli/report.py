@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..registration.document import corners, remarks
+from ..registration.result import RIVAL_FRACTION, corners, remarks
 
 __all__ = ["print_result"]
 
@@ -17,9 +17,10 @@ DOUBTFUL_PRESENCE = 0.5
 
 
 def print_result(document: Mapping[str, Any], out: Path) -> None:
-    """Print a :func:`~curvireg_torch.registration.document.result_document`; ``out`` is the folder of its files."""
+    """Print a :func:`~curvireg_torch.registration.result.result_document`; ``out`` is the folder of its files."""
     angles = ", ".join(f"{name} {value:.1f}" for name, value in document["viewpoint"].items())
-    print(f"viewpoint: {angles} degrees   score {document['score']:.3f}   confidence {document['confidence']:.2f}")
+    confidence = "not calibrated" if document["confidence"] is None else f"{document['confidence']:.2f}"
+    print(f"viewpoint: {angles} degrees   score {document['score']:.3f}   confidence {confidence}")
     if not document["reliable"]:
         print(f"no reliable match: take the pose as a guess; {_advice(document)}")
     print_alternatives(document)
@@ -44,16 +45,16 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
 
 
 def print_alternatives(document: Mapping[str, Any]) -> None:
-    """Print the other members of the answer set, if there are any."""
-    answers = document["answer_set"]
-    for member in answers["members"][1:]:
-        viewpoint = document["top"][member]["viewpoint"]
-        angles = ", ".join(f"{name} {value:.1f}" for name, value in viewpoint.items())
-        print(f"could also be: {angles} degrees   probability {answers['probabilities'][member]:.2f}")
-    if document["ambiguous"] is not None:
-        words = {"half turn": "differ by a half turn", "mirror": "are mirror images", "several": "differ"}
-        none = f"; none of them: {answers['none']:.2f}" if answers["holds_none"] else ""
-        print(f"the poses {words[document['ambiguous']]}{none}; a hint decides: --side, --azimuth or --near")
+    """Print rivals that are nearly as probable as the best pose, if there are any."""
+    if document["ambiguous"] is None:
+        return
+    for rival, probability in list(zip(document["top"], document["probabilities"], strict=False))[1:]:
+        if probability >= RIVAL_FRACTION * document["confidence"]:
+            angles = ", ".join(f"{name} {value:.1f}" for name, value in rival["viewpoint"].items())
+            print(f"could also be: {angles} degrees   probability {probability:.2f}")
+    words = {"half turn": "differ by a half turn", "mirror": "are mirror images", "several": "differ"}
+    none = f"none of them: {document['none']:.2f}"
+    print(f"the poses {words[document['ambiguous']]}; {none}; a hint decides: --side, --azimuth or --near")
 
 
 def _advice(document: Mapping[str, Any]) -> str:

@@ -14,7 +14,7 @@ from ..version import __version__
 from .benchmark import Benchmark, Row
 from .predict import register_object, registrar_opener
 from .runner import POSE_SOURCES, run_items
-from .scores import answer_set_quality, localization_recall
+from .scores import localization_recall
 from .store import ResultStore, to_json
 
 __all__ = ["evaluate", "score"]
@@ -98,7 +98,6 @@ def score(benchmark: Benchmark, out: Path, *, limit: int | None = None) -> Row:
     summary = {
         **benchmark.summary(items, rows),
         **({"localization": localization_recall(items, rows)} if benchmark.protocol.box is None else {}),
-        "answer_set": answer_set_quality(benchmark, items, rows),
         "failed": sum("failed" in row for row in rows),
         "skipped": dict(sorted(skipped.items())),
         "protocol": settings["protocol"],

@@ -9,7 +9,7 @@ import torch
 
 from ..errors import BankError, InvalidInputError
 from ..features import LearnedCurvilinearSaliency
-from ..geometry import camera_matrix, sample_views
+from ..geometry import camera_matrix
 from ..geometry.cameras import camera_of_view, transform
 from ..matching import ViewBank, cached_bank
 from ..mesh import load_mesh
@@ -87,8 +87,9 @@ class RegisterOptions:
 
     def complete(self, entry: Entry) -> Entry:
         """A photograph of a list with the options that a list does not hold."""
-        start = None if self.start is None else read_start(self.start)
-        return replace(entry, guess=self.guess, instances=self.instances, start=start)
+        start, confidence = (None, None) if self.start is None else read_start(self.start)
+        own = replace(entry, guess=self.guess, instances=self.instances)
+        return replace(own, start=start, start_confidence=confidence)
 
 
 def check_camera(camera: Sequence[float] | None, guess: str | float | None) -> None:
@@ -105,8 +106,9 @@ def check_camera(camera: Sequence[float] | None, guess: str | float | None) -> N
             raise InvalidInputError(f"--{error}") from error
 
 
-def read_start(path: Path) -> tuple[tuple[float, ...], ...]:
-    """(4, 4) pose ``T_cam_from_model`` of a JSON file that holds ``rotation`` and ``translation``, as result.json does.
+def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]:
+    """(4, 4) pose ``T_cam_from_model`` of a JSON file that holds ``rotation`` and ``translation``, as result.json does,
+    and its ``confidence``, if the file has one.
 
     Raises:
         CurviregError: the file is missing, damaged or does not hold a rigid pose.
@@ -123,7 +125,8 @@ def read_start(path: Path) -> tuple[tuple[float, ...], ...]:
     except InvalidInputError as error:
         raise error.with_subject(str(path)) from error
     T = transform(R, torch.tensor(translation, dtype=torch.float64))
-    return tuple(map(tuple, T.tolist()))
+    confidence = finite_numbers([content.get("confidence")], 1)
+    return tuple(map(tuple, T.tolist())), confidence[0] if confidence else None
 
 
 def open_registrar(
@@ -145,17 +148,17 @@ def open_registrar(
     """
     pipeline = options.open_pipeline()
     banks = [_open_bank(options, mesh, pipeline, progress or options.progress) for mesh in meshes]
-    bank = ViewBank.join(banks).to(options.device)
+    banks = [bank.to(options.device) for bank in banks]
     if all(mesh.suffix == ".safetensors" for mesh in meshes):
         if options.bank_decides:
-            pipeline = bank.pipeline
+            pipeline = banks[0].pipeline
         elif options.pose is None and options.pipeline is None:  # a preset does not fix the views
-            pipeline = replace(pipeline, views=bank.pipeline.views)
+            pipeline = replace(pipeline, views=banks[0].pipeline.views)
     if not options.refine:
-        pipeline = replace(pipeline, search=False, contours=False)
+        pipeline = replace(pipeline, contours=False)
     if options.top is not None:
         pipeline = replace(pipeline, hypotheses=options.top)
-    return Registrar(bank, pipeline=pipeline, field=field, renderer=options.renderer, mesh_is=options.mesh_is)
+    return Registrar(banks, pipeline=pipeline, field=field, renderer=options.renderer, mesh_is=options.mesh_is)
 
 
 def _open_bank(
@@ -163,9 +166,6 @@ def _open_bank(
 ) -> ViewBank:
     if mesh.suffix != ".safetensors":
         loaded = load_mesh(mesh, unit=options.unit, up=options.up)
-        if options.start is not None:  # a refinement needs no views
-            views = sample_views(azimuth_step=90, elevations=[0])
-            return ViewBank.build(loaded, views, pipeline=pipeline, renderer=options.renderer, progress=False)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
     bank = ViewBank.load(mesh)
     if options.pose not in (None, bank.pipeline.views.pose):

@@ -1,24 +1,22 @@
 """Poses of the objects of a dataset, from the CADs that the protocol allows."""
 
 import time
-from dataclasses import replace
 from pathlib import Path
 
-from torch import Tensor, nn
+from torch import nn
 
 from ..data import read_image
 from ..errors import ImageError, MeshError, MissingFileError
-from ..matching import Ranking, ViewBank, ViewMatcher, cached_bank
+from ..matching import cached_bank
 from ..mesh import load_mesh
 from ..pipeline import Pipeline
 from ..registration import FailedRegistration, Registrar
-from ..registration.document import localization_document
-from ..terms import QueryFeatures
+from ..registration.result import localization_document
 from .benchmark import Benchmark, BenchmarkItem, Row
 from .protocol import perturbed_box
 from .runner import OpenRegistrar
 
-__all__ = ["FusedMatcher", "register_object", "registrar_opener"]
+__all__ = ["register_object", "registrar_opener"]
 
 
 def registrar_opener(
@@ -34,8 +32,7 @@ def registrar_opener(
         except (MeshError, MissingFileError) as error:
             return error
         banks = [cached_bank(mesh, pipeline=pipeline, renderer=renderer, progress=False) for mesh in loaded]
-        matcher = FusedMatcher if protocol.cad == "fused" else ViewMatcher
-        return Registrar(matcher(ViewBank.join(banks), pipeline=pipeline, field=field), renderer=renderer)
+        return Registrar(banks, pipeline=pipeline, field=field, renderer=renderer)
 
     return open_registrar
 
@@ -72,23 +69,6 @@ def register_object(
         return {**size, "failed": result.error.message, "seconds": seconds}
     names = [path.name for path in item.meshes]
     row = {**size, **result.to_dict(), "mesh": names[result.model], "seconds": seconds}
-    for pose, hypothesis in zip(row["top"], result.hypotheses, strict=True):
-        pose["mesh"] = names[hypothesis.model]
     if result.localization is not None:
         row["localization"] = localization_document([result])
     return {**row, "projection": [matrix.tolist() for matrix in result.projection]}
-
-
-class FusedMatcher(ViewMatcher):
-    """Averages the scores of each view over the models of a bank, which all have the same views.
-
-    The mean is given to the model that scores best in that view; the others get 0.
-    """
-
-    def rank(self, query: QueryFeatures, log_prior: Tensor | None = None) -> Ranking:
-        ranking = super().rank(query, log_prior)
-        scores = ranking.scores.unflatten(1, (len(self.bank.meshes), -1))
-        best = scores == scores.amax(dim=1, keepdim=True)
-        first = best & (best.cumsum(dim=1) == 1)
-        mean = (scores.mean(dim=1, keepdim=True) * first).flatten(1)
-        return replace(ranking, scores=mean, order=mean.argsort(dim=1, descending=True, stable=True))

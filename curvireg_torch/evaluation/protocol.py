@@ -14,7 +14,7 @@ from ..utils.checks import check_option
 
 __all__ = ["Protocol", "hint_of_truth", "perturbed_box"]
 
-CHOICES = {"cad": ("annotated", "any", "fused"), "pose": ("upright", "any")}
+CHOICES = {"cad": ("annotated", "any"), "pose": ("upright", "any")}
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,7 @@ class Protocol:
     """The information that the method gets about an object, besides the photograph.
 
     Attributes:
-        cad: "annotated": that CAD. "any": all CADs of the class, the best hypothesis wins. "fused": the scores of a
-            view are averaged over the CADs of the class, the best view wins.
+        cad: "annotated": that CAD. "any": all CADs of the class, the best wins.
         pose: pose prior: "upright" or "any".
         box: 0: as annotated; x > 0 moves each edge at random by up to x of the side; None: the object is localized.
         hint: "azimuth:45": the azimuth lies within 45 degrees of a value that is itself up to 45 degrees off;

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ..registration import Registrar, Registration
-from ..registration.document import SCHEMA
+from ..registration.result import SCHEMA
 from ..utils.files import write_file
 from ..utils.threads import map_on_threads
 from ..visualization import pose_glb, registration_sheet
@@ -29,7 +29,7 @@ def write_result(
     Raises:
         OutputError: a file cannot be written.
     """
-    mesh = registrar.bank.meshes[result.model]
+    mesh = registrar.of_model(result.model).bank.mesh
     _remove(out)
     write_file(out / "result.json", to_json(document).encode())  # first: no failure to draw it loses the result
 

@@ -10,13 +10,11 @@ from torch import Tensor
 from ..geometry import viewpoint_from_rotation
 from ..geometry.crops import box_iou
 from ..metrics import accuracy, median_error
-from ..registration.answer_set import LEVEL
 from ..utils.files import write_csv
-from .benchmark import Benchmark, BenchmarkItem, Row
+from .benchmark import BenchmarkItem, Row
 
 __all__ = [
     "THRESHOLDS",
-    "answer_set_quality",
     "estimated_rotations",
     "localization_recall",
     "or_inf",
@@ -50,39 +48,6 @@ def estimated_rotations(rows: Sequence[Row]) -> Tensor:
 def or_inf(errors: Tensor, R: Tensor) -> Tensor:
     """``errors`` (N,), ``inf`` where the estimate ``R`` (N, 3, 3) is missing (NaN)."""
     return torch.where(R.isfinite().flatten(1).all(1), errors, torch.full_like(errors, torch.inf))
-
-
-def answer_set_quality(benchmark: Benchmark, items: Sequence[BenchmarkItem], rows: Sequence[Row]) -> Row:
-    """``coverage``: fraction of answer sets that hold the truth; ``mean_size``: answers in them; ``none``: fraction
-    that holds "none of them".
-
-    The truth is a pose within 30 degrees of the true rotation, or "none of them" where no reported pose is. Objects of
-    unknown pose do not count; a row that failed holds nothing. All are None if nothing counts.
-    """
-    pairs = list(zip(items, rows, strict=True))
-    first = benchmark.rotation_errors([item for item, _ in pairs], [row for _, row in pairs])
-    known = [pair for pair, error in zip(pairs, first.tolist(), strict=True) if not math.isnan(error)]
-    most = max((len(row.get("top", ())) for _, row in known), default=0)
-    right = torch.zeros(len(known), most + 1, dtype=torch.bool)  # the last column: a pose that is not reported
-    for k in range(most):
-        some = [
-            (n, item, {**row, **row["top"][k]}) for n, (item, row) in enumerate(known) if len(row.get("top", ())) > k
-        ]
-        errors = benchmark.rotation_errors([item for _, item, _ in some], [row for *_, row in some])
-        right[[n for n, *_ in some], k] = errors < THRESHOLDS["acc_30_deg"]
-    sets = [row.get("answer_set") for _, row in known]
-    held = [
-        answers is not None and bool(mine[answers["members"]].any() or (answers["holds_none"] and not mine.any()))
-        for answers, mine in zip(sets, right, strict=True)
-    ]
-    sizes = [0 if answers is None else len(answers["members"]) + answers["holds_none"] for answers in sets]
-    none = [answers is not None and answers["holds_none"] for answers in sets]
-    n = len(known)
-    means = {
-        name: sum(values) / n if n else None
-        for name, values in (("coverage", held), ("mean_size", sizes), ("none", none))
-    }
-    return {"level": LEVEL, "n": n, **means}
 
 
 def localization_recall(items: Sequence[BenchmarkItem], rows: Sequence[Row]) -> Row:

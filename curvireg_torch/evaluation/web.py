@@ -51,7 +51,7 @@ class WebBenchmark(Benchmark):
                 "n": len(some),
                 "n_posed": len(posed),
                 "reliable": sum(bool(row.get("reliable")) for row in some),
-                "mean_confidence": sum(row.get("confidence", 0.0) for row in some) / len(some) if some else None,
+                "mean_confidence": sum(row.get("confidence") or 0.0 for row in some) / len(some) if some else None,
             }
 
         return {

@@ -5,7 +5,7 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -14,12 +14,14 @@ from ..errors import CurviregError
 from ..geometry.cameras import transform
 from ..geometry.pose_prior import PosePrior, object_frame
 from ..geometry.viewpoint import rotation_error, viewpoint_from_rotation
-from ..matching import Ranking, ViewBank
+from ..matching import Ranking
 from ..mesh.mesh import mesh_unit
-from ..pipeline import Pipeline
 from ..utils.choices import SIDE_NAMES
 from ..version import __version__
 from .confidence import RELIABLE
+
+if TYPE_CHECKING:
+    from .registrar import Registrar
 
 __all__ = [
     "SCHEMA",
@@ -366,24 +368,18 @@ def ambiguity(rotations: Tensor) -> str | None:
     return "mirror" if float(angles.min()) <= MIRROR_ANGLE else "several"
 
 
-def result_document(
-    result: Registration,
-    bank: ViewBank,
-    pipeline: Pipeline,
-    seconds: Mapping[str, float],
-    symmetries: Tensor | None = None,
-) -> dict[str, Any]:
-    """:meth:`Registration.to_dict` and how the result was computed, with the seconds of ``bank`` and ``register``.
-
-    ``symmetries`` (S, 4, 4) are those that hypotheses were told apart by.
-    """
+def result_document(result: Registration, registrar: "Registrar", seconds: Mapping[str, float]) -> dict[str, Any]:
+    """:meth:`Registration.to_dict` and how the result was computed, with the seconds of ``bank`` and ``register``."""
+    registrar = registrar.of_model(result.model)
+    bank = registrar.bank
+    symmetries = registrar.symmetries_of(exact=registrar.is_exact(with_camera=result.translation is not None))
     return {
         "schema": SCHEMA,
         "unit": mesh_unit(bank.mesh),
         **result.to_dict(),
         "symmetries": 1 if symmetries is None else len(symmetries),
         "views": len(bank),
-        "pipeline": pipeline.describe(),
+        "pipeline": registrar.pipeline.describe(),
         "seconds": dict(seconds),
         "versions": {
             "curvireg_torch": __version__,

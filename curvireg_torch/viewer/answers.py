@@ -7,8 +7,7 @@ from nicegui import ui
 from ..geometry import rotation_error
 from ..mesh import mesh_unit, mesh_up
 from ..registration.confidence import RELIABLE
-from ..registration.document import remarks
-from ..registration.wording import pose_in_words, verdict
+from ..registration.result import RIVAL_FRACTION, pose_in_words, remarks, verdict
 from ..visualization import contour_overlay
 from ..visualization.encoding import png
 from ..visualization.sheet import thumbnail
@@ -121,11 +120,11 @@ class Answers:
 
     def _describe_pose(self) -> None:
         result, displayed = self.session.require_result()
-        word = verdict(result.registration.answer_set, result.document["reliable"])
+        word = verdict(result.registration.confidence, result.registration.none, result.document["reliable"])
         set_text(self.word, word)
         self.word.classes(replace=f"badge {word.replace(' ', '-')}")
         set_text(self.meaning, VERDICTS[word])
-        pose, mesh = displayed.pose, result.registrar.bank.meshes[displayed.pose.model]
+        pose, mesh = displayed.pose, result.registrar.bank.mesh
         front = (self.session.options.limits or {}).get("front")
         azimuth, elevation, theta = pose.viewpoint
         lines = [pose_in_words(pose.rotation, up=mesh_up(mesh), front=front)]
@@ -135,7 +134,7 @@ class Answers:
             lines.append(f"translation {', '.join(f'{v:.4g}' for v in pose.translation.tolist())} {unit}")
         if displayed.number:
             lines[0] = f"answer {displayed.number + 1}{', picked by you' if displayed.chosen else ''}: {lines[0]}"
-        certainty = f"{term('confidence', TERMS['confidence'])} {result.registration.confidence:.2f}"
+        certainty = f"{term('confidence', TERMS['confidence'])} {result.registration.confidence or 0.0:.2f}"
         self.certainty.set_content(certainty + (" of the first answer" if displayed.number else ""))
         lines += [*result.document["warnings"], *remarks(result.document)]
         if displayed.edits:
@@ -144,15 +143,12 @@ class Answers:
 
     async def _draw_cards(self) -> None:
         result, _ = self.session.require_result()
-        registrar, hypotheses, answers = (
-            result.registrar,
-            result.registration.hypotheses,
-            result.registration.answer_set,
-        )
+        registrar, hypotheses = result.registrar, result.registration.hypotheses
+        probabilities = result.registration.probabilities or (0.0,) * len(hypotheses)
 
         def make() -> list[bytes]:
             return [
-                thumbnail(registrar.describers[p.model].renderer, p.projection, result.image, result.box.tolist())
+                thumbnail(registrar.describer.renderer, p.projection, result.image, result.box.tolist())
                 for p in hypotheses
             ]
 
@@ -160,8 +156,14 @@ class Answers:
         self.cards.clear()
         for number, (pose, picture) in enumerate(zip(hypotheses, pictures or [], strict=True)):
             degrees = float(rotation_error(pose.rotation, hypotheses[0].rotation))
-            probability = answers.probabilities[number]
-            word = "likely" if probability >= RELIABLE else "possible" if number in answers.members else "unlikely"
+            probability = probabilities[number]
+            word = (
+                "likely"
+                if probability >= RELIABLE
+                else "possible"
+                if probability >= RIVAL_FRACTION * probabilities[0]
+                else "unlikely"
+            )
             values = {"probability": probability, "score": pose.score}
             if pose.edge_support is not None:
                 values["edge support"] = pose.edge_support
@@ -175,7 +177,7 @@ class Answers:
                     text("summary", f"{word}: {probability:.2f}")
                     ui.html(rows, tag="ul", sanitize=False)
                 self._build_choice("Show", number, chosen=False)
-                if len(answers.members) > 1 and number in answers.members:
+                if len(hypotheses) > 1:
                     self._build_choice("This is it", number, chosen=True)
 
     def _build_choice(self, label: str, number: int, *, chosen: bool) -> None:

@@ -35,7 +35,7 @@ def move_displayed(
     Raises:
         InvalidInputError: the object would touch the camera.
     """
-    describer = registrar.describers[displayed.pose.model]
+    describer = registrar.describer
     T = displayed.pose.projection[0].clone()
     angles, shift = (torch.tensor(list(v), dtype=torch.float64) for v in (rotation, translation))
     centre = T[:3, :3] @ describer.centre + T[:3, 3] + describer.radius * shift
@@ -50,7 +50,7 @@ def move_displayed(
 
 def fit_displayed(registrar: Registrar, displayed: DisplayedPose, image: Tensor, box: Tensor) -> DisplayedPose:
     """Fit the mesh's contours to the edges of an image (3, H, W) with a box (4,), see :func:`fit_contours`."""
-    describer = registrar.describers[displayed.pose.model]
+    describer = registrar.describer
     T, K = displayed.pose.projection
     fit = fit_contours(
         describer.contours,

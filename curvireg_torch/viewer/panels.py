@@ -125,7 +125,7 @@ class Panels:
         if not content:
             return
         url = self.workspace.serve("scene.glb", content, "model/gltf-binary")
-        describer = result.registrar.describers[displayed.pose.model]
+        describer = result.registrar.describer
         T, K = displayed.pose.projection
         x, y, z = ((T[:3, :3] @ describer.centre + T[:3, 3]) / describer.radius).tolist()
         fov = 2 * math.degrees(math.atan(result.image.shape[-2] / (1.7 * float(K[1, 1]))))

@@ -29,7 +29,7 @@ def pose_layers(registrar: Registrar, pose: Hypothesis, size: tuple[int, int]) -
     sy, sx = small[0] / size[0], small[1] / size[1]
     to_layer = torch.tensor([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
     K = to_layer.double() @ K
-    depth = registrar.describers[pose.model].renderer.render(T[None], K, small)[0, 0].cpu().float()
+    depth = registrar.describer.renderer.render(T[None], K, small)[0, 0].cpu().float()
     mask = (depth > 0).numpy()
     grey = shade(depth[None, None], K[None])[0, 0].numpy()
     solid = np.zeros((*small, 4), np.uint8)
@@ -41,7 +41,4 @@ def pose_layers(registrar: Registrar, pose: Hypothesis, size: tuple[int, int]) -
 def view_pictures(registrar: Registrar, views: Tensor) -> list[bytes]:
     """A shaded picture of each of (K,) views of the bank."""
     bank = registrar.bank
-    return [
-        png(view_picture(registrar, int(bank.model[view]), bank.rotations[view], float(bank.distances[view])))
-        for view in views.tolist()
-    ]
+    return [png(view_picture(registrar, bank.rotations[view], float(bank.distances[view]))) for view in views.tolist()]

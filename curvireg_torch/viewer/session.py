@@ -22,7 +22,7 @@ from ..evaluation.store import to_json
 from ..matching import ViewBank
 from ..mesh import has_colours, load_mesh
 from ..registration import Registrar, Registration
-from ..registration.document import used_box
+from ..registration.result import used_box
 from ..visualization import pose_glb
 from .editing import DisplayedPose, fit_displayed, move_displayed
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..matching.fields import depth_filter
+from ..matching.describe import depth_filter
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import ImageItem, image_item
 from ..terms import crop_regions, photograph_field
@@ -69,8 +69,9 @@ def draw_window(
     )
     left, top, right, bottom = item.box.tolist()
     corners = resize @ torch.tensor([[left, right], [top, bottom], [1.0, 1.0]], dtype=torch.float64)
-    renderer = registrar.describers[result.model].renderer
-    draw_pose(picture, renderer, (T, resize @ K), corners[:2].mT.flatten().tolist() if box else None)
+    draw_pose(
+        picture, registrar.describer.renderer, (T, resize @ K), corners[:2].mT.flatten().tolist() if box else None
+    )
     return picture
 
 
@@ -91,18 +92,18 @@ def side_pictures(
     crop = crop_regions([item.image], item.box[None, None], size=settings.image_size, margin=settings.margin)[0]
     field = photograph_field(registrar.matcher.field, crop.to(registrar.bank.device))
     rotation, distance = result.allocentric_rotation, result.distance
-    depth = registrar.describers[result.model].depth(rotation[None], torch.tensor([distance]))[0]
+    depth = registrar.describer.depth(rotation[None], torch.tensor([distance]))[0]
     return {
         "photograph": to_uint8(crop[0]),
         "photograph field": _field_picture(field[0]),
-        "pose": view_picture(registrar, result.model, rotation, distance),
+        "pose": view_picture(registrar, rotation, distance),
         "view field": _field_picture(depth_filter(settings)(depth)[0]),
     }
 
 
-def view_picture(registrar: Registrar, model: int, rotation: Tensor, distance: float) -> np.ndarray:
-    """(S, S, 3) uint8 RGB of a mesh as the bank's views show it, shaded before a white background."""
-    shaded = registrar.describers[model].shaded(rotation[None], torch.tensor([distance]))[0]
+def view_picture(registrar: Registrar, rotation: Tensor, distance: float) -> np.ndarray:
+    """(S, S, 3) uint8 RGB of the mesh as the bank's views show it, shaded before a white background."""
+    shaded = registrar.describer.shaded(rotation[None], torch.tensor([distance]))[0]
     return to_uint8(shaded[-3:] if len(shaded) > 1 else shaded)  # grey, or grey and RGB
 
 

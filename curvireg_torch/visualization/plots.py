@@ -50,7 +50,7 @@ def _axes(width: float, height: float) -> Any:
     return axes
 
 
-def view_sphere(bank: ViewBank, ranking: Ranking | Registration, *, image_index: int = 0, model: int = 0) -> Any:
+def view_sphere(bank: ViewBank, ranking: Ranking | Registration, *, image_index: int = 0) -> Any:
     """The scores of :func:`~curvireg_torch.visualization.sphere.direction_scores`; several maxima are rival poses.
 
     Hypotheses of a registration are numbered, best first.
@@ -58,7 +58,7 @@ def view_sphere(bank: ViewBank, ranking: Ranking | Registration, *, image_index:
     poses: Sequence[Hypothesis] = ()
     if isinstance(ranking, Registration):
         poses, ranking = ranking.hypotheses, ranking.ranking
-    scores = direction_scores(bank, ranking, image_index=image_index, model=model)
+    scores = direction_scores(bank, ranking, image_index=image_index)
     figure = _figure(7.0, 3.8)
     axes = figure.subplots()
     picture = axes.imshow(sphere_map(*scores), extent=(0, 360, -90, 90), aspect="auto", cmap="viridis")
@@ -66,10 +66,9 @@ def view_sphere(bank: ViewBank, ranking: Ranking | Registration, *, image_index:
     axes.set(xlabel="azimuth, degrees", xticks=range(0, 361, 45))
     axes.set(ylabel="elevation, degrees", yticks=range(-90, 91, 30))
     for number, pose in enumerate(poses, start=1):
-        if pose.model == model:
-            azimuth, elevation, _ = pose.viewpoint
-            axes.plot(azimuth % 360.0, elevation, "o", mfc="white", mec="black", ms=11, clip_on=False)
-            axes.annotate(str(number), (azimuth % 360.0, elevation), ha="center", va="center_baseline", fontsize=8)
+        azimuth, elevation, _ = pose.viewpoint
+        axes.plot(azimuth % 360.0, elevation, "o", mfc="white", mec="black", ms=11, clip_on=False)
+        axes.annotate(str(number), (azimuth % 360.0, elevation), ha="center", va="center_baseline", fontsize=8)
     return figure
 
 

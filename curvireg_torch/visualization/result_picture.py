@@ -12,7 +12,7 @@ from ..geometry import rotation_error
 from ..mesh import mesh_unit, mesh_up
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import ImageItem
-from ..registration.wording import pose_in_words, verdict
+from ..registration.result import pose_in_words, verdict
 from .overlay import Window, draw_window, photograph_item, side_pictures
 
 __all__ = ["registration_sheet"]
@@ -66,17 +66,19 @@ def _draw_caption(
 ) -> None:
     """Verdict and pose in words, and the meaning of the colours."""
     x, y = corner
-    word, font = verdict(result.answer_set, result.reliable), ImageFont.load_default(size)
-    badge = f"{word}: confidence {math.floor(100 * result.confidence) / 100:.2f}"  # 0.896 is not yet 0.90, reliable
+    word, font = verdict(result.confidence, result.none, result.reliable), ImageFont.load_default(size)
+    badge = word
+    if result.confidence is not None:  # 0.896 is not yet 0.90, reliable
+        badge += f": confidence {math.floor(100 * result.confidence) / 100:.2f}"
     right = x + draw.textlength(badge, font) + size
     draw.rounded_rectangle((x, y, right, y + 1.6 * size), 0.5 * size, VERDICT_COLOURS[word])
     draw.text((x + size / 2, y + 0.8 * size), badge, PAPER, font, anchor="lm")
-    mesh = registrar.bank.meshes[result.model]
+    mesh = registrar.of_model(result.model).bank.mesh
     front = None if result.prior is None else result.prior.front
     pose = pose_in_words(result.rotation, up=mesh_up(mesh), front=front)
     if result.translation is not None:
         pose += f", {float(f'{result.distance:.3g}'):g} {mesh_unit(mesh) or 'units'} away"
-    if len(registrar.bank.meshes) > 1:
+    if registrar.others:
         pose = f"mesh {result.model}, {pose}"
     room = draw.im.size[0] - right - 1.5 * size
     font = ImageFont.load_default(min(size, size * room / draw.textlength(pose, font)))
@@ -108,11 +110,8 @@ def _small_pictures(
 
 
 def _rival(result: Registration, index: int) -> str:
-    this, answers = result.hypotheses[index], result.answer_set
-    word = "could be" if index in answers.members else "rival"
-    angle = f"{float(rotation_error(this.rotation, result.rotation)):.0f}° away"
-    where = angle if this.model == result.model else f"mesh {this.model}"
-    return f"{word}: {where} ({answers.probabilities[index]:.2f})"
+    angle = f"rival: {float(rotation_error(result.hypotheses[index].rotation, result.rotation)):.0f}° away"
+    return f"{angle} ({result.probabilities[index]:.2f})" if result.probabilities else angle
 
 
 def _close_up(item: ImageItem) -> Window:

@@ -11,32 +11,26 @@ from ..matching import Ranking, ViewBank
 __all__ = ["direction_scores", "sphere_map"]
 
 
-def direction_scores(
-    bank: ViewBank, ranking: Ranking, *, image_index: int = 0, model: int = 0
-) -> tuple[Tensor, Tensor, Tensor]:
+def direction_scores(bank: ViewBank, ranking: Ranking, *, image_index: int = 0) -> tuple[Tensor, Tensor, Tensor]:
     """Best score of every viewing direction of a bank, over in-plane rotations and distances.
 
     Returns:
         azimuth and elevation (M,) in degrees, [0, 360) and [-90, 90], and score (M,); float64.
 
     Raises:
-        InvalidInputError: a ranking of other views, or no such photograph or model.
+        InvalidInputError: a ranking of other views, or no such photograph.
     """
     if ranking.scores.shape[1] != len(bank) or not 0 <= image_index < len(ranking):
         expected = f"{len(bank)} views and image {image_index}"
         raise InvalidInputError(f"ranking: expected {expected}, got {tuple(ranking.scores.shape)}")
-    views = (bank.model == model).nonzero()[:, 0].cpu()
-    if len(views) == 0:
-        raise InvalidInputError(f"model: the bank has {len(bank.meshes)} meshes, got {model}")
-    azimuth = bank.views.azimuth.cpu().double()[views] % 360.0
-    elevation = bank.views.elevation.cpu().double()[views]
+    azimuth, elevation = bank.views.azimuth.cpu().double() % 360.0, bank.views.elevation.cpu().double()
     azimuth = torch.where(elevation.abs() > 89.999, 0.0, azimuth)  # at a pole azimuth is an in-plane rotation
     keys = torch.stack([azimuth, elevation], dim=1).mul(1000).round().long()
     group = keys.unique(dim=0, return_inverse=True)[1]
     count = int(group.max()) + 1
     score = torch.full((count,), -torch.inf, dtype=torch.float64)
-    score = score.scatter_reduce(0, group, ranking.scores[image_index].cpu().double()[views], "amax")
-    first = torch.full((count,), len(views)).scatter_reduce(0, group, torch.arange(len(views)), "amin")
+    score = score.scatter_reduce(0, group, ranking.scores[image_index].cpu().double(), "amax")
+    first = torch.full((count,), len(bank)).scatter_reduce(0, group, torch.arange(len(bank)), "amin")
     return azimuth[first], elevation[first], score
 
 

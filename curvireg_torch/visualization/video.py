@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..errors import LostObjectError
 from ..registration import FailedRegistration, Registrar, Registration
-from ..registration.wording import verdict
+from ..registration.result import verdict
 from ..utils.files import write_file
 from .contours import draw_pose
 from .encoding import jpeg, shrink
@@ -116,7 +116,7 @@ def draw_frame(registrar: Registrar, image: Tensor, result: Registration | Faile
         sx, sy = (picture.shape[k] / whole.shape[k] for k in (1, 0))
         scale = [[sx, 0.0, 0.5 * (sx - 1.0)], [0.0, sy, 0.5 * (sy - 1.0)], [0.0, 0.0, 1.0]]  # of pixels, not corners
         K = torch.tensor(scale, dtype=K.dtype) @ K
-        draw_pose(picture, registrar.describers[result.model].renderer, (T, K))
+        draw_pose(picture, registrar.of_model(result.model).describer.renderer, (T, K))
     return picture
 
 
@@ -124,8 +124,9 @@ def caption(result: Registration | FailedRegistration) -> tuple[str, tuple[int, 
     """How sure the result is, in words and as a colour."""
     if isinstance(result, FailedRegistration):
         return "lost" if isinstance(result.error, LostObjectError) else "failed", _NO_POSE
-    word = verdict(result.answer_set, result.reliable)
-    return f"{word}, confidence {result.confidence:.2f}", _COLOURS[word]
+    word = verdict(result.confidence, result.none, result.reliable)
+    number = "" if result.confidence is None else f", confidence {result.confidence:.2f}"
+    return word + number, _COLOURS[word]
 
 
 def _write_caption(picture: np.ndarray, result: Registration | FailedRegistration) -> None:

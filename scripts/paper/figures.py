@@ -26,7 +26,7 @@ from curvireg_torch.data import Pascal3DPlus, read_image
 from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.geometry import crop_images
 from curvireg_torch.matching import ViewDescriber
-from curvireg_torch.matching.fields import depth_filter
+from curvireg_torch.matching.describe import depth_filter
 from curvireg_torch.mesh import load_mesh
 from scripts.training.field_dataset import SETTINGS
 from scripts.training.generated import GeneratedScenes

@@ -8,7 +8,7 @@ from torch.utils.data import Dataset
 from curvireg_torch.features.learned_field import WORK_SIZE, doubled_angle, halved_angle
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.matching import ViewDescriber
-from curvireg_torch.matching.fields import depth_filter, hog_layer
+from curvireg_torch.matching.describe import depth_filter, hog_layer
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.terms import normalized_correlation
 from scripts.training.generated import GeneratedScenes

@@ -24,7 +24,7 @@ from curvireg_torch.features import FieldNetwork, halved_angle
 from curvireg_torch.features.learned_field import save_weights
 from curvireg_torch.geometry import rotation_error, sample_views
 from curvireg_torch.matching import ViewDescriber
-from curvireg_torch.matching.fields import depth_filter, hog_layer
+from curvireg_torch.matching.describe import depth_filter, hog_layer
 from curvireg_torch.terms import normalized_correlation
 from curvireg_torch.utils.files import write_tensors
 from scripts.training.field_dataset import SETTINGS, FieldDataset, ReplayBuffer, augment, losses

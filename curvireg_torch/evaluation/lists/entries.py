@@ -49,12 +49,13 @@ class Entry:
     instances: int = 1
     prior: PosePrior | None = None
     start: tuple[tuple[float, ...], ...] | None = None
+    start_confidence: float | None = None
     error: str = ""
 
     def request(self) -> Any:
         """All that the result depends on besides the content of files."""
         prior = None if self.prior is None else self.prior.to_dict()
-        return [self.name, self.box, self.camera, self.guess, self.instances, prior, self.start]
+        return [self.name, self.box, self.camera, self.guess, self.instances, prior, self.start, self.start_confidence]
 
     @cached_property
     def key(self) -> str:

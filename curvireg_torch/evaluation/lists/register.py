@@ -13,9 +13,10 @@ from ...errors import BankError, CurviregError, ImageError, InvalidInputError, M
 from ...geometry import camera_matrix
 from ...geometry.cameras import camera_of_view
 from ...registration import FailedRegistration, Registrar, Registration, localize
-from ...registration.correction import projected_box
-from ...registration.document import SCHEMA, localization_document, result_document, used_box
 from ...registration.inputs import image_items
+from ...registration.poses import projected_box
+from ...registration.refinement import refine
+from ...registration.result import SCHEMA, localization_document, result_document, used_box
 from ...utils.files import write_file
 from ...visualization.sheet import SheetEntry, thumbnail, write_sheet
 from ..runner import OpenRegistrar, run_items
@@ -117,7 +118,7 @@ def register_entry(
     start = time.perf_counter()
     K, source = _camera(entry, photo)
     if entry.start is not None:
-        results = registrar.refine([photo.image], K, [entry.start])
+        results = refine(registrar, [photo.image], K, [entry.start], start_confidences=[entry.start_confidence])
     elif entry.box is None:
         results = localize(registrar, [photo.image], K, instances=entry.instances, prior=entry.prior)[0]
     else:
@@ -126,13 +127,13 @@ def register_entry(
     if isinstance(result, FailedRegistration):
         raise result.error.with_subject(entry.name)
     if entry.box is None:
-        box = projected_box(registrar, result) if result.localization is None else result.localization.box
+        describer = registrar.of_model(result.model).describer
+        box = projected_box(describer, result.projection) if result.localization is None else result.localization.box
     else:
         box = torch.tensor(entry.box)
-    document = result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start})
+    seconds = {"bank": bank_seconds, "register": time.perf_counter() - start}
+    document = result_document(result, registrar, seconds)
     document["mesh"] = str(entry.meshes[result.model])
-    for pose, hypothesis in zip(document["top"], result.hypotheses, strict=True):
-        pose["mesh"] = str(entry.meshes[hypothesis.model])
     document["inputs"] = {
         "photo": entry.name,
         "mesh": ", ".join(map(str, entry.meshes)),
@@ -144,7 +145,7 @@ def register_entry(
     if result.localization is not None:
         document["localization"] = localization_document([r for r in results if isinstance(r, Registration)])
     if source in ("exif", "fov"):  # the error of a guessed camera is unknown
-        document["covariance"] = document["standard_deviations"] = document["squared_radius"] = None
+        document["covariance"] = document["standard_deviations"] = None
     return result, document
 
 
@@ -177,7 +178,7 @@ def _register(entry: Entry, registrar: Registrar | Exception, bank_seconds: floa
         result, document = register_entry(entry, photo, registrar, bank_seconds=bank_seconds)
     except (ImageError, InvalidInputError) as error:
         return _failed(error)
-    renderer = registrar.describers[result.model].renderer
+    renderer = registrar.of_model(result.model).describer.renderer
     write_file(picture, thumbnail(renderer, result.projection, photo.image, used_box(document)))
     return {"status": "ok", "message": "", **document}
 
@@ -217,7 +218,7 @@ def _rows(photos: PhotoList, store: ResultStore) -> Iterator[Row]:
 
 
 def _sheet_entry(entry: Entry, row: Row, out: Path) -> tuple[SheetEntry, tuple[bool, bool, float, int]]:
-    message, reliable, confidence = row["message"], row.get("reliable", False), row.get("confidence", 0.0)
+    message, reliable, confidence = row["message"], row.get("reliable", False), row.get("confidence") or 0.0
     kind = "failed" if message else "reliable" if reliable else "doubtful"
     path = _thumbnail_path(out, row["digests"])
     entry_on_page = SheetEntry(

@@ -15,7 +15,7 @@ from ...detectors import DETECTORS
 from ...features import field_points
 from ...filters import ImageGradient, MultiScaleCurvilinearSaliency, MultiScaleFocusCurves
 from ...matching import ViewDescriber
-from ...matching.fields import depth_filter
+from ...matching.describe import depth_filter
 from ...metrics import hausdorff_distance, intersection_percentage, view_repeatability
 from ...pipeline import BankSettings
 from .cases import Case, grouped
