@@ -157,13 +157,8 @@ class Answers:
         for number, (pose, picture) in enumerate(zip(hypotheses, pictures or [], strict=True)):
             degrees = float(rotation_error(pose.rotation, hypotheses[0].rotation))
             probability = probabilities[number]
-            word = (
-                "likely"
-                if probability >= RELIABLE
-                else "possible"
-                if probability >= RIVAL_FRACTION * probabilities[0]
-                else "unlikely"
-            )
+            fraction = RIVAL_FRACTION * probabilities[0]
+            word = "likely" if probability >= RELIABLE else "possible" if probability >= fraction else "unlikely"
             values = {"probability": probability, "score": pose.score}
             if pose.edge_support is not None:
                 values["edge support"] = pose.edge_support
