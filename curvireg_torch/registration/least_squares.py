@@ -78,9 +78,10 @@ class PointMatches:
         weight = (self.weight * _geman_mcclure(residual, scale)).repeat_interleave(2, dim=1)
         return Measurements(J.flatten(1, 2), residual.flatten(1)[..., None], weight[..., None])
 
-    def inlier_ratio(self, T: Tensor, K: Tensor, centre: Tensor) -> float:
-        """Fraction of all points, in [0, 1], that were found where the pose has them."""
-        near = _geman_mcclure(self.uv - pixels(self.model, T, K, centre), INLIER_SCALE)
+    def inlier_ratio(self, T: Tensor, K: Tensor, centre: Tensor, *, scale: float = INLIER_SCALE) -> float:
+        """Fraction of all points, in [0, 1], that were found where the pose has them; at ``scale`` px a quarter of a
+        point counts."""
+        near = _geman_mcclure(self.uv - pixels(self.model, T, K, centre), scale)
         return float((near * (self.weight > 0)).sum()) / max(self.weight.shape[1], 1)
 
     def moved(self, before: Tensor, after: Tensor) -> "PointMatches":

@@ -36,8 +36,9 @@ an edge."""
 FAR_ROUND, NEAR_ROUND = (30, (32.0, 16.0, 8.0, 4.0)), (6, (6.0, 4.0, 2.0))
 """Of the two rounds: the search radius in px, and the scales of robust weights in px, one a step."""
 
-PROMISING_RATIO, CONVINCING_RATIO = 0.07, 0.2
-"""Inlier ratios of the corners that a pose needs after the first round, and after the second."""
+PATCH_INLIER_SCALE, PROMISING_RATIO, CONVINCING_RATIO = 4.0, 0.1, 0.3
+"""Distance in px at which a corner counts a quarter, and inlier ratios that a pose needs after the first round and
+after the second: patches seen from another side are found less exactly than those of the next frame."""
 
 TURN = 16.0
 """Degrees by which poses are turned both ways about an axis that contours do not determine: within them, the search of
@@ -168,7 +169,8 @@ class _TextureRounds:
         for _ in range(JOINT_STEPS):
             points = matches.measurements(T, K, centre, scales[-1])
             T = self.problem.step(contour_points, T, FULL_SIZE_RADII[0], [points])
-        return _Round(T, matches, matches.inlier_ratio(start, K, centre), matches.inlier_ratio(T, K, centre))
+        before, after = (matches.inlier_ratio(at, K, centre, scale=PATCH_INLIER_SCALE) for at in (start, T))
+        return _Round(T, matches, before, after)
 
     def _search(self, T: Tensor, radius: int) -> PointMatches | None:
         """Corners of the view at a pose and where they are in the photograph; None if there are few."""

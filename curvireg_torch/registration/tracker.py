@@ -409,9 +409,3 @@ class Tracker:
 
     def _outline(self, frame: Frame, T: Tensor) -> Outline:
         return Outline(T, self.contours.points(T, frame.window.K, WINDOW_SIZE))
-
-
-def _orthonormal(T: Tensor) -> Tensor:
-    """The poses (1, 4, 4) with the nearest rotations: predictions would let rounding grow from frame to frame."""
-    U, _, V = torch.linalg.svd(T[:, :3, :3])
-    return transform(U @ V, T[:, :3, 3])

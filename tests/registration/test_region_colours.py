@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from curvireg_torch.registration.tracking import regions
-from curvireg_torch.registration.tracking.regions import RegionModel, colour_bins, line_posterior
+from curvireg_torch.registration import region_colours
+from curvireg_torch.registration.region_colours import RegionModel, colour_bins, line_posterior
 
 
 @pytest.mark.parametrize("end", [-3, 0, 2])
@@ -62,17 +62,17 @@ def test_histograms_move_by_the_rate_towards_new_colours():
     model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] < 8).flatten(), rate=0.2)
     assert float(model._histograms[0, 0, red]) == 1.0
     model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] >= 8).flatten(), rate=0.2)  # the colours swap
-    step = 0.2 * 64 / (64 + regions.ENOUGH)
+    step = 0.2 * 64 / (64 + region_colours.HALF_RATE_COUNT)
     assert float(model._histograms[0, 0, green]) == pytest.approx(step)
     assert float(model._histograms[0, 0, red]) == pytest.approx(1.0 - step)
 
 
 def test_smoothing_keeps_the_sum_and_reaches_the_next_level():
-    histograms = torch.zeros(2, regions.SECTORS, regions.LEVELS**3)
-    middle = (3 * regions.LEVELS + 4) * regions.LEVELS + 5
+    histograms = torch.zeros(2, region_colours.SECTORS, region_colours.COLOUR_LEVELS**3)
+    middle = (3 * region_colours.COLOUR_LEVELS + 4) * region_colours.COLOUR_LEVELS + 5
     histograms[0, 2, middle] = 1.0
-    smooth = regions._smoothed(histograms)
+    smooth = region_colours._smoothed(histograms)
     assert float(smooth.sum()) == pytest.approx(1.0)
     assert float(smooth[0, 2, middle]) == pytest.approx(0.6**3)
-    for step in (1, regions.LEVELS, regions.LEVELS**2):
+    for step in (1, region_colours.COLOUR_LEVELS, region_colours.COLOUR_LEVELS**2):
         assert float(smooth[0, 2, middle + step]) == pytest.approx(0.6**2 * 0.2)

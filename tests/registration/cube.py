@@ -1,4 +1,4 @@
-"""A cube in front of a camera, shared by the tests of the contour fit."""
+"""A cube in front of a camera, shared by the tests of fits."""
 
 from typing import Any
 
@@ -9,9 +9,9 @@ from torch import Tensor
 from curvireg_torch import camera_matrix
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
-from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering import make_renderer
+from curvireg_torch.rendering.contours import MeshContours
 
 K = camera_matrix(300.0, 310.0, 63.5, 60.0, dtype=torch.float64)
 BOX = torch.tensor([40.0, 36, 88, 84])
@@ -30,10 +30,6 @@ def pose(axis_angle: list[float], position: list[float]) -> Tensor:
 CUBE_POSE = pose([0.4, 0.5, 0.1], [0.0, 0.0, 8.0])
 
 
-def geometry(mesh: trimesh.Trimesh) -> dict[str, Any]:
-    return {"centre": mesh_centre(mesh), "radius": mesh_radius(mesh)}
-
-
 def silhouette(mesh: trimesh.Trimesh, T: Tensor) -> Tensor:
     """(1, 128, 128) white object on black."""
     return (make_renderer(mesh).render(T[None], K, (128, 128))[0] > 0).float()
@@ -45,6 +41,4 @@ def noise() -> Tensor:
 
 def fitted(image: Tensor, starts: Tensor, *, mesh: trimesh.Trimesh | None = None, **options: Any) -> ContourFit:
     """Fit a mesh, by default the cube, to a photograph that shows it in ``BOX``."""
-    mesh = mesh or cube()
-    box, renderer = options.pop("box", BOX), options.pop("renderer", None) or make_renderer(mesh)
-    return fit_contours(renderer, image, box, K, starts, **geometry(mesh), **options)
+    return fit_contours(MeshContours(mesh or cube()), image, options.pop("box", BOX), K, starts, **options)

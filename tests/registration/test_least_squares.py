@@ -1,0 +1,193 @@
+"""Least squares over poses: derivatives, bounded steps, and the covariance in closed form and against injected noise."""
+
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F
+import trimesh
+
+from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
+from curvireg_torch.geometry.cameras import project_points, transform
+from curvireg_torch.mesh.mesh import mesh_centre
+from curvireg_torch.registration.confidence import COVARIANCE_SCALE
+from curvireg_torch.registration.least_squares import (
+    CELL_SIDE,
+    MIN_MATCHES,
+    POINT_ERROR,
+    SHARED_ERROR,
+    Measurements,
+    PointMatches,
+    apply_twist,
+    damped_solution,
+    fit_points,
+    least_squares_step,
+    nearest_rigid,
+    pixels,
+    pose_covariance,
+    project,
+)
+from curvireg_torch.rendering.contours import ContourPoints
+from tests.registration.cube import K, cube, fitted, pose, silhouette
+
+ZERO = torch.zeros(3, dtype=torch.float64)
+
+
+def test_project_and_its_derivative():
+    points = torch.rand(1, 7, 3, dtype=torch.float64)
+    T, centre = pose([0.3, -0.5, 0.2], [0.1, 0.2, 4.0])[None], torch.tensor([0.4, 0.5, 0.6], dtype=torch.float64)
+
+    def moved(step: torch.Tensor) -> torch.Tensor:
+        return project(points, apply_twist(T, step[None], centre), K[None], centre)[0][0]
+
+    # Not at zero, where the angle of an axis-angle vector is not differentiable.
+    expected = torch.autograd.functional.jacobian(moved, torch.full((6,), 1e-7, dtype=torch.float64))
+    uv, derivative = project(points, T, K[None], centre)
+    torch.testing.assert_close(uv[0], project_points(points[0], T[0], K))
+    torch.testing.assert_close(pixels(points, T, K[None], centre), uv)
+    torch.testing.assert_close(derivative[0], expected, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "translation", "fraction"),
+    [([0.1, 0, 0], [0, 0, 0.05], 1.0), ([0, 0.3, 0.4], [0, 0, 0.01], 0.4), ([0.1, 0, 0], [0.3, 0, 0.4], 0.2)],
+)
+def test_long_steps_are_shortened(rotation, translation, fraction):
+    """Translations are given as fractions of the distance of the centre, which lies half a unit behind the origin."""
+    T, centre = pose([0.0, 0.0, 0.0], [0.0, 0.0, 6.0])[None], torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64)
+    step = torch.tensor([[*rotation, *(6.5 * t for t in translation)]], dtype=torch.float64)
+    A = torch.eye(6, dtype=torch.float64)[None]
+    torch.testing.assert_close(least_squares_step(A, step[..., None], T, centre, 0.0), fraction * step)
+
+
+def test_damping_shortens_each_direction_alike():
+    A = torch.diag(torch.tensor([1.0, 100.0, 1e4, 1.0, 1.0, 1.0], dtype=torch.float64))[None]
+    x = damped_solution(A, A @ torch.ones(1, 6, 1, dtype=torch.float64), 0.25)
+    torch.testing.assert_close(x, torch.full((1, 6), 0.8, dtype=torch.float64))
+    assert damped_solution(0 * A, torch.zeros(1, 6, 1).double(), 0.01).tolist() == [[0.0] * 6]
+
+
+def test_points_need_a_minimum_of_matches():
+    T, truth = pose([0.0] * 3, [0.0, 0.0, 6.0])[None], pose([0.02, 0.0, 0.01], [0.05, 0.0, 6.1])[None]
+    points = torch.rand(1, 20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
+    uv = pixels(points, truth, K[None], ZERO)
+    for count, expected in ((MIN_MATCHES - 1, T), (MIN_MATCHES, truth)):
+        weight = (torch.arange(20) < count).double()[None]
+        found = fit_points(PointMatches(points, uv, weight), T, K[None], ZERO, [8.0] * 8)
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+
+
+def test_inlier_ratio_counts_all_points():
+    T = pose([0.0] * 3, [0.0, 0.0, 6.0])[None]
+    points = torch.rand(1, 10, 3, dtype=torch.float64) - 0.5
+    uv, weight = pixels(points, T, K[None], ZERO), torch.ones(1, 10)
+    uv[:, :2], uv[:, 2] = uv[:, :2] + 500.0, uv[:, 2] + torch.tensor([2.0, 0.0])
+    weight[:, 3:5] = 0.0  # not found
+    assert PointMatches(points, uv, weight).inlier_ratio(T, K[None], ZERO) == pytest.approx((5 + 0.25) / 10, abs=1e-4)
+
+
+def test_matches_move_with_the_crop():
+    points, T = torch.rand(1, 5, 3, dtype=torch.float64) - 0.5, pose([0.0] * 3, [0.0, 0.0, 6.0])[None]
+    other = torch.tensor([[[600.0, 0, 90.0], [0, 620.0, 20.0], [0, 0, 1]]], dtype=torch.float64)
+    moved = PointMatches(points, pixels(points, T, K[None], ZERO), torch.ones(1, 5)).moved(K[None], other)
+    torch.testing.assert_close(moved.uv, pixels(points, T, other, ZERO))
+
+
+def test_nearest_rigid_pose_is_orthogonal():
+    T = pose([0.3, -0.2, 0.5], [1.0, 2.0, 3.0])[None]
+    drifted = T.clone()
+    drifted[:, :3, :3] *= 1.001
+    torch.testing.assert_close(nearest_rigid(drifted), T)
+
+
+def cloud(count: int) -> tuple[ContourPoints, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Points in a cube with random normals, a pose, the cube's centre, and the derivatives along the normals."""
+    generator = torch.Generator().manual_seed(0)
+    T, centre = pose([0.3, -0.5, 0.2], [-1.6, -0.4, 6.0])[None], torch.tensor([2.0, 0.5, 0.6], dtype=torch.float64)
+    model = centre + 2.0 * torch.rand(1, count, 3, generator=generator, dtype=torch.float64) - 1.0
+    normals = F.normalize(torch.randn(1, count, 2, generator=generator, dtype=torch.float64), dim=-1)
+    J = (normals[..., None, :] @ project(model, T, K[None], centre)[1])[..., 0, :]
+    everywhere = torch.ones(1, count, dtype=torch.bool)
+    return ContourPoints(model, normals, everywhere, everywhere), T, centre, J
+
+
+def test_covariance_in_closed_form():
+    """Directly in (w, e), from autograd's derivative of R = exp([w]x) R0, t = t0 + e."""
+    points, T, centre, J = cloud(60)
+    generator = torch.Generator().manual_seed(1)
+    W, d = (torch.rand(1, 60, 1, generator=generator, dtype=torch.float64) for _ in range(2))
+    C, known = pose_covariance(Measurements(J, d, W), points, T, K[None], centre, radius=1.7)
+    assert int(known) == 6
+
+    def moved(step: torch.Tensor) -> torch.Tensor:
+        R = rotation_from_axis_angle(step[None, :3])[0] @ T[0, :3, :3]
+        return project_points(points.model[0], transform(R, T[0, :3, 3] + step[3:]), K)
+
+    derivative = torch.autograd.functional.jacobian(moved, torch.full((6,), 1e-7, dtype=torch.float64))
+    rows, w, r = (points.normals[0, :, None] @ derivative)[:, 0], W[0], d[0]
+    B = rows.T @ (w * w * rows) * (POINT_ERROR**2 + SHARED_ERROR * float((w * r * r).sum() / w.sum()))
+    cells = (project_points(points.model[0], T[0], K) / CELL_SIDE).floor()
+    for cell in cells.unique(dim=0):
+        g = (w * r * rows)[(cells == cell).all(dim=1)].sum(dim=0)
+        B += g[:, None] * g
+    inverse = torch.linalg.inv(rows.T @ (w * rows))
+    torch.testing.assert_close(C[0], COVARIANCE_SCALE * inverse @ B @ inverse, rtol=1e-3, atol=1e-9)
+
+
+def test_covariance_covers_injected_noise():
+    """Independent noise of 0.6 px on the distances: least squares spreads no more than the covariance says."""
+    points, T, centre, J = cloud(200)
+    d = 0.6 * torch.randn(400, 200, 1, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    estimates = (torch.linalg.pinv(J) @ d)[..., 0]  # rotation about the centre and its translation
+    T400 = T.expand(400, 4, 4)
+    ends = apply_twist(T400, estimates, centre)
+    off = torch.cat([axis_angle_from_rotation(ends[:, :3, :3] @ T[:, :3, :3].mT), ends[:, :3, 3] - T[:, :3, 3]], dim=1)
+    several = points[torch.zeros(400, dtype=torch.long)]
+    matches = Measurements(J.expand(400, -1, -1), d - J @ estimates[..., None], torch.ones_like(d))
+    C, _ = pose_covariance(matches, several, T400, K.expand(400, 3, 3), centre, radius=1.7)
+    # The mean covariance is the spread times the allowance for correlated errors.
+    allowed = COVARIANCE_SCALE * (POINT_ERROR**2 / 0.36 + SHARED_ERROR + 1)
+    ratio = C.mean(dim=0).diagonal() / torch.cov(off.T).diagonal()
+    assert float(ratio.min()) > 0.8 * (allowed - COVARIANCE_SCALE)
+    assert float(ratio.max()) < 1.25 * allowed
+
+
+@pytest.mark.parametrize(("factor", "known"), [(0.95, False), (1.05, True)])
+def test_covariance_needs_a_minimum_of_weight(factor, known):
+    points, T, centre, J = cloud(60)
+    W, d = torch.full((1, 60, 1), factor * 0.1, dtype=torch.float64), torch.full((1, 60, 1), 0.1, dtype=torch.float64)
+    C, directions = pose_covariance(Measurements(J, d, W), points, T, K[None], centre, radius=1.7)
+    assert bool(C.isfinite().all()) == bool(directions > 0) == known
+
+
+def silhouette_fit(mesh: trimesh.Trimesh, axis_angle: list[float]):
+    T = pose(axis_angle, [0.1, 0.0, 8.0])
+    off = torch.tensor([[0.0, 0.0, 0.0, 0.1, 0.1, 0.2]], dtype=torch.float64)
+    return T, fitted(silhouette(mesh, T), apply_twist(T[None], off, mesh_centre(mesh)), mesh=mesh)
+
+
+def test_covariance_of_a_sphere_has_unknown_rotation():
+    T, fit = silhouette_fit(trimesh.creation.icosphere(subdivisions=4, radius=0.7), [0.0, 0.0, 0.0])
+    assert float((fit.transform[0, :3, 3] - T[:3, 3]).norm()) < 0.08
+    assert int(fit.observable) == 3
+    deviation = fit.covariance[0].diagonal().sqrt()
+    assert float(deviation[:3].min()) > 1.0  # rad
+    assert float(deviation[3:].max()) < 0.5  # of a distance of 8
+
+
+@pytest.mark.parametrize("axis_angle", [[1.0, 0.3, 0.2], [1.9, -0.4, 0.3]])
+def test_covariance_of_a_cylinder_has_unknown_rotation_about_its_axis(axis_angle):
+    T, fit = silhouette_fit(trimesh.creation.cylinder(0.5, 1.4, sections=96), axis_angle)
+    assert 4 <= int(fit.observable) <= 5
+    C = fit.covariance[0, :3, :3]
+    axis = fit.transform[0, :3, 2]
+    # The rim of the near lid, which a silhouette does not show, pulls towards the outline.
+    assert float(axis @ T[:3, 2]) > 0.985
+    assert float((axis @ C @ axis).sqrt()) > 1.0
+    assert float(torch.linalg.eigvalsh(C)[0].sqrt()) < 0.2  # other rotations are known
+
+
+def test_covariance_of_a_cube_is_known_in_all_directions():
+    _, fit = silhouette_fit(cube(), [0.4, 0.5, 0.1])
+    assert int(fit.observable) == 6
+    assert math.degrees(float(fit.covariance[0].diagonal().sqrt()[:3].max())) < 20

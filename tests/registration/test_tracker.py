@@ -1,0 +1,220 @@
+"""The tracker: each measurement alone on drawn objects, and together on generated sequences."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from curvireg_torch import camera_matrix
+from curvireg_torch.errors import LostObjectError
+from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
+from curvireg_torch.geometry.cameras import transform
+from curvireg_torch.mesh.mesh import extreme_points
+from curvireg_torch.registration import tracker
+from curvireg_torch.registration.least_squares import fit_points, pixels
+from curvireg_torch.registration.texture_fit import surface_corners
+from curvireg_torch.registration.tracker import FLOW_SCALES, WINDOW_SIZE, Keyframe, Tracker, Window, track_points
+from curvireg_torch.rendering import make_renderer
+from curvireg_torch.rendering.contours import MeshContours
+from curvireg_torch.synthetic import example_mesh
+from tests._support.scenes import CAMERA
+from tests.registration.test_following import sequence
+
+K = camera_matrix(500.0, 500.0, 159.5, 119.5, dtype=torch.float64)
+SIZE = (240, 320)
+START = transform(
+    rotation_from_axis_angle(torch.tensor([0.4, 0.5, 0.1], dtype=torch.float64)),
+    torch.tensor([0.0, 0.0, 6.0], dtype=torch.float64),
+)
+WINDOW_K = torch.tensor([[[400.0, 0, 127.5], [0, 400.0, 127.5], [0, 0, 1]]], dtype=torch.float64)
+ZERO = torch.zeros(3, dtype=torch.float64)
+
+
+def make_tracker(mesh):
+    return Tracker(make_renderer(mesh), MeshContours(mesh), extreme_points(mesh))
+
+
+def cube():
+    return trimesh.creation.box((1.0, 1.4, 0.8))
+
+
+def moved(T, angles, shift):
+    out = T.clone()
+    out[:3, :3] = rotation_from_axis_angle(torch.tensor(angles, dtype=torch.float64)) @ T[:3, :3]
+    out[:3, 3] += torch.tensor(shift, dtype=torch.float64)
+    return out
+
+
+def drawn(T, inside=(0.8, 0.2, 0.2), outside=(0.2, 0.5, 0.3)):
+    """A cube of one colour on a background of another."""
+    mask = make_renderer(cube()).render(T[None], K, SIZE)[0] > 0
+    return torch.where(mask, torch.tensor(inside)[:, None, None], torch.tensor(outside)[:, None, None])
+
+
+def shift_in_pixels(T, truth):
+    """Mean distance of the cube's corners in the image."""
+    corners = torch.from_numpy(cube().vertices)
+    uv = [(corners @ P[:3, :3].mT + P[:3, 3]) @ K.mT for P in (T, truth)]
+    return float((uv[0][:, :2] / uv[0][:, 2:] - uv[1][:, :2] / uv[1][:, 2:]).norm(dim=1).mean())
+
+
+def plate(x: float = 0.0, y: float = 0.0):
+    """A plate with a print, 160 px wide, moved in its plane by (x, y): its window, pose, and depth."""
+    T = transform(torch.eye(3, dtype=torch.float64), torch.tensor([x, y, 5.0], dtype=torch.float64))[None]
+    size = (WINDOW_SIZE, WINDOW_SIZE)
+    depth = make_renderer(trimesh.creation.box((2.0, 2.0, 0.01))).render(T, WINDOW_K, size)
+    smooth = torch.nn.functional.interpolate(
+        torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(0)), size=1024, mode="bicubic"
+    )[0, 0]
+    v, u = torch.meshgrid(torch.arange(256.0), torch.arange(256.0), indexing="ij")
+    shift = 80.0 * torch.tensor([x, y])
+    look = smooth[(v - shift[1] + 300).long(), (u - shift[0] + 300).long()]  # shifts of whole pixels
+    grey = (255 * torch.where(depth[0, 0] > 0, look, 0.5)).clamp(0, 255).byte().numpy()
+    return Window(torch.zeros(1, 3, *size), grey, WINDOW_K, torch.ones(1, 1, *size)), T, depth
+
+
+def keyframe_of(window, T, depth) -> Keyframe:
+    uv, model = surface_corners(window.grey, depth, T, WINDOW_K, quality=0.01, inside=3)
+    return Keyframe(window, T, uv, model)
+
+
+def test_corners_lie_on_the_surface_inside_the_outline():
+    window, T, depth = plate()
+    keyframe = keyframe_of(window, T, depth)
+    assert len(keyframe.uv) > 50
+    assert np.abs(keyframe.uv - 127.5).max() < 80 - 2
+    assert float((keyframe.model[..., 2] + 0.005).abs().max()) < 1e-5
+    again = pixels(keyframe.model, T, WINDOW_K, ZERO)[0].numpy()
+    assert np.abs(again - keyframe.uv).max() < 1e-3
+
+
+def test_flow_finds_the_corners_of_a_moved_plate_and_their_pose():
+    window, T, depth = plate()
+    other, truth, _ = plate(0.15, -0.1)  # 12 px and -8 px
+    flow = track_points(keyframe_of(window, T, depth), other, T, ZERO, levels=3)
+    there = flow.weight[0] > 0
+    assert float(there.double().mean()) > 0.8
+    error = (flow.uv - pixels(flow.model, truth, WINDOW_K, ZERO)).norm(dim=-1)[0, there]
+    assert float(error.median()) < 0.1
+    assert torch.allclose(fit_points(flow, T, WINDOW_K, ZERO, FLOW_SCALES), truth, atol=5e-3)
+    assert flow.inlier_ratio(truth, WINDOW_K, ZERO) > 0.8
+    assert flow.inlier_ratio(T, WINDOW_K, ZERO) < 0.05  # 14 px beside
+
+
+def test_flow_that_does_not_lead_back_is_left_out():
+    """The right half of the plate is covered by another print."""
+    window, T, depth = plate()
+    covered = Window(window.colours, window.grey.copy(), WINDOW_K, window.inside)
+    covered.grey[:, 128:] = np.random.default_rng(0).integers(0, 255, (256, 128))
+    flow = track_points(keyframe_of(window, T, depth), covered, T, ZERO, levels=1)
+    right = flow.model[0, :, 0] > 0.1
+    assert float((flow.weight[0, right] > 0).double().mean()) < 0.2
+    assert float((flow.weight[0, ~right] > 0).double().mean()) > 0.7
+
+
+def test_uniform_surface_has_no_corners_and_no_flow():
+    window, T, depth = plate()
+    bare = Window(window.colours, np.full_like(window.grey, 90), WINDOW_K, window.inside)
+    flow = track_points(keyframe_of(bare, T, depth), window, T, ZERO, levels=1)
+    assert flow.uv.shape == (1, 0, 2)
+    assert flow.inlier_ratio(T, WINDOW_K, ZERO) == 0.0
+    assert torch.equal(fit_points(flow, T, WINDOW_K, ZERO, FLOW_SCALES), T)
+
+
+@pytest.fixture
+def only_colours(monkeypatch):
+    """Weights of points become 0, that of edges nearly so."""
+    for name in ("POINT_WEIGHT", "KEYFRAME_WEIGHT"):
+        monkeypatch.setattr(tracker, name, 0.0)
+    monkeypatch.setattr(tracker, "REGION_WEIGHT", 1e6)
+
+
+@pytest.fixture
+def only_edges(monkeypatch):
+    for name in ("POINT_WEIGHT", "KEYFRAME_WEIGHT", "REGION_WEIGHT"):
+        monkeypatch.setattr(tracker, name, 0.0)
+
+
+@pytest.mark.parametrize("measurement", ["only_edges", "only_colours"])
+def test_each_measurement_alone_moves_the_outline_onto_a_plain_cube(request, measurement):
+    request.getfixturevalue(measurement)
+    truth = moved(START, [0.0, 0.0, 0.03], [0.03, -0.02, 0.0])
+    follow = make_tracker(cube())
+    follow.start(drawn(START), K, START)
+    assert shift_in_pixels(START, truth) > 3.0
+    assert shift_in_pixels(follow.track(drawn(truth), K).T[0], truth) < 0.5
+
+
+def test_colours_pull_towards_the_object():
+    """The cube is 2 px further right than the pose: the step is a translation to the right, of about as much."""
+    follow = make_tracker(cube())
+    follow.start(drawn(START), K, START)
+    step = 2.0 * 6.0 / 500.0
+    frame = follow._frame(drawn(moved(START, [0.0, 0.0, 0.0], [step, 0.0, 0.0])), K, START[None])
+    outline = follow._outline(frame, START[None])
+    A, b = follow._measurements(frame, outline, START[None], [], 6.0)[0].equations()
+    x = torch.linalg.solve(A[:, 3:, 3:], b[:, 3:])[0, :, 0]
+    assert float(x[0]) == pytest.approx(step, rel=0.3)
+    assert float(x[1:].abs().max()) < 0.3 * step
+
+
+def test_prediction_goes_on_at_constant_velocity():
+    (_, _, first), (_, _, second), (_, _, third) = frames = sequence(3)
+    follow = make_tracker(example_mesh())
+    follow.start(frames[0][0], CAMERA, first)
+    assert [T.shape for T in follow.predictions()] == [(1, 4, 4)]
+    follow.accept(follow.measure(frames[1][0], CAMERA, second))
+    predicted, last = follow.predictions()
+    assert torch.equal(last[0], second)
+    assert float(rotation_error(predicted[0, :3, :3], third[:3, :3])) < 0.01
+    step, error = (float((T[:3, 3] - third[:3, 3]).norm()) for T in (second, predicted[0]))
+    assert error < 0.1 * step
+
+
+def test_tracker_follows_a_generated_sequence():
+    frames = sequence(8)
+    follow = make_tracker(example_mesh())
+    follow.start(frames[0][0], CAMERA, frames[0][2])
+    for image, _, T in frames[1:]:
+        found = follow.track(image, CAMERA)
+        follow.accept(found)
+        assert float(rotation_error(found.T[0, :3, :3], T[:3, :3])) < 2.0
+        assert float((found.T[0, :3, 3] - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.02
+        assert found.confidence > 0.5
+        assert all(0.0 <= value <= 1.0 for value in found.features.values())
+        R = found.T[0, :3, :3]
+        assert float((R @ R.mT - torch.eye(3)).abs().max()) < 1e-12
+        C = follow.covariance(found)
+        assert float(torch.linalg.eigvalsh(C).min()) > 0
+        assert float(torch.rad2deg(C[:3, :3].diagonal().sqrt()).max()) < 20.0
+
+
+def test_frames_from_other_directions_become_keyframes():
+    """The sequence turns by 4 degrees a frame: every second is another keyframe."""
+    frames = sequence(10)
+    follow = make_tracker(example_mesh())
+    follow.start(frames[0][0], CAMERA, frames[0][2])
+    for image, _, T in frames[1:]:
+        follow.accept(follow.measure(image, CAMERA, T))
+    angles = [float(rotation_error(k.T[0, :3, :3], frames[0][2][:3, :3])) for k in follow._keyframes]
+    assert angles == pytest.approx([0.0, 8.02, 16.04, 24.06, 32.09], abs=0.05)
+
+
+def test_confidence_falls_where_the_object_is_absent():
+    frames = sequence(2)
+    follow = make_tracker(example_mesh())
+    follow.start(frames[0][0], CAMERA, frames[0][2])
+    there = follow.track(frames[1][0], CAMERA)
+    noise = torch.rand(frames[1][0].shape, generator=torch.Generator().manual_seed(1))
+    absent = follow.track(noise, CAMERA)
+    assert absent.confidence < 0.2 < 0.5 < there.confidence
+
+
+def test_pose_outside_the_image_is_lost():
+    follow = make_tracker(cube())
+    with pytest.raises(LostObjectError, match="outside"):
+        follow.start(drawn(START), K, moved(START, [0.0, 0.0, 0.0], [5.0, 0.0, 0.0]))
+    behind = START.clone()
+    behind[2, 3] = -6.0
+    with pytest.raises(LostObjectError):
+        follow.start(drawn(START), K, behind)
