@@ -79,10 +79,10 @@ class PointMatches:
         return Measurements(J.flatten(1, 2), residual.flatten(1)[..., None], weight[..., None])
 
     def inlier_ratio(self, T: Tensor, K: Tensor, centre: Tensor, *, scale: float = INLIER_SCALE) -> float:
-        """Fraction of all points, in [0, 1], that were found where the pose has them; at ``scale`` px a quarter of a
-        point counts."""
+        """Mean weight, in [0, 1], of the points that were found where the pose has them; at ``scale`` px a quarter of it
+        counts."""
         near = _geman_mcclure(self.uv - pixels(self.model, T, K, centre), scale)
-        return float((near * (self.weight > 0)).sum()) / max(self.weight.shape[1], 1)
+        return float((near * self.weight).sum()) / max(self.weight.shape[1], 1)
 
     def moved(self, before: Tensor, after: Tensor) -> "PointMatches":
         """The same in another crop of the photograph: ``before`` and ``after`` are the crops' cameras (1, 3, 3)."""

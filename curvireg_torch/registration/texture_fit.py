@@ -36,9 +36,10 @@ an edge."""
 FAR_ROUND, NEAR_ROUND = (30, (32.0, 16.0, 8.0, 4.0)), (6, (6.0, 4.0, 2.0))
 """Of the two rounds: the search radius in px, and the scales of robust weights in px, one a step."""
 
-PATCH_INLIER_SCALE, PROMISING_RATIO, CONVINCING_RATIO = 4.0, 0.1, 0.3
+PATCH_INLIER_SCALE, PROMISING_RATIO, CONVINCING_RATIO = 4.0, 0.03, 0.15
 """Distance in px at which a corner counts a quarter, and inlier ratios that a pose needs after the first round and
-after the second: patches seen from another side are found less exactly than those of the next frame."""
+after the second: patches seen from another side are found less exactly than those of the next frame, and correlate
+less."""
 
 TURN = 16.0
 """Degrees by which poses are turned both ways about an axis that contours do not determine: within them, the search of
