@@ -12,7 +12,7 @@ from curvireg_torch.filters import MultiScaleFocusCurves
 from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching.describe import depth_filter
 from curvireg_torch.pipeline import DEFAULT, DEPTH_FIELDS, FIELDS, PRESETS, BankSettings, ViewPolicy, preset_named
-from curvireg_torch.terms import TERMS, BoxShape, Correlation, Repeatability
+from curvireg_torch.terms import TERMS, Correlation, Repeatability
 
 
 @pytest.mark.parametrize("name", sorted(FIELDS))
@@ -39,7 +39,7 @@ def test_presets_register_and_survive_json(name):
     registrar = Registrar(bank, pipeline=replace(pipeline, search=False, contours=False))
     result = registrar([torch.rand(3, 80, 100)], torch.tensor([[20.0, 10, 80, 70]]))[0]
     assert result.rotation.isfinite().all()
-    assert set(result.ranking.terms) == {term.name for term in pipeline.terms}
+    assert set(result.ranking.terms) == {term.name for term in pipeline.terms if term.weight}
     assert Registrar(bank).pipeline == pipeline.with_pose_prior("given")
 
 
@@ -49,11 +49,12 @@ def test_presets_have_the_stated_settings():
         preset_named("best")
     for name in ("classical", "paper"):  # nothing learned
         assert isinstance(PRESETS[name].photograph_field(), MultiScaleFocusCurves)
-        assert {term.name for term in PRESETS[name].terms} == {"hog", "repeatability", "box"}
+        assert {term.name for term in PRESETS[name].terms} >= {"hog", "repeatability"}
     assert isinstance(PRESETS["learned"].photograph_field(), LearnedCurvilinearSaliency)
     paper = PRESETS["paper"]
     assert (paper.bank.camera, paper.bank.formula) == ("orthographic", "paper")
-    assert paper.terms == (Correlation(whitening="bank"), Repeatability(mode="paper"), BoxShape(weight=0.0))
+    assert paper.terms == (Correlation(whitening="bank"), Repeatability(mode="paper"))
+    assert [name for name, preset in PRESETS.items() if preset.search] == ["paper"]
 
 
 def test_json_contains_every_setting():
@@ -65,7 +66,7 @@ def test_json_contains_every_setting():
         replace(base, box_jitter=0.2),
         replace(base, weights="0123"),
         replace(base, hypotheses=6),
-        replace(base, search=False),
+        replace(base, search=True),
         replace(base, contours=False),
     ]
     for part, names in {
@@ -109,7 +110,13 @@ def test_read_completes_a_partial_file_with_defaults(tmp_path):
         ('{"terms": {"hug": {}}}', "term: expected one of 'hog'"),
         *((f'{{"terms": {{"{name}": {{"weight": -1}}}}}}', f"{name}: weight") for name in TERMS),
         ('{"box_jitter": 0.6}', "box_jitter"),
-        ('{"terms": {"appearance": {}}}', "compare all views"),
+        ('{"terms": {"appearance": {}}}', "each term once, and 'hog'"),
+        ('{"box_jitter": "0.1"}', "box_jitter"),
+        ('{"hypotheses": 2.5}', "hypotheses"),
+        ('{"hypotheses": null}', "hypotheses"),
+        ('{"search": "yes"}', "search"),
+        ('{"bank": {"image_size": [64]}}', "image_size"),
+        ('{"terms": {"repeatability": {}}}', "each term once, and 'hog'"),
         ('{"terms": {"hog": {}, "appearance": {"weights": "0"}}}', "expected weights 0"),
     ],
 )

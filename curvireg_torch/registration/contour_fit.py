@@ -38,6 +38,7 @@ __all__ = ["ContourFit", "ContourProblem", "ContourState", "EdgeField", "ObjectM
 CROP_SIZE = 256
 """Side of the crop in px; the first rounds use half of it."""
 
+QUARTER_SIZE_RADII = (6.0, 4.0)
 FIRST_RADII, SECOND_RADII, FULL_SIZE_RADII = (6.0, 4.0), (3.0, 2.0), (4.0, 2.0, 2.0)
 """Search radius for edges in px, one a round: from all starts and then from the best at half size, and at full size."""
 
@@ -47,7 +48,7 @@ HALF_SIZE_DENSITY = 0.5
 SAME_POSE_SHIFT = 0.5
 """Mean shift in px at half size below which two fits count as one."""
 
-START_ANGLE, START_ROLL = 8.0, 6.0
+START_ANGLES, START_ROLL = (8.0,), 6.0
 """Degrees by which the pose is rotated left, right, up and down, and about the line of sight, for further starts: about
 half the spacing of a bank's views."""
 
@@ -352,6 +353,7 @@ def fit_contours(
     image_index: Tensor | None = None,
     margin: float = 0.1,
     finish: int | None = None,
+    start_angles: Sequence[float] = START_ANGLES,
     object_mask: Tensor | None = None,
 ) -> ContourFit:
     """Poses whose contours lie on a photograph's edges, by robust least squares over SE(3).
@@ -390,6 +392,7 @@ def fit_contours(
         margin: added around the box, as a fraction of its longer side.
         finish: number of starts of each photograph that are fitted to the end, those with the most support after the
             first rounds; None: all, each as if alone.
+        start_angles: degrees by which each start is rotated away, up, down, left and right, to fit from there too.
         object_mask: (B, 1, s, s) probability that pixels of the square crops, the boxes with their margin, belong to
             the object, for instance of :meth:`LearnedCurvilinearSaliency.mask`.
 
@@ -421,15 +424,13 @@ def fit_contours(
     if object_mask is not None:
         check_tensor(object_mask, "object_mask", (len(images), 1, None, None))
         full = replace(full, mask=ObjectMask(object_mask))
-    K = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64) @ full.K
-    half = replace(
-        full, edges=EdgeField(F.avg_pool2d(crops, 2), F.avg_pool2d(inside, 2).floor()), K=K, size=CROP_SIZE // 2
-    )
+    half, quarter = (_smaller(full, crops, inside, factor) for factor in (2, 4))
     before, weighted_before = half.supports(half.state(T0))
-    around = _turned(T0, half.centre)
+    around = _turned(T0, half.centre, start_angles)
     M = around.shape[1]
     every = torch.arange(N).repeat_interleave(M)
-    fits = half[every].descend(half[every].state(around.flatten(0, 1)), FIRST_RADII)
+    coarse = quarter[every].descend(quarter[every].state(around.flatten(0, 1)), QUARTER_SIZE_RADII).T
+    fits = half[every].descend(half[every].state(coarse), FIRST_RADII)
     supports = half[every].supports(fits)[1].view(N, M)
     support, best = supports.max(dim=1)
     first = fits[torch.arange(N) * M + best]
@@ -491,6 +492,14 @@ def full_size_problem(
     return crops, inside, ContourProblem(contours, EdgeField(crops, inside), image_index, K, CROP_SIZE)
 
 
+def _smaller(full: ContourProblem, crops: Tensor, inside: Tensor, factor: int) -> ContourProblem:
+    """The problem in crops whose sides are smaller by a factor."""
+    shrink = torch.diag(torch.tensor([1.0 / factor, 1.0 / factor, 1.0], dtype=torch.float64))
+    shrink[:2, 2] = 0.5 / factor - 0.5
+    edges = EdgeField(F.avg_pool2d(crops, factor), F.avg_pool2d(inside, factor).floor())
+    return replace(full, edges=edges, K=shrink @ full.K, size=full.size // factor, density=HALF_SIZE_DENSITY)
+
+
 def inside_photographs(images: Sequence[Tensor], boxes: Tensor, size: int, margin: float) -> Tensor:
     """(B, 1, size, size) float32: 1 where crops around (B, 4) boxes show their photograph, 0 where they repeat its
     border."""
@@ -502,13 +511,18 @@ def inside_photographs(images: Sequence[Tensor], boxes: Tensor, size: int, margi
     return (down[:, None, :, None] & across[:, None, None, :]).float()
 
 
-def _turned(T: Tensor, centre: Tensor) -> Tensor:
-    """(N, M, 4, 4) poses: each of (N, 4, 4), then turned about the camera's x and y axes and about its z axis."""
-    angles = torch.tensor([START_ANGLE, -START_ANGLE, START_ANGLE, -START_ANGLE, START_ROLL, -START_ROLL])
-    twists = torch.zeros(7, 6, dtype=torch.float64)
-    twists[torch.arange(1, 7), torch.tensor([0, 0, 1, 1, 2, 2])] = torch.deg2rad(angles.double())
-    N = len(T)
-    return apply_twist(T.repeat_interleave(7, 0), twists.repeat(N, 1), centre).view(N, 7, 4, 4)
+def _turned(T: Tensor, centre: Tensor, angles: Sequence[float]) -> Tensor:
+    """(N, M, 4, 4) poses: each of (N, 4, 4), then turned about the camera's z axis, and about x and y by ``angles``."""
+    axes = torch.eye(6, dtype=torch.float64)[:3]
+    both = torch.cat([axes, -axes])
+    turns = [
+        torch.zeros(1, 6, dtype=torch.float64),
+        START_ROLL * both[[2, 5]],
+        *(a * both[[0, 3, 1, 4]] for a in angles),
+    ]
+    twists = torch.deg2rad(torch.cat(turns))
+    N, M = len(T), len(twists)
+    return apply_twist(T.repeat_interleave(M, 0), twists.repeat(N, 1), centre).view(N, M, 4, 4)
 
 
 def _two_best(half: ContourProblem, fits: ContourState, supports: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:

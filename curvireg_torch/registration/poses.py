@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -176,8 +177,9 @@ def fit_poses(
     poses: Poses,
     boxes: Tensor,
     object_mask: Tensor | None = None,
+    **options: Any,
 ) -> Poses:
-    """Fit the contours of all poses, see :func:`fit_contours`."""
+    """Fit the contours of all poses, see :func:`fit_contours`, which has more ``options``."""
     fit = fit_contours(
         describer.contours,
         images,
@@ -186,8 +188,8 @@ def fit_poses(
         poses.T,
         image_index=poses.image_index,
         margin=describer.settings.margin,
-        finish=FINISHED_FITS,
         object_mask=object_mask,
+        **{"finish": FINISHED_FITS, **options},
     )
     return poses.with_fit(fit, describer.centre)
 

@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 
 __all__ = ["LOST_CONFIDENCE", "nearest_view", "refine"]
 
+WIDE_START_ANGLES = (8.0, 14.0, 22.0)
+"""Degrees by which given starts are rotated away, to fit from there too: they may be worse than views of a bank."""
+
 LOST_CONFIDENCE = 0.35
 """Confidence of the fit below which the object counts as lost, see docs/guides/known-pose.md."""
 
@@ -126,7 +129,8 @@ def refine_item(
     check_crop(query.crops[0])
     descriptors = describer.descriptor(query.field)
     poses = _poses(registrar, T, K, boxes)
-    poses = fit_poses(describer, images, poses, boxes, registrar.object_mask(query))
+    mask = registrar.object_mask(query)
+    poses = fit_poses(describer, images, poses, boxes, mask, start_angles=WIDE_START_ANGLES)
     evidence = _evidence(registrar, descriptors, poses)
     best = _scores(evidence).argmax()
     if (fitted := fit_texture_of(describer, images, poses, boxes, int(best))) is not None:

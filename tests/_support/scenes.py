@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix, sample_views
+from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
-__all__ = ["CAMERA", "SIZE", "scene", "truck_bank", "truck_registrar", "unrefined"]
+__all__ = ["CAMERA", "SIZE", "learned_registrar", "scene", "sequence", "truck_bank", "truck_registrar", "unrefined"]
 
 SIZE = (180, 240)
 CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
@@ -24,12 +25,33 @@ def truck_bank() -> ViewBank:
 
 
 @cache
+def learned_registrar() -> Registrar:
+    """A registrar of the truck with the default pipeline, whose results have a confidence."""
+    views = sample_views(azimuth_step=15, elevations=[0, 20, 40, 60])
+    return Registrar(ViewBank.build(example_mesh(), views, image_size=96, progress=False))
+
+
+@cache
 def scene(seed: int) -> tuple[Tensor, Tensor, Tensor]:
     """image (3, H, W), box (4,), true T_cam_from_model (4, 4)."""
     generator = torch.Generator().manual_seed(seed)
     T = random_pose(example_mesh(), CAMERA, SIZE, generator, elevations=(5.0, 50.0))
     image, box = synthesize_photograph(example_mesh(), T, CAMERA, SIZE, generator)
     return image, box, T
+
+
+def sequence(count: int) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Photographs, boxes and poses: 4 degrees about a vertical axis and 2 % nearer from frame to frame."""
+    T = scene(0)[2]
+    step = rotation_from_axis_angle(torch.tensor([0.0, 0.07, 0.0], dtype=torch.float64))
+    frames = []
+    for _ in range(count):
+        generator = torch.Generator().manual_seed(9)
+        frames.append((*synthesize_photograph(example_mesh(), T, CAMERA, SIZE, generator), T))
+        T = T.clone()
+        T[:3, :3] = step @ T[:3, :3]
+        T[:3, 3] *= 0.98
+    return frames
 
 
 def unrefined(bank: ViewBank, **changes: Any) -> Pipeline:

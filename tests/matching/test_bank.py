@@ -1,4 +1,4 @@
-"""Banks in memory, joined, and on disk."""
+"""Banks in memory and on disk."""
 
 import os
 import stat
@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-import trimesh
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
@@ -81,8 +80,6 @@ def test_build_stops_at_the_first_error(truck):
         (lambda bank: build(bank.mesh, bank.views[:0]), "views: expected at least one"),
         (lambda bank: build(bank.mesh, chunk_size=0), "chunk_size"),
         (lambda bank: ViewMatcher(bank, chunk_size=0), "chunk_size"),
-        (lambda bank: ViewBank.join([bank, bank]).mesh, r"choose one of bank\.meshes"),
-        (lambda _: ViewBank.join([]), "at least one bank"),
     ],
 )
 def test_bank_refuses_bad_arguments(small_bank, call, message):
@@ -126,43 +123,6 @@ def test_check_compatible_ignores_what_decides_no_view(upright, small_bank):
     for pose in ("any", "upright", "given"):  # the caller passed the views
         pipeline = Pipeline(bank=SETTINGS).with_pose_prior(pose)
         assert ViewMatcher(small_bank, pipeline=pipeline).pipeline.views.pose == "given"
-
-
-def test_join_concatenates_banks(small_bank):
-    second = build(trimesh.creation.box((0.1, 0.2, 0.1)), uniform_views(7))
-    both, n = ViewBank.join([small_bank, second]), len(small_bank)
-    assert len(both) == n + 7
-    for name in TENSORS:
-        assert torch.equal(getattr(both, name), torch.cat([getattr(small_bank, name), getattr(second, name)]))
-    points = torch.stack([second.points[2], small_bank.points[1]])
-    assert torch.equal(both.points_at(torch.tensor([n + 2, 1])), points)
-    assert both.model.tolist() == [0] * n + [1] * 7
-
-
-def test_join_of_joined_banks_numbers_all_models():
-    banks = [build(trimesh.creation.box((1, 1, height)), uniform_views(2)) for height in (1, 2, 3, 4)]
-    nested = ViewBank.join([ViewBank.join(banks[:2]), ViewBank.join(banks[2:])])
-    flat = ViewBank.join(banks)
-    assert nested.model.tolist() == flat.model.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
-    assert [float(mesh.extents[2]) for mesh in nested.meshes] == [1.0, 2.0, 3.0, 4.0]
-    assert_same(nested, flat)
-
-
-def test_join_refuses_banks_that_differ(small_bank, upright, truck):
-    coarse = build(truck, uniform_views(3), settings=replace(SETTINGS, sigma=2.0))
-    with pytest.raises(InvalidInputError, match="one set of settings"):
-        ViewBank.join([small_bank, coarse])
-    with pytest.raises(InvalidInputError, match=r"one view policy, but bank 1 has .*upright.* and bank 0 .*given"):
-        ViewBank.join([small_bank, upright])
-
-
-def test_matcher_finds_the_model_in_a_joined_bank(small_bank):
-    box = build(trimesh.creation.box((0.1, 0.2, 0.1)), small_bank.views)
-    both = ViewBank.join([box, small_bank])
-    picture = small_bank.silhouettes[5].float()[None, None].repeat(1, 3, 1, 1)
-    edges = torch.tensor([[-0.5, -0.5, 63.5, 63.5]])
-    ranking = ViewMatcher(both)(picture, edges / 1.2 + 63.0 * (1 - 1 / 1.2) / 2)  # with its margin, the whole view
-    assert len(box) + 5 in ranking.top(3)[0]
 
 
 def test_save_and_load(small_bank, tmp_path):
@@ -242,11 +202,9 @@ def with_nan(x):
         ("boxes", lambda x: x[1:], "boxes: not of the shape"),
         ("points", lambda x: x[:, 1:], "points: not of the shape"),
         ("views.distance", lambda x: x / 0.0, "viewpoints that are not finite"),
-        ("model", lambda x: x + 1, "meshes that do not exist"),
-        ("model", lambda x: x - 1, "meshes that do not exist"),
         ("reranking.appearance", lambda x: x[1:], "appearance that do not fit"),
         ("reranking.appearance", with_nan, "appearance that do not fit"),
-        ("mesh0.faces", lambda x: x + 10**6, "mesh 0 is not a mesh"),
+        ("mesh.faces", lambda x: x + 10**6, "not a mesh"),
     ],
 )
 def test_load_refuses_contents_that_no_bank_has(saved, name, change, message):

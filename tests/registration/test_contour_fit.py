@@ -298,9 +298,7 @@ def test_fit_finishes_the_best_starts_of_each_photograph():
     off = torch.tensor([0.6, 0.5, 0.7, 0.0, 0.0, 0.4], dtype=torch.float64).expand(5, 6)
     both = torch.cat([apply_twist(starts, off, mesh_centre(cube())), starts])
     index, contours = torch.cat([image_index, image_index]), MeshContours(cube())
-    whole, one = (
-        fit_contours(contours, images, boxes, cameras, both, image_index=index, finish=n) for n in (None, 1)
-    )
+    whole, one = (fit_contours(contours, images, boxes, cameras, both, image_index=index, finish=n) for n in (None, 1))
     same = (one.transform - whole.transform).abs().amax(dim=(1, 2)) < 1e-9
     assert torch.bincount(index[same], minlength=3).tolist() == [1, 1, 1]
     for b in range(3):

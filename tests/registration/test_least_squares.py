@@ -1,4 +1,4 @@
-"""Least squares over poses: derivatives, bounded steps, and the covariance in closed form and against injected noise."""
+"""Least squares over poses: derivatives, bounded steps, the covariance in closed form and against injected noise."""
 
 import math
 

@@ -1,25 +1,54 @@
 """Objects without a box: located, registered, counted, or reported as absent."""
 
-import json
+import copy
 import math
 from dataclasses import replace
-from pathlib import Path
+from functools import cache
 from types import SimpleNamespace
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 import curvireg_torch as cr
+from curvireg_torch import ViewBank
 from curvireg_torch.errors import CurviregError, InvalidInputError
-from curvireg_torch.geometry import PosePrior, box_iou, rotation_error, viewpoint_from_rotation
+from curvireg_torch.geometry import PosePrior, box_iou, projected_boxes, rotation_error, viewpoint_from_rotation
+from curvireg_torch.matching import ViewDescriber, ViewMatcher
+from curvireg_torch.registration import Located, Locator, localize, representative_views
 from curvireg_torch.registration import localization as localization_module
-from curvireg_torch.registration import localize
-from curvireg_torch.registration.confidence import presence
 from curvireg_torch.registration.inputs import ImageItem
-from curvireg_torch.registration.localization import ScoredCandidates, _allowed_views
-from curvireg_torch.registration.locator import Located
-from tests._support.scenes import CAMERA, scene, unrefined
-from tests.registration.locator.test_locator import bank, clutter, pasted_scene
+from curvireg_torch.registration.localization import Candidate, _allowed_views, _medoids, _nearest_representatives
+from curvireg_torch.synthetic import example_mesh, procedural_background
+from tests._support.scenes import CAMERA, scene, truck_bank, unrefined
+
+SIZE = (240, 320)
+
+
+@cache
+def bank(preset="learned"):
+    views = cr.sample_views(azimuth_step=30, elevations=[15, 45])
+    return cr.ViewBank.build(example_mesh(), views, pipeline=cr.pipeline.PRESETS[preset], progress=False)
+
+
+@cache
+def locator(preset="learned"):
+    return Locator(ViewMatcher(bank(preset)))
+
+
+def pasted_scene(seed, corner, scale):
+    """The scene's truck with its background, pasted into other clutter: image (3, H, W) and box (4,)."""
+    image, box, _ = scene(seed)
+    small = F.interpolate(image[None], scale_factor=scale, mode="bilinear", antialias=True)[0]
+    canvas = clutter(100 + seed)
+    x, y = corner
+    h, w = small.shape[1:]
+    canvas[:, y : y + h, x : x + w] = small
+    return canvas, (box + 0.5) * scale - 0.5 + torch.tensor([x, y, x, y])
+
+
+def clutter(seed):
+    return procedural_background(SIZE, torch.Generator().manual_seed(seed))
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +86,7 @@ def test_localization_agrees_with_the_given_box(registrar, found):
     given = registrar([image], box[None])[0]
     assert given.localization is None
     assert rotation_error(result.rotation, given.rotation) < 35, "one step of this bank"
-    assert 0.0 <= result.confidence <= where.presence <= 1.0
+    assert 0.0 <= where.presence <= 1.0
 
 
 @pytest.mark.parametrize(("seed", "corner", "scale"), [(5, (30, 60), 0.6), (3, (40, 10), 1.1)])
@@ -87,7 +116,7 @@ def test_pose_outside_the_photograph_has_presence_zero(registrar, found, monkeyp
     monkeypatch.setattr(localization_module, "projected_box", lambda *_: outside)
     result = registrar([found[0]])[0]
     assert result.ok
-    assert (result.localization.presence, result.confidence) == (0.0, 0.0)
+    assert result.localization.presence == 0.0
 
 
 def test_presence_is_lower_without_the_object(registrar):
@@ -189,27 +218,27 @@ def test_bad_distances_raise(registrar, found):
             _ = registrar([found[0]], boxes, CAMERA, prior=prior)[0].rotation
 
 
-@pytest.mark.parametrize(("preset", "features"), [("learned", [7.0, 0.6]), ("classical", [0.6])])
-def test_presence_uses_the_recorded_constants(preset, features):
-    record = Path(__file__).parents[2] / "scripts" / "results" / "location.json"
-    fit = json.loads(record.read_text(encoding="utf-8"))["presence"][preset]
-    logit = sum(w * v for w, v in zip(fit["weights"], features, strict=True)) + fit["bias"]
-    assert presence(features) == pytest.approx(1 / (1 + math.exp(-logit)))
-    for k in range(len(features)):
-        more = [value + 0.1 * (i == k) for i, value in enumerate(features)]
-        assert presence(more) > presence(features)
-
-
-@pytest.mark.parametrize(("preset", "count"), [("learned", 2), ("fast", 2), ("classical", 1), ("paper", 1)])
-def test_presence_uses_the_locator_score_of_learned_features_only(preset, count):
+@pytest.mark.parametrize(("preset", "learned"), [("learned", True), ("fast", True), ("classical", False)])
+@torch.no_grad()
+def test_presence_uses_the_score_of_learned_features_only(preset, learned):
     registrar = cr.Registrar(bank(preset))
     image, box = pasted_scene(5, (90, 40), 0.9)
-    low, high = (
-        ScoredCandidates.score_boxes(registrar, ImageItem(image, box, None), box[None], torch.tensor([score]))
-        for score in (4.0, 9.0)
-    )
-    assert len(low.evidence[0]) == len(high.evidence[0]) == count
-    assert float(low.presence[0]) < float(high.presence[0]) if count == 2 else low.presence.equal(high.presence)
+    low, high = (Candidate.ranked(registrar, ImageItem(image, box, None), box, score) for score in (4.0, 9.0))
+    assert (low.presence < high.presence) if learned else (low.presence == high.presence)
+
+
+def test_right_hint_that_leaves_no_view_at_some_proposals_does_not_fail():
+    """In a wide camera: the hint holds at the truck, and nowhere at the other proposals, which come first."""
+    registrar = cr.Registrar(bank(), pipeline=unrefined(bank()))
+    image, box = pasted_scene(5, (200, 120), 0.45)
+    K = cr.camera_matrix(150.0, 150.0, 159.5, 119.5, dtype=torch.float64)
+    alone = registrar([image], box[None], K)[0]
+    prior = PosePrior(rotation=alone.rotation, within=2.0)
+    far = torch.tensor([[4.0, 4.0, 44.0, 44.0], [4.0, 190.0, 44.0, 230.0]])
+    registrar.__dict__["locator"] = FixedLocator(torch.cat([far, box[None]]), [9.0, 8.0, 7.0])
+    result = registrar([image], camera_matrices=K, prior=prior)[0]
+    assert result.ok
+    assert box_iou(result.localization.box[None], box[None].double()) > 0.5
 
 
 def test_locator_does_not_compare_views_that_the_prior_excludes(registrar, found):
@@ -234,3 +263,225 @@ def test_allowed_views_are_those_of_any_place_in_the_photograph(registrar):
     half = math.degrees(math.atan(150 / 260))
     assert torch.equal(_allowed_views(registrar, item), degrees <= 8.5 + half)
     assert torch.equal(_allowed_views(registrar, replace(item, camera_matrix=None)), degrees <= 8.5)
+
+
+def test_dense_features_reuse_the_network_of_the_appearance_term():
+    assert any(locator().features.backbone is module for module in locator().matcher.modules())
+
+
+def test_locator_uses_learned_features_where_the_pipeline_has_any():
+    """The preset "fast" has the learned field, but not the appearance term."""
+    assert locator("fast").features.learned
+    assert not locator("classical").features.learned
+    image, box = pasted_scene(1, (100, 30), 0.8)
+    fast, default = locator("fast")([image])[0], locator()([image])[0]
+    assert torch.equal(fast.boxes, default.boxes)
+    assert box_iou(fast.boxes[:1], box[None]) > 0.6
+
+
+@pytest.mark.parametrize(("preset", "among", "least"), [("learned", 2, 0.6), ("classical", 5, 0.55)])
+@pytest.mark.parametrize(("seed", "corner", "scale"), [(0, (10, 20), 0.8), (1, (100, 30), 0.8), (3, (40, 10), 1.1)])
+def test_locator_finds_the_object(preset, among, least, seed, corner, scale):
+    image, box = pasted_scene(seed, corner, scale)
+    located = locator(preset)([image])[0]
+    assert box_iou(located.boxes, box[None])[:among].max() > least
+    assert located.scores.diff().max() <= 0
+    assert located.boxes.dtype == torch.float32
+    assert (box_iou(located.boxes, located.boxes) > 0.5).sum() == len(located.boxes), "boxes are distinct"
+
+
+def test_located_box_moves_with_the_object():
+    centres = []
+    for corner in ((10, 40), (100, 40), (100, 10)):
+        image, box = pasted_scene(5, corner, 0.8)
+        best = locator()([image])[0].boxes[0]
+        assert box_iou(best[None], box[None]) > 0.6
+        centres.append(0.5 * (best[:2] + best[2:]))
+    for shift, expected in zip(torch.stack(centres).diff(dim=0).tolist(), [(90, 0), (0, -30)], strict=True):
+        assert shift == pytest.approx(expected, abs=10)
+
+
+def test_located_scores_are_lower_without_the_object():
+    with_it = [locator()([pasted_scene(seed, (40, 30), 0.9)[0]])[0].scores[0] for seed in (0, 1, 3)]
+    without = [locator()([clutter(7 + k)])[0].scores[0] for k in range(3)]
+    assert min(with_it) > max(without)
+
+
+def test_scores_are_relative_to_the_view_elsewhere_in_the_photograph():
+    """Level and spread of a view's similarity do not matter."""
+    generator = torch.Generator().manual_seed(3)
+    K = len(locator()._templates.views)
+    maps = [0.1 * torch.rand(K, *size, generator=generator) for size in ((15, 20), (21, 28))]
+    fits, ratios = [torch.ones(K, dtype=torch.bool)] * 2, [(1.0, 1.0), (1.4, 1.4)]
+    gain, level = 0.5 + torch.rand(2, K, 1, 1, generator=generator)
+    plain = locator()._peaks(maps, fits, ratios)
+    biased = locator()._peaks([gain * m + level for m in maps], fits, ratios)
+    assert torch.equal(biased.views, plain.views)
+    assert torch.allclose(biased.scores, plain.scores, atol=1e-4)
+    every = torch.cat([m.flatten(1) for m in maps], dim=1)
+    z = (every - every.mean(dim=1, keepdim=True)) / every.std(dim=1, keepdim=True)
+    assert float(plain.scores[0]) == pytest.approx(float(z.max()), rel=1e-4)
+
+
+def test_locator_is_independent_of_batch_dtype_and_grey_channels():
+    images = [pasted_scene(0, (10, 20), 0.8)[0], pasted_scene(1, (60, 30), 0.8)[0]]
+    both, alone = locator()(images), locator()(images[1:])
+    assert torch.equal(both[1].boxes, alone[0].boxes)
+    assert torch.equal(both[1].scores, alone[0].scores)
+    as_bytes, grey = (images[0] * 255).round().to(torch.uint8), images[0].mean(dim=0, keepdim=True)
+    for one, other in ((as_bytes, as_bytes.float() / 255), (grey, grey.expand(3, -1, -1))):
+        assert torch.equal(locator()([one])[0].boxes, locator()([other])[0].boxes)
+
+
+def test_distance_limits_sizes():
+    image, box, T = scene(1)
+    true = float(T[2, 3])
+    within = locator()([image], camera_matrices=[CAMERA], distance=(0.85 * true, 1.15 * true))[0]
+    assert box_iou(within.boxes[:2], box[None]).max() > 0.5
+    side = (box[2:] - box[:2]).max()
+    for factor in (0.5, 2.0):
+        other = locator()([image], camera_matrices=[CAMERA], distance=(0.9 * factor * true, 1.1 * factor * true))[0]
+        sides = (other.boxes[:, 2:] - other.boxes[:, :2]).amax(dim=1)
+        assert 0.5 < float(sides.median() * factor / side) < 2.0, "nearer is larger"
+    doubled = torch.diag(torch.tensor([2.0, 2.0, 1.0])).double() @ CAMERA
+    same = locator()([image], camera_matrices=[doubled], distance=(1.7 * true, 2.3 * true))[0]
+    assert torch.equal(same.boxes, within.boxes), "twice the focal length is half the distance"
+
+
+def test_distance_limits_each_box_by_its_view():
+    """To half a step of sizes, and what rounding a size to cells of 16 px adds."""
+    image, _, T = scene(1)
+    low, high = 0.95 * float(T[2, 3]), 1.05 * float(T[2, 3])
+    located = locator()([image], camera_matrices=[CAMERA], distance=(low, high))[0]
+    boxes, views = bank().boxes[located.views], located.views
+    sides = (boxes[:, 2:] - boxes[:, :2]).amax(dim=1) * bank().distances[views]
+    away = sides * float(CAMERA[0, 0]) / (located.boxes[:, 2:] - located.boxes[:, :2]).amax(dim=1)
+    assert len(away) > 5
+    assert float(away.min()) > low / 2.0**0.25 * 0.9
+    assert float(away.max()) < high * 2.0**0.25 * 1.1
+
+
+def test_locator_rejects_bad_distances_images_and_settings():
+    for distance in ((0.0, 1.0), (2.0, 1.0), (-1.0, 1.0), (1.0, float("inf")), (float("nan"), 1.0)):
+        with pytest.raises(InvalidInputError, match="distance: expected 0 < NEAR <= FAR"):
+            locator()([torch.rand(3, 60, 80)], camera_matrices=[CAMERA], distance=distance)
+    with pytest.raises(InvalidInputError, match="distance: needs the camera matrix"):
+        locator()([torch.rand(3, 60, 80)], distance=(1.0, 2.0))
+    for wrong in (torch.rand(2, 60, 80), torch.rand(60, 80), torch.rand(3, 0, 80)):
+        with pytest.raises(InvalidInputError, match="images: expected"):
+            locator()([wrong])
+    for settings, message in (({"min_size": 0.0}, "min_size"), ({"views": 0}, "views, proposals")):
+        with pytest.raises(InvalidInputError, match=message):
+            cr.pipeline.LocateSettings(**settings)
+
+
+def test_locate_pads_photographs_with_fewer_boxes():
+    images = [pasted_scene(0, (10, 20), 0.8)[0], torch.full((3, 120, 160), 0.5)]
+    boxes, scores = cr.locate(truck_bank().pipeline, truck_bank(), images)
+    assert boxes.shape[:2] == scores.shape
+    assert len(scores) == 2
+    assert torch.equal(boxes.isnan().all(dim=2), scores == -torch.inf)
+    assert cr.locate(truck_bank().pipeline, truck_bank(), [])[0].shape == (0, 0, 4)
+
+
+def test_locator_is_independent_of_resolution():
+    image, box = pasted_scene(3, (40, 10), 1.1)
+    large = F.interpolate(image[None], scale_factor=3, mode="bilinear")[0]
+    best, best_large = (locator()([picture])[0].boxes[:1] for picture in (image, large))
+    assert box_iou(best, (best_large + 0.5) / 3 - 0.5) > 0.7
+    assert box_iou(best, box[None]) > 0.4
+
+
+def test_boxes_of_peaks_are_exact():
+    """The box of a peak is that of the view's projected hull, scaled and shifted with the template."""
+    views = locator()._templates.views
+    describer = ViewDescriber(example_mesh(), replace(bank().settings, image_size=96))
+    T, K, _ = describer.cameras(bank().rotations[views], bank().distances[views])
+    drawn = projected_boxes(describer.hull, T, K)
+    for k, i, j, ratio in ((0, 8, 11, (1.0, 1.0)), (3, 5, 9, (0.5, 0.4)), (5, 9, 3, (1.5, 1.6))):
+        similarity = torch.zeros(len(views), 15, 20)
+        similarity[k, i, j] = 1.0
+        best = locator()._peaks([similarity], [torch.ones(len(views), dtype=torch.bool)], [ratio])
+        # The template's centre, 47.5 px, is 8 j px from the left border of the resized photograph.
+        centre = torch.tensor([8.0 * j, 8.0 * i] * 2, dtype=torch.float64)
+        expected = (drawn[k] - 47.5 + centre) / torch.tensor(ratio * 2, dtype=torch.float64) - 0.5
+        torch.testing.assert_close(best.boxes[0].double(), expected, rtol=0, atol=0.01)
+        assert int(best.views[0]) == int(views[k])
+
+
+@pytest.mark.parametrize(("shape", "least"), [((60, 80), 32.0), ((20, 24), 24.0), ((900, 1200), None)])
+def test_smallest_size(shape, least):
+    """32 px in small photographs, at most the whole photograph; a fraction of the longer side in large ones."""
+    least = 1200 * locator().settings.min_size if least is None else least
+    scales = locator()._scales(torch.zeros(3, *shape), None, None, 80.0)
+    assert 80.0 / max(scales) == pytest.approx(least)
+
+
+def squared_distances(points: torch.Tensor) -> torch.Tensor:
+    return (points[:, None] - points).square()
+
+
+def bank_of_ratios(ratios: torch.Tensor) -> ViewBank:
+    """A bank whose views differ in the aspect ratio (width / height) of their boxes only."""
+    bank = copy.copy(truck_bank())
+    bank.descriptors = torch.ones_like(bank.descriptors)
+    corner = torch.stack([ratios, torch.ones_like(ratios)], dim=1)
+    bank.boxes = torch.cat([-corner, corner], dim=1)
+    return bank
+
+
+def test_medoids_are_the_centres_of_clusters() -> None:
+    points = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1, 5.2, 9.0, 9.1, 9.2])[torch.randperm(9)]
+    assert sorted(points[_medoids(squared_distances(points), 3)].tolist()) == pytest.approx([0.1, 5.1, 9.1])
+
+
+def test_medoids_are_better_than_random_choices() -> None:
+    points = torch.randn(300, 4, generator=torch.Generator().manual_seed(0))
+    distances = torch.cdist(points, points).square()
+    cost = distances[:, _medoids(distances, 12)].amin(dim=1).sum()
+    generator = torch.Generator().manual_seed(1)
+    random = [distances[:, torch.randperm(300, generator=generator)[:12]].amin(dim=1).sum() for _ in range(20)]
+    assert cost < 0.9 * min(random)
+
+
+def test_medoids_of_duplicates_are_different_points() -> None:
+    points = torch.tensor([0.0, 0.0, 2.0])
+    assert sorted(_medoids(squared_distances(points), 2).tolist()) in ([0, 2], [1, 2])
+
+
+def test_medoids_start_at_the_centre_and_continue_with_the_farthest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(localization_module, "MEDOID_ROUNDS", 0)
+    points = torch.tensor([1.0, 0.0, 3.0, 10.0, 2.0])
+    assert points[_medoids(squared_distances(points), 3)].tolist() == [3.0, 10.0, 0.0]
+
+
+def test_representative_views() -> None:
+    views = representative_views(truck_bank(), 7)
+    assert torch.equal(views, views.unique())
+    assert len(views) == 7
+    assert len(representative_views(truck_bank(), 10_000)) == len(truck_bank()), "all of a smaller bank"
+    with pytest.raises(InvalidInputError, match="count: expected >= 1, got 0"):
+        representative_views(truck_bank(), 0)
+
+
+def test_representative_views_differ_by_logarithms_of_aspect_ratios() -> None:
+    """Ratios of 1:8 differ more from squares than ratios of 3:1 do."""
+    n, dtype = len(truck_bank()), truck_bank().boxes.dtype
+    two = torch.where(torch.arange(n) < 5, 0.5, 2.0).to(dtype)
+    assert (representative_views(bank_of_ratios(two), 2) < 5).tolist() == [True, False]
+    three = torch.ones(n, dtype=dtype)
+    three[:2], three[2:12] = 1.0 / 8.0, 3.0
+    assert sorted(three[representative_views(bank_of_ratios(three), 2)].tolist()) == [0.125, 1.0]
+
+
+def test_nearest_representatives_of_representatives_are_themselves() -> None:
+    chosen = representative_views(truck_bank(), 7)
+    assert torch.equal(_nearest_representatives(truck_bank(), chosen)[chosen], torch.arange(7))
+
+
+def test_nearest_representatives_compare_descriptors_and_ratios() -> None:
+    bank = bank_of_ratios(torch.linspace(0.5, 2.0, len(truck_bank()), dtype=torch.float64))
+    n = len(bank)
+    assert _nearest_representatives(bank, torch.tensor([0, n - 1])).diff().tolist().index(1) + 1 == pytest.approx(
+        n / 3, abs=1
+    )

@@ -15,7 +15,7 @@ from tests._support.scenes import CAMERA
 
 VIEWS = sample_views(azimuth_step=30, elevations=[-25, 25], thetas=[0, 180]).for_up("y")
 PIPELINE = replace(Pipeline(field="focus", box_jitter=0.0, hypotheses=4), bank=replace(Pipeline().bank, image_size=64))
-UNREFINED = replace(PIPELINE, search=False, contours=False)
+UNREFINED = replace(PIPELINE, contours=False)
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,10 @@ from curvireg_torch.geometry import (
     viewpoint_from_rotation,
 )
 from curvireg_torch.geometry.pose_prior import PosePrior
-from curvireg_torch.matching import Ranking
-from curvireg_torch.registration.hypotheses import start_hypotheses
 from curvireg_torch.registration.inputs import ImageItem
+from curvireg_torch.registration.poses import Poses, lifted, placed
 from curvireg_torch.registration.priors import BatchPriors
-from tests._support.scenes import CAMERA, scene, truck_bank, truck_registrar
+from tests._support.scenes import CAMERA, learned_registrar, scene, truck_bank, truck_registrar
 
 IMAGE, BOX, T = scene(0)
 ONE, TRUTH = ([IMAGE], BOX[None], CAMERA), T[:3, :3]
@@ -47,7 +46,7 @@ def test_prior_around_the_truth_keeps_the_right_pose(registrar):
     assert result.prior_contradiction is None
 
 
-@pytest.mark.parametrize("pipeline", [{}, {"contours": False}, {"contours": False, "search": False}], ids=str)
+@pytest.mark.parametrize("pipeline", [{}, {"contours": False}], ids=str)
 def test_every_hypothesis_lies_within_hard_limits(pipeline):
     prior = around(AZIMUTH + 180.0, 40.0)
     result = truck_registrar(**pipeline)(*ONE, prior=prior)[0]
@@ -83,48 +82,71 @@ def limits_of(prior, box=(100.0, 60.0, 140.0, 100.0)):
     return BatchPriors([item], truck_bank())
 
 
-def test_batch_priors_rotate_views_towards_the_box():
-    """The limit holds in the photograph's own camera, which sees a box at the border 25 degrees off its axis."""
+def test_limits_hold_in_the_camera_of_the_photograph():
+    """It sees a box at the border 25 degrees off its axis."""
     bank, box = truck_bank(), (200.0, 20.0, 238.0, 60.0)
     ray = torch.linalg.solve(CAMERA, torch.tensor([219.0, 40.0, 1.0], dtype=torch.float64))
     R = rotation_towards(ray) @ bank.rotations[5].double()
-    log_prior = limits_of(PosePrior(rotation=R, within=0.1), box).log_prior(bank)[0]
+    allowed = limits_of(PosePrior(rotation=R, within=0.1), box).allowed(bank)[0]
     distances = rotation_error(bank.rotations.double(), bank.rotations[5].double())
-    assert float(log_prior[5]) == 0.0
-    assert bool((log_prior[distances > 7.7] == -torch.inf).all())
-    assert bool((log_prior[distances < 7.5] == 0.0).all())
+    assert bool(allowed[5])
+    assert not bool(allowed[distances > 7.7].any())
+    assert bool(allowed[distances < 7.5].all())
 
 
-def test_batch_priors_keep_fitted_poses_up_to_three_degrees_outside():
-    eye = torch.eye(3, dtype=torch.float64)
-    hypotheses = start_hypotheses(ranking_of(1), truck_bank(), count=1)
-    kept = []
-    for degrees in (12.9, 13.1):
-        T = torch.eye(4, dtype=torch.float64)[None].clone()
-        T[0, :3, :3] = rotation_from_axis_angle(torch.tensor([0.0, 0.0, math.radians(degrees)], dtype=torch.float64))
-        kept.append(bool(limits_of(PosePrior(rotation=eye, within=10.0)).keeps(hypotheses, T)))
-    assert kept == [True, False]
+def pose_at(away=1.5, degrees=0.0) -> Poses:
+    """A pose whose centre is so far away, off the optical axis, rotated about the axis."""
+    describer = truck_registrar().describer
+    index, one = torch.zeros(1, dtype=torch.long), torch.ones(1, dtype=torch.float64)
+    pose = torch.eye(4, dtype=torch.float64)[None].clone()
+    pose[0, :3, :3] = rotation_from_axis_angle(torch.tensor([0.0, 0.0, math.radians(degrees)], dtype=torch.float64))
+    pose[0, :3, 3] = away * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64) - pose[0, :3, :3] @ describer.centre
+    box = torch.tensor([[100.0, 60.0, 140.0, 100.0]], dtype=torch.float64)
+    start = lifted(describer, index, index, one, pose[:, :3, :3], one, box, CAMERA[None])
+    return placed(start, pose, describer.centre)
 
 
-def ranking_of(allowed):
-    """Equal scores of all views, of which the first ``allowed`` are allowed."""
-    n = len(truck_bank())
-    return Ranking(torch.zeros(1, n), torch.arange(n)[None].flip(1), {}, (torch.arange(n) < allowed)[None])
+def test_fitted_poses_up_to_three_degrees_outside_are_kept():
+    limits = limits_of(PosePrior(rotation=torch.eye(3, dtype=torch.float64), within=10.0))
+    assert [bool(limits.keeps(pose_at(degrees=d))) for d in (12.9, 13.1)] == [True, False]
 
 
-def test_start_hypotheses_come_from_allowed_views():
-    assert start_hypotheses(ranking_of(1), truck_bank(), count=5).view.tolist() == [0]
+def test_rotations_are_moved_into_all_limits():
+    """Combined limits, of which one moves a rotation out of another."""
+    limits = limits_of(PosePrior(azimuth=(20.0, 40.0), elevation=(50.0, 70.0), theta=(-5.0, 5.0)))
+    prior = limits.limits_of(0)
+    views = truck_bank().rotations.double()[::7]
+    moved = limits.moved_inside(torch.zeros(len(views), dtype=torch.long), views)
+    towards = limits._towards[0]
+    assert float(max(prior.excess(towards @ R) for R in moved)) < 0.01
+    inside = limits.moved_inside(torch.zeros(1, dtype=torch.long), moved[:1])
+    assert torch.equal(inside, moved[:1])
+
+
+def test_only_rival_outside_tells_whether_a_tight_right_hint_is_wrong():
+    """A hint within which no other view lies is no reason for doubt, and one on the far side is contradicted."""
+    registrar = learned_registrar()
+    free = registrar(*ONE)[0]
+    tight = registrar(*ONE, prior=PosePrior(rotation=TRUTH, within=6.0))[0]
+    assert float(rotation_error(tight.rotation, TRUTH)) < 5.0
+    assert tight.prior_contradiction is None
+    assert tight.confidence > 0.5
+    assert tight.confidence >= free.confidence - 0.1
+    for turned in (120.0, 180.0, 240.0):
+        wrong = registrar(*ONE, prior=around(AZIMUTH + turned, 20.0))[0]
+        assert wrong.prior_contradiction == "better outside"
+        assert not wrong.reliable
 
 
 DISTANCE = float(T[:3, 3].norm())  # of the origin, which is near the centre
 
 
 def centre_distances(result, registrar):
-    centre = registrar.describers[0].centre
+    centre = registrar.describer.centre
     return [float((h.rotation @ centre + h.translation).norm()) for h in result.hypotheses]
 
 
-@pytest.mark.parametrize("pipeline", [{}, {"contours": False}, {"contours": False, "search": False}], ids=str)
+@pytest.mark.parametrize("pipeline", [{}, {"contours": False}], ids=str)
 @pytest.mark.parametrize("factors", [(0.5, 0.7), (1.4, 2.0)])
 def test_every_hypothesis_lies_at_an_allowed_distance(pipeline, factors):
     registrar = truck_registrar(**pipeline)
@@ -133,7 +155,6 @@ def test_every_hypothesis_lies_at_an_allowed_distance(pipeline, factors):
     for distance in centre_distances(result, registrar):
         assert 0.97 * near <= distance <= 1.03 * far
     assert result.prior_contradiction == "better outside"
-    assert result.confidence >= 0.9 or pipeline == {}
     assert not result.reliable
 
 
@@ -155,39 +176,20 @@ def test_distance_at_a_limit_is_reported(registrar):
         assert registrar(*ONE, prior=PosePrior(distance=limits))[0].prior_contradiction == contradiction
 
 
-def test_batch_priors_keep_fitted_poses_up_to_three_percent_too_far():
-    hypotheses, limits = (
-        start_hypotheses(ranking_of(1), truck_bank(), count=1),
-        limits_of(PosePrior(distance=(1.0, 2.0))),
-    )
-    kept = []
-    for away in (0.969, 0.972, 2.055, 2.065):
-        kept.append(bool(limits.keeps(hypotheses, pose_at(away))))
+def test_fitted_poses_up_to_three_percent_too_far_are_kept():
+    limits = limits_of(PosePrior(distance=(1.0, 2.0)))
+    kept = [bool(limits.keeps(pose_at(away))) for away in (0.969, 0.972, 2.055, 2.065)]
     assert kept == [False, True, True, False]
 
 
-def pose_at(away):
-    """(1, 4, 4) pose whose centre is so far away, off the optical axis."""
-    pose = torch.eye(4, dtype=torch.float64)[None].clone()
-    pose[0, :3, 3] = away * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64) - truck_centre()
-    return pose
-
-
 @pytest.mark.parametrize(("away", "outside"), [(0.89, True), (0.92, False), (2.19, False), (2.21, True)])
-def test_box_that_asks_for_a_distance_far_outside_is_reported(registrar, away, outside):
-    limits, best = limits_of(PosePrior(distance=(1.0, 2.0))), start_hypotheses(ranking_of(1), truck_bank(), count=1)
-    noted = limits.note(registrar(*ONE)[0], best, pose_at(1.5), pose_at(away))
-    assert noted.prior_contradiction == ("better outside" if outside else None)
+def test_box_that_asks_for_a_distance_far_outside_is_reported(away, outside):
+    limits = limits_of(PosePrior(distance=(1.0, 2.0)))
+    word = limits.contradiction(pose_at(1.5), pose_at(away), better_outside=False)
+    assert word == ("better outside" if outside else None)
 
 
-def test_batch_priors_move_poses_along_the_ray_to_an_allowed_distance():
-    hypotheses, limits = (
-        start_hypotheses(ranking_of(1), truck_bank(), count=1),
-        limits_of(PosePrior(distance=(1.0, 2.0))),
-    )
+def test_poses_move_along_the_ray_to_an_allowed_distance():
+    limits = limits_of(PosePrior(distance=(1.0, 2.0)))
     for away, expected in ((0.5, 1.0), (1.5, 1.5), (9.0, 2.0)):
-        torch.testing.assert_close(limits.at_distance(hypotheses, pose_at(away)), pose_at(expected))
-
-
-def truck_centre():
-    return torch.from_numpy(truck_bank().mesh.bounds.mean(axis=0))
+        torch.testing.assert_close(limits.at_distance(pose_at(away)).T, pose_at(expected).T)

@@ -9,15 +9,18 @@ import trimesh
 
 from curvireg_torch import ImageGradient, Registrar, ViewBank, ViewMatcher, project_points, rotation_error, sample_views
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, MissingFileError
-from curvireg_torch.geometry import rotation_from_viewpoint, symmetry_transforms, transform
-from curvireg_torch.mesh.mesh import mesh_centre, mesh_radius
+from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, symmetry_transforms, transform
+from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration import RELIABLE, FailedRegistration, fit_contours
-from curvireg_torch.registration import results as results_module
-from curvireg_torch.registration.inputs import check_crop, image_items
-from curvireg_torch.rendering import make_renderer, render_depth
-from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import CAMERA, SIZE, scene, truck_bank, truck_registrar, unrefined
+from curvireg_torch.registration import FailedRegistration, fit_contours
+from curvireg_torch.registration import registrar as registrar_module
+from curvireg_torch.registration import result as result_module
+from curvireg_torch.registration.inputs import ImageItem, check_crop, image_items
+from curvireg_torch.registration.result import result_document, used_box
+from curvireg_torch.rendering import render_depth
+from curvireg_torch.rendering.contours import MeshContours
+from curvireg_torch.synthetic import example_mesh, synthesize_photograph
+from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank, truck_registrar, unrefined
 
 IMAGES, BOXES, TRUTHS = zip(*(scene(seed) for seed in range(6)), strict=True)
 IMAGE, BOX, TRUTH = scene(0)
@@ -25,7 +28,7 @@ IMAGE, BOX, TRUTH = scene(0)
 
 def ranking_registrar() -> Registrar:
     """A quick one, which reports views of the bank."""
-    return truck_registrar(search=False, contours=False)
+    return truck_registrar(contours=False)
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +57,6 @@ def test_results_have_valid_ranges(registered):
         torch.testing.assert_close(result.rotation @ result.rotation.T, torch.eye(3, dtype=torch.float64))
         assert float(torch.linalg.det(result.rotation)) == pytest.approx(1.0)
         assert 0 <= result.score <= 1
-        assert 0 <= result.confidence <= 1
-        assert result.reliable == (result.confidence >= RELIABLE)
         azimuth, elevation, theta = result.viewpoint
         assert 0 <= azimuth < 360
         assert -90 <= elevation <= 90
@@ -106,6 +107,15 @@ def test_registrar_of_several_meshes_reports_the_best(tmp_path, monkeypatch):
     result = Registrar(meshes, views=views)([IMAGE], BOX[None], CAMERA)[0]
     assert result.model == 1
     assert float(rotation_error(result.rotation, TRUTH[:3, :3])) < 5
+    with pytest.raises(InvalidInputError, match="empty list"):
+        Registrar([])
+
+
+def test_flat_mesh_without_colours_warns():
+    plate = trimesh.creation.box((1.0, 0.6, 1e-5))
+    bank = ViewBank.build(plate, sample_views(azimuth_step=90, elevations=[20]), image_size=64, progress=False)
+    assert "front and back look alike" in Registrar(bank).mesh_warnings[0]
+    assert truck_registrar().mesh_warnings == ()
 
 
 def test_failed_photographs_do_not_affect_others(tmp_path):
@@ -187,8 +197,7 @@ def test_standard_deviation_of_an_undetermined_rotation_is_infinite():
     bank = ViewBank.build(mesh, views, pipeline=PRESETS["classical"], image_size=96, progress=False)
     symmetries = symmetry_transforms({"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]})
     best = Registrar(bank, symmetries=symmetries)(image[None], box[None], CAMERA)[0].hypotheses[0]
-    options = {"centre": mesh_centre(mesh), "radius": mesh_radius(mesh)}
-    fit = fit_contours(make_renderer(mesh), image, box, CAMERA, best.transform[None], **options)
+    fit = fit_contours(MeshContours(mesh), image, box, CAMERA, best.transform[None])
     rotation, translation = replace(best, covariance=fit.covariance[0]).standard_deviations
     assert rotation[1] == rotation[2] == torch.inf, "the can's axis lies in the camera's y and z"
     assert float(rotation[0]) < 20
@@ -198,11 +207,14 @@ def test_standard_deviation_of_an_undetermined_rotation_is_infinite():
 
 @pytest.mark.parametrize("limit", [0.0, 1.01])
 def test_covariance_needs_a_reliable_result_and_a_camera(monkeypatch, limit):
-    monkeypatch.setattr(results_module, "RELIABLE", limit)
-    registrar = truck_registrar(hypotheses=2)
+    monkeypatch.setattr(result_module, "RELIABLE", limit)
+    registrar = learned_registrar()
     result = registrar([IMAGE], BOX[None], CAMERA)[0]
+    assert result.reliable == (limit == 0.0)
     assert (result.covariance is not None) == (result.standard_deviations is not None) == (limit == 0.0)
     assert registrar([IMAGE], BOX[None])[0].covariance is None
+    unknown = replace(result, hypotheses=(replace(result.hypotheses[0], covariance=None),))
+    assert not unknown.reliable, "a fitted pose without a covariance"
 
 
 def test_progress_reports_stages_and_may_cancel():
@@ -215,17 +227,17 @@ def test_progress_reports_stages_and_may_cancel():
     for boxes, expected in ((BOX[None], []), (None, ["localization"])):
         calls.clear()
         registrar([IMAGE], boxes, CAMERA)
-        assert calls[: len(expected) + 3] == [*expected, "ranking", "search", "contours"]
-        assert boxes is None or len(calls) == 3
+        assert calls[: len(expected) + 2] == [*expected, "ranking", "contours"]
+        assert boxes is None or len(calls) == 2
 
     def cancel(stage, *_):
-        raise InvalidInputError(f"cancelled in {stage}")
+        raise InterruptedError(f"cancelled in {stage}")
 
-    with pytest.raises(InvalidInputError, match="cancelled in bank"):
+    with pytest.raises(InterruptedError, match="cancelled in bank"):
         ViewBank.build(example_mesh(), views, image_size=64, progress=cancel)
-    with pytest.raises(InvalidInputError, match="cancelled in ranking"):
+    with pytest.raises(InterruptedError, match="cancelled in ranking"):
         Registrar(bank, progress=cancel)([IMAGE], BOX[None])
-    with pytest.raises(InvalidInputError, match="cancelled in localization"):
+    with pytest.raises(InterruptedError, match="cancelled in localization"):
         Registrar(bank, progress=cancel)([IMAGE])
 
 
@@ -244,3 +256,135 @@ def test_check_crop_allows_two_grey_levels_and_what_resampling_may_produce(low, 
     crop[:, 2:5, 3] = high
     with pytest.raises(ImageError, match=message) if message else nullcontext():
         check_crop(crop)
+
+
+EDGES = torch.tensor([-0.1, 0.2, 0.1, 0.15])
+"""Errors of a box's edges, as fractions of its sides."""
+WRONG = BOX + EDGES * (BOX[2:] - BOX[:2]).repeat(2)
+
+
+def uncorrected(box):
+    return truck_registrar(box_jitter=0.0)([IMAGE], box[None], CAMERA)[0]
+
+
+def test_wrong_box_is_corrected():
+    registrar = truck_registrar()
+    result, before = registrar([IMAGE], WRONG[None], CAMERA)[0], uncorrected(WRONG)
+    assert before.corrected_box is None
+    assert rotation_error(result.rotation, TRUTH[:3, :3]) < 2
+    assert result.score > before.score
+    overlap = box_iou(torch.stack([result.corrected_box, WRONG.double()]), BOX[None].double())[:, 0]
+    assert overlap[0] > overlap[1] + 0.1
+    document = {**result_document(result, registrar, {}), "inputs": {"box": [1.0, 2.0, 3.0, 4.0]}}
+    assert used_box(document) == document["corrected_box"] == result.corrected_box.tolist()
+    assert used_box({**document, "corrected_box": None}) == [1.0, 2.0, 3.0, 4.0]
+
+
+def test_correction_is_batch_independent():
+    registrar, (other, box, _) = truck_registrar(), scene(1)
+    results = registrar([IMAGE, other, other], torch.stack([WRONG, box, box + 9e3]), CAMERA)
+    assert [result.ok for result in results] == [True, True, False]
+    alone = registrar([IMAGE], WRONG[None], CAMERA)[0]
+    assert torch.equal(results[0].corrected_box, alone.corrected_box)
+    assert torch.allclose(results[0].rotation, alone.rotation, atol=1e-9)
+    assert results[1].corrected_box is None
+
+
+def test_fitting_box_is_registered_once(monkeypatch):
+    registrar, calls = truck_registrar(), []
+    register = registrar.register
+    monkeypatch.setattr(registrar, "register", lambda items, *a: calls.append(len(items)) or register(items, *a))
+    registrar([IMAGE], BOX[None], CAMERA)
+    assert calls == [1]
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_corrected_result_is_kept_if_its_score_is_higher(monkeypatch, better):
+    registrar = truck_registrar()
+    first = uncorrected(BOX)
+    other = replace(first, hypotheses=(replace(first.hypotheses[0], score=first.score + (0.01 if better else -0.01)),))
+    answers = iter([[first], [other]])
+    monkeypatch.setattr(registrar, "_register_given", lambda *_: list(next(answers)))
+    result = registrar([IMAGE], WRONG[None], CAMERA)[0]
+    assert (result is first) != better
+    assert (result.corrected_box is None) != better
+
+
+def test_boxes_are_not_corrected_without_a_camera_or_contours():
+    assert truck_registrar()([IMAGE], WRONG[None])[0].corrected_box is None
+    assert ranking_registrar()([IMAGE], WRONG[None], CAMERA)[0].corrected_box is None
+
+
+@pytest.mark.parametrize("box", [[-300.0, -200.0, -100.0, -50.0], [torch.nan] * 4, [240.0, 10.0, 300.0, 90.0]])
+def test_pose_outside_the_photograph_corrects_nothing(monkeypatch, box):
+    monkeypatch.setattr(registrar_module, "projected_box", lambda *_: torch.tensor(box, dtype=torch.float64))
+    assert truck_registrar()([IMAGE], BOX[None], CAMERA)[0].corrected_box is None
+
+
+@pytest.mark.parametrize(
+    ("size", "given", "box", "expected"),
+    [
+        ((100, 200), (150.0, 20.0, 199.5, 80.0), (150.0, 20.0, 260.0, 80.0), False),  # cut off by the right border
+        ((100, 200), (150.0, 20.0, 199.5, 80.0), (130.0, 20.0, 240.0, 80.0), True),
+        ((80, 120), (0.0, 10.0, 100.0, 60.0), (4.0, 10.0, 104.0, 60.0), False),  # IoU 0.92
+        ((80, 120), (0.0, 10.0, 100.0, 60.0), (12.0, 10.0, 112.0, 60.0), True),  # IoU 0.79
+        ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, 60.0, 79.5), False),  # by two borders
+        ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, 20.0, 79.5), True),
+        ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, -20.0, 79.5), False),  # outside: not used
+    ],
+)
+def test_boxes_are_compared_inside_the_photograph(size, given, box, expected):
+    item = ImageItem(torch.zeros(3, *size), torch.tensor(given), CAMERA)
+    assert registrar_module._shows_other_part(torch.tensor(box, dtype=torch.float64), item) == expected
+
+
+AZIMUTHS = (15.0, 45.0, 75.0, 225.0)
+"""Half-way between two views of a coarse bank, so that both lead to the same pose."""
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    """A registrar with views 30 degrees apart, photographs and boxes."""
+    mesh, images, boxes = example_mesh(), [], []
+    for azimuth in AZIMUTHS:
+        R = rotation_from_viewpoint(azimuth, 20.0, 0.0).double()
+        T = transform(R, torch.tensor([0.0, 0.0, 3.5 * mesh_radius(mesh)]) - R @ mesh_centre(mesh))
+        image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, torch.Generator().manual_seed(1))
+        images.append(image)
+        boxes.append(box)
+    views = sample_views(azimuth_step=30, elevations=[20])
+    bank = ViewBank.build(mesh, views, pipeline=PRESETS["classical"], image_size=96, progress=False)
+    return Registrar(bank), images, torch.stack(boxes)
+
+
+def angle_moved(registrar, hypothesis) -> float:
+    """Degrees from the view that the hypothesis started from."""
+    view = registrar.bank.rotations[hypothesis.view].double()
+    return float(rotation_error(hypothesis.allocentric_rotation, view))
+
+
+def test_hypotheses_that_merge_are_put_back_and_come_last(coarse):
+    registrar, images, boxes = coarse
+    restored = 0
+    for result in registrar(images, boxes, CAMERA):
+        is_moved = [angle_moved(registrar, h) > 0.01 for h in result.hypotheses]
+        assert is_moved[0]
+        assert is_moved == sorted(is_moved, reverse=True)
+        assert result.hypotheses[0].covariance is not None
+        assert all(h.covariance is None for h, moved in zip(result.hypotheses, is_moved, strict=True) if not moved)
+        restored += is_moved.count(False)
+    assert restored > 0
+
+
+def test_fits_without_a_camera_are_kept_where_they_are_trusted(coarse):
+    """Contours of rivals hardly fit, so their views are put back; with a camera, fits are kept."""
+    registrar, images, boxes = coarse
+    moved = {
+        camera: sum(
+            angle_moved(registrar, h) > 0.01
+            for result in registrar(images, boxes, CAMERA if camera else None)
+            for h in result.hypotheses[1:]
+        )
+        for camera in (True, False)
+    }
+    assert moved[False] < moved[True]

@@ -17,8 +17,7 @@ from curvireg_torch.registration.tracker import FLOW_SCALES, WINDOW_SIZE, Keyfra
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import CAMERA
-from tests.registration.test_following import sequence
+from tests._support.scenes import CAMERA, sequence
 
 K = camera_matrix(500.0, 500.0, 159.5, 119.5, dtype=torch.float64)
 SIZE = (240, 320)

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.terms import Correlation, Whitening, ledoit_wolf, normalized_correlation, unit_score
-from curvireg_torch.terms.correlation import CorrelationModule
+from curvireg_torch.terms.terms import _CorrelationModule
 
 
 def test_normalized_correlation_is_the_cosine():
@@ -21,9 +21,9 @@ def test_normalized_correlation_is_the_cosine():
     expected = torch.tensor([[24 / 25, 4 / 5, 63 / 65], [4 / 5, 0.0, 5 / 13]])
     torch.testing.assert_close(normalized_correlation(queries, views), expected)
     # Two crops of one photograph: the better one counts for each view.
-    together = CorrelationModule(views)(SimpleNamespace(descriptors=queries[None]))
+    together = _CorrelationModule(views)(SimpleNamespace(descriptors=queries[None]))
     torch.testing.assert_close(together, expected.amax(dim=0, keepdim=True))
-    torch.testing.assert_close(CorrelationModule(views)(SimpleNamespace(descriptors=queries[:, None])), expected)
+    torch.testing.assert_close(_CorrelationModule(views)(SimpleNamespace(descriptors=queries[:, None])), expected)
 
 
 def test_unit_score_is_an_exponential_of_standard_deviations():

@@ -7,8 +7,8 @@ import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.terms import Repeatability, dilate_points, repeatability, repeatability_score
-from curvireg_torch.terms.repeatability import CHUNK, cell_counts
+from curvireg_torch.terms import Repeatability, dilate_points, repeatability, repeatability_score, terms
+from curvireg_torch.terms.scores import cell_counts
 
 
 @pytest.mark.parametrize("eps", [0.0, 1.0, 2.0, 2.5, 2.9, 3.0, 4.0])
@@ -95,7 +95,8 @@ def test_repeatability_resolves_eps_with_64_cells_per_side(size):
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_repeatability_keeps_views_of_several_chunks_in_order(threads):
-    views, before = PointViews(64, *((i // 64, i % 64) for i in range(2 * CHUNK + 3))), torch.get_num_threads()
+    count, before = 2 * terms.VIEWS_AT_A_TIME + 3, torch.get_num_threads()
+    views = PointViews(64, *((i // 64, i % 64) for i in range(count)))
     torch.set_num_threads(threads)
     near = Repeatability(eps=0.016).build(views).near
     torch.set_num_threads(before)

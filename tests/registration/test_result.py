@@ -1,0 +1,194 @@
+"""Made-up registrations: what is reliable, ambiguous, and how results become JSON and plain words."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from curvireg_torch import Registration
+from curvireg_torch.geometry import rotation_from_viewpoint
+from curvireg_torch.geometry.pose_prior import object_frame
+from curvireg_torch.matching import Ranking
+from curvireg_torch.registration import Hypothesis, Localization
+from curvireg_torch.registration.result import (
+    ambiguity,
+    localization_document,
+    pose_in_words,
+    remarks,
+    result_document,
+    verdict,
+)
+
+
+def registration(covariance=None, confidence=0.9, localization=None):
+    """A registration to a bank of two views, the second of which one term did not compare."""
+    terms = {"hog": torch.tensor([[0.5, 0.4]]), "appearance": torch.tensor([[0.3, torch.nan]])}
+    ranking = Ranking(torch.tensor([[0.9, 0.8]]), torch.tensor([[0, 1]]), terms)
+    eye = torch.eye(3, dtype=torch.float64)
+    hypotheses = tuple(
+        Hypothesis(
+            rotation=eye,
+            translation=2.0 * eye[2],
+            score=0.7 - 0.1 * view,
+            evidence={"rank": 0.0},
+            allocentric_rotation=eye,
+            distance=2.0,
+            projection=(torch.eye(4, dtype=torch.float64), eye),
+            view=view,
+            covariance=covariance,
+        )
+        for view in (0, 1)
+    )
+    return Registration(hypotheses, (confidence, 0.0), ranking, localization=localization)
+
+
+class Bank(list):
+    mesh = SimpleNamespace(units="mm")
+
+
+REGISTRAR = SimpleNamespace(
+    bank=Bank([0, 1]),
+    of_model=lambda _: REGISTRAR,
+    pipeline=SimpleNamespace(describe=dict),
+    is_exact=lambda with_camera: with_camera,
+    symmetries_of=lambda exact: torch.eye(4).repeat(3, 1, 1) if exact else None,
+)
+
+
+def test_to_dict_replaces_unbounded_deviations_by_null():
+    """Unbounded from one radian, and from half the distance."""
+    variances = torch.tensor([0.25, 0.81, 1.21, 0.81, 0.9801, 1.0201], dtype=torch.float64)
+    document = registration(torch.diag(variances)).to_dict()
+    degrees = 180.0 / torch.pi
+    deviations = document["standard_deviations"]
+    assert deviations["rotation_deg"] == [pytest.approx(0.5 * degrees), pytest.approx(0.9 * degrees), None]
+    assert deviations["translation"] == [pytest.approx(0.9), pytest.approx(0.99), None]
+    json.dumps(document, allow_nan=False)
+
+
+def test_result_document_leaves_out_terms_that_did_not_compare_a_view():
+    document = result_document(registration(), REGISTRAR, {"bank": 1.0})
+    assert [list(pose["terms"]) for pose in document["top"]] == [["hog", "appearance"], ["hog"]]
+    assert [pose["score"] for pose in document["top"]] == pytest.approx([0.7, 0.6])
+    assert (document["views"], document["unit"], document["seconds"]) == (2, "mm", {"bank": 1.0})
+    assert document["symmetries"] == 3
+    assert "3 orientations" in remarks(document)[0]
+    json.dumps(document, allow_nan=False)
+
+
+def test_localization_document_reports_the_presence_of_the_most_certain_instance():
+    boxes, scores = torch.tensor([[1.0, 2, 30, 40], [50, 2, 80, 40]]).double(), torch.tensor([7.0, 6.5])
+    found = [Localization(box, p, s, boxes, scores) for box, p, s in zip(boxes, (0.9, 0.4), (7.0, 6.5), strict=True)]
+    document = localization_document([registration(localization=x, confidence=0.5 * x.presence) for x in found])
+    assert document["presence"] == 0.9
+    assert [(one["presence"], one["confidence"]) for one in document["instances"]] == [(0.9, 0.45), (0.4, 0.2)]
+    assert [one["box"] for one in document["proposals"]] == boxes.tolist()
+    assert [one["score"] for one in document["proposals"]] == [7.0, 6.5]
+
+
+@pytest.mark.parametrize(
+    ("contradiction", "words"),
+    [(None, ""), ("better outside", "much better outside"), ("at the limit", "at one of")],
+)
+def test_remarks_name_a_contradicted_prior(contradiction, words):
+    lines = remarks({"corrected_box": None, "prior": {"azimuth": [0, 9], "contradiction": contradiction}})
+    assert len(lines) == bool(words)
+    assert words in "".join(lines)
+
+
+def test_remarks_print_the_replaced_box_in_whole_pixels():
+    assert remarks({"corrected_box": None}) == []
+    (line,) = remarks({"corrected_box": [1.4, 2.6, 30.49, 40.51]})
+    assert line.endswith(": 1 3 30 41")
+
+
+@pytest.mark.parametrize(
+    ("viewpoint", "words"),
+    [
+        ((0, 0, 0), "seen from the front (azimuth 0°), level"),
+        ((359.8, 12, 0), "seen from the front (azimuth 0°), 12° above the horizon"),
+        ((88, -12, 5), "seen from the right (azimuth 88°), 12° below the horizon, tilted by 5° to the left"),
+        ((225, 30, -40), "seen from the back-left (azimuth 225°), 30° above the horizon, tilted by 40° to the right"),
+        ((340, 20, 0), "seen from the front (azimuth 340°), 20° above the horizon"),
+        ((45, 80, 0), "seen from above (azimuth 45°), 80° above the horizon"),
+        ((45, -80, 0), "seen from below (azimuth 45°), 80° below the horizon"),
+    ],
+)
+def test_pose_in_words(viewpoint, words):
+    R = rotation_from_viewpoint(*torch.tensor(viewpoint, dtype=torch.float64))
+    assert pose_in_words(R) == words
+    for up, front in (("y", None), ("-x", None), ("z", "x")):
+        assert pose_in_words(R @ object_frame(up, front), up=up, front=front) == words
+
+
+def test_pose_in_words_tilts_as_the_photograph_shows():
+    """Tilted to the left: the object's up axis points to the left in the picture."""
+    R = rotation_from_viewpoint(10.0, 20.0, 30.0)
+    assert float(R[0, 2]) < 0
+    assert "to the left" in pose_in_words(R)
+
+
+def test_verdict_has_three_words():
+    """A high confidence that is not reliable, because of a questionable camera, is no reason to be sure."""
+    assert verdict(0.95, 0.03, True) == "likely"
+    assert verdict(0.95, 0.03, False) == "unsure"
+    assert verdict(0.4, 0.39, False) == "unsure"
+    assert verdict(0.4, 0.41, False) == "no match"
+    assert verdict(None, None, False) == "unsure"
+
+
+def turned(*degrees: float, elevation: float = 0.0) -> torch.Tensor:
+    return torch.stack([rotation_from_viewpoint(d, elevation, 0.0).double() for d in degrees])
+
+
+@pytest.mark.parametrize(
+    ("rotations", "word"),
+    [
+        (turned(10.0), None),
+        (turned(10.0, 190.0), "half turn"),
+        (turned(10.0, 161.0), "half turn"),
+        (turned(40.0, 320.0), "mirror"),
+        (turned(40.0, 311.0, elevation=10.0), "mirror"),
+        (turned(40.0, 100.0), "several"),
+        (turned(0.0, 120.0, 240.0), "several"),
+    ],
+)
+def test_ambiguity(rotations, word):
+    assert ambiguity(rotations) == word
+
+
+@pytest.mark.parametrize(("second", "word"), [(0.31, "mirror"), (0.29, None)])
+def test_ambiguous_names_rivals_that_are_half_as_probable(second, word):
+    found = registration()
+    hypotheses = tuple(
+        replace(h, allocentric_rotation=R) for h, R in zip(found.hypotheses, turned(40.0, 320.0), strict=True)
+    )
+    result = replace(found, hypotheses=hypotheses, probabilities=(0.6, second))
+    assert result.ambiguous == word
+    assert result.none == pytest.approx(0.4 - second)
+
+
+def test_reliable_needs_confidence_no_warnings_and_no_better_pose_outside_the_limits():
+    sure = replace(registration(covariance=0.01 * torch.eye(6).double()), probabilities=(0.9, 0.0))
+    assert sure.reliable
+    for change in (
+        {"probabilities": (0.89, 0.0)},
+        {"probabilities": ()},
+        {"warnings": ("the camera is questionable",)},
+        {"prior_contradiction": "better outside"},
+    ):
+        assert not replace(sure, **change).reliable
+    assert replace(sure, prior_contradiction="at the limit").reliable
+
+
+def test_reliable_needs_a_rotation_that_contours_determine():
+    """Not where all three rotations are unknown, as those of a sphere."""
+    variances = torch.tensor([9.0, 9.0, 9.0, 1e-4, 1e-4, 1e-4], dtype=torch.float64)
+    sphere = registration(covariance=torch.diag(variances), confidence=0.95)
+    fitted = replace(sphere, hypotheses=tuple(replace(h, edge_support=0.5) for h in sphere.hypotheses))
+    assert not fitted.reliable
+    variances[0] = 1e-4
+    known = tuple(replace(h, covariance=torch.diag(variances)) for h in fitted.hypotheses)
+    assert replace(fitted, hypotheses=known).reliable
