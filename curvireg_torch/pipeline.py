@@ -346,16 +346,17 @@ _CLASSICAL_TERMS: tuple[Term, ...] = (Correlation(), Repeatability(), BoxShape()
 PRESETS: dict[str, Pipeline] = {
     "learned": Pipeline(),
     "classical": Pipeline(field="focus", terms=_CLASSICAL_TERMS),
-    "fast": Pipeline(terms=_CLASSICAL_TERMS, box_jitter=0.0, search=False, contours=False),
+    "fast": Pipeline(terms=_CLASSICAL_TERMS, box_jitter=0.0, contours=False),
     "paper": Pipeline(
         bank=BankSettings(image_size=256, sigma=1.0, formula="paper", camera="orthographic"),
         field="focus",
         terms=(Correlation(whitening="bank"), Repeatability(mode="paper")),
         box_jitter=0.0,
+        search=True,
     ),
 }
 """``learned``: :class:`LearnedCurvilinearSaliency` as the photograph's field, and the appearance term; ``classical``:
-focus curves, nothing learned; ``fast``: the learned field alone, without box jitter, search and contour fit; ``paper``:
+focus curves, nothing learned; ``fast``: the learned field alone, without box jitter and contour fit; ``paper``:
 the paper's own settings, as far as it states them."""
 
 

@@ -515,12 +515,8 @@ def _turned(T: Tensor, centre: Tensor, angles: Sequence[float]) -> Tensor:
     """(N, M, 4, 4) poses: each of (N, 4, 4), then turned about the camera's z axis, and about x and y by ``angles``."""
     axes = torch.eye(6, dtype=torch.float64)[:3]
     both = torch.cat([axes, -axes])
-    turns = [
-        torch.zeros(1, 6, dtype=torch.float64),
-        START_ROLL * both[[2, 5]],
-        *(a * both[[0, 3, 1, 4]] for a in angles),
-    ]
-    twists = torch.deg2rad(torch.cat(turns))
+    aside = [angle * both[[0, 3, 1, 4]] for angle in angles]
+    twists = torch.deg2rad(torch.cat([0.0 * both[:1], START_ROLL * both[[2, 5]], *aside]))
     N, M = len(T), len(twists)
     return apply_twist(T.repeat_interleave(M, 0), twists.repeat(N, 1), centre).view(N, M, 4, 4)
 

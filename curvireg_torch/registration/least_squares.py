@@ -79,8 +79,8 @@ class PointMatches:
         return Measurements(J.flatten(1, 2), residual.flatten(1)[..., None], weight[..., None])
 
     def inlier_ratio(self, T: Tensor, K: Tensor, centre: Tensor, *, scale: float = INLIER_SCALE) -> float:
-        """Mean weight, in [0, 1], of the points that were found where the pose has them; at ``scale`` px a quarter of it
-        counts."""
+        """Mean weight, in [0, 1], of the points that were found where the pose has them: a quarter of it counts at
+        ``scale`` px."""
         near = _geman_mcclure(self.uv - pixels(self.model, T, K, centre), scale)
         return float((near * self.weight).sum()) / max(self.weight.shape[1], 1)
 

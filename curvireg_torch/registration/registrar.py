@@ -111,8 +111,9 @@ class Registrar:
             :func:`curvireg_torch.mesh.mesh_symmetries`; ``torch.eye(4)[None]`` for none.
         device: of modules, bank and search.
         progress: True shows bars. A callback gets (stage, done, total), with the stages "localization" (without a box),
-            "bank", "ranking", "search" and "contours"; it may raise anything but a CurviregError to cancel. On a CPU photographs are registered in
-            parallel: callback, custom renderer and custom field are then called from several threads.
+            "bank", "ranking", "search" and "contours"; to cancel, it may raise what is no :class:`CurviregError`. On a
+            CPU photographs are registered in parallel: callback, custom renderer and custom field are then called from
+            several threads.
 
     Example:
         >>> import trimesh
