@@ -15,12 +15,12 @@ from typing import Any
 from ..errors import CurviregError, CurviregWarning
 from ..utils.files import terminable
 from ..version import __version__
-from . import bank, cache, completion, demo, evaluate, follow, plot, register, schema, view
+from . import bank, cache, completion, demo, evaluate, follow, plot, register, view
 from .options import split_numbers
 
 __all__ = ["build_parser", "main", "parse"]
 
-COMMANDS = (register, follow, bank, cache, evaluate, view, plot, demo, schema, completion)
+COMMANDS = (register, follow, bank, cache, evaluate, view, plot, demo, completion)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -4,7 +4,6 @@ import argparse
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,6 @@ from ..errors import (
     ImageError,
     InvalidInputError,
     LostObjectError,
-    MissingDependencyError,
     MissingFileError,
 )
 from ..utils.choices import VIDEOS
@@ -155,20 +153,9 @@ def _row(name: str, result: "Registration | FailedRegistration") -> list[Any]:
 
 
 def _write_tables(out: Path, rows: list[list[Any]]) -> None:
-    """Write results.csv and, if matplotlib is installed, support.png."""
-    import torch
-
+    """Write results.csv."""
     from ..evaluation.lists.tables import POSE_COLUMNS
-    from ..utils.files import write_csv, write_file
-    from ..visualization.plots import support_over_frames
+    from ..utils.files import write_csv
 
     header = ["photo", "status", *POSE_COLUMNS, "confidence", "edge_support", "message"]
     write_csv(out / "results.csv", [header, *rows])
-    confidence, support = (torch.tensor([float(row[header.index(n)] or "nan") for row in rows]) for n in header[-3:-1])
-    content = BytesIO()
-    try:
-        support_over_frames(support, confidence).savefig(content, format="png", dpi=100)
-    except MissingDependencyError as error:
-        print(f"support.png is not drawn: {error}")
-        return
-    write_file(out / "support.png", content.getvalue())

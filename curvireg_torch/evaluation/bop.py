@@ -11,7 +11,8 @@ from ..data import BOPDataset, BOPRow, write_bop_csv
 from ..geometry import symmetry_transforms
 from ..geometry.cameras import transform
 from ..mesh import load_mesh
-from ..metrics import (
+from .benchmark import Benchmark, BenchmarkItem, Row
+from .metrics import (
     add_error,
     add_recall,
     adds_error,
@@ -21,7 +22,6 @@ from ..metrics import (
     mssd_recall,
     symmetric_rotation_error,
 )
-from .benchmark import Benchmark, BenchmarkItem, Row
 from .scores import THRESHOLDS, estimated_rotations, or_inf, viewpoint_scores
 
 __all__ = ["BOPBenchmark", "bop_row"]

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from ..data import Pascal3DPlus
 from ..geometry import rotation_error, viewpoint_from_rotation
-from ..metrics import AVP_BINS, accuracy, axis_rotation_error, binned_accuracy, median_error, symmetric_rotation_error
 from .benchmark import Benchmark, BenchmarkItem, Row
+from .metrics import AVP_BINS, accuracy, axis_rotation_error, binned_accuracy, median_error, symmetric_rotation_error
 from .protocol import Protocol
 from .scores import estimated_rotations, or_inf, viewpoint_scores, write_viewpoints
 

@@ -1,14 +1,13 @@
-"""Datasets by name, for ``evaluate``, the paper's experiments and ``datasets/verify.py``.
+"""Datasets by name, for ``evaluate``, ``scripts/paper`` and ``datasets/verify.py``.
 
 Nothing heavy is imported before a dataset is opened, so that the command line's help is fast.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from os import PathLike
 from typing import Any
-
-from ..utils.registry import Registry, resolve
 
 __all__ = ["DATASETS", "DatasetSpec"]
 
@@ -18,7 +17,7 @@ class DatasetSpec:
     """A dataset, its benchmark, and what the command line says about it.
 
     Attributes:
-        dataset, benchmark: subclasses of :class:`ObjectDataset` and :class:`Benchmark`, or "package.module:attribute".
+        dataset, benchmark: "package.module:attribute" of an :class:`ObjectDataset` and its :class:`Benchmark`.
         help, root, example: for the command line: what the dataset is, what ROOT must contain, and an example of ROOT.
         pose: default of the protocol's ``pose``.
         category, mesh: of a sample: format string of its group's name, and the key of its mesh.
@@ -26,8 +25,8 @@ class DatasetSpec:
         whole: options that select objects that are neither occluded nor truncated.
     """
 
-    dataset: Callable[..., Any] | str
-    benchmark: Callable[..., Any] | str
+    dataset: str
+    benchmark: str
     help: str
     root: str
     example: str
@@ -49,55 +48,58 @@ class DatasetSpec:
 
     def open(self, root: str | PathLike[str], **options: Any) -> Any:
         """Open the dataset; :class:`CurviregError` if it does not exist, or an option is out of range."""
-        return resolve(self.dataset)(root, **options)
+        return _imported(self.dataset)(root, **options)
 
     @property
     def scored(self) -> Any:
         """The benchmark's class."""
-        return resolve(self.benchmark)
+        return _imported(self.benchmark)
 
 
-DATASETS: Registry[DatasetSpec] = Registry(
-    "dataset",
-    {
-        "pascal3d": DatasetSpec(
-            dataset="curvireg_torch.data:Pascal3DPlus",
-            benchmark="curvireg_torch.evaluation:Pascal3DBenchmark",
-            help="viewpoints on PASCAL3D+",
-            root="folder with Annotations, Images and CAD",
-            example="data/PASCAL3D+_release1.1",
-            pose="upright",
-            mesh="cad_path",
-            options={
-                "split": {"default": "val", "help": "name of the image lists (default: val)"},
-                "categories": {"nargs": "+", "metavar": "CLASS", "help": "default: all"},
-                "part": {"choices": ("pascal", "imagenet"), "default": "pascal", "help": "default: pascal"},
-                "pixel_origin": {
-                    "type": int,
-                    "choices": (0, 1),
-                    "default": 1,
-                    "help": "number of the first pixel (default: 1, the release)",
-                },
+def _imported(name: str) -> Any:
+    """The object that "package.module:attribute" names."""
+    module, _, attribute = name.partition(":")
+    return getattr(import_module(module), attribute)
+
+
+DATASETS: dict[str, DatasetSpec] = {
+    "pascal3d": DatasetSpec(
+        dataset="curvireg_torch.data:Pascal3DPlus",
+        benchmark="curvireg_torch.evaluation:Pascal3DBenchmark",
+        help="viewpoints on PASCAL3D+",
+        root="folder with Annotations, Images and CAD",
+        example="data/PASCAL3D+_release1.1",
+        pose="upright",
+        mesh="cad_path",
+        options={
+            "split": {"default": "val", "help": "name of the image lists (default: val)"},
+            "categories": {"nargs": "+", "metavar": "CLASS", "help": "default: all"},
+            "part": {"choices": ("pascal", "imagenet"), "default": "pascal", "help": "default: pascal"},
+            "pixel_origin": {
+                "type": int,
+                "choices": (0, 1),
+                "default": 1,
+                "help": "number of the first pixel (default: 1, the release)",
             },
-            whole={"occluded": False, "truncated": False},
-        ),
-        "bop": DatasetSpec(
-            dataset="curvireg_torch.data:BOPDataset",
-            benchmark="curvireg_torch.evaluation:BOPBenchmark",
-            help="6D poses on a BOP set",
-            root="folder with models and the split's folder",
-            example="data/bop/lm",
-            category="object {obj_id}",
-            mesh="model_path",
-            options={"split": {"default": "test", "help": "folder of the scenes (default: test)"}},
-        ),
-        "web": DatasetSpec(
-            dataset="curvireg_torch.data:WebCollection",
-            benchmark="curvireg_torch.evaluation:WebBenchmark",
-            help="viewpoints on a collection of your own",
-            root="folder with one folder per object",
-            example="data/web",
-        ),
-    },
-)
+        },
+        whole={"occluded": False, "truncated": False},
+    ),
+    "bop": DatasetSpec(
+        dataset="curvireg_torch.data:BOPDataset",
+        benchmark="curvireg_torch.evaluation:BOPBenchmark",
+        help="6D poses on a BOP set",
+        root="folder with models and the split's folder",
+        example="data/bop/lm",
+        category="object {obj_id}",
+        mesh="model_path",
+        options={"split": {"default": "test", "help": "folder of the scenes (default: test)"}},
+    ),
+    "web": DatasetSpec(
+        dataset="curvireg_torch.data:WebCollection",
+        benchmark="curvireg_torch.evaluation:WebBenchmark",
+        help="viewpoints on a collection of your own",
+        root="folder with one folder per object",
+        example="data/web",
+    ),
+}
 """Datasets by the name that the command line uses."""

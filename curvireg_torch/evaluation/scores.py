@@ -9,9 +9,9 @@ from torch import Tensor
 
 from ..geometry import viewpoint_from_rotation
 from ..geometry.crops import box_iou
-from ..metrics import accuracy, median_error
 from ..utils.files import write_csv
 from .benchmark import BenchmarkItem, Row
+from .metrics import accuracy, median_error
 
 __all__ = [
     "THRESHOLDS",

@@ -1,11 +1,7 @@
 """Renderers by name, and :func:`render_depth`."""
 
-import importlib.util
-import threading
-import warnings
 from collections.abc import Callable
 from os import PathLike
-from typing import Any
 
 import torch
 import trimesh
@@ -13,18 +9,40 @@ from torch import Tensor
 
 from ..errors import InvalidInputError, MissingDependencyError, RenderingError
 from ..mesh.mesh import as_mesh
-from ..utils.registry import Registry
-from .protocol import DepthRenderer, check_render_arguments
+from ..utils.checks import check_option
+from .protocol import DepthRenderer
 
 __all__ = ["BACKENDS", "make_renderer", "render_depth"]
 
-BACKENDS: Registry[Callable[..., DepthRenderer]] = Registry(
-    "renderer", {"torch": "curvireg_torch.rendering.zbuffer:TorchRenderer"}
-)
-"""Renderers by name: functions or classes that are called as ``(mesh, device=device)``."""
 
-AUTOMATIC = ("embree", "pyrender", "torch")
-"""What "auto" tries, in this order."""
+def _embree(mesh: trimesh.Trimesh, _: torch.device | str) -> DepthRenderer:
+    try:
+        from .embree import EmbreeRenderer
+    except ImportError as error:
+        message = f"renderer 'embree' needs the package embreex ({error}): pip install embreex"
+        raise MissingDependencyError(message) from error
+    return EmbreeRenderer(mesh)
+
+
+def _pyrender(mesh: trimesh.Trimesh, _: torch.device | str) -> DepthRenderer:
+    from .opengl import PyrenderRenderer
+
+    return PyrenderRenderer(mesh)
+
+
+def _torch(mesh: trimesh.Trimesh, device: torch.device | str) -> DepthRenderer:
+    from .zbuffer import TorchRenderer
+
+    return TorchRenderer(mesh, device=device)
+
+
+BACKENDS: dict[str, Callable[[trimesh.Trimesh, torch.device | str], DepthRenderer]] = {
+    "auto": _embree,
+    "embree": _embree,
+    "pyrender": _pyrender,
+    "torch": _torch,
+}
+"""Renderers by name."""
 
 
 def make_renderer(
@@ -32,12 +50,10 @@ def make_renderer(
 ) -> DepthRenderer:
     """A renderer of ``mesh``. All backends agree, see ``docs/conventions.md``; all may be shared by threads.
 
-    - ``"embree"`` casts rays on the CPU and needs only its wheel. Forked processes may share it.
+    - ``"embree"``, which "auto" means, casts rays on the CPU and needs only its wheel. Forked processes may share it.
     - ``"pyrender"`` draws through OpenGL and needs a system with EGL. A process that is forked after its first use
       cannot use it: start processes by "spawn".
     - ``"torch"`` runs on any torch device. Forked processes must call ``torch.set_num_threads(1)`` first.
-    - ``"auto"``: embree where it is installed (it needs no driver and survives forks), else pyrender where EGL works,
-      else torch. If a backend fails later, the next one replaces it with a warning.
 
     Args:
         mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
@@ -47,70 +63,10 @@ def make_renderer(
     Raises:
         RenderingError, MissingDependencyError: the backend does not work here.
     """
-    return BACKENDS[backend](mesh, device=device) if isinstance(backend, str) else backend
-
-
-@BACKENDS.register("auto")
-class _FirstThatWorks:
-    """Delegates to the first backend that works; after a failure, to the next."""
-
-    def __init__(self, mesh: trimesh.Trimesh, device: torch.device | str = "cpu") -> None:
-        self._mesh, self._device = mesh, device
-        self._untried = [b for b in AUTOMATIC if b != "embree" or importlib.util.find_spec("embreex")]
-        self._lock = threading.Lock()
-        self._renderer = self._next()
-
-    def _next(self) -> DepthRenderer:
-        while True:
-            try:
-                return make_renderer(self._mesh, self._untried.pop(0), device=self._device)
-            except (RenderingError, MissingDependencyError):
-                if not self._untried:
-                    raise
-
-    @property
-    def name(self) -> str:
-        return self._renderer.name
-
-    @property
-    def faces_at(self) -> Any:
-        """The backend's method of that name, or None if it has none; see :func:`render_colour`."""
-        return getattr(self._renderer, "faces_at", None)
-
-    def render(
-        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
-    ) -> Tensor:
-        # Invalid arguments must not count as a failure of the backend.
-        check_render_arguments(T_cam_from_model, camera_matrix, size)
-        while True:
-            used = self._renderer
-            try:
-                return used.render(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
-            except Exception as error:  # drivers raise anything
-                with self._lock:  # if several threads saw the same failure, only one replaces the backend
-                    if used is self._renderer:
-                        if not self._untried:
-                            raise
-                        self._renderer = self._next()
-                        reason = f"renderer {used.name!r} failed ({type(error).__name__}: {error})"
-                        warnings.warn(f"{reason}; continuing with {self.name!r}", stacklevel=2)
-
-
-@BACKENDS.register("embree")
-def _embree(mesh: trimesh.Trimesh, **_: Any) -> DepthRenderer:
-    try:
-        from .embree import EmbreeRenderer
-    except ImportError as error:
-        message = f"renderer 'embree' needs the package embreex ({error}): pip install embreex"
-        raise MissingDependencyError(message) from error
-    return EmbreeRenderer(mesh)
-
-
-@BACKENDS.register("pyrender")
-def _pyrender(mesh: trimesh.Trimesh, **_: Any) -> DepthRenderer:
-    from .opengl import PyrenderRenderer
-
-    return PyrenderRenderer(mesh)
+    if not isinstance(backend, str):
+        return backend
+    check_option(backend, list(BACKENDS), "renderer")
+    return BACKENDS[backend](mesh, device)
 
 
 def render_depth(

@@ -13,7 +13,7 @@ from ..mesh.mesh import mesh_unit
 from ..utils.choices import UNITS
 from ..visualization import side_pictures
 from ..visualization.encoding import png
-from ..visualization.plots import view_sphere
+from ..visualization.plots import viewpoints
 from .pictures import view_pictures
 from .widgets import region, text
 from .workspace import Workspace
@@ -106,7 +106,7 @@ class Panels:
 
         def make() -> bytes:
             file = BytesIO()
-            view_sphere(result.registrar.bank, result.registration).savefig(file, format="png", dpi=110)
+            viewpoints(result.registrar.bank, result.registration).savefig(file, format="png", dpi=110)
             return file.getvalue()
 
         content = await self.workspace.run("pose", make)

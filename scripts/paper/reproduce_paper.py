@@ -21,8 +21,9 @@ import sys
 from pathlib import Path
 
 from curvireg_torch.errors import CurviregError
-from curvireg_torch.evaluation import DATASETS, paper
+from curvireg_torch.evaluation import DATASETS
 from curvireg_torch.pipeline import BankSettings, Pipeline
+from scripts.paper import tables as paper
 
 RANKINGS = ("precision", "angles", "ranks")
 TABLES = ("detectors", "repeatability", "curve", *RANKINGS)

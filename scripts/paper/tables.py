@@ -1,0 +1,433 @@
+"""The measurements of the paper, on any of the datasets."""
+
+import io
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import torch
+import trimesh
+from kornia.color import rgb_to_grayscale
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from curvireg_torch.data import read_image
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evaluation import DATASETS
+from curvireg_torch.evaluation.bop import UNOCCLUDED
+from curvireg_torch.evaluation.metrics import accuracy
+from curvireg_torch.features import field_points
+from curvireg_torch.filters import ImageGradient, MultiScaleCurvilinearSaliency, MultiScaleFocusCurves
+from curvireg_torch.geometry import (
+    ViewSphere,
+    crop_images,
+    rotation_error,
+    rotation_towards,
+    viewpoint_from_rotation,
+)
+from curvireg_torch.geometry.views import DEFAULT_DISTANCE
+from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
+from curvireg_torch.matching.describe import depth_filter
+from curvireg_torch.mesh import load_mesh, mesh_centre, mesh_radius
+from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.utils.files import write_csv, write_file
+from scripts.paper.detectors import DETECTORS
+from scripts.paper.measures import (
+    hausdorff_distance,
+    intersection_percentage,
+    pose_parameter_errors,
+    rank_precision,
+    view_repeatability,
+)
+
+Cell = str | float
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of numbers with their definition.
+
+    Attributes:
+        name: of the files.
+        title, definition: what was measured, on what.
+        columns: the first names the rows.
+        rows: as long as ``columns``.
+        curve: the other columns are curves over the first, which is numeric.
+    """
+
+    name: str
+    title: str
+    definition: str
+    columns: list[str]
+    rows: list[list[Cell]]
+    curve: bool = False
+
+    def markdown(self) -> str:
+        """Title, definition and table, three digits."""
+        lines = [self.columns, *([_short(v) for v in row] for row in self.rows)]
+        head, *body = ("| " + " | ".join(line) + " |\n" for line in lines)
+        return f"## {self.title}\n\n{self.definition}\n\n{head}|{'---|' * len(self.columns)}\n{''.join(body)}"
+
+
+def write_table(table: Table, folder: Path) -> list[Path]:
+    """Write ``NAME.csv``, ``NAME.md`` and, where matplotlib is installed, ``NAME.png``; returns their paths."""
+    paths = [folder / f"{table.name}.{suffix}" for suffix in ("csv", "md", "png")]
+    write_csv(paths[0], [table.columns, *table.rows])
+    write_file(paths[1], table.markdown().encode())
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        return paths[:2]
+    figure = Figure(figsize=(8.0, 4.5), layout="constrained")
+    axes = figure.subplots()
+    width = 0.8 / (len(table.columns) - 1)
+    for k, name in enumerate(table.columns[1:]):
+        values = [float(row[k + 1]) for row in table.rows]
+        if table.curve:
+            axes.plot([float(row[0]) for row in table.rows], values, label=name)
+        else:
+            axes.bar([i + k * width for i in range(len(values))], values, width, label=name)
+    if not table.curve:
+        axes.set_xticks(range(len(table.rows)), [str(row[0]) for row in table.rows], rotation=30)
+    axes.set(title=table.title, xlabel=table.columns[0])
+    axes.legend(fontsize="small", ncols=2)
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=120, format="png")
+    write_file(paths[2], picture.getvalue())
+    return paths
+
+
+def _short(value: Cell) -> str:
+    if isinstance(value, str):
+        return value
+    return "-" if math.isnan(value) else f"{value:.3g}"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One object in one photograph.
+
+    Attributes:
+        category: class or object.
+        image_path, mesh_path, unit: files, and the unit of the mesh.
+        box: (4,) x0, y0, x1, y1 in px.
+        pose: (3, 4) float64 model to camera; without translation (NaN) it is that of a camera that looks at the box.
+    """
+
+    category: str
+    image_path: str
+    mesh_path: str
+    unit: str
+    box: Tensor
+    pose: Tensor
+
+    def crop(self, settings: BankSettings) -> Tensor:
+        """(1, 3, S, S) crop of the photograph, framed as the views of a bank."""
+        image = read_image(self.image_path)
+        return crop_images([image], self.box[None], size=settings.image_size, margin=settings.margin)[0]
+
+    def view(self, mesh: trimesh.Trimesh) -> tuple[Tensor, float]:
+        """Rotation (3, 3) and distance in model units of a camera that looks at the object's centre.
+
+        Without translation the distance is that of banks.
+        """
+        R, t = self.pose[:, :3], self.pose[:, 3]
+        if not bool(t.isfinite().all()):
+            return R, DEFAULT_DISTANCE * mesh_radius(mesh)
+        centre = R @ mesh_centre(mesh) + t
+        return rotation_towards(centre).T @ R, float(torch.linalg.vector_norm(centre))
+
+
+def find_cases(kind: str, root: Path, *, pixel_origin: int = 1, limit: int | None = None) -> list[Case]:
+    """The objects that the paper uses: neither occluded nor truncated, with known pose; grouped by mesh.
+
+    Args:
+        kind: "pascal3d", "bop" or "web".
+        root: of the dataset.
+        pixel_origin: of PASCAL3D+, see :class:`Pascal3DPlus`.
+        limit: use only this many, spread evenly.
+
+    Raises:
+        InvalidInputError: no such object, or an unknown kind.
+        MissingFileError: the dataset is missing.
+    """
+    row = DATASETS[kind]
+    origin = {"pixel_origin": pixel_origin} if "pixel_origin" in row.options else {}
+    dataset = row.open(root, **row.whole, **origin)
+    cases = [case for i in range(len(dataset)) if (case := _case(row, dataset.annotation(i))) is not None]
+    if not cases:
+        raise InvalidInputError(f"{root}: holds no whole object with a known pose")
+    if limit is not None and limit < len(cases):
+        cases = [cases[i * len(cases) // limit] for i in range(limit)]
+    return sorted(cases, key=lambda case: case.mesh_path)
+
+
+def _case(kind: Any, s: dict[str, Any]) -> Case | None:
+    translation = s.get("translation", torch.full((3,), math.nan))
+    pose = torch.cat([s["rotation"], translation[:, None]], dim=1).double()
+    known = bool(pose[:, :3].isfinite().all() and s["box"].isfinite().all())
+    if not known or s.get("visib_fract", 1.0) <= UNOCCLUDED:
+        return None
+    return Case(kind.category.format_map(s), s["image_path"], str(s[kind.mesh]), kind.scored.unit, s["box"], pose)
+
+
+def grouped(cases: list[Case], label: str, progress: bool) -> Iterator[tuple[trimesh.Trimesh, list[Case]]]:
+    """Meshes with their cases; one mesh is in memory at a time."""
+    with tqdm(total=len(cases), desc=label, unit="photo", disable=not progress) as bar:
+        for (path, unit), group in groupby(cases, key=lambda case: (case.mesh_path, case.unit)):
+            chosen = list(group)
+            yield load_mesh(path, unit=unit), chosen
+            bar.update(len(chosen))
+
+
+PHOTO_FIELDS: dict[str, Callable[[], nn.Module]] = {
+    "MFC": MultiScaleFocusCurves,
+    "MCS": MultiScaleCurvilinearSaliency,
+    "IG": ImageGradient,
+}
+"""The paper's filters of photographs, by their names there."""
+
+CURVE_OFFSETS = tuple(range(-100, 100, 5))
+"""Degrees about the object's z axis: 40 views, the true one in the middle."""
+
+CURVE_DETECTORS = ("mfc", "mcs", "ig", "sift", "sobel")
+
+Scores = defaultdict[str, defaultdict[str, list[float]]]
+"""Values by category and column."""
+
+
+def detector_tables(cases: list[Case], settings: BankSettings, eps_px: float, progress: bool = True) -> list[Table]:
+    """IP and Hausdorff distances of each detector against the curvilinear saliency of the true view, per category."""
+    detectors = _photo_detectors(settings)
+    scores: defaultdict[str, Scores] = defaultdict(_no_scores)
+    for category, depth, crop in _views(cases, settings, "detectors", progress):
+        view = _view_points(depth, settings)
+        chance = intersection_percentage(torch.ones_like(view), view, eps_px=eps_px)
+        scores["ip"][category]["chance"].append(float(chance))
+        for name, detect in detectors.items():
+            photo = detect(crop)
+            values = {
+                "ip": intersection_percentage(photo, view, eps_px=eps_px),
+                "hausdorff": hausdorff_distance(photo, view),
+                "hausdorff_95": hausdorff_distance(photo, view, percentile=95.0),
+                "points": photo.sum().float(),
+            }
+            for table, value in values.items():
+                if bool(value.isfinite().all()):
+                    scores[table][category][name].append(float(value))
+    where = f"Crops of {settings.image_size} px, N = {len(cases)}; mean over photographs with points"
+    definitions = {
+        "ip": (
+            "Intersection percentage",
+            f"fraction of the photograph's points within {eps_px:g} px of a point of the view; chance: of all pixels",
+        ),
+        "hausdorff": ("Hausdorff distance", "in px of the crop"),
+        "hausdorff_95": ("Hausdorff distance, 95th percentile", "in px of the crop"),
+        "points": ("Number of points", "in the photograph's crop"),
+    }
+    tables = []
+    for name, (title, text) in definitions.items():
+        columns = [*detectors, "chance"] if name == "ip" else [*detectors]
+        tables.append(_table(name, f"{title}, by detector", f"{title}: {text}. {where}.", scores[name], columns))
+    return tables
+
+
+def repeatability_table(cases: list[Case], settings: BankSettings, eps_px: float, progress: bool = True) -> Table:
+    """Repeatability of each depth filter's points in each photograph filter's points."""
+    detectors = _photo_detectors(settings, [*PHOTO_FIELDS])
+    depths = ("CS", "ASG", "HFN")
+    scores = _no_scores()
+    for category, depth, crop in _views(cases, settings, "repeatability", progress):
+        photos = {name: detect(crop) for name, detect in detectors.items()}
+        for name in depths:
+            view = _view_points(depth, replace(settings, depth_field=name))
+            for photo_name, photo in photos.items():
+                value = view_repeatability(view, photo, eps_px=eps_px)
+                if bool(value.isfinite().all()):
+                    scores[category][f"{name}/{photo_name}"].append(float(value))
+    text = (
+        f"Repeatability: fraction of the points of the true view with a point of the photograph within {eps_px:g} px. "
+        f"Crops of {settings.image_size} px, at most {settings.point_fraction:.0%} of the pixels, N = {len(cases)}."
+    )
+    title = "Repeatability, depth filter / photograph filter"
+    return _table("repeatability", title, text, scores, [f"{d}/{p}" for d in depths for p in detectors])
+
+
+def curve_table(cases: list[Case], settings: BankSettings, eps_px: float, progress: bool = True) -> Table:
+    """Repeatability in 40 views around the true one."""
+    detectors = _photo_detectors(settings, CURVE_DETECTORS)
+    angles = torch.deg2rad(torch.tensor(CURVE_OFFSETS, dtype=torch.float64))
+    rotations = torch.zeros(len(angles), 3, 3, dtype=torch.float64)
+    rotations[:, 0, 0] = rotations[:, 1, 1] = angles.cos()
+    rotations[:, 1, 0], rotations[:, 0, 1], rotations[:, 2, 2] = angles.sin(), -angles.sin(), 1.0
+    sums = torch.zeros(len(detectors), len(angles), dtype=torch.float64)
+    for _, depth, crop in _views(cases, settings, "curve", progress, rotations):
+        views = _view_points(depth, settings)
+        for k, detect in enumerate(detectors.values()):
+            sums[k] += view_repeatability(views, detect(crop).expand_as(views), eps_px=eps_px).nan_to_num().double()
+    means = (sums / len(cases)).T.tolist()
+    text = (
+        f"Fraction of the points of the view with a point of the photograph within {eps_px:g} px, with the object "
+        f"rotated about its z axis; curvilinear saliency on depth. Crops of {settings.image_size} px, mean over "
+        f"N = {len(cases)}."
+    )
+    rows: list[list[Cell]] = [[float(offset), *line] for offset, line in zip(CURVE_OFFSETS, means, strict=True)]
+    return Table("curve", "Repeatability around the true view", text, ["offset_deg", *detectors], rows, curve=True)
+
+
+def _no_scores() -> Scores:
+    return defaultdict(lambda: defaultdict(list))
+
+
+def _views(
+    cases: list[Case], settings: BankSettings, label: str, progress: bool, rotations: Tensor | None = None
+) -> Iterator[tuple[str, Tensor, Tensor]]:
+    """Of each case: category, depth (N, 1, S, S) after ``rotations`` of the object, and grey crop (1, 1, S, S)."""
+    for mesh, group in grouped(cases, label, progress):
+        describe = ViewDescriber(mesh, settings)
+        for case in group:
+            R, distance = case.view(mesh)
+            R = R[None] if rotations is None else R @ rotations
+            depth = describe.depth(R, torch.full((len(R),), distance, dtype=torch.float64))[0]
+            yield case.category, depth, rgb_to_grayscale(case.crop(settings))
+
+
+def _view_points(depth: Tensor, settings: BankSettings) -> Tensor:
+    """(N, S, S) bool."""
+    with torch.no_grad():
+        return _field_points(depth_filter(settings), settings.point_fraction, depth)
+
+
+def _photo_detectors(settings: BankSettings, names: Any = ()) -> dict[str, Callable[[Tensor], Tensor]]:
+    """Detectors (B, 1, H, W) -> bool (B, H, W) of the paper's filters and the classical ones; ``names`` selects."""
+    fraction = settings.point_fraction
+    found = {name: partial(_field_points, make(), fraction) for name, make in PHOTO_FIELDS.items()}
+    known = {name.lower() for name in found}
+    classical = {n: partial(_detected_points, d, fraction) for n, d in DETECTORS.items() if n.lower() not in known}
+    wanted = {name.lower() for name in names}
+    return {name: detect for name, detect in (found | classical).items() if not wanted or name.lower() in wanted}
+
+
+def _field_points(field: nn.Module, fraction: float, x: Tensor) -> Tensor:
+    return field_points(field(x), fraction=fraction)[:, 0]
+
+
+def _detected_points(detect: Callable[..., Any], fraction: float, image: Tensor) -> Tensor:
+    points: Tensor = detect(image, fraction=fraction).points
+    return points[:, 0]
+
+
+def _table(name: str, title: str, text: str, scores: Scores, columns: list[str]) -> Table:
+    """One row of means per category, and the mean of all photographs."""
+    everything = {c: [v for by_name in scores.values() for v in by_name[c]] for c in columns}
+    means: list[list[Cell]] = [
+        [category, *(fmean(values[c]) if values[c] else float("nan") for c in columns)]
+        for category, values in [*sorted(scores.items()), ("all", everything)]
+    ]
+    return Table(name, title, text, ["category", *columns], means)
+
+
+RANKS = (1, 3, 5, 10, 20)
+THRESHOLD_DEG = 30.0
+
+
+@dataclass(frozen=True)
+class Rankings:
+    """The best views of each photograph, for each pair of filters.
+
+    Attributes:
+        views: of all banks.
+        categories: (B) of the photographs.
+        truth: (B, 4) azimuth, elevation, theta in degrees, and distance 0, as banks have one distance.
+        errors: (B, N) rotation errors of the views, degrees.
+        orders: pair such as "CS/MFC" -> (B, 20) indices of the best views.
+    """
+
+    views: ViewSphere
+    categories: list[str]
+    truth: Tensor
+    errors: Tensor
+    orders: dict[str, Tensor]
+
+    @property
+    def definition(self) -> str:
+        settings = "no refinement, CAD and box as annotated"
+        return f"{len(self.views)} views per object, {settings}, N = {len(self.categories)}."
+
+
+@torch.no_grad()
+def rank_views(cases: list[Case], views: ViewSphere, settings: BankSettings, progress: bool = True) -> Rankings:
+    """Rank all views for every photograph with {CS, ASG, AR} x {MFC, MCS, IG}."""
+    depths = ("CS", "ASG", "AR")
+    photos = {name: make() for name, make in PHOTO_FIELDS.items()}
+    categories: list[str] = []
+    truth, errors = [], []
+    orders: dict[str, list[Tensor]] = {f"{d}/{p}": [] for d in depths for p in photos}
+    for mesh, group in grouped(cases, "rankings", progress):
+        crops = torch.cat([case.crop(settings) for case in group])
+        for case in group:
+            R, _ = case.view(mesh)
+            categories.append(case.category)
+            truth.append(torch.tensor([*map(float, viewpoint_from_rotation(R)), 0.0]))
+            errors.append(rotation_error(R[None].float(), views.rotations))
+        for depth in depths:
+            bank = ViewBank.build(mesh, views, settings=replace(settings, depth_field=depth), progress=False)
+            for photo, field in photos.items():
+                matcher = ViewMatcher(bank, field=field)
+                for chunk in crops.split(matcher.chunk_size):
+                    orders[f"{depth}/{photo}"].append(matcher.rank(matcher.features(chunk)).top(max(RANKS)))
+    found = {name: torch.cat(parts) for name, parts in orders.items()}
+    return Rankings(views, categories, torch.stack(truth), torch.stack(errors), found)
+
+
+def precision_table(rankings: Rankings) -> Table:
+    """Fraction of the photographs whose best view is nearly right, per category."""
+    rows: list[list[Cell]] = []
+    for category in [*sorted(set(rankings.categories)), "all"]:
+        mask = torch.tensor([category in (c, "all") for c in rankings.categories])
+        best = [rankings.errors.gather(1, order[:, :1])[mask, 0] for order in rankings.orders.values()]
+        rows.append([category, *(accuracy(errors, THRESHOLD_DEG) for errors in best)])
+    text = (
+        f"Precision: fraction of the photographs whose best view is within {THRESHOLD_DEG:g} degrees of the true one. "
+        f"{rankings.definition}"
+    )
+    return Table("precision", "Precision, depth filter / photograph filter", text, ["category", *rankings.orders], rows)
+
+
+def rank_tables(rankings: Rankings) -> list[Table]:
+    """Precision at rank 1, 3, 5, 10, 20, in two readings of a definition that the paper leaves open."""
+    readings = (
+        ("ranks", f"a view within {THRESHOLD_DEG:g} degrees of the true one", THRESHOLD_DEG),
+        ("ranks_nearest", "the view of the bank that is nearest to the true one", None),
+    )
+    names = ["k", *rankings.orders]
+    tables = []
+    for name, reading, limit in readings:
+        orders = rankings.orders.values()
+        columns = [rank_precision(order, rankings.errors, ks=RANKS, threshold_deg=limit) for order in orders]
+        rows: list[list[Cell]] = [[float(k), *(column[k] for column in columns)] for k in RANKS]
+        text = f"Fraction of the photographs with {reading} among the best k. {rankings.definition}"
+        tables.append(Table(name, f"Precision at rank k: {reading}", text, names, rows, curve=True))
+    return tables
+
+
+def angle_table(rankings: Rankings) -> Table:
+    """Mean errors of elevation, azimuth and in-plane angle: of the estimate and of the closest view of the bank."""
+    v = rankings.views
+    views = torch.stack([v.azimuth, v.elevation, v.theta, torch.zeros(len(v))], dim=1)
+    rows: list[list[Cell]] = []
+    for name, order in rankings.orders.items():
+        means = pose_parameter_errors(views[order[:, 0]], rankings.truth, views)
+        rows.append([name, *(means[k][a] for a in ("elevation", "azimuth", "theta") for k in ("est", "clo"))])
+    text = (
+        "Mean absolute errors in degrees: Est. of the best-ranked view, Clo. of the view that is closest to the true "
+        f"one. Distance is omitted: banks have one. {rankings.definition}"
+    )
+    columns = [f"{angle} {kind}" for angle in ("elevation", "azimuth", "in-plane") for kind in ("Est.", "Clo.")]
+    return Table("angles", "Errors of angles", text, ["filters", *columns], rows)
