@@ -1,14 +1,12 @@
 # ruff: noqa: I001 (one import for all modules)
 from . import (
     data as data,
-    detectors as detectors,
     errors as errors,
     evaluation as evaluation,
     filters as filters,
     geometry as geometry,
     mesh as mesh,
     matching as matching,
-    metrics as metrics,
     features as features,
     pipeline as pipeline,
     registration as registration,

@@ -85,9 +85,10 @@ def _outcome(row: Row, error: float, within_deg: float) -> tuple[str, str, tuple
     """Kind, caption and sort key of a result."""
     if "failed" in row:
         return "failed", str(row["failed"]), (2, 0.0)
-    confidence = f"confidence {row['confidence']:.2f}"
+    number = row["confidence"]
+    confidence = "not calibrated" if number is None else f"confidence {number:.2f}"
     if math.isnan(error):
-        return "reliable" if row["reliable"] else "doubtful", f"pose unknown, {confidence}", (1, -row["confidence"])
+        return "reliable" if row["reliable"] else "doubtful", f"pose unknown, {confidence}", (1, -(number or 0.0))
     return "right" if error < within_deg else "wrong", f"{error:.1f} degrees off, {confidence}", (0, error)
 
 

@@ -48,7 +48,7 @@ HALF_SIZE_DENSITY = 0.5
 SAME_POSE_SHIFT = 0.5
 """Mean shift in px at half size below which two fits count as one."""
 
-START_ANGLES, START_ROLL = (8.0,), 6.0
+START_ANGLE, START_ROLL = 8.0, 6.0
 """Degrees by which the pose is rotated left, right, up and down, and about the line of sight, for further starts: about
 half the spacing of a bank's views."""
 
@@ -353,7 +353,7 @@ def fit_contours(
     image_index: Tensor | None = None,
     margin: float = 0.1,
     finish: int | None = None,
-    start_angles: Sequence[float] = START_ANGLES,
+    wide_angles: Sequence[float] = (),
     object_mask: Tensor | None = None,
 ) -> ContourFit:
     """Poses whose contours lie on a photograph's edges, by robust least squares over SE(3).
@@ -365,10 +365,11 @@ def fit_contours(
         (J^T W J + lambda diag(J^T W J)) xi = J^T W d,
 
     where W is the strength of the edge times Tukey's weight of the residual. Within a step, edges are selected again
-    near the predicted position; the search distance shrinks from round to round, and the mesh is rendered again where
-    contours have moved. The fit begins at half size from each start and from four poses rotated away from it; the best
-    (by edge support, with a mask weighted as below) and the next best that differs from it continue, and end at full
-    size. The start is returned where no fit has more of it. All starts of all photographs are rendered together.
+    near the predicted position; the search radius shrinks from round to round, and the contours are found again where
+    they have moved. The fit begins at half size from each start and from six poses rotated away from it, and at a
+    quarter of the size where it may be farther away; the best (by edge support, with a mask weighted as below) and the
+    next best that differs from it continue, and end at full size. If no fit improves the edge support, the start is
+    kept.
 
     Prints, shadows and clutter have edges too. With an ``object_mask``, an edge counts for the outline as far as the
     object lies on its inner side alone, and for creases and inner contours as far as the object lies on both sides
@@ -392,7 +393,8 @@ def fit_contours(
         margin: added around the box, as a fraction of its longer side.
         finish: number of starts of each photograph that are fitted to the end, those with the most support after the
             first rounds; None: all, each as if alone.
-        start_angles: degrees by which each start is rotated away, up, down, left and right, to fit from there too.
+        wide_angles: degrees by which starts are rotated up, down, left and right, to begin there at a quarter of the size
+            too, if they may be worse than views of a bank.
         object_mask: (B, 1, s, s) probability that pixels of the square crops, the boxes with their margin, belong to
             the object, for instance of :meth:`LearnedCurvilinearSaliency.mask`.
 
@@ -426,11 +428,13 @@ def fit_contours(
         full = replace(full, mask=ObjectMask(object_mask))
     half, quarter = (_smaller(full, crops, inside, factor) for factor in (2, 4))
     before, weighted_before = half.supports(half.state(T0))
-    around = _turned(T0, half.centre, start_angles)
+    wide = _turned(T0, half.centre, wide_angles)
+    every = torch.arange(N).repeat_interleave(wide.shape[1])
+    wide = quarter[every].descend(quarter[every].state(wide.flatten(0, 1)), QUARTER_SIZE_RADII).T.view(wide.shape)
+    around = torch.cat([_turned(T0, half.centre, (START_ANGLE,), roll=START_ROLL), wide], dim=1)
     M = around.shape[1]
     every = torch.arange(N).repeat_interleave(M)
-    coarse = quarter[every].descend(quarter[every].state(around.flatten(0, 1)), QUARTER_SIZE_RADII).T
-    fits = half[every].descend(half[every].state(coarse), FIRST_RADII)
+    fits = half[every].descend(half[every].state(around.flatten(0, 1)), FIRST_RADII)
     supports = half[every].supports(fits)[1].view(N, M)
     support, best = supports.max(dim=1)
     first = fits[torch.arange(N) * M + best]
@@ -511,12 +515,12 @@ def inside_photographs(images: Sequence[Tensor], boxes: Tensor, size: int, margi
     return (down[:, None, :, None] & across[:, None, None, :]).float()
 
 
-def _turned(T: Tensor, centre: Tensor, angles: Sequence[float]) -> Tensor:
-    """(N, M, 4, 4) poses: each of (N, 4, 4), then turned about the camera's z axis, and about x and y by ``angles``."""
-    axes = torch.eye(6, dtype=torch.float64)[:3]
-    both = torch.cat([axes, -axes])
-    aside = [angle * both[[0, 3, 1, 4]] for angle in angles]
-    twists = torch.deg2rad(torch.cat([0.0 * both[:1], START_ROLL * both[[2, 5]], *aside]))
+def _turned(T: Tensor, centre: Tensor, angles: Sequence[float], *, roll: float | None = None) -> Tensor:
+    """(N, M, 4, 4) poses: each of (N, 4, 4), then turned about the camera's x and y axes by +-``angles`` degrees, and
+    about its z axis by +-``roll``."""
+    both = torch.cat([torch.eye(6, dtype=torch.float64)[:3], -torch.eye(6, dtype=torch.float64)[:3]])
+    aside = [angle * both[[0, 3, 1, 4]] for angle in angles] + ([] if roll is None else [roll * both[[2, 5]]])
+    twists = torch.deg2rad(torch.cat([0.0 * both[:1], *aside]))
     N, M = len(T), len(twists)
     return apply_twist(T.repeat_interleave(M, 0), twists.repeat(N, 1), centre).view(N, M, 4, 4)
 

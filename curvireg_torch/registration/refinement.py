@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LOST_CONFIDENCE", "nearest_view", "refine"]
 
-WIDE_START_ANGLES = (8.0, 14.0, 22.0)
+WIDE_ANGLES = (14.0, 22.0)
 """Degrees by which given starts are rotated away, to fit from there too: they may be worse than views of a bank."""
 
 LOST_CONFIDENCE = 0.35
@@ -130,7 +130,7 @@ def refine_item(
     descriptors = describer.descriptor(query.field)
     poses = _poses(registrar, T, K, boxes)
     mask = registrar.object_mask(query)
-    poses = fit_poses(describer, images, poses, boxes, mask, start_angles=WIDE_START_ANGLES)
+    poses = fit_poses(describer, images, poses, boxes, mask, wide_angles=WIDE_ANGLES)
     evidence = _evidence(registrar, descriptors, poses)
     best = _scores(evidence).argmax()
     if (fitted := fit_texture_of(describer, images, poses, boxes, int(best))) is not None:

@@ -33,7 +33,7 @@ def registration_sheet(
     """The photograph with the pose's contours and a caption; below it a close-up, the compared fields and the rivals.
 
     The photograph's longer side becomes 960 to 1600 px. Below a rival stand its rotation from the answer and its
-    probability, and "could be" if it is in the answer set. Arguments as for :func:`contour_overlay`.
+    probability. Arguments as for :func:`contour_overlay`.
 
     Returns:
         (H', W', 3) uint8 RGB.

@@ -34,7 +34,7 @@ import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.registration import Follower
-from curvireg_torch.registration.rescoring import POSE_FEATURES, rescore
+from curvireg_torch.registration.poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS
 from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
 
 Row: TypeAlias = dict[str, Any]
@@ -105,7 +105,8 @@ def registered(registrar: cr.Registrar, sample: Row, name: str) -> Iterator[Row]
         ray = sample["rotation"].double() @ model_centre(sample) + sample["translation"].double()
         sample = sample | {"rotation": cr.geometry.rotation_towards(ray).T @ sample["rotation"].double()}
     evidence = torch.tensor([[h.evidence[name] for name in POSE_FEATURES] for h in result.hypotheses]).double()
-    row = {"features": dict(result.confidence_features), "scores": rescore(evidence, exact=K is not None).tolist()}
+    weights = torch.tensor(RANK_ALONE if K is None else SCORE_WEIGHTS, dtype=torch.float64)
+    row = {"features": dict(result.confidence_features), "scores": (evidence @ weights).tolist()}
     row |= {"errors": errors_of(R, sample).tolist()}
     best = result.hypotheses[0]
     if name == "exact" and best.covariance is not None and row["errors"][0] < RIGHT:
@@ -154,7 +155,7 @@ def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
         result = registrar([shown["image"]], None, shown["camera_matrix"].double())[0]
         if result.ok:
             evidence = result.hypotheses[0].evidence
-            features = {"proposal": result.localization.score, "similarity": evidence["similarity"]}
+            features = {"score": result.localization.score, "similarity": evidence["similarity"]}
             x0, y0, x1, y1 = torch.cat([
                 torch.maximum(result.localization.box[:2], shown["box"][:2].double()),
                 torch.minimum(result.localization.box[2:], shown["box"][2:].double()),
@@ -271,21 +272,21 @@ def fit_rivals(rows: Sequence[Row]) -> Row:
 
 def calibrate(work: Path, jobs: int, limit: int | None) -> tuple[Row, Row]:
     """Constants, and their quality on held-out kinds of objects."""
-    constants: Row = {"confidence": {}, "rivals": {}}
+    old = json.loads(CONSTANTS.read_text())
+    constants: Row = {"detection without networks": old["detection without networks"]}
     quality: Row = {}
     for name, sets in FIELDS.items():
         rows = [row | {"set": s} for s in sets for row in rows_of(work, s, jobs, limit)]
         rows = [row | {"right": row["set"] != "wrong" and row["errors"][0] < RIGHT} for row in rows]
         wrong = np.array([row["set"] == "wrong" for row in rows])
         weight = np.where(wrong, WRONG_FRACTION / (1 - WRONG_FRACTION) * (~wrong).sum() / max(1, wrong.sum()), 1.0)
-        constants["confidence"][name], quality[name] = fit_logistic(rows, weight)
-        constants["rivals"][name] = fit_rivals([row for row in rows if row["set"] != "wrong"])
+        fitted, quality[name] = fit_logistic(rows, weight)
+        constants[name] = fitted | fit_rivals([row for row in rows if row["set"] != "wrong"])
         distances = [row["distance2"] for row in rows if "distance2" in row]
         if distances:
-            used = json.loads(CONSTANTS.read_text())["covariance"]["scale"]
-            scale = used * float(np.quantile(distances, 0.9)) / float(chi2.ppf(0.9, 6))
-            constants["covariance"] = {"scale": round(scale, 3)}
-    for name, kind in (("refinement", "refined"), ("tracking", "sequences"), ("presence", "detected")):
+            scale = old["covariance_scale"] * float(np.quantile(distances, 0.9)) / float(chi2.ppf(0.9, 6))
+            constants["covariance_scale"] = round(scale, 3)
+    for name, kind in (("refinement", "refined"), ("tracking", "sequences"), ("detection", "detected")):
         constants[name], quality[name] = fit_logistic(rows_of(work, kind, jobs, limit))
     return constants, quality
 

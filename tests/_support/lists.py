@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import scene, truck_bank
+from tests._support.scenes import learned_registrar, scene, truck_bank
 
 __all__ = ["CAMERA", "RESULTS", "box_of", "lines", "table", "write_files", "written"]
 
@@ -17,7 +17,7 @@ RESULTS += ["tx", "ty", "tz"]
 
 
 def write_files(folder):
-    """Three photographs, pictures that are none, a mesh and a bank of it."""
+    """Three photographs, files that are none, a mesh, and two banks: "truck", without confidence, and "learned"."""
     (folder / "photos").mkdir()
     for seed in range(3):
         picture = (scene(seed)[0].permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
@@ -26,6 +26,7 @@ def write_files(folder):
     (folder / "text.jpg").write_text("not a picture")
     example_mesh().export(folder / "truck.ply")
     truck_bank().save(folder / "truck.safetensors")
+    learned_registrar().bank.save(folder / "learned.safetensors")
     return folder
 
 

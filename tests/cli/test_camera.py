@@ -26,7 +26,7 @@ def register(folder, capsys):
     """Register one photograph; returns the document and what was printed beside it."""
 
     def run(photo, *words):
-        files = [str(folder / photo), str(folder / "truck.safetensors"), "--box", *box_of(0)]
+        files = [str(folder / photo), str(folder / "learned.safetensors"), "--box", *box_of(0)]
         assert main(["register", *files, *words, "--json", "--quiet"]) == 0
         printed = capsys.readouterr()
         return json.loads(printed.out), printed.err

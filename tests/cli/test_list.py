@@ -86,8 +86,7 @@ def test_list_reports_every_row_in_order(register_list, tmp_path, capsys):
             assert [row[name] for name in ("status", *RESULTS[2:])] == ["failed", "", "false", *[""] * 12]
         else:
             assert (row["status"], row["message"]) == ("ok", "")
-            assert 0 <= float(row["confidence"]) <= 1
-            assert row["reliable"] in ("true", "false")
+            assert (row["confidence"], row["reliable"]) == ("", "false"), "not calibrated"
             assert expected is None or float(rotation_error(rotation(row), scene(expected)[2][:3, :3])) < 15
     t = torch.tensor([float(rows[0][name]) for name in ("tx", "ty", "tz")], dtype=torch.float64)
     truth = scene(0)[2][:3, 3]
@@ -103,7 +102,7 @@ def test_list_reports_every_row_in_order(register_list, tmp_path, capsys):
 def test_list_equals_single_photographs_bit_by_bit(folder, tmp_path):
     """With the network and the search, where rounding errors would grow."""
     views = sample_views(azimuth_step=45, elevations=[20])
-    bank = folder / "learned.safetensors"
+    bank = folder / "coarse.safetensors"
     ViewBank.build(example_mesh(), views, pipeline=Pipeline(), progress=False).save(bank)
     rows = [[f"photos/{seed}.png", *box_of(seed), *CAMERA] for seed in range(2)]
     path = written(folder / "alone.csv", f"{HEADER},fx,fy,cx,cy", *rows)

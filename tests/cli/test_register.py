@@ -31,7 +31,7 @@ def rotation(document):
 
 
 def test_register_writes_result_and_overlay(register_one, document, tmp_path, capsys):
-    assert register_one("--camera", *CAMERA, "--top", "3") == 0
+    assert register_one("--camera", *CAMERA, "--top", "3", mesh="learned.safetensors") == 0
     result, truth = document(), scene(0)[2]
     assert float(rotation_error(rotation(result), truth[:3, :3])) < 15
     # Swapped CX and CY would move the object by 30 px of 260: 0.16 of its distance.
@@ -40,7 +40,8 @@ def test_register_writes_result_and_overlay(register_one, document, tmp_path, ca
     assert len(result["top"]) == 3
     assert cv2.imread(str(tmp_path / "out" / "overlay.png")).std() > 20
     assert np.shape(result["covariance"]) == (6, 6)
-    assert set(result["squared_radius"]) == {"0.5", "0.9", "0.95"}
+    assert len(result["probabilities"]) == 3
+    assert sum(result["probabilities"]) + result["none"] == pytest.approx(1.0)
     deviations = result["standard_deviations"]
     assert deviations["translation"] == pytest.approx([result["covariance"][i][i] ** 0.5 for i in (3, 4, 5)])
     assert all(0 < v < 30 for v in deviations["rotation_deg"])
@@ -57,7 +58,7 @@ def test_register_without_box_and_camera(folder, register_one, document, capsys)
     assert "0.png: localizing the object" in capsys.readouterr().err
     assert register_one("--no-refine", box=()) == 0
     assert capsys.readouterr().err == ""
-    keys = ("translation", "covariance", "squared_radius", "standard_deviations")
+    keys = ("translation", "covariance", "standard_deviations")
     assert {document()[key] for key in keys} == {None}
 
 

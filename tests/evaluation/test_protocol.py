@@ -16,7 +16,6 @@ BOX = torch.tensor([10.0, 20.0, 110.0, 70.0])
     ("words", "text"),
     [
         ([], "cad=annotated pose=upright box=annotated"),
-        (["cad=fused", "pose=any"], "cad=fused pose=any box=annotated"),
         (["box=0.2", "seed=7"], "cad=annotated pose=upright box=0.2 seed=7"),
         (["box=annotated"], "cad=annotated pose=upright box=annotated"),
         (["box=none"], "cad=annotated pose=upright box=none"),

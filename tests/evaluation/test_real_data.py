@@ -3,8 +3,9 @@
 import pytest
 
 from curvireg_torch.data import Pascal3DPlus
-from curvireg_torch.evaluation import Pascal3DBenchmark, Protocol, evaluate, paper
+from curvireg_torch.evaluation import Pascal3DBenchmark, Protocol, evaluate
 from curvireg_torch.pipeline import BankSettings
+from scripts.paper import tables as paper
 from tests._support.real_data import real_data
 
 pytestmark = pytest.mark.data

@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,7 +11,6 @@ import trimesh
 from curvireg_torch.data import Pascal3DPlus, read_bop_csv
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, WebBenchmark, score
-from curvireg_torch.evaluation.scores import answer_set_quality
 from curvireg_torch.evaluation.store import ResultStore, to_json
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
 from tests._support.miniature import pascal_object, write_image, write_mesh, write_record
@@ -180,26 +178,3 @@ def test_score_names_a_missing_result(furniture, tmp_path):
     ResultStore(tmp_path).open({"root": "x"})
     with pytest.raises(InvalidInputError, match=r"bottle.*run again"):
         score(furniture, tmp_path)
-
-
-def test_answer_set_quality_counts_sets_that_hold_the_truth():
-    """Errors are part of the rows: a member is right, another pose is right, none is right, unknown, failed."""
-    errors_of = SimpleNamespace(
-        rotation_errors=lambda _, rows: torch.tensor([row.get("error", math.inf) for row in rows])
-    )
-
-    def row(errors, members, holds_none):
-        top = [{"error": error} for error in errors]
-        return {**top[0], "top": top, "answer_set": {"members": members, "holds_none": holds_none}}
-
-    rows = [
-        row([90.0, 29.0], [0, 1], False),
-        row([90.0, 29.0], [0], True),
-        row([90.0, 31.0, 80.0], [0], True),
-        row([90.0], [0], False),
-        row([math.nan], [0], False),
-        {"failed": "no"},
-    ]
-    found = answer_set_quality(errors_of, [None] * len(rows), rows)
-    assert found == {"level": 0.9, "n": 5, "coverage": 2 / 5, "mean_size": 7 / 5, "none": 2 / 5}
-    assert answer_set_quality(errors_of, [], [])["coverage"] is None

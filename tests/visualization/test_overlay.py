@@ -2,10 +2,8 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-import trimesh
 from scipy.ndimage import binary_erosion, distance_transform_edt
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, camera_matrix, sample_views
@@ -75,7 +73,7 @@ def check_assumed_camera(registrar, result, image, box, truth):
     assert result.translation is None
     check_contour(is_contour(contour_overlay(registrar, result, image, box)), truth)
     rotation, distance = result.allocentric_rotation[None], torch.tensor([result.distance])
-    T, K = registrar.describers[0].cameras_of_boxes(rotation, distance, box[None])
+    T, K = registrar.describer.cameras_of_boxes(rotation, distance, box[None])
     filling = replace(result.hypotheses[0], projection=(T[0], K[0]))
     assert fraction_near(is_contour(contour_overlay(registrar, filling, image, box)), truth, 2) < 0.5
 
@@ -106,7 +104,7 @@ def test_hypotheses_are_projected_at_their_poses(with_camera, without_camera):
     registrar, result, _, box, _ = without_camera
     for hypothesis in result.hypotheses:
         T, K = hypothesis.projection
-        centre = T[:3, :3] @ registrar.describers[0].centre + T[:3, 3]
+        centre = T[:3, :3] @ registrar.describer.centre + T[:3, 3]
         assert float(centre.norm()) == pytest.approx(hypothesis.distance, rel=1e-6)
         mask = silhouette(T, K)
         rows, columns = mask.any(axis=1).nonzero()[0], mask.any(axis=0).nonzero()[0]
@@ -131,46 +129,5 @@ def test_contour_overlay_uses_the_renderer_of_the_registrar(bank):
     registrar = Registrar(bank, pipeline=unrefined(bank), renderer=renderer)
     contour_overlay(registrar, registrar([image], box[None])[0], image, box)
     assert sizes[-1] == SIZE
-    with pytest.raises(InvalidInputError, match="the bank has 2"):
-        Registrar(ViewBank.join([bank, bank]), renderer=renderer)
-
-
-def test_contour_overlay_draws_the_mesh_of_the_hypothesis():
-    views = sample_views(azimuth_step=30, elevations=[0, 30])
-    meshes = pole, _ = trimesh.creation.box((0.02, 0.02, 0.3)), example_mesh()
-    options = {"pipeline": truck_bank().pipeline, "progress": False}
-    bank = ViewBank.join([ViewBank.build(mesh, views, **options) for mesh in meshes])
-    registrar = Registrar(bank, pipeline=unrefined(bank))
-    image, box, T = scene(0)
-    result = registrar([image], box[None], CAMERA)[0]
-    truck = replace(next(h for h in result.hypotheses if h.model == 1), projection=(T, CAMERA))
-    for model, mesh in ((1, None), (0, pole)):
-        picture = contour_overlay(registrar, replace(truck, model=model), image, box)
-        assert fraction_near(is_contour(picture), silhouette(T, mesh=mesh), 1) == 1.0
-
-
-def test_pictures_take_photographs_as_the_registrar_does(with_camera):
-    registrar, result, image, box, _ = with_camera
-    pixels = (image * 255).round().byte()
-    expected = contour_overlay(registrar, result, pixels, box)
-    assert is_contour(expected).any()
-    array = pixels.permute(1, 2, 0).contiguous().numpy()
-    before = array.copy()
-    for same in (pixels / 255.0, array):
-        assert np.array_equal(contour_overlay(registrar, result, same, box.tolist()), expected)
-    assert np.array_equal(array, before), "the photograph itself is not drawn on"
-    assert contour_overlay(registrar, result, image[:1], box).shape == (*SIZE, 3)
-    with pytest.raises(InvalidInputError, match="channels"):
-        contour_overlay(registrar, result, torch.zeros(4, 9, 9), box)
-    with pytest.raises(InvalidInputError, match="X0 < X1"):
-        contour_overlay(registrar, result, image, -box)
-
-
-def test_contour_overlay_with_another_camera_matrix(with_camera, without_camera):
-    registrar, result, image, box, T = with_camera
-    half = torch.tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    small = torch.nn.functional.avg_pool2d(image[None], 2)[0]
-    picture = contour_overlay(registrar, result, small, (box - 0.5) / 2, half @ CAMERA)
-    assert fraction_near(is_contour(picture), silhouette(T, half @ CAMERA, size=(SIZE[0] // 2, SIZE[1] // 2)), 2) > 0.95
-    with pytest.raises(InvalidInputError, match="found without one"):
-        contour_overlay(registrar, *without_camera[1:4], CAMERA)
+    with pytest.raises(InvalidInputError, match="knows one mesh"):
+        Registrar([bank, bank], renderer=renderer)

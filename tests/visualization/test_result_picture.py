@@ -8,7 +8,6 @@ import torch
 import trimesh
 
 from curvireg_torch import Registrar, ViewBank, rotation_error, sample_views
-from curvireg_torch.registration import AnswerSet
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.visualization import registration_sheet, result_picture
@@ -107,8 +106,8 @@ def test_registration_sheet_of_narrow_and_flat_photographs(registered):
 def test_registration_sheet_has_the_verdict_in_its_colour(registered):
     registrar, result, image, box = registered
     for confidence, verdict in ((0.95, "likely"), (0.899, "unsure"), (0.49, "unsure"), (0.45, "no match")):
-        answers = AnswerSet((confidence, *[0.01] * (len(result.hypotheses) - 1)))
-        sheet = registration_sheet(registrar, replace(result, answer_set=answers), image, box)
+        answers = (confidence, *[0.01] * (len(result.hypotheses) - 1))
+        sheet = registration_sheet(registrar, replace(result, probabilities=answers), image, box)
         found = [word for word, colour in VERDICT_COLOURS.items() if (sheet[720:] == colour).all(axis=2).sum() > 500]
         assert found == [verdict]
 
@@ -127,9 +126,9 @@ def test_registration_sheet_of_several_meshes(registered):
     assert np.array_equal(sheet[:720], other[:720]), "bytes and floats are the same photograph"
 
 
-def test_registration_sheet_names_the_members_of_the_answer_set(registered):
+def test_registration_sheet_names_rivals_that_are_nearly_as_probable(registered):
     _, result, _, _ = registered
-    answers = AnswerSet((0.5, 0.05, 0.4, 0.02, 0.01), threshold=0.85)
-    captions = [result_picture._rival(replace(result, answer_set=answers), index) for index in (1, 2)]
+    answers = (0.5, 0.05, 0.4, 0.02, 0.01)
+    captions = [result_picture._rival(replace(result, probabilities=answers), index) for index in (1, 2)]
     angles = [rotation_error(h.rotation, result.rotation) for h in result.hypotheses[1:3]]
-    assert captions == [f"rival: {angles[0]:.0f}° away (0.05)", f"could be: {angles[1]:.0f}° away (0.40)"]
+    assert captions == [f"rival: {angles[0]:.0f}° away (0.05)", f"rival: {angles[1]:.0f}° away (0.40)"]

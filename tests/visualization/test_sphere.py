@@ -5,7 +5,7 @@ import torch
 from curvireg_torch import Ranking, Registrar, ViewBank, sample_views, uniform_views
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.synthetic import example_mesh
-from curvireg_torch.visualization.plots import view_sphere
+from curvireg_torch.visualization.plots import viewpoints
 from curvireg_torch.visualization.sphere import direction_scores, sphere_map
 from tests._support.scenes import CAMERA, scene, unrefined
 
@@ -30,8 +30,6 @@ def test_direction_scores_take_the_best_in_plane_rotation_and_distance(bank):
         assert s == float(scores[1][views].max())
     with pytest.raises(InvalidInputError, match="image 2"):
         direction_scores(bank, ranked(scores), image_index=2)
-    with pytest.raises(InvalidInputError, match="1 meshes"):
-        direction_scores(bank, ranked(scores), model=1)
 
 
 def test_sphere_map_shows_the_nearest_direction():
@@ -52,11 +50,11 @@ def test_sphere_map_shows_the_nearest_direction():
     assert not np.isnan(picture[7:9]).any()
 
 
-def test_view_sphere_draws_the_map_and_the_hypotheses(bank):
+def test_viewpoints_draws_the_map_and_the_hypotheses(bank):
     image, box, _ = scene(0)
     registrar = Registrar(bank, pipeline=unrefined(bank, hypotheses=3))
     result = registrar([image], box[None], CAMERA)[0]
-    figure = view_sphere(bank, result)
+    figure = viewpoints(bank, result)
     axes = figure.axes[0]
     expected = sphere_map(*direction_scores(bank, result.ranking))
     np.testing.assert_array_equal(np.asarray(axes.images[0].get_array().filled(np.nan)), expected)
@@ -65,4 +63,4 @@ def test_view_sphere_draws_the_map_and_the_hypotheses(bank):
     assert drawn == [(h.viewpoint[0] % 360, h.viewpoint[1]) for h in result.hypotheses]
     assert [text.get_text() for text in axes.texts] == ["1", "2", "3"]
     assert not any(line.get_clip_on() for line in axes.lines)  # complete at the border
-    assert not view_sphere(bank, result.ranking).axes[0].lines
+    assert not viewpoints(bank, result.ranking).axes[0].lines

@@ -10,7 +10,6 @@ import torch
 from curvireg_torch.data import Video
 from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.registration import FailedRegistration
-from curvireg_torch.registration.answer_set import AnswerSet
 from curvireg_torch.visualization import OverlayVideo
 from curvireg_torch.visualization.contours import OUTLINE
 from curvireg_torch.visualization.video import caption, draw_frame
@@ -51,7 +50,7 @@ def test_contours_stand_at_the_pose_in_any_size(registered):
 
 @pytest.mark.parametrize(("confidence", "expected"), [(0.95, "likely"), (0.6, "unsure"), (0.4, "no match")])
 def test_caption_says_how_sure_the_pose_is(registered, confidence, expected):
-    result = replace(registered[1], answer_set=AnswerSet((confidence,)))
+    result = replace(registered[1], probabilities=(confidence,))
     assert caption(result)[0] == f"{expected}, confidence {confidence:.2f}"
 
 

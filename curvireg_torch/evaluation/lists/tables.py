@@ -37,7 +37,7 @@ def _result_cells(row: Row) -> list[str]:
     translation = row["translation"] or [""] * 3
     reliable = "true" if row["reliable"] else "false"
     message = "; ".join(row["warnings"])
-    return ["ok", message, str(row["confidence"]), reliable, *map(str, rotation), *map(str, translation)]
+    return ["ok", message, "" if row["confidence"] is None else str(row["confidence"]), reliable, *map(str, rotation), *map(str, translation)]
 
 
 def write_bop_results(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
@@ -50,5 +50,5 @@ def write_bop_results(path: Path, columns: Sequence[str], rows: Iterable[Row]) -
         if row["status"] != "ok" or row["translation"] is None or not all(map(str.isdecimal, numbers)):
             continue
         millimetres = UNITS[row["unit"] or "m"] / UNITS["mm"]
-        poses.append(bop_row([*map(int, numbers)], row["confidence"], row, scale=millimetres))
+        poses.append(bop_row([*map(int, numbers)], row["confidence"] or 0.0, row, scale=millimetres))
     write_bop_csv(path, poses)

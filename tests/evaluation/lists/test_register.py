@@ -11,7 +11,7 @@ from curvireg_torch.data import read_photo
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation.lists import Entry, PhotoList, register
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration import AnswerSet, Registration
+from curvireg_torch.registration import Registration
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import SIZE, scene, unrefined
 
@@ -74,7 +74,7 @@ def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entr
         assert isinstance(result, Registration)
         best, *others = result.hypotheses
         best = replace(best, covariance=None if K is None else torch.eye(6, dtype=torch.float64))
-        return [replace(result, answer_set=AnswerSet((1.0,)), hypotheses=(best, *others))]
+        return [replace(result, probabilities=(1.0,), hypotheses=(best, *others))]
 
     class Certain:
         bank, pipeline = registrar.bank, registrar.pipeline

@@ -9,11 +9,10 @@ from scipy.linalg import logm
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from curvireg_torch import metrics
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evaluation import metrics
 from curvireg_torch.geometry import rotation_error
-
-from .helpers import rotations
+from tests._support.poses import rotations
 
 
 def _angle(R1: np.ndarray, R2: np.ndarray) -> float:

@@ -7,17 +7,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from curvireg_torch import metrics
 from curvireg_torch.errors import InvalidInputError
-
-from .helpers import poses, rotations
+from curvireg_torch.evaluation import metrics
+from tests._support.poses import poses, rotations
 
 R, T = rotations(3, 0), poses(3, 1)
 POINTS = torch.rand(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
 K = torch.tensor([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 SYMMETRIES = torch.eye(3, dtype=torch.float64)[None]
 AXIS = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-VIEWS = torch.tensor([[0.0, 0.0, 0.0, 2.0], [90.0, 0.0, 0.0, 2.0], [180.0, 0.0, 0.0, 2.0]])
 
 
 def corrupt(x: Tensor, value: float, *, whole: bool = False) -> Tensor:
@@ -75,13 +73,6 @@ def test_recalls_count_missing_poses_as_misses(value: float, whole: bool) -> Non
     assert metrics.adds_error(missing, T, POINTS)[2] == math.inf
 
 
-@corruptions
-def test_pose_parameter_errors_of_missing_estimates_are_infinite(value: float, whole: bool) -> None:
-    table = metrics.pose_parameter_errors(corrupt(VIEWS, value, whole=whole), VIEWS, VIEWS)
-    assert set(table["est"].values()) == {math.inf}
-    assert set(table["clo"].values()) == {0.0}
-
-
 def _zero_matrix(T: Tensor) -> Tensor:
     T = T.clone()
     T[1] = 0.0
@@ -114,10 +105,6 @@ NOT_FINITE: dict[str, Callable[[float], object]] = {
     "symmetries of projections": lambda bad: metrics.mspd_error(T, T, POINTS, K, symmetries=T * bad),
     "camera matrix": lambda bad: metrics.mspd_error(T, T, POINTS, K * bad),
     "points": lambda bad: metrics.add_error(T, T, POINTS * bad),
-    "errors": lambda bad: metrics.rank_precision(torch.tensor([[0, 1]]), torch.tensor([[bad, bad]]), ks=(1,)),
-    "views": lambda bad: metrics.closest_view(corrupt(VIEWS, bad), VIEWS),
-    "truth": lambda bad: metrics.closest_view(VIEWS, corrupt(VIEWS, bad)),
-    "truth of parameters": lambda bad: metrics.pose_parameter_errors(VIEWS, corrupt(VIEWS, bad), VIEWS),
     "diameter": lambda bad: metrics.add_recall(torch.ones(1), bad),
 }
 
@@ -135,11 +122,6 @@ WRONG: dict[str, Callable[[], object]] = {
     "azimuth": lambda: metrics.azimuth_bin([3.0], 4),  # type: ignore[arg-type]
     "camera_matrix": lambda: metrics.mspd_error(T, T, POINTS, K[None].repeat(2, 1, 1)),
     "camera_matrix: expected a torch.Tensor": lambda: metrics.mspd_error(T, T, POINTS, K.tolist()),  # type: ignore[arg-type]
-    "photo": lambda: metrics.intersection_percentage([[True]], torch.ones(1, 1, dtype=torch.bool)),  # type: ignore[arg-type]
-    "view": lambda: metrics.intersection_percentage(torch.ones(1, 1, dtype=torch.bool), [[True]]),  # type: ignore[arg-type]
-    "order": lambda: metrics.rank_precision([[0]], torch.ones(1, 1), ks=(1,)),  # type: ignore[arg-type]
-    "a": lambda: metrics.viewpoint_differences([0.0] * 4, torch.zeros(4)),  # type: ignore[arg-type]
-    "b": lambda: metrics.viewpoint_differences(torch.zeros(4), torch.zeros(3)),
 }
 
 
@@ -157,8 +139,6 @@ OTHER_DEVICE: dict[str, Callable[[Callable[[Tensor], Tensor]], object]] = {
     "points": lambda to: metrics.add_error(T, T, to(POINTS)),
     "camera_matrix": lambda to: metrics.mspd_error(T, T, POINTS, to(K)),
     "diameter": lambda to: metrics.add_recall(torch.ones(1), to(torch.ones(1))),
-    "order": lambda to: metrics.rank_precision(to(torch.tensor([[0]])), torch.ones(1, 1), ks=(1,)),
-    "view": lambda to: metrics.intersection_percentage(*(f(torch.ones(2, 2) > 0) for f in (torch.clone, to))),
 }
 
 
@@ -173,8 +153,6 @@ def test_metrics_of_empty_sets() -> None:
     assert metrics.symmetric_rotation_error(R[:0], R[:0], SYMMETRIES).shape == (0,)
     assert metrics.axis_rotation_error(R[:0], R[:0], AXIS).shape == (0,)
     assert metrics.azimuth_bin(empty, 4).shape == (0,)
-    assert metrics.closest_view(VIEWS, VIEWS[:0]).shape == (0,)
-    assert metrics.viewpoint_differences(VIEWS[:0], VIEWS[:0]).shape == (0, 4)
     averages = (
         metrics.accuracy(empty, 30.0),
         metrics.median_error(empty),

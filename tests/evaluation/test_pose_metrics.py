@@ -8,11 +8,9 @@ import pytest
 import torch
 from scipy.spatial.distance import cdist
 
-from curvireg_torch import metrics
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.metrics import pose
-
-from .helpers import poses
+from curvireg_torch.evaluation import metrics
+from tests._support.poses import poses
 
 K = torch.tensor([[600.0, 0.0, 320.0], [0.0, 620.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 POINTS = torch.rand(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
@@ -62,8 +60,8 @@ def test_mssd_and_mspd_against_loops(monkeypatch: pytest.MonkeyPatch) -> None:
         ]
         mssd.append(min(in_space))
         mspd.append(min(in_image))
-    for chunk in (pose._CHUNK, 90):  # all at once, and two transforms at a time
-        monkeypatch.setattr(pose, "_CHUNK", chunk)
+    for chunk in (metrics._CHUNK, 90):  # all at once, and two transforms at a time
+        monkeypatch.setattr(metrics, "_CHUNK", chunk)
         np.testing.assert_allclose(metrics.mssd_error(EST, GT, POINTS, symmetries=symmetries), mssd)
         np.testing.assert_allclose(metrics.mspd_error(EST, GT, POINTS, cameras, symmetries=symmetries), mspd)
 
