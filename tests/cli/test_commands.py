@@ -81,7 +81,7 @@ import curvireg_torch.__main__
         ("register PHOTO MESH --box 1 1 40 40 --out OUT", "evaluation.opening.open_registrar"),
         ("register PHOTO PHOTO MESH --box 1 1 40 40 --out OUT", "evaluation.lists.register_list"),
         ("follow PHOTOS MESH --camera 300 300 119.5 89.5 --out OUT", "evaluation.opening.open_registrar"),
-        ("plot sphere PHOTO MESH --box 1 1 40 40 --out OUT.png", "evaluation.opening.open_registrar"),
+        ("plot viewpoints PHOTO MESH --box 1 1 40 40 --out OUT.png", "evaluation.opening.open_registrar"),
         ("bank MESH --out OUT.safetensors", "matching.ViewBank.build"),
         ("demo --out OUT", "synthetic.demo_scene"),
         ("evaluate web ROOT --out OUT", "evaluation.datasets.evaluate"),

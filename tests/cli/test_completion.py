@@ -11,7 +11,7 @@ from curvireg_torch.utils.choices import PRESET_NAMES, UNITS
 COMPLETIONS = [
     ("curvireg reg", {"register"}),
     ("curvireg evaluate ", {"pascal3d", "bop", "web"}),
-    ("curvireg plot s", {"sphere", "sheet"}),
+    ("curvireg plot v", {"viewpoints"}),
     ("curvireg register --preset ", set(PRESET_NAMES)),
     ("curvireg register a.jpg b.stl --unit ", set(UNITS)),
     ("curvireg register a.jpg --no-re", {"--no-refine"}),

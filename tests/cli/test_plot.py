@@ -22,4 +22,4 @@ def test_plot_draws_a_registration(tmp_path, monkeypatch, kind):
 def test_plot_refuses_other_formats_and_results(tmp_path, refused):
     sheet = ["plot", "sheet", str(tmp_path), "--out"]
     refused(main([*sheet, str(tmp_path / "a.txt")]), "expected a name that ends in .html")
-    refused(main([*sheet, str(tmp_path / "a.html")]), "no results")
+    refused(main([*sheet, str(tmp_path / "a.html")]), "missing or damaged")

@@ -2,12 +2,12 @@
 
 import pytest
 
-from curvireg_torch import detectors, evaluation, pipeline, rendering, settings, terms
+from curvireg_torch import evaluation, pipeline, rendering, terms
 
 
 @pytest.fixture(autouse=True)
-def _registries(monkeypatch):
-    """What a page registers must not reach other tests."""
-    registries = (pipeline.FIELDS, settings.DEPTH_FIELDS, terms.TERMS, rendering.BACKENDS, evaluation.DATASETS)
-    for registry in (*registries, detectors.DETECTORS):
-        monkeypatch.setattr(registry, "_entries", dict(registry._entries))
+def _tables(monkeypatch):
+    """What a page adds must not reach other tests."""
+    for table in (pipeline.FIELDS, pipeline.DEPTH_FIELDS, terms.TERMS, rendering.BACKENDS, evaluation.DATASETS):
+        for name in table:
+            monkeypatch.setitem(table, name, table[name])

@@ -83,14 +83,12 @@ def test_contact_sheet_shows_failures_last_and_no_picture_of_missing_files(bop, 
     assert "predictions.csv has them all" in (tmp_path / "b.html").read_text()
 
 
-def test_contact_sheet_orders_unknown_poses_by_confidence(web, tmp_path):
+def test_contact_sheet_shows_unknown_poses_last(web, tmp_path):
     evaluate(WebBenchmark(web, Protocol(pose="any")), tmp_path / "out", progress=False)
     contact_sheet(tmp_path / "out", tmp_path / "sheet.html")
     found = figures(tmp_path / "sheet.html")
     assert ["pose unknown" in caption for _, _, _, caption, _ in found] == [False, False, True, True]
     assert all(kind in ("reliable", "doubtful") for kind, *_ in found[2:])
-    confidence = [float(caption.split()[-1]) for _, _, _, caption, _ in found[2:]]
-    assert confidence == sorted(confidence, reverse=True)
 
 
 def test_contact_sheet_refuses_other_folders(web, tmp_path, capsys):

@@ -7,10 +7,10 @@ import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, MeshError, RenderingError
-from curvireg_torch.rendering import BACKENDS, factory, make_renderer, opengl
+from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.embree import EmbreeRenderer
 
-from .conftest import camera, interior
+from .conftest import camera
 
 K = torch.tensor([[60.0, 0, 19.5], [0, 60.0, 14.5], [0, 0, 1]])
 
@@ -135,46 +135,19 @@ def test_render_depth_refuses_bad_arguments() -> None:
         cr.render_depth(trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False), T, one, size)
 
 
-def test_make_renderer_calls_a_registered_backend(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(BACKENDS, "_entries", dict(BACKENDS._entries))
-    BACKENDS.register("mine", lambda mesh, device: (mesh, device))
-    assert make_renderer(box := trimesh.creation.box(), "mine", device="meta") == (box, "meta")
-    assert make_renderer(box, renderer := EmbreeRenderer(box)) is renderer
-
-
-@pytest.fixture
-def no_driver(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(_: object) -> None:
-        raise RenderingError("no EGL")
-
-    monkeypatch.setattr(opengl, "PyrenderRenderer", fail)
-
-
-@pytest.mark.usefixtures("no_driver")
-def test_make_renderer_auto_takes_the_first_that_works(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_make_renderer_takes_names_and_renderers() -> None:
     box = trimesh.creation.box()
-    assert make_renderer(box).name == "embree"
-    monkeypatch.setattr(factory.importlib.util, "find_spec", lambda _: None)
-    assert make_renderer(box).name == "torch"
+    assert [make_renderer(box, name).name for name in ("auto", "embree", "torch")] == ["embree", "embree", "torch"]
+    assert make_renderer(box, renderer := EmbreeRenderer(box)) is renderer
+    with pytest.raises(InvalidInputError, match="renderer: expected one of 'auto'"):
+        make_renderer(box, "mine")
 
 
-@pytest.mark.usefixtures("no_driver")
-def test_make_renderer_auto_replaces_a_backend_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_renderer_that_fails_is_not_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise MemoryError("out of memory")
 
-    renderer = make_renderer(trimesh.creation.box())
     T, one, size = camera(2)
-    expected = renderer.render(T, one, size)
-    with pytest.raises(InvalidInputError):  # an invalid argument is no failure of the backend
-        renderer.render(T[:, :3], one, size)
-    assert renderer.name == "embree"
     monkeypatch.setattr(EmbreeRenderer, "_rays", fail)
-    with pytest.warns(UserWarning, match="'embree' failed.*out of memory.*'torch'"):
-        depth = renderer.render(T, one, size)
-    assert renderer.name == "torch"
-    even = interior(depth, expected)
-    torch.testing.assert_close(depth[even], expected[even], rtol=0, atol=1e-4)
-    renderer.render(T, one, size)  # a second warning would fail this test
-    with pytest.raises(RenderingError, match="embree"):  # a backend that was asked for by name is not replaced
-        cr.render_depth(trimesh.creation.box(), T, one, size, renderer="embree")
+    with pytest.raises(RenderingError, match="out of memory"):
+        cr.render_depth(trimesh.creation.box(), T, one, size)

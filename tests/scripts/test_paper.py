@@ -3,12 +3,12 @@
 import cv2
 import pytest
 import torch
-from scripts.paper import tables
-from scripts.paper.detectors import DETECTORS
 
 from curvireg_torch.geometry import camera_matrix, rotation_from_viewpoint, sample_views
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
+from scripts.paper import tables
+from scripts.paper.detectors import DETECTORS
 from tests._support.miniature import write_pascal3d
 
 SETTINGS = BankSettings(image_size=64)

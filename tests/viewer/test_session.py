@@ -106,7 +106,7 @@ def test_json_follows_the_schema(session):
 
 def test_move_rotates_about_the_centre_and_fit_restores_the_pose(session):
     before = session.displayed.pose
-    describer = session.result.registrar.describers[0]
+    describer = session.result.registrar.describer
     centre = before.rotation @ describer.centre + before.translation
     session.move(rotation=(0, 6, 0))
     rotated = session.displayed.pose

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import trimesh
 
-from curvireg_torch import Registrar, ViewBank, rotation_error, sample_views
+from curvireg_torch import Registrar, rotation_error
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.visualization import registration_sheet, result_picture
@@ -110,20 +109,6 @@ def test_registration_sheet_has_the_verdict_in_its_colour(registered):
         sheet = registration_sheet(registrar, replace(result, probabilities=answers), image, box)
         found = [word for word, colour in VERDICT_COLOURS.items() if (sheet[720:] == colour).all(axis=2).sum() > 500]
         assert found == [verdict]
-
-
-def test_registration_sheet_of_several_meshes(registered):
-    views = sample_views(azimuth_step=30, elevations=[0, 30])
-    options = {"pipeline": truck_bank().pipeline, "progress": False}
-    meshes = trimesh.creation.box((0.02, 0.02, 0.3)), example_mesh()
-    bank = ViewBank.join([ViewBank.build(mesh, views, **options) for mesh in meshes])
-    registrar, (_, _, image, box) = Registrar(bank, pipeline=unrefined(bank)), registered
-    result = registrar([image], box[None])[0]
-    first, second, *others = result.hypotheses
-    result = replace(result, hypotheses=(first, replace(second, model=1 - first.model), *others))
-    sheet = registration_sheet(registrar, result, image, box)
-    other = registration_sheet(registrar, result, (255 * image).round().byte(), box)
-    assert np.array_equal(sheet[:720], other[:720]), "bytes and floats are the same photograph"
 
 
 def test_registration_sheet_names_rivals_that_are_nearly_as_probable(registered):

@@ -33,7 +33,7 @@ def outline_box(picture):
 def test_contours_stand_at_the_pose_in_any_size(registered):
     image, result = registered
     T, K = result.projection
-    depth = truck_registrar().describers[0].renderer.render(T[None], K, image.shape[-2:])[0, 0].numpy()
+    depth = truck_registrar().describer.renderer.render(T[None], K, image.shape[-2:])[0, 0].numpy()
     rows, columns = depth.nonzero()
     expected = np.array([columns.min(), rows.min(), columns.max(), rows.max()])
     grey = torch.full_like(image, 0.5)
