@@ -393,8 +393,8 @@ def fit_contours(
         margin: added around the box, as a fraction of its longer side.
         finish: number of starts of each photograph that are fitted to the end, those with the most support after the
             first rounds; None: all, each as if alone.
-        wide_angles: degrees by which starts are rotated up, down, left and right, to begin there at a quarter of the size
-            too, if they may be worse than views of a bank.
+        wide_angles: degrees by which starts are rotated up, down, left and right, to begin there too at a quarter
+            of the size: for starts that may be worse than views of a bank.
         object_mask: (B, 1, s, s) probability that pixels of the square crops, the boxes with their margin, belong to
             the object, for instance of :meth:`LearnedCurvilinearSaliency.mask`.
 

@@ -66,7 +66,7 @@ plt.show()
 # the principal curvatures of its graph: large at occluding contours and creases, zero on planes and spheres.
 
 registrar = cr.Registrar(mesh, pipeline=cr.Pipeline().with_pose_prior("upright"), progress=False)
-bank, describer = registrar.bank, registrar.matcher.describers[0]
+bank, describer = registrar.bank, registrar.matcher.describer
 distances = bank.views.distance * mesh_radius(mesh)
 some = torch.arange(20, len(bank), len(bank) // 6)[:6]
 depth = describer.depth(bank.rotations[some], distances[some])[0]
@@ -137,7 +137,7 @@ plt.show()
 # A local search starts at the best distinct views; then the contour fit moves the mesh's contours onto the photograph's
 # edges. Left: the best view of the bank, placed into the box. Right: the final pose.
 
-coarse = cr.Registrar(bank, pipeline=replace(bank.pipeline, search=False, contours=False))
+coarse = cr.Registrar(bank, pipeline=replace(bank.pipeline, contours=False))
 before = coarse([photograph], box[None], K)[0]
 after = registrar([photograph], box[None], K)[0]
 

@@ -113,17 +113,10 @@ def test_architecture_page_lists_the_import_layers() -> None:
     assert [re.split(r" {3,}", line)[0] for line in lines] == layers
 
 
-def test_glossary_names_occur_in_the_package() -> None:
-    package = "".join(p.read_text(encoding="utf-8") for p in (ROOT / "curvireg_torch").rglob("*.py"))
-    rows = [line.split("|")[3] for line in (DOCS / "glossary.md").read_text(encoding="utf-8").splitlines()[6:]]
-    missing = {n for row in rows for n in re.findall(r"`(\w+)`", row) if not re.search(rf"\b{n}\b", package)}
-    assert not missing
-
-
 LAYERS = sorted(
     {
         found
-        for package in ("filters", "features", "detectors")
+        for package in ("filters", "features")
         for name in import_module(f"curvireg_torch.{package}").__all__
         if inspect.isclass(found := getattr(import_module(f"curvireg_torch.{package}"), name))
         and issubclass(found, nn.Module)
@@ -211,7 +204,7 @@ def test_helpers_find_broken_pages(tmp_path: Path) -> None:
     for words in (bank, script):
         with pytest.raises(SystemExit):
             parse(words)
-    assert resolve("curvireg_torch.registration.confidence.confidence_model") is not None
+    assert resolve("curvireg_torch.registration.confidence.registration_confidence") is not None
     assert resolve("curvireg_torch.Registar") is None
     assert "--box" in options()
     assert "--bocks" not in options()

@@ -28,7 +28,7 @@ def test_edge_blur_of_a_step_edge(mode: str, sigma: float, transposed: bool) -> 
 def test_multiscale_focus_curves_rank_edges_by_sharpness() -> None:
     x, _ = grid(121)
     sharp, blurred = (torch.erf((x - c) / (s * math.sqrt(2.0))) for c, s in ((-30.0, 1.0), (30.0, 3.0)))
-    field = filters.multiscale_focus_curves((0.5 + 0.2 * (sharp - blurred))[None, None], saliency_weight=False)
+    field = filters.multiscale_focus_curves((0.5 + 0.2 * (sharp - blurred))[None, None], saliency_weight=0.0)
     focus = field[0, :, 60].norm(dim=0)
     assert float(1 / focus[30]) == pytest.approx(math.sqrt(1 + 1), rel=0.03)  # includes the pre-smoothing of 1 px
     assert float(1 / focus[90]) == pytest.approx(math.sqrt(9 + 1), rel=0.03)

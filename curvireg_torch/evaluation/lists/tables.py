@@ -37,7 +37,14 @@ def _result_cells(row: Row) -> list[str]:
     translation = row["translation"] or [""] * 3
     reliable = "true" if row["reliable"] else "false"
     message = "; ".join(row["warnings"])
-    return ["ok", message, "" if row["confidence"] is None else str(row["confidence"]), reliable, *map(str, rotation), *map(str, translation)]
+    return [
+        "ok",
+        message,
+        "" if row["confidence"] is None else str(row["confidence"]),
+        reliable,
+        *map(str, rotation),
+        *map(str, translation),
+    ]
 
 
 def write_bop_results(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
