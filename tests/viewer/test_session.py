@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-import curvireg_torch
 from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.options import register_options
 from curvireg_torch.errors import BankError, CurviregError, CurviregWarning, ImageError, InvalidInputError, MeshError
