@@ -12,8 +12,8 @@ import torch
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset, Pascal3DPlus, read_image
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol
+from curvireg_torch.evaluation.metrics import symmetric_rotation_error
 from curvireg_torch.geometry import rotation_error, symmetry_transforms
-from curvireg_torch.metrics import symmetric_rotation_error
 from tests._support.real_data import real_data
 
 pytestmark = pytest.mark.data

@@ -59,12 +59,12 @@ def test_refine_is_the_same_in_a_batch(registrar):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_refine_loses_an_object_that_is_not_there(registrar, seed):
+def test_refine_loses_or_doubts_an_object_that_is_not_there(seed):
     _, _, T = scene(0)
     empty = procedural_background((192, 256), torch.Generator().manual_seed(seed))
-    result = registrar.refine([empty], CAMERA, [T])[0]
-    assert isinstance(result.error, LostObjectError)
-    assert "image 0" in str(result.error)
+    result = learned_registrar().refine([empty], CAMERA, [T])[0]
+    assert not result.ok or result.confidence < 0.3
+    assert result.ok or (isinstance(result.error, LostObjectError) and "image 0" in str(result.error))
 
 
 @pytest.mark.parametrize("move", [(0.0, 0.0, -100.0), (50.0, 0.0, 0.0)], ids=["behind", "beside"])
