@@ -134,8 +134,8 @@ plt.show()
 # From the best views to a pose
 # -----------------------------
 #
-# A local search starts at the best distinct views; then the contour fit moves the mesh's contours onto the photograph's
-# edges. Left: the best view of the bank, placed into the box. Right: the final pose.
+# From the best distinct views, the contour fit moves the mesh's contours onto the photograph's edges. Left: the best view
+# of the bank, placed into the box; a pose that is not fitted has no calibrated confidence. Right: the final pose.
 
 coarse = cr.Registrar(bank, pipeline=replace(bank.pipeline, contours=False))
 before = coarse([photograph], box[None], K)[0]
@@ -144,7 +144,9 @@ after = registrar([photograph], box[None], K)[0]
 _, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
 for ax, which, result in ((axes[0], coarse, before), (axes[1], registrar, after)):
     error = float(cr.rotation_error(result.rotation, truth[:3, :3]))
-    title = f"{error:.1f}° from the truth, confidence {result.confidence:.2f}"
+    title = f"{error:.1f}° from the truth"
+    if result.confidence is not None:
+        title += f", confidence {result.confidence:.2f}"
     show(ax, contour_overlay(which, result, photograph, box), title)
     ax.set(xlim=(x0 - 40, x1 + 40), ylim=(y1 + 30, y0 - 30))
 plt.show()

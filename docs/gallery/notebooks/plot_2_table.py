@@ -14,7 +14,6 @@ import matplotlib.pyplot as plt
 import torch
 
 import curvireg_torch as cr
-from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
 folder = Path(tempfile.mkdtemp())
@@ -37,7 +36,7 @@ photographs = sorted(folder.glob("*.png"))
 #
 # Photographs are registered in parallel. One that cannot be read does not stop the others: its result is not ``ok``.
 
-registrar = cr.Registrar(mesh, pipeline=PRESETS["fast"].with_pose_prior("upright"), progress=False)
+registrar = cr.Registrar(mesh, pipeline=cr.Pipeline().with_pose_prior("upright"), progress=False)
 results = registrar([str(path) for path in photographs], boxes)
 
 # %%
