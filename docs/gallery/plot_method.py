@@ -134,8 +134,8 @@ plt.show()
 # From the best views to a pose
 # -----------------------------
 #
-# From the best distinct views, the contour fit moves the mesh's contours onto the photograph's edges. Left: the best view
-# of the bank, placed into the box; a pose that is not fitted has no calibrated confidence. Right: the final pose.
+# From the best distinct views, the contour fit moves the mesh's contours onto the photograph's edges. Left: the best
+# view of the bank, placed into the box; a pose that is not fitted has no calibrated confidence. Right: the final pose.
 
 coarse = cr.Registrar(bank, pipeline=replace(bank.pipeline, contours=False))
 before = coarse([photograph], box[None], K)[0]
