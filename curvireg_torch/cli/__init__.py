@@ -1,7 +1,7 @@
 """The command ``curvireg``.
 
-Each command is a module: ``add_parser`` adds it to the subparsers, ``run`` runs it. It imports heavy modules only in
-``run``, so that help and errors in options appear at once. ``run`` raises :class:`CurviregError` for unusable input.
+Each command has a function ``add_*`` that adds it to the subparsers, and one that runs it, which imports heavy modules,
+so that help and mistakes in options appear at once, and raises :class:`CurviregError` for unusable input.
 """
 
 import argparse
@@ -15,12 +15,10 @@ from typing import Any
 from ..errors import CurviregError, CurviregWarning
 from ..utils.files import terminable
 from ..version import __version__
-from . import bank, cache, completion, demo, evaluate, follow, plot, register, view
-from .options import split_numbers
+from . import commands, evaluate, follow, register
+from .options import Parser
 
 __all__ = ["build_parser", "main", "parse"]
-
-COMMANDS = (register, follow, bank, cache, evaluate, view, plot, demo, completion)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -45,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def parse(argv: Sequence[str]) -> argparse.Namespace:
     """The options of a command line; a mistake in them ends the process with code 2."""
     parser = build_parser()
-    arguments, rest = parser.parse_known_args(split_numbers(argv))
+    arguments, rest = parser.parse_known_args(argv)
     if hasattr(arguments, "paths") and not any(word.startswith("-") for word in rest):
         arguments.paths += map(Path, rest)  # argparse does not collect positionals that follow an option
     elif rest:
@@ -58,11 +56,17 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands; parsed arguments hold ``run``, the function to be called with them."""
-    parser = argparse.ArgumentParser(prog="curvireg", description="Pose of a known 3D object from one photograph.")
+    parser = Parser(prog="curvireg", description="Pose of a known 3D object from one photograph.")
     parser.add_argument("--version", action="version", version=f"curvireg_torch {__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for command in COMMANDS:
-        command.add_parser(commands)
+    subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
+    register.add_register(subparsers)
+    follow.add_follow(subparsers)
+    commands.add_bank(subparsers)
+    commands.add_cache(subparsers)
+    evaluate.add_evaluate(subparsers)
+    commands.add_view(subparsers)
+    commands.add_plot(subparsers)
+    commands.add_demo(subparsers)
     return parser
 
 
@@ -72,14 +76,13 @@ def _run(arguments: argparse.Namespace) -> int:
             warnings.showwarning = _show_warning
             os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # of videos it cannot read, our message is enough
         try:
-            arguments.run(arguments)
+            return arguments.run(arguments) or 0
         except (CurviregError, OSError) as error:
             if arguments.debug or isinstance(error, BrokenPipeError):
                 raise
             advice = "" if isinstance(error, CurviregError) else "; check that it exists and can be read"
             print(f"curvireg: error: {error}{advice}", file=sys.stderr)
             return 2
-    return 0
 
 
 def _show_warning(message: Any, category: type[Warning], *_: Any, **__: Any) -> None:

@@ -6,52 +6,46 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidInputError, MissingFileError
+from ..evaluation.opening import whole_number
 from ..evaluation.registry import DATASETS
-from ..utils.choices import DEFAULT, PRESET_NAMES
+from ..utils.choices import DEFAULT
 from ..utils.files import check_writable
-from .options import PRESETS_HELP, common_options, examples, whole_number
+from .options import add_command, add_options
 
 PROTOCOL = (
-    "cad=annotated|any|fused: the annotated CAD model, the best of the class, or one vote of all of the class; "
+    "cad=annotated|any: the annotated CAD model, or the best of the class; "
     "pose=upright|any: whether objects are known to stand upright; "
     "box=annotated|none|FRACTION: as annotated; localized; or each edge moved by up to FRACTION of the side (seed=N); "
     "hint=none|azimuth:DEG|pose:DEG: azimuth or rotation known to lie within DEG of a value that is off by up to DEG"
 )
 
 
-def add_parser(commands: Any) -> None:
-    parser = commands.add_parser(
-        "evaluate", help="register and score a dataset", **examples("curvireg evaluate bop data/bop/lm --out out/lm")
+def add_evaluate(commands: Any) -> None:
+    example = "curvireg evaluate bop data/bop/lm --out out/lm"
+    datasets = add_command(commands, "evaluate", example, help="register and score a dataset").add_subparsers(
+        required=True, metavar="DATASET"
     )
-    datasets = parser.add_subparsers(required=True, metavar="DATASET")
     for name, kind in DATASETS.items():
-        dataset = datasets.add_parser(
+        dataset = add_command(
+            datasets,
             name,
-            parents=[common_options()],
+            f"curvireg evaluate {name} {kind.example} --out out/{name}",
+            f"curvireg evaluate {name} {kind.example} --jobs 2 --limit 100 --preset fast --out out/{name}-fast",
             help=kind.help,
             description="Writes DIR/summary.json and DIR/predictions.csv; the same command resumes if interrupted.",
-            **examples(
-                f"curvireg evaluate {name} {kind.example} --out out/{name}",
-                f"curvireg evaluate {name} {kind.example} --jobs 2 --limit 100 --preset fast --out out/{name}-fast",
-            ),
+            run=run,
         )
+        dataset.set_defaults(dataset=name)
         kind.add_arguments(dataset)
         add = dataset.add_argument
         protocol = f"{PROTOCOL} (default: cad=annotated pose={kind.pose} box=annotated)"
         add("--protocol", nargs="+", default=[], metavar="KEY=VALUE", help=protocol)
-        add("--preset", choices=PRESET_NAMES, default=DEFAULT, help=f"{PRESETS_HELP} (default: {DEFAULT})")
-        add("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
-        add(
-            "--jobs",
-            type=whole_number(1),
-            default=1,
-            metavar="N",
-            help="processes that share the objects (default: 1)",
-        )
+        add_options(dataset, "preset", "pipeline", "renderer", "progress")
+        jobs = "processes that share the objects (default: 1)"
+        add("--jobs", type=whole_number(1), default=1, metavar="N", help=jobs)
         add("--limit", type=whole_number(1), metavar="N", help="only N objects, spread evenly over the set")
         add("--overwrite", action="store_true", help="replace the predictions of other settings")
         add("--out", type=Path, required=True, metavar="DIR", help="folder of the results; made if it does not exist")
-        dataset.set_defaults(run=run, dataset=name)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -66,7 +60,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     kind = DATASETS[arguments.dataset]
     protocol = Protocol.parse(arguments.protocol, pose=kind.pose)
-    preset = arguments.preset if arguments.pipeline is None else Pipeline.read(arguments.pipeline)
+    preset = arguments.preset or DEFAULT if arguments.pipeline is None else Pipeline.read(arguments.pipeline)
     if run_processes(arguments.jobs, arguments.argv):
         return
     dataset = kind.open(arguments.root, **kind.chosen(arguments))
@@ -78,7 +72,7 @@ def run(arguments: argparse.Namespace) -> None:
             arguments.out,
             preset=preset,
             limit=arguments.limit,
-            renderer=arguments.renderer,
+            renderer=arguments.renderer or "auto",
             overwrite=arguments.overwrite,
             progress=arguments.progress,
         )

@@ -7,17 +7,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import (
-    CurviregError,
-    ImageError,
-    InvalidInputError,
-    LostObjectError,
-    MissingFileError,
-)
+from ..errors import CurviregError, ImageError, InvalidInputError, LostObjectError, MissingFileError
 from ..utils.choices import VIDEOS
 from ..utils.files import check_writable
 from ..utils.input_paths import check_given
-from .options import add_box_and_camera, common_options, examples, mesh_options, pipeline_options, register_options
+from .options import PHOTOGRAPH, add_command, add_options, register_options
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -29,42 +23,41 @@ FOLDER_FPS = 10.0
 """Frames per second of the overlay of a folder."""
 
 
-def add_parser(commands: Any) -> None:
-    parser = commands.add_parser(
+def add_follow(commands: Any) -> None:
+    parser = add_command(
+        commands,
         "follow",
-        parents=[common_options(), pipeline_options(), mesh_options()],
+        "curvireg follow shots/ part.stl --unit mm --camera 1450 1450 960 540 --out out/follow",
+        "curvireg follow turn.mp4 part.stl --camera 1450 1450 960 540 --box 410 220 890 700 --out out/follow",
         help="follow an object through the frames of a video",
         description="Registers the first frame and tracks the object from frame to frame. Writes\n"
         "DIR/results.csv: photo, status (ok: confidence of 0.5 or more; unsure, lost, failed),\nrotation row by row, "
-        "translation in the mesh's unit, "
-        "confidence, edge support, and why there is no pose;\n"
-        "DIR/overlay.mp4: contours of the pose and confidence on each frame;\n"
-        "DIR/support.png: edge support and confidence over the frames.",
-        **examples(
-            "curvireg follow shots/ part.stl --unit mm --camera 1450 1450 960 540 --out out/follow",
-            "curvireg follow turn.mp4 part.stl --camera 1450 1450 960 540 --box 410 220 890 700 --out out/follow",
-        ),
+        "translation in the mesh's unit, confidence, edge support, and why there is no pose;\n"
+        "DIR/overlay.mp4: contours of the pose and confidence on each frame.",
+        run=run,
     )
     frames = "a video, or a folder of frames in the order of their names"
     parser.add_argument("frames", type=Path, metavar="FRAMES", help=frames)
     parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh or a bank")
-    add_box_and_camera(parser, box="in px in the first frame; default: the object is localized", fov=False)
+    add_options(parser, *PHOTOGRAPH, box="in px in the first frame; default: the object is localized")
     parser.add_argument("--out", type=Path, metavar="DIR", required=True, help="folder of the results")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Follow the object; write its poses, and draw them."""
+    if "://" in str(arguments.frames) or ":/" in str(arguments.frames):
+        message = "streams are not read; record a video, or give a folder of frames"
+        raise InvalidInputError(message, subject=arguments.frames)
     check_given([arguments.frames], [arguments.mesh])
     if not arguments.frames.exists():
         raise MissingFileError("no such folder or video", subject=arguments.frames)
-    if arguments.camera is None:
-        raise InvalidInputError("follow: give --camera FX FY CX CY")
     from ..evaluation.opening import check_camera
     from ..utils.threads import one_torch_thread
 
     options, out = register_options(arguments, [arguments.frames], [arguments.mesh]), arguments.out
-    check_camera(options.camera, None)
+    if options.camera is None and options.guess is None:
+        raise InvalidInputError("follow: give --camera FX FY CX CY, --camera exif or --fov DEG")
+    check_camera(options.camera, options.guess)
     check_writable(out, "--out")
     with one_torch_thread():
         rows, seconds, video = _follow(options, out)
@@ -85,14 +78,13 @@ def _follow(options: "RegisterOptions", out: Path) -> tuple[list[list[Any]], lis
     from tqdm import tqdm
 
     from ..evaluation.opening import open_registrar
-    from ..geometry import camera_matrix
     from ..registration import Follower
     from ..visualization import OverlayVideo
 
-    assert options.camera is not None
     frames, count, fps = _frames(options.photos[0], options.meshes)
+    K = _camera_matrix(options)
     registrar = open_registrar(options, options.meshes, options.open_field())
-    follow = Follower(registrar, camera_matrix(*options.camera))
+    follow = Follower(registrar, K)
     rows: list[list[Any]] = []
     seconds: list[float] = []
     try:
@@ -107,6 +99,33 @@ def _follow(options: "RegisterOptions", out: Path) -> tuple[list[list[Any]], lis
         if rows:
             _write_tables(out, rows)
     return rows, seconds, video.path
+
+
+def _camera_matrix(options: "RegisterOptions") -> "Tensor":
+    """The given camera matrix, or that of the first frame by its EXIF or the field of view."""
+    from ..data import Video, read_photo
+    from ..evaluation.lists import list_photographs
+    from ..geometry import camera_matrix
+    from ..geometry.cameras import camera_of_view
+
+    frames = options.photos[0]
+    if options.camera is not None:
+        return camera_matrix(*options.camera)
+    if frames.is_file() and frames.suffix.lower() in VIDEOS:
+        if options.guess == "exif":
+            raise InvalidInputError("a video has no EXIF; give --camera FX FY CX CY, or --fov DEG", subject=frames)
+        image = next(iter(Video(frames)))[1]
+        return camera_of_view(float(options.guess or 0.0), (image.shape[-2], image.shape[-1]))
+    first = list_photographs([frames], options.meshes, frames=frames).entries[0]
+    photo = read_photo(first.photo)
+    if options.guess != "exif":
+        return camera_of_view(float(options.guess or 0.0), (photo.image.shape[-2], photo.image.shape[-1]))
+    K = photo.guessed_camera_matrix()
+    if K is None:
+        raise InvalidInputError(
+            "no focal length in its EXIF; give --camera FX FY CX CY, or --fov DEG", subject=first.photo
+        )
+    return K
 
 
 def _pose(follow: "Follower", image: "Tensor | ImageError", box: Any) -> "Registration | FailedRegistration":

@@ -1,180 +1,141 @@
-"""Options of several commands, and how they are read."""
+"""Commands and their arguments, from the declarations in :mod:`curvireg_torch.evaluation.opening`."""
 
 import argparse
 import re
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any, get_origin, get_type_hints
 
-from ..utils.choices import DEFAULT, MESH_KINDS, PRESET_NAMES, RENDERER_NAMES, SIDE_NAMES, UNITS, UP_AXES
-
-if TYPE_CHECKING:
-    from ..evaluation.opening import RegisterOptions
-
-PRESETS_HELP = (
-    "learned: with networks, the most accurate. classical: nothing learned. fast: the best view, without search and "
-    "contour fit. paper: the published method"
+from ..errors import InvalidInputError
+from ..evaluation.opening import (
+    PRIOR_OPTIONS,
+    Numbers,
+    RegisterOptions,
+    limits_from_options,
+    prior_from_limits,
 )
 
-_COUNTS = {"--box": 4, "--camera": 4, "--distance": 2, "--azimuth": 2, "--elevation": 2, "--theta": 2}
-NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
+DECLARED: dict[str, dict[str, Any]] = {
+    name: how.__metadata__[0]
+    for name, how in get_type_hints(RegisterOptions, include_extras=True).items()
+    if get_origin(how) is Annotated
+}
+METHOD = ("preset", "pipeline", "renderer", "device", "progress")
+MESH = ("unit", "pose", "up")
+PHOTOGRAPH = ("box", "camera", "guess", *MESH, "mesh_is", *METHOD)
+"""Options of several commands, by the names of their fields."""
 
 
-def examples(*lines: str) -> dict[str, Any]:
-    """Arguments for ``add_parser`` that show these command lines below the help."""
-    epilog = "\n  ".join(["examples:", *lines])
-    return {"epilog": epilog, "formatter_class": argparse.RawDescriptionHelpFormatter}
+class Parser(argparse.ArgumentParser):
+    """A parser that takes no abbreviations, and numbers as separate words too: ``--box 1 2 3 4``, ``--box 1,2,3,4``."""
+
+    def __init__(self, **how: Any) -> None:
+        super().__init__(allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **how)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        return super().parse_known_args(join_numbers(sys.argv[1:] if args is None else args), namespace)
 
 
-def whole_number(low: int, high: int | None = None) -> Callable[[str], int]:
-    """A type of options: a whole number from ``low`` to ``high``."""
-    limits = f"of at least {low}" if high is None else f"from {low} to {high}"
-
-    def read(text: str) -> int:
-        number = int(text) if re.fullmatch(r"[-+]?\d{1,18}", text) else None
-        if number is None or number < low or (high is not None and number > high):
-            raise argparse.ArgumentTypeError(f"expected a whole number {limits}, got {text!r}")
-        return number
-
-    return read
-
-
-def common_options() -> argparse.ArgumentParser:
-    """Parent parser: ``--debug --quiet --renderer``."""
-    parser = argparse.ArgumentParser(add_help=False)
+def add_command(commands: Any, name: str, *examples: str, **how: Any) -> Any:
+    """Add a command, with examples below its help, ``--debug``, and what it ``run``s."""
+    run = how.pop("run", None)
+    parser = commands.add_parser(name, epilog="\n  ".join(["examples:", *examples]), **how)
     parser.add_argument("--debug", action="store_true", help="show tracebacks")
-    parser.add_argument("--quiet", dest="progress", action="store_false", help="no progress bars")
-    parser.add_argument("--renderer", choices=RENDERER_NAMES, default="auto", help="default: auto")
+    if run is not None:
+        parser.set_defaults(run=run)
     return parser
 
 
-def pipeline_options() -> argparse.ArgumentParser:
-    """Parent parser: ``--preset --pipeline --device``."""
-    parser = argparse.ArgumentParser(add_help=False)
-    default = f"{PRESETS_HELP} (default: that of a bank, else {DEFAULT})"
-    parser.add_argument("--preset", choices=PRESET_NAMES, help=default)
-    parser.add_argument("--pipeline", type=Path, metavar="FILE", help="JSON of a pipeline, instead of --preset")
-    parser.add_argument("--device", default="cpu", help="device of modules, bank and search (default: cpu)")
-    return parser
+def add_options(parser: Any, *names: str, **help_texts: str) -> None:
+    """Add options of a registration; ``help_texts`` replace those of their declarations."""
+    for name in names:
+        how = _argument(DECLARED[name])
+        flag = how.pop("flag", f"--{name.replace('_', '-')}")
+        parser.add_argument(flag, dest=name, **{**how, "help": help_texts.get(name, how["help"])})
 
 
-def mesh_options() -> argparse.ArgumentParser:
-    """Parent parser: ``--unit --pose --up``."""
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument(
-        "--unit",
-        choices=sorted(UNITS),
-        help="unit of the mesh file, and of lengths in and out (default: m; for a BOP scene mm)",
-    )
-    parser.add_argument(
-        "--pose",
-        choices=("any", "upright"),
-        help="any: no assumption. upright: the mesh's up axis points up in the photograph and the object is seen "
-        "from 10 degrees below to 60 above; faster, and right more often where it is true (default: any)",
-    )
-    parser.add_argument(
-        "--up", choices=UP_AXES, help="axis of the mesh file that points up, as --up=-y; default: y for glTF, else z"
-    )
-    return parser
-
-
-def add_mesh_is(parser: argparse.ArgumentParser) -> None:
-    """Add ``--mesh-is``."""
-    parser.add_argument(
-        "--mesh-is",
-        choices=MESH_KINDS,
-        help="exact: the mesh of this very object. similar: of another one of its kind; answers are then less certain "
-        "(default: exact with a camera, similar without)",
-    )
-
-
-def add_box_and_camera(
-    parser: argparse.ArgumentParser,
-    *,
-    box: str = "in px of the photograph",
-    camera: str = "in px; gives the translation",
-    fov: bool = True,
-) -> None:
-    """Add ``--box`` and ``--camera`` with these help texts, and ``--fov``."""
-    parser.add_argument("--box", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help=box)
-    parser.add_argument("--camera", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help=camera)
-    if fov:
-        parser.add_argument("--fov", type=float, metavar="DEG", help="horizontal field of view in degrees")
-
-
-def add_pose_prior(parser: argparse.ArgumentParser) -> None:
+def add_limits(parser: Any) -> None:
     """Add the options that limit the pose."""
-    group = parser.add_argument_group(
-        "what is known about the pose",
+    text = (
         "limits, angles in degrees; all that are given must hold; the result stays within them. Lists have columns of "
-        "these names",
     )
-    limits = ("LOW", "HIGH")
-    add = group.add_argument
-    add("--azimuth", type=float, nargs=2, metavar=limits, help="counted upwards; 300 60 goes through 0")
-    add("--elevation", type=float, nargs=2, metavar=limits, help="-90 below to 90 above the object")
-    add("--theta", type=float, nargs=2, metavar=limits, help="in-plane rotation")
-    add("--side", choices=SIDE_NAMES, help="side that faces the camera, 45 degrees to either side of it")
-    add("--near", type=float, nargs="+", metavar="DEG", help="AZIMUTH ELEVATION [THETA] nearby")
-    add("--within", type=float, metavar="DEG", help="largest angle from --near (default: 45)")
-    distance = "of the object's centre, in the mesh's unit; needs a camera"
-    add("--distance", type=float, nargs=2, metavar=("NEAR", "FAR"), help=distance)
-    add("--front", choices=UP_AXES, help="axis of the mesh file that points out of its front, at azimuth 0")
+    group = parser.add_argument_group("what is known about the pose", text + "these names")
+    for name, how in PRIOR_OPTIONS.items():
+        group.add_argument(f"--{name}", **_argument(how))
+
+
+def _argument(how: dict[str, Any]) -> dict[str, Any]:
+    kind = how.get("type")
+    names = {"metavar": re.sub(r"[][]", "", kind.names)} if isinstance(kind, Numbers) else {}
+    return {**names, **({"metavar": "FILE"} if kind is Path else {}), **how}
 
 
 def register_options(
     arguments: argparse.Namespace, photos: Sequence[Path] = (), meshes: Sequence[Path] = ()
-) -> "RegisterOptions":
-    """The options of ``register``, ``plot`` and ``view``; an option that a command lacks has its default."""
-    from dataclasses import fields
+) -> RegisterOptions:
+    """The options of a command; those that it lacks have their defaults.
 
-    from ..errors import InvalidInputError
-    from ..evaluation.opening import RegisterOptions
-    from ..evaluation.prior_options import limits_from_options, prior_from_limits
+    Raises:
+        InvalidInputError: limits that contradict each other, or no such device.
+    """
     from ..utils.checks import check_device
 
-    names = {option.name for option in fields(RegisterOptions)} - {"photos", "meshes"}
-    values: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in vars(arguments).items()
-        if name in names and value is not None
-    }
+    given = {name: value for name in DECLARED if (value := getattr(arguments, name, None)) is not None}
+    if given.get("camera") == "exif":
+        given["guess"] = given.pop("camera")
     try:
-        values["limits"] = limits_from_options(vars(arguments))
-        prior_from_limits(values["limits"])
+        limits = limits_from_options(vars(arguments))
+        prior_from_limits(limits)
     except InvalidInputError as error:
         raise InvalidInputError(f"--{error}".replace("--viewpoint:", "--near:", 1)) from error
-    check_device(values.get("device", "cpu"), "--device")
-    guess = "exif" if getattr(arguments, "exif", False) else getattr(arguments, "fov", None)
-    return RegisterOptions(photos=tuple(photos), meshes=tuple(meshes), guess=guess, **values)
+    check_device(given.get("device", "cpu"), "--device")
+    return RegisterOptions(photos=tuple(photos), meshes=tuple(meshes), limits=limits, **given)
 
 
-def split_numbers(words: Sequence[str]) -> list[str]:
-    """The command line with one word per number.
+def _counts() -> dict[str, int]:
+    """Numbers that an option takes at most."""
+    counts = {"--camera": 4}
+    for name, how in [*DECLARED.items(), *PRIOR_OPTIONS.items()]:
+        if isinstance(how.get("type"), Numbers):
+            counts[how.get("flag", f"--{name}")] = how["type"].most
+    return counts
 
-    The numbers of ``--box``, ``--camera`` and ``--distance`` may also be separated by commas or blanks.
-    ``--camera exif`` becomes ``--exif``, as argparse cannot take either four numbers or one word.
+
+_COUNTS = _counts()
+
+
+def join_numbers(words: Sequence[str]) -> list[str]:
+    """The command line with one word for each option of numbers: "--box=1,2,3,4".
+
+    Example:
+        >>> join_numbers(["a.jpg", "--box", "1,", "-2", "3", "4", "--near=5", "6", "b.stl", "--camera", "exif"])
+        ['a.jpg', '--box=1,-2,3,4', '--near=5,6', 'b.stl', '--camera', 'exif']
     """
-    out: list[str] = []
-    expected = 0
-    for word in words:
+    joined, rest = [], list(words)
+    while rest:
+        word = rest.pop(0)
         option, equals, value = word.partition("=")
-        if option in _COUNTS:
-            expected, word = _COUNTS[option], value
-            out.append(option)
-            if not equals:
-                continue
-        parts = re.split(r"[,\s]+", word.strip(", "))
-        are_numbers = len(parts) <= expected and all(re.fullmatch(NUMBER, part) for part in parts)
-        expected = expected - len(parts) if are_numbers else 0
-        out += map(_plain, parts) if are_numbers else [word]
-    if ("--camera", "exif") in pairwise(out):
-        place = out.index("--camera")
-        out[place : place + 2] = ["--exif"]
-    return out
+        numbers = _numbers(value) if equals else []
+        if option not in _COUNTS or numbers is None:
+            joined.append(word)
+            continue
+        while rest and (more := _numbers(rest[0])) and len(numbers) + len(more) <= _COUNTS[option]:
+            numbers += more
+            del rest[0]
+        joined.append(f"{option}={','.join(numbers)}" if numbers else word)
+    return joined
 
 
-def _plain(number: str) -> str:
-    """A number as argparse takes it: it reads -1e3 as an option."""
-    return f"{float(number):f}" if re.match("-.*[eE]", number) else number
+def _numbers(word: str) -> list[str] | None:
+    """The numbers in a word; None if there is anything else."""
+    parts = re.split(r"[,\s]+", word.strip(", "))
+    try:
+        return parts if all(float(part) is not None for part in parts) else None
+    except ValueError:
+        return None
+
+
+def numbers_among(paths: Sequence[Path]) -> list[str]:
+    """Paths that are numbers, which an option has left over."""
+    return [str(path) for path in paths if _numbers(str(path))]

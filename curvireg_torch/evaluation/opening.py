@@ -1,27 +1,100 @@
-"""Options of a registration, and the registrar that they ask for: shared by the command line and the viewer."""
+"""Options of a registration, each declared once, and the registrar that they ask for.
 
+The command line and the viewer read the declarations, lists those of the limits on the pose. Nothing heavy is imported
+before a file is opened, so that help and mistakes in options appear at once.
+"""
+
+import argparse
+import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Annotated, Any
 
 from ..errors import BankError, InvalidInputError
-from ..features import LearnedCurvilinearSaliency
-from ..geometry import camera_matrix
-from ..geometry.cameras import camera_of_view, transform
-from ..matching import ViewBank, cached_bank
-from ..mesh import load_mesh
-from ..pipeline import Pipeline, preset_named
-from ..registration import Registrar
-from ..utils.checks import check_rotation, check_square_pixels
-from ..utils.choices import DEFAULT
+from ..utils.choices import DEFAULT, MESH_KINDS, PRESET_NAMES, RENDERER_NAMES, SIDE_NAMES, UNITS, UP_AXES
 from ..utils.files import finite_numbers, read_json
-from .lists import Entry
-from .prior_options import prior_from_limits
 
-__all__ = ["RegisterOptions", "check_camera", "open_registrar"]
+if TYPE_CHECKING:
+    from ..features import LearnedCurvilinearSaliency
+    from ..geometry.pose_prior import PosePrior
+    from ..matching import ViewBank
+    from ..pipeline import Pipeline
+    from ..registration import Registrar
+    from .lists import Entry
+
+__all__ = ["PRIOR_OPTIONS", "QUALIFIERS", "Numbers", "RegisterOptions", "check_camera", "open_registrar"]
+
+WITHIN = 45.0
+"""Degrees of ``within`` beside ``near`` if none are given."""
+
+QUALIFIERS = {"front"}
+"""Arguments of :class:`PosePrior` that limit nothing by themselves."""
+
+
+class Numbers:
+    """Type of an option: finite numbers separated by blanks or commas, one for each name; those in brackets may lack.
+
+    Example:
+        >>> Numbers("AZIMUTH ELEVATION [THETA]")("300, 20"), Numbers("DEG")("45")
+        ((300.0, 20.0), 45.0)
+    """
+
+    def __init__(self, names: str) -> None:
+        self.names, self.most = names, len(names.split())
+        self.least = self.most - names.count("[")
+
+    def __call__(self, text: str) -> Any:
+        try:
+            values = tuple(map(float, text.replace(",", " ").strip("[] ").split()))
+        except ValueError:
+            values = ()
+        if not self.least <= len(values) <= self.most or not all(map(math.isfinite, values)):
+            raise argparse.ArgumentTypeError(f"expected {self.names}, finite numbers, got {text[:40]!r}")
+        return values if self.most > 1 else values[0]
+
+
+def whole_number(low: int, high: int | None = None) -> Callable[[str], int]:
+    """Return a type of options: a whole number from ``low`` to ``high``."""
+    limits = f"of at least {low}" if high is None else f"from {low} to {high}"
+
+    def read(text: str) -> int:
+        number = int(text) if re.fullmatch(r"[-+]?\d{1,18}", text) else None
+        if number is None or number < low or (high is not None and number > high):
+            raise argparse.ArgumentTypeError(f"expected a whole number {limits}, got {text!r}")
+        return number
+
+    return read
+
+
+def camera_option(text: str) -> Any:
+    """Return fx, fy, cx, cy, or "exif"."""
+    if text.lower() == "exif":
+        return "exif"
+    try:
+        return Numbers("FX FY CX CY")(text)
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(f"{error}; or exif, or give --fov DEG instead") from None
+
+
+def _option(text: str, **how: Any) -> dict[str, Any]:
+    """Annotation of a field that is an option: its help, and other arguments of ``ArgumentParser.add_argument``;
+    ``flag`` is its name where that is not the field's."""
+    return {"help": text, **how}
+
+
+PRIOR_OPTIONS: dict[str, dict[str, Any]] = {
+    "azimuth": {"type": Numbers("LOW HIGH"), "help": "counted upwards; 300 60 goes through 0"},
+    "elevation": {"type": Numbers("LOW HIGH"), "help": "-90 below to 90 above the object"},
+    "theta": {"type": Numbers("LOW HIGH"), "help": "in-plane rotation"},
+    "side": {"choices": SIDE_NAMES, "help": "side that faces the camera, 45 degrees to either side of it"},
+    "near": {"type": Numbers("AZIMUTH ELEVATION [THETA]"), "help": "a viewpoint nearby"},
+    "within": {"type": Numbers("DEG"), "help": f"largest angle from --near (default: {WITHIN:g})"},
+    "distance": {"type": Numbers("NEAR FAR"), "help": "of the object's centre, in the mesh's unit; needs a camera"},
+    "front": {"choices": UP_AXES, "help": "axis of the mesh file that points out of its front, at azimuth 0"},
+}
+"""What may be known about the pose: options of the command line, and columns of lists."""
 
 
 @dataclass(frozen=True)
@@ -33,67 +106,163 @@ class RegisterOptions:
         meshes: mesh files or banks; of several, each photograph is registered to the best.
         box, camera: x0, y0, x1, y1 and fx, fy, cx, cy in px; None: localized, and unknown.
         guess: of an unknown camera: "exif", or the horizontal field of view in degrees.
-        instances: without a box, see :func:`curvireg_torch.registration.localize`.
         limits: on the pose, arguments of :class:`PosePrior`.
-        start: file of a pose (``rotation`` and ``translation``, as in result.json) that is refined instead of a search.
         preset, pipeline: name of a pipeline, or its JSON file; None: the pipeline of a bank, or the default.
         pose, top: the pose prior, and the number of hypotheses; None: those of the pipeline.
-        field: weights of an adapted field.
-        refine: False stops at the best view of the bank.
-        mesh_is: "exact" or "similar", see :class:`Registrar`.
-        unit, up: of mesh files, see :func:`curvireg_torch.load_mesh`.
-        renderer, device: where views are rendered, and where the search runs.
+
+    The help texts of the other fields are those of the command line.
     """
 
     photos: tuple[Path, ...] = ()
     meshes: tuple[Path, ...] = ()
-    box: tuple[float, float, float, float] | None = None
-    camera: tuple[float, float, float, float] | None = None
-    guess: str | float | None = None
-    instances: int = 1
+    box: Annotated[
+        tuple[float, float, float, float] | None,
+        _option("in px of the photograph; default: the object is localized", type=Numbers("X0 Y0 X1 Y1")),
+    ] = None
+    camera: Annotated[
+        tuple[float, float, float, float] | None,
+        _option(
+            "FX FY CX CY in px, which gives the translation; or exif for the focal length of the photograph's file: "
+            "the result then has no covariance",
+            type=camera_option,
+        ),
+    ] = None
+    guess: Annotated[
+        str | float | None, _option("horizontal field of view of an unknown camera", flag="--fov", type=Numbers("DEG"))
+    ] = None
+    start: Annotated[
+        Path | None,
+        _option("result.json, or any JSON with rotation and translation: refine this pose; needs no box", type=Path),
+    ] = None
     limits: Mapping[str, Any] | None = None
-    start: Path | None = None
-    preset: str | None = None
-    pipeline: Path | None = None
-    pose: str | None = None
-    field: Path | None = None
-    top: int | None = None
-    refine: bool = True
-    mesh_is: str | None = None
-    unit: str = "m"
-    up: str | None = None
-    renderer: str = "auto"
-    device: str = "cpu"
-    progress: bool = True
+    unit: Annotated[
+        str,
+        _option("of the mesh file, and of lengths in and out (default: m; for a BOP scene mm)", choices=sorted(UNITS)),
+    ] = "m"
+    pose: Annotated[
+        str | None,
+        _option(
+            "any: no assumption. upright: the mesh's up axis points up in the photograph and the object is seen from "
+            "10 degrees below to 60 above; faster, and right more often where it is true (default: any)",
+            choices=("any", "upright"),
+        ),
+    ] = None
+    up: Annotated[
+        str | None,
+        _option("axis of the mesh file that points up, as --up=-y; default: y for glTF, else z", choices=UP_AXES),
+    ] = None
+    mesh_is: Annotated[
+        str | None,
+        _option(
+            "exact: the mesh of this very object. similar: of another one of its kind; answers are then less certain "
+            "(default: exact with a camera, similar without)",
+            choices=MESH_KINDS,
+        ),
+    ] = None
+    preset: Annotated[
+        str | None,
+        _option(
+            "learned: with networks, the most accurate. classical: nothing learned. fast: the best view, without "
+            f"search and contour fit. paper: the published method (default: that of a bank, else {DEFAULT})",
+            choices=PRESET_NAMES,
+        ),
+    ] = None
+    pipeline: Annotated[Path | None, _option("JSON of a pipeline, instead of --preset", type=Path)] = None
+    instances: Annotated[int, _option("without a box: up to so many objects (default: 1)", type=whole_number(1))] = 1
+    field: Annotated[Path | None, _option("weights of a learned field", type=Path)] = None
+    top: Annotated[int | None, _option("hypotheses to carry and report (default: 5)", type=whole_number(1))] = None
+    refine: Annotated[bool, _option("stop at the best view of the bank", flag="--no-refine", action="store_false")] = (
+        True
+    )
+    renderer: Annotated[str, _option("default: auto", choices=RENDERER_NAMES)] = "auto"
+    device: Annotated[str, _option("device of modules, bank and search (default: cpu)")] = "cpu"
+    progress: Annotated[bool, _option("no progress bars", flag="--quiet", action="store_false")] = True
 
     @property
     def bank_decides(self) -> bool:
         """Whether the pipeline of a bank file applies, as none was chosen."""
         return self.preset is None and self.pipeline is None
 
-    def open_pipeline(self) -> Pipeline:
+    def open_pipeline(self) -> "Pipeline":
         """The pipeline that ``preset``, ``pipeline`` and ``pose`` choose."""
+        from ..pipeline import Pipeline, preset_named
+
         chosen = preset_named(self.preset or DEFAULT) if self.pipeline is None else Pipeline.read(self.pipeline)
         return chosen if self.pose is None else chosen.with_pose_prior(self.pose)
 
-    def open_field(self) -> LearnedCurvilinearSaliency | None:
+    def open_field(self) -> "LearnedCurvilinearSaliency | None":
         """The network of ``field``, or None."""
+        from ..features import LearnedCurvilinearSaliency
+
         return None if self.field is None else LearnedCurvilinearSaliency(weights=self.field)
 
-    def entry(self, photo: Path) -> Entry:
+    def entry(self, photo: Path) -> "Entry":
         """A photograph with the box, camera and meshes of these options."""
+        from .lists import Entry
+
         prior = prior_from_limits(self.limits or {})
         return self.complete(Entry((), str(photo), photo, self.meshes, self.box, self.camera, prior=prior))
 
-    def complete(self, entry: Entry) -> Entry:
+    def complete(self, entry: "Entry") -> "Entry":
         """A photograph of a list with the options that a list does not hold."""
         start, confidence = (None, None) if self.start is None else read_start(self.start)
         own = replace(entry, guess=self.guess, instances=self.instances)
         return replace(own, start=start, start_confidence=confidence)
 
 
+def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of :class:`PosePrior`, of which ``side`` and ``near`` are shorter forms; None means: not given.
+
+    Raises:
+        InvalidInputError: ``side`` beside ``azimuth``, or ``within`` without ``near``.
+
+    Example:
+        >>> limits_from_options({"side": "front", "near": (10, 20)})
+        {'azimuth': (315.0, 45.0), 'viewpoint': (10, 20, 0.0), 'within': 45.0}
+    """
+    given = {name: options[name] for name in PRIOR_OPTIONS if options.get(name) is not None}
+    side, near, within = (given.pop(name, None) for name in ("side", "near", "within"))
+    if side is not None:
+        from ..geometry.pose_prior import PosePrior
+
+        if "azimuth" in given:
+            raise InvalidInputError("side: give it or azimuth")
+        given["azimuth"] = PosePrior.side(side).azimuth
+    if near is not None:
+        given |= {"viewpoint": (*near, 0.0)[:3], "within": WITHIN if within is None else within}
+    elif within is not None:
+        raise InvalidInputError("within: expected near beside it")
+    return given
+
+
+def limits_from_cells(cells: Mapping[str, str]) -> dict[str, Any]:
+    """:func:`limits_from_options` of texts such as "300 60"; empty ones are not given.
+
+    Example:
+        >>> limits_from_cells({"azimuth": "300 60", "theta": "", "front": "-y"})
+        {'azimuth': (300.0, 60.0), 'front': '-y'}
+    """
+    values = {}
+    for name, text in cells.items():
+        try:
+            values[name] = PRIOR_OPTIONS[name].get("type", str)(text) if text else None
+        except argparse.ArgumentTypeError as error:
+            raise InvalidInputError(f"{name}: {error}") from None
+    return limits_from_options(values)
+
+
+def prior_from_limits(limits: Mapping[str, Any]) -> "PosePrior | None":
+    """The prior with these arguments; None if they limit nothing."""
+    from ..geometry.pose_prior import PosePrior
+
+    return PosePrior(**limits) if limits.keys() - QUALIFIERS else None
+
+
 def check_camera(camera: Sequence[float] | None, guess: str | float | None) -> None:
     """Refuse a camera (fx, fy, cx, cy) or field of view that cannot be used, before any file is read."""
+    from ..geometry.cameras import camera_matrix, camera_of_view
+    from ..utils.checks import check_square_pixels
+
     if camera is not None:
         try:
             check_square_pixels(camera_matrix(*camera), "--camera")
@@ -113,10 +282,18 @@ def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]
     Raises:
         CurviregError: the file is missing, damaged or does not hold a rigid pose.
     """
+    import torch
+
+    from ..geometry.cameras import transform
+    from ..utils.checks import check_rotation
+
     content = read_json(path, dict, "docs/guides/known-pose.md")
     rows = content.get("rotation")
     rotation = [finite_numbers(row, 3) for row in rows] if isinstance(rows, list) else []
     translation = finite_numbers(content.get("translation"), 3)
+    if len(rotation) == 3 and None not in rotation and content.get("translation", ...) is None:
+        message = "a result without a translation, as of a photograph without a camera; register with --camera first"
+        raise InvalidInputError(message, subject=path)
     if len(rotation) != 3 or None in rotation or translation is None:
         raise InvalidInputError("expected rotation (3 x 3 numbers) and translation (3 numbers)", subject=path)
     R = torch.tensor([list(row or ()) for row in rotation], dtype=torch.float64)
@@ -132,10 +309,10 @@ def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]
 def open_registrar(
     options: RegisterOptions,
     meshes: Sequence[Path],
-    field: LearnedCurvilinearSaliency | None = None,
+    field: "LearnedCurvilinearSaliency | None" = None,
     *,
     progress: Callable[[str, int, int], object] | None = None,
-) -> Registrar:
+) -> "Registrar":
     """The registrar of mesh files or banks.
 
     Args:
@@ -146,6 +323,8 @@ def open_registrar(
     Raises:
         CurviregError: a file is missing or damaged, or a bank was built with other settings.
     """
+    from ..registration import Registrar
+
     pipeline = options.open_pipeline()
     banks = [_open_bank(options, mesh, pipeline, progress or options.progress) for mesh in meshes]
     banks = [bank.to(options.device) for bank in banks]
@@ -162,8 +341,11 @@ def open_registrar(
 
 
 def _open_bank(
-    options: RegisterOptions, mesh: Path, pipeline: Pipeline, progress: bool | Callable[[str, int, int], object]
-) -> ViewBank:
+    options: RegisterOptions, mesh: Path, pipeline: "Pipeline", progress: bool | Callable[[str, int, int], object]
+) -> "ViewBank":
+    from ..matching import ViewBank, cached_bank
+    from ..mesh import load_mesh
+
     if mesh.suffix != ".safetensors":
         loaded = load_mesh(mesh, unit=options.unit, up=options.up)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)

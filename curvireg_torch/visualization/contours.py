@@ -4,11 +4,13 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+import torch
 from torch import Tensor
 
 from ..rendering.protocol import DepthRenderer
+from .encoding import to_uint8
 
-__all__ = ["contour_layer", "draw_box", "draw_pose", "line_width"]
+__all__ = ["contour_layer", "draw_box", "draw_window", "line_width"]
 
 OUTLINE, CREASE, BOX, RIM = (0, 255, 80), (255, 170, 0), (255, 255, 255), (0, 0, 0)
 RIM_OPACITY = 0.7  # of the black rim
@@ -22,17 +24,45 @@ def line_width(size: Sequence[int]) -> float:
     return max(1.5, max(size) / 350)
 
 
-def draw_pose(
-    picture: np.ndarray, renderer: DepthRenderer, projection: tuple[Tensor, Tensor], box: Sequence[float] | None = None
-) -> None:
-    """Draw a mesh's contours, and a box below them, into (H, W, 3) uint8; ``projection`` is pose and camera matrix."""
-    T, K = projection
+def draw_window(
+    renderer: DepthRenderer,
+    projection: tuple[Tensor, Tensor] | None,
+    image: Tensor,
+    window: Sequence[int],
+    scale: float,
+    box: Sequence[float] | None = None,
+) -> np.ndarray:
+    """Part of a photograph with a mesh's contours, and a box below them.
+
+    Args:
+        renderer: of the mesh.
+        projection: (4, 4) pose ``T_cam_from_model`` and (3, 3) camera matrix; None draws no mesh.
+        image: (1 or 3, H, W).
+        window, scale: columns x0 to x1 - 1 and rows y0 to y1 - 1, and the factor by which they are resized.
+        box: x0, y0, x1, y1 in px of the photograph.
+
+    Returns:
+        (H', W', 3) uint8 RGB.
+    """
+    x0, y0, x1, y1 = window
+    picture = to_uint8(image[:, y0:y1, x0:x1])
+    if scale != 1.0:
+        size = max(1, round((x1 - x0) * scale)), max(1, round((y1 - y0) * scale))
+        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC))
+    fx, fy = picture.shape[1] / (x1 - x0), picture.shape[0] / (y1 - y0)
+    moved = [[fx, 0.0, fx * (0.5 - x0) - 0.5], [0.0, fy, fy * (0.5 - y0) - 0.5], [0.0, 0.0, 1.0]]  # of pixel centres
+    resize = torch.tensor(moved, dtype=torch.float64)
     if box is not None:
-        draw_box(picture, box)
-    layer = contour_layer(renderer.render(T[None], K, picture.shape[:2])[0, 0], K)
-    drawn = layer[..., 3] > 0
-    alpha = layer[drawn][:, 3:] / 255.0
-    picture[drawn] = np.round(alpha * layer[drawn][:, :3] + (1.0 - alpha) * picture[drawn])
+        corners = resize @ torch.tensor([[box[0], box[2]], [box[1], box[3]], [1.0, 1.0]], dtype=torch.float64)
+        draw_box(picture, corners[:2].mT.flatten().tolist())
+    if projection is not None:
+        T, K = projection
+        K = resize @ K.cpu().double()
+        layer = contour_layer(renderer.render(T[None], K, picture.shape[:2])[0, 0], K)
+        drawn = layer[..., 3] > 0
+        alpha = layer[drawn][:, 3:] / 255.0
+        picture[drawn] = np.round(alpha * layer[drawn][:, :3] + (1.0 - alpha) * picture[drawn])
+    return picture
 
 
 def draw_box(picture: np.ndarray, box: Sequence[float]) -> None:

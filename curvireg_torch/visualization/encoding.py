@@ -1,9 +1,10 @@
-"""Pictures as files in memory."""
+"""Pictures as arrays and as files in memory."""
 
 import cv2
 import numpy as np
+from torch import Tensor
 
-__all__ = ["jpeg", "png", "shrink"]
+__all__ = ["jpeg", "png", "shrink", "to_uint8"]
 
 
 def png(picture: np.ndarray) -> bytes:
@@ -24,3 +25,11 @@ def shrink(picture: np.ndarray, side: int) -> np.ndarray:
         return picture
     size = max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale))
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def to_uint8(image: Tensor) -> np.ndarray:
+    """(H, W, 3) uint8 RGB, always a copy, of a (1 or 3, H, W) image, floating in [0, 1] or uint8; black for NaN."""
+    pixels = image.detach().cpu()
+    if pixels.is_floating_point():
+        pixels = (pixels.float().nan_to_num(0.0, 0.0, 0.0).clamp(0, 1) * 255).round().byte()
+    return np.array(pixels.expand(3, -1, -1).permute(1, 2, 0).numpy(), order="C")

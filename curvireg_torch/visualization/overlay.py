@@ -1,82 +1,51 @@
-"""One picture that shows whether a registration is right."""
+"""Pictures that show whether a registration is right: contours on the photograph, and how the pose was found."""
 
+import math
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from ..errors import InvalidInputError
+from ..geometry import rotation_error
 from ..matching.describe import depth_filter
+from ..mesh import mesh_unit, mesh_up
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import ImageItem, image_item
+from ..registration.result import pose_in_words, verdict
 from ..terms import crop_regions, photograph_field
-from ..utils.checks import as_numbers, check_camera_matrix
-from .contours import draw_pose
+from ..utils.checks import as_numbers
+from .contours import draw_window
+from .encoding import to_uint8
 
-__all__ = ["contour_overlay", "side_pictures"]
+__all__ = ["contour_overlay", "registration_sheet", "side_pictures", "to_uint8", "view_picture"]
 
 Window = tuple[int, int, int, int]
+LEAST, MOST = 960, 1600  # px of the photograph's longer side in the picture
+NARROWEST = 720  # px of width that the caption needs
+TILE = 180  # least side of a small picture in px
+GAP = 10  # px between pictures
+PAPER, INK, FAINT = (255, 255, 255), (30, 30, 30), (100, 100, 100)
+VERDICT_COLOURS = {"likely": (20, 125, 65), "unsure": (185, 105, 0), "no match": (190, 40, 40)}
+LEGEND = "Green: outline of the mesh at this pose. Orange: its inner edges. White: the box."
 
 
-def contour_overlay(
-    registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any, camera_matrix: Any | None = None
-) -> np.ndarray:
+def contour_overlay(registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any) -> np.ndarray:
     """The photograph with the mesh's outline (green), its inner edges (orange) at the pose, and the box (white).
 
     Args:
         registrar, result: the result of this registrar, or one of its hypotheses; it is drawn with its ``projection``.
         image, box: the photograph, as the registrar takes it: a (1 or 3, H, W) tensor, an array or a path; (4,) px.
-        camera_matrix: (3, 3), if ``image`` is another one from the same position, such as a smaller copy.
 
     Returns:
         (H, W, 3) uint8 RGB.
-
-    Raises:
-        InvalidInputError: a camera matrix, but a pose without translation.
     """
-    item = photograph_item(image, box)
-    H, W = item.image.shape[-2:]
-    return draw_window(registrar, result, item, (0, 0, W, H), 1.0, camera_matrix)
-
-
-def draw_window(
-    registrar: Registrar,
-    result: Registration | Hypothesis,
-    item: ImageItem,
-    window: Window,
-    scale: float,
-    camera_matrix: Any | None,
-    *,
-    box: bool = True,
-) -> np.ndarray:
-    """:func:`contour_overlay` of columns x0 to x1 - 1 and rows y0 to y1 - 1, resized by ``scale``."""
-    x0, y0, x1, y1 = window
-    T, K = result.projection
-    if camera_matrix is not None:
-        if result.translation is None:
-            raise InvalidInputError("camera_matrix: the pose was found without one; leave it out")
-        K = as_numbers(camera_matrix, "camera_matrix", dtype=torch.float64)
-        check_camera_matrix(K)
-    picture = to_uint8(item.image[:, y0:y1, x0:x1])
-    if scale != 1.0:
-        size = max(1, round((x1 - x0) * scale)), max(1, round((y1 - y0) * scale))
-        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC))
-    fx, fy = picture.shape[1] / (x1 - x0), picture.shape[0] / (y1 - y0)
-    resize = torch.tensor(
-        [[fx, 0.0, fx * (0.5 - x0) - 0.5], [0.0, fy, fy * (0.5 - y0) - 0.5], [0.0, 0.0, 1.0]], dtype=torch.float64
-    )
-    left, top, right, bottom = item.box.tolist()
-    corners = resize @ torch.tensor([[left, right], [top, bottom], [1.0, 1.0]], dtype=torch.float64)
-    draw_pose(
-        picture, registrar.describer.renderer, (T, resize @ K), corners[:2].mT.flatten().tolist() if box else None
-    )
-    return picture
-
-
-def photograph_item(image: Any, box: Any) -> ImageItem:
-    return image_item(image, as_numbers(box, "box"))
+    item = image_item(image, as_numbers(box, "box"))
+    H, W = item.size
+    renderer = registrar.of_model(getattr(result, "model", 0)).describer.renderer
+    return draw_window(renderer, result.projection, item.image, (0, 0, W, H), 1.0, item.box.tolist())
 
 
 @torch.no_grad()
@@ -87,7 +56,7 @@ def side_pictures(
 
     Arguments as for :func:`contour_overlay`.
     """
-    item = photograph_item(image, box)
+    item = image_item(image, as_numbers(box, "box"))
     settings = registrar.bank.settings
     crop = crop_regions([item.image], item.box[None, None], size=settings.image_size, margin=settings.margin)[0]
     field = photograph_field(registrar.matcher.field, crop.to(registrar.bank.device))
@@ -107,15 +76,99 @@ def view_picture(registrar: Registrar, rotation: Tensor, distance: float) -> np.
     return to_uint8(shaded[-3:] if len(shaded) > 1 else shaded)  # grey, or grey and RGB
 
 
-def to_uint8(image: Tensor) -> np.ndarray:
-    """(H, W, 3) uint8 RGB, always a copy, of a (1 or 3, H, W) image, floating in [0, 1] or uint8; black for NaN."""
-    pixels = image.detach().cpu()
-    if pixels.is_floating_point():
-        pixels = (pixels.float().nan_to_num(0.0, 0.0, 0.0).clamp(0, 1) * 255).round().byte()
-    return np.array(pixels.expand(3, -1, -1).permute(1, 2, 0).numpy(), order="C")
-
-
 def _field_picture(field: Tensor) -> np.ndarray:
     """Strong edges are dark, on white."""
     length = field.float().norm(dim=0, keepdim=True)
     return to_uint8(1.0 - (length / length.max().clamp(min=1e-12)).sqrt())
+
+
+@torch.no_grad()
+def registration_sheet(registrar: Registrar, result: Registration, image: Any, box: Any) -> np.ndarray:
+    """The photograph with the pose's contours and a caption; below it a close-up, the compared fields and the rivals.
+
+    The photograph's longer side becomes 960 to 1600 px. Below a rival stand its rotation from the answer and its
+    probability. Arguments as for :func:`contour_overlay`.
+
+    Returns:
+        (H', W', 3) uint8 RGB.
+    """
+    item = image_item(image, as_numbers(box, "box"))
+    registrar = registrar.of_model(result.model)
+    H, W = item.size
+    scale = min(max(LEAST, H, W), MOST) / max(H, W)
+    renderer = registrar.describer.renderer
+    photograph = draw_window(renderer, result.projection, item.image, (0, 0, W, H), scale, item.box.tolist())
+    height, width = photograph.shape[0], max(NARROWEST, photograph.shape[1])
+    count = 3 + len(result.hypotheses)
+    rows = -(-count // (width // TILE))
+    columns = -(-count // rows)
+    side = (width - GAP) // columns - GAP
+    text, line = max(15, width // 60), max(12, side // 13)
+    top, step = height + 4 * text + GAP, side + 2 * line + GAP
+    sheet = Image.new("RGB", (width, top + rows * step), PAPER)
+    sheet.paste(Image.fromarray(photograph), ((width - photograph.shape[1]) // 2, 0))
+    draw = ImageDraw.Draw(sheet)
+    _draw_caption(draw, registrar, result, (GAP, height + text // 2), text)
+    for k, (name, picture) in enumerate(_small_pictures(registrar, result, item, side)):
+        x, y = GAP + k % columns * (side + GAP), top + k // columns * step
+        h, w = picture.shape[:2]
+        sheet.paste(Image.fromarray(picture), (x + (side - w) // 2, y + (side - h) // 2))
+        draw.text((x, y + side + line // 3), name, INK, ImageFont.load_default(line))
+    return np.asarray(sheet).copy()
+
+
+def _draw_caption(
+    draw: ImageDraw.ImageDraw, registrar: Registrar, result: Registration, corner: tuple[int, int], size: int
+) -> None:
+    """Verdict and pose in words, and the meaning of the colours."""
+    x, y = corner
+    word, font = verdict(result.confidence, result.none, result.reliable), ImageFont.load_default(size)
+    badge = word
+    if result.confidence is not None:  # 0.896 is not yet 0.90, reliable
+        badge += f": confidence {math.floor(100 * result.confidence) / 100:.2f}"
+    right = x + draw.textlength(badge, font) + size
+    draw.rounded_rectangle((x, y, right, y + 1.6 * size), 0.5 * size, VERDICT_COLOURS[word])
+    draw.text((x + size / 2, y + 0.8 * size), badge, PAPER, font, anchor="lm")
+    mesh = registrar.bank.mesh
+    front = None if result.prior is None else result.prior.front
+    pose = pose_in_words(result.rotation, up=mesh_up(mesh), front=front)
+    if result.translation is not None:
+        pose += f", {float(f'{result.distance:.3g}'):g} {mesh_unit(mesh) or 'units'} away"
+    if registrar.others:
+        pose = f"mesh {result.model}, {pose}"
+    room = draw.im.size[0] - right - 1.5 * size
+    font = ImageFont.load_default(min(size, size * room / draw.textlength(pose, font)))
+    draw.text((right + size / 2, y + 0.8 * size), pose, INK, font, anchor="lm")
+    draw.text((x, y + 2 * size), LEGEND, FAINT, ImageFont.load_default(0.75 * size))
+
+
+def _small_pictures(
+    registrar: Registrar, result: Registration, item: ImageItem, side: int
+) -> list[tuple[str, np.ndarray]]:
+    """Captions and pictures, at most ``side`` px wide and high."""
+    window, renderer = _close_up(item), registrar.describer.renderer
+    scale = side / max(window[2] - window[0], window[3] - window[1])
+    close_ups = [draw_window(renderer, h.projection, item.image, window, scale) for h in result.hypotheses]
+    sides = side_pictures(registrar, result, item.image, item.box)
+    names = {"edges of the photograph": "photograph field", "edges of the mesh": "view field"}
+    names["mesh at this pose"] = "pose"
+    found = [
+        (text, cv2.resize(sides[name], (side, side), interpolation=cv2.INTER_CUBIC)) for text, name in names.items()
+    ]
+    rivals = [(_rival(result, k), close_ups[k]) for k in range(1, len(close_ups))]
+    return [("close-up", close_ups[0]), *found, *rivals]
+
+
+def _rival(result: Registration, index: int) -> str:
+    angle = f"rival: {float(rotation_error(result.hypotheses[index].rotation, result.rotation)):.0f}° away"
+    return f"{angle} ({result.probabilities[index]:.2f})" if result.probabilities else angle
+
+
+def _close_up(item: ImageItem) -> Window:
+    """A square around the box with a margin, moved into the photograph and cut at its borders."""
+    H, W = item.image.shape[-2:]
+    x0, y0, x1, y1 = item.box.tolist()
+    side = round(1.3 * max(x1 - x0, y1 - y0)) + 2
+    left = max(0, min(round(0.5 * (x0 + x1 - side)), W - side))
+    top = max(0, min(round(0.5 * (y0 + y1 - side)), H - side))
+    return left, top, min(W, left + side), min(H, top + side)

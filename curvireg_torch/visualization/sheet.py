@@ -6,13 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
-import torch
 from torch import Tensor
 
 from ..rendering.protocol import DepthRenderer
 from ..utils.files import write_file
-from .contours import draw_pose
+from .contours import draw_window
 from .encoding import jpeg
 
 __all__ = ["SheetEntry", "thumbnail", "write_sheet"]
@@ -64,18 +62,7 @@ def thumbnail(renderer: DepthRenderer, projection: tuple[Tensor, Tensor], image:
     left, top = max(0, int(x0 - margin)), max(0, int(y0 - margin))
     right, bottom = min(W, int(x1 + margin) + 1), min(H, int(y1 + margin) + 1)
     scale = min(1.0, SIDE / max(right - left, bottom - top))
-    size = max(1, round((right - left) * scale)), max(1, round((bottom - top) * scale))
-    cropped = image[:, top:bottom, left:right].permute(1, 2, 0).numpy()
-    small = cv2.resize(cropped, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], 3)
-    x, y = size[0] / (right - left), size[1] / (bottom - top)
-    to_small = torch.tensor(
-        [[x, 0.0, x * (0.5 - left) - 0.5], [0.0, y, y * (0.5 - top) - 0.5], [0.0, 0.0, 1.0]], dtype=torch.float64
-    )
-    corners = torch.tensor([[x0, x1], [y0, y1], [1.0, 1.0]], dtype=torch.float64)
-    (x0, x1), (y0, y1), _ = (to_small @ corners).tolist()
-    T, K = projection
-    draw_pose(small, renderer, (T, to_small @ K), (x0, y0, x1, y1))
-    return jpeg(small, 80)
+    return jpeg(draw_window(renderer, projection, image, (left, top, right, bottom), scale, box), 80)
 
 
 def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: str, each: int | None = None) -> None:

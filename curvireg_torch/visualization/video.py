@@ -7,21 +7,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from torch import Tensor
 
 from ..errors import LostObjectError
 from ..registration import FailedRegistration, Registrar, Registration
 from ..registration.result import verdict
-from ..utils.files import write_file
-from .contours import draw_pose
-from .encoding import jpeg, shrink
-from .overlay import to_uint8
+from .contours import draw_window
 
 __all__ = ["OverlayVideo"]
 
 _LONGER_SIDE = 960  # of the frames in px; larger ones are scaled down
-_QUALITY = 85  # of JPEG files
 _NO_POSE = (255, 90, 80)
 _COLOURS = {"likely": (90, 230, 120), "unsure": (255, 190, 60), "no match": _NO_POSE}
 
@@ -29,8 +24,7 @@ _COLOURS = {"likely": (90, 230, 120), "unsure": (255, 190, 60), "no match": _NO_
 class OverlayVideo:
     """Writes frames with the contours of the mesh at the pose, and the confidence in words, to an MP4 file.
 
-    Where OpenCV cannot encode MPEG-4, the frames become JPEG files in a folder beside it, after a warning. The file is
-    complete only after :meth:`close`; as a context manager, the video closes itself, whatever happens.
+    The file is complete only after :meth:`close`; as a context manager, the video closes itself, whatever happens.
 
     Args:
         path: of the file, which ends in ``.mp4``.
@@ -39,6 +33,7 @@ class OverlayVideo:
 
     Example:
         >>> import tempfile
+        >>> import torch
         >>> import curvireg_torch as cr
         >>> from curvireg_torch.synthetic import example_mesh
         >>> bank = cr.ViewBank.build(example_mesh(), cr.sample_views(azimuth_step=90), image_size=64, progress=False)
@@ -54,7 +49,6 @@ class OverlayVideo:
         self._temporary = path.with_name(f"{path.stem}.{secrets.token_hex(4)}.tmp{path.suffix}")
         self._writer: cv2.VideoWriter | None = None
         self._size = (0, 0)
-        self._count = 0
 
     def add(self, image: Tensor | None, result: Registration | FailedRegistration) -> None:
         """Draw and write the next frame: (1 or 3, H, W), or None if it could not be read.
@@ -68,35 +62,24 @@ class OverlayVideo:
         else:
             picture = draw_frame(self.registrar, image, result)
             if self._writer is None:
-                self._open(picture)
+                self._writer = self._open(picture)
             if picture.shape[1::-1] != self._size:
                 picture = np.asarray(cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA))
         _write_caption(picture, result)
-        self._write(picture)
+        self._writer.write(picture[..., ::-1])
 
-    def _open(self, picture: np.ndarray) -> None:
-        height, width = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2  # the codec needs even numbers
-        self._size = (width, height)
+    def _open(self, picture: np.ndarray) -> cv2.VideoWriter:
+        self._size = (picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2)  # the codec needs even numbers
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        code = cv2.VideoWriter.fourcc(*"mp4v")
-        self._writer = cv2.VideoWriter(str(self._temporary), code, self.fps, self._size)
-        if not self._writer.isOpened():
-            self.path = self.path.with_suffix("")
-            warnings.warn(f"OpenCV has no MPEG-4 encoder; the frames are JPEG files in {self.path}", stacklevel=4)
-
-    def _write(self, picture: np.ndarray) -> None:
-        assert self._writer is not None
-        if self._writer.isOpened():
-            self._writer.write(picture[..., ::-1])
-        else:
-            write_file(self.path / f"{self._count:06d}.jpg", jpeg(picture, _QUALITY))
-        self._count += 1
+        writer = cv2.VideoWriter(str(self._temporary), cv2.VideoWriter.fourcc(*"mp4v"), self.fps, self._size)
+        if not writer.isOpened():
+            warnings.warn("this OpenCV has no MPEG-4 encoder; no overlay is written", stacklevel=3)
+        return writer
 
     def close(self) -> None:
         """Finish the file. Nothing is written if there was no frame."""
-        if self._writer is None:
-            return
-        self._writer.release()
+        if self._writer is not None:
+            self._writer.release()
         if self._temporary.exists():
             os.replace(self._temporary, self.path)
 
@@ -109,15 +92,11 @@ class OverlayVideo:
 
 def draw_frame(registrar: Registrar, image: Tensor, result: Registration | FailedRegistration) -> np.ndarray:
     """(H, W, 3) uint8 of the image, of at most 960 px, with the contours of the mesh if there is a pose."""
-    whole = to_uint8(image)
-    picture = shrink(whole, _LONGER_SIDE)
-    if isinstance(result, Registration):
-        T, K = result.projection
-        sx, sy = (picture.shape[k] / whole.shape[k] for k in (1, 0))
-        scale = [[sx, 0.0, 0.5 * (sx - 1.0)], [0.0, sy, 0.5 * (sy - 1.0)], [0.0, 0.0, 1.0]]  # of pixels, not corners
-        K = torch.tensor(scale, dtype=K.dtype) @ K
-        draw_pose(picture, registrar.of_model(result.model).describer.renderer, (T, K))
-    return picture
+    H, W = image.shape[-2:]
+    found = isinstance(result, Registration)
+    renderer = registrar.of_model(result.model if found else 0).describer.renderer
+    scale = min(1.0, _LONGER_SIDE / max(H, W))
+    return draw_window(renderer, result.projection if found else None, image, (0, 0, W, H), scale)
 
 
 def caption(result: Registration | FailedRegistration) -> tuple[str, tuple[int, int, int]]:

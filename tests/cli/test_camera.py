@@ -82,7 +82,6 @@ def test_guesses_apply_to_rows_without_a_camera(folder, tmp_path, capsys):
         *[([f"--fov={degrees}"], "fov: expected 0 < degrees < 180") for degrees in ("0", "180", "nan", "-40")],
         (["--camera", "0", "260", "120", "90"], "FX, FY > 0"),
         (["--camera", "260", "-260", "120", "90"], "FX, FY > 0"),
-        (["--camera", "260", "nan", "120", "90"], "finite"),
         (["--camera", "130", "260", "120", "90"], "--camera: expected square pixels"),
     ],
 )

@@ -1,5 +1,6 @@
 """``curvireg demo``, ``bank``, ``cache`` and ``--help``."""
 
+import io
 import json
 import re
 import signal
@@ -13,6 +14,7 @@ import torch
 import trimesh
 
 from curvireg_torch.cli import main
+from curvireg_torch.cli.register import show_stages
 from curvireg_torch.errors import CurviregWarning, InvalidInputError
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.evaluation.registry import DatasetSpec
@@ -112,13 +114,43 @@ def test_commands_compute_with_one_thread_of_torch_for_each_job(words, work, fol
         torch.set_num_threads(before)
 
 
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_show_stages_updates_one_line_of_a_terminal_and_removes_it(monkeypatch):
+    screen = Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+
+    def interrupted():
+        with show_stages(enabled=True) as report:
+            report("bank", 20, 288)
+            report("search", 0, 1)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert screen.getvalue() == "".join(f"\r\033[K{line}" for line in ("rendering views 20 of 288", "search", ""))
+
+
+def test_show_stages_prints_one_line_a_stage_elsewhere_and_nothing_if_disabled(capsys):
+    with show_stages(enabled=True) as report:
+        for count in range(3):
+            report("bank", count, 3)
+        report("contours", 0, 1)
+    assert capsys.readouterr().err == "rendering views\nfitting contours\n"
+    with show_stages(enabled=False) as report:
+        assert report is None
+
+
 def test_main_prints_our_warnings_and_not_those_of_numpy(monkeypatch, capsys):
     def warn(_):
         warnings.simplefilter("always")
         warnings.warn("of ours", CurviregWarning, stacklevel=1)
         warnings.warn("of theirs", RuntimeWarning, stacklevel=1)
 
-    monkeypatch.setattr("curvireg_torch.cli.cache.run", warn)
+    monkeypatch.setattr("curvireg_torch.cli.commands.show_cache", warn)
     assert main(["cache"]) == 0
     assert capsys.readouterr().err == "curvireg: warning: of ours\n"
 

@@ -287,13 +287,13 @@ LIMITED = [
     ("", "", {"elevation": [-10.0, 80.0]}),
     ("distance", "1 2", "distance: needs the camera"),
     ("distance", "2 1", "distance: expected 0 < NEAR <= FAR"),
-    ("azimuth", "140", "azimuth: expected 2"),
-    ("azimuth", "from 140", "azimuth: expected numbers with blanks between them, got 'from 140'"),
+    ("azimuth", "140", "azimuth: expected LOW HIGH"),
+    ("azimuth", "from 140", "azimuth: expected LOW HIGH, finite numbers, got 'from 140'"),
     ("elevation", "60 0", "elevation: expected -90 <= low"),
     ("side", "top", "side"),
     ("within", "10", "within: expected near"),
     ("near", "1 2 3 4", "near: expected AZIMUTH"),
-    ("within", "1 2", "within: expected one number"),
+    ("within", "1 2", "within: expected DEG"),
     ("front", "z", "front: expected another axis"),
 ]
 

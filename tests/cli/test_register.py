@@ -12,7 +12,7 @@ import torch
 from curvireg_torch import Registrar, ViewBank, camera_matrix
 from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.options import register_options
-from curvireg_torch.cli.report import print_result
+from curvireg_torch.cli.register import print_result
 from curvireg_torch.errors import BankError
 from curvireg_torch.evaluation import evaluate
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
@@ -122,7 +122,6 @@ def broken_files(folder):
         ({}, ["--field", "none"], ["none"]),
         ({}, ["--preset", "paper"], ["built with other settings"]),
         ({}, ["--pose", "upright"], ["--pose"]),
-        ({}, ["--near", "10"], ["near: expected AZIMUTH ELEVATION"]),
         ({}, ["--within", "10"], ["within: expected near"]),
         ({}, ["--side", "left", "--azimuth", "0", "10"], ["side: give it or azimuth"]),
         ({}, ["--front", "x"], ["limits nothing"]),
@@ -151,10 +150,17 @@ def test_register_checks_box_and_camera_before_it_opens_a_bank(register_one, ref
         (["register", "a.jpg", "b.stl", "--json", "--every", "0"], "--every: expected a whole number of at least 1"),
         (["evaluate", "bop", "a", "--out", "b", "--limit", "0"], "--limit: expected a whole number of at least 1"),
         (["view", "--port", "65536"], "--port: expected a whole number from 0 to 65535, got '65536'"),
+        (
+            ["register", "a.jpg", "b.stl", "--json", "--near", "10"],
+            "--near: expected AZIMUTH ELEVATION [THETA]",
+        ),
+        (["register", "a.jpg", "b.stl", "--json", "--dist", "1", "2"], "unrecognized arguments: --dist"),
+        (["register", "a.jpg", "b.stl", "--json", "--box", "1,2", "3"], "--box: expected X0 Y0 X1 Y1, finite numbers"),
+        (["register", "a.jpg", "b.stl", "--json", "--camera", "cam.yaml"], "or exif, or give --fov DEG"),
         (["view", "--port", "-1"], "--port: expected a whole number from 0 to 65535, got '-1'"),
     ],
 )
-def test_whole_number_names_the_option_and_its_limits(capsys, words, message):
+def test_wrong_options_are_named(capsys, words, message):
     with pytest.raises(SystemExit, match="2"):
         main(words)
     assert message in capsys.readouterr().err

@@ -9,8 +9,8 @@ import torch
 from curvireg_torch import Registrar, rotation_error
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import example_mesh
-from curvireg_torch.visualization import registration_sheet, result_picture
-from curvireg_torch.visualization.result_picture import VERDICT_COLOURS
+from curvireg_torch.visualization import overlay, registration_sheet
+from curvireg_torch.visualization.overlay import VERDICT_COLOURS
 from tests._support.scenes import CAMERA, SIZE, scene, truck_bank, unrefined
 
 GREEN = (0, 255, 80)
@@ -114,6 +114,6 @@ def test_registration_sheet_has_the_verdict_in_its_colour(registered):
 def test_registration_sheet_names_rivals_that_are_nearly_as_probable(registered):
     _, result, _, _ = registered
     answers = (0.5, 0.05, 0.4, 0.02, 0.01)
-    captions = [result_picture._rival(replace(result, probabilities=answers), index) for index in (1, 2)]
+    captions = [overlay._rival(replace(result, probabilities=answers), index) for index in (1, 2)]
     angles = [rotation_error(h.rotation, result.rotation) for h in result.hypotheses[1:3]]
     assert captions == [f"rival: {angles[0]:.0f}° away (0.05)", f"rival: {angles[1]:.0f}° away (0.40)"]

@@ -5,8 +5,7 @@ import torch
 from curvireg_torch import Ranking, Registrar, ViewBank, sample_views, uniform_views
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.synthetic import example_mesh
-from curvireg_torch.visualization.plots import viewpoints
-from curvireg_torch.visualization.sphere import direction_scores, sphere_map
+from curvireg_torch.visualization.plots import direction_scores, sphere_map, viewpoints
 from tests._support.scenes import CAMERA, scene, unrefined
 
 

@@ -11,7 +11,7 @@ from ...errors import InvalidInputError
 from ...geometry import camera_matrix
 from ...geometry.pose_prior import PosePrior
 from ...utils.files import text_digest
-from ..prior_options import PRIOR_OPTIONS, limits_from_cells, prior_from_limits
+from ..opening import PRIOR_OPTIONS, limits_from_cells, prior_from_limits
 from .tables import BEST_MESH, RESULT_COLUMNS
 
 __all__ = ["BOX", "CAMERA", "Entry", "PhotoList", "photo_list"]

@@ -1,0 +1,225 @@
+"""The short commands: ``curvireg bank``, ``cache``, ``view``, ``plot`` and ``demo``."""
+
+import argparse
+import time
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from ..errors import InvalidInputError, MissingDependencyError
+from ..evaluation.opening import whole_number
+from ..utils.files import check_writable, write_file
+from ..utils.input_paths import check_given
+from .options import MESH, METHOD, PHOTOGRAPH, add_command, add_limits, add_options, register_options
+
+LOCAL = "127.0.0.1"
+PICTURES = {
+    "overlay": "the photograph with the contours at the pose",
+    "fields": "the photograph and its field, the pose and its field",
+    "viewpoints": "score over the viewing directions, and the hypotheses",
+}
+FORMATS = (".png", ".svg", ".pdf")
+
+
+def add_bank(commands: Any) -> None:
+    parser = add_command(
+        commands,
+        "bank",
+        "curvireg bank part.stl --unit mm --out part.safetensors",
+        "curvireg bank chair.glb --pose upright --out chair.safetensors",
+        help="render and describe the views of MESH",
+        run=build_bank,
+    )
+    parser.add_argument("mesh", type=Path, metavar="MESH")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the bank, as .safetensors")
+    add_options(parser, *MESH, *METHOD)
+
+
+def build_bank(arguments: argparse.Namespace) -> None:
+    """Build and save a bank."""
+    check_given([], [arguments.mesh])
+    if arguments.out.suffix != ".safetensors" or arguments.out.is_dir():
+        raise InvalidInputError(f"--out {arguments.out}: expected the name of a file that ends in .safetensors")
+    check_writable(arguments.out.parent, "--out")
+    if arguments.mesh.suffix == ".safetensors":
+        raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
+    from ..matching import ViewBank
+    from ..mesh import load_mesh
+    from ..utils.threads import one_torch_thread
+
+    start, options = time.perf_counter(), register_options(arguments)
+    pipeline = options.open_pipeline()
+    mesh = load_mesh(arguments.mesh, unit=options.unit, up=options.up)
+    settings: dict[str, Any] = {"renderer": options.renderer, "progress": options.progress, "device": options.device}
+    with one_torch_thread():
+        bank = ViewBank.build(mesh, pipeline=pipeline, **settings)
+    bank.save(arguments.out)
+    size = arguments.out.stat().st_size / 1e6
+    print(f"{arguments.out}: {len(bank)} views, {size:.1f} MB, {time.perf_counter() - start:.1f} s")
+
+
+def add_cache(commands: Any) -> None:
+    text, examples = "list or clear the banks cached on disk", ("curvireg cache", "curvireg cache --clear")
+    parser = add_command(commands, "cache", *examples, help=text, run=show_cache)
+    parser.add_argument("--clear", action="store_true", help="remove them all")
+
+
+def show_cache(arguments: argparse.Namespace) -> None:
+    """List the cached banks, or remove them."""
+    from ..matching import cache_folder, clear_cache, list_cache
+
+    if arguments.clear:
+        print(f"{cache_folder()}: {clear_cache()} banks removed")
+        return
+    banks = list_cache()
+    for bank in banks:
+        used = time.strftime("%Y-%m-%d %H:%M", time.localtime(bank.used))
+        print(f"{bank.size / 1e6:8.1f} MB   last used {used}   {bank.path.name}")
+    print(f"{cache_folder()}: {len(banks)} banks, {sum(bank.size for bank in banks) / 1e6:.1f} MB")
+
+
+def add_view(commands: Any) -> None:
+    parser = add_command(
+        commands,
+        "view",
+        "curvireg view",
+        "curvireg view photo.jpg part.stl --unit mm",
+        help="register in the browser: draw the box, inspect the result, correct it",
+        description="Opens a page on this machine; needs pip install -e '.[viewer]'.",
+        run=view,
+    )
+    parser.add_argument("photo", type=Path, nargs="?", metavar="PHOTO")
+    parser.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help="a mesh or a bank; both can be added later")
+    add_options(parser, *PHOTOGRAPH, box="in px; can be drawn")
+    add_limits(parser)
+    hosts = f"who may connect: {LOCAL}, only this machine (default), or 0.0.0.0, everyone"
+    parser.add_argument("--host", default=LOCAL, help=hosts)
+    parser.add_argument("--port", type=whole_number(0, 65535), default=0, help="default: a free one")
+    parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
+
+
+def view(arguments: argparse.Namespace) -> None:
+    """Serve the page until Ctrl-C."""
+    photos, meshes = ([path] if path else [] for path in (arguments.photo, arguments.mesh))
+    check_given(photos, meshes)
+    try:
+        import matplotlib  # noqa: F401
+        import nicegui  # noqa: F401
+    except ImportError as error:
+        message = f"curvireg view: {error.name} is not installed; in the folder of curvireg_torch: pip install -e "
+        raise MissingDependencyError(f"{message}'.[viewer]'") from error
+    from ..evaluation.opening import check_camera
+    from ..utils.threads import one_torch_thread
+    from ..viewer.server import serve
+
+    options = register_options(arguments, photos, meshes)
+    check_camera(options.camera, options.guess)
+    with one_torch_thread():
+        serve(options, host=arguments.host, port=arguments.port, browser=arguments.browser)
+
+
+def add_plot(commands: Any) -> None:
+    examples = [f"curvireg plot {kind} photo.jpg part.stl --box 410 220 890 700 --out {kind}.png" for kind in PICTURES]
+    plot = add_command(commands, "plot", *examples, help="draw a picture of a registration")
+    kinds = plot.add_subparsers(required=True, metavar="KIND")
+    for (kind, text), example in zip(PICTURES.items(), examples, strict=True):
+        parser = add_command(kinds, kind, example, help=text, run=draw)
+        parser.set_defaults(kind=kind)
+        parser.add_argument("photo", type=Path, metavar="PHOTO")
+        parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh or a bank")
+        add_options(parser, *PHOTOGRAPH)
+        add_limits(parser)
+        parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=", ".join(FORMATS))
+
+
+def draw(arguments: argparse.Namespace) -> None:
+    """Register one photograph and draw a picture of the result."""
+    check_given([arguments.photo], [arguments.mesh])
+    if arguments.out.suffix.lower() not in FORMATS:
+        raise InvalidInputError(f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}")
+    check_writable(arguments.out.parent, "--out")
+    import torch
+
+    from ..data import read_photo
+    from ..evaluation.lists import register_entry
+    from ..evaluation.opening import check_camera, open_registrar
+    from ..registration.result import used_box
+    from ..utils.threads import one_torch_thread
+    from ..visualization import contour_overlay, plots
+
+    options = register_options(arguments, [arguments.photo], [arguments.mesh])
+    check_camera(options.camera, options.guess)
+    photo = read_photo(options.photos[0], dtype=torch.uint8)
+    with one_torch_thread():
+        registrar = open_registrar(options, options.meshes)
+        result, document = register_entry(options.entry(options.photos[0]), photo, registrar, bank_seconds=0.0)
+        box = torch.tensor(used_box(document))
+        if arguments.kind == "viewpoints":
+            figure = plots.viewpoints(registrar.bank, result)
+        elif arguments.kind == "fields":
+            figure = plots.fields(registrar, result, photo.image, box)
+        else:
+            figure = plots.picture(contour_overlay(registrar, result, photo.image, box))
+    content = BytesIO()
+    figure.savefig(content, format=arguments.out.suffix[1:].lower(), dpi=150)
+    write_file(arguments.out, content.getvalue())
+    print(arguments.out)
+
+
+def add_demo(commands: Any) -> None:
+    examples = ("curvireg demo --out out/demo", "curvireg demo --seed 7 --preset fast --out out/demo")
+    text = "register a generated scene, whose true pose is known"
+    parser = add_command(commands, "demo", *examples, help=text, run=demo)
+    parser.set_defaults(pose="upright")
+    parser.add_argument("--seed", type=int, default=2, help="number of the scene (default: 2)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the results")
+    add_options(parser, *METHOD)
+
+
+def demo(arguments: argparse.Namespace) -> None:
+    """Generate a photograph of the example mesh, register it and print the error."""
+    check_writable(arguments.out, "--out")
+    from ..utils.threads import one_torch_thread
+
+    with one_torch_thread():
+        _register_scene(arguments)
+
+
+def _register_scene(arguments: argparse.Namespace) -> None:
+    from ..evaluation.result_files import write_result
+    from ..geometry import rotation_error
+    from ..matching import cached_bank
+    from ..registration import Registrar, Registration
+    from ..registration.result import result_document
+    from ..synthetic import demo_scene
+    from ..visualization.encoding import png
+    from ..visualization.overlay import to_uint8
+    from .register import print_result, show_stages
+
+    scene = demo_scene(arguments.seed)
+    mesh, image, box, truth = scene.mesh, scene.image, scene.box, scene.truth
+    options = register_options(arguments)
+    pipeline = options.open_pipeline()
+    with show_stages(enabled=options.progress) as progress:
+        start = time.perf_counter()
+        bank = cached_bank(mesh, pipeline=pipeline, renderer=options.renderer, progress=progress or options.progress)
+        ready = time.perf_counter()
+        settings: dict[str, Any] = {"renderer": options.renderer, "device": options.device}
+        registrar = Registrar(bank, pipeline=pipeline, progress=progress or False, **settings)
+        result = registrar([image], box[None], scene.camera_matrix)[0]
+    assert isinstance(result, Registration)
+    assert result.translation is not None
+    seconds = {"bank": ready - start, "register": time.perf_counter() - ready}
+    document = result_document(result, registrar, seconds)
+    document["rotation_error_deg"] = float(rotation_error(result.rotation, truth[:3, :3]))
+    document["translation_error"] = float((result.translation - truth[:3, 3]).norm() / truth[:3, 3].norm())
+    document["truth"] = {"rotation": truth[:3, :3].tolist(), "translation": truth[:3, 3].tolist()}
+    document["inputs"] = {"seed": arguments.seed, "box": box.tolist()}
+    write_result(arguments.out, document, registrar, result, image, box)
+    write_file(arguments.out / "mesh.ply", mesh.export(file_type="ply"))
+    write_file(arguments.out / "photo.png", png(to_uint8(image)))
+    print_result(document, arguments.out)
+    print(
+        f"error against the truth: rotation {document['rotation_error_deg']:.1f} degrees, "
+        f"translation {100 * document['translation_error']:.1f} % of the distance"
+    )
