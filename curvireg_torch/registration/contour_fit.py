@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -259,7 +259,7 @@ class ContourProblem:
             strength = strength * self.mask.weights(uv, points, _offsets(radius)[1:-1], self.image_index, self.size)
         equations = [other.equations() for other in others]
         step = torch.zeros(len(T), 6, 1, dtype=torch.float64)
-        for selection in range(SELECTIONS_PER_STEP):
+        for _ in range(SELECTIONS_PER_STEP):
             residual = distance - J @ step
             index = (strength * torch.exp(-2.0 * (residual / radius) ** 2)).argmax(dim=-1, keepdim=True)
             tukey = (1.0 - (residual.gather(-1, index) / radius) ** 2).clamp(min=0.0) ** 2
@@ -314,6 +314,9 @@ class ContourProblem:
         d = distance.gather(-1, index)
         W = strength.gather(-1, index) * (1.0 - (d / radius) ** 2).clamp(min=0.0) ** 2
         return Measurements((points.normals[..., None, :] @ du)[..., 0, :], d, W)
+
+
+Problem = TypeVar("Problem", bound=ContourProblem)
 
 
 def _offsets(radius: float) -> Tensor:
@@ -503,7 +506,7 @@ def full_size_problem(
     return crops, inside, ContourProblem(contours, EdgeField(crops, inside), image_index, K, CROP_SIZE)
 
 
-def smaller_problem(full: ContourProblem, crops: Tensor, inside: Tensor, factor: int) -> ContourProblem:
+def smaller_problem(full: Problem, crops: Tensor, inside: Tensor, factor: int) -> Problem:
     """The problem in crops whose sides are smaller by a factor."""
     shrink = torch.diag(torch.tensor([1.0 / factor, 1.0 / factor, 1.0], dtype=torch.float64))
     shrink[:2, 2] = 0.5 / factor - 0.5

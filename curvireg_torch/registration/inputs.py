@@ -105,7 +105,7 @@ def image_items(
         except CurviregError as error:
             return error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])]))
 
-    return _OnDemand(item, n)
+    return OnDemand(item, n)
 
 
 def image_item(
@@ -117,7 +117,7 @@ def image_item(
     return ImageItem(pixels, box.cpu(), camera_matrix, prior)
 
 
-class _OnDemand(Sequence[ImageItem | CurviregError]):
+class OnDemand(Sequence[ImageItem | CurviregError]):
     """``item(0)`` to ``item(count - 1)``, computed at each access."""
 
     def __init__(self, item: Callable[[int], ImageItem | CurviregError], count: int) -> None:

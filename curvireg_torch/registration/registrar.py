@@ -190,7 +190,7 @@ class Registrar:
             results = [found[0] for found in localize(self, images, camera_matrices, prior=prior)]
         else:
             items = image_items(images, boxes, camera_matrices, prior)
-            results = self.map_items(items, self._register_items)
+            results = self.map_items(items, self.register_items)
         for model, other in enumerate(self.others, 1):
             rivals = other(images, boxes, camera_matrices, prior=prior)
             results = [_better(one, rival, model) for one, rival in zip(results, rivals, strict=True)]
@@ -200,7 +200,9 @@ class Registrar:
         """Refine known poses of the first mesh, see :func:`curvireg_torch.registration.refine`."""
         return refine(self, images, camera_matrices, poses)
 
-    def register_views(self, images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any) -> Registration:
+    def register_views(
+        self, images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any
+    ) -> Registration:
         """Register several photographs of one object together, see :func:`.several.register_views`."""
         result = register_views(self, images, boxes, camera_matrices, T_cam_from_world)
         for model, other in enumerate(self.others, 1):
@@ -272,7 +274,7 @@ class Registrar:
         parts = map_on_threads(run, range(0, len(items), size), device=self.bank.device)
         return [result for part in parts for result in part]
 
-    def _register_items(self, items: Sequence[ImageItem | CurviregError], first: int) -> Results:
+    def register_items(self, items: Sequence[ImageItem | CurviregError], first: int) -> Results:
         """Register photographs with boxes, then again those whose pose asks for another box."""
         results = self._register_given(items, first)
         if not (self.pipeline.box_jitter and self.pipeline.contours):
