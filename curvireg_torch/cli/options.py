@@ -138,4 +138,4 @@ def _numbers(word: str) -> list[str] | None:
 
 def numbers_among(paths: Sequence[Path]) -> list[str]:
     """Paths that are numbers, which an option has left over."""
-    return [str(path) for path in paths if _numbers(str(path))]
+    return [str(path) for path in paths if len(_numbers(str(path)) or ()) == 1]

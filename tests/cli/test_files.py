@@ -113,7 +113,7 @@ def test_main_ends_silently_when_the_reader_of_a_pipe_has_gone(unbuffered):
     """As in ``curvireg ... | head``: no message, and the exit code of shell tools."""
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "curvireg_torch", "completion", "bash"]
+    command = [sys.executable, "-m", "curvireg_torch", "cache"]
     environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, env=environment, check=False, timeout=120)
     os.close(writer)

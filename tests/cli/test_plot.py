@@ -19,7 +19,7 @@ def test_plot_draws_a_registration(tmp_path, monkeypatch, kind):
     assert cv2.imread(str(out)).std() > 10
 
 
-def test_plot_refuses_other_formats_and_results(tmp_path, refused):
-    sheet = ["plot", "sheet", str(tmp_path), "--out"]
-    refused(main([*sheet, str(tmp_path / "a.txt")]), "expected a name that ends in .html")
-    refused(main([*sheet, str(tmp_path / "a.html")]), "missing or damaged")
+def test_plot_refuses_other_formats(tmp_path, refused):
+    write_scene(tmp_path)
+    words = ["plot", "overlay", str(tmp_path / "photo.png"), str(tmp_path / "truck.ply"), "--out"]
+    refused(main([*words, str(tmp_path / "a.txt")]), "expected a name that ends in .png, .svg, .pdf")

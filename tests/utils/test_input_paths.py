@@ -71,8 +71,8 @@ def test_options_accept_numbers_with_commas():
         "o",
     ]
     arguments = parse(words)
-    assert arguments.box == parse(["view", "--box=10, 20, 30.5, 40"]).box == [10.0, 20.0, 30.5, 40.0]
-    assert arguments.camera == [1000.0, 1000.0, -0.5, 2.0]
+    assert arguments.box == parse(["view", "--box=10, 20, 30.5, 40"]).box == (10.0, 20.0, 30.5, 40.0)
+    assert arguments.camera == (1000.0, 1000.0, -0.5, 2.0)
     assert arguments.paths == [Path("a,1.jpg"), Path("5,6")]
 
 
