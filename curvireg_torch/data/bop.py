@@ -43,7 +43,8 @@ class BOPDataset(ObjectDataset):
         - ``image`` (3, H, W) RGB in [0, 1], from ``rgb`` or ``gray``; ``image_path`` str
         - ``box`` (4,) x0, y0, x1, y1 of the whole silhouette, which may extend beyond the image; ``box_visible`` (4,)
           of its visible part, NaN if nothing is visible. BOP's width is x1 - x0. NaN without ``scene_gt_info.json``
-        - ``camera_matrix`` (3, 3); ``rotation`` (3, 3), ``translation`` (3,) in mm: model to OpenCV camera
+        - ``camera_matrix`` (3, 3); ``rotation`` (3, 3), ``translation`` (3,) in mm: model to OpenCV camera;
+          ``T_cam_from_world`` (4, 4) in mm, NaN if unknown
         - ``scene_id``, ``image_id``, ``obj_id`` int; ``instance_index`` int: index in the image's list of ``scene_gt``
         - ``visib_fract`` float in [0, 1], NaN if unknown; ``model_path`` str; ``model_info`` dict
 
@@ -156,11 +157,25 @@ class BOPDataset(ObjectDataset):
             "camera_matrix": _rows(matrix),
             "rotation": _rows(rotation),
             "translation": translation,
+            "T_cam_from_world": _camera_pose(camera),
             "obj_id": obj_id,
             "visib_fract": math.nan if visible is None else visible[0],
             "model_path": str(self.root / "models" / model),
             "model_info": self.models_info[obj_id],
         }
+
+
+def _camera_pose(camera: dict[str, Any]) -> tuple[tuple[float, ...], ...]:
+    """(4, 4) pose of the world in a camera of ``scene_camera.json``, NaN if it is not given or not rigid."""
+    rotation, translation = finite_numbers(camera.get("cam_R_w2c"), 9), finite_numbers(camera.get("cam_t_w2c"), 3)
+    try:
+        if rotation is not None and translation is not None:
+            check_rotation(torch.tensor(_rows(rotation), dtype=torch.float64), "cam_R_w2c")
+            rows = zip(_rows(rotation), translation, strict=True)
+            return *((*row, t) for row, t in rows), (0.0, 0.0, 0.0, 1.0)
+    except InvalidInputError:
+        pass
+    return ((math.nan,) * 4,) * 4
 
 
 def _models_info(path: Path) -> dict[int, dict[str, Any]]:

@@ -8,10 +8,6 @@ one unit:
 - ADD-S: mean over x of the distance of ``T_gt x`` to the nearest ``T_est y``;
 - MSSD, MSPD (Hodan et al. 2020): minimum over the symmetries S of the maximum over x of ``|T_est x - T_gt S x|``, in
   space or after projection into the image.
-
-The evaluation code of RenderForCNN computes ``norm(logm(R1' R2)) / sqrt(2)`` with the spectral norm, although only the
-Frobenius norm gives the angle. Its errors, and those of later papers, are too small by sqrt(2). ``legacy_sqrt2=True``
-reproduces them for comparison; report them only beside the correct numbers.
 """
 
 import math
@@ -27,7 +23,6 @@ from ..utils.checks import (
     check_camera_matrix,
     check_finite,
     check_last_axes,
-    check_option,
     check_pose,
     check_positive,
     check_rotation,
@@ -36,27 +31,31 @@ from ..utils.checks import (
 )
 
 __all__ = [
-    "AVP_BINS",
+    "ADD_THRESHOLDS",
+    "MSPD_THRESHOLDS",
+    "MSSD_THRESHOLDS",
     "accuracy",
     "add_error",
-    "add_recall",
     "adds_error",
+    "average_recall",
     "axis_rotation_error",
-    "azimuth_bin",
-    "binned_accuracy",
     "median_error",
     "mspd_error",
-    "mspd_recall",
     "mssd_error",
-    "mssd_recall",
     "symmetric_rotation_error",
 ]
 
 _CHUNK = 1 << 22
 """Points transformed at once: 50 MB of float32 coordinates."""
 
-_MSSD_THRESHOLDS = tuple(step / 20.0 for step in range(1, 11))
-_MSPD_THRESHOLDS = tuple(5.0 * step for step in range(1, 11))
+ADD_THRESHOLDS = (0.1,)
+"""Diameters: a pose with a smaller ADD or ADD-S is right."""
+
+MSSD_THRESHOLDS = tuple(step / 20.0 for step in range(1, 11))
+"""Diameters of BOP's average recall of MSSD."""
+
+MSPD_THRESHOLDS = tuple(5.0 * step / 640.0 for step in range(1, 11))
+"""Image widths of BOP's average recall of MSPD: 5, 10, ..., 50 px times width / 640."""
 
 
 def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
@@ -158,51 +157,19 @@ def mspd_error(
     return inf_unless(valid, torch.cat(largest).view(true.shape[:2]).amin(1))
 
 
-def add_recall(errors: Tensor, diameter: Tensor | float, *, fraction: float = 0.1) -> float:
-    """Fraction of the poses with ADD (or ADD-S) below a fraction of the object diameter; NaN for N = 0.
+def average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
+    """Fraction of the errors below a threshold, averaged over the thresholds; NaN for N = 0.
 
     Args:
-        errors: (N,) >= 0 from :func:`add_error` or :func:`adds_error`.
-        diameter: of the objects, a number or (N,) > 0, in the unit of the errors.
-        fraction: of the diameter, > 0.
+        errors: (N,) >= 0 in the unit of the thresholds: diameters of the objects, or image widths.
+        thresholds: :data:`ADD_THRESHOLDS`, :data:`MSSD_THRESHOLDS` or :data:`MSPD_THRESHOLDS`.
 
     Example:
-        >>> add_recall(torch.tensor([1.0, 9.0, 11.0, torch.inf]), 100.0)
-        0.5
-    """
-    check_positive(fraction, "fraction")
-    check_errors(errors)
-    return _average_recall(errors / per_item(diameter, errors, "diameter"), (fraction,))
-
-
-def mssd_recall(errors: Tensor, diameter: Tensor | float) -> float:
-    """AR_MSSD of BOP: fraction of the poses with MSSD below 0.05, 0.10, ..., 0.50 diameters, averaged.
-
-    ``diameter`` is that of :func:`add_recall`, ``errors`` come from :func:`mssd_error`.
-
-    Example:
-        >>> mssd_recall(torch.tensor([26.0]), 100.0)      # below 0.30, 0.35, 0.40, 0.45 and 0.50
+        >>> average_recall(torch.tensor([0.26]), MSSD_THRESHOLDS)      # below 0.30, 0.35, 0.40, 0.45 and 0.50
         0.5
     """
     check_errors(errors)
-    return _average_recall(errors / per_item(diameter, errors, "diameter"), _MSSD_THRESHOLDS)
-
-
-def mspd_recall(errors: Tensor, image_width: Tensor | float) -> float:
-    """AR_MSPD of BOP: fraction of the poses with MSPD below 5, 10, ..., 50 px times image width / 640, averaged.
-
-    ``image_width`` in px is a number or (N,) > 0, ``errors`` come from :func:`mspd_error`.
-
-    Example:
-        >>> mspd_recall(torch.tensor([26.0]), 640), mspd_recall(torch.tensor([26.0]), 1280)
-        (0.5, 0.8)
-    """
-    check_errors(errors)
-    return _average_recall(errors * 640.0 / per_item(image_width, errors, "image_width"), _MSPD_THRESHOLDS)
-
-
-def _average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
-    return sum(fraction_true(errors < threshold) for threshold in thresholds) / len(thresholds)
+    return sum(float((errors < threshold).double().mean()) for threshold in thresholds) / len(thresholds)
 
 
 def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -251,33 +218,25 @@ def _project(projections: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     return image[:, :2] / torch.where(front, image[:, 2], torch.ones_like(image[:, 2])).unsqueeze(1), front
 
 
-AVP_BINS = (4, 8, 16, 24)
-"""Numbers of azimuth bins in PASCAL3D+ tables."""
-
-
-def accuracy(errors: Tensor, threshold_deg: float, *, legacy_sqrt2: bool = False) -> float:
+def accuracy(errors: Tensor, threshold_deg: float) -> float:
     """Fraction of the errors below a threshold: Acc(pi/6) with 30, Acc(pi/18) with 10; NaN for N = 0.
 
     Args:
         errors: (N,) degrees >= 0; ``inf`` for an object without an estimate (a miss).
         threshold_deg: degrees > 0.
-        legacy_sqrt2: divide the errors by sqrt(2) first, as flawed evaluation code does.
 
     Example:
-        >>> errors = torch.tensor([5.0, 12.0, 40.0, 170.0])
-        >>> accuracy(errors, 30.0), accuracy(errors, 30.0, legacy_sqrt2=True)
-        (0.5, 0.75)
+        >>> accuracy(torch.tensor([5.0, 12.0, 40.0, 170.0]), 30.0)
+        0.5
     """
-    check_errors(errors)
     check_positive(threshold_deg, "threshold_deg")
-    return fraction_true((errors / math.sqrt(2.0) if legacy_sqrt2 else errors) < threshold_deg)
+    return average_recall(errors, (threshold_deg,))
 
 
-def median_error(errors: Tensor, *, legacy_sqrt2: bool = False) -> float:
+def median_error(errors: Tensor) -> float:
     """Median of the errors (MedErr); the mean of the middle two for an even number, NaN for N = 0.
 
-    Args:
-        errors, legacy_sqrt2: as in :func:`accuracy`; the median is ``inf`` if half of the errors are.
+    ``errors`` are those of :func:`accuracy`; the median is ``inf`` if half of them are.
 
     Example:
         >>> median_error(torch.tensor([40.0, 5.0, 12.0, 170.0]))
@@ -287,8 +246,7 @@ def median_error(errors: Tensor, *, legacy_sqrt2: bool = False) -> float:
     if errors.numel() == 0:
         return math.nan
     ordered = errors.double().sort().values
-    median = float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2.0
-    return median / math.sqrt(2.0) if legacy_sqrt2 else median
+    return float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2.0
 
 
 def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) -> Tensor:
@@ -356,41 +314,6 @@ def _check_rotations(R_est: Tensor, R_gt: Tensor) -> Tensor:
     return R_est.isfinite().flatten(-2).all(-1)
 
 
-def azimuth_bin(azimuth: Tensor, bins: int) -> Tensor:
-    """Azimuth bin of PASCAL3D+, int64 in [0, bins); bin i is [(i - 1/2) 360/bins, (i + 1/2) 360/bins).
-
-    Args:
-        azimuth: (...) degrees, not restricted to [0, 360).
-        bins: 4, 8, 16 or 24.
-
-    Example:
-        >>> azimuth_bin(torch.tensor([0.0, 44.0, 45.0, 350.0]), 4).tolist()
-        [0, 0, 1, 0]
-    """
-    check_option(str(bins), tuple(map(str, AVP_BINS)), "bins")
-    check_last_axes(azimuth, "azimuth", ())
-    check_finite(azimuth, "azimuth")
-    return torch.floor(azimuth % 360.0 * (bins / 360.0) + 0.5).long() % bins
-
-
-def binned_accuracy(azimuth_est: Tensor, azimuth_gt: Tensor, bins: int) -> float:
-    """Fraction of the objects whose azimuth is in the correct bin: AVP with ground-truth boxes; NaN for N = 0.
-
-    Args:
-        azimuth_est, azimuth_gt: (N,) degrees; NaN or inf in ``azimuth_est`` for a missing estimate.
-        bins: 4, 8, 16 or 24.
-
-    Example:
-        >>> binned_accuracy(torch.tensor([3.0, 100.0]), torch.tensor([350.0, 130.0]), 8)
-        0.5
-    """
-    check_tensor(azimuth_gt, "azimuth_gt", (None,))
-    check_tensor(azimuth_est, "azimuth_est", tuple(azimuth_gt.shape))
-    valid = azimuth_est.isfinite()
-    same = azimuth_bin(azimuth_est.where(valid, 0.0), bins) == azimuth_bin(azimuth_gt, bins)
-    return fraction_true(valid & same)
-
-
 def check_errors(errors: Tensor, name: str = "errors") -> None:
     """``errors`` is a floating (N,) tensor of numbers >= 0, ``inf`` included, NaN excluded."""
     check_tensor(errors, name, (None,))
@@ -404,20 +327,3 @@ def check_errors(errors: Tensor, name: str = "errors") -> None:
 def inf_unless(valid: Tensor, errors: Tensor) -> Tensor:
     """``errors``, replaced by ``inf`` where ``valid`` is False."""
     return torch.where(valid, errors, torch.full_like(errors, torch.inf))
-
-
-def fraction_true(hits: Tensor) -> float:
-    """Fraction of True in a boolean tensor; NaN if it is empty."""
-    return float(hits.double().mean())
-
-
-def per_item(value: Tensor | float, errors: Tensor, name: str) -> Tensor:
-    """``value``, a number or an (N,) tensor of numbers > 0, as a tensor that divides ``errors`` (N,)."""
-    if not isinstance(value, Tensor):
-        value = torch.as_tensor(value, dtype=errors.dtype, device=errors.device)
-    check_same_device(value, errors, name)
-    if value.shape not in ((), errors.shape):
-        raise InvalidInputError(f"{name}: expected a number or shape {tuple(errors.shape)}, got {tuple(value.shape)}")
-    if not bool(((value > 0) & value.isfinite()).all()):
-        raise InvalidInputError(f"{name}: expected finite numbers > 0, got {value.tolist()}")
-    return value.to(errors.dtype)

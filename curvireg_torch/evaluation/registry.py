@@ -95,9 +95,9 @@ DATASETS: dict[str, DatasetSpec] = {
         options={"split": {"default": "test", "help": "folder of the scenes (default: test)"}},
     ),
     "web": DatasetSpec(
-        dataset="curvireg_torch.data:WebCollection",
-        benchmark="curvireg_torch.evaluation:WebBenchmark",
-        help="viewpoints on a collection of your own",
+        dataset="curvireg_torch.data:PoseFolder",
+        benchmark="curvireg_torch.evaluation:PoseFolderBenchmark",
+        help="viewpoints on photographs of your own",
         root="folder with one folder per object",
         example="data/web",
     ),

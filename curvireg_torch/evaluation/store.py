@@ -4,9 +4,8 @@ import json
 import math
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import InvalidInputError, OutputError
 from ..utils.files import write_file
@@ -35,23 +34,20 @@ def _line(row: Row) -> bytes:
     return (json.dumps(finite(row), allow_nan=False) + "\n").encode()
 
 
-@dataclass(frozen=True)
-class _Location:
-    """Where a row is on disk, and whether it is valid."""
+class _Location(NamedTuple):
+    """Where a row is on disk, and what it depends on."""
 
     path: Path
     offset: int
     digests: Row
-    revision: int
-    final: bool
 
 
 class ResultStore:
-    """One row for each item, in ``results.jsonl`` of a folder.
+    """One row for each entry, in ``results.jsonl`` of a folder.
 
-    A row holds the ``key`` of its item and ``digests`` of all that it depends on. It is synced to disk once it is
+    A row holds the ``key`` of its entry and ``digests`` of all that it depends on. It is synced to disk once it is
     known; a last line that was cut short is ignored, and removed before the next row. Each of several processes appends
-    to ``results.RANK-of-SIZE.jsonl``; readers merge all files. The latest of several rows of one item counts.
+    to ``results.RANK-of-SIZE.jsonl``; readers merge all files. Of several rows of one entry, the last one counts.
 
     Args:
         folder: created with the first row.
@@ -64,8 +60,8 @@ class ResultStore:
         >>> import tempfile
         >>> store = ResultStore(Path(tempfile.mkdtemp()))
         >>> store.append({"key": "car/1", "digests": {"request": "a", "photo": "b"}, "score": 0.5})
-        >>> "car/1" in store, store.is_current("car/1", {"request": "a", "photo": "b"}), store.read("car/1")["score"]
-        (True, True, 0.5)
+        >>> store.is_current("car/1", {"request": "a", "photo": "b"}), store.read("car/1")["score"]
+        (True, 0.5)
     """
 
     def __init__(self, folder: Path, workers: Workers | None = None) -> None:
@@ -84,9 +80,9 @@ class ResultStore:
             InvalidInputError: the folder holds results of other settings, or ``overwrite`` in a job array.
             OutputError: it cannot be written to.
         """
-        if overwrite and self._in_job_array:
-            raise InvalidInputError("--overwrite: not in a job array, where it would delete the results of other jobs")
         if overwrite:
+            if self._in_job_array:
+                raise InvalidInputError("--overwrite: not in a job array, where it would delete results of other jobs")
             self.settings_path.unlink(missing_ok=True)  # first: rows without settings are refused after a kill
             for path in self._files():
                 path.unlink()
@@ -101,7 +97,7 @@ class ResultStore:
                     "choose another --out, or give --overwrite to start again"
                 )
             return
-        elif self._locations:
+        elif self._rows:
             raise InvalidInputError(
                 f"{self.folder}: holds results of unknown settings; choose another --out or --overwrite"
             )
@@ -121,7 +117,7 @@ class ResultStore:
 
     def refresh(self) -> None:
         """Read again what is on disk, rows of other processes included."""
-        self._locations: dict[str, _Location] = {}
+        self._rows: dict[str, list[_Location]] = {}
         for path in self._files():
             offset = 0
             with path.open("rb") as file:
@@ -131,36 +127,40 @@ class ResultStore:
                     self._add(path, offset, line)
                     offset += len(line)
 
-    def __contains__(self, key: str) -> bool:
-        return key in self._locations
-
-    def is_complete(self, keys: Iterable[str]) -> bool:
-        """Whether all processes together have written a row of each key."""
-        self.refresh()
-        return all(key in self for key in keys)
-
     def is_current(self, key: str, digests: Mapping[str, str]) -> bool:
-        """Whether the row of ``key`` is final and depends on exactly what ``digests`` describes."""
-        found = self._locations.get(key)
-        return found is not None and found.final and bool(digests["photo"]) and found.digests == digests
+        """Whether there is a row of ``key`` that depends on exactly what ``digests`` describes, a readable photograph
+        included; it is the one that :meth:`read` returns from now on."""
+        return bool(digests["photo"]) and self._choose(key, digests)
+
+    def is_complete(self, wanted: Mapping[str, Mapping[str, str]]) -> bool:
+        """Whether all processes together have written a row of each key with these digests; :meth:`read` returns it."""
+        self.refresh()
+        found = [self._choose(key, digests) for key, digests in wanted.items()]
+        return all(found)
+
+    def _choose(self, key: str, digests: Mapping[str, str]) -> bool:
+        rows = self._rows.get(key, [])
+        same = [row for row in rows if row.digests == digests]
+        if same:
+            self._rows[key] = [*(row for row in rows if row.digests != digests), *same]
+        return bool(same)
 
     def read(self, key: str) -> Row:
-        """The latest row of ``key``; :class:`InvalidInputError` if there is none."""
+        """The row of ``key``; :class:`InvalidInputError` if there is none."""
         for _ in range(2):
-            if key in self._locations:
-                found = self._locations[key]
-                with found.path.open("rb") as file:
-                    file.seek(found.offset)
-                    line = file.readline()
-                if (row := _parsed(line)) is not None and row["key"] == key:
+            if key in self._rows:
+                path, offset, digests = self._rows[key][-1]
+                with path.open("rb") as file:
+                    file.seek(offset)
+                    row = _parsed(file.readline())
+                if row is not None and row["key"] == key and row["digests"] == digests:
                     return row
             self.refresh()  # another process has rewritten the file
         raise InvalidInputError(f"{self.folder}: no result for {key}; run again")
 
     def append(self, row: Row) -> None:
         """Put a row on disk; numbers that are not finite become null. :class:`OutputError` if this fails."""
-        before = self._locations.get(row["key"])
-        line = _line(row if before is None else {**row, "revision": before.revision + 1})
+        line = _line(row)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             if not self._repaired and self._output.is_file():  # remove a line that was cut short
@@ -181,11 +181,10 @@ class ResultStore:
         self.refresh()
 
     def merge(self) -> None:
-        """Move the latest rows of all processes, none of which may still be running, into ``results.jsonl``."""
+        """Move one row of each key into ``results.jsonl``; no other process may still be running."""
         parts = [path for path in self._files() if path != self.path]
-        if parts or any(found.revision for found in self._locations.values()):
-            rows = [{k: v for k, v in self.read(key).items() if k != "revision"} for key in self._locations]
-            write_file(self.path, b"".join(map(_line, rows)))
+        if parts or any(len(rows) > 1 for rows in self._rows.values()):
+            write_file(self.path, b"".join(_line(self.read(key)) for key in list(self._rows)))
             for path in parts:
                 path.unlink()
             self.refresh()
@@ -198,9 +197,7 @@ class ResultStore:
         row = _parsed(line)
         if row is None:
             raise InvalidInputError(f"{path}: not results of this command; choose another --out, or move it away")
-        revision, before = row.get("revision", 0), self._locations.get(row["key"])
-        if before is None or revision >= before.revision:
-            self._locations[row["key"]] = _Location(path, offset, row["digests"], revision, "skipped" not in row)
+        self._rows.setdefault(row["key"], []).append(_Location(path, offset, row["digests"]))
 
 
 def _parsed(line: bytes) -> Row | None:

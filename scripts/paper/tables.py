@@ -20,7 +20,7 @@ from tqdm import tqdm
 from curvireg_torch.data import read_image
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import DATASETS
-from curvireg_torch.evaluation.bop import UNOCCLUDED
+from curvireg_torch.evaluation.benchmarks import UNOCCLUDED
 from curvireg_torch.evaluation.metrics import accuracy
 from curvireg_torch.features import field_points
 from curvireg_torch.filters import ImageGradient, MultiScaleCurvilinearSaliency, MultiScaleFocusCurves

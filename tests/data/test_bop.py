@@ -39,8 +39,8 @@ def test_bop_dataset_returns_documented_samples(tree):
     dataset = BOPDataset(tree[0], targets=False)
     sample = dataset[0]
     assert set(sample) == {
-        *("image", "image_path", "box", "box_visible", "camera_matrix", "rotation", "translation", "obj_id"),
-        *("scene_id", "image_id", "instance_index", "visib_fract", "model_path", "model_info"),
+        *("image", "image_path", "box", "box_visible", "camera_matrix", "rotation", "translation", "T_cam_from_world"),
+        *("obj_id", "scene_id", "image_id", "instance_index", "visib_fract", "model_path", "model_info"),
     }
     assert sample["image"].shape == (3, 60, 80)
     assert sample["box"].tolist() == [-5, 4, 25, 24], "x, y, width, height become corners, and may leave the image"
