@@ -50,7 +50,6 @@ def add_parser(commands: Any) -> None:
             help="processes that share the objects (default: 1)",
         )
         add("--limit", type=whole_number(1), metavar="N", help="only N objects, spread evenly over the set")
-        add("--overwrite", action="store_true", help="replace the predictions of other settings")
         add("--out", type=Path, required=True, metavar="DIR", help="folder of the results; made if it does not exist")
         dataset.set_defaults(run=run, dataset=name)
 
@@ -80,7 +79,6 @@ def run(arguments: argparse.Namespace) -> None:
             preset=preset,
             limit=arguments.limit,
             renderer=arguments.renderer,
-            overwrite=arguments.overwrite,
             progress=arguments.progress,
         )
     if summary is None:  # another process writes it

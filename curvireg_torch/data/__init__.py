@@ -5,22 +5,19 @@ A sample is a dict, one per object. Every dataset reports skipped objects with t
 """
 
 from ._base import ObjectDataset, collate
-from .bop import BOPDataset, BOPRow, read_bop_csv, write_bop_csv
+from .bop import BOPDataset
 from .images import Photo, Video, read_image, read_photo
 from .pascal3d import Pascal3DPlus
 from .pose_folder import PoseFolder
 
 __all__ = [
     "BOPDataset",
-    "BOPRow",
     "ObjectDataset",
     "Pascal3DPlus",
     "Photo",
     "PoseFolder",
     "Video",
     "collate",
-    "read_bop_csv",
     "read_image",
     "read_photo",
-    "write_bop_csv",
 ]

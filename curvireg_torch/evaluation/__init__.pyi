@@ -1,5 +1,5 @@
 from .benchmarks import Benchmark, BOPBenchmark, Pascal3DBenchmark, PoseFolderBenchmark
-from .datasets import evaluate, score
+from .datasets import evaluate
 from .protocol import Protocol
 from .registry import DATASETS
 
@@ -11,5 +11,4 @@ __all__ = [
     "PoseFolderBenchmark",
     "Protocol",
     "evaluate",
-    "score",
 ]

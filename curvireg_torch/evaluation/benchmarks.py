@@ -3,14 +3,15 @@
 import math
 from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from ..data import BOPDataset, BOPRow, Pascal3DPlus, PoseFolder, write_bop_csv
+from ..data import BOPDataset, Pascal3DPlus, PoseFolder
 from ..errors import InvalidInputError
 from ..geometry import rotation_error, symmetry_transforms, viewpoint_from_rotation
 from ..geometry.cameras import transform
@@ -27,7 +28,6 @@ from .metrics import (
     add_error,
     adds_error,
     average_recall,
-    axis_rotation_error,
     median_error,
     mspd_error,
     mssd_error,
@@ -37,7 +37,14 @@ from .protocol import Protocol, hint_of_truth, perturbed_box
 from .runner import Entry
 from .store import Row
 
-__all__ = ["BOPBenchmark", "Benchmark", "Pascal3DBenchmark", "PoseFolderBenchmark", "bop_row", "localization_recall"]
+__all__ = [
+    "BOPBenchmark",
+    "Benchmark",
+    "Pascal3DBenchmark",
+    "PoseFolderBenchmark",
+    "localization_recall",
+    "write_bop_csv",
+]
 
 MIN_IOU = 0.5
 """Intersection over union from which a box is right."""
@@ -157,11 +164,20 @@ def _cell(value: object) -> object:
     return value
 
 
-_Z_AXIS = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 _HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
 
+
+def _axis_error(R: Tensor, truth: Tensor) -> Tensor:
+    """Angles (N,) in degrees between the z axes of models: the least rotation error over all rotations about z.
+
+    Computed from the chord, since ``acos`` loses digits near 0.
+    """
+    half_chord = (R[..., 2] - truth[..., 2]).norm(dim=-1) / 2.0
+    return torch.rad2deg(2.0 * half_chord.clamp(max=1.0).asin())
+
+
 SYMMETRIES: dict[str, tuple[str, Callable[[Tensor, Tensor], Tensor]]] = {
-    "bottle": ("any rotation about z", lambda R, truth: axis_rotation_error(R, truth, _Z_AXIS)),
+    "bottle": ("any rotation about z", _axis_error),
     "diningtable": ("half a rotation about z", lambda R, truth: symmetric_rotation_error(R, truth, _HALF_TURN[None])),
 }
 """Classes of PASCAL3D+ whose objects have the same, or nearly the same, appearance from several azimuths."""
@@ -324,17 +340,27 @@ class BOPBenchmark(Benchmark):
         for image, row in zip(images, rows, strict=True):
             times[image] += row["seconds"]["register"]
         poses = [
-            bop_row((*image, s["obj_id"]), row["score"], row, time=times[image])
+            ((*image, s["obj_id"]), row["score"], row["rotation"], row["translation"], times[image])
             for image, s, row in zip(images, samples, rows, strict=True)
             if "rotation" in row
         ]
         write_bop_csv(path, poses)
 
 
-def bop_row(ids: Sequence[int], score: float, pose: Row, *, time: float = -1.0, scale: float = 1.0) -> BOPRow:
-    """A line of the BOP format: scene, image, object, and the pose of a result, whose unit is ``scale`` mm."""
-    R, t = (torch.tensor(pose[name], dtype=torch.float64) for name in ("rotation", "translation"))
-    return BOPRow(scene_id=ids[0], im_id=ids[1], obj_id=ids[2], score=score, R=R, t=t * scale, time=time)
+BOPPose = tuple[Sequence[object], float, Sequence[Sequence[float]], Sequence[float], float]
+
+
+def write_bop_csv(path: Path, poses: Iterable[BOPPose]) -> None:
+    """Write poses in the format of the BOP challenge, with all digits.
+
+    Each is (scene, image and object numbers; score; 3 x 3 rotation; translation in mm; seconds for the whole image, -1
+    if unknown). BOP wants equal seconds in all lines of an image.
+    """
+    lines: list[Sequence[object]] = [("scene_id", "im_id", "obj_id", "score", "R", "t", "time")]
+    for ids, score, rotation, translation, seconds in poses:
+        R, t = (" ".join(map(str, numbers)) for numbers in (chain(*rotation), translation))
+        lines.append((*ids, score, R, t, seconds))
+    write_csv(path, lines)
 
 
 def localization_recall(samples: Sequence[Row], rows: Sequence[Row]) -> Row:

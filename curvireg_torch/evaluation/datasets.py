@@ -21,7 +21,7 @@ from .benchmarks import Benchmark, localization_recall
 from .runner import POSE_SOURCES, run_entries, thumbnail_of
 from .store import ResultStore, Row, to_json
 
-__all__ = ["evaluate", "score"]
+__all__ = ["evaluate", "report"]
 
 NOT_EVALUATED = ("other_class", "no_target")
 """Reasons by which datasets leave out objects that are not to be evaluated; nothing is wrong with these."""
@@ -41,14 +41,14 @@ def evaluate(
     limit: int | None = None,
     renderer: str = "auto",
     field: nn.Module | None = None,
-    overwrite: bool = False,
     progress: bool = True,
 ) -> Row | None:
     """Register the objects of a benchmark and score the results.
 
-    ``out`` gets ``results.jsonl`` and ``settings.json`` (see :class:`~curvireg_torch.evaluation.store.ResultStore`),
-    ``predictions.csv``, ``summary.json`` and ``index.html``. A second call continues where the first one stopped. Under
-    ``torchrun``, or in a job array that sets ``RANK`` and ``WORLD_SIZE``, each process registers a part of the objects.
+    ``out`` gets ``results.jsonl``, ``predictions.csv``, ``summary.json`` and ``index.html``. A second call registers
+    only what is new or depends on other settings or files, see :func:`~curvireg_torch.evaluation.runner.run_entries`.
+    Under ``torchrun``, or in a job array that sets ``RANK`` and ``WORLD_SIZE``, each process registers a part of the
+    objects.
 
     Args:
         benchmark, out: the objects, and the folder for the results.
@@ -56,14 +56,13 @@ def evaluate(
         limit: register only this many objects, spread evenly over the dataset.
         renderer: of the views.
         field: photograph filter that replaces that of the pipeline.
-        overwrite: delete results of other settings and start again.
         progress: show a bar.
 
     Returns:
         The summary, as written to ``summary.json``; None in processes that do not write it.
 
     Raises:
-        InvalidInputError: an unknown preset, a bad limit, or a folder that holds results of other settings.
+        InvalidInputError: an unknown preset, or a bad limit.
 
     Example:
         >>> from curvireg_torch.data import Pascal3DPlus
@@ -97,23 +96,14 @@ def evaluate(
         out,
         open_registrar,
         settings=settings,
-        prepare=lambda store: store.open(settings, overwrite=overwrite),
         label=benchmark.name,
         progress=progress,
     )
-    return None if store is None else _report(benchmark, store, limit)
+    return None if store is None else report(benchmark, store, settings, limit)
 
 
-def score(benchmark: Benchmark, out: Path, *, limit: int | None = None) -> Row:
-    """Write ``predictions.csv``, ``summary.json`` and ``index.html`` from the results in ``out``; return the summary.
-
-    Raises:
-        InvalidInputError: a result is missing or damaged.
-    """
-    return _report(benchmark, ResultStore(out), limit)
-
-
-def _report(benchmark: Benchmark, store: ResultStore, limit: int | None) -> Row:
+def report(benchmark: Benchmark, store: ResultStore, settings: Row, limit: int | None = None) -> Row:
+    """Write ``predictions.csv``, ``index.html`` and ``summary.json`` from results; returns the summary."""
     skipped = Counter({k: n for k, n in benchmark.dataset.skipped.items() if k not in NOT_EVALUATED})
     scored: list[int] = []
     rows: list[Row] = []
@@ -128,8 +118,7 @@ def _report(benchmark: Benchmark, store: ResultStore, limit: int | None) -> Row:
     samples = [benchmark.samples[i] for i in scored]
     errors = benchmark.errors(samples, rows)
     seconds = {name: sum(row["seconds"][name] for row in rows) for name in ("bank", "register")}
-    settings = store.settings()
-    settings["root"] = Path(settings["root"]).name  # a summary is shared: no paths
+    settings = {**settings, "root": Path(settings["root"]).name}  # a summary is shared: no paths
     summary = {
         **benchmark.summary(samples, rows, errors),
         **({"localization": localization_recall(samples, rows)} if benchmark.protocol.box is None else {}),

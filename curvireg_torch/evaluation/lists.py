@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from ..data import BOPRow, Video, write_bop_csv
+from ..data import Video
 from ..data.bop import bop_box, entry_at
 from ..errors import InvalidInputError, MissingFileError
 from ..geometry import camera_matrix
@@ -20,7 +20,7 @@ from ..utils.input_paths import is_pattern
 from ..visualization.encoding import png
 from ..visualization.overlay import to_uint8
 from ..visualization.sheet import SheetEntry, write_sheet
-from .benchmarks import bop_row
+from .benchmarks import BOPPose, write_bop_csv
 from .prior_options import PRIOR_OPTIONS, limits_from_cells, prior_from_limits
 from .runner import Entry, OpenRegistrar, failed_row, run_entries, thumbnail_of
 from .store import ResultStore, Row
@@ -359,16 +359,10 @@ def register_list(
         CurviregError: ``open_registrar`` refuses its options, or ``out`` cannot be written to.
     """
     entries = list({entry.key: entry for entry in photos.entries if not entry.error}.values())
-    options: dict[str, Any] = {"settings": settings, "label": "register", "progress": progress}
-    store = run_entries(entries, out, open_registrar, prepare=_prepare, **options)
+    if (out / "summary.json").exists():
+        raise InvalidInputError(f"{out}: holds the evaluation of a dataset; choose another --out")
+    store = run_entries(entries, out, open_registrar, settings=settings, label="register", progress=progress)
     return None if store is None else _write_tables(photos, out, store)
-
-
-def _prepare(store: ResultStore) -> None:
-    if store.settings_path.exists():
-        raise InvalidInputError(f"{store.folder}: holds the evaluation of a dataset; choose another --out")
-    for name in ("results.csv", "index.html", "bop.csv"):  # they would not match newer rows
-        (store.folder / name).unlink(missing_ok=True)
 
 
 def _write_tables(photos: PhotoList, out: Path, store: ResultStore) -> Counts:
@@ -415,11 +409,11 @@ def _write_bop_results(path: Path, columns: Sequence[str], rows: Iterable[Row]) 
     """Write the poses that have a translation, in mm; nothing for a list without scene, image and object numbers."""
     if not set(_BOP_NUMBERS) <= set(columns):
         return
-    poses: list[BOPRow] = []
+    poses: list[BOPPose] = []
     for row in rows:
         numbers = [row["columns"][name] for name in _BOP_NUMBERS]
         if row["status"] != "ok" or row["translation"] is None or not all(map(str.isdecimal, numbers)):
             continue
-        millimetres = UNITS[row["unit"] or "m"] / UNITS["mm"]
-        poses.append(bop_row([*map(int, numbers)], row["confidence"] or 0.0, row, scale=millimetres))
+        millimetres = [v * UNITS[row["unit"] or "m"] / UNITS["mm"] for v in row["translation"]]
+        poses.append((numbers, row["confidence"] or 0.0, row["rotation"], millimetres, -1.0))
     write_bop_csv(path, poses)

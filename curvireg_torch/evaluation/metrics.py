@@ -11,7 +11,7 @@ one unit:
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from scipy.spatial import cKDTree
@@ -27,6 +27,7 @@ from ..utils.checks import (
     check_positive,
     check_rotation,
     check_same_device,
+    check_symmetries,
     check_tensor,
 )
 
@@ -38,12 +39,14 @@ __all__ = [
     "add_error",
     "adds_error",
     "average_recall",
-    "axis_rotation_error",
     "median_error",
     "mspd_error",
     "mssd_error",
     "symmetric_rotation_error",
 ]
+
+BOUNDING_POINTS = 300
+"""Points by which symmetries are compared before all points are."""
 
 _CHUNK = 1 << 22
 """Points transformed at once: 50 MB of float32 coordinates."""
@@ -117,8 +120,12 @@ def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tenso
     """
     T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
     difference = T_est.unsqueeze(1) - T_gt.unsqueeze(1) @ _checked_symmetries(symmetries, T_gt)
-    largest = [_transform(d, points).norm(dim=1).amax(1) for d in _chunks(difference.flatten(0, 1), points)]
-    return inf_unless(valid, torch.cat(largest).view(difference.shape[:2]).amin(1))
+
+    def largest(which: Tensor, points: Tensor) -> Tensor:
+        moved = difference.flatten(0, 1)[which]
+        return torch.cat([_transform(d, points).norm(dim=1).amax(1) for d in _chunks(moved, points)])
+
+    return inf_unless(valid, _least_maximum(largest, difference.shape[:2], points))
 
 
 def mspd_error(
@@ -150,11 +157,39 @@ def mspd_error(
         K = K.unsqueeze(1)
     true = K @ (T_gt.unsqueeze(1) @ _checked_symmetries(symmetries, T_gt))[:, :, :3]
     estimated = (K @ T_est.unsqueeze(1)[:, :, :3]).expand_as(true)
-    largest = []
-    for a, b in zip(*(_chunks(projections.flatten(0, 1), points) for projections in (estimated, true)), strict=True):
-        (xy_a, front_a), (xy_b, front_b) = _project(a, points), _project(b, points)
-        largest.append(inf_unless(front_a & front_b, (xy_a - xy_b).norm(dim=1)).amax(1))
-    return inf_unless(valid, torch.cat(largest).view(true.shape[:2]).amin(1))
+
+    def largest(which: Tensor, points: Tensor) -> Tensor:
+        found = []
+        for some in _chunks(which, points):
+            (xy_a, front_a), (xy_b, front_b) = (_project(p.flatten(0, 1)[some], points) for p in (estimated, true))
+            found.append(inf_unless(front_a & front_b, (xy_a - xy_b).norm(dim=1)).amax(1))
+        return torch.cat(found)
+
+    return inf_unless(valid, _least_maximum(largest, true.shape[:2], points))
+
+
+def _least_maximum(largest: Callable[[Tensor, Tensor], Tensor], shape: Sequence[int], points: Tensor) -> Tensor:
+    """(B,) minima over S symmetries of the largest distance that any point moves.
+
+    A few of the points bound the maximum of all from below; all are compared only where a bound is the least one.
+
+    Args:
+        largest: maps indices (M,) into ``shape``, flattened, and some points to the largest distances (M,).
+        shape: (B, S).
+        points: (P, 3).
+    """
+    everything = torch.arange(shape[0] * shape[1], device=points.device)
+    distances = largest(everything, points[:: max(1, len(points) // BOUNDING_POINTS)]).view(*shape)
+    exact = torch.zeros_like(distances, dtype=torch.bool)
+    row = torch.arange(shape[0], device=points.device)
+    while True:
+        best = distances.argmin(dim=1)
+        open_rows = (~exact[row, best]).nonzero()[:, 0]
+        if len(open_rows) == 0:
+            return distances.amin(dim=1)
+        chosen = best[open_rows]
+        distances[open_rows, chosen] = largest(open_rows * shape[1] + chosen, points)
+        exact[open_rows, chosen] = True
 
 
 def average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
@@ -193,10 +228,7 @@ def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tenso
 def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:
     if symmetries is None:
         return torch.eye(4, dtype=like.dtype, device=like.device).unsqueeze(0)
-    check_tensor(symmetries, "symmetries", (None, 4, 4))
-    if len(symmetries) == 0:
-        raise InvalidInputError("symmetries: expected at least the identity, got none")
-    check_pose(symmetries, "symmetries")
+    check_symmetries(symmetries)
     return symmetries.to(like)
 
 
@@ -273,34 +305,6 @@ def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) ->
     plain = rotation_error(R_est, R_gt)
     symmetric = rotation_error(R_est.unsqueeze(-3), R_gt.unsqueeze(-3) @ symmetries.to(R_gt.dtype))
     return inf_unless(valid, torch.cat([plain.unsqueeze(-1), symmetric], -1).amin(-1))
-
-
-def axis_rotation_error(R_est: Tensor, R_gt: Tensor, axis: Tensor) -> Tensor:
-    """Rotation error of a solid of revolution: ``min_phi angle(R_est, R_gt Rot(axis, phi))``.
-
-    The minimum is the angle between ``R_est axis`` and ``R_gt axis``, computed from the chord, since ``acos`` loses
-    digits near 0.
-
-    Args:
-        R_est, R_gt: as in :func:`symmetric_rotation_error`, as is the result.
-        axis: (3,) direction of the axis in the model frame, of any length > 0. Its two ends differ; for a solid that
-            looks the same upside down, take the minimum with the flipped rotation too.
-
-    Example:
-        >>> from curvireg_torch.geometry import rotation_from_viewpoint
-        >>> a, b = rotation_from_viewpoint(0.0, 10.0), rotation_from_viewpoint(120.0, 30.0)
-        >>> round(float(axis_rotation_error(a, b, torch.tensor([0.0, 0.0, 1.0]))), 3)   # the azimuth of a vase is free
-        20.0
-    """
-    valid = _check_rotations(R_est, R_gt)
-    check_tensor(axis, "axis", (3,))
-    check_same_device(axis, R_gt, "axis")
-    length = torch.linalg.vector_norm(axis)
-    if not bool(length > 0) or not bool(length.isfinite()):
-        raise InvalidInputError(f"axis: expected a direction of finite length > 0, got {axis.tolist()}")
-    axis = (axis / length).to(R_gt.dtype)
-    half_chord = torch.linalg.vector_norm(R_est @ axis - R_gt @ axis, dim=-1) / 2.0
-    return inf_unless(valid, torch.rad2deg(2.0 * torch.asin(half_chord.clamp(max=1.0))))
 
 
 def _check_rotations(R_est: Tensor, R_gt: Tensor) -> Tensor:

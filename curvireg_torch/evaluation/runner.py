@@ -39,6 +39,9 @@ POSE_SOURCES = (
 )
 """Parts of the package that results depend on."""
 
+REPORTS = ("summary.json", "predictions.csv", "results.csv", "bop.csv", "index.html")
+"""Files that are written from all results at the end; older ones would not match newer results."""
+
 OpenRegistrar = Callable[[tuple[Path, ...]], Registrar]
 """Opens the registrar of some mesh files."""
 
@@ -173,7 +176,6 @@ def run_entries(
     open_registrar: OpenRegistrar,
     *,
     settings: Mapping[str, Any],
-    prepare: Callable[[ResultStore], None],
     label: str,
     progress: bool = True,
 ) -> ResultStore | None:
@@ -190,7 +192,6 @@ def run_entries(
         out: folder of the store, and of the ``thumbnails`` of the results.
         open_registrar: called once for each set of meshes.
         settings: plain values, everything that all results depend on.
-        prepare: called with the store by one process before the others start; in a job array by each.
         label: of the progress bar.
         progress: show it.
 
@@ -210,7 +211,8 @@ def run_entries(
 
     with workers() as group:
         if group.reports:
-            prepare(ResultStore(out, group))
+            for name in REPORTS:
+                (out / name).unlink(missing_ok=True)
         group.wait()
         store = ResultStore(out, group)
         order = {meshes: place for place, meshes in enumerate(dict.fromkeys(entry.meshes for entry in entries))}

@@ -174,7 +174,9 @@ def _case(kind: Any, s: dict[str, Any]) -> Case | None:
     known = bool(pose[:, :3].isfinite().all() and s["box"].isfinite().all())
     if not known or s.get("visib_fract", 1.0) <= UNOCCLUDED:
         return None
-    return Case(kind.category.format_map(s), s["image_path"], str(s[kind.mesh]), kind.scored.unit, s["box"], pose)
+    return Case(
+        kind.category.format_map(s), s["image_path"], str(s[kind.scored.mesh]), kind.scored.unit, s["box"], pose
+    )
 
 
 def grouped(cases: list[Case], label: str, progress: bool) -> Iterator[tuple[trimesh.Trimesh, list[Case]]]:

@@ -66,7 +66,7 @@ def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, 
 
 
 def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp_path):
-    (tmp_path / "settings.json").write_text("{}")
+    (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(InvalidInputError, match="holds the evaluation of a dataset"):
         register_rows([entry], tmp_path, registrar)
 

@@ -44,7 +44,7 @@ def registered(entries, folder, *, settings=None, workers=None, stop_after=None)
     def open_registrar(meshes):
         raise MeshError(meshes[0].name)
 
-    options = {"settings": settings or {}, "prepare": lambda _: None, "label": "", "progress": False}
+    options = {"settings": settings or {}, "label": "", "progress": False}
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -68,16 +68,6 @@ def test_cut_line_is_removed(tmp_path, cut):
     assert store.read("c") == row("c")
 
 
-def test_read_finds_rows_that_have_moved(tmp_path):
-    """As when another job of an array writes results.jsonl in the order of its list."""
-    store, other = ResultStore(tmp_path), ResultStore(tmp_path)
-    for key in "ab":
-        store.append(row(key, i=key))
-    other.refresh()
-    store.rewrite([row(key, i=key, more=1) for key in "ba"])
-    assert other.read("a") == row("a", i="a", more=1)
-
-
 @pytest.mark.parametrize("content", ['{"score": 1}\n', "[1]\n", "no JSON\n", '{"key": "a"}\n', "[" * 100_000 + "\n"])
 def test_other_files_are_refused(tmp_path, content):
     (tmp_path / "results.jsonl").write_text(content)
@@ -85,39 +75,7 @@ def test_other_files_are_refused(tmp_path, content):
         ResultStore(tmp_path)
 
 
-def test_other_settings_are_refused(tmp_path):
-    store = ResultStore(tmp_path)
-    store.open({"preset": "a", "seed": 1})
-    store.append(row("x"))
-    store.open({"preset": "a", "seed": 1})
-    with pytest.raises(InvalidInputError, match=r"preset: 'a' there, 'b' now.*--overwrite"):
-        store.open({"preset": "b", "seed": 1})
-    with pytest.raises(InvalidInputError, match="job array"):
-        ResultStore(tmp_path, Workers(0, 2)).open({}, overwrite=True)
-    assert store.is_current("x", DIGESTS)
-    store.open({"preset": "b", "seed": 1}, overwrite=True)
-    assert not store.is_current("x", DIGESTS)
-    assert not store.path.exists()
-    assert store.settings() == {"preset": "b", "seed": 1}
-
-
-def test_results_without_settings_are_refused(tmp_path):
-    store = ResultStore(tmp_path)
-    with pytest.raises(InvalidInputError, match="missing or damaged"):
-        store.settings()
-    store.append(row("x"))
-    with pytest.raises(InvalidInputError, match="unknown settings"):
-        store.open({})
-    store.settings_path.write_text("[1]")
-    with pytest.raises(InvalidInputError, match="missing or damaged"):
-        store.settings()
-
-
 def test_folder_that_cannot_be_written(tmp_path, monkeypatch):
-    (tmp_path / "out").write_text("")
-    with pytest.raises(OutputError, match="choose another place"):
-        ResultStore(tmp_path / "out").open({})
-
     def full_disk(*_):
         raise OSError(28, "No space left on device")
 
