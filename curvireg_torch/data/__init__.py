@@ -6,6 +6,7 @@ A sample is a dict, one per object. Every dataset reports skipped objects with t
 
 from ._base import ObjectDataset, collate
 from .bop import BOPDataset
+from .camera_files import load_camera
 from .images import Photo, Video, read_image, read_photo
 from .pascal3d import Pascal3DPlus
 from .pose_folder import PoseFolder
@@ -18,6 +19,7 @@ __all__ = [
     "PoseFolder",
     "Video",
     "collate",
+    "load_camera",
     "read_image",
     "read_photo",
 ]
