@@ -141,8 +141,8 @@ def draw(arguments: argparse.Namespace) -> None:
     import torch
 
     from ..data import read_photo
-    from ..evaluation.lists import register_entry
     from ..evaluation.opening import check_camera, open_registrar
+    from ..evaluation.runner import register_entry
     from ..registration.result import used_box
     from ..utils.threads import one_torch_thread
     from ..visualization import contour_overlay, plots

@@ -16,7 +16,8 @@ PROTOCOL = (
     "cad=annotated|any: the annotated CAD model, or the best of the class; "
     "pose=upright|any: whether objects are known to stand upright; "
     "box=annotated|none|FRACTION: as annotated; localized; or each edge moved by up to FRACTION of the side (seed=N); "
-    "hint=none|azimuth:DEG|pose:DEG: azimuth or rotation known to lie within DEG of a value that is off by up to DEG"
+    "hint=none|azimuth:DEG|pose:DEG: azimuth or rotation known to lie within DEG of a value that is off by up to DEG; "
+    "views=N: N photographs of one pose together (bop; seed=N)"
 )
 
 
@@ -32,7 +33,7 @@ def add_evaluate(commands: Any) -> None:
             f"curvireg evaluate {name} {kind.example} --out out/{name}",
             f"curvireg evaluate {name} {kind.example} --jobs 2 --limit 100 --preset fast --out out/{name}-fast",
             help=kind.help,
-            description="Writes DIR/summary.json and DIR/predictions.csv; the same command resumes if interrupted.",
+            description="Writes DIR/summary.json, DIR/predictions.csv and DIR/index.html; the same command resumes.",
             run=run,
         )
         dataset.set_defaults(dataset=name)
@@ -44,7 +45,6 @@ def add_evaluate(commands: Any) -> None:
         jobs = "processes that share the objects (default: 1)"
         add("--jobs", type=whole_number(1), default=1, metavar="N", help=jobs)
         add("--limit", type=whole_number(1), metavar="N", help="only N objects, spread evenly over the set")
-        add("--overwrite", action="store_true", help="replace the predictions of other settings")
         add("--out", type=Path, required=True, metavar="DIR", help="folder of the results; made if it does not exist")
 
 
@@ -73,7 +73,6 @@ def run(arguments: argparse.Namespace) -> None:
             preset=preset,
             limit=arguments.limit,
             renderer=arguments.renderer or "auto",
-            overwrite=arguments.overwrite,
             progress=arguments.progress,
         )
     if summary is None:  # another process writes it

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..matching import ViewBank
     from ..pipeline import Pipeline
     from ..registration import Registrar
-    from .lists import Entry
+    from .runner import Entry
 
 __all__ = ["PRIOR_OPTIONS", "QUALIFIERS", "Numbers", "RegisterOptions", "check_camera", "open_registrar"]
 
@@ -198,7 +198,7 @@ class RegisterOptions:
 
     def entry(self, photo: Path) -> "Entry":
         """A photograph with the box, camera and meshes of these options."""
-        from .lists import Entry
+        from .runner import Entry
 
         prior = prior_from_limits(self.limits or {})
         return self.complete(Entry((), str(photo), photo, self.meshes, self.box, self.camera, prior=prior))

@@ -15,8 +15,8 @@ from torch import Tensor
 from ..data import read_photo
 from ..data.images import Photo
 from ..errors import MAX_VIEWER_SECONDS, CurviregError, CurviregWarning, InvalidInputError
-from ..evaluation.lists import register_entry
 from ..evaluation.opening import QUALIFIERS, RegisterOptions, check_camera, open_registrar
+from ..evaluation.runner import register_entry
 from ..evaluation.store import to_json
 from ..matching import ViewBank
 from ..mesh import has_colours, load_mesh

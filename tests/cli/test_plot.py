@@ -20,6 +20,9 @@ def test_plot_draws_a_registration(tmp_path, monkeypatch, kind):
 
 
 def test_plot_refuses_other_formats(tmp_path, refused):
-    write_scene(tmp_path)
-    words = ["plot", "overlay", str(tmp_path / "photo.png"), str(tmp_path / "truck.ply"), "--out"]
+    words = ["plot", "overlay", "photo.png", "truck.ply", "--out"]
+    refused(main([*words, str(tmp_path / "a.txt")]), "no such file", "photo.png")
+    for name in words[2:4]:
+        (tmp_path / name).write_text("")
+    words[2:4] = [str(tmp_path / name) for name in words[2:4]]
     refused(main([*words, str(tmp_path / "a.txt")]), "expected a name that ends in .png, .svg, .pdf")
