@@ -4,9 +4,8 @@ Descriptors keep the dtype (half types compute in float32). Wrong shapes, dtypes
 :class:`~curvireg_torch.errors.InvalidInputError`.
 """
 
-from .hog import HOG, hog, hog_length, orientation_cells
+from .hog import HOG, field_points, hog, hog_length, orientation_cells
 from .learned_field import FieldNetwork, LearnedCurvilinearSaliency, doubled_angle, halved_angle
-from .points import field_points
 
 __all__ = [
     "HOG",

@@ -10,8 +10,14 @@ from safetensors.torch import load
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError, MissingFileError
-from ..filters.inputs import fill_missing, may_have_missing, missing_mask
-from ..filters.numerics import at_least_float32, safe_eps, safe_sqrt
+from ..filters.operations import (
+    at_least_float32,
+    fill_missing,
+    may_have_missing,
+    missing_mask,
+    safe_eps,
+    safe_sqrt,
+)
 from ..utils.checks import check_colour_image
 from ..utils.files import write_tensors
 from .backbone import filters_channels_last

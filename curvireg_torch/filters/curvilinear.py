@@ -1,4 +1,4 @@
-"""Curvilinear saliency of depth images (the paper's contribution 1) and of photographs."""
+"""Gradient and curvilinear saliency of photographs, and curvilinear saliency of depth (the paper's contribution 1)."""
 
 import math
 
@@ -7,25 +7,33 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..utils.checks import check_image, check_mask, check_option, check_positive
-from .blocks import Planes, apply_in_blocks
-from .derivatives import central_derivatives, central_gradient, smooth
-from .inputs import apply_to_photograph
-from .learnable import OptionsModule, check_scalar
-from .numerics import at_least_float32, clone_if_grad, safe_eps, safe_sqrt, squared_length
+from .modules import DepthModule, FunctionModule
+from .operations import (
+    Planes,
+    apply_in_blocks,
+    apply_to_photograph,
+    at_least_float32,
+    central_derivatives,
+    central_gradient,
+    check_scalar,
+    clone_if_grad,
+    safe_eps,
+    safe_sqrt,
+    smooth,
+    squared_length,
+)
 
-BACKGROUND = 1.25
+BACKGROUND_DEPTH = 1.25
 """Depth of missing pixels behind the nearest visible point, in units of the visible depth range."""
 
-_MIN_RELATIVE_RANGE = 1e-6
+MIN_RELATIVE_RANGE = 1e-6
 """Visible depth range, relative to the largest depth, below which depths differ by rounding only: 8 ulp of float32."""
-
-FORMULAS = ("geometric", "paper")
 
 
 def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Depth with missing pixels at the largest number; nearest depth and depth range of each image, (B, 1, 1, 1).
 
-    Missing pixels are 0, negative, inf, NaN or outside ``mask``. For a range of at most ``_MIN_RELATIVE_RANGE``, which
+    Missing pixels are 0, negative, inf, NaN or outside ``mask``. For a range of at most ``MIN_RELATIVE_RANGE``, which
     must not be stretched, the largest depth is returned instead. The range of an empty image is 1.
     """
     # Two equivalent forms: eager, torch.where takes seven times as long; compiled, nan_to_num is not vectorised.
@@ -38,14 +46,14 @@ def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, T
     surface = F.threshold(clean, 0.0, torch.finfo(depth.dtype).max)
     near = torch.where(visible, surface.amin(dim=(1, 2, 3), keepdim=True), 1.0)
     span = far - near
-    return surface, near, torch.where(span > _MIN_RELATIVE_RANGE * far, span, torch.where(visible, far, 1.0))
+    return surface, near, torch.where(span > MIN_RELATIVE_RANGE * far, span, torch.where(visible, far, 1.0))
 
 
 def fill_depth(depth: Tensor, mask: Tensor | None, depth_scale: float | None) -> Tensor:
-    """Depth as a graph surface: nearest visible point at 0, missing pixels at ``BACKGROUND`` depth ranges."""
+    """Depth as a graph surface: nearest visible point at 0, missing pixels at ``BACKGROUND_DEPTH`` depth ranges."""
     surface, near, span = visible_range(depth, mask)
     scale = 1.0 / span if depth_scale is None else depth_scale
-    return torch.minimum(surface - near, BACKGROUND * span).mul_(scale)
+    return torch.minimum(surface - near, BACKGROUND_DEPTH * span).mul_(scale)
 
 
 def depth_curvilinear_saliency(
@@ -87,7 +95,7 @@ def depth_curvilinear_saliency(
     """
     mask, scale = check_depth(depth, mask), check_depth_scale(depth_scale)
     sigma = check_scalar(sigma, "sigma", zero_ok=True)
-    check_option(formula, FORMULAS, "formula")
+    check_option(formula, ("geometric", "paper"), "formula")
 
     def layer(depth: Tensor, mask: Tensor | None) -> Planes:
         factor, *m = _shape_operator(smooth(fill_depth(depth, mask, scale), sigma, linear=True), formula)
@@ -161,6 +169,25 @@ def default_to_x(vx: Tensor, vy: Tensor) -> Tensor:
     return torch.where(squared <= safe_eps(squared), 1.0, vx)
 
 
+def image_gradient(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
+    """Gradient of the Gaussian-smoothed image, the paper's IG.
+
+    Args:
+        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
+        sigma: smoothing in px before differentiation, >= 0.
+
+    Returns:
+        (B, 2, H, W) grey levels per px; channel 0 = x, 1 = y.
+
+    Example:
+        >>> ramp = torch.arange(8.0).expand(1, 1, 8, 8)
+        >>> image_gradient(ramp, sigma=0.0)[0, :, 4, 4].tolist()
+        [1.0, 0.0]
+    """
+    checked_sigma = check_scalar(sigma, "sigma", zero_ok=True)
+    return apply_to_photograph(lambda x: central_gradient(smooth(x, checked_sigma)), image)
+
+
 def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
     r"""Curvilinear saliency of a photograph, :math:`\mu_1-\mu_2 = |\nabla I|^2` (the paper's ``equ:PG:004``).
 
@@ -185,15 +212,30 @@ def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) ->
     return apply_to_photograph(layer, image)
 
 
-class DepthCurvilinearSaliency(OptionsModule):
-    """Module twin of :func:`depth_curvilinear_saliency`.
+class ImageGradient(FunctionModule, function=image_gradient, learnable=("sigma",)):
+    """Module twin of :func:`image_gradient`; ``learnable`` makes sigma a positive parameter.
 
-    Args:
-        sigma, formula, depth_scale: as in the function.
-        learnable: make sigma a positive parameter.
+    Example:
+        >>> len(list(ImageGradient(learnable=True).parameters()))
+        1
+    """
 
-    Shape:
-        Input (B, 1, H, W) depth and optionally a mask that broadcasts to it; output (B, 2, H, W).
+    def __init__(self, *, sigma: float = 1.0, learnable: bool = False) -> None: ...
+
+
+class ImageCurvilinearSaliency(FunctionModule, function=image_curvilinear_saliency, learnable=("sigma",)):
+    """Module twin of :func:`image_curvilinear_saliency`; ``learnable`` makes sigma a positive parameter.
+
+    Example:
+        >>> ImageCurvilinearSaliency(sigma=2.0)
+        ImageCurvilinearSaliency(sigma=2.0)
+    """
+
+    def __init__(self, *, sigma: float = 1.0, learnable: bool = False) -> None: ...
+
+
+class DepthCurvilinearSaliency(DepthModule, function=depth_curvilinear_saliency, learnable=("sigma",)):
+    """Module twin of :func:`depth_curvilinear_saliency`; ``learnable`` makes sigma a positive parameter.
 
     Example:
         >>> plane = torch.arange(32.0).expand(1, 1, 32, 32) + 10
@@ -208,34 +250,4 @@ class DepthCurvilinearSaliency(OptionsModule):
         formula: str = "geometric",
         depth_scale: float | None = None,
         learnable: bool = False,
-    ) -> None:
-        check_option(formula, FORMULAS, "formula")
-        check_scalar(sigma, "sigma", zero_ok=True)
-        check_depth_scale(depth_scale)
-        super().__init__(learnable, sigma=sigma, formula=formula, depth_scale=depth_scale)
-
-    def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
-        return depth_curvilinear_saliency(depth, mask, **self.options)
-
-
-class ImageCurvilinearSaliency(OptionsModule):
-    """Module twin of :func:`image_curvilinear_saliency`.
-
-    Args:
-        sigma: as in the function.
-        learnable: make sigma a positive parameter.
-
-    Shape:
-        Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
-
-    Example:
-        >>> len(list(ImageCurvilinearSaliency(learnable=True).parameters()))
-        1
-    """
-
-    def __init__(self, *, sigma: float = 1.0, learnable: bool = False) -> None:
-        check_scalar(sigma, "sigma", zero_ok=True)
-        super().__init__(learnable, sigma=sigma)
-
-    def forward(self, image: Tensor) -> Tensor:
-        return image_curvilinear_saliency(image, **self.options)
+    ) -> None: ...

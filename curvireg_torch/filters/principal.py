@@ -6,13 +6,9 @@ import torch
 from torch import Tensor
 
 from ..utils.checks import check_option
-from .blocks import Planes
 from .curvilinear import default_to_x, dominant_eigenvector, scaled_direction
-from .derivatives import central_derivatives, smooth
-from .inputs import apply_to_photograph
-from .learnable import OptionsModule, check_sigmas
-
-EIGENVALUES = ("largest", "smallest")
+from .modules import FunctionModule
+from .operations import Planes, apply_to_photograph, central_derivatives, check_sigmas, smooth
 
 
 def principal_curvature_image(
@@ -40,7 +36,7 @@ def principal_curvature_image(
         >>> int(field[0, 0, 16].abs().argmax())
         16
     """
-    check_option(eigenvalue, EIGENVALUES, "eigenvalue")
+    check_option(eigenvalue, ("largest", "smallest"), "eigenvalue")
     scales = check_sigmas(sigmas, "sigmas")
     sign = 1.0 if eigenvalue == "largest" else -1.0
 
@@ -57,24 +53,12 @@ def principal_curvature_image(
     return apply_to_photograph(layer, image)
 
 
-class PrincipalCurvatureImage(OptionsModule):
+class PrincipalCurvatureImage(FunctionModule, function=principal_curvature_image):
     """Module twin of :func:`principal_curvature_image`.
-
-    Args:
-        sigmas, eigenvalue: as in the function.
-
-    Shape:
-        Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
 
     Example:
         >>> PrincipalCurvatureImage(eigenvalue="smallest")(torch.rand(2, 3, 32, 32)).shape
         torch.Size([2, 2, 32, 32])
     """
 
-    def __init__(self, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0), eigenvalue: str = "largest") -> None:
-        check_option(eigenvalue, EIGENVALUES, "eigenvalue")
-        check_sigmas(sigmas, "sigmas")
-        super().__init__(sigmas=tuple(sigmas), eigenvalue=eigenvalue)
-
-    def forward(self, image: Tensor) -> Tensor:
-        return principal_curvature_image(image, **self.options)
+    def __init__(self, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0), eigenvalue: str = "largest") -> None: ...

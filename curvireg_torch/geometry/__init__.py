@@ -9,22 +9,26 @@ Conventions of the whole library (pinned by ``tests/geometry``):
 - Poses refer to the frame and unit of the mesh file; ``up`` names the axis that points up and rotates nothing.
 """
 
-from .cameras import camera_matrix, project_points, projected_boxes, rotation_towards, transform
+from .cameras import camera_matrix, pose_from_box, project_points, projected_boxes, rotation_towards, transform
 from .conversions import (
     axis_angle_from_rotation,
     opencv_from_opengl,
     opengl_from_opencv,
     opengl_projection,
-    quaternion_from_rotation,
     rotation_from_axis_angle,
-    rotation_from_quaternion,
     symmetry_transforms,
 )
 from .crops import box_iou, crop_images, crop_transforms, square_boxes, whole_image_box
 from .pose_prior import PosePrior, object_frame
-from .translation import pose_from_box
-from .viewpoint import rotation_error, rotation_from_viewpoint, up_rotation, viewpoint_from_rotation
-from .views import ViewSphere, sample_views, uniform_views
+from .viewpoint import (
+    ViewSphere,
+    rotation_error,
+    rotation_from_viewpoint,
+    sample_views,
+    uniform_views,
+    up_rotation,
+    viewpoint_from_rotation,
+)
 
 __all__ = [
     "PosePrior",
@@ -41,10 +45,8 @@ __all__ = [
     "pose_from_box",
     "project_points",
     "projected_boxes",
-    "quaternion_from_rotation",
     "rotation_error",
     "rotation_from_axis_angle",
-    "rotation_from_quaternion",
     "rotation_from_viewpoint",
     "rotation_towards",
     "sample_views",

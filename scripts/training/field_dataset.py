@@ -10,7 +10,6 @@ from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.matching.describe import depth_filter, hog_layer
 from curvireg_torch.pipeline import BankSettings
-from curvireg_torch.terms import normalized_correlation
 from scripts.training.generated import GeneratedScenes
 
 SETTINGS = BankSettings(image_size=WORK_SIZE, sigma=0.8)
@@ -147,7 +146,7 @@ def losses(
     code, target = output[:, :2], batch["code"]
     predicted = hog_layer(SETTINGS)(halved_angle(code))
     true = batch["descriptors"][:, 0]
-    correlation = normalized_correlation(predicted, torch.cat([true, mirrored_descriptors(true)]))
+    correlation = F.normalize(predicted) @ F.normalize(torch.cat([true, mirrored_descriptors(true)])).T
     labels = torch.arange(len(predicted), device=predicted.device)
     views = F.normalize(batch["descriptors"][:, 1:], dim=2)
     among_views = (views @ F.normalize(predicted, dim=1)[..., None])[..., 0]

@@ -211,7 +211,7 @@ class LayerContract:
         x = x.detach()
         direction = torch.randn(x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(0))
         if block is not None:
-            monkeypatch.setattr("curvireg_torch.filters.blocks.BLOCK", block)
+            monkeypatch.setattr("curvireg_torch.filters.operations.BLOCK_PIXELS", block)
         torch.testing.assert_close(torch.func.vmap(case)(torch.stack([x, 0.5 * x])), torch.stack([y, halved]))
         torch.testing.assert_close(torch.func.grad(loss)(x), want)
         _, slope = torch.func.jvp(loss, (x,), (direction,))

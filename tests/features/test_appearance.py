@@ -5,8 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.features.appearance import describe, similarity
-from curvireg_torch.features.backbone import Backbone
+from curvireg_torch.features.backbone import Backbone, describe, similarity
 from curvireg_torch.geometry import crop_images, sample_views
 from curvireg_torch.matching.describe import BankSettings, ViewDescriber
 from curvireg_torch.mesh.mesh import mesh_radius

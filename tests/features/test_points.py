@@ -24,7 +24,8 @@ def _line(angle: float) -> torch.Tensor:
 @pytest.mark.parametrize("angle", [0.0, 20.0, 45.0, 70.0, 90.0, 135.0, 160.0])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_field_points_of_a_ridge_are_a_thin_line(angle: float, sign: float) -> None:
-    points = field_points(sign * _line(angle)[None], fraction=1.0, threshold=0.5)[0, 0]
+    field = sign * _line(angle)[None]
+    points = (field_points(field, fraction=1.0) & (field.norm(dim=1, keepdim=True) > 0.5))[0, 0]
     y, x = (points.nonzero().T - 20).float()
     a = torch.tensor(angle).deg2rad()
     assert float((x * torch.cos(a) + y * torch.sin(a)).abs().max()) <= 0.75
@@ -47,24 +48,15 @@ def test_field_points_fraction_selects_the_longest_of_each_image(seed: int, frac
             assert float(v[p].min()) >= float(v[e & ~p].max())
 
 
-def test_field_points_threshold_without_suppression() -> None:
-    field = torch.zeros(1, 2, 1, 6)
-    field[0, 1, 0] = torch.tensor([0.0, 1.0, 2.0, 3.0, 2.0, 1.0])
-    assert field_points(field, fraction=1.0, suppress=False)[0, 0, 0].tolist() == [False, True, True, True, True, True]
-    assert field_points(field, fraction=1.0, suppress=False, threshold=1.5).sum() == 3
-
-
 def test_field_points_of_zero_fields_and_bad_input() -> None:
     assert not field_points(torch.zeros(2, 2, 8, 8)).any()
     assert field_points(torch.zeros(0, 2, 8, 8)).shape == (0, 1, 8, 8)
     with pytest.raises(InvalidInputError, match="fraction"):
         field_points(torch.zeros(1, 2, 8, 8), fraction=0.0)
-    with pytest.raises(InvalidInputError, match="threshold"):
-        field_points(torch.zeros(1, 2, 8, 8), threshold=-1.0)
 
 
 def test_field_points_of_a_fraction_below_one_pixel() -> None:
     field = torch.zeros(1, 2, 1, 9)
     field[0, 0, 0, [1, 4, 7]] = torch.tensor([1.0, 3.0, 2.0])
-    assert field_points(field, fraction=1e-3, suppress=False)[0, 0, 0].nonzero().flatten().tolist() == [4]
-    assert int(field_points(field, fraction=2 / 9, suppress=False).sum()) == 2
+    assert field_points(field, fraction=1e-3)[0, 0, 0].nonzero().flatten().tolist() == [4]
+    assert int(field_points(field, fraction=2 / 9).sum()) == 2

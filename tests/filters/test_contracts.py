@@ -23,7 +23,7 @@ def test_depth_curvilinear_saliency_is_independent_of_block_size(monkeypatch: py
     x = depths(5)
     mask = x > 2.4
     want = filters.depth_curvilinear_saliency(x, mask)
-    monkeypatch.setattr("curvireg_torch.filters.blocks.BLOCK", 2 * 24 * 24)
+    monkeypatch.setattr("curvireg_torch.filters.operations.BLOCK_PIXELS", 2 * 24 * 24)
     torch.testing.assert_close(filters.depth_curvilinear_saliency(x, mask), want)
     x.requires_grad_()
     trained = filters.depth_curvilinear_saliency(x, mask)
@@ -73,14 +73,13 @@ class TestCompiled:
         "mcs": [{"scales": 2, "diffusion_time": t, "threshold": 0.1 * t} for t in (1.0, 2.0, 3.0)],
         "mfc": [{"scales": 2, "saliency_weight": w, "threshold": 0.1 * w} for w in (0.5, 0.7, 0.9)],
         "hog": [{"clip": c} for c in (0.2, 0.3, 0.4)],
-        "bilateral": [{"sigma": s} for s in (0.5, 0.7, 0.9)],
     }
 
     @pytest.mark.parametrize("name", list(values))
     def test_any_value_of_a_float_option(self, name: str) -> None:
         """At the second value of a float torch.compile makes it a symbol."""
         torch._dynamo.reset()
-        function, inputs = PAIRS[name][:2] if name in PAIRS else (filters.bilateral_smooth, photos)
+        function, inputs = PAIRS[name][:2]
         x = inputs(2, 24)
         graph = torch.compile(function, fullgraph=True, backend="eager")
         for options in self.values[name]:

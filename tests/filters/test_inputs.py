@@ -8,7 +8,7 @@ from kornia.color import rgb_to_grayscale
 
 from curvireg_torch import filters
 from curvireg_torch.features import field_points, hog
-from curvireg_torch.filters.inputs import fill_missing, to_grey
+from curvireg_torch.filters.operations import fill_missing, to_grey
 
 from .._support.layer_contract import LayerCase
 from .layer_cases import LAYERS, colour_photos, photos
@@ -73,20 +73,6 @@ def test_fill_missing_reaches_holes_of_32_px() -> None:
         mean = float(image[~holes].mean())
         filled = fill_missing(image.masked_fill(holes, math.nan), holes)
         assert float(filled[0, 0, 70, 70]) == pytest.approx(mean if expected is None else expected, abs=1e-3)
-
-
-def test_smoothing_filters_fill_missing_pixels() -> None:
-    x = photos(1, 32, dtype=torch.float64)
-    broken = x.clone()
-    broken[0, 0, 16, 10:13] = math.nan
-    for smoothing in (
-        lambda x: filters.anisotropic_diffusion(x, iterations=5),
-        lambda x: filters.bilateral_smooth(x, sigma=1.5),
-        lambda x: filters.guided_smooth(x, sigma=1.5),
-    ):
-        y = smoothing(broken)
-        assert torch.isfinite(y).all()
-        assert float((y - smoothing(x)).abs().max()) < float(x.max() - x.min())
 
 
 @pytest.mark.filterwarnings("ignore:There is a performance drop")

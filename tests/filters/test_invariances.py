@@ -57,7 +57,7 @@ def test_photo_fields_are_invariant_to_an_intensity_offset(layer: LayerCase, see
 
 # A gradient is proportional to contrast, saliency to its square; focus is invariant. MCS is invariant if kappa, which
 # is in grey levels, is scaled too.
-CONTRAST = {"ig": 1, "ics": 2, "mfc": 2, "mfc-alone": 0, "pci": 1, "mcs": 0, "mcs-bilateral": 0, "mcs-guided": 0}
+CONTRAST = {"ig": 1, "ics": 2, "mfc": 2, "mfc-alone": 0, "pci": 1, "mcs": 0}
 
 
 @pytest.mark.parametrize("name", list(CONTRAST))

@@ -21,7 +21,6 @@ MODULES = {
     "mcs": (filters.MultiScaleCurvilinearSaliency, {"sigma": 0.9, "scales": 3}, photos, {"sigma", "kappa"}),
     "mfc": (filters.MultiScaleFocusCurves, {"sigma": 0.9}, photos, {"sigma"}),
 }
-MODULES["mcs-guided"] = (MODULES["mcs"][0], {**MODULES["mcs"][1], "smoothing": "guided"}, *MODULES["mcs"][2:])
 
 
 @pytest.mark.parametrize("name", list(MODULES))

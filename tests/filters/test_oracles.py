@@ -2,7 +2,6 @@
 
 import math
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -10,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from skimage.feature import hessian_matrix_eigvals
 
 from curvireg_torch import filters
-from curvireg_torch.filters.derivatives import central_derivatives, smooth
+from curvireg_torch.filters.operations import central_derivatives, smooth
 
 from .layer_cases import photos
 
@@ -121,33 +120,3 @@ def test_central_derivatives_and_gaussian_against_scipy() -> None:
     np.testing.assert_allclose(xy[1:-1], np.gradient(gx, axis=0)[1:-1], atol=1e-14)
     np.testing.assert_allclose(xx[:, 1:-1], np.diff(x, 2, axis=1), atol=1e-14)
     np.testing.assert_allclose(yy[1:-1], np.diff(x, 2, axis=0), atol=1e-14)
-
-
-def test_bilateral_smooth_against_opencv() -> None:
-    image = photos(1, 25)
-    inner = (..., slice(4, -4), slice(4, -4))  # borders differ
-    got = filters.bilateral_smooth(image, sigma=2.0, kappa=0.1)
-    # OpenCV uses the disc of that radius, not the square.
-    want = cv2.bilateralFilter(image[0, 0].numpy(), 9, 0.1, 2.0)
-    np.testing.assert_allclose(got[inner][0, 0], want[4:-4, 4:-4], atol=1e-2)
-
-
-def test_guided_smooth_against_loops() -> None:
-    image = photos(1, 15, dtype=torch.float64)
-    got = filters.guided_smooth(image, sigma=2.0, kappa=0.1)[0, 0]
-    r = round((math.sqrt(6 * 4 + 1) - 1) / 2)
-    x = image[0, 0].numpy()
-    H, W = x.shape
-
-    def box(y: np.ndarray, i: int, j: int) -> np.ndarray:
-        rows, columns = np.clip(np.arange(i - r, i + r + 1), 0, H - 1), np.clip(np.arange(j - r, j + r + 1), 0, W - 1)
-        return y[np.ix_(rows, columns)]
-
-    a, b = np.zeros_like(x), np.zeros_like(x)
-    for i in range(H):
-        for j in range(W):
-            window = box(x, i, j)
-            a[i, j] = window.var() / (window.var() + 0.1**2)
-            b[i, j] = window.mean() * (1 - a[i, j])
-    want = [[box(a, i, j).mean() * x[i, j] + box(b, i, j).mean() for j in range(W)] for i in range(H)]
-    np.testing.assert_allclose(got, want, atol=1e-12)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from curvireg_torch.filters.curvilinear import dominant_eigenvector, scaled_direction
-from curvireg_torch.filters.suppression import is_directional_maximum
+from curvireg_torch.filters.operations import is_directional_maximum
 
 
 def matrices() -> torch.Tensor:

@@ -8,8 +8,7 @@ import torch
 import trimesh
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
-from curvireg_torch.features.appearance import describe, similarity
-from curvireg_torch.features.backbone import Backbone
+from curvireg_torch.features.backbone import Backbone, describe, similarity
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.matching import matcher as matcher_module
 from curvireg_torch.mesh.mesh import as_mesh

@@ -9,8 +9,7 @@ from torch import Tensor
 import curvireg_torch as cr
 from curvireg_torch import filters
 from curvireg_torch.errors import ImageError
-from curvireg_torch.features.appearance import describe
-from curvireg_torch.features.backbone import Backbone
+from curvireg_torch.features.backbone import Backbone, describe
 from tests._support.scenes import CAMERA, scene, truck_registrar
 
 IMAGE, BOX, _ = scene(0)
@@ -46,7 +45,7 @@ def test_fields_fill_missing_pixels() -> None:
     image = torch.rand(1, 3, 64, 64, generator=generator)
     lost = image.clone()
     lost[0, :, 30:34, 30:34], lost[0, 2, 5, 5] = math.nan, math.inf
-    where = filters.inputs.missing_mask(lost).any(dim=1, keepdim=True)
+    where = filters.operations.missing_mask(lost).any(dim=1, keepdim=True)
     learned = cr.LearnedCurvilinearSaliency()
     field = learned(lost)
     assert bool(field.isfinite().all())
