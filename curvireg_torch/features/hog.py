@@ -22,8 +22,7 @@ from ..filters.operations import (
 )
 from ..utils.checks import check_field, check_fraction, check_integer, check_option, check_tensor
 
-MIN_BLOCK_LENGTH = 1e-5
-"""Length of a block, relative to the longest block of the image, below which normalisation suppresses it."""
+MIN_BLOCK_LENGTH = 1e-5  # relative to the longest block of the image; normalisation suppresses shorter ones
 
 
 def hog_length(*, grid: int = 8, bins: int = 9, block: int = 2) -> int:
@@ -44,10 +43,9 @@ def hog(
     """HOG (Dalal and Triggs 2005) of a vector field; one grid of cells covers the whole image.
 
     Each pixel votes with the length of its vector for the orientation of the vector modulo 180 degrees. ``"linear"``
-    voting interpolates between the two nearest bins and the four nearest cells; ``"hard"`` voting uses one bin and one
-    cell, as ``skimage.feature.hog`` does. Cell histograms are means over the cell area. Blocks of ``block`` x ``block``
-    cells are normalised by L2-Hys, regularised relative to the strongest block of the image, so the descriptor is
-    invariant to the unit of the field and to contrast.
+    voting interpolates between the two nearest bins and the four nearest cells; ``"hard"`` voting uses one of each, as
+    ``skimage.feature.hog`` does. Blocks of ``block`` x ``block`` cells are normalised by L2-Hys, relative to the
+    strongest block of the image, so the descriptor is invariant to the unit of the field and to contrast.
 
     Args:
         field: (B, 2, H, W), channel 0 = x, 1 = y, H and W >= grid. Vectors that are not finite have no vote.
@@ -56,8 +54,7 @@ def hog(
         block: cells along the side of a block, <= grid.
         clip: upper limit of L2-Hys in (0, 1]; 1 disables clipping.
         voting: ``"linear"`` or ``"hard"``.
-        bin_weights: (bins,) factor >= 0 on every vote for a bin; differentiable. The sign is not checked while tracing
-            (compile, export, vmap) and on devices other than the CPU.
+        bin_weights: (bins,) factor >= 0 on every vote for a bin; differentiable, and checked where it can be read.
 
     Returns:
         (B, D), D = (grid - block + 1)^2 block^2 bins = 1764 by default, ordered block row, block column, cell row, cell
@@ -167,7 +164,11 @@ def _normalised_blocks(cells: Tensor, block: int, clip: float) -> Tensor:
 
 
 class HOG(FunctionModule):
-    """Module twin of :func:`hog`; ``learnable`` makes ``bin_weights``, initially 1, a positive parameter.
+    """Module twin of :func:`hog`.
+
+    Args:
+        grid, bins, block, clip, voting: as in the function.
+        learnable: make ``bin_weights`` (bins,), initially 1, a positive parameter; otherwise it is None.
 
     Shape:
         Input (B, 2, H, W); output (B, D), D = :func:`hog_length` of grid, bins and block.

@@ -11,9 +11,11 @@ from .curvilinear import (
     DepthCurvilinearSaliency,
     ImageCurvilinearSaliency,
     ImageGradient,
+    PrincipalCurvatureImage,
     depth_curvilinear_saliency,
     image_curvilinear_saliency,
     image_gradient,
+    principal_curvature_image,
 )
 from .focus import EdgeBlur, MultiScaleFocusCurves, edge_blur, multiscale_focus_curves
 from .multiscale import (
@@ -23,7 +25,6 @@ from .multiscale import (
     multiscale_curvilinear_saliency,
 )
 from .operations import gaussian_smooth
-from .principal import PrincipalCurvatureImage, principal_curvature_image
 from .shading import (
     ApparentRidges,
     AverageShadingGradient,

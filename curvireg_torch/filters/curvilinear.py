@@ -1,6 +1,7 @@
-"""Gradient and curvilinear saliency of photographs, and curvilinear saliency of depth (the paper's contribution 1)."""
+"""Curvilinear saliency of depth (the paper's contribution 1); gradient, curvilinear saliency and PCI of photographs."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +17,7 @@ from .operations import (
     central_derivatives,
     central_gradient,
     check_scalar,
+    check_sigmas,
     clone_if_grad,
     safe_eps,
     safe_sqrt,
@@ -23,20 +25,17 @@ from .operations import (
     squared_length,
 )
 
-BACKGROUND_DEPTH = 1.25
-"""Depth of missing pixels behind the nearest visible point, in units of the visible depth range."""
-
-MIN_RELATIVE_RANGE = 1e-6
-"""Visible depth range, relative to the largest depth, below which depths differ by rounding only: 8 ulp of float32."""
+BACKGROUND_DEPTH = 1.25  # of missing pixels behind the nearest visible point, in units of the visible depth range
+MIN_RELATIVE_RANGE = 1e-6  # of visible depths, relative to the largest; below it (8 ulp of float32) they are rounding
 
 
 def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Depth with missing pixels at the largest number; nearest depth and depth range of each image, (B, 1, 1, 1).
 
-    Missing pixels are 0, negative, inf, NaN or outside ``mask``. For a range of at most ``MIN_RELATIVE_RANGE``, which
-    must not be stretched, the largest depth is returned instead. The range of an empty image is 1.
+    Missing pixels are 0, negative, inf, NaN or outside ``mask``. For a range of rounding, which must not be stretched,
+    the largest depth is returned instead. The range of an empty image is 1.
     """
-    # Two equivalent forms: eager, torch.where takes seven times as long; compiled, nan_to_num is not vectorised.
+    # Eager, torch.where takes seven times as long; compiled, nan_to_num is not vectorised.
     compiling = torch.compiler.is_compiling()
     clean = torch.where(depth < math.inf, depth, 0.0) if compiling else depth.nan_to_num(0.0, 0.0, 0.0)
     if mask is not None:
@@ -139,17 +138,15 @@ def _shape_operator(z: Tensor, formula: str) -> Planes:
 def dominant_eigenvector(
     m11: Tensor, m12: Tensor, m21: Tensor, m22: Tensor, sign: float | Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Eigenvector (vx, vy) of [[m11, m12], [m21, m22]] with real eigenvalues, and half the eigenvalue difference.
+    """Eigenvector (vx, vy), of any length, of [[m11, m12], [m21, m22]], and half the difference of its eigenvalues.
 
-    It belongs to the eigenvalue largest in absolute value, or with ``sign=1`` to the largest one, and has any length.
-    It is 0 for a multiple of the identity.
+    Its eigenvalue is the largest in absolute value, or with ``sign=1`` the largest; it is 0 for a multiple of I.
     """
     gap = m11 - m22
     # tr^2 / 4 - det in a form without cancellation.
     half_gap = safe_sqrt((m12 * m21).addcmul_(gap, gap, value=0.25))
     # (s half_gap + gap / 2, m21) and (m12, s half_gap - gap / 2), where s is the sign, are both eigenvectors. Take the
-    # one without cancellation, by arithmetic: torch.where with an unpredictable mask costs a CPU as much as 27
-    # additions.
+    # one without cancellation, by arithmetic, since torch.where with an unpredictable mask is slow.
     sign = (m11 + m22).ge_(0.0).mul_(2.0).sub_(1.0) if sign is None else sign
     diagonal = gap.abs().mul_(0.5).add_(half_gap).mul_(sign)
     first = (gap * sign).ge_(0.0)
@@ -212,8 +209,50 @@ def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) ->
     return apply_to_photograph(layer, image)
 
 
+def principal_curvature_image(
+    image: Tensor, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0), eigenvalue: str = "largest"
+) -> Tensor:
+    r"""Principal curvature image (Deng et al. 2007): lines and the sides of edges, over scales.
+
+    :math:`\max_\sigma \sigma^2 \max(\lambda, 0)` with :math:`\lambda` an eigenvalue of the Hessian of the image
+    smoothed by :math:`\sigma`: the largest one (``"largest"``: dark lines and the dark side of edges) or the negated
+    smallest one (``"smallest"``: bright lines and the bright side).
+
+    Args:
+        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
+        sigmas: scales in px, > 0.
+        eigenvalue: ``"largest"`` or ``"smallest"``.
+
+    Returns:
+        (B, 2, H, W): the length is the curvature >= 0 in grey levels, the direction is across the line at the scale of
+        the maximum, with arbitrary sign.
+
+    Example:
+        >>> line = torch.ones(1, 1, 33, 33)
+        >>> line[..., 16] = 0.0                                                     # dark, along y
+        >>> field = principal_curvature_image(line)
+        >>> int(field[0, 0, 16].abs().argmax())
+        16
+    """
+    check_option(eigenvalue, ("largest", "smallest"), "eigenvalue")
+    scales = check_sigmas(sigmas, "sigmas")
+    sign = 1.0 if eigenvalue == "largest" else -1.0
+
+    def layer(image: Tensor) -> Planes:
+        best = vx = vy = torch.zeros_like(image)
+        for sigma in scales:
+            xx, yy, xy = (sign * sigma**2 * h for h in central_derivatives(smooth(image, sigma))[2:])
+            x, y, half_gap = dominant_eigenvector(xx, xy, xy, yy, sign=1.0)
+            curvature = 0.5 * (xx + yy) + half_gap
+            better = (curvature > best).to(best.dtype)
+            best, vx, vy = torch.maximum(best, curvature), torch.lerp(vx, x, better), torch.lerp(vy, y, better)
+        return scaled_direction(best, default_to_x(vx, vy), vy)  # a round blob has no unique direction
+
+    return apply_to_photograph(layer, image)
+
+
 class ImageGradient(FunctionModule, function=image_gradient, learnable=("sigma",)):
-    """Module twin of :func:`image_gradient`; ``learnable`` makes sigma a positive parameter.
+    """Module twin of :func:`image_gradient`.
 
     Example:
         >>> len(list(ImageGradient(learnable=True).parameters()))
@@ -224,7 +263,7 @@ class ImageGradient(FunctionModule, function=image_gradient, learnable=("sigma",
 
 
 class ImageCurvilinearSaliency(FunctionModule, function=image_curvilinear_saliency, learnable=("sigma",)):
-    """Module twin of :func:`image_curvilinear_saliency`; ``learnable`` makes sigma a positive parameter.
+    """Module twin of :func:`image_curvilinear_saliency`.
 
     Example:
         >>> ImageCurvilinearSaliency(sigma=2.0)
@@ -235,7 +274,7 @@ class ImageCurvilinearSaliency(FunctionModule, function=image_curvilinear_salien
 
 
 class DepthCurvilinearSaliency(DepthModule, function=depth_curvilinear_saliency, learnable=("sigma",)):
-    """Module twin of :func:`depth_curvilinear_saliency`; ``learnable`` makes sigma a positive parameter.
+    """Module twin of :func:`depth_curvilinear_saliency`.
 
     Example:
         >>> plane = torch.arange(32.0).expand(1, 1, 32, 32) + 10
@@ -251,3 +290,14 @@ class DepthCurvilinearSaliency(DepthModule, function=depth_curvilinear_saliency,
         depth_scale: float | None = None,
         learnable: bool = False,
     ) -> None: ...
+
+
+class PrincipalCurvatureImage(FunctionModule, function=principal_curvature_image):
+    """Module twin of :func:`principal_curvature_image`.
+
+    Example:
+        >>> PrincipalCurvatureImage(eigenvalue="smallest")(torch.rand(2, 3, 32, 32)).shape
+        torch.Size([2, 2, 32, 32])
+    """
+
+    def __init__(self, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0), eigenvalue: str = "largest") -> None: ...

@@ -24,16 +24,9 @@ from .operations import (
 )
 
 MODES = ("reblur-image", "reblur-saliency")
-
-MAX_BLUR = 1000.0
-"""Blur in px reported where re-blurring does not lower the saliency."""
-
-DIFFERENCE_VARIANCE = 0.36
-"""Variance in px^2 that the central difference adds to an edge. Its second moment is 1/3, but it is not a Gaussian;
-0.36 lowers the largest error at blurs of 1 to 4 px from 3.1 to 1.8 %."""
-
-MIN_RELATIVE_SALIENCY = 1e-3
-"""CS relative to the largest CS of the image below which a pixel is noise, not an edge; about 3 % of the contrast."""
+MAX_BLUR = 1000.0  # px, reported where re-blurring does not lower the saliency
+DIFFERENCE_VARIANCE = 0.36  # px^2 that the central difference adds to an edge; best for blurs of 1 to 4 px
+MIN_RELATIVE_SALIENCY = 1e-3  # CS relative to the image's largest below which a pixel is noise: 3 % of the contrast
 
 
 def edge_blur(
@@ -160,7 +153,7 @@ class EdgeBlur(FunctionModule, function=edge_blur):
 
 
 class MultiScaleFocusCurves(FunctionModule, function=multiscale_focus_curves, learnable=("sigma",)):
-    """Module twin of :func:`multiscale_focus_curves`; ``learnable`` makes sigma a positive parameter.
+    """Module twin of :func:`multiscale_focus_curves`.
 
     Example:
         >>> from curvireg_torch import HOG

@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import re
 from collections.abc import Callable
 from typing import Any, ClassVar, Self
 
@@ -22,12 +23,33 @@ class Positive(nn.Module):
         return value.log()
 
 
-class FunctionModule(nn.Module):
-    """Module twin of a function of images: ``class Twin(FunctionModule, function=f, learnable=("sigma",))``.
+def _options(function: Callable[..., Any]) -> dict[str, Any]:
+    """Keyword-only options and their defaults."""
+    return {n: p.default for n, p in inspect.signature(function).parameters.items() if p.kind == p.KEYWORD_ONLY}
 
-    It holds the options of the function, in their order, and refuses what the function refuses. A twin writes its
-    constructor only as a signature, for type checkers and editors: the options and defaults of the function and, where
-    some are ``learnable``, the flag that makes them positive parameters.
+
+def _twin_docstring(twin: str, function: Callable[..., Any], learnable: tuple[str, ...]) -> str:
+    """The docstring of a twin with the options, the input and the output from the docstring of its function."""
+    sections = re.split(r"^(\w+):\n", inspect.getdoc(function) or "", flags=re.MULTILINE)
+    texts = dict(zip(sections[1::2], sections[2::2], strict=True))
+    options, shape = [], []
+    for names, text in re.findall(r"^    ([\w, ]+): (.*(?:\n {8}.*)*)", texts.get("Args", ""), flags=re.MULTILINE):
+        of_constructor = [name for name in names.split(", ") if name in _options(function)]
+        options += [f"    {', '.join(of_constructor)}: {text}"] if of_constructor else []
+        shape += [] if of_constructor and len(of_constructor) == len(names.split(", ")) else [f"    Input: {text}"]
+    if learnable:
+        options.append(f"    learnable: make {' and '.join(learnable)} trainable; they stay positive.")
+    summary, _, example = twin.partition("\n\n")
+    output = f"    Output: {texts.get('Returns', '').strip()}"
+    return "\n".join([summary, "", "Args:", *options, "", "Shape:", *shape, output, "", example])
+
+
+class FunctionModule(nn.Module):
+    """Module twin of a function of images, ``class Twin(FunctionModule, function=f, learnable=("sigma",))``.
+
+    It holds the function's options, refuses what the function refuses, and has its documentation. A twin writes its
+    constructor only as a signature, for type checkers and editors; the flag ``learnable`` makes options positive
+    parameters.
     """
 
     _function: ClassVar[Callable[..., Tensor]]
@@ -39,12 +61,9 @@ class FunctionModule(nn.Module):
         cls._function = staticmethod(function)
         declared = cls.__init__
         signature = inspect.signature(declared)
-        defaults = {
-            name: p.default for name, p in inspect.signature(function).parameters.items() if p.kind == p.KEYWORD_ONLY
-        }
-        stated = {name: p.default for name, p in signature.parameters.items() if name not in ("self", "learnable")}
-        if stated != defaults:
-            raise TypeError(f"{cls.__name__}: expected the options of its function, {defaults}, got {stated}")
+        wanted, stated = _options(function), _options(declared)
+        if wanted != {name: default for name, default in stated.items() if name != "learnable"}:
+            raise TypeError(f"{cls.__name__}: expected the options of its function, {wanted}, got {stated}")
 
         @functools.wraps(declared)
         def construct(self: "FunctionModule", *args: Any, **options: Any) -> None:
@@ -55,6 +74,8 @@ class FunctionModule(nn.Module):
             self._check(values)
 
         cls.__init__ = construct  # type: ignore[method-assign]
+        if cls.__doc__:
+            cls.__doc__ = _twin_docstring(inspect.cleandoc(cls.__doc__), function, learnable)
 
     def __init__(self, learnable: tuple[str, ...] = (), **options: Any) -> None:
         super().__init__()

@@ -26,9 +26,7 @@ from .operations import (
 )
 
 CONDUCTANCES = ("rational", "exponential")
-
-DIFFUSION_STEP = 0.2
-"""Time step of the diffusion under MCS."""
+DIFFUSION_STEP = 0.2  # of the diffusion under MCS
 
 
 def anisotropic_diffusion(
@@ -157,7 +155,7 @@ def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> tuple[Tensor, 
 
 
 class AnisotropicDiffusion(FunctionModule, function=anisotropic_diffusion, learnable=("kappa",)):
-    """Module twin of :func:`anisotropic_diffusion`; ``learnable`` makes kappa a positive parameter.
+    """Module twin of :func:`anisotropic_diffusion`.
 
     Example:
         >>> noise = torch.rand(1, 3, 32, 32)
@@ -179,7 +177,7 @@ class AnisotropicDiffusion(FunctionModule, function=anisotropic_diffusion, learn
 class MultiScaleCurvilinearSaliency(
     FunctionModule, function=multiscale_curvilinear_saliency, learnable=("sigma", "kappa")
 ):
-    """Module twin of :func:`multiscale_curvilinear_saliency`; ``learnable`` makes sigma and kappa positive parameters.
+    """Module twin of :func:`multiscale_curvilinear_saliency`.
 
     Example:
         >>> MultiScaleCurvilinearSaliency(scales=3)(torch.rand(2, 3, 32, 32)).shape

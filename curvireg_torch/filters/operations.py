@@ -1,6 +1,5 @@
 """What the layers share: safe arithmetic, blocks of a batch, missing pixels, derivatives, suppression of non-maxima."""
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -8,7 +7,6 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.autograd.forward_ad import unpack_dual
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_colour_image, check_positive, check_tensor
@@ -61,11 +59,6 @@ def is_host_readable(x: Tensor) -> bool:
     return not torch.compiler.is_compiling() and x.device.type == "cpu" and not _in_func_transform(x)
 
 
-def is_traced(x: Tensor) -> bool:
-    """Whether autograd, forward or backward, or ``torch.func`` follows x, so that x cannot be written to."""
-    return x.requires_grad or _in_func_transform(x) or unpack_dual(x).tangent is not None
-
-
 def check_scalar(value: float | Tensor, name: str, *, zero_ok: bool = False) -> float | Tensor:
     """Return a positive option, a number or a scalar tensor, whose value is checked where it is readable."""
     if not isinstance(value, Tensor):
@@ -88,33 +81,19 @@ def safe_reciprocal(value: float | Tensor) -> float | Tensor:
     return 1.0 / (value.clamp(min=1e-6, max=1e6) if isinstance(value, Tensor) else value)
 
 
-Planes = tuple[Tensor, ...]
-"""Channels of a result: several tensors (B, 1, H, W), or one tensor that holds them all."""
-
-BLOCK_PIXELS = 2**18
-"""Pixels that :func:`apply_in_blocks` passes to a layer at once, so that intermediate results stay in the cache."""
+Planes = tuple[Tensor, ...]  # channels of a result: several tensors (B, 1, H, W), or one tensor that holds them all
+BLOCK_PIXELS = 2**18  # that a layer gets at once, so that intermediate results stay in the cache
 
 
 def apply_in_blocks(layer: Callable[..., Planes], *tensors: Tensor | None) -> Tensor:
-    """``stack_channels(*layer(*tensors))``, computed a few images at a time on a CPU.
-
-    The layer must treat each image independently. All ``tensors`` have the same first dimension; None stays None.
-    """
+    """``stack_channels(*layer(*tensors))`` of a layer that treats images independently, in blocks on a CPU."""
     x = tensors[0]
     assert x is not None
     if torch.compiler.is_compiling() or x.device.type != "cpu" or x.numel() <= BLOCK_PIXELS:
         return stack_channels(*layer(*tensors))
     size = max(1, BLOCK_PIXELS // x.shape[1:].numel())
     parts = [[None] * math.ceil(len(x) / size) if t is None else t.split(size) for t in tensors]
-    blocks = (layer(*part) for part in zip(*parts, strict=True))
-    first = next(blocks)
-    if any(is_traced(plane) for plane in first):
-        return torch.cat([stack_channels(*planes) for planes in itertools.chain([first], blocks)])
-    # Only one block is in memory at a time.
-    out = first[0].new_empty((len(x), sum(plane.shape[1] for plane in first), *first[0].shape[2:]))
-    for target, planes in zip(out.split(size), itertools.chain([first], blocks), strict=True):
-        torch.cat(planes, dim=1, out=target)
-    return out
+    return torch.cat([stack_channels(*layer(*part)) for part in zip(*parts, strict=True)])
 
 
 def stack_channels(*planes: Tensor) -> Tensor:
@@ -125,8 +104,7 @@ def stack_channels(*planes: Tensor) -> Tensor:
     return torch.stack([plane.squeeze(1) for plane in planes], dim=1)
 
 
-MAX_HOLE_LEVELS = 5
-"""Holes of up to 2^5 px are filled from their surroundings, the middle of larger ones with the mean of the image."""
+MAX_HOLE_LEVELS = 5  # holes of up to 2^5 px are filled from their surroundings, the middle of larger ones with the mean
 
 
 def apply_to_photograph(layer: Callable[[Tensor], Planes], image: Tensor, *, missing_value: float = 0.0) -> Tensor:
@@ -146,7 +124,6 @@ def to_grey(image: Tensor) -> Tensor:
     """(B, 1, H, W) grey levels of (B, 3, H, W) RGB, 0.299 R + 0.587 G + 0.114 B; a grey image is returned unchanged."""
     if image.shape[1] == 1:
         return image
-    # kornia's rgb_to_grayscale has the same weights and rounds differently, which would change results.
     r, g, b = image.split(1, dim=1)
     grey: Tensor = 0.299 * r + 0.587 * g + 0.114 * b
     return grey
@@ -163,10 +140,8 @@ def missing_mask(x: Tensor) -> Tensor:
 
 
 def fill_missing(x: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Fill each missing pixel of (B, C, H, W) with the mean of the smallest pyramid cell that has any valid pixel.
-
-    ``mask`` is True where a pixel is missing; None: where x is not finite. An image without valid pixels becomes 0.
-    """
+    """Fill missing pixels of (B, C, H, W), by default those not finite, with the mean of the smallest pyramid cell that
+    has a valid pixel; an image without any becomes 0."""
     if mask is None:
         if not may_have_missing(x):
             return x
@@ -191,11 +166,8 @@ def zero_nonfinite_vectors(field: Tensor) -> Tensor:
     return torch.where(missing_mask(field).any(dim=1, keepdim=True), 0.0, field)
 
 
-MAX_TENSOR_RADIUS = 16
-"""Largest kernel radius in px for a sigma that is a tensor: a traced graph reserves it, since it cannot read sigma."""
-
-MIN_TENSOR_SIGMA = 1e-3
-"""Sigma in px below which a kernel is a single 1 in every dtype and has derivative 0."""
+MAX_TENSOR_RADIUS = 16  # px, of the kernel of a sigma that is a tensor: a traced graph reserves it
+MIN_TENSOR_SIGMA = 1e-3  # px, below which a kernel is a single 1 in every dtype and has derivative 0
 
 
 def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
@@ -204,8 +176,7 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
     Args:
         x: (B, C, H, W), as the result. NaN spreads.
         sigma: standard deviation in px, >= 0; 0 returns ``x``. A scalar tensor is differentiable. The kernel is cut at
-            ceil(4 sigma) px, for a tensor at 16 px at most. While tracing (compile, export, vmap), the sign of a tensor
-            cannot be checked, and values below 0.001 px are clamped to 0.001 px.
+            ceil(4 sigma) px, for a tensor at 16 px at most. Traced tensors are clamped to 0.001 px, not checked.
 
     Example:
         >>> gaussian_smooth(torch.ones(1, 1, 5, 5), 1.0).shape
@@ -215,17 +186,14 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
 
 
 def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = False) -> Tensor:
-    """:func:`gaussian_smooth` of an image enlarged by ``margin`` px on each side, as finite differences need it.
-
-    ``linear`` extrapolates beyond the borders with the slope there instead of replicating them.
-    """
+    """:func:`gaussian_smooth` of an image enlarged by ``margin`` px on each side, as finite differences need it:
+    ``linear`` by the slope at the borders, else by replicating them."""
     radius = _kernel_radius(sigma)
     x = (extrapolate_pad if linear else replicate_pad)(x, radius + margin)
     if radius == 0:
         return x
     weights = _gaussian_kernel(sigma, radius, x)
-    # Sums of shifted images: on a CPU seldom slower than a convolution, much faster on few images, one loop when
-    # compiled.
+    # Sums of shifted images: much faster than a convolution on few images, and one loop when compiled.
     for dim in (-1, -2):
         padded, length = x, x.shape[dim] - 2 * radius
         x = padded.narrow(dim, 0, length) * weights[0]

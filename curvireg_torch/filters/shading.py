@@ -76,7 +76,7 @@ def average_shading_gradient(
 def check_shading(
     sigma: float | Tensor, depth_scale: float | None, camera_matrix: Tensor | None
 ) -> tuple[float | Tensor, float | None]:
-    """Returns sigma and depth_scale."""
+    """Return sigma and depth_scale."""
     if camera_matrix is not None:
         check_tensor(camera_matrix, "camera_matrix", (None,) * (camera_matrix.ndim == 3) + (3, 3))
         if is_host_readable(camera_matrix):
@@ -184,9 +184,8 @@ def apparent_ridges(
     the largest singular value of :math:`[N_x\ N_y]`; :math:`t_1` is the screen direction of that step. Apparent ridges
     are the maxima of :math:`q_1` along :math:`t_1`.
 
-    This is an approximation: Judd et al. follow the zero crossings of :math:`D_{t_1} q_1` over the faces of the mesh.
-    Here N comes from finite differences of the smoothed depth, so :math:`q_1` is finite at an occluding contour; maxima
-    are pixels, along :math:`t_1` rounded to 45 degrees.
+    Judd et al. follow the zero crossings of :math:`D_{t_1} q_1` over the mesh's faces. Here N comes from the smoothed
+    depth, so :math:`q_1` is finite at an occluding contour; maxima are pixels, along :math:`t_1` rounded to 45 degrees.
 
     Args:
         depth, mask, camera_matrix, sigma, depth_scale: as in :func:`average_shading_gradient`.
@@ -218,7 +217,7 @@ def apparent_ridges(
 
 
 class AverageShadingGradient(DepthModule, function=average_shading_gradient):
-    """Module twin of :func:`average_shading_gradient`; the camera matrix keeps its dtype.
+    """Module twin of :func:`average_shading_gradient`.
 
     Example:
         >>> camera = torch.tensor([[50.0, 0.0, 15.5], [0.0, 50.0, 15.5], [0.0, 0.0, 1.0]])
@@ -244,7 +243,7 @@ class HessianFrobeniusNorm(DepthModule, function=hessian_frobenius_norm):
 
 
 class ApparentRidges(DepthModule, function=apparent_ridges):
-    """Module twin of :func:`apparent_ridges`; the camera matrix keeps its dtype.
+    """Module twin of :func:`apparent_ridges`.
 
     Example:
         >>> ApparentRidges(depth_scale=1.0)(torch.rand(1, 1, 32, 32)).shape

@@ -9,6 +9,9 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..utils.checks import check_camera_matrix, check_finite, check_number, check_pose, check_rotation
 
+MAX_BOX_ITERATIONS = 20
+MIN_BOX_STEP = 1e-9  # change of the position in an iteration, relative to the position
+
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dtype = torch.float64) -> Tensor:
     """Return the (3, 3) OpenCV camera matrix; all arguments in px."""
@@ -93,26 +96,21 @@ def rotation_towards(rays: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-MAX_BOX_ITERATIONS = 20
-MIN_BOX_STEP = 1e-9  # change of the position in an iteration, relative to the position
-
-
 def pose_from_box(
     points: Tensor, rotation: Tensor, box: Tensor, K: Tensor, *, allocentric: bool = True
 ) -> tuple[Tensor, Tensor]:
     """Estimate the pose with which the projected points fill a box, with the object in front of the camera.
 
-    Fixed point of two closed-form steps: the sizes of the projected and the given box determine the distance, their
-    centres the offset. With the true rotation and box it converges to the true translation; with others, to the best
-    scale (least squares over width and height) with equal centres.
+    Fixed point of two closed-form steps: the sizes of the projected and the given box determine the distance (least
+    squares over width and height), their centres the offset.
 
     Args:
         points: (P, 3) of the model, for instance the vertices of its convex hull.
-        rotation: (..., 3, 3) model -> camera. Allocentric: as seen by a camera that looks straight at the object's
-            centre; every step rotates it towards the ray of the object's current centre.
+        rotation: (..., 3, 3) model -> camera.
         box: (..., 4) x0, y0, x1, y1 in px.
         K: (..., 3, 3).
-        allocentric: whether the rotation is; otherwise it is kept.
+        allocentric: the rotation is as seen by a camera that looks straight at the object's centre, and every step
+            turns it towards the ray of the current centre; otherwise it is kept.
 
     Returns:
         rotation (..., 3, 3) and translation (..., 3) in the photograph's camera, float64, in model units.

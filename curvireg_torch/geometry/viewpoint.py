@@ -113,8 +113,7 @@ def rotation_error(R1: Tensor, R2: Tensor) -> Tensor:
     return torch.rad2deg(2.0 * torch.asin(chord.clamp(max=1.0)))
 
 
-DEFAULT_DISTANCE = 5.0
-"""Distance of a view in units of the object's radius: ``docs/experiments.md`` compares others."""
+DEFAULT_DISTANCE = 5.0  # of a view in units of the object's radius: docs/experiments.md compares others
 
 
 @dataclass(frozen=True)

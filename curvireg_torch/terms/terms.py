@@ -17,8 +17,7 @@ from ..utils.checks import check_integer, check_masks, check_option, check_posit
 from ..utils.threads import map_on_threads
 from .query import QueryFeatures, box_shapes
 
-VIEWS_AT_A_TIME = 64
-"""Views whose points are compared at a time."""
+VIEWS_AT_A_TIME = 64  # whose points are compared
 
 
 class Views(Protocol):
@@ -66,8 +65,8 @@ class RerankingTerm(Term):
     """A term that needs a picture of every view that it compares.
 
     A bank of up to ``exhaustive_limit`` views stores the features of all its views. In a larger bank the term compares
-    only the best distinct views of the other terms and computes their features on demand; every other view gets the
-    score of the nearest compared view, and NaN as raw score.
+    only the best distinct views of the other terms; every other view gets the score of the nearest compared view, and
+    NaN as raw score.
 
     Attributes:
         exhaustive_limit: largest number of views that are all compared.
@@ -347,13 +346,11 @@ class _BoxShapeModule(nn.Module):
 
 @dataclass(frozen=True)
 class Appearance(RerankingTerm):
-    """The appearance score: features of an ImageNet network agree, cell by cell, between the photograph's crop and the
-    shaded view.
+    """Appearance score: features of an ImageNet network agree, cell by cell, between photograph and shaded view.
 
-    A mesh with colours is rendered twice, in grey and in its colours, and the better match counts for each view: a
-    print distinguishes top from bottom, and the grey picture remains where the print misleads. Raw scores are mean
-    cosines (:func:`curvireg_torch.features.backbone.similarity`) in [-1, 1]; log S = (raw - max raw) / std raw, over
-    the compared views.
+    A mesh with colours is rendered in grey and in its colours, and the better match counts for each view: a print
+    distinguishes top from bottom, and the grey picture remains where it misleads. Raw scores are mean cosines
+    (:func:`curvireg_torch.features.backbone.similarity`), mapped by :func:`log_unit_score` over the compared views.
 
     Attributes:
         weights: digest of the network's weights.

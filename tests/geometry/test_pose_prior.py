@@ -62,12 +62,6 @@ def test_rotation_limit_is_the_geodesic_distance():
     assert expected[1] > 10.0
 
 
-def test_log_prior_excludes_what_is_outside_and_margin_widens_it():
-    R, prior = rotations([0.0, 25.0, 40.0]), PosePrior(azimuth=(-20, 20))
-    assert prior.log_prior(R).tolist() == [0.0, -math.inf, -math.inf]
-    assert prior.log_prior(R, margin=7.5).tolist() == [0.0, 0.0, -math.inf]
-
-
 @pytest.mark.parametrize(
     "prior",
     [
@@ -159,7 +153,7 @@ def test_object_frame_puts_up_on_z_and_the_front_towards_azimuth_zero(up):
         ({"rotation": 2 * torch.eye(3), "within": 5.0}, "rotation"),
         ({"viewpoint": (0, 0, 0), "within": "5"}, "within: expected a number"),
         ({"azimuth": (0, 9), "front": "w"}, "front"),
-        ({"viewpoint": (0, "a", 0), "within": 5.0}, "viewpoint: expected 3 numbers"),
+        ({"viewpoint": (0, "a", 0), "within": 5.0}, "viewpoint: expected numbers"),
     ],
     ids=str,
 )

@@ -47,13 +47,8 @@ def test_view_functions_refuse_invalid_options() -> None:
         (lambda: sample_views(azimuth_step="10"), "azimuth_step: expected a number"),
         (lambda: cr.camera_matrix("1", 1, 1, 1), "fx: expected a number"),
         (lambda: cr.crop_images(torch.rand(1, 1, 4, 4), [[0, 0, 3, 3]], size=8.0), "size: expected an integer"),
-        (lambda: uniform_views(5, elevation_range=(10, -10)), "elevation_range"),
-        (lambda: uniform_views(5, elevation_range=(-200, 90)), r"elevation_range: expected degrees in \[-90, 90\]"),
-        (lambda: uniform_views(5, elevation_range=(-90, 90.1)), "elevation_range: expected degrees"),
-        (lambda: uniform_views(5, elevation_range=(float("nan"), 90)), "elevation_range: expected degrees"),
-        (lambda: sample_views(elevations=[float("nan")]), "elevations: expected degrees"),
+        (lambda: sample_views(elevations=[float("nan")]), "elevations: expected at least one finite"),
         (lambda: uniform_views(5, thetas=[]), "thetas"),
-        (lambda: sample_views(elevations=[-91]), "elevations"),
     ):
         with pytest.raises(InvalidInputError, match=match):
             call()

@@ -57,20 +57,9 @@ def test_check_given_runs_before_heavy_imports(words):
 
 
 def test_options_accept_numbers_with_commas():
-    words = [
-        "register",
-        "a,1.jpg",
-        "--box",
-        "10,",
-        "20,",
-        "30.5,",
-        "40",
-        "--camera=1e3,1000,-.5,2",
-        "5,6",
-        "--out",
-        "o",
-    ]
-    arguments = parse(words)
+    arguments = parse(
+        ["register", "a,1.jpg", *["--box", "10,", "20,", "30.5,", "40", "--camera=1e3,1000,-.5,2", "5,6", "--out", "o"]]
+    )
     assert arguments.box == parse(["view", "--box=10, 20, 30.5, 40"]).box == [10.0, 20.0, 30.5, 40.0]
     assert arguments.camera == [1000.0, 1000.0, -0.5, 2.0]
     assert arguments.paths == [Path("a,1.jpg"), Path("5,6")]

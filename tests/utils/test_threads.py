@@ -1,5 +1,3 @@
-import contextlib
-import os
 import threading
 from collections.abc import Iterator
 
@@ -72,39 +70,6 @@ def test_for_each_stops_at_an_error_and_raises_it() -> None:
         for_each(100_000, job)
     assert len(done) < 99_999
     for_each(2, done.append)  # the threads survive
-
-
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_for_each_works_in_a_forked_process() -> None:
-    for_each(4, lambda _: None)
-    child = os.fork()
-    if child == 0:
-        done: list[int] = []
-        for_each(4, done.append)
-        os._exit(0 if sorted(done) == [0, 1, 2, 3] else 1)
-    killer = threading.Timer(20.0, os.kill, (child, 9))  # if it hangs
-    killer.start()
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-    killer.cancel()
-
-
-@pytest.mark.parametrize("error", [None, ValueError("within")])
-def test_single_threaded_pool_restores_the_number_of_threads(
-    monkeypatch: pytest.MonkeyPatch, error: Exception | None
-) -> None:
-    threads = [2]  # some libraries count threads for the whole process, so that a worker changes the number for all
-    monkeypatch.setattr(torch, "set_num_threads", lambda n: threads.append(n))
-    monkeypatch.setattr(torch, "get_num_threads", lambda: threads[-1])
-
-    with (
-        pytest.raises(ValueError, match="within") if error else contextlib.nullcontext(),
-        single_threaded_pool() as pool,
-    ):
-        pool.submit(threading.get_ident).result()
-        assert threads[-1] == 1
-        if error is not None:
-            raise error
-    assert threads == [2, 1, 2]
 
 
 def test_map_on_threads_keeps_the_order_on_single_threads() -> None:
