@@ -63,26 +63,6 @@ def test_fill_missing_uses_the_surroundings() -> None:
     assert float(filled[..., -1].max()) == pytest.approx(0.5)
 
 
-def test_fill_missing_reaches_holes_of_32_px() -> None:
-    """A hole of 31 px is filled from its surroundings, which are 0; the middle of one of 63 px with the image mean."""
-    for side, expected in ((31, 0.0), (63, None)):
-        image = torch.zeros(1, 1, 256, 256, dtype=torch.float64)
-        image[..., 192:, :] = 1.0
-        holes = torch.zeros_like(image, dtype=torch.bool)
-        holes[..., 64 : 64 + side, 64 : 64 + side] = True
-        mean = float(image[~holes].mean())
-        filled = fill_missing(image.masked_fill(holes, math.nan), holes)
-        assert float(filled[0, 0, 70, 70]) == pytest.approx(mean if expected is None else expected, abs=1e-3)
-
-
-@pytest.mark.filterwarnings("ignore:There is a performance drop")
-def test_image_gradient_fills_missing_pixels_under_vmap() -> None:
-    x = photos(3, 24, dtype=torch.float64)
-    x[1, 0, 4, 5] = math.nan
-    want = filters.image_gradient(x)
-    torch.testing.assert_close(torch.func.vmap(filters.image_gradient)(x[:, None])[:, 0], want)
-
-
 @every_photo_layer
 def test_photo_layers_convert_colour_to_grey(layer: LayerCase) -> None:
     colour = colour_photos(2, dtype=torch.float64)

@@ -1,4 +1,5 @@
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -6,7 +7,7 @@ import torch
 from torch import Tensor
 
 import curvireg_torch as cr
-from curvireg_torch import geometry
+from curvireg_torch import errors, geometry
 from curvireg_torch.errors import ImageError, InvalidInputError
 from curvireg_torch.utils.checks import (
     as_boxes,
@@ -157,3 +158,15 @@ def test_integers_of_the_wrong_type_are_refused(wrong: object) -> None:
     with pytest.raises(InvalidInputError, match="scales: expected an integer >= 1, got"):
         check_integer(wrong, "scales")
     assert check_integer(np.int64(3), "scales") == 3
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in vars(errors) if name.endswith(("Error", "Warning")) and name[0] != "_"]
+)
+def test_errors_keep_message_and_subject(name: str) -> None:
+    error = getattr(errors, name)("unusable; use another", subject="a.png")
+    for copy in (error, pickle.loads(pickle.dumps(error)), type(error)("unusable; use another").with_subject("a.png")):
+        assert str(copy) == "a.png: unusable; use another"
+        assert (copy.message, copy.subject) == ("unusable; use another", "a.png")
+    assert str(error.with_subject("image 3")) == "image 3: unusable; use another"
+    assert str(type(error)("unusable")) == "unusable"

@@ -35,12 +35,6 @@ def test_for_each_runs_every_job_once_and_two_at_a_time() -> None:
         assert sorted(done) == list(range(6))
 
 
-@pytest.mark.parametrize("enabled", [True, False])
-def test_jobs_have_the_gradient_mode_of_their_caller(enabled: bool) -> None:
-    with torch.set_grad_enabled(enabled):
-        assert map_on_threads(lambda _: torch.is_grad_enabled(), range(3)) == [enabled] * 3
-
-
 def test_for_each_runs_in_sequence_on_single_threads() -> None:
     here = []
     with single_threaded_pool() as pool:
@@ -82,20 +76,6 @@ def test_map_on_threads_keeps_the_order_on_single_threads() -> None:
     assert threading.get_ident() not in {thread for *_, thread in out}
     assert torch.get_num_threads() == 2
     assert map_on_threads(job, []) == []
-
-
-def test_map_on_threads_leaves_threads_to_for_each() -> None:
-    both = threading.Barrier(2, timeout=20)
-    assert map_on_threads(lambda _: for_each(2, lambda _: both.wait()), [0]) == [None]
-    here: list[tuple[int, int]] = []
-
-    def job(_: int) -> None:
-        mine = threading.get_ident()
-        for_each(3, lambda _: here.append((mine, threading.get_ident())))
-
-    map_on_threads(job, [0, 1])
-    assert len(here) == 6
-    assert all(mine == other for mine, other in here), "two jobs leave no thread over"
 
 
 def test_one_torch_thread_gives_the_threads_of_torch_to_jobs() -> None:
