@@ -102,7 +102,8 @@ class RerankingModule(nn.Module, ABC):
 
 def log_unit_score(similarity: Tensor) -> Tensor:
     """(B, N) ``(s - max s) / std s`` of similarities per photograph: the log of a softmax of z-scores, best view 0."""
-    spread = similarity.std(dim=1, keepdim=True, correction=0)
+    # Not by std, which warns of empty batches.
+    spread = (similarity - similarity.mean(dim=1, keepdim=True)).square().mean(dim=1, keepdim=True).sqrt()
     spread = torch.where(spread > 0, spread, torch.ones_like(spread))
     return (similarity - similarity.amax(dim=1, keepdim=True)) / spread
 
