@@ -9,6 +9,7 @@ Conventions of the whole library (pinned by ``tests/geometry``):
 - Poses refer to the frame and unit of the mesh file; ``up`` names the axis that points up and rotates nothing.
 """
 
+from .calibration import Camera, undistorted
 from .cameras import camera_matrix, pose_from_box, project_points, projected_boxes, rotation_towards, transform
 from .conversions import (
     axis_angle_from_rotation,
@@ -31,6 +32,7 @@ from .viewpoint import (
 )
 
 __all__ = [
+    "Camera",
     "PosePrior",
     "ViewSphere",
     "axis_angle_from_rotation",
@@ -53,6 +55,7 @@ __all__ = [
     "square_boxes",
     "symmetry_transforms",
     "transform",
+    "undistorted",
     "uniform_views",
     "up_rotation",
     "viewpoint_from_rotation",
