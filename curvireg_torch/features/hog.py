@@ -20,7 +20,7 @@ from ..filters.operations import (
     safe_sqrt,
     zero_nonfinite_vectors,
 )
-from ..utils.checks import check_field, check_fraction, check_integer, check_option, check_tensor
+from ..utils.checks import check_fraction, check_integer, check_option, check_tensor
 
 MIN_BLOCK_LENGTH = 1e-5  # relative to the longest block of the image; normalisation suppresses shorter ones
 
@@ -64,7 +64,7 @@ def hog(
         >>> hog(torch.randn(4, 2, 64, 64)).shape
         torch.Size([4, 1764])
     """
-    check_field(field)
+    check_tensor(field, "field", (None, 2, None, None))
     clip = _check_options(grid, bins, block, clip, voting)
     H, W = field.shape[-2:]
     if min(H, W) < grid:
@@ -97,7 +97,7 @@ def orientation_cells(field: Tensor, *, grid: tuple[int, int], bins: int = 9) ->
         >>> orientation_cells(torch.randn(1, 2, 48, 64), grid=(6, 8)).shape
         torch.Size([1, 9, 6, 8])
     """
-    check_field(field)
+    check_tensor(field, "field", (None, 2, None, None))
     _check_options(min(grid), bins, 1, 1.0, "linear")
     H, W = field.shape[-2:]
     if grid[0] > H or grid[1] > W:
@@ -240,7 +240,7 @@ def field_points(field: Tensor, *, fraction: float = 0.04) -> Tensor:
         >>> field_points(field, fraction=1.0)[0, 0].sum(dim=0).tolist()
         [0, 0, 0, 0, 9, 0, 0, 0, 0]
     """
-    check_field(field)
+    check_tensor(field, "field", (None, 2, None, None))
     x, y = zero_nonfinite_vectors(at_least_float32(field)).split(1, dim=1)
     length = safe_sqrt(x * x + y * y)
     return strongest_points(length, is_directional_maximum(length, x, y), fraction)

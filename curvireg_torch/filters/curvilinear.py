@@ -1,13 +1,13 @@
 """Curvilinear saliency of depth (the paper's contribution 1); gradient, curvilinear saliency and PCI of photographs."""
 
-import math
 from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..utils.checks import check_image, check_mask, check_option, check_positive
+from ..errors import InvalidInputError
+from ..utils.checks import check_image, check_option, check_positive, check_same_device, type_and_shape
 from .modules import DepthModule, FunctionModule
 from .operations import (
     Planes,
@@ -35,9 +35,7 @@ def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, T
     Missing pixels are 0, negative, inf, NaN or outside ``mask``. For a range of rounding, which must not be stretched,
     the largest depth is returned instead. The range of an empty image is 1.
     """
-    # Eager, torch.where takes seven times as long; compiled, nan_to_num is not vectorised.
-    compiling = torch.compiler.is_compiling()
-    clean = torch.where(depth < math.inf, depth, 0.0) if compiling else depth.nan_to_num(0.0, 0.0, 0.0)
+    clean = depth.nan_to_num(0.0, 0.0, 0.0)
     if mask is not None:
         clean = torch.where(mask, clean, 0.0)
     far = clean.amax(dim=(1, 2, 3), keepdim=True)
@@ -105,15 +103,15 @@ def depth_curvilinear_saliency(
 
 
 def check_depth(depth: Tensor, mask: Tensor | None) -> Tensor | None:
-    """The mask expanded to the shape of the depth."""
+    """Return the mask expanded to the shape of the depth."""
     check_image(depth, "depth")
     if mask is None:
         return None
     fits = mask.ndim <= 4 and all(m in (1, n) for m, n in zip(mask.shape[::-1], depth.shape[::-1], strict=False))
-    if fits:
-        mask = mask.expand(depth.shape)
-    check_mask(mask, depth)
-    return mask
+    if not fits or mask.dtype != torch.bool:
+        raise InvalidInputError(f"mask: expected bool of shape {tuple(depth.shape)}, got {type_and_shape(mask)}")
+    check_same_device(mask, depth, "mask")
+    return mask.expand(depth.shape)
 
 
 def check_depth_scale(depth_scale: float | None) -> float | None:

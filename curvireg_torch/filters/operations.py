@@ -225,15 +225,7 @@ def _kernel_radius(sigma: float | Tensor) -> int:
 
 def replicate_pad(x: Tensor, radius: int) -> Tensor:
     """Pad (B, C, H, W) by ``radius`` px on all sides with the nearest border pixel."""
-    if not torch.compiler.is_compiling():
-        return F.pad(x, (radius, radius, radius, radius), mode="replicate") if radius else x
-    # Compiled, a concatenation is a vectorised copy; F.pad becomes a gather inside every loop that reads it.
-    for dim in (-1, -2):
-        shape = list(x.shape)
-        shape[dim] = radius
-        first, last = x.narrow(dim, 0, 1), x.narrow(dim, x.shape[dim] - 1, 1)
-        x = torch.cat([first.expand(shape), x, last.expand(shape)], dim=dim)
-    return x
+    return F.pad(x, (radius, radius, radius, radius), mode="replicate") if radius else x
 
 
 def extrapolate_pad(x: Tensor, radius: int) -> Tensor:
@@ -269,10 +261,7 @@ def _half_difference(after: Tensor, before: Tensor) -> Tensor:
 def is_directional_maximum(length: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """True where ``length`` is a maximum along (x, y), rounded to 45 degrees as in Canny; all (B, 1, H, W)."""
     H, W = length.shape[-2:]
-    p = length
-    for dim in (-1, -2):  # F.pad would make a compiled graph recompute its input for every neighbour
-        margin = torch.zeros_like(p.narrow(dim, 0, 1))
-        p = torch.cat([margin, p, margin], dim=dim)
+    p = F.pad(length, (1, 1, 1, 1))
 
     def shifted(dx: int, dy: int) -> Tensor:
         return p[..., 1 + dy : 1 + dy + H, 1 + dx : 1 + dx + W]

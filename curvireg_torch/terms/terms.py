@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ..errors import InvalidInputError
 from ..features.backbone import SHA256, Backbone, describe, similarity
-from ..utils.checks import check_integer, check_masks, check_option, check_positive, check_tensor
+from ..utils.checks import check_integer, check_option, check_positive, check_tensor
 from ..utils.threads import map_on_threads
 from .query import QueryFeatures, box_shapes
 
@@ -278,7 +278,6 @@ class _RepeatabilityModule(nn.Module):
 
 def dilate_points(points: Tensor, eps: float) -> Tensor:
     """Pixels within ``eps`` >= 0 px (Euclidean) of a point: (N, H, W) bool -> (N, H, W) bool."""
-    check_masks(points, "points")
     radius = int(eps)
     if radius == 0:
         return points

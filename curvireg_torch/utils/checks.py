@@ -26,8 +26,8 @@ def check_tensor(x: Tensor, name: str, shape: tuple[int | None, ...]) -> None:
     if not isinstance(x, Tensor):
         raise InvalidInputError(f"{name}: expected a torch.Tensor, got {type(x).__name__}")
     if x.ndim != len(shape) or any(n is not None and n != size for n, size in zip(shape, x.shape, strict=True)):
-        expected = "(" + ", ".join("*" if n is None else str(n) for n in shape) + ")"
-        raise InvalidInputError(f"{name}: expected shape {expected}, got {tuple(x.shape)}")
+        expected = ", ".join("*" if n is None else str(n) for n in shape)
+        raise InvalidInputError(f"{name}: expected shape ({expected}), got {tuple(x.shape)}")
     if not x.is_floating_point():
         raise InvalidInputError(
             f"{name}: expected a floating dtype, got {x.dtype}; convert with x.float() (images: divide by 255)"
@@ -46,17 +46,12 @@ def check_image(x: Tensor, name: str = "image") -> None:
         raise InvalidInputError(f"{name}: expected at least one pixel, got {tuple(x.shape)}")
 
 
-def check_colour_image(x: Tensor, name: str = "image") -> None:
+def check_colour_image(x: Tensor) -> None:
     """``x`` is a floating (B, 1, H, W) or (B, 3, H, W) tensor with H, W >= 1."""
-    check_tensor(x, name, (None, None, None, None))
+    check_tensor(x, "image", (None, None, None, None))
     if x.shape[1] not in (1, 3):
-        raise InvalidInputError(f"{name}: expected 1 (grey) or 3 (RGB) channels, got {x.shape[1]}")
-    check_image(x[:, :1], name)
-
-
-def check_field(x: Tensor, name: str = "field") -> None:
-    """``x`` is a floating (B, 2, H, W) tensor: channel 0 = x, channel 1 = y."""
-    check_tensor(x, name, (None, 2, None, None))
+        raise InvalidInputError(f"image: expected 1 (grey) or 3 (RGB) channels, got {x.shape[1]}")
+    check_image(x[:, :1])
 
 
 def check_photograph(x: Any, name: str = "images") -> None:
@@ -77,21 +72,6 @@ def check_pixels(x: Tensor, where: str) -> None:
         raise ImageError(f"pixels outside [0, 1] {where}; divide floating images by 255, or pass uint8")
 
 
-def check_mask(mask: Tensor, like: Tensor, name: str = "mask") -> None:
-    """``mask`` is boolean, of the shape and on the device of ``like``."""
-    if mask.dtype != torch.bool or mask.shape != like.shape:
-        raise InvalidInputError(f"{name}: expected bool of shape {tuple(like.shape)}, got {type_and_shape(mask)}")
-    check_same_device(mask, like, name)
-
-
-def check_masks(masks: Tensor, name: str) -> None:
-    """``masks`` is boolean (N, H, W); a mask without its batch axis is refused."""
-    if not isinstance(masks, Tensor) or masks.dtype != torch.bool or masks.ndim != 3:
-        raise InvalidInputError(
-            f"{name}: expected bool (N, H, W), got {type_and_shape(masks)}; a single mask is mask[None]"
-        )
-
-
 def check_same_device(x: Tensor, like: Tensor, name: str) -> None:
     if x.device != like.device:
         raise InvalidInputError(f"{name}: expected device {like.device}, got {x.device}")
@@ -103,9 +83,8 @@ def check_device(name: torch.device | str, option: str = "device") -> None:
         torch.zeros(1, device=name).item()
     except (RuntimeError, AssertionError) as error:  # builds of torch without CUDA raise the second
         usable = ", ".join(["cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))])
-        raise InvalidInputError(
-            f"{option}: torch cannot use {str(name)!r} on this machine; choose from {usable}"
-        ) from error
+        message = f"torch cannot use {str(name)!r} on this machine; choose from {usable}"
+        raise InvalidInputError(f"{option}: {message}") from error
 
 
 def check_option(value: str, options: Iterable[str], name: str) -> None:

@@ -99,7 +99,7 @@ LAYERS = sorted(
     {
         found
         for package in ("filters", "features")
-        for name in import_module(f"curvireg_torch.{package}").__all__
+        for name in vars(import_module(f"curvireg_torch.{package}"))
         if inspect.isclass(found := getattr(import_module(f"curvireg_torch.{package}"), name))
         and issubclass(found, nn.Module)
     },

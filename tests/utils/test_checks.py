@@ -15,8 +15,6 @@ from curvireg_torch.utils.checks import (
     check_camera_matrix,
     check_fraction,
     check_integer,
-    check_mask,
-    check_masks,
     check_number,
     check_photograph,
     check_pixels,
@@ -134,16 +132,6 @@ def test_as_camera_matrices_accepts_one_for_all_or_one_for_each() -> None:
     for bad in ([None], "camera", [CAMERA, None], [[1.0, 2.0, 3.0]], [CAMERA, CAMERA[:2]], [CAMERA] * 3):
         with pytest.raises(InvalidInputError, match="camera_matrices: expected"):
             as_camera_matrices(bad, 2)
-
-
-def test_check_mask_and_check_masks_refuse_other_shapes_and_dtypes() -> None:
-    mask = torch.zeros(1, 9, 9, dtype=torch.bool)
-    for bad in (mask[0], mask[None], mask.float(), mask.byte(), mask.numpy()):
-        with pytest.raises(InvalidInputError, match=r"points: expected bool \(N, H, W\)"):
-            check_masks(bad, "points")
-    for bad in (mask[0], mask.float()):
-        with pytest.raises(InvalidInputError, match="mask: expected bool of shape"):
-            check_mask(bad, torch.rand(1, 9, 9))
 
 
 @pytest.mark.parametrize("wrong", ["1", None, True, math.nan, math.inf, 10**400, [1.0], torch.ones(2)])
