@@ -8,8 +8,8 @@ from typing import Any
 
 from ..errors import InvalidInputError, MissingDependencyError
 from ..evaluation.opening import whole_number
+from ..utils.choices import check_given
 from ..utils.files import check_writable, write_file
-from ..utils.input_paths import check_given
 from .options import MESH, METHOD, PHOTOGRAPH, add_command, add_limits, add_options, register_options
 
 LOCAL = "127.0.0.1"
@@ -142,7 +142,7 @@ def draw(arguments: argparse.Namespace) -> None:
 
     from ..data import read_photo
     from ..evaluation.opening import check_camera, open_registrar
-    from ..evaluation.runner import register_entry
+    from ..evaluation.runner import register_entry, seen_image
     from ..registration.result import used_box
     from ..utils.threads import one_torch_thread
     from ..visualization import contour_overlay, plots
@@ -152,14 +152,15 @@ def draw(arguments: argparse.Namespace) -> None:
     photo = read_photo(options.photos[0], dtype=torch.uint8)
     with one_torch_thread():
         registrar = open_registrar(options, options.meshes)
-        result, document = register_entry(options.entry(options.photos[0]), photo, registrar, bank_seconds=0.0)
-        box = torch.tensor(used_box(document))
+        entry = options.entry(options.photos[0])
+        result, document = register_entry(entry, photo, registrar, bank_seconds=0.0)
+        image, box = seen_image(entry, photo), torch.tensor(used_box(document))
         if arguments.kind == "viewpoints":
             figure = plots.viewpoints(registrar.bank, result)
         elif arguments.kind == "fields":
-            figure = plots.fields(registrar, result, photo.image, box)
+            figure = plots.fields(registrar, result, image, box)
         else:
-            figure = plots.picture(contour_overlay(registrar, result, photo.image, box))
+            figure = plots.picture(contour_overlay(registrar, result, image, box))
     content = BytesIO()
     figure.savefig(content, format=arguments.out.suffix[1:].lower(), dpi=150)
     write_file(arguments.out, content.getvalue())

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import CurviregError, ImageError, InvalidInputError, LostObjectError, MissingFileError
-from ..utils.choices import VIDEOS
+from ..utils.choices import VIDEOS, check_given
 from ..utils.files import check_writable
-from ..utils.input_paths import check_given
 from .options import PHOTOGRAPH, add_command, add_options, register_options
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, get_origin, get_type_hints
+from typing import Annotated, Any, get_origin
 
 from ..errors import InvalidInputError
 from ..evaluation.opening import (
@@ -17,13 +17,11 @@ from ..evaluation.opening import (
 )
 
 DECLARED: dict[str, dict[str, Any]] = {
-    name: how.__metadata__[0]
-    for name, how in get_type_hints(RegisterOptions, include_extras=True).items()
-    if get_origin(how) is Annotated
+    name: how.__metadata__[0] for name, how in RegisterOptions.__annotations__.items() if get_origin(how) is Annotated
 }
 METHOD = ("preset", "pipeline", "renderer", "device", "progress")
 MESH = ("unit", "pose", "up")
-PHOTOGRAPH = ("box", "camera", "guess", *MESH, "mesh_is", *METHOD)
+PHOTOGRAPH = ("box", "mask", "camera", "guess", *MESH, "mesh_is", *METHOD)
 """Options of several commands, by the names of their fields."""
 
 
@@ -84,6 +82,10 @@ def register_options(
     given = {name: value for name in DECLARED if (value := getattr(arguments, name, None)) is not None}
     if given.get("camera") == "exif":
         given["guess"] = given.pop("camera")
+    elif isinstance(given.get("camera"), str):
+        from ..data import load_camera
+
+        given["camera"] = load_camera(given["camera"])
     try:
         limits = limits_from_options(vars(arguments))
         prior_from_limits(limits)

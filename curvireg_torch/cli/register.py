@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInputError, LostObjectError
 from ..evaluation.opening import whole_number
+from ..utils.choices import check_given, is_one_photograph
 from ..utils.files import check_writable
-from ..utils.input_paths import check_given, is_one_photograph
 from .options import PHOTOGRAPH, add_command, add_limits, add_options, numbers_among, register_options
 
 if TYPE_CHECKING:
@@ -104,13 +104,13 @@ def complete(arguments: argparse.Namespace) -> str | None:
     if listed and len(arguments.paths) > 1:
         return f"with --list, expected at most one MESH, got {len(arguments.paths)}; give several by --mesh"
     if arguments.camera is not None and arguments.guess is not None:
-        return "expected one of --camera FX FY CX CY, --camera exif, --fov DEG"
-    if arguments.box and arguments.instances is not None:
-        return "--instances applies only without a box; leave --box out"
-    if arguments.start is not None and (arguments.box or listed or len(arguments.meshes) > 1):
-        return "--start refines one mesh in one photograph; leave --box and --list out"
-    if listed and (arguments.box or arguments.camera not in (None, "exif")):
-        return "the list holds boxes and cameras; leave --box and --camera out"
+        return "expected one of --camera FX FY CX CY, --camera FILE, --camera exif, --fov DEG"
+    if (arguments.box or arguments.mask) and arguments.instances is not None:
+        return "--instances applies only without a box; leave --box and --mask out"
+    if arguments.start is not None and (arguments.box or arguments.mask or listed or len(arguments.meshes) > 1):
+        return "--start refines one mesh in one photograph; leave --box, --mask and --list out"
+    if listed and (arguments.box or arguments.mask or arguments.camera not in (None, "exif")):
+        return "the list holds boxes, masks and cameras; leave --box, --mask and --camera out"
     return None
 
 
@@ -118,6 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Register one photograph, or several; returns the exit code."""
     check_given(arguments.photos, arguments.meshes, arguments.list)
     from ..evaluation.opening import check_camera, prior_from_limits
+    from ..evaluation.runner import CAMERA_OPTIONS
     from ..evaluation.workers import run_processes
     from ..utils.threads import one_torch_thread
 
@@ -128,7 +129,7 @@ def run(arguments: argparse.Namespace) -> int:
     if limits and prior_from_limits(limits) is None and arguments.list is None:
         raise InvalidInputError("--front limits nothing by itself; give --azimuth, for instance")
     if "distance" in limits and arguments.list is None and not (options.camera or options.guess):
-        raise InvalidInputError("--distance: needs a camera; give --camera FX FY CX CY, --camera exif or --fov DEG")
+        raise InvalidInputError(f"--distance: needs a camera; give {CAMERA_OPTIONS}")
     if options.start is not None and limits:
         raise InvalidInputError("--start: refines this pose alone; leave limits on the pose out")
     if arguments.list is None and is_one_photograph(options.photos):
@@ -137,6 +138,8 @@ def run(arguments: argparse.Namespace) -> int:
         return NONE_RELIABLE if arguments.strict and not reliable else 0
     if options.start is not None:
         raise InvalidInputError("--start: refines one pose; give one photograph")
+    if options.mask is not None:
+        raise InvalidInputError("--mask: is of one photograph; give several in a list, column mask")
     if run_processes(arguments.jobs, arguments.argv):
         return 0
     with one_torch_thread(), tempfile.TemporaryDirectory() as folder:
@@ -169,7 +172,7 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
     from ..data import read_photo
     from ..evaluation.opening import open_registrar
     from ..evaluation.result_files import write_lost, write_result
-    from ..evaluation.runner import check_entry, register_entry
+    from ..evaluation.runner import check_entry, register_entry, seen_image
     from ..evaluation.store import to_json
     from ..registration.result import used_box
 
@@ -179,7 +182,7 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
     check_entry(entry, photo)
     if out is not None:
         check_writable(out, "--out")
-    if options.box is None and options.start is None and options.progress:
+    if options.box is options.mask is options.start is None and options.progress:
         print(f"{path}: localizing the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
     with show_stages(enabled=options.progress) as progress:
         if progress is not None:
@@ -195,7 +198,7 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
             raise
     notes = sys.stderr if as_json else sys.stdout  # with --json, standard output holds only the result
     if out is not None:
-        write_result(out, document, registrar, result, photo.image, used_box(document))
+        write_result(out, document, registrar, result, seen_image(entry, photo), used_box(document))
     for warning in document["warnings"]:
         print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
     if document["inputs"]["camera_source"] in ("exif", "fov"):

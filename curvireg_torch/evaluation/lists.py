@@ -5,18 +5,17 @@ import glob
 import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from ..data import Video
+from ..data import Video, load_camera
 from ..data.bop import bop_box, entry_at
 from ..errors import InvalidInputError, MissingFileError
-from ..geometry import camera_matrix
-from ..utils.choices import IMAGES, UNITS, VIDEOS
+from ..geometry import Camera, camera_matrix
+from ..utils.choices import IMAGES, UNITS, VIDEOS, is_pattern
 from ..utils.files import check_table_size, finite_numbers, read_json, write_csv, write_file
-from ..utils.input_paths import is_pattern
 from ..visualization.encoding import png
 from ..visualization.overlay import to_uint8
 from ..visualization.sheet import SheetEntry, write_sheet
@@ -29,7 +28,7 @@ __all__ = ["POSE_COLUMNS", "Counts", "PhotoList", "list_photographs", "photo_lis
 
 BOX, CAMERA = ("x0", "y0", "x1", "y1"), ("fx", "fy", "cx", "cy")
 _REQUIRED = ("photo", *BOX)
-_KNOWN = (*_REQUIRED, *CAMERA, "mesh", *PRIOR_OPTIONS)
+_KNOWN = (*_REQUIRED, *CAMERA, "camera", "mask", "mesh", *PRIOR_OPTIONS)
 _BOP_NUMBERS = ("scene_id", "im_id", "obj_id")
 
 POSE_COLUMNS = (*("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33"), *("tx", "ty", "tz"))
@@ -60,8 +59,8 @@ def photo_list(
 ) -> PhotoList:
     """Make a list from a table of texts.
 
-    Columns, in any order: ``photo``, ``x0``, ``y0``, ``x1``, ``y1``; optional ``fx``, ``fy``, ``cx``, ``cy``, ``mesh``
-    and those of :data:`.PRIOR_OPTIONS`; others are passed through. Empty cells mean: localize the object, no camera,
+    Columns, in any order: ``photo``, ``x0``, ``y0``, ``x1``, ``y1``; optional ``fx``, ``fy``, ``cx``, ``cy`` or
+    ``camera`` (a calibration file), ``mask`` (a file), ``mesh`` and those of :data:`.PRIOR_OPTIONS`; others are passed through. Empty cells mean: localize the object, no camera,
     ``meshes``, ``limits``. A row that cannot be used holds the reason in its ``error``.
 
     Args:
@@ -131,11 +130,16 @@ def _entry(
         box, camera = _four_numbers(values, BOX), _four_numbers(values, CAMERA)
         if camera is not None:
             camera_matrix(*camera)  # raises if it is invalid
+        mask = folder / values["mask"] if values.get("mask") else None
+        calibration = load_camera(folder / values["camera"]) if values.get("camera") else None
+        if camera is not None and calibration is not None:
+            raise InvalidInputError("camera: give it or fx, fy, cx, cy")
         own = limits_from_cells({name: values[name] for name in PRIOR_OPTIONS if name in values})
         prior = prior_from_limits({**limits, **own})
-    except InvalidInputError as error:
+    except (InvalidInputError, MissingFileError) as error:
         return Entry(padded, values["photo"], error=str(error))
-    return Entry(padded, values["photo"], folder / values["photo"], meshes, box, camera, prior=prior)
+    photo = folder / values["photo"]
+    return Entry(padded, values["photo"], photo, meshes, box, camera or calibration, mask, prior=prior)
 
 
 def _four_numbers(values: Mapping[str, str], names: tuple[str, ...]) -> tuple[float, ...] | None:
@@ -160,7 +164,7 @@ def list_photographs(
     meshes: Sequence[Path],
     *,
     box: Sequence[float] | None = None,
-    camera: Sequence[float] | None = None,
+    camera: Sequence[float] | Camera | None = None,
     limits: Mapping[str, Any] | None = None,
     every: int = 1,
     frames: Path,
@@ -170,7 +174,7 @@ def list_photographs(
     Args:
         paths: photographs, folders of them, patterns such as ``shots/*.jpg``, videos.
         meshes: mesh files; of several the best is found.
-        box, camera: x0, y0, x1, y1 (default: the object is localized) and fx, fy, cx, cy, in px.
+        box, camera: x0, y0, x1, y1 (default: the object is localized) and fx, fy, cx, cy, in px; or a calibration.
         limits: arguments of :class:`PosePrior`.
         every, frames: use every n-th frame of videos; folder for these, as PNG.
 
@@ -180,9 +184,13 @@ def list_photographs(
     """
     if every < 1:
         raise InvalidInputError(f"--every: expected >= 1, got {every}")
-    numbers = [text for four in (box, camera) for text in (map(str, four) if four else [""] * 4)]
+    calibration = camera if isinstance(camera, Camera) else None
+    fours = box, None if isinstance(camera, Camera) else camera
+    numbers = [text for four in fours for text in (map(str, four) if four else [""] * 4)]
     rows = [[str(photo), *numbers] for path in paths for photo in _found(path, every, frames)]
-    return photo_list("photographs", ["photo", *BOX, *CAMERA], rows, Path(), meshes, limits)
+    photos = photo_list("photographs", ["photo", *BOX, *CAMERA], rows, Path(), meshes, limits)
+    entries = [replace(entry, camera=calibration or entry.camera) for entry in photos.entries]
+    return replace(photos, entries=tuple(entries))
 
 
 def _found(path: Path, every: int, frames: Path) -> Iterator[Path]:
@@ -264,7 +272,9 @@ def _json_rows(path: Path) -> list[Row]:
     for entry in content:  # values of box and camera that are not four numbers are refused later
         row = {key: value for key, value in entry.items() if key not in ("box", "camera")}
         for key, names in (("box", BOX), ("camera", CAMERA)):
-            if (values := entry.get(key)) is not None:
+            if isinstance(values := entry.get(key), str):
+                row[key] = values  # a calibration file
+            elif values is not None:
                 four = values if isinstance(values, list) and len(values) == 4 else [f"{key} {values}"] * 4
                 row |= dict(zip(names, four, strict=True))
         rows.append(row)

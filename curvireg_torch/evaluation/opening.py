@@ -18,6 +18,7 @@ from ..utils.files import finite_numbers, read_json
 
 if TYPE_CHECKING:
     from ..features import LearnedCurvilinearSaliency
+    from ..geometry import Camera
     from ..geometry.pose_prior import PosePrior
     from ..matching import ViewBank
     from ..pipeline import Pipeline
@@ -69,13 +70,13 @@ def whole_number(low: int, high: int | None = None) -> Callable[[str], int]:
 
 
 def camera_option(text: str) -> Any:
-    """Return fx, fy, cx, cy, or "exif"."""
-    if text.lower() == "exif":
-        return "exif"
+    """Return fx, fy, cx, cy, "exif", or the name of a calibration file."""
+    if not re.fullmatch(r"[-+.\deE,\s]+", text):
+        return "exif" if text.lower() == "exif" else text
     try:
         return Numbers("FX FY CX CY")(text)
     except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentTypeError(f"{error}; or exif, or give --fov DEG instead") from None
+        raise argparse.ArgumentTypeError(f"{error}; or give FILE (a calibration), exif, or --fov DEG") from None
 
 
 def _option(text: str, **how: Any) -> dict[str, Any]:
@@ -104,7 +105,7 @@ class RegisterOptions:
     Attributes:
         photos: photographs, folders, patterns or videos.
         meshes: mesh files or banks; of several, each photograph is registered to the best.
-        box, camera: x0, y0, x1, y1 and fx, fy, cx, cy in px; None: localized, and unknown.
+        box, camera: x0, y0, x1, y1 and fx, fy, cx, cy in px, or a calibrated camera; None: localized, and unknown.
         guess: of an unknown camera: "exif", or the horizontal field of view in degrees.
         limits: on the pose, arguments of :class:`PosePrior`.
         preset, pipeline: name of a pipeline, or its JSON file; None: the pipeline of a bank, or the default.
@@ -120,12 +121,16 @@ class RegisterOptions:
         _option("in px of the photograph; default: the object is localized", type=Numbers("X0 Y0 X1 Y1")),
     ] = None
     camera: Annotated[
-        tuple[float, float, float, float] | None,
+        "tuple[float, float, float, float] | Camera | None",
         _option(
-            "FX FY CX CY in px, which gives the translation; or exif for the focal length of the photograph's file: "
-            "the result then has no covariance",
+            "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, Kalibr, COLMAP or BOP, whose "
+            "distortion is removed: gives the translation. Or exif, the focal length of the photograph's file: the "
+            "result then has no covariance",
             type=camera_option,
         ),
+    ] = None
+    mask: Annotated[
+        Path | None, _option("picture in which the object is white, instead of --box or beside it", type=Path)
     ] = None
     guess: Annotated[
         str | float | None, _option("horizontal field of view of an unknown camera", flag="--fov", type=Numbers("DEG"))
@@ -201,7 +206,7 @@ class RegisterOptions:
         from .runner import Entry
 
         prior = prior_from_limits(self.limits or {})
-        return self.complete(Entry((), str(photo), photo, self.meshes, self.box, self.camera, prior=prior))
+        return self.complete(Entry((), str(photo), photo, self.meshes, self.box, self.camera, self.mask, prior=prior))
 
     def complete(self, entry: "Entry") -> "Entry":
         """A photograph of a list with the options that a list does not hold."""
@@ -258,12 +263,12 @@ def prior_from_limits(limits: Mapping[str, Any]) -> "PosePrior | None":
     return PosePrior(**limits) if limits.keys() - QUALIFIERS else None
 
 
-def check_camera(camera: Sequence[float] | None, guess: str | float | None) -> None:
-    """Refuse a camera (fx, fy, cx, cy) or field of view that cannot be used, before any file is read."""
+def check_camera(camera: "Sequence[float] | Camera | None", guess: str | float | None) -> None:
+    """Refuse a camera or field of view that cannot be used, before any photograph is read."""
     from ..geometry.cameras import camera_matrix, camera_of_view
     from ..utils.checks import check_square_pixels
 
-    if camera is not None:
+    if isinstance(camera, Sequence):
         try:
             check_square_pixels(camera_matrix(*camera), "--camera")
         except InvalidInputError as error:

@@ -16,12 +16,12 @@ from tqdm import tqdm
 
 from ..data import Photo, read_photo
 from ..errors import BankError, CurviregError, InvalidInputError, MeshError, MissingFileError
-from ..geometry import camera_matrix
+from ..geometry import Camera, camera_matrix, undistorted
 from ..geometry.cameras import camera_of_view
 from ..geometry.pose_prior import PosePrior
 from ..mesh.files import mesh_digest
 from ..registration import FailedRegistration, Registrar, Registration, localize
-from ..registration.inputs import image_items
+from ..registration.inputs import ImageItem, image_items
 from ..registration.poses import projected_box
 from ..registration.refinement import refine
 from ..registration.result import SCHEMA, localization_document, result_document, used_box
@@ -31,7 +31,16 @@ from ..visualization.sheet import thumbnail
 from .store import ResultStore, Row
 from .workers import workers
 
-__all__ = ["POSE_SOURCES", "Entry", "OpenRegistrar", "check_entry", "failed_row", "register_entry", "run_entries"]
+__all__ = [
+    "POSE_SOURCES",
+    "Entry",
+    "OpenRegistrar",
+    "check_entry",
+    "failed_row",
+    "register_entry",
+    "run_entries",
+    "seen_image",
+]
 
 POSE_SOURCES = (
     *("data", "filters", "geometry", "matching", "features", "mesh", "registration", "rendering", "terms"),
@@ -41,6 +50,9 @@ POSE_SOURCES = (
 
 REPORTS = ("summary.json", "predictions.csv", "results.csv", "bop.csv", "index.html")
 """Files that are written from all results at the end; older ones would not match newer results."""
+
+CAMERA_OPTIONS = "--camera FX FY CX CY, --camera FILE (a calibration), --camera exif or --fov DEG"
+"""How the command line takes a camera."""
 
 OpenRegistrar = Callable[[tuple[Path, ...]], Registrar]
 """Opens the registrar of some mesh files."""
@@ -55,7 +67,8 @@ class Entry:
         name, photo: the photograph as the user names it, and its file.
         meshes: mesh files; of several the best is found.
         box: x0, y0, x1, y1 in px; None: the object is localized.
-        camera: fx, fy, cx, cy in px; None if unknown.
+        camera: fx, fy, cx, cy in px, or a calibrated camera; None if unknown.
+        mask: file of a mask of the object, instead of a box or beside it.
         guess: replaces an unknown camera: "exif" takes the focal length in the photograph's file, a number is the
             horizontal field of view in degrees; None: no camera.
         instances: without a box, see :func:`curvireg_torch.registration.localize`.
@@ -71,7 +84,8 @@ class Entry:
     photo: Path = Path()
     meshes: tuple[Path, ...] = ()
     box: Sequence[float] | None = None
-    camera: Sequence[float] | None = None
+    camera: Sequence[float] | Camera | None = None
+    mask: Path | None = None
     guess: str | float | None = None
     instances: int = 1
     prior: PosePrior | None = None
@@ -84,8 +98,10 @@ class Entry:
     def request(self) -> list[Any]:
         """All that the result depends on besides the content of files."""
         prior = None if self.prior is None else self.prior.to_dict()
-        given = [self.name, self.box, self.camera, self.guess, self.instances, prior]
-        return [*given, self.start, self.start_confidence, self.as_stored]
+        camera = self.camera.describe() if isinstance(self.camera, Camera) else self.camera
+        given = [self.name, self.box, camera, self.guess, self.instances, prior]
+        mask = [] if self.mask is None else [str(self.mask), file_digest(self.mask)]
+        return [*given, self.start, self.start_confidence, self.as_stored, *mask]
 
     @property
     def key(self) -> str:
@@ -99,11 +115,21 @@ def check_entry(entry: Entry, photo: Photo) -> tuple[str, ...]:
     Raises:
         CurviregError: as :func:`register_entry`.
     """
-    K, _ = _camera(entry, photo)
-    item = image_items([photo.image], None if entry.box is None else [entry.box], K, entry.prior)[0]
+    return _item(entry, photo, _camera(entry, photo)[0]).warnings
+
+
+def seen_image(entry: Entry, photo: Photo) -> Tensor:
+    """The photograph as poses refer to it, without the distortion of a calibrated camera."""
+    return undistorted(photo.image, entry.camera).image if isinstance(entry.camera, Camera) else photo.image
+
+
+def _item(entry: Entry, photo: Photo, camera: Tensor | Camera | None) -> ImageItem:
+    boxes = None if entry.box is None else [entry.box]
+    masks = None if entry.mask is None else [entry.mask]
+    item = image_items([photo.image], boxes, camera, entry.prior, masks)[0]
     if isinstance(item, CurviregError):
         raise item.with_subject(entry.name)
-    return item.warnings
+    return item
 
 
 def register_entry(
@@ -118,22 +144,26 @@ def register_entry(
         CurviregError: it cannot be registered; the message begins with the photograph's name.
     """
     start = time.perf_counter()
-    K, source = _camera(entry, photo)
+    camera, source = _camera(entry, photo)
+    item, images = _item(entry, photo, camera), [photo.image]
     if entry.start is not None:
-        results = refine(registrar, [photo.image], K, [entry.start], start_confidences=[entry.start_confidence])
-    elif entry.box is None:
-        results = localize(registrar, [photo.image], K, instances=entry.instances, prior=entry.prior)[0]
+        results = refine(registrar, images, camera, [entry.start], start_confidences=[entry.start_confidence])
+    elif entry.box is None and entry.mask is None:
+        results = localize(registrar, images, camera, instances=entry.instances, prior=entry.prior)[0]
     else:
-        results = registrar([photo.image], torch.tensor(entry.box)[None], K, prior=entry.prior)
+        box = None if entry.box is None else torch.tensor(entry.box)[None]
+        masks = None if entry.mask is None else [entry.mask]
+        results = registrar(images, box, camera, prior=entry.prior, masks=masks)
     result = results[0]
     if isinstance(result, FailedRegistration):
         raise result.error.with_subject(entry.name)
-    if entry.box is not None:
-        box = torch.tensor(entry.box)
+    if entry.box is not None or entry.mask is not None:
+        box = item.box
     elif result.localization is not None:
         box = result.localization.box
     else:
         box = projected_box(registrar.of_model(result.model).describer, result.projection)
+    K = item.camera_matrix
     document = {
         **result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start}),
         "mesh": str(entry.meshes[result.model]),
@@ -145,6 +175,7 @@ def register_entry(
             "camera_source": source,
             "picture": photo.facts(),
         },
+        "camera": None if K is None else (camera if isinstance(camera, Camera) else Camera(K)).at(item.size).describe(),
     }
     if result.localization is not None:
         document["localization"] = localization_document([r for r in results if isinstance(r, Registration)])
@@ -153,20 +184,22 @@ def register_entry(
     return result, document
 
 
-def _camera(entry: Entry, photo: Photo) -> tuple[Tensor | None, str | None]:
-    """Camera matrix, and its source."""
+def _camera(entry: Entry, photo: Photo) -> tuple[Tensor | Camera | None, str | None]:
+    """Camera or camera matrix, and its source."""
+    if isinstance(entry.camera, Camera):
+        return entry.camera, "file"
     if entry.camera is not None:
         return camera_matrix(*entry.camera, dtype=torch.float64), "given"
     if entry.guess is None:
         if entry.start is not None:
-            raise InvalidInputError("--start: needs the camera; give --camera FX FY CX CY", subject=entry.name)
+            raise InvalidInputError(f"--start: needs the camera; give {CAMERA_OPTIONS}", subject=entry.name)
         return None, None
     if isinstance(entry.guess, float):
         H, W = photo.image.shape[-2:]
         return camera_of_view(entry.guess, (H, W)), "fov"
     K = photo.guessed_camera_matrix()
     if K is None:
-        raise InvalidInputError(f"{entry.name}: no focal length in its EXIF; give --camera FX FY CX CY, or --fov DEG")
+        raise InvalidInputError(f"no focal length in its EXIF; give {CAMERA_OPTIONS}", subject=entry.name)
     return K, "exif"
 
 
@@ -274,7 +307,7 @@ def _row(entry: Entry, registrar: Registrar | Exception, picture: Path, *, bank_
     except CurviregError as error:
         return failed_row(error, seconds={"bank": bank_seconds, "register": time.perf_counter() - start})
     renderer = registrar.of_model(result.model).describer.renderer
-    write_file(picture, thumbnail(renderer, result.projection, photo.image, used_box(document)))
+    write_file(picture, thumbnail(renderer, result.projection, seen_image(entry, photo), used_box(document)))
     return {"status": "ok", "message": "", **document}
 
 

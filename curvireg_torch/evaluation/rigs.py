@@ -1,0 +1,184 @@
+"""Rigs: photographs of one object from cameras whose poses are known, as CSV, COLMAP models and scenes of BOP sets."""
+
+import csv
+import io
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from ..data import load_camera
+from ..data.bop import bop_box, entry_at
+from ..errors import CurviregError, InvalidInputError, MissingFileError
+from ..geometry import Camera, camera_matrix
+from ..geometry.cameras import transform
+from ..utils.checks import check_pose
+from ..utils.files import check_table_size, finite_numbers, read_json
+
+__all__ = ["RigView", "read_rig"]
+
+BOX, CAMERA = ("x0", "y0", "x1", "y1"), ("fx", "fy", "cx", "cy")
+ROTATION, QUATERNION = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), ("qw", "qx", "qy", "qz")
+TRANSLATION = ("tx", "ty", "tz")
+COLUMNS = f"photo, {' '.join(BOX)}, {' '.join(CAMERA)} or camera, r11 to r33 or {' '.join(QUATERNION)}, tx ty tz"
+
+
+@dataclass(frozen=True)
+class RigView:
+    """One photograph of a rig.
+
+    Attributes:
+        name: where the rig names it, such as "row 2: left.png".
+        photo: its file.
+        box: x0, y0, x1, y1 in px, or None.
+        camera: the camera, with its distortion.
+        T_cam_from_world: (4, 4) float64, lengths in the mesh's unit.
+    """
+
+    name: str
+    photo: Path
+    box: tuple[float, ...] | None
+    camera: Camera
+    T_cam_from_world: Tensor
+
+
+def read_rig(path: Path, mesh: Path | None = None) -> list[RigView]:
+    """Read a rig: a CSV file, a folder of COLMAP with ``images.txt`` and ``cameras.txt``, or a scene of a BOP set.
+
+    Columns of the CSV are ``photo``, ``x0`` to ``y1`` (may be empty), ``fx fy cx cy`` or ``camera`` (a calibration
+    file), ``r11`` to ``r33`` or ``qw qx qy qz``, and ``tx ty tz``: the camera from the world, in the mesh's unit. Paths
+    are relative to the file. Of a BOP scene, boxes are those of the object that the name of ``mesh`` numbers, if each
+    photograph shows it once at most.
+
+    Raises:
+        CurviregError: a missing or damaged file; the message names the row.
+    """
+    if path.is_dir():
+        for name, read in (("images.txt", _colmap), ("scene_camera.json", lambda folder: _bop(folder, mesh))):
+            if (path / name).is_file():
+                return _checked(path, read(path))
+        raise InvalidInputError("a folder without images.txt (COLMAP) or scene_camera.json (BOP)", subject=path)
+    if not path.is_file():
+        raise MissingFileError("no such file; check the path of the rig", subject=path)
+    check_table_size(path)
+    return _checked(path, _colmap(path.parent) if path.name == "images.txt" else _table(path))
+
+
+def _checked(path: Path, rows: Iterator[RigView]) -> list[RigView]:
+    """The rows, whose errors name the file."""
+    try:
+        views = list(rows)
+    except CurviregError as error:
+        raise error.with_subject(f"{path}: {error.subject}") from error
+    if not views:
+        raise InvalidInputError("no photographs", subject=path)
+    return views
+
+
+def _view(name: str, photo: Path, box: Any, camera: Any, rotation: Any, translation: Any) -> RigView:
+    """A row from plain values: ``camera`` a path or 4 numbers, ``rotation`` 9 numbers or 4 of a quaternion."""
+    try:
+        numbers = finite_numbers(rotation, 9) or finite_numbers(rotation, 4)
+        t = finite_numbers(translation, 3)
+        if numbers is None or t is None:
+            raise InvalidInputError(f"a rotation and a translation are needed; expected columns {COLUMNS}")
+        R = torch.tensor(numbers, dtype=torch.float64)
+        if len(numbers) == 4 and abs(float(R.norm()) - 1.0) > 1e-2:
+            raise InvalidInputError(f"expected qw qx qy qz of length 1, got {float(R.norm()):.3g}; check their order")
+        R = R.view(3, 3) if len(numbers) == 9 else torch.from_numpy(Rotation.from_quat(R.roll(-1).numpy()).as_matrix())
+        T = transform(R, torch.tensor(t, dtype=torch.float64))
+        check_pose(T, "the camera's pose")
+        if isinstance(camera, Path | str):
+            return RigView(name, photo, box, load_camera(camera), T)
+        return RigView(name, photo, box, Camera(camera_matrix(*camera)), T)
+    except CurviregError as error:
+        raise InvalidInputError(str(error), subject=name) from error
+
+
+def _table(path: Path) -> Iterator[RigView]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        rows = list(csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True, strict=True))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InvalidInputError(f"not CSV in UTF-8 ({error}); expected columns {COLUMNS}") from error
+    for number, row in enumerate(rows, start=1):
+        photo = (row.get("photo") or "").strip()
+        name = f"row {number}: {photo}"
+        if not photo:
+            raise InvalidInputError(f"no photo; expected columns {COLUMNS}", subject=f"row {number}")
+        camera, file = _cells(row, CAMERA, name), (row.get("camera") or "").strip()
+        if (camera is None) == (not file):
+            raise InvalidInputError("expected fx fy cx cy, or camera (a calibration file)", subject=name)
+        rotation = _cells(row, ROTATION, name) or _cells(row, QUATERNION, name)
+        where = path.parent / photo, _cells(row, BOX, name), camera or str(path.parent / file)
+        yield _view(name, *where, rotation, _cells(row, TRANSLATION, name))
+
+
+def _cells(row: Mapping[str, Any], names: tuple[str, ...], where: str) -> tuple[float, ...] | None:
+    """The numbers in some columns; None if all are empty."""
+    texts = [(row.get(name) or "").strip() for name in names]
+    if not any(texts):
+        return None
+    try:
+        numbers = finite_numbers(list(map(float, texts)), len(names))
+    except ValueError:
+        numbers = None
+    if numbers is None:
+        raise InvalidInputError(f"expected numbers in {' '.join(names)}, got {' '.join(texts)!r}", subject=where)
+    return numbers
+
+
+def _colmap(folder: Path) -> Iterator[RigView]:
+    """Photographs of ``images.txt``, in which every second line lists points, that lie in the folder, in ``images`` in
+    it, or beside it."""
+    try:
+        lines = (folder / "images.txt").read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise InvalidInputError(f"not text ({error})", subject="images.txt") from error
+    lines = [line for line in lines if not line.startswith("#")]
+    for line in lines[::2]:
+        if not line.strip():
+            continue
+        match = re.fullmatch(r"\s*\d+((?:\s+\S+){7})\s+(\d+)\s+(\S.*?)\s*", line)
+        try:
+            pose = list(map(float, match[1].split())) if match else None
+        except ValueError:
+            pose = None
+        if match is None or pose is None:
+            message = f"expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {line[:60]!r}"
+            raise InvalidInputError(message, subject="images.txt")
+        places = [
+            folder / match[3],
+            *(place / "images" / match[3] for place in (folder, *folder.resolve().parents[:3])),
+        ]
+        photo = next((place for place in places if place.is_file()), places[0])
+        camera = f"{folder / 'cameras.txt'}:{match[2]}"
+        yield _view(f"image {match[3]}", photo, None, camera, pose[:4], pose[4:])
+
+
+def _bop(folder: Path, mesh: Path | None) -> Iterator[RigView]:
+    """Photographs of a scene whose cameras have ``cam_R_w2c`` and ``cam_t_w2c``; lengths in mm."""
+    cameras, truths, infos = (
+        read_json(folder / name, dict, "datasets/README.md") if (folder / name).is_file() else {}
+        for name in ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
+    )
+    number = re.search(r"obj_(\d+)$", mesh.stem) if mesh is not None else None
+    for key, camera in cameras.items():
+        pictures = [
+            folder / kind / f"{key.zfill(6)}{end}" for kind in ("rgb", "gray") for end in (".png", ".jpg", ".tif")
+        ]
+        photo = next((path for path in pictures if path.is_file()), pictures[0])
+        values = camera if isinstance(camera, dict) else {}
+        K = finite_numbers(values.get("cam_K"), 9)
+        if K is None:
+            raise InvalidInputError("no cam_K of 9 numbers in scene_camera.json", subject=f"image {key}")
+        objects = truths.get(key) if isinstance(truths.get(key), list) else []
+        mine = [k for k, one in enumerate(objects) if number and one.get("obj_id") == int(number[1])]
+        box = bop_box(entry_at(infos.get(key), mine[0]).get("bbox_obj")) if len(mine) == 1 else None
+        pose = values.get("cam_R_w2c"), values.get("cam_t_w2c")
+        yield _view(f"image {key}", photo, box, (K[0], K[4], K[2], K[5]), *pose)
