@@ -5,7 +5,7 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, get_origin
+from typing import Any
 
 from ..errors import InvalidInputError
 from ..evaluation.opening import (
@@ -17,7 +17,7 @@ from ..evaluation.opening import (
 )
 
 DECLARED: dict[str, dict[str, Any]] = {
-    name: how.__metadata__[0] for name, how in RegisterOptions.__annotations__.items() if get_origin(how) is Annotated
+    name: how.__metadata__[0] for name, how in RegisterOptions.__annotations__.items() if hasattr(how, "__metadata__")
 }
 METHOD = ("preset", "pipeline", "renderer", "device", "progress")
 MESH = ("unit", "pose", "up")

@@ -182,7 +182,7 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
     check_entry(entry, photo)
     if out is not None:
         check_writable(out, "--out")
-    if options.box is options.mask is options.start is None and options.progress:
+    if options.progress and not (options.box or options.mask or options.start):
         print(f"{path}: localizing the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
     with show_stages(enabled=options.progress) as progress:
         if progress is not None:

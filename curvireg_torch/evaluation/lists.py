@@ -60,8 +60,9 @@ def photo_list(
     """Make a list from a table of texts.
 
     Columns, in any order: ``photo``, ``x0``, ``y0``, ``x1``, ``y1``; optional ``fx``, ``fy``, ``cx``, ``cy`` or
-    ``camera`` (a calibration file), ``mask`` (a file), ``mesh`` and those of :data:`.PRIOR_OPTIONS`; others are passed through. Empty cells mean: localize the object, no camera,
-    ``meshes``, ``limits``. A row that cannot be used holds the reason in its ``error``.
+    ``camera`` (a calibration file), ``mask`` (a file), ``mesh`` and those of :data:`.PRIOR_OPTIONS`; others are passed
+    through. Empty cells mean: localize the object, no camera, ``meshes``, ``limits``. A row that
+    cannot be used holds the reason in its ``error``.
 
     Args:
         name, columns, rows: of the table; errors begin with the name. Empty cells beyond the last named column, as

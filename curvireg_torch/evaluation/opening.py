@@ -121,7 +121,7 @@ class RegisterOptions:
         _option("in px of the photograph; default: the object is localized", type=Numbers("X0 Y0 X1 Y1")),
     ] = None
     camera: Annotated[
-        "tuple[float, float, float, float] | Camera | None",
+        Any,  # four numbers, a Camera, or None
         _option(
             "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, Kalibr, COLMAP or BOP, whose "
             "distortion is removed: gives the translation. Or exif, the focal length of the photograph's file: the "
