@@ -78,6 +78,9 @@ from .features import (
 from .pipeline import (
     Pipeline as Pipeline,
 )
+from .evaluation.photograph import (
+    register as register,
+)
 from .registration import (
     Registrar as Registrar,
     Registration as Registration,

@@ -49,9 +49,11 @@ def add_register(commands: Any) -> None:
         "curvireg register --list photos.csv part.stl --out out/parts",
         "curvireg register shots/ turn.mp4 part.stl --every 10 --out out/shots",
         "curvireg register photo.jpg --mesh mug.obj --mesh bowl.obj --out out/which",
+        "curvireg register --views rig.csv part.stl --unit mm --out out/rig",
         help="find the pose of MESH in PHOTO",
         usage="curvireg register PHOTO... MESH --out DIR [options]\n       "
-        "curvireg register --list LIST [MESH] --out DIR [options]",
+        "curvireg register --list LIST [MESH] --out DIR [options]\n       "
+        "curvireg register --views RIG MESH --out DIR [options]",
         description="One photograph: writes DIR/result.json, DIR/overlay.png and DIR/pose.glb.\nSeveral, or a list: "
         "DIR/results.csv, DIR/results.jsonl and DIR/index.html;\nafter an interruption the same command resumes.",
         run=run,
@@ -75,6 +77,14 @@ def add_register(commands: Any) -> None:
         "is known about the pose). Paths are relative to the list's folder. Empty cells mean: localize the object, no "
         "camera, MESH, what the options say. Or the same as JSON, COCO annotations, or the folder of a BOP scene",
     )
+    add(
+        "--views",
+        type=Path,
+        metavar="RIG",
+        help="photographs of one pose from cameras with known poses: CSV with columns photo,x0,y0,x1,y1 (box may be "
+        "empty), fx,fy,cx,cy or camera (a file), r11..r33 or qw,qx,qy,qz and tx,ty,tz (camera from world, in the "
+        "mesh's unit); a folder of COLMAP with images.txt and cameras.txt; or the folder of a BOP scene with cam_R_w2c",
+    )
     add("--every", type=whole_number(1), default=1, metavar="N", help="use every N-th frame of videos (default: 1)")
     add_options(parser, *PHOTOGRAPH, "start", "instances", "field", "top", "refine")
     add_limits(parser)
@@ -82,16 +92,19 @@ def add_register(commands: Any) -> None:
     add("--jobs", type=whole_number(1), default=1, metavar="N", help=jobs)
     strict = f"exit code {NONE_RELIABLE} if no result is reliable, else {SOME_FAILED} if some photographs failed"
     add("--strict", action="store_true", help=strict)
+    ros = "ros: also write DIR/pose.yaml, a geometry_msgs/PoseStamped, in metres"
+    add("--format", choices=("ros",), help=ros)
     add("--json", action="store_true", help="print only the results as JSON; --out is optional")
     add("--out", type=Path, metavar="DIR", help="folder of the results; made if it does not exist")
 
 
 def complete(arguments: argparse.Namespace) -> str | None:
     """Divide ``paths`` into ``photos`` and ``meshes``; returns what is wrong with the options together, or None."""
-    listed = arguments.list is not None
+    rig, listed = arguments.views, arguments.list is not None or arguments.views is not None
     arguments.photos = [] if listed else arguments.paths if arguments.mesh else arguments.paths[:-1]
     arguments.meshes = [*arguments.paths[len(arguments.photos) :], *arguments.mesh]
-    if arguments.unit is None and listed and arguments.list.is_dir():
+    scene = arguments.list or (rig / "scene_camera.json" if rig and (rig / "scene_camera.json").is_file() else None)
+    if arguments.unit is None and scene is not None and (scene.is_dir() or rig):
         arguments.unit = "mm"  # of the models in a BOP set
     if numbers := numbers_among(arguments.paths):
         return f"{' '.join(numbers)}: numbers where a file is expected; --box and --camera take four, --distance two"
@@ -101,8 +114,10 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "expected --out DIR, or --json"
     if arguments.out is None and arguments.jobs > 1:
         return "--jobs: several processes need --out DIR, where their results meet"
+    if rig is not None and (arguments.list or arguments.start or not arguments.meshes):
+        return "--views takes one or several meshes, and neither --list nor --start"
     if listed and len(arguments.paths) > 1:
-        return f"with --list, expected at most one MESH, got {len(arguments.paths)}; give several by --mesh"
+        return f"with --list or --views, expected at most one MESH, got {len(arguments.paths)}; give several by --mesh"
     if arguments.camera is not None and arguments.guess is not None:
         return "expected one of --camera FX FY CX CY, --camera FILE, --camera exif, --fov DEG"
     if (arguments.box or arguments.mask) and arguments.instances is not None:
@@ -111,12 +126,16 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "--start refines one mesh in one photograph; leave --box, --mask and --list out"
     if listed and (arguments.box or arguments.mask or arguments.camera not in (None, "exif")):
         return "the list holds boxes, masks and cameras; leave --box, --mask and --camera out"
+    if rig is not None and arguments.guess is not None:
+        return "the rig holds the cameras; leave --fov out"
+    if arguments.format and (arguments.list or arguments.out is None):
+        return "--format ros: of one result, in --out DIR"
     return None
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Register one photograph, or several; returns the exit code."""
-    check_given(arguments.photos, arguments.meshes, arguments.list)
+    check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
     from ..evaluation.opening import check_camera, prior_from_limits
     from ..evaluation.runner import CAMERA_OPTIONS
     from ..evaluation.workers import run_processes
@@ -132,9 +151,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise InvalidInputError(f"--distance: needs a camera; give {CAMERA_OPTIONS}")
     if options.start is not None and limits:
         raise InvalidInputError("--start: refines this pose alone; leave limits on the pose out")
-    if arguments.list is None and is_one_photograph(options.photos):
+    if arguments.views is not None or (arguments.list is None and is_one_photograph(options.photos)):
         with one_torch_thread():
-            reliable = _register_one(options, field, arguments.out, as_json=arguments.json)
+            register = _register_one if arguments.views is None else _register_rig
+            reliable = register(options, field, arguments)
         return NONE_RELIABLE if arguments.strict and not reliable else 0
     if options.start is not None:
         raise InvalidInputError("--start: refines one pose; give one photograph")
@@ -165,21 +185,23 @@ def run(arguments: argparse.Namespace) -> int:
     return NONE_RELIABLE if not counts.reliable else SOME_FAILED if counts.failures else 0
 
 
-def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, as_json: bool) -> bool:
+def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Namespace) -> bool:
     """Register one photograph, write and print the result; returns whether it is reliable."""
     import torch
 
     from ..data import read_photo
     from ..evaluation.opening import open_registrar
-    from ..evaluation.result_files import write_lost, write_result
-    from ..evaluation.runner import check_entry, register_entry, seen_image
+    from ..evaluation.result_files import write_lost, write_pose_stamped, write_result
+    from ..evaluation.runner import CAMERA_OPTIONS, check_entry, register_entry, seen_image
     from ..evaluation.store import to_json
     from ..registration.result import used_box
 
-    start = time.perf_counter()
+    start, out, as_json = time.perf_counter(), arguments.out, arguments.json
     path = options.photos[0]
     photo, entry = read_photo(path, dtype=torch.uint8), options.entry(path)
     check_entry(entry, photo)
+    if arguments.format and options.camera is options.guess is None:
+        raise InvalidInputError(f"--format ros: needs a camera; give {CAMERA_OPTIONS}")
     if out is not None:
         check_writable(out, "--out")
     if options.progress and not (options.box or options.mask or options.start):
@@ -199,18 +221,55 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
     notes = sys.stderr if as_json else sys.stdout  # with --json, standard output holds only the result
     if out is not None:
         write_result(out, document, registrar, result, seen_image(entry, photo), used_box(document))
+    if arguments.format:
+        write_pose_stamped(out / "pose.yaml", document)
     for warning in document["warnings"]:
         print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
     if document["inputs"]["camera_source"] in ("exif", "fov"):
         focal = document["inputs"]["camera"][0]
         note = f"camera guessed, focal length {focal:.0f} px; distances are off by the same factor"
         print(f"{path}: {note}", file=notes)
-    if photo.notes:
-        print(f"{path}: {'; '.join(photo.notes)}", file=notes)
+    remarks = list(photo.notes)
+    if document["inputs"]["camera_source"] == "file" and options.camera.distorts:
+        remarks.append("distortion of the lens removed: boxes and overlay.png are of the undistorted photograph")
+    if remarks:
+        print(f"{path}: {'; '.join(remarks)}", file=notes)
     if as_json:
         print(to_json(document), end="")
     else:
         assert out is not None
+        print_result(document, out)
+    return result.reliable
+
+
+def _register_rig(options: "RegisterOptions", field: Any, arguments: argparse.Namespace) -> bool:
+    """Register the photographs of a rig together, write and print the result; returns whether it is reliable."""
+    from ..evaluation.opening import open_registrar
+    from ..evaluation.result_files import write_pose_stamped, write_views
+    from ..evaluation.rigs import read_rig, register_rig
+    from ..evaluation.store import to_json
+
+    start, out = time.perf_counter(), arguments.out
+    rig = read_rig(arguments.views, options.meshes[0])
+    if out is not None:
+        check_writable(out, "--out")
+    with show_stages(enabled=options.progress) as progress:
+        registrar = open_registrar(options, options.meshes, field, progress=progress)
+        registrar.progress = progress or False
+        ready = time.perf_counter() - start
+        result, document, photographs = register_rig(arguments.views, rig, registrar, bank_seconds=ready)
+    document["mesh"] = str(options.meshes[result.model])
+    if out is not None:
+        write_views(out, document, registrar, result, photographs)
+    if arguments.format:
+        write_pose_stamped(out / "pose.yaml", document)
+    if arguments.json:
+        print(to_json(document), end="")
+    else:
+        print("pose in the world (model to world)")
+        for view in document["views"]:
+            counts = f"prefers the pose by {view['contribution']:.2f}"
+            print(f"{view['name']}: {view['failure'] or counts}")
         print_result(document, out)
     return result.reliable
 

@@ -1,18 +1,24 @@
-"""The files of one result: ``result.json``, ``overlay.png`` and ``pose.glb``."""
+"""The files of one result: ``result.json``, ``overlay.png``, ``pose.glb`` and ``pose.yaml``."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
+from ..errors import InvalidInputError
 from ..registration import Registrar, Registration
 from ..registration.result import SCHEMA
+from ..utils.choices import UNITS
 from ..utils.files import write_file
 from ..utils.threads import map_on_threads
 from ..visualization import pose_glb, registration_sheet
 from ..visualization.encoding import png
+from ..visualization.overlay import views_sheet
+from ..visualization.pose_glb import scene_glb
 from .store import to_json
 
-__all__ = ["write_lost", "write_result"]
+__all__ = ["write_lost", "write_pose_stamped", "write_result", "write_views"]
 
 MAX_GLB_FACES = 300_000  # of the largest mesh that is written: viewers are slow with files above 30 MB
 
@@ -30,26 +36,78 @@ def write_result(
         OutputError: a file cannot be written.
     """
     mesh = registrar.of_model(result.model).bank.mesh
+    note = "Distortion of the lens removed." if _distorts(document.get("camera")) else ""
+    _write(
+        out,
+        document,
+        lambda: png(registration_sheet(registrar, result, image, box, note=note)),
+        lambda: pose_glb(mesh, *result.projection, image) if len(mesh.faces) <= MAX_GLB_FACES else None,
+    )
+
+
+def write_views(
+    out: Path,
+    document: dict[str, Any],
+    registrar: Registrar,
+    result: Registration,
+    photographs: Sequence[tuple[Tensor, Tensor, Tensor, str] | None],
+) -> None:
+    """Write the files of one pose in several photographs: pixels, camera matrix, ``T_cam_from_world`` and name of each,
+    or None for one that could not be read."""
+    registrar = registrar.of_model(result.model)
+    mesh, renderer = registrar.bank.mesh, registrar.describer.renderer
+    assert result.transform is not None
+    T, read = result.transform, [(one, view) for one, view in zip(photographs, result.views, strict=True) if one]
+    shown = []
+    for (image, K, _, name), view in read:
+        score = "" if view.edge_support is None else f"edge support {view.edge_support:.2f}"
+        box = None if view.box is None else view.box.tolist()
+        shown.append(((view.T_cam_from_model, K), image, box, f"{name}: {view.failure or score}"))
+    cameras = [(P, K, image) for (image, K, P, _), view in read if not view.failure]
+    _write(
+        out,
+        document,
+        lambda: png(views_sheet(renderer, shown)),
+        lambda: scene_glb(mesh, T, cameras) if len(mesh.faces) <= MAX_GLB_FACES else None,
+    )
+
+
+def _write(
+    out: Path, document: dict[str, Any], overlay: Callable[[], bytes], scene: Callable[[], bytes | None]
+) -> None:
     _remove(out)
     write_file(out / "result.json", to_json(document).encode())  # first: no failure to draw it loses the result
 
-    def attempt(write: Callable[[], None]) -> Exception | None:
+    def attempt(name_and_draw: tuple[str, Callable[[], bytes | None]]) -> Exception | None:
+        name, draw = name_and_draw
         try:
-            write()
+            content = draw()
+            if content is not None:
+                write_file(out / name, content)
         except Exception as error:  # it must not cost the other file
             return error
         return None
 
-    def write_sheet() -> None:
-        write_file(out / "overlay.png", png(registration_sheet(registrar, result, image, box)))
-
-    def write_scene() -> None:
-        if len(mesh.faces) <= MAX_GLB_FACES:
-            write_file(out / "pose.glb", pose_glb(mesh, *result.projection, image))
-
-    for error in map_on_threads(attempt, [write_sheet, write_scene]):
+    for error in map_on_threads(attempt, [("overlay.png", overlay), ("pose.glb", scene)]):
         if error is not None:
             raise error
+
+
+def write_pose_stamped(path: Path, document: dict[str, Any]) -> None:
+    """Write the pose as a ``geometry_msgs/PoseStamped`` of ROS in YAML: metres, in the camera's optical frame."""
+    if document["translation"] is None:
+        raise InvalidInputError("--format ros: a pose without translation; give a camera")
+    w, x, y, z = document["quaternion"]
+    metres = [v * UNITS[document["unit"] or "m"] for v in document["translation"]]
+    lines = ["header:", "  stamp: {sec: 0, nanosec: 0}"]
+    lines += [f"  frame_id: {'world' if isinstance(document['views'], list) else 'camera_optical_frame'}", "pose:"]
+    lines += ["  position: {x: %.9g, y: %.9g, z: %.9g}" % tuple(metres)]  # noqa: UP031
+    lines += ["  orientation: {x: %.12g, y: %.12g, z: %.12g, w: %.12g}" % (x, y, z, w)]  # noqa: UP031
+    write_file(path, ("\n".join(lines) + "\n").encode())
+
+
+def _distorts(camera: dict[str, Any] | None) -> bool:
+    return camera is not None and (camera["model"] == "fisheye" or any(camera["distortion"]))
 
 
 def write_lost(out: Path, message: str) -> None:
@@ -60,5 +118,5 @@ def write_lost(out: Path, message: str) -> None:
 
 def _remove(out: Path) -> None:
     """Remove an older result: none of its files may stay beside those of a new one."""
-    for name in ("result.json", "pose.glb", "overlay.png"):
+    for name in ("result.json", "pose.glb", "overlay.png", "pose.yaml"):
         (out / name).unlink(missing_ok=True)

@@ -3,7 +3,8 @@
 import csv
 import io
 import re
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,15 +13,18 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from ..data import load_camera
+from ..data import load_camera, read_photo
 from ..data.bop import bop_box, entry_at
 from ..errors import CurviregError, InvalidInputError, MissingFileError
-from ..geometry import Camera, camera_matrix
+from ..geometry import Camera, camera_matrix, undistorted
+from ..geometry.calibration import Undistorted
 from ..geometry.cameras import transform
+from ..registration import Registrar, Registration
+from ..registration.result import result_document
 from ..utils.checks import check_pose
 from ..utils.files import check_table_size, finite_numbers, read_json
 
-__all__ = ["RigView", "read_rig"]
+__all__ = ["RigView", "read_rig", "register_rig"]
 
 BOX, CAMERA = ("x0", "y0", "x1", "y1"), ("fx", "fy", "cx", "cy")
 ROTATION, QUATERNION = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), ("qw", "qx", "qy", "qz")
@@ -182,3 +186,54 @@ def _bop(folder: Path, mesh: Path | None) -> Iterator[RigView]:
         box = bop_box(entry_at(infos.get(key), mine[0]).get("bbox_obj")) if len(mine) == 1 else None
         pose = values.get("cam_R_w2c"), values.get("cam_t_w2c")
         yield _view(f"image {key}", photo, box, (K[0], K[4], K[2], K[5]), *pose)
+
+
+def _undistorted(path: Path, view: RigView) -> tuple[Undistorted | None, Camera]:
+    """The photograph without distortion, None if it cannot be read, which fails by itself; and its camera."""
+    try:
+        image = read_photo(view.photo).image
+    except (CurviregError, OSError):
+        return None, view.camera
+    try:
+        camera = view.camera.at((image.shape[-2], image.shape[-1]))
+        return undistorted(image, camera, None if view.box is None else torch.tensor(view.box)), camera
+    except CurviregError as error:
+        raise error.with_subject(f"{path}: {view.name}") from error
+
+
+def register_rig(
+    path: Path, rig: Sequence[RigView], registrar: Registrar, *, bank_seconds: float
+) -> tuple[Registration, dict[str, Any], list[tuple[Tensor, Tensor, Tensor, str] | None]]:
+    """Register the photographs of a rig together, see :meth:`.Registrar.register_views`, without their distortion.
+
+    Returns:
+        The registration, its document, and pixels, camera matrix, ``T_cam_from_world`` and name of each photograph, or
+        None for one that could not be read.
+
+    Raises:
+        CurviregError: no pose; the message names the row.
+    """
+    start = time.perf_counter()
+    seen = [_undistorted(path, view) for view in rig]
+    found = [
+        one and (one.image, camera.matrix, view.T_cam_from_world, view.name)
+        for view, (one, camera) in zip(rig, seen, strict=True)
+    ]
+    images = [view.photo if one is None else one.image for view, (one, _) in zip(rig, seen, strict=True)]
+    boxes = [None if one is None else one.box for one, _ in seen]
+    matrices = torch.stack([camera.matrix for _, camera in seen])
+    poses = torch.stack([view.T_cam_from_world for view in rig])
+    try:
+        boxes_given = boxes if any(box is not None for box in boxes) else None
+        result = registrar.register_views(images, boxes_given, matrices, poses)
+    except CurviregError as error:
+        named = re.sub(r"\bimage (\d+)\b", lambda number: rig[int(number[1])].name, f"{error}")
+        raise InvalidInputError(named, subject=path) from error
+    seconds = {"bank": bank_seconds, "register": time.perf_counter() - start}
+    document = result_document(result, registrar, seconds)
+    document["frame"] = "world"
+    document["inputs"] = {"rig": str(path), "box": None}
+    for row, view, (_, camera) in zip(document["views"], rig, seen, strict=True):
+        row |= {"name": view.name, "photo": str(view.photo), "camera": camera.describe()}
+        row["T_cam_from_world"] = view.T_cam_from_world.tolist()
+    return result, document, found

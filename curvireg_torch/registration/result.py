@@ -1,5 +1,6 @@
 """The results of a registration: poses with their probabilities, as values, as JSON documents, and in words."""
 
+import html
 import math
 import platform
 from collections.abc import Mapping, Sequence
@@ -8,6 +9,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ..errors import CurviregError
@@ -316,6 +318,36 @@ class Registration:
         return deviations is not None and bool(deviations[0].isfinite().any())
 
     @property
+    def quaternion(self) -> Tensor:
+        """(4,) float64 unit quaternion (w, x, y, z) of ``rotation``, w >= 0."""
+        x, y, z, w = Rotation.from_matrix(self.rotation.numpy()).as_quat(canonical=True)
+        return torch.tensor([w, x, y, z], dtype=torch.float64)
+
+    @property
+    def T_cam_from_model(self) -> Tensor | None:  # noqa: N802
+        """(4, 4) float64, None without a camera matrix, and for several photographs, whose ``views`` have it."""
+        return None if self.views else self.transform
+
+    def __repr__(self) -> str:
+        """At most ten lines."""
+        confidence = "not calibrated" if self.confidence is None else f"{self.confidence:.2f}"
+        rows = [", ".join(f"{v:8.4f}" for v in row) for row in self.rotation.tolist()]
+        t = None if self.translation is None else ", ".join(f"{v:.6g}" for v in self.translation.tolist())
+        lines = [
+            f"Registration: {verdict(self.confidence, self.none, self.reliable)}, confidence {confidence}",
+            f"rotation    [[{rows[0]}],",
+            *(f"             [{row}]{end}" for row, end in zip(rows[1:], (",", "]"), strict=True)),
+            f"translation {'unknown without a camera' if t is None else f'[{t}]'}",
+            "viewpoint   azimuth {:.1f}, elevation {:.1f}, theta {:.1f} degrees".format(*self.viewpoint),
+            f"hypotheses  {len(self.hypotheses)}" + (f", {self.ambiguous}" if self.ambiguous else ""),
+        ]
+        return "\n".join([*lines, *(f"warning     {text}" for text in self.warnings[:2])])
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+    @property
     def candidates(self) -> Tensor:
         """(K,) view indices of the hypotheses."""
         return torch.tensor([h.view for h in self.hypotheses])
@@ -334,6 +366,8 @@ class Registration:
         prior = None if self.prior is None else {**self.prior.to_dict(), "contradiction": self.prior_contradiction}
         return {
             **self.hypotheses[0].pose_dict(),
+            "quaternion": self.quaternion.tolist(),
+            "T_cam_from_model": None if self.T_cam_from_model is None else self.T_cam_from_model.tolist(),
             "score": self.score,
             "confidence": self.confidence,
             "reliable": self.reliable,

@@ -1,6 +1,7 @@
 """Pictures that show whether a registration is right: contours on the photograph, and how the pose was found."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -15,12 +16,13 @@ from ..mesh import mesh_unit, mesh_up
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import ImageItem, image_item
 from ..registration.result import pose_in_words, verdict
+from ..rendering.protocol import DepthRenderer
 from ..terms import crop_regions, photograph_field
 from ..utils.checks import as_numbers
 from .contours import draw_window
 from .encoding import to_uint8
 
-__all__ = ["contour_overlay", "registration_sheet", "side_pictures", "to_uint8", "view_picture"]
+__all__ = ["contour_overlay", "registration_sheet", "side_pictures", "to_uint8", "view_picture", "views_sheet"]
 
 Window = tuple[int, int, int, int]
 LEAST, MOST = 960, 1600  # px of the photograph's longer side in the picture
@@ -46,6 +48,34 @@ def contour_overlay(registrar: Registrar, result: Registration | Hypothesis, ima
     H, W = item.size
     renderer = registrar.of_model(getattr(result, "model", 0)).describer.renderer
     return draw_window(renderer, result.projection, item.image, (0, 0, W, H), 1.0, item.box.tolist())
+
+
+def views_sheet(
+    renderer: DepthRenderer, views: Sequence[tuple[tuple[Tensor, Tensor], Tensor, Sequence[float] | None, str]]
+) -> np.ndarray:
+    """Photographs beside each other, with a mesh's contours.
+
+    Args:
+        renderer: of the mesh.
+        views: of each photograph pose (4, 4) and camera matrix (3, 3), (1 or 3, H, W) pixels, box or None, and caption.
+
+    Returns:
+        (H', W', 3) uint8 RGB.
+    """
+    columns = math.ceil(math.sqrt(len(views)))
+    side, line = MOST // columns - GAP, 16
+    pictures = []
+    for projection, image, box, _ in views:
+        H, W = image.shape[-2:]
+        pictures.append(draw_window(renderer, projection, image, (0, 0, W, H), side / max(H, W), box))
+    height = max(picture.shape[0] for picture in pictures) + 2 * line
+    sheet = Image.new("RGB", (MOST, -(-len(views) // columns) * height), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    for k, (picture, (*_, caption)) in enumerate(zip(pictures, views, strict=True)):
+        x, y = k % columns * (side + GAP), k // columns * height
+        sheet.paste(Image.fromarray(picture), (x, y + 2 * line))
+        draw.text((x, y + line // 3), caption, INK, ImageFont.load_default(line))
+    return np.asarray(sheet).copy()
 
 
 @torch.no_grad()
@@ -83,11 +113,13 @@ def _field_picture(field: Tensor) -> np.ndarray:
 
 
 @torch.no_grad()
-def registration_sheet(registrar: Registrar, result: Registration, image: Any, box: Any) -> np.ndarray:
+def registration_sheet(
+    registrar: Registrar, result: Registration, image: Any, box: Any, *, note: str = ""
+) -> np.ndarray:
     """The photograph with the pose's contours and a caption; below it a close-up, the compared fields and the rivals.
 
     The photograph's longer side becomes 960 to 1600 px. Below a rival stand its rotation from the answer and its
-    probability. Arguments as for :func:`contour_overlay`.
+    probability. Arguments as for :func:`contour_overlay`; ``note`` ends the legend.
 
     Returns:
         (H', W', 3) uint8 RGB.
@@ -108,7 +140,7 @@ def registration_sheet(registrar: Registrar, result: Registration, image: Any, b
     sheet = Image.new("RGB", (width, top + rows * step), PAPER)
     sheet.paste(Image.fromarray(photograph), ((width - photograph.shape[1]) // 2, 0))
     draw = ImageDraw.Draw(sheet)
-    _draw_caption(draw, registrar, result, (GAP, height + text // 2), text)
+    _draw_caption(draw, registrar, result, (GAP, height + text // 2), text, note)
     for k, (name, picture) in enumerate(_small_pictures(registrar, result, item, side)):
         x, y = GAP + k % columns * (side + GAP), top + k // columns * step
         h, w = picture.shape[:2]
@@ -118,7 +150,7 @@ def registration_sheet(registrar: Registrar, result: Registration, image: Any, b
 
 
 def _draw_caption(
-    draw: ImageDraw.ImageDraw, registrar: Registrar, result: Registration, corner: tuple[int, int], size: int
+    draw: ImageDraw.ImageDraw, registrar: Registrar, result: Registration, corner: tuple[int, int], size: int, note: str
 ) -> None:
     """Verdict and pose in words, and the meaning of the colours."""
     x, y = corner
@@ -139,7 +171,7 @@ def _draw_caption(
     room = draw.im.size[0] - right - 1.5 * size
     font = ImageFont.load_default(min(size, size * room / draw.textlength(pose, font)))
     draw.text((right + size / 2, y + 0.8 * size), pose, INK, font, anchor="lm")
-    draw.text((x, y + 2 * size), LEGEND, FAINT, ImageFont.load_default(0.75 * size))
+    draw.text((x, y + 2 * size), f"{LEGEND} {note}", FAINT, ImageFont.load_default(0.75 * size))
 
 
 def _small_pictures(

@@ -1,6 +1,7 @@
 """The mesh at its pose, the camera and the photograph behind it, as one glTF binary file."""
 
 import math
+from collections.abc import Sequence
 from io import BytesIO
 from typing import Any
 
@@ -18,7 +19,7 @@ from ..utils.choices import UNITS
 from .encoding import jpeg, shrink
 from .overlay import to_uint8
 
-__all__ = ["pose_glb"]
+__all__ = ["pose_glb", "scene_glb"]
 
 _PHOTO_SIDE = 1024
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenCV's camera to glTF's, which has y up and looks along -z
@@ -48,37 +49,50 @@ def pose_glb(
         >>> pose_glb(trimesh.creation.box(), T, K, torch.rand(3, 64, 64))[:4]
         b'glTF'
     """
-    check_camera_matrix(camera_matrix)
     check_tensor(T_cam_from_model, "T_cam_from_model", (4, 4))
     check_pose(T_cam_from_model, "T_cam_from_model")
-    check_photograph(image, "image")
-    T, K = T_cam_from_model.detach().cpu().double(), camera_matrix.detach().cpu().double()
-    depth = float((T[:3, :3] @ mesh_centre(mesh) + T[:3, 3])[2])
-    if depth <= 0:
-        raise InvalidInputError("T_cam_from_model: the object is behind the camera; check the pose")
-    H, W = (int(n) for n in image.shape[-2:])
+    return scene_glb(mesh, T_cam_from_model, [(torch.eye(4), camera_matrix, image)], photographs=photograph)
+
+
+def scene_glb(
+    mesh: trimesh.Trimesh,
+    T_world_from_model: Tensor,
+    cameras: Sequence[tuple[Tensor, Tensor, Tensor]],
+    *,
+    photographs: bool = True,
+) -> bytes:
+    """:func:`pose_glb` of a pose in the world and of cameras: ``T_cam_from_world``, camera matrix and photograph."""
+    T = T_world_from_model.detach().cpu().double()
     unit = mesh_unit(mesh) or "m"
     metres = UNITS[unit]
     scale = np.diag([metres, metres, metres, 1.0])
     scene = trimesh.Scene()
     scene.add_geometry(_coloured(mesh), node_name="object", transform=scale @ _FLIP @ T.numpy())
-    if photograph:
-        plane = _photograph_plane(image, K, depth + 1.05 * mesh_radius(mesh))
-        scene.add_geometry(plane, node_name="picture", transform=scale @ _FLIP)
-    camera = {
-        "type": "perspective",
-        "perspective": {
-            "yfov": 2 * math.atan(H / (2 * float(K[1, 1]))),
-            "aspectRatio": W * float(K[1, 1]) / (H * float(K[0, 0])),
-            "znear": 0.01 * depth * metres,
-        },
-    }
-    exact = {"T_cam_from_model": T.tolist(), "camera_matrix": K.tolist(), "size": [W, H], "unit": unit}
+    lenses, nodes = [], []
+    for number, (pose, matrix, image) in enumerate(cameras):
+        check_camera_matrix(matrix)
+        check_photograph(image, "image")
+        P, K = pose.detach().cpu().double(), matrix.detach().cpu().double()
+        depth = float((P @ T @ torch.cat([mesh_centre(mesh), torch.ones(1)]))[2])
+        if depth <= 0:
+            raise InvalidInputError("T_cam_from_model: the object is behind the camera; check the pose")
+        H, W = (int(n) for n in image.shape[-2:])
+        world_from_camera = scale @ _FLIP @ np.linalg.inv(P.numpy())
+        if photographs:
+            plane = _photograph_plane(image, K, depth + 1.05 * mesh_radius(mesh))
+            scene.add_geometry(plane, node_name=f"picture {number}", transform=world_from_camera)
+        yfov, aspect = 2 * math.atan(H / (2 * float(K[1, 1]))), W * float(K[1, 1]) / (H * float(K[0, 0]))
+        lens = {"yfov": yfov, "aspectRatio": aspect, "znear": 0.01 * depth * metres}
+        lenses.append({"type": "perspective", "perspective": lens})
+        exact = {"T_cam_from_model": (P @ T).tolist(), "camera_matrix": K.tolist(), "size": [W, H], "unit": unit}
+        place = world_from_camera @ _FLIP @ np.linalg.inv(scale)
+        name = "photograph" if len(cameras) == 1 else f"photograph {number}"
+        nodes.append({"name": name, "camera": number, "matrix": place.T.flatten().tolist(), "extras": exact})
 
-    def with_camera(tree: dict[str, Any]) -> None:
-        tree["cameras"] = [camera]
-        tree["nodes"].append({"name": "photograph", "camera": 0, "extras": exact})
-        tree["scenes"][0]["nodes"].append(len(tree["nodes"]) - 1)
+    def with_cameras(tree: dict[str, Any]) -> None:
+        tree["cameras"] = lenses
+        tree["scenes"][0]["nodes"] += range(len(tree["nodes"]), len(tree["nodes"]) + len(nodes))
+        tree["nodes"] += nodes
         tree.setdefault("materials", []).append(_MATT)
         for mesh in tree["meshes"]:
             for part in mesh["primitives"]:
@@ -88,7 +102,7 @@ def pose_glb(
                 material["extensions"] = {"KHR_materials_unlit": {}}
                 tree["extensionsUsed"] = ["KHR_materials_unlit"]
 
-    return bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=with_camera))
+    return bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=with_cameras))
 
 
 def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
