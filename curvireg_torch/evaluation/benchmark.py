@@ -10,7 +10,7 @@ from torch import Tensor
 from ..data import BOPDataset, Pascal3DPlus, WebCollection
 from ..errors import InvalidInputError
 from ..geometry.pose_prior import PosePrior, object_frame
-from ..mesh.up import format_up
+from ..mesh.mesh import format_up
 from .protocol import Protocol, hint_of_truth
 from .store import Row
 

@@ -16,8 +16,7 @@ from tqdm import tqdm
 from ..errors import BankError, CurviregError, InvalidInputError, MissingFileError
 from ..geometry.views import ViewSphere
 from ..mesh.colours import SurfaceColours, surface_colours
-from ..mesh.mesh import as_mesh, mesh_radius, mesh_unit
-from ..mesh.up import mesh_up
+from ..mesh.mesh import as_mesh, mesh_radius, mesh_unit, mesh_up
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
 from ..utils.files import tensor_digest, write_tensors
