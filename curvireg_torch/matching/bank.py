@@ -295,30 +295,18 @@ def colour_arrays(mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
 
 def _check_contents(views: ViewSphere, settings: BankSettings, tensors: Mapping[str, Tensor]) -> None:
     """Raise ValueError for contents that no bank has: a checksum only shows that the file was not changed."""
-    N, S = len(views), settings.image_size
-    packed = (N, -(-(S**2) // 8))
-    descriptors, boxes = tensors["descriptors"], tensors["boxes"]
-    shapes = {"descriptors": (N, hog_layer(settings).length), "boxes": (N, 4), "points": packed, "silhouettes": packed}
-    wrong = [name for name, shape in shapes.items() if tuple(tensors[name].shape) != shape]
-    if wrong:
-        raise ValueError(f"{', '.join(wrong)}: not of the shape that the settings say")
-    viewpoints = torch.stack([getattr(views, f.name).double() for f in fields(ViewSphere)])
-    valid: dict[str, Tensor | bool] = {
-        "viewpoints that are not finite": viewpoints.isfinite().all(),
-        "descriptors that are not finite, or all zero": _is_finite(descriptors) and descriptors.any(),
-        "boxes that are empty or not finite": boxes.isfinite().all() and (boxes[:, 2:] > boxes[:, :2]).all(),
-    }
-    for name in (name for name in tensors if name.startswith(RERANKING)):
-        x, message = tensors[name], f"features of {name} that do not fit the views, or are not finite"
-        valid[message] = _is_finite(x) and x.ndim == 2 and len(x) == N
-    for message, passed in valid.items():
-        if not bool(passed):
-            raise ValueError(message)
-
-
-def _is_finite(x: Tensor) -> Tensor:
-    """Whether all half-precision values are finite: their sum in float32 cannot overflow otherwise, and is fast."""
-    return x.sum(dtype=torch.float32).isfinite()
+    N, masks = len(views), -(-(settings.image_size**2) // 8)
+    widths = {"descriptors": hog_layer(settings).length, "boxes": 4, "points": masks, "silhouettes": masks}
+    widths |= {name: tensors[name].shape[-1] for name in tensors if name.startswith(RERANKING)}
+    for name, width in widths.items():
+        x = tensors[name]
+        # A sum in float32 is finite if all half-precision values are, and fast.
+        if x.shape != (N, width) or not bool(x.sum(dtype=torch.float32).isfinite()):
+            raise ValueError(f"{name}: not of the shape that the settings say, or not finite")
+    if not all(bool(getattr(views, f.name).isfinite().all()) for f in fields(ViewSphere)):
+        raise ValueError("viewpoints that are not finite")
+    if not tensors["descriptors"].any() or not (tensors["boxes"][:, 2:] > tensors["boxes"][:, :2]).all():
+        raise ValueError("descriptors that are all zero, or empty boxes")
 
 
 def _pack(mask: Tensor) -> Tensor:

@@ -54,7 +54,7 @@ class SurfaceColours:
             raise ValueError("colours that do not match the mesh")
 
     @classmethod
-    def plain(cls, faces: int, colour: Sequence[int] = (_PLAIN,) * 3) -> "SurfaceColours":
+    def plain(cls, faces: int, colour: Any = (_PLAIN,) * 3) -> "SurfaceColours":
         """One colour everywhere, white by default."""
         corners = np.broadcast_to(np.array(colour, np.uint8), (faces, 3, 3))
         return cls(corners, np.zeros((faces, 3, 2), np.float32), np.full(faces, -1, np.int32))

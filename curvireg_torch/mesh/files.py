@@ -209,5 +209,3 @@ def _check_nodes(tree: dict[str, Any]) -> None:
     named += scenes[_natural(tree.get("scene", 0))].get("nodes", []) if scenes else []
     if len(set(map(_natural, named))) < len(named) or max(named, default=-1) >= len(nodes):
         raise ValueError("a node is missing, or the child of several; or the nodes form a circle")
-
-

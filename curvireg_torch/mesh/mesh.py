@@ -88,6 +88,7 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
 MANY_POINTS = 4096
 """Points of a hull: to project more of them in every view costs more than to cast the rays."""
 
+
 def _checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """(F, 3) faces, and (F,) whether a face has no area."""
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from ..registration import Hypothesis, Registrar
-from ..rendering.shading import shade
+from ..rendering import shade
 from ..visualization.contours import contour_layer
 from ..visualization.encoding import jpeg, png, shrink
 from ..visualization.overlay import to_uint8, view_picture

@@ -13,9 +13,11 @@ def test_describer_renders_quarter_turns_once(truck, camera):
     describe = ViewDescriber(truck, BankSettings(image_size=64, camera=camera))
     views = sample_views(azimuth_step=180, elevations=[20], thetas=[0, 35, 90, 180, 215, 270, 305])
     rotations, distances = views.rotations, views.distance * describe.radius
-    describe.renderer = Mock(wraps=describe.renderer)
+    describe.view_renderer = Mock(wraps=describe.view_renderer)
     together = describe(rotations, distances)
-    assert [len(call.args[0]) for call in describe.renderer.render.call_args_list] == [4]  # two directions, 0 and 35
+    assert [len(call.args[0]) for call in describe.view_renderer.render.call_args_list] == [
+        4
+    ]  # two directions, 0 and 35
     for i in range(len(rotations)):
         alone = describe(rotations[i : i + 1], distances[i : i + 1])
         assert (together.descriptors[i] - alone.descriptors[0]).norm() < 0.02 * alone.descriptors[0].norm()

@@ -41,10 +41,10 @@ def test_ranking_is_sorted_bounded_and_a_product(bank, matcher):
     assert ranking.scores.shape == ranking.order.shape == (2, len(bank))
     sorted_scores = ranking.scores.gather(1, ranking.order)
     assert bool((sorted_scores[:, :-1] >= sorted_scores[:, 1:]).all())
-    for scores in (ranking.scores, ranking.hog, ranking.repeatability, ranking.box):
+    for scores in (ranking.scores, ranking.hog, ranking.repeatability, ranking.terms["box"]):
         assert float(scores.min()) >= 0
         assert float(scores.max()) <= 1 + 1e-6
-    product = unit_score(ranking.hog) * repeatability_score(ranking.repeatability) * ranking.box
+    product = unit_score(ranking.hog) * repeatability_score(ranking.repeatability) * ranking.terms["box"]
     torch.testing.assert_close(ranking.scores, product)
     assert ranking.top(3).equal(ranking.order[:, :3])
 

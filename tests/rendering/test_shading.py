@@ -6,7 +6,7 @@ import trimesh
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.rendering import render_depth
-from curvireg_torch.rendering.shading import AMBIENT, LIT, shade
+from curvireg_torch.rendering.colour import AMBIENT, LIT, shade
 
 from .conftest import pixel_grid
 

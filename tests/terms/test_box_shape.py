@@ -43,10 +43,10 @@ def test_matcher_scores_the_whole_box(bank, photographs):
     images, boxes = photographs[0][:1], photographs[1][:1]
     matcher = ViewMatcher(bank)
     expected = box_shape_score(box_shapes(boxes), box_shapes(bank.boxes).float())
-    torch.testing.assert_close(matcher(images, boxes).box, expected)
+    torch.testing.assert_close(matcher(images, boxes).terms["box"], expected)
     H, W = images[0].shape[1:]
     assert bool((matcher(images, [[-0.5, -0.5, W - 0.5, H - 0.5]]).box == 1).all())
-    assert bool((matcher.rank(matcher.features(matcher.query(images, boxes).crops)).box == 1).all())
+    assert bool((matcher.rank(matcher.features(matcher.query(images, boxes).crops)).terms["box"] == 1).all())
 
 
 @pytest.mark.parametrize("shape", [math.nan, math.inf, -math.inf])
