@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -284,7 +284,7 @@ class ViewMatcher(nn.Module):
         raw, score = torch.full_like(log, torch.nan), torch.zeros_like(log)
         if len(log) == 0:
             return raw, score
-        module = self._reranking_module(term.name)
+        module = cast(RerankingModule, self._terms[term.name])
         if len(self.bank) <= term.exhaustive_limit:
             raw = module.compare(query, self._reranking_features(term.name, torch.arange(len(self.bank)))).to(log)
             return raw, term.log_score(raw)
@@ -300,11 +300,6 @@ class ViewMatcher(nn.Module):
             score[b] = term.log_score(raw[b : b + 1, index])[0, traces.argmax(dim=1)]
         return raw, score
 
-    def _reranking_module(self, name: str) -> RerankingModule:
-        module = self._terms[name]
-        assert isinstance(module, RerankingModule)
-        return module
-
     def _reranking_features(self, name: str, views: Tensor) -> Tensor:
         """(U, D) features of (U,) ascending views: from the bank, from the cache, or computed and cached."""
         if name in self.bank.reranking_features:
@@ -313,10 +308,11 @@ class ViewMatcher(nn.Module):
         cache = self._feature_cache.setdefault(name, {})
         found = {view: known for view in views.tolist() if (known := cache.get(view)) is not None}
         missing = [view for view in views.tolist() if view not in found]
-        module = self._reranking_module(name)
+        module = cast(RerankingModule, self._terms[name])
 
         def describe(chunk: list[int]) -> Tensor:
-            return module.describe(self._shaded(torch.tensor(chunk, device=self.device)))
+            views = torch.tensor(chunk, device=self.device)
+            return module.describe(self.describer.shaded(self.bank.rotations[views], self.bank.distances[views]))
 
         # One thread per chunk, so that rounding does not depend on which photograph came first.
         chunks = [missing[k : k + FEATURES_AT_A_TIME] for k in range(0, len(missing), FEATURES_AT_A_TIME)]
@@ -339,7 +335,7 @@ class ViewMatcher(nn.Module):
             pictures: (H, C, S, S), of :meth:`ViewDescriber.shaded`.
             image_index: (H,) photograph that each picture is compared with.
         """
-        module, term = self._reranking_module(name), next(t for t in self.terms if t.name == name)
+        module, term = cast(RerankingModule, self._terms[name]), next(t for t in self.terms if t.name == name)
         raw = module.compare(query, module.describe(pictures)).cpu().double()
         out = torch.zeros(len(pictures), dtype=torch.float64)
         for h, b in enumerate(image_index.tolist()):
@@ -347,9 +343,6 @@ class ViewMatcher(nn.Module):
             scores = term.log_score(torch.cat([views[views.isfinite()], raw[b, h : h + 1]])[None])[0]
             out[h] = scores[-1] - scores[:-1].max()  # positive if the pose is more similar than every view
         return out
-
-    def _shaded(self, views: Tensor) -> Tensor:
-        return self.describer.shaded(self.bank.rotations[views], self.bank.distances[views])
 
     @cached_property
     def describer(self) -> ViewDescriber:

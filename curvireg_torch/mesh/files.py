@@ -99,33 +99,24 @@ def _read(path: Path, folder: "_Folder") -> Any:
         logger.setLevel(level)
 
 
-class _Folder(trimesh.resolvers.Resolver):  # type: ignore[misc]
+class _Folder(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
     """Access to the files beside a mesh and in folders below; ``requested`` lists them, existing or not."""
 
     def __init__(self, path: Path) -> None:
-        self.folder, self.file_name = path.parent.resolve(), path.name
+        super().__init__(str(path))
+        self._folder, self._bytes_left = path.parent.resolve(), MAX_MESH_BYTES
         self.requested: set[Path] = set()
-        self._bytes_left = MAX_MESH_BYTES
 
-    def get(self, key: str) -> bytes:
-        path = (self.folder / urllib.parse.unquote(key)).resolve()
-        if "://" not in key and path.is_relative_to(self.folder):
+    def get(self, name: str) -> bytes:
+        path = (self._folder / urllib.parse.unquote(name)).resolve()
+        if "://" not in name and path.is_relative_to(self._folder):
             self.requested.add(path)
             if path.is_file():
                 self._bytes_left -= path.stat().st_size
                 if self._bytes_left < 0:
                     raise ValueError(f"the files that it names hold more than {MAX_MESH_BYTES:,} bytes")
                 return path.read_bytes()
-        raise ValueError(f"it names {key[:100]!r}, which is no file of its folder")
-
-    def keys(self) -> list[str]:
-        return []
-
-    def write(self, name: str, data: Any) -> None:
-        raise NotImplementedError
-
-    def namespaced(self, namespace: str) -> "_Folder":
-        raise NotImplementedError
+        raise ValueError(f"it names {name[:100]!r}, which is no file of its folder")
 
 
 def check_gltf(data: bytes) -> None:
@@ -182,15 +173,12 @@ def _check_sizes(tree: dict[str, Any]) -> None:
 
     def sizes(mesh: dict[str, Any]) -> tuple[int, int, int]:
         """Parts, vertices and faces of a mesh."""
-        parts = mesh["primitives"]
-        vertices = [max(map(count, part["attributes"].values()), default=0) for part in parts]
-        corners = [count(part["indices"]) if "indices" in part else n for part, n in zip(parts, vertices, strict=True)]
-        strips = [part.get("mode", 4) == 5 for part in parts]  # with a face for each corner
-        return (
-            len(parts),
-            sum(vertices),
-            sum(n if strip else n // 3 for n, strip in zip(corners, strips, strict=True)),
-        )
+        vertices, faces = 0, 0
+        for part in mesh["primitives"]:
+            n = max(map(count, part["attributes"].values()), default=0)
+            corners = count(part["indices"]) if "indices" in part else n
+            vertices, faces = vertices + n, faces + (corners if part.get("mode", 4) == 5 else corners // 3)
+        return len(mesh["primitives"]), vertices, faces
 
     meshes = [sizes(mesh) for mesh in tree.get("meshes", [])]
     copies = [meshes[_natural(node["mesh"])] for node in tree.get("nodes", []) if "mesh" in node]

@@ -18,7 +18,8 @@ Triangles = list[list[list[int]]]
 """For each face its triangles, as positions among its corners."""
 
 _UNUSUAL_OBJ = re.compile(
-    rb"^(?:[ \t]+\S|(?:v|vt|vn|f)\t|f[ ]+(?:(?:[^ \t\r\n]+[ \t]+){3}[^ \t\r\n]|[^\r\n]*(?:[-#]|(?<=[ \t/])0+(?![^/ \t\r\n]))))",
+    rb"^(?:[ \t]+\S|(?:v|vt|vn|f)\t|f +(?:(?:[^ \t\r\n]+[ \t]+){3}[^ \t\r\n]"
+    rb"|[^\r\n]*(?:[-#]|(?<=[ \t/])0+(?![^/ \t\r\n]))))",
     re.MULTILINE,
 )
 """Lines that trimesh does not read, or reads wrongly: an indent, tabs, a comment after a face, and faces of more than

@@ -25,7 +25,7 @@ _context: tuple[int, Any] | None = None
 
 
 def _offscreen() -> Any:
-    """The OffscreenRenderer, bound to no thread, so that this one can bind it; pyrender's make_uncurrent does nothing."""
+    """The OffscreenRenderer, bound to no thread, so that any can bind it; pyrender's make_uncurrent does nothing."""
     global _context
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     with suppress(ImportError):
