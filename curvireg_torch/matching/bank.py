@@ -29,6 +29,9 @@ FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 5
 RERANKING = "reranking."
 """Prefix of the names of reranking features among a bank's tensors."""
 
+VIEWS_AT_A_TIME = 24
+"""Views that a thread holds in memory, about 60 bytes x image_size^2 each."""
+
 REBUILD = "build it again with 'curvireg bank MESH --out FILE'"
 
 
@@ -123,10 +126,8 @@ class ViewBank:
         image_size: int | None = None,
         camera: str | None = None,
         renderer: str | DepthRenderer = "auto",
-        settings: BankSettings | None = None,
         pipeline: Pipeline | None = None,
         progress: bool | Callable[[str, int, int], object] = True,
-        chunk_size: int = 24,
         device: torch.device | str = "cpu",
     ) -> "ViewBank":
         """Render, filter and describe every view, in chunks on as many threads as torch may use.
@@ -136,10 +137,8 @@ class ViewBank:
             views: custom viewpoints; default those of the pipeline.
             image_size, camera: instead of the pipeline's.
             renderer: "auto", "embree", "pyrender", "torch" or a :class:`DepthRenderer` of this mesh.
-            settings: instead of the pipeline's ``bank``.
             pipeline: default ``Pipeline()``.
             progress: show a bar; or a callback (stage "bank", views done, views in all) that may raise to cancel.
-            chunk_size: views that a thread holds in memory, about 60 bytes x image_size^2 each.
             device: where views are filtered and described, and where the bank is stored.
 
         Raises:
@@ -154,22 +153,19 @@ class ViewBank:
         """
         mesh, pipeline = as_mesh(mesh), pipeline or Pipeline()
         options: dict[str, Any] = {"image_size": image_size, "camera": camera}
-        settings = replace(settings or pipeline.bank, **{k: v for k, v in options.items() if v is not None})
-        pipeline = replace(pipeline, bank=settings)
+        pipeline = replace(pipeline, bank=replace(pipeline.bank, **{k: v for k, v in options.items() if v is not None}))
         if views is None:
             views = pipeline.views.sphere(mesh_up(mesh))
         elif len(views) == 0:
             raise InvalidInputError("views: expected at least one viewpoint")
         else:
             pipeline = pipeline.with_pose_prior("given")
-        if chunk_size < 1:
-            raise InvalidInputError(f"chunk_size: expected >= 1, got {chunk_size}")
-        describe = ViewDescriber(mesh, settings, renderer=renderer, device=device)
+        describe = ViewDescriber(mesh, pipeline.bank, renderer=renderer, device=device)
         rotations, distances = views.rotations, views.distance * mesh_radius(mesh)
         reranking = {t.name: t.build(None).to(device) for t in pipeline.reranking_terms(len(views))}
 
         def describe_chunk(start: int) -> dict[str, Tensor]:
-            chunk = rotations[start : start + chunk_size], distances[start : start + chunk_size]
+            chunk = rotations[start : start + VIEWS_AT_A_TIME], distances[start : start + VIEWS_AT_A_TIME]
             described = describe(*chunk)
             tensors = vars(described) | {n: _pack(getattr(described, n)) for n in ("points", "silhouettes")}
             return tensors | {
@@ -181,11 +177,11 @@ class ViewBank:
             tqdm(total=len(views), desc="views", unit="view", disable=progress is not True) as bar,
             single_threaded_pool() as pool,
         ):
-            for part in pool.map(describe_chunk, range(0, len(views), chunk_size)):
+            for part in pool.map(describe_chunk, range(0, len(views), VIEWS_AT_A_TIME)):
                 parts.append(part)
                 bar.update(len(part["boxes"]))
                 if callable(progress):
-                    progress("bank", min(chunk_size * len(parts), len(views)), len(views))
+                    progress("bank", sum(len(each["boxes"]) for each in parts), len(views))
         tensors = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
         return cls(mesh, views, pipeline, tensors)
 

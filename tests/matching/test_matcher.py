@@ -63,12 +63,6 @@ def test_matcher_is_batch_independent(bank, matcher):
         torch.testing.assert_close(other.hog, together.hog, rtol=1e-5, atol=1e-5)
 
 
-def test_matcher_takes_images_of_different_sizes(matcher):
-    image, box, _ = scene(0)
-    ranking = matcher([image, image[:, 20:]], torch.stack([box, box - torch.tensor([0, 20.0, 0, 20.0])]))
-    torch.testing.assert_close(ranking.hog[0], ranking.hog[1], atol=1e-3, rtol=0)
-
-
 def test_matcher_takes_bytes_and_mixed_channels(matcher):
     images, boxes = batch(0, 1)
     exact = (images * 255).round() / 255

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_up
-from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
+from curvireg_torch.pipeline import PRESETS, ViewPolicy
 
 
 def moved(mesh: trimesh.Trimesh, rotation: torch.Tensor, scale: float, offset: list[float]) -> trimesh.Trimesh:
@@ -20,11 +20,10 @@ def moved(mesh: trimesh.Trimesh, rotation: torch.Tensor, scale: float, offset: l
 
 def test_bank_of_a_moved_copy_holds_the_same_views(truck: trimesh.Trimesh) -> None:
     # A quarter rotation about z maps the box, and a grid of azimuths, onto themselves.
-    settings = BankSettings(image_size=64)
     quarter = torch.from_numpy(Rotation.from_euler("z", 90, degrees=True).as_matrix())
     copy = moved(truck, quarter, 12.0, [30.0, -7.0, 2.0])
     views = cr.sample_views(azimuth_step=30, elevations=[-20, 40])
-    first, second = (cr.ViewBank.build(m, views, settings=settings, progress=False) for m in (truck, copy))
+    first, second = (cr.ViewBank.build(m, views, image_size=64, progress=False) for m in (truck, copy))
     rotated = (first.rotations.double() @ quarter.T).flatten(1) @ second.rotations.double().flatten(1).T
     assert float(rotated.amax(dim=1).min()) > 3.0 - 1e-5  # traces: every view is there
     order = rotated.argmax(dim=1)

@@ -105,18 +105,6 @@ def test_render_is_precise_for_tiny_and_distant_objects(backend: str, scale: flo
     torch.testing.assert_close(depth / scale, render(mesh, backend), rtol=0, atol=2e-5)
 
 
-@pytest.mark.slow
-def test_render_a_million_faces(backend: str) -> None:
-    mesh = trimesh.creation.icosphere(subdivisions=8)
-    assert len(mesh.faces) > 1_000_000
-    T, one, size = camera(2)
-    depth = make_renderer(mesh, backend).render(T, one, size)
-    coarse = make_renderer(trimesh.creation.icosphere(subdivisions=6), "embree").render(T, one, size)
-    both = (depth > 0) & (coarse > 0)
-    assert float((depth - coarse)[both].abs().median()) < 1e-3
-    assert int(((depth > 0) != (coarse > 0)).sum()) < 0.01 * both.sum()
-
-
 def test_render_depth_refuses_bad_arguments() -> None:
     T, one, size = camera(2)
     box = trimesh.creation.box()
