@@ -12,7 +12,7 @@ from ..features import HOG, field_points
 from ..geometry.cameras import projected_boxes, transform
 from ..geometry.crops import crop_transforms, image_transforms, square_boxes
 from ..mesh.colours import has_colours
-from ..mesh.edges import MAX_FACES
+from ..mesh.edges import simplified
 from ..mesh.mesh import extreme_points, mesh_centre, mesh_radius
 from ..pipeline import DEPTH_FIELDS, BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_colour, shade
@@ -22,6 +22,9 @@ __all__ = ["DescribedViews", "ViewDescriber", "depth_filter", "hog_layer"]
 
 VIEWS_AT_A_TIME = 64
 """Views in memory at a time."""
+
+VIEW_FACES = 8000
+"""Faces to which larger meshes are simplified for views: at 256 px their surface moves by a small part of a pixel."""
 
 EQUAL_VIEWS = 1e-6
 """Tolerance of equal rotations (entries) and distances (relative): 1e-4 px in a view."""
@@ -72,8 +75,7 @@ class DescribedViews:
 class ViewDescriber:
     """Renders, filters and describes arbitrary views of one mesh.
 
-    Framed views are rendered from the mesh as its contours see it, simplified to at most
-    :data:`curvireg_torch.mesh.edges.MAX_FACES` faces; ``renderer`` is one of the whole mesh.
+    Framed views are rendered from a mesh of at most :data:`VIEW_FACES` faces; ``renderer`` is one of the whole mesh.
 
     Args:
         mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
@@ -93,9 +95,9 @@ class ViewDescriber:
         self.renderer = self.view_renderer = make_renderer(mesh, renderer, device=device)
         self.centre, self.radius, self.hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
         self._device = device
-        if isinstance(renderer, str) and len(mesh.faces) > MAX_FACES:
-            edges = self.contours.edges
-            simple = trimesh.Trimesh(edges.vertices + self.centre.numpy(), edges.faces, process=False)
+        if isinstance(renderer, str) and len(mesh.faces) > VIEW_FACES:
+            vertices, faces = simplified(mesh, self.centre.numpy(), VIEW_FACES)
+            simple = trimesh.Trimesh(vertices + self.centre.numpy(), faces, process=False)
             self.view_renderer = make_renderer(simple, renderer, device=device)
         self._set(settings)
 
