@@ -153,7 +153,7 @@ def _colmap(text: str) -> dict[str, Any]:
     """Cameras by their number, with principal points that count from the centre of the first pixel."""
     cameras = {}
     for number, line in enumerate(text.splitlines(), start=1):
-        words = [_scalar(word) for word in line.partition("#")[0].split()]
+        words = line.partition("#")[0].split()
         if not words:
             continue
         focals, count = _COLMAP.get(words[1] if len(words) > 1 else "", (0, 0))
@@ -163,9 +163,9 @@ def _colmap(text: str) -> dict[str, Any]:
                 f"line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS..., MODEL (and number of PARAMS) one of "
                 f"{models}, got {line!r:.60}"
             )
-        width, height, *numbers = _numbers({f"line {number}": words[2:]}, f"line {number}")
+        width, height, *numbers = _numbers({f"line {number}": list(map(_scalar, words[2:]))}, f"line {number}")
         cx, cy, *distortion = numbers[focals:]
-        cameras[line.split()[0]] = {
+        cameras[words[0]] = {
             "intrinsics": [numbers[0], numbers[focals - 1], cx - 0.5, cy - 0.5],
             "distortion": [*distortion, 0.0, 0.0, 0.0][:4] if distortion else [],
             "distortion_model": "fisheye" if words[1] == "OPENCV_FISHEYE" else "",

@@ -204,6 +204,7 @@ def replaced(old, new):
         ("cameras.txt", "1 FOV 640 480 500 500 320 240 0.1\n", "line 1: expected CAMERA_ID MODEL .* got '1 FOV"),
         ("cameras.txt", "1 PINHOLE 640 480 500 320 240\n", r"PINHOLE \(4\), .* got '1 PINHOLE 640 480 500 320 240'"),
         ("cameras.txt", "1 PINHOLE 640 480 500 x 320 240\n", "line 1: expected finite numbers, got .*'x'"),
+        ("cameras.txt", COLMAP + "7 [PINHOLE 640 480\n", r"line 10: expected CAMERA_ID MODEL .* got '7 \[PINHOLE"),
         ("a.json", '{"fx": 500, ', "damaged, or no calibration"),
         ("a.json", '{"fx": 500, "fy": 500, "cx": 320}', "expected 9 numbers, or fx, fy, cx, cy, got 3"),
         ("a.json", '{"fx": "500", "fy": 500, "cx": 320, "cy": 240}', "fx: expected finite numbers, got .*'500'"),
