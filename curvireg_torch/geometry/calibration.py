@@ -135,7 +135,7 @@ def undistorted(image: Tensor, camera: Camera, box: Tensor | None = None, mask: 
         >>> camera = Camera([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]], (-0.3, 0.1, 0, 0))
         >>> seen = undistorted(torch.rand(3, 48, 64), camera, torch.tensor([0.0, 10, 20, 30]))
         >>> seen.image.shape, seen.box.round().tolist()
-        (torch.Size([3, 48, 64]), [-5.0, 9.0, 20.0, 31.0])
+        (torch.Size([3, 48, 64]), [-6.0, 8.0, 20.0, 31.0])
     """
     check_photograph(image, "photograph")
     H, W = size = int(image.shape[-2]), int(image.shape[-1])
