@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -49,6 +49,7 @@ from .priors import BatchPriors
 from .refinement import refine
 from .result import FailedRegistration, Registration
 from .search import search
+from .several import register_views
 
 __all__ = ["Registrar"]
 
@@ -194,7 +195,7 @@ class Registrar:
             results = [found[0] for found in localize(self, images, camera_matrices, prior=prior)]
         else:
             items = image_items(images, boxes, camera_matrices, prior, masks)
-            results = self.map_items(items, self._register_items)
+            results = self.map_items(items, self.register_items)
         for model, other in enumerate(self.others, 1):
             rivals = other(images, boxes, camera_matrices, prior=prior, masks=masks)
             results = [_better(one, rival, model) for one, rival in zip(results, rivals, strict=True)]
@@ -203,6 +204,16 @@ class Registrar:
     def refine(self, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any) -> Results:
         """Refine known poses of the first mesh, see :func:`curvireg_torch.registration.refine`."""
         return refine(self, images, camera_matrices, poses)
+
+    def register_views(
+        self, images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any
+    ) -> Registration:
+        """Register several photographs of one object together, see :func:`.several.register_views`."""
+        result = register_views(self, images, boxes, camera_matrices, T_cam_from_world)
+        for model, other in enumerate(self.others, 1):
+            rival = other.register_views(images, boxes, camera_matrices, T_cam_from_world)
+            result = cast(Registration, _better(result, rival, model))
+        return result
 
     def of_model(self, model: int) -> "Registrar":
         """Return the registrar of one of several meshes, by :attr:`Registration.model`."""
@@ -268,7 +279,7 @@ class Registrar:
         parts = map_on_threads(run, range(0, len(items), size), device=self.bank.device)
         return [result for part in parts for result in part]
 
-    def _register_items(self, items: Sequence[ImageItem | CurviregError], first: int) -> Results:
+    def register_items(self, items: Sequence[ImageItem | CurviregError], first: int) -> Results:
         """Register photographs with boxes, then again those whose pose asks for another box."""
         results = self._register_given(items, first)
         if not (self.pipeline.box_jitter and self.pipeline.contours):
