@@ -8,7 +8,7 @@ from nicegui import ui
 
 from ..utils.choices import IMAGES, MESHES_AND_BANKS
 
-__all__ = ["attributes", "button", "file_chooser", "region", "set_enabled", "set_text", "term", "text"]
+__all__ = ["attributes", "button", "file_chooser", "fold", "region", "set_enabled", "set_text", "term", "text"]
 
 
 def attributes(**values: str) -> str:
@@ -35,6 +35,14 @@ def button(label: str, on_click: Callable[..., Any], test_id: str, classes: str 
     """A button; symbols need an ``aria_label``."""
     element = text("button", label, f"button {classes}", type="button", data_testid=test_id, **values)
     return element.on("click", lambda: on_click())
+
+
+def fold(title: str, test_id: str, *, is_open: bool = False) -> Any:
+    """A part that can be folded away; what is built inside is added to it."""
+    part = region("details", "fold", data_testid=f"fold-{test_id}").props("open" if is_open else "")
+    with part:
+        text("summary", title)
+    return part
 
 
 def set_enabled(element: Any, enabled: bool) -> None:
