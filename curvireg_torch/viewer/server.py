@@ -23,20 +23,20 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ..errors import MAX_VIEWER_PAGES, InvalidInputError
+from ..errors import MAX_MESH_BYTES, MAX_VIEWER_PAGES, InvalidInputError
 from ..evaluation.opening import RegisterOptions
 from ..utils.threads import one_torch_thread
 from .page import Page, add_assets
 from .session import Session
-from .workspace import Workspaces, file_name, show_warning, size_limit
+from .workspace import Workspaces, file_name, show_warning
 
 __all__ = ["SECURITY_HEADERS", "guarded", "listen", "serve"]
 
 RECONNECT_SECONDS = 5.0
 """How long a page may be away; a reload takes less. The work is kept longer."""
 
-SWEEP_SECONDS = 10.0
 CONNECT_SECONDS = 20.0
+"""How long a request may take to become a page."""
 
 SECURITY_HEADERS = {
     # Vue compiles templates in the browser, which takes "unsafe-eval"; NiceGUI's scripts are inline and have no nonce.
@@ -214,9 +214,8 @@ def add_pages(spaces: Workspaces) -> None:
         name = file_name(unquote(request.headers.get("x-file-name", "")))
         length = request.headers.get("content-length", "")
         try:
-            kind, limit = size_limit(name)
-            if not length.isdigit() or int(length) > limit:
-                raise InvalidInputError(f"{name}: a {kind} may have {limit:,} bytes")
+            if not length.isdigit() or int(length) > MAX_MESH_BYTES:
+                raise InvalidInputError(f"{name}: a file may have {MAX_MESH_BYTES:,} bytes")
             await workspace.receive(name, int(length), request.stream())
         except InvalidInputError as error:
             workspace.messages["file"] = str(error)
@@ -230,5 +229,4 @@ def add_pages(spaces: Workspaces) -> None:
     app.get("/{page}/file/{name}")(send_file)
     app.post("/{page}/upload")(receive_file)
     app.add_exception_handler(404, lambda *_: PlainTextResponse("not found", status_code=404))
-    app.timer(SWEEP_SECONDS, spaces.sweep)
     app.on_shutdown(spaces.close)

@@ -95,6 +95,7 @@ class Result:
     document: dict[str, Any]  # the content of result.json, if the first answer is chosen
     image: Tensor  # (3, H, W) uint8
     box: Tensor  # (4,) px, with which the pose was found
+    request: RegisterOptions  # what was asked for
     command: str  # gives the same result
 
     def moved(
@@ -250,7 +251,7 @@ class Session:
         finally:
             self.cancelled = False
         box, command = torch.tensor(used_box(document)), _command_line(request, self.names)
-        self.result = Result(registrar, registration, document, photo.image, box, command)
+        self.result = Result(registrar, registration, document, photo.image, box, request, command)
         self.choose(0)
         return registration
 
@@ -321,39 +322,31 @@ class Session:
         return to_json(self.document()).encode()
 
     def python(self) -> str:
-        """The answer as a Python program, which gives the same numbers."""
+        """A Python program that gives the answer."""
         result, answer = self.require_result()
-        request, inputs = self.request(), result.document["inputs"]
+        request, camera = result.request, result.document["inputs"]["camera"]
         photo, mesh = self.names[request.photos[0]], self.names[request.meshes[0]]
-        words = ["pipeline=pipeline"]
-        words += [] if request.mesh_is is None else [f"mesh_is={request.mesh_is!r}"]
-        up = "" if request.up is None else f", up={request.up!r}"
-        is_bank = mesh.endswith(".safetensors")
-        opened = f"cr.ViewBank.load({mesh!r})" if is_bank else f"cr.load_mesh({mesh!r}, unit={request.unit!r}{up})"
+        prior = None if result.registration.prior is None else result.registration.prior.to_dict()
         pipeline = f"Pipeline.read({str(request.pipeline)!r})" if request.pipeline else ""
         pipeline = pipeline or f"PRESETS[{request.preset or DEFAULT!r}]"
-        if is_bank and request.bank_decides:
-            words.remove("pipeline=pipeline")
-        elif request.pose is not None:
-            pipeline += f".with_pose_prior({request.pose!r})"
-        camera = inputs["camera"] and f"cr.camera_matrix({', '.join(map(repr, inputs['camera']))})"
-        prior = result.registration.prior
-        limits = {} if prior is None else prior.to_dict()
-        limit_words = ", ".join(f"{name}={value!r}" for name, value in limits.items())
+        pipeline += "" if request.pose is None else f".with_pose_prior({request.pose!r})"
+        if mesh.endswith(".safetensors"):
+            model, pipeline = f"cr.ViewBank.load({mesh!r})", "None" if request.bank_decides else pipeline
+        else:
+            model = f"cr.load_mesh({mesh!r}, unit={request.unit!r}, up={request.up!r})"
         lines = [
             "import curvireg_torch as cr",
             "from curvireg_torch.pipeline import PRESETS, Pipeline",
             "",
-            f"pipeline = {pipeline}",
-            f"registrar = cr.Registrar({', '.join([opened, *words])})",
-            f"box, camera = {self.box and [list(self.box)]}, {camera}",
-            f"prior = {f'cr.PosePrior({limit_words})' if limits else None}",
+            f"model, pipeline = {model}, {pipeline}",
+            f"registrar = cr.Registrar(model, pipeline=pipeline, mesh_is={request.mesh_is!r})",
+            f"box = {None if request.box is None else [list(request.box)]}",
+            f"camera = {None if camera is None else f'cr.camera_matrix(*{camera})'}",
+            f"prior = {None if prior is None else f'cr.PosePrior(**{prior})'}",
             f"result = registrar([{photo!r}], box, camera, prior=prior)[0]",
-            f"pose = result.hypotheses[{answer.number}]",
+            f"pose = result.hypotheses[{answer.number}].pose_dict()",
         ]
-        if answer.edits:
-            pose = {name: value for name, value in answer.pose.pose_dict().items() if name != "viewpoint"}
-            lines.append(f"pose = {pose}  # corrected by hand")
+        lines += [f"pose = {answer.pose.pose_dict()}  # corrected by hand"] if answer.edits else []
         return "\n".join([*lines, "print(pose)", ""])
 
     def glb(self) -> bytes:

@@ -12,7 +12,7 @@ from ..mesh import mesh_unit, mesh_up
 from ..registration.result import pose_in_words, remarks, verdict
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
-from .widgets import button, fold, region, set_text, term, text
+from .widgets import button, fold, region, set_text, text
 from .workspace import Workspace
 
 __all__ = ["Answers", "Inputs"]
@@ -28,14 +28,7 @@ VERDICTS = {
     "no match": "Probably it is not right: check the mesh, its unit and the box, or choose another answer.",
     "by hand": "You set this pose. How probable it is, nobody has measured.",
 }
-TERMS = {
-    "probability": "estimated probability that this answer is within 30 degrees of the truth",
-    "score": "how well the view at this pose correlates with the photograph, with all other evidence",
-    "edge support": "how strongly the photograph's edges lie under the contours, 0 to 1",
-    "rank": "how well the view that the search started from compares with the best one; 0 is the best",
-    "similarity": "correlation of the curves in the photograph and in the view at this pose, 0 to 1",
-    "appearance": "how well shading and surface of the view compare with the photograph, by a network; 0 is the best",
-}
+PROBABILITY = "estimated probability that this answer is within 30 degrees of the truth"
 RANGES = ("azimuth", "elevation")
 AXES: Mapping[str | None, str] = {None: "as the format says", **{axis: axis for axis in UP_AXES}}
 FRONTS: Mapping[str | None, str] = {None: "default", **{axis: axis for axis in UP_AXES}}
@@ -53,7 +46,7 @@ class Answers:
         with region("section", "answers", aria_label="answer", data_testid="answers") as self.section:
             with region("div", "verdict"):
                 self.word = text("h2", "", data_testid="verdict")
-                self.certainty = ui.html("", tag="p", sanitize=False).props("data-testid=certainty")
+                self.certainty = text("p", "", title=PROBABILITY, data_testid="certainty")
                 with region("div", "row"):
                     for name in DOWNLOADS:
                         button(name, lambda name=name: self._download(name), f"download-{name}", "quiet")
@@ -61,7 +54,6 @@ class Answers:
                 self.meaning = text("p", "", "facts")
             self.cards = region("div", "cards", data_testid="panel-answer", role="group", aria_label="possible answers")
             self.facts = text("p", "", "lines", data_testid="facts")
-            self.numbers = ui.html("", tag="ul", sanitize=False).classes("facts")
 
     async def _download(self, kind: str) -> None:
         name, media_type = DOWNLOADS[kind]
@@ -92,10 +84,7 @@ class Answers:
         set_text(self.word, word)
         self.word.classes(replace=f"badge {word.replace(' ', '-')}")
         set_text(self.meaning, VERDICTS[word])
-        probability = document["confidence"]
-        self.certainty.set_content(
-            "" if probability is None else f"{term('probability', TERMS['probability'])} {probability:.2f}"
-        )
+        set_text(self.certainty, "" if document["confidence"] is None else f"probability {document['confidence']:.2f}")
         mesh = result.registrar.bank.mesh
         front = (self.session.options.limits or {}).get("front")
         azimuth, elevation, theta = pose.viewpoint
@@ -104,13 +93,10 @@ class Answers:
         if pose.translation is not None:
             unit = mesh_unit(mesh) or "in the mesh's unit"
             lines.append(f"translation {', '.join(f'{v:.4g}' for v in pose.translation.tolist())} {unit}")
+        numbers = {"score": document["score"], "edge support": document["edge_support"]}
+        lines += [f"{name} {value:.2f}" for name, value in numbers.items() if value is not None and value == value]
         lines += [*document["warnings"], *remarks(document), *answer.edits]
         set_text(self.facts, "\n".join(lines))
-        values = {} if answer.edits else {"score": pose.score, **pose.evidence}
-        if pose.edge_support is not None:
-            values["edge support"] = pose.edge_support
-        rows = [f"<li>{term(name, TERMS[name])} {value:.2f}</li>" for name, value in values.items() if name in TERMS]
-        self.numbers.set_content("".join(rows))
 
     async def _draw_cards(self) -> None:
         result, _ = self.session.require_result()
@@ -158,8 +144,6 @@ class Inputs:
                 self.exif = button(
                     "Guess from EXIF", lambda: self._set_camera(self.session.exif_camera()), "exif", "quiet"
                 )
-        with fold("Box in pixels", "box-numbers"):
-            self.box = self._numbers("box-", ("x0", "y0", "x1", "y1"), self._box_typed)
         with fold("What is known about the pose", "known"):
             self._build_known()
         with fold("The same on the command line, and in Python", "command-line"):
@@ -213,11 +197,6 @@ class Inputs:
         if not self._showing:
             change()
 
-    def _box_typed(self) -> None:
-        x0, y0, x1, y1 = (number.value for number in self.box)
-        if None not in (x0, y0, x1, y1):
-            self.session.box = (float(x0), float(y0), float(x1), float(y1))
-
     def _camera_typed(self) -> None:
         fx, fy, cx, cy = (number.value for number in self.camera)
         if None not in (fx, fy, cx, cy):
@@ -242,13 +221,13 @@ class Inputs:
         session = self.session
         set_text(self.command, session.command())
         set_text(self.python, "" if session.answer is None else session.python())
-        now = (session.box, session.camera, session.fov, session.photo_path, session.options)
+        now = (session.camera, session.fov, session.photo_path, session.options)
         if now == self.shown:
             return
         self.shown, self._showing = now, True
         limits = session.options.limits or {}
         ranges = [value for name in RANGES for value in limits.get(name) or (None, None)]
-        for fields, values in ((self.box, session.box), (self.camera, session.camera), (self.known, ranges)):
+        for fields, values in ((self.camera, session.camera), (self.known, ranges)):
             for number, value in zip(fields, values or (None,) * 4, strict=True):
                 number.value = value
         self.fov.value, self.front.value = session.fov, limits.get("front")

@@ -1,4 +1,4 @@
-"""Plain HTML elements of the page: text, buttons, choosers of files, and terms with an explanation."""
+"""Plain HTML elements of the page: text, buttons, choosers of files, and parts that fold away."""
 
 from collections.abc import Callable
 from html import escape
@@ -8,7 +8,7 @@ from nicegui import ui
 
 from ..utils.choices import IMAGES, MESHES_AND_BANKS
 
-__all__ = ["attributes", "button", "file_chooser", "fold", "region", "set_enabled", "set_text", "term", "text"]
+__all__ = ["attributes", "button", "file_chooser", "fold", "region", "set_enabled", "set_text", "text"]
 
 
 def attributes(**values: str) -> str:
@@ -56,9 +56,3 @@ def file_chooser(label: str, test_id: str) -> None:
         ui.label(label)
         accept = ",".join((*IMAGES, *MESHES_AND_BANKS, ".zip"))
         region("input", "hidden-text", type="file", data_testid=test_id, accept=accept).props("multiple")
-
-
-def term(word: str, explanation: str) -> str:
-    """HTML of a word whose explanation shows under the mouse, on focus and on a tap."""
-    tip = f'<span class="tip" role="tooltip">{escape(explanation)}</span>'
-    return f'<span class="term" tabindex="0">{escape(word)}{tip}</span>'

@@ -16,7 +16,6 @@ from typing import Any
 
 from ..errors import (
     MAX_ARCHIVE_FILES,
-    MAX_IMAGE_BYTES,
     MAX_MESH_BYTES,
     MAX_VIEWER_BYTES,
     MAX_VIEWER_PAGES,
@@ -32,10 +31,7 @@ from ..visualization.encoding import png
 from ..visualization.overlay import to_uint8
 from .session import Session
 
-__all__ = ["Workspace", "Workspaces", "file_name", "identify", "show_warning", "size_limit", "unpack"]
-
-KEPT_SECONDS = 24 * 3600.0
-"""How long the work of a closed page is kept."""
+__all__ = ["Workspace", "Workspaces", "file_name", "identify", "show_warning", "unpack"]
 
 GRACE_SECONDS = 30.0
 """Seconds after which the search of a closed page is stopped; a reload takes less."""
@@ -43,7 +39,7 @@ GRACE_SECONDS = 30.0
 MAX_NAME = 120
 """Characters of the name of an uploaded file."""
 
-HEAD_BYTES = 1 << 16
+HEAD_BYTES = 16
 """Bytes from the start of a file that tell what it is."""
 
 DIRECTORY_BYTES = 1024
@@ -55,7 +51,6 @@ _IMAGE_STARTS = (
     *(b"GIF8", b"\xff\x0a", b"\0\0\0\x0cJXL", b"\0\0\0\x0cjP"),
 )
 _MESH_STARTS = {b"glTF": ".glb", b"ply": ".ply", b"OFF": ".off", b"COFF": ".off", b"solid": ".stl"}
-_OBJ_LINE = re.compile(rb"(?m)^(v|vn|vt)( +[-+.0-9eE]+){2,}[ \r]*$")
 _caught: ContextVar[list[Any]] = ContextVar("caught")
 
 
@@ -76,7 +71,7 @@ class Workspace:
         loaded: whether the files of the command line were opened.
         waiting: whether a search waits for those of other pages.
         pages: browser windows that show it.
-        left: when the last of them was closed, in seconds of ``time.monotonic``.
+        left: when one of them was closed last, in seconds of ``time.monotonic``.
     """
 
     def __init__(self, session: Session, folder: Path, searches: asyncio.Semaphore) -> None:
@@ -150,6 +145,11 @@ class Workspace:
         elif self._search is not None:
             self.session.cancel()
 
+    def stop_if_left(self) -> None:
+        """End the search if no window shows the page any more."""
+        if self.pages == 0:
+            self.stop()
+
     async def receive(self, name: str, size: int, blocks: AsyncIterator[bytes]) -> None:
         """Store a file of ``size`` bytes and open it as a photograph or a mesh.
 
@@ -175,7 +175,7 @@ class Workspace:
         with path.open("rb") as file:
             head = file.read(HEAD_BYTES)
         try:
-            kind, suffix = identify(name, head, path.stat().st_size)
+            kind, suffix = identify(name, head)
         except InvalidInputError as error:
             self.messages["file"] = str(error)
             return
@@ -276,11 +276,13 @@ class Workspaces:
         self.searches = asyncio.Semaphore(max(1, (os.cpu_count() or 1) // 4))
 
     def join(self, name: str) -> Workspace | None:
-        """The workspace of a page that was opened, loaded again or left within a day; None if there is no place."""
-        self.sweep()
+        """The workspace of a page that was opened or loaded again; None if there is no place for it."""
         if name not in self.items:
-            if len(self.items) >= MAX_VIEWER_PAGES and not self._drop_the_first_left():
+            left = [other for other, workspace in self.items.items() if workspace.pages == 0]
+            if len(self.items) >= MAX_VIEWER_PAGES and not left:
                 return None
+            if len(self.items) >= MAX_VIEWER_PAGES:
+                self._remove(min(left, key=lambda other: self.items[other].left))
             self.items[name] = Workspace(Session(self.options), self.folder / name, self.searches)
         self.items[name].pages += 1
         return self.items[name]
@@ -289,27 +291,13 @@ class Workspaces:
         """A page was closed; its workspace waits for it, but gives up its place if another page needs it."""
         workspace = self.items[name]
         workspace.pages, workspace.left = workspace.pages - 1, time.monotonic()
-
-    def sweep(self) -> None:
-        """Stop the searches of pages that do not come back, and remove what was left a day ago."""
-        for name, workspace in list(self.items.items()):
-            away = time.monotonic() - workspace.left if workspace.pages == 0 else 0.0
-            if away > GRACE_SECONDS:
-                workspace.stop()
-            if away > KEPT_SECONDS:
-                self._remove(name)
+        asyncio.get_running_loop().call_later(GRACE_SECONDS, workspace.stop_if_left)
 
     def close(self) -> None:
         """Stop all searches and remove the folder."""
         for name in list(self.items):
             self._remove(name)
         shutil.rmtree(self.folder, ignore_errors=True)
-
-    def _drop_the_first_left(self) -> bool:
-        left = [name for name, workspace in self.items.items() if workspace.pages == 0]
-        if left:
-            self._remove(min(left, key=lambda name: self.items[name].left))
-        return bool(left)
 
     def _remove(self, name: str) -> None:
         workspace = self.items.pop(name)
@@ -328,20 +316,7 @@ def file_name(text: str) -> str:
     return name[-MAX_NAME:] or "file"
 
 
-def size_limit(name: str) -> tuple[str, int]:
-    """What a file seems to be by its name, and the bytes that it may have.
-
-    Raises:
-        InvalidInputError: by its name, it is neither a photograph nor a mesh.
-    """
-    suffix = Path(name).suffix.lower()
-    if suffix in (".mtl", ".bin"):
-        raise InvalidInputError(f"{name}: materials and buffers go with their mesh and its pictures into a zip archive")
-    is_mesh = suffix in (*MESHES_AND_BANKS, ".zip")
-    return ("mesh", MAX_MESH_BYTES) if is_mesh else ("photograph", MAX_IMAGE_BYTES)
-
-
-def identify(name: str, head: bytes, size: int) -> tuple[str, str]:
+def identify(name: str, head: bytes) -> tuple[str, str]:
     """Whether a file is a "photograph", a "mesh" or an "archive", and the suffix of its format ("" of photographs).
 
     The content decides, then the name: a part that is called ``wheel.jpg`` by mistake is still a mesh.
@@ -349,13 +324,12 @@ def identify(name: str, head: bytes, size: int) -> tuple[str, str]:
     Args:
         name: of the file.
         head: its first :data:`HEAD_BYTES` bytes.
-        size: of the file, bytes.
 
     Raises:
         InvalidInputError: it is none of them.
 
     Example:
-        >>> identify("part", b"ply\\nformat ascii 1.0", 300)
+        >>> identify("part", b"ply\\nformat ascii 1.0")
         ('mesh', '.ply')
     """
     suffix = Path(name).suffix.lower()
@@ -364,21 +338,15 @@ def identify(name: str, head: bytes, size: int) -> tuple[str, str]:
     for start, format_suffix in _MESH_STARTS.items():
         if head.startswith(start):
             return "mesh", format_suffix
-    if len(head) >= 84 and size == 84 + 50 * struct.unpack_from("<I", head, 80)[0]:
-        return "mesh", ".stl"
     if head.startswith(_IMAGE_STARTS) or head[4:8] == b"ftyp":
         return "photograph", ""
     if suffix in MESHES_AND_BANKS:
         return "mesh", suffix
     if suffix in IMAGES:
         return "photograph", ""
-    if head.lstrip().startswith(b"{") and b'"asset"' in head:
-        return "mesh", ".gltf"
-    if _OBJ_LINE.search(head):
-        return "mesh", ".obj"
     raise InvalidInputError(
         f"{name}: neither a photograph (JPEG, PNG, TIFF, WebP, BMP, PGM or PPM) nor a mesh "
-        f"({', '.join(MESHES)}, or a zip archive of one with its parts)"
+        f"({', '.join(MESHES)}, or a zip archive of one with its materials, pictures and buffers)"
     )
 
 

@@ -142,7 +142,8 @@ class Browser:
         ActionChains(self.driver, duration=50).release().perform()
 
     def box(self):
-        return [float(self.text(f"box-{name}") or "nan") for name in ("x0", "y0", "x1", "y1")]
+        facts = self.text("box-facts")
+        return [float(v) for v in facts.split()] if facts[:1].isdigit() else None
 
     def downloaded(self, name):
         path = self.folder / "downloads" / name

@@ -33,7 +33,7 @@ def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browse
     assert browser.driver.find_element("css selector", "html").get_attribute("lang") == "en-US"
     assert [browser.text(name) for name in ("sample", "register")] == ["Try the sample", "Find the pose"]
     assert browser.part("register").get_attribute("disabled")
-    browser.emulate(1280, 800)
+    browser.emulate(1440, 900)
     browser.picture("viewer-empty")
     browser.click("sample")
     browser.wait(lambda: browser.text("photograph-facts").startswith("sample.png: 960 x 720 px"), "photograph")
@@ -45,7 +45,6 @@ def test_a_search_can_be_stopped_and_started_again(browser):
     browser.click("register")
     browser.wait(lambda: browser.text("seconds") == "1 s", "seconds")
     assert browser.text("progress")
-    browser.picture("viewer-search")
     browser.click("stop")
     browser.wait(lambda: browser.messages() == ["stopped"], "stopped", 20)
     browser.wait(lambda: not browser.part("stop").is_displayed(), "nothing to stop")
@@ -64,8 +63,21 @@ def test_a_reload_keeps_photograph_mesh_box_and_answer(browser):
     browser.wait(lambda: [int(image.get_attribute("naturalWidth")) for image in images] == [960] * 3, "layers")
     browser.wait(lambda: len(browser.part("panel-answer").find_elements("css selector", "img")) > 1, "cards")
     assert browser.text("progress") == "done"
-    browser.emulate(1280, 1000)
+    browser.emulate(1440, 900)
     browser.picture("viewer")
+
+
+def test_contours_follow_the_mesh_that_is_dragged(browser):
+    before = browser.text("facts")
+
+    def follows():
+        browser.wait(lambda: browser.driver.find_element("css selector", ".canvas path.outline"), "contours", 20)
+        browser.picture("viewer-drag")
+
+    browser.drag((20, 20), (80, 60), 960, held=follows)
+    browser.wait(lambda: "moved: rotated" in browser.text("facts"), "turned")
+    browser.click("undo")
+    browser.wait(lambda: browser.text("facts") == before, "as before")
 
 
 def test_another_page_has_its_own_work(browser, folder, address):
@@ -85,13 +97,13 @@ def test_axe_finds_nothing_serious(browser):
         browser.emulate(1280, 1000, dark=dark)
         browser.wait(lambda d=dark: browser.driver.execute_script(
             "return document.body.classList.contains('body--dark')") == d, "colours")  # fmt: skip
-        for name in ("camera", "box-numbers", "known", "command-line"):
+        for name in ("camera", "known", "command-line"):
             browser.unfold(name)
         assert not (found := serious(browser)), found
 
 
 def test_dark_colours_follow_the_system(browser):
-    browser.emulate(1280, 1000, dark=True)
+    browser.emulate(1440, 900, dark=True)
     body = browser.driver.find_element("css selector", "body")
     browser.wait(lambda: body.value_of_css_property("background-color") == "rgba(20, 23, 26, 1)", "dark")
     browser.picture("viewer-dark")
@@ -128,7 +140,6 @@ def test_a_small_screen_stacks_everything(browser):
 def test_keys_undo_and_zoom_change_the_box(browser):
     from selenium.webdriver import ActionChains, Keys
 
-    browser.unfold("box-numbers")
     browser.click("mode-box")
     x0, y0, x1, y1 = browser.box()
     viewport = browser.driver.find_element("css selector", ".viewport")
@@ -153,7 +164,7 @@ def test_keys_undo_and_zoom_change_the_box(browser):
     press("z", Keys.CONTROL)
     becomes(x0 + 1, y0, x1 + 1, y1)
     press(Keys.DELETE)
-    browser.wait(lambda: browser.text("box-x0") == "", "no box")
+    browser.wait(lambda: browser.box() is None, "no box")
     browser.click("undo")
     becomes(x0 + 1, y0, x1 + 1, y1)
 
@@ -185,7 +196,7 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
         assert browser.text(f"message-{part}").startswith(f"{name}: ")
         assert str(folder) not in browser.text(f"message-{part}")
     assert browser.text("photograph-facts") == "photo.png: 240 x 180 px", "the former one stays"
-    browser.emulate(1280, 800)
+    browser.emulate(1440, 900)
     browser.picture("viewer-mistakes")
     browser.emulate(0, 0)
     browser.drop(folder / "photo.png")

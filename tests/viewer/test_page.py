@@ -100,11 +100,6 @@ def test_steps_tick_off_and_say_what_is_missing(workspace, build):
 
 def test_typed_numbers_and_sides_go_into_the_session(workspace, build):
     inputs, session = build(Inputs), workspace.session
-    session.box = (10.0, 20.0, 60.0, 70.0)
-    inputs.refresh()
-    assert [number.value for number in inputs.box] == [10, 20, 60, 70]
-    inputs.box[2].set_value(90)
-    assert session.box == (10, 20, 90, 70)
     inputs.camera[0].set_value(300)
     assert session.camera is None, "not before all four are there"
     for number, value in zip(inputs.camera[1:], (300, 119.5, 89.5), strict=True):

@@ -157,8 +157,9 @@ def test_the_python_program_gives_the_same_numbers(session, registered):
         patch.setenv("CURVIREG_CACHE", str(registered[1] / "cache"))
         names: dict = {}
         exec(session.python(), names)
-    assert float(rotation_error(names["pose"].rotation, session.answer.pose.rotation)) < 0.1
-    assert torch.allclose(names["pose"].translation, session.answer.pose.translation, rtol=1e-3)
+    found = {name: torch.tensor(names["pose"][name], dtype=torch.float64) for name in ("rotation", "translation")}
+    assert float(rotation_error(found["rotation"], session.answer.pose.rotation)) < 0.1
+    assert torch.allclose(found["translation"], session.answer.pose.translation, rtol=1e-3)
     session.place(session.result.moved(session.answer.pose.projection[0], rotation=(0, 6, 0)))
     assert f"'rotation': {session.answer.pose.rotation.tolist()}" in session.python()
 
