@@ -17,14 +17,8 @@ import torch
 import trimesh
 
 from ..errors import BankError
-<<<<<<< HEAD
-from ..geometry.views import ViewSphere
-from ..mesh.mesh import as_mesh, mesh_unit, mesh_up
-=======
 from ..geometry.viewpoint import ViewSphere
-from ..mesh.mesh import as_mesh, mesh_unit
-from ..mesh.up import mesh_up
->>>>>>> main
+from ..mesh.mesh import as_mesh, mesh_unit, mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..utils.files import code_digest, tensor_digest, text_digest

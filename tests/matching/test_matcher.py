@@ -38,13 +38,9 @@ def test_ranking_is_sorted_bounded_and_a_product(bank, matcher):
     for scores in (ranking.scores, ranking.hog, ranking.repeatability, ranking.terms["box"]):
         assert float(scores.min()) >= 0
         assert float(scores.max()) <= 1 + 1e-6
-<<<<<<< HEAD
-    product = unit_score(ranking.hog) * repeatability_score(ranking.repeatability) * ranking.terms["box"]
-    torch.testing.assert_close(ranking.scores, product)
-=======
-    parts = Correlation().log_score(ranking.hog), Repeatability().log_score(ranking.repeatability), ranking.box.log()
+    box = ranking.terms["box"].log()
+    parts = Correlation().log_score(ranking.hog), Repeatability().log_score(ranking.repeatability), box
     torch.testing.assert_close(ranking.scores, sum(parts).exp())
->>>>>>> main
     assert ranking.top(3).equal(ranking.order[:, :3])
 
 
