@@ -82,7 +82,8 @@ def register(
 
     Args:
         image: a path, a PIL image, an (H, W) or (H, W, 3) array, or a (1 or 3, H, W) tensor.
-        mesh: a mesh or a bank, or the path of one, see :class:`Registrar`; or a registrar, which is faster for several photographs.
+        mesh: a mesh or a bank, or the path of one, see :class:`Registrar`; or a registrar, which is faster for several
+            photographs.
         box: x0, y0, x1, y1 in px; without box and mask the object is searched for.
         camera: fx, fy, cx, cy in px, a (3, 3) camera matrix, a :class:`Camera`, or the path of a calibration file;
             "exif" takes the focal length of the photograph's file. None: the rotation is estimated alone.

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..rendering.protocol import DepthRenderer
+from ..rendering import DepthRenderer
 from .encoding import to_uint8
 
 __all__ = ["contour_layer", "draw_box", "draw_window", "line_width"]

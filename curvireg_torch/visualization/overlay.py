@@ -16,7 +16,7 @@ from ..mesh import mesh_unit, mesh_up
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import ImageItem, image_item
 from ..registration.result import pose_in_words, verdict
-from ..rendering.protocol import DepthRenderer
+from ..rendering import DepthRenderer
 from ..terms import crop_regions, photograph_field
 from ..utils.checks import as_numbers
 from .contours import draw_window

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from ..rendering.protocol import DepthRenderer
+from ..rendering import DepthRenderer
 from ..utils.files import write_file
 from .contours import draw_window
 from .encoding import jpeg

@@ -120,6 +120,8 @@ def broken_files(folder):
         ({}, ["--camera", "325", "242", "572", "573"], ["swap the halves: 572 573 325 242"]),
         ({}, ["--camera", *CAMERA, "--distance", "2", "1"], ["distance: expected 0 < NEAR <= FAR"]),
         ({}, ["--field", "none"], ["none"]),
+        ({}, ["--camera", "cam.yaml"], ["cam.yaml: no such file", "--camera exif"]),
+        ({}, ["--format", "ros"], ["--format ros: needs a camera"]),
         ({}, ["--preset", "paper"], ["built with other settings"]),
         ({}, ["--pose", "upright"], ["--pose"]),
         ({}, ["--within", "10"], ["within: expected near"]),
@@ -156,7 +158,7 @@ def test_register_checks_box_and_camera_before_it_opens_a_bank(register_one, ref
         ),
         (["register", "a.jpg", "b.stl", "--json", "--dist", "1", "2"], "unrecognized arguments: --dist"),
         (["register", "a.jpg", "b.stl", "--json", "--box", "1,2", "3"], "--box: expected X0 Y0 X1 Y1, finite numbers"),
-        (["register", "a.jpg", "b.stl", "--json", "--camera", "cam.yaml"], "or exif, or give --fov DEG"),
+        (["register", "a.jpg", "b.stl", "--json", "--camera", "1", "2", "3"], "or give FILE"),
         (["view", "--port", "-1"], "--port: expected a whole number from 0 to 65535, got '-1'"),
     ],
 )
