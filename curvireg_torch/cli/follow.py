@@ -1,9 +1,12 @@
 """``curvireg follow FRAMES MESH``."""
 
 import argparse
+import json
+import sys
+import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +22,9 @@ if TYPE_CHECKING:
     from ..registration import FailedRegistration, Follower, Registration
 
 FOLDER_FPS = 10.0
-"""Frames per second of the overlay of a folder."""
+"""Frames per second of the overlay of a folder, or of a camera that does not tell."""
+
+STATUSES = ("ok", "unsure", "lost", "failed")
 
 
 def add_follow(commands: Any) -> None:
@@ -27,134 +32,219 @@ def add_follow(commands: Any) -> None:
         commands,
         "follow",
         "curvireg follow shots/ part.stl --unit mm --camera 1450 1450 960 540 --out out/follow",
-        "curvireg follow turn.mp4 part.stl --camera 1450 1450 960 540 --box 410 220 890 700 --out out/follow",
-        help="follow an object through the frames of a video",
+        "curvireg follow turn.mp4 part.stl --camera cam.yaml --box 410 220 890 700 --out out/follow",
+        "curvireg follow 0 part.stl --unit mm --camera cam.yaml --json",
+        help="follow an object through a video, or live",
         description="Registers the first frame and tracks the object from frame to frame. Writes\n"
         "DIR/results.csv: photo, status (ok: confidence of 0.5 or more; unsure, lost, failed),\nrotation row by row, "
         "translation in the mesh's unit, confidence, edge support, and why there is no pose;\n"
-        "DIR/overlay.mp4: contours of the pose and confidence on each frame.",
+        "DIR/overlay.mp4: contours of the pose and confidence on each frame.\n"
+        "Ctrl-C ends it; the poses so far are kept.",
         run=run,
     )
-    frames = "a video, or a folder of frames in the order of their names"
-    parser.add_argument("frames", type=Path, metavar="FRAMES", help=frames)
+    frames = "a video; a folder of frames in the order of their names; the number of a camera, such as 0; or a stream, "
+    parser.add_argument("frames", metavar="FRAMES", help=frames + "rtsp://... Live frames are dropped, not delayed")
     parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh or a bank")
-    add_options(parser, *PHOTOGRAPH, box="in px in the first frame; default: the object is localized")
-    parser.add_argument("--out", type=Path, metavar="DIR", required=True, help="folder of the results")
+    options = [name for name in PHOTOGRAPH if name != "mask"]
+    add_options(parser, *options, "start", "field", box="in px in the first frame; default: the object is localized")
+    parser.add_argument("--json", action="store_true", help="print each pose as a line of JSON; --out is optional")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Follow the object; write its poses, and draw them."""
-    if "://" in str(arguments.frames) or ":/" in str(arguments.frames):
-        message = "streams are not read; record a video, or give a folder of frames"
-        raise InvalidInputError(message, subject=arguments.frames)
-    check_given([arguments.frames], [arguments.mesh])
-    if not arguments.frames.exists():
-        raise MissingFileError("no such folder or video", subject=arguments.frames)
+    source, out = arguments.frames, arguments.out
+    live = source.isdecimal() or "://" in source
+    check_given([] if live else [Path(source)], [arguments.mesh])
+    if not live and not Path(source).exists():
+        raise MissingFileError("no such folder or video; or give the number of a camera, or rtsp://...", subject=source)
     from ..evaluation.opening import check_camera
+    from ..evaluation.runner import CAMERA_OPTIONS
     from ..utils.threads import one_torch_thread
 
-    options, out = register_options(arguments, [arguments.frames], [arguments.mesh]), arguments.out
+    options = register_options(arguments, [Path(source)], [arguments.mesh])
     if options.camera is None and options.guess is None:
-        raise InvalidInputError("follow: give --camera FX FY CX CY, --camera exif or --fov DEG")
+        raise InvalidInputError(f"follow: give {CAMERA_OPTIONS}")
     check_camera(options.camera, options.guess)
-    check_writable(out, "--out")
+    if out is None and not arguments.json:
+        raise InvalidInputError("follow: give --out DIR, or --json")
+    if out is not None:
+        check_writable(out, "--out")
     with one_torch_thread():
-        rows, seconds, video = _follow(options, out)
-    counts = {status: sum(row[1] == status for row in rows) for status in ("ok", "unsure", "lost", "failed")}
-    summary = ", ".join([f"{counts['ok']} of {len(rows)} believed", *(f"{counts[s]} {s}" for s in list(counts)[1:])])
+        rows, seconds, video = _follow(options, source, out, live=live, as_json=arguments.json)
+    counts = {status: sum(row[1] == status for row in rows) for status in STATUSES}
+    summary = ", ".join([f"{counts['ok']} of {len(rows)} believed", *(f"{counts[s]} {s}" for s in STATUSES[1:])])
     after_first = seconds[1:]  # the first frame is registered
     rate = f", {len(after_first) / sum(after_first):.1f} frames per second" if after_first else ""
-    print(f"{len(rows)} frames: {summary}{rate}; see {out}/results.csv and {video}")
+    files = "" if out is None else f"; see {out}/results.csv and {video}"
+    print(f"{len(rows)} frames: {summary}{rate}{files}", file=sys.stderr if arguments.json else sys.stdout)
     if not counts["ok"] and not counts["unsure"]:
         reason = f"; the first: {rows[0][-1]}" if rows else ""
         message = f"no frame could be registered{reason}; give frames that can be read, and --box of the object"
-        raise InvalidInputError(message, subject=arguments.frames)
+        raise InvalidInputError(message, subject=source)
 
 
-def _follow(options: "RegisterOptions", out: Path) -> tuple[list[list[Any]], list[float], Path]:
+def _follow(
+    options: "RegisterOptions", source: str, out: Path | None, *, live: bool, as_json: bool
+) -> tuple[list[list[Any]], list[float], Path | None]:
     """Rows of ``out / "results.csv"``, which is also written after an interruption, seconds that the pose of each frame
     took, and path of the overlay."""
     from tqdm import tqdm
 
     from ..evaluation.opening import open_registrar
-    from ..registration import Follower
     from ..visualization import OverlayVideo
 
-    frames, count, fps = _frames(options.photos[0], options.meshes)
-    K = _camera_matrix(options)
+    frames, count, fps = _live(source) if live else _frames(options.photos[0])
     registrar = open_registrar(options, options.meshes, options.open_field())
-    follow = Follower(registrar, K)
     rows: list[list[Any]] = []
     seconds: list[float] = []
+    object_pose, start, video = _Poses(options, registrar), time.monotonic(), None
     try:
-        with closing(OverlayVideo(out / "overlay.mp4", registrar, fps=fps)) as video:
-            for name, image in tqdm(frames, desc="follow", unit="frame", total=count, disable=not options.progress):
-                start = time.perf_counter()
-                result = _pose(follow, image, None if rows else options.box)
-                seconds.append(time.perf_counter() - start)
+        with ExitStack() as stack:
+            if out is not None:
+                video = stack.enter_context(closing(OverlayVideo(out / "overlay.mp4", registrar, fps=fps)))
+            bar = tqdm(frames, desc="follow", unit="frame", total=count, disable=not options.progress or as_json)
+            for name, image in bar:
+                begun = time.perf_counter()
+                shown, result = object_pose(image)
+                seconds.append(time.perf_counter() - begun)
                 rows.append(_row(name, result))
-                video.add(None if isinstance(image, ImageError) else image, result)
+                if as_json:
+                    print(_json_line(rows[-1], result, time.monotonic() - start), flush=True)
+                if video is not None:
+                    video.add(shown, result)
+    except KeyboardInterrupt:
+        if not live:  # a file has an end
+            raise
     finally:
-        if rows:
-            _write_tables(out, rows)
-    return rows, seconds, video.path
+        if rows and out is not None:
+            _write_table(out, rows)
+    return rows, seconds, None if video is None else video.path
 
 
-def _camera_matrix(options: "RegisterOptions") -> "Tensor":
-    """The given camera matrix, or that of the first frame by its EXIF or the field of view."""
-    from ..data import Video, read_photo
+class _Poses:
+    """The pose in each frame, which is returned without the distortion of its camera."""
+
+    def __init__(self, options: "RegisterOptions", registrar: Any) -> None:
+        self.options, self.registrar = options, registrar
+        self.follow: Follower | None = None
+        self.box: Any = None if options.box is None else list(options.box)
+
+    def __call__(self, image: "Tensor | ImageError") -> tuple["Tensor | None", "Registration | FailedRegistration"]:
+        import torch
+
+        from ..evaluation.opening import read_start
+        from ..geometry import Camera, undistorted
+        from ..registration import FailedRegistration, Follower
+
+        if isinstance(image, ImageError):
+            return None, FailedRegistration(image)
+        camera = self.options.camera
+        try:
+            if isinstance(camera, Camera):
+                seen = undistorted(image, camera, None if self.box is None else torch.tensor(self.box))
+                image, self.box = seen.image, seen.box
+            if self.follow is None:
+                self.follow = Follower(self.registrar, self._matrix(image))
+                if self.options.start is not None:
+                    self.follow.start(image, read_start(self.options.start)[0])
+            box, self.box = self.box, None  # of the first frame
+            return image, self.follow(image, box)
+        except CurviregError as error:
+            return image, FailedRegistration(error)
+
+    def _matrix(self, image: "Tensor") -> "Tensor":
+        """The given camera matrix, or that of the first frame by its EXIF or the field of view."""
+        from ..data import read_photo
+        from ..geometry import Camera, camera_matrix
+        from ..geometry.cameras import camera_of_view
+
+        size, camera, guess = (image.shape[-2], image.shape[-1]), self.options.camera, self.options.guess
+        if camera is not None:
+            return camera.at(size).matrix if isinstance(camera, Camera) else camera_matrix(*camera)
+        if guess != "exif":
+            return camera_of_view(float(guess or 0.0), size)
+        first = _photographs(self.options.photos[0])[0] if self.options.photos[0].is_dir() else None
+        K = None if first is None else read_photo(first).guessed_camera_matrix()
+        if K is None:
+            message = "no focal length in EXIF, which only photographs have; give --camera FX FY CX CY, or --fov DEG"
+            raise InvalidInputError(message, subject=first or self.options.photos[0])
+        return K
+
+
+def _photographs(folder: Path) -> list[Path]:
     from ..evaluation.lists import list_photographs
-    from ..geometry import camera_matrix
-    from ..geometry.cameras import camera_of_view
 
-    frames = options.photos[0]
-    if options.camera is not None:
-        return camera_matrix(*options.camera)
-    if frames.is_file() and frames.suffix.lower() in VIDEOS:
-        if options.guess == "exif":
-            raise InvalidInputError("a video has no EXIF; give --camera FX FY CX CY, or --fov DEG", subject=frames)
-        image = next(iter(Video(frames)))[1]
-        return camera_of_view(float(options.guess or 0.0), (image.shape[-2], image.shape[-1]))
-    first = list_photographs([frames], options.meshes, frames=frames).entries[0]
-    photo = read_photo(first.photo)
-    if options.guess != "exif":
-        return camera_of_view(float(options.guess or 0.0), (photo.image.shape[-2], photo.image.shape[-1]))
-    K = photo.guessed_camera_matrix()
-    if K is None:
-        raise InvalidInputError(
-            "no focal length in its EXIF; give --camera FX FY CX CY, or --fov DEG", subject=first.photo
-        )
-    return K
+    return [entry.photo for entry in list_photographs([folder], [folder], frames=folder).entries]
 
 
-def _pose(follow: "Follower", image: "Tensor | ImageError", box: Any) -> "Registration | FailedRegistration":
-    from ..registration import FailedRegistration
-
-    try:
-        return FailedRegistration(image) if isinstance(image, ImageError) else follow(image, box)
-    except CurviregError as error:
-        return FailedRegistration(error)
-
-
-def _frames(path: Path, meshes: Sequence[Path]) -> tuple[Iterator[tuple[str, "Tensor | ImageError"]], int, float]:
+def _frames(path: Path) -> tuple[Iterator[tuple[str, "Tensor | ImageError"]], int, float]:
     """Names and pixels of the frames, with errors in place of unreadable ones; their number, and frames per second."""
     from ..data import Video, read_photo
-    from ..evaluation.lists import list_photographs
 
     if path.suffix.lower() in VIDEOS and path.is_file():
         video = Video(path)
         fps = video.fps if 0 < video.fps < 1000 else FOLDER_FPS
         return ((f"{path.stem}-{number:06d}", image) for number, image in video), video.count, fps
-    photos = list_photographs([path], meshes, frames=path).entries
+    photos = _photographs(path)
 
     def read() -> Iterator[tuple[str, "Tensor | ImageError"]]:
-        for entry in photos:
+        for photo in photos:
             try:
-                yield entry.name, read_photo(entry.photo).image
+                yield str(photo), read_photo(photo).image
             except (CurviregError, OSError) as error:
-                yield entry.name, ImageError(str(error))
+                yield str(photo), ImageError(str(error))
 
     return read(), len(photos), FOLDER_FPS
+
+
+def _live(source: str) -> tuple[Iterator[tuple[str, "Tensor | ImageError"]], None, float]:
+    """Frames of a camera or a stream: a thread reads them, and the latest one is taken, so that none is late."""
+    import cv2
+    import numpy as np
+    import torch
+
+    file = cv2.VideoCapture(int(source) if source.isdecimal() else source)
+    if not file.isOpened():
+        kind = "no such camera, or another program uses it" if source.isdecimal() else "the stream cannot be opened"
+        raise InvalidInputError(f"{kind}; check its number or address", subject=source)
+    latest: list[Any] = []
+    arrived, finished, ended = threading.Condition(), threading.Event(), threading.Event()
+
+    def read() -> None:
+        number = 0
+        while not ended.is_set():
+            known, pixels = file.read()
+            with arrived:
+                if known:
+                    latest[:] = [(number, pixels)]
+                else:
+                    finished.set()
+                arrived.notify()
+            if not known:
+                return
+            number += 1
+
+    def frames() -> Iterator[tuple[str, "Tensor | ImageError"]]:
+        reader = threading.Thread(target=read, daemon=True)
+        reader.start()
+        try:
+            while True:
+                with arrived:
+                    while not latest:
+                        if finished.is_set():
+                            return
+                        arrived.wait(0.2)  # Ctrl-C is heard between
+                    number, pixels = latest.pop()
+                rgb = np.ascontiguousarray(pixels[..., ::-1].transpose(2, 0, 1))
+                yield f"frame-{number:06d}", torch.from_numpy(rgb)
+        finally:
+            ended.set()
+            reader.join(timeout=5.0)
+            file.release()
+
+    fps = file.get(cv2.CAP_PROP_FPS)
+    return frames(), None, fps if 0 < fps < 1000 else FOLDER_FPS
 
 
 def _row(name: str, result: "Registration | FailedRegistration") -> list[Any]:
@@ -170,8 +260,20 @@ def _row(name: str, result: "Registration | FailedRegistration") -> list[Any]:
     return [name, "ok" if believed else "unsure", *pose, result.confidence, result.edge_support, ""]
 
 
-def _write_tables(out: Path, rows: list[list[Any]]) -> None:
-    """Write results.csv."""
+def _json_line(row: list[Any], result: "Registration | FailedRegistration", seconds: float) -> str:
+    from ..registration import Registration
+
+    line = {"frame": row[0], "seconds": round(seconds, 4), "status": row[1]}
+    if isinstance(result, Registration):
+        keys = ("rotation", "translation", "quaternion")
+        line |= {key: getattr(result, key).tolist() for key in keys}
+        line |= {"confidence": result.confidence, "edge_support": result.edge_support}
+    else:
+        line["message"] = row[-1]
+    return json.dumps(line, allow_nan=False)
+
+
+def _write_table(out: Path, rows: list[list[Any]]) -> None:
     from ..evaluation.lists import POSE_COLUMNS
     from ..utils.files import write_csv
 

@@ -1,6 +1,7 @@
 """``curvireg follow``: poses and a video."""
 
 import csv
+import json
 import re
 
 import cv2
@@ -11,6 +12,7 @@ from curvireg_torch.cli import main
 from curvireg_torch.data import Video
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.registration import Follower
+from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA
 from tests._support.scenes import learned_registrar, sequence
 
@@ -21,35 +23,56 @@ def frames(tmp_path_factory):
     learned_registrar().bank.save(folder / "truck.safetensors")
     (folder / "shots").mkdir()
     scenes = sequence(3)
+    writer = cv2.VideoWriter(str(folder / "turn.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (240, 180))
     for k, (image, _, _) in enumerate(scenes):
         pixels = (image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy()
         cv2.imwrite(str(folder / "shots" / f"{k}.png"), pixels)
+        writer.write(pixels)
+    writer.release()
+    with_exif(folder / "shots" / "0.png", exif(1, 38))
     (folder / "shots" / "3.png").write_bytes(b"no photograph")
     return folder, scenes
 
 
-def run(folder, *options):
-    return main(["follow", str(folder / "shots"), str(folder / "truck.safetensors"), "--quiet", *map(str, options)])
-
-
-def test_follow_writes_a_pose_for_each_frame(frames, tmp_path, capsys):
+@pytest.fixture
+def follow(frames):
+    """Run ``curvireg follow``, by default on the folder, with the box of the first frame."""
     folder, scenes = frames
-    box = scenes[0][1].tolist()
-    assert run(folder, "--camera", *CAMERA, "--box", *box, "--out", tmp_path) == 0
-    closing = capsys.readouterr().out
-    assert "4 frames: 3 of 4 believed, 0 unsure, 0 lost, 1 failed" in closing
-    rate = re.search(r", ([\d.]+) frames per second; see", closing)
-    assert rate is not None
-    assert float(rate[1]) > 0.0
-    with (tmp_path / "results.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["status"] for row in rows] == ["ok", "ok", "ok", "failed"]
+
+    def run(*options, source="shots", box=True):
+        source = str(folder / source) if (folder / source).exists() else source
+        boxes = ["--box", *map(str, scenes[0][1].tolist())] if box else []
+        words = ["follow", source, str(folder / "truck.safetensors"), "--quiet", *boxes]
+        return main([*words, *map(str, options)])
+
+    return run
+
+
+def table(out):
+    with (out / "results.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def check_poses(rows, scenes):
     for row, (_, _, T) in zip(rows, scenes, strict=False):
         R = torch.tensor([float(row[f"r{i}{j}"]) for i in (1, 2, 3) for j in (1, 2, 3)], dtype=torch.float64)
         t = torch.tensor([float(row[name]) for name in ("tx", "ty", "tz")], dtype=torch.float64)
         assert float(rotation_error(R.view(3, 3), T[:3, :3])) < 4.0
         assert float((t - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.04
-        assert 0.0 <= float(row["confidence"]) <= 1.0
+
+
+def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):
+    _, scenes = frames
+    assert follow("--camera", *CAMERA, "--out", tmp_path) == 0
+    closing = capsys.readouterr().out
+    assert "4 frames: 3 of 4 believed, 0 unsure, 0 lost, 1 failed" in closing
+    rate = re.search(r", ([\d.]+) frames per second; see", closing)
+    assert rate is not None
+    assert float(rate[1]) > 0.0
+    rows = table(tmp_path)
+    assert [row["status"] for row in rows] == ["ok", "ok", "ok", "failed"]
+    check_poses(rows, scenes)
+    assert all(0.5 <= float(row["confidence"]) <= 1.0 for row in rows[:3])
     assert (rows[3]["r11"], rows[3]["confidence"], rows[0]["message"]) == ("", "", "")
     assert "3.png" in rows[3]["message"]
     pictures = [image.int() for _, image in Video(tmp_path / "overlay.mp4")]
@@ -59,34 +82,109 @@ def test_follow_writes_a_pose_for_each_frame(frames, tmp_path, capsys):
     assert 2 < (pictures[2] - photograph).abs().float().mean() < 30  # contours and codec
 
 
-def test_follow_reads_a_video_and_keeps_its_rate(frames, tmp_path):
+def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(follow, tmp_path, capsys):
+    assert follow("--camera", *CAMERA, "--out", tmp_path, "--json", source="turn.avi") == 0
+    printed = capsys.readouterr()
+    assert "3 of 3 believed" in printed.err
+    lines, rows = [json.loads(line) for line in printed.out.splitlines()], table(tmp_path)
+    assert [row["photo"] for row in rows] == [line["frame"] for line in lines] == [f"turn-00000{k}" for k in range(3)]
+    for line, row in zip(lines, rows, strict=True):
+        assert (line["status"], line["confidence"]) == (row["status"], float(row["confidence"]))
+        assert line["translation"] == [float(row[name]) for name in ("tx", "ty", "tz")]
+        assert len(line["quaternion"]) == 4
+    assert [line["seconds"] for line in lines] == sorted(line["seconds"] for line in lines)
+    assert Video(tmp_path / "overlay.mp4").fps == 25.0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["overlay.mp4", "results.csv"]
+
+
+@pytest.mark.parametrize("source", ["0", "rtsp://camera/stream"])
+def test_follow_live_drops_frames_that_are_late(frames, follow, tmp_path, monkeypatch, source):
+    """A video file in the place of a camera, which delivers as fast as it can."""
+    opened, capture = [], cv2.VideoCapture
+    file = str(frames[0] / "turn.avi")
+    monkeypatch.setattr(cv2, "VideoCapture", lambda name: opened.append(name) or capture(file))
+    assert follow("--camera", *CAMERA, "--out", tmp_path, source=source) == 0
+    assert opened == [0 if source == "0" else source]
+    names = [row["photo"] for row in table(tmp_path)]
+    assert len(names) < 3
+    assert names[-1] == "frame-000002"
+
+
+class Camera:
+    """Delivers the frames of a sequence, each once the one before was taken, then waits for Ctrl-C."""
+
+    def __init__(self, frames, taken):
+        self.frames, self.taken, self.number = frames, taken, 0
+
+    def isOpened(self):  # noqa: N802
+        return True
+
+    def get(self, _):
+        return 0.0
+
+    def release(self):
+        pass
+
+    def read(self):
+        while len(self.taken) < self.number:
+            if self.number > len(self.frames):
+                return False, None
+        self.number += 1
+        return (True, self.frames[self.number - 1]) if self.number <= len(self.frames) else (False, None)
+
+
+def test_follow_live_ends_cleanly_with_ctrl_c(frames, follow, tmp_path, monkeypatch, capsys):
     folder, scenes = frames
-    writer = cv2.VideoWriter(str(tmp_path / "turn.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (240, 180))
-    for k in range(3):
-        writer.write(cv2.imread(str(folder / "shots" / f"{k}.png")))
-    writer.release()
-    options = ("--quiet", "--camera", *CAMERA, "--box", *scenes[0][1].tolist(), "--out", tmp_path / "out")
-    assert main(["follow", str(tmp_path / "turn.avi"), str(folder / "truck.safetensors"), *map(str, options)]) == 0
-    with (tmp_path / "out" / "results.csv").open() as file:
-        assert [(row["photo"], row["status"]) for row in csv.DictReader(file)] == [
-            (f"turn-00000{k}", "ok") for k in range(3)
-        ]
-    assert Video(tmp_path / "out" / "overlay.mp4").fps == 25.0
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["overlay.mp4", "results.csv"]
+    taken, call = [], Follower.__call__
+
+    def interrupted(self, *args):
+        if len(taken) == 2:
+            raise KeyboardInterrupt
+        result = call(self, *args)
+        taken.append(args)
+        return result
+
+    monkeypatch.setattr(Follower, "__call__", interrupted)
+    pictures = [cv2.imread(str(folder / "shots" / f"{k}.png")) for k in range(3)]
+    monkeypatch.setattr(cv2, "VideoCapture", lambda _: Camera(pictures, taken))
+    assert follow("--camera", *CAMERA, "--out", tmp_path, source="0") == 0
+    assert "2 frames: 2 of 2 believed" in capsys.readouterr().out
+    rows = table(tmp_path)
+    assert [row["photo"] for row in rows] == ["frame-000000", "frame-000001"]
+    check_poses(rows, scenes)
 
 
-def test_follow_needs_a_camera(frames, tmp_path, capsys):
-    assert run(frames[0], "--out", tmp_path) == 2
-    assert "--camera" in capsys.readouterr().err
+@pytest.mark.parametrize("words", [("--camera", "exif"), ("--fov", "49.55")])
+def test_follow_guesses_the_camera_from_the_first_frame(frames, follow, tmp_path, words):
+    assert follow(*words, "--out", tmp_path) == 0
+    check_poses(table(tmp_path), frames[1])
 
 
-def test_follow_refuses_a_missing_video(frames, tmp_path, capsys):
-    mesh = frames[0] / "truck.safetensors"
-    assert main(["follow", "nowhere.mp4", str(mesh), "--camera", *CAMERA, "--out", str(tmp_path)]) == 2
-    assert "nowhere.mp4: no such folder or video" in capsys.readouterr().err
+def test_follow_starts_from_a_known_pose(frames, follow, tmp_path):
+    T = frames[1][0][2]
+    (tmp_path / "start.json").write_text(json.dumps({"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist()}))
+    assert follow("--camera", *CAMERA, "--start", tmp_path / "start.json", "--out", tmp_path / "out", box=False) == 0
+    check_poses(table(tmp_path / "out"), frames[1])
 
 
-def test_follow_keeps_the_poses_before_an_interruption(frames, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("words", "source", "message"),
+    [
+        (["--out", "OUT"], "shots", "give --camera FX FY CX CY, --camera FILE (a calibration), --camera exif or --fov"),
+        (["--camera", *CAMERA], "shots", "give --out DIR, or --json"),
+        (["--camera", *CAMERA, "--out", "OUT"], "nowhere.mp4", "nowhere.mp4: no such folder or video; or give the"),
+        (["--camera", *CAMERA, "--out", "OUT"], "99", "99: no such camera"),
+        (["--camera", *CAMERA, "--out", "OUT"], "rtsp://127.0.0.1:9/none", "the stream cannot be opened"),
+        (["--camera", "exif", "--out", "OUT"], "turn.avi", "no focal length in EXIF, which only photographs have"),
+    ],
+)
+def test_follow_refuses_what_it_cannot_follow(follow, tmp_path, capsys, words, source, message):
+    words = [str(tmp_path) if word == "OUT" else word for word in words]
+    assert follow(*words, source=source) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_follow_keeps_the_poses_before_an_interruption(follow, tmp_path, monkeypatch):
     call, seen = Follower.__call__, []
 
     def interrupted(self, *args):
@@ -96,9 +194,7 @@ def test_follow_keeps_the_poses_before_an_interruption(frames, tmp_path, monkeyp
         return call(self, *args)
 
     monkeypatch.setattr(Follower, "__call__", interrupted)
-    folder, scenes = frames
-    assert run(folder, "--camera", *CAMERA, "--box", *scenes[0][1].tolist(), "--out", tmp_path) == 130
-    with (tmp_path / "results.csv").open() as file:
-        assert [row["status"] for row in csv.DictReader(file)] == ["ok"]
+    assert follow("--camera", *CAMERA, "--out", tmp_path) == 130
+    assert [row["status"] for row in table(tmp_path)] == ["ok"]
     assert len(list(Video(tmp_path / "overlay.mp4"))) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["overlay.mp4", "results.csv"]
