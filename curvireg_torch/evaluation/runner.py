@@ -126,6 +126,8 @@ def seen_image(entry: Entry, photo: Photo) -> Tensor:
 def _item(entry: Entry, photo: Photo, camera: Tensor | Camera | None) -> ImageItem:
     boxes = None if entry.box is None else [entry.box]
     masks = None if entry.mask is None else [entry.mask]
+    if entry.mask is not None and not entry.mask.is_file():
+        raise MissingFileError("no such file; check the path of the mask", subject=entry.mask)
     item = image_items([photo.image], boxes, camera, entry.prior, masks)[0]
     if isinstance(item, CurviregError):
         raise item.with_subject(entry.name)

@@ -1,13 +1,20 @@
-"""``curvireg register`` with unknown cameras: guessed only on request."""
+"""``curvireg register`` with unknown cameras, calibration files and masks."""
 
 import json
 import math
+import re
 
 import cv2
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from curvireg_torch.cli import main
+from curvireg_torch.cli.register import NONE_RELIABLE, SOME_FAILED
+from curvireg_torch.geometry import rotation_error
+from curvireg_torch.rendering import render_depth
+from curvireg_torch.synthetic import example_mesh
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, lines, written
 from tests._support.scenes import scene
@@ -89,3 +96,109 @@ def test_check_camera_refuses_unusable_values_before_reading(folder, refused, mo
     monkeypatch.setattr("curvireg_torch.data.read_photo", lambda *_, **__: pytest.fail("read"))
     files = [str(folder / "photos" / "0.png"), str(folder / "truck.safetensors")]
     refused(main(["register", *files, "--json", *words]), message)
+
+
+CALIBRATION = """%YAML:1.0
+---
+image_width: 240
+image_height: 180
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [260., 0., 119.5, 0., 260., 89.5, 0., 0., 1.]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [-0.25, 0.1, 0., 0., 0.]
+"""
+
+
+@pytest.fixture(scope="module")
+def distorted(folder):
+    """The first photograph as a lens with distortion shows it, its calibration, its box there, and a mask."""
+    (folder / "cam.yaml").write_text(CALIBRATION)
+    D = np.array([-0.25, 0.1, 0.0, 0.0, 0.0])
+    K = np.array([[260.0, 0.0, 119.5], [0.0, 260.0, 89.5], [0.0, 0.0, 1.0]])
+    v, u = np.mgrid[:180, :240].astype(np.float64)
+    straight = cv2.undistortPoints(np.stack([u, v], axis=-1).reshape(-1, 1, 2), K, D, P=K).reshape(180, 240, 2)
+    maps = straight.astype(np.float32)
+    picture = cv2.imread(str(folder / "photos" / "0.png"))
+    cv2.imwrite(str(folder / "distorted.png"), cv2.remap(picture, maps, None, cv2.INTER_CUBIC))
+    depth = render_depth(example_mesh(), scene(0)[2], torch.from_numpy(K), (180, 240))[0, 0].numpy()
+    mask = cv2.remap((depth > 0).astype(np.uint8) * 255, maps, None, cv2.INTER_LINEAR)
+    cv2.imwrite(str(folder / "mask.png"), mask)
+    rows, columns = np.nonzero(mask > 127)
+    return [str(v) for v in (columns.min(), rows.min(), columns.max(), rows.max())]
+
+
+def check_truth(document):
+    R, t = (torch.tensor(document[name], dtype=torch.float64) for name in ("rotation", "translation"))
+    truth = scene(0)[2]
+    assert float(rotation_error(R, truth[:3, :3])) < 3.0
+    assert float((t - truth[:3, 3]).norm() / truth[:3, 3].norm()) < 0.03
+
+
+def test_calibration_file_removes_the_distortion(folder, distorted, tmp_path, capsys):
+    out, camera = tmp_path / "out", str(folder / "cam.yaml")
+    files = [str(folder / "distorted.png"), str(folder / "learned.safetensors"), "--camera", camera]
+    words = ["--box", *distorted, "--out", str(out), "--quiet", "--format", "ros"]
+    assert main(["register", *files, *words]) == 0
+    assert "distortion of the lens removed" in capsys.readouterr().out
+    document = json.loads((out / "result.json").read_text())
+    check_truth(document)
+    camera = document["camera"]
+    assert (camera["distortion"][0], camera["size"], document["inputs"]["camera_source"]) == (-0.25, [180, 240], "file")
+    assert document["inputs"]["box"] != [float(v) for v in distorted]
+    assert np.array(document["T_cam_from_model"])[:3, 3].tolist() == document["translation"]
+    # The pose for ROS, in metres: the bank's unit.
+    stamped = (out / "pose.yaml").read_text()
+    position = [float(v) for v in re.findall(r"position: {x: (\S+), y: (\S+), z: (\S+)}", stamped)[0]]
+    orientation = [float(v) for v in re.findall(r"orientation: {x: (\S+), y: (\S+), z: (\S+), w: (\S+)}", stamped)[0]]
+    assert position == pytest.approx(document["translation"], rel=1e-6)
+    assert [orientation[3], *orientation[:3]] == pytest.approx(document["quaternion"])
+    assert Rotation.from_quat(orientation).as_matrix().tolist() == pytest.approx(np.array(document["rotation"]))
+
+
+def test_lists_take_calibration_files_and_masks(folder, distorted, tmp_path):
+    rows = [["distorted.png", *distorted, "cam.yaml", ""], ["distorted.png", *[""] * 4, "cam.yaml", "mask.png"]]
+    rows += [["distorted.png", *distorted, "none.yaml", ""], ["distorted.png", *distorted, "", "none.png"]]
+    path = written(folder / "calibrated.csv", "photo,x0,y0,x1,y1,camera,mask", *rows)
+    words = ["register", "--list", str(path), str(folder / "learned.safetensors"), "--quiet", "--out", str(tmp_path)]
+    assert main([*words, "--strict"]) == SOME_FAILED
+    boxed, masked, *failed = lines(tmp_path)
+    check_truth(boxed)
+    check_truth(masked)
+    assert masked["inputs"]["box"] == pytest.approx(boxed["inputs"]["box"], abs=3.0)
+    assert "none.yaml: no such file" in failed[0]["message"]
+    assert "none.png" in failed[1]["message"]
+
+
+@pytest.mark.usefixtures("distorted")
+def test_mask_replaces_the_box(folder, tmp_path):
+    files = [str(folder / "distorted.png"), str(folder / "learned.safetensors"), "--camera", str(folder / "cam.yaml")]
+    assert main(["register", *files, "--mask", str(folder / "mask.png"), "--out", str(tmp_path), "--quiet"]) == 0
+    check_truth(json.loads((tmp_path / "result.json").read_text()))
+
+
+@pytest.mark.usefixtures("distorted")
+def test_masks_and_calibrations_that_do_not_fit_are_refused(folder, refused, tmp_path):
+    cv2.imwrite(str(folder / "black.png"), np.zeros((180, 240), np.uint8))
+    cv2.imwrite(str(folder / "small.png"), np.full((90, 120), 255, np.uint8))
+    cv2.imwrite(str(folder / "tall.png"), cv2.resize(cv2.imread(str(folder / "photos/0.png")), (180, 240)))
+    for photo, words, message in (
+        ("photos/0.png", ["--mask", "black.png"], "no white pixel"),
+        ("photos/0.png", ["--mask", "small.png"], "that of the photograph"),
+        ("tall.png", ["--camera", "cam.yaml"], "turn the photograph by 90 degrees"),
+        ("photos/0.png", ["--camera", "photos/1.png"], "not a text file"),
+    ):
+        words[1] = str(folder / words[1])
+        words += ["--out", str(tmp_path), "--quiet"]
+        refused(main(["register", str(folder / photo), str(folder / "truck.safetensors"), *words]), message)
+
+
+@pytest.mark.parametrize(("bank", "code"), [("learned", 0), ("truck", NONE_RELIABLE)])
+def test_strict_tells_by_the_exit_code_whether_a_result_is_reliable(folder, tmp_path, bank, code):
+    files = [str(folder / "photos" / "0.png"), str(folder / f"{bank}.safetensors"), "--box", *box_of(0)]
+    assert main(["register", *files, "--camera", *CAMERA, "--out", str(tmp_path), "--quiet", "--strict"]) == code

@@ -74,7 +74,7 @@ def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkey
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize(("draws", "file"), [("pose_glb", "pose.glb"), ("registration_sheet", "overlay.png")])
 def test_a_file_that_cannot_be_drawn_costs_no_other(folder, register, tmp_path, monkeypatch, draws, file, threads):
-    def fail(*_):
+    def fail(*_, **__):
         raise InvalidInputError("it cannot be drawn")
 
     before = torch.get_num_threads()

@@ -1,0 +1,193 @@
+"""``curvireg register --views``: rigs as CSV, COLMAP models and BOP scenes, and the files of one pose."""
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from curvireg_torch.cli import main
+from curvireg_torch.errors import CurviregError
+from curvireg_torch.evaluation.rigs import read_rig
+from curvireg_torch.geometry import rotation_error
+from tests._support.lists import CAMERA
+from tests.registration.test_several import EASY, WORLD, rig_of
+
+COLUMNS = [*("photo", "x0", "y0", "x1", "y1", "fx", "fy", "cx", "cy")]
+POSE = [*(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "tx", "ty", "tz"]
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    """A folder with three photographs of one pose, and the rows of their rig."""
+    folder = tmp_path_factory.mktemp("rig")
+    rows = []
+    for k, (image, box, T) in enumerate(zip(*rig_of(EASY), strict=True)):
+        picture = (image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy()
+        cv2.imwrite(str(folder / f"{k}.png"), picture)
+        pose = [*T[:3, :3].flatten().tolist(), *T[:3, 3].tolist()]
+        rows.append([f"{k}.png", *box.tolist(), *CAMERA, *pose])
+    return folder, rows
+
+
+def write(path, header, rows):
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
+    return path
+
+
+def register(folder, rig, out, *words):
+    command = ["register", "--views", str(rig), str(folder / "learned.safetensors"), "--quiet", "--out", str(out)]
+    return main([*command, *words])
+
+
+def check(document):
+    R, t = (torch.tensor(document[name], dtype=torch.float64) for name in ("rotation", "translation"))
+    assert float(rotation_error(R, WORLD[:3, :3])) < 1.5
+    assert float((t - WORLD[:3, 3]).norm()) < 0.1
+
+
+def test_views_write_one_pose_in_the_world(rig, folder, tmp_path, capsys):
+    place, rows = rig
+    path = write(place / "rig.csv", [*COLUMNS, *POSE], [*rows, ["none.png", *rows[0][1:]]])
+    assert register(folder, path, tmp_path, "--format", "ros") == 0
+    document = json.loads((tmp_path / "result.json").read_text())
+    check(document)
+    assert (document["frame"], document["T_cam_from_model"]) == ("world", None)
+    assert [view["photo"] for view in document["views"]] == [str(place / row[0]) for row in [*rows, ["none.png"]]]
+    assert [view["failure"] is None for view in document["views"]] == [True, True, True, False]
+    assert "no such file" in document["views"][3]["failure"]
+    assert document["views"][0]["camera"]["matrix"][0] == [260.0, 0.0, 119.5]
+    assert Rotation.from_quat([document["quaternion"][k] for k in (1, 2, 3, 0)]).as_matrix() == pytest.approx(
+        torch.tensor(document["rotation"]).numpy(), abs=1e-6
+    )
+    printed = capsys.readouterr().out
+    assert "row 1: 0.png: prefers the pose by " in printed
+    assert "row 4: none.png: " in printed
+    # All photographs are shown; their cameras stand in the scene.
+    assert cv2.imread(str(tmp_path / "overlay.png")).shape[1] == 1600
+    scene = trimesh.load(tmp_path / "pose.glb")
+    assert sum(name.startswith("picture") for name in scene.graph.nodes_geometry) == 3
+    assert "frame_id: world" in (tmp_path / "pose.yaml").read_text()
+
+
+def test_views_of_quaternions_and_calibration_files(rig, folder, tmp_path):
+    place, rows = rig
+    (place / "cameras.txt").write_text("1 PINHOLE 240 180 260 260 120 90\n")
+    some = []
+    for row in rows:
+        x, y, z, w = Rotation.from_matrix(torch.tensor(row[9:18]).view(3, 3).numpy()).as_quat()
+        some.append([*row[:5], "cameras.txt", w, x, y, z, *row[18:]])
+    some[1][1:5] = [""] * 4  # the others say where the object is
+    path = write(place / "q.csv", [*COLUMNS[:5], "camera", "qw", "qx", "qy", "qz", "tx", "ty", "tz"], some)
+    assert register(folder, path, tmp_path) == 0
+    check(json.loads((tmp_path / "result.json").read_text()))
+
+
+def test_read_rig_reads_colmap_and_bop(rig, tmp_path):
+    place, rows = rig
+    expected = [torch.tensor(row[9:18]).double().view(3, 3) for row in rows]
+    (tmp_path / "images").mkdir()
+    lines = ["# Image list"]
+    scene: dict = {}
+    for k, row in enumerate(rows):
+        x, y, z, w = Rotation.from_matrix(expected[k].numpy()).as_quat()
+        lines += [f"{k + 1} {w} {x} {y} {z} {row[18]} {row[19]} {row[20]} 1 {row[0]}", "12.0 13.0 -1"]
+        (tmp_path / "images" / row[0]).write_bytes((place / row[0]).read_bytes())
+        K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
+        scene[str(k)] = {"cam_K": K, "cam_R_w2c": row[9:18], "cam_t_w2c": row[18:]}
+    (tmp_path / "images.txt").write_text("\n".join(lines))
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 240 180 260 260 120 90\n")
+    bop = tmp_path / "bop"
+    bop.mkdir()
+    (bop / "scene_camera.json").write_text(json.dumps(scene))
+    truth = {str(k): [{"obj_id": 7}, {"obj_id": 5}] for k in range(3)}
+    (bop / "scene_gt.json").write_text(json.dumps(truth))
+    info = {str(k): [{"bbox_obj": [1, 2, 3, 4]}, {"bbox_obj": [5, 6, 20, 30]}] for k in range(3)}
+    (bop / "scene_gt_info.json").write_text(json.dumps(info))
+    for path, mesh, box in ((tmp_path, None, None), (bop, Path("obj_000005.ply"), (5.0, 6.0, 25.0, 36.0))):
+        views = read_rig(path, mesh)
+        assert [view.box for view in views] == [box] * 3
+        for view, R, row in zip(views, expected, rows, strict=True):
+            torch.testing.assert_close(view.T_cam_from_world[:3, :3], R, atol=1e-6, rtol=0)
+            assert view.T_cam_from_world[:3, 3].tolist() == pytest.approx(row[18:], abs=1e-6)
+            assert view.camera.matrix[:2].flatten().tolist() == [260.0, 0.0, 119.5, 0.0, 260.0, 89.5]
+    assert [view.photo.is_file() for view in read_rig(tmp_path)] == [True] * 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"photo": ""}, "row 2: no photo"),
+        ({"x1": ""}, "row 2: 1.png: expected numbers in x0 y0 x1 y1"),
+        ({"fx": "wide"}, "row 2: 1.png: expected numbers in fx fy cx cy"),
+        ({"fx": "", "fy": "", "cx": "", "cy": ""}, "row 2: 1.png: expected fx fy cx cy, or camera"),
+        ({"fx": "-260"}, "row 2: 1.png"),
+        ({"r11": "5"}, "row 2: 1.png: the camera's pose: expected rigid transforms"),
+        ({"r11": ""}, "row 2: 1.png: expected numbers in r11"),
+        ({"tz": "nan"}, "row 2: 1.png: expected numbers in tx ty tz"),
+        ({"tx": "", "ty": "", "tz": ""}, "row 2: 1.png: a rotation and a translation are needed"),
+    ],
+)
+def test_read_rig_names_the_row_that_is_wrong(rig, changes, message):
+    place, rows = rig
+    header, some = [*COLUMNS, *POSE], [list(row) for row in rows]
+    for name, value in changes.items():
+        some[1][header.index(name)] = value
+    path = write(place / "bad.csv", header, some)
+    with pytest.raises(CurviregError, match=r"bad\.csv") as caught:
+        read_rig(path)
+    assert message in str(caught.value)
+
+
+def test_read_rig_refuses_other_files(tmp_path):
+    (tmp_path / "empty.csv").write_text("photo\n")
+    (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00")
+    (tmp_path / "colmap").mkdir()
+    (tmp_path / "colmap" / "images.txt").write_text("1 0 0 0\n")
+    for name, message in (
+        ("none.csv", "no such file"),
+        ("empty.csv", "no photographs"),
+        ("binary.csv", "not CSV in UTF-8"),
+        ("colmap", "expected IMAGE_ID QW"),
+        ("", "without images.txt"),
+    ):
+        with pytest.raises(CurviregError, match=message):
+            read_rig(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda rows: rows[1].__setitem__(slice(9, 21), rows[0][9:21]), "row 2: 1.png: T_cam_from_world: the same as"),
+        (lambda rows: [row.__setitem__(slice(18, 21), [1e3 * v for v in row[18:21]]) for row in rows], "mesh's unit"),
+    ],
+)
+def test_views_refuse_rigs_that_cannot_be_right(rig, folder, tmp_path, capsys, change, message):
+    place, rows = rig
+    some = [list(row) for row in rows]
+    change(some)
+    path = write(place / "wrong.csv", [*COLUMNS, *POSE], some)
+    assert register(folder, path, tmp_path / "out") == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert "wrong.csv: " in error
+    assert "row 1" in error
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--list", "a.csv"], "neither --list nor --start"),
+        (["--box", "1", "2", "3", "4"], "leave --box"),
+        (["--fov", "50"], "the rig holds the cameras"),
+    ],
+)
+def test_views_exclude_other_options(words, message, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["register", "--views", "rig.csv", "a.stl", "--out", "o", *words])
+    assert message in capsys.readouterr().err
