@@ -7,9 +7,8 @@ from typing import Any
 
 from ...data import Video
 from ...errors import InvalidInputError, MissingFileError
-from ...utils.choices import IMAGES, VIDEOS
+from ...utils.choices import IMAGES, VIDEOS, is_pattern
 from ...utils.files import write_file
-from ...utils.input_paths import is_pattern
 from ...visualization.encoding import png
 from ...visualization.overlay import to_uint8
 from .entries import BOX, CAMERA, PhotoList, photo_list
