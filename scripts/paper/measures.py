@@ -10,14 +10,6 @@ from torch import Tensor
 
 from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint
 
-__all__ = [
-    "hausdorff_distance",
-    "intersection_percentage",
-    "pose_parameter_errors",
-    "rank_precision",
-    "view_repeatability",
-]
-
 Mask = NDArray[np.bool_]
 
 
@@ -30,7 +22,6 @@ def intersection_percentage(photo: Tensor, view: Tensor, *, eps_px: float = 2.0)
 
     Returns:
         (...) in [0, 1]; NaN where the photograph has no points, 0 where only the view has none.
-
     """
     return _per_image(_fraction_within(eps_px), photo, view)
 
@@ -38,14 +29,12 @@ def intersection_percentage(photo: Tensor, view: Tensor, *, eps_px: float = 2.0)
 def view_repeatability(view: Tensor, photo: Tensor, *, eps_px: float = 2.0) -> Tensor:
     """Repeatability of a detector: fraction of the view's points within ``eps_px`` of a point of the photograph.
 
-    This is :func:`intersection_percentage` with the roles exchanged. The paper's Rep, which ranks views
-    (:func:`curvireg_torch.terms.repeatability`), has the other direction.
-
+    This is :func:`intersection_percentage` with the roles exchanged; the paper's Rep, which ranks views, is not.
     """
     return _per_image(_fraction_within(eps_px), view, photo)
 
 
-def hausdorff_distance(a: Tensor, b: Tensor, *, percentile: float = 100.0, directed: bool = False) -> Tensor:
+def hausdorff_distance(a: Tensor, b: Tensor, *, percentile: float = 100.0) -> Tensor:
     """Hausdorff distance of two point sets in pixels, or a percentile of it.
 
     ``h(A, B)`` is the percentile over a in A of the distance from a to the nearest point of B; the result is
@@ -54,18 +43,15 @@ def hausdorff_distance(a: Tensor, b: Tensor, *, percentile: float = 100.0, direc
     Args:
         a, b: (..., H, W) bool.
         percentile: in (0, 100], linear between order statistics.
-        directed: only ``h(A, B)``.
 
     Returns:
         (...) px >= 0; ``inf`` where one mask is empty, NaN where both are.
-
     """
 
     def of_pair(x: Mask, y: Mask) -> float:
         if not (x.any() and y.any()):
             return np.inf if x.any() or y.any() else np.nan
-        forward = float(np.percentile(_distances(x, y), percentile))
-        return forward if directed else max(forward, float(np.percentile(_distances(y, x), percentile)))
+        return max(float(np.percentile(_distances(*pair), percentile)) for pair in ((x, y), (y, x)))
 
     return _per_image(of_pair, a, b)
 
@@ -89,8 +75,7 @@ def _per_image(score: Callable[[Mask, Mask], float], a: Tensor, b: Tensor) -> Te
     return torch.tensor(scores, dtype=torch.get_default_dtype(), device=a.device).reshape(a.shape[:-2])
 
 
-SAME_DEGREES = 1e-2
-"""Rotation errors closer than this count as equal; float32 rotations are exact to about 1e-4 degrees."""
+SAME_DEGREES = 1e-2  # rotation errors closer than this count as equal
 
 
 def rank_precision(
@@ -104,7 +89,6 @@ def rank_precision(
         ks: ranks >= 1; a rank above N counts as N.
         threshold_deg: None for the *nearest* definition (views of one rotation at several distances are all nearest),
             degrees > 0 for the *threshold* definition.
-
     """
     n = errors.shape[1]
     best = errors.gather(1, order.long()).cummin(1).values
@@ -119,7 +103,6 @@ def viewpoint_differences(a: Tensor, b: Tensor) -> Tensor:
 
     Args:
         a, b: (..., 4) azimuth, elevation, theta (in-plane) in degrees and distance, broadcast against each other.
-
     """
     difference = (a - b).abs()
     remainder = difference % 360.0
@@ -133,7 +116,6 @@ def closest_view(views: Tensor, truth: Tensor) -> Tensor:
     Args:
         views: (N, 4), N >= 1, azimuth, elevation, theta in degrees and distance of the views of the bank.
         truth: (B, 4), the same for the queries.
-
     """
     error = rotation_error(
         rotation_from_viewpoint(*truth[:, :3].unbind(1)).unsqueeze(1), rotation_from_viewpoint(*views[:, :3].unbind(1))
@@ -154,7 +136,6 @@ def pose_parameter_errors(estimate: Tensor, truth: Tensor, views: Tensor) -> dic
     Returns:
         ``{"est": {...}, "clo": {...}}``, each with ``azimuth``, ``elevation`` and ``theta`` in degrees and ``distance``
         in the input unit; NaN for B = 0.
-
     """
     names = ("azimuth", "elevation", "theta", "distance")
     table = {}

@@ -36,7 +36,7 @@ SKIPPED = {
     r"git |(\S*/)?pip |apt-get |python datasets/download|python -m zipfile|python scripts/benchmark/meshes": "download",
     r"(\S*/)?curvireg view": "browser",  # tests/viewer/test_browser.py opens it
     r"scripts/test\.sh|python -m (coverage|mutmut)|python scripts/robustness/wrong_inputs\.py": "test suite",
-    r"python scripts/results_table|python scripts/paper/figures\.py detectors$": "writes into the project",
+    r"python scripts/results_table": "writes into the project",
     r".*[ /=$][A-Z]+([ ./]|$)": "placeholder",
     r"curvireg register .*--field": "needs trained weights",
     r"curvireg .* /data/": "needs a generated benchmark",
