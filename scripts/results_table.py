@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from scripts._shared import REPOSITORY, RESULTS, commit, replace_between, table_lines, today, write_json
+from scripts._shared import REPOSITORY, RESULTS, commit, replace_between, today, write_json
 
 BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
 
@@ -84,7 +84,8 @@ def table(results: Path) -> str:
     ):
         chosen = [r for r in records if r["summary"]["settings"]["dataset"] == kind]
         if chosen:
-            body = "\n".join(table_lines([columns, *(cells(r["name"], r["summary"]) for r in chosen)]))
+            rows = [columns, ["---"] * len(columns), *(cells(r["name"], r["summary"]) for r in chosen)]
+            body = "\n".join("| " + " | ".join(row) + " |" for row in rows)
             sets: dict[str, list[str]] = {}
             for r in chosen:
                 sets.setdefault(note(r), []).append(r["name"])
