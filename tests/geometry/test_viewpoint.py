@@ -75,14 +75,6 @@ def test_uniform_views_has_the_stated_covering_radius(count: int) -> None:
     assert 0.9 * 157 / math.sqrt(count) < radius <= 157 / math.sqrt(count)
 
 
-def test_uniform_views_covers_rotations_with_thetas() -> None:
-    views = uniform_views(200, thetas=range(0, 360, 20))
-    R = torch.from_numpy(Rotation.random(2000, random_state=0).as_matrix())
-    nearest = (R.flatten(1) @ views.rotations.double().flatten(1).T).argmax(dim=1)
-    error = rotation_error(R, views.rotations[nearest].double())
-    assert float(error.max()) <= 157 / math.sqrt(200) + 10.0
-
-
 def test_view_functions_refuse_invalid_options() -> None:
     one = torch.zeros(1)
     for call, match in (

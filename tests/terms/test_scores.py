@@ -20,7 +20,6 @@ from curvireg_torch.terms import (
     Whitening,
     box_shapes,
     ledoit_wolf,
-    terms,
     whole_box_shapes,
 )
 from curvireg_torch.terms.terms import cell_counts, dilate_points
@@ -153,28 +152,6 @@ def test_repeatability_counts_points_in_cut_cells_once(size, cell):
     assert term.cell == cell
     query = PointViews(size, ([size - 1, 0, 0, 2 * cell], [size - 1, size - 1, 0, cell])).points[None]
     assert term(SimpleNamespace(points=query)).item() == 0.5
-
-
-@pytest.mark.parametrize("size", [64, 128, 256])
-def test_repeatability_resolves_eps_with_64_cells_per_side(size):
-    """A point 3 px nearer than eps matches, and one 4 px farther does not."""
-    eps = 0.1
-    middle, distance = size // 2, int(eps * size)
-    views = PointViews(size, *((middle, middle + distance + d) for d in (-3, 4)))
-    term = Repeatability(eps=eps).build(views)
-    assert term.near.shape == (2, 64**2)
-    query = PointViews(size, (middle, middle)).points[None]
-    assert term(SimpleNamespace(points=query)).tolist() == [[1.0, 0.0]]
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_repeatability_keeps_views_of_several_chunks_in_order(threads):
-    count, before = 2 * terms.VIEWS_AT_A_TIME + 3, torch.get_num_threads()
-    views = PointViews(64, *((i // 64, i % 64) for i in range(count)))
-    torch.set_num_threads(threads)
-    near = Repeatability(eps=0.016).build(views).near
-    torch.set_num_threads(before)
-    assert torch.equal(near, dilate_points(views.points, 1.0).flatten(1).to(near.dtype))
 
 
 @pytest.mark.parametrize(("eps", "side"), [(0.016, 64), (0.008, 128)])
