@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 import curvireg_torch as cr
 from curvireg_torch import geometry as g
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import ViewSphere, rotation_error, sample_views, uniform_views, up_rotation
+from curvireg_torch.geometry import ViewSphere, sample_views, uniform_views, up_rotation
 from curvireg_torch.utils.choices import UP_AXES
 
 
