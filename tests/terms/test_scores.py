@@ -73,18 +73,6 @@ def test_whitening_decorrelates():
         Whitening(torch.zeros(3), torch.eye(2))
 
 
-def test_ledoit_wolf_of_degenerate_samples():
-    """All shrinkage, because equal descriptors have no covariance; and no shrinkage is below 0."""
-    two = torch.tensor([[1.0, 0, 0], [-1.0, 0, 0]])
-    mean, covariance = ledoit_wolf(two)
-    assert torch.equal(mean, torch.zeros(3))
-    expected = sklearn.covariance.ledoit_wolf(two.numpy())[0]
-    np.testing.assert_allclose(covariance.numpy(), expected, rtol=1e-5)
-    assert torch.equal(ledoit_wolf(torch.ones(4, 3))[1], torch.zeros(3, 3))
-    with pytest.raises(InvalidInputError, match="at least 2"):
-        ledoit_wolf(torch.ones(1, 3))
-
-
 def test_matcher_ranks_by_whitened_correlation(bank, photographs):
     assert Correlation().build(bank).whitening is None
     images, boxes = photographs[0][:1], photographs[1][:1]

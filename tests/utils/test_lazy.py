@@ -98,13 +98,6 @@ def test_check_given_reports_missing_and_swapped_files_in_one_line(words, messag
     assert not Path("out").exists()
 
 
-@pytest.mark.parametrize("words", [["none.jpg", "part.stl"], ["photo.jpg", "none.stl"], ["part.stl", "photo.jpg"]])
-@pytest.mark.usefixtures("files")
-def test_check_given_runs_before_heavy_imports(words):
-    code = f"from curvireg_torch.cli import main; assert main({['register', *words, '--json']}) == 2"
-    assert not imported_by(code) & HEAVY
-
-
 def test_options_accept_numbers_with_commas():
     arguments = parse(
         ["register", "a,1.jpg", *["--box", "10,", "20,", "30.5,", "40", "--camera=1e3,1000,-.5,2", "5,6", "--out", "o"]]
