@@ -104,6 +104,7 @@ def evaluate(
 
 def report(benchmark: Benchmark, store: ResultStore, settings: Row, limit: int | None = None) -> Row:
     """Write ``predictions.csv``, ``index.html`` and ``summary.json`` from results; returns the summary."""
+    located = benchmark.protocol.box is None and benchmark.protocol.views == 1
     skipped = Counter({k: n for k, n in benchmark.dataset.skipped.items() if k not in NOT_EVALUATED})
     scored: list[int] = []
     rows: list[Row] = []
@@ -121,7 +122,7 @@ def report(benchmark: Benchmark, store: ResultStore, settings: Row, limit: int |
     settings = {**settings, "root": Path(settings["root"]).name}  # a summary is shared: no paths
     summary = {
         **benchmark.summary(samples, rows, errors),
-        **({"localization": localization_recall(samples, rows)} if benchmark.protocol.box is None else {}),
+        **({"localization": localization_recall(samples, rows)} if located else {}),
         "failed": sum(row["status"] == "failed" for row in rows),
         "skipped": dict(sorted(skipped.items())),
         "protocol": settings["protocol"],
