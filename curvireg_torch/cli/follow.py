@@ -14,9 +14,8 @@ from ..errors import (
     LostObjectError,
     MissingFileError,
 )
-from ..utils.choices import VIDEOS
+from ..utils.choices import VIDEOS, check_given
 from ..utils.files import check_writable
-from ..utils.input_paths import check_given
 from .options import add_box_and_camera, common_options, examples, mesh_options, pipeline_options, register_options
 
 if TYPE_CHECKING:

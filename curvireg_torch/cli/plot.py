@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidInputError
+from ..utils.choices import check_given
 from ..utils.files import check_writable, write_file
-from ..utils.input_paths import check_given
 from .options import (
     add_box_and_camera,
     common_options,

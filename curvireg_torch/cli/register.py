@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInputError, LostObjectError
+from ..utils.choices import check_given, is_one_photograph
 from ..utils.files import check_writable
-from ..utils.input_paths import check_given, is_one_photograph
 from .options import (
     NUMBER,
     add_box_and_camera,

@@ -14,9 +14,8 @@ from ..data import Video
 from ..data.bop import bop_box, entry_at
 from ..errors import InvalidInputError, MissingFileError
 from ..geometry import camera_matrix
-from ..utils.choices import IMAGES, UNITS, VIDEOS
+from ..utils.choices import IMAGES, UNITS, VIDEOS, is_pattern
 from ..utils.files import check_table_size, finite_numbers, read_json, write_csv, write_file
-from ..utils.input_paths import is_pattern
 from ..visualization.encoding import png
 from ..visualization.overlay import to_uint8
 from ..visualization.sheet import SheetEntry, write_sheet

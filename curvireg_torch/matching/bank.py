@@ -14,7 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ..errors import BankError, CurviregError, InvalidInputError, MissingFileError
-from ..geometry.views import ViewSphere
+from ..geometry.viewpoint import ViewSphere
 from ..mesh.colours import SurfaceColours, surface_colours
 from ..mesh.mesh import as_mesh, mesh_radius, mesh_unit
 from ..mesh.up import mesh_up

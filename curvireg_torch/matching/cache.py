@@ -17,7 +17,7 @@ import torch
 import trimesh
 
 from ..errors import BankError
-from ..geometry.views import ViewSphere
+from ..geometry.viewpoint import ViewSphere
 from ..mesh.mesh import as_mesh, mesh_unit
 from ..mesh.up import mesh_up
 from ..pipeline import Pipeline

@@ -31,7 +31,7 @@ from curvireg_torch.geometry import (
     rotation_towards,
     viewpoint_from_rotation,
 )
-from curvireg_torch.geometry.views import DEFAULT_DISTANCE
+from curvireg_torch.geometry.viewpoint import DEFAULT_DISTANCE
 from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
 from curvireg_torch.matching.describe import depth_filter
 from curvireg_torch.mesh import load_mesh, mesh_centre, mesh_radius

@@ -16,7 +16,7 @@ from curvireg_torch.geometry import uniform_views
 from curvireg_torch.matching import ViewBank, ViewMatcher
 from curvireg_torch.pipeline import BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
-from curvireg_torch.terms import normalized_correlation
+from curvireg_torch.terms import Correlation
 from curvireg_torch.utils.files import tensor_digest
 
 SETTINGS = BankSettings(image_size=64)
@@ -145,7 +145,8 @@ def test_float16_storage_changes_no_ranking(small_bank, saved):
     noise = torch.rand(200, small_bank.descriptors.shape[1], generator=torch.Generator().manual_seed(0))
     noise *= 0.5 * small_bank.descriptors.norm(dim=1).mean() / noise.norm(dim=1, keepdim=True)
     queries = small_bank.descriptors[torch.arange(200) % len(small_bank)] + noise
-    exact, stored = (normalized_correlation(queries, b.descriptors) for b in (small_bank, ViewBank.load(saved)))
+    query = SimpleNamespace(descriptors=queries[:, None])
+    exact, stored = (Correlation().build(bank)(query) for bank in (small_bank, ViewBank.load(saved)))
     assert float((exact - stored).abs().max()) < 1e-4
     assert torch.equal(exact.argmax(dim=1), stored.argmax(dim=1))
 
