@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..matching import cached_bank
 from ..mesh import load_mesh
@@ -40,7 +40,6 @@ def evaluate(
     preset: str | Pipeline = DEFAULT,
     limit: int | None = None,
     renderer: str = "auto",
-    field: nn.Module | None = None,
     progress: bool = True,
 ) -> Row | None:
     """Register the objects of a benchmark and score the results.
@@ -55,7 +54,6 @@ def evaluate(
         preset: name of a pipeline, or a pipeline.
         limit: register only this many objects, spread evenly over the dataset.
         renderer: of the views.
-        field: photograph filter that replaces that of the pipeline.
         progress: show a bar.
 
     Returns:
@@ -71,7 +69,6 @@ def evaluate(
         >>> evaluate(Pascal3DBenchmark(cars, Protocol()), Path("out"))["acc_pi_6"]          # doctest: +SKIP
     """
     pipeline = preset_named(preset) if isinstance(preset, str) else preset
-    pipeline = pipeline if field is None else pipeline.with_field(field)
     name = next((known for known, settings in PRESETS.items() if settings is pipeline), "custom")
     pipeline = pipeline.with_pose_prior(benchmark.protocol.pose)
     if limit is not None:
@@ -89,7 +86,7 @@ def evaluate(
     def open_registrar(meshes: tuple[Path, ...]) -> Registrar:
         loaded = [load_mesh(path, unit=benchmark.unit) for path in meshes]
         banks = [cached_bank(mesh, pipeline=pipeline, renderer=renderer, progress=False) for mesh in loaded]
-        return Registrar(banks, pipeline=pipeline, field=field, renderer=renderer)
+        return Registrar(banks, pipeline=pipeline, renderer=renderer)
 
     store = run_entries(
         [entry for i in benchmark.selection(limit) if not (entry := benchmark.entries[i]).error],

@@ -22,11 +22,9 @@ from ..geometry import rotation_error
 from ..utils.checks import (
     check_camera_matrix,
     check_finite,
-    check_last_axes,
     check_pose,
     check_positive,
     check_rotation,
-    check_same_device,
     check_symmetries,
     check_tensor,
 )
@@ -150,7 +148,6 @@ def mspd_error(
     T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
     batch = () if getattr(camera_matrix, "ndim", 0) == 2 else (len(T_est),)
     check_tensor(camera_matrix, "camera_matrix", (*batch, 3, 3))
-    check_same_device(camera_matrix, T_est, "camera_matrix")
     check_camera_matrix(camera_matrix)
     K = camera_matrix.to(T_est.dtype)
     if K.ndim == 3:
@@ -212,8 +209,6 @@ def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tenso
     check_tensor(T_est, "T_est", (None, 4, 4))
     check_tensor(T_gt, "T_gt", (len(T_est), 4, 4))
     check_tensor(points, "points", (None, 3))
-    check_same_device(T_gt, T_est, "T_gt")
-    check_same_device(points, T_est, "points")
     if len(points) == 0:
         raise InvalidInputError("points: expected at least one point, got none")
     check_finite(points, "points")
@@ -297,34 +292,23 @@ def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) ->
         >>> float(symmetric_rotation_error(half_turn, torch.eye(3), half_turn[None]))
         0.0
     """
-    valid = _check_rotations(R_est, R_gt)
-    check_tensor(symmetries, "symmetries", (None, 3, 3))
-    check_same_device(symmetries, R_gt, "symmetries")
+    for name, R in (("R_est", R_est), ("R_gt", R_gt), ("symmetries", symmetries)):
+        check_rotation(R, name)
+    check_finite(R_gt, "R_gt")
     check_finite(symmetries, "symmetries")
-    check_rotation(symmetries, "symmetries")
+    valid = R_est.isfinite().flatten(-2).all(-1)
     plain = rotation_error(R_est, R_gt)
     symmetric = rotation_error(R_est.unsqueeze(-3), R_gt.unsqueeze(-3) @ symmetries.to(R_gt.dtype))
     return inf_unless(valid, torch.cat([plain.unsqueeze(-1), symmetric], -1).amin(-1))
 
 
-def _check_rotations(R_est: Tensor, R_gt: Tensor) -> Tensor:
-    """Which estimates are not missing, (...) bool."""
-    for name, R in (("R_est", R_est), ("R_gt", R_gt)):
-        check_last_axes(R, name, (3, 3))
-    check_same_device(R_est, R_gt, "R_est")
-    check_rotation(R_gt, "R_gt")
-    check_rotation(R_est, "R_est")
-    check_finite(R_gt, "R_gt")
-    return R_est.isfinite().flatten(-2).all(-1)
-
-
-def check_errors(errors: Tensor, name: str = "errors") -> None:
+def check_errors(errors: Tensor) -> None:
     """``errors`` is a floating (N,) tensor of numbers >= 0, ``inf`` included, NaN excluded."""
-    check_tensor(errors, name, (None,))
+    check_tensor(errors, "errors", (None,))
     bad = int((~(errors >= 0)).sum())
     if bad:
         raise InvalidInputError(
-            f"{name}: expected numbers >= 0, got {bad} that are negative or NaN; a missing estimate counts as inf"
+            f"errors: expected numbers >= 0, got {bad} that are negative or NaN; a missing estimate counts as inf"
         )
 
 

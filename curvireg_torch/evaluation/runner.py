@@ -112,17 +112,12 @@ class Entry:
         return self.label or text_digest(repr((self.request(), self.meshes)))
 
 
-def check_entry(entry: Entry, photo: Photo) -> tuple[str, ...]:
-    """Refuse a box or camera that cannot be used, before meshes are opened; returns what is questionable about them.
-
-    Raises:
-        CurviregError: as :func:`register_entry`.
-    """
+def check_entry(entry: Entry, photo: Photo) -> None:
+    """Refuse a box or camera that cannot be used, as :func:`register_entry` does, before meshes are opened."""
     K, _ = _camera(entry, photo)
     item = image_items([photo.image], None if entry.box is None else [entry.box], K, entry.prior)[0]
     if isinstance(item, CurviregError):
         raise item.with_subject(entry.name)
-    return item.warnings
 
 
 def register_entry(

@@ -14,7 +14,6 @@ from curvireg_torch.cli import main
 from curvireg_torch.data import Photo, read_image
 from curvireg_torch.errors import InvalidInputError, RenderingError
 from curvireg_torch.evaluation import DATASETS, BOPBenchmark, Pascal3DBenchmark, Protocol
-from curvireg_torch.filters import ImageGradient
 from curvireg_torch.matching import ViewBank, ViewMatcher
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.registration import Registrar
@@ -137,11 +136,6 @@ def test_selection_is_spread(pascal):
     benchmark = Pascal3DBenchmark(pascal, Protocol())
     assert benchmark.selection(2) == [0, 2]
     assert benchmark.selection(9) == [0, 1, 2, 3, 4]
-
-
-def test_settings_name_the_users_field(pascal, tmp_path):
-    summary = run(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out", field=ImageGradient(), limit=1)
-    assert summary["settings"]["pipeline"]["field"] == "custom:ImageGradient"
 
 
 def test_changed_photographs_are_registered_again(pascal, tmp_path):
