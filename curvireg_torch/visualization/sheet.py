@@ -10,7 +10,7 @@ import cv2
 import torch
 from torch import Tensor
 
-from ..rendering.protocol import DepthRenderer
+from ..rendering import DepthRenderer
 from ..utils.files import write_file
 from .contours import draw_pose
 from .encoding import jpeg

@@ -35,7 +35,7 @@ from curvireg_torch.geometry.viewpoint import DEFAULT_DISTANCE
 from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
 from curvireg_torch.matching.describe import depth_filter
 from curvireg_torch.mesh import load_mesh, mesh_centre, mesh_radius
-from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.pipeline import BankSettings, Pipeline
 from curvireg_torch.utils.files import write_csv, write_file
 from scripts.paper.detectors import DETECTORS
 from scripts.paper.measures import (
@@ -379,7 +379,8 @@ def rank_views(cases: list[Case], views: ViewSphere, settings: BankSettings, pro
             truth.append(torch.tensor([*map(float, viewpoint_from_rotation(R)), 0.0]))
             errors.append(rotation_error(R[None].float(), views.rotations))
         for depth in depths:
-            bank = ViewBank.build(mesh, views, settings=replace(settings, depth_field=depth), progress=False)
+            pipeline = replace(Pipeline(), bank=replace(settings, depth_field=depth))
+            bank = ViewBank.build(mesh, views, pipeline=pipeline, progress=False)
             for photo, field in photos.items():
                 matcher = ViewMatcher(bank, field=field)
                 for chunk in crops.split(matcher.chunk_size):
