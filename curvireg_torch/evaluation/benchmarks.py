@@ -19,7 +19,7 @@ from ..geometry.cameras import transform
 from ..geometry.crops import box_iou
 from ..geometry.pose_prior import object_frame
 from ..mesh import load_mesh
-from ..mesh.up import format_up
+from ..mesh.mesh import format_up
 from ..utils.files import write_csv
 from .metrics import (
     ADD_THRESHOLDS,
