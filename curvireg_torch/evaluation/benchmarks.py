@@ -317,7 +317,9 @@ class BOPBenchmark(Benchmark):
             T_one, T_two = (transform(s["rotation"].double(), s["translation"].double()) for s in (one, two))
         assert entry.camera is not None
         relative = T_two @ torch.linalg.inv(T_one)
-        return OtherView(entry.photo, None if entry.error else entry.box, entry.camera, _tuples(relative))
+        return OtherView(
+            entry.photo, None if entry.error else entry.box, entry.camera, tuple(map(tuple, relative.tolist()))
+        )
 
     def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
         """Rotation errors in degrees, ADD(-S) and MSSD in diameters, MSPD in image widths."""
@@ -428,33 +430,19 @@ def same_instances(samples: Sequence[Row]) -> list[list[int]]:
     counts = Counter((s["scene_id"], s["obj_id"], s["image_id"]) for s in samples)
     repeated = {key[:2] for key, count in counts.items() if count > 1}
     groups: dict[tuple[int, ...], list[list[int]]] = defaultdict(list)
-    places = [_place_in_world(sample) for sample in samples]
-    for i, sample in enumerate(samples):
+    worlds = [s["T_cam_from_world"].double() for s in samples]
+    places = [T[:3, :3].mT @ (s["translation"].double() - T[:3, 3]) for T, s in zip(worlds, samples, strict=True)]
+    for i, (sample, place) in enumerate(zip(samples, places, strict=True)):
         kind: tuple[int, ...] = (sample["scene_id"], sample["obj_id"])
-        if places[i] is None:
+        if bool(place.isnan().any()):
             kind = (*kind, sample["instance_index"] if kind in repeated else -1)
         reach = SAME_PLACE * sample["model_info"]["diameter"]
-        for group in groups[kind]:
-            if _distance(places[i], places[group[0]]) < reach:
-                group.append(i)
-                break
+        near = [group for group in groups[kind] if not float((place - places[group[0]]).norm()) > reach]  # or NaN
+        if near:
+            near[0].append(i)
         else:
             groups[kind].append([i])
     return [group for found in groups.values() for group in found]
-
-
-def _place_in_world(sample: Row) -> Tensor | None:
-    """(3,) position of the model's origin, None if the pose of the camera is unknown."""
-    T: Tensor = sample["T_cam_from_world"].double()
-    return T[:3, :3].mT @ (sample["translation"].double() - T[:3, 3]) if bool(T.isfinite().all()) else None
-
-
-def _distance(one: Tensor | None, two: Tensor | None) -> float:
-    return 0.0 if one is None or two is None else float((one - two).norm())
-
-
-def _tuples(matrix: Tensor) -> tuple[tuple[float, ...], ...]:
-    return tuple(map(tuple, matrix.tolist()))
 
 
 def estimated_rotations(rows: Sequence[Row]) -> Tensor:

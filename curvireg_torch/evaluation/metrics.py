@@ -83,9 +83,8 @@ def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
 def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     """ADD-S: mean distance of each point under the true pose to the nearest point under the estimate.
 
-    Computed in float64 on the CPU with one k-d tree in the model frame, since rigid poses preserve distances.
-
-    Arguments and result are those of :func:`add_error`.
+    Arguments and result are those of :func:`add_error`. Computed in float64 on the CPU with one k-d tree in the model
+    frame, since rigid poses preserve distances.
 
     Example:
         >>> T = torch.eye(4)[None]
@@ -166,14 +165,10 @@ def mspd_error(
 
 
 def _least_maximum(largest: Callable[[Tensor, Tensor], Tensor], shape: Sequence[int], points: Tensor) -> Tensor:
-    """(B,) minima over S symmetries of the largest distance that any point moves.
+    """(B,) minima over S symmetries of the largest distance of a point, for a ``shape`` of (B, S).
 
-    A few of the points bound the maximum of all from below; all are compared only where a bound is the least one.
-
-    Args:
-        largest: maps indices (M,) into ``shape``, flattened, and some points to the largest distances (M,).
-        shape: (B, S).
-        points: (P, 3).
+    ``largest`` maps indices (M,) into the flattened ``shape``, and some points, to the largest distances (M,). A few of
+    the points bound the maximum of all from below; all are compared only where a bound is the least one.
     """
     everything = torch.arange(shape[0] * shape[1], device=points.device)
     distances = largest(everything, points[:: max(1, len(points) // BOUNDING_POINTS)]).view(*shape)
@@ -190,11 +185,7 @@ def _least_maximum(largest: Callable[[Tensor, Tensor], Tensor], shape: Sequence[
 
 
 def average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
-    """Fraction of the errors below a threshold, averaged over the thresholds; NaN for N = 0.
-
-    Args:
-        errors: (N,) >= 0 in the unit of the thresholds: diameters of the objects, or image widths.
-        thresholds: :data:`ADD_THRESHOLDS`, :data:`MSSD_THRESHOLDS` or :data:`MSPD_THRESHOLDS`.
+    """Fraction of the errors (N,) below a threshold, averaged over the thresholds in the same unit; NaN for N = 0.
 
     Example:
         >>> average_recall(torch.tensor([0.26]), MSSD_THRESHOLDS)      # below 0.30, 0.35, 0.40, 0.45 and 0.50
@@ -246,11 +237,7 @@ def _project(projections: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def accuracy(errors: Tensor, threshold_deg: float) -> float:
-    """Fraction of the errors below a threshold: Acc(pi/6) with 30, Acc(pi/18) with 10; NaN for N = 0.
-
-    Args:
-        errors: (N,) degrees >= 0; ``inf`` for an object without an estimate (a miss).
-        threshold_deg: degrees > 0.
+    """Fraction of the errors (N,) in degrees below a threshold: Acc(pi/6) with 30, Acc(pi/18) with 10; NaN for N = 0.
 
     Example:
         >>> accuracy(torch.tensor([5.0, 12.0, 40.0, 170.0]), 30.0)
@@ -261,9 +248,7 @@ def accuracy(errors: Tensor, threshold_deg: float) -> float:
 
 
 def median_error(errors: Tensor) -> float:
-    """Median of the errors (MedErr); the mean of the middle two for an even number, NaN for N = 0.
-
-    ``errors`` are those of :func:`accuracy`; the median is ``inf`` if half of them are.
+    """Median of the errors (N,) (MedErr): the mean of the middle two for an even number, NaN for N = 0.
 
     Example:
         >>> median_error(torch.tensor([40.0, 5.0, 12.0, 170.0]))
