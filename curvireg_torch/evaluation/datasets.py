@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from ..errors import InvalidInputError
 from ..matching import cached_bank
 from ..mesh import load_mesh
 from ..pipeline import DEFAULT, PRESETS, Pipeline, preset_named
@@ -59,7 +60,7 @@ def evaluate(
         The summary, as written to ``summary.json``; None in processes that do not write it.
 
     Raises:
-        InvalidInputError: an unknown preset, or a bad limit.
+        InvalidInputError: an unknown preset, a bad limit, or a folder that holds the results of a list.
 
     Example:
         >>> from curvireg_torch.data import Pascal3DPlus
@@ -72,6 +73,8 @@ def evaluate(
     pipeline = pipeline.with_pose_prior(benchmark.protocol.pose)
     if limit is not None:
         check_positive(limit, "limit")
+    if (out / "results.csv").exists():
+        raise InvalidInputError(f"{out}: holds the results of a list; choose another --out")
     settings = {  # all that results depend on besides their files; --limit and --categories only select objects
         **benchmark.settings(),
         "protocol": str(benchmark.protocol),

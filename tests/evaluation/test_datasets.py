@@ -130,6 +130,9 @@ def test_other_settings_are_registered_again(pascal, tmp_path):
 def test_bad_options_are_refused(pascal, tmp_path, options):
     with pytest.raises(InvalidInputError, match=next(iter(options))):
         run(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out", **options)
+    (tmp_path / "results.csv").write_text("photo\n")
+    with pytest.raises(InvalidInputError, match="results of a list"):
+        run(Pascal3DBenchmark(pascal, Protocol()), tmp_path)
 
 
 def test_selection_is_spread(pascal):
