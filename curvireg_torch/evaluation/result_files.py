@@ -28,12 +28,8 @@ def write_result(
 ) -> None:
     """Write the files of a result into the folder ``out``; ``document`` is the content of ``result.json``.
 
-    The picture and the scene are drawn beside each other, on threads.
-
-    The other arguments are those of :func:`curvireg_torch.visualization.registration_sheet`.
-
-    Raises:
-        OutputError: a file cannot be written.
+    The picture and the scene are drawn beside each other, on threads. The other arguments are those of
+    :func:`curvireg_torch.visualization.registration_sheet`. :class:`OutputError` if a file cannot be written.
     """
     mesh = registrar.of_model(result.model).bank.mesh
     note = "Distortion of the lens removed." if _distorts(document.get("camera")) else ""

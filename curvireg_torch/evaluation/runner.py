@@ -59,6 +59,22 @@ OpenRegistrar = Callable[[tuple[Path, ...]], Registrar]
 
 
 @dataclass(frozen=True)
+class OtherView:
+    """Another photograph of the object of an :class:`Entry`, in the same pose.
+
+    Attributes:
+        photo, box, camera: as of an entry; the camera is needed.
+        T_cam_from_first: (4, 4) transform from the camera of the entry's photograph to that of this one, with lengths
+            in the unit of the mesh.
+    """
+
+    photo: Path
+    box: Sequence[float] | None
+    camera: Sequence[float]
+    T_cam_from_first: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
 class Entry:
     """One object in one photograph, to register.
 
@@ -74,6 +90,7 @@ class Entry:
         instances: without a box, see :func:`curvireg_torch.registration.localize`.
         prior: limits on the pose.
         start, start_confidence: (4, 4) pose that is refined, nothing is searched for; and its confidence if known.
+        views: other photographs, with which the pose in ``photo`` is found together.
         as_stored: boxes refer to the pixels as the file holds them; else the EXIF orientation is applied first.
         label: of a dataset's object: a name that no other object has.
         error: why the object cannot be registered; "" if it can.
@@ -91,6 +108,7 @@ class Entry:
     prior: PosePrior | None = None
     start: tuple[tuple[float, ...], ...] | None = None
     start_confidence: float | None = None
+    views: tuple[OtherView, ...] = ()
     as_stored: bool = False
     label: str = ""
     error: str = ""
@@ -100,8 +118,9 @@ class Entry:
         prior = None if self.prior is None else self.prior.to_dict()
         camera = self.camera.describe() if isinstance(self.camera, Camera) else self.camera
         given = [self.name, self.box, camera, self.guess, self.instances, prior]
+        views = [(view.box, view.camera, view.T_cam_from_first) for view in self.views]
         mask = [] if self.mask is None else [str(self.mask), file_digest(self.mask)]
-        return [*given, self.start, self.start_confidence, self.as_stored, *mask]
+        return [*given, self.start, self.start_confidence, views, self.as_stored, *mask]
 
     @property
     def key(self) -> str:
@@ -109,13 +128,9 @@ class Entry:
         return self.label or text_digest(repr((self.request(), self.meshes)))
 
 
-def check_entry(entry: Entry, photo: Photo) -> tuple[str, ...]:
-    """Refuse a box or camera that cannot be used, before meshes are opened; returns what is questionable about them.
-
-    Raises:
-        CurviregError: as :func:`register_entry`.
-    """
-    return _item(entry, photo, _camera(entry, photo)[0]).warnings
+def check_entry(entry: Entry, photo: Photo) -> None:
+    """Refuse a box or camera that cannot be used, as :func:`register_entry` does, before meshes are opened."""
+    _item(entry, photo, _camera(entry, photo)[0])
 
 
 def seen_image(entry: Entry, photo: Photo) -> Tensor:
@@ -150,6 +165,8 @@ def register_entry(
     item, images = _item(entry, photo, camera), [photo.image]
     if entry.start is not None:
         results = refine(registrar, images, camera, [entry.start], start_confidences=[entry.start_confidence])
+    elif entry.views:
+        results = [_registered_views(entry, photo, registrar)]
     elif entry.box is None and entry.mask is None:
         results = localize(registrar, images, camera, instances=entry.instances, prior=entry.prior)[0]
     else:
@@ -164,7 +181,7 @@ def register_entry(
     elif result.localization is not None:
         box = result.localization.box
     else:
-        box = projected_box(registrar.of_model(result.model).describer, result.projection)
+        box = projected_box(registrar.of_model(result.model).describer, projection_of(result, item.camera_matrix))
     K = item.camera_matrix
     document = {
         **result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start}),
@@ -184,6 +201,28 @@ def register_entry(
     if source in ("exif", "fov"):  # the error of a guessed camera is unknown
         document["covariance"] = document["standard_deviations"] = None
     return result, document
+
+
+def _registered_views(entry: Entry, photo: Photo, registrar: Registrar) -> Registration:
+    """The pose in the first of several photographs: the world is its camera."""
+    images: list[Any] = [photo.image]
+    for view in entry.views:
+        try:
+            images.append(read_photo(view.photo, as_stored=entry.as_stored).image)
+        except CurviregError:
+            images.append(view.photo)  # the registrar reports that it cannot be read, and goes on without it
+    boxes = [entry.box, *(view.box for view in entry.views)]
+    assert not isinstance(entry.camera, Camera)  # of datasets only
+    cameras = [entry.camera or (), *(view.camera for view in entry.views)]
+    K = torch.stack([camera_matrix(*camera, dtype=torch.float64) for camera in cameras])
+    first = torch.eye(4, dtype=torch.float64)
+    poses = [torch.tensor(view.T_cam_from_first, dtype=torch.float64) for view in entry.views]
+    return registrar.register_views(images, boxes, K, torch.stack([first, *poses]))
+
+
+def projection_of(result: Registration, K: Tensor | None) -> tuple[Tensor, Tensor]:
+    """``T_cam_from_model`` and the camera matrix that project the mesh onto the photograph, the first of several."""
+    return (result.views[0].T_cam_from_model, K) if result.views and K is not None else result.projection
 
 
 def _camera(entry: Entry, photo: Photo) -> tuple[Tensor | Camera | None, str | None]:
@@ -242,7 +281,8 @@ def run_entries(
     def digests(entry: Entry) -> dict[str, str]:
         meshes = [(path.name, digest_of_mesh(path)) for path in entry.meshes]
         request = text_digest(json.dumps([common, entry.request(), meshes]))
-        return {"request": request, "photo": photo_digest(entry.photo)}
+        photos = [photo_digest(path) for path in (entry.photo, *(view.photo for view in entry.views))]
+        return {"request": request, "photo": "-".join(photos) if all(photos) else ""}
 
     with workers() as group:
         if group.reports:
@@ -309,7 +349,9 @@ def _row(entry: Entry, registrar: Registrar | Exception, picture: Path, *, bank_
     except CurviregError as error:
         return failed_row(error, seconds={"bank": bank_seconds, "register": time.perf_counter() - start})
     renderer = registrar.of_model(result.model).describer.renderer
-    write_file(picture, thumbnail(renderer, result.projection, seen_image(entry, photo), used_box(document)))
+    K = camera_matrix(*entry.camera) if entry.views and isinstance(entry.camera, Sequence) else None
+    projection = projection_of(result, K)
+    write_file(picture, thumbnail(renderer, projection, seen_image(entry, photo), used_box(document)))
     return {"status": "ok", "message": "", **document}
 
 
