@@ -1,0 +1,92 @@
+"""``cr.register``: one photograph in one line, and what its result can do."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+import curvireg_torch as cr
+from curvireg_torch.cli import main
+from tests._support.exif import exif, with_exif
+from tests._support.lists import CAMERA, box_of, write_files
+from tests._support.scenes import learned_registrar, scene
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_files(tmp_path_factory.mktemp("one"))
+
+
+@pytest.fixture(scope="module")
+def result(folder):
+    photo, box = folder / "photos" / "0.png", [float(v) for v in box_of(0)]
+    return cr.register(str(photo), str(folder / "learned.safetensors"), box, camera=[float(v) for v in CAMERA])
+
+
+def test_register_equals_the_command_to_the_last_digit(folder, result, tmp_path):
+    words = [str(folder / "photos" / "0.png"), str(folder / "learned.safetensors"), "--box", *box_of(0)]
+    assert main(["register", *words, "--camera", *CAMERA, "--out", str(tmp_path), "--quiet"]) == 0
+    document = json.loads((tmp_path / "result.json").read_text())
+    for name in ("rotation", "translation", "quaternion", "T_cam_from_model"):
+        assert getattr(result, name).tolist() == document[name]
+    assert result.confidence == document["confidence"]
+    assert cr.camera_matrix(*map(float, CAMERA)).dtype == torch.float64
+
+
+def test_register_takes_pictures_of_other_kinds(folder, result):
+    registrar, box = learned_registrar(), box_of(0)
+    numbers = [float(v) for v in box]
+    with Image.open(folder / "photos" / "0.png") as picture:
+        pixels = np.array(picture.convert("RGB"))
+        for image in (picture, pixels, torch.from_numpy(pixels).permute(2, 0, 1)):
+            same = cr.register(image, registrar, numbers, camera=cr.camera_matrix(*map(float, CAMERA)))
+            assert same.rotation.equal(result.rotation)
+
+
+def test_register_detects_the_object_without_a_box(folder):
+    found = cr.register(folder / "photos" / "0.png", learned_registrar(), camera=tuple(map(float, CAMERA)))
+    assert float(cr.rotation_error(found.rotation, scene(0)[2][:3, :3])) < 5
+    expected = torch.tensor([float(v) for v in box_of(0)])
+    assert float((found.box - expected).abs().max()) < 12
+
+
+def test_register_takes_the_camera_from_exif(folder):
+    photo = folder / "exif.png"
+    cv2.imwrite(str(photo), cv2.imread(str(folder / "photos" / "0.png")))
+    with pytest.raises(cr.CurviregError, match="no focal length"):
+        cr.register(photo, learned_registrar(), [1, 1, 90, 90], camera="exif")
+    with_exif(photo, exif(1, 38))
+    guessed = cr.register(photo, learned_registrar(), [float(v) for v in box_of(0)], camera="exif")
+    assert guessed.translation is not None
+
+
+def test_errors_are_raised(folder):
+    with pytest.raises(cr.CurviregError, match=r"none\.png: no such file"):
+        cr.register(folder / "none.png", learned_registrar())
+    with pytest.raises(cr.CurviregError, match="entirely outside"):
+        cr.register(folder / "photos" / "0.png", learned_registrar(), [900, 5, 950, 90])
+
+
+def test_result_is_shown_in_ten_lines_and_in_notebooks(result):
+    lines = repr(result).splitlines()
+    assert len(lines) <= 10
+    assert lines[0].startswith("Registration: likely, confidence 0.")
+    assert len(repr(result)) < 800
+    shown = result._repr_html_()
+    assert shown.startswith('<img alt="contours on the photograph" src="data:image/jpeg;base64,')
+    assert "confidence" in shown
+    drawn = np.asarray(result.plot().axes[0].images[0].get_array())
+    np.testing.assert_array_equal(drawn, result.overlay())
+    w, x, y, z = result.quaternion.tolist()
+    np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).as_matrix(), result.rotation.numpy(), atol=1e-9)
+    assert result.T_cam_from_model[:3, 3].equal(result.translation)
+
+
+def test_result_is_saved_as_the_command_does(result, tmp_path):
+    result.save(tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "overlay.png", "pose.glb"}
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["rotation"] == result.rotation.tolist()
