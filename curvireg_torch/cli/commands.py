@@ -75,8 +75,19 @@ def show_cache(arguments: argparse.Namespace) -> None:
     banks = list_cache()
     for bank in banks:
         used = time.strftime("%Y-%m-%d %H:%M", time.localtime(bank.used))
-        print(f"{bank.size / 1e6:8.1f} MB   last used {used}   {bank.path.name}")
+        print(f"{bank.size / 1e6:8.1f} MB   last used {used}   {_mesh_of(bank.path)}   {bank.path.name}")
     print(f"{cache_folder()}: {len(banks)} banks, {sum(bank.size for bank in banks) / 1e6:.1f} MB")
+
+
+def _mesh_of(bank: Path) -> str:
+    """Name of the mesh file that a bank was built for."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(bank, framework="numpy") as file:
+            return (file.metadata() or {}).get("mesh") or "a mesh without a file"
+    except (SafetensorError, OSError):
+        return "damaged"
 
 
 def add_view(commands: Any) -> None:

@@ -214,6 +214,7 @@ class ViewBank:
             "format": FORMAT,
             "version": str(FORMAT_VERSION),
             "pipeline": self.pipeline.to_json(),
+            "mesh": str(self.mesh.metadata.get("file_name", "")),
             "unit": mesh_unit(self.mesh) or "",
             "up": mesh_up(self.mesh),
             "checksum": tensor_digest(contents, size=16),

@@ -79,7 +79,7 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
     unit = mesh_unit(source)
     if unit is not None:  # trimesh keeps None as the word "none"
         mesh.units = unit
-    mesh.metadata["up"] = mesh_up(source)
+    mesh.metadata.update(file_name=source.metadata.get("file_name", ""), up=mesh_up(source))
     if colours is not None:
         mesh.metadata["colours"] = colours[~is_degenerate]
     return mesh

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import warnings
+from dataclasses import replace
 
 import cv2
 import pytest
@@ -19,6 +20,9 @@ from curvireg_torch.errors import CurviregWarning, InvalidInputError
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.evaluation.registry import DatasetSpec
 from curvireg_torch.geometry import rotation_error
+from curvireg_torch.matching import cached_bank
+from curvireg_torch.mesh import load_mesh
+from curvireg_torch.pipeline import PRESETS, ViewPolicy
 from curvireg_torch.utils.threads import available_threads
 from tests._support.scenes import truck_bank
 
@@ -42,15 +46,18 @@ def test_bank_refuses_an_output_that_cannot_be_written(folder, refused):
     refused(main(["bank", str(folder / "truck.ply"), "--quiet", "--out", str(out)]), "flat.png", "--out")
 
 
-def test_cache_lists_and_clears_banks(folder, capsys, tmp_path, monkeypatch):
+def test_cache_names_meshes_and_clears_banks(folder, capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path))
-    (tmp_path / "banks").mkdir()
-    bank = tmp_path / "banks" / f"bank-{'0' * 32}.safetensors"
-    bank.write_bytes((folder / "truck.safetensors").read_bytes())
+    pipeline = replace(PRESETS["fast"], views=ViewPolicy(pose="upright", azimuth_step=180.0, elevations=(10.0,)))
+    cached_bank(load_mesh(folder / "truck.ply"), pipeline=pipeline, progress=False)
+    (tmp_path / "banks" / f"bank-{'0' * 32}.safetensors").write_bytes(b"cut")
     assert main(["cache"]) == 0
-    assert "1 banks" in capsys.readouterr().out
+    listed = capsys.readouterr().out
+    assert listed.count("truck.ply") == 1
+    assert "damaged" in listed
+    assert "2 banks" in listed
     assert main(["cache", "--clear"]) == 0
-    assert not bank.exists()
+    assert list((tmp_path / "banks").iterdir()) == []
 
 
 def test_demo_runs_as_a_module(tmp_path, monkeypatch):
