@@ -2,8 +2,6 @@
 
 import io
 import json
-import re
-import signal
 import subprocess
 import sys
 import warnings
@@ -16,22 +14,13 @@ import trimesh
 
 from curvireg_torch.cli import main
 from curvireg_torch.cli.register import show_stages
-from curvireg_torch.errors import CurviregWarning, InvalidInputError
+from curvireg_torch.errors import CurviregWarning
 from curvireg_torch.evaluation.opening import RegisterOptions
-from curvireg_torch.evaluation.registry import DatasetSpec
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.matching import cached_bank
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import PRESETS, ViewPolicy
-from curvireg_torch.utils.threads import available_threads
 from tests._support.scenes import truck_bank
-
-
-def test_help_names_the_commands(capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["--help"])
-    assert stop.value.code == 0
-    assert {"register", "bank", "evaluate", "demo", "view", "plot"} <= set(capsys.readouterr().out.split())
 
 
 def test_bank_is_registered_to(folder, register_one, tmp_path, capsys):
@@ -67,58 +56,6 @@ def test_demo_runs_as_a_module(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "demo" / "result.json").read_text())["rotation_error_deg"] < 2
     assert "error against the truth" in done.stdout
     assert (tmp_path / "demo" / "overlay.png").stat().st_size > 10_000
-
-
-def test_interruption_while_modules_are_imported_prints_nothing():
-    script = """
-import os, signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs inherit that it is ignored
-class Interrupt:
-    def find_spec(name, *_):
-        if name == "curvireg_torch.cli":
-            os.kill(os.getpid(), signal.SIGINT)
-sys.meta_path.insert(0, Interrupt)
-import curvireg_torch.__main__
-"""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
-
-
-@pytest.mark.parametrize(
-    ("words", "work"),
-    [
-        ("register PHOTO MESH --box 1 1 40 40 --out OUT", "evaluation.opening.open_registrar"),
-        ("register PHOTO PHOTO MESH --box 1 1 40 40 --out OUT", "evaluation.lists.register_list"),
-        ("follow PHOTOS MESH --camera 300 300 119.5 89.5 --out OUT", "evaluation.opening.open_registrar"),
-        ("plot viewpoints PHOTO MESH --box 1 1 40 40 --out OUT.png", "evaluation.opening.open_registrar"),
-        ("bank MESH --out OUT.safetensors", "matching.ViewBank.build"),
-        ("demo --out OUT", "synthetic.demo_scene"),
-        ("evaluate web ROOT --out OUT", "evaluation.datasets.evaluate"),
-        ("view", "viewer.server.serve"),
-    ],
-)
-def test_commands_compute_with_one_thread_of_torch_for_each_job(words, work, folder, tmp_path, monkeypatch):
-    if words == "view":
-        pytest.importorskip("nicegui")
-    seen = []
-
-    def stop(*_, **__):
-        seen.append((torch.get_num_threads(), available_threads()))
-        raise InvalidInputError("seen")
-
-    monkeypatch.setattr(f"curvireg_torch.{work}", stop)
-    for name in ("open", "scored"):
-        monkeypatch.setattr(DatasetSpec, name, lambda *_: None)
-    places = {"PHOTOS": folder / "photos", "PHOTO": folder / "photos" / "0.png", "MESH": folder / "truck.ply"}
-    places["OUT"] = places["ROOT"] = tmp_path
-    command = re.sub("[A-Z]{3,}", lambda name: str(places[name[0]]), words)
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        assert main(command.split()) == 2
-        assert (seen, torch.get_num_threads()) == ([(1, 2)], 2)
-    finally:
-        torch.set_num_threads(before)
 
 
 class Terminal(io.StringIO):

@@ -1,6 +1,5 @@
 """``curvireg register`` of one photograph."""
 
-import inspect
 import json
 from dataclasses import replace
 
@@ -10,18 +9,13 @@ import pytest
 import torch
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix
-from curvireg_torch.cli import main, parse
-from curvireg_torch.cli.options import register_options
-from curvireg_torch.cli.register import print_result
-from curvireg_torch.errors import BankError
-from curvireg_torch.evaluation import evaluate
+from curvireg_torch.cli import main
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
-from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline, ViewPolicy, preset_named
-from curvireg_torch.registration import registrar
+from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of
-from tests._support.scenes import scene, truck_bank, unrefined
+from tests._support.scenes import scene, unrefined
 
 BOX = [float(v) for v in box_of(0)]
 
@@ -176,26 +170,8 @@ def test_register_warns_of_a_questionable_camera(register_one, document, capsys)
     assert document()["reliable"] is False
 
 
-def test_register_keeps_the_result_of_a_tiny_picture(folder, register_one, document):
-    picture = np.random.default_rng(0).integers(0, 255, (12, 12, 3)).astype(np.uint8)
-    cv2.imwrite(str(folder / "tiny.png"), picture)
-    assert register_one("--no-refine", photo="tiny.png", box=()) == 0
-    assert document()["warnings"]
-
-
-def test_register_debug_shows_the_traceback(register_one):
-    with pytest.raises(FileNotFoundError):
-        register_one("--debug", photo="none.png")
-
-
 def test_register_refuses_a_file_as_output_folder(folder, register_one, refused):
     refused(register_one("--out", folder / "photos/0.png"), "--out")
-
-
-@pytest.mark.parametrize("preset", ["learned", "classical", "fast"])
-def test_register_bank_with_presets_of_the_same_bank_settings(register_one, tmp_path, preset):
-    (tmp_path / "pipeline.json").write_text(replace(PRESETS[preset], bank=truck_bank().settings).to_json())
-    assert register_one("--pipeline", tmp_path / "pipeline.json", "--no-refine") == 0
 
 
 def test_register_takes_views_from_the_bank_unless_a_pipeline_file_is_given(folder, register_one, document, capsys):
@@ -224,60 +200,6 @@ def test_register_equals_registrar_bit_by_bit(folder, register_one, document, mo
     assert (written["score"], written["confidence"]) == (result.score, result.confidence)
     assert [top["rotation"] for top in written["top"]] == [h.rotation.tolist() for h in result.hypotheses]
     assert written["pipeline"] == registrar.pipeline.describe()
-
-
-def test_pipeline_is_the_default_everywhere(monkeypatch):
-    assert preset_named(DEFAULT) == Pipeline()
-    options = register_options(parse(["register", "a.jpg", "b.stl", "--out", "c"]))
-    assert options.open_pipeline() == Pipeline()
-    assert inspect.signature(evaluate).parameters["preset"].default == DEFAULT
-    pipelines = []
-    monkeypatch.setattr(registrar, "cached_bank", lambda *_, pipeline, **__: pipelines.append(pipeline) or truck_bank())
-    with pytest.raises(BankError):  # the bank of the truck has another pipeline
-        Registrar(example_mesh())
-    assert pipelines == [Pipeline()]
-
-
-@pytest.mark.parametrize(
-    ("pose", "changes", "expected", "unexpected"),
-    [
-        ("any", {}, "the box is tight and that the mesh is the object's\n", "no box"),
-        ("upright", {}, "(--pose upright, --up)\n", "no box"),
-        ("any", {"edge_support": 0.34}, "its contours hardly show", "tight"),
-        ("any", {"edge_support": None}, "the box is tight", "contours"),
-        ("any", {"warnings": ["small"], "edge_support": 0.1}, "correct what the warning names", "contours"),
-        (
-            "any",
-            {"prior": {"distance": [1, 2], "contradiction": None}},
-            "check --distance, --unit and --camera",
-            "tight",
-        ),
-        (
-            "any",
-            {"localization": {"presence": 0.4, "instances": []}},
-            "may not be in the photograph: add --box",
-            "tight",
-        ),
-        (
-            "any",
-            {"localization": {"presence": 0.5, "instances": []}},
-            "seems to be there, at an unsure pose",
-            "may not",
-        ),
-        ("any", {"corrected_box": [1.2, 2.0, 30.6, 40.0]}, "did not fit the pose; one that does: 1 2 31 40\n", "found"),
-    ],
-)
-def test_print_result_advises_when_not_reliable(pose, changes, expected, unexpected, tmp_path, capsys):
-    document = {
-        "viewpoint": {"azimuth": 1.0}, "score": 0.2, "confidence": 0.1, "reliable": False, "translation": None,
-        "standard_deviations": None, "seconds": {"bank": 1.0, "register": 2.0}, "corrected_box": None,
-        "ambiguous": None, "answer_set": {"members": [0]}, "warnings": [], "edge_support": 0.36,
-        "pipeline": Pipeline().with_pose_prior(pose).describe(), **changes,
-    }  # fmt: skip
-    print_result(document, tmp_path)
-    printed = capsys.readouterr().out
-    assert expected in printed
-    assert unexpected not in printed
 
 
 def test_register_limits_the_pose(register_one, document):

@@ -91,17 +91,6 @@ def test_registration_sheet_shrinks_large_photographs(registered):
     assert is_outline(sheet[200:400, 200:400]).any()
 
 
-def test_registration_sheet_of_narrow_and_flat_photographs(registered):
-    registrar, result, _, _ = registered
-    for H, W in ((600, 60), (40, 900)):
-        photograph = torch.full((3, H, W), 0.2)
-        sheet = registration_sheet(registrar, result, photograph, [5.0, 5.0, 35.0, 35.0])
-        scale = 960 / max(H, W)
-        left = (sheet.shape[1] - round(W * scale)) // 2
-        assert sheet.shape[1] == max(720, round(W * scale))
-        assert tuple(sheet[round(H * scale) - 3, left + 3]) == (51, 51, 51)
-
-
 def test_registration_sheet_has_the_verdict_in_its_colour(registered):
     registrar, result, image, box = registered
     for confidence, verdict in ((0.95, "likely"), (0.899, "unsure"), (0.49, "unsure"), (0.45, "no match")):
