@@ -6,16 +6,14 @@ from typing import Any
 
 from nicegui import ui
 
-from .side import Answers, Inputs
+from .side import Answers, Inputs, Preview
 from .stage import Stage
 from .widgets import button, file_chooser, region, set_enabled, set_text, text
 from .workspace import Workspace
 
 __all__ = ["Page", "Steps", "add_assets"]
 
-TICK_SECONDS = 0.15
-"""Between two looks at what changed."""
-
+TICK_SECONDS = 0.15  # between two looks at what changed
 STAGES: Mapping[str, str] = {
     "bank": "rendering views of the mesh",
     "localization": "looking for the object in the photograph",
@@ -53,6 +51,7 @@ class Page:
             with region("div", "side"):
                 self.steps = Steps(self.workspace)
                 self.answers = Answers(self.workspace)
+                self.preview = Preview(self.workspace)
                 self.inputs = Inputs(self.workspace)
         ui.timer(TICK_SECONDS, self._refresh)
 
@@ -65,6 +64,7 @@ class Page:
             self.inputs.refresh()
             await self.stage.refresh()
             await self.answers.refresh()
+            await self.preview.refresh()
         finally:
             self._busy = False
 
@@ -94,7 +94,7 @@ class Steps:
             self.bar = region("progress", "", max="1", value="0", aria_label="progress of the search")
             self.stage = text("p", "", "stage", data_testid="progress", role="status")
             self.seconds = text("p", "", "stage", data_testid="seconds")
-        self.messages["pose"] = self._message("pose")
+        self.messages |= {part: self._message(part) for part in ("pose", "page")}
 
     def _message(self, part: str) -> Any:
         return text("p", "", "message", data_testid=f"message-{part}", role="alert")

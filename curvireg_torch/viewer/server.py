@@ -32,11 +32,8 @@ from .workspace import Workspaces, file_name, show_warning
 
 __all__ = ["SECURITY_HEADERS", "guarded", "listen", "serve"]
 
-RECONNECT_SECONDS = 5.0
-"""How long a page may be away; a reload takes less. The work is kept longer."""
-
-CONNECT_SECONDS = 20.0
-"""How long a request may take to become a page."""
+RECONNECT_SECONDS = 5.0  # that a page may be away; a reload takes less. The work is kept longer
+CONNECT_SECONDS = 20.0  # that a request may take to become a page
 
 SECURITY_HEADERS = {
     # Vue compiles templates in the browser, which takes "unsafe-eval"; NiceGUI's scripts are inline and have no nonce.
@@ -128,14 +125,7 @@ def public_addresses(host: str, port: int) -> list[str]:
     """
     if not _is_everyone(host):
         return [f"[{host}]:{port}" if ":" in host else f"{host}:{port}"]
-    names = ["127.0.0.1"]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # an address for documentation; a datagram socket only chooses the route
-            names.insert(0, probe.getsockname()[0])
-        except OSError:  # no network
-            pass
-    return [f"{name}:{port}" for name in dict.fromkeys(names)]
+    return [f"{socket.gethostname()}:{port}", f"127.0.0.1:{port}"]
 
 
 def _is_everyone(host: str) -> bool:

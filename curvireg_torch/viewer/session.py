@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import trimesh
 from torch import Tensor
 
 from ..data import read_photo
@@ -18,11 +19,12 @@ from ..errors import MAX_VIEWER_SECONDS, CurviregError, CurviregWarning, Invalid
 from ..evaluation.lists import register_entry
 from ..evaluation.opening import RegisterOptions, check_camera, open_registrar
 from ..evaluation.prior_options import QUALIFIERS
-from ..evaluation.store import to_json
 from ..geometry import rotation_error, rotation_from_axis_angle
-from ..geometry.cameras import rotation_towards
+from ..geometry.cameras import rotation_towards, transform
+from ..geometry.pose_prior import object_frame
+from ..geometry.viewpoint import viewpoint_from_rotation
 from ..matching import ViewBank
-from ..mesh import has_colours, load_mesh
+from ..mesh import has_colours, load_mesh, mesh_centre, mesh_radius, mesh_up
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
 from ..registration.result import used_box
 from ..utils.choices import DEFAULT
@@ -31,11 +33,10 @@ from ..visualization.encoding import png
 
 __all__ = ["Answer", "Result", "Session"]
 
-MAX_PROPOSALS = 5
-"""Proposed boxes that are drawn where the object was localized."""
-
-NEAREST = 1.2
-"""Least depth of the object's centre in its radii to which it can be moved by hand."""
+MAX_PROPOSALS = 5  # proposed boxes that are drawn where the object was localized
+HINT_WIDTH = 45.0  # degrees by which the pose may differ from a hint
+PREVIEW_DEPTH = 2.0  # radii by which the mesh of a preview is below the origin: its format knows what is in view
+NEAREST = 1.2  # least depth of the object's centre, in its radii, to which it can be moved by hand
 
 Numbers = tuple[float, float, float, float]
 
@@ -101,12 +102,7 @@ class Result:
     def moved(
         self, T: Tensor, rotation: Sequence[float] = (0, 0, 0), translation: Sequence[float] = (0, 0, 0)
     ) -> Tensor:
-        """Return the (4, 4) pose ``T``, turned about the object's centre and moved.
-
-        Args:
-            T: ``T_cam_from_model``.
-            rotation: degrees about the camera's x, y and z axes.
-            translation: along them, in radii of the object.
+        """Return the (4, 4) pose ``T``, turned by degrees about the camera's axes and moved along them by radii.
 
         Raises:
             InvalidInputError: the object would touch the camera.
@@ -129,27 +125,31 @@ class Session:
     Attributes:
         options: of ``curvireg view``; replace them to change unit, up, pose or preset, call ``set_limits`` for limits.
         names: what the user calls the files, for messages and the command line.
-        box, camera, fov: as ``--box``, ``--camera`` and ``--fov``, or None; a camera takes precedence over ``fov``.
+        box, camera: as ``--box`` and ``--camera``, or None.
+        guess: of an unknown camera: "exif", or the horizontal field of view in degrees; None: no camera.
         result, answer: the last result and its chosen pose, or None.
         limit: seconds after which a registration is cancelled.
+        answer_before: the answer before the last change by hand, or None.
         progress: stage, done and total.
+        cancelled: set it to end a registration at its next step.
     """
 
     options: RegisterOptions
     photo_path: Path | None = None
     mesh_path: Path | None = None
+    mesh: trimesh.Trimesh | None = None
     names: dict[Path, str] = field(default_factory=dict)
     photo: Photo | None = None
     box: Numbers | None = None
     camera: Numbers | None = None
-    fov: float | None = None
+    guess: str | float | None = None
     result: Result | None = None
     answer: Answer | None = None
     limit: float = MAX_VIEWER_SECONDS
     progress: tuple[str, int, int] = ("", 0, 1)
     cancelled: bool = False
     _registrar: tuple[RegisterOptions, Registrar] | None = None
-    _answer_before: Answer | None = None
+    answer_before: Answer | None = None
 
     def load(self) -> str:
         """Open the files that the options name, and take their box and camera; describes the mesh, or ""."""
@@ -158,8 +158,7 @@ class Session:
         for path in options.photos:
             self.open_photo(path)
         facts = "".join([self.open_mesh(path) for path in options.meshes])
-        self.box, self.camera = options.box, options.camera
-        self.fov = options.guess if isinstance(options.guess, float) else None
+        self.box, self.camera, self.guess = options.box, options.camera, options.guess
         return facts
 
     def open_photo(self, path: Path, name: str | None = None) -> Photo:
@@ -168,7 +167,7 @@ class Session:
         with self._user_names():
             photo = read_photo(path, dtype=torch.uint8)
         if self.photo is not None:  # those of the command line are meant for the first
-            self.box = self.camera = self.fov = None
+            self.box = self.camera = self.guess = None
         self.photo_path, self.photo, self.result, self.answer = path, photo, None, None
         return photo
 
@@ -177,35 +176,59 @@ class Session:
         self.names[path] = name or str(path)
         with self._user_names():
             if path.suffix == ".safetensors":
-                facts = f"bank of {len(ViewBank.load(path))} views"
+                bank = ViewBank.load(path)
+                mesh, facts = bank.mesh, f"bank of {len(bank)} views"
             else:
                 mesh = load_mesh(path, unit=self.options.unit, up=self.options.up)
                 size = " x ".join(f"{v:.4g}" for v in mesh.extents)
                 colours = "in its colours" if has_colours(mesh) else "in grey"
                 facts = f"{len(mesh.faces):,} faces, {size} {self.options.unit}, rendered {colours}"
-        self.mesh_path = path
-        self.result = self.answer = None
+        self.mesh_path, self.mesh, self.result, self.answer = path, mesh, None, None
         return facts
 
-    def exif_camera(self) -> Numbers | None:
-        """FX FY CX CY from the focal length in the photograph's EXIF block, to 0.01 px; None without one."""
-        K = None if self.photo is None else self.photo.guessed_camera_matrix()
-        if K is None:
-            return None
-        fx, fy, cx, cy = (round(float(K[i, j]), 2) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        return fx, fy, cx, cy
-
     @property
-    def guess(self) -> str | float | None:
-        """How the camera is guessed: "exif", or the field of view in degrees; None if it is given or unknown."""
-        if self.camera is None:
-            return self.fov
-        return "exif" if self.camera == self.exif_camera() else None
+    def has_exif(self) -> bool:
+        """Whether the photograph's file tells the focal length."""
+        return self.photo is not None and self.photo.guessed_camera_matrix() is not None
 
     def set_limits(self, **limits: Any) -> None:
         """Change what is known of the pose: arguments of :class:`PosePrior`; None removes a limit."""
         known = {**(self.options.limits or {}), **limits}
         self.options = replace(self.options, limits={n: value for n, value in known.items() if value is not None})
+
+    def remove_limits(self) -> None:
+        """Forget what was known of the pose, but not which side of the mesh is its front."""
+        self.set_limits(**{name: None for name in self.options.limits or {} if name != "front"})
+
+    def object_frame(self) -> Tensor:
+        """(3, 3) rotation from the mesh's axes to those of limits, see :func:`.object_frame`."""
+        assert self.mesh is not None
+        return object_frame(mesh_up(self.mesh), (self.options.limits or {}).get("front"))
+
+    def hint_direction(self, position: Sequence[float]) -> None:
+        """Limit the pose to views like that from a point beside the object, in the frame of limits, z up."""
+        forward = -torch.tensor(list(position), dtype=torch.float64)
+        right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+        R = torch.nn.functional.normalize(torch.stack([right, torch.linalg.cross(forward, right), forward]), dim=1)
+        azimuth, elevation, _ = (round(float(v), 1) for v in viewpoint_from_rotation(R))
+        self.remove_limits()
+        self.set_limits(viewpoint=(azimuth % 360.0, elevation, 0.0), within=HINT_WIDTH)
+
+    def mesh_axis(self, position: Sequence[float]) -> str:
+        """The mesh's axis that points to a point on its surface, in the frame of limits about the object's centre."""
+        x, y, z = (self.object_frame().mT @ torch.tensor(list(position), dtype=torch.float64)).tolist()
+        value, name = max(((abs(v), v), axis) for v, axis in zip((x, y, z), "xyz", strict=True))
+        return name if value[1] > 0 else f"-{name}"
+
+    def preview(self) -> bytes:
+        """The mesh as a GLB file, in the frame of limits and its radii; :data:`PREVIEW_DEPTH` below the origin."""
+        assert self.mesh is not None
+        frame, radius = self.object_frame(), mesh_radius(self.mesh)
+        T = transform(frame, -frame @ mesh_centre(self.mesh))
+        T = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)) @ T  # back from glTF's axes
+        T[2, 3] += PREVIEW_DEPTH * radius
+        K = torch.tensor([[8.0, 0.0, 3.5], [0.0, 8.0, 3.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+        return pose_glb(self.mesh, T, K, torch.zeros(3, 8, 8), photograph=False)
 
     def request(self) -> RegisterOptions:
         """The registration that the inputs describe."""
@@ -214,7 +237,7 @@ class Session:
             photos=() if self.photo_path is None else (self.photo_path,),
             meshes=() if self.mesh_path is None else (self.mesh_path,),
             box=self.box,
-            camera=None if self.guess == "exif" else self.camera,
+            camera=self.camera,
             guess=self.guess,
         )
 
@@ -269,7 +292,7 @@ class Session:
     def choose(self, number: int) -> None:
         """Make a hypothesis the answer, by its number from 0."""
         assert self.result is not None
-        self._answer_before = None
+        self.answer_before = None
         self.answer = Answer(self.result.registration.hypotheses[number], number)
 
     def place(self, T: Tensor, edit: str = "") -> None:
@@ -280,7 +303,7 @@ class Session:
         centres = [pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (before, T)]
         radii = float(torch.linalg.vector_norm(centres[1] - centres[0])) / describer.radius
         edit = f"{edit or 'moved'}: rotated {degrees:.1f} degrees, shifted {radii:.2f} radii"
-        self._answer_before, self.answer = answer, answer.placed(describer.centre, T, edit)
+        self.answer_before, self.answer = answer, answer.placed(describer.centre, T, edit)
 
     def fit(self) -> None:
         """Fit the contours at the answer to the photograph's edges."""
@@ -292,15 +315,10 @@ class Session:
         supports = f"{float(fit.start_support[0]):.2f} to {float(fit.edge_support[0]):.2f}"
         self.place(fit.transform[0], f"contours fitted, edge support {supports}")
 
-    @property
-    def can_undo(self) -> bool:
-        """Whether :meth:`undo` changes the answer."""
-        return self.answer is not None and self._answer_before is not None
-
     def undo(self) -> None:
         """Take back the last change by hand; a second call repeats it."""
-        if self.can_undo:
-            self.answer, self._answer_before = self._answer_before, self.answer
+        if self.answer_before is not None:
+            self.answer, self.answer_before = self.answer_before, self.answer
 
     def document(self) -> dict[str, Any]:
         """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done by hand."""
@@ -316,10 +334,6 @@ class Session:
                 document["localization"] = {**document["localization"], "instances": [first, *others]}
         by_hand = {"hypothesis": answer.number, "by_hand": list(answer.edits)}
         return {**document, "viewer": {"command": result.command, **by_hand}}
-
-    def json(self) -> bytes:
-        """:meth:`document` as a file."""
-        return to_json(self.document()).encode()
 
     def python(self) -> str:
         """A Python program that gives the answer."""
@@ -358,10 +372,6 @@ class Session:
         """The contours at the answer on the photograph, as a PNG file."""
         result, answer = self.require_result()
         return png(contour_overlay(result.registrar, answer.pose, result.image, result.box))
-
-    def cancel(self) -> None:
-        """End the registration at its next step."""
-        self.cancelled = True
 
     def describe_warning(self, warning: Warning) -> str:
         """The text of a warning, with the user's name of its file."""

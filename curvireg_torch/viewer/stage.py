@@ -22,31 +22,16 @@ from .workspace import Workspace
 
 __all__ = ["Stage", "contour_paths", "pose_layers"]
 
-PHOTO_SIDE = 2400
-"""Longer side in px of the displayed photograph, which can be zoomed."""
-
-LAYER_SIDE = 1400
-"""Longer side in px of the layers over it."""
-
-CONTOUR_SIDE = 256
-"""Side in px of the crop in which contours are followed while a pose is moved."""
-
-DASH = 0.008
-"""Half the length of a contour's dash, as a fraction of that crop."""
-
-COMMIT_SECONDS = 0.5
-"""Seconds without wheel or keys after which a moved pose becomes the answer."""
-
+PHOTO_SIDE = 2400  # px of the longer side of the displayed photograph, which can be zoomed
+LAYER_SIDE = 1400  # px of the longer side of the layers over it
+CONTOUR_SIDE = 256  # px of the crop in which contours are followed while a pose is moved
+DASH = 0.011  # half the length of a contour's dash, as a fraction of that crop
+COMMIT_SECONDS = 0.5  # without wheel or keys, after which a moved pose becomes the answer
 LEGEND = {"outline": "outline of the mesh at this pose", "crease": "its inner edges", "box": "the box"}
 HELP = {
-    "box": "Photograph. Drag to draw a box; drag its edges, corners or middle to correct it. Arrow keys move it, with "
-    "Shift by 10 px, with Alt they resize it. Wheel or pinch zooms, the middle button pans.",
-    "pose": "Photograph. Drag the mesh to move it, drag beside it to turn it; the wheel or a pinch changes its "
-    "distance, with Shift or a twist it rolls. Arrow keys move, with Shift turn, with Alt roll or change distance.",
-}
-HINT = {
-    "box": "Drag a rectangle around the object; drag its edges to correct it. The wheel zooms.",
-    "pose": "Drag the mesh to move it, drag beside it to turn it. Wheel: distance. Shift and wheel: roll.",
+    "box": "Drag to draw a box; drag its edges, corners or middle to correct it. Arrow keys move it. The wheel zooms.",
+    "pose": "Drag the mesh to move it, drag beside it to turn it. Wheel: distance; with Shift: roll. Arrow keys move, "
+    "with Shift turn.",
 }
 
 
@@ -270,21 +255,19 @@ class Stage:
     def _show_mode(self) -> None:
         is_pose = self.mode == "pose"
         self.canvas.props(f"data-mode={self.mode}")
-        self.viewport.props(f'aria-label="{HELP[self.mode]}"')
-        self.hint.set_content(HINT[self.mode])
+        self.viewport.props(f'aria-label="Photograph. {HELP[self.mode]}"')
+        self.hint.set_content(HELP[self.mode])
         for mode, element in self.modes.items():
             element.props(f"aria-pressed={'true' if mode == self.mode else 'false'}")
         set_enabled(self.modes["pose"], self.session.answer is not None)
         self.fit.set_visibility(is_pose)
-        can_undo = (
-            self.session.can_undo or self.drag is not None if is_pose else self.drawing.previous != self.drawing.box
-        )
+        can_undo = self.session.answer_before or self.drag if is_pose else self.drawing.previous != self.drawing.box
         set_enabled(self.undo, can_undo)
 
     async def _show_photo(self) -> None:
         photo = self.session.photo
         assert photo is not None
-        content = await self.workspace.run("photograph", lambda: jpeg(shrink(to_uint8(photo.image), PHOTO_SIDE), 92))
+        content = await self.workspace.run("page", lambda: jpeg(shrink(to_uint8(photo.image), PHOTO_SIDE), 92))
         if content:
             H, W = photo.image.shape[-2:]
             self.photo.props(f'src="{self.workspace.serve("photograph.jpg", content, "image/jpeg")}"')
@@ -295,7 +278,7 @@ class Stage:
             return
         result, answer = self.session.require_result()
         size = (int(result.image.shape[-2]), int(result.image.shape[-1]))
-        layers = await self.workspace.run("pose", lambda: pose_layers(result.registrar, answer.pose, size))
+        layers = await self.workspace.run("page", lambda: pose_layers(result.registrar, answer.pose, size))
         if layers:
             self.mask = layers[2]
             for element, name, content in zip((self.solid, self.lines), ("solid", "lines"), layers, strict=False):

@@ -33,17 +33,10 @@ from .session import Session
 
 __all__ = ["Workspace", "Workspaces", "file_name", "identify", "show_warning", "unpack"]
 
-GRACE_SECONDS = 30.0
-"""Seconds after which the search of a closed page is stopped; a reload takes less."""
-
-MAX_NAME = 120
-"""Characters of the name of an uploaded file."""
-
-HEAD_BYTES = 16
-"""Bytes from the start of a file that tell what it is."""
-
-DIRECTORY_BYTES = 1024
-"""Largest mean size of an entry in the directory of a zip archive."""
+GRACE_SECONDS = 30.0  # after which the search of a closed page is stopped; a reload takes less
+MAX_NAME = 120  # characters of the name of an uploaded file
+HEAD_BYTES = 16  # from the start of a file, which tell what it is
+DIRECTORY_BYTES = 1024  # largest mean size of an entry in the directory of a zip archive
 
 _SAMPLE_OPTIONS: dict[str, Any] = {"unit": "m", "up": None, "pose": "upright"}
 _IMAGE_STARTS = (
@@ -64,7 +57,8 @@ class Workspace:
 
     Attributes:
         session: inputs and results.
-        messages: what is wrong with, or remarkable about, a part of the work: "file", "photograph", "mesh" or "pose".
+        messages: what is wrong with, or remarkable about, a part of the work: "file", "photograph", "mesh", "pose" or
+            the "page" itself.
         files: pictures and downloads by name, with their media types.
         receiving: names of files that are being received.
         mesh_facts: the mesh in words.
@@ -143,7 +137,7 @@ class Workspace:
         if self._search is not None and self.waiting:
             self._search.cancel()
         elif self._search is not None:
-            self.session.cancel()
+            self.session.cancelled = True
 
     def stop_if_left(self) -> None:
         """End the search if no window shows the page any more."""
@@ -217,6 +211,13 @@ class Workspace:
         self.mesh_facts = facts or self.mesh_facts
         return bool(facts)
 
+    async def set_option(self, name: str, value: Any) -> None:
+        """Change an option; the mesh is opened again if it depends on it."""
+        self.session.options = replace(self.session.options, **{name: value})
+        path = self.session.mesh_path
+        if name in ("unit", "up") and path is not None:
+            await self.open_mesh(path, self.session.names[path])
+
     async def _open(self, part: str, job: Callable[[], Any]) -> Any:
         async with self._lock:  # no search begins before it is open
             if self._search is not None and not self.waiting:
@@ -259,7 +260,7 @@ class Workspace:
             K = scene.camera_matrix
             self.session.camera = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
             x0, y0, x1, y1 = (round(float(v), 1) for v in scene.box)
-            self.session.box, self.session.fov = (x0, y0, x1, y1), None
+            self.session.box, self.session.guess = (x0, y0, x1, y1), None
 
     def serve(self, name: str, content: bytes, media_type: str) -> str:
         """Put a file on the server; returns its address relative to the page, which is new each time."""
@@ -306,30 +307,21 @@ class Workspaces:
 
 
 def file_name(text: str) -> str:
-    """The name of an uploaded file without folders and control characters.
-
-    Example:
-        >>> file_name("C:\\\\parts\\\\wheel.stl")
-        'wheel.stl'
-    """
+    """Return the name of an uploaded file without folders and control characters."""
     name = "".join(c for c in re.split(r"[/\\]", text)[-1] if c.isprintable()).strip()
     return name[-MAX_NAME:] or "file"
 
 
 def identify(name: str, head: bytes) -> tuple[str, str]:
-    """Whether a file is a "photograph", a "mesh" or an "archive", and the suffix of its format ("" of photographs).
+    """Return whether a file is a "photograph", a "mesh" or an "archive", and the suffix of its format.
 
-    The content decides, then the name: a part that is called ``wheel.jpg`` by mistake is still a mesh.
-
-    Args:
-        name: of the file.
-        head: its first :data:`HEAD_BYTES` bytes.
+    Its first bytes decide, then its name: a part that is called ``wheel.jpg`` by mistake is still a mesh.
 
     Raises:
         InvalidInputError: it is none of them.
 
     Example:
-        >>> identify("part", b"ply\\nformat ascii 1.0")
+        >>> identify("part", b"ply")
         ('mesh', '.ply')
     """
     suffix = Path(name).suffix.lower()
@@ -353,12 +345,7 @@ def identify(name: str, head: bytes) -> tuple[str, str]:
 def unpack(archive: Path, folder: Path, name: str) -> Path:
     """Unpack a zip archive into a new folder; returns the path of the only mesh in it.
 
-    Names that lead outside stay inside, as ``zipfile`` removes ``..`` and drives.
-
-    Args:
-        archive: the file.
-        folder: that is created.
-        name: what the user calls the archive, for messages.
+    Names that lead outside stay inside, as ``zipfile`` removes ``..`` and drives. Messages call the archive ``name``.
 
     Raises:
         InvalidInputError: it is damaged, too large, encrypted, or does not hold one mesh.
