@@ -112,13 +112,7 @@ def _near_edge(at: float, low: float, high: float, reach: float, index: int) -> 
 
 
 class PoseDrag:
-    """A pose as the mouse, fingers and keys change it.
-
-    Args:
-        result: with the object that is moved.
-        T: (4, 4) ``T_cam_from_model`` to begin with.
-        K: (3, 3) camera matrix of the photograph.
-    """
+    """A pose as the mouse, fingers and keys change it, from (4, 4) ``T`` before a camera (3, 3) ``K``."""
 
     def __init__(self, result: Result, T: Tensor, K: Tensor) -> None:
         self.result, self.T, self.focal = result, T, float(K[0, 0])

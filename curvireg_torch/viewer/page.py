@@ -1,5 +1,6 @@
 """The page: the photograph, and beside it three steps, the answers and the inputs."""
 
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,8 @@ class Steps:
                     else:
                         file_chooser("Choose files", f"upload-{name}")
                         self.messages[name] = self._message(name)
+                    if name == "mesh":
+                        self.use_mm = button("Use mm", lambda: workspace.set_option("unit", "mm"), "use-mm", "quiet")
         self.messages["file"] = self._message("file")
         with region("div", "go"):
             self.find = button("Find the pose", self._find, "register", "primary")
@@ -117,6 +120,7 @@ class Steps:
         set_text(self.facts["mesh"], self._describe_mesh())
         set_text(self.facts["box"], BOX_HINT if session.box is None else " ".join(f"{v:g}" for v in session.box))
         self.no_box.set_visibility(session.box is not None)
+        self.use_mm.set_visibility("(mm?)" in workspace.messages.get("mesh", "") and session.options.unit != "mm")
         set_text(self.find, "Find the pose" if session.box or session.photo is None else "Find the object and its pose")
         set_enabled(self.find, bool(done["photograph"] and done["mesh"]) and not workspace.searching)
         self._show_progress()
@@ -150,10 +154,10 @@ class Steps:
         elif workspace.receiving:
             words = f"receiving {', '.join(workspace.receiving.values())}"
         elif session.result is not None:
-            changed = session.result.command != session.command()
+            changed = session.result.request != session.request()
             share, words = 1.0, "the inputs have changed since this answer" if changed else "done"
         self.stop.set_visibility(workspace.searching)
         self.bar.set_visibility(workspace.searching)
         self.bar.props(f"value={share:.3f}")
         set_text(self.stage, words)
-        set_text(self.seconds, f"{workspace.seconds:.0f} s" if workspace.searching else "")
+        set_text(self.seconds, f"{time.monotonic() - workspace.started:.0f} s" if workspace.searching else "")

@@ -3,7 +3,7 @@
 import math
 import shlex
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..data import read_photo
 from ..data.images import Photo
-from ..errors import MAX_VIEWER_SECONDS, CurviregError, CurviregWarning, InvalidInputError
+from ..errors import CurviregError, CurviregWarning, InvalidInputError
 from ..evaluation.lists import register_entry
 from ..evaluation.opening import RegisterOptions, check_camera, open_registrar
 from ..evaluation.prior_options import QUALIFIERS
@@ -33,7 +33,6 @@ from ..visualization.encoding import png
 
 __all__ = ["Answer", "Result", "Session"]
 
-MAX_PROPOSALS = 5  # proposed boxes that are drawn where the object was localized
 HINT_WIDTH = 45.0  # degrees by which the pose may differ from a hint
 PREVIEW_DEPTH = 2.0  # radii by which the mesh of a preview is below the origin: its format knows what is in view
 NEAREST = 1.2  # least depth of the object's centre, in its radii, to which it can be moved by hand
@@ -46,13 +45,7 @@ _DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
 
 @dataclass(frozen=True)
 class Answer:
-    """The pose that is shown and saved.
-
-    Attributes:
-        pose: the hypothesis, or where it was moved to by hand.
-        number: of the hypothesis, from 0.
-        edits: what was done to it by hand, in words.
-    """
+    """The pose that is shown and saved: a hypothesis, its number from 0, and what was done to it by hand, in words."""
 
     pose: Hypothesis
     number: int = 0
@@ -97,7 +90,6 @@ class Result:
     image: Tensor  # (3, H, W) uint8
     box: Tensor  # (4,) px, with which the pose was found
     request: RegisterOptions  # what was asked for
-    command: str  # gives the same result
 
     def moved(
         self, T: Tensor, rotation: Sequence[float] = (0, 0, 0), translation: Sequence[float] = (0, 0, 0)
@@ -128,7 +120,6 @@ class Session:
         box, camera: as ``--box`` and ``--camera``, or None.
         guess: of an unknown camera: "exif", or the horizontal field of view in degrees; None: no camera.
         result, answer: the last result and its chosen pose, or None.
-        limit: seconds after which a registration is cancelled.
         answer_before: the answer before the last change by hand, or None.
         progress: stage, done and total.
         cancelled: set it to end a registration at its next step.
@@ -145,7 +136,6 @@ class Session:
     guess: str | float | None = None
     result: Result | None = None
     answer: Answer | None = None
-    limit: float = MAX_VIEWER_SECONDS
     progress: tuple[str, int, int] = ("", 0, 1)
     cancelled: bool = False
     _registrar: tuple[RegisterOptions, Registrar] | None = None
@@ -160,6 +150,11 @@ class Session:
         facts = "".join([self.open_mesh(path) for path in options.meshes])
         self.box, self.camera, self.guess = options.box, options.camera, options.guess
         return facts
+
+    def close(self) -> None:
+        """Forget the photograph, the mesh, and what belongs to them."""
+        self.photo_path = self.photo = self.mesh_path = self.mesh = self.box = self.camera = self.guess = None
+        self.result = self.answer = None
 
     def open_photo(self, path: Path, name: str | None = None) -> Photo:
         """Read a photograph; it removes box, camera and result of the one before."""
@@ -255,26 +250,22 @@ class Session:
         if photo is None or not request.meshes:
             raise InvalidInputError("register: choose a photograph and a mesh first")
         check_camera(request.camera, request.guess)
-        report_progress = self._progress_callback(start)
         names = {path: Path(name) for path, name in self.names.items()}
         try:
             with self._user_names():
-                registrar = self._open_registrar(request.meshes[0], report_progress)
-                registrar.progress = report_progress
+                registrar = self._open_registrar(request.meshes[0])
+                registrar.progress = self._report_progress
                 entry = request.entry(request.photos[0])
                 entry = replace(entry, name=self.names[entry.photo], meshes=tuple(names[p] for p in entry.meshes))
                 ready = time.perf_counter() - start
                 registration, document = register_entry(entry, photo, registrar, bank_seconds=ready)
-            if self.cancelled:  # too late for the last step
-                raise CurviregError("stopped")
-        except CurviregError:
-            if self.cancelled:
-                raise CurviregError("stopped") from None
-            raise
+            self._report_progress("contours", 1, 1)  # it may have been stopped in the last step
+        except CurviregError as error:
+            raise (CurviregError("stopped") if self.cancelled else error) from None
         finally:
             self.cancelled = False
-        box, command = torch.tensor(used_box(document)), _command_line(request, self.names)
-        self.result = Result(registrar, registration, document, photo.image, box, request, command)
+        box = torch.tensor(used_box(document))
+        self.result = Result(registrar, registration, document, photo.image, box, request)
         self.choose(0)
         return registration
 
@@ -283,11 +274,6 @@ class Session:
         if self.result is None or self.answer is None:
             raise InvalidInputError("there is no result yet; register first")
         return self.result, self.answer
-
-    def proposals(self) -> list[list[float]]:
-        """The best boxes of the localization, the chosen one first; empty if the box was given."""
-        localization = {} if self.result is None else self.result.document.get("localization", {})
-        return [proposal["box"] for proposal in localization.get("proposals", [])[:MAX_PROPOSALS]]
 
     def choose(self, number: int) -> None:
         """Make a hypothesis the answer, by its number from 0."""
@@ -333,7 +319,7 @@ class Session:
                 first = {**first, "confidence": registration.confidence, **answer.pose.pose_dict()}
                 document["localization"] = {**document["localization"], "instances": [first, *others]}
         by_hand = {"hypothesis": answer.number, "by_hand": list(answer.edits)}
-        return {**document, "viewer": {"command": result.command, **by_hand}}
+        return {**document, "viewer": {"command": _command_line(result.request, self.names), **by_hand}}
 
     def python(self) -> str:
         """A Python program that gives the answer."""
@@ -379,24 +365,16 @@ class Session:
             warning = warning.with_subject(self.names.get(Path(warning.subject), warning.subject))
         return str(warning)
 
-    def _progress_callback(self, start: float) -> Callable[[str, int, int], None]:
-        def report_progress(stage: str, done: int, total: int) -> None:
-            self.progress = (stage, done, total)
-            if self.cancelled:
-                raise CurviregError("stopped")
-            if time.perf_counter() - start > self.limit:
-                raise CurviregError(
-                    f"stopped after {self.limit:g} s in the stage {stage!r}; "
-                    "use a simpler mesh, the pose prior upright, or the command line, which has no limit"
-                )
+    def _report_progress(self, stage: str, done: int, total: int) -> None:
+        self.progress = (stage, done, total)
+        if self.cancelled:
+            raise CurviregError("stopped")
 
-        return report_progress
-
-    def _open_registrar(self, mesh: Path, report_progress: Callable[[str, int, int], None]) -> Registrar:
+    def _open_registrar(self, mesh: Path) -> Registrar:
         """The registrar of a mesh and the present options; the last one is reused."""
         key = replace(self.options, meshes=(mesh,), limits=None)
         if self._registrar is None or self._registrar[0] != key:
-            self._registrar = key, open_registrar(key, key.meshes, progress=report_progress)
+            self._registrar = key, open_registrar(key, key.meshes, progress=self._report_progress)
         return self._registrar[1]
 
     @contextmanager
@@ -413,30 +391,23 @@ def _command_line(options: RegisterOptions, names: Mapping[Path, str]) -> str:
     words = ["curvireg", "register"]
     for paths, placeholder in ((options.photos, "PHOTO"), (options.meshes, "MESH")):
         words += [names[path] for path in paths] or [placeholder]
-    for name, numbers in (("--box", options.box), ("--camera", options.camera)):
-        words += [] if numbers is None else [name, *map(_number, numbers)]
-    if isinstance(options.guess, float):
-        words += ["--fov", _number(options.guess)]
-    elif options.guess is not None:
-        words += ["--camera", options.guess]
-    words += _limit_words(options.limits or {})
-    for name in _OPTIONS:
-        value, option = getattr(options, name), name.replace("_", "-")
-        if value != _DEFAULTS[name]:
-            words += [f"--{option}={value}"] if str(value).startswith("-") else [f"--{option}", str(value)]
+    limits = {} if options.limits is None or not options.limits.keys() - QUALIFIERS else dict(options.limits)
+    values: dict[str, Any] = {
+        "box": options.box,
+        "camera": "exif" if options.guess == "exif" else options.camera,
+        "fov": None if options.guess == "exif" else options.guess,
+        **{"near" if name == "viewpoint" else name: value for name, value in limits.items()},
+        **{name.replace("_", "-"): v for name in _OPTIONS if (v := getattr(options, name)) != _DEFAULTS[name]},
+    }
+    for name, value in values.items():
+        if value is not None:
+            texts = [v if isinstance(v, str) else _number(v) for v in (value if isinstance(value, tuple) else (value,))]
+            words += [f"--{name}={value}"] if isinstance(value, str) and value[0] == "-" else [f"--{name}", *texts]
     return shlex.join([*words, "--out", "result"])
 
 
-def _limit_words(limits: Mapping[str, Any]) -> list[str]:
-    words: list[str] = []
-    for name, value in limits.items() if limits.keys() - QUALIFIERS else ():
-        if isinstance(value, str):
-            words.append(f"--{name}={value}")
-        else:
-            numbers = value if isinstance(value, tuple) else (value,)
-            words += ["--near" if name == "viewpoint" else f"--{name}", *map(_number, numbers)]
-    return words
-
-
-def _number(value: float) -> str:
+def _number(value: Any) -> str:
+    """A path, or a number without needless digits."""
+    if isinstance(value, Path):
+        return str(value)
     return repr(int(value)) if math.isfinite(value) and value == int(value) else repr(float(value))

@@ -1,6 +1,7 @@
 """The column beside the photograph: the answers to choose from, the model, and the inputs besides files and box."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from nicegui import ui
@@ -51,6 +52,7 @@ class Answers:
                         button(name, lambda name=name: self._download(name), f"download-{name}", "quiet")
                     text("button", "copy as Python", "button quiet", type="button", data_copy="python")
                 self.meaning = text("p", "", "facts")
+                self.repairs = region("div", "row", data_testid="repairs")
             self.cards = region("div", "cards", data_testid="panel-answer", role="group", aria_label="possible answers")
             self.facts = text("p", "", "lines", data_testid="facts")
 
@@ -100,6 +102,30 @@ class Answers:
         lines += [f"{name} {value:.2f}" for name, value in numbers.items() if value is not None and value == value]
         lines += [*document["warnings"], *remarks(document), *answer.edits]
         set_text(self.facts, "\n".join(lines))
+        self.repairs.clear()
+        with self.repairs:
+            for label, repair in self._repairs(document, word).items():
+                button(label, repair, label.lower().replace(" ", "-"))
+
+    def _repairs(self, document: Mapping[str, Any], word: str) -> dict[str, Callable[[], None]]:
+        """What one click can do about what the page says of the answer."""
+        session, box, found = self.session, document["corrected_box"], dict[str, Callable[[], None]]()
+
+        def search_with(**inputs: Any) -> None:
+            for name, value in inputs.items():
+                setattr(session, name, value)
+            self.workspace.start_search()
+
+        if document.get("prior", {}).get("contradiction") is not None:
+            front = {name: value for name, value in (session.options.limits or {}).items() if name == "front"}
+            found["Search without the hint"] = lambda: search_with(options=replace(session.options, limits=front))
+        if box is not None:
+            found["Search with that box"] = lambda: search_with(box=tuple(round(v, 1) for v in box))
+        if session.camera is None and session.guess is None and session.has_exif:
+            found["Search with the photograph's EXIF camera"] = lambda: search_with(guess="exif")
+        if word == "no match":
+            found["Draw the box again"] = lambda: setattr(session, "box", None)
+        return found
 
     async def _draw_cards(self) -> None:
         result, _ = self.session.require_result()
@@ -110,9 +136,9 @@ class Answers:
             box = result.box.tolist()
             return [thumbnail(renderer, pose.projection, result.image, box) for pose in hypotheses]
 
-        pictures = await self.workspace.run("page", make)
+        pictures = await self.workspace.run("page", make) or ()
         self.cards.clear()
-        for number, (pose, picture) in enumerate(zip(hypotheses, pictures or [], strict=True)):
+        for number, (pose, picture) in enumerate(zip(hypotheses, pictures, strict=False)):
             degrees = float(rotation_error(pose.rotation, hypotheses[0].rotation))
             url = self.workspace.serve(f"answer-{number}.jpeg", picture, "image/jpeg")
             card = region("button", "card", type="button", data_testid=f"answer-{number + 1}")
@@ -144,9 +170,7 @@ class Inputs:
                 self.camera = [self._number(f"camera-{name}", name, self._camera_typed) for name in names]
             self.fov = self._number("fov", "or the horizontal field of view, degrees", self._fov_typed)
             self.camera_facts = text("p", "", "facts", data_testid="camera-facts")
-            with region("div", "row"):
-                button("No camera", lambda: self._set_camera(), "no-camera", "quiet")
-                self.exif = button("Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet")
+            self.exif = button("Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet")
         with fold("The same on the command line, and in Python", "command-line"):
             self.command = self._copied("command")
             self.python = self._copied("python")
@@ -177,6 +201,8 @@ class Inputs:
         fx, fy, cx, cy = (number.value for number in self.camera)
         if None not in (fx, fy, cx, cy):
             self._set_camera((float(fx), float(fy), float(cx), float(cy)))
+        else:
+            self.session.camera = None
 
     def _fov_typed(self) -> None:
         if self.fov.value is not None:
@@ -208,9 +234,9 @@ class Inputs:
     def _describe_camera(self) -> str:
         session = self.session
         if session.guess == "exif" and session.photo is not None:
-            return (
-                f"guessed from the photograph's EXIF, {session.photo.focal_35mm:g} mm of a 35 mm camera: no covariance"
-            )
+            focal = session.photo.focal_35mm
+            source = f"{focal:g} mm of a 35 mm camera: no covariance" if focal else "which has no focal length"
+            return f"guessed from the photograph's EXIF, {source}"
         if session.guess is not None:
             return "guessed from the field of view: no covariance"
         return "" if session.camera is not None else "unknown: the result is a rotation without translation"
