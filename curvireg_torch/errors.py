@@ -93,10 +93,8 @@ MAX_MESH_COORDINATE = 1e12
 #: Longest side of a mesh's box, in the file's unit; of smaller ones single precision computes no views
 MIN_MESH_EXTENT = 1e-6
 MAX_MESH_PARTS = 10_000  #: Nodes with a mesh in a glTF scene
-MAX_MESH_DEPTH = 200  #: Nodes from the root of a glTF scene to a part
-#: Corners of a concave face; the time of its division into triangles grows with their square
-MAX_POLYGON_CORNERS = 2000
-#: Sum of squared corners of all concave faces: a million quads, or five faces of 2000 corners
+#: Sum of squared corners of all concave faces, which bounds the time of their division: a million quads, or five faces
+#: of 2000 corners
 MAX_POLYGON_WORK = 20_000_000
 #: Bytes of a JSON or CSV file, 32 MiB; rows of a CSV of poses take up to 60 times as much memory
 MAX_TABLE_BYTES = 1 << 25

@@ -39,7 +39,7 @@ def photograph(seed):
 
 
 def test_small_bank_stores_features_of_all_views(small_bank, matcher, tmp_path):
-    pictures = matcher._shaded(torch.arange(len(small_bank)))
+    pictures = matcher.describer.shaded(small_bank.rotations, small_bank.distances)
     assert pictures.shape == (len(small_bank), 1, 64, 64)
     expected = describe(pictures, Backbone())
     torch.testing.assert_close(small_bank.reranking_features["appearance"], expected, atol=2e-3, rtol=0)
@@ -74,7 +74,8 @@ def test_large_bank_compares_the_best_distinct_views(small_bank, large_bank, mat
 
 
 def test_appearance_is_largest_for_the_same_view(matcher):
-    query = matcher.features(matcher._shaded(torch.tensor([0, 9, 20])))
+    bank, views = matcher.bank, torch.tensor([0, 9, 20])
+    query = matcher.features(matcher.describer.shaded(bank.rotations[views], bank.distances[views]))
     assert matcher.rank(query).terms["appearance"].argmax(dim=1).tolist() == [0, 9, 20]
 
 

@@ -216,10 +216,10 @@ def test_whole_box_shapes_are_nan_at_the_border(box, whole):
 def test_matcher_scores_the_whole_box(bank, photographs):
     images, boxes = photographs[0][:1], photographs[1][:1]
     matcher = ViewMatcher(bank)
-    torch.testing.assert_close(matcher(images, boxes).box, box_score(box_shapes(boxes), bank.boxes))
+    torch.testing.assert_close(matcher(images, boxes).terms["box"], box_score(box_shapes(boxes), bank.boxes))
     H, W = images[0].shape[1:]
-    assert bool((matcher(images, [[-0.5, -0.5, W - 0.5, H - 0.5]]).box == 1).all())
-    assert bool((matcher.rank(matcher.features(matcher.query(images, boxes).crops)).box == 1).all())
+    assert bool((matcher(images, [[-0.5, -0.5, W - 0.5, H - 0.5]]).terms["box"] == 1).all())
+    assert bool((matcher.rank(matcher.features(matcher.query(images, boxes).crops)).terms["box"] == 1).all())
 
 
 def test_box_shape_refuses_boxes_without_area():

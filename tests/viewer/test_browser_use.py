@@ -1,10 +1,12 @@
 """The page as people use it: dropped files, mistakes, a reload, keys, small screens, and readers of screens."""
 
 import os
+import re
 from pathlib import Path
 
 import pytest
 
+from curvireg_torch.synthetic import example_mesh
 from tests.viewer.browser import MISSING, Browser
 from tests.viewer.test_browser import scroll
 
@@ -39,6 +41,32 @@ def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browse
     browser.wait(lambda: browser.text("photograph-facts").startswith("sample.png: 960 x 720 px"), "photograph")
     browser.wait(lambda: "done" in browser.part("step-box").get_attribute("class"), "box")
     browser.wait(lambda: not browser.part("register").get_attribute("disabled"), "ready")
+
+
+def test_the_model_turned_with_the_mouse_is_a_hint(browser):
+    from selenium.webdriver import ActionChains
+
+    browser.unfold("command-line")
+    canvas = browser.wait(lambda: browser.part("preview").find_element("css selector", "canvas"), "the model")
+    assert browser.wait(lambda: [e.text for e in browser.driver.find_elements(
+        "css selector", ".nicegui-scene div div") if e.text] == ["up", "front"], "axes")  # fmt: skip
+
+    def azimuth():
+        browser.click("looks-like-this")
+        browser.wait(lambda: browser.text("hint-facts").startswith("Hint: seen from azimuth"), "hint")
+        return float(re.search(r"azimuth ([\d.]+)", browser.text("hint-facts"))[1])
+
+    before = azimuth()
+    assert f"--near {before:g} " in browser.text("command")
+    ActionChains(browser.driver).move_to_element(canvas).click_and_hold().move_by_offset(-90, 0).release().perform()
+    browser.wait(lambda: 30 < (azimuth() - before) % 360 < 180, "turned")
+    browser.picture("viewer-model")
+    browser.click("no-hint")
+    browser.wait(lambda: "--near" not in browser.text("command"), "no hint")
+    browser.click("mark-front")
+    browser.wait(lambda: browser.text("hint-facts") == "Click on the side that is front.", "asked for the front")
+    ActionChains(browser.driver).move_to_element_with_offset(canvas, -22, 0).click().perform()
+    browser.wait(lambda: "Click" not in browser.text("hint-facts"), "clicked")
 
 
 def test_a_search_can_be_stopped_and_started_again(browser):
@@ -201,5 +229,11 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     browser.emulate(0, 0)
     browser.drop(folder / "photo.png")
     browser.wait(lambda: browser.text("message-photograph") == "", "gone")
-    browser.upload("mesh", folder / "truck.ply")
+    mesh = example_mesh()
+    mesh.apply_scale(1000.0)
+    mesh.export(folder / "large.ply")
+    browser.upload("mesh", folder / "large.ply")
+    browser.wait(lambda: "give the unit (mm?)" in browser.text("message-mesh"), "a question")
+    browser.click("use-mm")
+    browser.wait(lambda: browser.text("mesh-facts").endswith(" mm, rendered in grey"), "in mm")
     browser.wait(lambda: browser.messages() == [], "all gone")
