@@ -305,7 +305,7 @@ class Preview:
             scene = ui.scene(340, 240, False, camera, self._clicked, click_events=["click"], background_color="#c8ced3")
         with scene:
             scene.gltf(url).scale(1.0 / (mesh_radius(mesh) * UNITS[mesh_unit(mesh) or "m"])).move(0, 0, PREVIEW_DEPTH)
-            for name, end in (("up", [0, 0, 1.1]), ("front", [0, -1.2, 0])):
+            for name, end in (("up", [0, 0, 1.0]), ("front", [0, -1.2, 0])):
                 scene.line([0, 0, 0], end).material("#0a6b35" if name == "up" else "#a8201a")
                 scene.text(name, "font-weight: bold").move(*end)
         scene.move_camera(1.6, -2.6, 1.3, 0, 0, 0, duration=0)
