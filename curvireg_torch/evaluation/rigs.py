@@ -140,6 +140,7 @@ def _cells(row: Mapping[str, Any], names: tuple[str, ...], where: str) -> tuple[
 def _colmap(folder: Path) -> Iterator[RigView]:
     """Photographs of ``images.txt``, in which every second line lists points, that lie in the folder, in ``images`` in
     it, or beside it."""
+    check_table_size(folder / "images.txt")
     try:
         lines = (folder / "images.txt").read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:
