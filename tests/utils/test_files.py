@@ -36,7 +36,9 @@ def path(tmp_path: Path) -> Path:
 def test_write_file_replaces_files_and_targets_of_links(tmp_path: Path) -> None:
     path = tmp_path / "new" / "folder" / "file"
     write_file(path, OLD)
-    write_file(path, NEW)
+    with path.open("rb") as reader:
+        write_file(path, NEW)
+        assert reader.read() == OLD, "who has the file open keeps the old content"
     assert path.read_bytes() == NEW
     assert list(path.parent.iterdir()) == [path]
     link = tmp_path / "link"
