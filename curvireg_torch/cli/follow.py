@@ -153,7 +153,7 @@ def _row(name: str, result: "Registration | FailedRegistration") -> list[Any]:
 
 def _write_tables(out: Path, rows: list[list[Any]]) -> None:
     """Write results.csv."""
-    from ..evaluation.lists.tables import POSE_COLUMNS
+    from ..evaluation.lists import POSE_COLUMNS
     from ..utils.files import write_csv
 
     header = ["photo", "status", *POSE_COLUMNS, "confidence", "edge_support", "message"]

@@ -15,9 +15,9 @@ from torch import Tensor
 from ..data import read_photo
 from ..data.images import Photo
 from ..errors import MAX_VIEWER_SECONDS, CurviregError, CurviregWarning, InvalidInputError
-from ..evaluation.lists import register_entry
 from ..evaluation.opening import RegisterOptions, check_camera, open_registrar
 from ..evaluation.prior_options import QUALIFIERS
+from ..evaluation.runner import register_entry
 from ..evaluation.store import to_json
 from ..geometry import rotation_error, rotation_from_axis_angle
 from ..geometry.cameras import rotation_towards

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from curvireg_torch.data import read_image
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import DATASETS
-from curvireg_torch.evaluation.bop import UNOCCLUDED
+from curvireg_torch.evaluation.benchmarks import UNOCCLUDED
 from curvireg_torch.evaluation.metrics import accuracy
 from curvireg_torch.features import field_points
 from curvireg_torch.filters import ImageGradient, MultiScaleCurvilinearSaliency, MultiScaleFocusCurves
@@ -174,7 +174,9 @@ def _case(kind: Any, s: dict[str, Any]) -> Case | None:
     known = bool(pose[:, :3].isfinite().all() and s["box"].isfinite().all())
     if not known or s.get("visib_fract", 1.0) <= UNOCCLUDED:
         return None
-    return Case(kind.category.format_map(s), s["image_path"], str(s[kind.mesh]), kind.scored.unit, s["box"], pose)
+    return Case(
+        kind.category.format_map(s), s["image_path"], str(s[kind.scored.mesh]), kind.scored.unit, s["box"], pose
+    )
 
 
 def grouped(cases: list[Case], label: str, progress: bool) -> Iterator[tuple[trimesh.Trimesh, list[Case]]]:

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from curvireg_torch.data import WebCollection
+from curvireg_torch.data import PoseFolder
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from tests._support.miniature import write_mesh, write_web
@@ -12,16 +12,16 @@ def tree(tmp_path):
     return tmp_path, write_web(tmp_path)
 
 
-def test_web_collection_counts_skipped_items(tree):
+def test_pose_folder_counts_skipped_items(tree):
     root, reasons = tree
-    dataset = WebCollection(root)
+    dataset = PoseFolder(root)
     assert len(dataset) == 4
     assert dict(dataset.skipped) == reasons
     assert dataset.skipped_items["missing_image"] == ["cup/views.csv #3"]
 
 
-def test_web_collection_returns_documented_samples(tree):
-    dataset = WebCollection(tree[0])
+def test_pose_folder_returns_documented_samples(tree):
+    dataset = PoseFolder(tree[0])
     sample, unknown, level = (dataset[i] for i in range(3))
     names = "image image_path image_id box viewpoint rotation distance category mesh_path object_index"
     assert set(sample) == set(names.split())
@@ -39,11 +39,11 @@ def test_web_collection_returns_documented_samples(tree):
     assert level["distance"] != level["distance"]
 
 
-def test_web_collection_refuses_unusable_roots(tree, tmp_path):
+def test_pose_folder_refuses_unusable_roots(tree, tmp_path):
     (tmp_path / "empty").mkdir()
     for root in (tmp_path / "nothing", tmp_path / "empty"):
         with pytest.raises(MissingFileError, match=r"datasets/web/README\.md"):
-            WebCollection(root)
+            PoseFolder(root)
     write_mesh(tree[0] / "cup" / "mesh.ply")
     with pytest.raises(InvalidInputError, match=r"one mesh.*mesh\.ply, mesh\.off"):
-        WebCollection(tree[0])
+        PoseFolder(tree[0])

@@ -1,4 +1,4 @@
-"""A collection of the user: objects, each with a mesh and photographs."""
+"""Folders of the user: objects, each with a mesh and photographs of known or unknown pose."""
 
 import csv
 import math
@@ -14,7 +14,7 @@ _README = "datasets/web/README.md"
 _COLUMNS = ["image", "x0", "y0", "x1", "y1", "azimuth", "elevation", "theta", "distance"]
 
 
-class WebCollection(ObjectDataset):
+class PoseFolder(ObjectDataset):
     """One folder per object, with ``mesh.*``, photographs, and ``views.csv`` with boxes and poses.
 
     ``views.csv`` is UTF-8 with the header ``image,x0,y0,x1,y1,azimuth,elevation,theta,distance``: a file of the
@@ -38,7 +38,7 @@ class WebCollection(ObjectDataset):
         InvalidInputError: a folder has two meshes.
 
     Example:
-        >>> WebCollection("data/web")[0]["viewpoint"]  # doctest: +SKIP
+        >>> PoseFolder("data/web")[0]["viewpoint"]  # doctest: +SKIP
     """
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
