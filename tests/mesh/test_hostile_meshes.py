@@ -17,7 +17,7 @@ from PIL import Image
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
-from curvireg_torch.mesh import files, polygons
+from curvireg_torch.mesh import files
 from curvireg_torch.mesh import mesh as mesh_module
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
@@ -232,18 +232,12 @@ def test_divide_faces_counts_before_it_divides(tmp_path: Path, monkeypatch: pyte
         monkeypatch.undo()
         (tmp_path / name).write_bytes(content)
         assert len(cr.load_mesh(tmp_path / name).faces) == 20
-        monkeypatch.setattr(polygons, "MAX_POLYGON_WORK", 159)
+        monkeypatch.setattr(files, "MAX_POLYGON_WORK", 159)
         refused(tmp_path / name, content, "not convex have too many corners")
-        monkeypatch.setattr(polygons, "MAX_MESH_FACES", 19)
+        monkeypatch.setattr(files, "MAX_MESH_FACES", 19)
         refused(tmp_path / name, content, "more than 19 faces")
-        monkeypatch.setattr(polygons, "MAX_MESH_LINES", 9)
+        monkeypatch.setattr(files, "MAX_MESH_LINES", 9)
         refused(tmp_path / name, content, "more than 9 lines")
     monkeypatch.undo()
-    monkeypatch.setattr(polygons, "MAX_POLYGON_WORK", 160)
+    monkeypatch.setattr(files, "MAX_POLYGON_WORK", 160)
     assert len(cr.load_mesh(tmp_path / "a.off").faces) == 20
-
-
-def test_as_mesh_refuses_a_part_with_malformed_vertices():
-    malformed = trimesh.Trimesh(np.zeros((3, 1)), [[0, 1, 2]], process=False)
-    with pytest.raises(MeshError, match="put together"):
-        mesh_module.as_mesh(trimesh.Scene([trimesh.creation.box(), malformed]))

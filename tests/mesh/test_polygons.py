@@ -11,7 +11,7 @@ import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
-from curvireg_torch.mesh.polygons import divide_faces, obj_with_triangles, off_with_triangles
+from curvireg_torch.mesh.files import divide_faces, obj_with_triangles, off_with_triangles
 
 U = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
 

@@ -56,16 +56,6 @@ def test_render_ignores_doubled_and_degenerate_faces(backend: str) -> None:
     assert_same_depth(render(damaged, backend), render(mesh, backend))
 
 
-def test_render_places_the_parts_of_a_scene(backend: str) -> None:
-    T = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3], [0.1, 0, 0])
-    part = trimesh.creation.box((0.3, 0.5, 0.7))
-    scene = trimesh.Scene()
-    scene.add_geometry(part, node_name="a", transform=T)
-    scene.add_geometry(part, node_name="b", parent_node_name="a", transform=T)  # relative to a
-    whole = trimesh.util.concatenate([part.copy().apply_transform(T), part.copy().apply_transform(T @ T)])
-    assert torch.equal(render(scene, backend), render(whole, backend))
-
-
 def test_render_with_the_camera_inside_and_the_object_behind(backend: str, orthographic: bool) -> None:
     renderer = make_renderer(trimesh.creation.box((2.0, 2.0, 2.0)), backend)
     wide = torch.tensor([[30.0, 0, 19.5], [0, 30.0, 14.5], [0, 0, 1]])
