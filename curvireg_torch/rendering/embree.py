@@ -22,7 +22,11 @@ _MAX_HULL_VERTICES = 200_000  # above, a convex hull takes more time than it sav
 _MAX_COORDINATE = 16000  # px; OpenCV draws no polygons beyond
 
 BESIDE = 1e-3
-"""Space, in object radii, between the object and the planes between which OpenCV's z-buffer is precise."""
+"""Space, in object radii, between the object and the planes in front and behind it between which OpenCV draws."""
+
+
+FARTHEST = 1000.0
+"""Depth, in object radii, beyond which single precision does not separate object and background."""
 
 
 class RayScene:
@@ -159,7 +163,8 @@ class RasterRenderer:
     """Draws into OpenCV's z-buffer, views in parallel on threads; rays take over where OpenCV is slower or wrong.
 
     The time of the z-buffer grows with the faces, that of ray casting with the pixels: it is used for meshes of fewer
-    faces than the image has pixels. It does not clip faces that cross the near plane, and knows no parallel projection.
+    faces than the image has pixels. It does not clip faces that cross the near plane, is not precise far away, and
+    knows no parallel projection.
 
     Attributes:
         rays: a renderer of the same mesh by ray casting, built on first use.
@@ -199,15 +204,15 @@ class RasterRenderer:
         near, far = z.min(axis=1) - BESIDE, z.max(axis=1) + BESIDE
         depth = np.zeros((len(T), 1, *size), np.float32)
 
+        drawn = (near > NEAREST) & (far < FARTHEST)
+
         def draw(i: int) -> None:
-            if near[i] > NEAREST:
+            if drawn[i]:
                 depth[i, 0] = self._draw(T[i, :3, :3], position[i], K[i], size, float(near[i]), float(far[i]))
 
         for_each(len(T), draw)
-        if len(crossing := np.nonzero((near <= NEAREST) & (far > NEAREST))[0]):
-            index = torch.from_numpy(crossing)
-            K_crossing = torch.from_numpy(K[crossing])
-            depth[crossing] = self.rays.render(T_cam_from_model[index], K_crossing, size).numpy()
+        if len(rest := np.nonzero(~drawn & (far > NEAREST))[0]):
+            depth[rest] = self.rays.render(torch.from_numpy(T[rest]), torch.from_numpy(K[rest]), size).numpy()
         return torch.from_numpy(depth)
 
     def _draw(

@@ -68,12 +68,12 @@ def test_divide_faces_takes_little_time_for_polygons_that_cross_themselves() -> 
     rng = np.random.default_rng(0)
     angle = np.arange(1999) * 2 * np.pi * 998 / 1999
     crossing = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    start = time.perf_counter()
+    start = time.process_time()
     for flat in (crossing, rng.random((2000, 2)), rng.integers(0, 5, (2000, 2)).astype(float)):
         triangles = divide(np.insert(flat, 2, 0.0, axis=1))
         assert 0 < len(triangles) <= len(flat) - 2
         assert 0 <= triangles.min() <= triangles.max() < len(flat)
-    assert time.perf_counter() - start < 5
+    assert time.process_time() - start < 5
 
 
 def prism() -> tuple[np.ndarray, list[list[int]]]:

@@ -68,6 +68,23 @@ def test_render_with_the_camera_inside_and_the_object_behind(backend: str, ortho
     assert depth[2, 0, 15, 20] == pytest.approx(near, abs=1e-4)
 
 
+@pytest.mark.parametrize("times", [20.0, 3000.0])
+def test_render_from_far_away_is_that_of_parallel_projection(backend: str, times: float) -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=3)
+    T, one, size = camera(2)
+    far, longer = T.clone(), one.clone()
+    far[:, 2, 3] *= times
+    longer[:2, :2] *= times
+    depth = make_renderer(mesh, backend).render(far, longer, size).double()
+    flat = one.clone()
+    flat[:2, :2] /= 4.0  # at the distance of the object's centre
+    expected = make_renderer(mesh, "embree").render(T, flat, size, orthographic=True).double()
+    assert int(((depth > 0) != (expected > 0)).sum()) < 0.2 / times * (expected > 0).sum() + 10
+    both = (depth > 0) & (expected > 0)
+    error = (depth - 4.0 * (times - 1.0) - expected)[both].abs()
+    assert float(error.median()) < 0.5 / times + 1e-3
+
+
 def test_render_batches(backend: str) -> None:
     """No views, an object outside the image, and a camera matrix per view."""
     renderer = make_renderer(trimesh.creation.box(), backend)
