@@ -48,8 +48,8 @@ if TYPE_CHECKING:
 
 __all__ = ["register_views"]
 
-MAX_CANDIDATES, FINISHED_CANDIDATES = 6, 2
-"""World poses that are fitted in all photographs, and those that are fitted at full size."""
+FITTED_CANDIDATES, JUDGED_CANDIDATES, FINISHED_CANDIDATES = 6, 4, 2
+"""World poses that are fitted in all photographs, those whose evidence is compared, and those fitted at full size."""
 
 SAME_ANGLE, SAME_SHIFT = 15.0, 0.5
 """Degrees, and shift in object radii, within which two candidates count as one."""
@@ -279,7 +279,7 @@ class _Rig:
         T = transform(R, place - R @ self.describer.centre)
         rank = torch.stack([self.rank(p, T) for p in self.photographs])
         order = _bounded(rank).sum(dim=0)
-        return T[self.distinct(T, order)[:MAX_CANDIDATES]]
+        return T[self.distinct(T, order)[:FITTED_CANDIDATES]]
 
     def distinct(self, T: Tensor, score: Tensor) -> Tensor:
         """Indices of world poses, best first, without those that are nearly equal to a better one."""
@@ -368,7 +368,7 @@ class _Rig:
         T, support, _ = self.fitted(half, T, FIRST_RADII)
         rank = torch.stack([self.rank(p, T) for p in self.photographs])
         promising = (SCORE_WEIGHTS[2] * support + _bounded(rank)).sum(dim=0)
-        chosen = self.distinct(T, promising)
+        chosen = self.distinct(T, promising)[:JUDGED_CANDIDATES]
         T, support = T[chosen], support[:, chosen]
         best = min(FINISHED_CANDIDATES, len(T))
         finished, full_support, state = self.fitted(full, T[:best], FULL_SIZE_RADII)
