@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError, LostObjectError
+from ..geometry.calibration import Camera
 from ..geometry.cameras import rotation_towards
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_tensor
@@ -39,7 +40,7 @@ class Follower:
 
     Args:
         registrar: of one mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
-        camera_matrix: (3, 3) in px, of all frames.
+        camera_matrix: (3, 3) in px, or a :class:`Camera`, of all frames.
 
     Raises:
         InvalidInputError: a registrar of several meshes.
@@ -53,7 +54,7 @@ class Follower:
         torch.Size([3])
     """
 
-    def __init__(self, registrar: Any, camera_matrix: Tensor) -> None:
+    def __init__(self, registrar: Any, camera_matrix: Tensor | Camera) -> None:
         self.registrar = registrar if isinstance(registrar, Registrar) else Registrar(registrar)
         if self.registrar.others:
             raise InvalidInputError("Follower: expected a registrar of one mesh, which is followed, got several")
@@ -103,7 +104,7 @@ class Follower:
             return FailedRegistration(item)
         boxes = None if box is None else [box]
         if not self._start_confidence:
-            result = self.registrar([item.image], boxes, self.camera_matrix)[0]
+            result = self.registrar([image], boxes, self.camera_matrix)[0]
             if isinstance(result, Registration) and (result.confidence or 0.0) >= BELIEVED_CONFIDENCE:
                 self._begin(item, result)
             return result
@@ -112,7 +113,7 @@ class Follower:
         if tracked and found and tracked.confidence >= TRUSTED_CONFIDENCE:
             self._tracker.accept(tracked)
             return found
-        return self._search(item, boxes, tracked, found)
+        return self._search(item, image, boxes, tracked, found)
 
     def _begin(self, item: ImageItem, result: Registration) -> None:
         """Track from a registered pose, if it lies within the frame."""
@@ -137,7 +138,7 @@ class Follower:
             return None
 
     def _search(
-        self, item: ImageItem, boxes: Any, tracked: TrackedPose | None, found: Registration | None
+        self, item: ImageItem, image: Any, boxes: Any, tracked: TrackedPose | None, found: Registration | None
     ) -> Registration | FailedRegistration:
         """The pose in a frame in which tracking ``found`` a doubtful one, or none."""
         starts = [self._tracker.last_pose] if tracked is None else [tracked.T, self._tracker.last_pose]
@@ -158,7 +159,7 @@ class Follower:
         if tracked and found and tracked.confidence >= KEPT_CONFIDENCE:
             self._tracker.accept(tracked)
             return found
-        registered = self.registrar([item.image], boxes, self.camera_matrix)[0]
+        registered = self.registrar([image], boxes, self.camera_matrix)[0]
         if isinstance(registered, Registration) and registered.reliable:
             self._begin(item, registered)
             return registered

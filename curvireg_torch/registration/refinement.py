@@ -129,7 +129,7 @@ def refine_item(
     check_crop(query.crops[0])
     descriptors = describer.descriptor(query.field)
     poses = _poses(registrar, T, K, boxes)
-    mask = registrar.object_mask(query)
+    mask = registrar.object_mask(query, [item] * len(T))
     poses = fit_poses(describer, images, poses, boxes, mask, wide_angles=WIDE_ANGLES)
     evidence = _evidence(registrar, descriptors, poses)
     best = _scores(evidence).argmax()

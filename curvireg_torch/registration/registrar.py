@@ -169,6 +169,7 @@ class Registrar:
         camera_matrices: Any | None = None,
         *,
         prior: PosePrior | Sequence[PosePrior | None] | None = None,
+        masks: Any | None = None,
     ) -> Results:
         """Register a batch.
 
@@ -176,23 +177,27 @@ class Registrar:
             images: (B, C, H, W) or a list of (C, H, W) tensors, (H, W, C) arrays or paths, C = 1 or 3, floating in
                 [0, 1] or uint8.
             boxes: (B, 4) x0, y0, x1, y1 in px; None searches for the object, see :func:`localize`.
-            camera_matrices: (B, 3, 3) or (3, 3) in px; None: rotations are relative to a camera that looks at the box.
+            camera_matrices: (B, 3, 3) or (3, 3) in px, a :class:`Camera`, or a list of these; None: rotations are
+                relative to a camera that looks at the box.
             prior: what is known of the poses in advance, one for all photographs or a list.
+            masks: B masks (H, W) of the objects, white in bool, uint8 or floating in [0, 1], paths, or None for some
+                photographs with boxes. Contours are fitted to them; without boxes they give these.
 
         Returns:
             A :class:`Registration` for each photograph; a :class:`FailedRegistration` for one that cannot be registered
             (unreadable, box empty or outside, one colour, NaN), which raises its error on access to a pose.
 
         Raises:
-            InvalidInputError: not as many boxes, cameras or priors as images, or a distance limited without cameras.
+            InvalidInputError: not as many boxes, cameras, priors or masks as images, or a distance limited without
+                cameras.
         """
-        if boxes is None:
+        if boxes is None and masks is None:
             results = [found[0] for found in localize(self, images, camera_matrices, prior=prior)]
         else:
-            items = image_items(images, boxes, camera_matrices, prior)
+            items = image_items(images, boxes, camera_matrices, prior, masks)
             results = self.map_items(items, self.register_items)
         for model, other in enumerate(self.others, 1):
-            rivals = other(images, boxes, camera_matrices, prior=prior)
+            rivals = other(images, boxes, camera_matrices, prior=prior, masks=masks)
             results = [_better(one, rival, model) for one, rival in zip(results, rivals, strict=True)]
         return results
 
@@ -325,7 +330,7 @@ class Registrar:
             poses = self._searched(batch, poses)
         if self.pipeline.contours:
             self.report_progress("contours")
-            poses = fit_poses(self.describer, batch.images, poses, batch.boxes, self.object_mask(query))
+            poses = fit_poses(self.describer, batch.images, poses, batch.boxes, self.object_mask(query, items))
         evidence = self._evidence(batch, poses)
         if self.pipeline.contours and batch.exact:
             poses, evidence = self._fit_textures(batch, poses, evidence, outside)
@@ -395,12 +400,17 @@ class Registrar:
         poses = lifted(self.describer, *found, batch.boxes, batch.cameras)
         return poses if batch.priors is None else batch.priors.at_distance(poses)
 
-    def object_mask(self, query: QueryFeatures) -> Tensor | None:
-        """(B, 1, S, S) probability that pixels of the crops belong to the object, if the field predicts it."""
-        field = self.matcher.field
-        if not isinstance(field, LearnedCurvilinearSaliency):
+    def object_mask(self, query: QueryFeatures, items: Sequence[ImageItem]) -> Tensor | None:
+        """(B, 1, S, S) probability that pixels of the crops belong to the object: given, predicted, or None."""
+        settings, field = self.bank.settings, self.matcher.field
+        masks = [item.mask_crop(settings.image_size, settings.margin) for item in items]
+        if isinstance(field, LearnedCurvilinearSaliency):
+            crops = query.crops.split(1)  # rounding is that of a photograph alone
+            masks = [field.mask(crop) if mask is None else mask for mask, crop in zip(masks, crops, strict=True)]
+        known = next((mask for mask in masks if mask is not None), None)
+        if known is None:
             return None
-        return torch.cat([field.mask(crop) for crop in query.crops.split(1)])  # rounding is that of a photograph alone
+        return torch.cat([torch.ones_like(known) if mask is None else mask.to(known) for mask in masks])
 
     def _evidence(self, batch: _Batch, poses: Poses) -> Tensor:
         """(H, 4) :data:`POSE_FEATURES`."""

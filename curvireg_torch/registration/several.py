@@ -165,7 +165,7 @@ class _Photograph:
             inside=inside_photographs([image], boxes, CROP_SIZE, settings.margin),
             query=query,
             descriptor=F.normalize(registrar.describer.descriptor(query.field), dim=1),
-            mask=registrar.object_mask(query),
+            mask=registrar.object_mask(query, [replace(item, box=box)]),
             result=result,
         )
 
