@@ -176,7 +176,7 @@ def test_bad_photographs_and_boxes():
     images, boxes, cameras = rig_of(EASY)
     with pytest.raises(InvalidInputError, match=r"no photograph can be registered: image 0: .*one colour"):
         registered([torch.zeros(3, *SIZE)], boxes[:1], cameras[:1])
-    with pytest.raises(InvalidInputError, match="boxes: expected 3"):
+    with pytest.raises(InvalidInputError, match=r"boxes: expected shape \(3, 4\)"):
         registered(images, boxes[:2], cameras)
     with pytest.raises(InvalidInputError, match="needs the camera matrix"):
         learned_registrar().register_views(images, boxes, None, cameras)
