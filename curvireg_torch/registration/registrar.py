@@ -261,8 +261,8 @@ class Registrar:
 
     def map_items(
         self,
-        items: Sequence[ImageItem | CurviregError],
-        function: Callable[[Sequence[ImageItem | CurviregError], int], list[Any]],
+        items: Sequence[Any],
+        function: Callable[[Sequence[Any], int], list[Any]],
     ) -> list[Any]:
         """Results of ``function(some items, index of the first)`` for all items, in their order.
 

@@ -28,9 +28,10 @@ from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.conversions import axis_angle_from_rotation
 from curvireg_torch.registration import several
 from curvireg_torch.registration.inputs import image_items
+from curvireg_torch.registration.rig import RigPhotograph
 from scripts.calibration.calibrate import Row, errors_of, truth_of
 
-SIZES, ERRORS, FIRSTS = (2, 3, 5), (0.0, 0.5, 1.0), 2
+SIZES, ERRORS, FIRSTS = (2, 3, 5), (0.0, 0.5, 1.0), 1
 """Photographs of a group, errors of the cameras in degrees, and first photographs of groups with errors."""
 
 
@@ -64,11 +65,13 @@ def rows_of(registrar: cr.Registrar, samples: list[Row], *, wrong: bool) -> Iter
     generator = torch.Generator().manual_seed(samples[0]["scene_id"])
     alone = [(0.0, [k]) for k in range(len(samples))]
     for error, chosen in [*alone, *groups(len(samples), generator)]:
+        if wrong and (error or chosen[0]):
+            continue
         rig, some = disturbed(cameras[chosen], error, generator), {}
         for k, i in enumerate(chosen):
             one = found[i]
-            some[k] = replace(one, camera=rig[k]) if isinstance(one, several._Photograph) else one
-        if not any(isinstance(one, several._Photograph) for one in some.values()):
+            some[k] = replace(one, camera=rig[k], index=k) if isinstance(one, RigPhotograph) else one
+        if not any(isinstance(one, RigPhotograph) for one in some.values()):
             continue
         start = time.process_time()
         result = several._registration(registrar, some, rig)
