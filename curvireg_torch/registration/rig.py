@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError
-from ..filters.inputs import fill_missing
+from ..filters.operations import fill_missing
 from ..geometry import rotation_error
 from ..geometry.cameras import rotation_towards, transform
 from ..geometry.conversions import axis_angle_from_rotation, cross_matrix
