@@ -89,11 +89,15 @@ class RigProblem(ContourProblem):
         return replace(self, image_index=self.image_index[index], K=K, **rest)  # type: ignore[arg-type]
 
     def step(self, points: ContourPoints, T: Tensor, radius: float, others: Sequence[Measurements] = ()) -> Tensor:
+        scale, distance = self.size / CROP_SIZE, self.gaps(T)
+        known = Measurements(scale * self.root, scale * distance, torch.ones_like(distance))
+        return super().step(points, T, radius, [*others, known])
+
+    def gaps(self, T: Tensor) -> Tensor:
+        """(N, 6, 1) from poses to those that the photographs alone found, in standard deviations of these."""
         turn = axis_angle_from_rotation(self.alone[:, :3, :3] @ T[:, :3, :3].mT)
         shift = (self.alone - T)[:, :3, :3] @ self.centre + (self.alone - T)[:, :3, 3]
-        J = self.size / CROP_SIZE * self.root
-        distance = J @ torch.cat([turn, shift], dim=1)[..., None]
-        return super().step(points, T, radius, [*others, Measurements(J, distance, torch.ones_like(distance))])
+        return self.root @ torch.cat([turn, shift], dim=1)[..., None]
 
     def solution(self, A: Tensor, b: Tensor) -> Tensor:
         P = in_frames(self.axes)
@@ -381,16 +385,23 @@ class Rig:
         return Answer(photograph.poses, evidence, self.scores(evidence), P.mT @ C @ P)
 
     def covariances(self, T: Tensor, state: ContourState) -> Tensor:
-        """(M, 6, 6) of finished world poses, from those of each photograph: its contours', or that found alone."""
+        """(M, 6, 6) of finished world poses, from those of each photograph: its contours', or that found alone.
+
+        They are larger where the photographs alone contradict the joint pose, by the mean of their squared gaps: the
+        cameras' poses have errors.
+        """
         (each, cams), V = self.tied(self.problems[0], T), len(self.photographs)
         measured, radius = each.measured_edges(state, FULL_SIZE_RADII[-1]), self.describer.radius
         seen, _ = pose_covariance(measured, state.points, state.T, each.K, each.centre, radius=radius)
         _, alone = self.found_alone(cams, torch.arange(V).repeat(len(T)))
-        better = ~(alone.logdet() >= seen.logdet()) & alone.isfinite().all(dim=-1).all(dim=-1)
+        known = alone.isfinite().all(dim=-1).all(dim=-1)
+        better = ~(alone.logdet() >= seen.logdet()) & known
         precision = _inverse(torch.where(better[:, None, None], alone, seen))
         weights, P = torch.cat([self.weights(one) for one in T]), in_frames(each.axes)
         covariance: Tensor = torch.linalg.inv(each.summed(weights[:, None, None] * (P.mT @ precision @ P)))
-        return covariance
+        freedom = 6.0 * each.summed(known.double()) - 6.0
+        misfit = each.summed(each.gaps(state.T).square().sum(dim=(1, 2))) / freedom.clamp(min=6.0)
+        return covariance * misfit.clamp(min=1.0)[:, None, None]
 
     def weights(self, T: Tensor) -> Tensor:
         """(V,) in (0, 1] weights of photographs: those from nearly the same side of a world pose (4, 4) share one."""

@@ -4,7 +4,7 @@
     python scripts/calibration/several.py rows.jsonl /data/shelf [...]
 
 Every photograph is registered once; groups of two, three and five of them are registered together, with errors of
-0, 0.5 and 1 degree in the cameras' relative orientations. Each fourth rig is also registered to a wrong mesh. Rows are
+0, 0.5 and 1 degree in the cameras' relative orientations. Each sixth rig is also registered to a wrong mesh. Rows are
 appended to the file, and finished rigs of it are not measured again. A table is printed.
 """
 
@@ -111,7 +111,7 @@ def measure(folder: Path, done: set[tuple[str, int, int]], out: Path) -> None:
             continue
         samples = [data[i] for i in indices]
         other = next((k for k in meshes if k > obj_id), min(meshes))
-        names = [obj_id, other] if number % 4 == 0 and other != obj_id else [obj_id]
+        names = [obj_id, other] if number % 6 == 0 and other != obj_id else [obj_id]
         rows: list[dict[str, Any]] = []
         for name in names:
             rows += rows_of(registrar_of(meshes[name]), samples, wrong=name != obj_id)
