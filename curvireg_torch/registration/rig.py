@@ -437,12 +437,16 @@ class Rig:
         """Why photographs do not show the best pose, by their index; {} if none shows it."""
         reasons: dict[int, str] = {}
         pairs = answer.evidence[:, 0, 1:3].tolist()
-        found = [refinement_confidence({"similarity": one, "edge_support": other}) for one, other in pairs]
-        for photograph, confidence, (similarity, support) in zip(self.photographs, found, pairs, strict=True):
-            if not bool(photograph.sees(self.describer.hull, answer.T[:1])):
+        sees = [bool(p.sees(self.describer.hull, answer.T[:1])) for p in self.photographs]
+        found = [
+            refinement_confidence({"similarity": similarity, "edge_support": support}) if seen else 0.0
+            for (similarity, support), seen in zip(pairs, sees, strict=True)
+        ]
+        for v, photograph in enumerate(self.photographs):
+            if not sees[v]:
                 reasons[photograph.index] = ELSEWHERE
-            elif confidence < LOST_CONFIDENCE * max(found):
-                numbers = f"edge support {support:.2f}, similarity {similarity:.2f}"
+            elif found[v] < LOST_CONFIDENCE * max(found):
+                numbers = "similarity {:.2f}, edge support {:.2f}".format(*pairs[v])
                 reasons[photograph.index] = f"the object is not seen where the other photographs have it ({numbers})"
         return reasons if len(reasons) < len(self.photographs) else {}
 
