@@ -208,7 +208,7 @@ class Registrar:
     def register_views(
         self, images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any
     ) -> Registration:
-        """Register several photographs of one object together, see :func:`curvireg_torch.registration.register_views`."""
+        """Register photographs of one object together, see :func:`curvireg_torch.registration.register_views`."""
         result = register_views(self, images, boxes, camera_matrices, T_cam_from_world)
         for model, other in enumerate(self.others, 1):
             rival = other.register_views(images, boxes, camera_matrices, T_cam_from_world)
