@@ -328,7 +328,8 @@ class Rig:
         # From errors of the model's origin to those of the object's centre.
         lever = torch.eye(6, dtype=torch.float64).repeat(len(cams), 1, 1)
         lever[:, 3:, :3] = cross_matrix(alone[:, :3, :3] @ self.describer.centre)
-        root = torch.linalg.cholesky(lever.mT @ _inverse(covariance) @ lever).mT
+        values, vectors = torch.linalg.eigh(lever.mT @ _inverse(covariance) @ lever)
+        root = (vectors * values.clamp(min=0.0).sqrt()[:, None]).mT
         return replace(problem[every], group=pose, alone=alone, root=root), cams
 
     def found_alone(self, cams: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
@@ -418,13 +419,8 @@ class Rig:
             similarity = (views @ photograph.descriptor).double().cpu()
             appearance, ranking = torch.zeros_like(similarity), photograph.result.ranking
             if Appearance.name in ranking.terms:
-                compared = (
-                    photograph.query,
-                    ranking,
-                    matcher.describer.shaded(R, distance),
-                    torch.zeros(len(T)).long(),
-                )
-                appearance = matcher.reranking_score(Appearance.name, *compared)
+                pictures, only = matcher.describer.shaded(R, distance), torch.zeros(len(T)).long()
+                appearance = matcher.reranking_score(Appearance.name, photograph.query, ranking, pictures, only)
             parts.append(torch.stack([similarity, appearance]))
         similarity, appearance = torch.stack(parts, dim=1)
         return torch.stack([self.ranks(T), similarity, support, appearance], dim=-1)
