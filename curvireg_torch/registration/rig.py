@@ -72,7 +72,8 @@ ELSEWHERE = "where the other photographs have the object, it lies outside this o
 @dataclass(frozen=True, kw_only=True)
 class RigProblem(ContourProblem):
     """Poses of several photographs that are tied together: those with the same number in ``group`` (N,) are one pose in
-    the world, seen by cameras with ``axes`` (N, 3, 3), rotations from the world.
+    the world, seen by cameras with ``axes`` (N, 3, 3), rotations from the axes of the first camera: with those of the
+    world, the damping and so the result would depend on these.
 
     Each photograph alone found ``alone`` (N, 4, 4), with a precision whose root is ``root`` (N, 6, 6): it may know more
     than its contours tell, such as the rotation of a can by its label.
@@ -114,7 +115,7 @@ class RigProblem(ContourProblem):
 
 
 def in_frames(axes: Tensor) -> Tensor:
-    """(N, 6, 6) from twists along the world's axes to those along cameras' with rotations (N, 3, 3) from the world."""
+    """(N, 6, 6) from twists along some axes to those along other ones, of rotations (N, 3, 3)."""
     zero = torch.zeros_like(axes)
     return torch.cat([torch.cat([axes, zero], dim=2), torch.cat([zero, axes], dim=2)], dim=1)
 
@@ -312,7 +313,7 @@ class Rig:
         index = torch.arange(len(photographs))
         full = RigProblem(
             *(self.describer.contours, EdgeField(crops, inside), index, K, CROP_SIZE, mask),
-            axes=self.cameras[:, :3, :3],
+            axes=self.cameras[:, :3, :3] @ self.cameras[0, :3, :3].mT,
             group=torch.zeros_like(index),
             alone=self.cameras,
             root=torch.zeros(len(index), 6, 6, dtype=torch.float64),
@@ -391,14 +392,15 @@ class Rig:
         They are larger where the photographs alone contradict the joint pose, by the mean of their squared gaps: the
         cameras' poses have errors.
         """
-        (each, cams), V = self.tied(self.problems[0], T), len(self.photographs)
+        each, cams = self.tied(self.problems[0], T)
         measured, radius = each.measured_edges(state, FULL_SIZE_RADII[-1]), self.describer.radius
         seen, _ = pose_covariance(measured, state.points, state.T, each.K, each.centre, radius=radius)
-        _, alone = self.found_alone(cams, torch.arange(V).repeat(len(T)))
+        every = torch.arange(len(self.photographs)).repeat(len(T))
+        _, alone = self.found_alone(cams, every)
         known = alone.isfinite().all(dim=-1).all(dim=-1)
         better = ~(alone.logdet() >= seen.logdet()) & known
         precision = _inverse(torch.where(better[:, None, None], alone, seen))
-        weights, P = torch.cat([self.weights(one) for one in T]), in_frames(each.axes)
+        weights, P = torch.cat([self.weights(one) for one in T]), in_frames(self.cameras[every, :3, :3])
         covariance: Tensor = torch.linalg.inv(each.summed(weights[:, None, None] * (P.mT @ precision @ P)))
         freedom = 6.0 * each.summed(known.double()) - 6.0
         misfit = each.summed(each.gaps(state.T).square().sum(dim=(1, 2))) / freedom.clamp(min=6.0)
