@@ -273,14 +273,15 @@ class Rig:
         kept: list[int] = []
         place = self.centres(T)
         for k in score.argsort(descending=True, stable=True).tolist():
-            near = self.angles(T[kept, :3, :3], T[k : k + 1, :3, :3])[:, 0] <= SAME_ANGLE
+            near = self.angles(T[kept], T[k : k + 1])[:, 0] <= SAME_ANGLE
             shift = torch.linalg.vector_norm(place[kept] - place[k], dim=1)
             if not bool((near & (shift <= SAME_SHIFT * self.describer.radius)).any()):
                 kept.append(k)
         return torch.tensor(kept)
 
     def angles(self, R: Tensor, others: Tensor) -> Tensor:
-        """(M, N) degrees between rotations (M, 3, 3) and (N, 3, 3), up to symmetries."""
+        """(M, N) degrees between rotations (M, 3, 3) and (N, 3, 3), or those of poses, up to symmetries."""
+        R, others = R[:, :3, :3], others[:, :3, :3]
         traces = ((R[:, None] @ self.symmetries).flatten(2) @ others.flatten(1).T).amax(dim=1)
         return torch.rad2deg((0.5 * (traces - 1.0)).clamp(-1.0, 1.0).acos())
 

@@ -8,7 +8,14 @@ import torch
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError, LostObjectError
-from .confidence import confidence_features, hypothesis_probabilities, is_calibrated, registration_confidence
+from .confidence import (
+    MAX_MARGIN,
+    RIVAL_ANGLE,
+    confidence_features,
+    hypothesis_probabilities,
+    is_calibrated,
+    registration_confidence,
+)
 from .inputs import ImageItem, image_items, is_missing, rig_cameras
 from .localization import localize
 from .result import FailedRegistration, PhotographPose, Registration
@@ -140,7 +147,9 @@ def _registration(registrar: "Registrar", found: Found, cameras: Tensor) -> Regi
     total, mean = weights @ answer.scores, torch.einsum("v,vmk->mk", weights / weights.sum(), answer.evidence)
     shares = [p.result.confidence_features["concentration"] for p in rig.photographs]
     known = torch.tensor([torch.nan if share is None else share for share in shares]).double()
-    features = confidence_features(mean, total, float(weights @ known / weights.sum()))
+    features = confidence_features(mean, total, float(known.nanmean()))
+    if len(total) == 1 and len(rig.photographs) > 1:  # the hypotheses of all photographs led to the same pose
+        features["margin"] = MAX_MARGIN
     count, probabilities = registrar.pipeline.hypotheses, first.result.probabilities
     if is_calibrated(registrar.pipeline) and len(rig.photographs) + len(lost) > 1:
         confidence = probabilities[0]
@@ -149,7 +158,10 @@ def _registration(registrar: "Registrar", found: Found, cameras: Tensor) -> Regi
                 1.0 if p.result.localization is None else p.result.localization.presence for p in rig.photographs
             ]
             confidence = max(presence) * registration_confidence(features, exact=rig.exact)
-        confidence = _contradicted(confidence, [p.result.confidence for p in every.photographs if p.index in lost])
+        against = [
+            p for p in every.photographs if p.index in lost and rig.angles(p.poses[:1], answer.T[:1]) > RIVAL_ANGLE
+        ]
+        confidence = _contradicted(confidence, [p.result.confidence for p in against])
         probabilities = hypothesis_probabilities(confidence, total, exact=rig.exact)[:count]
     margins = weights * (answer.scores[:, 0] - answer.scores[:, min(1, len(total) - 1)])
     contributions = dict(zip([p.index for p in rig.photographs], margins.tolist(), strict=True))
