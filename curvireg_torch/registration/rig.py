@@ -59,7 +59,7 @@ MAX_PLACE_DISTANCE = 16.0
 MIN_OVERLAP = 0.3
 """Overlap (IoU) with the box of a photograph below which a pose lies elsewhere."""
 
-SAME_DIRECTION = 10.0
+SAME_DIRECTION = 30.0
 """Degrees within which two photographs show partly the same; the weights of equal ones add up to one."""
 
 MIN_PARALLAX, MAX_UNIT_FACTOR = 0.03, 30.0
