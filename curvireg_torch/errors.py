@@ -108,4 +108,3 @@ MAX_VIEWER_PAGES = 8
 MAX_VIEWER_BYTES = 1 << 30  #: Bytes of the files of a page of the viewer, those on their way included
 MAX_VIEWER_UPLOADS = 8  #: Files that a page of the viewer receives at a time
 MAX_ARCHIVE_FILES = 1000  #: Files in a zip archive with a mesh and its parts
-MAX_VIEWER_SECONDS = 600.0  #: Time limit of a registration in the viewer

@@ -12,8 +12,7 @@ __all__ = ["BoxDrawing", "PoseDrag"]
 
 Box = tuple[float, float, float, float]
 
-MIN_SIDE = 3.0
-"""Pixels of a new box; a smaller one was a click."""
+MIN_SIDE = 3.0  # px of a new box; a smaller one was a click
 
 
 @dataclass
@@ -113,21 +112,15 @@ def _near_edge(at: float, low: float, high: float, reach: float, index: int) -> 
 
 
 class PoseDrag:
-    """A pose as the mouse, fingers and keys change it.
-
-    Args:
-        result: with the object that is moved.
-        T: (4, 4) ``T_cam_from_model`` to begin with.
-        K: (3, 3) camera matrix of the photograph.
-    """
+    """A pose as the mouse, fingers and keys change it, from (4, 4) ``T`` before a camera (3, 3) ``K``."""
 
     def __init__(self, result: Result, T: Tensor, K: Tensor) -> None:
         self.result, self.T, self.focal = result, T, float(K[0, 0])
-        self._start: tuple[Tensor, float, float, bool] | None = None
+        self._start: tuple[Tensor, float, float, bool] | None = None  # pose, pixel, whether it turns
 
     @property
     def active(self) -> bool:
-        """Whether a button or a finger is down."""
+        """Whether it is being dragged."""
         return self._start is not None
 
     def press(self, x: float, y: float, *, turns: bool) -> None:
@@ -139,8 +132,9 @@ class PoseDrag:
         if self._start is None:
             return
         T, x0, y0, turns = self._start
-        depth, radius = self._depth(T), self.result.registrar.describer.radius
-        radii = depth / self.focal / radius  # that one pixel is long
+        describer = self.result.registrar.describer
+        depth = float((T[:3, :3] @ describer.centre + T[:3, 3])[2])
+        radii = depth / self.focal / describer.radius  # that one pixel is long
         dx, dy = (x - x0) * radii, (y - y0) * radii
         if max(abs(x - x0), abs(y - y0)) < 1.0:  # a click
             self.T = T
@@ -162,6 +156,3 @@ class PoseDrag:
     def move(self, *, rotation: Sequence[float] = (0, 0, 0), translation: Sequence[float] = (0, 0, 0)) -> None:
         """Turn by degrees about the camera's axes, and move by radii of the object along them."""
         self.T = self.result.moved(self.T, rotation, translation)
-
-    def _depth(self, T: Tensor) -> float:
-        return float((T[:3, :3] @ self.result.registrar.describer.centre + T[:3, 3])[2])

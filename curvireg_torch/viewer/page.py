@@ -1,21 +1,20 @@
 """The page: the photograph, and beside it three steps, the answers and the inputs."""
 
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from nicegui import ui
 
-from .side import Answers, Inputs
+from .side import Answers, Inputs, Preview
 from .stage import Stage
 from .widgets import button, file_chooser, region, set_enabled, set_text, text
 from .workspace import Workspace
 
 __all__ = ["Page", "Steps", "add_assets"]
 
-TICK_SECONDS = 0.15
-"""Between two looks at what changed."""
-
+TICK_SECONDS = 0.15  # between two looks at what changed
 STAGES: Mapping[str, str] = {
     "bank": "rendering views of the mesh",
     "localization": "looking for the object in the photograph",
@@ -53,6 +52,7 @@ class Page:
             with region("div", "side"):
                 self.steps = Steps(self.workspace)
                 self.answers = Answers(self.workspace)
+                self.preview = Preview(self.workspace)
                 self.inputs = Inputs(self.workspace)
         ui.timer(TICK_SECONDS, self._refresh)
 
@@ -65,6 +65,7 @@ class Page:
             self.inputs.refresh()
             await self.stage.refresh()
             await self.answers.refresh()
+            await self.preview.refresh()
         finally:
             self._busy = False
 
@@ -87,6 +88,8 @@ class Steps:
                     else:
                         file_chooser("Choose files", f"upload-{name}")
                         self.messages[name] = self._message(name)
+                    if name == "mesh":
+                        self.use_mm = button("Use mm", lambda: workspace.set_option("unit", "mm"), "use-mm", "quiet")
         self.messages["file"] = self._message("file")
         with region("div", "go"):
             self.find = button("Find the pose", self._find, "register", "primary")
@@ -94,7 +97,7 @@ class Steps:
             self.bar = region("progress", "", max="1", value="0", aria_label="progress of the search")
             self.stage = text("p", "", "stage", data_testid="progress", role="status")
             self.seconds = text("p", "", "stage", data_testid="seconds")
-        self.messages["pose"] = self._message("pose")
+        self.messages |= {part: self._message(part) for part in ("pose", "page")}
 
     def _message(self, part: str) -> Any:
         return text("p", "", "message", data_testid=f"message-{part}", role="alert")
@@ -117,6 +120,7 @@ class Steps:
         set_text(self.facts["mesh"], self._describe_mesh())
         set_text(self.facts["box"], BOX_HINT if session.box is None else " ".join(f"{v:g}" for v in session.box))
         self.no_box.set_visibility(session.box is not None)
+        self.use_mm.set_visibility("(mm?)" in workspace.messages.get("mesh", "") and session.options.unit != "mm")
         set_text(self.find, "Find the pose" if session.box or session.photo is None else "Find the object and its pose")
         set_enabled(self.find, bool(done["photograph"] and done["mesh"]) and not workspace.searching)
         self._show_progress()
@@ -150,10 +154,10 @@ class Steps:
         elif workspace.receiving:
             words = f"receiving {', '.join(workspace.receiving.values())}"
         elif session.result is not None:
-            changed = session.result.command != session.command()
+            changed = session.result.request != session.request()
             share, words = 1.0, "the inputs have changed since this answer" if changed else "done"
         self.stop.set_visibility(workspace.searching)
         self.bar.set_visibility(workspace.searching)
         self.bar.props(f"value={share:.3f}")
         set_text(self.stage, words)
-        set_text(self.seconds, f"{workspace.seconds:.0f} s" if workspace.searching else "")
+        set_text(self.seconds, f"{time.monotonic() - workspace.started:.0f} s" if workspace.searching else "")

@@ -1,8 +1,6 @@
 """The server of the viewer: its secret address, what it refuses, its pages, their files and uploads."""
 
 import errno
-import ipaddress
-import os
 import re
 import secrets
 import socket
@@ -32,11 +30,8 @@ from .workspace import Workspaces, file_name, show_warning
 
 __all__ = ["SECURITY_HEADERS", "guarded", "listen", "serve"]
 
-RECONNECT_SECONDS = 5.0
-"""How long a page may be away; a reload takes less. The work is kept longer."""
-
-CONNECT_SECONDS = 20.0
-"""How long a request may take to become a page."""
+RECONNECT_SECONDS = 5.0  # that a page may be away; a reload takes less. The work is kept longer
+CONNECT_SECONDS = 20.0  # that a request may take to become a page
 
 SECURITY_HEADERS = {
     # Vue compiles templates in the browser, which takes "unsafe-eval"; NiceGUI's scripts are inline and have no nonce.
@@ -52,12 +47,9 @@ SECURITY_HEADERS = {
 """Of every answer."""
 
 _LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
+_EVERYONE = ("0.0.0.0", "::")
 _PAGE_NAME = re.compile(r"[-\w]{16}")  # of token_urlsafe
 _NAME_BYTES = 12
-_ICON = (
-    "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 16 16'><path d='M8 1l6 3.5v7L8 15l-6-3.5v-7z' "
-    "fill='none' stroke='#0a7d3c' stroke-width='2'/></svg>"
-)
 
 
 def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> None:
@@ -77,7 +69,7 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
             site,
             mount_path=prefix,
             title="curvireg",
-            favicon=_ICON,
+            favicon="📐",
             language="en-US",
             dark=None,
             tailwind=False,
@@ -88,9 +80,7 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
         addresses = [f"http://{name}{prefix}/" for name in public_addresses(host, listener.getsockname()[1])]
         print(f"curvireg: {addresses[0]}   (Ctrl-C ends it)", flush=True)
         if host not in _LOOPBACK:
-            print(
-                "curvireg: everyone who can reach this machine and has this address can use the page", file=sys.stderr
-            )
+            print("curvireg: everyone who reaches this machine with this address can use the page", file=sys.stderr)
         if browser:
             threading.Timer(0.5, webbrowser.open, (addresses[-1],)).start()
         with one_torch_thread(), warnings.catch_warnings():
@@ -102,21 +92,11 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
 def listen(host: str, port: int) -> socket.socket:
     """A socket that listens on a host and a port, 0 for a free one."""
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        listener = socket.socket(family, kind, protocol)
+        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except OSError as error:
-        raise InvalidInputError(f"--host {host}: {error.strerror}") from None
-    try:
-        if os.name == "posix":
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(address)
-        listener.listen()
-    except OSError as error:
-        listener.close()
         if error.errno == errno.EADDRINUSE:
             raise InvalidInputError(f"--port {port}: in use by another program; leave it out for a free one") from None
         raise InvalidInputError(f"--host {host} --port {port}: {error.strerror}") from None
-    return listener
 
 
 def public_addresses(host: str, port: int) -> list[str]:
@@ -126,23 +106,9 @@ def public_addresses(host: str, port: int) -> list[str]:
         >>> public_addresses("::1", 8080)
         ['[::1]:8080']
     """
-    if not _is_everyone(host):
+    if host not in _EVERYONE:
         return [f"[{host}]:{port}" if ":" in host else f"{host}:{port}"]
-    names = ["127.0.0.1"]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # an address for documentation; a datagram socket only chooses the route
-            names.insert(0, probe.getsockname()[0])
-        except OSError:  # no network
-            pass
-    return [f"{name}:{port}" for name in dict.fromkeys(names)]
-
-
-def _is_everyone(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_unspecified
-    except ValueError:
-        return False
+    return [f"{socket.gethostname()}:{port}", f"127.0.0.1:{port}"]
 
 
 def guarded(site: ASGIApp, host: str) -> ASGIApp:
@@ -151,7 +117,7 @@ def guarded(site: ASGIApp, host: str) -> ASGIApp:
     A browser that is led here by another site's name (DNS rebinding) sends that name as Host, which must be that of
     ``host``; anything goes if everyone may connect. A script of another site sends its own Origin.
     """
-    names = ["*"] if _is_everyone(host) else list(_LOOPBACK) if host in _LOOPBACK else [host.lower()]
+    names = ["*"] if host in _EVERYONE else list(_LOOPBACK) if host in _LOOPBACK else [host.lower()]
     trusted = TrustedHostMiddleware(site, names, www_redirect=False)
     own_headers = [(name.encode(), value.encode()) for name, value in SECURITY_HEADERS.items()]
     replaced = {b"server", *(name for name, _ in own_headers)}

@@ -3,26 +3,28 @@
 import math
 import shlex
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+import trimesh
 from torch import Tensor
 
 from ..data import read_photo
 from ..data.images import Photo
-from ..errors import MAX_VIEWER_SECONDS, CurviregError, CurviregWarning, InvalidInputError
+from ..errors import CurviregError, CurviregWarning, InvalidInputError
 from ..evaluation.opening import RegisterOptions, check_camera, open_registrar
 from ..evaluation.prior_options import QUALIFIERS
 from ..evaluation.runner import register_entry
-from ..evaluation.store import to_json
 from ..geometry import rotation_error, rotation_from_axis_angle
-from ..geometry.cameras import rotation_towards
+from ..geometry.cameras import rotation_towards, transform
+from ..geometry.pose_prior import object_frame
+from ..geometry.viewpoint import viewpoint_from_rotation
 from ..matching import ViewBank
-from ..mesh import has_colours, load_mesh
+from ..mesh import has_colours, load_mesh, mesh_centre, mesh_radius, mesh_up
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
 from ..registration.result import used_box
 from ..utils.choices import DEFAULT
@@ -31,11 +33,9 @@ from ..visualization.encoding import png
 
 __all__ = ["Answer", "Result", "Session"]
 
-MAX_PROPOSALS = 5
-"""Proposed boxes that are drawn where the object was localized."""
-
-NEAREST = 1.2
-"""Least depth of the object's centre in its radii to which it can be moved by hand."""
+HINT_WIDTH = 45.0  # degrees by which the pose may differ from a hint
+PREVIEW_DEPTH = 2.0  # radii by which the mesh of a preview is below the origin: its format knows what is in view
+NEAREST = 1.2  # least depth of the object's centre, in its radii, to which it can be moved by hand
 
 Numbers = tuple[float, float, float, float]
 
@@ -45,13 +45,7 @@ _DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
 
 @dataclass(frozen=True)
 class Answer:
-    """The pose that is shown and saved.
-
-    Attributes:
-        pose: the hypothesis, or where it was moved to by hand.
-        number: of the hypothesis, from 0.
-        edits: what was done to it by hand, in words.
-    """
+    """The pose that is shown and saved: a hypothesis, its number from 0, and what was done to it by hand, in words."""
 
     pose: Hypothesis
     number: int = 0
@@ -96,17 +90,11 @@ class Result:
     image: Tensor  # (3, H, W) uint8
     box: Tensor  # (4,) px, with which the pose was found
     request: RegisterOptions  # what was asked for
-    command: str  # gives the same result
 
     def moved(
         self, T: Tensor, rotation: Sequence[float] = (0, 0, 0), translation: Sequence[float] = (0, 0, 0)
     ) -> Tensor:
-        """Return the (4, 4) pose ``T``, turned about the object's centre and moved.
-
-        Args:
-            T: ``T_cam_from_model``.
-            rotation: degrees about the camera's x, y and z axes.
-            translation: along them, in radii of the object.
+        """Return the (4, 4) pose ``T``, turned by degrees about the camera's axes and moved along them by radii.
 
         Raises:
             InvalidInputError: the object would touch the camera.
@@ -129,27 +117,29 @@ class Session:
     Attributes:
         options: of ``curvireg view``; replace them to change unit, up, pose or preset, call ``set_limits`` for limits.
         names: what the user calls the files, for messages and the command line.
-        box, camera, fov: as ``--box``, ``--camera`` and ``--fov``, or None; a camera takes precedence over ``fov``.
+        box, camera: as ``--box`` and ``--camera``, or None.
+        guess: of an unknown camera: "exif", or the horizontal field of view in degrees; None: no camera.
         result, answer: the last result and its chosen pose, or None.
-        limit: seconds after which a registration is cancelled.
+        answer_before: the answer before the last change by hand, or None.
         progress: stage, done and total.
+        cancelled: set it to end a registration at its next step.
     """
 
     options: RegisterOptions
     photo_path: Path | None = None
     mesh_path: Path | None = None
+    mesh: trimesh.Trimesh | None = None
     names: dict[Path, str] = field(default_factory=dict)
     photo: Photo | None = None
     box: Numbers | None = None
     camera: Numbers | None = None
-    fov: float | None = None
+    guess: str | float | None = None
     result: Result | None = None
     answer: Answer | None = None
-    limit: float = MAX_VIEWER_SECONDS
     progress: tuple[str, int, int] = ("", 0, 1)
     cancelled: bool = False
     _registrar: tuple[RegisterOptions, Registrar] | None = None
-    _answer_before: Answer | None = None
+    answer_before: Answer | None = None
 
     def load(self) -> str:
         """Open the files that the options name, and take their box and camera; describes the mesh, or ""."""
@@ -158,9 +148,13 @@ class Session:
         for path in options.photos:
             self.open_photo(path)
         facts = "".join([self.open_mesh(path) for path in options.meshes])
-        self.box, self.camera = options.box, options.camera
-        self.fov = options.guess if isinstance(options.guess, float) else None
+        self.box, self.camera, self.guess = options.box, options.camera, options.guess
         return facts
+
+    def close(self) -> None:
+        """Forget the photograph, the mesh, and what belongs to them."""
+        self.photo_path = self.photo = self.mesh_path = self.mesh = self.box = self.camera = self.guess = None
+        self.result = self.answer = None
 
     def open_photo(self, path: Path, name: str | None = None) -> Photo:
         """Read a photograph; it removes box, camera and result of the one before."""
@@ -168,7 +162,7 @@ class Session:
         with self._user_names():
             photo = read_photo(path, dtype=torch.uint8)
         if self.photo is not None:  # those of the command line are meant for the first
-            self.box = self.camera = self.fov = None
+            self.box = self.camera = self.guess = None
         self.photo_path, self.photo, self.result, self.answer = path, photo, None, None
         return photo
 
@@ -177,35 +171,59 @@ class Session:
         self.names[path] = name or str(path)
         with self._user_names():
             if path.suffix == ".safetensors":
-                facts = f"bank of {len(ViewBank.load(path))} views"
+                bank = ViewBank.load(path)
+                mesh, facts = bank.mesh, f"bank of {len(bank)} views"
             else:
                 mesh = load_mesh(path, unit=self.options.unit, up=self.options.up)
                 size = " x ".join(f"{v:.4g}" for v in mesh.extents)
                 colours = "in its colours" if has_colours(mesh) else "in grey"
                 facts = f"{len(mesh.faces):,} faces, {size} {self.options.unit}, rendered {colours}"
-        self.mesh_path = path
-        self.result = self.answer = None
+        self.mesh_path, self.mesh, self.result, self.answer = path, mesh, None, None
         return facts
 
-    def exif_camera(self) -> Numbers | None:
-        """FX FY CX CY from the focal length in the photograph's EXIF block, to 0.01 px; None without one."""
-        K = None if self.photo is None else self.photo.guessed_camera_matrix()
-        if K is None:
-            return None
-        fx, fy, cx, cy = (round(float(K[i, j]), 2) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        return fx, fy, cx, cy
-
     @property
-    def guess(self) -> str | float | None:
-        """How the camera is guessed: "exif", or the field of view in degrees; None if it is given or unknown."""
-        if self.camera is None:
-            return self.fov
-        return "exif" if self.camera == self.exif_camera() else None
+    def has_exif(self) -> bool:
+        """Whether the photograph's file tells the focal length."""
+        return self.photo is not None and self.photo.guessed_camera_matrix() is not None
 
     def set_limits(self, **limits: Any) -> None:
         """Change what is known of the pose: arguments of :class:`PosePrior`; None removes a limit."""
         known = {**(self.options.limits or {}), **limits}
         self.options = replace(self.options, limits={n: value for n, value in known.items() if value is not None})
+
+    def remove_limits(self) -> None:
+        """Forget what was known of the pose, but not which side of the mesh is its front."""
+        self.set_limits(**{name: None for name in self.options.limits or {} if name != "front"})
+
+    def object_frame(self) -> Tensor:
+        """(3, 3) rotation from the mesh's axes to those of limits, see :func:`.object_frame`."""
+        assert self.mesh is not None
+        return object_frame(mesh_up(self.mesh), (self.options.limits or {}).get("front"))
+
+    def hint_direction(self, position: Sequence[float]) -> None:
+        """Limit the pose to views like that from a point beside the object, in the frame of limits, z up."""
+        forward = -torch.tensor(list(position), dtype=torch.float64)
+        right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+        R = torch.nn.functional.normalize(torch.stack([right, torch.linalg.cross(forward, right), forward]), dim=1)
+        azimuth, elevation, _ = (round(float(v), 1) for v in viewpoint_from_rotation(R))
+        self.remove_limits()
+        self.set_limits(viewpoint=(azimuth % 360.0, elevation, 0.0), within=HINT_WIDTH)
+
+    def mesh_axis(self, position: Sequence[float]) -> str:
+        """The mesh's axis that points to a point on its surface, in the frame of limits about the object's centre."""
+        x, y, z = (self.object_frame().mT @ torch.tensor(list(position), dtype=torch.float64)).tolist()
+        value, name = max(((abs(v), v), axis) for v, axis in zip((x, y, z), "xyz", strict=True))
+        return name if value[1] > 0 else f"-{name}"
+
+    def preview(self) -> bytes:
+        """The mesh as a GLB file, in the frame of limits and its radii; :data:`PREVIEW_DEPTH` below the origin."""
+        assert self.mesh is not None
+        frame, radius = self.object_frame(), mesh_radius(self.mesh)
+        T = transform(frame, -frame @ mesh_centre(self.mesh))
+        T = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)) @ T  # back from glTF's axes
+        T[2, 3] += PREVIEW_DEPTH * radius
+        K = torch.tensor([[8.0, 0.0, 3.5], [0.0, 8.0, 3.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+        return pose_glb(self.mesh, T, K, torch.zeros(3, 8, 8), photograph=False)
 
     def request(self) -> RegisterOptions:
         """The registration that the inputs describe."""
@@ -214,7 +232,7 @@ class Session:
             photos=() if self.photo_path is None else (self.photo_path,),
             meshes=() if self.mesh_path is None else (self.mesh_path,),
             box=self.box,
-            camera=None if self.guess == "exif" else self.camera,
+            camera=self.camera,
             guess=self.guess,
         )
 
@@ -232,26 +250,22 @@ class Session:
         if photo is None or not request.meshes:
             raise InvalidInputError("register: choose a photograph and a mesh first")
         check_camera(request.camera, request.guess)
-        report_progress = self._progress_callback(start)
         names = {path: Path(name) for path, name in self.names.items()}
         try:
             with self._user_names():
-                registrar = self._open_registrar(request.meshes[0], report_progress)
-                registrar.progress = report_progress
+                registrar = self._open_registrar(request.meshes[0])
+                registrar.progress = self._report_progress
                 entry = request.entry(request.photos[0])
                 entry = replace(entry, name=self.names[entry.photo], meshes=tuple(names[p] for p in entry.meshes))
                 ready = time.perf_counter() - start
                 registration, document = register_entry(entry, photo, registrar, bank_seconds=ready)
-            if self.cancelled:  # too late for the last step
-                raise CurviregError("stopped")
-        except CurviregError:
-            if self.cancelled:
-                raise CurviregError("stopped") from None
-            raise
+            self._report_progress("contours", 1, 1)  # it may have been stopped in the last step
+        except CurviregError as error:
+            raise (CurviregError("stopped") if self.cancelled else error) from None
         finally:
             self.cancelled = False
-        box, command = torch.tensor(used_box(document)), _command_line(request, self.names)
-        self.result = Result(registrar, registration, document, photo.image, box, request, command)
+        box = torch.tensor(used_box(document))
+        self.result = Result(registrar, registration, document, photo.image, box, request)
         self.choose(0)
         return registration
 
@@ -261,15 +275,10 @@ class Session:
             raise InvalidInputError("there is no result yet; register first")
         return self.result, self.answer
 
-    def proposals(self) -> list[list[float]]:
-        """The best boxes of the localization, the chosen one first; empty if the box was given."""
-        localization = {} if self.result is None else self.result.document.get("localization", {})
-        return [proposal["box"] for proposal in localization.get("proposals", [])[:MAX_PROPOSALS]]
-
     def choose(self, number: int) -> None:
         """Make a hypothesis the answer, by its number from 0."""
         assert self.result is not None
-        self._answer_before = None
+        self.answer_before = None
         self.answer = Answer(self.result.registration.hypotheses[number], number)
 
     def place(self, T: Tensor, edit: str = "") -> None:
@@ -280,7 +289,7 @@ class Session:
         centres = [pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (before, T)]
         radii = float(torch.linalg.vector_norm(centres[1] - centres[0])) / describer.radius
         edit = f"{edit or 'moved'}: rotated {degrees:.1f} degrees, shifted {radii:.2f} radii"
-        self._answer_before, self.answer = answer, answer.placed(describer.centre, T, edit)
+        self.answer_before, self.answer = answer, answer.placed(describer.centre, T, edit)
 
     def fit(self) -> None:
         """Fit the contours at the answer to the photograph's edges."""
@@ -292,15 +301,10 @@ class Session:
         supports = f"{float(fit.start_support[0]):.2f} to {float(fit.edge_support[0]):.2f}"
         self.place(fit.transform[0], f"contours fitted, edge support {supports}")
 
-    @property
-    def can_undo(self) -> bool:
-        """Whether :meth:`undo` changes the answer."""
-        return self.answer is not None and self._answer_before is not None
-
     def undo(self) -> None:
         """Take back the last change by hand; a second call repeats it."""
-        if self.can_undo:
-            self.answer, self._answer_before = self._answer_before, self.answer
+        if self.answer_before is not None:
+            self.answer, self.answer_before = self.answer_before, self.answer
 
     def document(self) -> dict[str, Any]:
         """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done by hand."""
@@ -315,11 +319,7 @@ class Session:
                 first = {**first, "confidence": registration.confidence, **answer.pose.pose_dict()}
                 document["localization"] = {**document["localization"], "instances": [first, *others]}
         by_hand = {"hypothesis": answer.number, "by_hand": list(answer.edits)}
-        return {**document, "viewer": {"command": result.command, **by_hand}}
-
-    def json(self) -> bytes:
-        """:meth:`document` as a file."""
-        return to_json(self.document()).encode()
+        return {**document, "viewer": {"command": _command_line(result.request, self.names), **by_hand}}
 
     def python(self) -> str:
         """A Python program that gives the answer."""
@@ -359,34 +359,22 @@ class Session:
         result, answer = self.require_result()
         return png(contour_overlay(result.registrar, answer.pose, result.image, result.box))
 
-    def cancel(self) -> None:
-        """End the registration at its next step."""
-        self.cancelled = True
-
     def describe_warning(self, warning: Warning) -> str:
         """The text of a warning, with the user's name of its file."""
         if isinstance(warning, CurviregWarning):
             warning = warning.with_subject(self.names.get(Path(warning.subject), warning.subject))
         return str(warning)
 
-    def _progress_callback(self, start: float) -> Callable[[str, int, int], None]:
-        def report_progress(stage: str, done: int, total: int) -> None:
-            self.progress = (stage, done, total)
-            if self.cancelled:
-                raise CurviregError("stopped")
-            if time.perf_counter() - start > self.limit:
-                raise CurviregError(
-                    f"stopped after {self.limit:g} s in the stage {stage!r}; "
-                    "use a simpler mesh, the pose prior upright, or the command line, which has no limit"
-                )
+    def _report_progress(self, stage: str, done: int, total: int) -> None:
+        self.progress = (stage, done, total)
+        if self.cancelled:
+            raise CurviregError("stopped")
 
-        return report_progress
-
-    def _open_registrar(self, mesh: Path, report_progress: Callable[[str, int, int], None]) -> Registrar:
+    def _open_registrar(self, mesh: Path) -> Registrar:
         """The registrar of a mesh and the present options; the last one is reused."""
         key = replace(self.options, meshes=(mesh,), limits=None)
         if self._registrar is None or self._registrar[0] != key:
-            self._registrar = key, open_registrar(key, key.meshes, progress=report_progress)
+            self._registrar = key, open_registrar(key, key.meshes, progress=self._report_progress)
         return self._registrar[1]
 
     @contextmanager
@@ -403,30 +391,23 @@ def _command_line(options: RegisterOptions, names: Mapping[Path, str]) -> str:
     words = ["curvireg", "register"]
     for paths, placeholder in ((options.photos, "PHOTO"), (options.meshes, "MESH")):
         words += [names[path] for path in paths] or [placeholder]
-    for name, numbers in (("--box", options.box), ("--camera", options.camera)):
-        words += [] if numbers is None else [name, *map(_number, numbers)]
-    if isinstance(options.guess, float):
-        words += ["--fov", _number(options.guess)]
-    elif options.guess is not None:
-        words += ["--camera", options.guess]
-    words += _limit_words(options.limits or {})
-    for name in _OPTIONS:
-        value, option = getattr(options, name), name.replace("_", "-")
-        if value != _DEFAULTS[name]:
-            words += [f"--{option}={value}"] if str(value).startswith("-") else [f"--{option}", str(value)]
+    limits = {} if options.limits is None or not options.limits.keys() - QUALIFIERS else dict(options.limits)
+    values: dict[str, Any] = {
+        "box": options.box,
+        "camera": "exif" if options.guess == "exif" else options.camera,
+        "fov": None if options.guess == "exif" else options.guess,
+        **{"near" if name == "viewpoint" else name: value for name, value in limits.items()},
+        **{name.replace("_", "-"): v for name in _OPTIONS if (v := getattr(options, name)) != _DEFAULTS[name]},
+    }
+    for name, value in values.items():
+        if value is not None:
+            texts = [v if isinstance(v, str) else _number(v) for v in (value if isinstance(value, tuple) else (value,))]
+            words += [f"--{name}={value}"] if isinstance(value, str) and value[0] == "-" else [f"--{name}", *texts]
     return shlex.join([*words, "--out", "result"])
 
 
-def _limit_words(limits: Mapping[str, Any]) -> list[str]:
-    words: list[str] = []
-    for name, value in limits.items() if limits.keys() - QUALIFIERS else ():
-        if isinstance(value, str):
-            words.append(f"--{name}={value}")
-        else:
-            numbers = value if isinstance(value, tuple) else (value,)
-            words += ["--near" if name == "viewpoint" else f"--{name}", *map(_number, numbers)]
-    return words
-
-
-def _number(value: float) -> str:
+def _number(value: Any) -> str:
+    """A path, or a number without needless digits."""
+    if isinstance(value, Path):
+        return str(value)
     return repr(int(value)) if math.isfinite(value) and value == int(value) else repr(float(value))

@@ -1,21 +1,23 @@
-"""The column beside the photograph: the answers to choose from, and all inputs besides the files and a drawn box."""
+"""The column beside the photograph: the answers to choose from, the model, and the inputs besides files and box."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
 from nicegui import ui
 
+from ..errors import MAX_VIEWER_FACES
+from ..evaluation.store import to_json
 from ..geometry import rotation_error
-from ..geometry.pose_prior import SIDES, PosePrior
-from ..mesh import mesh_unit, mesh_up
+from ..mesh import mesh_radius, mesh_unit, mesh_up
 from ..registration.result import pose_in_words, remarks, verdict
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
+from .session import PREVIEW_DEPTH
 from .widgets import button, fold, region, set_text, text
 from .workspace import Workspace
 
-__all__ = ["Answers", "Inputs"]
+__all__ = ["Answers", "Inputs", "Preview"]
 
 DOWNLOADS = {
     "picture": ("overlay.png", "image/png"),
@@ -29,9 +31,7 @@ VERDICTS = {
     "by hand": "You set this pose. How probable it is, nobody has measured.",
 }
 PROBABILITY = "estimated probability that this answer is within 30 degrees of the truth"
-RANGES = ("azimuth", "elevation")
 AXES: Mapping[str | None, str] = {None: "as the format says", **{axis: axis for axis in UP_AXES}}
-FRONTS: Mapping[str | None, str] = {None: "default", **{axis: axis for axis in UP_AXES}}
 POSES: Mapping[str | None, str] = {None: "default", "any": "any", "upright": "upright"}
 PRESETS: Mapping[str | None, str] = {None: "default", **{name: name for name in PRESET_NAMES}}
 
@@ -52,12 +52,17 @@ class Answers:
                         button(name, lambda name=name: self._download(name), f"download-{name}", "quiet")
                     text("button", "copy as Python", "button quiet", type="button", data_copy="python")
                 self.meaning = text("p", "", "facts")
+                self.repairs = region("div", "row", data_testid="repairs")
             self.cards = region("div", "cards", data_testid="panel-answer", role="group", aria_label="possible answers")
             self.facts = text("p", "", "lines", data_testid="facts")
 
     async def _download(self, kind: str) -> None:
         name, media_type = DOWNLOADS[kind]
-        make = {"picture": self.session.overlay, "result.json": self.session.json, "pose.glb": self.session.glb}[kind]
+        make = {
+            "picture": self.session.overlay,
+            "result.json": lambda: to_json(self.session.document()).encode(),
+            "pose.glb": self.session.glb,
+        }[kind]
         if content := await self.workspace.run("pose", make):
             ui.download.from_url(self.workspace.serve(name, content, media_type), name)
 
@@ -97,6 +102,30 @@ class Answers:
         lines += [f"{name} {value:.2f}" for name, value in numbers.items() if value is not None and value == value]
         lines += [*document["warnings"], *remarks(document), *answer.edits]
         set_text(self.facts, "\n".join(lines))
+        self.repairs.clear()
+        with self.repairs:
+            for label, repair in self._repairs(document, word).items():
+                button(label, repair, label.lower().replace(" ", "-"))
+
+    def _repairs(self, document: Mapping[str, Any], word: str) -> dict[str, Callable[[], None]]:
+        """What one click can do about what the page says of the answer."""
+        session, box, found = self.session, document["corrected_box"], dict[str, Callable[[], None]]()
+
+        def search_with(**inputs: Any) -> None:
+            for name, value in inputs.items():
+                setattr(session, name, value)
+            self.workspace.start_search()
+
+        if document.get("prior", {}).get("contradiction") is not None:
+            front = {name: value for name, value in (session.options.limits or {}).items() if name == "front"}
+            found["Search without the hint"] = lambda: search_with(options=replace(session.options, limits=front))
+        if box is not None:
+            found["Search with that box"] = lambda: search_with(box=tuple(round(v, 1) for v in box))
+        if session.camera is None and session.guess is None and session.has_exif:
+            found["Search with the photograph's EXIF camera"] = lambda: search_with(guess="exif")
+        if word == "no match":
+            found["Draw the box again"] = lambda: setattr(session, "box", None)
+        return found
 
     async def _draw_cards(self) -> None:
         result, _ = self.session.require_result()
@@ -107,9 +136,9 @@ class Answers:
             box = result.box.tolist()
             return [thumbnail(renderer, pose.projection, result.image, box) for pose in hypotheses]
 
-        pictures = await self.workspace.run("pose", make)
+        pictures = await self.workspace.run("page", make) or ()
         self.cards.clear()
-        for number, (pose, picture) in enumerate(zip(hypotheses, pictures or [], strict=True)):
+        for number, (pose, picture) in enumerate(zip(hypotheses, pictures, strict=False)):
             degrees = float(rotation_error(pose.rotation, hypotheses[0].rotation))
             url = self.workspace.serve(f"answer-{number}.jpeg", picture, "image/jpeg")
             card = region("button", "card", type="button", data_testid=f"answer-{number + 1}")
@@ -136,16 +165,12 @@ class Inputs:
             self._select("preset", "method", PRESETS)
         with fold("Camera", "camera"):
             text("p", "With it the position is found, not only the rotation.", "facts")
-            self.camera = self._numbers("camera-", ("fx", "fy", "cx", "cy"), self._camera_typed)
+            with region("div", "numbers"):
+                names = ("fx", "fy", "cx", "cy")
+                self.camera = [self._number(f"camera-{name}", name, self._camera_typed) for name in names]
             self.fov = self._number("fov", "or the horizontal field of view, degrees", self._fov_typed)
             self.camera_facts = text("p", "", "facts", data_testid="camera-facts")
-            with region("div", "row"):
-                button("No camera", lambda: self._set_camera(None), "no-camera", "quiet")
-                self.exif = button(
-                    "Guess from EXIF", lambda: self._set_camera(self.session.exif_camera()), "exif", "quiet"
-                )
-        with fold("What is known about the pose", "known"):
-            self._build_known()
+            self.exif = button("Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet")
         with fold("The same on the command line, and in Python", "command-line"):
             self.command = self._copied("command")
             self.python = self._copied("python")
@@ -155,94 +180,133 @@ class Inputs:
         text("button", "Copy", "button quiet", type="button", data_copy=name)
         return element
 
-    def _build_known(self) -> None:
-        text("p", "Seen from its", "facts")
-        with region("div", "row"):
-            for name in SIDES:
-                limits = {"azimuth": PosePrior.side(name).azimuth}
-                button(name, lambda limits=limits: self.session.set_limits(**limits), f"known-{name}", "quiet")
-            nothing = dict.fromkeys(RANGES)
-            button("anything", lambda: self.session.set_limits(**nothing), "known-anything", "quiet")
-        text("p", "or within these degrees", "facts")
-        names = [f"{name}-{end}" for name in RANGES for end in ("low", "high")]
-        self.known = self._numbers("", names, self._known_typed)
-        self.front = ui.select(dict(FRONTS), label="front of the mesh")
-        self.front.on_value_change(
-            lambda event: self._unless_showing(lambda: self.session.set_limits(front=event.value))
-        )
-        self.front.props("dense options-dense data-testid=front")
-
     def _select(self, name: str, label: str, choices: Mapping[Any, str]) -> None:
         async def changed(event: Any) -> None:
             if self._showing:
                 return
-            self.session.options = replace(self.session.options, **{name: event.value})
-            path = self.session.mesh_path
-            if name in ("unit", "up") and path is not None:
-                await self.workspace.open_mesh(path, self.session.names[path])
+            await self.workspace.set_option(name, event.value)
 
         value = getattr(self.session.options, name)
         select = ui.select(dict(choices), value=value, label=label, on_change=changed)
         self.selects[name] = select.props(f"dense options-dense data-testid={name}")
 
     def _number(self, test_id: str, label: str, on_change: Callable[[], None]) -> Any:
-        field = ui.number(label, on_change=lambda: self._unless_showing(on_change))
-        return field.props(f"dense data-testid={test_id}")
+        def changed() -> None:
+            if not self._showing:
+                on_change()
 
-    def _numbers(self, prefix: str, names: Sequence[str], on_change: Callable[[], None]) -> list[Any]:
-        with region("div", "numbers"):
-            return [self._number(prefix + name, name.replace("-", " "), on_change) for name in names]
-
-    def _unless_showing(self, change: Callable[[], None]) -> None:
-        if not self._showing:
-            change()
+        return ui.number(label, on_change=changed).props(f"dense data-testid={test_id}")
 
     def _camera_typed(self) -> None:
         fx, fy, cx, cy = (number.value for number in self.camera)
         if None not in (fx, fy, cx, cy):
             self._set_camera((float(fx), float(fy), float(cx), float(cy)))
+        else:
+            self.session.camera = None
 
     def _fov_typed(self) -> None:
         if self.fov.value is not None:
-            self.session.camera, self.session.fov = None, float(self.fov.value)
-        elif self.session.camera is None:
-            self.session.fov = None
+            self._set_camera(guess=float(self.fov.value))
+        elif self.session.guess != "exif":
+            self.session.guess = None
 
-    def _known_typed(self) -> None:
-        for k, name in enumerate(RANGES):
-            low, high = (number.value for number in self.known[2 * k : 2 * k + 2])
-            self.session.set_limits(**{name: None if None in (low, high) else (float(low), float(high))})
-
-    def _set_camera(self, camera: Any) -> None:
-        self.session.camera, self.session.fov = camera, None
+    def _set_camera(self, camera: Any = None, guess: str | float | None = None) -> None:
+        self.session.camera, self.session.guess = camera, guess
 
     def refresh(self) -> None:
         """Show what changed in the session since the last time, here or in another window."""
         session = self.session
         set_text(self.command, session.command())
         set_text(self.python, "" if session.answer is None else session.python())
-        now = (session.camera, session.fov, session.photo_path, session.options)
+        now = (session.camera, session.guess, session.photo_path, session.options)
         if now == self.shown:
             return
         self.shown, self._showing = now, True
-        limits = session.options.limits or {}
-        ranges = [value for name in RANGES for value in limits.get(name) or (None, None)]
-        for fields, values in ((self.camera, session.camera), (self.known, ranges)):
-            for number, value in zip(fields, values or (None,) * 4, strict=True):
-                number.value = value
-        self.fov.value, self.front.value = session.fov, limits.get("front")
+        for number, value in zip(self.camera, session.camera or (None,) * 4, strict=True):
+            number.value = value
+        self.fov.value = session.guess if isinstance(session.guess, float) else None
         for name, select in self.selects.items():
             select.value = getattr(session.options, name)
         self._showing = False
-        self.exif.set_visibility(session.exif_camera() is not None)
+        self.exif.set_visibility(session.has_exif)
         set_text(self.camera_facts, self._describe_camera())
 
     def _describe_camera(self) -> str:
         session = self.session
         if session.guess == "exif" and session.photo is not None:
-            return (
-                f"guessed from the photograph's EXIF, {session.photo.focal_35mm:g} mm of a 35 mm camera: no covariance"
-            )
+            focal = session.photo.focal_35mm
+            source = f"{focal:g} mm of a 35 mm camera: no covariance" if focal else "which has no focal length"
+            return f"guessed from the photograph's EXIF, {source}"
         if session.guess is not None:
             return "guessed from the field of view: no covariance"
         return "" if session.camera is not None else "unknown: the result is a rotation without translation"
+
+
+class Preview:
+    """The mesh in 3D. Turned with the mouse until it looks as in the photograph, it is a hint."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.workspace, self.session = workspace, workspace.session
+        self.shown: tuple[Any, ...] = ()
+        self.scene: Any = None
+        self.mark = ""
+        with fold("The model", "model", is_open=True) as self.section:
+            self.place = region("div", "preview", data_testid="preview")
+            with region("div", "row"):
+                button("It looks like this", self._hint, "looks-like-this")
+                self.no_hint = button("No hint", self.session.remove_limits, "no-hint", "quiet")
+                for name, label in (("up", "Mark what is up"), ("front", "Mark the front")):
+                    button(label, lambda name=name: setattr(self, "mark", name), f"mark-{name}", "quiet")
+            self.facts = text("p", "", "facts", data_testid="hint-facts")
+
+    async def _hint(self) -> None:
+        if self.scene is not None:
+            at = (await self.scene.get_camera())["position"]
+            self.session.hint_direction((at["x"], at["y"], at["z"]))
+
+    async def _clicked(self, event: Any) -> None:
+        if not self.mark or not event.hits:
+            return
+        name, self.mark, hit = self.mark, "", event.hits[0]
+        axis = self.session.mesh_axis((hit.x, hit.y, hit.z))
+        if name == "up":
+            self.session.set_limits(front=None)
+            await self.workspace.set_option("up", axis)
+        elif axis[-1] != mesh_up(self.session.mesh)[-1]:
+            self.session.set_limits(front=axis)
+
+    async def refresh(self) -> None:
+        """Show the mesh of the session, if it or its frame changed, and the hint."""
+        mesh, limits = self.session.mesh, self.session.options.limits or {}
+        self.section.set_visibility(mesh is not None)
+        hint = limits.keys() - {"front"}
+        self.no_hint.set_visibility(bool(hint))
+        words = "Turn it with the mouse until it looks as in the photograph: that helps the search."
+        if "viewpoint" in limits:
+            azimuth, elevation, _ = limits["viewpoint"]
+            words = (
+                f"Hint: seen from azimuth {azimuth:g}, elevation {elevation:g}, within {limits['within']:g} degrees."
+            )
+        elif hint:
+            words = "There are limits on the pose; the command line below has them."
+        set_text(self.facts, f"Click on the side that is {self.mark}." if self.mark else words)
+        if self.shown == (mesh, limits.get("front")):
+            return
+        self.shown, self.scene = (mesh, limits.get("front")), None
+        self.place.clear()
+        if mesh is None or len(mesh.faces) > MAX_VIEWER_FACES:
+            return
+        if content := await self.workspace.run("page", self.session.preview):
+            self._draw(self.workspace.serve("model.glb", content, "model/gltf-binary"), mesh)
+
+    def _draw(self, url: str, mesh: Any) -> None:
+        camera = ui.scene.perspective_camera(fov=40)
+        with self.place:
+            scene = ui.scene(340, 240, False, camera, self._clicked, click_events=["click"], background_color="#c8ced3")
+        with scene:
+            scene.gltf(url).scale(1.0 / (mesh_radius(mesh) * UNITS[mesh_unit(mesh) or "m"])).move(0, 0, PREVIEW_DEPTH)
+            for name, end in (("up", [0, 0, 1.0]), ("front", [0, -1.2, 0])):
+                scene.line([0, 0, 0], end).material("#0a6b35" if name == "up" else "#a8201a")
+                scene.text(name, "font-weight: bold").move(*end)
+        scene.move_camera(1.6, -2.6, 1.3, 0, 0, 0, duration=0)
+        self.scene = scene

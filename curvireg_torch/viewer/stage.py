@@ -2,7 +2,6 @@
 
 import asyncio
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,31 +21,16 @@ from .workspace import Workspace
 
 __all__ = ["Stage", "contour_paths", "pose_layers"]
 
-PHOTO_SIDE = 2400
-"""Longer side in px of the displayed photograph, which can be zoomed."""
-
-LAYER_SIDE = 1400
-"""Longer side in px of the layers over it."""
-
-CONTOUR_SIDE = 256
-"""Side in px of the crop in which contours are followed while a pose is moved."""
-
-DASH = 0.008
-"""Half the length of a contour's dash, as a fraction of that crop."""
-
-COMMIT_SECONDS = 0.5
-"""Seconds without wheel or keys after which a moved pose becomes the answer."""
-
+PHOTO_SIDE = 2400  # px of the longer side of the displayed photograph, which can be zoomed
+LAYER_SIDE = 1400  # px of the longer side of the layers over it
+CONTOUR_SIDE = 256  # px of the crop in which contours are followed while a pose is moved
+DASH = 0.011  # half the length of a contour's dash, as a fraction of that crop
+COMMIT_SECONDS = 0.5  # without wheel or keys, after which a moved pose becomes the answer
 LEGEND = {"outline": "outline of the mesh at this pose", "crease": "its inner edges", "box": "the box"}
 HELP = {
-    "box": "Photograph. Drag to draw a box; drag its edges, corners or middle to correct it. Arrow keys move it, with "
-    "Shift by 10 px, with Alt they resize it. Wheel or pinch zooms, the middle button pans.",
-    "pose": "Photograph. Drag the mesh to move it, drag beside it to turn it; the wheel or a pinch changes its "
-    "distance, with Shift or a twist it rolls. Arrow keys move, with Shift turn, with Alt roll or change distance.",
-}
-HINT = {
-    "box": "Drag a rectangle around the object; drag its edges to correct it. The wheel zooms.",
-    "pose": "Drag the mesh to move it, drag beside it to turn it. Wheel: distance. Shift and wheel: roll.",
+    "box": "Drag to draw a box; drag its edges, corners or middle to correct it. Arrow keys move it. The wheel zooms.",
+    "pose": "Drag the mesh to move it, drag beside it to turn it. Wheel: distance; with Shift: roll. Arrow keys move, "
+    "with Shift turn.",
 }
 
 
@@ -93,18 +77,16 @@ class Stage:
             }
             self.undo = button("Undo", self._undo, "undo", "quiet", title="Ctrl+Z; once more repeats it")
             self.fit = button("Fit the contours", self._fit, "fit", "quiet")
-            for name, label, symbol in (
-                ("out", "zoom out", "−"),
-                ("fit", "whole photograph", "⤢"),
-                ("in", "zoom in", "+"),
-            ):
-                text("button", symbol, "button quiet", type="button", data_zoom=name, aria_label=label, title=label)
+            for name, symbol in {"out": "−", "fit": "⤢", "in": "+"}.items():
+                text("button", symbol, "button quiet", type="button", data_zoom=name, aria_label=f"zoom {name}")
             self.hint = text("p", "", "facts", data_testid="hint")
 
     def _build_layers(self) -> None:
         with region("div", "layers") as self.layers:
-            self._slider("mesh", "Mesh", 35)
-            self._slider("wipe", "Wipe", 100)
+            with region("label"):
+                text("span", "Mesh")
+                values = {"min": "0", "max": "100", "value": "35", "data_testid": "mesh", "data_property": "--mesh"}
+                region("input", type="range", **values)
             with region("label"):
                 self.contours = region("input", type="checkbox", data_testid="contours", checked="checked")
                 text("span", "Contours")
@@ -112,13 +94,6 @@ class Stage:
             with region("ul", "legend"):
                 for name, meaning in LEGEND.items():
                     text("li", meaning, name)
-
-    def _slider(self, name: str, label: str, value: int) -> None:
-        """A slider that sets the custom property ``--name`` of the photograph, in the browser alone."""
-        with region("label"):
-            text("span", label)
-            values = {"min": "0", "max": "100", "value": str(value), "data_testid": name, "data_property": f"--{name}"}
-            region("input", type="range", **values)
 
     def _set_mode(self, mode: str) -> None:
         self._commit()
@@ -162,8 +137,6 @@ class Stage:
             drawing.cancel()
         elif kind == "release" and drawing.active:
             drawing.release()
-            if drawing.box is None and (proposal := self._proposal_at(x, y)):
-                drawing.set(proposal)
             self.session.box = drawing.box
         elif kind == "nudge":
             step = 10.0 if what["shift"] else 1.0
@@ -186,8 +159,7 @@ class Stage:
                 drag.drag(x, y)
             elif kind == "release":
                 drag.release()
-                if not self._commit() and (proposal := self._proposal_at(x, y)):  # a click
-                    self.mode, self.session.box = "box", proposal
+                self._commit()
             elif kind == "cancel":
                 self.drag = None
             elif kind == "scale":  # wheel and pinch
@@ -226,21 +198,12 @@ class Stage:
         finally:
             self._following = False
 
-    def _commit(self) -> bool:
-        """Make the pose that was moved the answer; returns whether it was moved."""
+    def _commit(self) -> None:
+        """Make the pose that was moved the answer."""
         drag, self.drag = self.drag, None
         answer = self.session.answer
-        moved = drag is not None and answer is not None and drag.T is not answer.pose.projection[0]
-        if drag is not None and moved:
+        if drag is not None and answer is not None and drag.T is not answer.pose.projection[0]:
             self.session.place(drag.T)
-        return moved
-
-    def _proposal_at(self, x: float, y: float) -> Any:
-        """The first dashed box that contains a point, to 0.1 px, or None."""
-        for x0, y0, x1, y1 in self.session.proposals():
-            if x0 <= x <= x1 and y0 <= y <= y1:
-                return tuple(round(v, 1) for v in (x0, y0, x1, y1))
-        return None
 
     async def refresh(self) -> None:
         """Show the photograph, the box and the answer of the workspace."""
@@ -249,7 +212,8 @@ class Stage:
         self.area.set_visibility(session.photo is not None)
         if session.photo is None:
             return
-        if not self.drawing.active and self.drawing.box != session.box:  # typed, loaded, or drawn in another window
+        if not self.drawing.active and self.drawing.box != session.box:  # changed elsewhere on the page
+            self.mode = "box"
             self.drawing.set(session.box)
         if self.shown_photo != session.photo_path:
             self.shown_photo, self.drawing, self.drag = session.photo_path, BoxDrawing(session.box), None
@@ -270,21 +234,19 @@ class Stage:
     def _show_mode(self) -> None:
         is_pose = self.mode == "pose"
         self.canvas.props(f"data-mode={self.mode}")
-        self.viewport.props(f'aria-label="{HELP[self.mode]}"')
-        self.hint.set_content(HINT[self.mode])
+        self.viewport.props(f'aria-label="Photograph. {HELP[self.mode]}"')
+        self.hint.set_content(HELP[self.mode])
         for mode, element in self.modes.items():
             element.props(f"aria-pressed={'true' if mode == self.mode else 'false'}")
         set_enabled(self.modes["pose"], self.session.answer is not None)
         self.fit.set_visibility(is_pose)
-        can_undo = (
-            self.session.can_undo or self.drag is not None if is_pose else self.drawing.previous != self.drawing.box
-        )
-        set_enabled(self.undo, can_undo)
+        moved = self.session.answer_before is not None or self.drag is not None
+        set_enabled(self.undo, moved if is_pose else self.drawing.previous != self.drawing.box)
 
     async def _show_photo(self) -> None:
         photo = self.session.photo
         assert photo is not None
-        content = await self.workspace.run("photograph", lambda: jpeg(shrink(to_uint8(photo.image), PHOTO_SIDE), 92))
+        content = await self.workspace.run("page", lambda: jpeg(shrink(to_uint8(photo.image), PHOTO_SIDE), 92))
         if content:
             H, W = photo.image.shape[-2:]
             self.photo.props(f'src="{self.workspace.serve("photograph.jpg", content, "image/jpeg")}"')
@@ -295,7 +257,7 @@ class Stage:
             return
         result, answer = self.session.require_result()
         size = (int(result.image.shape[-2]), int(result.image.shape[-1]))
-        layers = await self.workspace.run("pose", lambda: pose_layers(result.registrar, answer.pose, size))
+        layers = await self.workspace.run("page", lambda: pose_layers(result.registrar, answer.pose, size))
         if layers:
             self.mask = layers[2]
             for element, name, content in zip((self.solid, self.lines), ("solid", "lines"), layers, strict=False):
@@ -307,31 +269,21 @@ class Stage:
         self.layers.set_visibility(self.session.answer is not None)
 
     def _draw_shapes(self, contours: str = "") -> None:
-        """Draw the box, with handles where it can be changed, or dashed the proposals of the localization."""
-        photo, box = self.session.photo, self.drawing.box
+        """Draw the box, with handles where it can be changed, and contours."""
+        photo, box, parts = self.session.photo, self.drawing.box, contours
         if photo is None:
             return
         H, W = photo.image.shape[-2:]
-        boxes = [(box, "")] if box is not None else [(proposal, "4 6") for proposal in self.session.proposals()]
-        parts = "".join(_outline(box, dashes) for box, dashes in boxes) + contours
-        if box is not None and self.mode == "box":
-            parts += _handles(box)
+        if box is not None:
+            x0, y0, x1, y1 = box
+            shape = f"x='{x0:g}' y='{y0:g}' width='{x1 - x0:g}' height='{y1 - y0:g}'"
+            parts += f"<rect {shape} class='rim'/><rect {shape} class='line'/>"
+        if box is not None and self.mode == "box":  # squares of the same size at every zoom
+            middle = ((x0 + x1) / 2, (y0 + y1) / 2)
+            points = [(x, y) for x in (x0, middle[0], x1) for y in (y0, middle[1], y1) if (x, y) != middle]
+            path = " ".join(f"M{x:g} {y:g}h0" for x, y in points)
+            parts += f"<path d='{path}' class='handle rim'/><path d='{path}' class='handle line'/>"
         self.shapes.set_content(f"<svg viewBox='-0.5 -0.5 {W} {H}' preserveAspectRatio='none'>{parts}</svg>")
-
-
-def _outline(box: Sequence[float], dashes: str) -> str:
-    x0, y0, x1, y1 = box
-    shape = f"x='{x0:g}' y='{y0:g}' width='{x1 - x0:g}' height='{y1 - y0:g}' stroke-dasharray='{dashes}'"
-    return f"<rect {shape} class='rim'/><rect {shape} class='line'/>"
-
-
-def _handles(box: Sequence[float]) -> str:
-    """Squares at the corners and in the middle of the edges, of the same size at every zoom."""
-    x0, y0, x1, y1 = box
-    middle = ((x0 + x1) / 2, (y0 + y1) / 2)
-    points = [(x, y) for x in (x0, middle[0], x1) for y in (y0, middle[1], y1) if (x, y) != middle]
-    path = " ".join(f"M{x:g} {y:g}h0" for x, y in points)
-    return f"<path d='{path}' class='handle rim'/><path d='{path}' class='handle line'/>"
 
 
 def contour_paths(registrar: Registrar, T: Tensor, K: Tensor) -> str:

@@ -8,22 +8,19 @@ from nicegui import ui
 
 from ..utils.choices import IMAGES, MESHES_AND_BANKS
 
-__all__ = ["attributes", "button", "file_chooser", "fold", "region", "set_enabled", "set_text", "text"]
-
-
-def attributes(**values: str) -> str:
-    """HTML attributes as ``Element.props`` takes them; ``_`` stands for ``-``."""
-    return " ".join(f'{name.replace("_", "-")}="{escape(value)}"' for name, value in values.items())
+__all__ = ["button", "file_chooser", "fold", "region", "set_enabled", "set_text", "text"]
 
 
 def region(tag: str, classes: str = "", **values: str) -> Any:
-    """An element that holds others."""
-    return ui.element(tag).classes(classes).props(attributes(**values))
+    """An element that holds others; attributes are written with ``_`` for ``-``."""
+    words = [f'{name.replace("_", "-")}="{escape(value)}"' for name, value in values.items()]
+    return ui.element(tag).classes(classes).props(" ".join(words))
 
 
 def text(tag: str, content: str = "", classes: str = "", **values: str) -> Any:
     """An element with text."""
-    return ui.html(escape(content), tag=tag, sanitize=False).classes(classes).props(attributes(**values))
+    words = [f'{name.replace("_", "-")}="{escape(value)}"' for name, value in values.items()]
+    return ui.html(escape(content), tag=tag, sanitize=False).classes(classes).props(" ".join(words))
 
 
 def set_text(element: Any, content: str) -> None:

@@ -33,19 +33,11 @@ from .session import Session
 
 __all__ = ["Workspace", "Workspaces", "file_name", "identify", "show_warning", "unpack"]
 
-GRACE_SECONDS = 30.0
-"""Seconds after which the search of a closed page is stopped; a reload takes less."""
+GRACE_SECONDS = 30.0  # after which the search of a closed page is stopped; a reload takes less
+MAX_NAME = 120  # characters of the name of an uploaded file
+HEAD_BYTES = 16  # from the start of a file, which tell what it is
+DIRECTORY_BYTES = 1024  # largest mean size of an entry in the directory of a zip archive
 
-MAX_NAME = 120
-"""Characters of the name of an uploaded file."""
-
-HEAD_BYTES = 16
-"""Bytes from the start of a file that tell what it is."""
-
-DIRECTORY_BYTES = 1024
-"""Largest mean size of an entry in the directory of a zip archive."""
-
-_SAMPLE_OPTIONS: dict[str, Any] = {"unit": "m", "up": None, "pose": "upright"}
 _IMAGE_STARTS = (
     *(b"\xff\xd8", b"\x89PNG", b"II*\0", b"MM\0*", b"RIFF", b"BM", b"P2", b"P3", b"P5", b"P6"),
     *(b"GIF8", b"\xff\x0a", b"\0\0\0\x0cJXL", b"\0\0\0\x0cjP"),
@@ -64,11 +56,13 @@ class Workspace:
 
     Attributes:
         session: inputs and results.
-        messages: what is wrong with, or remarkable about, a part of the work: "file", "photograph", "mesh" or "pose".
+        messages: what is wrong with, or remarkable about, a part of the work: "file", "photograph", "mesh", "pose" or
+            the "page" itself.
         files: pictures and downloads by name, with their media types.
         receiving: names of files that are being received.
         mesh_facts: the mesh in words.
         loaded: whether the files of the command line were opened.
+        started: when the search began or was put into the queue, in seconds of ``time.monotonic``.
         waiting: whether a search waits for those of other pages.
         pages: browser windows that show it.
         left: when one of them was closed last, in seconds of ``time.monotonic``.
@@ -80,22 +74,17 @@ class Workspace:
         self.files: dict[str, tuple[bytes, str]] = {}
         self.receiving: dict[Path, str] = {}
         self.mesh_facts, self.loaded, self.waiting, self.pages, self.left = "", False, False, 0, time.monotonic()
-        self._version, self._started = 0, 0.0
+        self._version, self.started = 0, 0.0
         self._bytes: dict[Path, int] = {}
         self._lock, self._searches = asyncio.Lock(), searches
         self._search: asyncio.Task[None] | None = None
-        self._before_sample: dict[str, Any] = {}  # options that the sample changed
+        self._before_sample: RegisterOptions | None = None
         folder.mkdir(parents=True, exist_ok=True)
 
     @property
     def searching(self) -> bool:
         """Whether a registration waits or runs."""
         return self._search is not None
-
-    @property
-    def seconds(self) -> float:
-        """Since the search began, or was put into the queue."""
-        return time.monotonic() - self._started
 
     async def run(self, part: str, job: Callable[[], Any]) -> Any:
         """Run a short job in a thread; returns its result or True, and None after an error, which becomes a message."""
@@ -122,7 +111,7 @@ class Workspace:
         """Find the pose as soon as files are open and no other page searches; one search of a page at a time."""
         if self._search is None:
             self.session.progress, self.session.cancelled = ("", 0, 1), False
-            self._started, self.waiting = time.monotonic(), True
+            self.started, self.waiting = time.monotonic(), True
             self._search = asyncio.create_task(self._find())
         return self._search
 
@@ -143,7 +132,7 @@ class Workspace:
         if self._search is not None and self.waiting:
             self._search.cancel()
         elif self._search is not None:
-            self.session.cancel()
+            self.session.cancelled = True
 
     def stop_if_left(self) -> None:
         """End the search if no window shows the page any more."""
@@ -181,21 +170,14 @@ class Workspace:
             return
         self.messages.pop("file", None)
         path = path.rename(path.with_suffix(suffix))
+        self._leave_sample()
         if kind == "photograph":
-            if await self.open_photo(path, name):
-                self._leave_sample("pose")
-            return
-        if kind == "archive":
-            parts = path.with_name("parts")
-            path = await self.run("mesh", lambda: unpack(path, parts, name))
-            self._bytes[parts.parent] = sum(p.stat().st_size for p in parts.parent.rglob("*") if p.is_file())
-            if not path:
-                return
-            name = str(path.relative_to(parts))
-        before = self.session.options, dict(self._before_sample)
-        self._leave_sample("unit", "up", "pose")
-        if not await self.open_mesh(path, name):
-            self.session.options, self._before_sample = before
+            await self.open_photo(path, name)
+        elif kind == "mesh":
+            await self.open_mesh(path, name)
+        elif mesh := await self.run("mesh", lambda: unpack(path, path.with_name("parts"), name)):
+            await self.open_mesh(mesh, str(mesh.relative_to(path.with_name("parts"))))
+            self._bytes[path.parent] = sum(p.stat().st_size for p in path.parent.rglob("*") if p.is_file())
 
     def _remove_unused(self) -> None:
         """Remove uploaded files that were replaced or refused."""
@@ -207,15 +189,20 @@ class Workspace:
                 names = self.session.names
                 self.session.names = {path: name for path, name in names.items() if folder not in path.parents}
 
-    async def open_photo(self, path: Path, name: str) -> bool:
-        """Replace the photograph; a search in the former one is stopped. Returns whether it could be read."""
-        return bool(await self._open("photograph", lambda: self.session.open_photo(path, name)))
+    async def open_photo(self, path: Path, name: str) -> None:
+        """Replace the photograph; a search in the former one is stopped."""
+        await self._open("photograph", lambda: self.session.open_photo(path, name))
 
-    async def open_mesh(self, path: Path, name: str) -> bool:
-        """Replace the mesh; a search for the former one is stopped. Returns whether it could be read."""
-        facts = await self._open("mesh", lambda: self.session.open_mesh(path, name))
-        self.mesh_facts = facts or self.mesh_facts
-        return bool(facts)
+    async def open_mesh(self, path: Path, name: str) -> None:
+        """Replace the mesh; a search for the former one is stopped."""
+        self.mesh_facts = await self._open("mesh", lambda: self.session.open_mesh(path, name)) or self.mesh_facts
+
+    async def set_option(self, name: str, value: Any) -> None:
+        """Change an option; the mesh is opened again if it depends on it."""
+        self.session.options = replace(self.session.options, **{name: value})
+        path = self.session.mesh_path
+        if name in ("unit", "up") and path is not None:
+            await self.open_mesh(path, self.session.names[path])
 
     async def _open(self, part: str, job: Callable[[], Any]) -> Any:
         async with self._lock:  # no search begins before it is open
@@ -226,13 +213,11 @@ class Workspace:
                 self.messages.pop("pose", None)
             return opened
 
-    def _leave_sample(self, *names: str) -> None:
-        """Bring back options that the sample has changed, unless the user did since."""
-        for name in names:
-            if name in self._before_sample:
-                own = self._before_sample.pop(name)
-                if getattr(self.session.options, name) == _SAMPLE_OPTIONS[name]:
-                    self.session.options = replace(self.session.options, **{name: own})
+    def _leave_sample(self) -> None:
+        """Close the sample and bring back the options of before it, as one's own files replace it."""
+        if self._before_sample is not None:
+            self.session.close()
+            self.session.options, self._before_sample = self._before_sample, None
 
     async def load(self) -> None:
         """Open the files that the options name."""
@@ -251,15 +236,14 @@ class Workspace:
 
         self.messages.clear()
         if scene := await self.run("file", write):
-            for option in _SAMPLE_OPTIONS:
-                self._before_sample.setdefault(option, getattr(self.session.options, option))
-            self.session.options = replace(self.session.options, **_SAMPLE_OPTIONS)
+            self._before_sample = self._before_sample or self.session.options
+            self.session.options = replace(self.session.options, unit="m", up=None, pose="upright", limits=None)
             await self.open_photo(photo, photo.name)
             await self.open_mesh(mesh, mesh.name)
             K = scene.camera_matrix
             self.session.camera = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
             x0, y0, x1, y1 = (round(float(v), 1) for v in scene.box)
-            self.session.box, self.session.fov = (x0, y0, x1, y1), None
+            self.session.box, self.session.guess = (x0, y0, x1, y1), None
 
     def serve(self, name: str, content: bytes, media_type: str) -> str:
         """Put a file on the server; returns its address relative to the page, which is new each time."""
@@ -306,30 +290,21 @@ class Workspaces:
 
 
 def file_name(text: str) -> str:
-    """The name of an uploaded file without folders and control characters.
-
-    Example:
-        >>> file_name("C:\\\\parts\\\\wheel.stl")
-        'wheel.stl'
-    """
+    """Return the name of an uploaded file without folders and control characters."""
     name = "".join(c for c in re.split(r"[/\\]", text)[-1] if c.isprintable()).strip()
     return name[-MAX_NAME:] or "file"
 
 
 def identify(name: str, head: bytes) -> tuple[str, str]:
-    """Whether a file is a "photograph", a "mesh" or an "archive", and the suffix of its format ("" of photographs).
+    """Return whether a file is a "photograph", a "mesh" or an "archive", and the suffix of its format.
 
-    The content decides, then the name: a part that is called ``wheel.jpg`` by mistake is still a mesh.
-
-    Args:
-        name: of the file.
-        head: its first :data:`HEAD_BYTES` bytes.
+    Its first bytes decide, then its name: a part that is called ``wheel.jpg`` by mistake is still a mesh.
 
     Raises:
         InvalidInputError: it is none of them.
 
     Example:
-        >>> identify("part", b"ply\\nformat ascii 1.0")
+        >>> identify("part", b"ply")
         ('mesh', '.ply')
     """
     suffix = Path(name).suffix.lower()
@@ -353,12 +328,7 @@ def identify(name: str, head: bytes) -> tuple[str, str]:
 def unpack(archive: Path, folder: Path, name: str) -> Path:
     """Unpack a zip archive into a new folder; returns the path of the only mesh in it.
 
-    Names that lead outside stay inside, as ``zipfile`` removes ``..`` and drives.
-
-    Args:
-        archive: the file.
-        folder: that is created.
-        name: what the user calls the archive, for messages.
+    Names that lead outside stay inside, as ``zipfile`` removes ``..`` and drives. Messages call the archive ``name``.
 
     Raises:
         InvalidInputError: it is damaged, too large, encrypted, or does not hold one mesh.

@@ -6,7 +6,6 @@ import re
 
 import pytest
 
-from curvireg_torch.viewer.session import MAX_PROPOSALS
 from tests.viewer.browser import MISSING
 from tests.viewer.test_session import run_command
 
@@ -87,12 +86,8 @@ def test_page_shows_the_result(browser, folder):
     layer = browser.part("photograph").find_elements("css selector", "img")[1]
     browser.wait(lambda: layer.get_attribute("naturalWidth") == "240", "layer")
     assert layer.value_of_css_property("opacity") == "0.35"
-    slider = browser.part("wipe")
-    slider.click()  # in the middle
-    browser.wait(lambda: re.search(r" (49|50|51)%", layer.value_of_css_property("clip-path")), "wipe", 20)
-    browser.driver.execute_script(
-        "arguments[0].value = 100; arguments[0].dispatchEvent(new Event('input', {bubbles: true}))", slider
-    )
+    browser.part("mesh").click()  # in the middle
+    browser.wait(lambda: 0.45 < float(layer.value_of_css_property("opacity")) < 0.55, "opacity", 20)
     images = browser.wait(lambda: browser.part("panel-answer").find_elements("css selector", "img"), "cards")
     x0, y0, x1, y1 = json.loads((folder / "box.json").read_text())
     margin = 0.25 * max(x1 - x0, y1 - y0)
@@ -166,46 +161,20 @@ def scroll(browser, element, amount):
     ActionChains(browser.driver).scroll_from_origin(ScrollOrigin.from_element(element), 0, amount).perform()
 
 
-def test_page_draws_proposals_and_a_click_chooses_one(browser, folder):
-    assert browser.box() == pytest.approx(json.loads((folder / "box.json").read_text()), abs=0.7)
-    watch = """
-        const stage = document.querySelector('[data-testid=progress]');
-        window.stages = [];
-        new MutationObserver(() => stages.push(stage.textContent)).observe(
-            stage, {childList: true, subtree: true, characterData: true})"""
-    browser.driver.execute_script(watch)
-
-    def stages():
-        return browser.driver.execute_script("return stages")
-
+def test_without_a_box_the_object_is_found_in_the_whole_photograph(browser, folder):
     browser.click("no-box")
     browser.wait(lambda: browser.text("register") == "Find the object and its pose", "no box")
+    browser.wait(lambda: browser.text("progress") == "the inputs have changed since this answer", "outdated")
     browser.click("register")
-    looking = "looking for the object in the photograph"
-    browser.wait(lambda: looking in stages() and stages()[-1] == "done", "result without a box")
+    browser.wait(lambda: browser.text("progress") == "done", "result without a box")
     assert browser.messages() == []
     assert browser.box() is None
     command = browser.text("command")
     assert "--box" not in command
-    written = run_command(folder, command)
-    proposals = [proposal["box"] for proposal in written["localization"]["proposals"]][:MAX_PROPOSALS]
-    assert proposals[0] == written["inputs"]["box"]
-    assert len(proposals) > 1
-
-    def dashed():
-        """Corners of the dashed boxes."""
-        shown = browser.part("photograph").find_elements("css selector", "rect.line[stroke-dasharray='4 6']")
-        sides = [[float(rect.get_attribute(name)) for name in ("x", "y", "width", "height")] for rect in shown]
-        return [[x, y, x + w, y + h] for x, y, w, h in sides]
-
-    drawn = browser.wait(dashed, "proposals")
-    assert len(drawn) == len(proposals)
-    for one, other in zip(drawn, proposals, strict=True):
-        assert one == pytest.approx(other, abs=0.001)
-    x0, y0, x1, y1 = proposals[0]
-    middle = ((x0 + x1) / 2, (y0 + y1) / 2)
-    browser.drag(middle, middle, 240)
-    browser.wait(lambda: browser.box() == [round(v, 1) for v in proposals[0]], "clicked box")
-    assert not dashed()
-    browser.wait(lambda: "--box" in browser.text("command"), "command with the box")
-    browser.wait(lambda: browser.text("progress") == "the inputs have changed since this answer", "outdated")
+    document = saved(browser)
+    assert document["rotation"] == run_command(folder, command)["rotation"]
+    assert document["localization"]["instances"][0]["rotation"] == document["rotation"]
+    browser.click("answer-2")
+    browser.wait(lambda: browser.part("answer-2").get_attribute("aria-pressed") == "true", "chosen")
+    second = saved(browser)
+    assert second["localization"]["instances"][0]["rotation"] == second["rotation"] != document["rotation"]

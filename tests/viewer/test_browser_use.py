@@ -1,11 +1,11 @@
 """The page as people use it: dropped files, mistakes, a reload, keys, small screens, and readers of screens."""
 
-import os
-from pathlib import Path
+import re
 
 import pytest
 
-from tests.viewer.browser import MISSING, Browser
+from curvireg_torch.synthetic import example_mesh
+from tests.viewer.browser import MISSING
 from tests.viewer.test_browser import scroll
 
 OPTIONS = []  # of the command that starts the viewer
@@ -14,19 +14,6 @@ pytestmark = [
     pytest.mark.browser,
     pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}"),
 ]
-
-AXE = os.environ.get("CURVIREG_AXE", "")
-
-
-def serious(browser):
-    """What axe-core finds that hinders people, with the elements."""
-    browser.driver.execute_script(Path(AXE).read_text())
-    found = browser.driver.execute_async_script("axe.run().then(arguments[0])")
-    return [
-        (rule["id"], [node["html"][:160] for node in rule["nodes"]][:4])
-        for rule in found["violations"]
-        if rule["impact"] in ("serious", "critical")
-    ]
 
 
 def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browser):
@@ -39,6 +26,34 @@ def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browse
     browser.wait(lambda: browser.text("photograph-facts").startswith("sample.png: 960 x 720 px"), "photograph")
     browser.wait(lambda: "done" in browser.part("step-box").get_attribute("class"), "box")
     browser.wait(lambda: not browser.part("register").get_attribute("disabled"), "ready")
+
+
+def test_the_model_turned_with_the_mouse_is_a_hint(browser):
+    from selenium.webdriver import ActionChains
+
+    browser.unfold("command-line")
+    canvas = browser.wait(lambda: browser.part("preview").find_element("css selector", "canvas"), "the model")
+    labels = """
+        const all = [...document.querySelectorAll('.nicegui-scene div')];
+        return all.filter(e => !e.children.length && e.textContent).map(e => e.textContent)"""
+    browser.wait(lambda: {"up", "front"} <= set(browser.driver.execute_script(labels)), "axes")
+
+    def azimuth():
+        browser.click("looks-like-this")
+        browser.wait(lambda: browser.text("hint-facts").startswith("Hint: seen from azimuth"), "hint")
+        return float(re.search(r"azimuth ([\d.]+)", browser.text("hint-facts"))[1])
+
+    before = azimuth()
+    assert f"--near {before:g} " in browser.text("command")
+    ActionChains(browser.driver).move_to_element(canvas).click_and_hold().move_by_offset(45, 0).release().perform()
+    browser.wait(lambda: 20 < (before - azimuth()) % 360 < 120, "turned")
+    browser.picture("viewer-model")
+    browser.click("no-hint")
+    browser.wait(lambda: "--near" not in browser.text("command"), "no hint")
+    browser.click("mark-front")
+    browser.wait(lambda: browser.text("hint-facts") == "Click on the side that is front.", "asked for the front")
+    ActionChains(browser.driver).move_to_element_with_offset(canvas, -22, 0).click().perform()
+    browser.wait(lambda: "Click" not in browser.text("hint-facts"), "clicked")
 
 
 def test_a_search_can_be_stopped_and_started_again(browser):
@@ -80,28 +95,6 @@ def test_contours_follow_the_mesh_that_is_dragged(browser):
     browser.wait(lambda: browser.text("facts") == before, "as before")
 
 
-def test_another_page_has_its_own_work(browser, folder, address):
-    other = Browser(folder / "other", address)
-    try:
-        assert other.page != browser.page
-        assert other.part("sample").is_displayed()
-        assert "sample.png" in browser.text("photograph-facts")
-    finally:
-        other.driver.quit()
-
-
-def test_axe_finds_nothing_serious(browser):
-    if not AXE:
-        pytest.skip("CURVIREG_AXE does not name axe.min.js of axe-core")
-    for dark in (False, True):
-        browser.emulate(1280, 1000, dark=dark)
-        browser.wait(lambda d=dark: browser.driver.execute_script(
-            "return document.body.classList.contains('body--dark')") == d, "colours")  # fmt: skip
-        for name in ("camera", "known", "command-line"):
-            browser.unfold(name)
-        assert not (found := serious(browser)), found
-
-
 def test_dark_colours_follow_the_system(browser):
     browser.emulate(1440, 900, dark=True)
     body = browser.driver.find_element("css selector", "body")
@@ -127,9 +120,11 @@ def test_the_photograph_fits_the_window_and_stays_in_view(browser, size):
 
 def test_a_small_screen_stacks_everything(browser):
     browser.emulate(390, 844)
-    wide = "return [...document.querySelectorAll('*')].filter(e => e.getBoundingClientRect().right > 391).length"
+    wide = (
+        "return [...document.querySelectorAll('*:not(.preview *)')].filter(e => e.getBoundingClientRect().right > 391)"
+    )
     browser.wait(lambda: browser.driver.execute_script("return document.documentElement.scrollWidth") == 390, "narrow")
-    assert browser.driver.execute_script(f"{wide} - document.querySelectorAll('.panels *').length") <= 0
+    assert browser.driver.execute_script(wide) == []
     parts = [browser.part(name).rect for name in ("photograph", "step-photograph", "step-mesh", "register", "verdict")]
     assert [part["y"] for part in parts] == sorted(part["y"] for part in parts)
     assert browser.part("photograph").rect["width"] > 300
@@ -201,5 +196,11 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     browser.emulate(0, 0)
     browser.drop(folder / "photo.png")
     browser.wait(lambda: browser.text("message-photograph") == "", "gone")
-    browser.upload("mesh", folder / "truck.ply")
+    mesh = example_mesh()
+    mesh.apply_scale(1000.0)
+    mesh.export(folder / "large.ply")
+    browser.upload("mesh", folder / "large.ply")
+    browser.wait(lambda: "give the unit (mm?)" in browser.text("message-mesh"), "a question")
+    browser.click("use-mm")
+    browser.wait(lambda: browser.text("mesh-facts").endswith(" mm, rendered in grey"), "in mm")
     browser.wait(lambda: browser.messages() == [], "all gone")

@@ -17,6 +17,7 @@ from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.options import register_options
 from curvireg_torch.errors import BankError, CurviregError, CurviregWarning, ImageError, InvalidInputError, MeshError
 from curvireg_torch.evaluation.opening import read_start
+from curvireg_torch.evaluation.store import to_json
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
@@ -68,7 +69,7 @@ def session(registered):
     session.choose(0)
     camera = session.camera
     yield session
-    session.camera, session.fov = camera, None
+    session.camera, session.guess = camera, None
 
 
 def test_command_gives_the_same_result_bit_by_bit(session, registered):
@@ -76,7 +77,7 @@ def test_command_gives_the_same_result_bit_by_bit(session, registered):
     assert session.command().startswith(f"curvireg register 'my photo.png' {folder / 'truck.ply'} ")
     (folder / "my photo.png").write_bytes((folder / "photo.png").read_bytes())
     written = run_command(folder, session.command())
-    document = json.loads(session.json())
+    document = json.loads(to_json(session.document()))
     for key in ("rotation", "translation", "score", "confidence", "covariance", "top", "pipeline"):
         assert document[key] == written[key], key
     assert document["inputs"]["box"] == written["inputs"]["box"]
@@ -87,7 +88,7 @@ def test_command_gives_the_same_result_bit_by_bit(session, registered):
 def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registered):
     found, first = session.result.registration, session.document()
     session.choose(1)
-    document = json.loads(session.json())
+    document = json.loads(to_json(session.document()))
     assert document["rotation"] == first["top"][1]["rotation"]
     assert document["translation"] == first["top"][1]["translation"]
     assert document["score"] == first["top"][1]["score"]
@@ -106,7 +107,7 @@ def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registere
     # The file is a start for the command line, and picture and scene show the same pose.
     folder = registered[1]
     session.choose(1)
-    (folder / "chosen.json").write_bytes(session.json())
+    (folder / "chosen.json").write_text(to_json(session.document()))
     start, confidence = read_start(folder / "chosen.json")
     assert start == tuple(map(tuple, session.answer.pose.transform.tolist()))
     assert confidence is None
@@ -121,14 +122,14 @@ def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registere
 def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
     before, describer = session.answer.pose, session.result.registrar.describer
     centre = before.rotation @ describer.centre + before.translation
-    assert not session.can_undo
+    assert session.answer_before is None
     moved = session.result.moved(before.projection[0], rotation=(0, 6, 0), translation=(0.05, 0, 0))
     session.place(moved)
     pose = session.answer.pose
     assert float(rotation_error(pose.rotation, before.rotation)) == pytest.approx(6, abs=1e-4)
     shift = pose.rotation @ describer.centre + pose.translation - centre
     torch.testing.assert_close(shift, torch.tensor([0.05 * describer.radius, 0, 0], dtype=torch.float64))
-    document = json.loads(session.json())
+    document = json.loads(to_json(session.document()))
     assert document["rotation"] == pose.rotation.tolist() == document["top"][0]["rotation"]
     assert len(document["top"]) == 2
     for name in ("confidence", "none", "score", "edge_support", "covariance", "ambiguous"):
@@ -144,7 +145,7 @@ def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
         session.undo()
         assert session.answer.pose is answer
     session.choose(1)
-    assert (session.answer.edits, session.can_undo) == ((), False)
+    assert (session.answer.edits, session.answer_before) == ((), None)
     with pytest.raises(InvalidInputError, match="touch the camera"):
         session.result.moved(moved, translation=(0, 0, -100))
 
@@ -181,7 +182,7 @@ def test_move_without_a_camera_keeps_the_allocentric_rotation(session):
 
 def test_register_with_a_field_of_view(session):
     camera, session.camera = session.camera, None
-    session.fov = 2 * math.degrees(math.atan(120 / 260))
+    session.guess = 2 * math.degrees(math.atan(120 / 260))
     session.register()
     document = session.document()
     assert document["inputs"]["camera_source"] == "fov"
@@ -222,9 +223,9 @@ def test_a_photograph_replaces_box_and_camera_of_the_former_one_unless_it_is_dam
     session = new_session("--fov", "65")
     session.load()
     session.open_photo(folder / "photo.png")
-    assert session.fov == 65, "of the command line, for the first photograph"
+    assert session.guess == 65, "of the command line, for the first photograph"
     session.open_photo(folder / "photo.png")
-    assert (session.box, session.camera, session.fov) == (None, None, None)
+    assert (session.box, session.camera, session.guess) == (None, None, None)
     (folder / "broken.png").write_bytes((folder / "photo.png").read_bytes()[:200])
     with pytest.raises(ImageError):
         session.open_photo(folder / "broken.png")
@@ -241,22 +242,20 @@ def test_load_takes_files_box_and_camera_from_the_options():
 def test_command_contains_inputs_and_options(folder):
     session = new_session("--unit", "mm", "--up=-y", "--pose", "any", "--preset", "fast")
     session.open_photo(folder / "photo.png", "photo.png")
-    assert session.exif_camera() is None
+    assert not session.has_exif
     with_exif(folder / "photo.png", exif(1, 50))
     session.open_photo(folder / "photo.png", "photo.png")
-    focal = 50 * np.hypot(180, 240) / np.hypot(36, 24)
-    assert session.exif_camera() == pytest.approx((focal, focal, 119.5, 89.5), abs=0.005)
-    session.camera, session.box = session.exif_camera(), (10.0, 20.5, 90.0, 80.0)
+    assert session.has_exif
+    session.guess, session.box = "exif", (10.0, 20.5, 90.0, 80.0)
     assert session.command() == (
         "curvireg register photo.png MESH --box 10 20.5 90 80 --camera exif "
         "--unit mm --up=-y --pose any --preset fast --out result"
     )
-    session.camera = (300.0, 300.5, 119.5, 89.5)
-    session.fov = 65.0
-    assert "--camera 300 300.5 119.5 89.5 --unit" in session.command(), "a camera takes precedence"
-    session.camera = None
+    session.camera, session.guess = (300.0, 300.5, 119.5, 89.5), None
+    assert "--camera 300 300.5 119.5 89.5 --unit" in session.command()
+    session.camera, session.guess = None, 65.0
     assert "--box 10 20.5 90 80 --fov 65 --unit" in session.command()
-    session.fov, session.options = 180.0, replace(session.options, unit="m")
+    session.guess, session.options = 180.0, replace(session.options, unit="m")
     session.open_mesh(folder / "truck.ply")
     with pytest.raises(InvalidInputError, match="180"):
         session.register()
@@ -292,24 +291,21 @@ def test_limits_do_not_open_the_mesh_again(session):
 
 
 @pytest.mark.usefixtures("folder")
-def test_register_is_cancelled_by_the_limit_and_by_the_user(monkeypatch):
+def test_register_is_cancelled_by_the_user(monkeypatch):
     box = map(str, scene(0)[1].tolist())
     session = new_session("photo.png", "truck.ply", "--pipeline", "small.json", "--box", *box)
     session.load()
-    session.limit = 0.0
-    with pytest.raises(CurviregError, match=r"stopped after 0 s in the stage .bank."):
-        session.register()
-    assert session.result is None
-    session.limit = 600.0
-    callback = session._progress_callback
+    report_progress, stages = session._report_progress, []
 
-    def cancel_first(start):
-        def report_progress(*progress):
-            session.cancel()
-            callback(start)(*progress)
+    def cancel_later(stage, *progress):
+        stages.append(stage)
+        session.cancelled = stage != "bank"
+        report_progress(stage, *progress)
 
-        return report_progress
-
-    monkeypatch.setattr(session, "_progress_callback", cancel_first)
+    monkeypatch.setattr(session, "_report_progress", cancel_later)
     with pytest.raises(CurviregError, match=r"^stopped$"):
         session.register()
+    assert "bank" not in stages[-1:]
+    assert len(set(stages)) == 2, "at the first step after it"
+    assert session.result is None
+    assert not session.cancelled

@@ -158,21 +158,19 @@ def test_a_photograph_dropped_while_a_mesh_loads_stays(workspace, scene, monkeyp
 
 
 def test_options_of_the_sample_do_not_stay_for_ones_own_object(workspace, scene):
-    session = workspace.session
-    session.options = replace(session.options, unit="ft", pose="any")
-    asyncio.run(workspace.load_sample())
-    assert (session.options.unit, session.options.pose) == ("m", "upright")
+    session, own = workspace.session, replace(RegisterOptions(), unit="ft", pose="any", limits={"theta": (-10.0, 10.0)})
+    session.options = own
+    for _ in range(2):
+        asyncio.run(workspace.load_sample())
+        assert (session.options.unit, session.options.pose, session.options.limits) == ("m", "upright", None)
+    asyncio.run(upload(workspace, scene / "photo.png", "notes.txt", b"x"))
+    assert session.options.pose == "upright", "it replaces nothing"
     asyncio.run(upload(workspace, scene / "photo.png"))
-    assert (session.options.unit, session.options.pose, session.box, session.camera) == ("m", "any", None, None)
-    asyncio.run(upload(workspace, scene / "truck.ply", "bad.ply", b"ply\nnonsense"))
-    assert session.options.unit == "m", "the truck of the sample is still there"
+    assert session.options == own
+    assert (session.mesh_path, session.mesh, session.box, session.camera, session.guess) == (None,) * 5
     asyncio.run(upload(workspace, scene / "truck.ply"))
-    assert session.options == replace(RegisterOptions(), unit="ft", pose="any")
     assert workspace.mesh_facts.endswith(" ft, rendered in grey")
-    asyncio.run(workspace.load_sample())
-    session.options = replace(session.options, pose=None)  # the user's choice
-    asyncio.run(upload(workspace, scene / "truck.ply"))
-    assert session.options.pose is None
+    assert session.names[session.photo_path] == "photo.png"
 
 
 class Search:
