@@ -6,7 +6,8 @@ from .following import Follower
 from .localization import Located, Locator, localize, locate, representative_views
 from .refinement import refine
 from .registrar import Registrar
-from .result import FailedRegistration, Hypothesis, Localization, Registration
+from .result import FailedRegistration, Hypothesis, Localization, PhotographPose, Registration
+from .several import register_views
 
 __all__ = [
     "RELIABLE",
@@ -17,11 +18,13 @@ __all__ = [
     "Localization",
     "Located",
     "Locator",
+    "PhotographPose",
     "Registrar",
     "Registration",
     "fit_contours",
     "localize",
     "locate",
     "refine",
+    "register_views",
     "representative_views",
 ]

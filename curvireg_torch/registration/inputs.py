@@ -11,6 +11,7 @@ from typing import Any, overload
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..data.images import read_photo
@@ -22,15 +23,27 @@ from ..utils.checks import (
     are_nearly_equal,
     as_boxes,
     as_camera_matrices,
+    as_numbers,
     check_camera_matrix,
     check_finite,
     check_photograph,
     check_pixels,
+    check_pose,
     check_square_pixels,
+    check_tensor,
     type_and_shape,
 )
 
-__all__ = ["ImageItem", "camera_warnings", "check_box_side", "check_crop", "image_item", "image_items"]
+__all__ = [
+    "ImageItem",
+    "camera_warnings",
+    "check_box_side",
+    "check_crop",
+    "image_item",
+    "image_items",
+    "is_missing",
+    "rig_cameras",
+]
 
 MIN_BOX_SIDE = 12
 """Pixels; a smaller box is refused. With one of 1 px, the preset "fast" reached a confidence of 0.98."""
@@ -40,6 +53,9 @@ SMALL_BOX_SIDE = 24
 
 FOCAL_RANGE = (1 / 3, 20.0)
 """Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of 113 to 3 degrees."""
+
+SAME_PICTURE = 0.8
+"""Correlation of small copies of two photographs from which they may come from the same place."""
 
 MISSING_SHARE = 0.2
 """Part of a box without pixels of the photograph, from which a result carries a warning."""
@@ -103,7 +119,7 @@ def image_items(
     if isinstance(images, str | PathLike) or (isinstance(images, Tensor) and images.ndim != 4):
         raise InvalidInputError("images: expected a batch (B, C, H, W) or a list; put a single image into a list")
     n = len(images)
-    boxes = None if boxes is None else as_boxes(boxes, n)
+    boxes = None if boxes is None else _boxes(boxes, n)
     cameras = _cameras(camera_matrices, n)
     masks = [None] * n if masks is None else list(masks)
     if len(masks) != n:
@@ -124,7 +140,58 @@ def image_items(
         except CurviregError as error:
             return error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])]))
 
-    return OnDemand(item, n)
+    return _OnDemand(item, n)
+
+
+def _boxes(given: Any, count: int) -> Sequence[Tensor | None]:
+    """A box for each image, None where there is none."""
+    if not (isinstance(given, list | tuple) and any(is_missing(box) for box in given)):
+        return list(as_boxes(given, count))
+    if len(given) != count:
+        raise InvalidInputError(f"boxes: expected {count}, one for each image or None, got {len(given)}")
+    return [None if is_missing(box) else as_boxes([box], 1)[0] for box in given]
+
+
+def is_missing(box: Any) -> bool:
+    """Whether a box is None, or all its numbers are NaN."""
+    return box is None or bool(as_numbers(box, "boxes").isnan().all())
+
+
+def rig_cameras(poses: Any, items: "Sequence[ImageItem | CurviregError]") -> Tensor:
+    """Poses of the cameras of photographs from the world as (V, 4, 4) float64; errors name the photograph.
+
+    Raises:
+        InvalidInputError: another number of poses, one that is not rigid and finite, or photographs that show different
+            things though camera and pose are the same.
+    """
+    T = as_numbers(poses, "T_cam_from_world", dtype=torch.float64).detach().cpu().double()
+    check_tensor(T, "T_cam_from_world", (len(items), 4, 4))
+    for i, pose in enumerate(T):
+        try:
+            check_pose(pose, "T_cam_from_world")
+        except InvalidInputError as error:
+            raise error.with_subject(f"image {i}") from None
+        same = (T[:i] - pose).flatten(1).abs().amax(dim=1) <= 1e-9 * float(pose.abs().max())
+        for j in same.nonzero()[:1, 0].tolist():
+            one, other = items[j], items[i]
+            if isinstance(one, ImageItem) and isinstance(other, ImageItem) and _contradict(one, other):
+                raise InvalidInputError(
+                    f"T_cam_from_world: the same as of image {j}, which shows something else; give each photograph "
+                    "the pose of its own camera",
+                    subject=f"image {i}",
+                )
+    return T
+
+
+def _contradict(one: ImageItem, other: ImageItem) -> bool:
+    """Whether small copies of two photographs by the same camera are hardly correlated."""
+    if one.size != other.size or not torch.equal(
+        torch.as_tensor(one.camera_matrix), torch.as_tensor(other.camera_matrix)
+    ):
+        return False
+    grey = [item.image.float().mean(dim=0).nan_to_num()[None, None] for item in (one, other)]
+    a, b = (F.adaptive_avg_pool2d(picture, 32).flatten() for picture in grey)
+    return float(F.cosine_similarity(a - a.mean(), b - b.mean(), dim=0)) < SAME_PICTURE
 
 
 def _cameras(given: Any, count: int) -> Sequence[Tensor | Camera | None]:
@@ -206,7 +273,7 @@ def _inside(pixels: Tensor, box: Tensor) -> Tensor:
     return pixels[y0:y1, x0:x1]
 
 
-class OnDemand(Sequence[ImageItem | CurviregError]):
+class _OnDemand(Sequence[ImageItem | CurviregError]):
     """``item(0)`` to ``item(count - 1)``, computed at each access."""
 
     def __init__(self, item: Callable[[int], ImageItem | CurviregError], count: int) -> None:

@@ -208,7 +208,7 @@ class Registrar:
     def register_views(
         self, images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any
     ) -> Registration:
-        """Register several photographs of one object together, see :func:`.several.register_views`."""
+        """Register photographs of one object together, see :func:`curvireg_torch.registration.register_views`."""
         result = register_views(self, images, boxes, camera_matrices, T_cam_from_world)
         for model, other in enumerate(self.others, 1):
             rival = other.register_views(images, boxes, camera_matrices, T_cam_from_world)
@@ -261,8 +261,8 @@ class Registrar:
 
     def map_items(
         self,
-        items: Sequence[ImageItem | CurviregError],
-        function: Callable[[Sequence[ImageItem | CurviregError], int], list[Any]],
+        items: Sequence[Any],
+        function: Callable[[Sequence[Any], int], list[Any]],
     ) -> list[Any]:
         """Results of ``function(some items, index of the first)`` for all items, in their order.
 

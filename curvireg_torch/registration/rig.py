@@ -1,0 +1,481 @@
+"""Photographs of one object by cameras with known poses: world poses are fitted and compared in all of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..errors import CurviregError, InvalidInputError
+from ..filters.operations import fill_missing
+from ..geometry import rotation_error
+from ..geometry.cameras import rotation_towards, transform
+from ..geometry.conversions import axis_angle_from_rotation, cross_matrix
+from ..geometry.crops import box_iou, crop_transforms, square_boxes
+from ..rendering.contours import ContourPoints
+from ..terms import Appearance, QueryFeatures, crop_regions
+from .confidence import MAX_MARGIN, refinement_confidence
+from .contour_fit import (
+    CROP_SIZE,
+    FIRST_RADII,
+    FULL_SIZE_RADII,
+    QUARTER_SIZE_RADII,
+    ContourProblem,
+    ContourState,
+    EdgeField,
+    ObjectMask,
+    inside_photographs,
+    smaller_problem,
+)
+from .inputs import ImageItem
+from .least_squares import Measurements, pose_covariance
+from .poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS
+from .refinement import LOST_CONFIDENCE, nearest_view
+from .result import Hypothesis, Registration
+from .tracker import boxes_at
+
+if TYPE_CHECKING:
+    from .registrar import Registrar
+
+__all__ = ["Answer", "Found", "Rig", "RigPhotograph", "RigProblem"]
+
+FITTED_CANDIDATES, JUDGED_CANDIDATES, FINISHED_CANDIDATES = 6, 4, 2
+"""World poses that are fitted in all photographs, those whose evidence is compared, and those fitted at full size."""
+
+SAME_ANGLE, SAME_SHIFT = 15.0, 0.5
+"""Degrees, and shift in object radii, within which two candidates count as one; the best view of the bank so near to a
+pose stands for it."""
+
+DEPTH_ERROR, RIG_ERROR, CENTRE_ERROR = 0.08, 0.01, 0.1
+"""Standard deviations of an object's place from one photograph: along its ray and across it, as fractions of the
+distance, and across it in object radii."""
+
+MAX_PLACE_DISTANCE = 16.0
+"""Squared Mahalanobis distance up to which two photographs see the object in the same place."""
+
+MIN_OVERLAP = 0.3
+"""Overlap (IoU) with the box of a photograph below which a pose lies elsewhere."""
+
+SAME_DIRECTION = 30.0
+"""Degrees within which two photographs show partly the same; the weights of equal ones add up to one."""
+
+MIN_PARALLAX, MAX_UNIT_FACTOR = 0.03, 30.0
+"""Root mean square sine of the angles between rays from which they tell a distance, and the factor between that and the
+distance from the object's size that is a mistake in the unit."""
+
+ELSEWHERE = "where the other photographs have the object, it lies outside this one or its box"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigProblem(ContourProblem):
+    """Poses of several photographs that are tied together: those with the same number in ``group`` (N,) are one pose in
+    the world, seen by cameras with ``axes`` (N, 3, 3), rotations from the axes of the first camera: with those of the
+    world, the damping and so the result would depend on these.
+
+    Each photograph alone found ``alone`` (N, 4, 4), with a precision whose root is ``root`` (N, 6, 6): it may know more
+    than its contours tell, such as the rotation of a can by its label.
+    """
+
+    axes: Tensor
+    group: Tensor
+    alone: Tensor
+    root: Tensor
+
+    def __getitem__(self, index: Tensor) -> "RigProblem":
+        K, axes, group, alone, root = (x[index] for x in (self.K, self.axes, self.group, self.alone, self.root))
+        rest = {"axes": axes, "group": group, "alone": alone, "root": root}
+        return replace(self, image_index=self.image_index[index], K=K, **rest)  # type: ignore[arg-type]
+
+    def step(self, points: ContourPoints, T: Tensor, radius: float, others: Sequence[Measurements] = ()) -> Tensor:
+        scale, distance = self.size / CROP_SIZE, self.gaps(T)
+        known = Measurements(scale * self.root, scale * distance, torch.ones_like(distance))
+        return super().step(points, T, radius, [*others, known])
+
+    def gaps(self, T: Tensor) -> Tensor:
+        """(N, 6, 1) from poses to those that the photographs alone found, in standard deviations of these."""
+        turn = axis_angle_from_rotation(self.alone[:, :3, :3] @ T[:, :3, :3].mT)
+        shift = (self.alone - T)[:, :3, :3] @ self.centre + (self.alone - T)[:, :3, 3]
+        return self.root @ torch.cat([turn, shift], dim=1)[..., None]
+
+    def solution(self, A: Tensor, b: Tensor) -> Tensor:
+        P = in_frames(self.axes)
+        shared = super().solution(self.summed(P.mT @ A @ P), self.summed(P.mT @ b))
+        return (P @ shared[self.group, :, None])[..., 0]
+
+    def step_fraction(self, step: Tensor, T: Tensor) -> Tensor:
+        least = T.new_ones(int(self.group.max()) + 1)
+        return least.scatter_reduce(0, self.group, super().step_fraction(step, T), "amin")[self.group]
+
+    def summed(self, x: Tensor) -> Tensor:
+        """(G, ...) sums of (N, ...) over the photographs of each pose."""
+        return x.new_zeros(int(self.group.max()) + 1, *x.shape[1:]).index_add(0, self.group, x)
+
+
+def in_frames(axes: Tensor) -> Tensor:
+    """(N, 6, 6) from twists along some axes to those along other ones, of rotations (N, 3, 3)."""
+    zero = torch.zeros_like(axes)
+    return torch.cat([torch.cat([axes, zero], dim=2), torch.cat([zero, axes], dim=2)], dim=1)
+
+
+@dataclass(frozen=True)
+class RigPhotograph:
+    """A registered photograph ``index`` of a rig: its ``camera`` (4, 4) from the world, ``K`` (3, 3) and ``size``; the
+    ``box`` (4,) in which poses are compared, the crops of it, and the registration of it alone."""
+
+    index: int
+    camera: Tensor
+    K: Tensor
+    size: tuple[int, int]
+    box: Tensor
+    crop: Tensor
+    inside: Tensor
+    query: QueryFeatures
+    descriptor: Tensor
+    mask: Tensor | None
+    result: Registration
+
+    @staticmethod
+    def of(
+        registrar: "Registrar", item: ImageItem, result: Registration, index: int, camera: Tensor
+    ) -> "RigPhotograph":
+        box = item.box.double() if result.corrected_box is None else result.corrected_box
+        settings, boxes, image = registrar.bank.settings, box.float()[None], item.image.expand(3, -1, -1)
+        assert item.camera_matrix is not None
+
+        def crop(size: int) -> Tensor:
+            return crop_regions([image], boxes[:, None], size=size, margin=settings.margin)[:, 0].float()
+
+        query = registrar.matcher.features(crop(settings.image_size).to(registrar.bank.device))
+        return RigPhotograph(
+            index=index,
+            camera=camera,
+            K=item.camera_matrix.double(),
+            size=item.size,
+            box=box,
+            crop=fill_missing(crop(CROP_SIZE)),
+            inside=inside_photographs([image], boxes, CROP_SIZE, settings.margin),
+            query=query,
+            descriptor=F.normalize(registrar.describer.descriptor(query.field), dim=1)[0],
+            mask=registrar.object_mask(query, [replace(item, box=boxes[0])]),
+            result=result,
+        )
+
+    @property
+    def poses(self) -> Tensor:
+        """(H, 4, 4) ``T_world_from_model`` of its hypotheses."""
+        poses: Tensor = torch.linalg.inv(self.camera) @ torch.stack([h.projection[0] for h in self.result.hypotheses])
+        return poses
+
+    def sees(self, hull: Tensor, T: Tensor) -> Tensor:
+        """(N,) bool: whether world poses (N, 4, 4) lie near the box."""
+        boxes, visible = boxes_at(hull, self.camera @ T, self.K, self.size)
+        return visible & (box_iou(boxes, self.box[None].to(boxes))[:, 0] >= MIN_OVERLAP)
+
+
+Found = dict[int, RigPhotograph | CurviregError]
+"""Photographs of a rig by their index, or why they failed."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """M candidate poses in the world, best first, with ``evidence`` (V, M, 4) and ``scores`` (V, M) in V photographs,
+    and covariances (M, 6, 6), NaN for those that are not finished."""
+
+    T: Tensor
+    evidence: Tensor
+    scores: Tensor
+    covariance: Tensor
+
+
+class Rig:
+    """Photographs of one object, whose poses are compared in all of them."""
+
+    def __init__(self, registrar: "Registrar", photographs: Sequence[RigPhotograph]) -> None:
+        self.registrar, self.describer, self.photographs = registrar, registrar.describer, photographs
+        self.exact = registrar.is_exact(with_camera=True)
+        symmetries = registrar.symmetries_of(exact=self.exact)
+        self.symmetries = torch.eye(3)[None].double() if symmetries is None else symmetries[:, :3, :3].double()
+        self.cameras = torch.stack([p.camera for p in photographs])
+        self.eyes = -(self.cameras[:, :3, :3].mT @ self.cameras[:, :3, 3:])[..., 0]
+
+    @staticmethod
+    def of(registrar: "Registrar", found: Found) -> "Rig":
+        """The photographs that were registered, if there are any, in the unit of the mesh."""
+        usable = [one for _, one in sorted(found.items()) if isinstance(one, RigPhotograph)]
+        if not usable:
+            reasons = "; ".join(
+                f"image {i}: {one.message}" for i, one in found.items() if isinstance(one, CurviregError)
+            )
+            raise InvalidInputError(f"no photograph can be registered: {reasons}")
+        rig = Rig(registrar, usable)
+        rig.check_unit()
+        return rig
+
+    def check_unit(self) -> None:
+        """Refuse cameras whose rays meet much nearer or farther than the size of the object says."""
+        rays = self.places[0] - self.eyes
+        distance = torch.linalg.vector_norm(rays, dim=1)
+        rays = rays / distance[:, None]
+        across = torch.eye(3).double() - rays[:, :, None] * rays[:, None]
+        if float(torch.linalg.eigvalsh(across.mean(dim=0))[0]) < MIN_PARALLAX**2:
+            return
+        meeting = torch.linalg.solve(across.sum(dim=0), (across @ self.eyes[..., None]).sum(dim=0))[:, 0]
+        factor = ((meeting - self.eyes) * rays).sum(dim=1).abs() / distance
+        if float(factor.min()) > MAX_UNIT_FACTOR or float(factor.max()) < 1.0 / MAX_UNIT_FACTOR:
+            raise InvalidInputError(
+                f"T_cam_from_world: by its size the object is {float(distance[0]):.3g} away, by the cameras' rays "
+                f"{float(factor[0] * distance[0]):.3g}; give translations in the mesh's unit",
+                subject=f"image {self.photographs[0].index}",
+            )
+
+    def centres(self, T: Tensor) -> Tensor:
+        """(N, 3) the object's centres of poses (N, 4, 4)."""
+        centres: Tensor = T[:, :3, :3] @ self.describer.centre + T[:, :3, 3]
+        return centres
+
+    @cached_property
+    def places(self) -> tuple[Tensor, Tensor]:
+        """The object's centre (V, 3) from each photograph alone, and its precision, see :meth:`precision`."""
+        place = self.centres(torch.stack([p.poses[0] for p in self.photographs]))
+        return place, self.precision(place, torch.arange(len(place)))
+
+    def precision(self, place: Tensor, source: Tensor) -> Tensor:
+        """(N, 3, 3) inverse covariances of centres (N, 3) that photographs ``source`` (N,) alone tell."""
+        ray = place - self.eyes[source]
+        distance = torch.linalg.vector_norm(ray, dim=1)[:, None, None]
+        along = (ray[:, :, None] * ray[:, None]) / distance**2
+        across = (CENTRE_ERROR * self.describer.radius) ** 2 + (RIG_ERROR * distance) ** 2
+        precision: Tensor = (torch.eye(3).double() - along) / across + along / (DEPTH_ERROR * distance) ** 2
+        return precision
+
+    def candidates(self) -> Tensor:
+        """(M, 4, 4) distinct world poses of all hypotheses, moved to where the photographs agree that the object is,
+        most promising first."""
+        T = torch.cat([p.poses for p in self.photographs])
+        source = torch.tensor([v for v, p in enumerate(self.photographs) for _ in p.result.hypotheses])
+        place, (others, theirs) = self.centres(T), self.places
+        own = self.precision(place, source)
+        gap = (place[:, None] - others)[..., None]
+        total = torch.linalg.inv(own)[:, None] + torch.linalg.inv(theirs)
+        agree = (gap.mT @ torch.linalg.solve(total, gap))[..., 0, 0] <= MAX_PLACE_DISTANCE
+        agree = agree.scatter(1, source[:, None], False)[:, :, None, None].double()
+        A = own + (agree * theirs).sum(dim=1)
+        b = own @ place[..., None] + (agree * (theirs @ others[..., None])).sum(dim=1)
+        R = T[:, :3, :3]
+        T = transform(R, torch.linalg.solve(A, b)[..., 0] - R @ self.describer.centre)
+        return T[self.distinct(T, _bounded(self.ranks(T)).sum(dim=0))[:FITTED_CANDIDATES]]
+
+    def distinct(self, T: Tensor, score: Tensor) -> Tensor:
+        """Indices of world poses, best first, without those that are nearly equal to a better one."""
+        kept: list[int] = []
+        place = self.centres(T)
+        for k in score.argsort(descending=True, stable=True).tolist():
+            near = self.angles(T[kept], T[k : k + 1])[:, 0] <= SAME_ANGLE
+            shift = torch.linalg.vector_norm(place[kept] - place[k], dim=1)
+            if not bool((near & (shift <= SAME_SHIFT * self.describer.radius)).any()):
+                kept.append(k)
+        return torch.tensor(kept)
+
+    def angles(self, R: Tensor, others: Tensor) -> Tensor:
+        """(M, N) degrees between rotations (M, 3, 3) and (N, 3, 3), or those of poses, up to symmetries."""
+        R, others = R[:, :3, :3], others[:, :3, :3]
+        traces = ((R[:, None] @ self.symmetries).flatten(2) @ others.flatten(1).T).amax(dim=1)
+        return torch.rad2deg((0.5 * (traces - 1.0)).clamp(-1.0, 1.0).acos())
+
+    def ranks(self, T: Tensor) -> Tensor:
+        """(V, M) log S of the best view of the bank near world poses, minus that of the best view of all."""
+        ranks, views = [], self.registrar.bank.rotations.cpu().double()
+        for photograph in self.photographs:
+            scores = photograph.result.ranking.scores[0].cpu().double()
+            log = scores.clamp(min=torch.finfo(torch.float64).tiny).log()
+            angles = self.angles(self.allocentric(photograph, T)[0], views)
+            near = angles <= angles.amin(dim=1, keepdim=True).clamp(min=SAME_ANGLE)
+            ranks.append(torch.where(near, log, -torch.inf).amax(dim=1) - log.max())
+        return torch.stack(ranks)
+
+    def allocentric(self, photograph: RigPhotograph, T: Tensor) -> tuple[Tensor, Tensor]:
+        """Rotations (M, 3, 3) as seen by a camera that looks straight at the object, and its distances (M,)."""
+        position = self.centres(photograph.camera @ T)
+        R = rotation_towards(position).mT @ photograph.camera[:3, :3] @ T[:, :3, :3]
+        return R, torch.linalg.vector_norm(position, dim=1)
+
+    @cached_property
+    def problems(self) -> list[RigProblem]:
+        """One pose in all photographs: at full size, half of it, and a quarter."""
+        photographs, settings = self.photographs, self.registrar.bank.settings
+        crops, inside = (torch.cat([getattr(p, name) for p in photographs]) for name in ("crop", "inside"))
+        squares = square_boxes(torch.stack([p.box for p in photographs]).float(), settings.margin)
+        K = crop_transforms(squares, CROP_SIZE).double() @ torch.stack([p.K for p in photographs])
+        masks = [p.mask for p in photographs if p.mask is not None]
+        mask = ObjectMask(torch.cat(masks)) if masks else None
+        index = torch.arange(len(photographs))
+        full = RigProblem(
+            *(self.describer.contours, EdgeField(crops, inside), index, K, CROP_SIZE, mask),
+            axes=self.cameras[:, :3, :3] @ self.cameras[0, :3, :3].mT,
+            group=torch.zeros_like(index),
+            alone=self.cameras,
+            root=torch.zeros(len(index), 6, 6, dtype=torch.float64),
+        )
+        return [full, *(smaller_problem(full, crops, inside, factor) for factor in (2, 4))]
+
+    def tied(self, problem: RigProblem, T: Tensor) -> tuple[RigProblem, Tensor]:
+        """The problem of M world poses, and their poses (M V, 4, 4) in the cameras."""
+        M, V = len(T), len(self.photographs)
+        every, pose = torch.arange(V).repeat(M), torch.arange(M).repeat_interleave(V)
+        cams = self.cameras[every] @ T[pose]
+        alone, covariance = self.found_alone(cams, every)
+        # From errors of the model's origin to those of the object's centre.
+        lever = torch.eye(6, dtype=torch.float64).repeat(len(cams), 1, 1)
+        lever[:, 3:, :3] = cross_matrix(alone[:, :3, :3] @ self.describer.centre)
+        values, vectors = torch.linalg.eigh(lever.mT @ _inverse(covariance) @ lever)
+        root = (vectors * values.clamp(min=0.0).sqrt()[:, None]).mT
+        return replace(problem[every], group=pose, alone=alone, root=root), cams
+
+    def found_alone(self, cams: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
+        """The poses (N, 4, 4) nearest to given ones that photographs ``source`` (N,) alone found, and their covariances
+        (N, 6, 6): NaN where there is none within ``SAME_ANGLE``."""
+        T, C = cams.clone(), torch.full((len(cams), 6, 6), torch.nan, dtype=torch.float64)
+        for n, (pose, v) in enumerate(zip(cams, source.tolist(), strict=True)):
+            for hypothesis in self.photographs[v].result.hypotheses:
+                near = float(rotation_error(hypothesis.projection[0][:3, :3], pose[:3, :3])) <= SAME_ANGLE
+                if near and hypothesis.covariance is not None and bool(C[n].isnan().all()):
+                    T[n], C[n] = hypothesis.projection[0], hypothesis.covariance
+        return T, C
+
+    def fitted(self, problem: RigProblem, T: Tensor, radii: Sequence[float]) -> tuple[Tensor, Tensor, ContourState]:
+        """World poses (M, 4, 4) after a joint fit, their edge supports (V, M), and their state.
+
+        If the fit does not improve the support of all photographs together, the initial pose is kept.
+        """
+        (each, cams), V = self.tied(problem, T), len(self.photographs)
+        start = each.state(cams)
+        found = each.descend(start, radii)
+        (before, weighted_before), (after, weighted) = each.supports(start), each.supports(found)
+        better = (each.summed(weighted) > each.summed(weighted_before))[each.group]
+        state = ContourState.cat([start, found])[torch.arange(len(cams)) + len(cams) * better]
+        support = torch.where(better, after, before).view(len(T), V).T
+        return torch.linalg.inv(self.cameras[0]) @ state.T[::V], support, state
+
+    def answer(self) -> Answer:
+        """Candidates, fitted in all photographs and ordered by the sum of their scores; the hypotheses of one."""
+        if len(self.photographs) == 1:
+            return self.hypotheses_of_one()
+        full, half, quarter = self.problems
+        T, _, _ = self.fitted(quarter, self.candidates(), QUARTER_SIZE_RADII)
+        T, support, _ = self.fitted(half, T, FIRST_RADII)
+        promising = (SCORE_WEIGHTS[2] * support + _bounded(self.ranks(T))).sum(dim=0)
+        chosen = self.distinct(T, promising)[:JUDGED_CANDIDATES]
+        T, support = T[chosen], support[:, chosen]
+        best = min(FINISHED_CANDIDATES, len(T))
+        T[:best], support[:, :best], state = self.fitted(full, T[:best], FULL_SIZE_RADII)
+        covariance = torch.full((len(T), 6, 6), torch.nan, dtype=torch.float64)
+        covariance[:best] = self.covariances(T[:best], state)
+        evidence = self.evidence(T, support)
+        sees = torch.stack([p.sees(self.describer.hull, T) for p in self.photographs])
+        scores = _bounded(torch.where(sees, self.scores(evidence), -torch.inf))
+        order = (self.weights(T[0]) @ scores).argsort(descending=True, stable=True)
+        return Answer(T[order], evidence[:, order], scores[:, order], covariance[order])
+
+    def hypotheses_of_one(self) -> Answer:
+        (photograph,) = self.photographs
+        found = photograph.result.hypotheses
+        evidence = torch.tensor([[h.evidence[name] for name in POSE_FEATURES] for h in found]).double()[None]
+        P, unknown = in_frames(self.cameras[:, :3, :3]), torch.full((6, 6), torch.nan).double()
+        C = torch.stack([unknown if h.covariance is None else h.covariance for h in found])
+        return Answer(photograph.poses, evidence, self.scores(evidence), P.mT @ C @ P)
+
+    def covariances(self, T: Tensor, state: ContourState) -> Tensor:
+        """(M, 6, 6) of finished world poses, from those of each photograph: its contours', or that found alone.
+
+        They are larger where the photographs alone contradict the joint pose, by the mean of their squared gaps: the
+        cameras' poses have errors.
+        """
+        each, cams = self.tied(self.problems[0], T)
+        measured, radius = each.measured_edges(state, FULL_SIZE_RADII[-1]), self.describer.radius
+        seen, _ = pose_covariance(measured, state.points, state.T, each.K, each.centre, radius=radius)
+        every = torch.arange(len(self.photographs)).repeat(len(T))
+        _, alone = self.found_alone(cams, every)
+        known = alone.isfinite().all(dim=-1).all(dim=-1)
+        better = ~(alone.logdet() >= seen.logdet()) & known
+        precision = _inverse(torch.where(better[:, None, None], alone, seen))
+        weights, P = torch.cat([self.weights(one) for one in T]), in_frames(self.cameras[every, :3, :3])
+        covariance: Tensor = torch.linalg.inv(each.summed(weights[:, None, None] * (P.mT @ precision @ P)))
+        freedom = 6.0 * each.summed(known.double()) - 6.0
+        misfit = each.summed(each.gaps(state.T).square().sum(dim=(1, 2))) / freedom.clamp(min=6.0)
+        return covariance * misfit.clamp(min=1.0)[:, None, None]
+
+    def weights(self, T: Tensor) -> Tensor:
+        """(V,) in (0, 1] weights of photographs: those from nearly the same side of a world pose (4, 4) share one."""
+        side = F.normalize(self.eyes - self.centres(T[None]), dim=1)
+        angle = torch.rad2deg((side @ side.T).clamp(-1.0, 1.0).acos())
+        return 1.0 / (1.0 - angle / SAME_DIRECTION).clamp(min=0.0).fill_diagonal_(1.0).sum(dim=1)
+
+    def evidence(self, T: Tensor, support: Tensor) -> Tensor:
+        """(V, M, 4) :data:`POSE_FEATURES` of world poses with edge supports (V, M)."""
+        matcher, parts = self.registrar.matcher, []
+        for photograph in self.photographs:
+            R, distance = self.allocentric(photograph, T)
+            views = F.normalize(self.describer.descriptors(R, distance), dim=1)
+            similarity = (views @ photograph.descriptor).double().cpu()
+            appearance, ranking = torch.zeros_like(similarity), photograph.result.ranking
+            if Appearance.name in ranking.terms:
+                pictures, only = matcher.describer.shaded(R, distance), torch.zeros(len(T)).long()
+                appearance = matcher.reranking_score(Appearance.name, photograph.query, ranking, pictures, only)
+            parts.append(torch.stack([similarity, appearance]))
+        similarity, appearance = torch.stack(parts, dim=1)
+        return torch.stack([self.ranks(T), similarity, support, appearance], dim=-1)
+
+    def scores(self, evidence: Tensor) -> Tensor:
+        """(V, M) of (V, M, 4)."""
+        return evidence @ torch.tensor(SCORE_WEIGHTS if self.exact else RANK_ALONE, dtype=torch.float64)
+
+    def lost(self, answer: Answer) -> dict[int, str]:
+        """Why photographs do not show the best pose, by their index; {} if none shows it."""
+        reasons: dict[int, str] = {}
+        pairs = answer.evidence[:, 0, 1:3].tolist()
+        sees = [bool(p.sees(self.describer.hull, answer.T[:1])) for p in self.photographs]
+        found = [
+            refinement_confidence({"similarity": similarity, "edge_support": support}) if seen else 0.0
+            for (similarity, support), seen in zip(pairs, sees, strict=True)
+        ]
+        for v, photograph in enumerate(self.photographs):
+            if not sees[v]:
+                reasons[photograph.index] = ELSEWHERE
+            elif found[v] < LOST_CONFIDENCE * max(found):
+                numbers = "similarity {:.2f}, edge support {:.2f}".format(*pairs[v])
+                reasons[photograph.index] = f"the object is not seen where the other photographs have it ({numbers})"
+        return reasons if len(reasons) < len(self.photographs) else {}
+
+    def hypothesis(self, answer: Answer, m: int, evidence: Tensor) -> Hypothesis:
+        """World pose ``m`` with its mean evidence, as it is reported."""
+        first, T, C = self.photographs[0], answer.T[m], answer.covariance[m]
+        (R,), (distance,) = self.allocentric(first, T[None])
+        features = dict(zip(POSE_FEATURES, evidence.tolist(), strict=True))
+        return Hypothesis(
+            rotation=T[:3, :3].clone(),
+            translation=T[:3, 3].clone(),
+            score=features["similarity"],
+            evidence=features,
+            allocentric_rotation=R,
+            distance=float(distance),
+            projection=(first.camera @ T, first.K),
+            view=nearest_view(self.registrar, R),
+            edge_support=features["edge_support"],
+            covariance=C.clone() if bool(C.isfinite().all()) else None,
+        )
+
+
+def _inverse(covariance: Tensor) -> Tensor:
+    """(N, 6, 6) precisions of covariances, nearly 0 where they are unknown (NaN)."""
+    known = covariance.isfinite().all(dim=-1).all(dim=-1)[:, None, None]
+    none = 1e-12 * torch.eye(6, dtype=torch.float64)
+    return torch.where(known, torch.linalg.inv(torch.where(known, covariance, torch.eye(6).double())), none)
+
+
+def _bounded(scores: Tensor) -> Tensor:
+    """(V, M) scores, at least ``MAX_MARGIN`` below the best of each photograph."""
+    best = scores.amax(dim=1, keepdim=True)
+    return torch.where(best.isfinite(), torch.maximum(scores, best - MAX_MARGIN), 0.0)
