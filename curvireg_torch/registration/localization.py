@@ -26,7 +26,7 @@ from ..utils.checks import as_numbers, check_camera_matrix, check_photograph, ch
 from .confidence import detection_probability
 from .inputs import ImageItem, check_crop, image_items
 from .poses import projected_box
-from .priors import BatchPriors
+from .priors import Limits
 from .result import FailedRegistration, Localization, Registration
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def _allowed_views(registrar: "Registrar", item: ImageItem) -> Tensor:
         points = torch.tensor([((x0 + x1) / 2, (y0 + y1) / 2, 1), (x0, y0, 1), (x1, y0, 1), (x0, y1, 1), (x1, y1, 1)])
         rays = F.normalize(torch.linalg.solve(item.camera_matrix.double(), points.double().T), dim=0)
         off_centre = float(torch.rad2deg(torch.acos((rays[:, :1] * rays[:, 1:]).sum(dim=0).clamp(-1, 1).min())))
-    return BatchPriors([item], registrar.bank).allowed(registrar.bank, off_centre=off_centre)[0]
+    return Limits(item, registrar.bank).allowed(off_centre=off_centre)
 
 
 def _register_candidates(
@@ -209,7 +209,7 @@ class Candidate:
         query = registrar.matcher.query([item.image], box[None].float())
         allowed = None
         if item.prior is not None:
-            allowed = BatchPriors([replace(item, box=box.float())], registrar.bank).allowed(registrar.bank)
+            allowed = Limits(replace(item, box=box.float()), registrar.bank).allowed()[None]
         ranking = registrar.matcher.rank(query, allowed)
         similarity = float(ranking.hog[0, ranking.order[0, 0]])
         learned = registrar.locator.features.learned
@@ -217,7 +217,7 @@ class Candidate:
 
     def register(self, registrar: "Registrar", item: ImageItem) -> Registration:
         """Register the box; the result's box is the one around its pose."""
-        result = registrar.register([replace(item, box=self.box.float())], self.query, self.ranking)[0]
+        result = registrar.register(replace(item, box=self.box.float()), self.query, self.ranking)
         box = projected_box(registrar.describer, result.projection)
         none = torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0)
         return replace(result, localization=Localization(box, self.presence, self.score, *none))
