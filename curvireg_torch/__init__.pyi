@@ -19,6 +19,7 @@ from .data import (
     BOPDataset as BOPDataset,
     Pascal3DPlus as Pascal3DPlus,
     WebCollection as WebCollection,
+    load_camera as load_camera,
 )
 from .features import (
     HOG as HOG,
@@ -53,6 +54,7 @@ from .filters import (
     principal_curvature_image as principal_curvature_image,
 )
 from .geometry import (
+    Camera as Camera,
     PosePrior as PosePrior,
     ViewSphere as ViewSphere,
     camera_matrix as camera_matrix,

@@ -123,6 +123,9 @@ MAX_POLYGON_WORK = 20_000_000
 MAX_TABLE_BYTES = 1 << 25
 """Bytes of a JSON or CSV file, 32 MiB; rows of a CSV of poses take up to 60 times as much memory."""
 
+MAX_CAMERA_BYTES = 1 << 22
+"""Bytes of a calibration file."""
+
 MAX_MAT_BYTES = 1 << 20
 """Bytes of a MATLAB annotation file, and of what it unpacks to."""
 

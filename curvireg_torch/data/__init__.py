@@ -6,6 +6,7 @@ A sample is a dict, one per object. Every dataset reports skipped objects with t
 
 from ._base import ObjectDataset, collate
 from .bop import BOPDataset, BOPRow, read_bop_csv, write_bop_csv
+from .camera_files import load_camera
 from .images import Photo, read_image, read_photo
 from .pascal3d import Pascal3DPlus
 from .videos import Video
@@ -20,6 +21,7 @@ __all__ = [
     "Video",
     "WebCollection",
     "collate",
+    "load_camera",
     "read_bop_csv",
     "read_image",
     "read_photo",

@@ -9,6 +9,7 @@ Conventions of the whole library (pinned by ``tests/geometry``):
 - Poses refer to the frame and unit of the mesh file; ``up`` names the axis that points up and rotates nothing.
 """
 
+from .calibration import Camera, undistorted
 from .cameras import camera_matrix, project_points, projected_boxes, rotation_towards, transform
 from .conversions import (
     axis_angle_from_rotation,
@@ -27,6 +28,7 @@ from .viewpoint import rotation_error, rotation_from_viewpoint, up_rotation, vie
 from .views import ViewSphere, sample_views, uniform_views
 
 __all__ = [
+    "Camera",
     "PosePrior",
     "ViewSphere",
     "axis_angle_from_rotation",
@@ -51,6 +53,7 @@ __all__ = [
     "square_boxes",
     "symmetry_transforms",
     "transform",
+    "undistorted",
     "uniform_views",
     "up_rotation",
     "viewpoint_from_rotation",

@@ -8,9 +8,6 @@ import trimesh
 
 __all__ = ["MeshEdges"]
 
-MAX_FACES = 8000
-"""Faces to which larger meshes are simplified: at 256 px their contours move by less than a fifth of a pixel."""
-
 WELD = 1e-6
 """Vertices nearer than this fraction of the mesh's longest side are one."""
 
@@ -29,6 +26,11 @@ class MeshEdges:
 
     Polygon soups work: vertices are welded, doubled faces count once, and the orientation of faces does not matter.
 
+    Args:
+        mesh: a triangle mesh.
+        centre: (3,), subtracted from its vertices.
+        max_faces: to which larger meshes are simplified.
+
     Attributes:
         vertices: (V, 3) float64, relative to ``centre``.
         faces: (F, 3) int.
@@ -38,16 +40,16 @@ class MeshEdges:
         is_boundary, is_crease, is_smooth: (E,) bool.
 
     Example:
-        >>> edges = MeshEdges(trimesh.creation.box((1, 2, 3)), np.zeros(3))
+        >>> edges = MeshEdges(trimesh.creation.box((1, 2, 3)), np.zeros(3), max_faces=100)
         >>> int(edges.is_crease.sum()), len(edges.edges)
         (12, 18)
     """
 
-    def __init__(self, mesh: trimesh.Trimesh, centre: np.ndarray) -> None:
+    def __init__(self, mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int) -> None:
         vertices, faces = _welded(np.asarray(mesh.vertices, np.float64) - centre, np.asarray(mesh.faces))
-        if len(faces) > MAX_FACES:
+        if len(faces) > max_faces:
             points, triangles = fast_simplification.simplify(
-                vertices.astype(np.float32), faces.astype(np.int32), target_count=MAX_FACES
+                vertices.astype(np.float32), faces.astype(np.int32), target_count=max_faces
             )
             vertices, faces = _welded(points.astype(np.float64), triangles)
         self.vertices, self.faces = vertices, faces

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,9 +19,17 @@ __all__ = ["mesh_symmetries"]
 POINTS, TESTED = 40_000, 2_000
 """Random points of the surface, and how many of them are compared with all."""
 
-TOLERANCE, FRACTION = 0.03, 0.995
+TOLERANCE, FRACTION = 0.03, 0.975
 """A rotation is a symmetry if so large a fraction of the points lands within 0.03 radii of the surface: about 2 px of
-a crop of 128 px, which hardly changes its contours, while a handle does."""
+a crop of 128 px, which hardly changes its contours. The pull tab of a can is less than the rest, a handle more."""
+
+NEAR_SYMMETRY = 0.12
+"""Mean distance in radii below which a rotation is aligned: axes of scanned meshes are tilted by a degree or two, and
+do not pass through the centroid."""
+
+ALIGNMENT_STEPS, ALIGNED_POINTS, ALIGNED_FRACTION, MAX_TILT = 8, 500, 0.9, 5.0
+"""Iterations of ICP, the points that it moves, the fraction of them that it trusts in each iteration, and the degrees
+by which it may change a rotation."""
 
 ROUND = 36
 """Rotations that stand for a body of revolution; steps of 10 degrees are those of a bank."""
@@ -34,15 +43,15 @@ LARGEST_GROUP = 2 * ROUND
 DEFINED = 0.05
 """A principal axis is well defined if its moment differs from the others by so large a fraction of the largest."""
 
-NEARLY_EQUAL = 1.0 + 2.0 * math.cos(math.radians(3.0))
-"""Trace of A^T B from which two rotations count as one: 3 degrees apart."""
+NEARLY_EQUAL = 1.0 + 2.0 * math.cos(math.radians(5.0))
+"""Trace of A^T B from which two rotations count as one: 5 degrees apart."""
 
 
 def mesh_symmetries(mesh: trimesh.Trimesh) -> Tensor:
-    """Rotations about the centroid of a mesh's surface that leave its shape as it is; colours are not compared.
+    """Rotations of a mesh that leave its shape as it is, up to small details; colours are not compared.
 
-    The axes that are tried are those of the mesh file and the principal axes of its surface. About each, bodies of
-    revolution and rotations of order 2 to 6 and 8 are found; products of symmetries are symmetries too.
+    The axes that are tried are those of the mesh file and the principal axes of its surface, each aligned by ICP. About
+    each, bodies of revolution and rotations of order 2 to 6 and 8 are found; products of symmetries are symmetries too.
 
     Returns:
         (S, 4, 4) float64 transforms of the model frame, the identity first; S = 1 for a mesh without symmetries.
@@ -51,34 +60,81 @@ def mesh_symmetries(mesh: trimesh.Trimesh) -> Tensor:
         >>> mesh_symmetries(trimesh.creation.box((1, 2, 3))).shape  # half turns about three axes
         torch.Size([4, 4, 4])
     """
-    centre = torch.from_numpy(np.array(mesh.centroid, dtype=np.float64))  # which every symmetry maps to itself
-    cloud = np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=0)[0])
-    cloud = (cloud - centre.numpy()) / mesh_radius(mesh)
-    tree, some = cKDTree(cloud), cloud[:: POINTS // TESTED]
-
-    def fits(axis: Tensor, angle: float) -> bool:
-        R = rotation_from_axis_angle(angle * axis).numpy()
-        return _close(tree, some[::20] @ R.T) and _close(tree, some @ R.T)
-
-    turns, revolutions = [], []
-    for axis in _axes(cloud):
-        if all(fits(axis, angle) for angle in (1.0, 2.3)):
-            revolutions.append(axis)
-        else:
-            turns += [(axis, 2.0 * math.pi / order) for order in ORDERS if fits(axis, 2.0 * math.pi / order)]
+    centre, radius = np.array(mesh.centroid, dtype=np.float64), mesh_radius(mesh)
+    surface = _Surface((np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=0)[0]) - centre) / radius)
+    revolutions: list[_Line] = []
+    turns: list[tuple[_Line, float]] = []
+    for axis in _axes(surface.cloud):
+        if all(lines := [surface.aligned(axis, angle) for angle in (1.0, 2.3)]):
+            revolutions += [line for line in lines[1:] if line is not None]
+            continue
+        angles = [2.0 * math.pi / order for order in ORDERS]
+        turns += [(line, angle) for angle in angles if (line := surface.aligned(axis, angle)) is not None]
     if revolutions:  # any half turn about another axis turns it upside down; more of them would add nothing
-        upside_down = [(axis, math.pi) for axis in revolutions[1:]] + turns
-        turns = [(revolutions[0], 2.0 * math.pi / ROUND), *upside_down[:1]]
-    R = _group([rotation_from_axis_angle(angle * axis) for axis, angle in turns])
+        round_axis = revolutions[0]
+        upside_down = [(line, math.pi) for line in revolutions[1:]] + [turn for turn in turns if turn[1] == math.pi]
+        turns = [(round_axis, 2.0 * math.pi / ROUND)]
+        turns += [(line.across(round_axis), angle) for line, angle in upside_down[:1]]
+    R = _group([rotation_from_axis_angle(angle * line.axis) for line, angle in turns])
+    fixed = torch.from_numpy(centre) + radius * _common_point([line for line, _ in turns])
     transforms = torch.eye(4, dtype=torch.float64).repeat(len(R), 1, 1)
     transforms[:, :3, :3] = R
-    transforms[:, :3, 3] = centre - R @ centre
+    transforms[:, :3, 3] = fixed - R @ fixed
     return transforms
 
 
-def _close(tree: cKDTree, points: NDArray[np.float64]) -> bool:
-    distance, _ = tree.query(points, distance_upper_bound=TOLERANCE)
-    return float(np.isfinite(distance).mean()) >= FRACTION
+@dataclass(frozen=True)
+class _Line:
+    """An axis of rotation: a unit vector (3,) and a point (3,) on it."""
+
+    axis: Tensor
+    point: Tensor
+
+    def across(self, other: "_Line") -> "_Line":
+        """The nearest axis that is perpendicular to the other one."""
+        axis = self.axis - (self.axis @ other.axis) * other.axis
+        return _Line(axis / torch.linalg.vector_norm(axis), self.point)
+
+
+def _common_point(lines: Sequence[_Line]) -> Tensor:
+    """(3,) point nearest to all lines, and among such points to the origin; the origin without lines."""
+    if not lines:
+        return torch.zeros(3, dtype=torch.float64)
+    across = torch.stack([torch.eye(3, dtype=torch.float64) - torch.outer(line.axis, line.axis) for line in lines])
+    points = torch.stack([line.point for line in lines])
+    point: Tensor = torch.linalg.pinv(across.sum(dim=0), rtol=1e-3) @ (across @ points[..., None]).sum(dim=0)[:, 0]
+    return point
+
+
+class _Surface:
+    """Points (N, 3) of a surface whose radius is 1, near the origin."""
+
+    def __init__(self, cloud: NDArray[np.float64]) -> None:
+        self.cloud, self._tree, self._some = cloud, cKDTree(cloud), cloud[:: POINTS // TESTED]
+
+    def aligned(self, axis: Tensor, angle: float) -> _Line | None:
+        """The axis near a given one through the origin about which a rotation leaves the shape as it is, if any."""
+        R = start = rotation_from_axis_angle(angle * axis).numpy()
+        t, points = np.zeros(3), self._some[:: TESTED // ALIGNED_POINTS]
+        if self._tree.query(points[::5] @ R.T)[0].mean() > NEAR_SYMMETRY:
+            return None
+        for _ in range(ALIGNMENT_STEPS):
+            distance, nearest = self._tree.query(points @ R.T + t)
+            near = distance <= np.quantile(distance, ALIGNED_FRACTION)
+            source, target = points[near], self.cloud[nearest[near]]
+            U, _, V = np.linalg.svd((source - source.mean(axis=0)).T @ (target - target.mean(axis=0)))
+            V[2] *= np.sign(np.linalg.det(U @ V))
+            R = (U @ V).T
+            t = target.mean(axis=0) - R @ source.mean(axis=0)
+        if np.trace(R @ start.T) < 1.0 + 2.0 * math.cos(math.radians(MAX_TILT)):
+            return None
+        distance, _ = self._tree.query(self._some @ R.T + t, distance_upper_bound=TOLERANCE)
+        if float(np.isfinite(distance).mean()) < FRACTION:
+            return None
+        # The axis is what R leaves in place; the point on it nearest to the origin solves (1 - R) x = t across it.
+        vectors, _, _ = np.linalg.svd(np.eye(3) - R.T)
+        found = torch.from_numpy(vectors[:, 2] * np.sign(vectors[:, 2] @ axis.numpy()))
+        return _Line(found, torch.from_numpy(np.linalg.pinv(np.eye(3) - R, rcond=1e-3) @ t))
 
 
 def _axes(cloud: NDArray[np.float64]) -> list[Tensor]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -27,10 +27,10 @@ from .least_squares import (
     Measurements,
     apply_twist,
     damped_solution,
-    least_squares_step,
     pixels,
     pose_covariance,
     project,
+    step_fraction,
 )
 
 __all__ = ["ContourFit", "ContourProblem", "ContourState", "EdgeField", "ObjectMask", "contour_support", "fit_contours"]
@@ -259,15 +259,22 @@ class ContourProblem:
             strength = strength * self.mask.weights(uv, points, _offsets(radius)[1:-1], self.image_index, self.size)
         equations = [other.equations() for other in others]
         step = torch.zeros(len(T), 6, 1, dtype=torch.float64)
-        for selection in range(SELECTIONS_PER_STEP):
+        for _ in range(SELECTIONS_PER_STEP):
             residual = distance - J @ step
             index = (strength * torch.exp(-2.0 * (residual / radius) ** 2)).argmax(dim=-1, keepdim=True)
             tukey = (1.0 - (residual.gather(-1, index) / radius) ** 2).clamp(min=0.0) ** 2
             edges = Measurements(J, distance.gather(-1, index), strength.gather(-1, index) * tukey)
             A, b = (sum(parts) for parts in zip(edges.equations(), *equations, strict=True))
-            if selection < SELECTIONS_PER_STEP - 1:
-                step = damped_solution(A, b, EDGE_DAMPING)[..., None]
-        return apply_twist(T, least_squares_step(A, b, T, self.centre, EDGE_DAMPING), self.centre)
+            step = self.solution(A, b)[..., None]
+        return apply_twist(T, step[..., 0] * self.step_fraction(step[..., 0], T)[:, None], self.centre)
+
+    def solution(self, A: Tensor, b: Tensor) -> Tensor:
+        """(N, 6) damped solutions of normal equations (N, 6, 6) and (N, 6, 1)."""
+        return damped_solution(A, b, EDGE_DAMPING)
+
+    def step_fraction(self, step: Tensor, T: Tensor) -> Tensor:
+        """(N,) see :func:`step_fraction`."""
+        return step_fraction(step, T, self.centre)
 
     def _candidates(self, uv: Tensor, points: ContourPoints, radius: float) -> tuple[Tensor, Tensor]:
         """Distances in px along the normals and strengths, both (N, P, L); the strength is 0 where there is no edge."""
@@ -307,6 +314,9 @@ class ContourProblem:
         d = distance.gather(-1, index)
         W = strength.gather(-1, index) * (1.0 - (d / radius) ** 2).clamp(min=0.0) ** 2
         return Measurements((points.normals[..., None, :] @ du)[..., 0, :], d, W)
+
+
+Problem = TypeVar("Problem", bound=ContourProblem)
 
 
 def _offsets(radius: float) -> Tensor:
@@ -426,7 +436,7 @@ def fit_contours(
     if object_mask is not None:
         check_tensor(object_mask, "object_mask", (len(images), 1, None, None))
         full = replace(full, mask=ObjectMask(object_mask))
-    half, quarter = (_smaller(full, crops, inside, factor) for factor in (2, 4))
+    half, quarter = (smaller_problem(full, crops, inside, factor) for factor in (2, 4))
     before, weighted_before = half.supports(half.state(T0))
     wide = _turned(T0, half.centre, wide_angles)
     every = torch.arange(N).repeat_interleave(wide.shape[1])
@@ -496,7 +506,7 @@ def full_size_problem(
     return crops, inside, ContourProblem(contours, EdgeField(crops, inside), image_index, K, CROP_SIZE)
 
 
-def _smaller(full: ContourProblem, crops: Tensor, inside: Tensor, factor: int) -> ContourProblem:
+def smaller_problem(full: Problem, crops: Tensor, inside: Tensor, factor: int) -> Problem:
     """The problem in crops whose sides are smaller by a factor."""
     shrink = torch.diag(torch.tensor([1.0 / factor, 1.0 / factor, 1.0], dtype=torch.float64))
     shrink[:2, 2] = 0.5 / factor - 0.5

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError, LostObjectError
+from ..geometry.calibration import Camera
 from ..geometry.cameras import rotation_towards
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_tensor
@@ -41,7 +42,7 @@ class Follower:
 
     Args:
         registrar: of one mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
-        camera_matrix: (3, 3) in px, of all frames.
+        camera_matrix: (3, 3) in px, or a :class:`Camera`, of all frames.
 
     Raises:
         InvalidInputError: a registrar of several meshes.
@@ -55,7 +56,7 @@ class Follower:
         torch.Size([3])
     """
 
-    def __init__(self, registrar: Any, camera_matrix: Tensor) -> None:
+    def __init__(self, registrar: Any, camera_matrix: Tensor | Camera) -> None:
         self.registrar = registrar if isinstance(registrar, Registrar) else Registrar(registrar)
         if self.registrar.others:
             raise InvalidInputError("Follower: expected a registrar of one mesh, which is followed, got several")
@@ -106,7 +107,7 @@ class Follower:
         if not isinstance(item, ImageItem):
             return FailedRegistration(item)
         if not self._base:
-            return self._registered(item, box, BELIEVED_CONFIDENCE)
+            return self._registered(item, image, box, BELIEVED_CONFIDENCE)
         tracked = map_on_threads(self._track, [item])[0]
         found = None if tracked is None else self._registration(tracked, item)
         if tracked and found and tracked.confidence >= TRUSTED_CONFIDENCE and self._base >= BELIEVED_CONFIDENCE:
@@ -121,12 +122,12 @@ class Follower:
             self._tracker.accept(tracked)
             self._base = _confidence(found)
             return found
-        registered = self._registered(item, box, RELIABLE)
+        registered = self._registered(item, image, box, RELIABLE)
         return registered if isinstance(registered, Registration) and registered.reliable else refined
 
-    def _registered(self, item: ImageItem, box: Any, least: float) -> Registration | FailedRegistration:
+    def _registered(self, item: ImageItem, image: Any, box: Any, least: float) -> Registration | FailedRegistration:
         """Register a frame; track from its pose if it lies within the frame, with a confidence of ``least``."""
-        result = self.registrar([item.image], None if box is None else [box], self.camera_matrix)[0]
+        result = self.registrar([image], None if box is None else [box], self.camera_matrix)[0]
         if isinstance(result, Registration) and _confidence(result) >= least:
             with suppress(LostObjectError):
                 map_on_threads(lambda T: self._tracker.start(item.image, _camera(item), T), [_pose(result)])

@@ -1,11 +1,11 @@
-"""Photographs, boxes and cameras in the forms that callers have them, checked one by one.
+"""Photographs, boxes, masks and cameras in the forms that callers have them, checked one by one.
 
 Boxes and cameras that are possible, but probably a mistake, give warnings: a result from them is never reliable.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any, overload
 
@@ -15,16 +15,19 @@ from torch import Tensor
 
 from ..data.images import read_photo
 from ..errors import CurviregError, ImageError, InvalidInputError
-from ..geometry.crops import check_boxes, whole_image_box
+from ..geometry.calibration import Camera, undistorted
+from ..geometry.crops import check_boxes, crop_squares, square_boxes, whole_image_box
 from ..geometry.pose_prior import PosePrior
 from ..utils.checks import (
     are_nearly_equal,
     as_boxes,
     as_camera_matrices,
     check_camera_matrix,
+    check_finite,
     check_photograph,
     check_pixels,
     check_square_pixels,
+    type_and_shape,
 )
 
 __all__ = ["ImageItem", "camera_warnings", "check_box_side", "check_crop", "image_item", "image_items"]
@@ -38,10 +41,14 @@ SMALL_BOX_SIDE = 24
 FOCAL_RANGE = (1 / 3, 20.0)
 """Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of 113 to 3 degrees."""
 
+MISSING_SHARE = 0.2
+"""Part of a box without pixels of the photograph, from which a result carries a warning."""
+
 
 @dataclass(frozen=True)
 class ImageItem:
-    """One photograph to register: ``image`` (1 or 3, H, W) float or uint8, ``box`` (4,), ``camera_matrix`` (3, 3).
+    """One photograph to register, without distortion: ``image`` (1 or 3, H, W) float or uint8, ``box`` (4,),
+    ``camera_matrix`` (3, 3), ``mask`` (H, W) float32 in [0, 1] of the object, and what is questionable about them.
 
     Raises:
         InvalidInputError: something else, an empty box or one outside the image, skew, or pixels that are not square.
@@ -51,6 +58,8 @@ class ImageItem:
     box: Tensor
     camera_matrix: Tensor | None
     prior: PosePrior | None = None
+    mask: Tensor | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_photograph(self.image, "photograph")
@@ -66,8 +75,12 @@ class ImageItem:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is questionable about box and camera, see :func:`input_warnings`."""
-        return input_warnings(self.box, self.camera_matrix, self.size)
+        """What is questionable about box, camera and mask, see :func:`input_warnings`."""
+        return input_warnings(self.box, self.camera_matrix, self.size) + self.notes
+
+    def mask_crop(self, size: int, margin: float) -> Tensor | None:
+        """(1, 1, size, size) of the mask, as the photograph is cropped to its box."""
+        return None if self.mask is None else crop_squares(self.mask[None], square_boxes(self.box[None], margin), size)
 
 
 def image_items(
@@ -75,22 +88,28 @@ def image_items(
     boxes: Any,
     camera_matrices: Any | None,
     prior: PosePrior | Sequence[PosePrior | None] | None = None,
+    masks: Any | None = None,
 ) -> Sequence[ImageItem | CurviregError]:
-    """Photographs with boxes (None: the whole images) and cameras, or their errors; arguments as of ``Registrar``.
+    """Photographs with boxes (None: those of the masks, or the whole images), cameras and masks, or their errors.
+
+    Arguments are those of ``Registrar``. A :class:`Camera` is scaled to the photograph, and its distortion removed.
 
     Each is read and checked whenever it is asked for, so that many large files need the memory of few. A box of which
     too little lies inside its photograph is refused, see :func:`check_box_side`.
 
     Raises:
-        InvalidInputError: not as many boxes, cameras or priors as images, or a distance limited without cameras.
+        InvalidInputError: not as many boxes, cameras, priors or masks as images, or a distance limited without cameras.
     """
     if isinstance(images, str | PathLike) or (isinstance(images, Tensor) and images.ndim != 4):
         raise InvalidInputError("images: expected a batch (B, C, H, W) or a list; put a single image into a list")
     n = len(images)
     boxes = None if boxes is None else as_boxes(boxes, n)
-    cameras: Sequence[Tensor | None] = [None] * n
-    if camera_matrices is not None:
-        cameras = list(as_camera_matrices(camera_matrices, n).detach().cpu())
+    cameras = _cameras(camera_matrices, n)
+    masks = [None] * n if masks is None else list(masks)
+    if len(masks) != n:
+        raise InvalidInputError(f"masks: expected {n}, one for each image or None, got {len(masks)}")
+    if boxes is None and any(m is None for m in masks) and any(m is not None for m in masks):
+        raise InvalidInputError(f"masks: image {masks.index(None)} has neither mask nor box; register it separately")
     priors = [prior] * n if prior is None or isinstance(prior, PosePrior) else list(prior)
     if len(priors) != n or not all(p is None or isinstance(p, PosePrior) for p in priors):
         raise InvalidInputError(f"prior: expected a PosePrior, or a list of {n} with None where there is none")
@@ -99,25 +118,98 @@ def image_items(
 
     def item(i: int) -> ImageItem | CurviregError:
         try:
-            item = image_item(images[i], None if boxes is None else boxes[i], cameras[i], priors[i])
+            item = image_item(images[i], None if boxes is None else boxes[i], cameras[i], priors[i], masks[i])
             check_box_side(item.box, item.size)
             return item
         except CurviregError as error:
             return error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])]))
 
-    return _OnDemand(item, n)
+    return OnDemand(item, n)
+
+
+def _cameras(given: Any, count: int) -> Sequence[Tensor | Camera | None]:
+    """A camera or camera matrix for all, or one for each."""
+    if given is None or isinstance(given, Camera):
+        return [given] * count
+    if not (isinstance(given, list | tuple) and any(isinstance(camera, Camera) for camera in given)):
+        return list(as_camera_matrices(given, count).detach().cpu())
+    if len(given) != count:
+        raise InvalidInputError(f"camera_matrices: expected {count}, one for each image, got {len(given)}")
+    return [c if isinstance(c, Camera) else as_camera_matrices(c, 1)[0].detach().cpu() for c in given]
 
 
 def image_item(
-    image: Any, box: Tensor | None, camera_matrix: Tensor | None = None, prior: PosePrior | None = None
+    image: Any,
+    box: Tensor | None,
+    camera: Tensor | Camera | None = None,
+    prior: PosePrior | None = None,
+    mask: Any | None = None,
 ) -> ImageItem:
-    """One photograph in any form, with its (4,) box (None: the whole image), however small that is."""
-    pixels = _pixels(image)
-    box = whole_image_box(pixels) if box is None else box.detach().float()
-    return ImageItem(pixels, box.cpu(), camera_matrix, prior)
+    """One photograph in any form, with its (4,) box (None: that of the mask, or the whole image), however small."""
+    pixels, notes = _pixels(image), []
+    box = None if box is None else box.detach().float().cpu()
+    if mask is not None:
+        mask = _object_mask(mask, pixels)
+        if _looks_inverted(mask):
+            notes.append(
+                "the mask covers most of the photograph and of its border; the object must be white, not black"
+            )
+    missing = None
+    if isinstance(camera, Camera):
+        camera = camera.at((pixels.shape[-2], pixels.shape[-1]))
+        pixels, box, mask, missing = undistorted(pixels, camera, box, mask)
+        camera = camera.matrix
+    if mask is not None:
+        box = _box_of_mask(mask, box)
+    box = whole_image_box(pixels).cpu() if box is None else box
+    item = ImageItem(pixels, box, camera, prior, mask)
+    if missing is not None and (share := float(_inside(missing, box).float().mean())) > MISSING_SHARE:
+        notes.append(f"{100 * share:.0f} % of the box lie where the distorted photograph shows nothing")
+    return replace(item, notes=tuple(notes))
 
 
-class _OnDemand(Sequence[ImageItem | CurviregError]):
+def _object_mask(mask: Any, image: Tensor) -> Tensor:
+    """A mask of a photograph in any form as (H, W) float32 in [0, 1] on the CPU."""
+    if isinstance(mask, str | PathLike):
+        mask = read_photo(mask).image.amax(dim=0)
+    x = torch.as_tensor(mask) if isinstance(mask, np.ndarray | Tensor) else None
+    if x is None or not (x.dtype in (torch.bool, torch.uint8) or x.is_floating_point()):
+        raise InvalidInputError(f"mask: expected bool, uint8 or floating (H, W), or a path, got {type_and_shape(mask)}")
+    if x.shape != image.shape[-2:]:
+        (H, W), shape = image.shape[-2:], tuple(x.shape)
+        raise InvalidInputError(f"mask: expected shape ({H}, {W}), that of the photograph, got {shape}")
+    x = x.detach().cpu().float() / (255.0 if x.dtype == torch.uint8 and int(x.max()) > 1 else 1.0)
+    check_finite(x, "mask")
+    if float(x.min()) < 0 or float(x.max()) > 1:
+        raise InvalidInputError("mask: expected values from 0 to 1, the object white; divide by the largest")
+    return x
+
+
+def _looks_inverted(mask: Tensor) -> bool:
+    white = mask >= 0.5
+    border = torch.cat([white[0], white[-1], white[:, 0], white[:, -1]])
+    return bool(border.float().mean() > 0.5 and white.float().mean() > 0.5)
+
+
+def _box_of_mask(mask: Tensor, box: Tensor | None) -> Tensor:
+    """The (4,) box, or that around the white pixels of (H, W); refuses a mask without any, or without any in it."""
+    white = mask >= 0.5
+    if not bool((white if box is None else _inside(white, box)).any()):
+        where = "" if box is None else " in the box"
+        raise InvalidInputError(f"mask: no white pixel{where}; expected the object white, all else black")
+    if box is not None:
+        return box
+    y, x = white.nonzero().unbind(1)
+    return torch.stack([x.min() - 0.5, y.min() - 0.5, x.max() + 0.5, y.max() + 0.5])
+
+
+def _inside(pixels: Tensor, box: Tensor) -> Tensor:
+    """The part of (H, W) pixels whose centres lie in a (4,) box."""
+    x0, y0, x1, y1 = (max(0, math.ceil(value)) for value in box.tolist())
+    return pixels[y0:y1, x0:x1]
+
+
+class OnDemand(Sequence[ImageItem | CurviregError]):
     """``item(0)`` to ``item(count - 1)``, computed at each access."""
 
     def __init__(self, item: Callable[[int], ImageItem | CurviregError], count: int) -> None:

@@ -14,6 +14,7 @@ from ..rendering.contours import ContourPoints
 from .confidence import COVARIANCE_SCALE
 
 __all__ = [
+    "Information",
     "Measurements",
     "PointMatches",
     "apply_twist",
@@ -22,7 +23,9 @@ __all__ = [
     "nearest_rigid",
     "pixels",
     "pose_covariance",
+    "pose_information",
     "project",
+    "step_fraction",
 ]
 
 MAX_ROTATION, MAX_TRANSLATION = 0.2, 0.1
@@ -126,10 +129,14 @@ def fit_points(matches: PointMatches, T: Tensor, K: Tensor, centre: Tensor, scal
 def least_squares_step(A: Tensor, b: Tensor, T: Tensor, centre: Tensor, damping: float) -> Tensor:
     """(N, 6) Levenberg-Marquardt steps of poses ``T`` (N, 4, 4) from normal equations, of bounded length."""
     step = damped_solution(A, b, damping)
+    return step * step_fraction(step, T, centre)[:, None]
+
+
+def step_fraction(step: Tensor, T: Tensor, centre: Tensor) -> Tensor:
+    """(N,) in [0, 1]: the part of steps (N, 6) of poses that is not too long."""
     z = (T[:, :3, :3] @ centre + T[:, :3, 3])[:, 2].clamp(min=0.0)
     w, t = (torch.linalg.vector_norm(part, dim=1).clamp(min=1e-12) for part in step.split(3, dim=1))
-    fraction = torch.minimum(MAX_ROTATION / w, MAX_TRANSLATION * z / t).clamp(max=1.0)
-    return step * fraction[:, None]
+    return torch.minimum(MAX_ROTATION / w, MAX_TRANSLATION * z / t).clamp(max=1.0)
 
 
 def damped_solution(A: Tensor, b: Tensor, damping: float) -> Tensor:
@@ -192,6 +199,42 @@ MIN_TOTAL_WEIGHT = 6.0
 """Sum of weights that a covariance needs."""
 
 
+@dataclass(frozen=True)
+class Information:
+    """What measurements tell of N poses, see :func:`pose_covariance`: ``A``, ``E`` and ``B`` (N, 6, 6), and the sums
+    ``weight`` (N,) of the measurements' weights."""
+
+    A: Tensor
+    E: Tensor
+    B: Tensor
+    weight: Tensor
+
+    def covariance(self, arms: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
+        """Covariances and numbers of known directions, for arms (N, 3) from the model's origin to the object's centre
+        and distances (N,) of the centre."""
+        A, E, B = self.A, self.E, self.B
+        # Basis of directions in which A + E is the identity and A is diagonal; first normalise the units.
+        unit = (A + E).diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
+        total = unit[:, :, None] * (A + E) * unit[:, None] + 1e-9 * torch.eye(6, dtype=A.dtype)
+        lower = torch.linalg.cholesky(total)
+        half = torch.linalg.solve_triangular(lower, unit[:, :, None] * A * unit[:, None], upper=False)
+        fraction, vectors = torch.linalg.eigh(torch.linalg.solve_triangular(lower, half.mT, upper=False))
+        basis = unit[:, :, None] * torch.linalg.solve_triangular(lower.mT, vectors, upper=True)
+        known = fraction > OBSERVABLE_FRACTION
+        inverse = basis * (known / fraction.clamp(min=1e-12))[:, None]
+        C = COVARIANCE_SCALE * inverse @ (basis.mT @ B @ basis) @ inverse.mT
+        rotation, translation = (torch.linalg.vector_norm(p, dim=1).clamp(min=1e-300) for p in basis.split(3, dim=1))
+        size = torch.minimum(UNKNOWN_ROTATION / rotation, distance[:, None] / translation)
+        unknown = basis * (~known * size)[:, None]
+        C = C + unknown @ unknown.mT
+        # From the translation e of the centre to that of the origin, e - w x arm.
+        lever = torch.eye(6, dtype=C.dtype).repeat(len(C), 1, 1)
+        lever[:, 3:, :3] = cross_matrix(arms)
+        C = lever @ C @ lever.mT
+        enough = self.weight > MIN_TOTAL_WEIGHT
+        return torch.where(enough[:, None, None], 0.5 * (C + C.mT), torch.nan), known.sum(dim=1) * enough
+
+
 def pose_covariance(
     measured: Measurements, points: ContourPoints, T: Tensor, K: Tensor, centre: Tensor, *, radius: float
 ) -> tuple[Tensor, Tensor]:
@@ -218,6 +261,15 @@ def pose_covariance(
         (N, 6, 6) of (rotation, translation of the model's origin), NaN where too few edges were matched; (N,) number
         of known directions, 0 to 6.
     """
+    arms = T[:, :3, :3] @ centre
+    distance = torch.linalg.vector_norm(arms + T[:, :3, 3], dim=1)
+    return pose_information(measured, points, T, K, centre, radius=radius).covariance(arms, distance)
+
+
+def pose_information(
+    measured: Measurements, points: ContourPoints, T: Tensor, K: Tensor, centre: Tensor, *, radius: float
+) -> Information:
+    """What edges tell of poses; arguments of :func:`pose_covariance`."""
     uv, du = project(points.model, T, K, centre)
     n, W = points.normals, measured.weight
     along = (torch.stack([-n[..., 1], n[..., 0]], dim=-1)[..., None, :] @ du)[..., 0, :]
@@ -227,14 +279,6 @@ def pose_covariance(
     sight[..., :3] = torch.linalg.cross(ray, measured.J[..., 3:])
     A = measured.J.mT @ (W * measured.J)
     E = NORMAL_ERROR**2 * along.mT @ (W * along) + (SIGHT_ERROR * radius) ** 2 * sight.mT @ (W * sight)
-    # Basis of directions in which A + E is the identity and A is diagonal; first normalise the units.
-    unit = (A + E).diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
-    total = unit[:, :, None] * (A + E) * unit[:, None] + 1e-9 * torch.eye(6, dtype=A.dtype)
-    lower = torch.linalg.cholesky(total)
-    half = torch.linalg.solve_triangular(lower, unit[:, :, None] * A * unit[:, None], upper=False)
-    fraction, vectors = torch.linalg.eigh(torch.linalg.solve_triangular(lower, half.mT, upper=False))
-    basis = unit[:, :, None] * torch.linalg.solve_triangular(lower.mT, vectors, upper=True)
-    known = fraction > OBSERVABLE_FRACTION
 
     cell = (uv / CELL_SIDE).floor().long().clamp(0, CELLS_PER_SIDE - 1)
     cell = (cell * torch.tensor([1, CELLS_PER_SIDE])).sum(dim=-1)
@@ -242,17 +286,4 @@ def pose_covariance(
     g.scatter_add_(1, cell[..., None].expand(-1, -1, 6), W * measured.distance * measured.J)
     square = (W * measured.distance**2).sum(dim=1, keepdim=True) / W.sum(dim=1, keepdim=True).clamp(min=1e-12)
     B = g.mT @ g + (POINT_ERROR**2 + SHARED_ERROR * square) * (measured.J.mT @ (W * W * measured.J))
-    inverse = basis * (known / fraction.clamp(min=1e-12))[:, None]
-    C = COVARIANCE_SCALE * inverse @ (basis.mT @ B @ basis) @ inverse.mT
-    position = T[:, :3, :3] @ centre + T[:, :3, 3]
-    rotation, translation = (torch.linalg.vector_norm(part, dim=1).clamp(min=1e-300) for part in basis.split(3, dim=1))
-    distance = torch.linalg.vector_norm(position, dim=1)[:, None]
-    size = torch.minimum(UNKNOWN_ROTATION / rotation, distance / translation)
-    unknown = basis * (~known * size)[:, None]
-    C = C + unknown @ unknown.mT
-    # From the translation e of the centre to that of the origin, e - w x (R centre).
-    lever = torch.eye(6, dtype=C.dtype).repeat(len(C), 1, 1)
-    lever[:, 3:, :3] = cross_matrix(T[:, :3, :3] @ centre)
-    C = lever @ C @ lever.mT
-    enough = W.sum(dim=(1, 2)) > MIN_TOTAL_WEIGHT
-    return torch.where(enough[:, None, None], 0.5 * (C + C.mT), torch.nan), known.sum(dim=1) * enough
+    return Information(A, E, B, W.sum(dim=(1, 2)))

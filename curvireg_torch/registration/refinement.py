@@ -103,7 +103,8 @@ def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: fl
     poses = Poses.at(T, K.expand(len(T), 3, 3), describer.centre, each, torch.zeros(len(T), dtype=torch.float64))
     views = torch.tensor([nearest_view(registrar, R) for R in poses.rotation])
     poses = replace(poses, crop_index=each, view=views)
-    poses = fit_poses(describer, images, poses, boxes, registrar.object_mask(query), wide_angles=WIDE_ANGLES)
+    mask = registrar.object_mask(query, [item] * len(T))
+    poses = fit_poses(describer, images, poses, boxes, mask, wide_angles=WIDE_ANGLES)
     best = pose_scores(pose_features(describer, descriptors, poses), exact=True).argmax()[None]
     if (fitted := fit_texture_of(describer, images, poses, boxes, int(best))) is not None:
         poses = poses.replaced(best, fitted)

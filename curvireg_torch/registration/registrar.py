@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -50,6 +50,7 @@ from .priors import Limits
 from .refinement import refine
 from .result import FailedRegistration, Registration
 from .search import search
+from .several import register_views
 
 __all__ = ["Registrar"]
 
@@ -166,6 +167,7 @@ class Registrar:
         camera_matrices: Any | None = None,
         *,
         prior: PosePrior | Sequence[PosePrior | None] | None = None,
+        masks: Any | None = None,
     ) -> Results:
         """Register a batch.
 
@@ -173,29 +175,43 @@ class Registrar:
             images: (B, C, H, W) or a list of (C, H, W) tensors, (H, W, C) arrays or paths, C = 1 or 3, floating in
                 [0, 1] or uint8.
             boxes: (B, 4) x0, y0, x1, y1 in px; None searches for the object, see :func:`localize`.
-            camera_matrices: (B, 3, 3) or (3, 3) in px; None: rotations are relative to a camera that looks at the box.
+            camera_matrices: (B, 3, 3) or (3, 3) in px, a :class:`Camera`, or a list of these; None: rotations are
+                relative to a camera that looks at the box.
             prior: what is known of the poses in advance, one for all photographs or a list.
+            masks: B masks (H, W) of the objects, white in bool, uint8 or floating in [0, 1], paths, or None for some
+                photographs with boxes. Contours are fitted to them; without boxes they give these.
 
         Returns:
             A :class:`Registration` for each photograph; a :class:`FailedRegistration` for one that cannot be registered
             (unreadable, box empty or outside, one colour, NaN), which raises its error on access to a pose.
 
         Raises:
-            InvalidInputError: not as many boxes, cameras or priors as images, or a distance limited without cameras.
+            InvalidInputError: not as many boxes, cameras, priors or masks as images, or a distance limited without
+                cameras.
         """
-        if boxes is None:
+        if boxes is None and masks is None:
             results = [found[0] for found in localize(self, images, camera_matrices, prior=prior)]
         else:
-            items = image_items(images, boxes, camera_matrices, prior)
-            results = self.map_items(items, self._register_items)
+            items = image_items(images, boxes, camera_matrices, prior, masks)
+            results = self.map_items(items, self.register_items)
         for model, other in enumerate(self.others, 1):
-            rivals = other(images, boxes, camera_matrices, prior=prior)
+            rivals = other(images, boxes, camera_matrices, prior=prior, masks=masks)
             results = [_better(one, rival, model) for one, rival in zip(results, rivals, strict=True)]
         return results
 
     def refine(self, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any) -> Results:
         """Refine known poses of the first mesh, see :func:`curvireg_torch.registration.refine`."""
         return refine(self, images, camera_matrices, poses)
+
+    def register_views(
+        self, images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any
+    ) -> Registration:
+        """Register several photographs of one object together, see :func:`.several.register_views`."""
+        result = register_views(self, images, boxes, camera_matrices, T_cam_from_world)
+        for model, other in enumerate(self.others, 1):
+            rival = other.register_views(images, boxes, camera_matrices, T_cam_from_world)
+            result = cast(Registration, _better(result, rival, model))
+        return result
 
     def of_model(self, model: int) -> "Registrar":
         """Return the registrar of one of several meshes, by :attr:`Registration.model`."""
@@ -261,7 +277,7 @@ class Registrar:
         parts = map_on_threads(run, range(0, len(items), size), device=self.bank.device)
         return [result for part in parts for result in part]
 
-    def _register_items(self, items: Sequence[ImageItem | CurviregError], first: int) -> Results:
+    def register_items(self, items: Sequence[ImageItem | CurviregError], first: int) -> Results:
         """Register photographs with boxes, then again those whose pose asks for another box."""
         results = self._register_given(items, first)
         if not (self.pipeline.box_jitter and self.pipeline.contours):
@@ -313,7 +329,8 @@ class Registrar:
                 poses = work.limits.moved_inside(poses)
         if self.pipeline.contours:
             self.report_progress("contours")
-            poses = fit_poses(self.describer, [item.image], poses, item.box[None], self.object_mask(query))
+            mask = self.object_mask(query, [item])
+            poses = fit_poses(self.describer, [item.image], poses, item.box[None], mask)
         features = self._features(work, poses)
         if self.pipeline.contours and work.exact:
             poses, features = self._with_texture(work, poses, features, outside)
@@ -365,12 +382,17 @@ class Registrar:
     def _in_box(self, work: _Work, *poses: Tensor) -> Poses:
         return Poses.in_box(self.describer, work.item.box, work.item.camera_matrix, *poses)
 
-    def object_mask(self, query: QueryFeatures) -> Tensor | None:
-        """(B, 1, S, S) probability that pixels of the crops belong to the object, if the field predicts it."""
-        field = self.matcher.field
-        if not isinstance(field, LearnedCurvilinearSaliency):
+    def object_mask(self, query: QueryFeatures, items: Sequence[ImageItem]) -> Tensor | None:
+        """(B, 1, S, S) probability that pixels of the crops belong to the object: given, predicted, or None."""
+        settings, field = self.bank.settings, self.matcher.field
+        masks = [item.mask_crop(settings.image_size, settings.margin) for item in items]
+        if isinstance(field, LearnedCurvilinearSaliency):
+            crops = query.crops.split(1)  # rounding is that of a photograph alone
+            masks = [field.mask(crop) if mask is None else mask for mask, crop in zip(masks, crops, strict=True)]
+        known = next((mask for mask in masks if mask is not None), None)
+        if known is None:
             return None
-        return torch.cat([field.mask(crop) for crop in query.crops.split(1)])  # rounding is that of a photograph alone
+        return torch.cat([torch.ones_like(known) if mask is None else mask.to(known) for mask in masks])
 
     def _features(self, work: _Work, poses: Poses) -> Tensor:
         """(H, 4) :data:`POSE_FEATURES`."""

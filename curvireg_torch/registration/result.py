@@ -28,6 +28,7 @@ __all__ = [
     "FailedRegistration",
     "Hypothesis",
     "Localization",
+    "PhotographPose",
     "Registration",
     "ambiguity",
     "corners",
@@ -167,6 +168,41 @@ class Localization:
 
 
 @dataclass(frozen=True)
+class PhotographPose:
+    """The pose of an object that was registered in several photographs, in one of them.
+
+    Attributes:
+        T_cam_from_model: (4, 4) float64.
+        box: (4,) float64 x0, y0, x1, y1 in px, in which the photograph was compared: the given one, one that replaced
+            it, or one around the pose; None for a photograph that was not read.
+        edge_support, similarity: of the pose in this photograph; None where it was not compared.
+        contribution: score by which the photograph prefers the pose to its best rival: negative if it prefers the
+            rival, 0 if it does not count.
+        failure: why the photograph does not count, in words; None if it does.
+    """
+
+    T_cam_from_model: Tensor
+    box: Tensor | None = None
+    edge_support: float | None = None
+    similarity: float | None = None
+    contribution: float = 0.0
+    failure: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """All attributes as JSON values, the pose as ``rotation`` and ``translation``."""
+        T, box = self.T_cam_from_model, self.box
+        return {
+            "rotation": T[:3, :3].tolist(),
+            "translation": T[:3, 3].tolist(),
+            "box": None if box is None else box.tolist(),
+            "edge_support": self.edge_support,
+            "similarity": self.similarity,
+            "contribution": self.contribution,
+            "failure": self.failure,
+        }
+
+
+@dataclass(frozen=True)
 class Registration:
     """Poses of one object in one photograph, best first.
 
@@ -189,6 +225,8 @@ class Registration:
         warnings: what is questionable about the box, the camera and the mesh, in words; a result with one is not
             reliable.
         model: number of the mesh, of several.
+        views: of :meth:`.Registrar.register_views`, the pose in each photograph; poses and covariance are then
+            ``T_world_from_model``, along the world's axes.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -201,6 +239,7 @@ class Registration:
     prior_contradiction: str | None = None
     warnings: tuple[str, ...] = ()
     model: int = 0
+    views: tuple[PhotographPose, ...] = ()
 
     ok = True
     """False of a :class:`FailedRegistration`."""
@@ -311,6 +350,7 @@ class Registration:
             "corrected_box": None if self.corrected_box is None else self.corrected_box.tolist(),
             **({} if prior is None else {"prior": prior}),
             "top": [self._hypothesis_dict(hypothesis) for hypothesis in self.hypotheses],
+            **({"views": [view.to_dict() for view in self.views]} if self.views else {}),
         }
 
     def _hypothesis_dict(self, hypothesis: Hypothesis) -> dict[str, Any]:
@@ -376,9 +416,9 @@ def result_document(result: Registration, registrar: "Registrar", seconds: Mappi
     return {
         "schema": SCHEMA,
         "unit": mesh_unit(bank.mesh),
+        "views": len(bank),
         **result.to_dict(),
         "symmetries": 1 if symmetries is None else len(symmetries),
-        "views": len(bank),
         "pipeline": registrar.pipeline.describe(),
         "seconds": dict(seconds),
         "versions": {

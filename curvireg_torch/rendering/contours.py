@@ -35,6 +35,10 @@ CREASE_SCALE = 1.0 / 64.0
 CREASE_BEND = 0.36
 """Least change of the surface's slope across a crease at that distance: a fold of 20 degrees seen from the front."""
 
+LEVELS = ((128, 2500), (256, 8000))
+"""Side in px of the largest crop for which a mesh with so many faces is used: its contours move by less than a fifth of
+a pixel."""
+
 NEAR_PLANE = 1e-3
 """Depth in object radii below which points are not projected."""
 
@@ -58,6 +62,45 @@ class ContourPoints:
         return ContourPoints(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(ContourPoints)))
 
 
+class _Level:
+    """The mesh with at most ``max_faces`` faces, in units relative to its centre (3,)."""
+
+    def __init__(self, mesh: trimesh.Trimesh, centre: np.ndarray, radius: float, max_faces: int) -> None:
+        self.radius, self.edges = radius, MeshEdges(mesh, centre, max_faces)
+        self._vertices = _float32(self.edges.vertices)
+        self._scene = RayScene(self.edges.vertices / radius, self.edges.faces)
+
+    def lengths(self, R: np.ndarray, position: np.ndarray, K: np.ndarray, size: int) -> np.ndarray:
+        """(N, E) float32 lengths of the edges in px; 0 for those outside the crop and behind the camera."""
+        x, y, z = np.moveaxis(self._vertices @ _float32(R.transpose(0, 2, 1)) + _float32(position)[:, None], -1, 0)
+        behind = z <= NEAR_PLANE * self.radius
+        z = np.maximum(z, np.float32(NEAR_PLANE * self.radius))
+        fx, fy, cx, cy = (_float32(K[:, i, j])[:, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        u, v = fx * x / z + cx, fy * y / z + cy
+        beyond = (u < -0.5) + 2 * (v < -0.5) + 4 * (u > size - 0.5) + 8 * (v > size - 0.5) + 16 * behind
+        a, b = self.edges.edges.T
+        beyond = beyond.astype(np.uint8)
+        outside = (beyond[:, a] & beyond[:, b]) | ((beyond[:, a] | beyond[:, b]) & 16)
+        length: np.ndarray = np.hypot(u[:, b] - u[:, a], v[:, b] - v[:, a]) * (outside == 0)
+        return length
+
+    def smooth_normals(
+        self, index: np.ndarray, fraction: np.ndarray, ends: np.ndarray, R: np.ndarray, K: np.ndarray
+    ) -> np.ndarray:
+        """Normals (N, M, 2) across the contour of a smooth surface, whose vertices' normals are interpolated."""
+        n = self.edges.normals
+        normal = n[ends[..., 0]] + fraction[..., None] * (n[ends[..., 1]] - n[ends[..., 0]])
+        return _across(normal @ R.transpose(0, 2, 1), K)
+
+    def depth_at(self, uv: np.ndarray, K: np.ndarray, R: np.ndarray, eye: np.ndarray) -> np.ndarray:
+        """Depth (N, M) of the mesh at pixels (N, M, 2); inf where it is not seen."""
+        xy = (uv - K[:, None, :2, 2]) / np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)[:, None]
+        rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1) @ R
+        origins = np.broadcast_to((eye / self.radius)[:, None], rays.shape)
+        depth = self._scene.distance(origins.reshape(-1, 3), rays.reshape(-1, 3)).reshape(rays.shape[:2])
+        return depth * self.radius
+
+
 class MeshContours:
     """Occluding contours and creases of a mesh, at any pose.
 
@@ -79,9 +122,7 @@ class MeshContours:
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self.centre, self.radius = mesh_centre(mesh), mesh_radius(mesh)
-        self.edges = MeshEdges(mesh, self.centre.numpy())
-        self._vertices = _float32(self.edges.vertices)
-        self._scene = RayScene(self.edges.vertices / self.radius, self.edges.faces)
+        self._levels = [(size, _Level(mesh, self.centre.numpy(), self.radius, faces)) for size, faces in LEVELS]
 
     def points(
         self, T_cam_from_model: Tensor, camera_matrices: Tensor, size: int, *, density: float = 1.0
@@ -91,11 +132,13 @@ class MeshContours:
         ``density`` is a fraction of the usual number of points.
         """
         T, K = T_cam_from_model.numpy(), camera_matrices.expand(len(T_cam_from_model), 3, 3).numpy()
-        R, edges = T[:, :3, :3], self.edges
+        R = T[:, :3, :3]
+        level = next((level for limit, level in self._levels if size <= limit), self._levels[-1][1])
+        edges = level.edges
         position = R @ self.centre.numpy() + T[:, :3, 3]
         eye = -(position[:, None] @ R)[:, 0]
         on_contour, side = edges.sides(eye)
-        length = self._lengths(R, position, K, size)
+        length = level.lengths(R, position, K, size)
         parts = []
         for weights, count, most, occluding in (
             (length * on_contour, OCCLUDING_CANDIDATES, MAX_OCCLUDING, True),
@@ -108,19 +151,19 @@ class MeshContours:
             at = a + fraction[..., None] * (b - a)
             normal = _across(np.cross(a, b), K) * -side[rows, index][..., None]
             if occluding:
-                smooth = self._smooth_normals(index, fraction, ends, R, K)
+                smooth = level.smooth_normals(index, fraction, ends, R, K)
                 smooth *= np.where((smooth * normal).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
                 agree = edges.is_smooth[index] & ((smooth * normal).sum(axis=-1) > 0.5)
                 normal = np.where(agree[..., None], smooth, normal)
             pixel = at @ K[:, :2].transpose(0, 2, 1) / np.maximum(at[..., 2:], NEAR_PLANE * self.radius)
             if occluding:
-                hit = self._depth_at(pixel + ASIDE * normal, K, R, eye)
+                hit = level.depth_at(pixel + ASIDE * normal, K, R, eye)
                 valid &= hit - at[..., 2] > OCCLUSION_JUMP * self.radius
                 outline = valid & np.isinf(hit)
             else:
                 step = CREASE_SCALE * size
                 beside = np.concatenate([pixel, pixel + step * normal, pixel - step * normal], axis=1)
-                here, ahead, back = np.split(self._depth_at(beside, K, R, eye), 3, axis=1)
+                here, ahead, back = np.split(level.depth_at(beside, K, R, eye), 3, axis=1)
                 z = at[..., 2]
                 valid &= here > z - VISIBLE_TOLERANCE * self.radius
                 with np.errstate(invalid="ignore"):
@@ -132,36 +175,6 @@ class MeshContours:
             chosen, valid = _evenly(valid, round(density * most))
             parts.append((model[rows, chosen], normal[rows, chosen], valid, outline[rows, chosen] & valid))
         return ContourPoints(*(torch.from_numpy(np.concatenate(each, axis=1)) for each in zip(*parts, strict=True)))
-
-    def _lengths(self, R: np.ndarray, position: np.ndarray, K: np.ndarray, size: int) -> np.ndarray:
-        """(N, E) float32 lengths of the edges in px; 0 for those outside the crop and behind the camera."""
-        x, y, z = np.moveaxis(self._vertices @ _float32(R.transpose(0, 2, 1)) + _float32(position)[:, None], -1, 0)
-        behind = z <= NEAR_PLANE * self.radius
-        z = np.maximum(z, np.float32(NEAR_PLANE * self.radius))
-        fx, fy, cx, cy = (_float32(K[:, i, j])[:, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        u, v = fx * x / z + cx, fy * y / z + cy
-        beyond = (u < -0.5) + 2 * (v < -0.5) + 4 * (u > size - 0.5) + 8 * (v > size - 0.5) + 16 * behind
-        a, b = self.edges.edges.T
-        beyond = beyond.astype(np.uint8)
-        outside = (beyond[:, a] & beyond[:, b]) | ((beyond[:, a] | beyond[:, b]) & 16)
-        length: np.ndarray = np.hypot(u[:, b] - u[:, a], v[:, b] - v[:, a]) * (outside == 0)
-        return length
-
-    def _smooth_normals(
-        self, index: np.ndarray, fraction: np.ndarray, ends: np.ndarray, R: np.ndarray, K: np.ndarray
-    ) -> np.ndarray:
-        """Normals (N, M, 2) across the contour of a smooth surface, whose vertices' normals are interpolated."""
-        n = self.edges.normals
-        normal = n[ends[..., 0]] + fraction[..., None] * (n[ends[..., 1]] - n[ends[..., 0]])
-        return _across(normal @ R.transpose(0, 2, 1), K)
-
-    def _depth_at(self, uv: np.ndarray, K: np.ndarray, R: np.ndarray, eye: np.ndarray) -> np.ndarray:
-        """Depth (N, M) of the mesh at pixels (N, M, 2); inf where it is not seen."""
-        xy = (uv - K[:, None, :2, 2]) / np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)[:, None]
-        rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1) @ R
-        origins = np.broadcast_to((eye / self.radius)[:, None], rays.shape)
-        depth = self._scene.distance(origins.reshape(-1, 3), rays.reshape(-1, 3)).reshape(rays.shape[:2])
-        return depth * self.radius
 
 
 def _float32(x: np.ndarray) -> np.ndarray:

@@ -1,0 +1,268 @@
+"""Calibration files of OpenCV, ROS, Kalibr, COLMAP and BOP."""
+
+import json
+import os
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import torch
+
+from ..errors import MAX_CAMERA_BYTES, InvalidInputError, MissingFileError
+from ..geometry.calibration import Camera
+from ..utils.files import finite_numbers
+
+__all__ = ["load_camera"]
+
+_FORMATS = (
+    "YAML, XML or JSON of OpenCV, camera_info of ROS, camchain of Kalibr, cameras.txt of COLMAP, camera.json of BOP"
+)
+_MATRIX = ("camera_matrix", "intrinsic_matrix", "intrinsics", "camera_intrinsics", "mtx", "K")
+_DISTORTION = ("distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distortion", "dist", "D")
+_MODELS = {
+    **dict.fromkeys(("", "none", "pinhole", "plumb_bob", "radtan", "rational_polynomial"), "radial-tangential"),
+    **dict.fromkeys(("equidistant", "fisheye"), "fisheye"),
+}
+_COLMAP = {  # numbers of focal lengths and of coefficients, which are the first ones of OpenCV
+    "SIMPLE_PINHOLE": (1, 0),
+    "PINHOLE": (2, 0),
+    "SIMPLE_RADIAL": (1, 1),
+    "RADIAL": (1, 2),
+    "OPENCV": (2, 4),
+    "OPENCV_FISHEYE": (2, 4),
+}
+
+
+def load_camera(path: str | os.PathLike[str]) -> Camera:
+    """Read a calibration file; of one with several cameras, ``FILE:NAME`` names one.
+
+    Read are YAML, XML and JSON of OpenCV, ``camera_info`` YAML of ROS (plumb_bob, rational_polynomial, equidistant),
+    camchains of Kalibr (pinhole with radtan, equidistant or none), ``cameras.txt`` of COLMAP (SIMPLE_PINHOLE, PINHOLE,
+    SIMPLE_RADIAL, RADIAL, OPENCV, OPENCV_FISHEYE) and ``camera.json`` of BOP. Principal points of COLMAP, for which
+    the corner of the picture is (0, 0), are converted.
+
+    Raises:
+        MissingFileError: the file does not exist.
+        InvalidInputError: it is none of these, lacks a value, or describes a camera that is not supported.
+
+    Example:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp(), "cameras.txt")
+        >>> _ = file.write_text("1 SIMPLE_RADIAL 640 480 500 320 240 -0.1")
+        >>> camera = load_camera(f"{file}:1")
+        >>> camera.matrix.tolist(), camera.distortion, camera.size
+        ([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]], (-0.1, 0.0, 0.0, 0.0), (480, 640))
+    """
+    file, name = Path(path), ""
+    if not file.is_file() and ":" in str(path):
+        front, _, name = str(path).rpartition(":")
+        file = Path(front)
+    if not file.is_file():
+        raise MissingFileError("no such file; check the path of the calibration, or use --camera exif", subject=path)
+    try:
+        if file.stat().st_size > MAX_CAMERA_BYTES:
+            raise InvalidInputError(f"larger than {MAX_CAMERA_BYTES:,} bytes; leave images and points out")
+        return _chosen(_content(file), name)
+    except RecursionError:
+        raise InvalidInputError("nested too deeply; write it again", subject=path) from None
+    except InvalidInputError as error:
+        message = f"{error}; without a calibration, use --camera exif"
+        raise InvalidInputError(message, subject=path) from error
+
+
+def _content(file: Path) -> dict[str, Any]:
+    """Keys and values of a file: numbers, strings, lists of these, and dicts."""
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+        if text.lstrip().startswith("{"):
+            return dict(json.loads(text))
+        if text.lstrip().startswith("<"):
+            return _xml(text)
+    except UnicodeDecodeError as error:
+        raise InvalidInputError(f"not a text file; expected {_FORMATS}") from error
+    except (ValueError, RecursionError, ElementTree.ParseError) as error:
+        raise InvalidInputError(f"damaged, or no calibration ({error}); write it again") from error
+    if re.search(r"^\s*\d+[ \t]+[A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]", text, re.MULTILINE):
+        return _colmap(text)
+    return _yaml(text)
+
+
+def _chosen(cameras: dict[str, Any], name: str) -> Camera:
+    """The camera of a file's content, or one of several."""
+    if _holds_camera(cameras):
+        if name:
+            raise InvalidInputError(f"holds one camera; leave ':{name}' out")
+        return _camera(cameras)
+    several = {key: value for key, value in cameras.items() if isinstance(value, dict) and _holds_camera(value)}
+    if not several:
+        raise InvalidInputError(f"no camera matrix; expected {_FORMATS}")
+    if name not in several and (name or len(several) > 1):
+        names = ", ".join(list(several)[:8]) + (", ..." if len(several) > 8 else "")
+        problem = f"no camera {name!r}" if name else f"{len(several)} cameras"
+        raise InvalidInputError(f"{problem}; choose one as FILE:NAME from {names}")
+    return _camera(several[name] if name else next(iter(several.values())))
+
+
+def _holds_camera(values: dict[str, Any]) -> bool:
+    return any(_get(values, names) is not None for names in (_MATRIX, ("fx",)))
+
+
+def _camera(values: dict[str, Any]) -> Camera:
+    matrix = _numbers(values, _MATRIX)
+    if matrix is None:
+        matrix = [number for name in ("fx", "fy", "cx", "cy") for number in _numbers(values, (name,)) or ()]
+    if len(matrix) == 4:
+        fx, fy, cx, cy = matrix
+        matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    if len(matrix) != 9:
+        raise InvalidInputError(f"camera matrix: expected 9 numbers, or fx, fy, cx, cy, got {len(matrix)}")
+    models = [_get(values, ("camera_model",)), _get(values, ("distortion_model",))]
+    models += ["fisheye"] if _get(values, ("fisheye_model",)) == 1 else []
+    known = [_MODELS.get(str(model or "").lower()) for model in models]
+    if None in known:
+        unknown = models[known.index(None)]
+        raise InvalidInputError(
+            f"camera model {unknown!r} is not supported; choose from {', '.join(filter(None, _MODELS))}"
+        )
+    size = _numbers(values, ("resolution", "image_size"))
+    if size is None:
+        both = [_numbers(values, names) for names in (("image_width", "width"), ("image_height", "height"))]
+        size = [number for side in both for number in side or ()] or None
+    if size is not None and (len(size) != 2 or any(side != int(side) for side in size)):
+        raise InvalidInputError(f"size of the image: expected width and height in px, got {size}")
+    return Camera(
+        torch.tensor(matrix, dtype=torch.float64).view(3, 3),
+        _numbers(values, _DISTORTION) or (),
+        "fisheye" if "fisheye" in known else "radial-tangential",
+        None if size is None else (int(size[1]), int(size[0])),
+    )
+
+
+def _get(values: dict[str, Any], names: Sequence[str]) -> Any:
+    """The value of the first key that is one of the names, whatever its case and underscores."""
+    plain = {key.lower().replace("_", ""): value for key, value in values.items()}
+    return next((plain[key] for name in names if (key := name.lower().replace("_", "")) in plain), None)
+
+
+def _numbers(values: dict[str, Any], names: Sequence[str]) -> list[float] | None:
+    """The finite numbers of the first of some keys, of a matrix row by row; None without such a key."""
+    value = _get(values, names)
+    if value is None:
+        return None
+    flat = list(_flat(value))
+    numbers = finite_numbers(flat, len(flat))
+    if numbers is None:
+        wrong = next(number for number in flat if finite_numbers([number], 1) is None)
+        raise InvalidInputError(f"{names[0]}: expected finite numbers, got {wrong!r:.40}")
+    return list(numbers)
+
+
+def _flat(value: Any) -> Iterator[Any]:
+    while isinstance(value, dict) and "data" in value:
+        value = value["data"]
+    if isinstance(value, list):
+        for item in value:
+            yield from _flat(item)
+    elif value != {}:
+        yield value
+
+
+def _colmap(text: str) -> dict[str, Any]:
+    """Cameras by their number, with principal points that count from the centre of the first pixel."""
+    cameras = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.partition("#")[0].split()
+        if not words:
+            continue
+        focals, count = _COLMAP.get("".join(words[1:2]), (0, 0))
+        if not focals:
+            raise InvalidInputError(
+                f"line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS... with a model of {', '.join(_COLMAP)}, "
+                f"got {line!r:.60}"
+            )
+        if len(words) != 6 + focals + count:
+            raise InvalidInputError(f"line {number}: expected {2 + focals + count} parameters, got {len(words) - 4}")
+        width, height, *numbers = map(_scalar, words[2:])
+        cx, cy, *distortion = numbers[focals:]
+        if not all(isinstance(value, float) for value in (width, height, *numbers)):
+            raise InvalidInputError(f"line {number}: expected numbers after the model, got {line!r:.60}")
+        cameras[words[0]] = {
+            "intrinsics": [numbers[0], numbers[focals - 1], cx - 0.5, cy - 0.5],
+            "distortion": [*distortion, 0.0, 0.0, 0.0][:4] if distortion else [],
+            "distortion_model": "fisheye" if words[1] == "OPENCV_FISHEYE" else "",
+            "resolution": [width, height],
+        }
+    return cameras
+
+
+def _xml(text: str) -> dict[str, Any]:
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise InvalidInputError("defines entities, which are not read; write it with cv2.FileStorage")
+
+    def value(element: ElementTree.Element) -> Any:
+        if len(element):
+            return {child.tag: value(child) for child in element}
+        words = [_scalar(word) for word in (element.text or "").split()]
+        return words[0] if len(words) == 1 else words
+
+    root = value(ElementTree.fromstring(text))
+    return root if isinstance(root, dict) else {}
+
+
+def _yaml(text: str) -> dict[str, Any]:
+    """The part of YAML that calibrations are written in: nested keys, and lists of scalars.
+
+    Items of a list below its key become ``"data"`` of it, and what is nested in an item is left out.
+    """
+    root: dict[str, Any] = {}
+    parents: list[tuple[float, dict[str, Any]]] = [(-1.0, root)]
+    for number, line in _yaml_lines(text):
+        indent, line = float(len(line) - len(line.lstrip())), line.strip()
+        item = line == "-" or line.startswith("- ")
+        indent += 0.5 * item  # items may stand as far left as their key
+        while parents[-1][0] >= indent:
+            parents.pop()
+        nested: dict[str, Any] = {}
+        if item:
+            parents[-1][1].setdefault("data", []).append(_scalar(line[1:]))
+        else:
+            key, colon, content = line.partition(":")
+            if not colon or content[:1].strip():
+                raise InvalidInputError(f"line {number}: expected 'key: value', got {line!r:.60}; expected {_FORMATS}")
+            content = re.sub(r"^\s*!\S*", "", content).strip()
+            parents[-1][1][key.strip("\"' ")] = _scalar(content) if content else nested
+        parents.append((indent, nested))
+    return root
+
+
+def _yaml_lines(text: str) -> Iterator[tuple[int, str]]:
+    """Numbers and lines of the first document, without comments; lists in brackets in one line."""
+    begun, open_brackets, start, parts = False, 0, 0, list[str]()
+    for number, line in enumerate(text.splitlines(), start=1):
+        line = re.sub(r"(^|\s)#.*", "", line).rstrip()
+        if not parts and (not line.strip() or line.startswith(("%", "---", "..."))):
+            if begun and line:  # a second document
+                return
+            continue
+        begun, start = True, start if parts else number
+        parts.append(line)
+        unquoted = re.sub(r"\"[^\"]*\"|'[^']*'", "", line)
+        open_brackets += unquoted.count("[") - unquoted.count("]")
+        if open_brackets <= 0:
+            yield start, "".join(parts)
+            open_brackets, parts = 0, []
+    if parts:
+        raise InvalidInputError(f"line {start}: '[' without its ']'")
+
+
+def _scalar(text: str) -> Any:
+    """A number, a string, or a list of these."""
+    text = text.strip()
+    if text.startswith("["):
+        return [_scalar(word) for word in re.sub(r"[\[\]]", "", text).split(",") if word.strip()]
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip("\"'")

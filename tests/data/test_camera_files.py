@@ -1,0 +1,228 @@
+"""Calibration files as their tools write them, and damaged ones."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from curvireg_torch import load_camera
+from curvireg_torch.errors import MAX_CAMERA_BYTES, InvalidInputError, MissingFileError
+
+K = np.array([[520.5, 0.0, 321.25], [0.0, 522.0, 238.5], [0.0, 0.0, 1.0]])
+D = np.array([[-0.31, 0.12, 0.001, -0.002, 0.03]])
+
+ROS = """image_width: 640
+image_height: 480
+camera_name: head_camera
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [520.5, 0, 321.25, 0, 522, 238.5, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.31, 0.12, 0.001, -0.002, 0.03]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [480, 0, 322, 0, 0, 500, 239, 0, 0, 0, 1, 0]
+"""
+ROS_MESSAGE = """header:
+  stamp: {sec: 12, nanosec: 3}
+  frame_id: "head"
+height: 480
+width: 640
+distortion_model: plumb_bob
+d:
+- -0.31
+- 0.12
+- 0.001
+- -0.002
+- 0.03
+k: [520.5, 0.0, 321.25,
+  0.0, 522.0, 238.5, 0.0, 0.0, 1.0]
+binning_x: 0
+roi:
+  x_offset: 0
+  do_rectify: false
+---
+height: 1
+"""
+KALIBR = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.31, 0.12, 0.001, -0.002]
+  distortion_model: radtan
+  intrinsics: [520.5, 522.0, 321.25, 238.5]
+  resolution: [640, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1:
+  - [0.99, 0.0, 0.0, -0.1]
+  - [0.0, 0.99, 0.0, 0.0]
+  cam_overlaps: [0]
+  camera_model: pinhole
+  distortion_coeffs: [0.02, -0.01, 0.003, -0.001]
+  distortion_model: equidistant
+  intrinsics: [519.0, 519.0, 320.0, 240.0]
+  resolution: [640, 480]
+  rostopic: /cam1/image_raw
+"""
+COLMAP = """# Camera list with one line of data per camera:
+#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
+# Number of cameras: 6
+1 SIMPLE_PINHOLE 640 480 520.5 321.75 239
+2 PINHOLE 640 480 520.5 522 321.75 239
+3 SIMPLE_RADIAL 640 480 520.5 321.75 239 -0.31
+4 RADIAL 640 480 520.5 321.75 239 -0.31 0.12
+5 OPENCV 640 480 520.5 522 321.75 239 -0.31 0.12 0.001 -0.002
+6 OPENCV_FISHEYE 640 480 520.5 522 321.75 239 0.02 -0.01 0.003 -0.001
+"""
+
+
+def check(camera, distortion, *, fy=522.0, model="radial-tangential", size=(480, 640)):
+    expected = torch.from_numpy(K).clone()
+    expected[1, 1] = fy
+    torch.testing.assert_close(camera.matrix, expected)
+    assert (camera.distortion, camera.model, camera.size) == (distortion, model, size)
+
+
+@pytest.mark.parametrize("suffix", ["yml", "yaml", "xml", "json"])
+def test_opencv(tmp_path, suffix):
+    file = tmp_path / f"camera.{suffix}"
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    storage.write("calibration_time", "Thu 01 Jan 2026: [noon")
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    if suffix != "json":
+        storage.writeComment("flags: +zero_tangent_dist")
+    storage.write("camera_matrix", K)
+    storage.write("distortion_coefficients", D)
+    storage.write("image_points", np.random.default_rng(0).random((40, 2)).astype(np.float32))
+    storage.release()
+    check(load_camera(file), tuple(D[0]))
+
+
+def test_opencv_with_other_keys(tmp_path):
+    file = tmp_path / "fisheye.yml"
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    for name, value in {"cameraMatrix": K, "distCoeffs": D[0, :4], "fisheye_model": 1}.items():
+        storage.write(name, value)
+    storage.release()
+    check(load_camera(file), tuple(D[0, :4]), model="fisheye", size=None)
+    file = tmp_path / "python.json"
+    file.write_text(json.dumps({"mtx": K.tolist(), "dist": D.tolist(), "image_size": [640, 480]}))
+    check(load_camera(file), tuple(D[0]))
+
+
+@pytest.mark.parametrize("text", [ROS, ROS_MESSAGE, ROS.replace("\n", "\r\n")], ids=["file", "message", "windows"])
+def test_ros_camera_info(tmp_path, text):
+    file = tmp_path / "camera_info.yaml"
+    file.write_bytes(text.encode())
+    check(load_camera(file), tuple(D[0]))
+
+
+@pytest.mark.parametrize(
+    ("ros_model", "count", "model"), [("rational_polynomial", 8, "radial-tangential"), ("equidistant", 4, "fisheye")]
+)
+def test_other_models_of_ros(tmp_path, ros_model, count, model):
+    file, numbers = tmp_path / "info.yaml", tuple(0.01 * k for k in range(count))
+    changed = ROS.replace("plumb_bob", ros_model).replace(str(D[0].tolist()), str(list(numbers)))
+    file.write_text(changed)
+    check(load_camera(file), numbers, model=model)
+
+
+def test_kalibr(tmp_path):
+    file = tmp_path / "camchain.yaml"
+    file.write_text(KALIBR)
+    check(load_camera(f"{file}:cam0"), tuple(D[0, :4]))
+    camera = load_camera(f"{file}:cam1")
+    assert (camera.model, camera.distortion) == ("fisheye", (0.02, -0.01, 0.003, -0.001))
+
+
+def test_colmap_counts_from_the_corner_of_the_picture(tmp_path):
+    file = tmp_path / "cameras.txt"
+    file.write_text(COLMAP)
+    check(load_camera(f"{file}:1"), (), fy=520.5)
+    check(load_camera(f"{file}:2"), ())
+    check(load_camera(f"{file}:3"), (-0.31, 0.0, 0.0, 0.0), fy=520.5)
+    check(load_camera(f"{file}:4"), (-0.31, 0.12, 0.0, 0.0), fy=520.5)
+    check(load_camera(f"{file}:5"), tuple(D[0, :4]))
+    check(load_camera(f"{file}:6"), (0.02, -0.01, 0.003, -0.001), model="fisheye")
+
+
+def test_bop(tmp_path):
+    file = tmp_path / "camera.json"
+    values = {"cx": 321.25, "cy": 238.5, "depth_scale": 1.0, "fx": 520.5, "fy": 522.0, "height": 480, "width": 640}
+    file.write_text(json.dumps(values))
+    check(load_camera(file), ())
+
+
+def replaced(old, new):
+    assert old in ROS
+    return ROS.replace(old, new)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.yaml", "", "no camera matrix; expected YAML, XML or JSON of OpenCV, camera_info"),
+        ("a.yaml", "# nothing\n---\n", "no camera matrix"),
+        ("a.yaml", "just some words\n", "line 1: expected 'key: value', got 'just some words'"),
+        ("a.png", b"\x89PNG\r\n\x1a\n\xff\xfe", "not a text file; expected"),
+        ("a.yaml", ROS[: ROS.index("rows")], "expected 9 numbers, or fx, fy, cx, cy, got 0"),
+        ("a.yaml", replaced("238.5, 0, 0, 1]", "238.5, 0, 0, 1"), "line 7: '\\[' without its '\\]'"),
+        ("a.yaml", replaced("[520.5, 0, ", "["), "expected 9 numbers, or fx, fy, cx, cy, got 7"),
+        ("a.yaml", replaced("520.5", "five"), "camera_matrix: expected finite numbers, got 'five'"),
+        ("a.yaml", replaced("520.5", "nan"), "camera_matrix: expected finite numbers, got nan"),
+        ("a.yaml", replaced("520.5", "-520.5"), "FX, FY > 0"),
+        ("a.yaml", replaced("[520.5, 0, ", "[520.5, 3, "), "no skew"),
+        ("a.yaml", replaced("[520.5, 0, 321.25, 0, 522, 238.5, 0, 0, 1]", "[0, 0, 0, 0, 0, 0, 0, 0, 0]"), "FX, FY > 0"),
+        (
+            "a.yaml",
+            replaced("plumb_bob", "double_sphere"),
+            "'double_sphere' is not supported; choose from none, pinhole",
+        ),
+        ("a.yaml", replaced("plumb_bob", "equidistant"), "expected 4 finite coefficients of the model 'fisheye'"),
+        ("a.yaml", replaced(", 0.03]", ", 0.03, 1, 1]"), "expected 0, 4, 5, 8, 12, 14 finite coefficients"),
+        ("a.yaml", replaced("-0.31", ".inf"), "distortion_coefficients: expected finite numbers, got '.inf'"),
+        ("a.yaml", replaced("640", "640.5"), "size of the image: expected width and height"),
+        ("a.yaml", replaced("image_height: 480\n", ""), "size of the image: expected width and height"),
+        ("a.yaml", replaced("640", "0"), "width of the image: expected an integer >= 1"),
+        ("a.yaml", KALIBR.replace("pinhole", "omni"), "2 cameras; choose one as FILE:NAME from cam0, cam1"),
+        ("a.yaml:cam0", KALIBR.replace("pinhole", "omni"), "'omni' is not supported"),
+        ("a.yaml:cam7", KALIBR, "no camera 'cam7'; choose one as FILE:NAME from cam0, cam1"),
+        ("a.yaml:left", ROS, "holds one camera; leave ':left' out"),
+        ("cameras.txt", COLMAP, "6 cameras; choose one as FILE:NAME from 1, 2, 3, 4, 5, 6"),
+        ("cameras.txt", "1 FOV 640 480 500 500 320 240 0.1\n", "line 1: expected CAMERA_ID MODEL .* got '1 FOV"),
+        ("cameras.txt", "1 PINHOLE 640 480 500 320 240\n", "line 1: expected 4 parameters, got 3"),
+        ("cameras.txt", "1 PINHOLE 640 480 500 x 320 240\n", "line 1: expected numbers after the model"),
+        ("a.json", '{"fx": 500, ', "damaged, or no calibration"),
+        ("a.json", '{"fx": 500, "fy": 500, "cx": 320}', "expected 9 numbers, or fx, fy, cx, cy, got 3"),
+        ("a.json", '{"fx": "500", "fy": 500, "cx": 320, "cy": 240}', "fx: expected finite numbers, got '500'"),
+        ("a.json", '{"K": ' + "[" * 100_000 + "]" * 100_000 + "}", "damaged|nested too deeply"),
+        ("a.xml", "<opencv_storage><camera_matrix>", "damaged, or no calibration"),
+        ("a.xml", "<a>" * 100_000 + "</a>" * 100_000, "damaged|nested too deeply"),
+        ("a.xml", '<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "defines entities"),
+        ("a.yaml", b" " * (MAX_CAMERA_BYTES + 1), "larger than 4,194,304 bytes"),
+    ],
+)
+def test_bad_files_say_what_is_wrong(tmp_path, name, content, words):
+    file = tmp_path / name.partition(":")[0]
+    file.write_bytes(content.encode() if isinstance(content, str) else content)
+    with pytest.raises(InvalidInputError, match=words) as error:
+        load_camera(tmp_path / name)
+    assert str(error.value).startswith(f"{tmp_path / name}: ")
+    assert "--camera exif" in str(error.value)
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(MissingFileError, match="no such file; check the path of the calibration"):
+        load_camera(tmp_path / "cam.yaml:left")

@@ -1,0 +1,139 @@
+"""Cameras with distortion: undistortion against OpenCV's, validity of polynomials, and other resolutions."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import Camera, camera_matrix, project_points, undistorted
+
+SIZE = (120, 160)
+MATRIX = camera_matrix(110.0, 112.0, 77.0, 61.0)
+RADIAL = Camera(MATRIX, (-0.3, 0.1, 0.003, -0.002, 0.01), size=SIZE)
+TILTED = Camera(MATRIX, (-0.2, 0.05, 0.001, 0.001, 0, 0.1, 0, 0, 0.01, 0.001, 0.02, 0.003, 0.01, -0.02), size=SIZE)
+FISHEYE = Camera(MATRIX, (0.02, -0.01, 0.003, -0.001), "fisheye", SIZE)
+
+
+def undistorted_points(points, camera):
+    """(N, 2) px by OpenCV."""
+    K, D, points = camera.matrix.numpy(), np.array(camera.distortion), np.array(points, np.float64)[:, None]
+    if camera.model == "fisheye":
+        return cv2.fisheye.undistortPoints(points, K, D, P=K)[:, 0]
+    return cv2.undistortImagePoints(points, K, D, None, (3, 500, 1e-12))[:, 0]
+
+
+@pytest.mark.parametrize("camera", [RADIAL, TILTED, FISHEYE], ids=["radial", "tilted", "fisheye"])
+def test_photograph_is_undistorted_as_by_opencv(camera):
+    image = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0))
+    K, D, pixels = camera.matrix.numpy(), np.array(camera.distortion), image.permute(1, 2, 0).numpy()
+    if camera.model == "fisheye":
+        expected = cv2.fisheye.undistortImage(pixels, K, D, Knew=K)
+    else:
+        expected = cv2.undistort(pixels, K, D)
+    seen = undistorted(image, camera)
+    assert not seen.missing.any()
+    torch.testing.assert_close(seen.image, torch.from_numpy(expected).permute(2, 0, 1), atol=0.05, rtol=0)
+    assert undistorted(image.double(), camera).image.dtype == torch.float64
+    in_bytes = undistorted((image * 255).round().byte(), camera).image
+    assert in_bytes.dtype == torch.uint8
+    torch.testing.assert_close(in_bytes.float() / 255, seen.image, atol=2 / 255, rtol=0)
+
+
+@pytest.mark.parametrize("camera", [RADIAL, TILTED, FISHEYE], ids=["radial", "tilted", "fisheye"])
+def test_box_is_around_its_undistorted_outline(camera):
+    box = torch.tensor([12.0, 8.0, 150.0, 100.0])
+    moved = undistorted(torch.zeros(1, *SIZE), camera, box).box
+    side = np.linspace(0.0, 1.0, 500)
+    outline = [(12 + 138 * s, y) for s in side for y in (8, 100)] + [(x, 8 + 92 * s) for s in side for x in (12, 150)]
+    points = undistorted_points(outline, camera)
+    expected = torch.tensor([*points.min(axis=0), *points.max(axis=0)]).float()
+    torch.testing.assert_close(moved, expected, atol=0.01, rtol=0)
+    beyond = undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([-40.0, 8.0, 150.0, 100.0])).box
+    border = undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([-0.5, 8.0, 150.0, 100.0])).box
+    assert float(beyond[0]) == pytest.approx(float(border[0]) - 39.5, abs=0.1)
+
+
+def test_mask_moves_with_the_photograph():
+    mask = torch.zeros(SIZE)
+    mask[20:90, 5:60] = 1.0
+    seen = undistorted(mask[None], RADIAL, mask=mask)
+    torch.testing.assert_close(seen.mask, seen.image[0])
+    assert bool((seen.mask != mask).any())
+
+
+def test_pixels_beyond_the_valid_radius_repeat_its_border():
+    # r - 0.5 r^3 grows up to r = 0.816, and falls beyond: rays at the corners would show the centre again.
+    camera = Camera(camera_matrix(60.0, 60.0, 79.5, 59.5), (-0.5, 0.0, 0.0, 0.0))
+    v, u = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
+    radius = torch.hypot(u - 79.5, v - 59.5) / 100
+    seen = undistorted(radius[None], camera)
+    beyond = torch.hypot(u - 79.5, v - 59.5) > 0.8165 * 60
+    assert torch.equal(seen.missing, beyond)
+    largest = 0.8165 * (1 - 0.5 * 0.8165**2) * 60 / 100
+    assert float((seen.image[0][beyond] - largest).abs().max()) < 0.01
+    folded = cv2.undistort(radius.numpy(), camera.matrix.numpy(), np.array(camera.distortion))
+    assert float(folded[beyond.numpy()].min()) < 0.05  # the centre again
+
+
+def test_pixels_that_were_not_recorded_are_missing():
+    seen = undistorted(torch.rand(1, *SIZE), Camera(MATRIX, (0.4, 0.0, 0.0, 0.0)))
+    assert bool(seen.missing[0, 0])
+    assert not bool(seen.missing[60, 80])
+    assert bool(seen.image.isfinite().all())
+
+
+def test_pinhole_leaves_a_photograph_as_it_is():
+    image, box = torch.rand(1, *SIZE), torch.tensor([1.0, 2, 30, 40])
+    seen = undistorted(image, Camera(MATRIX, (0.0,) * 5), box)
+    assert torch.equal(seen.image, image)
+    assert torch.equal(seen.box, box)
+
+
+def test_box_outside_of_what_is_shown_is_refused():
+    camera = Camera(camera_matrix(60.0, 60.0, 79.5, 59.5), (0.0,) * 4, "fisheye")
+    with pytest.raises(InvalidInputError, match=r"box \(0, 0, 15, 15\): outside .* too far from the optical axis"):
+        undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([0.0, 0, 15, 15]))
+    with pytest.raises(InvalidInputError, match="entirely outside the 160 x 120 image"):
+        undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([200.0, 0, 300, 15]))
+
+
+def test_camera_of_a_resized_photograph():
+    small = RADIAL.at((60, 80))
+    points = torch.tensor([[0.3, -0.2, 1.0], [-0.5, 0.4, 2.0]], dtype=torch.float64)
+    large, pose = project_points(points, torch.eye(4).double(), MATRIX), torch.eye(4).double()
+    # The corner of the picture, (-0.5, -0.5) in px, is the same point in both.
+    torch.testing.assert_close(project_points(points, pose, small.matrix), (large + 0.5) / 2 - 0.5)
+    assert (small.size, small.distortion) == ((60, 80), RADIAL.distortion)
+    assert RADIAL.at((40, 53)).size == (40, 53)  # 53.3, rounded
+    with pytest.raises(InvalidInputError, match=r"calibrated for 160 x 120 px, .* has 160 x 90 px, .* uncropped"):
+        RADIAL.at((90, 160))
+    with pytest.raises(InvalidInputError, match=r"has 120 x 160 px, .*turn the photograph by 90 degrees"):
+        RADIAL.at((160, 120))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"distortion": (0.1, 0.2)}, "expected 0, 4, 5, 8, 12, 14 finite coefficients"),
+        ({"distortion": (0.1, 0.2, 0, float("nan"))}, "finite"),
+        ({"model": "fisheye"}, "expected 4 finite coefficients"),
+        ({"model": "fov"}, "distortion model: expected one of 'radial-tangential', 'fisheye'"),
+        ({"matrix": torch.eye(4)}, r"camera matrix: expected shape \(3, 3\)"),
+        ({"matrix": -MATRIX}, "FX, FY > 0"),
+        ({"size": (0, 640)}, "height of the image"),
+    ],
+)
+def test_unusable_cameras_are_refused(arguments, words):
+    with pytest.raises(InvalidInputError, match=words):
+        Camera(**{"matrix": MATRIX, **arguments})
+
+
+def test_description_is_plain():
+    assert FISHEYE.describe() == {
+        "matrix": MATRIX.tolist(),
+        "distortion": [0.02, -0.01, 0.003, -0.001],
+        "model": "fisheye",
+        "width": 160,
+        "height": 120,
+    }

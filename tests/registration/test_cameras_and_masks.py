@@ -1,0 +1,174 @@
+"""Distorted photographs give the poses of undistorted ones, and masks stand in for boxes and predicted masks."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from curvireg_torch import Camera, camera_matrix, project_points, render_depth, rotation_error
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import undistorted
+from curvireg_torch.geometry.cameras import boxes_around
+from curvireg_torch.registration import FailedRegistration, Follower, localize
+from curvireg_torch.registration.inputs import image_item, image_items
+from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
+from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
+
+OFF_CENTRE = camera_matrix(260.0, 260.0, 20.0, 30.0)
+"""The object, in the middle of the picture, is 20 degrees off its axis, where distortion moves it."""
+
+RADIAL = Camera(OFF_CENTRE, (-0.35, 0.12, 0.004, -0.003, 0.0), size=SIZE)
+FISHEYE = Camera(OFF_CENTRE, (0.02, -0.01, 0.003, -0.001), "fisheye", SIZE)
+
+
+def distorted(camera, seed):
+    """A photograph by a camera with distortion, the box and mask of the object in it, and the true pose."""
+    generator = torch.Generator().manual_seed(seed)
+    T = random_pose(example_mesh(), OFF_CENTRE, SIZE, generator, elevations=(5.0, 50.0))
+    ideal, _ = synthesize_photograph(example_mesh(), T, OFF_CENTRE, SIZE, generator)
+    mask = (render_depth(example_mesh(), T, OFF_CENTRE, SIZE)[0, 0] > 0).float()
+    K, D = camera.matrix.numpy(), np.array(camera.distortion)
+    pixels = np.stack(np.meshgrid(np.arange(SIZE[1]), np.arange(SIZE[0])), axis=-1).reshape(-1, 1, 2).astype(np.float64)
+    if camera.model == "fisheye":
+        source = cv2.fisheye.undistortPoints(pixels, K, D, P=K)
+    else:
+        source = cv2.undistortImagePoints(pixels, K, D, None, (3, 500, 1e-12))
+    source = source.reshape(*SIZE, 2).astype(np.float32)
+    planes = [cv2.remap(plane.numpy(), source, None, cv2.INTER_CUBIC) for plane in (*ideal, mask)]
+    moved = torch.from_numpy(np.stack(planes)).clamp(0, 1)
+    y, x = (moved[3] >= 0.5).nonzero().unbind(1)
+    box = boxes_around(torch.stack([x, y], dim=1).float()) + torch.tensor([-0.5, -0.5, 0.5, 0.5])
+    return ideal, moved[:3], box, moved[3], T
+
+
+def errors(result, T):
+    """Degrees, and the error of the position as a fraction of the distance."""
+    away = torch.linalg.vector_norm(result.translation - T[:3, 3]) / torch.linalg.vector_norm(T[:3, 3])
+    return float(rotation_error(result.rotation, T[:3, :3])), float(away)
+
+
+@pytest.mark.parametrize("camera", [RADIAL, FISHEYE], ids=["radial-tangential", "fisheye"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_distorted_photograph_gives_the_pose_of_the_true_camera(camera, seed):
+    ideal, photo, box, _, T = distorted(camera, seed)
+    true_box = undistorted(photo, camera, box).box[None]
+    register = truck_registrar()
+    angle, away = errors(register([ideal], true_box, OFF_CENTRE)[0], T)
+    result, ignored = register([photo] * 2, torch.stack([box] * 2), [camera, OFF_CENTRE])
+    assert not result.warnings
+    assert torch.equal(result.projection[1], OFF_CENTRE)
+    assert errors(result, T)[0] < angle + 0.3
+    assert errors(result, T)[1] < away + 0.005
+    assert errors(ignored, T)[1] > 0.02  # so the photograph needs it
+
+
+def test_camera_is_scaled_to_each_photograph():
+    ideal, photo, box, _, _ = distorted(RADIAL, 1)
+    half = torch.nn.functional.avg_pool2d(photo[None], 2)[0]
+    items = image_items([photo, half, ideal], [box.tolist(), ((box + 0.5) / 2 - 0.5).tolist(), [1, 1, 60, 60]], RADIAL)
+    point = torch.tensor([[0.4, 0.2, 1.0]]).double()
+    large, small = (project_points(point, torch.eye(4).double(), item.camera_matrix) for item in items[:2])
+    torch.testing.assert_close((large + 0.5) / 2 - 0.5, small)
+    torch.testing.assert_close((items[0].box + 0.5) / 2 - 0.5, items[1].box, atol=0.02, rtol=0)
+    (error,) = image_items([photo[:, :90]], None, RADIAL)
+    assert "calibrated for 240 x 180 px, but the photograph has 240 x 90 px" in str(error)
+    with pytest.raises(InvalidInputError, match="expected 1, one for each image, got 2"):
+        image_items([photo], None, [RADIAL, OFF_CENTRE])
+
+
+def test_localization_refinement_and_following_take_cameras():
+    _, photo, box, _, T = distorted(RADIAL, 0)
+    register = truck_registrar()
+    assert errors(localize(register, [photo], RADIAL)[0][0], T)[1] < 0.02
+    start = T.clone()
+    start[0, 3] += 0.02 * start[2, 3]
+    assert errors(register.refine([photo], RADIAL, [start])[0], T)[1] < 0.01
+    follow = Follower(learned_registrar(), RADIAL)
+    assert errors(follow(photo, box=box), T)[1] < 0.02
+    assert errors(follow(photo), T)[1] < 0.02
+
+
+def test_box_that_the_camera_did_not_record_is_warned_of():
+    camera = Camera(CAMERA, (1.5, 0.0, 0.0, 0.0), size=SIZE)
+    item = image_item(torch.rand(3, *SIZE), torch.tensor([0.0, 0.0, 60.0, 60.0]), camera)
+    assert not item.warnings
+    item = image_item(torch.rand(3, *SIZE), torch.tensor([-60.0, -60.0, 30.0, 30.0]), camera)
+    assert "% of the box lie where the distorted photograph shows nothing" in item.warnings[0]
+
+
+def test_mask_gives_the_box_and_the_outline():
+    _, photo, box, mask, T = distorted(RADIAL, 2)
+    (result,) = truck_registrar()([photo], None, RADIAL, masks=[mask])
+    assert errors(result, T)[0] < 1.0
+    y, x = (render_depth(example_mesh(), T, OFF_CENTRE, SIZE)[0, 0] > 0).nonzero().unbind(1)
+    true_box = boxes_around(torch.stack([x, y], dim=1).float()) + torch.tensor([-0.5, -0.5, 0.5, 0.5])
+    torch.testing.assert_close(image_item(photo, None, RADIAL, mask=mask).box, true_box, atol=1.0, rtol=0)
+    assert torch.equal(image_item(photo, box, RADIAL, mask=mask).box, undistorted(photo, RADIAL, box).box)
+
+
+def test_mask_decides_which_edges_are_the_outline():
+    image, box, T = scene(0)
+    mask = render_depth(example_mesh(), T, CAMERA, SIZE)[0, 0] > 0
+    register = truck_registrar()
+    without, with_mask, wrong = register([image] * 3, torch.stack([box] * 3), CAMERA, masks=[None, mask, ~mask])
+    assert errors(with_mask, T)[1] < errors(without, T)[1]
+    assert not torch.equal(wrong.translation, with_mask.translation)
+    query = register.matcher.query([image], box[None])
+    crop = register.object_mask(query, [image_item(image, box, CAMERA, mask=mask)])
+    assert crop.shape == (1, 1, 96, 96)
+    assert 0.3 < float(crop.mean()) < 0.7
+    assert register.object_mask(query, [image_item(image, box, CAMERA)]) is None
+
+
+@pytest.mark.parametrize("kind", ["bool", "bytes", "zeros and ones", "array", "file"])
+def test_masks_in_any_form(tmp_path, kind):
+    mask = torch.zeros(40, 60, dtype=torch.bool)
+    mask[10:30, 20:50] = True
+    Image.fromarray(mask.numpy()).save(tmp_path / "mask.png")
+    forms = {
+        "bool": mask,
+        "bytes": mask.byte() * 255,
+        "zeros and ones": mask.byte(),
+        "array": mask.numpy().astype(np.float64),
+        "file": tmp_path / "mask.png",
+    }
+    item = image_item(torch.rand(3, 40, 60), None, mask=forms[kind])
+    assert torch.equal(item.mask, mask.float())
+    assert item.box.tolist() == [19.5, 9.5, 49.5, 29.5]
+
+
+@pytest.mark.parametrize(
+    ("mask", "box", "words"),
+    [
+        (torch.zeros(40, 60, dtype=torch.bool), None, "mask: no white pixel; expected the object white"),
+        (torch.eye(40, 60), [50.0, 0.0, 58.0, 9.0], "mask: no white pixel in the box"),
+        (torch.ones(60, 40), None, r"mask: expected shape \(40, 60\), that of the photograph, got \(60, 40\)"),
+        (torch.ones(3, 40, 60), None, r"mask: expected shape \(40, 60\), that of the photograph, got \(3, 40, 60\)"),
+        (torch.ones(40, 60, dtype=torch.int64), None, "mask: expected bool, uint8 or floating"),
+        (torch.full((40, 60), 255.0), None, "mask: expected values from 0 to 1"),
+        (torch.full((40, 60), float("nan")), None, "mask: expected finite entries"),
+        ("no.png", None, "no.png: no such file"),
+        ([[1, 0]], None, "mask: expected bool, uint8 or floating"),
+    ],
+)
+def test_unusable_masks_are_named(mask, box, words):
+    (result,) = truck_registrar()([torch.rand(3, 40, 60)], None if box is None else [box], masks=[mask])
+    assert isinstance(result, FailedRegistration)
+    with pytest.raises((InvalidInputError, FileNotFoundError), match=words):
+        raise result.error
+
+
+def test_inverted_mask_is_warned_of():
+    mask = torch.ones(40, 60)
+    mask[5:35, 20:50] = 0.0
+    assert "must be white, not black" in image_item(torch.rand(3, 40, 60), None, mask=mask).warnings[0]
+    assert not image_item(torch.rand(3, 40, 60), None, mask=1.0 - mask).warnings
+
+
+def test_masks_must_be_as_many_as_photographs():
+    photos, register = [torch.rand(3, 40, 60)] * 2, truck_registrar()
+    with pytest.raises(InvalidInputError, match="masks: expected 2, one for each image or None, got 1"):
+        register(photos, masks=[torch.ones(40, 60)])
+    with pytest.raises(InvalidInputError, match="masks: image 1 has neither mask nor box"):
+        register(photos, masks=[torch.ones(40, 60), None])

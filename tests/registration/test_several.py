@@ -1,0 +1,190 @@
+"""Several photographs of the truck from a rig of cameras: one pose in the world."""
+
+from functools import cache
+
+import pytest
+import torch
+from torch import Tensor
+
+from curvireg_torch import Registration, rotation_error, rotation_from_viewpoint
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import rotation_from_axis_angle, transform
+from curvireg_torch.mesh import mesh_centre, mesh_radius
+from curvireg_torch.registration.result import result_document
+from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
+from tests._support.scenes import CAMERA, SIZE, learned_registrar
+
+EASY = ((100.0, 1), (135.0, 2), (175.0, 3))
+IN_DOUBT = ((335.0, 100), (329.0, 105), (190.0, 107))
+"""Azimuths and seeds of photographs; those of the second rig, with strong noise, are registered the wrong way round."""
+
+WORLD = transform(
+    rotation_from_axis_angle(torch.tensor([0.3, -0.8, 0.5]).double()), torch.tensor([0.2, 0.1, -0.4]).double()
+)
+"""True ``T_world_from_model``."""
+
+
+@cache
+def photograph(azimuth: float, seed: int, noise: float) -> tuple[Tensor, Tensor, Tensor]:
+    """(3, H, W), its box (4,) and the true ``T_cam_from_model``, from six radii away and slightly above."""
+    generator = torch.Generator().manual_seed(seed)
+    mesh = example_mesh()
+    R = rotation_from_viewpoint(azimuth, 8.0, 0.0).double()
+    ahead = torch.tensor([0.0, 0.0, 6.0 * mesh_radius(mesh)], dtype=torch.float64)
+    T = transform(R, ahead - R @ mesh_centre(mesh))
+    image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, generator, texture=0.6)
+    return (image + noise * torch.randn(image.shape, generator=generator)).clamp(0, 1), box, T
+
+
+def rig_of(which: tuple[tuple[float, int], ...], noise: float = 0.1) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    """Photographs, boxes, and ``T_cam_from_world`` (V, 4, 4)."""
+    images, boxes, poses = zip(*(photograph(*one, noise) for one in which), strict=True)
+    return list(images), list(boxes), torch.stack(poses) @ torch.linalg.inv(WORLD)
+
+
+def registered(images: list, boxes: list | None, cameras: Tensor) -> Registration:
+    return learned_registrar().register_views(images, boxes, CAMERA, cameras)
+
+
+def check_pose(result: Registration, *, degrees: float = 2.0, shift: float = 0.1) -> None:
+    """``T_world_from_model`` is right, ``shift`` in radii."""
+    assert float(rotation_error(result.rotation, WORLD[:3, :3])) < degrees
+    off = result.translation - WORLD[:3, 3]
+    assert float(off.norm()) < shift * mesh_radius(example_mesh())
+
+
+@pytest.fixture(scope="module")
+def easy() -> Registration:
+    return registered(*rig_of(EASY))
+
+
+def test_pose_in_the_world_and_in_each_photograph(easy):
+    check_pose(easy, degrees=1.0, shift=0.05)
+    for view, camera, box in zip(easy.views, rig_of(EASY)[2], rig_of(EASY)[1], strict=True):
+        torch.testing.assert_close(view.T_cam_from_model, camera @ easy.transform)
+        assert view.box.tolist() == box.tolist()
+        assert view.failure is None
+        assert view.contribution > 0
+        assert view.edge_support > 0.4
+        assert view.similarity > 0.6
+    torch.testing.assert_close(easy.projection[0], easy.views[0].T_cam_from_model)
+    assert easy.confidence > 0.9
+    assert len(easy.probabilities) == len(easy.hypotheses) > 1
+
+
+def test_half_turns_in_doubt_are_decided_together():
+    """Views of the two ends differ by half a turn, but not of the same world: only the truth is common to all."""
+    images, boxes, cameras = rig_of(IN_DOUBT, noise=0.35)
+    alone = learned_registrar()(images, torch.stack(boxes), CAMERA)
+    errors = [float(rotation_error(r.rotation, (c @ WORLD)[:3, :3])) for r, c in zip(alone, cameras, strict=True)]
+    assert min(errors) > 150
+    check_pose(registered(images, boxes, cameras), degrees=3.0, shift=0.2)
+
+
+def test_photographs_that_fail_are_reported_and_change_nothing(easy, tmp_path):
+    images, boxes, cameras = rig_of(EASY)
+    other, box, T = photograph(60.0, 4, 0.1)
+    empty = procedural_background(SIZE, torch.Generator().manual_seed(5))
+    more = torch.stack([T @ torch.linalg.inv(WORLD), photograph(220.0, 4, 0.1)[2] @ torch.linalg.inv(WORLD)])
+    result = registered([*images, empty, tmp_path / "none.png"], [*boxes, box, box], torch.cat([cameras, more]))
+    assert [view.failure is None for view in result.views] == [True, True, True, False, False]
+    assert "not seen where" in result.views[3].failure or "lies outside" in result.views[3].failure
+    assert "no such file" in result.views[4].failure
+    assert result.views[4].box is None
+    assert result.views[3].contribution == result.views[4].contribution == 0
+    torch.testing.assert_close(result.transform, easy.transform, atol=1e-6, rtol=0)
+    torch.testing.assert_close(result.views[4].T_cam_from_model, more[1] @ easy.transform, atol=1e-6, rtol=0)
+    shown = registered([*images, other], [*boxes, box], torch.cat([cameras, more[:1]]))
+    assert all(view.failure is None for view in shown.views)
+
+
+def test_boxes_may_be_missing():
+    images, boxes, cameras = rig_of(EASY)
+    result = registered(images, [boxes[0], None, boxes[2]], cameras)
+    check_pose(result, degrees=1.0, shift=0.05)
+    assert result.views[1].failure is None
+    assert float((result.views[1].box - boxes[1]).abs().max()) < 8
+    away = cameras.clone()
+    away[1, :3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0]).double()) @ cameras[1, :3]  # looks the other way
+    result = registered(images, [boxes[0], None, boxes[2]], away)
+    check_pose(result, degrees=1.0, shift=0.05)
+    assert "lies outside" in result.views[1].failure
+
+
+@pytest.mark.slow
+def test_without_any_box_the_object_is_searched_for():
+    images, _, cameras = rig_of(EASY)
+    check_pose(registered(images, None, cameras))
+
+
+def test_one_photograph_gives_the_answer_of_the_registrar():
+    images, boxes, cameras = (part[:1] for part in rig_of(EASY))
+    alone = learned_registrar()(images, torch.stack(boxes), CAMERA)[0]
+    result = registered(images, boxes, cameras)
+    torch.testing.assert_close(cameras[0] @ result.transform, alone.transform)
+    assert result.probabilities == alone.probabilities
+    R = cameras[0, :3, :3]
+    torch.testing.assert_close(R @ result.covariance[3:, 3:] @ R.T, alone.covariance[3:, 3:])
+
+
+def test_covariance_shrinks_with_photographs_but_not_with_copies(easy):
+    images, boxes, cameras = rig_of(EASY)
+    two = registered(images[:2], boxes[:2], cameras[:2])
+    deviations = [torch.linalg.eigvalsh(r.hypotheses[0].covariance[3:, 3:]).sqrt() for r in (two, easy)]
+    alone = registered(images[:1], boxes[:1], cameras[:1])
+    largest = torch.linalg.eigvalsh(alone.hypotheses[0].covariance[3:, 3:])[-1].sqrt()
+    assert float(deviations[0][-1]) < 0.5 * float(largest)  # the depth is seen from the side
+    assert float(deviations[1].prod()) < float(deviations[0].prod())
+    copies = registered(images[:1] * 3, boxes[:1] * 3, cameras[[0, 0, 0]])
+    assert copies.confidence <= alone.confidence + 0.05
+    volumes = [torch.logdet(r.hypotheses[0].covariance) for r in (alone, copies)]
+    assert float(volumes[1] - volumes[0]) > -1.5
+
+
+def test_a_motion_of_the_world_moves_the_answer(easy):
+    images, boxes, cameras = rig_of(EASY)
+    turn = rotation_from_axis_angle(torch.tensor([0.4, 2.0, -0.7], dtype=torch.float64))
+    motion = transform(turn, torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64))
+    moved = registered(images, boxes, cameras @ torch.linalg.inv(motion))
+    torch.testing.assert_close(moved.transform, motion @ easy.transform, atol=1e-4, rtol=0)
+    assert moved.confidence == pytest.approx(easy.confidence, abs=1e-3)
+
+
+def in_another_unit(T: Tensor, factor: float) -> Tensor:
+    return transform(T[:, :3, :3], factor * T[:, :3, 3])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda T: in_another_unit(T, 1000.0), "image 0: T_cam_from_world: by its size .* mesh's unit"),
+        (lambda T: in_another_unit(T, 0.001), "image 0: T_cam_from_world: by its size .* mesh's unit"),
+        (lambda T: T[[0, 1, 1]], "image 2: T_cam_from_world: the same as of image 1"),
+        (lambda T: torch.cat([T[:1], 1.1 * T[1:2], T[2:]]), "image 1: T_cam_from_world: expected rigid"),
+        (lambda T: T.index_fill(0, torch.tensor([2]), torch.nan), "image 2: T_cam_from_world: expected finite"),
+        (lambda T: T[:2], r"T_cam_from_world: expected shape \(3, 4, 4\)"),
+    ],
+    ids=["metres for millimetres", "millimetres for metres", "same place", "scaled", "NaN", "too few"],
+)
+def test_bad_rigs_name_the_photograph(change, message):
+    images, boxes, cameras = rig_of(EASY)
+    with pytest.raises(InvalidInputError, match=message):
+        registered(images, boxes, change(cameras))
+
+
+def test_bad_photographs_and_boxes():
+    images, boxes, cameras = rig_of(EASY)
+    with pytest.raises(InvalidInputError, match=r"no photograph can be registered: image 0: .*one colour"):
+        registered([torch.zeros(3, *SIZE)], boxes[:1], cameras[:1])
+    with pytest.raises(InvalidInputError, match="boxes: expected 3"):
+        registered(images, boxes[:2], cameras)
+    with pytest.raises(InvalidInputError, match="needs the camera matrix"):
+        learned_registrar().register_views(images, boxes, None, cameras)
+
+
+def test_document_lists_the_photographs(easy):
+    document = result_document(easy, learned_registrar(), {})
+    assert document["rotation"] == easy.rotation.tolist()
+    assert [set(view) for view in document["views"]] == [
+        {"rotation", "translation", "box", "edge_support", "similarity", "contribution", "failure"}
+    ] * 3
