@@ -113,7 +113,7 @@ class Follower:
         if tracked and found and tracked.confidence >= TRUSTED_CONFIDENCE and self._base >= BELIEVED_CONFIDENCE:
             self._tracker.accept(tracked)
             return found
-        starts = [self._tracker.last_pose] if tracked is None else [tracked.T, self._tracker.last_pose]
+        starts = [self._tracker.last_pose] if tracked is None else [tracked.state.T, self._tracker.last_pose]
         refined = map_on_threads(lambda T: self._refined(item, T), [torch.cat(starts)])[0]
         if isinstance(refined, Registration) and _confidence(refined) >= (0.0 if found is None else _confidence(found)):
             self._go_on(item, refined)
@@ -154,7 +154,7 @@ class Follower:
 
     def _registration(self, tracked: TrackedPose, item: ImageItem) -> Registration:
         """The result of a tracked pose, without ranking and without rivals."""
-        T, support = tracked.T[0], tracked.features["edge_support"]
+        T, support = tracked.state.T[0], tracked.features["edge_support"]
         rotation, position = T[:3, :3], T[:3, :3] @ self._tracker.centre + T[:3, 3]
         allocentric = rotation_towards(position).mT @ rotation
         covariance = self._tracker.covariance(tracked)
