@@ -14,7 +14,7 @@ from ..version import __version__
 from .benchmark import Benchmark, Row
 from .predict import register_object, registrar_opener
 from .runner import POSE_SOURCES, run_items
-from .scores import localization_recall
+from .scores import detection_recall
 from .store import ResultStore, to_json
 
 __all__ = ["evaluate", "score"]
@@ -97,7 +97,7 @@ def score(benchmark: Benchmark, out: Path, *, limit: int | None = None) -> Row:
     settings["root"] = Path(settings["root"]).name  # a summary is shared: no paths
     summary = {
         **benchmark.summary(items, rows),
-        **({"localization": localization_recall(items, rows)} if benchmark.protocol.box is None else {}),
+        **({"detection": detection_recall(items, rows)} if benchmark.protocol.box is None else {}),
         "failed": sum("failed" in row for row in rows),
         "skipped": dict(sorted(skipped.items())),
         "protocol": settings["protocol"],

@@ -11,7 +11,7 @@ from ..matching import cached_bank
 from ..mesh import load_mesh
 from ..pipeline import Pipeline
 from ..registration import FailedRegistration, Registrar
-from ..registration.result import localization_document
+from ..registration.result import detection_document
 from .benchmark import Benchmark, BenchmarkItem, Row
 from .protocol import perturbed_box
 from .runner import OpenRegistrar
@@ -47,7 +47,7 @@ def register_object(
         registrar, bank_seconds: of its meshes, or why there is none; time that opening it took.
 
     Returns:
-        :meth:`Registration.to_dict` with the name of the ``mesh``, the ``image_size`` (height, width), ``localization``
+        :meth:`Registration.to_dict` with the name of the ``mesh``, the ``image_size`` (height, width), ``detection``
         and ``seconds`` as in docs/results.md, and ``projection``, see :class:`Hypothesis`; or ``failed`` or ``skipped``
         with the reason. Scores count ``failed`` as a miss.
     """
@@ -69,6 +69,6 @@ def register_object(
         return {**size, "failed": result.error.message, "seconds": seconds}
     names = [path.name for path in item.meshes]
     row = {**size, **result.to_dict(), "mesh": names[result.model], "seconds": seconds}
-    if result.localization is not None:
-        row["localization"] = localization_document([result])
+    if result.detection is not None:
+        row["detection"] = detection_document([result])
     return {**row, "projection": [matrix.tolist() for matrix in result.projection]}

@@ -1,4 +1,4 @@
-"""Scores and tables that several benchmarks share, and the recall of localized boxes."""
+"""Scores and tables that several benchmarks share, and the recall of detected boxes."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,8 +15,8 @@ from .metrics import accuracy, median_error
 
 __all__ = [
     "THRESHOLDS",
+    "detection_recall",
     "estimated_rotations",
-    "localization_recall",
     "or_inf",
     "viewpoint_scores",
     "write_viewpoints",
@@ -50,7 +50,7 @@ def or_inf(errors: Tensor, R: Tensor) -> Tensor:
     return torch.where(R.isfinite().flatten(1).all(1), errors, torch.full_like(errors, torch.inf))
 
 
-def localization_recall(items: Sequence[BenchmarkItem], rows: Sequence[Row]) -> Row:
+def detection_recall(items: Sequence[BenchmarkItem], rows: Sequence[Row]) -> Row:
     """``recall_1``, ``recall_5``, ``recall_20``: fractions of the ``n`` annotated boxes that the best proposals find.
 
     Boxes are clipped to the image on both sides: some datasets annotate the visible part, some the whole object. A row
@@ -63,9 +63,9 @@ def localization_recall(items: Sequence[BenchmarkItem], rows: Sequence[Row]) -> 
 
 def _rank(box: Tensor, row: Row) -> float:
     """Rank of the first right proposal, from 1; infinite if none is right."""
-    if "localization" not in row:
+    if "detection" not in row:
         return float("inf")
-    boxes = [proposal["box"] for proposal in row["localization"]["proposals"]]
+    boxes = [proposal["box"] for proposal in row["detection"]["proposals"]]
     proposals = torch.tensor(boxes, dtype=torch.float64).view(-1, 4)
     H, W = row["image_size"]
     end = torch.tensor([W, H, W, H], dtype=torch.float64) - 0.5

@@ -102,8 +102,8 @@ def _picture(benchmark: Benchmark, item: BenchmarkItem, row: Row) -> bytes | Non
         image = read_image(item.photo, dtype=torch.uint8)
     except (CurviregError, StopIteration):
         return None
-    if "localization" in row:
-        box = row["localization"]["proposals"][0]["box"]
+    if "detection" in row:
+        box = row["detection"]["proposals"][0]["box"]
     else:
         box = perturbed_box(item.box, benchmark.protocol, item.key).tolist()
     return thumbnail(renderer, (T, K), image, box)

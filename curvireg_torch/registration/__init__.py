@@ -2,26 +2,24 @@
 
 from .confidence import RELIABLE
 from .contour_fit import ContourFit, fit_contours
+from .detection import Detector, Proposals, detect
 from .following import Follower
-from .localization import Located, Locator, localize, locate, representative_views
 from .refinement import refine
 from .registrar import Registrar
-from .result import FailedRegistration, Hypothesis, Localization, Registration
+from .result import Detection, FailedRegistration, Hypothesis, Registration
 
 __all__ = [
     "RELIABLE",
     "ContourFit",
+    "Detection",
+    "Detector",
     "FailedRegistration",
     "Follower",
     "Hypothesis",
-    "Localization",
-    "Located",
-    "Locator",
+    "Proposals",
     "Registrar",
     "Registration",
+    "detect",
     "fit_contours",
-    "localize",
-    "locate",
     "refine",
-    "representative_views",
 ]

@@ -126,21 +126,18 @@ def tracking_confidence(features: Features) -> float:
     return model({name: features[name] for name in model.weights})
 
 
-def detection_probability(score: float, similarity: float, *, learned: bool) -> float:
+def detection_probability(response: float, similarity: float) -> float:
     """Probability that a photograph shows the object in a box.
 
     Args:
-        score: the detector's, of the box.
+        response: the detector's, of the box.
         similarity: normalised correlation of the box's best view.
-        learned: whether the detector's features are; without, only the similarity counts.
 
     Example:
-        >>> detection_probability(8.0, 0.9, learned=True) > detection_probability(4.0, 0.6, learned=True)
+        >>> detection_probability(8.0, 0.9) > detection_probability(4.0, 0.6)
         True
     """
-    if not learned:
-        return LogisticModel.named("detection without networks")({"similarity": similarity})
-    return LogisticModel.named("detection")({"score": score, "similarity": similarity})
+    return LogisticModel.named("detection")({"response": response, "similarity": similarity})
 
 
 def are_near(rotations: Tensor, rotation: Tensor, symmetries: Tensor | None = None) -> Tensor:

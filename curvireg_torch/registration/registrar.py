@@ -31,8 +31,8 @@ from .confidence import (
     is_calibrated,
     registration_confidence,
 )
+from .detection import Detector, detect
 from .inputs import ImageItem, check_crop, image_items
-from .localization import Locator, localize
 from .poses import (
     SCORE_WEIGHTS,
     Poses,
@@ -109,7 +109,7 @@ class Registrar:
             differ by one of them are reported once. Default: those of the shape of an exact mesh without colours, see
             :func:`curvireg_torch.mesh.mesh_symmetries`; ``torch.eye(4)[None]`` for none.
         device: of modules, bank and search.
-        progress: True shows bars. A callback gets (stage, done, total), with the stages "localization" (without a box),
+        progress: True shows bars. A callback gets (stage, done, total), with the stages "detection" (without a box),
             "bank", "ranking", "search" and "contours"; to cancel, it may raise what is no :class:`CurviregError`. On a
             CPU photographs are registered in parallel: callback, custom renderer and custom field are then called from
             several threads.
@@ -174,7 +174,7 @@ class Registrar:
         Args:
             images: (B, C, H, W) or a list of (C, H, W) tensors, (H, W, C) arrays or paths, C = 1 or 3, floating in
                 [0, 1] or uint8.
-            boxes: (B, 4) x0, y0, x1, y1 in px; None searches for the object, see :func:`localize`.
+            boxes: (B, 4) x0, y0, x1, y1 in px; None searches for the object, see :func:`detect`.
             camera_matrices: (B, 3, 3) or (3, 3) in px, a :class:`Camera`, or a list of these; None: rotations are
                 relative to a camera that looks at the box.
             prior: what is known of the poses in advance, one for all photographs or a list.
@@ -190,7 +190,7 @@ class Registrar:
                 cameras.
         """
         if boxes is None and masks is None:
-            results = [found[0] for found in localize(self, images, camera_matrices, prior=prior)]
+            results = [found[0] for found in detect(self, images, camera_matrices, prior=prior)]
         else:
             items = image_items(images, boxes, camera_matrices, prior, masks)
             results = self.map_items(items, self.register_items)
@@ -248,9 +248,9 @@ class Registrar:
         return self.matcher.describer.with_settings(replace(settings, grid=min(2 * settings.grid, settings.image_size)))
 
     @cached_property
-    def locator(self) -> Locator:
+    def detector(self) -> Detector:
         """Proposes boxes where none are given."""
-        return map_on_threads(lambda _: Locator(self.matcher), [0])[0]  # one thread: rounding is always the same
+        return map_on_threads(lambda _: Detector(self.matcher), [0])[0]  # one thread: rounding is always the same
 
     def report_progress(self, stage: str) -> None:
         """Call the progress callback, if there is one."""

@@ -36,9 +36,9 @@ from .contour_fit import (
     inside_photographs,
     smaller_problem,
 )
+from .detection import detect
 from .inputs import ImageItem, OnDemand, image_items
 from .least_squares import Information, pose_information
-from .localization import localize
 from .poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS
 from .refinement import LOST_CONFIDENCE, nearest_view
 from .result import FailedRegistration, Hypothesis, PhotographPose, Registration
@@ -518,7 +518,7 @@ def register_views(
     _check_places(items, cameras, K)
     missing = [i for i, box in enumerate(given) if box is None]
     if len(missing) == len(items):
-        found = _localized(registrar, images, items, K, cameras)
+        found = _detected(registrar, images, items, K, cameras)
     else:
         found = _registered(registrar, items, cameras, [i for i in range(len(items)) if i not in missing])
         if missing:
@@ -600,7 +600,7 @@ def _registered(
     return dict(zip(chosen, registrar.map_items(OnDemand(item, len(chosen)), register), strict=True))
 
 
-def _localized(
+def _detected(
     registrar: "Registrar",
     images: Sequence[Any],
     items: Sequence[ImageItem | CurviregError],
@@ -609,14 +609,14 @@ def _localized(
 ) -> _Found:
     """Photographs in which the object was searched for, each alone."""
     found: _Found = {}
-    for i, (result,) in enumerate(localize(registrar, images, K)):
+    for i, (result,) in enumerate(detect(registrar, images, K)):
         if isinstance(result, FailedRegistration):
             found[i] = result.error
         else:
             item = items[i]
             assert isinstance(item, ImageItem)
-            assert result.localization is not None
-            item = replace(item, box=result.localization.box.float())
+            assert result.detection is not None
+            item = replace(item, box=result.detection.box.float())
             found[i] = _Photograph.of(registrar, item, result, i, cameras[i])
     return found
 

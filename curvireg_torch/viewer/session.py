@@ -28,7 +28,7 @@ from .editing import DisplayedPose, fit_displayed, move_displayed
 
 __all__ = ["MAX_PROPOSALS", "Result", "Session"]
 
-MAX_PROPOSALS = 5  # proposed boxes that are drawn where the object was localized
+MAX_PROPOSALS = 5  # proposed boxes that are drawn where the object was detected
 
 Numbers = tuple[float, float, float, float]
 
@@ -186,9 +186,9 @@ class Session:
         return self.result, self.displayed
 
     def proposals(self) -> list[list[float]]:
-        """The best boxes of the localization, the chosen one first; empty if the box was given."""
-        localization = {} if self.result is None else self.result.document.get("localization", {})
-        return [proposal["box"] for proposal in localization.get("proposals", [])[:MAX_PROPOSALS]]
+        """The best boxes of the detection, the chosen one first; empty if the box was given."""
+        detection = {} if self.result is None else self.result.document.get("detection", {})
+        return [proposal["box"] for proposal in detection.get("proposals", [])[:MAX_PROPOSALS]]
 
     def display(self, number: int, *, chosen: bool = False) -> None:
         """Put a hypothesis on the page, by its number from 0; ``chosen`` if the user picks it as the answer."""

@@ -160,7 +160,7 @@ class Stage:
         self.layers.set_visibility(shown)
 
     def _draw_boxes(self) -> None:
-        """Draw the box with its handles, or dashed the proposals of the localization."""
+        """Draw the box with its handles, or dashed the proposals of the detection."""
         photo, box = self.session.photo, self.workspace.drawing.box
         if photo is None:
             return

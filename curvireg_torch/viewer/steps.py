@@ -12,7 +12,7 @@ __all__ = ["Steps"]
 
 STAGES: Mapping[str, str] = {
     "bank": "rendering views of the mesh",
-    "localization": "looking for the object in the photograph",
+    "detection": "looking for the object in the photograph",
     "ranking": "comparing the photograph with the views",
     "search": "searching around the best views",
     "contours": "fitting contours",

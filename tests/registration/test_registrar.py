@@ -224,7 +224,7 @@ def test_progress_reports_stages_and_may_cancel():
     bank = ViewBank.build(example_mesh(), views, image_size=64, **options)
     assert calls == [("bank", 3, 8), ("bank", 6, 8), ("bank", 8, 8)]
     registrar = Registrar(bank, progress=lambda stage, *_: calls.append(stage))
-    for boxes, expected in ((BOX[None], []), (None, ["localization"])):
+    for boxes, expected in ((BOX[None], []), (None, ["detection"])):
         calls.clear()
         registrar([IMAGE], boxes, CAMERA)
         assert calls[: len(expected) + 2] == [*expected, "ranking", "contours"]
@@ -237,7 +237,7 @@ def test_progress_reports_stages_and_may_cancel():
         ViewBank.build(example_mesh(), views, image_size=64, progress=cancel)
     with pytest.raises(InterruptedError, match="cancelled in ranking"):
         Registrar(bank, progress=cancel)([IMAGE], BOX[None])
-    with pytest.raises(InterruptedError, match="cancelled in localization"):
+    with pytest.raises(InterruptedError, match="cancelled in detection"):
         Registrar(bank, progress=cancel)([IMAGE])
 
 

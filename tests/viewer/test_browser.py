@@ -171,7 +171,7 @@ def test_page_draws_proposals_and_a_click_chooses_one(browser, folder):
     command = browser.text("command")
     assert "--box" not in command
     written = run_command(folder, command)
-    proposals = [proposal["box"] for proposal in written["localization"]["proposals"]][:MAX_PROPOSALS]
+    proposals = [proposal["box"] for proposal in written["detection"]["proposals"]][:MAX_PROPOSALS]
     assert proposals[0] == written["inputs"]["box"]
     assert len(proposals) > 1
 

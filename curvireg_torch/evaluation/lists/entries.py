@@ -29,11 +29,11 @@ class Entry:
         cells: the texts of the row, one for each column of the list.
         name, photo: the photograph as the list names it, and its file.
         meshes: mesh files; of several the best is found.
-        box: x0, y0, x1, y1 in px; None: the object is localized.
+        box: x0, y0, x1, y1 in px; None: the object is detected.
         camera: fx, fy, cx, cy in px; None if unknown.
         guess: replaces an unknown camera: "exif" takes the focal length in the photograph's file, a number is the
             horizontal field of view in degrees; None: no camera.
-        instances: without a box, see :func:`curvireg_torch.registration.localize`.
+        instances: without a box, see :func:`curvireg_torch.registration.detect`.
         prior: limits on the pose.
         start: (4, 4) pose that is refined; nothing is searched for.
         error: why the row cannot be used; "" if it can.
@@ -82,7 +82,7 @@ def photo_list(
     """Make a list from a table of texts.
 
     Columns, in any order: ``photo``, ``x0``, ``y0``, ``x1``, ``y1``; optional ``fx``, ``fy``, ``cx``, ``cy``, ``mesh``
-    and those of :data:`.PRIOR_OPTIONS`; others are passed through. Empty cells mean: localize the object, no camera,
+    and those of :data:`.PRIOR_OPTIONS`; others are passed through. Empty cells mean: detect the object, no camera,
     ``meshes``, ``limits``. A row that cannot be used holds the reason in its ``error``.
 
     Args:

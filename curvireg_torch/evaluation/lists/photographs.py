@@ -32,7 +32,7 @@ def list_photographs(
     Args:
         paths: photographs, folders of them, patterns such as ``shots/*.jpg``, videos.
         meshes: mesh files; of several the best is found.
-        box, camera: x0, y0, x1, y1 (default: the object is localized) and fx, fy, cx, cy, in px.
+        box, camera: x0, y0, x1, y1 (default: the object is detected) and fx, fy, cx, cy, in px.
         limits: arguments of :class:`PosePrior`.
         every, frames: use every n-th frame of videos; folder for these, as PNG.
 

@@ -12,11 +12,11 @@ from ...data import Photo, read_photo
 from ...errors import BankError, CurviregError, ImageError, InvalidInputError, MeshError
 from ...geometry import camera_matrix
 from ...geometry.cameras import camera_of_view
-from ...registration import FailedRegistration, Registrar, Registration, localize
+from ...registration import FailedRegistration, Registrar, Registration, detect
 from ...registration.inputs import image_items
 from ...registration.poses import projected_box
 from ...registration.refinement import refine
-from ...registration.result import SCHEMA, localization_document, result_document, used_box
+from ...registration.result import SCHEMA, detection_document, result_document, used_box
 from ...utils.files import write_file
 from ...visualization.sheet import SheetEntry, thumbnail, write_sheet
 from ..runner import OpenRegistrar, run_items
@@ -120,7 +120,7 @@ def register_entry(
     if entry.start is not None:
         results = refine(registrar, [photo.image], K, [entry.start], start_confidences=[entry.start_confidence])
     elif entry.box is None:
-        results = localize(registrar, [photo.image], K, instances=entry.instances, prior=entry.prior)[0]
+        results = detect(registrar, [photo.image], K, instances=entry.instances, prior=entry.prior)[0]
     else:
         results = registrar([photo.image], torch.tensor(entry.box)[None], K, prior=entry.prior)
     result = results[0]
@@ -128,7 +128,7 @@ def register_entry(
         raise result.error.with_subject(entry.name)
     if entry.box is None:
         describer = registrar.of_model(result.model).describer
-        box = projected_box(describer, result.projection) if result.localization is None else result.localization.box
+        box = projected_box(describer, result.projection) if result.detection is None else result.detection.box
     else:
         box = torch.tensor(entry.box)
     seconds = {"bank": bank_seconds, "register": time.perf_counter() - start}
@@ -142,8 +142,8 @@ def register_entry(
         "camera_source": source,
         "picture": photo.facts(),
     }
-    if result.localization is not None:
-        document["localization"] = localization_document([r for r in results if isinstance(r, Registration)])
+    if result.detection is not None:
+        document["detection"] = detection_document([r for r in results if isinstance(r, Registration)])
     if source in ("exif", "fov"):  # the error of a guessed camera is unknown
         document["covariance"] = document["standard_deviations"] = None
     return result, document
