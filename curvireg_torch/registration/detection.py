@@ -86,29 +86,20 @@ def detect(
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
     detector = registrar.detector  # created once, before threads use it
 
-    def detect_one(item: ImageItem | CurviregError, index: int) -> Results:
-        if not isinstance(item, ImageItem):
-            return [FailedRegistration(item)]
+    def detect_in(item: ImageItem, _: int) -> list[Registration]:
         registrar.report_progress("detection")
-        try:
-            check_crop(_extremes(item.image))
-            limits: dict[str, Any] = {}
-            if item.prior is not None:
-                limits = {"distance": item.prior.distance, "allowed": _allowed_views(registrar, item)}
-            focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
-            proposals = detector(item.image, focal=focal, **limits)
-            if not len(proposals.boxes):
-                raise InvalidInputError(
-                    "nothing of such a size fits into the photograph; give other distances, or the box"
-                )
-            return [*_with_proposals(_register_candidates(registrar, item, proposals, instances), proposals)]
-        except CurviregError as error:
-            return [FailedRegistration(error.with_subject(f"image {index}"))]
+        check_crop(_extremes(item.image))
+        limits: dict[str, Any] = {}
+        if item.prior is not None:
+            limits = {"distance": item.prior.distance, "allowed": _allowed_views(registrar, item)}
+        focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
+        proposals = detector(item.image, focal=focal, **limits)
+        if not len(proposals.boxes):
+            raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
+        return _with_proposals(_register_candidates(registrar, item, proposals, instances), proposals)
 
-    return registrar.map_items(
-        image_items(images, None, camera_matrices, prior),
-        lambda items, first: [detect_one(item, i) for i, item in enumerate(items, first)],
-    )
+    found = registrar.map_items(image_items(images, None, camera_matrices, prior), detect_in)
+    return [[one] if isinstance(one, FailedRegistration) else one for one in found]
 
 
 def _allowed_views(registrar: "Registrar", item: ImageItem) -> Tensor:

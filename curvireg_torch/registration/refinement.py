@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ..errors import CurviregError, InvalidInputError, LostObjectError
+from ..errors import InvalidInputError, LostObjectError
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose
 from .confidence import are_near, is_calibrated, refinement_confidence
@@ -64,15 +64,7 @@ def refine(
     if len(starts) != len(items) or len(limits) != len(items):
         raise InvalidInputError(f"refine: expected starts of {len(items)} photographs, got {len(starts)}")
 
-    def refine_one(item: ImageItem | CurviregError, i: int) -> Registration | FailedRegistration:
-        if not isinstance(item, ImageItem):
-            return FailedRegistration(item)
-        try:
-            return refine_item(registrar, item, starts[i], limit=limits[i])
-        except CurviregError as error:
-            return FailedRegistration(error.with_subject(f"image {i}"))
-
-    return registrar.map_items(items, lambda some, first: [refine_one(item, i) for i, item in enumerate(some, first)])
+    return registrar.map_items(items, lambda item, i: refine_item(registrar, item, starts[i], limit=limits[i]))
 
 
 def _starts(poses: Any) -> Tensor:

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, cast
@@ -193,7 +194,7 @@ class Registrar:
             results = [found[0] for found in detect(self, images, camera_matrices, prior=prior)]
         else:
             items = image_items(images, boxes, camera_matrices, prior, masks)
-            results = self.map_items(items, self.register_items)
+            results = self.map_items(items, lambda item, _: self.register_item(item))
         for model, other in enumerate(self.others, 1):
             rivals = other(images, boxes, camera_matrices, prior=prior, masks=masks)
             results = [_better(one, rival, model) for one, rival in zip(results, rivals, strict=True)]
@@ -258,56 +259,42 @@ class Registrar:
             self.progress(stage, 0, 1)
 
     def map_items(
-        self,
-        items: Sequence[ImageItem | CurviregError],
-        function: Callable[[Sequence[ImageItem | CurviregError], int], list[Any]],
+        self, items: Sequence[ImageItem | CurviregError], function: Callable[[ImageItem, int], Any]
     ) -> list[Any]:
-        """Results of ``function(some items, index of the first)`` for all items, in their order.
+        """Results of ``function(item, index)`` for all items, a :class:`FailedRegistration` for each error.
 
         On a CPU each photograph has a thread, in which torch uses no further ones: its result is the same to the bit,
-        whatever else is registered. On a GPU the matcher's ``chunk_size`` are registered at a time. Items are read on
-        demand, so that few photographs are in memory.
+        whatever else is registered. Items are read on demand, so that few photographs are in memory.
         """
-        size = 1 if self.bank.device.type == "cpu" else self.matcher.chunk_size
         _ = self.describer.contours, self.mesh_warnings  # create once what threads share, before they use it
 
-        def run(first: int) -> list[Any]:
-            return function(items[first : first + size], first)
+        def run(index: int) -> Any:
+            item = items[index]
+            if not isinstance(item, ImageItem):
+                return FailedRegistration(item)
+            try:
+                return function(item, index)
+            except CurviregError as error:
+                return FailedRegistration(error.with_subject(f"image {index}"))
 
-        parts = map_on_threads(run, range(0, len(items), size), device=self.bank.device)
-        return [result for part in parts for result in part]
+        return map_on_threads(run, range(len(items)), device=self.bank.device)
 
-    def register_items(self, items: Sequence[ImageItem | CurviregError], first: int) -> Results:
-        """Register photographs with boxes, then again those whose pose asks for another box."""
-        results = self._register_given(items, first)
-        if not (self.pipeline.box_jitter and self.pipeline.contours):
-            return results
-        for k, (item, result) in enumerate(zip(items, results, strict=True)):
-            # Without a camera matrix, poses are derived from their boxes.
-            if not isinstance(item, ImageItem) or not isinstance(result, Registration) or item.camera_matrix is None:
-                continue
+    def register_item(self, item: ImageItem) -> Registration:
+        """Register a photograph with a box, and again if its pose asks for another box."""
+        result = self._register_box(item)
+        # Without a camera matrix, poses are derived from their boxes.
+        if self.pipeline.box_jitter and self.pipeline.contours and item.camera_matrix is not None:
             box = projected_box(self.describer, result.projection)
             if _shows_other_part(box, item):
-                again = self._register_given([replace(item, box=box.float())], first + k)[0]
-                if isinstance(again, Registration) and again.score > result.score:
-                    results[k] = replace(again, corrected_box=box)
-        return results
+                with suppress(CurviregError):
+                    again = self._register_box(replace(item, box=box.float()))
+                    result = replace(again, corrected_box=box) if again.score > result.score else result
+        return result
 
-    def _register_given(self, items: Sequence[ImageItem | CurviregError], first: int) -> Results:
-        """Results of photographs or errors, the first of which has the index ``first``."""
-        results: list[Any] = [item if isinstance(item, ImageItem) else FailedRegistration(item) for item in items]
-        usable = [i for i, item in enumerate(items) if isinstance(item, ImageItem)]
-        if not usable:
-            return results
-        boxes = torch.stack([results[i].box for i in usable])
-        query = self.matcher.query([results[i].image for i in usable], boxes)
-        for row, i in enumerate(usable):
-            try:
-                check_crop(query.crops[row])
-                results[i] = self.register(results[i], query[torch.tensor([row])])
-            except CurviregError as error:
-                results[i] = FailedRegistration(error.with_subject(f"image {first + i}"))
-        return results
+    def _register_box(self, item: ImageItem) -> Registration:
+        query = self.matcher.query([item.image], item.box[None])
+        check_crop(query.crops[0])
+        return self.register(item, query)
 
     @torch.no_grad()
     def register(self, item: ImageItem, query: QueryFeatures, ranking: Ranking | None = None) -> Registration:

@@ -587,17 +587,11 @@ def _registered(
         box, visible = boxes_at(hull, cameras[chosen[k]] @ T, K, one.size)
         return replace(one, box=box[0].float()) if bool(visible) else LostObjectError(ELSEWHERE)
 
-    def register(some: Sequence[ImageItem | CurviregError], first: int) -> list[_Photograph | CurviregError]:
-        return [register_one(one, chosen[k]) for k, one in enumerate(some, first)]
+    def register(one: ImageItem, k: int) -> _Photograph:
+        return _Photograph.of(registrar, one, registrar.register_item(one), chosen[k], cameras[chosen[k]])
 
-    def register_one(one: ImageItem | CurviregError, i: int) -> _Photograph | CurviregError:
-        result = registrar.register_items([one], i)[0]
-        if isinstance(result, FailedRegistration):
-            return result.error
-        assert isinstance(one, ImageItem)
-        return _Photograph.of(registrar, one, result, i, cameras[i])
-
-    return dict(zip(chosen, registrar.map_items(OnDemand(item, len(chosen)), register), strict=True))
+    found = registrar.map_items(OnDemand(item, len(chosen)), register)
+    return {i: r.error if isinstance(r, FailedRegistration) else r for i, r in zip(chosen, found, strict=True)}
 
 
 def _detected(

@@ -303,8 +303,8 @@ def test_corrected_result_is_kept_if_its_score_is_higher(monkeypatch, better):
     registrar = truck_registrar()
     first = uncorrected(BOX)
     other = replace(first, hypotheses=(replace(first.hypotheses[0], score=first.score + (0.01 if better else -0.01)),))
-    answers = iter([[first], [other]])
-    monkeypatch.setattr(registrar, "_register_given", lambda *_: list(next(answers)))
+    answers = iter([first, other])
+    monkeypatch.setattr(registrar, "_register_box", lambda _: next(answers))
     result = registrar([IMAGE], WRONG[None], CAMERA)[0]
     assert (result is first) != better
     assert (result.corrected_box is None) != better
