@@ -1,6 +1,7 @@
 """Following an object through the frames of a video."""
 
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -38,7 +39,8 @@ class Follower:
 
     The ``confidence`` of a tracked frame is the probability that its pose is within 10 degrees and 10 % of the distance
     of the truth: the tracker's own, times that of the last pose that a registration confirmed. It never exceeds the
-    latter, nor that of a doubtful pose that was kept: no pose gains confidence from being followed.
+    latter, nor that of a doubtful pose that was kept: no pose gains confidence from being followed, unless a further
+    registration is reliable.
 
     Args:
         registrar: of one mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
@@ -135,10 +137,13 @@ class Follower:
         return result
 
     def _refined(self, item: ImageItem, starts: Tensor) -> Registration | FailedRegistration:
+        """Refined poses; a registration that is not reliable does not raise the confidence."""
         try:
-            return refine_item(self.registrar, item, starts)
+            result = refine_item(self.registrar, item, starts)
         except CurviregError as error:
             return FailedRegistration(error)
+        bound = self._base if _confidence(result) < RELIABLE else 1.0
+        return replace(result, probabilities=tuple(min(p, bound) for p in result.probabilities))
 
     def _go_on(self, item: ImageItem, result: Registration) -> None:
         """Track on from a refined pose, if it lies within the frame."""
