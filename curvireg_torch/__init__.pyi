@@ -18,7 +18,7 @@ from . import (
 from .data import (
     BOPDataset as BOPDataset,
     Pascal3DPlus as Pascal3DPlus,
-    WebCollection as WebCollection,
+    PoseFolder as PoseFolder,
     load_camera as load_camera,
 )
 from .features import (

@@ -3,9 +3,8 @@
 All derive from :class:`CurviregError`, so ``except CurviregError`` catches them together. Each also derives from the
 built-in error that fits, so ``except ValueError`` works too. A message is one line: what is wrong and what to do.
 
-Input files are untrusted: a file beyond one of the limits below is refused with an error that names the limit; nothing
-is truncated silently. Readers use no network, and open only the named file and, for meshes, files that it names in its
-folder.
+Input files are untrusted: a file beyond one of the limits below is refused with an error that names the limit. Readers
+use no network, and open only the named file and, for meshes, files that it names in its folder.
 """
 
 from typing import Self
@@ -81,69 +80,32 @@ class RenderingError(CurviregError, RuntimeError):
     """No renderer works on this machine, or the selected one failed."""
 
 
-MAX_IMAGE_BYTES = 1 << 28
-"""Bytes of an image file."""
-
-MAX_IMAGE_PIXELS = 89_478_485
-"""Width times height in the header, before anything is decoded: Pillow's limit."""
-
+MAX_IMAGE_BYTES = 1 << 28  #: Bytes of an image file
+MAX_IMAGE_PIXELS = 89_478_485  #: Width times height in the header, before anything is decoded: Pillow's limit
+#: Scans of a progressive JPEG. Encoders write about ten, and each takes as long to decode as the whole picture.
 MAX_IMAGE_SCANS = 64
-"""Scans of a progressive JPEG. Encoders write about ten, and each takes as long to decode as the whole picture."""
-
-MAX_BOX_COORDINATE = 1e6
-"""Distance of a box's corner from the origin, px; no image is that wide."""
-
-MAX_MESH_BYTES = 1 << 29
-"""Bytes of a mesh file, and of all the buffers of a glTF file together."""
-
-MAX_MESH_FACES = 10_000_000
-"""Triangles of a mesh; every copy of a part counts."""
-
-MAX_MESH_LINES = 50_000_000
-"""Lines of a text file with polygons; each takes some 50 bytes more than its text."""
-
+MAX_BOX_COORDINATE = 1e6  #: Distance of a box's corner from the origin, px; no image is that wide
+MAX_MESH_BYTES = 1 << 29  #: Bytes of a mesh file, and of all the buffers of a glTF file together
+MAX_MESH_FACES = 10_000_000  #: Triangles of a mesh; every copy of a part counts
+MAX_MESH_LINES = 50_000_000  #: Lines of a text file with polygons; each takes some 50 bytes more than its text
+#: Distance of a vertex from the origin along an axis, in the file's unit; squares and products stay finite
 MAX_MESH_COORDINATE = 1e12
-"""Distance of a vertex from the origin along an axis, in the file's unit; squares and products stay finite."""
-
+#: Longest side of a mesh's box, in the file's unit; of smaller ones single precision computes no views
 MIN_MESH_EXTENT = 1e-6
-"""Longest side of a mesh's box, in the file's unit; of smaller ones single precision computes no views."""
-
-MAX_MESH_PARTS = 10_000
-"""Nodes with a mesh in a glTF scene."""
-
-MAX_MESH_DEPTH = 200
-"""Nodes from the root of a glTF scene to a part."""
-
-MAX_POLYGON_CORNERS = 2000
-"""Corners of a concave face; the time of its division into triangles grows with their square."""
-
+MAX_MESH_PARTS = 10_000  #: Nodes with a mesh in a glTF scene
+#: Sum of squared corners of all concave faces, which bounds the time of their division: a million quads, or five faces
+#: of 2000 corners
 MAX_POLYGON_WORK = 20_000_000
-"""Sum of squared corners of all concave faces: a million quads, or five faces of 2000 corners."""
-
+#: Bytes of a JSON or CSV file, 32 MiB; rows of a CSV of poses take up to 60 times as much memory
 MAX_TABLE_BYTES = 1 << 25
-"""Bytes of a JSON or CSV file, 32 MiB; rows of a CSV of poses take up to 60 times as much memory."""
-
-MAX_CAMERA_BYTES = 1 << 22
-"""Bytes of a calibration file."""
-
-MAX_MAT_BYTES = 1 << 20
-"""Bytes of a MATLAB annotation file, and of what it unpacks to."""
-
+MAX_CAMERA_BYTES = 1 << 22  #: Bytes of a calibration file
+MAX_MAT_BYTES = 1 << 20  #: Bytes of a MATLAB annotation file, and of what it unpacks to
+#: Triangles that the viewer sends to the browser, 96 bytes each; for larger meshes it shows a notice
 MAX_VIEWER_FACES = 300_000
-"""Triangles that the viewer sends to the browser, 96 bytes each; for larger meshes it shows a notice."""
-
+#: Pages of the viewer, open or left, each with a photograph, a mesh and a bank in memory; a new one replaces the page
+#: that was left first
 MAX_VIEWER_PAGES = 8
-"""Pages of the viewer, open or left, each with a photograph, a mesh and a bank in memory; a new one replaces the page
-that was left first."""
-
-MAX_VIEWER_BYTES = 1 << 30
-"""Bytes of the files of a page of the viewer, those on their way included."""
-
-MAX_VIEWER_UPLOADS = 8
-"""Files that a page of the viewer receives at a time."""
-
-MAX_ARCHIVE_FILES = 1000
-"""Files in a zip archive with a mesh and its parts."""
-
-MAX_VIEWER_SECONDS = 600.0
-"""Time limit of a registration in the viewer."""
+MAX_VIEWER_BYTES = 1 << 30  #: Bytes of the files of a page of the viewer, those on their way included
+MAX_VIEWER_UPLOADS = 8  #: Files that a page of the viewer receives at a time
+MAX_ARCHIVE_FILES = 1000  #: Files in a zip archive with a mesh and its parts
+MAX_VIEWER_SECONDS = 600.0  #: Time limit of a registration in the viewer

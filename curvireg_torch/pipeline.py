@@ -24,7 +24,7 @@ from .filters import (
     MultiScaleFocusCurves,
 )
 from .geometry import ViewSphere, sample_views, uniform_views
-from .geometry.views import DEFAULT_DISTANCE
+from .geometry.viewpoint import DEFAULT_DISTANCE
 from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, RerankingTerm, Term, jittered_boxes
 from .utils.checks import check_option, check_positive
 from .utils.choices import DEFAULT

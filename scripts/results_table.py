@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from scripts._shared import REPOSITORY, commit, replace_between, today, write_json
+from scripts._shared import REPOSITORY, commit, replace_between, table_lines, today, write_json
 
 BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
 
@@ -44,8 +44,7 @@ BOP = (
 )
 
 
-LIGHTINGS = {"hope": 5}
-"""Lightings per view. Objects of these sets are not independent."""
+LIGHTINGS = {"hope": 5}  # per view; objects of these sets are not independent
 
 
 def main() -> int:
@@ -74,13 +73,8 @@ def main() -> int:
 def record(summary: Path, name: str, results: Path, root: Path) -> Path:
     """Store ``summary`` with the date and the commit; returns the path."""
     path = results / f"evaluation_{name}.json"
-    content = {
-        "name": name,
-        "date": today(),
-        "commit": commit(root),
-        "summary": json.loads(summary.read_text(encoding="utf-8")),
-    }
-    write_json(path, content)
+    content = json.loads(summary.read_text(encoding="utf-8"))
+    write_json(path, {"name": name, "date": today(), "commit": commit(root), "summary": content})
     return path
 
 
@@ -94,8 +88,7 @@ def table(results: Path) -> str:
     ):
         chosen = [r for r in records if r["summary"]["settings"]["dataset"] == kind]
         if chosen:
-            lines = [columns, ["---"] * len(columns), *(cells(r["name"], r["summary"]) for r in chosen)]
-            body = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+            body = "\n".join(table_lines([columns, *(cells(r["name"], r["summary"]) for r in chosen)]))
             sets: dict[str, list[str]] = {}
             for r in chosen:
                 sets.setdefault(note(r), []).append(r["name"])
@@ -126,16 +119,8 @@ def pascal3d_cells(name: str, s: dict[str, Any]) -> list[str]:
 def bop_cells(name: str, s: dict[str, Any]) -> list[str]:
     whole = s["subsets"]["unoccluded"]
     values = [percent(s["acc_15_deg"]), percent(s["acc_30_deg"]), degrees(s["med_err_deg"])]
-    recalls = [percent(s[key]) for key in ("add_recall_0.1d", "mssd_ar", "mspd_ar")]
-    return [
-        name,
-        counted(name, s["n"]),
-        *values,
-        *recalls,
-        str(whole["n"]),
-        percent(whole["acc_30_deg"]),
-        seconds_each(s),
-    ]
+    values += [percent(s[key]) for key in ("add_recall_0.1d", "mssd_ar", "mspd_ar")]
+    return [name, counted(name, s["n"]), *values, str(whole["n"]), percent(whole["acc_30_deg"]), seconds_each(s)]
 
 
 def counted(name: str, n: int) -> str:

@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 from curvireg_torch import ViewBank, sample_views
-from curvireg_torch.data import BOPDataset, Pascal3DPlus, WebCollection
+from curvireg_torch.data import BOPDataset, Pascal3DPlus, PoseFolder
 from curvireg_torch.synthetic import example_mesh
 from tests._support import scenes
 from tests._support.miniature import write_bop, write_pascal3d, write_web
@@ -73,4 +73,4 @@ def bop(tmp_path):
 def web(tmp_path):
     """Four photographs of two objects, two of them with a pose."""
     write_web(tmp_path / "web")
-    return WebCollection(tmp_path / "web")
+    return PoseFolder(tmp_path / "web")

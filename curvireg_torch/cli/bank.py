@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidInputError
+from ..utils.choices import check_given
 from ..utils.files import check_writable
-from ..utils.input_paths import check_given
 from .options import common_options, examples, mesh_options, pipeline_options, register_options
 
 

@@ -12,10 +12,11 @@ from ..utils.files import check_writable
 from .options import PRESETS_HELP, common_options, examples, whole_number
 
 PROTOCOL = (
-    "cad=annotated|any|fused: the annotated CAD model, the best of the class, or one vote of all of the class; "
+    "cad=annotated|any: the annotated CAD model, or the best of the class; "
     "pose=upright|any: whether objects are known to stand upright; "
     "box=annotated|none|FRACTION: as annotated; detected; or each edge moved by up to FRACTION of the side (seed=N); "
-    "hint=none|azimuth:DEG|pose:DEG: azimuth or rotation known to lie within DEG of a value that is off by up to DEG"
+    "hint=none|azimuth:DEG|pose:DEG: azimuth or rotation known to lie within DEG of a value that is off by up to DEG; "
+    "views=N: N photographs of one pose together (bop; seed=N)"
 )
 
 
@@ -29,7 +30,7 @@ def add_parser(commands: Any) -> None:
             name,
             parents=[common_options()],
             help=kind.help,
-            description="Writes DIR/summary.json and DIR/predictions.csv; the same command resumes if interrupted.",
+            description="Writes DIR/summary.json, DIR/predictions.csv and DIR/index.html; the same command resumes.",
             **examples(
                 f"curvireg evaluate {name} {kind.example} --out out/{name}",
                 f"curvireg evaluate {name} {kind.example} --jobs 2 --limit 100 --preset fast --out out/{name}-fast",
@@ -49,7 +50,6 @@ def add_parser(commands: Any) -> None:
             help="processes that share the objects (default: 1)",
         )
         add("--limit", type=whole_number(1), metavar="N", help="only N objects, spread evenly over the set")
-        add("--overwrite", action="store_true", help="replace the predictions of other settings")
         add("--out", type=Path, required=True, metavar="DIR", help="folder of the results; made if it does not exist")
         dataset.set_defaults(run=run, dataset=name)
 
@@ -79,7 +79,6 @@ def run(arguments: argparse.Namespace) -> None:
             preset=preset,
             limit=arguments.limit,
             renderer=arguments.renderer,
-            overwrite=arguments.overwrite,
             progress=arguments.progress,
         )
     if summary is None:  # another process writes it

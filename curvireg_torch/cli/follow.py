@@ -14,9 +14,8 @@ from ..errors import (
     LostObjectError,
     MissingFileError,
 )
-from ..utils.choices import VIDEOS
+from ..utils.choices import VIDEOS, check_given
 from ..utils.files import check_writable
-from ..utils.input_paths import check_given
 from .options import add_box_and_camera, common_options, examples, mesh_options, pipeline_options, register_options
 
 if TYPE_CHECKING:
@@ -154,7 +153,7 @@ def _row(name: str, result: "Registration | FailedRegistration") -> list[Any]:
 
 def _write_tables(out: Path, rows: list[list[Any]]) -> None:
     """Write results.csv."""
-    from ..evaluation.lists.tables import POSE_COLUMNS
+    from ..evaluation.lists import POSE_COLUMNS
     from ..utils.files import write_csv
 
     header = ["photo", "status", *POSE_COLUMNS, "confidence", "edge_support", "message"]

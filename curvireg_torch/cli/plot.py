@@ -1,4 +1,4 @@
-"""``curvireg plot KIND``: pictures of a registration, and a page of an evaluation."""
+"""``curvireg plot KIND``: pictures of a registration."""
 
 import argparse
 from io import BytesIO
@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidInputError
+from ..utils.choices import check_given
 from ..utils.files import check_writable, write_file
-from ..utils.input_paths import check_given
 from .options import (
     add_box_and_camera,
     common_options,
@@ -15,7 +15,6 @@ from .options import (
     mesh_options,
     pipeline_options,
     register_options,
-    whole_number,
 )
 
 PICTURES = {
@@ -29,11 +28,10 @@ FORMATS = (".png", ".svg", ".pdf")
 def add_parser(commands: Any) -> None:
     plot = commands.add_parser(
         "plot",
-        help="draw a picture of a registration, or a page of an evaluation",
+        help="draw a picture of a registration",
         **examples(
             "curvireg plot overlay photo.jpg part.stl --unit mm --box 410 220 890 700 --out overlay.png",
             "curvireg plot viewpoints photo.jpg part.stl --unit mm --box 410 220 890 700 --out viewpoints.png",
-            "curvireg plot sheet results/pascal3d --out sheet.html",
         ),
     )
     kinds = plot.add_subparsers(required=True, metavar="KIND")
@@ -46,35 +44,17 @@ def add_parser(commands: Any) -> None:
         add_box_and_camera(parser, fov=False)
         parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=", ".join(FORMATS))
         parser.set_defaults(run=draw, kind=kind)
-    text = "a page of the best and the worst photographs, with the contours at the estimated poses"
-    example = examples("curvireg plot sheet results/pascal3d --out sheet.html")
-    sheet = kinds.add_parser("sheet", parents=[common_options()], help=text, **example)
-    sheet.add_argument("source", type=Path, metavar="DIR", help="of curvireg evaluate pascal3d, bop or web")
-    sheet.add_argument("--out", type=Path, required=True, metavar="FILE", help=".html")
-    largest = "largest right error (default: 30)"
-    sheet.add_argument("--within", type=float, default=30.0, metavar="DEG", help=largest)
-    sheet.add_argument("--each", type=whole_number(1), default=30, metavar="N", help="best and worst (default: 30)")
-    sheet.set_defaults(run=write_sheet)
-
-
-def write_sheet(arguments: argparse.Namespace) -> None:
-    """Write the page of an evaluation."""
-    _check_out(arguments.out, (".html",))
-    from ..evaluation import contact_sheet
-
-    n = contact_sheet(arguments.source, arguments.out, each=arguments.each, within_deg=arguments.within)
-    print(f"{arguments.out}: {n} objects")
 
 
 def draw(arguments: argparse.Namespace) -> None:
     """Register one photograph and draw a picture of the result."""
     check_given([arguments.photo], [arguments.mesh])
-    _check_out(arguments.out, FORMATS)
+    _check_out(arguments.out)
     import torch
 
     from ..data import read_photo
-    from ..evaluation.lists import register_entry
     from ..evaluation.opening import check_camera, open_registrar
+    from ..evaluation.runner import register_entry
     from ..registration.result import used_box
     from ..utils.threads import one_torch_thread
     from ..visualization import contour_overlay, plots
@@ -98,7 +78,7 @@ def draw(arguments: argparse.Namespace) -> None:
     print(arguments.out)
 
 
-def _check_out(out: Path, formats: tuple[str, ...]) -> None:
-    if out.suffix.lower() not in formats:
-        raise InvalidInputError(f"--out {out}: expected a name that ends in {', '.join(formats)}")
+def _check_out(out: Path) -> None:
+    if out.suffix.lower() not in FORMATS:
+        raise InvalidInputError(f"--out {out}: expected a name that ends in {', '.join(FORMATS)}")
     check_writable(out.parent, "--out")

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInputError, LostObjectError
+from ..utils.choices import check_given, is_one_photograph
 from ..utils.files import check_writable
-from ..utils.input_paths import check_given, is_one_photograph
 from .options import (
     NUMBER,
     add_box_and_camera,
@@ -179,9 +179,9 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
     import torch
 
     from ..data import read_photo
-    from ..evaluation.lists import check_entry, register_entry
     from ..evaluation.opening import open_registrar
     from ..evaluation.result_files import write_lost, write_result
+    from ..evaluation.runner import check_entry, register_entry
     from ..evaluation.store import to_json
     from ..registration.result import used_box
     from .report import print_result

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MissingDependencyError
-from ..utils.input_paths import check_given
+from ..utils.choices import check_given
 from .options import (
     add_box_and_camera,
     add_mesh_is,

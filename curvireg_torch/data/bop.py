@@ -1,30 +1,20 @@
-"""Datasets in the layout of the BOP challenge (scenewise), and its results files: one line per pose estimate."""
+"""Datasets in the layout of the BOP challenge (scenewise)."""
 
-import csv
 import math
 import os
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from ..errors import InvalidInputError, MissingFileError
 from ..geometry import symmetry_transforms
-from ..utils.checks import (
-    check_camera_matrix,
-    check_integer,
-    check_rotation,
-    check_symmetries,
-    check_tensor,
-)
-from ..utils.files import check_table_size, finite_numbers, read_json, write_csv
+from ..utils.checks import check_camera_matrix, check_rotation, check_symmetries
+from ..utils.files import finite_numbers, read_json
 from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, existing_root, is_plain_name
 
 _README = "datasets/bop/README.md"
 _UNKNOWN_BOX = (math.nan,) * 4
-_HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
 
 
 class BOPDataset(ObjectDataset):
@@ -43,7 +33,8 @@ class BOPDataset(ObjectDataset):
         - ``image`` (3, H, W) RGB in [0, 1], from ``rgb`` or ``gray``; ``image_path`` str
         - ``box`` (4,) x0, y0, x1, y1 of the whole silhouette, which may extend beyond the image; ``box_visible`` (4,)
           of its visible part, NaN if nothing is visible. BOP's width is x1 - x0. NaN without ``scene_gt_info.json``
-        - ``camera_matrix`` (3, 3); ``rotation`` (3, 3), ``translation`` (3,) in mm: model to OpenCV camera
+        - ``camera_matrix`` (3, 3); ``rotation`` (3, 3), ``translation`` (3,) in mm: model to OpenCV camera;
+          ``T_cam_from_world`` (4, 4) in mm, NaN if unknown
         - ``scene_id``, ``image_id``, ``obj_id`` int; ``instance_index`` int: index in the image's list of ``scene_gt``
         - ``visib_fract`` float in [0, 1], NaN if unknown; ``model_path`` str; ``model_info`` dict
 
@@ -156,11 +147,25 @@ class BOPDataset(ObjectDataset):
             "camera_matrix": _rows(matrix),
             "rotation": _rows(rotation),
             "translation": translation,
+            "T_cam_from_world": _camera_pose(camera),
             "obj_id": obj_id,
             "visib_fract": math.nan if visible is None else visible[0],
             "model_path": str(self.root / "models" / model),
             "model_info": self.models_info[obj_id],
         }
+
+
+def _camera_pose(camera: dict[str, Any]) -> tuple[tuple[float, ...], ...]:
+    """(4, 4) pose of the world in a camera of ``scene_camera.json``, NaN if it is not given or not rigid."""
+    rotation, translation = finite_numbers(camera.get("cam_R_w2c"), 9), finite_numbers(camera.get("cam_t_w2c"), 3)
+    try:
+        if rotation is not None and translation is not None:
+            check_rotation(torch.tensor(_rows(rotation), dtype=torch.float64), "cam_R_w2c")
+            rows = zip(_rows(rotation), translation, strict=True)
+            return *((*row, t) for row, t in rows), (0.0, 0.0, 0.0, 1.0)
+    except InvalidInputError:
+        pass
+    return ((math.nan,) * 4,) * 4
 
 
 def _models_info(path: Path) -> dict[int, dict[str, Any]]:
@@ -219,96 +224,3 @@ def entry_at(infos: object, index: int) -> dict[str, Any]:
 
 def _rows(values: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
     return values[:3], values[3:6], values[6:]
-
-
-class BOPRow(TypedDict):
-    """A pose estimate: R (3, 3) and t (3,), mm, take model points into the OpenCV camera; time in seconds or -1."""
-
-    scene_id: int
-    im_id: int
-    obj_id: int
-    score: float
-    R: Tensor
-    t: Tensor
-    time: float
-
-
-def write_bop_csv(path: str | os.PathLike[str], rows: Iterable[BOPRow]) -> None:
-    """Write pose estimates in the format of the BOP challenge, atomically and with all digits.
-
-    Columns: scene_id, im_id, obj_id, score, R (9 numbers, row by row, separated by spaces), t (3 numbers, mm), time
-    (seconds for the whole image, so equal for all its rows; -1 if unknown).
-
-    Raises:
-        InvalidInputError: a row lacks a key, is not finite, or disagrees on an image's time.
-        MissingFileError: the folder does not exist.
-        OutputError: the file cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> row = BOPRow(scene_id=1, im_id=2, obj_id=3, score=0.5, R=torch.eye(3), t=torch.zeros(3), time=-1.0)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_bop_csv(Path(folder, "results.csv"), [row])
-        ...     read_bop_csv(Path(folder, "results.csv"))[0]["score"]
-        0.5
-    """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise MissingFileError("no such folder; create it before writing results", subject=path.parent)
-    lines, times = [_HEADER], dict[tuple[int, int], float]()
-    for number, row in enumerate(rows):
-        name = f"row {number}"
-        if set(row) != set(_HEADER):
-            raise InvalidInputError(f"expected the keys {', '.join(_HEADER)}, got {', '.join(row)}", subject=name)
-        check_tensor(row["R"], f"{name} R", (3, 3))
-        check_tensor(row["t"], f"{name} t", (3,))
-        ids = [check_integer(row[key], f"{name} {key}", least=0) for key in ("scene_id", "im_id", "obj_id")]
-        _check_time(row, times, name)
-        numbers = finite_numbers([row["score"], *row["R"].flatten().tolist(), *row["t"].tolist(), row["time"]], 14)
-        if numbers is None:
-            raise InvalidInputError("score, R, t and time must be finite numbers", subject=name)
-        texts = [repr(v) for v in numbers]
-        lines.append([*map(str, ids), texts[0], " ".join(texts[1:10]), " ".join(texts[10:13]), texts[13]])
-    write_csv(path, lines)
-
-
-def read_bop_csv(path: str | os.PathLike[str]) -> list[BOPRow]:
-    """Read a results file of the BOP challenge; R and t are float64.
-
-    Raises:
-        MissingFileError: the file does not exist.
-        InvalidInputError: another header, or a line with a wrong number of values or one that is not finite.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise MissingFileError("no such file; write_bop_csv writes one", subject=path)
-    check_table_size(path)
-    rows, times = list[BOPRow](), dict[tuple[int, int], float]()
-    try:
-        with open(path, newline="", encoding="utf-8") as file:
-            lines = list(csv.reader(file))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InvalidInputError(f"not a csv file ({error})", subject=path) from error
-    if lines[:1] != [_HEADER]:
-        raise InvalidInputError(f"expected the header {','.join(_HEADER)}", subject=path)
-    for number, cells in enumerate(lines[1:], start=2):
-        name = f"{path}, line {number}"
-        try:
-            ids = dict(zip(_HEADER, map(int, cells[:3]), strict=False))
-            numbers = [float(v) for cell in cells[3:] for v in cell.split()]
-        except ValueError as error:
-            raise InvalidInputError(str(error), subject=name) from error
-        if [len(cell.split()) for cell in cells[3:]] != [1, 9, 3, 1] or not all(map(math.isfinite, numbers)):
-            raise InvalidInputError("expected ids and finite numbers: a score, 9 of R, 3 of t, a time", subject=name)
-        R, t = torch.tensor(numbers[1:10], dtype=torch.float64), torch.tensor(numbers[10:13], dtype=torch.float64)
-        rows.append(BOPRow(**ids, score=numbers[0], R=R.view(3, 3), t=t, time=numbers[13]))  # type: ignore[typeddict-item]
-        _check_time(rows[-1], times, name)
-    return rows
-
-
-def _check_time(row: BOPRow, times: dict[tuple[int, int], float], name: str) -> None:
-    first = times.setdefault((row["scene_id"], row["im_id"]), row["time"])
-    if first != row["time"]:
-        raise InvalidInputError(
-            f"time {row['time']}, but an earlier row of this image has {first}; BOP requires one", subject=name
-        )

@@ -84,59 +84,45 @@ def _content(file: Path) -> dict[str, Any]:
         raise InvalidInputError(f"not a text file; expected {_FORMATS}") from error
     except (ValueError, RecursionError, ElementTree.ParseError) as error:
         raise InvalidInputError(f"damaged, or no calibration ({error}); write it again") from error
-    if re.search(r"^\s*\d+[ \t]+[A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]", text, re.MULTILINE):
-        return _colmap(text)
-    return _yaml(text)
+    return _colmap(text) if re.search(r"^\d+ [A-Z_]+ \d+ \d+ ", text, re.MULTILINE) else _yaml(text)
 
 
-def _chosen(cameras: dict[str, Any], name: str) -> Camera:
+def _chosen(content: dict[str, Any], name: str) -> Camera:
     """The camera of a file's content, or one of several."""
-    if _holds_camera(cameras):
-        if name:
-            raise InvalidInputError(f"holds one camera; leave ':{name}' out")
-        return _camera(cameras)
-    several = {key: value for key, value in cameras.items() if isinstance(value, dict) and _holds_camera(value)}
-    if not several:
+    found = {"": content, **{key: value for key, value in content.items() if isinstance(value, dict)}}
+    found = {key: value for key, value in found.items() if _get(value, (*_MATRIX, "fx")) is not None}
+    if not found:
         raise InvalidInputError(f"no camera matrix; expected {_FORMATS}")
-    if name not in several and (name or len(several) > 1):
-        names = ", ".join(list(several)[:8]) + (", ..." if len(several) > 8 else "")
-        problem = f"no camera {name!r}" if name else f"{len(several)} cameras"
-        raise InvalidInputError(f"{problem}; choose one as FILE:NAME from {names}")
-    return _camera(several[name] if name else next(iter(several.values())))
-
-
-def _holds_camera(values: dict[str, Any]) -> bool:
-    return any(_get(values, names) is not None for names in (_MATRIX, ("fx",)))
+    if not name and len(found) == 1:
+        (name,) = found
+    if name not in found:
+        names = ", ".join(list(found)[:8]) + (", ..." if len(found) > 8 else "")
+        advice = f"choose one as FILE:NAME from {names}" if names else "leave the name out"
+        raise InvalidInputError((f"no camera {name!r}; " if name else "several cameras; ") + advice)
+    return _camera(found[name])
 
 
 def _camera(values: dict[str, Any]) -> Camera:
-    matrix = _numbers(values, _MATRIX)
-    if matrix is None:
-        matrix = [number for name in ("fx", "fy", "cx", "cy") for number in _numbers(values, (name,)) or ()]
+    matrix = _numbers(values, *_MATRIX) or [n for name in ("fx", "fy", "cx", "cy") for n in _numbers(values, name)]
     if len(matrix) == 4:
         fx, fy, cx, cy = matrix
         matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
     if len(matrix) != 9:
         raise InvalidInputError(f"camera matrix: expected 9 numbers, or fx, fy, cx, cy, got {len(matrix)}")
-    models = [_get(values, ("camera_model",)), _get(values, ("distortion_model",))]
+    models = [str(_get(values, (name,)) or "") for name in ("camera_model", "distortion_model")]
     models += ["fisheye"] if _get(values, ("fisheye_model",)) == 1 else []
-    known = [_MODELS.get(str(model or "").lower()) for model in models]
-    if None in known:
-        unknown = models[known.index(None)]
-        raise InvalidInputError(
-            f"camera model {unknown!r} is not supported; choose from {', '.join(filter(None, _MODELS))}"
-        )
-    size = _numbers(values, ("resolution", "image_size"))
-    if size is None:
-        both = [_numbers(values, names) for names in (("image_width", "width"), ("image_height", "height"))]
-        size = [number for side in both for number in side or ()] or None
-    if size is not None and (len(size) != 2 or any(side != int(side) for side in size)):
+    if unknown := [model for model in models if model.lower() not in _MODELS]:
+        known = ", ".join(filter(None, _MODELS))
+        raise InvalidInputError(f"camera model {unknown[0]!r} is not supported; choose from {known}")
+    size = _numbers(values, "resolution", "image_size")
+    size = size or _numbers(values, "image_width", "width") + _numbers(values, "image_height", "height")
+    if len(size) not in (0, 2) or any(side != int(side) for side in size):
         raise InvalidInputError(f"size of the image: expected width and height in px, got {size}")
     return Camera(
         torch.tensor(matrix, dtype=torch.float64).view(3, 3),
-        _numbers(values, _DISTORTION) or (),
-        "fisheye" if "fisheye" in known else "radial-tangential",
-        None if size is None else (int(size[1]), int(size[0])),
+        _numbers(values, *_DISTORTION),
+        "fisheye" if any(_MODELS[model.lower()] == "fisheye" for model in models) else "radial-tangential",
+        (int(size[1]), int(size[0])) if size else None,
     )
 
 
@@ -146,27 +132,21 @@ def _get(values: dict[str, Any], names: Sequence[str]) -> Any:
     return next((plain[key] for name in names if (key := name.lower().replace("_", "")) in plain), None)
 
 
-def _numbers(values: dict[str, Any], names: Sequence[str]) -> list[float] | None:
-    """The finite numbers of the first of some keys, of a matrix row by row; None without such a key."""
-    value = _get(values, names)
-    if value is None:
-        return None
-    flat = list(_flat(value))
+def _numbers(values: dict[str, Any], *names: str) -> list[float]:
+    """The finite numbers of the first of some keys, of a matrix row by row; none without such a key."""
+    flat = _flat(_get(values, names))
     numbers = finite_numbers(flat, len(flat))
     if numbers is None:
-        wrong = next(number for number in flat if finite_numbers([number], 1) is None)
-        raise InvalidInputError(f"{names[0]}: expected finite numbers, got {wrong!r:.40}")
+        raise InvalidInputError(f"{names[0]}: expected finite numbers, got {flat!r:.80}")
     return list(numbers)
 
 
-def _flat(value: Any) -> Iterator[Any]:
-    while isinstance(value, dict) and "data" in value:
-        value = value["data"]
+def _flat(value: Any) -> list[Any]:
+    while isinstance(value, dict):
+        value = value.get("data")
     if isinstance(value, list):
-        for item in value:
-            yield from _flat(item)
-    elif value != {}:
-        yield value
+        return [number for item in value for number in _flat(item)]
+    return [] if value is None else [value]
 
 
 def _colmap(text: str) -> dict[str, Any]:
@@ -176,18 +156,15 @@ def _colmap(text: str) -> dict[str, Any]:
         words = line.partition("#")[0].split()
         if not words:
             continue
-        focals, count = _COLMAP.get("".join(words[1:2]), (0, 0))
-        if not focals:
+        focals, count = _COLMAP.get(words[1] if len(words) > 1 else "", (0, 0))
+        if not focals or len(words) != 6 + focals + count:
+            models = ", ".join(f"{model} ({2 + sum(counts)})" for model, counts in _COLMAP.items())
             raise InvalidInputError(
-                f"line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS... with a model of {', '.join(_COLMAP)}, "
-                f"got {line!r:.60}"
+                f"line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS..., MODEL (and number of PARAMS) one of "
+                f"{models}, got {line!r:.60}"
             )
-        if len(words) != 6 + focals + count:
-            raise InvalidInputError(f"line {number}: expected {2 + focals + count} parameters, got {len(words) - 4}")
-        width, height, *numbers = map(_scalar, words[2:])
+        width, height, *numbers = _numbers({f"line {number}": list(map(_scalar, words[2:]))}, f"line {number}")
         cx, cy, *distortion = numbers[focals:]
-        if not all(isinstance(value, float) for value in (width, height, *numbers)):
-            raise InvalidInputError(f"line {number}: expected numbers after the model, got {line!r:.60}")
         cameras[words[0]] = {
             "intrinsics": [numbers[0], numbers[focals - 1], cx - 0.5, cy - 0.5],
             "distortion": [*distortion, 0.0, 0.0, 0.0][:4] if distortion else [],

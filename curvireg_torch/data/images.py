@@ -1,14 +1,16 @@
-"""Photographs from disk."""
+"""Photographs and frames of videos from disk."""
 
 import math
 import os
 import re
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,6 +18,7 @@ from torch import Tensor
 
 from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, MAX_IMAGE_SCANS, ImageError, InvalidInputError, MissingFileError
 from ..geometry.cameras import camera_matrix
+from ..utils.checks import check_integer
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -73,12 +76,13 @@ class Photo:
         return {**facts, "notes": list(self.notes)}
 
 
-def read_photo(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.uint8) -> Photo:
+def read_photo(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.uint8, as_stored: bool = False) -> Photo:
     """Read a photograph as viewers show it: the EXIF orientation is applied, and boxes refer to the result.
 
     Args:
         path: JPEG, PNG, TIFF, WebP, BMP, PGM or PPM with up to 16 bits per channel, which are rounded to 8.
         dtype: ``torch.uint8``, 0 to 255, or ``torch.float32``, 0 to 1.
+        as_stored: leave the orientation as it is in the file, to which boxes of datasets refer.
 
     Raises:
         MissingFileError: the file does not exist.
@@ -94,6 +98,8 @@ def read_photo(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.uint8
         (torch.Size([3, 4, 6]), 51, ('grey: three equal channels',))
     """
     rgb, orientation, focal, notes = _decode(Path(path))
+    if as_stored:
+        orientation = 1
     if orientation != 1:
         notes = (f"EXIF orientation {orientation} applied", *notes)
     return Photo(_to_tensor(_APPLY_ORIENTATION[orientation](rgb), dtype), orientation, focal, notes)
@@ -104,7 +110,7 @@ def read_image(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float
 
     Grey images get three equal channels, an alpha channel is dropped. Arguments and errors as in :func:`read_photo`.
     """
-    return _to_tensor(_decode(Path(path))[0], dtype)
+    return read_photo(path, dtype=dtype, as_stored=True).image
 
 
 def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str, ...]]:
@@ -207,3 +213,74 @@ def _to_tensor(rgb: NDArray[np.uint8], dtype: torch.dtype) -> Tensor:
         raise InvalidInputError(f"dtype: expected torch.uint8 or torch.float32, got {dtype}")
     x = torch.from_numpy(np.array(rgb.transpose(2, 0, 1), order="C"))
     return x if dtype == torch.uint8 else x.float().div_(255.0)
+
+
+_CONTAINERS = re.compile(
+    rb"RIFF....AVI |....(ftyp|moov|mdat|wide|free|skip)|\x1a\x45\xdf\xa3|\0\0\1[\xba\xb3]|\x47.{187}\x47", re.DOTALL
+)
+"""Starts of AVI, MP4 and QuickTime, Matroska and WebM, and MPEG files. Text that FFmpeg reads as a playlist, such as
+``ffconcat``, would make it open other files."""
+
+
+class Video:
+    """The frames of a video, decoded one after the other: pairs of a frame's number and its (3, H, W) uint8 RGB pixels.
+
+    Args:
+        path: an AVI, MP4, MOV, MKV, WebM or MPEG file in a format that OpenCV decodes.
+        every: step between the frames that are yielded, >= 1.
+
+    Attributes:
+        fps: frames per second of the file.
+        count: number of frames that it announces; some files announce a wrong one.
+
+    Raises:
+        ImageError: not a video, or one beyond :mod:`curvireg_torch.errors`; while iterating, a frame that cannot be
+            decoded, or a video without frames.
+
+    Example:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp(), "two.avi")
+        >>> writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 48))
+        >>> _ = [writer.write(np.zeros((48, 64, 3), np.uint8)) for _ in range(2)]
+        >>> writer.release()
+        >>> video = Video(file)
+        >>> video.fps, [(number, image.shape) for number, image in video]
+        (25.0, [(0, torch.Size([3, 48, 64])), (1, torch.Size([3, 48, 64]))])
+    """
+
+    def __init__(self, path: Path, *, every: int = 1) -> None:
+        self.path, self.every = path, check_integer(every, "every")
+        file = self._open()
+        self.fps, self.count = float(file.get(cv2.CAP_PROP_FPS)), int(file.get(cv2.CAP_PROP_FRAME_COUNT))
+        file.release()
+
+    def __iter__(self) -> Iterator[tuple[int, Tensor]]:
+        file, number = self._open(), 0
+        try:
+            while file.grab():
+                if number % self.every == 0:
+                    known, pixels = file.retrieve()
+                    if not known:
+                        raise ImageError(f"frame {number} cannot be read; save the video again", subject=self.path)
+                    yield number, torch.from_numpy(np.ascontiguousarray(pixels[..., ::-1].transpose(2, 0, 1)))
+                number += 1
+            if number == 0:
+                raise ImageError("a video without frames; save it again", subject=self.path)
+        finally:
+            file.release()
+
+    def _open(self) -> cv2.VideoCapture:
+        message = "not a video that can be read; save it as MP4 (H.264), or give its frames"
+        try:
+            with self.path.open("rb") as stream:
+                known = _CONTAINERS.match(stream.read(256))
+        except OSError as error:
+            raise ImageError(f"cannot be read ({error.strerror})", subject=self.path) from error
+        if known is None:
+            raise ImageError(message, subject=self.path)
+        file = cv2.VideoCapture(str(self.path))
+        width, height = (int(file.get(k)) for k in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if not file.isOpened() or not 0 < width * height <= MAX_IMAGE_PIXELS:
+            file.release()
+            raise ImageError(message, subject=self.path)
+        return file

@@ -74,7 +74,7 @@ class Pascal3DPlus(ObjectDataset):
             raise InvalidInputError(f"categories: expected a list of names, got the text {categories!r}")
         self.root, self.split, self.part = existing_root(root, _README), split, part
         self.categories = sorted(self._listed() if categories is None else set(categories))
-        self._pixel_origin = pixel_origin
+        self.pixel_origin = pixel_origin
         self._excluded = {"occluded": not occluded, "truncated": not truncated, "difficult": not difficult}
         for name in (split, *self.categories):
             if not is_plain_name(name):
@@ -138,7 +138,7 @@ class Pascal3DPlus(ObjectDataset):
         for name, excluded in self._excluded.items():
             if excluded and flags[name]:
                 return name
-        box = _box(entry.get("bbox"), self._pixel_origin)
+        box = _box(entry.get("bbox"), self.pixel_origin)
         if box is None:
             return "bad_box"
         views = entry.get("viewpoint")
@@ -156,7 +156,7 @@ class Pascal3DPlus(ObjectDataset):
             **pose_fields(azimuth, elevation, _number(views[0].get("theta")) or 0.0),
             "distance": distance,
             "translation": (0.0, 0.0, distance),
-            "camera_matrix": _camera(views[0], box, self._pixel_origin),
+            "camera_matrix": _camera(views[0], box, self.pixel_origin),
             "category": category,
             "cad_index": int(cad_index),
             "cad_path": str(cad),

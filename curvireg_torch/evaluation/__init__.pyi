@@ -1,20 +1,14 @@
-from .benchmark import Benchmark
-from .bop import BOPBenchmark
-from .datasets import evaluate, score
-from .pascal3d import Pascal3DBenchmark
+from .benchmarks import Benchmark, BOPBenchmark, Pascal3DBenchmark, PoseFolderBenchmark
+from .datasets import evaluate
 from .protocol import Protocol
 from .registry import DATASETS
-from .sheet import contact_sheet
-from .web import WebBenchmark
 
 __all__ = [
     "DATASETS",
     "BOPBenchmark",
     "Benchmark",
     "Pascal3DBenchmark",
+    "PoseFolderBenchmark",
     "Protocol",
-    "WebBenchmark",
-    "contact_sheet",
     "evaluate",
-    "score",
 ]

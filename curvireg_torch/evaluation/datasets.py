@@ -1,26 +1,36 @@
 """Evaluation of a dataset: results to disk, then scores from disk."""
 
+import math
 import platform
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
+from ..matching import cached_bank
+from ..mesh import load_mesh
 from ..pipeline import DEFAULT, PRESETS, Pipeline, preset_named
+from ..registration import Registrar
 from ..utils.checks import check_positive
 from ..utils.files import code_digest, write_file
 from ..version import __version__
-from .benchmark import Benchmark, Row
-from .predict import register_object, registrar_opener
-from .runner import POSE_SOURCES, run_items
-from .scores import detection_recall
-from .store import ResultStore, to_json
+from ..visualization.sheet import SheetEntry, write_sheet
+from .benchmarks import Benchmark, detection_recall
+from .runner import POSE_SOURCES, run_entries, thumbnail_of
+from .store import ResultStore, Row, to_json
 
-__all__ = ["evaluate", "score"]
+__all__ = ["evaluate", "report"]
 
 NOT_EVALUATED = ("other_class", "no_target")
 """Reasons by which datasets leave out objects that are not to be evaluated; nothing is wrong with these."""
+
+SHOWN_EACH = 30
+"""Best objects on the page, and worst ones."""
+
+RIGHT_DEG = 30.0
+"""Error of the rotation below which the page calls a pose right."""
 
 
 def evaluate(
@@ -31,14 +41,14 @@ def evaluate(
     limit: int | None = None,
     renderer: str = "auto",
     field: nn.Module | None = None,
-    overwrite: bool = False,
     progress: bool = True,
 ) -> Row | None:
     """Register the objects of a benchmark and score the results.
 
-    ``out`` gets ``results.jsonl`` and ``settings.json`` (see :class:`~curvireg_torch.evaluation.store.ResultStore`),
-    ``predictions.csv`` and ``summary.json``. A second call continues where the first one stopped. Under ``torchrun``,
-    or in a job array that sets ``RANK`` and ``WORLD_SIZE``, each process registers a part of the objects.
+    ``out`` gets ``results.jsonl``, ``predictions.csv``, ``summary.json`` and ``index.html``. A second call registers
+    only what is new or depends on other settings or files, see :func:`~curvireg_torch.evaluation.runner.run_entries`.
+    Under ``torchrun``, or in a job array that sets ``RANK`` and ``WORLD_SIZE``, each process registers a part of the
+    objects.
 
     Args:
         benchmark, out: the objects, and the folder for the results.
@@ -46,14 +56,13 @@ def evaluate(
         limit: register only this many objects, spread evenly over the dataset.
         renderer: of the views.
         field: photograph filter that replaces that of the pipeline.
-        overwrite: delete results of other settings and start again.
         progress: show a bar.
 
     Returns:
         The summary, as written to ``summary.json``; None in processes that do not write it.
 
     Raises:
-        InvalidInputError: an unknown preset, a bad limit, or a folder that holds results of other settings.
+        InvalidInputError: an unknown preset, or a bad limit.
 
     Example:
         >>> from curvireg_torch.data import Pascal3DPlus
@@ -64,41 +73,56 @@ def evaluate(
     pipeline = preset_named(preset) if isinstance(preset, str) else preset
     pipeline = pipeline if field is None else pipeline.with_field(field)
     name = next((known for known, settings in PRESETS.items() if settings is pipeline), "custom")
+    pipeline = pipeline.with_pose_prior(benchmark.protocol.pose)
     if limit is not None:
         check_positive(limit, "limit")
-    settings = _settings(benchmark, name, pipeline, renderer)
-    store = run_items(
-        benchmark.selection(limit),
+    settings = {  # all that results depend on besides their files; --limit and --categories only select objects
+        **benchmark.settings(),
+        "protocol": str(benchmark.protocol),
+        "preset": name,
+        "pipeline": pipeline.describe(),
+        "renderer": renderer,
+        "version": __version__,
+        "code": code_digest(*POSE_SOURCES),
+    }
+
+    def open_registrar(meshes: tuple[Path, ...]) -> Registrar:
+        loaded = [load_mesh(path, unit=benchmark.unit) for path in meshes]
+        banks = [cached_bank(mesh, pipeline=pipeline, renderer=renderer, progress=False) for mesh in loaded]
+        return Registrar(banks, pipeline=pipeline, field=field, renderer=renderer)
+
+    store = run_entries(
+        [entry for i in benchmark.selection(limit) if not (entry := benchmark.entries[i]).error],
         out,
-        registrar_opener(benchmark, pipeline, renderer=renderer, field=field),
-        lambda item, registrar, seconds, _: register_object(benchmark, item, registrar, bank_seconds=seconds),
+        open_registrar,
         settings=settings,
-        prepare=lambda store: store.open(settings, overwrite=overwrite),
         label=benchmark.name,
         progress=progress,
     )
-    return None if store is None else score(benchmark, out, limit=limit)
+    return None if store is None else report(benchmark, store, settings, limit)
 
 
-def score(benchmark: Benchmark, out: Path, *, limit: int | None = None) -> Row:
-    """Write ``predictions.csv`` and ``summary.json`` from the results in ``out``, and return the summary.
-
-    Raises:
-        InvalidInputError: a result is missing or damaged.
-    """
-    store = ResultStore(out)
-    pairs = [(item, store.read(item.key)) for item in benchmark.selection(limit)]
+def report(benchmark: Benchmark, store: ResultStore, settings: Row, limit: int | None = None) -> Row:
+    """Write ``predictions.csv``, ``index.html`` and ``summary.json`` from results; returns the summary."""
     skipped = Counter({k: n for k, n in benchmark.dataset.skipped.items() if k not in NOT_EVALUATED})
-    skipped.update(row["skipped"] for _, row in pairs if "skipped" in row)
-    items = [item for item, row in pairs if "skipped" not in row]
-    rows = [row for _, row in pairs if "skipped" not in row]
+    scored: list[int] = []
+    rows: list[Row] = []
+    for i in benchmark.selection(limit):
+        entry = benchmark.entries[i]
+        row = {"skipped": entry.error} if entry.error else store.read(entry.key)
+        if "skipped" in row:
+            skipped[row["skipped"]] += 1
+        else:
+            scored.append(i)
+            rows.append(row)
+    samples = [benchmark.samples[i] for i in scored]
+    errors = benchmark.errors(samples, rows)
     seconds = {name: sum(row["seconds"][name] for row in rows) for name in ("bank", "register")}
-    settings = store.settings()
-    settings["root"] = Path(settings["root"]).name  # a summary is shared: no paths
+    settings = {**settings, "root": Path(settings["root"]).name}  # a summary is shared: no paths
     summary = {
-        **benchmark.summary(items, rows),
-        **({"detection": detection_recall(items, rows)} if benchmark.protocol.box is None else {}),
-        "failed": sum("failed" in row for row in rows),
+        **benchmark.summary(samples, rows, errors),
+        **({"detection": detection_recall(samples, rows)} if benchmark.protocol.box is None else {}),
+        "failed": sum(row["status"] == "failed" for row in rows),
         "skipped": dict(sorted(skipped.items())),
         "protocol": settings["protocol"],
         "limit": limit,
@@ -106,19 +130,32 @@ def score(benchmark: Benchmark, out: Path, *, limit: int | None = None) -> Row:
         "versions": {"curvireg_torch": __version__, "python": platform.python_version(), "torch": torch.__version__},
         "seconds": {**seconds, "register_each": seconds["register"] / len(rows) if rows else None},
     }
-    benchmark.write_predictions(out / "predictions.csv", items, rows)
-    write_file(out / "summary.json", to_json(summary).encode())
+    benchmark.write_predictions(store.folder / "predictions.csv", samples, rows, errors)
+    _write_page(benchmark, store.folder, scored, rows, next(iter(errors.values())))
+    write_file(store.folder / "summary.json", to_json(summary).encode())
     return summary
 
 
-def _settings(benchmark: Benchmark, name: str, pipeline: Pipeline, renderer: str) -> Row:
-    """All that results depend on besides their own files; --limit and --categories only select objects."""
-    return {
-        **benchmark.settings(),
-        "protocol": str(benchmark.protocol),
-        "preset": name,
-        "pipeline": pipeline.with_pose_prior(benchmark.protocol.pose).describe(),
-        "renderer": renderer,
-        "version": __version__,
-        "code": code_digest(*POSE_SOURCES),
-    }
+def _write_page(benchmark: Benchmark, out: Path, scored: Sequence[int], rows: Sequence[Row], errors: Tensor) -> None:
+    """The best and the worst objects: by error; then those of unknown pose, by confidence; then those that failed."""
+    shown = []
+    for i, row, error in zip(scored, rows, errors.tolist(), strict=True):
+        kind, caption, order = _outcome(row, error)
+        name, picture = benchmark.entries[i].key, thumbnail_of(out, row)
+        shown.append((order, SheetEntry(number=i + 1, name=name, caption=caption, kind=kind, picture=picture)))
+    shown.sort(key=lambda pair: pair[0])
+    known = [error for error in errors.tolist() if not math.isnan(error)]
+    right, failed = sum(error < RIGHT_DEG for error in known), sum(row["status"] == "failed" for row in rows)
+    title = f"{len(rows)} objects: {right} of {len(known)} within {RIGHT_DEG:g} degrees, {failed} failed"
+    write_sheet(out / "index.html", title, [entry for _, entry in shown], table="predictions.csv", each=SHOWN_EACH)
+
+
+def _outcome(row: Row, error: float) -> tuple[str, str, tuple[int, float]]:
+    """Kind, caption and sort key of a result."""
+    if row["status"] == "failed":
+        return "failed", row["message"], (2, 0.0)
+    number = row["confidence"]
+    confidence = "not calibrated" if number is None else f"confidence {number:.2f}"
+    if math.isnan(error):
+        return "reliable" if row["reliable"] else "doubtful", f"pose unknown, {confidence}", (1, -(number or 0.0))
+    return "right" if error < RIGHT_DEG else "wrong", f"{error:.1f} degrees off, {confidence}", (0, error)

@@ -8,14 +8,10 @@ one unit:
 - ADD-S: mean over x of the distance of ``T_gt x`` to the nearest ``T_est y``;
 - MSSD, MSPD (Hodan et al. 2020): minimum over the symmetries S of the maximum over x of ``|T_est x - T_gt S x|``, in
   space or after projection into the image.
-
-The evaluation code of RenderForCNN computes ``norm(logm(R1' R2)) / sqrt(2)`` with the spectral norm, although only the
-Frobenius norm gives the angle. Its errors, and those of later papers, are too small by sqrt(2). ``legacy_sqrt2=True``
-reproduces them for comparison; report them only beside the correct numbers.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from scipy.spatial import cKDTree
@@ -27,36 +23,42 @@ from ..utils.checks import (
     check_camera_matrix,
     check_finite,
     check_last_axes,
-    check_option,
     check_pose,
     check_positive,
     check_rotation,
     check_same_device,
+    check_symmetries,
     check_tensor,
 )
 
 __all__ = [
-    "AVP_BINS",
+    "ADD_THRESHOLDS",
+    "MSPD_THRESHOLDS",
+    "MSSD_THRESHOLDS",
     "accuracy",
     "add_error",
-    "add_recall",
     "adds_error",
-    "axis_rotation_error",
-    "azimuth_bin",
-    "binned_accuracy",
+    "average_recall",
     "median_error",
     "mspd_error",
-    "mspd_recall",
     "mssd_error",
-    "mssd_recall",
     "symmetric_rotation_error",
 ]
+
+BOUNDING_POINTS = 300
+"""Points by which symmetries are compared before all points are."""
 
 _CHUNK = 1 << 22
 """Points transformed at once: 50 MB of float32 coordinates."""
 
-_MSSD_THRESHOLDS = tuple(step / 20.0 for step in range(1, 11))
-_MSPD_THRESHOLDS = tuple(5.0 * step for step in range(1, 11))
+ADD_THRESHOLDS = (0.1,)
+"""Diameters: a pose with a smaller ADD or ADD-S is right."""
+
+MSSD_THRESHOLDS = tuple(step / 20.0 for step in range(1, 11))
+"""Diameters of BOP's average recall of MSSD."""
+
+MSPD_THRESHOLDS = tuple(5.0 * step / 640.0 for step in range(1, 11))
+"""Image widths of BOP's average recall of MSPD: 5, 10, ..., 50 px times width / 640."""
 
 
 def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
@@ -118,8 +120,12 @@ def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tenso
     """
     T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
     difference = T_est.unsqueeze(1) - T_gt.unsqueeze(1) @ _checked_symmetries(symmetries, T_gt)
-    largest = [_transform(d, points).norm(dim=1).amax(1) for d in _chunks(difference.flatten(0, 1), points)]
-    return inf_unless(valid, torch.cat(largest).view(difference.shape[:2]).amin(1))
+
+    def largest(which: Tensor, points: Tensor) -> Tensor:
+        moved = difference.flatten(0, 1)[which]
+        return torch.cat([_transform(d, points).norm(dim=1).amax(1) for d in _chunks(moved, points)])
+
+    return inf_unless(valid, _least_maximum(largest, difference.shape[:2], points))
 
 
 def mspd_error(
@@ -151,58 +157,54 @@ def mspd_error(
         K = K.unsqueeze(1)
     true = K @ (T_gt.unsqueeze(1) @ _checked_symmetries(symmetries, T_gt))[:, :, :3]
     estimated = (K @ T_est.unsqueeze(1)[:, :, :3]).expand_as(true)
-    largest = []
-    for a, b in zip(*(_chunks(projections.flatten(0, 1), points) for projections in (estimated, true)), strict=True):
-        (xy_a, front_a), (xy_b, front_b) = _project(a, points), _project(b, points)
-        largest.append(inf_unless(front_a & front_b, (xy_a - xy_b).norm(dim=1)).amax(1))
-    return inf_unless(valid, torch.cat(largest).view(true.shape[:2]).amin(1))
+
+    def largest(which: Tensor, points: Tensor) -> Tensor:
+        found = []
+        for some in _chunks(which, points):
+            (xy_a, front_a), (xy_b, front_b) = (_project(p.flatten(0, 1)[some], points) for p in (estimated, true))
+            found.append(inf_unless(front_a & front_b, (xy_a - xy_b).norm(dim=1)).amax(1))
+        return torch.cat(found)
+
+    return inf_unless(valid, _least_maximum(largest, true.shape[:2], points))
 
 
-def add_recall(errors: Tensor, diameter: Tensor | float, *, fraction: float = 0.1) -> float:
-    """Fraction of the poses with ADD (or ADD-S) below a fraction of the object diameter; NaN for N = 0.
+def _least_maximum(largest: Callable[[Tensor, Tensor], Tensor], shape: Sequence[int], points: Tensor) -> Tensor:
+    """(B,) minima over S symmetries of the largest distance that any point moves.
+
+    A few of the points bound the maximum of all from below; all are compared only where a bound is the least one.
 
     Args:
-        errors: (N,) >= 0 from :func:`add_error` or :func:`adds_error`.
-        diameter: of the objects, a number or (N,) > 0, in the unit of the errors.
-        fraction: of the diameter, > 0.
+        largest: maps indices (M,) into ``shape``, flattened, and some points to the largest distances (M,).
+        shape: (B, S).
+        points: (P, 3).
+    """
+    everything = torch.arange(shape[0] * shape[1], device=points.device)
+    distances = largest(everything, points[:: max(1, len(points) // BOUNDING_POINTS)]).view(*shape)
+    exact = torch.zeros_like(distances, dtype=torch.bool)
+    row = torch.arange(shape[0], device=points.device)
+    while True:
+        best = distances.argmin(dim=1)
+        open_rows = (~exact[row, best]).nonzero()[:, 0]
+        if len(open_rows) == 0:
+            return distances.amin(dim=1)
+        chosen = best[open_rows]
+        distances[open_rows, chosen] = largest(open_rows * shape[1] + chosen, points)
+        exact[open_rows, chosen] = True
+
+
+def average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
+    """Fraction of the errors below a threshold, averaged over the thresholds; NaN for N = 0.
+
+    Args:
+        errors: (N,) >= 0 in the unit of the thresholds: diameters of the objects, or image widths.
+        thresholds: :data:`ADD_THRESHOLDS`, :data:`MSSD_THRESHOLDS` or :data:`MSPD_THRESHOLDS`.
 
     Example:
-        >>> add_recall(torch.tensor([1.0, 9.0, 11.0, torch.inf]), 100.0)
+        >>> average_recall(torch.tensor([0.26]), MSSD_THRESHOLDS)      # below 0.30, 0.35, 0.40, 0.45 and 0.50
         0.5
     """
-    check_positive(fraction, "fraction")
     check_errors(errors)
-    return _average_recall(errors / per_item(diameter, errors, "diameter"), (fraction,))
-
-
-def mssd_recall(errors: Tensor, diameter: Tensor | float) -> float:
-    """AR_MSSD of BOP: fraction of the poses with MSSD below 0.05, 0.10, ..., 0.50 diameters, averaged.
-
-    ``diameter`` is that of :func:`add_recall`, ``errors`` come from :func:`mssd_error`.
-
-    Example:
-        >>> mssd_recall(torch.tensor([26.0]), 100.0)      # below 0.30, 0.35, 0.40, 0.45 and 0.50
-        0.5
-    """
-    check_errors(errors)
-    return _average_recall(errors / per_item(diameter, errors, "diameter"), _MSSD_THRESHOLDS)
-
-
-def mspd_recall(errors: Tensor, image_width: Tensor | float) -> float:
-    """AR_MSPD of BOP: fraction of the poses with MSPD below 5, 10, ..., 50 px times image width / 640, averaged.
-
-    ``image_width`` in px is a number or (N,) > 0, ``errors`` come from :func:`mspd_error`.
-
-    Example:
-        >>> mspd_recall(torch.tensor([26.0]), 640), mspd_recall(torch.tensor([26.0]), 1280)
-        (0.5, 0.8)
-    """
-    check_errors(errors)
-    return _average_recall(errors * 640.0 / per_item(image_width, errors, "image_width"), _MSPD_THRESHOLDS)
-
-
-def _average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
-    return sum(fraction_true(errors < threshold) for threshold in thresholds) / len(thresholds)
+    return sum(float((errors < threshold).double().mean()) for threshold in thresholds) / len(thresholds)
 
 
 def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -226,10 +228,7 @@ def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tenso
 def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:
     if symmetries is None:
         return torch.eye(4, dtype=like.dtype, device=like.device).unsqueeze(0)
-    check_tensor(symmetries, "symmetries", (None, 4, 4))
-    if len(symmetries) == 0:
-        raise InvalidInputError("symmetries: expected at least the identity, got none")
-    check_pose(symmetries, "symmetries")
+    check_symmetries(symmetries)
     return symmetries.to(like)
 
 
@@ -251,33 +250,25 @@ def _project(projections: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     return image[:, :2] / torch.where(front, image[:, 2], torch.ones_like(image[:, 2])).unsqueeze(1), front
 
 
-AVP_BINS = (4, 8, 16, 24)
-"""Numbers of azimuth bins in PASCAL3D+ tables."""
-
-
-def accuracy(errors: Tensor, threshold_deg: float, *, legacy_sqrt2: bool = False) -> float:
+def accuracy(errors: Tensor, threshold_deg: float) -> float:
     """Fraction of the errors below a threshold: Acc(pi/6) with 30, Acc(pi/18) with 10; NaN for N = 0.
 
     Args:
         errors: (N,) degrees >= 0; ``inf`` for an object without an estimate (a miss).
         threshold_deg: degrees > 0.
-        legacy_sqrt2: divide the errors by sqrt(2) first, as flawed evaluation code does.
 
     Example:
-        >>> errors = torch.tensor([5.0, 12.0, 40.0, 170.0])
-        >>> accuracy(errors, 30.0), accuracy(errors, 30.0, legacy_sqrt2=True)
-        (0.5, 0.75)
+        >>> accuracy(torch.tensor([5.0, 12.0, 40.0, 170.0]), 30.0)
+        0.5
     """
-    check_errors(errors)
     check_positive(threshold_deg, "threshold_deg")
-    return fraction_true((errors / math.sqrt(2.0) if legacy_sqrt2 else errors) < threshold_deg)
+    return average_recall(errors, (threshold_deg,))
 
 
-def median_error(errors: Tensor, *, legacy_sqrt2: bool = False) -> float:
+def median_error(errors: Tensor) -> float:
     """Median of the errors (MedErr); the mean of the middle two for an even number, NaN for N = 0.
 
-    Args:
-        errors, legacy_sqrt2: as in :func:`accuracy`; the median is ``inf`` if half of the errors are.
+    ``errors`` are those of :func:`accuracy`; the median is ``inf`` if half of them are.
 
     Example:
         >>> median_error(torch.tensor([40.0, 5.0, 12.0, 170.0]))
@@ -287,8 +278,7 @@ def median_error(errors: Tensor, *, legacy_sqrt2: bool = False) -> float:
     if errors.numel() == 0:
         return math.nan
     ordered = errors.double().sort().values
-    median = float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2.0
-    return median / math.sqrt(2.0) if legacy_sqrt2 else median
+    return float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2.0
 
 
 def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) -> Tensor:
@@ -317,34 +307,6 @@ def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) ->
     return inf_unless(valid, torch.cat([plain.unsqueeze(-1), symmetric], -1).amin(-1))
 
 
-def axis_rotation_error(R_est: Tensor, R_gt: Tensor, axis: Tensor) -> Tensor:
-    """Rotation error of a solid of revolution: ``min_phi angle(R_est, R_gt Rot(axis, phi))``.
-
-    The minimum is the angle between ``R_est axis`` and ``R_gt axis``, computed from the chord, since ``acos`` loses
-    digits near 0.
-
-    Args:
-        R_est, R_gt: as in :func:`symmetric_rotation_error`, as is the result.
-        axis: (3,) direction of the axis in the model frame, of any length > 0. Its two ends differ; for a solid that
-            looks the same upside down, take the minimum with the flipped rotation too.
-
-    Example:
-        >>> from curvireg_torch.geometry import rotation_from_viewpoint
-        >>> a, b = rotation_from_viewpoint(0.0, 10.0), rotation_from_viewpoint(120.0, 30.0)
-        >>> round(float(axis_rotation_error(a, b, torch.tensor([0.0, 0.0, 1.0]))), 3)   # the azimuth of a vase is free
-        20.0
-    """
-    valid = _check_rotations(R_est, R_gt)
-    check_tensor(axis, "axis", (3,))
-    check_same_device(axis, R_gt, "axis")
-    length = torch.linalg.vector_norm(axis)
-    if not bool(length > 0) or not bool(length.isfinite()):
-        raise InvalidInputError(f"axis: expected a direction of finite length > 0, got {axis.tolist()}")
-    axis = (axis / length).to(R_gt.dtype)
-    half_chord = torch.linalg.vector_norm(R_est @ axis - R_gt @ axis, dim=-1) / 2.0
-    return inf_unless(valid, torch.rad2deg(2.0 * torch.asin(half_chord.clamp(max=1.0))))
-
-
 def _check_rotations(R_est: Tensor, R_gt: Tensor) -> Tensor:
     """Which estimates are not missing, (...) bool."""
     for name, R in (("R_est", R_est), ("R_gt", R_gt)):
@@ -354,41 +316,6 @@ def _check_rotations(R_est: Tensor, R_gt: Tensor) -> Tensor:
     check_rotation(R_est, "R_est")
     check_finite(R_gt, "R_gt")
     return R_est.isfinite().flatten(-2).all(-1)
-
-
-def azimuth_bin(azimuth: Tensor, bins: int) -> Tensor:
-    """Azimuth bin of PASCAL3D+, int64 in [0, bins); bin i is [(i - 1/2) 360/bins, (i + 1/2) 360/bins).
-
-    Args:
-        azimuth: (...) degrees, not restricted to [0, 360).
-        bins: 4, 8, 16 or 24.
-
-    Example:
-        >>> azimuth_bin(torch.tensor([0.0, 44.0, 45.0, 350.0]), 4).tolist()
-        [0, 0, 1, 0]
-    """
-    check_option(str(bins), tuple(map(str, AVP_BINS)), "bins")
-    check_last_axes(azimuth, "azimuth", ())
-    check_finite(azimuth, "azimuth")
-    return torch.floor(azimuth % 360.0 * (bins / 360.0) + 0.5).long() % bins
-
-
-def binned_accuracy(azimuth_est: Tensor, azimuth_gt: Tensor, bins: int) -> float:
-    """Fraction of the objects whose azimuth is in the correct bin: AVP with ground-truth boxes; NaN for N = 0.
-
-    Args:
-        azimuth_est, azimuth_gt: (N,) degrees; NaN or inf in ``azimuth_est`` for a missing estimate.
-        bins: 4, 8, 16 or 24.
-
-    Example:
-        >>> binned_accuracy(torch.tensor([3.0, 100.0]), torch.tensor([350.0, 130.0]), 8)
-        0.5
-    """
-    check_tensor(azimuth_gt, "azimuth_gt", (None,))
-    check_tensor(azimuth_est, "azimuth_est", tuple(azimuth_gt.shape))
-    valid = azimuth_est.isfinite()
-    same = azimuth_bin(azimuth_est.where(valid, 0.0), bins) == azimuth_bin(azimuth_gt, bins)
-    return fraction_true(valid & same)
 
 
 def check_errors(errors: Tensor, name: str = "errors") -> None:
@@ -404,20 +331,3 @@ def check_errors(errors: Tensor, name: str = "errors") -> None:
 def inf_unless(valid: Tensor, errors: Tensor) -> Tensor:
     """``errors``, replaced by ``inf`` where ``valid`` is False."""
     return torch.where(valid, errors, torch.full_like(errors, torch.inf))
-
-
-def fraction_true(hits: Tensor) -> float:
-    """Fraction of True in a boolean tensor; NaN if it is empty."""
-    return float(hits.double().mean())
-
-
-def per_item(value: Tensor | float, errors: Tensor, name: str) -> Tensor:
-    """``value``, a number or an (N,) tensor of numbers > 0, as a tensor that divides ``errors`` (N,)."""
-    if not isinstance(value, Tensor):
-        value = torch.as_tensor(value, dtype=errors.dtype, device=errors.device)
-    check_same_device(value, errors, name)
-    if value.shape not in ((), errors.shape):
-        raise InvalidInputError(f"{name}: expected a number or shape {tuple(errors.shape)}, got {tuple(value.shape)}")
-    if not bool(((value > 0) & value.isfinite()).all()):
-        raise InvalidInputError(f"{name}: expected finite numbers > 0, got {value.tolist()}")
-    return value.to(errors.dtype)

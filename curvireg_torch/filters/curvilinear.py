@@ -1,36 +1,41 @@
-"""Curvilinear saliency of depth images (the paper's contribution 1) and of photographs."""
+"""Curvilinear saliency of depth (the paper's contribution 1); gradient, curvilinear saliency and PCI of photographs."""
 
-import math
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..utils.checks import check_image, check_mask, check_option, check_positive
-from .blocks import Planes, apply_in_blocks
-from .derivatives import central_derivatives, central_gradient, smooth
-from .inputs import apply_to_photograph
-from .learnable import OptionsModule, check_scalar
-from .numerics import at_least_float32, clone_if_grad, safe_eps, safe_sqrt, squared_length
+from ..errors import InvalidInputError
+from ..utils.checks import check_image, check_option, check_positive, check_same_device, type_and_shape
+from .modules import DepthModule, FunctionModule
+from .operations import (
+    Planes,
+    apply_in_blocks,
+    apply_to_photograph,
+    at_least_float32,
+    central_derivatives,
+    central_gradient,
+    check_scalar,
+    check_sigmas,
+    clone_if_grad,
+    safe_eps,
+    safe_sqrt,
+    smooth,
+    squared_length,
+)
 
-BACKGROUND = 1.25
-"""Depth of missing pixels behind the nearest visible point, in units of the visible depth range."""
-
-_MIN_RELATIVE_RANGE = 1e-6
-"""Visible depth range, relative to the largest depth, below which depths differ by rounding only: 8 ulp of float32."""
-
-FORMULAS = ("geometric", "paper")
+BACKGROUND_DEPTH = 1.25  # of missing pixels behind the nearest visible point, in units of the visible depth range
+MIN_RELATIVE_RANGE = 1e-6  # of visible depths, relative to the largest; below it (8 ulp of float32) they are rounding
 
 
 def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Depth with missing pixels at the largest number; nearest depth and depth range of each image, (B, 1, 1, 1).
 
-    Missing pixels are 0, negative, inf, NaN or outside ``mask``. For a range of at most ``_MIN_RELATIVE_RANGE``, which
-    must not be stretched, the largest depth is returned instead. The range of an empty image is 1.
+    Missing pixels are 0, negative, inf, NaN or outside ``mask``. For a range of rounding, which must not be stretched,
+    the largest depth is returned instead. The range of an empty image is 1.
     """
-    # Two equivalent forms: eager, torch.where takes seven times as long; compiled, nan_to_num is not vectorised.
-    compiling = torch.compiler.is_compiling()
-    clean = torch.where(depth < math.inf, depth, 0.0) if compiling else depth.nan_to_num(0.0, 0.0, 0.0)
+    clean = depth.nan_to_num(0.0, 0.0, 0.0)
     if mask is not None:
         clean = torch.where(mask, clean, 0.0)
     far = clean.amax(dim=(1, 2, 3), keepdim=True)
@@ -38,14 +43,14 @@ def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, T
     surface = F.threshold(clean, 0.0, torch.finfo(depth.dtype).max)
     near = torch.where(visible, surface.amin(dim=(1, 2, 3), keepdim=True), 1.0)
     span = far - near
-    return surface, near, torch.where(span > _MIN_RELATIVE_RANGE * far, span, torch.where(visible, far, 1.0))
+    return surface, near, torch.where(span > MIN_RELATIVE_RANGE * far, span, torch.where(visible, far, 1.0))
 
 
 def fill_depth(depth: Tensor, mask: Tensor | None, depth_scale: float | None) -> Tensor:
-    """Depth as a graph surface: nearest visible point at 0, missing pixels at ``BACKGROUND`` depth ranges."""
+    """Depth as a graph surface: nearest visible point at 0, missing pixels at ``BACKGROUND_DEPTH`` depth ranges."""
     surface, near, span = visible_range(depth, mask)
     scale = 1.0 / span if depth_scale is None else depth_scale
-    return torch.minimum(surface - near, BACKGROUND * span).mul_(scale)
+    return torch.minimum(surface - near, BACKGROUND_DEPTH * span).mul_(scale)
 
 
 def depth_curvilinear_saliency(
@@ -87,7 +92,7 @@ def depth_curvilinear_saliency(
     """
     mask, scale = check_depth(depth, mask), check_depth_scale(depth_scale)
     sigma = check_scalar(sigma, "sigma", zero_ok=True)
-    check_option(formula, FORMULAS, "formula")
+    check_option(formula, ("geometric", "paper"), "formula")
 
     def layer(depth: Tensor, mask: Tensor | None) -> Planes:
         factor, *m = _shape_operator(smooth(fill_depth(depth, mask, scale), sigma, linear=True), formula)
@@ -98,15 +103,15 @@ def depth_curvilinear_saliency(
 
 
 def check_depth(depth: Tensor, mask: Tensor | None) -> Tensor | None:
-    """The mask expanded to the shape of the depth."""
+    """Return the mask expanded to the shape of the depth."""
     check_image(depth, "depth")
     if mask is None:
         return None
     fits = mask.ndim <= 4 and all(m in (1, n) for m, n in zip(mask.shape[::-1], depth.shape[::-1], strict=False))
-    if fits:
-        mask = mask.expand(depth.shape)
-    check_mask(mask, depth)
-    return mask
+    if not fits or mask.dtype != torch.bool:
+        raise InvalidInputError(f"mask: expected bool of shape {tuple(depth.shape)}, got {type_and_shape(mask)}")
+    check_same_device(mask, depth, "mask")
+    return mask.expand(depth.shape)
 
 
 def check_depth_scale(depth_scale: float | None) -> float | None:
@@ -131,17 +136,15 @@ def _shape_operator(z: Tensor, formula: str) -> Planes:
 def dominant_eigenvector(
     m11: Tensor, m12: Tensor, m21: Tensor, m22: Tensor, sign: float | Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Eigenvector (vx, vy) of [[m11, m12], [m21, m22]] with real eigenvalues, and half the eigenvalue difference.
+    """Eigenvector (vx, vy), of any length, of [[m11, m12], [m21, m22]], and half the difference of its eigenvalues.
 
-    It belongs to the eigenvalue largest in absolute value, or with ``sign=1`` to the largest one, and has any length.
-    It is 0 for a multiple of the identity.
+    Its eigenvalue is the largest in absolute value, or with ``sign=1`` the largest; it is 0 for a multiple of I.
     """
     gap = m11 - m22
     # tr^2 / 4 - det in a form without cancellation.
     half_gap = safe_sqrt((m12 * m21).addcmul_(gap, gap, value=0.25))
     # (s half_gap + gap / 2, m21) and (m12, s half_gap - gap / 2), where s is the sign, are both eigenvectors. Take the
-    # one without cancellation, by arithmetic: torch.where with an unpredictable mask costs a CPU as much as 27
-    # additions.
+    # one without cancellation, by arithmetic, since torch.where with an unpredictable mask is slow.
     sign = (m11 + m22).ge_(0.0).mul_(2.0).sub_(1.0) if sign is None else sign
     diagonal = gap.abs().mul_(0.5).add_(half_gap).mul_(sign)
     first = (gap * sign).ge_(0.0)
@@ -159,6 +162,25 @@ def default_to_x(vx: Tensor, vy: Tensor) -> Tensor:
     """vx, replaced by 1 where (vx, vy) is numerically 0 and the direction is arbitrary."""
     squared = squared_length(vx, vy)
     return torch.where(squared <= safe_eps(squared), 1.0, vx)
+
+
+def image_gradient(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
+    """Gradient of the Gaussian-smoothed image, the paper's IG.
+
+    Args:
+        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
+        sigma: smoothing in px before differentiation, >= 0.
+
+    Returns:
+        (B, 2, H, W) grey levels per px; channel 0 = x, 1 = y.
+
+    Example:
+        >>> ramp = torch.arange(8.0).expand(1, 1, 8, 8)
+        >>> image_gradient(ramp, sigma=0.0)[0, :, 4, 4].tolist()
+        [1.0, 0.0]
+    """
+    checked_sigma = check_scalar(sigma, "sigma", zero_ok=True)
+    return apply_to_photograph(lambda x: central_gradient(smooth(x, checked_sigma)), image)
 
 
 def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
@@ -185,15 +207,72 @@ def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) ->
     return apply_to_photograph(layer, image)
 
 
-class DepthCurvilinearSaliency(OptionsModule):
-    """Module twin of :func:`depth_curvilinear_saliency`.
+def principal_curvature_image(
+    image: Tensor, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0), eigenvalue: str = "largest"
+) -> Tensor:
+    r"""Principal curvature image (Deng et al. 2007): lines and the sides of edges, over scales.
+
+    :math:`\max_\sigma \sigma^2 \max(\lambda, 0)` with :math:`\lambda` an eigenvalue of the Hessian of the image
+    smoothed by :math:`\sigma`: the largest one (``"largest"``: dark lines and the dark side of edges) or the negated
+    smallest one (``"smallest"``: bright lines and the bright side).
 
     Args:
-        sigma, formula, depth_scale: as in the function.
-        learnable: make sigma a positive parameter.
+        image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
+        sigmas: scales in px, > 0.
+        eigenvalue: ``"largest"`` or ``"smallest"``.
 
-    Shape:
-        Input (B, 1, H, W) depth and optionally a mask that broadcasts to it; output (B, 2, H, W).
+    Returns:
+        (B, 2, H, W): the length is the curvature >= 0 in grey levels, the direction is across the line at the scale of
+        the maximum, with arbitrary sign.
+
+    Example:
+        >>> line = torch.ones(1, 1, 33, 33)
+        >>> line[..., 16] = 0.0                                                     # dark, along y
+        >>> field = principal_curvature_image(line)
+        >>> int(field[0, 0, 16].abs().argmax())
+        16
+    """
+    check_option(eigenvalue, ("largest", "smallest"), "eigenvalue")
+    scales = check_sigmas(sigmas, "sigmas")
+    sign = 1.0 if eigenvalue == "largest" else -1.0
+
+    def layer(image: Tensor) -> Planes:
+        best = vx = vy = torch.zeros_like(image)
+        for sigma in scales:
+            xx, yy, xy = (sign * sigma**2 * h for h in central_derivatives(smooth(image, sigma))[2:])
+            x, y, half_gap = dominant_eigenvector(xx, xy, xy, yy, sign=1.0)
+            curvature = 0.5 * (xx + yy) + half_gap
+            better = (curvature > best).to(best.dtype)
+            best, vx, vy = torch.maximum(best, curvature), torch.lerp(vx, x, better), torch.lerp(vy, y, better)
+        return scaled_direction(best, default_to_x(vx, vy), vy)  # a round blob has no unique direction
+
+    return apply_to_photograph(layer, image)
+
+
+class ImageGradient(FunctionModule, function=image_gradient, learnable=("sigma",)):
+    """Module twin of :func:`image_gradient`.
+
+    Example:
+        >>> len(list(ImageGradient(learnable=True).parameters()))
+        1
+    """
+
+    def __init__(self, *, sigma: float = 1.0, learnable: bool = False) -> None: ...
+
+
+class ImageCurvilinearSaliency(FunctionModule, function=image_curvilinear_saliency, learnable=("sigma",)):
+    """Module twin of :func:`image_curvilinear_saliency`.
+
+    Example:
+        >>> ImageCurvilinearSaliency(sigma=2.0)
+        ImageCurvilinearSaliency(sigma=2.0)
+    """
+
+    def __init__(self, *, sigma: float = 1.0, learnable: bool = False) -> None: ...
+
+
+class DepthCurvilinearSaliency(DepthModule, function=depth_curvilinear_saliency, learnable=("sigma",)):
+    """Module twin of :func:`depth_curvilinear_saliency`.
 
     Example:
         >>> plane = torch.arange(32.0).expand(1, 1, 32, 32) + 10
@@ -208,34 +287,15 @@ class DepthCurvilinearSaliency(OptionsModule):
         formula: str = "geometric",
         depth_scale: float | None = None,
         learnable: bool = False,
-    ) -> None:
-        check_option(formula, FORMULAS, "formula")
-        check_scalar(sigma, "sigma", zero_ok=True)
-        check_depth_scale(depth_scale)
-        super().__init__(learnable, sigma=sigma, formula=formula, depth_scale=depth_scale)
-
-    def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
-        return depth_curvilinear_saliency(depth, mask, **self.options)
+    ) -> None: ...
 
 
-class ImageCurvilinearSaliency(OptionsModule):
-    """Module twin of :func:`image_curvilinear_saliency`.
-
-    Args:
-        sigma: as in the function.
-        learnable: make sigma a positive parameter.
-
-    Shape:
-        Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
+class PrincipalCurvatureImage(FunctionModule, function=principal_curvature_image):
+    """Module twin of :func:`principal_curvature_image`.
 
     Example:
-        >>> len(list(ImageCurvilinearSaliency(learnable=True).parameters()))
-        1
+        >>> PrincipalCurvatureImage(eigenvalue="smallest")(torch.rand(2, 3, 32, 32)).shape
+        torch.Size([2, 2, 32, 32])
     """
 
-    def __init__(self, *, sigma: float = 1.0, learnable: bool = False) -> None:
-        check_scalar(sigma, "sigma", zero_ok=True)
-        super().__init__(learnable, sigma=sigma)
-
-    def forward(self, image: Tensor) -> Tensor:
-        return image_curvilinear_saliency(image, **self.options)
+    def __init__(self, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0), eigenvalue: str = "largest") -> None: ...

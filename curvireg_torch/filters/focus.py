@@ -7,25 +7,26 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..errors import InvalidInputError
-from ..utils.checks import check_option, check_positive
-from .blocks import Planes
+from ..utils.checks import check_integer, check_option, check_positive
 from .curvilinear import scaled_direction
-from .derivatives import central_gradient, smooth
-from .inputs import apply_to_photograph
-from .learnable import OptionsModule, check_scalar, check_sigmas
-from .numerics import image_maximum, safe_eps, safe_sqrt, squared_length
+from .modules import FunctionModule
+from .operations import (
+    Planes,
+    apply_to_photograph,
+    central_gradient,
+    check_scalar,
+    check_sigmas,
+    image_maximum,
+    safe_eps,
+    safe_sqrt,
+    smooth,
+    squared_length,
+)
 
 MODES = ("reblur-image", "reblur-saliency")
-MAX_BLUR = 1000.0
-"""Blur in px reported where re-blurring does not lower the saliency."""
-
-_DIFFERENCE_VARIANCE = 0.36
-"""Variance in px^2 that the central difference adds to an edge. Its second moment is 1/3, but it is not a Gaussian;
-0.36 lowers the largest error at blurs of 1 to 4 px from 3.1 to 1.8 %."""
-
-_MIN_RELATIVE_SALIENCY = 1e-3
-"""CS relative to the largest CS of the image below which a pixel is noise, not an edge; about 3 % of the contrast."""
+MAX_BLUR = 1000.0  # px, reported where re-blurring does not lower the saliency
+DIFFERENCE_VARIANCE = 0.36  # px^2 that the central difference adds to an edge; best for blurs of 1 to 4 px
+MIN_RELATIVE_SALIENCY = 1e-3  # CS relative to the image's largest below which a pixel is noise: 3 % of the contrast
 
 
 def edge_blur(
@@ -79,8 +80,8 @@ def _edge_blur(x: Tensor, saliency: Tensor, reblur_sigmas: Sequence[float], mode
             reblurred = smooth(saliency, sigma, margin=0)
             numerator, denominator = 2.0 * sigma**2 * reblurred.square(), saliency.square() - reblurred.square()
         numerator = numerator + safe_eps(numerator)
-        quotient = numerator / torch.maximum(denominator, numerator / (MAX_BLUR**2 + _DIFFERENCE_VARIANCE))
-        blurs.append(safe_sqrt(quotient - _DIFFERENCE_VARIANCE))
+        quotient = numerator / torch.maximum(denominator, numerator / (MAX_BLUR**2 + DIFFERENCE_VARIANCE))
+        blurs.append(safe_sqrt(quotient - DIFFERENCE_VARIANCE))
     return blurs
 
 
@@ -117,7 +118,10 @@ def multiscale_focus_curves(
         >>> multiscale_focus_curves(torch.rand(2, 1, 32, 32)).shape
         torch.Size([2, 2, 32, 32])
     """
-    power, limit = _check_focus(scales, mode, saliency_weight, threshold)
+    check_option(mode, MODES, "mode")
+    check_integer(scales, "scales", least=2)
+    power = check_positive(saliency_weight, "saliency_weight", zero_ok=True)
+    limit = check_positive(math.exp(-scales) if threshold is None else threshold, "threshold", zero_ok=True)
     checked_sigma = check_scalar(sigma, "sigma", zero_ok=True)
 
     def layer(image: Tensor) -> Planes:
@@ -127,55 +131,29 @@ def multiscale_focus_curves(
         saliency = squared_length(gx, gy)
         blur = functools.reduce(torch.maximum, _edge_blur(x, saliency, [float(i) for i in range(1, scales)], mode))
         # Blur below that of the derivative kernel cannot be measured.
-        focus = blur.clamp(min=_DIFFERENCE_VARIANCE**0.5).reciprocal()
-        retained = (focus > limit) & (saliency > _MIN_RELATIVE_SALIENCY * image_maximum(saliency))
+        focus = blur.clamp(min=DIFFERENCE_VARIANCE**0.5).reciprocal()
+        retained = (focus > limit) & (saliency > MIN_RELATIVE_SALIENCY * image_maximum(saliency))
         weight = saliency.clamp(min=safe_eps(saliency)) ** power
         return scaled_direction(focus * weight * retained, gx, gy)
 
     return apply_to_photograph(layer, image)
 
 
-def _check_focus(scales: int, mode: str, saliency_weight: float, threshold: float | None) -> tuple[float, float]:
-    """Returns p and T."""
-    check_option(mode, MODES, "mode")
-    if scales < 2:
-        raise InvalidInputError(f"scales: expected >= 2, got {scales}")
-    limit = math.exp(-scales) if threshold is None else check_positive(threshold, "threshold", zero_ok=True)
-    return check_positive(saliency_weight, "saliency_weight", zero_ok=True), limit
-
-
-class EdgeBlur(OptionsModule):
+class EdgeBlur(FunctionModule, function=edge_blur):
     """Module twin of :func:`edge_blur`.
-
-    Args:
-        reblur_sigmas, mode: as in the function.
-
-    Shape:
-        Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, S, H, W) in px.
 
     Example:
         >>> EdgeBlur(reblur_sigmas=(1.0, 2.0))(torch.rand(1, 1, 32, 32)).shape
         torch.Size([1, 2, 32, 32])
     """
 
-    def __init__(self, *, reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0), mode: str = "reblur-image") -> None:
-        check_option(mode, MODES, "mode")
-        check_sigmas(reblur_sigmas, "reblur_sigmas")
-        super().__init__(reblur_sigmas=tuple(reblur_sigmas), mode=mode)
-
-    def forward(self, image: Tensor) -> Tensor:
-        return edge_blur(image, **self.options)
+    def __init__(
+        self, *, reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0), mode: str = "reblur-image"
+    ) -> None: ...
 
 
-class MultiScaleFocusCurves(OptionsModule):
+class MultiScaleFocusCurves(FunctionModule, function=multiscale_focus_curves, learnable=("sigma",)):
     """Module twin of :func:`multiscale_focus_curves`.
-
-    Args:
-        scales, sigma, mode, saliency_weight, threshold: as in the function.
-        learnable: make sigma a positive parameter.
-
-    Shape:
-        Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
 
     Example:
         >>> from curvireg_torch import HOG
@@ -192,12 +170,4 @@ class MultiScaleFocusCurves(OptionsModule):
         saliency_weight: float = 1.0,
         threshold: float | None = None,
         learnable: bool = False,
-    ) -> None:
-        _check_focus(scales, mode, saliency_weight, threshold)
-        check_scalar(sigma, "sigma", zero_ok=True)
-        super().__init__(
-            learnable, scales=scales, sigma=sigma, mode=mode, saliency_weight=saliency_weight, threshold=threshold
-        )
-
-    def forward(self, image: Tensor) -> Tensor:
-        return multiscale_focus_curves(image, **self.options)
+    ) -> None: ...

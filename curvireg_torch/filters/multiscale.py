@@ -1,4 +1,4 @@
-"""Multi-scale curvilinear saliency (MCS) of photographs over an edge-preserving scale space."""
+"""Perona-Malik diffusion, and multi-scale curvilinear saliency (MCS) of photographs over its scale space."""
 
 import math
 
@@ -6,20 +6,86 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import check_option, check_positive
-from .blocks import Planes, stack_channels
+from ..utils.checks import check_integer, check_option, check_positive, check_tensor
 from .curvilinear import scaled_direction
-from .derivatives import central_gradient, smooth
-from .diffusion import CONDUCTANCES, diffuse
-from .edge_preserving import bilateral_smooth, guided_smooth
-from .inputs import apply_to_photograph
-from .learnable import OptionsModule, check_scalar
-from .numerics import image_maximum, squared_length
+from .modules import FunctionModule
+from .operations import (
+    Planes,
+    apply_in_blocks,
+    apply_to_photograph,
+    at_least_float32,
+    central_gradient,
+    check_scalar,
+    fill_missing,
+    image_maximum,
+    replicate_pad,
+    safe_reciprocal,
+    smooth,
+    squared_length,
+    stack_channels,
+)
 
-SMOOTHINGS = ("perona-malik", "bilateral", "guided")
+CONDUCTANCES = ("rational", "exponential")
+DIFFUSION_STEP = 0.2  # of the diffusion under MCS
 
-_STEP = 0.2
-"""Time step of the diffusion."""
+
+def anisotropic_diffusion(
+    image: Tensor,
+    *,
+    iterations: int,
+    kappa: float | Tensor = 0.03,
+    step: float = 0.2,
+    conductance: str = "rational",
+) -> Tensor:
+    r"""Perona-Malik diffusion: explicit steps, four neighbours, no flow through the border.
+
+    :math:`I \leftarrow I + \mathrm{step} \sum_{n \in N_4} g(\nabla_n I)\,\nabla_n I` with
+    :math:`g = 1/(1 + (d/\kappa)^2)` (``"rational"``) or :math:`g = \exp(-(d/\kappa)^2)` (``"exponential"``).
+
+    Args:
+        image: (B, C, H, W); channels diffuse independently. NaN pixels are missing and filled.
+        iterations: number of steps, >= 0.
+        kappa: difference in grey levels above which an edge is preserved, > 0; a scalar tensor is differentiable.
+        step: time step in (0, 0.25]; larger steps are unstable.
+        conductance: ``"rational"`` or ``"exponential"``.
+
+    Returns:
+        (B, C, H, W) with the mean of the input and values within its range.
+
+    Example:
+        >>> anisotropic_diffusion(torch.rand(1, 3, 16, 16), iterations=5).shape
+        torch.Size([1, 3, 16, 16])
+    """
+    check_tensor(image, "image", (None, None, None, None))
+    check_option(conductance, CONDUCTANCES, "conductance")
+    check_integer(iterations, "iterations", least=0)
+    kappa, step = check_scalar(kappa, "kappa"), check_positive(step, "step")
+    if step > 0.25:
+        raise InvalidInputError(f"step: expected 0 < step <= 0.25 (stability), got {step}")
+
+    def layer(x: Tensor) -> Planes:
+        return (diffuse(fill_missing(x), iterations, kappa, step, conductance),)
+
+    return apply_in_blocks(layer, at_least_float32(image)).to(image.dtype)
+
+
+def diffuse(x: Tensor, iterations: int, kappa: float | Tensor, step: float, conductance: str) -> Tensor:
+    """:func:`anisotropic_diffusion` of checked arguments."""
+    for _ in range(iterations):
+        p = replicate_pad(x, 1)  # no difference, hence no flow, across the border
+        # The flow between two neighbours is computed once and enters both with opposite signs.
+        flow_x = _flow(p[..., 1:-1, 1:] - p[..., 1:-1, :-1], kappa, conductance)
+        flow_y = _flow(p[..., 1:, 1:-1] - p[..., :-1, 1:-1], kappa, conductance)
+        x = torch.add(x, flow_x[..., 1:], alpha=step).sub_(flow_x[..., :-1], alpha=step)
+        x = x.add_(flow_y[..., 1:, :], alpha=step).sub_(flow_y[..., :-1, :], alpha=step)
+    return x
+
+
+def _flow(difference: Tensor, kappa: float | Tensor, conductance: str) -> Tensor:
+    scaled = difference * safe_reciprocal(kappa)
+    if conductance == "rational":
+        return difference / torch.addcmul(scaled.new_ones(()), scaled, scaled)
+    return difference * torch.exp(-scaled.square())
 
 
 def multiscale_curvilinear_saliency(
@@ -27,7 +93,6 @@ def multiscale_curvilinear_saliency(
     *,
     scales: int = 5,
     sigma: float | Tensor = 1.0,
-    smoothing: str = "perona-malik",
     kappa: float | Tensor = 0.03,
     conductance: str = "rational",
     diffusion_time: float | None = None,
@@ -42,10 +107,7 @@ def multiscale_curvilinear_saliency(
         image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
         scales: number n of levels, the image included; each has twice the diffusion time t of the previous one.
         sigma: smoothing in px before differentiation, >= 0.
-        smoothing: ``"perona-malik"`` (:func:`anisotropic_diffusion` to time t), or ``"bilateral"`` or ``"guided"``
-            with the width of linear diffusion to time t, sqrt(2 t) px.
-        kappa: contrast in grey levels above which an edge is preserved, > 0, for all smoothings.
-        conductance: of :func:`anisotropic_diffusion`.
+        kappa, conductance: of :func:`anisotropic_diffusion`, which smooths the levels.
         diffusion_time: t of the last level in px^2; None is 2^(n-2), that is 0, 5, 10, 20, ... steps of 0.2.
         threshold: T in [0, 1); None is the paper's :math:`e^{-n}`.
 
@@ -58,21 +120,22 @@ def multiscale_curvilinear_saliency(
         >>> round(float(field[0, :, 16, 16].norm()), 3)
         1.0
     """
-    times, limit = _check_scales(scales, smoothing, conductance, diffusion_time, threshold)
+    check_option(conductance, CONDUCTANCES, "conductance")
+    check_integer(scales, "scales")
+    limit = check_positive(math.exp(-scales) if threshold is None else threshold, "threshold", zero_ok=True)
+    if limit >= 1:
+        raise InvalidInputError(f"threshold: expected 0 <= threshold < 1, got {threshold}")
+    last = check_positive(2.0 ** (scales - 2) if diffusion_time is None else diffusion_time, "diffusion_time")
     checked_sigma, contrast = check_scalar(sigma, "sigma", zero_ok=True), check_scalar(kappa, "kappa")
 
     def layer(image: Tensor) -> Planes:
         level, steps_done = image, 0
         field, saliency = _normalised_saliency(level, checked_sigma)
         lowest = saliency
-        for time in times:
-            if smoothing == "perona-malik":
-                steps = max(round(time / _STEP), 1)
-                level = diffuse(level, max(steps - steps_done, 0), contrast, _STEP, conductance)
-                steps_done = max(steps, steps_done)
-            else:
-                edge_preserving = bilateral_smooth if smoothing == "bilateral" else guided_smooth
-                level = edge_preserving(image, sigma=math.sqrt(2.0 * time), kappa=contrast)
+        for k in range(2, scales + 1):
+            steps = max(round(last * 2.0 ** (k - scales) / DIFFUSION_STEP), 1)
+            level = diffuse(level, max(steps - steps_done, 0), contrast, DIFFUSION_STEP, conductance)
+            steps_done = max(steps, steps_done)
             level_field, level_saliency = _normalised_saliency(level, checked_sigma)
             # On a CPU, selection by arithmetic is much faster than argmax and gather.
             field = torch.lerp(field, level_field, (level_saliency > saliency).to(field.dtype))
@@ -80,21 +143,6 @@ def multiscale_curvilinear_saliency(
         return (field * (lowest > limit),)
 
     return apply_to_photograph(layer, image)
-
-
-def _check_scales(
-    scales: int, smoothing: str, conductance: str, diffusion_time: float | None, threshold: float | None
-) -> tuple[list[float], float]:
-    """Returns the diffusion times of the smoothed levels, and T."""
-    check_option(smoothing, SMOOTHINGS, "smoothing")
-    check_option(conductance, CONDUCTANCES, "conductance")
-    if scales < 1:
-        raise InvalidInputError(f"scales: expected >= 1, got {scales}")
-    limit = math.exp(-scales) if threshold is None else threshold
-    if not 0 <= limit < 1:
-        raise InvalidInputError(f"threshold: expected 0 <= threshold < 1, got {threshold}")
-    last = check_positive(2.0 ** (scales - 2) if diffusion_time is None else diffusion_time, "diffusion_time")
-    return [last * 2.0 ** (k - scales) for k in range(2, scales + 1)], limit
 
 
 def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> tuple[Tensor, Tensor]:
@@ -106,47 +154,44 @@ def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> tuple[Tensor, 
     return stack_channels(*scaled_direction(saliency, gx, gy)), saliency
 
 
-class MultiScaleCurvilinearSaliency(OptionsModule):
+class AnisotropicDiffusion(FunctionModule, function=anisotropic_diffusion, learnable=("kappa",)):
+    """Module twin of :func:`anisotropic_diffusion`.
+
+    Example:
+        >>> noise = torch.rand(1, 3, 32, 32)
+        >>> bool(AnisotropicDiffusion(iterations=10, kappa=1.0)(noise).std() < 0.5 * noise.std())
+        True
+    """
+
+    def __init__(
+        self,
+        *,
+        iterations: int,
+        kappa: float = 0.03,
+        step: float = 0.2,
+        conductance: str = "rational",
+        learnable: bool = False,
+    ) -> None: ...
+
+
+class MultiScaleCurvilinearSaliency(
+    FunctionModule, function=multiscale_curvilinear_saliency, learnable=("sigma", "kappa")
+):
     """Module twin of :func:`multiscale_curvilinear_saliency`.
-
-    Args:
-        scales, sigma, smoothing, kappa, conductance, diffusion_time, threshold: as in the function.
-        learnable: make sigma and kappa positive parameters.
-
-    Shape:
-        Input (B, 1, H, W) grey levels or (B, 3, H, W) RGB; output (B, 2, H, W).
 
     Example:
         >>> MultiScaleCurvilinearSaliency(scales=3)(torch.rand(2, 3, 32, 32)).shape
         torch.Size([2, 2, 32, 32])
     """
 
-    LEARNABLE = ("sigma", "kappa")
-
     def __init__(
         self,
         *,
         scales: int = 5,
         sigma: float = 1.0,
-        smoothing: str = "perona-malik",
         kappa: float = 0.03,
         conductance: str = "rational",
         diffusion_time: float | None = None,
         threshold: float | None = None,
         learnable: bool = False,
-    ) -> None:
-        _check_scales(scales, smoothing, conductance, diffusion_time, threshold)
-        check_scalar(sigma, "sigma", zero_ok=True), check_scalar(kappa, "kappa")
-        super().__init__(
-            learnable,
-            scales=scales,
-            sigma=sigma,
-            smoothing=smoothing,
-            kappa=kappa,
-            conductance=conductance,
-            diffusion_time=diffusion_time,
-            threshold=threshold,
-        )
-
-    def forward(self, image: Tensor) -> Tensor:
-        return multiscale_curvilinear_saliency(image, **self.options)
+    ) -> None: ...

@@ -1,17 +1,15 @@
-"""Average shading gradient (ASG) and Hessian Frobenius norm (HFN) of depth images, which the paper compares with CS."""
+"""Fields of depth images that the paper compares with CS: average shading gradient (ASG), Hessian Frobenius norm (HFN),
+and apparent ridges (AR)."""
 
 import math
-from collections.abc import Callable
-from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_camera_matrix, check_same_device, check_tensor
-from .blocks import Planes, apply_in_blocks
 from .curvilinear import (
-    BACKGROUND,
+    BACKGROUND_DEPTH,
     check_depth,
     check_depth_scale,
     default_to_x,
@@ -20,9 +18,18 @@ from .curvilinear import (
     scaled_direction,
     visible_range,
 )
-from .derivatives import central_derivatives, smooth
-from .learnable import OptionsModule, check_scalar
-from .numerics import at_least_float32, is_host_readable, safe_sqrt
+from .modules import DepthModule
+from .operations import (
+    Planes,
+    apply_in_blocks,
+    at_least_float32,
+    central_derivatives,
+    check_scalar,
+    is_directional_maximum,
+    is_host_readable,
+    safe_sqrt,
+    smooth,
+)
 
 
 def average_shading_gradient(
@@ -69,7 +76,7 @@ def average_shading_gradient(
 def check_shading(
     sigma: float | Tensor, depth_scale: float | None, camera_matrix: Tensor | None
 ) -> tuple[float | Tensor, float | None]:
-    """Returns sigma and depth_scale."""
+    """Return sigma and depth_scale."""
     if camera_matrix is not None:
         check_tensor(camera_matrix, "camera_matrix", (None,) * (camera_matrix.ndim == 3) + (3, 3))
         if is_host_readable(camera_matrix):
@@ -100,7 +107,7 @@ def normal_structure_tensor(
         one, zero = torch.ones_like(zx), torch.zeros_like(zx)
         return _unit_vector_products((-zx, -zy, one), (-zxx, -zxy, zero), (-zxy, -zyy, zero))
     surface, near, span = visible_range(depth, mask)
-    z = smooth(torch.minimum(surface, near + BACKGROUND * span) / span, sigma, linear=True)
+    z = smooth(torch.minimum(surface, near + BACKGROUND_DEPTH * span) / span, sigma, linear=True)
     zx, zy, zxx, zyy, zxy = central_derivatives(z)
     z = z[..., 1:-1, 1:-1]
     H, W = z.shape[-2:]
@@ -162,34 +169,55 @@ def hessian_frobenius_norm(
     return apply_in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
 
 
-class CameraModule(OptionsModule):
-    """A module whose camera matrix moves between devices and keeps its dtype: ``.half()`` would round it."""
+def apparent_ridges(
+    depth: Tensor,
+    mask: Tensor | None = None,
+    *,
+    camera_matrix: Tensor | None = None,
+    sigma: float | Tensor = 1.0,
+    depth_scale: float | None = None,
+    maxima: bool = True,
+) -> Tensor:
+    r"""Apparent ridges (Judd, Durand and Adelson 2007): maxima of view-dependent curvature.
 
-    camera_matrix: Tensor | None
+    View-dependent curvature :math:`q_1` is the largest rate of change of the surface normal per step *on the screen*,
+    the largest singular value of :math:`[N_x\ N_y]`; :math:`t_1` is the screen direction of that step. Apparent ridges
+    are the maxima of :math:`q_1` along :math:`t_1`.
 
-    def __init__(self, camera_matrix: Tensor | None, **options: Any) -> None:
-        super().__init__(**options)
-        self.register_buffer("camera_matrix", camera_matrix, persistent=False)
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        camera = self.camera_matrix
-        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        if camera is not None and self.camera_matrix is not None:
-            self.camera_matrix = camera.to(self.camera_matrix.device)
-        return self
-
-    def extra_repr(self) -> str:
-        return f"{'orthographic' if self.camera_matrix is None else 'perspective'}, {super().extra_repr()}"
-
-
-class AverageShadingGradient(CameraModule):
-    """Module twin of :func:`average_shading_gradient`.
+    Judd et al. follow the zero crossings of :math:`D_{t_1} q_1` over the mesh's faces. Here N comes from the smoothed
+    depth, so :math:`q_1` is finite at an occluding contour; maxima are pixels, along :math:`t_1` rounded to 45 degrees.
 
     Args:
-        camera_matrix, sigma, depth_scale: as in the function; the camera keeps its dtype.
+        depth, mask, camera_matrix, sigma, depth_scale: as in :func:`average_shading_gradient`.
+        maxima: False returns :math:`q_1` at all pixels.
 
-    Shape:
-        Input (B, 1, H, W) depth and optionally a mask that broadcasts to it; output (B, 2, H, W).
+    Returns:
+        (B, 2, H, W): length :math:`q_1` in 1/px (0 off the ridges), direction :math:`t_1` with arbitrary sign.
+
+    Example:
+        >>> x = (torch.arange(33.0) - 16).expand(1, 1, 33, 33)
+        >>> roof = 10 + x.abs()
+        >>> field = apparent_ridges(roof, sigma=1.0, depth_scale=1.0)
+        >>> int(field[0, :, 16].norm(dim=0).argmax())                              # its edge
+        16
+    """
+    sigma, scale = check_shading(sigma, depth_scale, camera_matrix)
+    mask, camera = check_depth(depth, mask), batched_camera(camera_matrix, depth)
+
+    def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Planes:
+        a, b, c = normal_structure_tensor(depth, mask, camera, sigma, scale)
+        vx, vy, half_gap = dominant_eigenvector(a, b, b, c)
+        vx = default_to_x(vx, vy)
+        curvature = safe_sqrt(0.5 * (a + c) + half_gap)
+        if maxima:
+            curvature = torch.where(is_directional_maximum(curvature, vx, vy), curvature, 0.0)
+        return scaled_direction(curvature, vx, vy)
+
+    return apply_in_blocks(layer, at_least_float32(depth), mask, camera).to(depth.dtype)
+
+
+class AverageShadingGradient(DepthModule, function=average_shading_gradient):
+    """Module twin of :func:`average_shading_gradient`.
 
     Example:
         >>> camera = torch.tensor([[50.0, 0.0, 15.5], [0.0, 50.0, 15.5], [0.0, 0.0, 1.0]])
@@ -200,31 +228,33 @@ class AverageShadingGradient(CameraModule):
 
     def __init__(
         self, *, camera_matrix: Tensor | None = None, sigma: float = 1.0, depth_scale: float | None = None
-    ) -> None:
-        check_shading(sigma, depth_scale, camera_matrix)
-        super().__init__(camera_matrix, sigma=sigma, depth_scale=depth_scale)
-
-    def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
-        return average_shading_gradient(depth, mask, camera_matrix=self.camera_matrix, **self.options)
+    ) -> None: ...
 
 
-class HessianFrobeniusNorm(OptionsModule):
+class HessianFrobeniusNorm(DepthModule, function=hessian_frobenius_norm):
     """Module twin of :func:`hessian_frobenius_norm`.
-
-    Args:
-        sigma, depth_scale: as in the function.
-
-    Shape:
-        Input (B, 1, H, W) depth and optionally a mask that broadcasts to it; output (B, 2, H, W).
 
     Example:
         >>> HessianFrobeniusNorm()(torch.ones(1, 1, 32, 32)).shape
         torch.Size([1, 2, 32, 32])
     """
 
-    def __init__(self, *, sigma: float = 1.0, depth_scale: float | None = None) -> None:
-        check_shading(sigma, depth_scale, None)
-        super().__init__(sigma=sigma, depth_scale=depth_scale)
+    def __init__(self, *, sigma: float = 1.0, depth_scale: float | None = None) -> None: ...
 
-    def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
-        return hessian_frobenius_norm(depth, mask, **self.options)
+
+class ApparentRidges(DepthModule, function=apparent_ridges):
+    """Module twin of :func:`apparent_ridges`.
+
+    Example:
+        >>> ApparentRidges(depth_scale=1.0)(torch.rand(1, 1, 32, 32)).shape
+        torch.Size([1, 2, 32, 32])
+    """
+
+    def __init__(
+        self,
+        *,
+        camera_matrix: Tensor | None = None,
+        sigma: float = 1.0,
+        depth_scale: float | None = None,
+        maxima: bool = True,
+    ) -> None: ...

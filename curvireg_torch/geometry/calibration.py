@@ -12,14 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import (
-    as_numbers,
-    check_camera_matrix,
-    check_integer,
-    check_option,
-    check_photograph,
-    check_tensor,
-)
+from ..utils.checks import as_numbers, check_camera_matrix, check_integer, check_option, check_photograph, check_tensor
 from ..utils.files import finite_numbers
 from .cameras import boxes_around
 from .crops import check_boxes
@@ -71,14 +64,10 @@ class Camera:
         given = list(self.distortion)
         numbers = finite_numbers(given, len(given))
         if numbers is None or len(numbers) not in MODELS[self.model]:
-            counts = ", ".join(map(str, MODELS[self.model]))
-            raise InvalidInputError(
-                f"distortion: expected {counts} finite coefficients of the model {self.model!r}, got {given!r:.80}"
-            )
-        if self.size is not None:
-            height, width = self.size
-            size = check_integer(height, "height of the image"), check_integer(width, "width of the image")
-            object.__setattr__(self, "size", size)
+            expected = f"{' or '.join(map(str, MODELS[self.model]))} finite coefficients of the model {self.model!r}"
+            raise InvalidInputError(f"distortion: expected {expected}, got {given!r:.80}")
+        for side in self.size or ():
+            check_integer(side, "size of the image")
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "distortion", numbers)
 
@@ -93,9 +82,7 @@ class Camera:
         Raises:
             InvalidInputError: another aspect ratio than that of the calibration.
         """
-        if self.size is None or self.size == tuple(size):
-            return replace(self, size=size)
-        (h, w), (H, W) = self.size, size
+        (h, w), (H, W) = self.size or size, size
         if abs(w * H / h - W) > 1 and abs(h * W / w - H) > 1:  # sides of resized pictures are rounded
             turned = abs(h * H / w - W) <= 1
             advice = "turn the photograph by 90 degrees" if turned else "give one of uncropped photographs of this size"
@@ -108,10 +95,9 @@ class Camera:
         return replace(self, matrix=scale @ self.matrix, size=size)
 
     def describe(self) -> dict[str, Any]:
-        """Return the attributes as plain JSON; the size as width and height."""
-        H, W = self.size or (None, None)
+        """Return the attributes as plain JSON."""
         attributes = {"matrix": self.matrix.tolist(), "distortion": list(self.distortion), "model": self.model}
-        return {**attributes, "width": W, "height": H}
+        return {**attributes, "size": None if self.size is None else list(self.size)}
 
 
 class Undistorted(NamedTuple):
@@ -149,7 +135,7 @@ def undistorted(image: Tensor, camera: Camera, box: Tensor | None = None, mask: 
         >>> camera = Camera([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]], (-0.3, 0.1, 0, 0))
         >>> seen = undistorted(torch.rand(3, 48, 64), camera, torch.tensor([0.0, 10, 20, 30]))
         >>> seen.image.shape, seen.box.round().tolist()
-        (torch.Size([3, 48, 64]), [-5.0, 9.0, 20.0, 31.0])
+        (torch.Size([3, 48, 64]), [-6.0, 8.0, 20.0, 31.0])
     """
     check_photograph(image, "photograph")
     H, W = size = int(image.shape[-2]), int(image.shape[-1])
@@ -230,10 +216,8 @@ def _undistorted_box(camera: Camera, box: Tensor, size: tuple[int, int]) -> Tens
     (H, W), K, D = size, camera.matrix.numpy(), np.array(camera.distortion)
     check_boxes(box[None].detach().float(), [size])
     x0, y0, x1, y1 = box.detach().cpu().double().tolist()
-    at, one = np.linspace(0.0, 1.0, 50), np.ones(50)
-    x = np.concatenate([x0 + (x1 - x0) * at] * 2 + [x0 * one, x1 * one])
-    y = np.concatenate([y0 * one, y1 * one] + [y0 + (y1 - y0) * at] * 2)
-    outline = np.stack([x, y], axis=1)
+    around, corners = np.linspace(0.0, 4.0, 201), ([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0])
+    outline = np.stack([np.interp(around, range(5), values) for values in corners], axis=1)
     inside = outline.clip([-0.5, -0.5], [W - 0.5, H - 0.5])
     radius, distorted, _ = _growing_radii(camera.distortion, camera.model)
     centre, focal = K[:2, 2], np.diag(K)[:2]

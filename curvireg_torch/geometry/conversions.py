@@ -1,12 +1,8 @@
-"""Conversions between the OpenCV camera and other conventions, and from BOP's symmetries.
+"""Conversions between the OpenCV camera (x right, y down, z forward; the centre of pixel (i, j) is (i, j)) and the
+OpenGL camera (x right, y up, z backward; (i + 0.5, j + 0.5)), of axis-angle vectors, and of BOP's symmetries.
 
-| convention | camera axes | transform | principal point of pixel (i, j)'s centre |
-|---|---|---|---|
-| OpenCV, used here | x right, y down, z forward | ``x_cam = R x + t`` | (i, j) |
-| OpenGL | x right, y up, z backward | ``x_cam = R x + t`` | (i + 0.5, j + 0.5) |
-
-Quaternions are (w, x, y, z), of length 1; axis-angle vectors have the angle, in radians, as their length. All functions
-raise :class:`InvalidInputError` for other shapes and dtypes and for what is no rotation, rigid transform or camera.
+All functions raise :class:`InvalidInputError` for other shapes and dtypes and for what is no rotation, rigid transform
+or camera.
 """
 
 import math
@@ -18,10 +14,10 @@ from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..utils.checks import (
-    as_numbers,
     check_camera_matrix,
     check_fraction,
     check_last_axes,
+    check_numbers,
     check_pose,
     check_rotation,
 )
@@ -87,34 +83,13 @@ def opengl_projection(
     return P
 
 
-def quaternion_from_rotation(R: Tensor) -> Tensor:
-    """(..., 3, 3) rotations to (..., 4) unit quaternions (w, x, y, z); q and -q are the same rotation."""
+def axis_angle_from_rotation(R: Tensor) -> Tensor:
+    """(..., 3, 3) rotations to (..., 3) axis x angle, the angle in radians, at most pi."""
     check_rotation(R, "R")
     from kornia.geometry import conversions  # here, because its import takes 0.3 s
 
-    quaternion: Tensor = conversions.rotation_matrix_to_quaternion(R.contiguous())
-    return quaternion
-
-
-def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
-    """(..., 4) quaternions (w, x, y, z) of any length > 0 to (..., 3, 3) rotations.
-
-    Example:
-        >>> rotation_from_quaternion(torch.tensor([0.0, 0.0, 0.0, 2.0])).diagonal().tolist()
-        [-1.0, -1.0, 1.0]
-    """
-    check_last_axes(quaternion, "quaternion", (4,))
-    from kornia.geometry import conversions
-
-    R: Tensor = conversions.quaternion_to_rotation_matrix(quaternion)
-    return R
-
-
-def axis_angle_from_rotation(R: Tensor) -> Tensor:
-    """(..., 3, 3) rotations to (..., 3) axis x angle, the angle in radians, at most pi."""
-    from kornia.geometry import conversions
-
-    axis_angle: Tensor = conversions.quaternion_to_axis_angle(quaternion_from_rotation(R))
+    quaternion = conversions.rotation_matrix_to_quaternion(R.contiguous())
+    axis_angle: Tensor = conversions.quaternion_to_axis_angle(quaternion)
     return axis_angle
 
 
@@ -169,14 +144,14 @@ def symmetry_transforms(info: Mapping[str, Any], *, max_step_fraction: float = 0
         torch.Size([315, 4, 4])
     """
     check_fraction(max_step_fraction, "max_step_fraction")
-    matrices = [_numbers(matrix, 16, "symmetries_discrete") for matrix in _list(info, "symmetries_discrete")]
+    matrices = [check_numbers(matrix, "symmetries_discrete", 16) for matrix in _list(info, "symmetries_discrete")]
     discrete = torch.stack([torch.eye(4, dtype=torch.float64), *(matrix.view(4, 4) for matrix in matrices)])
     rotations = [discrete[:1]]
     for symmetry in _list(info, "symmetries_continuous"):
         if not isinstance(symmetry, Mapping):
             raise InvalidInputError(f"symmetries_continuous: expected axis and offset, got {symmetry!r:.80}")
-        axis = _numbers(symmetry.get("axis"), 3, "axis")
-        offset = _numbers(symmetry.get("offset", (0.0, 0.0, 0.0)), 3, "offset")
+        axis = check_numbers(symmetry.get("axis"), "axis", 3)
+        offset = check_numbers(symmetry.get("offset", (0.0, 0.0, 0.0)), "offset", 3)
         rotations.append(_axis_rotations(axis, offset, math.ceil(math.pi / max_step_fraction)))
     # (C, 1, 4, 4) @ (D, 4, 4): the discrete symmetry acts first.
     return (torch.cat(rotations).unsqueeze(1) @ discrete).flatten(0, 1)
@@ -187,13 +162,6 @@ def _list(info: Mapping[str, Any], key: str) -> Sequence[Any]:
     if not isinstance(values, list | tuple):
         raise InvalidInputError(f"{key}: expected a list, got {values!r:.80}")
     return values
-
-
-def _numbers(values: Any, count: int, name: str) -> Tensor:
-    numbers = as_numbers(values, name, dtype=torch.float64).flatten()
-    if len(numbers) != count or not bool(numbers.isfinite().all()):
-        raise InvalidInputError(f"{name}: expected {count} finite numbers, got {values!r:.80}")
-    return numbers
 
 
 def _axis_rotations(axis: Tensor, offset: Tensor, count: int) -> Tensor:

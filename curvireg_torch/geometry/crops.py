@@ -10,8 +10,7 @@ from torch import Tensor
 from ..errors import MAX_BOX_COORDINATE, InvalidInputError
 from ..utils.checks import as_boxes, check_integer, check_positive, check_tensor
 
-BLOCK = 16
-"""Samples that are computed by one matrix product: fewer are slow, more multiply by many zeros."""
+SAMPLES_AT_A_TIME = 16  # of a matrix product: fewer are slow, more multiply by many zeros
 
 
 def whole_image_box(image: Tensor) -> Tensor:
@@ -184,7 +183,7 @@ class _Resampling:
         centres, order = self._centres[which].flatten().sort(stable=True)
         widths = self._widths[which].flatten()[order]
         parts = []
-        for centre, width in zip(centres.split(BLOCK), widths.split(BLOCK), strict=True):
+        for centre, width in zip(centres.split(SAMPLES_AT_A_TIME), widths.split(SAMPLES_AT_A_TIME), strict=True):
             low = max(0, int((centre - width).amin()) - self.first)
             high = int((centre + width).amax()) + 1 - self.first
             part = x[:, low:high].to(centres.dtype)

@@ -1,7 +1,6 @@
 """What is known about the pose in advance: ranges of viewpoint and distance, a rotation nearby, which way is up."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -9,23 +8,16 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import as_numbers, check_number, check_option, check_rotation
+from ..utils.checks import as_numbers, check_number, check_numbers, check_option, check_rotation
 from ..utils.choices import SIDE_NAMES, UP_AXES
 from .conversions import axis_angle_from_rotation, rotation_from_axis_angle
 from .viewpoint import rotation_error, rotation_from_viewpoint, up_rotation, viewpoint_from_rotation
 
-__all__ = ["SIDES", "PosePrior", "check_distance", "object_frame"]
-
 SIDES = {name: 45.0 * k for k, name in enumerate(SIDE_NAMES)}
 """Azimuth in degrees from which a side of the object is seen; right and left as in a photograph of its front."""
 
-SIDE_WIDTH = 45.0
-"""Degrees of azimuth to either side of the middle that a named side covers."""
-
-MAX_ROUNDS = 20
-"""Alternating moves into limits that hold together."""
-
-_LIMITS = ("azimuth", "elevation", "theta", "viewpoint", "rotation", "distance")
+SIDE_WIDTH = 45.0  # degrees of azimuth to either side of the middle that a named side covers
+MAX_MOVES = 20  # alternating moves into limits that hold together
 
 
 @dataclass(frozen=True)
@@ -53,8 +45,8 @@ class PosePrior:
     Example:
         >>> prior = PosePrior(azimuth=(300, 60), elevation=(0, 45))
         >>> R = rotation_from_viewpoint(torch.tensor([350.0, 80.0]), 20.0)
-        >>> prior.log_prior(R).tolist()
-        [0.0, -inf]
+        >>> [round(degrees, 1) for degrees in prior.excess(R).tolist()]
+        [-20.0, 18.7]
     """
 
     azimuth: tuple[float, float] | None = None
@@ -67,11 +59,10 @@ class PosePrior:
     front: str | None = None
 
     def __post_init__(self) -> None:
-        for name in ("azimuth", "elevation", "theta", "distance"):
+        for name in ("azimuth", "elevation", "theta", "distance", "viewpoint"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, _numbers(getattr(self, name), name, 2))
-        if self.viewpoint is not None:
-            object.__setattr__(self, "viewpoint", _numbers(self.viewpoint, "viewpoint", 3))
+                numbers = check_numbers(getattr(self, name), name, 3 if name == "viewpoint" else 2)
+                object.__setattr__(self, name, tuple(numbers.tolist()))
         if self.elevation is not None and not -90.0 <= self.elevation[0] <= self.elevation[1] <= 90.0:
             raise InvalidInputError(f"elevation: expected -90 <= low <= high <= 90, got {self.elevation}")
         check_distance(self.distance)
@@ -87,7 +78,7 @@ class PosePrior:
             raise InvalidInputError("within: expected degrees beside rotation or viewpoint, and only there")
         if self.within is not None and not 0.0 < check_number(self.within, "within") <= 180.0:
             raise InvalidInputError(f"within: expected degrees in (0, 180], got {self.within}")
-        if all(getattr(self, name) is None for name in _LIMITS):
+        if not self.to_dict().keys() - {"front"}:
             raise InvalidInputError("prior: expected at least one limit, got none; leave the prior out")
 
     @classmethod
@@ -116,34 +107,19 @@ class PosePrior:
             azimuth, elevation, theta = viewpoint_from_rotation(_in_object_frame(rotations, frame))
             if self.azimuth is not None:
                 worst = torch.maximum(worst, _outside(azimuth, self.azimuth, elevation))
-            if self.elevation is not None:
-                low, high = self.elevation
-                worst = worst if low == -90.0 else torch.maximum(worst, low - elevation)
-                worst = worst if high == 90.0 else torch.maximum(worst, elevation - high)
+            for bound, beyond in zip(self.elevation or (), (1.0, -1.0), strict=False):
+                if beyond * bound > -90.0:  # no pose misses a bound at a pole
+                    worst = torch.maximum(worst, beyond * (bound - elevation))
             if self.theta is not None:
                 worst = torch.maximum(worst, _outside(theta, self.theta, elevation))
         for R in self._centres(rotations, frame):
             worst = torch.maximum(worst, rotation_error(rotations, R) - (self.within or 0.0))
         return worst
 
-    def log_prior(self, rotations: Tensor, frame: Tensor | None = None, *, margin: float = 0.0) -> Tensor:
-        """Return the (...) log prior of (..., 3, 3) rotations: 0 within the limits, ``-inf`` outside.
-
-        Args:
-            rotations: from the mesh file's axes to the camera.
-            frame: (3, 3) of :func:`object_frame`.
-            margin: degrees by which limits are widened, for views that stand for poses around them.
-        """
-        excess = self.excess(rotations, frame)
-        return torch.zeros_like(excess).masked_fill(excess > margin + 1e-4, -torch.inf)
-
     def nearest(self, rotations: Tensor, frame: Tensor | None = None) -> Tensor:
-        """Return (..., 3, 3) rotations moved into the limits; those within them are not changed.
-
-        Each round moves them into one limit after the other; limits that do not meet are missed by the least of them.
-        """
+        """Return (..., 3, 3) rotations moved into the limits, one after the other in rounds; those within stay."""
         moved = rotations
-        for _ in range(MAX_ROUNDS):
+        for _ in range(MAX_MOVES):
             outside = self.excess(moved, frame) > 1e-6
             if not bool(outside.any()):
                 break
@@ -214,16 +190,6 @@ def check_distance(distance: tuple[float, ...] | None) -> None:
 
 def _in_object_frame(rotations: Tensor, frame: Tensor | None) -> Tensor:
     return rotations if frame is None else rotations @ frame.mT.to(rotations)
-
-
-def _numbers(values: Sequence[float], name: str, count: int) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(value) for value in values)
-    except (TypeError, ValueError) as error:
-        raise InvalidInputError(f"{name}: expected {count} numbers, got {values!r}") from error
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise InvalidInputError(f"{name}: expected {count} finite numbers, got {values!r}")
-    return numbers
 
 
 def _position(angle: Tensor, limits: tuple[float, ...]) -> tuple[Tensor, float]:

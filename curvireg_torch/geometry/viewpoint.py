@@ -1,4 +1,4 @@
-"""PASCAL3D+ viewpoint angles, rotations, and the angle between two rotations.
+"""PASCAL3D+ viewpoint angles, their rotations, the angle between two rotations, and samplings of viewpoints.
 
 The PASCAL3D+ camera looks from ``C = d (cos e sin a, -cos e cos a, sin e)`` at the model's origin, with the model's +z
 up in the image, rotated by ``theta`` about the optical axis. With the image's y flipped to OpenCV's that is
@@ -9,12 +9,15 @@ Other shapes and dtypes, and matrices that are no rotations, raise :class:`Inval
 """
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import reduce
 
 import torch
 from torch import Tensor
 
-from ..utils.checks import check_option, check_rotation
+from ..errors import InvalidInputError
+from ..utils.checks import check_integer, check_numbers, check_option, check_positive, check_rotation
 from ..utils.choices import UP_AXES
 
 
@@ -108,3 +111,111 @@ def rotation_error(R1: Tensor, R2: Tensor) -> Tensor:
     check_rotation(R2, "R2")
     chord = torch.linalg.matrix_norm(R1 - R2) / (2.0 * math.sqrt(2.0))
     return torch.rad2deg(2.0 * torch.asin(chord.clamp(max=1.0)))
+
+
+DEFAULT_DISTANCE = 5.0  # of a view in units of the object's radius: docs/experiments.md compares others
+
+
+@dataclass(frozen=True)
+class ViewSphere:
+    """N viewpoints in PASCAL3D+ angles.
+
+    Attributes:
+        azimuth, elevation, theta: (N,) degrees.
+        distance: (N,) camera to object centre, in units of the object's radius (half the diagonal of its box).
+    """
+
+    azimuth: Tensor
+    elevation: Tensor
+    theta: Tensor
+    distance: Tensor
+
+    def __post_init__(self) -> None:
+        shapes = {tuple(v.shape) for v in (self.azimuth, self.elevation, self.theta, self.distance)}
+        if len(shapes) != 1 or self.azimuth.ndim != 1:
+            raise InvalidInputError(f"ViewSphere: expected four tensors of one shape (N,), got shapes {sorted(shapes)}")
+        if not bool((self.distance > 1).all()):
+            raise InvalidInputError("ViewSphere: expected distances > 1 object radius (the camera outside the object)")
+
+    def __len__(self) -> int:
+        return self.azimuth.numel()
+
+    def __getitem__(self, index: Tensor | slice) -> "ViewSphere":
+        return ViewSphere(self.azimuth[index], self.elevation[index], self.theta[index], self.distance[index])
+
+    @property
+    def rotations(self) -> Tensor:
+        """(N, 3, 3) rotations model -> camera."""
+        return rotation_from_viewpoint(self.azimuth, self.elevation, self.theta)
+
+    def for_up(self, up: str) -> "ViewSphere":
+        """Return the same views of an object whose axis ``up`` (:func:`up_rotation`) points up, in its own frame."""
+        if up == "z":
+            return self
+        exact = rotation_from_viewpoint(self.azimuth.double(), self.elevation.double(), self.theta.double())
+        azimuth, elevation, theta = viewpoint_from_rotation(exact @ up_rotation(up).to(exact.device))
+        return ViewSphere(azimuth.to(self.azimuth), elevation.to(self.azimuth), theta.to(self.azimuth), self.distance)
+
+
+def sample_views(
+    *,
+    azimuth_step: float = 10.0,
+    elevations: Sequence[float] = (-10, 0, 10, 20, 30, 40, 50, 60),
+    thetas: Sequence[float] = (0.0,),
+    distances: Sequence[float] = (DEFAULT_DISTANCE,),
+) -> ViewSphere:
+    """Grid of viewpoints; by default of an upright object, seen from the side or from above.
+
+    Args:
+        azimuth_step: degrees; the circle is divided into ``round(360 / azimuth_step)`` equal parts.
+        elevations, thetas: degrees.
+        distances: in units of the object's radius, > 1.
+
+    Returns:
+        All combinations, distance fastest, then theta, azimuth, elevation. Duplicates at the poles stay.
+
+    Raises:
+        InvalidInputError: an empty range, a step that is not positive, or a distance <= 1.
+
+    Example:
+        >>> len(sample_views(azimuth_step=20, elevations=[0, 50], thetas=[-10, 0, 10]))
+        108
+    """
+    count = max(1, round(360.0 / check_positive(azimuth_step, "azimuth_step")))
+    heights = check_numbers(elevations, "elevations")
+    if float(heights.abs().max()) > 90.0:
+        raise InvalidInputError(f"elevations: expected degrees in [-90, 90], got {heights.tolist()}")
+    azimuths = torch.arange(count, dtype=torch.float64) * 360.0 / count
+    axes = [heights, azimuths, check_numbers(thetas, "thetas"), check_numbers(distances, "distances")]
+    elevation, azimuth, theta, distance = (v.flatten().float() for v in torch.meshgrid(*axes, indexing="ij"))
+    return ViewSphere(azimuth, elevation, theta, distance)
+
+
+def uniform_views(
+    count: int, *, thetas: Sequence[float] = (0.0,), distances: Sequence[float] = (DEFAULT_DISTANCE,)
+) -> ViewSphere:
+    """Near-uniform view directions on the sphere, by the Fibonacci spiral.
+
+    No direction is farther than ``157 / sqrt(count)`` degrees from the nearest view (measured for 2 to 3000
+    directions). With thetas in steps of ``s`` degrees no rotation is farther than that + ``s / 2``.
+
+    Args:
+        count: number of view directions; each is combined with every theta and distance.
+        thetas: in-plane rotations in degrees.
+        distances: in units of the object's radius, > 1.
+
+    Raises:
+        InvalidInputError: count < 1, an empty option, or a distance <= 1.
+
+    Example:
+        >>> len(uniform_views(100, thetas=[0, 90, 180, 270]))
+        400
+    """
+    check_integer(count, "count")
+    i = torch.arange(count, dtype=torch.float64)
+    elevations = torch.rad2deg(torch.asin(-1.0 + 2.0 * (i + 0.5) / count))
+    azimuths = (i * 180.0 * (3.0 - math.sqrt(5.0))) % 360.0
+    t, d = check_numbers(thetas, "thetas"), check_numbers(distances, "distances")
+    k, theta, distance = (v.flatten() for v in torch.meshgrid(i, t, d, indexing="ij"))
+    k = k.long()
+    return ViewSphere(azimuths[k].float(), elevations[k].float(), theta.float(), distance.float())

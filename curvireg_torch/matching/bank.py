@@ -14,10 +14,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ..errors import BankError, CurviregError, InvalidInputError, MissingFileError
-from ..geometry.views import ViewSphere
+from ..geometry.viewpoint import ViewSphere
 from ..mesh.colours import SurfaceColours, surface_colours
-from ..mesh.mesh import as_mesh, mesh_radius, mesh_unit
-from ..mesh.up import mesh_up
+from ..mesh.mesh import as_mesh, mesh_radius, mesh_unit, mesh_up
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
 from ..utils.files import tensor_digest, write_tensors
@@ -29,6 +28,9 @@ __all__ = ["FORMAT", "FORMAT_VERSION", "ViewBank", "colour_arrays"]
 FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 5
 RERANKING = "reranking."
 """Prefix of the names of reranking features among a bank's tensors."""
+
+VIEWS_AT_A_TIME = 24
+"""Views that a thread holds in memory, about 60 bytes x image_size^2 each."""
 
 REBUILD = "build it again with 'curvireg bank MESH --out FILE'"
 
@@ -124,10 +126,8 @@ class ViewBank:
         image_size: int | None = None,
         camera: str | None = None,
         renderer: str | DepthRenderer = "auto",
-        settings: BankSettings | None = None,
         pipeline: Pipeline | None = None,
         progress: bool | Callable[[str, int, int], object] = True,
-        chunk_size: int = 24,
         device: torch.device | str = "cpu",
     ) -> "ViewBank":
         """Render, filter and describe every view, in chunks on as many threads as torch may use.
@@ -137,10 +137,8 @@ class ViewBank:
             views: custom viewpoints; default those of the pipeline.
             image_size, camera: instead of the pipeline's.
             renderer: "auto", "embree", "pyrender", "torch" or a :class:`DepthRenderer` of this mesh.
-            settings: instead of the pipeline's ``bank``.
             pipeline: default ``Pipeline()``.
             progress: show a bar; or a callback (stage "bank", views done, views in all) that may raise to cancel.
-            chunk_size: views that a thread holds in memory, about 60 bytes x image_size^2 each.
             device: where views are filtered and described, and where the bank is stored.
 
         Raises:
@@ -155,22 +153,19 @@ class ViewBank:
         """
         mesh, pipeline = as_mesh(mesh), pipeline or Pipeline()
         options: dict[str, Any] = {"image_size": image_size, "camera": camera}
-        settings = replace(settings or pipeline.bank, **{k: v for k, v in options.items() if v is not None})
-        pipeline = replace(pipeline, bank=settings)
+        pipeline = replace(pipeline, bank=replace(pipeline.bank, **{k: v for k, v in options.items() if v is not None}))
         if views is None:
             views = pipeline.views.sphere(mesh_up(mesh))
         elif len(views) == 0:
             raise InvalidInputError("views: expected at least one viewpoint")
         else:
             pipeline = pipeline.with_pose_prior("given")
-        if chunk_size < 1:
-            raise InvalidInputError(f"chunk_size: expected >= 1, got {chunk_size}")
-        describe = ViewDescriber(mesh, settings, renderer=renderer, device=device)
+        describe = ViewDescriber(mesh, pipeline.bank, renderer=renderer, device=device)
         rotations, distances = views.rotations, views.distance * mesh_radius(mesh)
         reranking = {t.name: t.build(None).to(device) for t in pipeline.reranking_terms(len(views))}
 
         def describe_chunk(start: int) -> dict[str, Tensor]:
-            chunk = rotations[start : start + chunk_size], distances[start : start + chunk_size]
+            chunk = rotations[start : start + VIEWS_AT_A_TIME], distances[start : start + VIEWS_AT_A_TIME]
             described = describe(*chunk)
             tensors = vars(described) | {n: _pack(getattr(described, n)) for n in ("points", "silhouettes")}
             return tensors | {
@@ -182,11 +177,11 @@ class ViewBank:
             tqdm(total=len(views), desc="views", unit="view", disable=progress is not True) as bar,
             single_threaded_pool() as pool,
         ):
-            for part in pool.map(describe_chunk, range(0, len(views), chunk_size)):
+            for part in pool.map(describe_chunk, range(0, len(views), VIEWS_AT_A_TIME)):
                 parts.append(part)
                 bar.update(len(part["boxes"]))
                 if callable(progress):
-                    progress("bank", min(chunk_size * len(parts), len(views)), len(views))
+                    progress("bank", sum(len(each["boxes"]) for each in parts), len(views))
         tensors = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
         return cls(mesh, views, pipeline, tensors)
 
@@ -296,30 +291,18 @@ def colour_arrays(mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
 
 def _check_contents(views: ViewSphere, settings: BankSettings, tensors: Mapping[str, Tensor]) -> None:
     """Raise ValueError for contents that no bank has: a checksum only shows that the file was not changed."""
-    N, S = len(views), settings.image_size
-    packed = (N, -(-(S**2) // 8))
-    descriptors, boxes = tensors["descriptors"], tensors["boxes"]
-    shapes = {"descriptors": (N, hog_layer(settings).length), "boxes": (N, 4), "points": packed, "silhouettes": packed}
-    wrong = [name for name, shape in shapes.items() if tuple(tensors[name].shape) != shape]
-    if wrong:
-        raise ValueError(f"{', '.join(wrong)}: not of the shape that the settings say")
-    viewpoints = torch.stack([getattr(views, f.name).double() for f in fields(ViewSphere)])
-    valid: dict[str, Tensor | bool] = {
-        "viewpoints that are not finite": viewpoints.isfinite().all(),
-        "descriptors that are not finite, or all zero": _is_finite(descriptors) and descriptors.any(),
-        "boxes that are empty or not finite": boxes.isfinite().all() and (boxes[:, 2:] > boxes[:, :2]).all(),
-    }
-    for name in (name for name in tensors if name.startswith(RERANKING)):
-        x, message = tensors[name], f"features of {name} that do not fit the views, or are not finite"
-        valid[message] = _is_finite(x) and x.ndim == 2 and len(x) == N
-    for message, passed in valid.items():
-        if not bool(passed):
-            raise ValueError(message)
-
-
-def _is_finite(x: Tensor) -> Tensor:
-    """Whether all half-precision values are finite: their sum in float32 cannot overflow otherwise, and is fast."""
-    return x.sum(dtype=torch.float32).isfinite()
+    N, masks = len(views), -(-(settings.image_size**2) // 8)
+    widths = {"descriptors": hog_layer(settings).length, "boxes": 4, "points": masks, "silhouettes": masks}
+    widths |= {name: tensors[name].shape[-1] for name in tensors if name.startswith(RERANKING)}
+    for name, width in widths.items():
+        x = tensors[name]
+        # A sum in float32 is finite if all half-precision values are, and fast.
+        if x.shape != (N, width) or not bool(x.sum(dtype=torch.float32).isfinite()):
+            raise ValueError(f"{name}: not of the shape that the settings say, or not finite")
+    if not all(bool(getattr(views, f.name).isfinite().all()) for f in fields(ViewSphere)):
+        raise ValueError("viewpoints that are not finite")
+    if not tensors["descriptors"].any() or not (tensors["boxes"][:, 2:] > tensors["boxes"][:, :2]).all():
+        raise ValueError("descriptors that are all zero, or empty boxes")
 
 
 def _pack(mask: Tensor) -> Tensor:

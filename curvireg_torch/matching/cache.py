@@ -6,43 +6,31 @@ import re
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import trimesh
 
 from ..errors import BankError
-from ..geometry.views import ViewSphere
-from ..mesh.mesh import as_mesh, mesh_unit
-from ..mesh.up import mesh_up
+from ..geometry.viewpoint import ViewSphere
+from ..mesh.mesh import as_mesh, mesh_unit, mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..utils.files import code_digest, tensor_digest, text_digest
 from .bank import FORMAT_VERSION, ViewBank, colour_arrays
 
-__all__ = [
-    "CACHE_LIMIT",
-    "CachedBank",
-    "bank_key",
-    "cache_folder",
-    "cached_bank",
-    "clear_cache",
-    "list_cache",
-    "trim_cache",
-]
+__all__ = ["CACHE_LIMIT", "CachedBank", "bank_key", "cache_folder", "cached_bank", "clear_cache", "list_cache"]
 
 CACHE_LIMIT = 2_000_000_000
 """Size limit of the cache in bytes; least recently used banks are removed. ``$CURVIREG_CACHE_LIMIT`` overrides it."""
 
-_ABANDONED = 3600.0  # seconds after which an incomplete file is taken for the remains of a killed process
-_HEADER_LIMIT = 1_000_000  # bytes; a bank's header takes about 2000
-_BANK = re.compile(r"bank-[0-9a-f]{32}\.safetensors")
-_INCOMPLETE = re.compile(_BANK.pattern + r"\.[0-9a-f]{8}\.tmp")
+ABANDONED_SECONDS = 3600.0
+"""Age from which an incomplete file counts as the remains of a killed process."""
 
 _SOURCES = (
     "features",
@@ -57,8 +45,7 @@ _SOURCES = (
 """Code that turns a mesh into described views: a bank that another version of it built is not found."""
 
 
-@dataclass(frozen=True)
-class CachedBank:
+class CachedBank(NamedTuple):
     """A file of the cache: ``path``, ``size`` in bytes, and ``used``, the time of its last use in seconds."""
 
     path: Path
@@ -69,8 +56,8 @@ class CachedBank:
 def cache_folder() -> Path:
     """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else ``~/.cache/curvireg_torch``.
 
-    Banks are stored in its folder ``banks`` as ``bank-<key>.safetensors``. Only files in that folder that have such a
-    name and the header of a bank are ever listed, overwritten or removed.
+    Banks are stored in its folder ``banks`` as ``bank-<32 digits>.safetensors``. Only files in that folder that have
+    such a name are ever listed, overwritten or removed.
     """
     if folder := os.environ.get("CURVIREG_CACHE"):
         return Path(folder)
@@ -136,14 +123,9 @@ def cached_bank(
         return build()
     key = bank_key(mesh, views, pipeline=pipeline, renderer=renderer)
     path = folder / "banks" / f"bank-{key}.safetensors"
-    if _is_bank(path):
-        try:
-            bank = ViewBank.load(path, device=device)
-            if bank_key(bank.mesh, bank.views, pipeline=bank.pipeline, renderer=renderer) != key:
-                raise BankError(f"{path}: holds another bank than its name says")
-        except BankError:  # build it again and replace the file
-            pass
-        else:
+    with suppress(BankError, FileNotFoundError):  # damaged, or not there: build it
+        bank = ViewBank.load(path, device=device)
+        if bank_key(bank.mesh, bank.views, pipeline=bank.pipeline, renderer=renderer) == key:
             with suppress(OSError):  # a read-only cache
                 os.utime(path)
             bank.pipeline = pipeline  # pipelines that differ in ranking or search share a bank
@@ -151,9 +133,6 @@ def cached_bank(
     bank = build()
     bank.pipeline = pipeline
     bank.descriptors = bank.descriptors.half().float()  # as the file stores them, so that both rank alike
-    if os.path.lexists(path) and not _is_bank(path):
-        warnings.warn(f"{path}: not a view bank, so it stays and the bank is not cached; move it away", stacklevel=2)
-        return bank
     try:
         bank.save(path)
     except OSError as error:
@@ -161,7 +140,7 @@ def cached_bank(
         warnings.warn(warning, stacklevel=2)
         return bank
     try:
-        trim_cache(folder, keep=path)
+        _trim(folder, keep=path)
     except OSError as error:  # files may be added to the folder, but not removed
         warning = f"the cache exceeds its limit: {error.filename} cannot be removed ({error.strerror})"
         warnings.warn(warning, stacklevel=2)
@@ -170,56 +149,35 @@ def cached_bank(
 
 def list_cache(folder: Path | None = None) -> list[CachedBank]:
     """The banks of the cache, most recently used first."""
-    banks = []
-    for path in _files(folder or cache_folder(), _BANK):
-        with suppress(FileNotFoundError):  # removed by another process
-            status = path.stat()
-            banks.append(CachedBank(path, status.st_size, status.st_mtime))
-    return sorted(banks, key=lambda bank: bank.used, reverse=True)
+    return [bank for bank in _files(folder or cache_folder()) if bank.path.suffix != ".tmp"]
 
 
 def clear_cache(folder: Path | None = None) -> int:
     """Remove every bank of the cache and incomplete files of killed processes; returns the number of banks."""
-    folder = folder or cache_folder()
-    banks = list_cache(folder)
-    for path in [*(bank.path for bank in banks), *_files(folder, _INCOMPLETE)]:
-        path.unlink(missing_ok=True)
-    return len(banks)
+    files = _files(folder or cache_folder())
+    for file in files:
+        file.path.unlink(missing_ok=True)
+    return sum(file.path.suffix != ".tmp" for file in files)
 
 
-def trim_cache(folder: Path | None = None, *, keep: Path | None = None) -> int:
-    """Remove the least recently used banks, but not ``keep``, until the limit is met; returns how many were removed."""
-    folder, given = folder or cache_folder(), os.environ.get("CURVIREG_CACHE_LIMIT", "")
-    limit = int(given) if given.isdecimal() else CACHE_LIMIT
-    for path in _files(folder, _INCOMPLETE):
-        with suppress(FileNotFoundError):
-            if time.time() - path.stat().st_mtime > _ABANDONED:
-                path.unlink()
-    removed, total = 0, 0
-    for bank in list_cache(folder):
-        total += bank.size
-        if total > limit and bank.path != keep:
-            bank.path.unlink(missing_ok=True)
-            total -= bank.size
-            removed += 1
-    return removed
+def _trim(folder: Path, *, keep: Path) -> None:
+    """Remove the least recently used banks, but not ``keep``, until the limit is met, and abandoned files."""
+    given = os.environ.get("CURVIREG_CACHE_LIMIT", "")
+    limit, total = int(given) if given.isdecimal() else CACHE_LIMIT, 0
+    for file in _files(folder):
+        total += file.size
+        incomplete = file.path.suffix == ".tmp"
+        if (time.time() - file.used > ABANDONED_SECONDS) if incomplete else (total > limit and file.path != keep):
+            file.path.unlink(missing_ok=True)
+            total -= file.size
 
 
-def _files(folder: Path, name: re.Pattern[str]) -> Iterator[Path]:
-    banks = folder / "banks"
-    try:
-        names = os.listdir(banks)
-    except OSError:  # the folder does not exist yet, or cannot be read
-        names = []
-    return (banks / found for found in names if name.fullmatch(found) and _is_bank(banks / found))
-
-
-def _is_bank(path: Path) -> bool:
-    """Whether this safetensors header names this library. An empty file, which a killed process may leave, counts."""
-    try:
-        with path.open("rb") as file:
-            size = file.read(8)
-            header = file.read(min(int.from_bytes(size, "little"), _HEADER_LIMIT))
-        return not size or str(json.loads(header)["__metadata__"]["format"]).startswith("curvireg_torch.")
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return False
+def _files(folder: Path) -> list[CachedBank]:
+    """Banks and incomplete files, most recently used first."""
+    found = []
+    with suppress(OSError):  # the folder does not exist yet, or cannot be read
+        for path in (folder / "banks").iterdir():
+            if re.fullmatch(r"bank-[0-9a-f]{32}\.safetensors(\.[0-9a-f]{8}\.tmp)?", path.name):
+                with suppress(FileNotFoundError):  # removed by another process
+                    found.append(CachedBank(path, path.stat().st_size, path.stat().st_mtime))
+    return sorted(found, key=lambda file: file.used, reverse=True)

@@ -12,16 +12,19 @@ from ..features import HOG, field_points
 from ..geometry.cameras import projected_boxes, transform
 from ..geometry.crops import crop_transforms, image_transforms, square_boxes
 from ..mesh.colours import has_colours
+from ..mesh.edges import simplified
 from ..mesh.mesh import extreme_points, mesh_centre, mesh_radius
 from ..pipeline import DEPTH_FIELDS, BankSettings
-from ..rendering import DepthRenderer, make_renderer, render_colour
+from ..rendering import DepthRenderer, make_renderer, render_colour, shade
 from ..rendering.contours import MeshContours
-from ..rendering.shading import shade
 
 __all__ = ["DescribedViews", "ViewDescriber", "depth_filter", "hog_layer"]
 
 VIEWS_AT_A_TIME = 64
 """Views in memory at a time."""
+
+VIEW_FACES = 8000
+"""Faces to which larger meshes are simplified for views: at 256 px their surface moves by a small part of a pixel."""
 
 EQUAL_VIEWS = 1e-6
 """Tolerance of equal rotations (entries) and distances (relative): 1e-4 px in a view."""
@@ -72,6 +75,8 @@ class DescribedViews:
 class ViewDescriber:
     """Renders, filters and describes arbitrary views of one mesh.
 
+    Framed views are rendered from a mesh of at most :data:`VIEW_FACES` faces; ``renderer`` is one of the whole mesh.
+
     Args:
         mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
         settings, renderer, device: see :meth:`curvireg_torch.ViewBank.build`.
@@ -87,9 +92,13 @@ class ViewDescriber:
     ) -> None:
         self._mesh = mesh
         self._coloured = has_colours(mesh)
-        self.renderer = make_renderer(mesh, renderer, device=device)
+        self.renderer = self.view_renderer = make_renderer(mesh, renderer, device=device)
         self.centre, self.radius, self.hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
         self._device = device
+        if isinstance(renderer, str) and len(mesh.faces) > VIEW_FACES:
+            vertices, faces = simplified(mesh, self.centre.numpy(), VIEW_FACES)
+            simple = trimesh.Trimesh(vertices + self.centre.numpy(), faces, process=False)
+            self.view_renderer = make_renderer(simple, renderer, device=device)
         self._set(settings)
 
     def _set(self, settings: BankSettings) -> None:
@@ -143,18 +152,18 @@ class ViewDescriber:
         """Depth (N, 1, S, S) of the framed views, and their boxes (N, 4)."""
         S = self.settings.image_size
         T, K, boxes = self.cameras(rotations, distances)
-        depth = self.renderer.render(T, K, (S, S), orthographic=self._orthographic)
+        depth = self.view_renderer.render(T, K, (S, S), orthographic=self._orthographic)
         return depth.to(self._device), boxes.to(self._device)
 
     @torch.no_grad()
     def shaded(self, rotations: Tensor, distances: Tensor) -> Tensor:
-        """(N, 1, S, S) grey pictures of the framed views, see :func:`curvireg_torch.rendering.shading.shade`.
+        """(N, 1, S, S) grey pictures of the framed views, see :func:`curvireg_torch.rendering.shade`.
 
         With the mesh's colours (N, 4, S, S): grey, then RGB of :func:`curvireg_torch.rendering.render_colour`.
         """
         S, projection = self.settings.image_size, {"orthographic": self._orthographic}
         T, K, _ = self.cameras(rotations, distances)
-        grey = shade(self.renderer.render(T, K, (S, S), **projection), K, **projection).to(self._device)
+        grey = shade(self.view_renderer.render(T, K, (S, S), **projection), K, **projection).to(self._device)
         if not self._coloured:
             return grey
         colour = render_colour(self._mesh, T, K, (S, S), renderer=self.renderer, **projection)

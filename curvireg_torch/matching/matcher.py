@@ -1,9 +1,9 @@
-"""All views of a bank ranked for every photograph of a batch."""
+"""All views of a bank ranked for every photograph of a batch, and the selection of distinct views."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -21,13 +21,12 @@ from ..terms import (
     photograph_field,
     whole_box_shapes,
 )
-from ..utils.checks import as_boxes, check_photograph, check_pixels
+from ..utils.checks import as_boxes, check_photograph, check_pixels, check_symmetries
 from ..utils.threads import map_on_threads
 from .bank import ViewBank
 from .describe import ViewDescriber, hog_layer
-from .ranking import Ranking, distinct_views
 
-__all__ = ["ViewMatcher"]
+__all__ = ["Ranking", "ViewMatcher", "distinct_views"]
 
 MAX_CACHED_VIEWS = 2048
 """Views whose reranking features are cached, 35 kB each at 128 px."""
@@ -37,6 +36,109 @@ NEAR_TRACE = 1.0 + 3.0**0.5
 
 FEATURES_AT_A_TIME = 16
 """Views whose reranking features are computed at a time."""
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Scores of N views for B photographs.
+
+    Attributes:
+        scores: (B, N) in [0, 1], the product of the terms' scores, each to the power of its weight.
+        order: (B, N) view indices, best first; ties in the order of the bank.
+        terms: name -> (B, N) raw scores of each term: "hog": normalised correlation of descriptors, in [0, 1], or in
+            [-1, 1] if they are whitened; "repeatability": fraction of the photograph's points found in the view; "box":
+            S_box in [0, 1], similarity of the boxes' aspect ratios, best view 1.
+        allowed: (B, N) bool, which views a pose prior leaves; None without one.
+        outside: (B,) best of the other views more than 30 degrees from the best view, -1 if there are none; None
+            without a prior.
+    """
+
+    scores: Tensor
+    order: Tensor
+    terms: Mapping[str, Tensor]
+    allowed: Tensor | None = None
+    outside: Tensor | None = None
+
+    @staticmethod
+    def none() -> "Ranking":
+        """That of a photograph which was compared with no view."""
+        return Ranking(torch.zeros(1, 0), torch.zeros(1, 0, dtype=torch.long), {})
+
+    def __len__(self) -> int:
+        return self.scores.shape[0]
+
+    def __getitem__(self, index: slice) -> "Ranking":
+        """Rankings of some photographs, as copies that do not keep the batch in memory."""
+        return self._of(lambda *parts: parts[0][index].clone(), self)
+
+    @property
+    def hog(self) -> Tensor:
+        """``terms["hog"]``."""
+        return self.terms["hog"]
+
+    @property
+    def repeatability(self) -> Tensor:
+        """``terms["repeatability"]``."""
+        return self.terms["repeatability"]
+
+    def top(self, k: int) -> Tensor:
+        """(B, k) indices of the best views; fewer if the bank is smaller."""
+        return self.order[:, :k]
+
+    @staticmethod
+    def cat(parts: Sequence["Ranking"]) -> "Ranking":
+        """Concatenate rankings of the same views."""
+        return Ranking._of(lambda *tensors: torch.cat(tensors), *parts)
+
+    @staticmethod
+    def _of(make: Callable[..., Tensor], *parts: "Ranking") -> "Ranking":
+        """The ranking each of whose tensors is made of that of the parts."""
+        terms = {name: make(*(part.terms[name] for part in parts)) for name in parts[0].terms}
+        columns = zip(*((p.scores, p.order, p.allowed, p.outside) for p in parts), strict=True)
+        scores, order, allowed, outside = (None if each[0] is None else make(*each) for each in columns)
+        assert scores is not None
+        assert order is not None
+        return Ranking(scores, order, terms, allowed, outside)
+
+
+def distinct_views(
+    order: Tensor,
+    rotations: Tensor,
+    *,
+    count: int,
+    angle: float = 30.0,
+    symmetries: Tensor | None = None,
+) -> Tensor:
+    """Best views that are more than ``angle`` degrees from every better selected one.
+
+    Args:
+        order: (N,) view indices, best first.
+        rotations: (N, 3, 3) of the views.
+        symmetries: (S, 3, 3) or (S, 4, 4) of the model, from :func:`curvireg_torch.geometry.symmetry_transforms`: views
+            that differ by one of them count as the same.
+
+    Returns:
+        (K,) view indices, best first, K <= count.
+
+    Example:
+        >>> R = torch.stack([torch.eye(3), torch.diag(torch.tensor([-1.0, -1.0, 1.0]))])     # 180 degrees about z
+        >>> distinct_views(torch.tensor([1, 0]), R, count=2, symmetries=R).tolist()
+        [1]
+    """
+    symmetries = torch.eye(3)[None] if symmetries is None else symmetries
+    check_symmetries(symmetries)
+    symmetries = symmetries[:, :3, :3].to(rotations)
+    selected: list[int] = []
+    available = torch.ones(len(rotations), dtype=torch.bool, device=order.device)
+    while len(selected) < count and len(candidates := order[available[order]]):
+        best = int(candidates[0])
+        selected.append(best)
+        equivalent = rotations[best] @ symmetries
+        traces = (equivalent.flatten(1) @ rotations.flatten(1).T).amax(dim=0)
+        near = torch.rad2deg(torch.acos((0.5 * (traces - 1.0)).clamp(-1.0, 1.0))) <= angle
+        available &= ~near
+        available[best] = False
+    return torch.tensor(selected, dtype=torch.long, device=order.device)
 
 
 class ViewMatcher(nn.Module):
@@ -182,7 +284,7 @@ class ViewMatcher(nn.Module):
         raw, score = torch.full_like(log, torch.nan), torch.zeros_like(log)
         if len(log) == 0:
             return raw, score
-        module = self._reranking_module(term.name)
+        module = cast(RerankingModule, self._terms[term.name])
         if len(self.bank) <= term.exhaustive_limit:
             raw = module.compare(query, self._reranking_features(term.name, torch.arange(len(self.bank)))).to(log)
             return raw, term.log_score(raw)
@@ -198,11 +300,6 @@ class ViewMatcher(nn.Module):
             score[b] = term.log_score(raw[b : b + 1, index])[0, traces.argmax(dim=1)]
         return raw, score
 
-    def _reranking_module(self, name: str) -> RerankingModule:
-        module = self._terms[name]
-        assert isinstance(module, RerankingModule)
-        return module
-
     def _reranking_features(self, name: str, views: Tensor) -> Tensor:
         """(U, D) features of (U,) ascending views: from the bank, from the cache, or computed and cached."""
         if name in self.bank.reranking_features:
@@ -211,10 +308,11 @@ class ViewMatcher(nn.Module):
         cache = self._feature_cache.setdefault(name, {})
         found = {view: known for view in views.tolist() if (known := cache.get(view)) is not None}
         missing = [view for view in views.tolist() if view not in found]
-        module = self._reranking_module(name)
+        module = cast(RerankingModule, self._terms[name])
 
         def describe(chunk: list[int]) -> Tensor:
-            return module.describe(self._shaded(torch.tensor(chunk, device=self.device)))
+            views = torch.tensor(chunk, device=self.device)
+            return module.describe(self.describer.shaded(self.bank.rotations[views], self.bank.distances[views]))
 
         # One thread per chunk, so that rounding does not depend on which photograph came first.
         chunks = [missing[k : k + FEATURES_AT_A_TIME] for k in range(0, len(missing), FEATURES_AT_A_TIME)]
@@ -237,7 +335,7 @@ class ViewMatcher(nn.Module):
             pictures: (H, C, S, S), of :meth:`ViewDescriber.shaded`.
             image_index: (H,) photograph that each picture is compared with.
         """
-        module, term = self._reranking_module(name), next(t for t in self.terms if t.name == name)
+        module, term = cast(RerankingModule, self._terms[name]), next(t for t in self.terms if t.name == name)
         raw = module.compare(query, module.describe(pictures)).cpu().double()
         out = torch.zeros(len(pictures), dtype=torch.float64)
         for h, b in enumerate(image_index.tolist()):
@@ -245,9 +343,6 @@ class ViewMatcher(nn.Module):
             scores = term.log_score(torch.cat([views[views.isfinite()], raw[b, h : h + 1]])[None])[0]
             out[h] = scores[-1] - scores[:-1].max()  # positive if the pose is more similar than every view
         return out
-
-    def _shaded(self, views: Tensor) -> Tensor:
-        return self.describer.shaded(self.bank.rotations[views], self.bank.distances[views])
 
     @cached_property
     def describer(self) -> ViewDescriber:

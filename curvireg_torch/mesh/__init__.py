@@ -1,9 +1,8 @@
 """Meshes: files of several formats become one trimesh with metadata for unit, up axis and colours."""
 
 from .colours import SurfaceColours, has_colours, surface_colours
-from .mesh import as_mesh, load_mesh, mesh_centre, mesh_radius, mesh_unit, normalization_transform
+from .mesh import as_mesh, load_mesh, mesh_centre, mesh_radius, mesh_unit, mesh_up
 from .symmetry import mesh_symmetries
-from .up import mesh_up, with_z_up
 
 __all__ = [
     "SurfaceColours",
@@ -15,7 +14,5 @@ __all__ = [
     "mesh_symmetries",
     "mesh_unit",
     "mesh_up",
-    "normalization_transform",
     "surface_colours",
-    "with_z_up",
 ]

@@ -1,7 +1,7 @@
 """Surface colours of a mesh, from its textures, materials, faces or vertices."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,21 +54,22 @@ class SurfaceColours:
             raise ValueError("colours that do not match the mesh")
 
     @classmethod
-    def plain(cls, faces: int, colour: Sequence[int] = (_PLAIN,) * 3) -> "SurfaceColours":
+    def plain(cls, faces: int, colour: Any = (_PLAIN,) * 3) -> "SurfaceColours":
         """One colour everywhere, white by default."""
         corners = np.broadcast_to(np.array(colour, np.uint8), (faces, 3, 3))
         return cls(corners, np.zeros((faces, 3, 2), np.float32), np.full(faces, -1, np.int32))
 
     @classmethod
     def concatenate(cls, parts: Sequence["SurfaceColours"]) -> "SurfaceColours":
-        """The colours of a mesh that is made of several."""
-        first = np.cumsum([0] + [len(part.textures) for part in parts])
-        texture = [np.where(part.texture < 0, -1, part.texture + k) for part, k in zip(parts, first, strict=False)]
+        """The colours of a mesh that is made of several, which may share textures."""
+        textures = {id(texture): texture for part in parts for texture in part.textures}
+        number = {key: k for k, key in enumerate(textures)}
+        texture = [np.array([*(number[id(t)] for t in part.textures), -1])[part.texture] for part in parts]
         return cls(
             np.concatenate([part.corners for part in parts]),
             np.concatenate([part.uv for part in parts]),
             np.concatenate(texture).astype(np.int32),
-            tuple(texture for part in parts for texture in part.textures),
+            tuple(textures.values()),
         )
 
     def at(self, face: NDArray[np.int32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -94,6 +95,28 @@ def surface_colours(mesh: Any) -> SurfaceColours | None:
 
     They come from ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else from ``mesh.visual``.
     """
+    return _surface_colours(mesh, _Textures())
+
+
+def colours_of_parts(meshes: Iterable[Any], *, close: bool = False) -> list[SurfaceColours | None]:
+    """:func:`surface_colours` of each mesh; None, with a warning, where they cannot be used.
+
+    A texture is decoded once, however many meshes share it. ``close`` frees its picture then.
+    """
+    textures, found = _Textures(close=close), []
+    for mesh in meshes:
+        try:
+            colours = _surface_colours(mesh, textures)
+            if colours is not None and len(colours) != len(mesh.faces):
+                raise ValueError(f"{len(colours)} for {len(mesh.faces)} faces")
+        except Exception as error:  # files may hold anything
+            warnings.warn(f"the mesh's colours cannot be used ({error}); it is drawn in grey", stacklevel=2)
+            colours = None
+        found.append(colours)
+    return found
+
+
+def _surface_colours(mesh: Any, textures: "_Textures") -> SurfaceColours | None:
     colours = mesh.metadata.get("colours")
     if isinstance(colours, SurfaceColours) and len(colours) == len(mesh.faces):
         return colours
@@ -107,27 +130,51 @@ def surface_colours(mesh: Any) -> SurfaceColours | None:
     if visual.kind != "texture":
         return None
     material = visual.material
-    factor = getattr(material, "baseColorFactor", None)
     image = getattr(material, "image", None)  # beside an image, exporters of OBJ write any colour
     image = getattr(material, "baseColorTexture", None) if image is None else image
-    texture = None if image is None or visual.uv is None else _texture(image)
+    factor = getattr(material, "baseColorFactor", None)
+    colour = material.main_color[:3] if factor is None else _encoded(factor[:3])
+    texture = None if image is None or visual.uv is None else textures(image)
     if texture is not None:
-        tint = SurfaceColours.plain(len(faces), (_PLAIN,) * 3 if factor is None else factor[:3])
+        tint = SurfaceColours.plain(len(faces), (_PLAIN,) * 3 if factor is None else colour)
         uv = np.nan_to_num(np.asarray(visual.uv, np.float32), posinf=0.0, neginf=0.0)[faces][..., :2]
         return SurfaceColours(tint.corners, uv, np.zeros(len(faces), np.int32), (texture,))
-    colour = tuple(int(c) for c in np.asarray(material.main_color)[:3])
-    return None if colour == _UNSET else SurfaceColours.plain(len(faces), colour)
+    unset = factor is None and tuple(colour) == _UNSET
+    return None if unset else SurfaceColours.plain(len(faces), colour)
 
 
-def _texture(image: Any) -> NDArray[np.uint8] | None:
-    """(h, w, 3) uint8 of a PIL image, transparent texels white; None, with a warning, if it cannot be used."""
-    try:
-        if image.width * image.height > MAX_IMAGE_PIXELS:
-            raise ValueError(f"{image.width} x {image.height} px are too many")
-        rgba = np.asarray(image.convert("RGBA"), np.uint8)
-    except Exception as error:  # decoders raise anything
-        warnings.warn(f"a texture cannot be read ({error}); its faces are drawn in their plain colour", stacklevel=2)
-        return None
+def _encoded(linear: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """sRGB of a colour whose bytes are linear, as factors in glTF are."""
+    x = np.asarray(linear, np.float64) / 255
+    srgb = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+    return np.asarray((255 * srgb).round(), np.uint8)
+
+
+class _Textures:
+    """(h, w, 3) uint8 of PIL images, each decoded once; transparent texels are white. None, with a warning, if one
+    cannot be used."""
+
+    def __init__(self, *, close: bool = False) -> None:
+        self._close, self._known = close, dict[int, tuple[Any, NDArray[np.uint8] | None]]()
+
+    def __call__(self, image: Any) -> NDArray[np.uint8] | None:
+        if id(image) not in self._known:
+            try:
+                texture = _texture(image)
+            except Exception as error:  # decoders raise anything
+                message = f"a texture cannot be read ({error}); its faces are drawn in their plain colour"
+                warnings.warn(message, stacklevel=2)
+                texture = None
+            if self._close:
+                image.close()
+            self._known[id(image)] = image, texture  # the image, so that no other one gets its id
+        return self._known[id(image)][1]
+
+
+def _texture(image: Any) -> NDArray[np.uint8]:
+    if image.width * image.height > MAX_IMAGE_PIXELS:
+        raise ValueError(f"{image.width} x {image.height} px are too many")
+    rgba = np.asarray(image.convert("RGBA"), np.uint8)
     shrink = TEXTURE_SIDE / max(rgba.shape[:2])
     if shrink < 1:
         size = max(1, round(rgba.shape[1] * shrink)), max(1, round(rgba.shape[0] * shrink))

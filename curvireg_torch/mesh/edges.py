@@ -6,7 +6,7 @@ import fast_simplification
 import numpy as np
 import trimesh
 
-__all__ = ["MeshEdges"]
+__all__ = ["MeshEdges", "simplified"]
 
 WELD = 1e-6
 """Vertices nearer than this fraction of the mesh's longest side are one."""
@@ -46,13 +46,7 @@ class MeshEdges:
     """
 
     def __init__(self, mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int) -> None:
-        vertices, faces = _welded(np.asarray(mesh.vertices, np.float64) - centre, np.asarray(mesh.faces))
-        if len(faces) > max_faces:
-            points, triangles = fast_simplification.simplify(
-                vertices.astype(np.float32), faces.astype(np.int32), target_count=max_faces
-            )
-            vertices, faces = _welded(points.astype(np.float64), triangles)
-        self.vertices, self.faces = vertices, faces
+        self.vertices, self.faces = vertices, faces = simplified(mesh, centre, max_faces)
         a, b, c = (vertices[faces[:, k]] for k in range(3))
         self._plane = np.cross(b - a, c - a)  # length: twice the area
         self._offset = (self._plane * a).sum(axis=1)
@@ -104,6 +98,22 @@ class MeshEdges:
         for other in others:
             all_same &= first == other
         return all_same, np.where(first, 1.0, -1.0)
+
+
+def simplified(mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float64 relative to ``centre`` and faces (F, 3) of a mesh, welded, F at most about ``max_faces``.
+
+    Example:
+        >>> len(simplified(trimesh.creation.icosphere(4), np.zeros(3), 1000)[1])
+        1000
+    """
+    vertices, faces = _welded(np.asarray(mesh.vertices, np.float64) - centre, np.asarray(mesh.faces))
+    if len(faces) <= max_faces:
+        return vertices, faces
+    points, triangles = fast_simplification.simplify(
+        vertices.astype(np.float32), faces.astype(np.int32), target_count=max_faces
+    )
+    return _welded(points.astype(np.float64), triangles)
 
 
 def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

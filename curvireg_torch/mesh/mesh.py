@@ -1,4 +1,4 @@
-"""Mesh files to one cleaned ``trimesh.Trimesh``, its measures, and a normalised model frame."""
+"""One clean ``trimesh.Trimesh`` from files, scenes and meshes, and its measures."""
 
 import math
 import warnings
@@ -11,15 +11,13 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from ..errors import MAX_MESH_COORDINATE, MAX_MESH_FACES, MIN_MESH_EXTENT, CurviregWarning, MeshError, MissingFileError
 from ..utils.checks import check_option
 from ..utils.choices import MESHES, UNITS, UP_AXES
-from .colours import SurfaceColours, surface_colours
+from .colours import SurfaceColours, colours_of_parts
 from .files import read_mesh
-from .up import format_up, mesh_up
 
 
 def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = None) -> trimesh.Trimesh:
@@ -67,14 +65,14 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
         return load_mesh(source)
     if isinstance(source, trimesh.Scene):
         try:
-            parts = _placed_parts(source)
-            source = _concatenate(parts) if parts else None
+            source, colours = _joined(source)
         except Exception as error:  # singular transforms, unconnected parts, malformed vertices
             raise MeshError(f"its parts cannot be put together ({error}); re-export the file", subject=name) from error
+    elif isinstance(source, trimesh.Trimesh):
+        (colours,) = colours_of_parts([source])
     if not isinstance(source, trimesh.Trimesh):
-        raise MeshError(_NO_FACES, subject=name)
+        raise MeshError("expected a mesh with faces, got none; points and curves cannot be rendered", subject=name)
     triangles, is_degenerate = _checked_triangles(source, name)
-    colours = _colours(source)
     vertices, faces = np.asarray(source.vertices, dtype=np.float64), triangles[~is_degenerate]
     mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
     mesh.remove_unreferenced_vertices()
@@ -87,16 +85,15 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
     return mesh
 
 
-_MANY_POINTS = 4096  # of a hull: to project more of them in every view costs more than to cast the rays
-
-_NO_FACES = "expected a mesh with faces, got none; point clouds and curves cannot be rendered"
+MANY_POINTS = 4096
+"""Points of a hull: to project more of them in every view costs more than to cast the rays."""
 
 
 def _checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """(F, 3) faces, and (F,) whether a face has no area."""
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     if len(faces) == 0:
-        raise MeshError(_NO_FACES, subject=name)
+        raise MeshError("expected a mesh with faces, got none; points and curves cannot be rendered", subject=name)
     if len(faces) > MAX_MESH_FACES:
         raise MeshError(f"{len(faces):,} faces, more than {MAX_MESH_FACES:,}; simplify it", subject=name)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
@@ -138,11 +135,24 @@ def mesh_unit(mesh: trimesh.Trimesh) -> str | None:
     return next((unit for unit, length in UNITS.items() if math.isclose(metres, length, rel_tol=1e-6)), None)
 
 
-def _placed_parts(scene: trimesh.Scene) -> list[trimesh.Trimesh]:
-    """The transformed meshes of a scene: ``scene.dump()`` takes time with the cube of a part's depth."""
+def format_up(suffix: str) -> str:
+    """The axis that points up in files of a format: y in glTF, by its specification; else z, as in CAD."""
+    return "y" if suffix.lower() in (".glb", ".gltf") else "z"
+
+
+def mesh_up(mesh: trimesh.Trimesh) -> str:
+    """The axis that :func:`load_mesh` noted, "z" for meshes from elsewhere; mesh and poses stay in the file's frame."""
+    return str(mesh.metadata.get("up", "z"))
+
+
+def _joined(scene: trimesh.Scene) -> tuple[trimesh.Trimesh | None, SurfaceColours | None]:
+    """One mesh of the meshes of a scene, at their places: ``scene.dump()`` takes time with the cube of a part's depth,
+    and would pack textures into one that cannot repeat."""
+    geometry = {name: part for name, part in scene.geometry.items() if isinstance(part, trimesh.Trimesh)}
+    colours = dict(zip(geometry, colours_of_parts(geometry.values()), strict=True))
     forest = scene.graph.transforms
     world = {scene.graph.base_frame: np.eye(4)}
-    parts = []
+    parts, found = [], []
     for node in scene.graph.nodes_geometry:
         path = [node]
         while path[-1] not in world and path[-1] in forest.parents:
@@ -151,33 +161,18 @@ def _placed_parts(scene: trimesh.Scene) -> list[trimesh.Trimesh]:
             world[path[-1]] = scene.graph.get(path[-1])[0]
         for child, parent in zip(path[-2::-1], path[:0:-1], strict=True):
             world[child] = world[parent] @ forest.edge_data[parent, child].get("matrix", np.eye(4))
-        part = scene.geometry[forest.node_data[node]["geometry"]]
-        if isinstance(part, trimesh.Trimesh):
-            parts.append(part.copy().apply_transform(world[node]))
-    return parts
-
-
-def _colours(mesh: trimesh.Trimesh) -> SurfaceColours | None:
-    try:
-        colours = surface_colours(mesh)
-        if colours is not None and len(colours) != len(mesh.faces):
-            raise ValueError(f"{len(colours)} for {len(mesh.faces)} faces")
-        return colours
-    except Exception as error:  # files may hold anything
-        warnings.warn(f"the mesh's colours cannot be used ({error}); it is drawn in grey", stacklevel=2)
-        return None
-
-
-def _concatenate(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """One mesh of several. Their textures stay apart: trimesh would pack them into one that cannot repeat."""
-    colours = [_colours(part) for part in parts]
-    for part in parts:
-        part.visual = trimesh.visual.ColorVisuals()
+        name = forest.node_data[node]["geometry"]
+        if name in geometry:
+            bare = trimesh.Trimesh(geometry[name].vertices, geometry[name].faces, process=False)
+            parts.append(bare.apply_transform(world[node]))
+            found.append(colours[name])
+    if not parts:
+        return None, None
     mesh = trimesh.util.concatenate(parts)
-    if any(c is not None for c in colours):
-        known = [c or SurfaceColours.plain(len(part.faces)) for c, part in zip(colours, parts, strict=True)]
-        mesh.metadata["colours"] = SurfaceColours.concatenate(known)
-    return mesh
+    if all(each is None for each in found):
+        return mesh, None
+    known = [each or SurfaceColours.plain(len(part.faces)) for each, part in zip(found, parts, strict=True)]
+    return mesh, SurfaceColours.concatenate(known)
 
 
 def extreme_points(mesh: trimesh.Trimesh) -> Tensor:
@@ -186,10 +181,12 @@ def extreme_points(mesh: trimesh.Trimesh) -> Tensor:
     Of more than 4096 of them, those that are outermost in one of 2562 directions of the object scaled to equal extents:
     sides of boxes move by about 0.1 % of their length at most.
     """
+    from scipy.spatial import ConvexHull, QhullError
+
     points = np.array(mesh.vertices, dtype=np.float64)
     with suppress(QhullError, ValueError):  # flat objects, and fewer than four points
         points = points[ConvexHull(points).vertices]
-    if len(points) > _MANY_POINTS:
+    if len(points) > MANY_POINTS:
         directions = trimesh.creation.icosphere(subdivisions=4).vertices
         scaled, _, _ = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
         outermost = [(some @ scaled.T).argmax(axis=1) for some in np.array_split(directions, 32)]  # bounded memory
@@ -210,35 +207,3 @@ def mesh_centre(mesh: trimesh.Trimesh) -> Tensor:
 def mesh_radius(mesh: trimesh.Trimesh) -> float:
     """Half the diagonal of the axis-aligned box, in model units."""
     return 0.5 * float(np.linalg.norm(mesh.extents))
-
-
-def normalization_transform(mesh: trimesh.Trimesh, *, align_axes: bool = False) -> Tensor:
-    """(4, 4) float64 similarity from the model's frame to a normalised frame.
-
-    The area-weighted centroid goes to the origin and the farthest vertex to distance 1. With ``align_axes`` (the
-    paper's normalisation) the principal axes of the surface go to x, y, z in decreasing order of variance. The third
-    moments of the surface along x and y are positive; z completes a right-handed frame.
-
-    Example:
-        >>> T = normalization_transform(trimesh.creation.box((2.0, 4.0, 4.0)))
-        >>> round(1 / float(T[0, 0]), 6)                                        # half the diagonal
-        3.0
-    """
-    corners = np.asarray(mesh.triangles, dtype=np.float64)
-    area = np.asarray(mesh.area_faces, dtype=np.float64)
-    centroid = np.average(corners.mean(axis=1), axis=0, weights=area)
-    R = np.eye(3)
-    if align_axes:
-        # Edge midpoints integrate the second moments of a triangle exactly.
-        points = (0.5 * (corners + np.roll(corners, 1, axis=1)) - centroid).reshape(-1, 3)
-        weights = np.repeat(area / area.sum() / 3.0, 3)
-        _, axes = np.linalg.eigh((points * weights[:, None]).T @ points)
-        R = axes.T[::-1].copy()
-        third = ((points @ R.T) ** 3 * weights[:, None]).sum(axis=0)
-        R[:2] *= np.where(third[:2] < 0, -1.0, 1.0)[:, None]
-        R[2] = np.cross(R[0], R[1])
-    scale = 1.0 / np.linalg.norm(mesh.vertices - centroid, axis=1).max()
-    T = np.eye(4)
-    T[:3, :3] = scale * R
-    T[:3, 3] = -scale * (R @ centroid)
-    return torch.from_numpy(T)

@@ -9,8 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..filters.derivatives import central_gradient, smooth
-from ..filters.inputs import fill_missing
+from ..filters.operations import central_gradient, fill_missing, smooth
 from ..geometry.crops import crop_transforms, image_transforms, square_boxes
 from ..rendering.contours import ContourPoints, MeshContours
 from ..terms import crop_regions

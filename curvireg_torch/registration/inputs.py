@@ -148,13 +148,10 @@ def image_item(
     """One photograph in any form, with its (4,) box (None: that of the mask, or the whole image), however small."""
     pixels, notes = _pixels(image), []
     box = None if box is None else box.detach().float().cpu()
-    if mask is not None:
-        mask = _object_mask(mask, pixels)
-        if _looks_inverted(mask):
-            notes.append(
-                "the mask covers most of the photograph and of its border; the object must be white, not black"
-            )
-    missing = None
+    mask = None if mask is None else _object_mask(mask, pixels)
+    if mask is not None and _looks_inverted(mask):
+        notes.append("the mask covers most of the photograph and of its border; the object must be white, not black")
+    missing = torch.zeros(pixels.shape[-2:], dtype=torch.bool)
     if isinstance(camera, Camera):
         camera = camera.at((pixels.shape[-2], pixels.shape[-1]))
         pixels, box, mask, missing = undistorted(pixels, camera, box, mask)
@@ -163,7 +160,7 @@ def image_item(
         box = _box_of_mask(mask, box)
     box = whole_image_box(pixels).cpu() if box is None else box
     item = ImageItem(pixels, box, camera, prior, mask)
-    if missing is not None and (share := float(_inside(missing, box).float().mean())) > MISSING_SHARE:
+    if (share := float(_inside(missing, box).float().mean())) > MISSING_SHARE:
         notes.append(f"{100 * share:.0f} % of the box lie where the distorted photograph shows nothing")
     return replace(item, notes=tuple(notes))
 

@@ -8,8 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..geometry.cameras import projected_boxes, rotation_towards
-from ..geometry.translation import pose_from_box
+from ..geometry.cameras import pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
 from .contour_fit import ContourFit, contour_support, fit_contours
 from .result import Hypothesis

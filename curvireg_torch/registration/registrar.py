@@ -15,7 +15,7 @@ from ..errors import CurviregError, InvalidInputError
 from ..features.learned_field import LearnedCurvilinearSaliency
 from ..geometry.crops import box_iou
 from ..geometry.pose_prior import PosePrior
-from ..geometry.views import ViewSphere
+from ..geometry.viewpoint import ViewSphere
 from ..matching import Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
 from ..mesh import has_colours, mesh_symmetries
 from ..pipeline import BankSettings, Pipeline

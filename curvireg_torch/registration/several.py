@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError, LostObjectError
-from ..filters.inputs import fill_missing
+from ..filters.operations import fill_missing
 from ..geometry.cameras import rotation_towards, transform
 from ..geometry.crops import box_iou, crop_transforms, square_boxes
 from ..terms import Appearance, QueryFeatures, crop_regions

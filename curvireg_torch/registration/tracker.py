@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..errors import LostObjectError
-from ..filters.inputs import fill_missing
+from ..filters.operations import fill_missing
 from ..geometry import rotation_error
 from ..geometry.cameras import projected_boxes, transform
 from ..geometry.crops import crop_transforms, square_boxes

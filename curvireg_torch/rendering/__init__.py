@@ -1,7 +1,6 @@
 """Depth images of meshes behind one protocol; every backend samples the pixel's centre."""
 
-from .colour import render_colour
-from .factory import BACKENDS, make_renderer, render_depth
-from .protocol import DepthRenderer
+from .colour import render_colour, shade
+from .depth import DepthRenderer, make_renderer, render_depth
 
-__all__ = ["BACKENDS", "DepthRenderer", "make_renderer", "render_colour", "render_depth"]
+__all__ = ["DepthRenderer", "make_renderer", "render_colour", "render_depth", "shade"]

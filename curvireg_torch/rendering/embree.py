@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..mesh.mesh import box_corners, extreme_points, mesh_centre, mesh_radius
 from ..utils.threads import for_each
-from .protocol import NEAREST, check_render_arguments
+from .depth import NEAREST, check_render_arguments
 
 __all__ = ["EmbreeRenderer", "RayScene"]
 
@@ -33,23 +33,12 @@ class RayScene:
         distance[distance >= _MISS] = np.inf
         return distance
 
-    def hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """:meth:`distance`, the triangle hit (N,), and its normal (N, 3) of arbitrary length and sign."""
-        found, distance = self._intersect(origins, directions)
-        return distance, found["primID"], found["Ng"]
-
-    def barycentric_hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
+    def hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
         """The first triangle hit (N,), -1 for none; barycentric u, v (N,) of its corners 2 and 3; the distance."""
-        found, distance = self._intersect(origins, directions)
-        return np.where(np.isfinite(distance), found["primID"], -1), found["u"], found["v"], distance
-
-    def _intersect(self, origins: np.ndarray, directions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
         found = self._scene.run(_float32(origins), _float32(directions), query="INTERSECT", output=True)
-        return found, np.where(found["tfar"] < _MISS, found["tfar"], np.inf)
-
-    def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(N,) bool: rays that hit anything."""
-        return np.asarray(self._scene.run(_float32(origins), _float32(directions), query="OCCLUDED") >= 0)
+        missed = found["tfar"] >= _MISS
+        face, distance = np.where(missed, -1, found["primID"]), np.where(missed, np.inf, found["tfar"])
+        return face, found["u"], found["v"], distance
 
 
 def _float32(x: np.ndarray) -> np.ndarray:
@@ -102,7 +91,7 @@ class EmbreeRenderer:
         def cast(i: int) -> None:
             if rays := self._rays(T[i], K[i], size, orthographic):
                 mask, starts, directions, near = rays
-                face[i][mask], u[i][mask], v[i][mask], along = self._scene.barycentric_hits(starts, directions)
+                face[i][mask], u[i][mask], v[i][mask], along = self._scene.hits(starts, directions)
                 depth[i][mask] = self._depth(along, near)
 
         for_each(len(T), cast)

@@ -1,42 +1,19 @@
 """Ranking terms: scores of views for photographs, and what photographs are described by."""
 
-from .query import QueryFeatures, crop_regions, jittered_boxes, photograph_field
-from .scores import (
-    Whitening,
-    box_shape_score,
-    box_shapes,
-    dilate_points,
-    ledoit_wolf,
-    normalized_correlation,
-    repeatability,
-    repeatability_score,
-    unit_score,
-    whole_box_shapes,
-)
-from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, RerankingModule, RerankingTerm, Term, Views
-
-__all__ = [
-    "TERMS",
-    "Appearance",
-    "BoxShape",
-    "Correlation",
-    "QueryFeatures",
-    "Repeatability",
-    "RerankingModule",
-    "RerankingTerm",
-    "Term",
-    "Views",
-    "Whitening",
-    "box_shape_score",
-    "box_shapes",
-    "crop_regions",
-    "dilate_points",
-    "jittered_boxes",
-    "ledoit_wolf",
-    "normalized_correlation",
-    "photograph_field",
-    "repeatability",
-    "repeatability_score",
-    "unit_score",
-    "whole_box_shapes",
-]
+from .query import QueryFeatures as QueryFeatures
+from .query import box_shapes as box_shapes
+from .query import crop_regions as crop_regions
+from .query import jittered_boxes as jittered_boxes
+from .query import photograph_field as photograph_field
+from .query import whole_box_shapes as whole_box_shapes
+from .terms import TERMS as TERMS
+from .terms import Appearance as Appearance
+from .terms import BoxShape as BoxShape
+from .terms import Correlation as Correlation
+from .terms import Repeatability as Repeatability
+from .terms import RerankingModule as RerankingModule
+from .terms import RerankingTerm as RerankingTerm
+from .terms import Term as Term
+from .terms import Views as Views
+from .terms import Whitening as Whitening
+from .terms import ledoit_wolf as ledoit_wolf

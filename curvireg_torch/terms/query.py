@@ -8,11 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError
-from ..filters.inputs import fill_missing, may_have_missing, missing_mask, to_grey
+from ..filters.operations import fill_missing, may_have_missing, missing_mask, to_grey
 from ..geometry.crops import check_boxes, crop_squares, square_boxes
 from ..utils.checks import as_numbers, check_photograph, check_tensor
 
-__all__ = ["QueryFeatures", "crop_regions", "jittered_boxes", "photograph_field"]
+BORDER_DISTANCE = 0.01  # of a box cut off by the image's border, as a fraction of its longer side, plus 1 px
 
 _JITTER = ((0, 0, 0), (-0.75, 0, 0), (0.75, 0, 0), (0, -0.75, 0), (0, 0.75, 0), (0, 0, -1), (0, 0, 1))
 """Shifts in x and y in units of the box jitter, and the exponent of the scale."""
@@ -114,3 +114,27 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
         cut = crop_squares(image, square_boxes(each, margin), size).to(boxes.device)
         crops.append(cut.expand(-1, channels, -1, -1))
     return torch.stack(crops)
+
+
+def box_shapes(boxes: Tensor) -> Tensor:
+    """(...,) log of width / height of (..., 4) boxes x0, y0, x1, y1.
+
+    Example:
+        >>> box_shapes(torch.tensor([0.0, 0.0, 10.0, 10.0])).item()
+        0.0
+    """
+    sides = boxes[..., 2:] - boxes[..., :2]
+    return torch.log(sides[..., 0] / sides[..., 1])
+
+
+def whole_box_shapes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
+    """(B,) shapes of (B, 4) boxes in px in images of ``sizes`` (H, W); NaN if the border may cut the object off.
+
+    Example:
+        >>> whole_box_shapes(torch.tensor([[9.0, 9, 19, 19], [-0.5, 9, 19, 19]]), [(48, 64)] * 2).tolist()
+        [0.0, nan]
+    """
+    end = torch.tensor([[W, H] for H, W in sizes], dtype=boxes.dtype, device=boxes.device).view(-1, 2) - 0.5
+    border = 1.0 + BORDER_DISTANCE * (boxes[:, 2:] - boxes[:, :2]).amax(dim=1, keepdim=True)
+    inside = (boxes[:, :2] > -0.5 + border).all(dim=1) & (boxes[:, 2:] < end - border).all(dim=1)
+    return torch.where(inside, box_shapes(boxes), torch.nan)

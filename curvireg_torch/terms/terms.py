@@ -1,47 +1,23 @@
 """Ranking terms: each compares photographs with views; the ranking multiplies them."""
 
-import math
+import functools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
+import cv2
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError
-from ..features.appearance import describe, similarity
-from ..features.backbone import SHA256, Backbone
-from ..utils.checks import check_option, check_positive
+from ..features.backbone import SHA256, Backbone, describe, similarity
+from ..utils.checks import check_integer, check_option, check_positive, check_tensor
 from ..utils.threads import map_on_threads
-from .query import QueryFeatures
-from .scores import (
-    REPEATABILITY_MODES,
-    VIEWS_AT_A_TIME,
-    Whitening,
-    box_shapes,
-    cell_counts,
-    check_box_shapes,
-    dilate_points,
-    inner_products,
-    ledoit_wolf,
-    log_repeatability_score,
-    log_unit_score,
-    matched_fraction,
-    shape_scores,
-)
+from .query import QueryFeatures, box_shapes
 
-__all__ = [
-    "TERMS",
-    "Appearance",
-    "BoxShape",
-    "Correlation",
-    "Repeatability",
-    "RerankingModule",
-    "RerankingTerm",
-    "Term",
-    "Views",
-]
+VIEWS_AT_A_TIME = 64  # whose points are compared
 
 
 class Views(Protocol):
@@ -73,8 +49,7 @@ class Term(ABC):
     weight: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.weight) and self.weight >= 0):
-            raise InvalidInputError(f"{self.name}: weight: expected a number >= 0, got {self.weight}")
+        check_positive(self.weight, f"{self.name}: weight", zero_ok=True)
 
     @abstractmethod
     def build(self, views: Views) -> nn.Module:
@@ -90,8 +65,8 @@ class RerankingTerm(Term):
     """A term that needs a picture of every view that it compares.
 
     A bank of up to ``exhaustive_limit`` views stores the features of all its views. In a larger bank the term compares
-    only the best distinct views of the other terms and computes their features on demand; every other view gets the
-    score of the nearest compared view, and NaN as raw score.
+    only the best distinct views of the other terms; every other view gets the score of the nearest compared view, and
+    NaN as raw score.
 
     Attributes:
         exhaustive_limit: largest number of views that are all compared.
@@ -105,10 +80,8 @@ class RerankingTerm(Term):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(self.min_angle, "min_angle", zero_ok=True)
-        if self.top < 1 or self.exhaustive_limit < 0:
-            raise InvalidInputError(
-                f"{self.name}: expected top >= 1 and exhaustive_limit >= 0, got {self.top} and {self.exhaustive_limit}"
-            )
+        check_integer(self.top, f"{self.name}: top")
+        check_integer(self.exhaustive_limit, f"{self.name}: exhaustive_limit", least=0)
 
     @abstractmethod
     def build(self, views: Views | None) -> "RerankingModule":
@@ -127,15 +100,80 @@ class RerankingModule(nn.Module, ABC):
         """(B, N) raw scores of B photographs and the (N, D) features of N views."""
 
 
+def log_unit_score(similarity: Tensor) -> Tensor:
+    """(B, N) ``(s - max s) / std s`` of similarities per photograph: the log of a softmax of z-scores, best view 0."""
+    # Not by std, which warns of empty batches.
+    spread = (similarity - similarity.mean(dim=1, keepdim=True)).square().mean(dim=1, keepdim=True).sqrt()
+    spread = torch.where(spread > 0, spread, torch.ones_like(spread))
+    return (similarity - similarity.amax(dim=1, keepdim=True)) / spread
+
+
+class Whitening(nn.Module):
+    r"""x -> L^-1 (x - mean), where Sigma = L L^T: inner products become :math:`(x - \mu)^T \Sigma^{-1} (y - \mu)`.
+
+    ``mean`` is (D,), ``covariance`` (D, D), symmetric, positive definite.
+
+    Example:
+        >>> whiten = Whitening(torch.zeros(2), torch.diag(torch.tensor([4.0, 1.0])))
+        >>> whiten(torch.tensor([[2.0, 3.0]])).tolist()
+        [[1.0, 3.0]]
+    """
+
+    def __init__(self, mean: Tensor, covariance: Tensor) -> None:
+        super().__init__()
+        check_tensor(mean, "mean", (None,))
+        check_tensor(covariance, "covariance", (len(mean), len(mean)))
+        factor, failed = torch.linalg.cholesky_ex(covariance.double())
+        if int(failed):
+            raise InvalidInputError("covariance: expected a positive definite matrix; shrink it")
+        identity = torch.eye(len(mean), dtype=torch.float64, device=mean.device)
+        self.mean: Tensor
+        self.matrix: Tensor
+        self.register_buffer("mean", mean.float())
+        self.register_buffer("matrix", torch.linalg.solve_triangular(factor, identity, upper=False).float())
+
+    def forward(self, descriptors: Tensor) -> Tensor:
+        """(N, D) -> (N, D)."""
+        check_tensor(descriptors, "descriptors", (None, len(self.mean)))
+        return (descriptors.to(self.mean) - self.mean) @ self.matrix.T
+
+
+def ledoit_wolf(descriptors: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean (D,) and shrunk covariance (D, D) of (N, D) descriptors, N >= 2, float32.
+
+    The covariance is (1 - a) S + a tr(S)/D Id with the a of Ledoit and Wolf (2004) that estimates the population's
+    covariance best from the sample's covariance S.
+
+    Example:
+        >>> mean, covariance = ledoit_wolf(torch.rand(50, 8))
+        >>> Whitening(mean, covariance)(torch.rand(3, 8)).shape
+        torch.Size([3, 8])
+    """
+    check_tensor(descriptors, "descriptors", (None, None))
+    count = len(descriptors)
+    if count < 2:
+        raise InvalidInputError(f"descriptors: expected at least 2, got {count}")
+    x = descriptors.float()
+    mean = x.mean(dim=0)
+    x = x - mean
+    fourth = float(x.square().sum(dim=1).double().square().mean())
+    S = x.T @ x / count
+    square = float(S.double().square().sum())
+    spread = square - float(S.double().trace()) ** 2 / len(S)  # squared distance of S from its multiple of the identity
+    a = min(1.0, max(0.0, (fourth - square) / count / spread)) if spread > 0 else 1.0
+    ridge = a * float(S.diagonal().mean()) * torch.eye(len(S), dtype=S.dtype, device=S.device)
+    return mean, (1.0 - a) * S + ridge
+
+
 @dataclass(frozen=True)
 class Correlation(Term):
-    """S_hog: normalised correlation of descriptors, the best over the jittered crops, mapped by :func:`unit_score`.
+    """S_hog: normalised correlation of descriptors, the best over the jittered crops, mapped by :func:`log_unit_score`.
 
     Attributes:
         whitening: "none", or "bank": both descriptors are whitened by the mean mu and the covariance Sigma of the
-            bank's views before the cosine. The paper scores (D_view - mu)^T Sigma^-1 D_query with the same mu and
-            Sigma. Here the photograph's descriptor is centred too, lengths are divided out, and Sigma is shrunk
-            (Ledoit-Wolf), because a bank has fewer views than a descriptor has entries.
+            bank's views before the cosine. The paper scores (D_view - mu)^T Sigma^-1 D_query. Here the photograph's
+            descriptor is centred too, lengths are divided out, and Sigma is shrunk (Ledoit-Wolf), because a bank has
+            fewer views than a descriptor has entries.
     """
 
     name: ClassVar[str] = "hog"
@@ -154,7 +192,7 @@ class Correlation(Term):
 
 
 class _CorrelationModule(nn.Module):
-    """Compares photographs with (N, D) descriptors of views, whitened or not."""
+    """Compares photographs with (N, D) descriptors of views, whitened or not; a zero descriptor scores 0."""
 
     def __init__(self, descriptors: Tensor, whitening: Whitening | None = None) -> None:
         super().__init__()
@@ -173,10 +211,16 @@ class _CorrelationModule(nn.Module):
 
 @dataclass(frozen=True)
 class Repeatability(Term):
-    """S_rep: the photograph's feature points have points of the view nearby, the best over the jittered crops.
+    r"""S_rep: the photograph's feature points have points of the view nearby, the best over the jittered crops.
+
+    The raw score Rep is the fraction of the photograph's points that have a view's point within eps (the paper's
+    Rep, view -> query), 0 without points. With :math:`R = 1 - Rep`, S_rep is
+
+    - ``"monotone"``: :math:`\exp(-(R - \min R)^2 / (2\sigma^2))`: the most repeatable view scores 1;
+    - ``"paper"``: :math:`\exp(-(R - \mathrm{mean} R)^2 / (2\sigma^2))`, which favours average views.
 
     Attributes:
-        sigma, mode: of :func:`repeatability_score`.
+        sigma, mode: of the score; the paper's :math:`\sigma_r`.
         eps: largest distance of matching points, as a fraction of the crop's side.
     """
 
@@ -188,14 +232,16 @@ class Repeatability(Term):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(self.sigma, "sigma")
-        check_option(self.mode, REPEATABILITY_MODES, "mode")
+        check_option(self.mode, ("monotone", "paper"), "mode")
         check_positive(self.eps, "eps", zero_ok=True)
 
     def build(self, views: Views) -> nn.Module:
         return _RepeatabilityModule(views, self.eps)
 
     def log_score(self, raw: Tensor) -> Tensor:
-        return log_repeatability_score(raw, self.mode, self.sigma)
+        R = 1.0 - raw
+        centre = R.amin(dim=1, keepdim=True) if self.mode == "monotone" else R.mean(dim=1, keepdim=True)
+        return -(R - centre).square() / (2.0 * self.sigma**2)
 
 
 class _RepeatabilityModule(nn.Module):
@@ -211,9 +257,8 @@ class _RepeatabilityModule(nn.Module):
         self.cell = max(1, min(int(eps * S), S // 64))
 
         def count(i: int) -> Tensor:
-            return cell_counts(
-                dilate_points(views.points_at(slice(i, i + VIEWS_AT_A_TIME)), eps * S), self.cell
-            ).flatten(1)
+            points = dilate_points(views.points_at(slice(i, i + VIEWS_AT_A_TIME)), eps * S)
+            return cell_counts(points, self.cell).flatten(1)
 
         near = map_on_threads(count, range(0, len(views), VIEWS_AT_A_TIME), device=views.descriptors.device)
         whole = torch.ones(1, S, S, dtype=torch.bool, device=near[0].device)
@@ -224,13 +269,48 @@ class _RepeatabilityModule(nn.Module):
         B, K = query.points.shape[:2]
         # A point in a cut cell counts as much as any other.
         points = cell_counts(query.points.flatten(0, 1), self.cell).flatten(1).float()
-        matched = inner_products(points / self.area, self.near)
-        return matched_fraction(matched, points).view(B, K, len(self.near)).amax(dim=1)
+        queries = points / self.area
+        # A float32 copy of all views would take longer than the product.
+        matched = torch.cat([queries @ few.float().T for few in self.near.split(VIEWS_AT_A_TIME)], dim=1)
+        rep = matched / points.sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+        return rep.view(B, K, len(self.near)).amax(dim=1)
+
+
+def dilate_points(points: Tensor, eps: float) -> Tensor:
+    """Pixels within ``eps`` >= 0 px (Euclidean) of a point: (N, H, W) bool -> (N, H, W) bool."""
+    radius = int(eps)
+    if radius == 0:
+        return points
+    offsets = np.arange(-radius, radius + 1)
+    disc = (offsets[:, None] ** 2 + offsets**2 <= eps**2).astype(np.uint8)
+    planes = points.cpu().numpy().view(np.uint8)
+    dilated = np.stack([cv2.dilate(plane, disc) for plane in planes]) if len(planes) else planes
+    return torch.from_numpy(dilated.view(bool)).to(points.device)
+
+
+def cell_counts(points: Tensor, cell: int) -> Tensor:
+    """(N, C, C) number of set pixels of (N, S, S) bool in cells of ``cell`` px, the last of which may be cut.
+
+    The integers have 8 bits if that suffices for a cell, else 16.
+    """
+    over = -points.shape[-1] % cell
+    count = F.pad(points.view(torch.uint8), (0, over, 0, over))
+    count = count if cell**2 < 256 else count.short()
+    for dim in (1, 2):  # rows first: they are contiguous
+        count = functools.reduce(torch.add, count.unfold(dim, cell, cell).unbind(dim=3))
+    return count
 
 
 @dataclass(frozen=True)
 class BoxShape(Term):
-    """S_box: :func:`box_shape_score` with ``sigma``; 1 for all views if the box reaches the image's border."""
+    r"""S_box in (0, 1], best view 1: :math:`\exp(-(d^2 - \min d^2) / (2\sigma^2))`.
+
+    d is the difference of the logs of width / height of the boxes of photograph and view. All views score 1 if the
+    photograph's box reaches its border.
+
+    Attributes:
+        sigma: 0.2 corresponds to a box that is a fifth too wide.
+    """
 
     name: ClassVar[str] = "box"
     sigma: float = 0.2
@@ -247,26 +327,30 @@ class BoxShape(Term):
 
 
 class _BoxShapeModule(nn.Module):
+    """Compares boxes with (N,) shapes of views; NaN is the shape of an unknown box of a photograph."""
+
     def __init__(self, shapes: Tensor, sigma: float) -> None:
         super().__init__()
-        check_box_shapes(shapes)
+        if bad := int((~shapes.isfinite()).sum()):
+            raise InvalidInputError(
+                f"views: expected finite shapes, got {bad} of {len(shapes)} NaN or infinite; their boxes have no area"
+            )
         self.sigma = sigma
         self.shapes: Tensor
         self.register_buffer("shapes", shapes, persistent=False)
 
     def forward(self, query: QueryFeatures) -> Tensor:
-        return shape_scores(query.shapes.float(), self.shapes, self.sigma)
+        square = (query.shapes.float()[:, None] - self.shapes).nan_to_num(0.0).square()
+        return torch.exp((square.amin(dim=1, keepdim=True) - square) / (2.0 * self.sigma**2))
 
 
 @dataclass(frozen=True)
 class Appearance(RerankingTerm):
-    """The appearance score: features of an ImageNet network agree, cell by cell, between the photograph's crop and the
-    shaded view.
+    """Appearance score: features of an ImageNet network agree, cell by cell, between photograph and shaded view.
 
-    A mesh with colours is rendered twice, in grey and in its colours, and the better match counts for each view: a
-    print distinguishes top from bottom, and the grey picture remains where the print misleads. Raw scores are mean
-    cosines (:func:`curvireg_torch.features.appearance.similarity`) in [-1, 1]; log S = (raw - max raw) / std raw, over
-    the compared views.
+    A mesh with colours is rendered in grey and in its colours, and the better match counts for each view: a print
+    distinguishes top from bottom, and the grey picture remains where it misleads. Raw scores are mean cosines
+    (:func:`curvireg_torch.features.backbone.similarity`), mapped by :func:`log_unit_score` over the compared views.
 
     Attributes:
         weights: digest of the network's weights.
@@ -285,9 +369,7 @@ class Appearance(RerankingTerm):
         return _AppearanceModule()
 
     def log_score(self, raw: Tensor) -> Tensor:
-        spread = raw.std(dim=1, keepdim=True, correction=0)
-        spread = torch.where(spread > 0, spread, torch.ones_like(spread))
-        return (raw - raw.amax(dim=1, keepdim=True)) / spread
+        return log_unit_score(raw)
 
 
 class _AppearanceModule(RerankingModule):

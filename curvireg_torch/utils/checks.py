@@ -12,11 +12,8 @@ from torch import Tensor
 
 from ..errors import ImageError, InvalidInputError
 
-MAX_ROTATION_DEVIATION = 1e-2
-"""Largest deviation from a rotation: poses in files are rounded, and half precision rounds to 5e-4."""
-
-MAX_PIXEL_ASPECT = 1.1
-"""Largest ratio of the focal lengths at which pixels count as square."""
+MAX_ROTATION_DEVIATION = 1e-2  # poses in files are rounded, and half precision rounds to 5e-4
+MAX_PIXEL_ASPECT = 1.1  # largest ratio of the focal lengths at which pixels count as square
 
 
 def type_and_shape(value: object) -> str:
@@ -29,8 +26,8 @@ def check_tensor(x: Tensor, name: str, shape: tuple[int | None, ...]) -> None:
     if not isinstance(x, Tensor):
         raise InvalidInputError(f"{name}: expected a torch.Tensor, got {type(x).__name__}")
     if x.ndim != len(shape) or any(n is not None and n != size for n, size in zip(shape, x.shape, strict=True)):
-        expected = "(" + ", ".join("*" if n is None else str(n) for n in shape) + ")"
-        raise InvalidInputError(f"{name}: expected shape {expected}, got {tuple(x.shape)}")
+        expected = ", ".join("*" if n is None else str(n) for n in shape)
+        raise InvalidInputError(f"{name}: expected shape ({expected}), got {tuple(x.shape)}")
     if not x.is_floating_point():
         raise InvalidInputError(
             f"{name}: expected a floating dtype, got {x.dtype}; convert with x.float() (images: divide by 255)"
@@ -45,59 +42,34 @@ def check_last_axes(x: Tensor, name: str, shape: tuple[int | None, ...]) -> None
 def check_image(x: Tensor, name: str = "image") -> None:
     """``x`` is a floating (B, 1, H, W) tensor with H, W >= 1."""
     check_tensor(x, name, (None, 1, None, None))
-    if x.shape[-1] < 1 or x.shape[-2] < 1:
+    if 0 in x.shape[2:]:
         raise InvalidInputError(f"{name}: expected at least one pixel, got {tuple(x.shape)}")
 
 
-def check_colour_image(x: Tensor, name: str = "image") -> None:
+def check_colour_image(x: Tensor) -> None:
     """``x`` is a floating (B, 1, H, W) or (B, 3, H, W) tensor with H, W >= 1."""
-    check_tensor(x, name, (None, None, None, None))
+    check_tensor(x, "image", (None, None, None, None))
     if x.shape[1] not in (1, 3):
-        raise InvalidInputError(f"{name}: expected 1 (grey) or 3 (RGB) channels, got {x.shape[1]}")
-    check_image(x[:, :1], name)
-
-
-def check_field(x: Tensor, name: str = "field") -> None:
-    """``x`` is a floating (B, 2, H, W) tensor: channel 0 = x, channel 1 = y."""
-    check_tensor(x, name, (None, 2, None, None))
+        raise InvalidInputError(f"image: expected 1 (grey) or 3 (RGB) channels, got {x.shape[1]}")
+    check_image(x[:, :1])
 
 
 def check_photograph(x: Any, name: str = "images") -> None:
     """``x`` is a (C, H, W) tensor, C = 1 (grey) or 3 (RGB), with at least one pixel, floating or uint8."""
-    if not isinstance(x, Tensor):
-        raise InvalidInputError(f"{name}: expected tensors (C, H, W), got {type(x).__name__}")
-    if x.ndim != 3 or x.shape[0] not in (1, 3) or 0 in x.shape:
-        raise InvalidInputError(
-            f"{name}: expected 1 (grey) or 3 (RGB) channels in shape (C, H, W), arrays (H, W, C), got {tuple(x.shape)}"
-        )
+    if not isinstance(x, Tensor) or x.ndim != 3 or x.shape[0] not in (1, 3) or 0 in x.shape:
+        expected = "1 (grey) or 3 (RGB) channels in shape (C, H, W), arrays (H, W, C)"
+        raise InvalidInputError(f"{name}: expected {expected}, got {type_and_shape(x)}")
     if x.dtype != torch.uint8 and not x.is_floating_point():
         raise InvalidInputError(f"{name}: expected uint8, or floating in [0, 1], got {x.dtype}")
 
 
 def check_pixels(x: Tensor, where: str) -> None:
     """The pixels of floating ``x`` are finite and in [0, 1] within 0.001; ``where`` names them, as "of the box"."""
-    if x.numel() == 0:
-        return
-    low, high = (float(value) for value in x.aminmax())
+    low, high = (float(value) for value in x.aminmax()) if x.numel() else (0.0, 0.0)
     if not (math.isfinite(low) and math.isfinite(high)):
         raise ImageError(f"NaN or inf in the pixels {where}; repair the image, or use another")
     if high > 1.0 + 1e-3 or low < -1e-3:
         raise ImageError(f"pixels outside [0, 1] {where}; divide floating images by 255, or pass uint8")
-
-
-def check_mask(mask: Tensor, like: Tensor, name: str = "mask") -> None:
-    """``mask`` is boolean, of the shape and on the device of ``like``."""
-    if mask.dtype != torch.bool or mask.shape != like.shape:
-        raise InvalidInputError(f"{name}: expected bool of shape {tuple(like.shape)}, got {type_and_shape(mask)}")
-    check_same_device(mask, like, name)
-
-
-def check_masks(masks: Tensor, name: str) -> None:
-    """``masks`` is boolean (N, H, W); a mask without its batch axis is refused."""
-    if not isinstance(masks, Tensor) or masks.dtype != torch.bool or masks.ndim != 3:
-        raise InvalidInputError(
-            f"{name}: expected bool (N, H, W), got {type_and_shape(masks)}; a single mask is mask[None]"
-        )
 
 
 def check_same_device(x: Tensor, like: Tensor, name: str) -> None:
@@ -111,9 +83,8 @@ def check_device(name: torch.device | str, option: str = "device") -> None:
         torch.zeros(1, device=name).item()
     except (RuntimeError, AssertionError) as error:  # builds of torch without CUDA raise the second
         usable = ", ".join(["cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))])
-        raise InvalidInputError(
-            f"{option}: torch cannot use {str(name)!r} on this machine; choose from {usable}"
-        ) from error
+        message = f"torch cannot use {str(name)!r} on this machine; choose from {usable}"
+        raise InvalidInputError(f"{option}: {message}") from error
 
 
 def check_option(value: str, options: Iterable[str], name: str) -> None:
@@ -254,6 +225,14 @@ def as_numbers(values: Any, name: str, *, dtype: torch.dtype = torch.float32) ->
     if x.is_complex() or x.dtype == torch.bool:
         raise InvalidInputError(f"{name}: expected numbers, got {x.dtype}")
     return x.to(torch.promote_types(x.dtype, dtype) if x.is_floating_point() else dtype)
+
+
+def check_numbers(values: Any, name: str, count: int | None = None) -> Tensor:
+    """Return ``count`` finite numbers, or at least one, of a list, range, array or tensor as (N,) float64."""
+    numbers = as_numbers(list(values) if isinstance(values, range) else values, name, dtype=torch.float64).flatten()
+    if len(numbers) != (count or max(1, len(numbers))) or not bool(numbers.isfinite().all()):
+        raise InvalidInputError(f"{name}: expected {count or 'at least one'} finite numbers, got {values!r:.80}")
+    return numbers.double()
 
 
 def as_boxes(boxes: Any, count: int) -> Tensor:

@@ -1,4 +1,10 @@
-"""Names that a user may choose from. The command line lists them without importing torch."""
+"""Names that a user may choose from, and files that a user may name, checked before torch is imported."""
+
+import glob
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..errors import InvalidInputError, MissingFileError
 
 RENDERER_NAMES = ("auto", "embree", "pyrender", "torch")
 """Renderers."""
@@ -33,3 +39,42 @@ UP_AXES = {
     "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
 }
 """Axis that points up, and the rotation by quarter turns that brings it to z."""
+
+_ORDER = "the photograph comes first, the mesh last"
+
+
+def is_pattern(path: Path) -> bool:
+    """Whether a path is a pattern of several, such as ``shots/*.jpg``."""
+    return glob.has_magic(str(path)) and not path.exists()
+
+
+def is_one_photograph(paths: Sequence[Path]) -> bool:
+    """Whether the paths are a single file that is not a video."""
+    return len(paths) == 1 and not (is_pattern(paths[0]) or paths[0].is_dir() or paths[0].suffix.lower() in VIDEOS)
+
+
+def check_given(photos: Sequence[Path], meshes: Sequence[Path], listed: Path | None = None) -> None:
+    """Refuse files of another kind, swapped files, and a missing list, mesh or only photograph.
+
+    Of several photographs, those that are missing are reported later, each by itself.
+    """
+    for path, kind in [*((photo, "a photograph") for photo in photos), *([(listed, "a list")] if listed else [])]:
+        if path.suffix.lower() in MESHES_AND_BANKS:
+            other = next((str(mesh) for mesh in meshes if mesh.suffix.lower() not in MESHES_AND_BANKS), "")
+            advice = f"it and {other} seem to be swapped: {_ORDER}" if other else f"{_ORDER}, several by --mesh each"
+            raise InvalidInputError(f"a mesh where {kind} is expected; {advice}", subject=path)
+        if kind == "a photograph" and path.suffix.lower() in (".csv", ".json"):
+            raise InvalidInputError(f"a list where a photograph is expected; give it as --list {path}", subject=path)
+    for mesh in meshes:
+        is_picture = is_pattern(mesh) or mesh.suffix.lower() in (*IMAGES, *VIDEOS)
+        if mesh.is_dir() or is_picture:
+            kind = "a photograph" if is_picture else "a folder"
+            raise InvalidInputError(f"{kind} where a mesh is expected; {_ORDER} ({', '.join(MESHES)})", subject=mesh)
+    required = [(path, "photograph") for path in photos] if is_one_photograph(photos) else []
+    if listed is None:
+        required += [(mesh, "mesh") for mesh in meshes]
+    elif not listed.is_dir():
+        required.append((listed, "list"))
+    for path, kind in required:
+        if not path.is_file():
+            raise MissingFileError(f"no such file; check the path of the {kind}", subject=path)

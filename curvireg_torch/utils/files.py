@@ -54,7 +54,7 @@ def write_csv(path: Path, rows: Iterable[Sequence[object]]) -> None:
     """:func:`write_file` of rows of comma-separated cells; an apostrophe precedes what a spreadsheet would compute."""
     text = io.StringIO(newline="")
     csv.writer(text, lineterminator="\n").writerows(map(_inert, row) for row in rows)
-    write_file(path, text.getvalue().encode())
+    write_file(path, text.getvalue().encode(errors="backslashreplace"))  # file names may be no UTF-8
 
 
 def _inert(cell: object) -> object:

@@ -1,7 +1,5 @@
 """Many small jobs on as many threads as torch may use, one job per thread."""
 
-import itertools
-import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +11,6 @@ import torch
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_pool_of_process: tuple[int, ThreadPoolExecutor] | None = None
 _this_thread = threading.local()
 _threads_for_jobs = 1
 
@@ -22,9 +19,8 @@ _threads_for_jobs = 1
 def one_torch_thread() -> Iterator[None]:
     """Within, torch computes on one thread in each job, and as many jobs run at a time as torch had threads before.
 
-    Threads that divide an operation of torch wait for the slowest of them, in a loop that occupies a core. Where
-    another program takes a core from one of them, every operation waits until it returns. Threads that each have a job
-    of their own wait once, at the end. Commands compute like this; for its caller, a library changes nothing.
+    Threads that divide an operation of torch all wait for the slowest, busily; threads with jobs of their own wait
+    once, at the end. Commands compute like this; for its caller, a library changes nothing.
 
     Example:
         >>> with one_torch_thread():
@@ -43,43 +39,27 @@ def one_torch_thread() -> Iterator[None]:
 
 
 def for_each(count: int, job: Callable[[int], object]) -> None:
-    """Call ``job(0)`` to ``job(count - 1)`` on as many threads as torch may use, which live as long as the process.
+    """Call ``job(0)`` to ``job(count - 1)`` on as many threads as torch may use; jobs must not call torch.
 
-    Jobs must not call torch. Nested calls, and those on threads of :func:`single_threaded_pool`, run in sequence unless
-    :func:`map_on_threads` left threads over. The first error stops all threads after their current job and is raised.
+    Nested calls, and those on threads of :func:`single_threaded_pool`, run in sequence unless :func:`map_on_threads`
+    left threads over. The first error stops all threads after their current job and is raised.
     """
     threads = min(available_threads(), count)
-    numbers = itertools.count()
-    stopped = False
-
-    def work() -> None:
-        nonlocal stopped
-        _this_thread.working = True
-        try:
-            while not stopped and (number := next(numbers)) < count:
-                job(number)
-        except BaseException:
-            stopped = True
-            raise
-
     if threads <= 1 or getattr(_this_thread, "working", False):
         for number in range(count):
             job(number)
         return
-    futures = [_pool().submit(work) for _ in range(threads)]
-    try:
-        for future in futures:
-            future.result()
-    finally:
-        stopped = True  # also if this thread was interrupted while it waited
+    with ThreadPoolExecutor(threads, initializer=_start_working) as pool:
+        try:
+            for _ in pool.map(job, range(count)):
+                pass
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
-def _pool() -> ThreadPoolExecutor:
-    """The threads of this process for short jobs; a forked process has none and starts its own."""
-    global _pool_of_process
-    if _pool_of_process is None or _pool_of_process[0] != os.getpid():
-        _pool_of_process = os.getpid(), ThreadPoolExecutor(max(os.cpu_count() or 1, available_threads()))
-    return _pool_of_process[1]
+def _start_working() -> None:
+    _this_thread.working = True
 
 
 def available_threads() -> int:

@@ -1,67 +1,62 @@
-"""The page: three steps, the photograph, the answer, and how it was found."""
+"""The page: the photograph, and beside it three steps, the answers and the inputs."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from nicegui import ui
 
-from .answers import Answers
-from .inputs import Inputs
-from .panels import Panels
+from .side import Answers, Inputs
 from .stage import Stage
-from .steps import Steps
-from .widgets import button, region, text
+from .widgets import button, file_chooser, region, set_enabled, set_text, text
 from .workspace import Workspace
 
-__all__ = ["Page", "add_assets"]
+__all__ = ["Page", "Steps", "add_assets"]
 
-_STATIC = Path(__file__).parent / "static"
-_TICK_SECONDS = 0.15
-_THEMES = {None: "Colours: as the system", False: "Colours: light", True: "Colours: dark"}
+TICK_SECONDS = 0.15
+"""Between two looks at what changed."""
+
+STAGES: Mapping[str, str] = {
+    "bank": "rendering views of the mesh",
+    "detection": "looking for the object in the photograph",
+    "ranking": "comparing the photograph with the views",
+    "search": "searching around the best views",
+    "contours": "fitting contours",
+}
+BOX_HINT = "Drag a rectangle around the object. Without one the whole photograph is searched: slower, less certain."
 
 
 def add_assets() -> None:
     """Put styles and script into the page, before it is sent."""
-    ui.add_css((_STATIC / "page.css").read_text())
-    ui.add_body_html(f"<script>{(_STATIC / 'page.js').read_text()}</script>")
+    static = Path(__file__).parent / "static"
+    ui.add_css((static / "page.css").read_text())
+    ui.add_body_html(f"<script>{(static / 'page.js').read_text()}</script>")
 
 
 class Page:
-    """One browser window. It holds nothing: five times a second it shows what changed in its workspace."""
+    """One browser window. It holds nothing: several times a second it shows what changed in its workspace."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace, self._busy = workspace, False
+        self.workspace, self.session, self._busy = workspace, workspace.session, False
 
     def build(self) -> None:
         """Lay out the page."""
         text("a", "To the photograph", "skip", href="#work")
-        self._build_header()
-        with region("main"):
-            self.steps = Steps(self.workspace)
-            with region("div", "work", id="work"):
-                self.stage = Stage(self.workspace)
-                with region("div", "side"):
-                    self.answers = Answers(self.workspace)
-                    self.inputs = Inputs(self.workspace)
-                self.panels = Panels(self.workspace)
-        ui.timer(_TICK_SECONDS, self._refresh)
-
-    def _build_header(self) -> None:
-        self.dark = ui.dark_mode(None)
+        ui.dark_mode(None)
         with region("header", "top"):
             with region("div"):
                 text("h1", "curvireg")
                 text("p", "Where is this object, and how is it turned? One photograph and its 3D model are enough.")
-            with region("div", "row"):
-                button("Sample", self.workspace.load_sample, "sample-again", "quiet")
-                self.theme = button(_THEMES[None], self._change_theme, "theme", "quiet")
+            button("Sample", self.workspace.load_sample, "sample-again", "quiet")
+        with region("div", "work", id="work"):
+            self.stage = Stage(self.workspace)
+            with region("div", "side"):
+                self.steps = Steps(self.workspace)
+                self.answers = Answers(self.workspace)
+                self.inputs = Inputs(self.workspace)
+        ui.timer(TICK_SECONDS, self._refresh)
 
-    def _change_theme(self) -> None:
-        values: list[bool | None] = list(_THEMES)
-        self.dark.value = values[(values.index(self.dark.value) + 1) % len(values)]
-        self.theme.set_content(_THEMES[self.dark.value])
-
-    async def _refresh(self, _: Any = None) -> None:
+    async def _refresh(self) -> None:
         if self._busy:  # still drawing
             return
         self._busy = True
@@ -70,6 +65,95 @@ class Page:
             self.inputs.refresh()
             await self.stage.refresh()
             await self.answers.refresh()
-            await self.panels.refresh()
         finally:
             self._busy = False
+
+
+class Steps:
+    """What is there, what is missing, and the button that finds the pose."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.workspace, self.session = workspace, workspace.session
+        self.cards: dict[str, Any] = {}
+        self.facts: dict[str, Any] = {}
+        self.messages: dict[str, Any] = {}
+        with region("ol", "steps"):
+            for number, name in enumerate(("photograph", "mesh", "box"), start=1):
+                with region("li", "step", data_testid=f"step-{name}") as self.cards[name]:
+                    text("h2", name.capitalize(), data_number=str(number))
+                    self.facts[name] = text("p", "", "facts", data_testid=f"{name}-facts")
+                    if name == "box":
+                        self.no_box = button("Remove the box", self._remove_box, "no-box", "quiet")
+                    else:
+                        file_chooser("Choose files", f"upload-{name}")
+                        self.messages[name] = self._message(name)
+        self.messages["file"] = self._message("file")
+        with region("div", "go"):
+            self.find = button("Find the pose", self._find, "register", "primary")
+            self.stop = button("Stop", workspace.stop, "stop")
+            self.bar = region("progress", "", max="1", value="0", aria_label="progress of the search")
+            self.stage = text("p", "", "stage", data_testid="progress", role="status")
+            self.seconds = text("p", "", "stage", data_testid="seconds")
+        self.messages["pose"] = self._message("pose")
+
+    def _message(self, part: str) -> Any:
+        return text("p", "", "message", data_testid=f"message-{part}", role="alert")
+
+    def _find(self) -> None:
+        self.workspace.start_search()  # the task outlives the page
+
+    def _remove_box(self) -> None:
+        self.session.box = None
+
+    def refresh(self) -> None:
+        """Show the state of the workspace."""
+        session, workspace = self.session, self.workspace
+        for part, element in self.messages.items():
+            set_text(element, workspace.messages.get(part, ""))
+        done = {"photograph": session.photo, "mesh": session.mesh_path, "box": session.box or session.result}
+        for name, card in self.cards.items():
+            card.classes(**{"add" if done[name] else "remove": "done"})
+        set_text(self.facts["photograph"], self._describe_photo())
+        set_text(self.facts["mesh"], self._describe_mesh())
+        set_text(self.facts["box"], BOX_HINT if session.box is None else " ".join(f"{v:g}" for v in session.box))
+        self.no_box.set_visibility(session.box is not None)
+        set_text(self.find, "Find the pose" if session.box or session.photo is None else "Find the object and its pose")
+        set_enabled(self.find, bool(done["photograph"] and done["mesh"]) and not workspace.searching)
+        self._show_progress()
+
+    def _describe_photo(self) -> str:
+        photo, path = self.session.photo, self.session.photo_path
+        if photo is None or path is None:
+            return "A picture with the whole object in it."
+        H, W = photo.image.shape[-2:]
+        return "; ".join([f"{self.session.names[path]}: {W} x {H} px", *photo.notes])
+
+    def _describe_mesh(self) -> str:
+        path = self.session.mesh_path
+        if path is None:
+            return "The object's 3D model: .obj, .ply, .stl, .off, .glb, or .gltf with its parts as a .zip."
+        return f"{self.session.names[path]}: {self.workspace.mesh_facts}"
+
+    def _show_progress(self) -> None:
+        session, workspace = self.session, self.workspace
+        stage, done, total = session.progress
+        share, words = 0.0, ""
+        if workspace.waiting:
+            words = "waiting for another search"
+        elif workspace.searching and session.cancelled:
+            words = "stopping"
+        elif workspace.searching and stage:
+            share = (list(STAGES).index(stage) + done / total) / len(STAGES)
+            words = STAGES[stage] + (f": {done} of {total}" if total > 1 else "")
+        elif workspace.searching:
+            words = "starting"
+        elif workspace.receiving:
+            words = f"receiving {', '.join(workspace.receiving.values())}"
+        elif session.result is not None:
+            changed = session.result.command != session.command()
+            share, words = 1.0, "the inputs have changed since this answer" if changed else "done"
+        self.stop.set_visibility(workspace.searching)
+        self.bar.set_visibility(workspace.searching)
+        self.bar.props(f"value={share:.3f}")
+        set_text(self.stage, words)
+        set_text(self.seconds, f"{workspace.seconds:.0f} s" if workspace.searching else "")

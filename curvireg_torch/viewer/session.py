@@ -1,4 +1,4 @@
-"""The state of one page: inputs, result and displayed pose. It needs no page and no NiceGUI."""
+"""The state of one page: inputs, result and the chosen pose. It needs no page and no NiceGUI."""
 
 import math
 import shlex
@@ -15,20 +15,27 @@ from torch import Tensor
 from ..data import read_photo
 from ..data.images import Photo
 from ..errors import MAX_VIEWER_SECONDS, CurviregError, CurviregWarning, InvalidInputError
-from ..evaluation.lists import register_entry
 from ..evaluation.opening import RegisterOptions, check_camera, open_registrar
 from ..evaluation.prior_options import QUALIFIERS
+from ..evaluation.runner import register_entry
 from ..evaluation.store import to_json
+from ..geometry import rotation_error, rotation_from_axis_angle
+from ..geometry.cameras import rotation_towards
 from ..matching import ViewBank
 from ..mesh import has_colours, load_mesh
-from ..registration import Registrar, Registration
+from ..registration import Hypothesis, Registrar, Registration, fit_contours
 from ..registration.result import used_box
-from ..visualization import pose_glb
-from .editing import DisplayedPose, fit_displayed, move_displayed
+from ..utils.choices import DEFAULT
+from ..visualization import contour_overlay, pose_glb
+from ..visualization.encoding import png
 
-__all__ = ["MAX_PROPOSALS", "Result", "Session"]
+__all__ = ["Answer", "Result", "Session"]
 
-MAX_PROPOSALS = 5  # proposed boxes that are drawn where the object was detected
+MAX_PROPOSALS = 5
+"""Proposed boxes that are drawn where the object was detected."""
+
+NEAREST = 1.2
+"""Least depth of the object's centre in its radii to which it can be moved by hand."""
 
 Numbers = tuple[float, float, float, float]
 
@@ -37,15 +44,82 @@ _DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
 
 
 @dataclass(frozen=True)
+class Answer:
+    """The pose that is shown and saved.
+
+    Attributes:
+        pose: the hypothesis, or where it was moved to by hand.
+        number: of the hypothesis, from 0.
+        edits: what was done to it by hand, in words.
+    """
+
+    pose: Hypothesis
+    number: int = 0
+    edits: tuple[str, ...] = ()
+
+    def registration(self, found: Registration) -> Registration:
+        """Return what was ``found`` with this pose first; nobody knows how probable a pose is that was set by hand."""
+        if self.number == 0 and not self.edits:
+            return found
+        order = sorted(range(len(found.hypotheses)), key=lambda k: k != self.number)
+        probabilities = () if self.edits or not found.probabilities else tuple(found.probabilities[k] for k in order)
+        hypotheses = (self.pose, *(found.hypotheses[k] for k in order[1:]))
+        return replace(found, hypotheses=hypotheses, probabilities=probabilities, confidence_features={})
+
+    def placed(self, centre: Tensor, T: Tensor, edit: str) -> "Answer":
+        """Return it at (4, 4) ``T_cam_from_model``, without its measurements; ``centre`` (3,) is that of the mesh."""
+        position = T[:3, :3] @ centre + T[:3, 3]
+        allocentric = rotation_towards(position).mT @ T[:3, :3]
+        has_translation = self.pose.translation is not None
+        pose = replace(
+            self.pose,
+            rotation=T[:3, :3].clone() if has_translation else allocentric,
+            translation=T[:3, 3].clone() if has_translation else None,
+            score=float("nan"),
+            evidence={},
+            allocentric_rotation=allocentric,
+            distance=float(torch.linalg.vector_norm(position)),
+            projection=(T, self.pose.projection[1]),
+            edge_support=None,
+            covariance=None,
+        )
+        return replace(self, pose=pose, edits=(*self.edits, edit))
+
+
+@dataclass(frozen=True)
 class Result:
     """A registration with its inputs."""
 
     registrar: Registrar
     registration: Registration
-    document: dict[str, Any]  # the content of result.json
+    document: dict[str, Any]  # the content of result.json, if the first answer is chosen
     image: Tensor  # (3, H, W) uint8
     box: Tensor  # (4,) px, with which the pose was found
+    request: RegisterOptions  # what was asked for
     command: str  # gives the same result
+
+    def moved(
+        self, T: Tensor, rotation: Sequence[float] = (0, 0, 0), translation: Sequence[float] = (0, 0, 0)
+    ) -> Tensor:
+        """Return the (4, 4) pose ``T``, turned about the object's centre and moved.
+
+        Args:
+            T: ``T_cam_from_model``.
+            rotation: degrees about the camera's x, y and z axes.
+            translation: along them, in radii of the object.
+
+        Raises:
+            InvalidInputError: the object would touch the camera.
+        """
+        describer = self.registrar.describer
+        angles, shift = (torch.tensor(list(v), dtype=torch.float64) for v in (rotation, translation))
+        centre = T[:3, :3] @ describer.centre + T[:3, 3] + describer.radius * shift
+        if float(centre[2]) < NEAREST * describer.radius:
+            raise InvalidInputError("the object would touch the camera; move it away")
+        T = T.clone()
+        T[:3, :3] = rotation_from_axis_angle(torch.deg2rad(angles)) @ T[:3, :3]
+        T[:3, 3] = centre - T[:3, :3] @ describer.centre
+        return T
 
 
 @dataclass
@@ -56,7 +130,7 @@ class Session:
         options: of ``curvireg view``; replace them to change unit, up, pose or preset, call ``set_limits`` for limits.
         names: what the user calls the files, for messages and the command line.
         box, camera, fov: as ``--box``, ``--camera`` and ``--fov``, or None; a camera takes precedence over ``fov``.
-        result, displayed: the last result and the pose on the page, or None.
+        result, answer: the last result and its chosen pose, or None.
         limit: seconds after which a registration is cancelled.
         progress: stage, done and total.
     """
@@ -70,11 +144,12 @@ class Session:
     camera: Numbers | None = None
     fov: float | None = None
     result: Result | None = None
-    displayed: DisplayedPose | None = None
+    answer: Answer | None = None
     limit: float = MAX_VIEWER_SECONDS
     progress: tuple[str, int, int] = ("", 0, 1)
     cancelled: bool = False
     _registrar: tuple[RegisterOptions, Registrar] | None = None
+    _answer_before: Answer | None = None
 
     def load(self) -> str:
         """Open the files that the options name, and take their box and camera; describes the mesh, or ""."""
@@ -88,12 +163,13 @@ class Session:
         return facts
 
     def open_photo(self, path: Path, name: str | None = None) -> Photo:
-        """Read a photograph; it replaces box, camera and result of the one before."""
+        """Read a photograph; it removes box, camera and result of the one before."""
         self.names[path] = name or str(path)
         with self._user_names():
             photo = read_photo(path, dtype=torch.uint8)
-        self.photo_path, self.photo, self.box, self.camera = path, photo, None, None
-        self.result = self.displayed = None
+        if self.photo is not None:  # those of the command line are meant for the first
+            self.box = self.camera = self.fov = None
+        self.photo_path, self.photo, self.result, self.answer = path, photo, None, None
         return photo
 
     def open_mesh(self, path: Path, name: str | None = None) -> str:
@@ -108,7 +184,7 @@ class Session:
                 colours = "in its colours" if has_colours(mesh) else "in grey"
                 facts = f"{len(mesh.faces):,} faces, {size} {self.options.unit}, rendered {colours}"
         self.mesh_path = path
-        self.result = self.displayed = None
+        self.result = self.answer = None
         return facts
 
     def exif_camera(self) -> Numbers | None:
@@ -175,51 +251,113 @@ class Session:
         finally:
             self.cancelled = False
         box, command = torch.tensor(used_box(document)), _command_line(request, self.names)
-        self.result = Result(registrar, registration, document, photo.image, box, command)
-        self.display(0)
+        self.result = Result(registrar, registration, document, photo.image, box, request, command)
+        self.choose(0)
         return registration
 
-    def require_result(self) -> tuple[Result, DisplayedPose]:
-        """The result and the displayed pose; an error if there is none yet."""
-        if self.result is None or self.displayed is None:
+    def require_result(self) -> tuple[Result, Answer]:
+        """The result and the chosen pose; an error if there is none yet."""
+        if self.result is None or self.answer is None:
             raise InvalidInputError("there is no result yet; register first")
-        return self.result, self.displayed
+        return self.result, self.answer
 
     def proposals(self) -> list[list[float]]:
         """The best boxes of the detection, the chosen one first; empty if the box was given."""
         detection = {} if self.result is None else self.result.document.get("detection", {})
         return [proposal["box"] for proposal in detection.get("proposals", [])[:MAX_PROPOSALS]]
 
-    def display(self, number: int, *, chosen: bool = False) -> None:
-        """Put a hypothesis on the page, by its number from 0; ``chosen`` if the user picks it as the answer."""
+    def choose(self, number: int) -> None:
+        """Make a hypothesis the answer, by its number from 0."""
         assert self.result is not None
-        self.displayed = DisplayedPose(self.result.registration.hypotheses[number], number, chosen=chosen)
+        self._answer_before = None
+        self.answer = Answer(self.result.registration.hypotheses[number], number)
 
-    def move(self, *, rotation: Sequence[float] = (0, 0, 0), translation: Sequence[float] = (0, 0, 0)) -> None:
-        """Change the displayed pose, see :func:`~curvireg_torch.viewer.editing.move_displayed`."""
-        result, displayed = self.require_result()
-        self.displayed = move_displayed(result.registrar, displayed, rotation=rotation, translation=translation)
+    def place(self, T: Tensor, edit: str = "") -> None:
+        """Move the answer to the (4, 4) pose ``T``; ``edit`` says how it was done, in words."""
+        result, answer = self.require_result()
+        describer, before = result.registrar.describer, answer.pose.projection[0]
+        degrees = float(rotation_error(T[:3, :3], before[:3, :3]))
+        centres = [pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (before, T)]
+        radii = float(torch.linalg.vector_norm(centres[1] - centres[0])) / describer.radius
+        edit = f"{edit or 'moved'}: rotated {degrees:.1f} degrees, shifted {radii:.2f} radii"
+        self._answer_before, self.answer = answer, answer.placed(describer.centre, T, edit)
 
-    def fit(self) -> str:
-        """Fit the contours at the displayed pose to the photograph's edges; returns the change in words."""
-        result, displayed = self.require_result()
-        self.displayed = fit_displayed(result.registrar, displayed, result.image, result.box)
-        return self.displayed.edits[-1]
+    def fit(self) -> None:
+        """Fit the contours at the answer to the photograph's edges."""
+        result, answer = self.require_result()
+        T, K = answer.pose.projection
+        registrar = result.registrar
+        margin = registrar.bank.settings.margin
+        fit = fit_contours(registrar.describer.contours, result.image, result.box, K, T[None], margin=margin)
+        supports = f"{float(fit.start_support[0]):.2f} to {float(fit.edge_support[0]):.2f}"
+        self.place(fit.transform[0], f"contours fitted, edge support {supports}")
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether :meth:`undo` changes the answer."""
+        return self.answer is not None and self._answer_before is not None
+
+    def undo(self) -> None:
+        """Take back the last change by hand; a second call repeats it."""
+        if self.can_undo:
+            self.answer, self._answer_before = self._answer_before, self.answer
 
     def document(self) -> dict[str, Any]:
-        """``result.json`` of the command line; ``viewer`` holds that command line and the displayed pose."""
-        result, displayed = self.require_result()
-        edits = {"hypothesis": displayed.number, "chosen": displayed.chosen, "by_hand": list(displayed.edits)}
-        return {**result.document, "viewer": {"command": result.command, **edits, **displayed.pose.pose_dict()}}
+        """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done by hand."""
+        result, answer = self.require_result()
+        document, registration = dict(result.document), answer.registration(result.registration)
+        if registration is not result.registration:
+            document |= registration.to_dict()
+            if document["inputs"]["camera_source"] in ("exif", "fov"):
+                document["covariance"] = document["standard_deviations"] = None
+            if "detection" in document:
+                first, *others = document["detection"]["instances"]
+                first = {**first, "confidence": registration.confidence, **answer.pose.pose_dict()}
+                document["detection"] = {**document["detection"], "instances": [first, *others]}
+        by_hand = {"hypothesis": answer.number, "by_hand": list(answer.edits)}
+        return {**document, "viewer": {"command": result.command, **by_hand}}
 
     def json(self) -> bytes:
         """:meth:`document` as a file."""
         return to_json(self.document()).encode()
 
+    def python(self) -> str:
+        """A Python program that gives the answer."""
+        result, answer = self.require_result()
+        request, camera = result.request, result.document["inputs"]["camera"]
+        photo, mesh = self.names[request.photos[0]], self.names[request.meshes[0]]
+        prior = None if result.registration.prior is None else result.registration.prior.to_dict()
+        pipeline = f"Pipeline.read({str(request.pipeline)!r})" if request.pipeline else ""
+        pipeline = pipeline or f"PRESETS[{request.preset or DEFAULT!r}]"
+        pipeline += "" if request.pose is None else f".with_pose_prior({request.pose!r})"
+        if mesh.endswith(".safetensors"):
+            model, pipeline = f"cr.ViewBank.load({mesh!r})", "None" if request.bank_decides else pipeline
+        else:
+            model = f"cr.load_mesh({mesh!r}, unit={request.unit!r}, up={request.up!r})"
+        lines = [
+            "import curvireg_torch as cr",
+            "from curvireg_torch.pipeline import PRESETS, Pipeline",
+            "",
+            f"model, pipeline = {model}, {pipeline}",
+            f"registrar = cr.Registrar(model, pipeline=pipeline, mesh_is={request.mesh_is!r})",
+            f"box = {None if request.box is None else [list(request.box)]}",
+            f"camera = {None if camera is None else f'cr.camera_matrix(*{camera})'}",
+            f"prior = {None if prior is None else f'cr.PosePrior(**{prior})'}",
+            f"result = registrar([{photo!r}], box, camera, prior=prior)[0]",
+            f"pose = result.hypotheses[{answer.number}].pose_dict()",
+        ]
+        lines += [f"pose = {answer.pose.pose_dict()}  # corrected by hand"] if answer.edits else []
+        return "\n".join([*lines, "print(pose)", ""])
+
     def glb(self) -> bytes:
-        """The displayed pose as a GLB file, see :func:`curvireg_torch.visualization.pose_glb`."""
-        result, displayed = self.require_result()
-        return pose_glb(result.registrar.bank.mesh, *displayed.pose.projection, result.image)
+        """The answer as a GLB file, see :func:`curvireg_torch.visualization.pose_glb`."""
+        result, answer = self.require_result()
+        return pose_glb(result.registrar.bank.mesh, *answer.pose.projection, result.image)
+
+    def overlay(self) -> bytes:
+        """The contours at the answer on the photograph, as a PNG file."""
+        result, answer = self.require_result()
+        return png(contour_overlay(result.registrar, answer.pose, result.image, result.box))
 
     def cancel(self) -> None:
         """End the registration at its next step."""

@@ -1,4 +1,4 @@
-"""Plain HTML elements of the page: text, buttons, choosers of files, and terms with an explanation."""
+"""Plain HTML elements of the page: text, buttons, choosers of files, and parts that fold away."""
 
 from collections.abc import Callable
 from html import escape
@@ -8,7 +8,7 @@ from nicegui import ui
 
 from ..utils.choices import IMAGES, MESHES_AND_BANKS
 
-__all__ = ["attributes", "button", "file_chooser", "region", "set_enabled", "set_text", "term", "text"]
+__all__ = ["attributes", "button", "file_chooser", "fold", "region", "set_enabled", "set_text", "text"]
 
 
 def attributes(**values: str) -> str:
@@ -37,6 +37,14 @@ def button(label: str, on_click: Callable[..., Any], test_id: str, classes: str 
     return element.on("click", lambda: on_click())
 
 
+def fold(title: str, test_id: str, *, is_open: bool = False) -> Any:
+    """A part that can be folded away; what is built inside is added to it."""
+    part = region("details", "fold", data_testid=f"fold-{test_id}").props("open" if is_open else "")
+    with part:
+        text("summary", title)
+    return part
+
+
 def set_enabled(element: Any, enabled: bool) -> None:
     """Let a button be pressed or not."""
     element.props(remove="disabled") if enabled else element.props("disabled")
@@ -48,9 +56,3 @@ def file_chooser(label: str, test_id: str) -> None:
         ui.label(label)
         accept = ",".join((*IMAGES, *MESHES_AND_BANKS, ".zip"))
         region("input", "hidden-text", type="file", data_testid=test_id, accept=accept).props("multiple")
-
-
-def term(word: str, explanation: str) -> str:
-    """HTML of a word whose explanation shows under the mouse, on focus and on a tap."""
-    tip = f'<span class="tip" role="tooltip">{escape(explanation)}</span>'
-    return f'<span class="term" tabindex="0">{escape(word)}{tip}</span>'

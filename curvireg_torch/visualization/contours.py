@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from ..rendering.protocol import DepthRenderer
+from ..rendering import DepthRenderer
 
 __all__ = ["contour_layer", "draw_box", "draw_pose", "line_width"]
 

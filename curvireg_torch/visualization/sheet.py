@@ -10,7 +10,7 @@ import cv2
 import torch
 from torch import Tensor
 
-from ..rendering.protocol import DepthRenderer
+from ..rendering import DepthRenderer
 from ..utils.files import write_file
 from .contours import draw_pose
 from .encoding import jpeg
@@ -89,7 +89,8 @@ def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: st
         rows = [*rows[:each], *rows[-each:]]
         note = f"The {each} best, then the {each} worst; {table} has them all."
     figures = "\n".join(map(_figure, rows))
-    write_file(path, _PAGE.format(title=html.escape(title), note=note, figures=figures).encode())
+    page = _PAGE.format(title=html.escape(title), note=note, figures=figures)
+    write_file(path, page.encode(errors="backslashreplace"))  # file names may be no UTF-8
 
 
 def _figure(entry: SheetEntry) -> str:

@@ -16,16 +16,22 @@ from kornia.feature import gftt_response, harris_response
 from torch import Tensor
 
 from curvireg_torch.features import field_points
-from curvireg_torch.features.points import strongest_points
+from curvireg_torch.features.hog import strongest_points
 from curvireg_torch.filters import (
     image_gradient,
     multiscale_curvilinear_saliency,
     multiscale_focus_curves,
     principal_curvature_image,
 )
-from curvireg_torch.filters.derivatives import central_derivatives, replicate_pad, smooth
-from curvireg_torch.filters.inputs import to_grey
-from curvireg_torch.filters.numerics import at_least_float32, image_maximum, safe_sqrt
+from curvireg_torch.filters.operations import (
+    at_least_float32,
+    central_derivatives,
+    image_maximum,
+    replicate_pad,
+    safe_sqrt,
+    smooth,
+    to_grey,
+)
 
 __all__ = ["DETECTORS", "Detection"]
 

@@ -25,33 +25,7 @@ from curvireg_torch.evaluation import DATASETS
 from curvireg_torch.pipeline import BankSettings, Pipeline
 from scripts.paper import tables as paper
 
-RANKINGS = ("precision", "angles", "ranks")
-TABLES = ("detectors", "repeatability", "curve", *RANKINGS)
-
-
-def main() -> int:
-    arguments = parser().parse_args()
-    try:
-        run(arguments)
-    except CurviregError as error:
-        print(f"reproduce_paper: error: {error}", file=sys.stderr)
-        return 2
-    return 0
-
-
-def parser() -> argparse.ArgumentParser:
-    result = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    result.add_argument("table", choices=(*TABLES, "all"), metavar="TABLE")
-    result.add_argument("kind", choices=DATASETS)
-    result.add_argument("root", type=Path, metavar="ROOT")
-    result.add_argument("--out", type=Path, required=True, metavar="DIR")
-    result.add_argument("--limit", type=int, metavar="N", help="use N photographs, spread evenly over the set")
-    result.add_argument("--image-size", type=int, default=128, metavar="PX", help="side of crops (default: 128)")
-    result.add_argument("--eps", type=float, default=2.0, metavar="PX", help="radius of a hit in the crop (default: 2)")
-    result.add_argument("--pose", choices=("upright", "any"), help="views of the banks (default: the dataset's)")
-    result.add_argument("--pixel-origin", type=int, choices=(0, 1), default=1, help="of PASCAL3D+ (default: 1)")
-    result.add_argument("--quiet", action="store_true", help="no progress bars")
-    return result
+TABLES = ("detectors", "repeatability", "curve", "precision", "angles", "ranks")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -65,18 +39,35 @@ def run(arguments: argparse.Namespace) -> None:
         tables.append(paper.repeatability_table(cases, settings, arguments.eps, progress))
     if "curve" in wanted:
         tables.append(paper.curve_table(cases, settings, arguments.eps, progress))
-    if any(name in wanted for name in RANKINGS):
+    if set(wanted) & {"precision", "angles", "ranks"}:
         views = Pipeline().with_pose_prior(arguments.pose or DATASETS[arguments.kind].pose).views.sphere()
         rankings = paper.rank_views(cases, views, settings, progress)
-        tables_of = {
-            "precision": lambda: [paper.precision_table(rankings)],
-            "angles": lambda: [paper.angle_table(rankings)],
-            "ranks": lambda: paper.rank_tables(rankings),
-        }
-        tables += [table for name in RANKINGS if name in wanted for table in tables_of[name]()]
+        tables += [paper.precision_table(rankings)] if "precision" in wanted else []
+        tables += [paper.angle_table(rankings)] if "angles" in wanted else []
+        tables += paper.rank_tables(rankings) if "ranks" in wanted else []
     for table in tables:
         paper.write_table(table, arguments.out)
         print(table.markdown())
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("table", choices=(*TABLES, "all"), metavar="TABLE")
+    parser.add_argument("kind", choices=DATASETS)
+    parser.add_argument("root", type=Path, metavar="ROOT")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--limit", type=int, metavar="N", help="use N photographs, spread evenly over the set")
+    parser.add_argument("--image-size", type=int, default=128, metavar="PX", help="side of crops (default: 128)")
+    parser.add_argument("--eps", type=float, default=2.0, metavar="PX", help="radius of a hit in the crop (default: 2)")
+    parser.add_argument("--pose", choices=("upright", "any"), help="views of the banks (default: the dataset's)")
+    parser.add_argument("--pixel-origin", type=int, choices=(0, 1), default=1, help="of PASCAL3D+ (default: 1)")
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    try:
+        run(parser.parse_args())
+    except CurviregError as error:
+        print(f"reproduce_paper: error: {error}", file=sys.stderr)
+        return 2
+    return 0
 
 
 if __name__ == "__main__":

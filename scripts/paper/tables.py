@@ -20,7 +20,7 @@ from tqdm import tqdm
 from curvireg_torch.data import read_image
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import DATASETS
-from curvireg_torch.evaluation.bop import UNOCCLUDED
+from curvireg_torch.evaluation.benchmarks import UNOCCLUDED
 from curvireg_torch.evaluation.metrics import accuracy
 from curvireg_torch.features import field_points
 from curvireg_torch.filters import ImageGradient, MultiScaleCurvilinearSaliency, MultiScaleFocusCurves
@@ -31,11 +31,11 @@ from curvireg_torch.geometry import (
     rotation_towards,
     viewpoint_from_rotation,
 )
-from curvireg_torch.geometry.views import DEFAULT_DISTANCE
+from curvireg_torch.geometry.viewpoint import DEFAULT_DISTANCE
 from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
 from curvireg_torch.matching.describe import depth_filter
 from curvireg_torch.mesh import load_mesh, mesh_centre, mesh_radius
-from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.pipeline import BankSettings, Pipeline
 from curvireg_torch.utils.files import write_csv, write_file
 from scripts.paper.detectors import DETECTORS
 from scripts.paper.measures import (
@@ -174,7 +174,9 @@ def _case(kind: Any, s: dict[str, Any]) -> Case | None:
     known = bool(pose[:, :3].isfinite().all() and s["box"].isfinite().all())
     if not known or s.get("visib_fract", 1.0) <= UNOCCLUDED:
         return None
-    return Case(kind.category.format_map(s), s["image_path"], str(s[kind.mesh]), kind.scored.unit, s["box"], pose)
+    return Case(
+        kind.category.format_map(s), s["image_path"], str(s[kind.scored.mesh]), kind.scored.unit, s["box"], pose
+    )
 
 
 def grouped(cases: list[Case], label: str, progress: bool) -> Iterator[tuple[trimesh.Trimesh, list[Case]]]:
@@ -377,7 +379,8 @@ def rank_views(cases: list[Case], views: ViewSphere, settings: BankSettings, pro
             truth.append(torch.tensor([*map(float, viewpoint_from_rotation(R)), 0.0]))
             errors.append(rotation_error(R[None].float(), views.rotations))
         for depth in depths:
-            bank = ViewBank.build(mesh, views, settings=replace(settings, depth_field=depth), progress=False)
+            pipeline = replace(Pipeline(), bank=replace(settings, depth_field=depth))
+            bank = ViewBank.build(mesh, views, pipeline=pipeline, progress=False)
             for photo, field in photos.items():
                 matcher = ViewMatcher(bank, field=field)
                 for chunk in crops.split(matcher.chunk_size):

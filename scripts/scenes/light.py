@@ -78,7 +78,7 @@ def shade_points(
         facing = np.maximum(normal @ lamp.towards, 0)
         if lamp.shadows:
             start = points + 2e-3 * points[:, 2:].mean() * normal
-            blocked = scene.blocked(start, np.broadcast_to(lamp.towards, start.shape))
+            blocked = np.isfinite(scene.distance(start, np.broadcast_to(lamp.towards, start.shape)))
             facing = facing * np.where(blocked, SHADOW, 1.0)
         half = view + lamp.towards
         half /= np.linalg.norm(half, axis=1, keepdims=True) + 1e-9

@@ -2,9 +2,8 @@
 
 import cv2
 import numpy as np
-import torch
+from scipy.spatial.transform import Rotation
 
-from curvireg_torch.geometry.conversions import rotation_from_quaternion
 from scripts.scenes.surfaces import Array, Rng
 
 
@@ -118,4 +117,4 @@ def random_texture(rng: Rng, size: int = 256) -> Array:
 
 def random_rotation(rng: Rng) -> Array:
     """(3, 3) rotation, uniformly distributed because a quaternion of normal numbers has no preferred direction."""
-    return np.asarray(rotation_from_quaternion(torch.from_numpy(rng.normal(size=4))))
+    return Rotation.from_quat(rng.normal(size=4), scalar_first=True).as_matrix()

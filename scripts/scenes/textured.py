@@ -253,7 +253,7 @@ def render(
     first = np.cumsum([0, *map(len, corners)])
     triangles = np.concatenate(corners)
     scene = _rays(triangles)
-    depth, triangle, _ = scene.hits(start, rays)
+    triangle, _, _, depth = scene.hits(start, rays)
     hit = np.flatnonzero(np.isfinite(depth))
     points, numbers = rays[hit] * depth[hit, None], triangle[hit]
     owner = np.searchsorted(first, numbers, side="right") - 1

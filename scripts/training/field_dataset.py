@@ -10,15 +10,12 @@ from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.matching.describe import depth_filter, hog_layer
 from curvireg_torch.pipeline import BankSettings
-from curvireg_torch.terms import normalized_correlation
 from scripts.training.generated import GeneratedScenes
 
 SETTINGS = BankSettings(image_size=WORK_SIZE, sigma=0.8)
 """Settings of the depth views that the network learns to imitate."""
 
-TEMPERATURE = 0.05
-"""Of the ranking losses: about the difference between the correlations of right and wrong views."""
-
+TEMPERATURE = 0.05  # of the ranking losses: about the difference between the correlations of right and wrong views
 OTHER_VIEWS = 5
 
 
@@ -126,14 +123,7 @@ def augment(batch: dict[str, Tensor], generator: torch.Generator) -> dict[str, T
     return {"image": images.clamp(0, 1), "code": code, "mask": mask, "descriptors": descriptors}
 
 
-def losses(
-    output: Tensor,
-    batch: dict[str, Tensor],
-    *,
-    descriptor_weight: float = 1.0,
-    ranking_weight: float = 0.1,
-    other_views_weight: float = 0.2,
-) -> dict[str, Tensor]:
+def losses(output: Tensor, batch: dict[str, Tensor]) -> dict[str, Tensor]:
     """Terms of the training loss, to be added up.
 
     ``field``: squared error of the code, relative to predicting no field. ``mask``: cross entropy. ``descriptor``: one
@@ -147,14 +137,14 @@ def losses(
     code, target = output[:, :2], batch["code"]
     predicted = hog_layer(SETTINGS)(halved_angle(code))
     true = batch["descriptors"][:, 0]
-    correlation = normalized_correlation(predicted, torch.cat([true, mirrored_descriptors(true)]))
+    correlation = F.normalize(predicted) @ F.normalize(torch.cat([true, mirrored_descriptors(true)])).T
     labels = torch.arange(len(predicted), device=predicted.device)
     views = F.normalize(batch["descriptors"][:, 1:], dim=2)
     among_views = (views @ F.normalize(predicted, dim=1)[..., None])[..., 0]
     return {
         "field": (code - target).square().sum(dim=1).mean() / target.square().sum(dim=1).mean(),
         "mask": F.binary_cross_entropy_with_logits(output[:, 2:], batch["mask"]),
-        "descriptor": descriptor_weight * (1.0 - correlation.diagonal()).mean(),
-        "ranking": ranking_weight * F.cross_entropy(correlation / TEMPERATURE, labels),
-        "other_views": other_views_weight * F.cross_entropy(among_views / TEMPERATURE, torch.zeros_like(labels)),
+        "descriptor": (1.0 - correlation.diagonal()).mean(),
+        "ranking": 0.1 * F.cross_entropy(correlation / TEMPERATURE, labels),
+        "other_views": 0.2 * F.cross_entropy(among_views / TEMPERATURE, torch.zeros_like(labels)),
     }

@@ -1,6 +1,5 @@
 """Generated scenes as a dataset: crops of procedural objects, with the depth of the object alone."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
@@ -18,9 +17,7 @@ from scripts.scenes.scene import simulate_camera, single
 from scripts.scenes.surfaces import Array, Rng
 from scripts.scenes.textured import Placed, TexturedMesh
 
-CLUTTER = 500
-"""Shapes that clutter is drawn from; each process builds them once."""
-
+CLUTTER = 500  # shapes that clutter is drawn from; each process builds them once
 MARGIN = 0.1  # around the object's box, as in BankSettings
 PHOTOGRAPH = (480, 640)  # the crop's scene is composed for a photograph of this size
 
@@ -33,46 +30,29 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
         seed: another seed gives other objects.
         image_size: side of the crops in px.
         upright: fraction of the objects that stand upright.
-        meshes: use these instead of procedural objects.
 
     Items (a dict): ``image`` (3, S, S) float32 in [0, 1], ``depth`` (1, S, S) float32 in radii of the object, 0 =
-    background, ``visible`` (1, S, S) bool, ``rotation`` (3, 3) float32 of a camera that looks straight at the object,
+    background, ``rotation`` (3, 3) float32 of a camera that looks straight at the object,
     ``distance`` () float32 in radii.
     """
 
-    def __init__(
-        self,
-        length: int,
-        *,
-        seed: int = 0,
-        image_size: int = 128,
-        upright: float = 0.6,
-        meshes: Sequence[trimesh.Trimesh] = (),
-    ) -> None:
-        self._length, self._seed, self._size, self._upright, self._meshes = length, seed, image_size, upright, meshes
+    def __init__(self, length: int, *, seed: int = 0, image_size: int = 128, upright: float = 0.6) -> None:
+        self._length, self._seed, self._size, self._upright = length, seed, image_size, upright
 
     def __len__(self) -> int:
         return self._length
 
     def mesh(self, index: int) -> trimesh.Trimesh:
         """The object of sample ``index``, of radius 1 around the origin."""
-        if self._meshes:
-            mesh = self._meshes[index % len(self._meshes)].copy()
-            mesh.apply_translation(-mesh.bounds.mean(axis=0))
-        else:
-            vertices, faces, _ = random_shape(np.random.default_rng((self._seed, index)))
-            mesh = trimesh.Trimesh(vertices, faces, process=False)
+        vertices, faces, _ = random_shape(np.random.default_rng((self._seed, index)))
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
         return mesh.apply_scale(1.0 / np.linalg.norm(0.5 * mesh.extents))
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
         if not 0 <= index < self._length:
             raise IndexError(index)
         rng = np.random.default_rng((self._seed, index, 1))
-        if self._meshes:
-            mesh = self.mesh(index)
-            shape = TexturedMesh.from_arrays(mesh.vertices, mesh.faces, [Material(rng)])
-        else:
-            shape = _painted(np.random.default_rng((self._seed, index)), rng)
+        shape = _painted(np.random.default_rng((self._seed, index)), rng)
         upright, occluded = bool(rng.random() < self._upright), bool(rng.random() < 0.3)
         options = {"size": PHOTOGRAPH, "upright": upright, "occluded": occluded}
         scene = single(shape, 1, _clutter, random_texture, rng, **options)
@@ -84,15 +64,12 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
         picture = scene.render((R, t, K), (self._size, self._size))
         if picture.seen.sum() < 0.1 * picture.whole.sum():  # hidden objects are of no use for training
             picture = replace(scene, shapes=[target]).render((R, t, K), (self._size, self._size))
-        visible = np.zeros((self._size, self._size), bool)
-        visible[y0:y1, x0:x1] = picture.seen[0, y0:y1, x0:x1]
         image = np.pad(
             picture.linear[y0:y1, x0:x1], ((y0, self._size - y1), (x0, self._size - x1), (0, 0)), mode="edge"
         )
         return {
             "image": torch.from_numpy(simulate_camera(image, rng)).permute(2, 0, 1).float() / 255.0,
             "depth": torch.from_numpy(picture.depth)[None],
-            "visible": torch.from_numpy(visible)[None],
             "rotation": torch.from_numpy(R @ target.rotation).float(),
             "distance": torch.tensor(np.linalg.norm(centre), dtype=torch.float32),
         }

@@ -25,7 +25,6 @@ from curvireg_torch.features.learned_field import save_weights
 from curvireg_torch.geometry import rotation_error, sample_views
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.matching.describe import depth_filter, hog_layer
-from curvireg_torch.terms import normalized_correlation
 from curvireg_torch.utils.files import write_tensors
 from scripts.training.field_dataset import SETTINGS, FieldDataset, ReplayBuffer, augment, losses
 from scripts.training.generated import GeneratedScenes
@@ -55,9 +54,9 @@ class Validation:
         errors, cosines = [], []
         for image, depth, error, bank in zip(self.images, self.depths, self.errors, self.banks, strict=True):
             query = descriptor(field(image[None]))
-            errors.append(float(error[normalized_correlation(query, bank.float())[0].argmax()]))
+            errors.append(float(error[F.cosine_similarity(query, bank.float()).argmax()]))
             target = descriptor(depth_filter(SETTINGS)(depth[None]))
-            cosines.append(float(normalized_correlation(query, target)))
+            cosines.append(float(F.cosine_similarity(query, target)))
         e = np.array(errors)
         return {
             "accuracy_30": float((e < 30).mean()),

@@ -9,7 +9,7 @@ import numpy as np
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import learned_registrar, scene, truck_bank
 
-__all__ = ["CAMERA", "RESULTS", "box_of", "lines", "table", "write_files", "written"]
+__all__ = ["CAMERA", "RESULTS", "bop_poses", "box_of", "lines", "table", "write_files", "written"]
 
 CAMERA = ["260", "260", "119.5", "89.5"]
 RESULTS = [*("status", "message", "confidence", "reliable"), *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))]
@@ -43,6 +43,17 @@ def written(path, header, *rows):
 def table(folder):
     with (folder / "results.csv").open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
+
+
+def bop_poses(path):
+    """The lines of a results file of the BOP challenge, as numbers and arrays."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        row |= {name: int(row[name]) for name in ("scene_id", "im_id", "obj_id")}
+        row |= {name: float(row[name]) for name in ("score", "time")}
+        row |= {"R": np.array(row["R"].split(), float).reshape(3, 3), "t": np.array(row["t"].split(), float)}
+    return rows
 
 
 def lines(folder):

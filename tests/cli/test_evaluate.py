@@ -7,8 +7,7 @@ import pytest
 
 from curvireg_torch.cli import parse
 from curvireg_torch.errors import InvalidInputError, MissingFileError
-from curvireg_torch.evaluation import contact_sheet
-from curvireg_torch.evaluation.scores import detection_recall
+from curvireg_torch.evaluation.benchmarks import detection_recall
 from curvireg_torch.pipeline import DEFAULT, PRESETS
 from tests.evaluation.small import SMALL
 
@@ -53,15 +52,14 @@ def test_evaluate_bop_assumes_any_pose(bop, evaluate):
 
 def test_evaluate_without_boxes_reports_detection(pascal, evaluate, tmp_path, capsys, monkeypatch):
     """The summary has the recall of boxes, or says that no box is annotated; thumbnails show the found box."""
+    boxes = []
+    monkeypatch.setattr("curvireg_torch.evaluation.runner.thumbnail", lambda *a: boxes.append(a[3]) or b"")
     words = ("pascal3d", pascal.root, "--limit", "2", "--protocol", "box=none")
     summary = evaluate(*words)
     assert summary["detection"]["n"] == 2
     assert f"recall_1 {summary['detection']['recall_1']:.3f}   recall_5" in capsys.readouterr().out
     rows = [json.loads(line) for line in (tmp_path / "out" / "results.jsonl").read_text().splitlines()]
     row = next(row for row in rows if "detection" in row)
-    boxes = []
-    monkeypatch.setattr("curvireg_torch.evaluation.sheet.thumbnail", lambda *a: boxes.append(a[3]) or b"")
-    contact_sheet(tmp_path / "out", tmp_path / "sheet.html")
     assert row["detection"]["proposals"][0]["box"] in boxes
     summary["detection"] = detection_recall([], [])
     monkeypatch.setattr("curvireg_torch.evaluation.datasets.evaluate", lambda *_, **__: summary)

@@ -17,11 +17,10 @@ import torch
 import trimesh
 
 from curvireg_torch import camera_matrix
-from curvireg_torch.data import read_bop_csv
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.visualization import sheet
-from tests._support.lists import CAMERA, box_of, lines, table, written
+from tests._support.lists import CAMERA, bop_poses, box_of, lines, table, written
 
 
 def test_list_page_shows_every_row_best_first(folder, register, tmp_path):
@@ -97,13 +96,13 @@ def test_list_writes_bop_csv(folder, register, tmp_path):
     ]
     path = written(folder / "bop.csv", header, *rows)
     assert register("--list", path, folder / "truck.safetensors", "--unit", "mm") == 0
-    (row,) = read_bop_csv(tmp_path / "out" / "bop.csv")
+    (row,) = bop_poses(tmp_path / "out" / "bop.csv")
     found = lines(tmp_path / "out")[0]
     assert (row["scene_id"], row["im_id"], row["obj_id"], row["score"]) == (1, 7, 3, 0.0)
     assert row["R"].tolist() == found["rotation"]
     metres = torch.tensor(found["translation"], dtype=torch.float64)
     assert found["unit"] == "m"  # of the bank
-    torch.testing.assert_close(row["t"].double(), metres * 1000, rtol=1e-6, atol=0)
+    np.testing.assert_allclose(row["t"], metres * 1000)
     K = camera_matrix(*map(float, CAMERA), dtype=torch.float64)
     assert float((K @ metres)[2]) > 0
 

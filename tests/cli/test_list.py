@@ -7,7 +7,7 @@ import torch
 
 from curvireg_torch import Pipeline, ViewBank, sample_views
 from curvireg_torch.cli import main
-from curvireg_torch.evaluation.lists import register as lists_register
+from curvireg_torch.evaluation import runner
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import CAMERA, RESULTS, box_of, lines, table, written
@@ -32,7 +32,7 @@ def register_list(folder, register):
 def registered(monkeypatch):
     """Names of the photographs that are registered; ``stop_after`` of them, Ctrl-C is simulated."""
     names = []
-    register_one = lists_register.register_entry
+    register_one = runner.register_entry
 
     def register_entry(entry, *rest, **options):
         if len(names) == register_entry.stop_after:
@@ -41,7 +41,7 @@ def registered(monkeypatch):
         return register_one(entry, *rest, **options)
 
     register_entry.stop_after = None
-    monkeypatch.setattr(lists_register, "register_entry", register_entry)
+    monkeypatch.setattr(runner, "register_entry", register_entry)
     return names, register_entry
 
 

@@ -68,6 +68,6 @@ def test_video_refuses_other_files_and_too_many_pixels(five, tmp_path, monkeypat
         Video(tmp_path / "no.mp4")
     with pytest.raises(ImageError, match="cannot be read"):
         Video(tmp_path / "nothing.mp4")
-    monkeypatch.setattr("curvireg_torch.data.videos.MAX_IMAGE_PIXELS", 64 * 48 - 1)
+    monkeypatch.setattr("curvireg_torch.data.images.MAX_IMAGE_PIXELS", 64 * 48 - 1)
     with pytest.raises(ImageError, match="not a video"):
         Video(five)

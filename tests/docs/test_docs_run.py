@@ -17,7 +17,7 @@ import torch
 import curvireg_torch as cr
 from curvireg_torch import cli
 from curvireg_torch.geometry import rotation_error, transform
-from curvireg_torch.geometry.translation import pose_from_box
+from curvireg_torch.geometry.cameras import pose_from_box
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 
 from .._support.exif import exif, with_exif

@@ -1,7 +1,7 @@
 """Evaluations in tests: short calls, and what they wrote."""
 
 from curvireg_torch.evaluation import evaluate
-from curvireg_torch.evaluation.store import ResultStore
+from tests._support.lists import lines
 
 __all__ = ["rows_of", "run", "without_seconds"]
 
@@ -11,10 +11,9 @@ def run(benchmark, out, **options):
 
 
 def rows_of(benchmark, out):
-    store = ResultStore(out)
-    return {item.key: store.read(item.key) for item in benchmark.items if item.key in store}
+    rows = {row["key"]: row for row in lines(out)}
+    return {entry.key: rows[entry.key] for entry in benchmark.entries if entry.key in rows}
 
 
 def without_seconds(rows):
-    dropped = ("seconds", "revision")
-    return {key: {name: v for name, v in row.items() if name not in dropped} for key, row in rows.items()}
+    return {key: {name: v for name, v in row.items() if name != "seconds"} for key, row in rows.items()}

@@ -1,19 +1,28 @@
 """Evaluation of datasets, from files to files."""
 
+import csv
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import pytest
 import torch
+import trimesh
 
-from curvireg_torch.data import read_bop_csv
+from curvireg_torch.cli import main
+from curvireg_torch.data import Photo, read_image
 from curvireg_torch.errors import InvalidInputError, RenderingError
-from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, score
-from curvireg_torch.evaluation.store import ResultStore
+from curvireg_torch.evaluation import DATASETS, BOPBenchmark, Pascal3DBenchmark, Protocol
 from curvireg_torch.filters import ImageGradient
+from curvireg_torch.matching import ViewBank, ViewMatcher
+from curvireg_torch.mesh import load_mesh
+from curvireg_torch.registration import Registrar
+from tests._support.lists import bop_poses, lines
+from tests._support.miniature import write_bop, write_pascal3d, write_web
 
 from .helpers import rows_of, run, without_seconds
+from .small import SMALL
 
 
 def test_evaluate_pascal3d(pascal, tmp_path):
@@ -27,21 +36,23 @@ def test_evaluate_pascal3d(pascal, tmp_path):
     assert "other_class" not in summary["skipped"], "objects of other classes are not"
     assert summary["failed"] == 0
     rows = rows_of(benchmark, tmp_path / "out")
-    assert {k: r.get("skipped") for k, r in rows.items()} == {
-        "car/2008_000001/0": None,
-        "car/2008_000002/1": None,
-        "car/2008_000002/2": None,
-        "car/2008_000003/8": "unreadable_image",
-        "sofa/2008_000002/0": "unreadable_mesh",
+    assert {k: (r.get("skipped"), r["status"]) for k, r in rows.items()} == {
+        "car/2008_000001/0": (None, "ok"),
+        "car/2008_000002/1": (None, "ok"),
+        "car/2008_000002/2": (None, "ok"),
+        "car/2008_000003/8": ("unreadable_image", "failed"),
+        "sofa/2008_000002/0": ("unreadable_mesh", "failed"),
     }
     good = rows["car/2008_000001/0"]
     assert good["translation"] is None, "no camera was given"
-    assert good["mesh"] == "01.off"
+    assert good["mesh"].endswith("car/01.off")
+    assert {"probabilities", "none", "top", "reliable", "confidence"} <= set(good)
     assert good["seconds"]["register"] > 0
     R = torch.tensor(good["rotation"], dtype=torch.float64)
     torch.testing.assert_close(R @ R.T, torch.eye(3).double(), atol=1e-6, rtol=0)
     files = {p.name for p in (tmp_path / "out").iterdir()}
-    assert files == {"results.jsonl", "settings.json", "predictions.csv", "summary.json"}
+    assert files == {"results.jsonl", "predictions.csv", "summary.json", "index.html", "thumbnails"}
+    assert (tmp_path / "out" / "index.html").read_text().count("<img") == 3
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["protocol"] == str(Protocol())
 
 
@@ -51,22 +62,20 @@ def test_evaluate_bop(bop, tmp_path):
     assert summary["skipped"]["unknown_box"] == 1, "without scene_gt_info there is no box"
     detected = run(BOPBenchmark(bop, Protocol(pose="any", box=None)), tmp_path / "detected")
     assert "unknown_box" not in detected["skipped"]
-    table = read_bop_csv(tmp_path / "out" / "predictions.csv")
+    table = bop_poses(tmp_path / "out" / "predictions.csv")
     assert len(table) == 3
     assert all(row["t"][2] > 0 for row in table)
 
 
 def test_objects_fail_alone(bop, tmp_path):
     benchmark = BOPBenchmark(bop, Protocol(pose="any"))
-    first, second, third = benchmark.items[:3]
-    oblong = first.camera_matrix.clone()
-    oblong[0, 0] *= 1.3
-    benchmark.items[0] = replace(first, camera_matrix=oblong)
-    benchmark.items[1] = replace(second, box=second.box + 5000.0)
+    first, second, third = benchmark.entries[:3]
+    benchmark.entries[0] = replace(first, camera=(400.0, *first.camera[1:]))
+    benchmark.entries[1] = replace(second, box=tuple(v + 5000.0 for v in second.box))
     summary = run(benchmark, tmp_path / "out")
     rows = rows_of(benchmark, tmp_path / "out")
-    assert "square pixels" in rows[first.key]["failed"]
-    assert "entirely outside" in rows[second.key]["failed"]
+    assert "square pixels" in rows[first.key]["message"]
+    assert "entirely outside" in rows[second.key]["message"]
     assert "rotation" in rows[third.key]
     assert summary["failed"] == 2
 
@@ -89,30 +98,33 @@ def test_results_are_the_same_bits_on_other_threads_and_resumed(pascal, tmp_path
 
 
 def test_flat_photograph_is_a_miss(pascal, tmp_path, monkeypatch):
-    monkeypatch.setattr("curvireg_torch.evaluation.predict.read_image", lambda _: torch.full((3, 60, 80), 0.5))
+    grey = Photo(torch.full((3, 60, 80), 90, dtype=torch.uint8), 1, None, ())
+    monkeypatch.setattr("curvireg_torch.evaluation.runner.read_photo", lambda *_, **__: grey)
     benchmark = Pascal3DBenchmark(pascal, Protocol())
     summary = run(benchmark, tmp_path / "out")
     assert (summary["n"], summary["failed"], summary["acc_pi_6"]) == (4, 4, 0.0)
-    assert rows_of(benchmark, tmp_path / "out")["car/2008_000001/0"]["failed"].startswith("the box shows one colour")
+    assert rows_of(benchmark, tmp_path / "out")["car/2008_000001/0"]["message"].startswith(
+        "Images/car_pascal/2008_000001.jpg: the box shows one colour"
+    )
 
 
 def test_defects_end_the_run(pascal, tmp_path, monkeypatch):
     def broken(*_, **__):
         raise RenderingError("no renderer")
 
-    monkeypatch.setattr("curvireg_torch.evaluation.predict.cached_bank", broken)
+    monkeypatch.setattr("curvireg_torch.evaluation.datasets.cached_bank", broken)
     with pytest.raises(RenderingError):
         run(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out")
 
 
-def test_other_settings_are_refused(pascal, tmp_path):
-    run(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out")
+def test_other_settings_are_registered_again(pascal, tmp_path):
+    out = tmp_path / "out"
+    run(Pascal3DBenchmark(pascal, Protocol()), out)
     other = Pascal3DBenchmark(pascal, Protocol(pose="any"))
-    with pytest.raises(InvalidInputError, match=r"other settings \(pipeline: .*protocol: .*--overwrite"):
-        run(other, tmp_path / "out")
-    summary = score(other, tmp_path / "out")
-    assert summary["protocol"] == str(Protocol()), "that of the results"
-    assert run(other, tmp_path / "out", overwrite=True)["protocol"] == str(other.protocol)
+    assert run(other, out)["protocol"] == str(other.protocol)
+    rows = rows_of(other, out)
+    assert {row["pipeline"]["views"]["pose"] for row in rows.values() if "pipeline" in row} == {"any"}
+    assert len(lines(out)) == len(rows), "one row for each object"
 
 
 @pytest.mark.parametrize("options", [{"limit": 0}, {"limit": -1}, {"preset": "best"}])
@@ -123,13 +135,13 @@ def test_bad_options_are_refused(pascal, tmp_path, options):
 
 def test_selection_is_spread(pascal):
     benchmark = Pascal3DBenchmark(pascal, Protocol())
-    assert [item.index for item in benchmark.selection(2)] == [0, 2]
-    assert [item.index for item in benchmark.selection(9)] == [0, 1, 2, 3, 4]
+    assert benchmark.selection(2) == [0, 2]
+    assert benchmark.selection(9) == [0, 1, 2, 3, 4]
 
 
 def test_settings_name_the_users_field(pascal, tmp_path):
-    run(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out", field=ImageGradient(), limit=1)
-    assert ResultStore(tmp_path / "out").settings()["pipeline"]["field"] == "custom:ImageGradient"
+    summary = run(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out", field=ImageGradient(), limit=1)
+    assert summary["settings"]["pipeline"]["field"] == "custom:ImageGradient"
 
 
 def test_changed_photographs_are_registered_again(pascal, tmp_path):
@@ -143,7 +155,78 @@ def test_changed_photographs_are_registered_again(pascal, tmp_path):
     run(benchmark, tmp_path / "out")
     after = rows_of(benchmark, tmp_path / "out")
     assert before["car/2008_000003/8"]["skipped"] == "unreadable_image"
-    assert "on its shorter side" in after["car/2008_000003/8"]["failed"], "read now; its box is too small"
+    assert "on its shorter side" in after["car/2008_000003/8"]["message"], "read now; its box is too small"
     assert after["car/2008_000001/0"] == before["car/2008_000001/0"], "seconds included"
     for key in ("car/2008_000002/1", "car/2008_000002/2"):
         assert after[key]["score"] != before[key]["score"]
+
+
+@pytest.fixture
+def two_cars(pascal):
+    """A second CAD of a car, of another shape."""
+    trimesh.creation.box((0.2, 0.9, 0.2)).export(pascal.root / "CAD" / "car" / "02.off")
+    return pascal
+
+
+def test_cad_any_takes_the_best_of_all(two_cars, tmp_path):
+    """Without confidence, the mesh whose best view is most similar to the photograph."""
+    folder, upright = two_cars.root / "CAD" / "car", SMALL.with_pose_prior("upright")
+    benchmark = Pascal3DBenchmark(two_cars, Protocol(cad="any"))
+    run(benchmark, tmp_path)
+    banks = {p.name: ViewBank.build(load_mesh(p), pipeline=upright, progress=False) for p in folder.iterdir()}
+    rows = {key: row for key, row in rows_of(benchmark, tmp_path).items() if "rotation" in row}
+    assert rows
+    for entry in benchmark.entries:
+        if entry.key in rows and len(entry.meshes) == 2:
+            scores = {}
+            for name, bank in banks.items():
+                with torch.no_grad():
+                    box = torch.tensor(entry.box)[None]
+                    ranking = ViewMatcher(bank, pipeline=upright)([read_image(entry.photo)], box)
+                scores[name] = float(ranking.hog[0, ranking.order[0, 0]])
+            assert Path(rows[entry.key]["mesh"]).name == max(scores, key=scores.__getitem__)
+
+
+def test_protocol_and_pipeline_reach_the_registrar(two_cars, tmp_path, monkeypatch):
+    registrars, init = [], Registrar.__init__
+    monkeypatch.setattr(Registrar, "__init__", lambda self, *a, **k: registrars.append(self) or init(self, *a, **k))
+    benchmark = Pascal3DBenchmark(two_cars, Protocol(cad="any"))
+    run(benchmark, tmp_path, preset=replace(SMALL, box_jitter=0.05), limit=1)
+    assert len(registrars[0].others or registrars[-1].others) == 1
+    for registrar in registrars:
+        assert registrar.pipeline.box_jitter == 0.05
+        assert registrar.pipeline.views.pose == "upright"
+
+
+def test_evaluate_web_tells_known_from_unknown_poses(web, tmp_path, capsys):
+    words = ["evaluate", "web", str(web.root), "--out", str(tmp_path), "--quiet"]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "4 objects, 0 failed" in out
+    assert "the true pose of 2 is known: their scores are\nacc_15_deg" in out
+    assert "pose=any" in out
+    with open(tmp_path / "predictions.csv", newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [line["category"] for line in lines] == ["cup"] * 3 + ["shoe"]
+    assert [line["true_azimuth"] for line in lines] == ["30", "", "90", ""]
+    assert [bool(line["error_deg"]) for line in lines] == [True, False, True, False]
+    assert all(line["azimuth"] for line in lines)
+    for name in ("no_mesh", "no_table", "other_table", "cup"):
+        for path in (web.root / name).iterdir():
+            path.unlink()
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "the true pose of 0 is known: nothing to compare" in out
+    assert "acc_" not in out
+
+
+@pytest.mark.parametrize("kind", DATASETS)
+def test_every_dataset_opens_and_names_its_groups(kind, tmp_path):
+    {"pascal3d": write_pascal3d, "bop": write_bop, "web": write_web}[kind](tmp_path)
+    row = DATASETS[kind]
+    dataset = row.open(tmp_path, **row.whole)
+    sample = dataset.annotation(0)
+    assert row.category.format_map(sample) in ("car", "object 1", "cup")
+    benchmark = row.scored(dataset, Protocol(pose=row.pose))
+    assert benchmark.name == kind
+    assert [str(path) for path in benchmark.entries[0].meshes] == [str(sample[benchmark.mesh])]

@@ -1,7 +1,7 @@
-"""The loop over items, with a function in place of the registration."""
+"""The loop over entries, with a function in place of the registration."""
 
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -11,26 +11,13 @@ import torch
 from curvireg_torch import PosePrior
 from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.evaluation import runner
-from curvireg_torch.evaluation.benchmark import BenchmarkItem
-from curvireg_torch.evaluation.lists import Entry
-from curvireg_torch.evaluation.runner import run_items
+from curvireg_torch.evaluation.runner import Entry, run_entries
 from curvireg_torch.evaluation.workers import Workers, run_processes, workers
 
 
-@dataclass(frozen=True)
-class Item:
-    key: str
-    photo: Path
-    meshes: tuple[Path, ...]
-    options: dict = field(default_factory=dict)
-
-    def request(self):
-        return self.options
-
-
 @pytest.fixture
-def items(tmp_path):
-    """Four items: two photographs, each with two meshes in turn; one mesh has a texture."""
+def entries(tmp_path):
+    """Four entries: two photographs, each with two meshes in turn; one mesh has a texture."""
     for name in ("0.png", "1.png", "skin.png"):
         (tmp_path / name).write_text(name)
     (tmp_path / "a.stl").write_text("a")
@@ -38,35 +25,49 @@ def items(tmp_path):
     (tmp_path / "b.obj").write_text(text)
     (tmp_path / "skin.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
     pairs = [(photo, mesh) for photo in ("0.png", "1.png") for mesh in ("a.stl", "b.obj")]
-    return [Item(f"{p[0]}{m[0]}", tmp_path / p, (tmp_path / m,)) for p, m in pairs]
+    return [Entry(photo=tmp_path / p, meshes=(tmp_path / m,), label=f"{p[0]}{m[0]}") for p, m in pairs]
 
 
-def registered(items, folder, *, settings=None, row=None, workers=None, register=None):
-    """The keys of the items that a run registers, in their order."""
-    keys = []
+def registered(entries, folder, *, settings=None, workers=None, stop_after=None):
+    """The labels of the entries that a run registers, in their order; Ctrl-C after ``stop_after`` of them."""
+    labels = []
 
-    def plain(item, registrar, seconds, _):
-        keys.append(item.key)
-        assert str(registrar) == item.meshes[0].name
-        assert (seconds > 0) == (sum(key[1] == item.key[1] for key in keys) == 1), "the first pays for the bank"
-        return row or {}
+    def register(entry, registrar, _, *, bank_seconds):
+        if len(labels) == stop_after:
+            raise KeyboardInterrupt
+        labels.append(entry.label)
+        assert str(registrar) == entry.meshes[0].name
+        first = sum(label[1] == entry.label[1] for label in labels) == 1
+        assert (bank_seconds > 0) == first, "the first pays for the bank"
+        return {"status": "ok"}
 
-    with patch.object(runner, "workers", lambda: nullcontext(workers or Workers())):
-        run_items(
-            items, folder, lambda meshes: MeshError(meshes[0].name), register or plain,
-            settings=settings or {}, prepare=lambda _: None, label="", progress=False,
-        )  # fmt: skip
-    return keys
+    def open_registrar(meshes):
+        raise MeshError(meshes[0].name)
+
+    options = {"settings": settings or {}, "label": "", "progress": False}
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with (
+            patch.object(runner, "workers", lambda: nullcontext(workers or Workers())),
+            patch.object(runner, "_row", register),
+        ):
+            registered.store = run_entries(entries, folder, open_registrar, **options)
+    except KeyboardInterrupt:
+        assert stop_after is not None
+    finally:
+        torch.set_num_threads(threads)
+    return labels
 
 
-def test_items_of_one_mesh_follow_each_other(items, tmp_path):
-    assert registered(items, tmp_path / "out") == ["0a", "1a", "0b", "1b"]
-    assert registered(items, tmp_path / "out") == []
-    assert registered(items[::-1], tmp_path / "out") == [], "in any order"
-    parts = [registered(items, tmp_path / "two", workers=Workers(rank, 2)) for rank in (0, 1)]
+def test_entries_of_one_mesh_follow_each_other(entries, tmp_path):
+    assert registered(entries, tmp_path / "out") == ["0a", "1a", "0b", "1b"]
+    assert registered(entries, tmp_path / "out") == []
+    assert registered(entries[::-1], tmp_path / "out") == [], "in any order"
+    parts = [registered(entries, tmp_path / "two", workers=Workers(rank, 2)) for rank in (0, 1)]
     assert parts == [["0a", "1a"], ["0b", "1b"]]
-    parts = [registered(items, tmp_path / "eight", workers=Workers(rank, 8)) for rank in range(8)]
-    assert [key for part in parts for key in part] == ["0a", "1a", "0b", "1b"]
+    parts = [registered(entries, tmp_path / "eight", workers=Workers(rank, 8)) for rank in range(8)]
+    assert [label for part in parts for label in part] == ["0a", "1a", "0b", "1b"]
 
 
 @pytest.mark.parametrize(
@@ -79,16 +80,16 @@ def test_items_of_one_mesh_follow_each_other(items, tmp_path):
         ("skin.png", ["0b", "1b"]),
     ],
 )
-def test_changed_files_are_registered_again(items, tmp_path, name, again):
-    registered(items, tmp_path / "out")
+def test_changed_files_are_registered_again(entries, tmp_path, name, again):
+    registered(entries, tmp_path / "out")
     (tmp_path / name).write_text((tmp_path / name).read_text() + "\n# changed\n")
-    assert registered(items, tmp_path / "out") == again
-    assert registered(items, tmp_path / "out") == []
+    assert registered(entries, tmp_path / "out") == again
+    assert registered(entries, tmp_path / "out") == []
 
 
-def test_other_requests_settings_and_code_are_registered_again(items, tmp_path, monkeypatch):
-    registered(items, tmp_path / "out")
-    changed = [replace(items[0], options={"box": 1}), *items[1:]]
+def test_other_requests_settings_and_code_are_registered_again(entries, tmp_path, monkeypatch):
+    registered(entries, tmp_path / "out")
+    changed = [replace(entries[0], box=(1.0, 2.0, 3.0, 4.0)), *entries[1:]]
     assert registered(changed, tmp_path / "out") == ["0a"]
     assert len(registered(changed, tmp_path / "out", settings={"top": 2})) == 4
     assert registered(changed, tmp_path / "out", settings={"top": 2}) == []
@@ -96,66 +97,56 @@ def test_other_requests_settings_and_code_are_registered_again(items, tmp_path, 
     assert len(registered(changed, tmp_path / "out", settings={"top": 2})) == 4
 
 
-def test_skipped_and_missing_items_are_tried_again(items, tmp_path):
-    items[0].photo.unlink()
-    for _ in range(2):
-        assert registered(items, tmp_path / "out") == (["0a", "0b"] if _ else ["0a", "1a", "0b", "1b"])
-    for _ in range(2):
-        assert len(registered(items, tmp_path / "skipped", row={"skipped": "unknown_box"})) == 4
+def test_missing_photographs_are_tried_again(entries, tmp_path):
+    entries[0].photo.unlink()
+    assert registered(entries, tmp_path / "out") == ["0a", "1a", "0b", "1b"]
+    assert registered(entries, tmp_path / "out") == ["0a", "0b"]
+    assert registered.store.read("0a")["digests"]["photo"] == ""
 
 
-def test_interrupted_run_keeps_what_is_done(items, tmp_path):
-    done = []
+def test_interrupted_run_keeps_what_is_done(entries, tmp_path):
+    assert registered(entries, tmp_path / "out", stop_after=2) == ["0a", "1a"]
+    assert registered(entries, tmp_path / "out") == ["0b", "1b"]
 
-    def register(item, *_):
-        if len(done) == 2:
-            raise KeyboardInterrupt
-        done.append(item.key)
-        return {}
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            registered(items, tmp_path / "out", register=register)
-    finally:
-        torch.set_num_threads(threads)
-    assert done == ["0a", "1a"]
-    assert registered(items, tmp_path / "out") == ["0b", "1b"]
+def test_job_array_reports_nothing_of_photographs_that_have_changed(entries, tmp_path):
+    """The job that finds rows of the others reports them only if they belong to the present files."""
+    out = tmp_path / "out"
+    for rank in (0, 1):
+        registered(entries, out, workers=Workers(rank, 2))
+    assert registered.store is not None
+    (tmp_path / "0.png").write_text("changed")
+    assert registered(entries, out, workers=Workers(0, 2)) == ["0a"]
+    assert registered.store is None, "job 1 has not registered 0b again"
+    assert registered(entries, out, workers=Workers(1, 2)) == ["0b"]
+    digests = {registered.store.read(label)["digests"]["photo"] for label in ("0a", "0b")}
+    assert len(digests) == 1
 
 
 ENTRY = Entry(("x",), "x.png", Path("x.png"), (Path("x.ply"),), box=(1.0, 2.0, 3.0, 4.0), camera=(5.0, 5.0, 6.0, 7.0))
-OBJECT = BenchmarkItem("x", 0, Path("x.png"), (Path("x.ply"),), torch.arange(4.0), torch.eye(3).double())
-
-
-def moved(tensor, place):
-    tensor = tensor.clone()
-    tensor.view(-1)[place] += 1e-3
-    return tensor
 
 
 @pytest.mark.parametrize(
-    ("item", "changes"),
+    "changes",
     [
-        (ENTRY, {"name": "y.png"}),
-        (ENTRY, {"box": (1.0, 2.0, 3.0, 4.25)}),
-        (ENTRY, {"box": None}),
-        (ENTRY, {"camera": (5.0, 5.0, 6.25, 7.0)}),
-        (ENTRY, {"camera": None}),
-        (ENTRY, {"guess": "exif"}),
-        (ENTRY, {"guess": 50.0}),
-        (ENTRY, {"instances": 2}),
-        (ENTRY, {"prior": PosePrior(distance=(1.0, 2.0))}),
-        (OBJECT, {"camera_matrix": None}),
-        *[(OBJECT, {"box": moved(OBJECT.box, place)}) for place in range(4)],
-        *[(OBJECT, {"camera_matrix": moved(OBJECT.camera_matrix, place)}) for place in (0, 2, 4, 5)],
+        {"name": "y.png"},
+        {"box": (1.0, 2.0, 3.0, 4.25)},
+        {"box": None},
+        {"camera": (5.0, 5.0, 6.25, 7.0)},
+        {"camera": None},
+        {"guess": "exif"},
+        {"guess": 50.0},
+        {"instances": 2},
+        {"prior": PosePrior(distance=(1.0, 2.0))},
+        {"start": ((1.0, 0.0, 0.0, 0.0),)},
+        {"start_confidence": 0.5},
+        {"as_stored": True},
     ],
 )
-def test_request_covers_every_option(item, changes):
-    changed = replace(item, **changes)
-    assert changed.request() != item.request() == replace(item).request()
-    if isinstance(item, Entry):
-        assert changed.key != item.key == replace(item, cells=("y",)).key
+def test_request_covers_every_option(changes):
+    changed = replace(ENTRY, **changes)
+    assert changed.request() != ENTRY.request() == replace(ENTRY).request()
+    assert changed.key != ENTRY.key == replace(ENTRY, cells=("y",)).key
 
 
 @pytest.mark.parametrize(("rank", "size"), [("2", "2"), ("-1", "2"), ("a", "2"), ("0", "0")])

@@ -1,21 +1,28 @@
 """Scores of results that are written by hand, so that every number is known."""
 
+import base64
 import csv
 import json
 import math
+import re
 
 import pytest
 import torch
 import trimesh
 
-from curvireg_torch.data import Pascal3DPlus, read_bop_csv
+from curvireg_torch.data import Pascal3DPlus
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, WebBenchmark, score
+from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, PoseFolderBenchmark, Protocol
+from curvireg_torch.evaluation.benchmarks import detection_recall, write_bop_csv
+from curvireg_torch.evaluation.datasets import report
 from curvireg_torch.evaluation.store import ResultStore, to_json
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
+from tests._support.lists import bop_poses
 from tests._support.miniature import pascal_object, write_image, write_mesh, write_record
 
 SECONDS = {"bank": 2.0, "register": 0.5}
+PICTURE = {"width": 80, "height": 60}
+FAILED = {"status": "failed", "message": "?"}
 
 
 def rotated(sample, axis, degrees):
@@ -28,18 +35,18 @@ def rotated(sample, axis, degrees):
 def scores_of(benchmark, out, rows):
     """Write results with these rows, and score them."""
     store = ResultStore(out)
-    store.open({"root": "/some/where", "protocol": str(benchmark.protocol)})
-    known = {"score": 0.5, "confidence": 0.5, "mesh": "01.off", "image_size": [60, 80], "seconds": SECONDS}
-    for item, row in zip(benchmark.items, rows, strict=True):
-        store.append({"key": item.key, "digests": {}, **({} if "skipped" in row else known), **row})
-    return score(benchmark, out)
+    known = {"score": 0.5, "confidence": 0.5, "reliable": False, "mesh": "CAD/01.off", "inputs": {"picture": PICTURE}}
+    for entry, row in zip(benchmark.entries, rows, strict=False):
+        head = {"key": entry.key, "digests": {"request": ""}, "status": "ok", "message": "", "seconds": SECONDS}
+        store.append({**head, **(known if "rotation" in row else {}), **row})
+    return report(benchmark, store, {"root": "/some/where", "protocol": str(benchmark.protocol)})
 
 
 @pytest.fixture
 def instances(bop):
     """Four instances of a BOP dataset, and their annotations."""
-    benchmark = BOPBenchmark(bop, Protocol(pose="any"))
-    return benchmark, benchmark.samples(benchmark.items)
+    benchmark = BOPBenchmark(bop, Protocol(pose="any", box=None))  # one has no annotated box
+    return benchmark, list(benchmark.samples)
 
 
 @pytest.fixture
@@ -63,9 +70,9 @@ def furniture(tmp_path):
 
 def test_pascal3d_summary(furniture, tmp_path):
     rotations = [("z", 90), ("z", 40), ("x", 20), None, ("z", 180), ("z", 5), ("z", 20), ("z", 180)]
-    samples = furniture.samples(furniture.items)
+    samples = furniture.samples
     pairs = zip(samples[:8], rotations, strict=True)
-    rows = [{"rotation": rotated(sample, *r)} if r else {"failed": "?"} for sample, r in pairs]
+    rows = [{"rotation": rotated(sample, *r)} if r else FAILED for sample, r in pairs]
     summary = scores_of(furniture, tmp_path, [*rows, {"skipped": "unreadable_image"}])
     assert (tmp_path / "summary.json").read_text() == to_json(summary)
     # errors: bottles 90, 40, 20, miss; table 180; sofas 5, 20, 180
@@ -82,17 +89,13 @@ def test_pascal3d_summary(furniture, tmp_path):
     assert summary["subsets"]["difficult"]["med_err_deg"] == float("inf")
     assert {name: s["n"] for name, s in summary["per_class"].items()} == {"bottle": 4, "diningtable": 1, "sofa": 3}
     assert summary["per_class"]["sofa"]["acc_pi_6"] == 2 / 3
-    # 40 / sqrt 2 is right, 90 / sqrt 2 and 180 / sqrt 2 are not
-    assert summary["legacy_sqrt2"]["acc_pi_6"] == 4 / 8
-    # bins of 15 degrees about 30: the rotation by 5 stays inside, and that about x, which moves the azimuth by < 3.5
-    assert summary["azimuth_bin_accuracy"]["24"] == 2 / 8
     assert summary["seconds"] == {"bank": 16.0, "register": 4.0, "register_each": 0.5}
     assert summary["settings"]["root"] == "where", "a summary is shared: no paths"
 
 
 def test_pascal3d_table(furniture, tmp_path):
     R = rotation_from_viewpoint(*torch.tensor([200.0, 10, -5]).double()).tolist()
-    scores_of(furniture, tmp_path, [{"rotation": R}, {"failed": "?"}] + [{"skipped": "x"}] * 7)
+    scores_of(furniture, tmp_path, [{"rotation": R}, FAILED] + [{"skipped": "x"}] * 7)
     with open(tmp_path / "predictions.csv", newline="") as file:
         first, second = csv.DictReader(file)
     assert (first["category"], first["image_id"], first["truncated"]) == ("bottle", "1", "0")
@@ -103,12 +106,37 @@ def test_pascal3d_table(furniture, tmp_path):
     assert float(first["symmetric_error_deg"]) == pytest.approx(0, abs=1e-3)
     assert 150 < float(first["error_deg"]) <= 170
     assert first["seconds"] == "0.5", "of the registration, without the bank"
+    assert first["mesh"] == "01.off"
     assert (second["failed"], second["azimuth"], second["error_deg"]) == ("?", "", "inf")
+
+
+def test_page_shows_the_best_first_then_unknown_poses_then_failures(furniture, web, tmp_path):
+    (tmp_path / "thumbnails").mkdir()
+    (tmp_path / "thumbnails" / "a.jpg").write_bytes(b"picture")
+    pairs = zip(furniture.samples[:3], (40, 5, 50), strict=True)
+    turned = [{"rotation": rotated(sample, "z", degrees)} for sample, degrees in pairs]
+    turned[1] |= {"digests": {"request": "a"}, "confidence": None}
+    scores_of(furniture, tmp_path, [*turned, {**FAILED, "message": "<flat>"}] + [{"skipped": "x"}] * 5)
+    page = (tmp_path / "index.html").read_text()
+    found = re.findall(r'<figure class="(\w+)">(.*?)<figcaption><b>(\d+)</b> (\S+)<br>(.*?)</figcaption>', page)
+    assert [(kind, number, caption) for kind, _, number, _, caption in found] == [
+        ("right", "2", "5.0 degrees off, not calibrated"),
+        ("wrong", "1", "40.0 degrees off, confidence 0.50"),
+        ("wrong", "3", "50.0 degrees off, confidence 0.50"),
+        ("failed", "4", "&lt;flat&gt;"),
+    ]
+    assert [base64.b64encode(b"picture").decode() in picture for _, picture, *_ in found] == [True, False, False, False]
+    assert "<h1>4 objects: 1 of 4 within 30 degrees, 1 failed</h1>" in page
+    benchmark = PoseFolderBenchmark(web, Protocol(pose="any"))
+    rows = [{"rotation": torch.eye(3).tolist(), "confidence": c, "reliable": c > 0.7} for c in (0.5, 0.6, 0.5, 0.9)]
+    scores_of(benchmark, tmp_path / "web", rows)
+    captions = re.findall("<br>(.*?)</figcaption>", (tmp_path / "web" / "index.html").read_text())
+    assert captions[2:] == ["pose unknown, confidence 0.90", "pose unknown, confidence 0.60"]
 
 
 def test_bop_summary(instances, tmp_path):
     benchmark, samples = instances
-    assert [item.key for item in benchmark.items] == ["1/0/0", "1/0/1", "1/0/2", "2/7/0"]
+    assert [entry.key for entry in benchmark.entries] == ["1/0/0", "1/0/1", "1/0/2", "2/7/0"]
     assert [s["obj_id"] for s in samples] == [1, 2, 1, 1]
 
     def row(i, degrees, offset=(0.0, 0.0, 0.0)):
@@ -116,7 +144,7 @@ def test_bop_summary(instances, tmp_path):
         return {"rotation": rotated(samples[i], "z", degrees), "translation": t}
 
     diameter = 86.6  # half a rotation is a symmetry of object 1, not of object 2; y is along the object's z
-    rows = [row(0, 180), row(1, 180), {"failed": "?"}, row(3, 20, (0.0, 0.04 * diameter, 0.0))]
+    rows = [row(0, 180), row(1, 180), FAILED, row(3, 20, (0.0, 0.04 * diameter, 0.0))]
     summary = scores_of(benchmark, tmp_path, rows)
     assert (summary["n"], summary["failed"]) == (4, 1)
     # errors 0, 180, miss, 20
@@ -136,13 +164,22 @@ def test_bop_summary(instances, tmp_path):
 def test_bop_table(instances, tmp_path):
     benchmark, samples = instances
     rows = [{"rotation": s["rotation"].tolist(), "translation": s["translation"].tolist()} for s in samples]
-    rows[1] = {"failed": "?"}
+    rows[1] = FAILED
     scores_of(benchmark, tmp_path, rows)
-    table = read_bop_csv(tmp_path / "predictions.csv")
+    table = bop_poses(tmp_path / "predictions.csv")
     del samples[1]
     expected = [(s["scene_id"], s["image_id"], s["obj_id"]) for s in samples]
     assert [(r["scene_id"], r["im_id"], r["obj_id"]) for r in table] == expected
     assert [r["time"] for r in table] == [1.5, 1.5, 0.5], "BOP counts the seconds of the whole image"
+
+
+def test_write_bop_csv_writes_the_format_of_the_challenge(tmp_path):
+    rotation = [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0], [6.0, 7.0, 8.0]]
+    write_bop_csv(tmp_path / "a.csv", [((1, 2, 3), 0.25, rotation, [0.5, 1.0, 1000.0 / 3.0], 1.5)])
+    assert (tmp_path / "a.csv").read_bytes() == (
+        b"scene_id,im_id,obj_id,score,R,t,time\n"
+        b"1,2,3,0.25,0.0 1.0 2.0 3.0 4.0 5.0 6.0 7.0 8.0,0.5 1.0 333.3333333333333,1.5\n"
+    )
 
 
 def test_mspd_is_relative_to_the_width_of_the_image(instances, tmp_path):
@@ -160,7 +197,7 @@ def test_mspd_is_relative_to_the_width_of_the_image(instances, tmp_path):
 
 
 def test_cad_any_is_refused_for_objects_with_one_mesh(bop, web):
-    for benchmark, dataset in ((BOPBenchmark, bop), (WebBenchmark, web)):
+    for benchmark, dataset in ((BOPBenchmark, bop), (PoseFolderBenchmark, web)):
         with pytest.raises(InvalidInputError, match="cad=annotated; got cad=any"):
             benchmark(dataset, Protocol(cad="any"))
 
@@ -168,13 +205,68 @@ def test_cad_any_is_refused_for_objects_with_one_mesh(bop, web):
 @pytest.mark.parametrize("kind", ["pascal3d", "bop"])
 def test_score_without_results(tmp_path, instances, furniture, kind):
     benchmark = instances[0] if kind == "bop" else furniture
-    n = len(benchmark.items)
+    n = len(benchmark.entries)
     summary = scores_of(benchmark, tmp_path, [{"skipped": "x"}] * n)
     assert (summary["n"], summary["skipped"]["x"]) == (0, n)
     assert json.loads((tmp_path / "summary.json").read_text())["med_err_deg"] is None
 
 
-def test_score_names_a_missing_result(furniture, tmp_path):
-    ResultStore(tmp_path).open({"root": "x"})
+def test_a_missing_result_is_named(furniture, tmp_path):
     with pytest.raises(InvalidInputError, match=r"bottle.*run again"):
-        score(furniture, tmp_path)
+        scores_of(furniture, tmp_path, [])
+
+
+def test_pose_folders_score_known_poses(web):
+    benchmark = PoseFolderBenchmark(web, Protocol(pose="any"))
+    half = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    first, _, third, _ = (sample["rotation"] for sample in benchmark.samples)
+    poses = [(first, 0.75), (half, 0.25), (third @ half, 0.5)]
+    rows = [{"rotation": R.tolist(), "confidence": c, "reliable": c > 0.7} for R, c in poses] + [FAILED]
+    errors = benchmark.errors(benchmark.samples, rows)
+    assert errors["error_deg"][[0, 2]].tolist() == pytest.approx([0, 180], abs=0.1)
+    assert errors["error_deg"].isnan().tolist() == [False, True, False, True]
+    summary = benchmark.summary(benchmark.samples, rows, errors)
+    assert (summary["n"], summary["n_posed"], summary["reliable"]) == (4, 2, 1)
+    assert (summary["acc_30_deg"], summary["mean_confidence"]) == (0.5, 0.375)
+    assert summary["per_object"]["cup"]["mean_confidence"] == 0.5
+    assert summary["per_object"]["shoe"] == {
+        "n": 1, "n_posed": 0, "reliable": 0, "mean_confidence": 0.0,
+        "acc_15_deg": None, "acc_30_deg": None, "med_err_deg": None,
+    }  # fmt: skip
+    assert benchmark.errors(benchmark.samples[:1], [FAILED])["error_deg"].tolist() == [torch.inf]
+
+
+BOX = (10.0, 10.0, 30.0, 30.0)
+AWAY = (150, 50, 160, 60)
+
+
+def sample(*box):
+    return {"box": torch.tensor(box)}
+
+
+def located(*boxes):
+    proposals = [{"box": list(map(float, box)), "score": 0.5} for box in boxes]
+    return {"detection": {"proposals": proposals}, "inputs": {"picture": {"width": 200, "height": 100}}}
+
+
+def test_detection_recall_counts_the_first_right_proposal_and_failures_but_no_unknown_boxes():
+    half, less = (10, 10, 30, 20), (10, 10, 30, 19.9)
+    rows = [located(BOX), located(AWAY, half), located(*[AWAY] * 5, BOX), located(less), located(*[AWAY] * 20, BOX)]
+    recall = detection_recall([sample(*BOX)] * 5, rows)
+    assert recall == {"n": 5, "recall_1": 0.2, "recall_5": 0.4, "recall_20": 0.6}
+    unknown = sample(*[math.nan] * 4)
+    recall = detection_recall([sample(*BOX), unknown, sample(*BOX)], [located(BOX), located(AWAY), FAILED])
+    assert (recall["n"], recall["recall_1"]) == (2, 0.5)
+    assert detection_recall([], []) == {"n": 0, "recall_1": None, "recall_5": None, "recall_20": None}
+
+
+@pytest.mark.parametrize(
+    ("annotated", "proposed"),
+    [
+        ((-20.5, 10.0, 19.5, 50.0), (-0.5, 10.0, 19.5, 50.0)),
+        ((-0.5, 10.0, 19.5, 50.0), (-20.5, 10.0, 19.5, 50.0)),
+        ((10.0, 60.0, 30.0, 159.5), (10.0, 60.0, 30.0, 99.5)),
+    ],
+)
+def test_detection_recall_clips_boxes_to_the_image(annotated, proposed):
+    assert detection_recall([sample(*annotated)], [located(proposed)])["recall_1"] == 1.0

@@ -17,40 +17,40 @@ def test_rows_are_read_again(tmp_path):
     store = ResultStore(tmp_path / "new")
     keys = ["a/1", "a-1", "../a", "é"]
     for i, key in enumerate(keys):
-        assert key not in store
+        with pytest.raises(InvalidInputError, match=r"no result for .*; run again"):
+            store.read(key)
         store.append(row(key, i=i, value=float("nan")))
     for again in (store, ResultStore(tmp_path / "new")):
         assert [again.read(key) for key in keys] == [row(key, i=i, value=None) for i, key in enumerate(keys)]
-        assert again.is_complete(keys)
-        assert not again.is_complete([*keys, "b"])
-    with pytest.raises(InvalidInputError, match=r"no result for b; run again"):
-        store.read("b")
+        assert again.is_complete(dict.fromkeys(keys, DIGESTS))
+        assert not again.is_complete(dict.fromkeys([*keys, "b"], DIGESTS))
 
 
 @pytest.mark.parametrize("workers", [None, Workers(1, 2)])
 def test_rows_replace_older_ones(tmp_path, workers):
-    """Also those in the file of another process that sorts later."""
-    ResultStore(tmp_path, Workers(2, 3)).append(row("a", i=0))
+    """Those of other digests, also in the file of another process that sorts later; of the same digests, the last."""
+    ResultStore(tmp_path, Workers(2, 3)).append({**row("a", i=0), "digests": {"request": "a", "photo": "old"}})
     for i in (1, 2):
         store = ResultStore(tmp_path, workers)
         store.append(row("a", i=i))
-        assert store.read("a")["i"] == ResultStore(tmp_path).read("a")["i"] == i
+        assert store.is_complete({"a": DIGESTS})
+        assert store.read("a")["i"] == i
     store.merge()
     assert [path.name for path in tmp_path.iterdir()] == ["results.jsonl"]
-    assert store.read("a") == row("a", i=2)
+    assert store.read("a") == ResultStore(tmp_path).read("a") == row("a", i=2)
 
 
 def test_is_current_compares_digests(tmp_path):
     store = ResultStore(tmp_path)
     store.append(row("a"))
-    store.append(row("b", skipped="unreadable_image"))
     store.append({"key": "c", "digests": {"request": "a", "photo": ""}})
     assert store.is_current("a", dict(DIGESTS))
     assert not store.is_current("a", {**DIGESTS, "request": "c"})
     assert not store.is_current("a", {**DIGESTS, "photo": "c"})
-    assert not store.is_current("b", DIGESTS), "what was skipped is tried again"
     assert not store.is_current("c", {"request": "a", "photo": ""}), "the photograph could not be read"
     assert not store.is_current("d", DIGESTS)
+    assert store.is_complete({"a": DIGESTS, "c": {"request": "a", "photo": ""}})
+    assert not store.is_complete({"a": {**DIGESTS, "photo": "c"}}), "as of a job array, whose photograph has changed"
 
 
 @pytest.mark.parametrize("cut", [1, 20, -1])
@@ -62,20 +62,10 @@ def test_cut_line_is_removed(tmp_path, cut):
     last = whole.splitlines(keepends=True)[-1][:cut]
     store.path.write_bytes(whole[: whole.rindex(b'{"key"')] + last)
     reader, store = ResultStore(tmp_path), ResultStore(tmp_path)
-    assert [key in reader for key in "abc"] == [True, True, False]
+    assert [reader.is_current(key, DIGESTS) for key in "abc"] == [True, True, False]
     store.append(row("c"))
     assert store.path.read_bytes() == whole
     assert store.read("c") == row("c")
-
-
-def test_read_finds_rows_that_have_moved(tmp_path):
-    """As when another job of an array writes results.jsonl in the order of its list."""
-    store, other = ResultStore(tmp_path), ResultStore(tmp_path)
-    for key in "ab":
-        store.append(row(key, i=key))
-    other.refresh()
-    store.rewrite([row(key, i=key, more=1) for key in "ba"])
-    assert other.read("a") == row("a", i="a", more=1)
 
 
 @pytest.mark.parametrize("content", ['{"score": 1}\n', "[1]\n", "no JSON\n", '{"key": "a"}\n', "[" * 100_000 + "\n"])
@@ -85,39 +75,7 @@ def test_other_files_are_refused(tmp_path, content):
         ResultStore(tmp_path)
 
 
-def test_other_settings_are_refused(tmp_path):
-    store = ResultStore(tmp_path)
-    store.open({"preset": "a", "seed": 1})
-    store.append(row("x"))
-    store.open({"preset": "a", "seed": 1})
-    with pytest.raises(InvalidInputError, match=r"preset: 'a' there, 'b' now.*--overwrite"):
-        store.open({"preset": "b", "seed": 1})
-    with pytest.raises(InvalidInputError, match="job array"):
-        ResultStore(tmp_path, Workers(0, 2)).open({}, overwrite=True)
-    assert "x" in store
-    store.open({"preset": "b", "seed": 1}, overwrite=True)
-    assert "x" not in store
-    assert not store.path.exists()
-    assert store.settings() == {"preset": "b", "seed": 1}
-
-
-def test_results_without_settings_are_refused(tmp_path):
-    store = ResultStore(tmp_path)
-    with pytest.raises(InvalidInputError, match="missing or damaged"):
-        store.settings()
-    store.append(row("x"))
-    with pytest.raises(InvalidInputError, match="unknown settings"):
-        store.open({})
-    store.settings_path.write_text("[1]")
-    with pytest.raises(InvalidInputError, match="missing or damaged"):
-        store.settings()
-
-
 def test_folder_that_cannot_be_written(tmp_path, monkeypatch):
-    (tmp_path / "out").write_text("")
-    with pytest.raises(OutputError, match="choose another place"):
-        ResultStore(tmp_path / "out").open({})
-
     def full_disk(*_):
         raise OSError(28, "No space left on device")
 

@@ -10,7 +10,7 @@ from curvireg_torch.features.backbone import Backbone
 from curvireg_torch.geometry import crop_images, sample_views
 from curvireg_torch.matching.describe import BankSettings, ViewDescriber
 from curvireg_torch.mesh.mesh import mesh_radius
-from curvireg_torch.rendering.shading import shade
+from curvireg_torch.rendering.colour import shade
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
 
 

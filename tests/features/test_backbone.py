@@ -5,10 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 from curvireg_torch.errors import InvalidInputError, MissingDependencyError, MissingFileError
 from curvireg_torch.features import backbone
-from curvireg_torch.features.backbone import CHANNELS, STRIDES, Backbone
+from curvireg_torch.features.backbone import Backbone, describe, similarity
 from curvireg_torch.synthetic import procedural_background
 
 from .._support.layer_contract import LayerCase, LayerContract
@@ -25,9 +26,9 @@ class TestBackbone(LayerContract):
         LayerCase("colour", network, colour_photos, constant_gives_zero=False),
     )
     batch_tolerance = {"rtol": 1e-4, "atol": 1e-4}  # noqa: RUF012
-    test_gradcheck = test_function_transforms = test_autocast_changes_nothing = None
+    test_gradcheck = test_function_transforms = None
     test_dtype_is_kept = None  # features are float32
-    test_compile_fullgraph = test_export_with_any_batch = test_onnx_export = None
+    test_compile_fullgraph = test_export_with_any_batch = None
 
 
 @pytest.fixture(scope="module")
@@ -41,39 +42,11 @@ def picture(height=64, width=75):
     return torch.stack([0.5 + 0.5 * torch.sin(x * (c + 1) + y * math.sqrt(2 + c)) for c in range(3)])[None]
 
 
-def test_backbone_equals_timm(network):
-    timm = pytest.importorskip("timm", exc_type=ImportError, reason="timm, the oracle, does not import here")
-    other = timm.create_model("tf_efficientnet_lite0", features_only=True, out_indices=(2, 3)).eval()
-    wanted = other.state_dict()
-    # Both list the same tensors in the same order under different names; timm omits the head.
-    weights = list(backbone._read_weights(backbone._weights_path()).values())
-    other.load_state_dict({k: w for (k, v), w in zip(wanted.items(), weights, strict=False) if v.shape == w.shape})
-    for size in ((64, 75), (97, 128)):  # odd sides: "same" padding
-        for ours, theirs in zip(network(picture(*size)), other(2.0 * picture(*size) - 1.0), strict=True):
-            torch.testing.assert_close(ours, theirs, atol=2e-4, rtol=1e-4)
-
-
 def test_backbone_equals_stored_features_of_timm(network):
     """Every 9th channel at the centre of the map, from timm 1.0.31."""
     for features, numbers in zip(network(picture()), (FINE, COARSE), strict=True):
         H, W = features.shape[-2:]
         torch.testing.assert_close(features[0, ::9, H // 2, W // 2], torch.tensor(numbers), atol=1e-3, rtol=1e-3)
-
-
-def test_backbone_shapes_and_grey(network):
-    grey = torch.rand(2, 1, 96, 70)
-    for ours, colour, stride, width in zip(
-        network(grey), network(grey.expand(-1, 3, -1, -1)), STRIDES, CHANNELS, strict=True
-    ):
-        assert ours.shape == (2, width, math.ceil(96 / stride), math.ceil(70 / stride))
-        assert torch.equal(ours, colour)
-
-
-def test_backbone_passes_gradients_to_images_only(network):
-    image = torch.rand(1, 3, 32, 32, requires_grad=True)
-    network(image)[1].sum().backward()
-    assert image.grad.abs().sum() > 0
-    assert not any(p.requires_grad for p in network.parameters())
 
 
 def test_backbone_rejects_a_missing_package_and_a_missing_or_damaged_file(monkeypatch, tmp_path):
@@ -101,3 +74,40 @@ def test_backbone_spreads_match_measured_standard_deviations(network):
     ):
         measured = (features - features.mean(dim=(2, 3), keepdim=True)).square().mean(dim=(0, 2, 3)).sqrt()
         assert low < float((measured / spread).median()) < high
+
+
+def images(n, size=64, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.stack([procedural_background((size, size), generator) for _ in range(n)])
+
+
+def test_similarity_is_the_mean_cosine_of_the_cells(network):
+    pictures = images(3)
+    expected = torch.zeros(3, 3)
+    for features, spread in zip(network(pictures), network.spreads, strict=True):
+        cells = features - features.mean(dim=(2, 3), keepdim=True)
+        cells = F.normalize(cells / spread.view(1, -1, 1, 1), dim=1)
+        expected += torch.einsum("achw,bchw->abhw", cells, cells).mean(dim=(2, 3)) / 2
+    d = describe(pictures, network)
+    assert d.dtype == torch.float16
+    assert d.shape == (3, 40 * 8 * 8 + 112 * 4 * 4)
+    torch.testing.assert_close(similarity(d[:, None], d), expected, atol=2e-3, rtol=0)
+    torch.testing.assert_close(similarity(d[:, None], d).diagonal(), torch.ones(3), atol=2e-3, rtol=0)
+
+
+def test_similarity_takes_the_best_crop(network):
+    d = describe(images(4), network)
+    both = similarity(d[:2][None], d[2:])
+    assert torch.equal(both[0], similarity(d[:2, None], d[2:]).amax(dim=0))
+
+
+def test_describe_is_bit_identical_in_any_batch_on_any_threads(network):
+    before = torch.get_num_threads()
+    grey = torch.rand(18, 1, 64, 64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    parts = []
+    for threads, count in ((1, 18), (1, 1), (1, 3), (3, 17), (3, 1)):
+        torch.set_num_threads(threads)
+        parts.append(describe(grey[:count], network))
+    torch.set_num_threads(before)
+    assert all(torch.equal(part, parts[0][: len(part)]) for part in parts)
+    assert not any(part.requires_grad for part in parts)

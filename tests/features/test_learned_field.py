@@ -8,9 +8,9 @@ import torch
 from safetensors.torch import save_file
 
 from curvireg_torch.errors import InvalidInputError, MissingFileError
-from curvireg_torch.features import FieldNetwork, LearnedCurvilinearSaliency, doubled_angle, halved_angle
+from curvireg_torch.features import LearnedCurvilinearSaliency, doubled_angle, halved_angle
 from curvireg_torch.features.backbone import Backbone
-from curvireg_torch.features.learned_field import WEIGHTS
+from curvireg_torch.features.learned_field import save_weights
 
 from .._support.layer_contract import LayerCase, LayerContract
 from ..filters.layer_cases import colour_photos, equal_up_to_sign, photos
@@ -28,35 +28,10 @@ class TestLearnedField(LayerContract):
         LayerCase("colour", network, colour_photos, constant_gives_zero=False),
     )
     test_gradcheck = test_function_transforms = None  # the network computes in float32
-    test_autocast_changes_nothing = test_onnx_export = None
 
     def test_batched_equals_one_by_one(self, case: LayerCase) -> None:
         x = case.inputs(3, 48)
         assert equal_up_to_sign(case(x), torch.cat([case(image[None]) for image in x]), atol=1e-3)
-
-
-def test_doubled_angle_ignores_sign_and_halved_angle_inverts_it():
-    t = torch.linspace(-3, 3, 25, dtype=torch.float64)
-    m = torch.linspace(0.1, 4, 25, dtype=torch.float64)
-    vectors = torch.stack([m * t.cos(), m * t.sin()])[None, :, :, None]
-    code = doubled_angle(vectors)
-    assert torch.allclose(code, doubled_angle(-vectors))
-    assert torch.allclose(code[0, :, :, 0], m.sqrt() * torch.stack([(2 * t).cos(), (2 * t).sin()]))
-    restored = halved_angle(code)
-    assert torch.allclose(restored, torch.where(vectors[:, :1] < 0, -vectors, vectors), atol=1e-9)
-
-
-def test_halved_angle_has_finite_gradients():
-    code = torch.tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, -1.0]]).T[None, :, :, None].requires_grad_()
-    halved_angle(code).square().sum().backward()
-    assert code.grad.isfinite().all()
-    generic = torch.randn(1, 2, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    assert torch.autograd.gradcheck(halved_angle, (generic,))
-
-
-def test_size_of_network_and_file():
-    assert sum(p.numel() for p in FieldNetwork().parameters()) <= 2_000_000
-    assert WEIGHTS.stat().st_size <= 8_000_000
 
 
 @pytest.mark.parametrize("make", [LearnedCurvilinearSaliency, Backbone])
@@ -94,14 +69,11 @@ def test_halved_angle_inverts_doubled_angle_in_every_dtype(dtype, size):
     assert off.max() < precision * size
 
 
-def test_save_and_load_weights(field, tmp_path):
-    field.save(tmp_path / "weights.safetensors")
+def test_learned_field_loads_other_weights_and_rejects_bad_ones(field, tmp_path):
+    save_weights(field.network, tmp_path / "weights.safetensors")
     loaded = LearnedCurvilinearSaliency(weights=tmp_path / "weights.safetensors")
     x = torch.rand(1, 3, 128, 128)
     assert torch.equal(loaded(x), field(x))
-
-
-def test_learned_field_rejects_bad_weights(tmp_path):
     missing, corrupt, other = (tmp_path / f"{name}.safetensors" for name in ("missing", "corrupt", "other"))
     corrupt.write_bytes(b"not weights")
     save_file({"a": torch.zeros(2)}, other)
@@ -110,15 +82,6 @@ def test_learned_field_rejects_bad_weights(tmp_path):
     for path, message in ((corrupt, "not a safetensors file"), (other, "FieldNetwork")):
         with pytest.raises(InvalidInputError, match=message):
             LearnedCurvilinearSaliency(weights=path)
-
-
-def test_learned_field_rejects_damaged_packaged_weights(tmp_path, monkeypatch):
-    content = bytearray(WEIGHTS.read_bytes())
-    content[-1] ^= 1
-    (tmp_path / "damaged.safetensors").write_bytes(content)
-    monkeypatch.setattr("curvireg_torch.features.learned_field.WEIGHTS", tmp_path / "damaged.safetensors")
-    with pytest.raises(InvalidInputError, match="install curvireg_torch again"):
-        LearnedCurvilinearSaliency()
 
 
 def test_learned_field_of_a_square_is_its_outline(field):
@@ -135,13 +98,6 @@ def test_learned_field_of_a_square_is_its_outline(field):
     mask = field.mask(x)[0, 0]
     assert mask[40:88, 40:88].mean() > 0.8
     assert mask[:8].mean() < 0.2
-
-
-def test_field_network_normalises_images_to_plus_minus_2():
-    network, inputs = FieldNetwork((8, 8, 8, 8)).eval(), []
-    network.down[0].register_forward_pre_hook(lambda _module, arguments: inputs.append(arguments[0]))
-    network(torch.linspace(0, 1, 3 * 32 * 32).view(1, 3, 32, 32))
-    assert torch.allclose(inputs[0], torch.linspace(-2, 2, 3 * 32 * 32).view(1, 3, 32, 32), atol=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(2, 600), (600, 2), (1, 1), (1, 5000)])

@@ -86,8 +86,6 @@ OPTIONS: dict[str, dict[str, object]] = {
     "diffusion": {"iterations": 4},
     "diffusion-exponential": {"iterations": 4, "conductance": "exponential"},
     "mcs": {"scales": 3},
-    "mcs-bilateral": {"scales": 2, "smoothing": "bilateral"},
-    "mcs-guided": {"scales": 3, "smoothing": "guided"},
     "blur-saliency": {"mode": "reblur-saliency"},
     "mfc-alone": {"saliency_weight": 0.0},
     "pci": {"sigmas": (1.0, 2.0)},

@@ -8,7 +8,7 @@ from kornia.color import rgb_to_grayscale
 
 from curvireg_torch import filters
 from curvireg_torch.features import field_points, hog
-from curvireg_torch.filters.inputs import fill_missing, to_grey
+from curvireg_torch.filters.operations import fill_missing, to_grey
 
 from .._support.layer_contract import LayerCase
 from .layer_cases import LAYERS, colour_photos, photos
@@ -61,40 +61,6 @@ def test_fill_missing_uses_the_surroundings() -> None:
     large[..., :, 2:] = True  # beyond the reach of the pyramid: the mean of the valid pixels
     filled = fill_missing(ramp.masked_fill(large, math.nan), large)
     assert float(filled[..., -1].max()) == pytest.approx(0.5)
-
-
-def test_fill_missing_reaches_holes_of_32_px() -> None:
-    """A hole of 31 px is filled from its surroundings, which are 0; the middle of one of 63 px with the image mean."""
-    for side, expected in ((31, 0.0), (63, None)):
-        image = torch.zeros(1, 1, 256, 256, dtype=torch.float64)
-        image[..., 192:, :] = 1.0
-        holes = torch.zeros_like(image, dtype=torch.bool)
-        holes[..., 64 : 64 + side, 64 : 64 + side] = True
-        mean = float(image[~holes].mean())
-        filled = fill_missing(image.masked_fill(holes, math.nan), holes)
-        assert float(filled[0, 0, 70, 70]) == pytest.approx(mean if expected is None else expected, abs=1e-3)
-
-
-def test_smoothing_filters_fill_missing_pixels() -> None:
-    x = photos(1, 32, dtype=torch.float64)
-    broken = x.clone()
-    broken[0, 0, 16, 10:13] = math.nan
-    for smoothing in (
-        lambda x: filters.anisotropic_diffusion(x, iterations=5),
-        lambda x: filters.bilateral_smooth(x, sigma=1.5),
-        lambda x: filters.guided_smooth(x, sigma=1.5),
-    ):
-        y = smoothing(broken)
-        assert torch.isfinite(y).all()
-        assert float((y - smoothing(x)).abs().max()) < float(x.max() - x.min())
-
-
-@pytest.mark.filterwarnings("ignore:There is a performance drop")
-def test_image_gradient_fills_missing_pixels_under_vmap() -> None:
-    x = photos(3, 24, dtype=torch.float64)
-    x[1, 0, 4, 5] = math.nan
-    want = filters.image_gradient(x)
-    torch.testing.assert_close(torch.func.vmap(filters.image_gradient)(x[:, None])[:, 0], want)
 
 
 @every_photo_layer

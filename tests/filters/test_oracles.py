@@ -2,7 +2,6 @@
 
 import math
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -10,7 +9,8 @@ from scipy.ndimage import gaussian_filter
 from skimage.feature import hessian_matrix_eigvals
 
 from curvireg_torch import filters
-from curvireg_torch.filters.derivatives import central_derivatives, smooth
+from curvireg_torch.filters.curvilinear import dominant_eigenvector, scaled_direction
+from curvireg_torch.filters.operations import central_derivatives, is_directional_maximum, smooth
 
 from .layer_cases import photos
 
@@ -123,31 +123,51 @@ def test_central_derivatives_and_gaussian_against_scipy() -> None:
     np.testing.assert_allclose(yy[1:-1], np.diff(x, 2, axis=0), atol=1e-14)
 
 
-def test_bilateral_smooth_against_opencv() -> None:
-    image = photos(1, 25)
-    inner = (..., slice(4, -4), slice(4, -4))  # borders differ
-    got = filters.bilateral_smooth(image, sigma=2.0, kappa=0.1)
-    # OpenCV uses the disc of that radius, not the square.
-    want = cv2.bilateralFilter(image[0, 0].numpy(), 9, 0.1, 2.0)
-    np.testing.assert_allclose(got[inner][0, 0], want[4:-4, 4:-4], atol=1e-2)
+def matrices() -> torch.Tensor:
+    """(N, 2, 2) with real eigenvalues: adj(I_P) H_Z of random surfaces, and the boundaries between branches."""
+    g = torch.Generator().manual_seed(0)
+    slope, h = (2 * torch.randn(500, n, generator=g, dtype=torch.float64) for n in (2, 3))
+    across = torch.stack([slope[:, 1], -slope[:, 0]], dim=1)
+    adjugate = torch.eye(2, dtype=torch.float64) + across[:, :, None] * across[:, None]
+    general = adjugate @ h[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+    special = [
+        [[-1, 2], [2, -1]],  # equal diagonal, negative trace: a diagonal ridge
+        [[1, 2], [2, 1]],
+        [[-1, 2], [2, 1]],  # trace 0
+        [[1, -2], [-2, -1]],
+        [[0, 3], [0, 1]],  # triangular
+        [[0, 0], [3, -1]],
+        [[2, 3], [0, -1]],
+        [[0, 0], [0, -5]],
+        [[-5, 0], [0, 0]],
+    ]
+    return torch.cat([general, torch.tensor(special, dtype=torch.float64)])
 
 
-def test_guided_smooth_against_loops() -> None:
-    image = photos(1, 15, dtype=torch.float64)
-    got = filters.guided_smooth(image, sigma=2.0, kappa=0.1)[0, 0]
-    r = round((math.sqrt(6 * 4 + 1) - 1) / 2)
-    x = image[0, 0].numpy()
-    H, W = x.shape
+def test_dominant_eigenvector_against_lapack() -> None:
+    m = matrices()
+    planes = [m[:, i, j].view(-1, 1, 1, 1) for i in range(2) for j in range(2)]
+    vx, vy, half_gap = dominant_eigenvector(*planes)
+    v = torch.cat(scaled_direction(torch.ones_like(vx), vx, vy), dim=1)[:, :, 0, 0]
+    values = torch.linalg.eigvals(m).real
+    torch.testing.assert_close(2 * half_gap.flatten(), values.amax(dim=1) - values.amin(dim=1))
+    torch.testing.assert_close(v.norm(dim=1), torch.ones(len(m), dtype=torch.float64))
+    rayleigh = (m @ v[:, :, None])[:, :, 0]
+    value = (rayleigh * v).sum(dim=1)
+    torch.testing.assert_close(rayleigh, value[:, None] * v, atol=1e-12, rtol=1e-9)
+    torch.testing.assert_close(value.abs(), values.abs().amax(dim=1))
 
-    def box(y: np.ndarray, i: int, j: int) -> np.ndarray:
-        rows, columns = np.clip(np.arange(i - r, i + r + 1), 0, H - 1), np.clip(np.arange(j - r, j + r + 1), 0, W - 1)
-        return y[np.ix_(rows, columns)]
 
-    a, b = np.zeros_like(x), np.zeros_like(x)
-    for i in range(H):
-        for j in range(W):
-            window = box(x, i, j)
-            a[i, j] = window.var() / (window.var() + 0.1**2)
-            b[i, j] = window.mean() * (1 - a[i, j])
-    want = [[box(a, i, j).mean() * x[i, j] + box(b, i, j).mean() for j in range(W)] for i in range(H)]
-    np.testing.assert_allclose(got, want, atol=1e-12)
+@pytest.mark.parametrize("angle", [0.0, 22.0, 23.0, 45.0, 67.0, 68.0, 90.0, 112.0, 113.0, 135.0, 157.0, 158.0])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_is_directional_maximum_rounds_directions_to_45_degrees(angle: float, sign: float) -> None:
+    """Only the two neighbours on the rounded axis count."""
+    axis = [(1, 0), (1, 1), (0, 1), (-1, 1)][round(angle / 45.0) % 4]
+    length = torch.full((1, 1, 3, 3), 2.0)
+    length[..., 1, 1] = 1.0
+    radians = torch.deg2rad(torch.tensor(angle))
+    x, y = (sign * f(radians).expand(1, 1, 3, 3) for f in (torch.cos, torch.sin))
+    assert not bool(is_directional_maximum(length, x, y)[0, 0, 1, 1])
+    for side in (1, -1):
+        length[..., 1 + side * axis[1], 1 + side * axis[0]] = 0.5
+    assert bool(is_directional_maximum(length, x, y)[0, 0, 1, 1])

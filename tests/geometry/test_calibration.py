@@ -115,13 +115,13 @@ def test_camera_of_a_resized_photograph():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"distortion": (0.1, 0.2)}, "expected 0, 4, 5, 8, 12, 14 finite coefficients"),
+        ({"distortion": (0.1, 0.2)}, "expected 0 or 4 or 5 or 8 or 12 or 14 finite coefficients"),
         ({"distortion": (0.1, 0.2, 0, float("nan"))}, "finite"),
         ({"model": "fisheye"}, "expected 4 finite coefficients"),
         ({"model": "fov"}, "distortion model: expected one of 'radial-tangential', 'fisheye'"),
         ({"matrix": torch.eye(4)}, r"camera matrix: expected shape \(3, 3\)"),
         ({"matrix": -MATRIX}, "FX, FY > 0"),
-        ({"size": (0, 640)}, "height of the image"),
+        ({"size": (0, 640)}, "size of the image"),
     ],
 )
 def test_unusable_cameras_are_refused(arguments, words):
@@ -134,6 +134,5 @@ def test_description_is_plain():
         "matrix": MATRIX.tolist(),
         "distortion": [0.02, -0.01, 0.003, -0.001],
         "model": "fisheye",
-        "width": 160,
-        "height": 120,
+        "size": [120, 160],
     }

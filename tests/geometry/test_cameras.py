@@ -1,9 +1,13 @@
 import cv2
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from curvireg_torch import geometry as g
+from curvireg_torch.mesh import mesh_centre, mesh_radius
+from curvireg_torch.mesh.mesh import extreme_points
+from curvireg_torch.synthetic import example_mesh
 
 K = torch.tensor([[240.0, 0.0, 70.3], [0, 260.0, 51.8], [0, 0, 1]], dtype=torch.float64)
 
@@ -12,14 +16,6 @@ def test_camera_matrix_by_hand() -> None:
     assert g.camera_matrix(1.0, 2.0, 3.0, 4.0).tolist() == [[1, 0, 3], [0, 2, 4], [0, 0, 1]]
     assert g.camera_matrix(1.0, 2.0, 3.0, 4.0).dtype == torch.float64
     assert g.camera_matrix(1.0, 2.0, 3.0, 4.0, dtype=torch.float32).dtype == torch.float32
-
-
-def test_transform_joins_rotation_and_translation() -> None:
-    R = torch.arange(18.0).view(2, 3, 3)
-    t = torch.arange(6.0).view(2, 3) + 100.0
-    T = g.transform(R, t)
-    assert torch.equal(T[:, :3], torch.cat([R, t[..., None]], -1))
-    assert T[:, 3].tolist() == [[0, 0, 0, 1]] * 2
 
 
 def test_project_points_agrees_with_opencv() -> None:
@@ -33,10 +29,42 @@ def test_project_points_agrees_with_opencv() -> None:
     np.testing.assert_allclose(box, [*expected.min(0), *expected.max(0)], atol=1e-9)
 
 
-def test_project_points_orthographic_ignores_depth() -> None:
-    X = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 30.0]], dtype=torch.float64)
-    uv = g.project_points(X, torch.eye(4, dtype=torch.float64), K, orthographic=True)
-    expected = torch.tensor([240.0 + 70.3, 520.0 + 51.8], dtype=torch.float64)
-    torch.testing.assert_close(uv, expected.expand(2, 2))
-    box = g.projected_boxes(X, torch.eye(4, dtype=torch.float64), K, orthographic=True)
-    torch.testing.assert_close(box, expected.repeat(2))
+K = g.camera_matrix(800.0, 820.0, 310.0, 255.0, dtype=torch.float64)
+
+
+def true_poses(spread: float, count: int = 25) -> list[tuple[torch.Tensor, ...]]:
+    """(hull, centre, view R, R, t, box) of objects 3 to 12 radii away, ``spread`` (tangent) off the axis."""
+    mesh = example_mesh()
+    mesh.apply_translation([3.0, -2.0, 1.0])  # the centre is far from the origin
+    centre, radius, hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
+    generator = torch.Generator().manual_seed(0)
+    poses = []
+    for i in range(count):
+        u = torch.rand(3, generator=generator, dtype=torch.float64)
+        ray = torch.stack([spread * (2 * u[0] - 1), spread * (2 * u[1] - 1), torch.ones_like(u[0])])
+        ray = ray / ray.norm() * (3.0 + 9.0 * u[2]) * radius
+        view = torch.from_numpy(Rotation.random(random_state=i).as_matrix())
+        R = g.rotation_towards(ray) @ view
+        t = ray - R @ centre
+        poses.append((hull, centre, view, R, t, g.projected_boxes(hull, g.transform(R, t), K)))
+    return poses
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_pose_from_box_recovers_the_true_pose(spread: float) -> None:
+    for hull, centre, view, R, t, box in true_poses(spread):
+        assert float((g.pose_from_box(hull, R, box, K, allocentric=False)[1] - t).norm() / t.norm()) < 1e-6
+        found_R, found_t = g.pose_from_box(hull, view, box, K)
+        distance = (R @ centre + t).norm()
+        assert float(g.rotation_error(found_R, R)) < 0.01
+        assert float((found_R @ centre + found_t - R @ centre - t).norm() / distance) < 1e-4
+
+
+def test_pose_from_box_keeps_the_object_in_front_of_the_camera() -> None:
+    cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
+    box = torch.tensor([-1e5, -1e5, 1e5, 1e5], dtype=torch.float64) + K[:2, 2].repeat(2)
+    nearest = 1.05 * 3.0**0.5  # extents of the cube
+    straight = g.pose_from_box(cube, torch.eye(3, dtype=torch.float64), box, K, allocentric=False)[1]
+    assert float(straight[2]) == pytest.approx(nearest, rel=1e-6)
+    rotated = g.rotation_from_viewpoint(20.0, 30.0, 10.0).double()
+    assert float(g.pose_from_box(cube, rotated, box, K, allocentric=False)[1][2]) > nearest - 1e-6

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint, viewpoint_from_rotation
+from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import SIDES, PosePrior, object_frame
 
 
@@ -54,20 +54,6 @@ def test_elevation_and_theta_are_limited_each_by_itself():
     assert PosePrior(elevation=(-90, 90)).excess(R).tolist() == [-180.0] * 4
 
 
-def test_rotation_limit_is_the_geodesic_distance():
-    prior = PosePrior(viewpoint=(30.0, 20.0, 5.0), within=10.0)
-    centre, R = rotations(30.0, 20.0, 5.0), rotations([30.0, 60.0], [20.0, 20.0], [5.0, 5.0])
-    expected = rotation_error(R, centre) - 10.0
-    assert torch.allclose(prior.excess(R), expected)
-    assert expected[1] > 10.0
-
-
-def test_log_prior_excludes_what_is_outside_and_margin_widens_it():
-    R, prior = rotations([0.0, 25.0, 40.0]), PosePrior(azimuth=(-20, 20))
-    assert prior.log_prior(R).tolist() == [0.0, -math.inf, -math.inf]
-    assert prior.log_prior(R, margin=7.5).tolist() == [0.0, 0.0, -math.inf]
-
-
 @pytest.mark.parametrize(
     "prior",
     [
@@ -101,13 +87,6 @@ def test_nearest_satisfies_limits_together():
     R = rotations(360.0 * a, 160.0 * e - 80.0, 360.0 * t - 180.0)
     assert float(prior.excess(prior._moved_once(R, None)).max()) > 1.0
     assert float(prior.excess(prior.nearest(R)).max()) < 0.1
-
-
-def test_nearest_clamps_each_angle_to_its_nearer_limit():
-    prior = PosePrior(azimuth=(300, 60), elevation=(0, 45))
-    azimuth, elevation, _ = viewpoint_from_rotation(prior.nearest(rotations([70.0, 290.0, 179.0], [60.0, -5.0, 20.0])))
-    assert azimuth.tolist() == pytest.approx([60.0, 300.0, 60.0], abs=1e-3)
-    assert elevation.tolist() == pytest.approx([45.0, 0.0, 45.0], abs=1e-3)
 
 
 @pytest.mark.parametrize("prior", [PosePrior(azimuth=(300, 60)), PosePrior(viewpoint=(20, 10, 0), within=30)], ids=str)
@@ -159,7 +138,7 @@ def test_object_frame_puts_up_on_z_and_the_front_towards_azimuth_zero(up):
         ({"rotation": 2 * torch.eye(3), "within": 5.0}, "rotation"),
         ({"viewpoint": (0, 0, 0), "within": "5"}, "within: expected a number"),
         ({"azimuth": (0, 9), "front": "w"}, "front"),
-        ({"viewpoint": (0, "a", 0), "within": 5.0}, "viewpoint: expected 3 numbers"),
+        ({"viewpoint": (0, "a", 0), "within": 5.0}, "viewpoint: expected numbers"),
     ],
     ids=str,
 )

@@ -1,10 +1,15 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+import curvireg_torch as cr
 from curvireg_torch import geometry as g
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import ViewSphere, rotation_error, sample_views, uniform_views, up_rotation
+from curvireg_torch.utils.choices import UP_AXES
 
 
 def test_viewpoint_from_rotation_inverts_rotation_from_viewpoint() -> None:
@@ -12,17 +17,6 @@ def test_viewpoint_from_rotation_inverts_rotation_from_viewpoint() -> None:
     a, e, t = g.viewpoint_from_rotation(R)
     assert bool(((a >= 0) & (a < 360) & (e.abs() <= 90) & (t >= -180) & (t < 180)).all())
     torch.testing.assert_close(g.rotation_from_viewpoint(a, e, t), R, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("elevation", [90.0, -90.0])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_viewpoint_from_rotation_has_theta_0_at_the_poles(elevation: float, dtype: torch.dtype) -> None:
-    azimuth = torch.tensor([0.0, 30.0, 200.0, 359.0], dtype=dtype)
-    R = g.rotation_from_viewpoint(azimuth, elevation, 20.0)
-    a, e, t = g.viewpoint_from_rotation(R)
-    assert t.tolist() == [0.0] * 4
-    torch.testing.assert_close(e, torch.full_like(e, elevation), rtol=0, atol=1e-3)
-    torch.testing.assert_close(g.rotation_from_viewpoint(a, e, t), R, rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize("elevation", [90.0, -90.0])
@@ -38,13 +32,6 @@ def test_viewpoint_from_rotation_is_accurate_in_float32_near_the_poles(elevation
     back = g.rotation_from_viewpoint(*g.viewpoint_from_rotation(rounded))
     assert back.shape == rounded.shape
     assert math.radians(float(g.rotation_error(back.double(), rounded.double()).max())) < 5e-5
-
-
-def test_viewpoint_from_rotation_has_finite_gradients_near_the_poles() -> None:
-    R = g.rotation_from_viewpoint(torch.tensor([30.0, 200.0, 10.0]), torch.tensor([89.999, -89.99, 0.0]), 20.0)
-    R.requires_grad_()
-    sum(angle.sum() for angle in g.viewpoint_from_rotation(R)).backward()
-    assert bool(R.grad.isfinite().all())
 
 
 def test_viewpoint_from_rotation_wraps_angles() -> None:
@@ -73,3 +60,65 @@ def test_rotation_error_agrees_with_scipy() -> None:
     small = ours[expected < 1e-6]
     torch.testing.assert_close(small, expected[expected < 1e-6], rtol=0.02, atol=1e-12)
     assert g.rotation_error(torch.eye(3).expand(4, 1, 3, 3), torch.eye(3).expand(5, 3, 3)).shape == (4, 5)
+
+
+def directions(views: ViewSphere) -> torch.Tensor:
+    return -views.rotations[:, 2].double()
+
+
+@pytest.mark.parametrize("count", [2, 5, 20, 100, 300, 700])
+def test_uniform_views_has_the_stated_covering_radius(count: int) -> None:
+    probes = torch.randn(100_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    probes = torch.nn.functional.normalize(torch.cat([probes, torch.eye(3).double(), -torch.eye(3).double()]), dim=1)
+    nearest = torch.cat([(p @ directions(uniform_views(count)).T).amax(1) for p in probes.split(20_000)])
+    radius = math.degrees(math.acos(max(-1.0, float(nearest.min()))))
+    assert 0.9 * 157 / math.sqrt(count) < radius <= 157 / math.sqrt(count)
+
+
+def test_uniform_views_covers_rotations_with_thetas() -> None:
+    views = uniform_views(200, thetas=range(0, 360, 20))
+    R = torch.from_numpy(Rotation.random(2000, random_state=0).as_matrix())
+    nearest = (R.flatten(1) @ views.rotations.double().flatten(1).T).argmax(dim=1)
+    error = rotation_error(R, views.rotations[nearest].double())
+    assert float(error.max()) <= 157 / math.sqrt(200) + 10.0
+
+
+def test_view_functions_refuse_invalid_options() -> None:
+    one = torch.zeros(1)
+    for call, match in (
+        (lambda: ViewSphere(one, one, one, one + 1), "distances > 1"),
+        (lambda: ViewSphere(one, one, torch.zeros(2), one + 2), "one shape"),
+        (lambda: sample_views(azimuth_step=0), "azimuth_step"),
+        (lambda: sample_views(elevations=[]), "elevations"),
+        (lambda: sample_views(elevations=[91]), "elevations"),
+        (lambda: uniform_views(0), "count"),
+        (lambda: uniform_views(2.5), "count: expected an integer"),
+        (lambda: uniform_views(5, distances="far"), "distances: expected numbers"),
+        (lambda: sample_views(elevations=["high"]), "elevations: expected numbers"),
+        (lambda: sample_views(azimuth_step="10"), "azimuth_step: expected a number"),
+        (lambda: cr.camera_matrix("1", 1, 1, 1), "fx: expected a number"),
+        (lambda: cr.crop_images(torch.rand(1, 1, 4, 4), [[0, 0, 3, 3]], size=8.0), "size: expected an integer"),
+        (lambda: sample_views(elevations=[float("nan")]), "elevations: expected at least one finite"),
+        (lambda: uniform_views(5, thetas=[]), "thetas"),
+    ):
+        with pytest.raises(InvalidInputError, match=match):
+            call()
+
+
+AXES = {s + a: (-1 if s else 1) * np.eye(3)[i] for i, a in enumerate("xyz") for s in ("", "-")}
+
+
+@pytest.mark.parametrize("up", UP_AXES)
+def test_up_rotation_takes_the_axis_to_z(up: str) -> None:
+    R = up_rotation(up).numpy()
+    assert np.linalg.det(R) == 1
+    assert np.array_equal(R @ R.T, np.eye(3))
+    assert np.array_equal(R @ AXES[up], [0, 0, 1])
+    assert (up_rotation("y").numpy() @ [0, 0, 1]).tolist() == [0, -1, 0], "from glTF's front to that of PASCAL3D+"
+
+
+@pytest.mark.parametrize("up", UP_AXES)
+def test_for_up_shows_the_same_views_of_a_rotated_object(up: str) -> None:
+    views = cr.sample_views(azimuth_step=40, elevations=[-20, 30, 90], thetas=[0, 25])
+    seen = views.for_up(up).rotations.double() @ up_rotation(up).T
+    torch.testing.assert_close(seen, views.rotations.double(), rtol=0, atol=2e-6)

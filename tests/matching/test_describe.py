@@ -2,10 +2,12 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+import trimesh
 
 from curvireg_torch.geometry import projected_boxes, sample_views
-from curvireg_torch.matching.describe import ViewDescriber, quarter_turns
+from curvireg_torch.matching.describe import VIEW_FACES, ViewDescriber, quarter_turns
 from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.rendering import make_renderer
 
 
 @pytest.mark.parametrize("camera", ["perspective", "orthographic"])
@@ -13,9 +15,11 @@ def test_describer_renders_quarter_turns_once(truck, camera):
     describe = ViewDescriber(truck, BankSettings(image_size=64, camera=camera))
     views = sample_views(azimuth_step=180, elevations=[20], thetas=[0, 35, 90, 180, 215, 270, 305])
     rotations, distances = views.rotations, views.distance * describe.radius
-    describe.renderer = Mock(wraps=describe.renderer)
+    describe.view_renderer = Mock(wraps=describe.view_renderer)
     together = describe(rotations, distances)
-    assert [len(call.args[0]) for call in describe.renderer.render.call_args_list] == [4]  # two directions, 0 and 35
+    assert [len(call.args[0]) for call in describe.view_renderer.render.call_args_list] == [
+        4
+    ]  # two directions, 0 and 35
     for i in range(len(rotations)):
         alone = describe(rotations[i : i + 1], distances[i : i + 1])
         assert (together.descriptors[i] - alone.descriptors[0]).norm() < 0.02 * alone.descriptors[0].norm()
@@ -56,3 +60,15 @@ def test_silhouettes_fill_their_crops_up_to_the_margin(bank):
         longer = max(int(y.max() - y.min()), int(x.max() - x.min())) + 1
         assert abs(longer - expected) < 2.5
         assert bool(silhouette[S // 2].any())
+
+
+def test_views_of_a_fine_mesh_equal_those_of_a_simplified_one():
+    fine = trimesh.util.concatenate([trimesh.creation.icosphere(5), trimesh.creation.box((0.4, 0.5, 2.6))])
+    views = sample_views(azimuth_step=120, elevations=[-20, 35])
+    exact = ViewDescriber(fine, BankSettings(), renderer=make_renderer(fine))
+    quick = ViewDescriber(fine, BankSettings())
+    assert len(fine.faces) > 2 * VIEW_FACES
+    expected, found = (each(views.rotations, views.distance * exact.radius) for each in (exact, quick))
+    assert float((expected.silhouettes ^ found.silhouettes).float().mean()) < 1e-3
+    assert float(torch.cosine_similarity(expected.descriptors, found.descriptors).min()) > 0.995
+    torch.testing.assert_close(found.boxes, expected.boxes)

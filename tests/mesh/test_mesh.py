@@ -1,14 +1,15 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from curvireg_torch import geometry as g
-from curvireg_torch.matching import ViewBank
-from curvireg_torch.mesh import normalization_transform
-from curvireg_torch.mesh.mesh import extreme_points
-from curvireg_torch.pipeline import BankSettings
+import curvireg_torch as cr
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_up
+from curvireg_torch.pipeline import PRESETS, ViewPolicy
 
 
 def moved(mesh: trimesh.Trimesh, rotation: torch.Tensor, scale: float, offset: list[float]) -> trimesh.Trimesh:
@@ -17,29 +18,12 @@ def moved(mesh: trimesh.Trimesh, rotation: torch.Tensor, scale: float, offset: l
     return mesh.copy().apply_transform(T.numpy())
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_normalization_transform_is_invariant_to_similarities(truck: trimesh.Trimesh, seed: int) -> None:
-    R = torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
-    meshes = truck, moved(truck, R, 7.0, [3.0, -2.0, 5.0])
-    transforms = [normalization_transform(mesh, align_axes=True) for mesh in meshes]
-    first, second = (
-        torch.tensor(mesh.copy().apply_transform(T.numpy()).vertices)
-        for mesh, T in zip(meshes, transforms, strict=True)
-    )
-    torch.testing.assert_close(first, second, rtol=0, atol=1e-9)
-    spread = first.square().mean(dim=0)
-    assert spread[0] > spread[1] > spread[2]
-    assert float(first.norm(dim=1).max()) == pytest.approx(1.0)
-    assert float(torch.linalg.det(transforms[0][:3, :3])) > 0, "not mirrored"
-
-
 def test_bank_of_a_moved_copy_holds_the_same_views(truck: trimesh.Trimesh) -> None:
     # A quarter rotation about z maps the box, and a grid of azimuths, onto themselves.
-    settings = BankSettings(image_size=64)
     quarter = torch.from_numpy(Rotation.from_euler("z", 90, degrees=True).as_matrix())
     copy = moved(truck, quarter, 12.0, [30.0, -7.0, 2.0])
-    views = g.sample_views(azimuth_step=30, elevations=[-20, 40])
-    first, second = (ViewBank.build(m, views, settings=settings, progress=False) for m in (truck, copy))
+    views = cr.sample_views(azimuth_step=30, elevations=[-20, 40])
+    first, second = (cr.ViewBank.build(m, views, image_size=64, progress=False) for m in (truck, copy))
     rotated = (first.rotations.double() @ quarter.T).flatten(1) @ second.rotations.double().flatten(1).T
     assert float(rotated.amax(dim=1).min()) > 3.0 - 1e-5  # traces: every view is there
     order = rotated.argmax(dim=1)
@@ -69,3 +53,23 @@ def test_extreme_points_are_the_hull_of_a_small_mesh_and_all_of_a_flat_one() -> 
     assert len(extreme_points(box)) == 8
     flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
     assert len(extreme_points(flat)) == 4
+
+
+@pytest.mark.parametrize(("suffix", "up"), [("glb", "y"), ("ply", "z"), ("stl", "z"), ("off", "z"), ("obj", "z")])
+def test_load_mesh_notes_the_up_axis(tmp_path: Path, suffix: str, up: str) -> None:
+    path = tmp_path / f"a.{suffix}"
+    trimesh.creation.box((1.0, 2.0, 3.0)).export(path)
+    mesh = cr.load_mesh(path)
+    assert mesh_up(mesh) == mesh_up(as_mesh(mesh)) == up
+    np.testing.assert_allclose(mesh.extents, [1, 2, 3], rtol=1e-6)  # not rotated
+    assert mesh_up(cr.load_mesh(path, up="-x")) == "-x"
+    with pytest.raises(InvalidInputError, match="up: expected one of 'x'"):
+        cr.load_mesh(path, up="w")
+
+
+def test_views_of_y_up_meshes_are_upright(tmp_path: Path) -> None:
+    trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / "a.glb")
+    few = cr.Pipeline(views=ViewPolicy(pose="upright", azimuth_step=180.0), terms=PRESETS["classical"].terms)
+    bank = cr.ViewBank.build(tmp_path / "a.glb", pipeline=few, progress=False)
+    up = bank.rotations @ torch.tensor([0.0, 1.0, 0.0])
+    assert float(up[:, 1].max()) <= -0.5  # y of the file points up in the picture in every view

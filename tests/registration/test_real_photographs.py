@@ -46,16 +46,15 @@ SIMILAR = [
 
 def registered(benchmark, case):
     """(annotation, result) of each photograph, registered alone to the bank of their common mesh."""
-    items = {item.key: item for item in benchmark.items}
-    chosen = [items[key] for key in case.keys]
-    assert len({item.meshes for item in chosen}) == 1
-    mesh = cr.load_mesh(chosen[0].meshes[0], unit=benchmark.unit)
+    pairs = {entry.key: (entry, known) for entry, known in zip(benchmark.entries, benchmark.samples, strict=True)}
+    chosen = [pairs[key] for key in case.keys]
+    assert len({entry.meshes for entry, _ in chosen}) == 1
+    mesh = cr.load_mesh(chosen[0][0].meshes[0], unit=benchmark.unit)
     pipeline = cr.Pipeline().with_pose_prior(benchmark.protocol.pose)
     registrar = cr.Registrar(cr.ViewBank.build(mesh, pipeline=pipeline, progress=False))
-    for item in chosen:
-        known = benchmark.dataset.annotation(item.index)
-        K = None if item.camera_matrix is None else item.camera_matrix[None]
-        yield known, registrar([read_image(known["image_path"])], item.box[None], K)[0]
+    for entry, known in chosen:
+        K = None if entry.camera is None else cr.camera_matrix(*entry.camera)[None]
+        yield known, registrar([read_image(entry.photo)], torch.tensor(entry.box)[None], K)[0]
 
 
 @pytest.mark.parametrize("case", EXACT, ids=lambda case: case.name)

@@ -12,7 +12,7 @@ from curvireg_torch.errors import RenderingError
 from curvireg_torch.geometry import transform, uniform_views
 from curvireg_torch.rendering import make_renderer
 
-BACKENDS = ("embree", "pyrender", "torch")
+BACKENDS = ("auto", "embree", "pyrender", "torch")
 
 
 @functools.cache
@@ -24,10 +24,10 @@ def _works(backend: str) -> bool:
     return True
 
 
-def require(*backends: str) -> None:
-    """Skip where pyrender has no driver; the others need none."""
-    if "pyrender" in backends and not _works("pyrender"):
-        pytest.skip("pyrender needs EGL")
+def require(*backends: str, orthographic: bool = False) -> None:
+    """Skip where pyrender has no driver, and its parallel projection, which it lacks."""
+    if "pyrender" in backends and (orthographic or not _works("pyrender")):
+        pytest.skip("pyrender needs EGL, and draws in perspective")
 
 
 @pytest.fixture(params=BACKENDS)
@@ -38,6 +38,8 @@ def backend(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(params=[False, True], ids=["perspective", "orthographic"])
 def orthographic(request: pytest.FixtureRequest) -> bool:
+    if "backend" in request.fixturenames:
+        require(request.getfixturevalue("backend"), orthographic=request.param)
     return bool(request.param)
 
 

@@ -12,8 +12,8 @@ from torch import Tensor
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.mesh import has_colours, load_mesh, surface_colours
 from curvireg_torch.rendering import make_renderer, render_colour
+from curvireg_torch.rendering.colour import shade
 from curvireg_torch.rendering.embree import EmbreeRenderer
-from curvireg_torch.rendering.shading import shade
 
 COLOURS = [(230, 20, 20), (20, 220, 30), (30, 40, 240), (240, 230, 10), (10, 230, 230), (220, 20, 230)]
 SIZE = (72, 96)
@@ -111,7 +111,8 @@ def test_cleaning_preserves_vertex_and_face_colours() -> None:
 def test_load_mesh_reads_textures_and_materials(tmp_path: Path, suffix: str) -> None:
     red = trimesh.creation.box((0.4, 0.4, 0.4))
     material = trimesh.visual.material
-    rgba = np.array([250, 10, 10, 255], np.uint8)
+    # Factors of glTF are linear: 0.2 of it is 124 of sRGB.
+    rgba = np.array([255, 51, 0, 255] if suffix == ".glb" else [255, 124, 0, 255], np.uint8)
     plain = material.PBRMaterial(baseColorFactor=rgba) if suffix == ".glb" else material.SimpleMaterial(diffuse=rgba)
     red.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(red.vertices), 2)), material=plain)
     scene = trimesh.Scene()
@@ -129,7 +130,7 @@ def test_load_mesh_reads_textures_and_materials(tmp_path: Path, suffix: str) -> 
     assert is_red.sum() == 12
     centre = np.full(24, 1 / 3, np.float32)
     found = colours.at(np.arange(24, dtype=np.int32), centre, centre)
-    np.testing.assert_allclose(found[is_red], np.tile([250 / 255, 10 / 255, 10 / 255], (12, 1)), atol=0.01)
+    np.testing.assert_allclose(found[is_red], np.tile([1.0, 124 / 255, 0.0], (12, 1)), atol=0.005)
     box = textured_box()
     expected = surface_colours(box)
     assert expected is not None

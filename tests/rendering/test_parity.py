@@ -26,7 +26,7 @@ MESHES = {
 @pytest.mark.parametrize("name", MESHES)
 @pytest.mark.parametrize("pair", list(itertools.combinations(BACKENDS, 2)), ids="-".join)
 def test_backends_agree(pair: tuple[str, str], name: str, orthographic: bool) -> None:
-    require(*pair)
+    require(*pair, orthographic=orthographic)
     mesh = MESHES[name]()
     radius = mesh_radius(mesh)
     T, K, size = camera(6, radius=radius, centre=mesh_centre(mesh), orthographic=orthographic)
@@ -108,11 +108,8 @@ def test_silhouette_agrees_with_project_points(backend: str, orthographic: bool)
 
 def test_torch_renderer_does_not_depend_on_chunks(orthographic: bool) -> None:
     mesh = MESHES["knot"]()
-    T, K, size = camera(7, radius=mesh_radius(mesh), centre=mesh_centre(mesh), orthographic=orthographic)
+    T, K, size = camera(3, radius=mesh_radius(mesh), centre=mesh_centre(mesh), orthographic=orthographic)
     renderer = TorchRenderer(mesh)
     expected = renderer.render(T, K, size, orthographic=orthographic)
-    for views, triangles, pairs in ((3, 10**6, 10**7), (7, 501, 10**7), (2, 10**6, 4099)):
-        renderer._views, renderer._triangles, renderer._pairs = views, triangles, pairs
-        depth = renderer.render(T, K, size, orthographic=orthographic)
-        assert torch.equal(depth > 0, expected > 0)
-        torch.testing.assert_close(depth, expected, rtol=0, atol=1e-6)
+    renderer._pairs = 4099
+    assert torch.equal(renderer.render(T, K, size, orthographic=orthographic), expected)

@@ -8,13 +8,11 @@ import torch
 import trimesh
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
-from curvireg_torch.features.appearance import describe, similarity
-from curvireg_torch.features.backbone import Backbone
+from curvireg_torch.features.backbone import Backbone, describe, similarity
 from curvireg_torch.matching import distinct_views
-from curvireg_torch.matching import matcher as matcher_module
 from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.terms import Appearance
-from tests._support.scenes import CAMERA, scene
+from tests._support.scenes import scene
 
 VIEWS = sample_views(azimuth_step=30, elevations=[0, 30])  # those of `small_bank`
 PIPELINE = Pipeline(field="focus", box_jitter=0.0, bank=replace(Pipeline().bank, image_size=64))
@@ -41,7 +39,7 @@ def photograph(seed):
 
 
 def test_small_bank_stores_features_of_all_views(small_bank, matcher, tmp_path):
-    pictures = matcher._shaded(torch.arange(len(small_bank)))
+    pictures = matcher.describer.shaded(small_bank.rotations, small_bank.distances)
     assert pictures.shape == (len(small_bank), 1, 64, 64)
     expected = describe(pictures, Backbone())
     torch.testing.assert_close(small_bank.reranking_features["appearance"], expected, atol=2e-3, rtol=0)
@@ -52,15 +50,6 @@ def test_small_bank_stores_features_of_all_views(small_bank, matcher, tmp_path):
     small_bank.save(tmp_path / "bank.safetensors")
     loaded = ViewMatcher(ViewBank.load(tmp_path / "bank.safetensors"), pipeline=PIPELINE)(*photograph(0))
     torch.testing.assert_close(loaded.scores, ranking.scores, atol=1e-3, rtol=1e-2)
-
-
-def test_appearance_weight_is_an_exponent(small_bank):
-    plain, weighted = (
-        ViewMatcher(small_bank, pipeline=PIPELINE.with_term("appearance", weight=w))(*photograph(1)) for w in (0, 3)
-    )
-    raw = weighted.terms["appearance"]
-    factor = torch.exp(3 * (raw - raw.max()) / raw.std(correction=0))
-    torch.testing.assert_close(weighted.scores, plain.scores * factor, rtol=1e-3, atol=1e-6)
 
 
 def test_large_bank_compares_the_best_distinct_views(small_bank, large_bank, matcher):
@@ -85,27 +74,9 @@ def test_large_bank_compares_the_best_distinct_views(small_bank, large_bank, mat
 
 
 def test_appearance_is_largest_for_the_same_view(matcher):
-    query = matcher.features(matcher._shaded(torch.tensor([0, 9, 20])))
+    bank, views = matcher.bank, torch.tensor([0, 9, 20])
+    query = matcher.features(matcher.describer.shaded(bank.rotations[views], bank.distances[views]))
     assert matcher.rank(query).terms["appearance"].argmax(dim=1).tolist() == [0, 9, 20]
-
-
-def test_reranking_score_is_on_the_scale_of_views(matcher):
-    query = matcher.query(*photograph(0))
-    ranking = matcher.rank(query)
-    views = torch.tensor([3, 11, 3])
-    image_index = torch.zeros(3, dtype=torch.long)
-    scores = matcher.reranking_score("appearance", query, ranking, matcher._shaded(views), image_index)
-    expected = Appearance().log_score(ranking.terms["appearance"].double())[0, views]
-    torch.testing.assert_close(scores, expected, atol=0.1, rtol=0.1)
-    assert float(scores[0]) == float(scores[2])
-
-
-def test_hypotheses_have_an_appearance_score(small_bank):
-    image, box, T = scene(0)
-    result = Registrar(small_bank, pipeline=PIPELINE)([image], box[None], CAMERA)[0]
-    assert float(rotation_error(result.rotation, T[:3, :3])) < 5
-    scores = [h.evidence["appearance"] for h in result.hypotheses]
-    assert scores[0] == max(scores) != 0
 
 
 def painted() -> trimesh.Trimesh:
@@ -139,20 +110,3 @@ def test_colours_distinguish_front_and_back(painted_bank, tmp_path, exhaustive_l
         best = registrar([picture[1:]], [[4.0, 4, 59, 59]])[0]
         assert rotation_error(best.rotation, bank.rotations[view].double()) < 20
         assert best.hypotheses[0].view != best.hypotheses[1].view
-
-
-def test_feature_cache_that_overflows_changes_no_ranking(large_bank, monkeypatch):
-    """Some views of a query are cached, and together they exceed the limit: the ranking is that of an empty cache."""
-    pipeline = large(top=6, min_angle=20.0)
-    queries = [ViewMatcher(large_bank, pipeline=pipeline).query(*photograph(k)) for k in range(3)]
-    fresh = [ViewMatcher(large_bank, pipeline=pipeline).rank(query).scores for query in queries]
-    monkeypatch.setattr(matcher_module, "MAX_CACHED_VIEWS", 8)
-    matcher, overflowed = ViewMatcher(large_bank, pipeline=pipeline), []
-    for query, expected in zip(queries, fresh, strict=True):
-        cached = set(matcher._feature_cache.get("appearance", {}))
-        ranking = matcher.rank(query)
-        compared = set(ranking.terms["appearance"][0].isfinite().nonzero()[:, 0].tolist())
-        overflowed.append(bool(cached & compared) and len(cached | compared) > 8)
-        torch.testing.assert_close(ranking.scores, expected, rtol=1e-4, atol=1e-7)
-        assert len(matcher._feature_cache["appearance"]) <= 8
-    assert any(overflowed)

@@ -1,4 +1,5 @@
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -6,7 +7,7 @@ import torch
 from torch import Tensor
 
 import curvireg_torch as cr
-from curvireg_torch import geometry
+from curvireg_torch import errors, geometry
 from curvireg_torch.errors import ImageError, InvalidInputError
 from curvireg_torch.utils.checks import (
     as_boxes,
@@ -14,8 +15,6 @@ from curvireg_torch.utils.checks import (
     check_camera_matrix,
     check_fraction,
     check_integer,
-    check_mask,
-    check_masks,
     check_number,
     check_photograph,
     check_pixels,
@@ -135,16 +134,6 @@ def test_as_camera_matrices_accepts_one_for_all_or_one_for_each() -> None:
             as_camera_matrices(bad, 2)
 
 
-def test_check_mask_and_check_masks_refuse_other_shapes_and_dtypes() -> None:
-    mask = torch.zeros(1, 9, 9, dtype=torch.bool)
-    for bad in (mask[0], mask[None], mask.float(), mask.byte(), mask.numpy()):
-        with pytest.raises(InvalidInputError, match=r"points: expected bool \(N, H, W\)"):
-            check_masks(bad, "points")
-    for bad in (mask[0], mask.float()):
-        with pytest.raises(InvalidInputError, match="mask: expected bool of shape"):
-            check_mask(bad, torch.rand(1, 9, 9))
-
-
 @pytest.mark.parametrize("wrong", ["1", None, True, math.nan, math.inf, 10**400, [1.0], torch.ones(2)])
 def test_numbers_of_the_wrong_type_are_refused(wrong: object) -> None:
     for check in (check_number, check_positive, check_fraction):
@@ -157,3 +146,15 @@ def test_integers_of_the_wrong_type_are_refused(wrong: object) -> None:
     with pytest.raises(InvalidInputError, match="scales: expected an integer >= 1, got"):
         check_integer(wrong, "scales")
     assert check_integer(np.int64(3), "scales") == 3
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in vars(errors) if name.endswith(("Error", "Warning")) and name[0] != "_"]
+)
+def test_errors_keep_message_and_subject(name: str) -> None:
+    error = getattr(errors, name)("unusable; use another", subject="a.png")
+    for copy in (error, pickle.loads(pickle.dumps(error)), type(error)("unusable; use another").with_subject("a.png")):
+        assert str(copy) == "a.png: unusable; use another"
+        assert (copy.message, copy.subject) == ("unusable; use another", "a.png")
+    assert str(error.with_subject("image 3")) == "image 3: unusable; use another"
+    assert str(type(error)("unusable")) == "unusable"

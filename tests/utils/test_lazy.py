@@ -1,11 +1,15 @@
 import subprocess
 import sys
-from importlib import import_module
+from argparse import Namespace
+from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 import curvireg_torch
-from curvireg_torch import evaluation
+from curvireg_torch import cli, evaluation
+from curvireg_torch.cli import main, parse
+from curvireg_torch.errors import CurviregError
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.utils import choices
 
@@ -58,12 +62,75 @@ def test_every_lazy_name_can_be_imported(package):
     assert set(package.__all__) <= set(dir(package))
 
 
-def test_unknown_names_raise_attribute_errors():
-    with pytest.raises(AttributeError, match="registrar_of"):
-        curvireg_torch.registrar_of  # noqa: B018
-    assert curvireg_torch.filters is import_module("curvireg_torch.filters")
-
-
 def test_choices_agree_with_the_presets():
     assert list(PRESETS) == list(choices.PRESET_NAMES)
     assert choices.DEFAULT in PRESETS
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """Empty files: none of them is read."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("photo.jpg", "part.stl", "bank.safetensors", "list.csv", "odd.part"):
+        Path(name).touch()
+    Path("shots").mkdir()
+
+
+MISPLACED = "where a photograph is expected"
+SWAPPED = "seem to be swapped: the photograph comes first, the mesh last"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["register", "part.stl", "photo.jpg"], f"part.stl: a mesh {MISPLACED}; it and photo.jpg {SWAPPED}"),
+        (["register", "part.stl", "shots/*.jpg"], f"it and shots/*.jpg {SWAPPED}"),
+        (["register", "--list", "part.stl", "list.csv"], f"a mesh where a list is expected; it and list.csv {SWAPPED}"),
+        (["view", "part.stl", "photo.jpg"], f"it and photo.jpg {SWAPPED}"),
+        (["register", "photo.jpg", "part.stl", "bank.safetensors"], "several by --mesh"),
+        (["register", "photo.jpg", "shots"], "shots: a folder where a mesh is expected"),
+        (["register", "list.csv", "part.stl"], "give it as --list list.csv"),
+        (["register", "photo.jpg", "none.stl"], "none.stl: no such file; check the path of the mesh"),
+        (["register", "none.jpg", "part.stl"], "none.jpg: no such file; check the path of the photograph"),
+        (["register", "--list", "none.csv", "part.stl"], "none.csv: no such file; check the path of the list"),
+        (["register", "photo.jpg", "--mesh", "part.stl", "--mesh", "none.stl"], "none.stl: no such file"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)  # fmt: skip
+@pytest.mark.usefixtures("files")
+def test_check_given_reports_missing_and_swapped_files_in_one_line(words, message, capsys):
+    out = [] if words[0] == "view" else ["--out", "out"]
+    assert main([*words, *out]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("words", [["none.jpg", "part.stl"], ["photo.jpg", "none.stl"], ["part.stl", "photo.jpg"]])
+@pytest.mark.usefixtures("files")
+def test_check_given_runs_before_heavy_imports(words):
+    code = f"from curvireg_torch.cli import main; assert main({['register', *words, '--json']}) == 2"
+    assert not imported_by(code) & HEAVY
+
+
+def test_options_accept_numbers_with_commas():
+    arguments = parse(
+        ["register", "a,1.jpg", *["--box", "10,", "20,", "30.5,", "40", "--camera=1e3,1000,-.5,2", "5,6", "--out", "o"]]
+    )
+    assert arguments.box == parse(["view", "--box=10, 20, 30.5, 40"]).box == [10.0, 20.0, 30.5, 40.0]
+    assert arguments.camera == [1000.0, 1000.0, -0.5, 2.0]
+    assert arguments.paths == [Path("a,1.jpg"), Path("5,6")]
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "message"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+        (PermissionError(13, "denied", "x.ply"), 2, "error: [Errno 13] denied: 'x.ply'; check that it exists"),
+        (CurviregError("no good"), 2, "error: no good\n"),
+    ],
+)
+def test_main_reports_errors_in_one_line_with_a_code(raised, code, message, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "parse", lambda _: Namespace(run=Mock(side_effect=raised), debug=False))
+    assert main(["cache"]) == code
+    assert capsys.readouterr().err.startswith(f"curvireg: {message}")

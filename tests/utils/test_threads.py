@@ -1,5 +1,3 @@
-import contextlib
-import os
 import threading
 from collections.abc import Iterator
 
@@ -37,12 +35,6 @@ def test_for_each_runs_every_job_once_and_two_at_a_time() -> None:
         assert sorted(done) == list(range(6))
 
 
-@pytest.mark.parametrize("enabled", [True, False])
-def test_jobs_have_the_gradient_mode_of_their_caller(enabled: bool) -> None:
-    with torch.set_grad_enabled(enabled):
-        assert map_on_threads(lambda _: torch.is_grad_enabled(), range(3)) == [enabled] * 3
-
-
 def test_for_each_runs_in_sequence_on_single_threads() -> None:
     here = []
     with single_threaded_pool() as pool:
@@ -74,39 +66,6 @@ def test_for_each_stops_at_an_error_and_raises_it() -> None:
     for_each(2, done.append)  # the threads survive
 
 
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_for_each_works_in_a_forked_process() -> None:
-    for_each(4, lambda _: None)
-    child = os.fork()
-    if child == 0:
-        done: list[int] = []
-        for_each(4, done.append)
-        os._exit(0 if sorted(done) == [0, 1, 2, 3] else 1)
-    killer = threading.Timer(20.0, os.kill, (child, 9))  # if it hangs
-    killer.start()
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-    killer.cancel()
-
-
-@pytest.mark.parametrize("error", [None, ValueError("within")])
-def test_single_threaded_pool_restores_the_number_of_threads(
-    monkeypatch: pytest.MonkeyPatch, error: Exception | None
-) -> None:
-    threads = [2]  # some libraries count threads for the whole process, so that a worker changes the number for all
-    monkeypatch.setattr(torch, "set_num_threads", lambda n: threads.append(n))
-    monkeypatch.setattr(torch, "get_num_threads", lambda: threads[-1])
-
-    with (
-        pytest.raises(ValueError, match="within") if error else contextlib.nullcontext(),
-        single_threaded_pool() as pool,
-    ):
-        pool.submit(threading.get_ident).result()
-        assert threads[-1] == 1
-        if error is not None:
-            raise error
-    assert threads == [2, 1, 2]
-
-
 def test_map_on_threads_keeps_the_order_on_single_threads() -> None:
     def job(number: int) -> tuple[int, int, int]:
         return number, torch.get_num_threads(), threading.get_ident()
@@ -117,20 +76,6 @@ def test_map_on_threads_keeps_the_order_on_single_threads() -> None:
     assert threading.get_ident() not in {thread for *_, thread in out}
     assert torch.get_num_threads() == 2
     assert map_on_threads(job, []) == []
-
-
-def test_map_on_threads_leaves_threads_to_for_each() -> None:
-    both = threading.Barrier(2, timeout=20)
-    assert map_on_threads(lambda _: for_each(2, lambda _: both.wait()), [0]) == [None]
-    here: list[tuple[int, int]] = []
-
-    def job(_: int) -> None:
-        mine = threading.get_ident()
-        for_each(3, lambda _: here.append((mine, threading.get_ident())))
-
-    map_on_threads(job, [0, 1])
-    assert len(here) == 6
-    assert all(mine == other for mine, other in here), "two jobs leave no thread over"
 
 
 def test_one_torch_thread_gives_the_threads_of_torch_to_jobs() -> None:

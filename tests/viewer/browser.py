@@ -123,8 +123,8 @@ class Browser:
             pixels = cv2.imdecode(np.frombuffer(self.driver.get_screenshot_as_png(), np.uint8), cv2.IMREAD_COLOR)
             cv2.imwrite(str(Path(folder) / f"{name}.webp"), pixels, [cv2.IMWRITE_WEBP_QUALITY, 80])
 
-    def drag(self, start, end, size):
-        """Drag the mouse between pixels of the photograph, whose width is ``size`` px."""
+    def drag(self, start, end, size, held=None):
+        """Drag the mouse between pixels of the photograph, whose width is ``size`` px; call ``held`` before the end."""
         from selenium.webdriver import ActionChains
 
         image = self.part("photograph")
@@ -136,12 +136,18 @@ class Browser:
         )
         chain = ActionChains(self.driver, duration=50).move_to_element_with_offset(image, x0, y0).click_and_hold()
         chain.move_by_offset((x1 - x0) // 2, (y1 - y0) // 2)
-        chain.move_to_element_with_offset(image, x1, y1).release().perform()
+        chain.move_to_element_with_offset(image, x1, y1).perform()
+        if held is not None:
+            held()
+        ActionChains(self.driver, duration=50).release().perform()
 
     def box(self):
-        return [float(self.text(f"box-{name}") or "nan") for name in ("x0", "y0", "x1", "y1")]
+        facts = self.text("box-facts")
+        return [float(v) for v in facts.split()] if facts[:1].isdigit() else None
 
     def downloaded(self, name):
         path = self.folder / "downloads" / name
         self.wait(lambda: path.is_file() and not list(path.parent.glob("*.crdownload")), f"download of {name}")
-        return path.read_bytes()
+        content = path.read_bytes()
+        path.unlink()
+        return content

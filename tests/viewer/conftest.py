@@ -12,7 +12,7 @@ import pytest
 
 from tests._support.exif import exif, with_exif
 from tests.viewer.browser import Browser, wait_for
-from tests.viewer.test_session import write_scene
+from tests.viewer.test_session import new_session, write_scene
 
 
 @pytest.fixture(scope="module")
@@ -62,3 +62,18 @@ def browser(folder, address):
     errors = [entry for entry in browser.driver.get_log("browser") if entry["level"] == "SEVERE"]
     browser.driver.quit()
     assert not errors
+
+
+@pytest.fixture(scope="module")
+def registered(tmp_path_factory):
+    """A session with a result, its folder and the true pose."""
+    folder = tmp_path_factory.mktemp("viewer")
+    box, T = write_scene(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CURVIREG_CACHE", str(folder / "cache"))
+        session = new_session("--pipeline", str(folder / "small.json"))
+        session.open_photo(folder / "photo.png", "my photo.png")
+        session.open_mesh(folder / "truck.ply")
+        session.box, session.camera = tuple(round(v, 1) for v in box), (260.0, 260.0, 119.5, 89.5)
+        session.register()
+        yield session, folder, T

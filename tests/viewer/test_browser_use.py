@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.viewer.browser import MISSING, Browser
+from tests.viewer.test_browser import scroll
 
 OPTIONS = []  # of the command that starts the viewer
 
@@ -32,7 +33,7 @@ def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browse
     assert browser.driver.find_element("css selector", "html").get_attribute("lang") == "en-US"
     assert [browser.text(name) for name in ("sample", "register")] == ["Try the sample", "Find the pose"]
     assert browser.part("register").get_attribute("disabled")
-    browser.emulate(1280, 800)
+    browser.emulate(1440, 900)
     browser.picture("viewer-empty")
     browser.click("sample")
     browser.wait(lambda: browser.text("photograph-facts").startswith("sample.png: 960 x 720 px"), "photograph")
@@ -43,13 +44,12 @@ def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browse
 def test_a_search_can_be_stopped_and_started_again(browser):
     browser.click("register")
     browser.wait(lambda: browser.text("seconds") == "1 s", "seconds")
-    assert browser.text("stage")
-    browser.picture("viewer-search")
+    assert browser.text("progress")
     browser.click("stop")
     browser.wait(lambda: browser.messages() == ["stopped"], "stopped", 20)
     browser.wait(lambda: not browser.part("stop").is_displayed(), "nothing to stop")
     browser.click("register")
-    browser.wait(lambda: browser.text("stage") == "done", "result")
+    browser.wait(lambda: browser.text("progress") == "done", "result")
     assert browser.messages() == []
 
 
@@ -62,9 +62,22 @@ def test_a_reload_keeps_photograph_mesh_box_and_answer(browser):
     images = browser.part("photograph").find_elements("css selector", "img")
     browser.wait(lambda: [int(image.get_attribute("naturalWidth")) for image in images] == [960] * 3, "layers")
     browser.wait(lambda: len(browser.part("panel-answer").find_elements("css selector", "img")) > 1, "cards")
-    assert browser.text("stage") == "done"
-    browser.emulate(1280, 1000)
+    assert browser.text("progress") == "done"
+    browser.emulate(1440, 900)
     browser.picture("viewer")
+
+
+def test_contours_follow_the_mesh_that_is_dragged(browser):
+    before = browser.text("facts")
+
+    def follows():
+        browser.wait(lambda: browser.driver.find_element("css selector", ".canvas path.outline"), "contours", 20)
+        browser.picture("viewer-drag")
+
+    browser.drag((20, 20), (80, 60), 960, held=follows)
+    browser.wait(lambda: "moved: rotated" in browser.text("facts"), "turned")
+    browser.click("undo")
+    browser.wait(lambda: browser.text("facts") == before, "as before")
 
 
 def test_another_page_has_its_own_work(browser, folder, address):
@@ -84,18 +97,31 @@ def test_axe_finds_nothing_serious(browser):
         browser.emulate(1280, 1000, dark=dark)
         browser.wait(lambda d=dark: browser.driver.execute_script(
             "return document.body.classList.contains('body--dark')") == d, "colours")  # fmt: skip
-        for name in ("camera", "box-numbers", "known", "command-line", "by-hand"):
+        for name in ("camera", "known", "command-line"):
             browser.unfold(name)
         assert not (found := serious(browser)), found
 
 
 def test_dark_colours_follow_the_system(browser):
-    browser.emulate(1280, 1000, dark=True)
+    browser.emulate(1440, 900, dark=True)
     body = browser.driver.find_element("css selector", "body")
     browser.wait(lambda: body.value_of_css_property("background-color") == "rgba(20, 23, 26, 1)", "dark")
     browser.picture("viewer-dark")
-    browser.click("theme")
-    browser.wait(lambda: body.value_of_css_property("background-color") == "rgba(246, 247, 248, 1)", "light")
+    browser.emulate(0, 0)
+
+
+@pytest.mark.parametrize("size", [(1440, 900), (390, 844)])
+def test_the_photograph_fits_the_window_and_stays_in_view(browser, size):
+    browser.emulate(*size)
+    viewport = browser.driver.find_element("css selector", ".viewport")
+    inside = """
+        const frame = arguments[0].getBoundingClientRect();
+        return frame.top >= 0 && frame.left >= 0 && frame.bottom <= innerHeight && frame.right <= innerWidth"""
+    for end in (0, 300, 100000):
+        browser.driver.execute_script("scrollTo(0, arguments[0])", end)
+        browser.wait(lambda: browser.driver.execute_script(inside, viewport), f"in view at {end}", 5)
+    assert browser.driver.execute_script("return scrollY") > 300
+    assert viewport.rect["width"] > 0.5 * size[0]
     browser.emulate(0, 0)
 
 
@@ -104,7 +130,7 @@ def test_a_small_screen_stacks_everything(browser):
     wide = "return [...document.querySelectorAll('*')].filter(e => e.getBoundingClientRect().right > 391).length"
     browser.wait(lambda: browser.driver.execute_script("return document.documentElement.scrollWidth") == 390, "narrow")
     assert browser.driver.execute_script(f"{wide} - document.querySelectorAll('.panels *').length") <= 0
-    parts = [browser.part(name).rect for name in ("step-photograph", "step-mesh", "register", "photograph", "verdict")]
+    parts = [browser.part(name).rect for name in ("photograph", "step-photograph", "step-mesh", "register", "verdict")]
     assert [part["y"] for part in parts] == sorted(part["y"] for part in parts)
     assert browser.part("photograph").rect["width"] > 300
     browser.picture("viewer-phone")
@@ -114,52 +140,44 @@ def test_a_small_screen_stacks_everything(browser):
 def test_keys_undo_and_zoom_change_the_box(browser):
     from selenium.webdriver import ActionChains, Keys
 
-    browser.unfold("box-numbers")
+    browser.click("mode-box")
     x0, y0, x1, y1 = browser.box()
     viewport = browser.driver.find_element("css selector", ".viewport")
 
-    def press(*keys, held=()):
+    def press(key, *held):
         browser.driver.execute_script("arguments[0].focus()", viewport)
         chain = ActionChains(browser.driver)
-        for key in held:
-            chain.key_down(key)
-        chain.send_keys(*keys)
-        for key in held:
-            chain.key_up(key)
+        for name in held:
+            chain.key_down(name)
+        chain.send_keys(key)
+        for name in held:
+            chain.key_up(name)
         chain.perform()
 
     def becomes(*box):
         browser.wait(lambda: browser.box() == pytest.approx(box, abs=0.01), f"{box}", 20)
 
-    press(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_UP)
-    becomes(x0 + 2, y0 - 1, x1 + 2, y1 - 1)
-    press(Keys.ARROW_LEFT, held=[Keys.SHIFT])
-    becomes(x0 - 8, y0 - 1, x1 - 8, y1 - 1)
-    press("z", held=[Keys.CONTROL])
-    becomes(x0 + 2, y0 - 1, x1 + 2, y1 - 1)
-    browser.click("redo")
-    becomes(x0 - 8, y0 - 1, x1 - 8, y1 - 1)
+    press(Keys.ARROW_RIGHT)
+    becomes(x0 + 1, y0, x1 + 1, y1)
+    press(Keys.ARROW_LEFT, Keys.SHIFT)
+    becomes(x0 - 9, y0, x1 - 9, y1)
+    press("z", Keys.CONTROL)
+    becomes(x0 + 1, y0, x1 + 1, y1)
     press(Keys.DELETE)
-    browser.wait(lambda: browser.text("box-x0") == "", "no box")
+    browser.wait(lambda: browser.box() is None, "no box")
     browser.click("undo")
-    becomes(x0 - 8, y0 - 1, x1 - 8, y1 - 1)
+    becomes(x0 + 1, y0, x1 + 1, y1)
 
     # The wheel zooms at the mouse; a box that is drawn then is where the mouse was.
     image = browser.part("photograph")
     width = image.size["width"]
-    ActionChains(browser.driver).scroll_from_origin(origin_at(image), 0, -300).perform()
+    scroll(browser, image, -300)
     browser.wait(lambda: image.size["width"] > 1.5 * width, "zoomed")
     assert browser.driver.execute_script("return arguments[0].scrollLeft", viewport) > 100
     browser.driver.find_element("css selector", "[data-zoom=fit]").click()
     browser.wait(lambda: image.size["width"] == width, "as before")
     browser.drag((100, 500), (300, 650), 960)
     browser.wait(lambda: browser.box() == pytest.approx([100, 500, 300, 650], abs=2), "drawn box")
-
-
-def origin_at(element):
-    from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
-
-    return ScrollOrigin.from_element(element)
 
 
 def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(browser, folder):
@@ -178,7 +196,7 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
         assert browser.text(f"message-{part}").startswith(f"{name}: ")
         assert str(folder) not in browser.text(f"message-{part}")
     assert browser.text("photograph-facts") == "photo.png: 240 x 180 px", "the former one stays"
-    browser.emulate(1280, 800)
+    browser.emulate(1440, 900)
     browser.picture("viewer-mistakes")
     browser.emulate(0, 0)
     browser.drop(folder / "photo.png")

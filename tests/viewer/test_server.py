@@ -1,5 +1,6 @@
 """The server of the viewer, without a browser."""
 
+import asyncio
 import re
 import socket
 from http.client import HTTPConnection
@@ -10,10 +11,103 @@ import pytest
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 
 from curvireg_torch.errors import MAX_VIEWER_PAGES, InvalidInputError
-from curvireg_torch.viewer.guard import SECURITY_HEADERS, public_addresses
-from curvireg_torch.viewer.server import listen
+from curvireg_torch.viewer.server import SECURITY_HEADERS, guarded, listen, public_addresses
 
 OPTIONS = []  # of the command that starts the viewer
+
+
+class Site:
+    """A guarded application that records which requests reach it."""
+
+    def __init__(self, host):
+        self.guard, self.reached = guarded(self.page, host), 0
+
+    async def page(self, scope, _, send):
+        self.reached += 1
+        if scope["type"] == "websocket":
+            await send({"type": "websocket.accept"})
+            return
+        foreign = [(b"Access-Control-Allow-Origin", b"*"), (b"server", b"x"), (b"X-Frame-Options", b"ALLOWALL")]
+        await send({"type": "http.response.start", "status": 200, "headers": foreign})
+        await send({"type": "http.response.body", "body": b"page"})
+
+    def request(self, kind="http", **headers):
+        """The first message that answers a request."""
+        sent = []
+
+        async def receive():
+            return {"type": f"{kind}.{'connect' if kind == 'websocket' else 'request'}"}
+
+        async def send(message):
+            sent.append(message)
+
+        pairs = [(name.encode(), value.encode()) for name, value in {"host": "127.0.0.1:8080", **headers}.items()]
+        scope = {
+            "type": kind,
+            "path": "/",
+            "method": "GET",
+            "headers": pairs,
+            "extensions": {"websocket.http.response": {}},
+        }
+        asyncio.run(self.guard(scope, receive, send))
+        return sent[0]
+
+    def status(self, **headers):
+        """Status of the answer; that of a request for a channel is the same."""
+        channel = self.request("websocket", **headers)
+        status = self.request(**headers)["status"]
+        assert channel.get("status", 200) == status
+        return status
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost:9000", "[::1]:8080", "LOCALHOST"])
+def test_local_names_reach_the_page(host):
+    site = Site("127.0.0.1")
+    assert site.status(host=host) == 200
+    assert site.status(host=host, origin=f"http://{host}") == 200
+    assert site.reached == 4
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example:8080", "192.168.1.7", "[::1", ""])
+def test_other_hosts_are_refused(host):
+    site = Site("127.0.0.1")
+    assert site.status(host=host) == 400
+    assert site.reached == 0
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "http://127.0.0.1:9000", "http://localhost:8080", ""]
+)
+def test_other_origins_are_refused(origin):
+    for host in ("127.0.0.1", "0.0.0.0"):
+        site = Site(host)
+        assert site.status(origin=origin) == 403
+        assert site.reached == 0
+
+
+def test_every_answer_has_the_security_headers_and_no_others_for_other_sites():
+    site = Site("127.0.0.1")
+    for headers in ({}, {"host": "evil.example"}, {"origin": "http://evil.example"}):
+        pairs = [(name.decode(), value.decode()) for name, value in site.request(**headers)["headers"]]
+        others = {"content-length", "content-type"}
+        assert {name: value for name, value in pairs if name not in others} == SECURITY_HEADERS
+        assert len(pairs) == len(dict(pairs))
+    policy = dict(part.strip().split(" ", 1) for part in SECURITY_HEADERS["content-security-policy"].split(";"))
+    assert policy["default-src"] == policy["frame-ancestors"] == policy["base-uri"] == "'none'"
+    allowed = {"'self'", "'none'", "'unsafe-inline'", "'unsafe-eval'", "data:", "blob:"}
+    assert {source for sources in policy.values() for source in sources.split()} <= allowed
+    assert "data:" not in policy["script-src"]
+
+
+def test_a_server_for_others_answers_to_its_addresses():
+    for host, names in {"0.0.0.0": ("192.168.1.7:80", "[fe80::1]:80", "bench"), "bench.lan": ("BENCH.lan:80",)}.items():
+        for name in names:
+            assert Site(host).status(host=name) == 200, name
+    assert Site("bench.lan").status(host="192.168.1.7") == 400
+    addresses = public_addresses("0.0.0.0", 80)
+    assert addresses == public_addresses("::", 80)
+    assert addresses[-1] == "127.0.0.1:80"
+    assert public_addresses("bench.lan", 80) == ["bench.lan:80"]
 
 
 def test_listen_names_a_used_port_and_a_host_that_is_not_ours():
@@ -21,23 +115,9 @@ def test_listen_names_a_used_port_and_a_host_that_is_not_ours():
         port = listener.getsockname()[1]
         with pytest.raises(InvalidInputError, match=rf"^--port {port}: in use by another program"):
             listen("127.0.0.1", port)
-    with listen("127.0.0.1", port):
-        pass
-    with pytest.raises(InvalidInputError, match=re.escape("--host 192.0.2.1 ")):
-        listen("192.0.2.1", 0)
-    with pytest.raises(InvalidInputError, match=re.escape("--host no.such.host.invalid: ")):
-        listen("no.such.host.invalid", 0)
-
-
-def test_the_printed_address_of_ipv6_works():
-    try:
-        listener = listen("::1", 0)
-    except InvalidInputError:
-        pytest.skip("no IPv6")
-    with listener:
-        (address,) = public_addresses("::1", listener.getsockname()[1])
-        host, port = re.fullmatch(r"\[(.+)\]:(\d+)", address).groups()
-        socket.create_connection((host, int(port)), timeout=5).close()
+    for host in ("192.0.2.1", "no.such.host.invalid"):
+        with pytest.raises(InvalidInputError, match=re.escape(f"--host {host}")):
+            listen(host, 0)
 
 
 def test_the_server_answers_plain_requests_without_giving_them_a_place(address, folder):
@@ -53,6 +133,7 @@ def test_the_server_answers_plain_requests_without_giving_them_a_place(address, 
         assert answer.headers["server"] is None
         return answer.status, answer.headers.get("location", ""), body
 
+    assert len(parts.path) >= 20
     for _ in range(MAX_VIEWER_PAGES + 1):
         status, page, _ = request(parts.path)
         assert (status, len(page)) == (307, 16)
@@ -61,10 +142,14 @@ def test_the_server_answers_plain_requests_without_giving_them_a_place(address, 
         assert b'<html lang="en-US">' in body
     (spaces,) = (folder / "temporary").glob("curvireg-view-*")
     assert not list(spaces.iterdir()), "no place was taken"
-    for path in ("/", parts.path[:-2] + "/", parts.path + "page", f"{parts.path}{page}/file/photograph.jpg"):
+    unknown = ("/", "/docs", parts.path[:-2] + "/", parts.path + "page", f"{parts.path}{page}/file/photograph.jpg")
+    for path in unknown:
         status, _, body = request(path)
         assert status == 404, path
         assert len(body) < 100
     assert request(f"{parts.path}{page}/upload", "POST")[0] == 404, "no browser shows this page"
-    assert request(parts.path, host="evil.example")[0] == 421
+    assert request(parts.path, host="evil.example")[0] == 400
     assert request(parts.path, origin="http://evil.example")[0] == 403
+    with socket.create_connection((parts.hostname, parts.port), timeout=60) as plain:
+        plain.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nHost: evil.example\r\n\r\n")
+        assert plain.recv(100).startswith(b"HTTP/1.1 400 ")

@@ -1,5 +1,6 @@
 """The viewer's session: the result of the command line, moved by hand and fitted again. No page is needed."""
 
+import io
 import json
 import math
 import shlex
@@ -10,14 +11,16 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.options import register_options
 from curvireg_torch.errors import BankError, CurviregError, CurviregWarning, ImageError, InvalidInputError, MeshError
+from curvireg_torch.evaluation.opening import read_start
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
-from curvireg_torch.viewer.session import Session
+from curvireg_torch.viewer.session import Answer, Session
 from tests._support.exif import exif, with_exif
 from tests._support.scenes import scene
 
@@ -58,26 +61,11 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.fixture(scope="module")
-def registered(tmp_path_factory):
-    """A session with a result, its folder and the true pose."""
-    folder = tmp_path_factory.mktemp("viewer")
-    box, T = write_scene(folder)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CURVIREG_CACHE", str(folder / "cache"))
-        session = new_session("--pipeline", str(folder / "small.json"))
-        session.open_photo(folder / "photo.png", "my photo.png")
-        session.open_mesh(folder / "truck.ply")
-        session.box, session.camera = tuple(round(v, 1) for v in box), (260.0, 260.0, 119.5, 89.5)
-        session.register()
-        yield session, folder, T
-
-
 @pytest.fixture
 def session(registered):
     """The session at its first hypothesis; its camera is restored afterwards."""
     session = registered[0]
-    session.display(0)
+    session.choose(0)
     camera = session.camera
     yield session
     session.camera, session.fov = camera, None
@@ -92,54 +80,103 @@ def test_command_gives_the_same_result_bit_by_bit(session, registered):
     for key in ("rotation", "translation", "score", "confidence", "covariance", "top", "pipeline"):
         assert document[key] == written[key], key
     assert document["inputs"]["box"] == written["inputs"]["box"]
-    assert document["viewer"]["command"] == session.command()
-    assert all(document["viewer"][key] == written[key] for key in ("rotation", "translation", "viewpoint"))
+    assert document["viewer"] == {"command": session.command(), "hypothesis": 0, "by_hand": []}
     assert float(rotation_error(torch.tensor(document["rotation"]).double(), truth[:3, :3])) < 10
 
 
-def test_move_rotates_about_the_centre_and_fit_restores_the_pose(session):
-    before = session.displayed.pose
-    describer = session.result.registrar.describer
+def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registered):
+    found, first = session.result.registration, session.document()
+    session.choose(1)
+    document = json.loads(session.json())
+    assert document["rotation"] == first["top"][1]["rotation"]
+    assert document["translation"] == first["top"][1]["translation"]
+    assert document["score"] == first["top"][1]["score"]
+    assert [top["rotation"] for top in document["top"]] == [first["top"][k]["rotation"] for k in (1, 0)]
+    assert document["viewer"]["hypothesis"] == 1
+    # A pipeline that was calibrated has probabilities; each answer has its own.
+    calibrated = replace(found, probabilities=(0.95, 0.03))
+    session.result = replace(session.result, registration=calibrated)
+    assert (session.document()["confidence"], session.document()["reliable"]) == (0.03, False)
+    assert session.document()["probabilities"] == [0.03, 0.95]
+    assert session.document()["none"] == pytest.approx(0.02)
+    assert session.document()["covariance"] is None
+    session.choose(0)
+    assert Answer(found.hypotheses[0]).registration(calibrated) is calibrated
+    session.result = replace(session.result, registration=found)
+    # The file is a start for the command line, and picture and scene show the same pose.
+    folder = registered[1]
+    session.choose(1)
+    (folder / "chosen.json").write_bytes(session.json())
+    start, confidence = read_start(folder / "chosen.json")
+    assert start == tuple(map(tuple, session.answer.pose.transform.tolist()))
+    assert confidence is None
+    scene = trimesh.load(io.BytesIO(session.glb()), file_type="glb")
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    assert np.allclose(flip @ scene.graph["object"][0], session.answer.pose.transform, atol=1e-5)
+    overlays = [session.overlay()]
+    session.choose(0)
+    assert session.overlay() != overlays[0]
+
+
+def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
+    before, describer = session.answer.pose, session.result.registrar.describer
     centre = before.rotation @ describer.centre + before.translation
-    session.move(rotation=(0, 6, 0))
-    rotated = session.displayed.pose
-    assert float(rotation_error(rotated.rotation, before.rotation)) == pytest.approx(6, abs=1e-4)
-    torch.testing.assert_close(rotated.rotation @ describer.centre + rotated.translation, centre)
-    # Right-handed about the camera's y, which points down: the point nearest to the camera moves to the left.
-    front = before.rotation.T @ torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
-    assert float((rotated.rotation @ front)[0]) < 0
-    session.move(translation=(0.05, 0, 0))
-    moved = session.displayed.pose.rotation @ describer.centre + session.displayed.pose.translation - centre
-    torch.testing.assert_close(moved, torch.tensor([0.05 * describer.radius, 0, 0], dtype=torch.float64))
-    assert np.isnan(session.displayed.pose.score)
-    assert session.fit().startswith("contours fitted: ")
-    assert float(rotation_error(session.displayed.pose.rotation, before.rotation)) < 1.5
-    assert float((session.displayed.pose.translation - before.translation).norm()) < 0.03 * float(centre.norm())
-    assert [edit.split()[0] for edit in session.displayed.edits] == ["rotated", "moved", "contours"]
-    document = session.document()
-    assert document["viewer"]["rotation"] == session.displayed.pose.rotation.tolist()
-    assert document["rotation"] == before.rotation.tolist()
-    session.display(1)
-    assert session.document()["viewer"]["hypothesis"] == 1
-    assert session.displayed.edits == ()
+    assert not session.can_undo
+    moved = session.result.moved(before.projection[0], rotation=(0, 6, 0), translation=(0.05, 0, 0))
+    session.place(moved)
+    pose = session.answer.pose
+    assert float(rotation_error(pose.rotation, before.rotation)) == pytest.approx(6, abs=1e-4)
+    shift = pose.rotation @ describer.centre + pose.translation - centre
+    torch.testing.assert_close(shift, torch.tensor([0.05 * describer.radius, 0, 0], dtype=torch.float64))
+    document = json.loads(session.json())
+    assert document["rotation"] == pose.rotation.tolist() == document["top"][0]["rotation"]
+    assert len(document["top"]) == 2
+    for name in ("confidence", "none", "score", "edge_support", "covariance", "ambiguous"):
+        assert document[name] is None, name
+    assert (document["reliable"], document["probabilities"], document["confidence_features"]) == (False, [], {})
+    assert document["viewer"]["by_hand"] == ["moved: rotated 6.0 degrees, shifted 0.05 radii"]
+    session.fit()
+    fitted = session.answer
+    assert fitted.edits[1].startswith("contours fitted, edge support ")
+    assert float(rotation_error(fitted.pose.rotation, before.rotation)) < 1.5
+    assert float((fitted.pose.translation - before.translation).norm()) < 0.03 * float(centre.norm())
+    for answer in (pose, fitted.pose):  # one step back, and again
+        session.undo()
+        assert session.answer.pose is answer
+    session.choose(1)
+    assert (session.answer.edits, session.can_undo) == ((), False)
     with pytest.raises(InvalidInputError, match="touch the camera"):
-        session.move(translation=(0, 0, -100))
+        session.result.moved(moved, translation=(0, 0, -100))
+
+
+def test_the_python_program_gives_the_same_numbers(session, registered):
+    session.choose(1)
+    (registered[1] / "my photo.png").write_bytes((registered[1] / "photo.png").read_bytes())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(registered[1])
+        patch.setenv("CURVIREG_CACHE", str(registered[1] / "cache"))
+        names: dict = {}
+        exec(session.python(), names)
+    found = {name: torch.tensor(names["pose"][name], dtype=torch.float64) for name in ("rotation", "translation")}
+    assert float(rotation_error(found["rotation"], session.answer.pose.rotation)) < 0.1
+    assert torch.allclose(found["translation"], session.answer.pose.translation, rtol=1e-3)
+    session.place(session.result.moved(session.answer.pose.projection[0], rotation=(0, 6, 0)))
+    assert f"'rotation': {session.answer.pose.rotation.tolist()}" in session.python()
 
 
 def test_move_without_a_camera_keeps_the_allocentric_rotation(session):
     session.camera = None
     session.register()
-    before = session.displayed.pose
-    session.move(rotation=(0, 0, 5))
-    pose = session.displayed.pose
+    before, T = session.answer.pose, session.answer.pose.projection[0]
+    session.place(session.result.moved(T, rotation=(0, 0, 5)))
+    pose = session.answer.pose
     assert pose.translation is None
     assert float(rotation_error(pose.rotation, before.rotation)) == pytest.approx(5, abs=1e-3)
     # A translation keeps the rotation of the projection and changes the allocentric one.
-    T = pose.projection[0]
-    session.move(translation=(0.1, 0, 0))
-    assert torch.equal(session.displayed.pose.projection[0][:3, :3], T[:3, :3])
-    assert 0.1 < float(rotation_error(session.displayed.pose.rotation, pose.rotation)) < 5
-    assert session.document()["viewer"]["translation"] is None
+    session.place(session.result.moved(pose.projection[0], translation=(0.1, 0, 0)))
+    assert torch.equal(session.answer.pose.projection[0][:3, :3], pose.projection[0][:3, :3])
+    assert 0.1 < float(rotation_error(session.answer.pose.rotation, pose.rotation)) < 5
+    assert session.document()["translation"] is None
 
 
 def test_register_with_a_field_of_view(session):
@@ -169,7 +206,7 @@ def test_messages_use_the_names_of_the_user(folder):
     with pytest.raises(InvalidInputError, match="choose a photograph and a mesh"):
         session.register()
     with pytest.raises(InvalidInputError, match="register first"):
-        session.move(rotation=(1, 0, 0))
+        session.fit()
 
 
 def test_open_mesh_describes_the_mesh(folder):
@@ -181,9 +218,13 @@ def test_open_mesh_describes_the_mesh(folder):
     assert new_session().open_mesh(folder / "red.ply").endswith(" m, rendered in its colours")
 
 
-def test_open_photo_keeps_the_old_one_after_an_error(folder):
-    session = new_session()
+def test_a_photograph_replaces_box_and_camera_of_the_former_one_unless_it_is_damaged(folder):
+    session = new_session("--fov", "65")
+    session.load()
     session.open_photo(folder / "photo.png")
+    assert session.fov == 65, "of the command line, for the first photograph"
+    session.open_photo(folder / "photo.png")
+    assert (session.box, session.camera, session.fov) == (None, None, None)
     (folder / "broken.png").write_bytes((folder / "photo.png").read_bytes()[:200])
     with pytest.raises(ImageError):
         session.open_photo(folder / "broken.png")
@@ -247,7 +288,7 @@ def test_limits_do_not_open_the_mesh_again(session):
     session.set_limits(elevation=None)
     assert session.result.registrar is registrar
     assert session.document()["prior"]["elevation"] == (35.0, 90.0)
-    assert session.displayed.pose.viewpoint[1] > 32.0
+    assert session.answer.pose.viewpoint[1] > 32.0
 
 
 @pytest.mark.usefixtures("folder")
@@ -272,10 +313,3 @@ def test_register_is_cancelled_by_the_limit_and_by_the_user(monkeypatch):
     monkeypatch.setattr(session, "_progress_callback", cancel_first)
     with pytest.raises(CurviregError, match=r"^stopped$"):
         session.register()
-
-
-def test_a_picked_hypothesis_is_recorded_as_the_users_choice(session):
-    session.display(1, chosen=True)
-    assert session.document()["viewer"]["chosen"]
-    session.display(0)
-    assert not session.document()["viewer"]["chosen"]

@@ -28,17 +28,24 @@
   });
   addEventListener("paste", (event) => sendFiles([...event.clipboardData.files]));
 
-  // --- The photograph: one pointer draws, two zoom and pan, the wheel zooms, the middle button pans.
+  // --- The photograph: one pointer draws the box or moves the pose. Two pointers and the wheel zoom and pan where the
+  // box is corrected; where the pose is, they change its distance and roll it.
   const pointers = new Map();
-  let drawing = false, queued = null, pinch = null;
+  let drawing = false, queued = null, pinch = null, scaled = null;
 
   const canvasOf = (target) => target.closest?.(".canvas");
+  const isPose = (canvas) => canvas.dataset.mode === "pose";
 
   function send(type, event, canvas) {
     const frame = canvas.getBoundingClientRect();
     const reach = (event.pointerType === "touch" ? 22 : 10) / frame.width;
     const [x, y] = [(event.clientX - frame.left) / frame.width, (event.clientY - frame.top) / frame.height];
     emitEvent("stage", { type, x, y, reach });
+  }
+
+  function scalePose(factor, roll) {
+    if (!scaled) requestAnimationFrame(() => { emitEvent("stage", { type: "scale", ...scaled }); scaled = null; });
+    scaled = { factor: (scaled?.factor ?? 1) * factor, roll: (scaled?.roll ?? 0) + roll };
   }
 
   function zoomTo(canvas, zoom, clientX, clientY) {
@@ -56,9 +63,15 @@
 
   addEventListener("wheel", (event) => {
     const canvas = canvasOf(event.target);
-    if (!canvas || event.shiftKey || (event.deltaY > 0 && zoomOf(canvas) === 1)) return;  // the page scrolls
+    if (!canvas) return;
+    if (isPose(canvas)) {
+      const turn = event.deltaY || event.deltaX;  // Shift makes it horizontal
+      event.shiftKey ? scalePose(1, turn / 20) : scalePose(Math.exp(-turn / 1500), 0);
+    } else {
+      if (event.shiftKey || (event.deltaY > 0 && zoomOf(canvas) === 1)) return;  // the page scrolls
+      zoomTo(canvas, zoomOf(canvas) * Math.exp(-event.deltaY / 400), event.clientX, event.clientY);
+    }
     event.preventDefault();
-    zoomTo(canvas, zoomOf(canvas) * Math.exp(-event.deltaY / 400), event.clientX, event.clientY);
   }, { passive: false });
 
   addEventListener("click", (event) => {
@@ -89,9 +102,10 @@
 
   function spread() {
     const [a, b] = [...pointers.values()];
+    const [dx, dy] = [b.clientX - a.clientX, b.clientY - a.clientY];
     return {
       x: (a.clientX + b.clientX) / 2, y: (a.clientY + b.clientY) / 2,
-      size: Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY) || 1,
+      size: Math.hypot(dx, dy) || 1, angle: (Math.atan2(dy, dx) * 180) / Math.PI,
     };
   }
 
@@ -101,8 +115,12 @@
     pointers.set(event.pointerId, event);
     if (pinch && pointers.size === 2) {
       const now = spread();
-      zoomTo(canvas, (zoomOf(canvas) * now.size) / pinch.size, now.x, now.y);
-      canvas.parentElement.scrollBy(pinch.x - now.x, pinch.y - now.y);
+      if (isPose(canvas)) {
+        scalePose(now.size / pinch.size, ((now.angle - pinch.angle + 540) % 360) - 180);
+      } else {
+        zoomTo(canvas, (zoomOf(canvas) * now.size) / pinch.size, now.x, now.y);
+        canvas.parentElement.scrollBy(pinch.x - now.x, pinch.y - now.y);
+      }
       pinch = now;
     } else if (event.buttons === 4) {
       canvas.parentElement.scrollBy(before.clientX - event.clientX, before.clientY - event.clientY);
@@ -129,19 +147,13 @@
 
   addEventListener("keydown", (event) => {
     const at = event.target;
-    const step = event.shiftKey ? 10 : 1;
-    const arrow = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] }[event.key];
-    const control = event.ctrlKey || event.metaKey;
-    const key = event.key.toLowerCase();
+    const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
     let what = null;
     if (at.matches?.(".viewport")) {
-      if (arrow) what = { type: "nudge", dx: arrow[0], dy: arrow[1], resize: event.altKey };
+      if (arrow) what = { type: "nudge", dx: arrow[0], dy: arrow[1], shift: event.shiftKey, alt: event.altKey };
       else if (event.key === "Delete" || event.key === "Backspace") what = { type: "remove" };
     }
-    if (control && !at.matches?.("input, textarea")) {
-      if (key === "y" || (key === "z" && event.shiftKey)) what = { type: "redo" };
-      else if (key === "z") what = { type: "undo" };
-    }
+    if ((event.ctrlKey || event.metaKey) && event.key === "z" && !at.matches?.("input, textarea")) what = { type: "undo" };
     if (!what) return;
     event.preventDefault();
     emitEvent("stage", what);
@@ -153,7 +165,9 @@
     if (property) document.querySelector(".canvas").style.setProperty(property, event.target.value / 100);
   });
 
-  // --- The map of directions has fields beside it; its picture, which NiceGUI leaves without a text, says nothing more.
-  const describe = () => document.querySelectorAll("img:not([alt])").forEach((image) => (image.alt = ""));
-  new MutationObserver(describe).observe(document, { childList: true, subtree: true });
+  // --- Texts to copy.
+  addEventListener("click", (event) => {
+    const source = event.target.dataset?.copy;
+    if (source) navigator.clipboard?.writeText(document.querySelector(`[data-testid="${source}"]`).textContent);
+  });
 })();

@@ -1,0 +1,405 @@
+"""Datasets as evaluation sees them: the objects to register, and the scores of the results."""
+
+import math
+from abc import ABC, abstractmethod
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from ..data import BOPDataset, Pascal3DPlus, PoseFolder
+from ..errors import InvalidInputError
+from ..geometry import rotation_error, symmetry_transforms, viewpoint_from_rotation
+from ..geometry.cameras import transform
+from ..geometry.crops import box_iou
+from ..geometry.pose_prior import object_frame
+from ..mesh import load_mesh
+from ..mesh.mesh import format_up
+from ..utils.files import write_csv
+from .metrics import (
+    ADD_THRESHOLDS,
+    MSPD_THRESHOLDS,
+    MSSD_THRESHOLDS,
+    accuracy,
+    add_error,
+    adds_error,
+    average_recall,
+    median_error,
+    mspd_error,
+    mssd_error,
+    symmetric_rotation_error,
+)
+from .protocol import Protocol, hint_of_truth, perturbed_box
+from .runner import Entry
+from .store import Row
+
+__all__ = [
+    "BOPBenchmark",
+    "Benchmark",
+    "Pascal3DBenchmark",
+    "PoseFolderBenchmark",
+    "detection_recall",
+    "write_bop_csv",
+]
+
+MIN_IOU = 0.5
+"""Intersection over union from which a box is right."""
+
+UNOCCLUDED = 0.95
+"""Visible fraction above which an object of a BOP set counts as whole."""
+
+Errors = Mapping[str, Tensor]
+
+
+class Benchmark(ABC):
+    """A dataset with the protocol of its evaluation, and its scores.
+
+    Attributes:
+        name, unit: kind of dataset, and unit of its meshes.
+        label: format of the entries' labels, from a sample.
+        mesh: key of the mesh in a sample.
+        gives_camera: whether the method gets the camera matrix.
+        thresholds: degrees of the accuracies in the summary.
+        dataset, protocol: as given.
+        samples, entries: annotations without photographs, and what is registered, in the order of the dataset.
+
+    Raises:
+        InvalidInputError: a ``cad`` that the dataset cannot offer, or ``views`` without poses of the cameras.
+    """
+
+    name: ClassVar[str]
+    unit: ClassVar[str] = "m"
+    label: ClassVar[str]
+    mesh: ClassVar[str] = "mesh_path"
+    gives_camera: ClassVar[bool] = False
+    thresholds: ClassVar[Mapping[str, float]] = {"acc_15_deg": 15.0, "acc_30_deg": 30.0}
+
+    def __init__(self, dataset: Pascal3DPlus | BOPDataset | PoseFolder, protocol: Protocol) -> None:
+        self.dataset, self.protocol = dataset, protocol
+        self.samples = [dataset.annotation(i) for i in range(len(dataset))]
+        self.entries = [self._entry(sample) for sample in self.samples]
+
+    def selection(self, limit: int | None) -> list[int]:
+        """Indices of ``limit`` objects spread evenly over the dataset, or of all."""
+        n = len(self.entries)
+        count = n if limit is None else min(limit, n)
+        return [i * n // count for i in range(count)]
+
+    def settings(self) -> Row:
+        """What results depend on besides pipeline and protocol."""
+        split = getattr(self.dataset, "split", None)  # folders of the user have none
+        return {"dataset": self.name, "root": str(self.dataset.root.resolve()), "split": split}
+
+    def meshes(self, sample: Row) -> tuple[Path, ...]:
+        """Meshes that an object is registered to: its own; other datasets may offer more."""
+        if self.protocol.cad != "annotated":
+            raise InvalidInputError(
+                f"protocol: each object of this dataset has one mesh, so cad=annotated; got cad={self.protocol.cad}"
+            )
+        return (Path(sample[self.mesh]),)
+
+    def _entry(self, sample: Row) -> Entry:
+        label, meshes, photo = self.label.format_map(sample), self.meshes(sample), Path(sample["image_path"])
+        box, K, protocol = sample["box"], sample.get("camera_matrix"), self.protocol
+        unknown = protocol.box is not None and not bool(box.isfinite().all())
+        return Entry(
+            name=str(photo.relative_to(self.dataset.root)),
+            photo=photo,
+            meshes=meshes,
+            box=None if protocol.box is None else tuple(perturbed_box(box, protocol, label).tolist()),
+            camera=None if K is None or not self.gives_camera else tuple(K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()),
+            prior=hint_of_truth(sample["rotation"], object_frame(format_up(meshes[0].suffix)), protocol, label),
+            as_stored=True,
+            label=label,
+            error="unknown_box" if unknown else "",
+        )
+
+    @abstractmethod
+    def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
+        """Errors (N,) by name, float64: ``inf`` for a miss, NaN where the truth is unknown. The first one orders."""
+
+    @abstractmethod
+    def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
+        """Scores of the results ``rows``, none of them skipped."""
+
+    @abstractmethod
+    def write_predictions(self, path: Path, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> None:
+        """Write the results as one table; ``path`` appears when it is complete."""
+
+    def _rotation_scores(self, errors: Tensor) -> Row:
+        """``n``, an accuracy for each threshold, and ``med_err_deg``, of errors (N,) in degrees."""
+        accuracies = {name: accuracy(errors, degrees) for name, degrees in self.thresholds.items()}
+        return {"n": len(errors), **accuracies, "med_err_deg": median_error(errors)}
+
+
+class _ViewpointBenchmark(Benchmark):
+    """Datasets of viewpoints: rotations, without a camera."""
+
+    columns: ClassVar[Sequence[str]]
+
+    def write_predictions(self, path: Path, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> None:
+        """One line for each object: its annotation, the estimate, errors, and the true angles as ``true_azimuth``..."""
+        names, R = ("azimuth", "elevation", "theta"), estimated_rotations(rows)
+        lines: list[Sequence[object]] = [self.columns]
+        for i, (sample, row) in enumerate(zip(samples, rows, strict=True)):
+            line = {**sample, **row, "seconds": row["seconds"]["register"], "failed": row["message"]}
+            line |= {f"true_{name}": float(v) for name, v in zip(names, sample["viewpoint"], strict=True)}
+            line |= {name: float(values[i]) for name, values in errors.items()}
+            if "rotation" in row:
+                line |= {n: float(v) for n, v in zip(names, viewpoint_from_rotation(R[i]), strict=True)}
+                line["mesh"] = Path(row["mesh"]).name
+            lines.append([_cell(line.get(name, "")) for name in self.columns])
+        write_csv(path, lines)
+
+
+def _cell(value: object) -> object:
+    if isinstance(value, bool):
+        return int(value)
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.6g}"
+    return value
+
+
+_HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+
+
+def _axis_error(R: Tensor, truth: Tensor) -> Tensor:
+    """Angles (N,) in degrees between the z axes of models: the least rotation error over all rotations about z.
+
+    Computed from the chord, since ``acos`` loses digits near 0.
+    """
+    half_chord = (R[..., 2] - truth[..., 2]).norm(dim=-1) / 2.0
+    return torch.rad2deg(2.0 * half_chord.clamp(max=1.0).asin())
+
+
+SYMMETRIES: dict[str, tuple[str, Callable[[Tensor, Tensor], Tensor]]] = {
+    "bottle": ("any rotation about z", _axis_error),
+    "diningtable": ("half a rotation about z", lambda R, truth: symmetric_rotation_error(R, truth, _HALF_TURN[None])),
+}
+"""Classes of PASCAL3D+ whose objects have the same, or nearly the same, appearance from several azimuths."""
+
+
+class Pascal3DBenchmark(_ViewpointBenchmark):
+    """Viewpoints on PASCAL3D+. The method gets no camera: viewpoints are relative to a camera that looks at the box."""
+
+    name, label, mesh = "pascal3d", "{category}/{image_id}/{object_index}", "cad_path"
+    thresholds: ClassVar = {"acc_pi_6": 30.0, "acc_pi_18": 10.0}
+    flags = ("truncated", "occluded", "difficult")
+    columns = (
+        *("image_id", "object_index", "category", "cad_index", "mesh", "azimuth", "elevation", "theta"),
+        *("true_azimuth", "true_elevation", "true_theta", "error_deg", "symmetric_error_deg", "score", "confidence"),
+        *(*flags, "failed", "seconds"),
+    )
+    dataset: Pascal3DPlus
+
+    def meshes(self, sample: Row) -> tuple[Path, ...]:
+        if self.protocol.cad == "annotated":
+            return super().meshes(sample)
+        return tuple(sorted(Path(sample["cad_path"]).parent.glob("*.off")))
+
+    def settings(self) -> Row:
+        return {**super().settings(), "part": self.dataset.part, "pixel_origin": self.dataset.pixel_origin}
+
+    def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
+        R = estimated_rotations(rows)
+        truth = _stacked(samples, "rotation", (3, 3))
+        plain = symmetric = rotation_error(R, truth)
+        for category, (_, error) in SYMMETRIES.items():
+            mask = torch.tensor([s["category"] == category for s in samples], dtype=torch.bool)
+            symmetric = torch.where(mask, error(R, truth), symmetric)
+        return {"error_deg": _or_inf(plain, R), "symmetric_error_deg": _or_inf(symmetric, R)}
+
+    def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
+        """Acc(pi/6), Acc(pi/18), MedErr: of all, of subsets, of each class, and up to the symmetries of the classes."""
+
+        def scores_of(chosen: list[bool]) -> Row:
+            plain, aware = (self._rotation_scores(e[torch.tensor(chosen, dtype=torch.bool)]) for e in errors.values())
+            del aware["n"]
+            return {**plain, "symmetry_aware": aware}
+
+        return {
+            **scores_of([True] * len(samples)),
+            "subsets": {
+                "easy": scores_of([not any(s[flag] for flag in self.flags) for s in samples]),
+                **{flag: scores_of([s[flag] for s in samples]) for flag in self.flags},
+            },
+            "per_class": {
+                name: scores_of([s["category"] == name for s in samples])
+                for name in sorted({s["category"] for s in samples})
+            },
+            "symmetries": {name: text for name, (text, _) in SYMMETRIES.items()},
+        }
+
+
+class PoseFolderBenchmark(_ViewpointBenchmark):
+    """Viewpoints in folders of the user. The method is given the box and the object's mesh, and no camera.
+
+    Photographs of unknown pose are registered too. They count in ``n``, ``reliable`` and ``mean_confidence``; accuracy
+    and errors are those of the ``n_posed`` others.
+    """
+
+    name, label = "web", "{category}/{object_index}"
+    columns = (
+        *("category", "object_index", "image_id", "azimuth", "elevation", "theta", "true_azimuth", "true_elevation"),
+        *("true_theta", "error_deg", "score", "confidence", "reliable", "failed", "seconds"),
+    )
+    dataset: PoseFolder
+
+    def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
+        R, truth = estimated_rotations(rows), _stacked(samples, "rotation", (3, 3))
+        known = truth.isfinite().flatten(1).all(1)
+        errors = torch.full((len(rows),), torch.nan, dtype=torch.float64)
+        errors[known] = _or_inf(rotation_error(R[known], truth[known]), R[known])
+        return {"error_deg": errors}
+
+    def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
+        """Accuracy at 15 and 30 degrees and the median error where the pose is known; confidence of all."""
+
+        def scores_of(chosen: list[int]) -> Row:
+            posed = errors["error_deg"][chosen]
+            posed = posed[~posed.isnan()]
+            scores = self._rotation_scores(posed) if len(posed) else dict.fromkeys((*self.thresholds, "med_err_deg"))
+            confidences = [rows[i].get("confidence") or 0.0 for i in chosen]
+            return {
+                **scores,
+                "n": len(chosen),
+                "n_posed": len(posed),
+                "reliable": sum(bool(rows[i].get("reliable")) for i in chosen),
+                "mean_confidence": sum(confidences) / len(chosen) if chosen else None,
+            }
+
+        groups: dict[str, list[int]] = defaultdict(list)
+        for i, sample in enumerate(samples):
+            groups[sample["category"]].append(i)
+        return {
+            **scores_of(list(range(len(rows)))),
+            "per_object": {name: scores_of(chosen) for name, chosen in sorted(groups.items())},
+        }
+
+
+class BOPBenchmark(Benchmark):
+    """Poses on one BOP dataset. The method gets the box of the whole silhouette and the camera matrix."""
+
+    name, unit, mesh, gives_camera = "bop", "mm", "model_path", True
+    label = "{scene_id}/{image_id}/{instance_index}"
+    dataset: BOPDataset
+
+    def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
+        """Rotation errors in degrees, ADD(-S) and MSSD in diameters, MSPD in image widths."""
+        names = ("rotation", "add", "mssd", "mspd")
+        errors = torch.full((len(names), len(rows)), torch.inf, dtype=torch.float64)
+        objects: dict[int, list[int]] = defaultdict(list)
+        for i, (sample, row) in enumerate(zip(samples, rows, strict=True)):
+            if "rotation" in row:
+                objects[sample["obj_id"]].append(i)
+        for chosen in objects.values():
+            errors[:, chosen] = self._errors_of_one_object([samples[i] for i in chosen], [rows[i] for i in chosen])
+        return dict(zip(names, errors, strict=True))
+
+    def _errors_of_one_object(self, samples: Sequence[Row], rows: Sequence[Row]) -> Tensor:
+        info = samples[0]["model_info"]
+        points = torch.from_numpy(load_mesh(samples[0]["model_path"], unit=self.unit).vertices.copy())
+        symmetries = symmetry_transforms(info)
+        R, t = estimated_rotations(rows), torch.tensor([row["translation"] for row in rows], dtype=torch.float64)
+        R_true, t_true = _stacked(samples, "rotation", (3, 3)), _stacked(samples, "translation", (3,))
+        T, T_true, K = transform(R, t), transform(R_true, t_true), _stacked(samples, "camera_matrix", (3, 3))
+        rotation = symmetric_rotation_error(R, R_true, symmetries[:, :3, :3])
+        add = (adds_error if len(symmetries) > 1 else add_error)(T, T_true, points)
+        mssd = mssd_error(T, T_true, points, symmetries=symmetries)
+        mspd = mspd_error(T, T_true, points, K, symmetries=symmetries)
+        width = torch.tensor([row["inputs"]["picture"]["width"] for row in rows], dtype=torch.float64)
+        return torch.stack([rotation, add / info["diameter"], mssd / info["diameter"], mspd / width])
+
+    def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
+        """Rotation errors up to the symmetries, ADD(-S) recall, average recall of MSSD and MSPD."""
+
+        def scores_of(chosen: Tensor) -> Row:
+            return {
+                **self._rotation_scores(errors["rotation"][chosen]),
+                "add_recall_0.1d": average_recall(errors["add"][chosen], ADD_THRESHOLDS),
+                "mssd_ar": average_recall(errors["mssd"][chosen], MSSD_THRESHOLDS),
+                "mspd_ar": average_recall(errors["mspd"][chosen], MSPD_THRESHOLDS),
+            }
+
+        objects = torch.tensor([s["obj_id"] for s in samples], dtype=torch.long)
+        whole = torch.tensor([float(s["visib_fract"]) > UNOCCLUDED for s in samples], dtype=torch.bool)
+        return {
+            **scores_of(torch.ones(len(samples), dtype=torch.bool)),
+            "subsets": {"unoccluded": scores_of(whole)},
+            "per_object": {str(o): scores_of(objects == o) for o in objects.unique().tolist()},
+        }
+
+    def write_predictions(self, path: Path, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> None:
+        """The results file of the BOP challenge; it omits objects without an estimate."""
+        images = [(s["scene_id"], s["image_id"]) for s in samples]
+        times: dict[tuple[int, int], float] = defaultdict(float)
+        for image, row in zip(images, rows, strict=True):
+            times[image] += row["seconds"]["register"]
+        poses = [
+            ((*image, s["obj_id"]), row["score"], row["rotation"], row["translation"], times[image])
+            for image, s, row in zip(images, samples, rows, strict=True)
+            if "rotation" in row
+        ]
+        write_bop_csv(path, poses)
+
+
+BOPPose = tuple[Sequence[object], float, Sequence[Sequence[float]], Sequence[float], float]
+
+
+def write_bop_csv(path: Path, poses: Iterable[BOPPose]) -> None:
+    """Write poses in the format of the BOP challenge, with all digits.
+
+    Each is (scene, image and object numbers; score; 3 x 3 rotation; translation in mm; seconds for the whole image, -1
+    if unknown). BOP wants equal seconds in all lines of an image.
+    """
+    lines: list[Sequence[object]] = [("scene_id", "im_id", "obj_id", "score", "R", "t", "time")]
+    for ids, score, rotation, translation, seconds in poses:
+        R, t = (" ".join(map(str, numbers)) for numbers in (chain(*rotation), translation))
+        lines.append((*ids, score, R, t, seconds))
+    write_csv(path, lines)
+
+
+def detection_recall(samples: Sequence[Row], rows: Sequence[Row]) -> Row:
+    """``recall_1``, ``recall_5``, ``recall_20``: fractions of the ``n`` annotated boxes that the best proposals find.
+
+    Boxes are clipped to the image on both sides: some datasets annotate the visible part, some the whole object. A row
+    that failed has no proposals. Recalls are None if no box is annotated.
+    """
+    pairs = [(sample["box"], row) for sample, row in zip(samples, rows, strict=True)]
+    ranks = [_rank(box, row) for box, row in pairs if bool(box.isfinite().all())]
+    recalls = {f"recall_{k}": sum(rank <= k for rank in ranks) / len(ranks) if ranks else None for k in (1, 5, 20)}
+    return {"n": len(ranks), **recalls}
+
+
+def _rank(box: Tensor, row: Row) -> float:
+    """Rank of the first right proposal, from 1; infinite if none is right."""
+    if "detection" not in row:
+        return math.inf
+    boxes = [proposal["box"] for proposal in row["detection"]["proposals"]]
+    proposals = torch.tensor(boxes, dtype=torch.float64).view(-1, 4)
+    picture = row["inputs"]["picture"]
+    end = torch.tensor([picture["width"], picture["height"]] * 2, dtype=torch.float64) - 0.5
+    clipped = [torch.minimum(boxes.clamp(min=-0.5), end) for boxes in (proposals, box.double()[None])]
+    right = (box_iou(*clipped)[:, 0] >= MIN_IOU).nonzero()[:, 0]
+    return float(right[0]) + 1 if len(right) else math.inf
+
+
+def estimated_rotations(rows: Sequence[Row]) -> Tensor:
+    """(N, 3, 3) float64; NaN for rows without an estimate."""
+    missing = [[math.nan] * 3] * 3
+    return torch.tensor([row.get("rotation", missing) for row in rows], dtype=torch.float64).view(-1, 3, 3)
+
+
+def _stacked(samples: Sequence[Row], name: str, shape: tuple[int, ...]) -> Tensor:
+    """(N, *shape) float64 values of the samples."""
+    values: list[Any] = [sample[name].double() for sample in samples]
+    return torch.stack(values) if values else torch.empty(0, *shape, dtype=torch.float64)
+
+
+def _or_inf(errors: Tensor, R: Tensor) -> Tensor:
+    """``errors`` (N,), ``inf`` where the estimate ``R`` (N, 3, 3) is missing (NaN)."""
+    return torch.where(R.isfinite().flatten(1).all(1), errors, torch.full_like(errors, torch.inf))

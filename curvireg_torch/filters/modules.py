@@ -1,0 +1,132 @@
+"""The base class of the modules that mirror a function."""
+
+import functools
+import inspect
+import re
+from collections.abc import Callable
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils import parametrize
+
+from ..utils.checks import check_positive
+
+
+class Positive(nn.Module):
+    """Parametrization of a positive parameter by its logarithm, so that any optimiser step keeps it positive."""
+
+    def forward(self, log: Tensor) -> Tensor:
+        return log.exp()
+
+    def right_inverse(self, value: Tensor) -> Tensor:
+        return value.log()
+
+
+def _options(function: Callable[..., Any]) -> dict[str, Any]:
+    """Keyword-only options and their defaults."""
+    return {n: p.default for n, p in inspect.signature(function).parameters.items() if p.kind == p.KEYWORD_ONLY}
+
+
+def _twin_docstring(twin: str, function: Callable[..., Any], learnable: tuple[str, ...]) -> str:
+    """The docstring of a twin with the options, the input and the output from the docstring of its function."""
+    sections = re.split(r"^(\w+):\n", inspect.getdoc(function) or "", flags=re.MULTILINE)
+    texts = dict(zip(sections[1::2], sections[2::2], strict=True))
+    options, shape = [], []
+    for names, text in re.findall(r"^    ([\w, ]+): (.*(?:\n {8}.*)*)", texts.get("Args", ""), flags=re.MULTILINE):
+        of_constructor = [name for name in names.split(", ") if name in _options(function)]
+        options += [f"    {', '.join(of_constructor)}: {text}"] if of_constructor else []
+        shape += [] if of_constructor and len(of_constructor) == len(names.split(", ")) else [f"    Input: {text}"]
+    if learnable:
+        options.append(f"    learnable: make {' and '.join(learnable)} trainable; they stay positive.")
+    summary, _, example = twin.partition("\n\n")
+    output = f"    Output: {texts.get('Returns', '').strip()}"
+    return "\n".join([summary, "", "Args:", *options, "", "Shape:", *shape, output, "", example])
+
+
+class FunctionModule(nn.Module):
+    """Module twin of a function of images, ``class Twin(FunctionModule, function=f, learnable=("sigma",))``.
+
+    It holds the function's options, refuses what the function refuses, and has its documentation. A twin writes its
+    constructor only as a signature, for type checkers and editors; the flag ``learnable`` makes options positive
+    parameters.
+    """
+
+    _function: ClassVar[Callable[..., Tensor]]
+
+    def __init_subclass__(cls, *, function: Callable[..., Tensor] | None = None, learnable: tuple[str, ...] = ()):
+        super().__init_subclass__()
+        if function is None:  # a further subclass, such as those that torch derives for parametrized modules
+            return
+        cls._function = staticmethod(function)
+        declared = cls.__init__
+        signature = inspect.signature(declared)
+        wanted, stated = _options(function), _options(declared)
+        if wanted != {name: default for name, default in stated.items() if name != "learnable"}:
+            raise TypeError(f"{cls.__name__}: expected the options of its function, {wanted}, got {stated}")
+
+        @functools.wraps(declared)
+        def construct(self: "FunctionModule", *args: Any, **options: Any) -> None:
+            bound = signature.bind(self, *args, **options)
+            bound.apply_defaults()
+            values = {name: value for name, value in bound.arguments.items() if name not in ("self", "learnable")}
+            FunctionModule.__init__(self, learnable if bound.arguments.get("learnable") else (), **values)
+            self._check(values)
+
+        cls.__init__ = construct  # type: ignore[method-assign]
+        if cls.__doc__:
+            cls.__doc__ = _twin_docstring(inspect.cleandoc(cls.__doc__), function, learnable)
+
+    def __init__(self, learnable: tuple[str, ...] = (), **options: Any) -> None:
+        super().__init__()
+        self._names = tuple(options)
+        for name, value in options.items():
+            if name in learnable:
+                self.register_parameter(name, nn.Parameter(torch.tensor(check_positive(value, name))))
+                parametrize.register_parametrization(self, name, Positive())
+            elif name == "camera_matrix":
+                self.register_buffer(name, value, persistent=False)
+            else:
+                setattr(self, name, tuple(value) if isinstance(value, list) else value)
+
+    def _check(self, options: dict[str, Any]) -> None:
+        """Let the function refuse the options: it is called with no image, or with as many as there are cameras."""
+        camera = options.get("camera_matrix")
+        if isinstance(camera, Tensor):
+            images = torch.zeros(len(camera) if camera.ndim == 3 else 0, 1, 1, 1, device=camera.device)
+        else:
+            images = torch.zeros(0, 1, 1, 1, device="cpu")
+        self._function(images, **options)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The present values, as keyword arguments of the function."""
+        return {name: getattr(self, name) for name in self._names}
+
+    def forward(self, image: Tensor) -> Tensor:
+        return self._function(image, **self.options)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move a camera matrix between devices, but keep its dtype: ``.half()`` would round it."""
+        camera = self._buffers.get("camera_matrix")
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        moved = self._buffers.get("camera_matrix")
+        if camera is not None and moved is not None:
+            self._buffers["camera_matrix"] = camera.to(moved.device)
+        return self
+
+    def extra_repr(self) -> str:
+        options = self.options
+        texts = []
+        if "camera_matrix" in options:
+            texts.append("orthographic" if options.pop("camera_matrix") is None else "perspective")
+        for name, value in options.items():
+            texts.append(f"{name}={round(float(value.detach()), 6) if isinstance(value, Tensor) else value!r}")
+        return ", ".join(texts)
+
+
+class DepthModule(FunctionModule):
+    """Module twin of a function of depth images and masks."""
+
+    def forward(self, depth: Tensor, mask: Tensor | None = None) -> Tensor:
+        return self._function(depth, mask, **self.options)

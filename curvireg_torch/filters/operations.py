@@ -1,0 +1,277 @@
+"""What the layers share: safe arithmetic, blocks of a batch, missing pixels, derivatives, suppression of non-maxima."""
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..errors import InvalidInputError
+from ..utils.checks import check_colour_image, check_positive, check_tensor
+
+
+def safe_eps(x: Tensor) -> float:
+    """Smallest positive number of x's dtype whose power -1.5, the derivative of ``rsqrt``, is finite with a margin."""
+    return math.pow(torch.finfo(x.dtype).tiny, 0.6)
+
+
+def safe_sqrt(x: Tensor) -> Tensor:
+    """sqrt(max(x, 0)) with gradient 0 instead of inf where x <= 0."""
+    tiny: float = torch.finfo(x.dtype).tiny
+    return x.clamp(min=tiny).sqrt() - math.sqrt(tiny)
+
+
+def squared_length(x: Tensor, y: Tensor) -> Tensor:
+    """x^2 + y^2 as a new tensor."""
+    return (x * x).addcmul_(y, y)
+
+
+def clone_if_grad(x: Tensor) -> Tensor:
+    """A tensor that may be changed in place: x itself, or a clone where autograd still needs its value."""
+    return x.clone() if x.requires_grad else x
+
+
+def full_precision(x: Tensor) -> AbstractContextManager[object]:
+    """Disable autocast: a second derivative has no correct digit left in bfloat16."""
+    device = x.device.type
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
+
+
+def at_least_float32(x: Tensor) -> Tensor:
+    """Convert float16 and bfloat16 to float32, since squared derivatives exceed their range."""
+    return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
+
+
+def image_maximum(x: Tensor) -> Tensor:
+    """(B, 1, 1, 1) maximum of each image."""
+    return x.amax(dim=(1, 2, 3), keepdim=True)
+
+
+def _in_func_transform(x: Tensor) -> bool:
+    # torch has no public test for this; code that branches on values or writes into a tensor would fail under vmap.
+    return torch._C._functorch.is_functorch_wrapped_tensor(x)
+
+
+def is_host_readable(x: Tensor) -> bool:
+    """Whether Python can read the values of x at no cost: a CPU tensor, not compiled, not in a ``torch.func`` call."""
+    return not torch.compiler.is_compiling() and x.device.type == "cpu" and not _in_func_transform(x)
+
+
+def check_scalar(value: float | Tensor, name: str, *, zero_ok: bool = False) -> float | Tensor:
+    """Return a positive option, a number or a scalar tensor, whose value is checked where it is readable."""
+    if not isinstance(value, Tensor):
+        return check_positive(value, name, zero_ok=zero_ok)
+    check_tensor(value, name, ())
+    if is_host_readable(value):
+        check_positive(float(value.detach()), name, zero_ok=zero_ok)
+    return value
+
+
+def check_sigmas(sigmas: Sequence[float], name: str) -> list[float]:
+    """Return at least one standard deviation, each > 0."""
+    if not hasattr(sigmas, "__len__") or len(sigmas) == 0:
+        raise InvalidInputError(f"{name}: expected a sequence of at least one sigma, got {sigmas!r:.40}")
+    return [check_positive(sigma, name) for sigma in sigmas]
+
+
+def safe_reciprocal(value: float | Tensor) -> float | Tensor:
+    """1 / value; a tensor is clamped to [1e-6, 1e6], because its range cannot be checked while tracing."""
+    return 1.0 / (value.clamp(min=1e-6, max=1e6) if isinstance(value, Tensor) else value)
+
+
+Planes = tuple[Tensor, ...]  # channels of a result: several tensors (B, 1, H, W), or one tensor that holds them all
+BLOCK_PIXELS = 2**18  # that a layer gets at once, so that intermediate results stay in the cache
+
+
+def apply_in_blocks(layer: Callable[..., Planes], *tensors: Tensor | None) -> Tensor:
+    """``stack_channels(*layer(*tensors))`` of a layer that treats images independently, in blocks on a CPU."""
+    x = tensors[0]
+    assert x is not None
+    if torch.compiler.is_compiling() or x.device.type != "cpu" or x.numel() <= BLOCK_PIXELS:
+        return stack_channels(*layer(*tensors))
+    size = max(1, BLOCK_PIXELS // x.shape[1:].numel())
+    parts = [[None] * math.ceil(len(x) / size) if t is None else t.split(size) for t in tensors]
+    return torch.cat([stack_channels(*layer(*part)) for part in zip(*parts, strict=True)])
+
+
+def stack_channels(*planes: Tensor) -> Tensor:
+    """(B, C, H, W) from C tensors (B, 1, H, W)."""
+    if len(planes) == 1:
+        return planes[0]
+    # A compiled concatenation of single channels is laid out channels-last and then transposed.
+    return torch.stack([plane.squeeze(1) for plane in planes], dim=1)
+
+
+MAX_HOLE_LEVELS = 5  # holes of up to 2^5 px are filled from their surroundings, the middle of larger ones with the mean
+
+
+def apply_to_photograph(layer: Callable[[Tensor], Planes], image: Tensor, *, missing_value: float = 0.0) -> Tensor:
+    """Apply ``layer`` to grey levels; missing pixels are filled from their surroundings and give ``missing_value``."""
+    check_colour_image(image)
+
+    def on_filled(x: Tensor) -> Planes:
+        if not may_have_missing(x):
+            return layer(x)
+        mask = missing_mask(x)
+        return tuple(torch.where(mask, missing_value, plane) for plane in layer(fill_missing(x, mask)))
+
+    return apply_in_blocks(on_filled, to_grey(at_least_float32(image))).to(image.dtype)
+
+
+def to_grey(image: Tensor) -> Tensor:
+    """(B, 1, H, W) grey levels of (B, 3, H, W) RGB, 0.299 R + 0.587 G + 0.114 B; a grey image is returned unchanged."""
+    if image.shape[1] == 1:
+        return image
+    r, g, b = image.split(1, dim=1)
+    grey: Tensor = 0.299 * r + 0.587 * g + 0.114 * b
+    return grey
+
+
+def may_have_missing(x: Tensor) -> bool:
+    """False if all of x is known to be finite, at the cost of one sum; always True while tracing."""
+    return not is_host_readable(x) or not math.isfinite(float(x.detach().sum()))
+
+
+def missing_mask(x: Tensor) -> Tensor:
+    """True where x is NaN or infinite."""
+    return ~(x.abs() < math.inf)
+
+
+def fill_missing(x: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Fill missing pixels of (B, C, H, W), by default those not finite, with the mean of the smallest pyramid cell that
+    has a valid pixel; an image without any becomes 0."""
+    if mask is None:
+        if not may_have_missing(x):
+            return x
+        mask = missing_mask(x)
+    sums, weights = [torch.where(mask, 0.0, x)], [(~mask).to(x.dtype)]
+    for _ in range(MAX_HOLE_LEVELS):
+        sums.append(F.avg_pool2d(sums[-1], 2, ceil_mode=True))
+        weights.append(F.avg_pool2d(weights[-1], 2, ceil_mode=True))
+    tiny = torch.finfo(x.dtype).tiny
+    fill = sums[-1].sum(dim=(2, 3), keepdim=True) / weights[-1].sum(dim=(2, 3), keepdim=True).clamp(min=tiny)
+    for total, weight in zip(sums[:0:-1], weights[:0:-1], strict=True):
+        coarser = fill[..., : weight.shape[-2], : weight.shape[-1]]
+        fill = torch.where(weight > 0, total / weight.clamp(min=tiny), coarser)
+        fill = F.interpolate(fill, scale_factor=2.0, mode="nearest")
+    return torch.where(mask, fill[..., : x.shape[-2], : x.shape[-1]], x)
+
+
+def zero_nonfinite_vectors(field: Tensor) -> Tensor:
+    """(B, 2, H, W) with vectors that have a NaN or infinite component replaced by zero."""
+    if not may_have_missing(field):
+        return field
+    return torch.where(missing_mask(field).any(dim=1, keepdim=True), 0.0, field)
+
+
+MAX_TENSOR_RADIUS = 16  # px, of the kernel of a sigma that is a tensor: a traced graph reserves it
+MIN_TENSOR_SIGMA = 1e-3  # px, below which a kernel is a single 1 in every dtype and has derivative 0
+
+
+def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
+    """Separable Gaussian smoothing with replicated borders.
+
+    Args:
+        x: (B, C, H, W), as the result. NaN spreads.
+        sigma: standard deviation in px, >= 0; 0 returns ``x``. A scalar tensor is differentiable. The kernel is cut at
+            ceil(4 sigma) px, for a tensor at 16 px at most. Traced tensors are clamped to 0.001 px, not checked.
+
+    Example:
+        >>> gaussian_smooth(torch.ones(1, 1, 5, 5), 1.0).shape
+        torch.Size([1, 1, 5, 5])
+    """
+    return smooth(at_least_float32(x), check_scalar(sigma, "sigma", zero_ok=True), margin=0).to(x.dtype)
+
+
+def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = False) -> Tensor:
+    """:func:`gaussian_smooth` of an image enlarged by ``margin`` px on each side, as finite differences need it:
+    ``linear`` by the slope at the borders, else by replicating them."""
+    radius = _kernel_radius(sigma)
+    x = (extrapolate_pad if linear else replicate_pad)(x, radius + margin)
+    if radius == 0:
+        return x
+    weights = _gaussian_kernel(sigma, radius, x)
+    # Sums of shifted images: much faster than a convolution on few images, and one loop when compiled.
+    for dim in (-1, -2):
+        padded, length = x, x.shape[dim] - 2 * radius
+        x = padded.narrow(dim, 0, length) * weights[0]
+        for i in range(1, 2 * radius + 1):
+            part = padded.narrow(dim, i, length)
+            x = x.addcmul_(part, weights[i]) if isinstance(weights, Tensor) else x.add_(part, alpha=weights[i])
+    return x
+
+
+def _gaussian_kernel(sigma: float | Tensor, radius: int, like: Tensor) -> Sequence[float] | Tensor:
+    """2 radius + 1 weights: floats for a float, a tensor for a tensor."""
+    if not isinstance(sigma, Tensor):
+        kernel = [math.exp(-0.5 * (i / sigma) ** 2) for i in range(-radius, radius + 1)]
+        total = sum(kernel)
+        return [weight / total for weight in kernel]
+    sigma = sigma.to(like.dtype).clamp(min=MIN_TENSOR_SIGMA)
+    offsets = torch.arange(-radius, radius + 1, device=like.device, dtype=like.dtype)
+    weights = torch.exp(-0.5 * (offsets / sigma) ** 2) * (offsets.abs() <= torch.ceil(4.0 * sigma))
+    return weights / weights.sum()
+
+
+def _kernel_radius(sigma: float | Tensor) -> int:
+    if not isinstance(sigma, Tensor):
+        return math.ceil(4.0 * sigma)
+    if not is_host_readable(sigma):
+        return MAX_TENSOR_RADIUS
+    return min(max(math.ceil(4.0 * float(sigma.detach())), 1), MAX_TENSOR_RADIUS)
+
+
+def replicate_pad(x: Tensor, radius: int) -> Tensor:
+    """Pad (B, C, H, W) by ``radius`` px on all sides with the nearest border pixel."""
+    return F.pad(x, (radius, radius, radius, radius), mode="replicate") if radius else x
+
+
+def extrapolate_pad(x: Tensor, radius: int) -> Tensor:
+    """Pad (B, C, H, W) by ``radius`` px on all sides with the slope at the border, so that planes stay planes."""
+    steps = torch.arange(1, radius + 1, device=x.device, dtype=x.dtype)
+    for dim in (-1, -2):
+        n, k = x.shape[dim], steps if dim == -1 else steps[:, None]
+        first, last = x.narrow(dim, 0, 1), x.narrow(dim, n - 1, 1)
+        # The indices are clamped because an image one pixel wide has no slope.
+        fall, rise = first - x.narrow(dim, min(1, n - 1), 1), last - x.narrow(dim, max(n - 2, 0), 1)
+        x = torch.cat([first + fall * k.flip(0), x, last + rise * k], dim=dim)
+    return x
+
+
+def central_gradient(p: Tensor) -> tuple[Tensor, Tensor]:
+    """(p_x, p_y) per px by central differences; the result is 1 px smaller than p on each side."""
+    return _half_difference(p[..., 1:-1, 2:], p[..., 1:-1, :-2]), _half_difference(p[..., 2:, 1:-1], p[..., :-2, 1:-1])
+
+
+def central_derivatives(p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """(p_x, p_y, p_xx, p_yy, p_xy) per px and px^2; each is 1 px smaller than p on each side."""
+    x, slope = p[..., 1:-1, 1:-1], _half_difference(p[..., 2:], p[..., :-2])
+    xx = (p[..., 1:-1, 2:] + p[..., 1:-1, :-2]).sub_(x, alpha=2)
+    yy = (p[..., 2:, 1:-1] + p[..., :-2, 1:-1]).sub_(x, alpha=2)
+    xy = _half_difference(slope[..., 2:, :], slope[..., :-2, :])
+    return slope[..., 1:-1, :], _half_difference(p[..., 2:, 1:-1], p[..., :-2, 1:-1]), xx, yy, xy
+
+
+def _half_difference(after: Tensor, before: Tensor) -> Tensor:
+    return torch.sub(after, before).mul_(0.5)
+
+
+def is_directional_maximum(length: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """True where ``length`` is a maximum along (x, y), rounded to 45 degrees as in Canny; all (B, 1, H, W)."""
+    H, W = length.shape[-2:]
+    p = F.pad(length, (1, 1, 1, 1))
+
+    def shifted(dx: int, dy: int) -> Tensor:
+        return p[..., 1 + dy : 1 + dy + H, 1 + dx : 1 + dx + W]
+
+    tan = 0.41421356  # tan 22.5 degrees
+    horizontal, vertical = y.abs() <= tan * x.abs(), x.abs() <= tan * y.abs()
+    diagonal = ~(horizontal | vertical)
+    falling = diagonal & (x * y > 0)  # y points down: equal signs run from top left to bottom right
+    result = torch.zeros_like(horizontal)
+    for selected, dx, dy in ((horizontal, 1, 0), (vertical, 0, 1), (falling, 1, 1), (diagonal & ~falling, 1, -1)):
+        # Strict on one side only, so that a plateau two pixels wide yields exactly one point.
+        result = result | (selected & (length > shifted(dx, dy)) & (length >= shifted(-dx, -dy)))
+    return result

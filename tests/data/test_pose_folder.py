@@ -1,0 +1,49 @@
+import pytest
+import torch
+
+from curvireg_torch.data import PoseFolder
+from curvireg_torch.errors import InvalidInputError, MissingFileError
+from curvireg_torch.geometry import rotation_from_viewpoint
+from tests._support.miniature import write_mesh, write_web
+
+
+@pytest.fixture
+def tree(tmp_path):
+    return tmp_path, write_web(tmp_path)
+
+
+def test_pose_folder_counts_skipped_items(tree):
+    root, reasons = tree
+    dataset = PoseFolder(root)
+    assert len(dataset) == 4
+    assert dict(dataset.skipped) == reasons
+    assert dataset.skipped_items["missing_image"] == ["cup/views.csv #3"]
+
+
+def test_pose_folder_returns_documented_samples(tree):
+    dataset = PoseFolder(tree[0])
+    sample, unknown, level = (dataset[i] for i in range(3))
+    names = "image image_path image_id box viewpoint rotation distance category mesh_path object_index"
+    assert set(sample) == set(names.split())
+    assert sample["image"].shape == (3, 60, 80)
+    assert sample["box"].tolist() == [10, 5, 70, 55]
+    assert sample["viewpoint"].tolist() == [30, 10, -5]
+    torch.testing.assert_close(sample["rotation"], rotation_from_viewpoint(30.0, 10.0, -5.0))
+    assert sample["distance"] == 3
+    assert sample["category"] == "cup"
+    assert sample["mesh_path"].endswith("mesh.off")
+    assert unknown["viewpoint"].isnan().all()
+    assert unknown["rotation"].isnan().all()
+    assert level["viewpoint"].tolist() == [90, 0, 0]
+    assert level["rotation"].isfinite().all()
+    assert level["distance"] != level["distance"]
+
+
+def test_pose_folder_refuses_unusable_roots(tree, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for root in (tmp_path / "nothing", tmp_path / "empty"):
+        with pytest.raises(MissingFileError, match=r"datasets/web/README\.md"):
+            PoseFolder(root)
+    write_mesh(tree[0] / "cup" / "mesh.ply")
+    with pytest.raises(InvalidInputError, match=r"one mesh.*mesh\.ply, mesh\.off"):
+        PoseFolder(tree[0])

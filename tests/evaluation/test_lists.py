@@ -1,0 +1,155 @@
+"""Registration of lists: what is repeated, what the tables and the page show, and names that are no text."""
+
+import csv
+import json
+import os
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from curvireg_torch import Registrar, ViewBank, sample_views
+from curvireg_torch.data import read_photo
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evaluation import lists, runner
+from curvireg_torch.evaluation.lists import PhotoList, list_photographs, read_list
+from curvireg_torch.evaluation.runner import Entry
+from curvireg_torch.geometry.cameras import camera_of_view
+from curvireg_torch.pipeline import PRESETS
+from curvireg_torch.registration import Registration
+from curvireg_torch.synthetic import example_mesh
+from tests._support.scenes import SIZE, scene, unrefined
+
+CAMERA = (260.0, 260.0, 119.5, 89.5)
+
+
+@pytest.fixture(scope="module")
+def registrar():
+    """The example mesh in eight views, without refinement."""
+    views = sample_views(azimuth_step=45, elevations=[20])
+    bank = ViewBank.build(example_mesh(), views, pipeline=PRESETS["classical"], image_size=64, progress=False)
+    return Registrar(bank, pipeline=unrefined(bank))
+
+
+@pytest.fixture
+def entry(tmp_path):
+    """A photograph with its box."""
+    picture = (scene(0)[0].permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "photo.png"), picture)
+    (tmp_path / "mesh.ply").write_text("a mesh")
+    return Entry((), "photo.png", tmp_path / "photo.png", (tmp_path / "mesh.ply",), box=tuple(scene(0)[1].tolist()))
+
+
+def register_rows(rows, out, registrar, settings=None):
+    photos = PhotoList((), tuple(rows))
+    return lists.register_list(photos, out, lambda _: registrar, settings=settings or {}, progress=False)
+
+
+def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, monkeypatch):
+    unknown_box = replace(entry, box=None, camera=CAMERA)
+    rows = [entry, replace(entry, camera=CAMERA), replace(unknown_box, instances=2), replace(entry, guess=50.0), entry]
+    done = []
+
+    def register_entry(one, photo, registrar, **_):
+        done.append(one)
+        return original(replace(one, box=entry.box, instances=1), photo, registrar, bank_seconds=0.0)
+
+    original = runner.register_entry
+    monkeypatch.setattr(runner, "register_entry", register_entry)
+    for settings in ({"top": 1}, {"top": 2}):
+        done.clear()
+        for _ in range(2):
+            assert register_rows(rows, tmp_path / "out", registrar, settings).ok == 5
+        assert done == rows[:4], "equal rows are registered once"
+
+
+def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp_path):
+    (tmp_path / "summary.json").write_text("{}")
+    with pytest.raises(InvalidInputError, match="holds the evaluation of a dataset"):
+        register_rows([entry], tmp_path, registrar)
+
+
+@pytest.mark.parametrize(
+    ("camera", "guess", "source"),
+    [(CAMERA, None, "given"), (None, 50.0, "fov"), (None, "exif", "exif"), (None, None, None)],
+)
+def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entry, monkeypatch, camera, guess, source):
+    def with_covariance(image, box, K, **_):
+        (result,) = registrar(image, box, K)
+        assert isinstance(result, Registration)
+        best, *others = result.hypotheses
+        best = replace(best, covariance=None if K is None else torch.eye(6, dtype=torch.float64))
+        return [replace(result, probabilities=(1.0,), hypotheses=(best, *others))]
+
+    class Certain:
+        bank, pipeline = registrar.bank, registrar.pipeline
+        is_exact, symmetries_of = registrar.is_exact, registrar.symmetries_of
+        of_model = registrar.of_model
+        __call__ = staticmethod(with_covariance)
+
+    photo = read_photo(entry.photo)
+    monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: camera_of_view(40.0, SIZE))
+    one = replace(entry, camera=camera, guess=guess)
+    result, document = runner.register_entry(one, photo, Certain(), bank_seconds=0.0)
+    assert document["inputs"]["camera_source"] == source
+    known = source == "given"
+    assert document["covariance"] == (torch.eye(6).tolist() if known else None)
+    assert (document["standard_deviations"] is not None) == known
+    assert (result.translation is not None) == (source is not None)
+    json.dumps(document, allow_nan=False)
+
+
+def test_page_shows_reliable_results_first_and_failures_last(registrar, entry, tmp_path, monkeypatch):
+    """Equally reliable ones are ordered by confidence, then by their row."""
+    confidence = {"a": 0.3, "b": 0.95, "c": None, "d": 0.85, "e": 0.5, "f": 0.95}
+
+    def register_entry(one, photo, registrar, **_):
+        value = confidence[one.name]
+        if value is None:
+            raise InvalidInputError("dark")
+        result, document = original(replace(one, name="photo.png"), photo, registrar, bank_seconds=0.0)
+        return result, {**document, "confidence": value, "reliable": value >= 0.8}
+
+    shown = []
+    original = runner.register_entry
+    monkeypatch.setattr(runner, "register_entry", register_entry)
+    monkeypatch.setattr(lists, "write_sheet", lambda _path, _title, entries, **_: shown.extend(entries))
+    counts = register_rows([replace(entry, name=name) for name in confidence], tmp_path / "out", registrar)
+    assert [one.name for one in shown] == ["b", "f", "d", "e", "a", "c"]
+    assert [one.number for one in shown] == [2, 6, 4, 5, 1, 3]
+    assert [one.kind for one in shown] == ["reliable"] * 3 + ["doubtful"] * 2 + ["failed"]
+    assert shown[-1].caption == "dark"
+    assert (counts.ok, len(counts.failures), counts.reliable) == (5, 1, 3)
+
+
+def test_names_that_are_not_utf8_do_not_end_a_list(registrar, entry, tmp_path):
+    """Of a Latin-1 archive, for instance; they are written with their bytes in hexadecimal."""
+    folder = tmp_path / "old"
+    folder.mkdir()
+    (folder / os.fsdecode(b"caf\xe9.png")).write_bytes(entry.photo.read_bytes())
+    (folder / os.fsdecode(b"gar\xe7on.png")).write_text("no picture")
+    photos = list_photographs([folder], entry.meshes, box=entry.box, frames=tmp_path)
+    counts = lists.register_list(photos, tmp_path / "out", lambda _: registrar, settings={}, progress=False)
+    assert (counts.ok, len(counts.failures)) == (1, 1)
+    assert r"gar\udce7on.png" in counts.failures[0]
+    with (tmp_path / "out" / "results.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [os.path.basename(row["photo"]) for row in rows] == [r"caf\udce9.png", r"gar\udce7on.png"]
+    assert [row["status"] for row in rows] == ["ok", "failed"]
+    assert r"caf\udce9.png" in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+
+
+def test_empty_columns_of_a_spreadsheet_do_not_count(tmp_path):
+    """Excel ends every line by the commas of cells that were used once."""
+    path = tmp_path / "excel.csv"
+    path.write_text(
+        "photo,x0,y0,x1,y1,note,,\na.png,1,2,30,40,,,\nb.png,1,2,30,40,new,,\n,,,,,,,\nc.png,1,2,30,40,x,y,\n"
+    )
+    found = read_list(path, [tmp_path / "part.stl"])
+    assert found.columns == ("photo", "x0", "y0", "x1", "y1", "note")
+    assert [entry.cells[-1] for entry in found.entries] == ["", "new", "x"]
+    assert [entry.error for entry in found.entries] == ["", "", "7 cells, the header has 6; quote texts with commas"]
+    path.write_text("photo,x0,,y0,x1,y1,\na.png,1,,2,30,40,\n")  # one within the table is passed through
+    assert read_list(path, [tmp_path / "part.stl"]).entries[0].box == (1.0, 2.0, 30.0, 40.0)

@@ -1,0 +1,228 @@
+"""Errors and recalls against scipy, numpy and loops; missing estimates (NaN, inf) are misses; bad input is refused."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evaluation import metrics
+from curvireg_torch.geometry import rotation_error
+from tests._support.poses import poses, rotations
+
+K = torch.tensor([[600.0, 0.0, 320.0], [0.0, 620.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+POINTS = torch.rand(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
+GT = poses(5, 1)
+EST = poses(5, 2, near=GT)
+R = rotations(5, 0)
+SYMMETRIES = torch.eye(3, dtype=torch.float64)[None]
+
+
+def _angle(R1: np.ndarray, R2: np.ndarray) -> float:
+    return math.degrees(Rotation.from_matrix(R1.T @ R2).magnitude())
+
+
+def _move(T: Tensor | np.ndarray, points: Tensor = POINTS) -> np.ndarray:
+    T = np.asarray(T)
+    return np.array([T[:3, :3] @ x + T[:3, 3] for x in points.numpy()])
+
+
+def _project(xyz: np.ndarray, camera: Tensor) -> np.ndarray:
+    uvw = xyz @ camera.numpy().T
+    return uvw[:, :2] / uvw[:, 2:]
+
+
+def test_averages_count_missing_estimates_as_misses_and_thresholds_are_strict() -> None:
+    errors = torch.tensor([0.0, 9.999, 10.0, 29.0, 30.0, torch.inf])
+    assert metrics.accuracy(errors, 10.0) == pytest.approx(2 / 6)
+    assert metrics.accuracy(errors, 30.0) == pytest.approx(4 / 6)
+    for values, median in (([1.0, 2.0, torch.inf], 2.0), ([1.0, torch.inf, torch.inf], math.inf)):
+        assert metrics.median_error(torch.tensor(values)) == median
+    for n in (1, 6, 7):
+        values = 180.0 * torch.rand(n, generator=torch.Generator().manual_seed(n))
+        assert metrics.median_error(values) == pytest.approx(float(np.median(values.numpy())))
+
+
+def test_average_recall_worked_example() -> None:
+    errors = torch.tensor([0.0, 0.07, 0.26, 0.50, torch.inf])
+    # Thresholds 0.05, 0.10, ..., 0.50: the errors pass 10, 9, 5, 0 (0.5 is not below 0.5) and 0 of the ten.
+    assert metrics.average_recall(errors, metrics.MSSD_THRESHOLDS) == pytest.approx(24 / 50)
+    assert metrics.average_recall(errors, metrics.ADD_THRESHOLDS) == pytest.approx(2 / 5)
+    pixels = torch.tensor([0.0, 7.0, 26.0, 50.0, torch.inf], dtype=torch.float64)
+    assert metrics.average_recall(pixels / 640, metrics.MSPD_THRESHOLDS) == pytest.approx(24 / 50)
+    assert metrics.average_recall(pixels / 320, metrics.MSPD_THRESHOLDS) == pytest.approx((10 + 8) / 50)
+
+
+@pytest.mark.parametrize("bad", [torch.tensor([-1.0]), torch.tensor([math.nan]), torch.zeros(2, 2), torch.tensor([1])])
+def test_averages_refuse_what_is_no_error(bad: Tensor) -> None:
+    for average in (
+        lambda errors: metrics.accuracy(errors, 30.0),
+        metrics.median_error,
+        lambda errors: metrics.average_recall(errors, metrics.ADD_THRESHOLDS),
+    ):
+        with pytest.raises(InvalidInputError, match="errors: expected"):
+            average(bad)
+    with pytest.raises(InvalidInputError, match="threshold_deg"):
+        metrics.accuracy(torch.zeros(1), 0.0)
+
+
+def test_symmetric_rotation_error_is_the_minimum_over_symmetries_and_identity() -> None:
+    est, gt, symmetries = rotations(10, 2), rotations(10, 3), rotations(4, 4)
+    group = [np.eye(3), *symmetries.numpy()]
+    slow = [min(_angle(e, g @ s) for s in group) for e, g in zip(est.numpy(), gt.numpy(), strict=True)]
+    np.testing.assert_allclose(metrics.symmetric_rotation_error(est, gt, symmetries), slow, atol=1e-6)
+    plain = metrics.symmetric_rotation_error(est, gt, torch.empty(0, 3, 3))
+    torch.testing.assert_close(plain, rotation_error(est, gt))
+
+
+@pytest.mark.parametrize(("value", "whole"), [(math.nan, True), (math.nan, False), (-math.inf, False)])
+def test_rotation_errors_of_missing_estimates_are_infinite(value: float, whole: bool) -> None:
+    missing = R.clone()
+    missing[2].view(-1)[slice(None) if whole else slice(0, 1)] = value
+    for errors in (
+        metrics.symmetric_rotation_error(missing, R, SYMMETRIES),
+        metrics.symmetric_rotation_error(missing, R, SYMMETRIES[:0]),
+    ):
+        assert errors.isinf().tolist() == [False, False, True, False, False]
+        assert float(errors[[0, 1, 3, 4]].max()) < 1e-5
+
+
+def test_add_and_adds_against_loops() -> None:
+    add = [np.linalg.norm(_move(e) - _move(g), axis=1).mean() for e, g in zip(EST, GT, strict=True)]
+    adds = [cdist(_move(g), _move(e)).min(1).mean() for e, g in zip(EST, GT, strict=True)]
+    np.testing.assert_allclose(metrics.add_error(EST, GT, POINTS), add)
+    np.testing.assert_allclose(metrics.adds_error(EST, GT, POINTS), adds)
+    # The model is asymmetric, so the opposite direction of nearest neighbours gives another result.
+    points = torch.cat([POINTS * 0.01, torch.tensor([[3.0, 0.0, 0.0]], dtype=torch.float64)])
+    est, gt = poses(1, 3), poses(1, 4)
+    forward = cdist(_move(gt[0], points), _move(est[0], points)).min(1).mean()
+    backward = cdist(_move(est[0], points), _move(gt[0], points)).min(1).mean()
+    assert abs(forward - backward) > 0.01
+    assert float(metrics.adds_error(est, gt, points)) == pytest.approx(forward)
+
+
+def test_mssd_and_mspd_against_loops(monkeypatch: pytest.MonkeyPatch) -> None:
+    symmetries = torch.stack([torch.eye(4, dtype=torch.float64), *poses(3, 5)])
+    symmetries[:, :3, 3] *= 0.02
+    cameras = K.repeat(5, 1, 1)
+    cameras[:, 0, 0] += 50.0 * torch.arange(5)
+    mssd, mspd = [], []
+    for e, g, camera in zip(EST, GT, cameras, strict=True):
+        turned = [_move(g.numpy() @ s.numpy()) for s in symmetries]
+        mssd.append(min(np.linalg.norm(_move(e) - points, axis=1).max() for points in turned))
+        pixels = [_project(_move(e), camera) - _project(points, camera) for points in turned]
+        mspd.append(min(np.linalg.norm(difference, axis=1).max() for difference in pixels))
+    for chunk, few in ((metrics._CHUNK, 300), (90, 3)):  # all at once; two transforms at a time, bounds by few points
+        monkeypatch.setattr(metrics, "_CHUNK", chunk)
+        monkeypatch.setattr(metrics, "BOUNDING_POINTS", few)
+        np.testing.assert_allclose(metrics.mssd_error(EST, GT, POINTS, symmetries=symmetries), mssd)
+        np.testing.assert_allclose(metrics.mspd_error(EST, GT, POINTS, cameras, symmetries=symmetries), mspd)
+
+
+def test_few_symmetries_of_a_solid_of_revolution_are_compared_by_all_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scores of cans with 315 symmetries took minutes."""
+    angles = torch.arange(315.0, dtype=torch.float64) * (2 * math.pi / 315)
+    symmetries = torch.eye(4, dtype=torch.float64).repeat(315, 1, 1)
+    symmetries[:, :2, :2] = torch.stack([angles.cos(), -angles.sin(), angles.sin(), angles.cos()], 1).view(-1, 2, 2)
+    points = torch.rand(6000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
+    moved, transform = [], metrics._transform
+    counted = lambda T, points: moved.append(len(T) * len(points)) or transform(T, points)  # noqa: E731
+    monkeypatch.setattr(metrics, "_transform", counted)
+    found = [metrics.mssd_error(EST, GT, points, symmetries=symmetries)]
+    found.append(metrics.mspd_error(EST, GT, points, K, symmetries=symmetries))
+    assert sum(moved) < 0.25 * 3 * len(EST) * 315 * len(points)
+    monkeypatch.setattr(metrics, "BOUNDING_POINTS", len(points))
+    torch.testing.assert_close(found[0], metrics.mssd_error(EST, GT, points, symmetries=symmetries), rtol=0, atol=0)
+    torch.testing.assert_close(found[1], metrics.mspd_error(EST, GT, points, K, symmetries=symmetries), rtol=0, atol=0)
+
+
+def test_symmetries_apply_in_the_model_frame() -> None:
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
+    symmetries = torch.stack([torch.eye(4, dtype=torch.float64), half_turn])
+    assert float(metrics.mssd_error(GT @ half_turn, GT, POINTS, symmetries=symmetries).max()) < 1e-12
+    assert float(metrics.mspd_error(GT @ half_turn, GT, POINTS, K, symmetries=symmetries).max()) < 1e-9
+    assert float(metrics.mssd_error(half_turn @ GT, GT, POINTS, symmetries=symmetries).min()) > 0.5
+    turned = GT[:, :3, :3] @ half_turn[:3, :3]
+    assert float(metrics.symmetric_rotation_error(turned, GT[:, :3, :3], half_turn[None, :3, :3]).max()) < 1e-5
+
+
+def test_mspd_error_is_infinite_for_points_behind_the_camera() -> None:
+    behind = EST.clone()
+    behind[2, 2, 3] = 0.1
+    mspd = metrics.mspd_error(behind, GT, POINTS, K)
+    assert mspd.isinf().tolist() == [False, False, True, False, False]
+    assert bool(metrics.mssd_error(behind, GT, POINTS).isfinite().all())
+
+
+PoseError = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [metrics.add_error, metrics.adds_error, metrics.mssd_error, lambda *poses: metrics.mspd_error(*poses, K)],
+)
+def test_pose_errors_contract(error: PoseError) -> None:
+    whole = error(EST, GT, POINTS)
+    for value in (math.nan, math.inf):
+        missing = EST.clone()
+        missing[1, 0, 0] = value
+        want = torch.where(torch.arange(5) == 1, math.inf, whole)
+        torch.testing.assert_close(error(missing, GT, POINTS), want)
+    one_by_one = [error(e[None], g[None], POINTS) for e, g in zip(EST, GT, strict=True)]
+    torch.testing.assert_close(torch.cat(one_by_one), whole)
+    assert error(EST[:0], GT[:0], POINTS).shape == (0,)
+    single = error(EST.float(), GT, POINTS)
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), whole, rtol=1e-3, atol=1e-5)
+    zero = torch.zeros_like(EST)  # would map every point to the origin, which may be close to the surface
+    for est, gt, points, message in (
+        (EST, GT, POINTS[:0], "points: expected at least one"),
+        (EST, GT, POINTS * math.nan, "points: expected finite"),
+        (EST, GT, POINTS.to("meta"), "points: expected device"),
+        (EST, GT[:2], POINTS, "T_gt: expected shape"),
+        (EST, GT * math.nan, POINTS, "T_gt: expected finite"),
+        (EST, GT.to("meta"), POINTS, "T_gt: expected device"),
+        *((bad, GT, POINTS, "T_est: expected rigid") for bad in (zero, EST * 1.05, EST.mT, -EST)),
+        (EST, GT * 1.05, POINTS, "T_gt: expected rigid"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            error(est, gt, points)
+
+
+def test_pose_errors_accept_rounded_poses() -> None:
+    rounded = GT.clone()
+    rounded[:, :3, :3] = (rounded[:, :3, :3] * 1000.0).round() / 1000.0  # three digits, as in some result files
+    assert float(metrics.mssd_error(rounded, GT, POINTS).max()) < 2e-3
+    assert metrics.mssd_error(GT.half(), GT, POINTS).isfinite().all()
+
+
+WRONG: dict[str, Callable[[], object]] = {
+    "R_est: expected": lambda: metrics.symmetric_rotation_error(R[0, 0], R, SYMMETRIES),
+    "R_est: expected device": lambda: metrics.symmetric_rotation_error(R.to("meta"), R, SYMMETRIES),
+    "R_gt: expected": lambda: metrics.symmetric_rotation_error(R, R.tolist(), SYMMETRIES),  # type: ignore[arg-type]
+    "R_gt: expected finite": lambda: metrics.symmetric_rotation_error(R, R * math.nan, SYMMETRIES),
+    "symmetries: expected finite": lambda: metrics.symmetric_rotation_error(R, R, SYMMETRIES * math.nan),
+    "symmetries: expected device": lambda: metrics.symmetric_rotation_error(R, R, SYMMETRIES.to("meta")),
+    "symmetries: expected shape .* with S >= 1": lambda: metrics.mssd_error(EST, GT, POINTS, symmetries=GT[:0]),
+    "symmetries: expected": lambda: metrics.mspd_error(EST, GT, POINTS, K, symmetries=GT * math.inf),
+    "camera_matrix: expected": lambda: metrics.mspd_error(EST, GT, POINTS, K[None].repeat(2, 1, 1)),
+    "camera matrix: expected finite": lambda: metrics.mspd_error(EST, GT, POINTS, K * math.nan),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_metrics_refuse_wrong_input(message: str) -> None:
+    with pytest.raises(InvalidInputError, match=f"^{message}"):
+        WRONG[message]()
+
+
+def test_metrics_of_empty_sets() -> None:
+    empty = torch.empty(0, dtype=torch.float64)
+    assert metrics.symmetric_rotation_error(R[:0], R[:0], SYMMETRIES).shape == (0,)
+    recall = metrics.average_recall(empty, metrics.MSSD_THRESHOLDS)
+    assert all(map(math.isnan, (metrics.accuracy(empty, 30.0), metrics.median_error(empty), recall)))

@@ -1,0 +1,229 @@
+"""Scores of descriptors, feature points and box shapes."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import sklearn.covariance
+import torch
+import torch.nn.functional as F
+from scipy.ndimage import distance_transform_edt
+
+from curvireg_torch import ViewMatcher
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.terms import (
+    BoxShape,
+    Correlation,
+    Repeatability,
+    Whitening,
+    box_shapes,
+    ledoit_wolf,
+    terms,
+    whole_box_shapes,
+)
+from curvireg_torch.terms.terms import cell_counts, dilate_points
+
+
+@pytest.mark.parametrize("term", [Correlation, Repeatability, BoxShape])
+@pytest.mark.parametrize("weight", [-1.0, math.nan, "1"])
+def test_terms_refuse_bad_weights(term, weight):
+    with pytest.raises(InvalidInputError, match=f"{term.name}: weight: expected"):
+        term(weight=weight)
+
+
+def test_correlation_is_the_cosine_of_the_better_crop():
+    queries, views = torch.tensor([[3.0, 4.0], [1.0, 0.0]]), torch.tensor([[4.0, 3.0], [0.0, 2.0], [5.0, 12.0]])
+    expected = torch.tensor([[24 / 25, 4 / 5, 63 / 65], [4 / 5, 0.0, 5 / 13]])
+    module = Correlation().build(SimpleNamespace(descriptors=views))
+    torch.testing.assert_close(module(SimpleNamespace(descriptors=queries[:, None])), expected)
+    together = module(SimpleNamespace(descriptors=queries[None]))
+    torch.testing.assert_close(together, expected.amax(dim=0, keepdim=True))
+
+
+def test_correlation_score_is_an_exponential_of_standard_deviations():
+    score = Correlation().log_score(torch.tensor([[0.0, 0.0, 0.0, 1.0], [3.0, 3.0, 3.0, 5.0], [2.0] * 4]))
+    low = -4.0 / math.sqrt(3.0)  # the standard deviation of 0, 0, 0, 1 is sqrt(3) / 4
+    torch.testing.assert_close(score, torch.tensor([[low, low, low, 0.0]] * 2 + [[0.0] * 4]))
+
+
+def sample(count: int, length: int = 12) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(count)
+    mixing = torch.randn(length, length, generator=generator)
+    return torch.randn(count, length, generator=generator) @ mixing + 3.0
+
+
+@pytest.mark.parametrize("count", [5, 30, 2000])
+def test_ledoit_wolf_equals_scikit_learn(count):
+    x = sample(count)
+    mean, covariance = ledoit_wolf(x)
+    expected = sklearn.covariance.ledoit_wolf(x.double().numpy())[0]
+    np.testing.assert_allclose(covariance.numpy(), expected, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(mean, x.mean(dim=0))
+
+
+def test_whitening_decorrelates():
+    x = sample(4000)
+    white = Whitening(x.mean(dim=0), x.T.cov(correction=0))(x)
+    torch.testing.assert_close(white.mean(dim=0), torch.zeros(12), atol=1e-3, rtol=0)
+    torch.testing.assert_close(white.T @ white / len(white), torch.eye(12), atol=1e-2, rtol=0)
+    with pytest.raises(InvalidInputError, match="positive definite"):
+        Whitening(x[:5].mean(dim=0), x[:5].T.cov())
+    with pytest.raises(InvalidInputError, match="covariance"):
+        Whitening(torch.zeros(3), torch.eye(2))
+
+
+def test_ledoit_wolf_of_degenerate_samples():
+    """All shrinkage, because equal descriptors have no covariance; and no shrinkage is below 0."""
+    two = torch.tensor([[1.0, 0, 0], [-1.0, 0, 0]])
+    mean, covariance = ledoit_wolf(two)
+    assert torch.equal(mean, torch.zeros(3))
+    expected = sklearn.covariance.ledoit_wolf(two.numpy())[0]
+    np.testing.assert_allclose(covariance.numpy(), expected, rtol=1e-5)
+    assert torch.equal(ledoit_wolf(torch.ones(4, 3))[1], torch.zeros(3, 3))
+    with pytest.raises(InvalidInputError, match="at least 2"):
+        ledoit_wolf(torch.ones(1, 3))
+
+
+def test_matcher_ranks_by_whitened_correlation(bank, photographs):
+    assert Correlation().build(bank).whitening is None
+    images, boxes = photographs[0][:1], photographs[1][:1]
+    pipeline = replace(bank.pipeline.with_term("hog", whitening="bank"), box_jitter=0.0)
+    matcher = ViewMatcher(bank, pipeline=pipeline)
+    query = matcher.query(images, boxes).descriptors[:, 0]
+    mean, covariance = ledoit_wolf(bank.descriptors)
+    factor = torch.linalg.cholesky(covariance.double())
+    a, b = (torch.linalg.solve(factor, (x - mean).double().T).T for x in (query, bank.descriptors))
+    expected = F.cosine_similarity(a[:, None], b[None], dim=2).float()
+    torch.testing.assert_close(matcher(images, boxes).hog, expected, atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize("eps", [0.0, 1.0, 2.0, 2.5, 2.9, 3.0, 4.0])
+def test_dilate_points_uses_a_euclidean_disc(eps):
+    points = torch.rand(3, 31, 40, generator=torch.Generator().manual_seed(0)) < 0.02
+    points[0] = False
+    dilated = dilate_points(points, eps)
+    assert not bool(dilated[0].any())
+    for plane, expected in zip(dilated[1:], points[1:], strict=True):
+        assert (plane.numpy() == (distance_transform_edt(~expected.numpy()) <= eps)).all()
+
+
+def test_repeatability_score_has_the_closed_form():
+    rep = torch.tensor([[0.2, 0.5, 0.8]])
+    assert int(Repeatability(mode="paper").log_score(rep).argmax()) == 1  # favours average views
+    for sigma in (0.1, 0.2):
+        expected = [-(d**2) / (2 * sigma**2) for d in (0.6, 0.3, 0.0)]
+        torch.testing.assert_close(Repeatability(sigma=sigma).log_score(rep)[0], torch.tensor(expected))
+    with pytest.raises(InvalidInputError, match="mode"):
+        Repeatability(mode="other")
+
+
+@pytest.mark.parametrize(("size", "cell"), [(128, 2), (64, 1), (65, 2), (100, 3), (1030, 16)])
+def test_cell_counts_equal_average_pooling(size, cell):
+    points = torch.rand(3, size, size, generator=torch.Generator().manual_seed(0)) < 0.3
+    points[1] = True
+    expected = F.avg_pool2d(points[:, None].double(), cell, ceil_mode=True)[:, 0]
+    counts = cell_counts(points, cell)
+    torch.testing.assert_close(counts / counts[1].double(), expected)
+    assert int(counts[1, 0, 0]) == cell**2
+
+
+class PointViews:
+    """Views of ``size`` px; view i has feature points at the (row, column) indices ``points[i]``."""
+
+    def __init__(self, size, *points):
+        self.settings = SimpleNamespace(image_size=size)
+        self.points, self.descriptors = torch.zeros(len(points), size, size, dtype=torch.bool), torch.zeros(1)
+        for view, (rows, columns) in zip(self.points, points, strict=True):
+            view[rows, columns] = True
+
+    def __len__(self):
+        return len(self.points)
+
+    def points_at(self, index):
+        return self.points[index]
+
+
+@pytest.mark.parametrize(("size", "cell"), [(129, 2), (194, 3)])
+def test_repeatability_counts_points_in_cut_cells_once(size, cell):
+    """One point in the cut corner, one at a cut side, two in whole cells; the view's points fill the last column."""
+    assert 0 < size % cell < cell
+    term = Repeatability().build(PointViews(size, (slice(None), -1)))
+    assert term.cell == cell
+    query = PointViews(size, ([size - 1, 0, 0, 2 * cell], [size - 1, size - 1, 0, cell])).points[None]
+    assert term(SimpleNamespace(points=query)).item() == 0.5
+
+
+@pytest.mark.parametrize("size", [64, 128, 256])
+def test_repeatability_resolves_eps_with_64_cells_per_side(size):
+    """A point 3 px nearer than eps matches, and one 4 px farther does not."""
+    eps = 0.1
+    middle, distance = size // 2, int(eps * size)
+    views = PointViews(size, *((middle, middle + distance + d) for d in (-3, 4)))
+    term = Repeatability(eps=eps).build(views)
+    assert term.near.shape == (2, 64**2)
+    query = PointViews(size, (middle, middle)).points[None]
+    assert term(SimpleNamespace(points=query)).tolist() == [[1.0, 0.0]]
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_repeatability_keeps_views_of_several_chunks_in_order(threads):
+    count, before = 2 * terms.VIEWS_AT_A_TIME + 3, torch.get_num_threads()
+    views = PointViews(64, *((i // 64, i % 64) for i in range(count)))
+    torch.set_num_threads(threads)
+    near = Repeatability(eps=0.016).build(views).near
+    torch.set_num_threads(before)
+    assert torch.equal(near, dilate_points(views.points, 1.0).flatten(1).to(near.dtype))
+
+
+@pytest.mark.parametrize(("eps", "side"), [(0.016, 64), (0.008, 128)])
+def test_repeatability_cells_are_at_most_eps(eps, side):
+    assert Repeatability(eps=eps).build(PointViews(128, (64, 64))).near.shape[1] == side**2
+
+
+def box_score(shapes, boxes, **options):
+    return BoxShape(**options).build(SimpleNamespace(boxes=boxes))(SimpleNamespace(shapes=shapes))
+
+
+def test_box_shape_score_is_a_gaussian_of_the_log_aspect_ratio():
+    boxes = torch.tensor([[0.0, 0, 20, 10], [0, 0, 10, 10], [0, 0, 10, 20]]) + 3.0
+    expected = [math.exp(-((k * math.log(2)) ** 2) / (2 * 0.5**2)) for k in (0, 1, 2)]
+    assert box_score(box_shapes(boxes[:1]), boxes, sigma=0.5)[0].tolist() == pytest.approx(expected, rel=1e-5)
+    assert box_score(torch.tensor([-9.0]), boxes)[0, 2] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("box", "whole"),
+    [
+        ([10, 10, 60, 40], True),
+        ([-0.5, 10, 60, 40], False),
+        ([10, 10, 98.8, 40], False),
+        ([10, 0, 60, 40], False),
+        ([10, 10, 60, 99], False),
+        ([-9, -9, 200, 200], False),
+        # The border is 1 px and 1/100 of the longer side, 80 px: 1.8 px.
+        ([1.4, 20, 81.4, 60], True),
+        ([1.2, 20, 81.2, 60], False),
+    ],
+)
+def test_whole_box_shapes_are_nan_at_the_border(box, whole):
+    shape = whole_box_shapes(torch.tensor([box], dtype=torch.float32), [(80, 100)])
+    assert bool(shape.isfinite()) == whole
+    assert bool((box_score(shape, torch.tensor([[0.0, 0, 1, 1], [0, 0, 1, 9]])) == 1).all()) != whole
+
+
+def test_matcher_scores_the_whole_box(bank, photographs):
+    images, boxes = photographs[0][:1], photographs[1][:1]
+    matcher = ViewMatcher(bank)
+    torch.testing.assert_close(matcher(images, boxes).terms["box"], box_score(box_shapes(boxes), bank.boxes))
+    H, W = images[0].shape[1:]
+    assert bool((matcher(images, [[-0.5, -0.5, W - 0.5, H - 0.5]]).terms["box"] == 1).all())
+    assert bool((matcher.rank(matcher.features(matcher.query(images, boxes).crops)).terms["box"] == 1).all())
+
+
+def test_box_shape_refuses_boxes_without_area():
+    with pytest.raises(InvalidInputError, match="views: expected finite shapes, got 1 of 2"):
+        box_score(torch.zeros(1), torch.tensor([[0.0, 0, 20, 10], [math.nan] * 4]))
+    with pytest.raises(InvalidInputError, match="sigma"):
+        BoxShape(sigma=0.0)
