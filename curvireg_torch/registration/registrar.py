@@ -156,7 +156,27 @@ class Registrar:
             same |= {"renderer": renderer, "mesh_is": mesh_is, "symmetries": symmetries, "device": device}
             self.others = [Registrar(mesh, **same, progress=progress) for mesh in meshes[1:]]
             bank_or_mesh = meshes[0]
-        self.matcher = _matcher(bank_or_mesh, pipeline, views, settings, field, renderer, device, progress)
+        self.matcher: ViewMatcher = bank_or_mesh
+        if isinstance(bank_or_mesh, ViewMatcher):
+            if any(value is not None for value in (pipeline, field, views, settings)):
+                raise InvalidInputError("Registrar: pipeline, field, views and settings belong to the matcher")
+        else:
+            if not isinstance(bank := bank_or_mesh, ViewBank):
+                pipeline = pipeline or Pipeline()
+                pipeline = replace(pipeline, bank=settings or pipeline.bank)
+                built: dict[str, Any] = {
+                    "pipeline": pipeline,
+                    "renderer": renderer,
+                    "progress": progress,
+                    "device": device or "cpu",
+                }
+                bank = cached_bank(bank_or_mesh, views, **built)
+            elif views is not None or settings is not None:
+                raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
+            bank = bank if device is None else bank.to(device)
+            options: dict[str, Any] = {"pipeline": pipeline, "field": field, "renderer": renderer}
+            # Built on one thread, so that rounding does not depend on the number of threads.
+            self.matcher = map_on_threads(lambda bank: ViewMatcher(bank, **options), [bank])[0]
         self.bank, self.pipeline = self.matcher.bank, self.matcher.pipeline
         self.mesh_is, self.symmetries, self.progress = mesh_is, symmetries, progress
 
@@ -441,36 +461,6 @@ class Registrar:
             prior_contradiction=contradiction,
             warnings=work.item.warnings + self.mesh_warnings,
         )
-
-
-def _matcher(
-    given: Any,
-    pipeline: Pipeline | None,
-    views: ViewSphere | None,
-    settings: BankSettings | None,
-    field: nn.Module | None,
-    renderer: str | DepthRenderer,
-    device: torch.device | str | None,
-    progress: bool | Callable[[str, int, int], object],
-) -> ViewMatcher:
-    """The matcher of a bank, or of the bank of a mesh, with the arguments of :class:`Registrar`."""
-    if isinstance(given, ViewMatcher):
-        if any(value is not None for value in (pipeline, field, views, settings)):
-            raise InvalidInputError("Registrar: pipeline, field, views and settings belong to the matcher")
-        return given
-    if isinstance(given, ViewBank):
-        if views is not None or settings is not None:
-            raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
-        bank = given if device is None else given.to(device)
-    else:
-        pipeline = pipeline or Pipeline()
-        pipeline = replace(pipeline, bank=settings or pipeline.bank)
-        bank = cached_bank(
-            given, views, pipeline=pipeline, renderer=renderer, progress=progress, device=device or "cpu"
-        )
-    # Built on one thread, so that rounding does not depend on the number of threads.
-    options: dict[str, Any] = {"pipeline": pipeline, "field": field, "renderer": renderer}
-    return map_on_threads(lambda bank: ViewMatcher(bank, **options), [bank])[0]
 
 
 def _better(

@@ -316,11 +316,6 @@ class Registration:
         return deviations is not None and bool(deviations[0].isfinite().any())
 
     @property
-    def candidates(self) -> Tensor:
-        """(K,) view indices of the hypotheses."""
-        return torch.tensor([h.view for h in self.hypotheses])
-
-    @property
     def covariance(self) -> Tensor | None:
         return self.hypotheses[0].covariance if self.reliable else None
 

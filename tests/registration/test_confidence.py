@@ -188,6 +188,7 @@ def test_evidence_is_measured_at_the_reported_pose(camera):
         view = describer.descriptors(h.allocentric_rotation[None], distance)
         assert h.score == pytest.approx(float(torch.nn.functional.cosine_similarity(view, query)), abs=1e-5)
         T, K = h.projection
+        assert h.distance == pytest.approx(float((T[:3, :3] @ describer.centre + T[:3, 3]).norm()))
         margin = describer.settings.margin
         support = contour_support(describer.contours, image[None], box[None], K[None], T[None], margin=margin)
         assert h.edge_support == pytest.approx(float(support), abs=0.03)

@@ -76,7 +76,7 @@ def test_hypotheses_are_distinct(registered):
         errors = rotation_error(R[:, None], R[None]) + 1000 * torch.eye(len(R))
         assert float(errors.min()) > 15
     first = registered[0][0]
-    assert int(first.candidates[0]) == int(first.ranking.order[0, 0])
+    assert first.hypotheses[0].view == int(first.ranking.order[0, 0])
 
 
 def test_rivals_are_complete_poses(registered):
@@ -132,6 +132,31 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
         assert isinstance(result, FailedRegistration)
         with pytest.raises(CurviregError, match=f"image {i}: .*{message}"):
             _ = result.rotation
+
+
+def test_an_error_inside_a_fit_fails_its_photograph_alone(monkeypatch):
+    fit_poses = registrar_module.fit_poses
+
+    def fail(describer, images, *fit):
+        if images[0].shape[-1] < 240:
+            raise CurviregError("no fit")
+        return fit_poses(describer, images, *fit)
+
+    monkeypatch.setattr(registrar_module, "fit_poses", fail)
+    results = truck_registrar()([IMAGE, IMAGE[..., :230], IMAGE], BOX.repeat(3, 1), CAMERA)
+    assert [result.ok for result in results] == [True, False, True]
+    assert str(results[1].error) == "image 1: no fit"
+
+
+def test_origin_of_the_mesh_may_be_far_away():
+    """A million radii, as in geographic coordinates."""
+    mesh, away = example_mesh(), torch.tensor([1e6 * float(mesh_radius(example_mesh())), 0.0, 0.0]).double()
+    mesh.apply_translation(away.numpy())
+    views = sample_views(azimuth_step=15, elevations=[0, 20, 40])
+    result = Registrar(ViewBank.build(mesh, views, image_size=96, progress=False))([IMAGE], BOX[None], CAMERA)[0]
+    assert float(rotation_error(result.rotation, TRUTH[:3, :3])) < 2.0
+    position = result.rotation @ away + result.translation
+    assert float((position - TRUTH[:3, 3]).norm() / TRUTH[:3, 3].norm()) < 0.02
 
 
 def test_image_items_are_read_one_at_a_time(tmp_path):
