@@ -9,15 +9,15 @@ from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..geometry.calibration import Camera
-from ..geometry.cameras import rotation_towards
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_tensor
 from ..utils.threads import map_on_threads
 from .confidence import RELIABLE
 from .inputs import ImageItem, image_items
+from .poses import Poses, hypothesis_of
 from .refinement import nearest_view, refine_item
 from .registrar import Registrar
-from .result import FailedRegistration, Hypothesis, Registration
+from .result import FailedRegistration, Registration
 from .tracker import TrackedPose, Tracker
 
 __all__ = ["Follower"]
@@ -159,22 +159,15 @@ class Follower:
 
     def _registration(self, tracked: TrackedPose, item: ImageItem) -> Registration:
         """The result of a tracked pose, without ranking and without rivals."""
-        T, support = tracked.state.T[0], tracked.features["edge_support"]
-        rotation, position = T[:3, :3], T[:3, :3] @ self._tracker.centre + T[:3, 3]
-        allocentric = rotation_towards(position).mT @ rotation
-        covariance = self._tracker.covariance(tracked)
-        hypothesis = Hypothesis(
-            rotation=rotation.clone(),
-            translation=T[:3, 3].clone(),
-            score=tracked.features["region"],
-            evidence=tracked.features,
-            allocentric_rotation=allocentric,
-            distance=float(torch.linalg.vector_norm(position)),
-            projection=(T.clone(), _camera(item)),
-            view=nearest_view(self.registrar, allocentric),
-            edge_support=support,
-            covariance=covariance if bool(covariance.isfinite().all()) else None,
+        describer, T, none = self.registrar.describer, tracked.state.T, torch.zeros(1, dtype=torch.long)
+        poses = Poses.at(T, _camera(item)[None], describer.centre, none, none)
+        poses = replace(
+            poses,
+            view=torch.tensor([nearest_view(self.registrar, poses.rotation[0])]),
+            edge_support=torch.tensor([tracked.features["edge_support"]]),
+            covariance=self._tracker.covariance(tracked)[None],
         )
+        hypothesis = hypothesis_of(poses, 0, tracked.features, score="region")
         probabilities = (self._base * tracked.confidence,)
         warnings = item.warnings + self.registrar.mesh_warnings
         return Registration((hypothesis,), probabilities, Ranking.none(), dict(tracked.features), warnings=warnings)

@@ -1,6 +1,7 @@
 """Candidate poses under work: the best distinct views of rankings, put into boxes, fitted and judged."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -23,6 +24,7 @@ __all__ = [
     "fit_poses",
     "fit_texture_of",
     "hypothesis_of",
+    "named_features",
     "placed",
     "pose_features",
     "pose_scores",
@@ -238,20 +240,25 @@ def projected_box(describer: ViewDescriber, projection: tuple[Tensor, Tensor]) -
     return projected_boxes(describer.hull, T[None], K)[0]
 
 
-def hypothesis_of(poses: Poses, h: int, evidence: Tensor, *, with_camera: bool) -> Hypothesis:
-    """Pose ``h`` with its (H, 4) :data:`POSE_FEATURES`, as it is reported."""
-    T = poses.T[h]
-    features = dict(zip(POSE_FEATURES, evidence[h].tolist(), strict=True))
-    is_fitted, known = bool(poses.edge_support[h].isfinite()), bool(poses.covariance[h].isfinite().all())
+def hypothesis_of(
+    poses: Poses, h: int, evidence: Mapping[str, float], *, score: str = "similarity", with_camera: bool = True
+) -> Hypothesis:
+    """Pose ``h`` with its ``evidence``, one of which is its ``score``, as it is reported."""
+    T, support, covariance = poses.T[h], float(poses.edge_support[h]), poses.covariance[h]
     return Hypothesis(
         rotation=T[:3, :3].clone() if with_camera else poses.rotation[h].clone(),
         translation=T[:3, 3].clone() if with_camera else None,
-        score=features["similarity"],
-        evidence=features,
+        score=evidence[score],
+        evidence=evidence,
         allocentric_rotation=poses.rotation[h].clone(),
         distance=float(poses.distance[h]),
         projection=(T.clone(), poses.cameras[h].clone()),
         view=int(poses.view[h]),
-        edge_support=features["edge_support"] if is_fitted else None,
-        covariance=poses.covariance[h].clone() if known and with_camera else None,
+        edge_support=None if math.isnan(support) else support,
+        covariance=covariance.clone() if with_camera and bool(covariance.isfinite().all()) else None,
     )
+
+
+def named_features(features: Tensor, h: int) -> dict[str, float]:
+    """Row ``h`` of :func:`pose_features`, by the names of :data:`POSE_FEATURES`."""
+    return dict(zip(POSE_FEATURES, features[h].tolist(), strict=True))

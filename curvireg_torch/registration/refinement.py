@@ -12,7 +12,16 @@ from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose
 from .confidence import are_near, is_calibrated, refinement_confidence
 from .inputs import MIN_BOX_SIDE, ImageItem, check_crop, image_items
-from .poses import Poses, distinct_poses, fit_poses, fit_texture_of, hypothesis_of, pose_features, pose_scores
+from .poses import (
+    Poses,
+    distinct_poses,
+    fit_poses,
+    fit_texture_of,
+    hypothesis_of,
+    named_features,
+    pose_features,
+    pose_scores,
+)
 from .result import FailedRegistration, Registration
 from .tracker import OUTSIDE, boxes_at
 
@@ -104,7 +113,7 @@ def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: fl
     scores = pose_scores(evidence, exact=True)
     distinct = distinct_poses(poses, scores, registrar.symmetries_of(exact=True))
     order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]
-    hypotheses = tuple(hypothesis_of(poses, h, evidence, with_camera=True) for h in order)
+    hypotheses = tuple(hypothesis_of(poses, h, named_features(evidence, h)) for h in order)
     features = {name: hypotheses[0].evidence[name] for name in ("similarity", "edge_support")}
     confidence = refinement_confidence(features)
     if confidence < LOST_CONFIDENCE:

@@ -42,6 +42,7 @@ from .poses import (
     fit_poses,
     fit_texture_of,
     hypothesis_of,
+    named_features,
     pose_features,
     pose_scores,
     projected_box,
@@ -453,7 +454,7 @@ class Registrar:
             better = gain is not None and gain > OUTSIDE_MARGIN
             contradiction = work.limits.contradiction(one, filling, better_outside=better)
         return Registration(
-            tuple(hypothesis_of(poses, h, features, with_camera=with_camera) for h in reported),
+            tuple(hypothesis_of(poses, h, named_features(features, h), with_camera=with_camera) for h in reported),
             probabilities,
             ranking[:1],
             measured,

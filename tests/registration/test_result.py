@@ -123,13 +123,6 @@ def test_pose_in_words(viewpoint, words):
         assert pose_in_words(R @ object_frame(up, front), up=up, front=front) == words
 
 
-def test_pose_in_words_tilts_as_the_photograph_shows():
-    """Tilted to the left: the object's up axis points to the left in the picture."""
-    R = rotation_from_viewpoint(10.0, 20.0, 30.0)
-    assert float(R[0, 2]) < 0
-    assert "to the left" in pose_in_words(R)
-
-
 def test_verdict_has_three_words():
     """A high confidence that is not reliable, because of a questionable camera, is no reason to be sure."""
     assert verdict(0.95, 0.03, True) == "likely"
