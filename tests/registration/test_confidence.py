@@ -170,7 +170,7 @@ def test_confidence_does_not_depend_on_the_number_of_reported_hypotheses(seed):
 
 def test_result_of_a_bank_without_rival_views_is_at_most_as_likely_as_not():
     image, box, _ = scene(0)
-    near = sample_views(azimuths=[0.0, 10.0, 20.0], elevations=[10])
+    near = sample_views(elevations=[10])[:3]
     bank = ViewBank.build(truck_bank().mesh, near, image_size=96, progress=False)
     result = Registrar(bank)([image], box[None], CAMERA)[0]
     assert result.confidence_features["concentration"] is None
