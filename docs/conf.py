@@ -27,7 +27,6 @@ extensions = [
 ]
 exclude_patterns = ["_build", "gallery"]
 nitpicky = True
-nitpick_ignore = [("py:class", "curvireg_torch.evaluation.runner.ItemT")]  # a type variable has no page
 
 html_theme = "furo"
 html_title = "curvireg_torch"

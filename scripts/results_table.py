@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from scripts._shared import REPOSITORY, commit, replace_between, table_lines, today, write_json
+from scripts._shared import REPOSITORY, RESULTS, commit, replace_between, today, write_json
 
 BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
 
@@ -51,16 +51,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--record", nargs=2, metavar=("SUMMARY", "NAME"), help="store a summary.json under a name")
     parser.add_argument("--check", action="store_true", help="write nothing; exit 1 if the README is out of date")
-    parser.add_argument("--root", type=Path, default=REPOSITORY, metavar="DIR", help="root of the repository")
     arguments = parser.parse_args()
-    results, readme = arguments.root / "scripts" / "results", arguments.root / "README.md"
+    results, readme = RESULTS, REPOSITORY / "README.md"
     if arguments.record:
-        print(record(Path(arguments.record[0]), arguments.record[1], results, arguments.root))
+        print(record(Path(arguments.record[0]), arguments.record[1]))
         return 0
     text = readme.read_text(encoding="utf-8")
-    if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
-        print(f"results_table: error: {readme}: expected {BEGIN} and then {END}, once each", file=sys.stderr)
-        return 2
     expected = replace_between(text, BEGIN, END, table(results))
     if arguments.check:
         if expected != text:
@@ -70,11 +66,11 @@ def main() -> int:
     return 0
 
 
-def record(summary: Path, name: str, results: Path, root: Path) -> Path:
+def record(summary: Path, name: str) -> Path:
     """Store ``summary`` with the date and the commit; returns the path."""
-    path = results / f"evaluation_{name}.json"
+    path = RESULTS / f"evaluation_{name}.json"
     content = json.loads(summary.read_text(encoding="utf-8"))
-    write_json(path, {"name": name, "date": today(), "commit": commit(root), "summary": content})
+    write_json(path, {"name": name, "date": today(), "commit": commit(), "summary": content})
     return path
 
 
@@ -88,7 +84,8 @@ def table(results: Path) -> str:
     ):
         chosen = [r for r in records if r["summary"]["settings"]["dataset"] == kind]
         if chosen:
-            body = "\n".join(table_lines([columns, *(cells(r["name"], r["summary"]) for r in chosen)]))
+            rows = [columns, ["---"] * len(columns), *(cells(r["name"], r["summary"]) for r in chosen)]
+            body = "\n".join("| " + " | ".join(row) + " |" for row in rows)
             sets: dict[str, list[str]] = {}
             for r in chosen:
                 sets.setdefault(note(r), []).append(r["name"])

@@ -3,7 +3,7 @@
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -163,7 +163,7 @@ def _colmap(text: str) -> dict[str, Any]:
                 f"line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS..., MODEL (and number of PARAMS) one of "
                 f"{models}, got {line!r:.60}"
             )
-        width, height, *numbers = _numbers({f"line {number}": list(map(_scalar, words[2:]))}, f"line {number}")
+        width, height, *numbers = _numbers({f"line {number}": list(map(_number, words[2:]))}, f"line {number}")
         cx, cy, *distortion = numbers[focals:]
         cameras[words[0]] = {
             "intrinsics": [numbers[0], numbers[focals - 1], cx - 0.5, cy - 0.5],
@@ -181,7 +181,7 @@ def _xml(text: str) -> dict[str, Any]:
     def value(element: ElementTree.Element) -> Any:
         if len(element):
             return {child.tag: value(child) for child in element}
-        words = [_scalar(word) for word in (element.text or "").split()]
+        words = [_number(word) for word in (element.text or "").split()]
         return words[0] if len(words) == 1 else words
 
     root = value(ElementTree.fromstring(text))
@@ -189,13 +189,17 @@ def _xml(text: str) -> dict[str, Any]:
 
 
 def _yaml(text: str) -> dict[str, Any]:
-    """The part of YAML that calibrations are written in: nested keys, and lists of scalars.
+    """The part of YAML that calibrations are written in: nested keys, and lists of scalars; the first document.
 
     Items of a list below its key become ``"data"`` of it, and what is nested in an item is left out.
     """
+    text = re.sub(r"(?m)^%.*|(?:^|[ \t])#.*", "", text)
+    text = next((part for part in re.split(r"(?m)^(?:---|\.\.\.)", text) if part.strip()), "")
+    lists = r"\"[^\"\n]*\"|\[(?:[^\[\]]|\[[^\[\]]*\])*\]"  # and strings, in which brackets are no lists
+    text = re.sub(lists, lambda match: " ".join(match[0].split()), text)
     root: dict[str, Any] = {}
     parents: list[tuple[float, dict[str, Any]]] = [(-1.0, root)]
-    for number, line in _yaml_lines(text):
+    for line in filter(str.strip, text.splitlines()):
         indent, line = float(len(line) - len(line.lstrip())), line.strip()
         item = line == "-" or line.startswith("- ")
         indent += 0.5 * item  # items may stand as far left as their key
@@ -207,38 +211,24 @@ def _yaml(text: str) -> dict[str, Any]:
         else:
             key, colon, content = line.partition(":")
             if not colon or content[:1].strip():
-                raise InvalidInputError(f"line {number}: expected 'key: value', got {line!r:.60}; expected {_FORMATS}")
+                raise InvalidInputError(f"expected 'key: value', got {line!r:.60}; expected {_FORMATS}")
             content = re.sub(r"^\s*!\S*", "", content).strip()
             parents[-1][1][key.strip("\"' ")] = _scalar(content) if content else nested
         parents.append((indent, nested))
     return root
 
 
-def _yaml_lines(text: str) -> Iterator[tuple[int, str]]:
-    """Numbers and lines of the first document, without comments; lists in brackets in one line."""
-    begun, open_brackets, start, parts = False, 0, 0, list[str]()
-    for number, line in enumerate(text.splitlines(), start=1):
-        line = re.sub(r"(^|\s)#.*", "", line).rstrip()
-        if not parts and (not line.strip() or line.startswith(("%", "---", "..."))):
-            if begun and line:  # a second document
-                return
-            continue
-        begun, start = True, start if parts else number
-        parts.append(line)
-        unquoted = re.sub(r"\"[^\"]*\"|'[^']*'", "", line)
-        open_brackets += unquoted.count("[") - unquoted.count("]")
-        if open_brackets <= 0:
-            yield start, "".join(parts)
-            open_brackets, parts = 0, []
-    if parts:
-        raise InvalidInputError(f"line {start}: '[' without its ']'")
-
-
 def _scalar(text: str) -> Any:
-    """A number, a string, or a list of these."""
+    """A number, a string, or a list of these, of YAML."""
     text = text.strip()
-    if text.startswith("["):
-        return [_scalar(word) for word in re.sub(r"[\[\]]", "", text).split(",") if word.strip()]
+    if not text.startswith("["):
+        return _number(text)
+    if not text.endswith("]"):
+        raise InvalidInputError(f"a list without its ']': {text!r:.60}")
+    return [_number(word.strip("[] ")) for word in text.split(",") if word.strip("[] ")]
+
+
+def _number(text: str) -> float | str:
     try:
         return float(text)
     except ValueError:

@@ -2,8 +2,9 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar
@@ -33,8 +34,8 @@ from .metrics import (
     mssd_error,
     symmetric_rotation_error,
 )
-from .protocol import Protocol, hint_of_truth, perturbed_box
-from .runner import Entry
+from .protocol import Protocol, hint_of_truth, perturbed_box, random_numbers
+from .runner import Entry, OtherView
 from .store import Row
 
 __all__ = [
@@ -51,6 +52,9 @@ MIN_IOU = 0.5
 
 UNOCCLUDED = 0.95
 """Visible fraction above which an object of a BOP set counts as whole."""
+
+SAME_PLACE = 0.1
+"""Diameters within which the positions in the world of one instance agree, in different photographs."""
 
 Errors = Mapping[str, Tensor]
 
@@ -79,6 +83,8 @@ class Benchmark(ABC):
     thresholds: ClassVar[Mapping[str, float]] = {"acc_15_deg": 15.0, "acc_30_deg": 30.0}
 
     def __init__(self, dataset: Pascal3DPlus | BOPDataset | PoseFolder, protocol: Protocol) -> None:
+        if protocol.views > 1 and not self.gives_camera:
+            raise InvalidInputError("protocol: views needs a dataset with cameras, such as a BOP set; leave it out")
         self.dataset, self.protocol = dataset, protocol
         self.samples = [dataset.annotation(i) for i in range(len(dataset))]
         self.entries = [self._entry(sample) for sample in self.samples]
@@ -288,6 +294,33 @@ class BOPBenchmark(Benchmark):
     label = "{scene_id}/{image_id}/{instance_index}"
     dataset: BOPDataset
 
+    def __init__(self, dataset: BOPDataset, protocol: Protocol) -> None:
+        super().__init__(dataset, protocol)
+        if protocol.views > 1:
+            for group in same_instances(self.samples):
+                views = [self._views(i, group) for i in group]
+                for i, others in zip(group, views, strict=True):
+                    self.entries[i] = replace(self.entries[i], views=others)
+
+    def _views(self, first: int, group: Sequence[int]) -> tuple[OtherView, ...]:
+        """Photographs drawn from those of ``group`` to be registered together with that of the sample ``first``."""
+        image = self.samples[first]["image_id"]
+        others = [i for i in group if self.samples[i]["image_id"] != image]
+        generator = random_numbers(self.protocol, f"views {self.entries[first].label}")
+        order = torch.randperm(len(others), generator=generator).tolist()[: self.protocol.views - 1]
+        return tuple(self._other_view(first, others[k]) for k in order)
+
+    def _other_view(self, first: int, other: int) -> OtherView:
+        entry, (one, two) = self.entries[other], (self.samples[i] for i in (first, other))
+        T_one, T_two = one["T_cam_from_world"].double(), two["T_cam_from_world"].double()
+        if not bool((T_one.isfinite() & T_two.isfinite()).all()):  # the object stands still: it is the world
+            T_one, T_two = (transform(s["rotation"].double(), s["translation"].double()) for s in (one, two))
+        assert entry.camera is not None
+        relative = T_two @ torch.linalg.inv(T_one)
+        return OtherView(
+            entry.photo, None if entry.error else entry.box, entry.camera, tuple(map(tuple, relative.tolist()))
+        )
+
     def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
         """Rotation errors in degrees, ADD(-S) and MSSD in diameters, MSPD in image widths."""
         names = ("rotation", "add", "mssd", "mspd")
@@ -386,6 +419,30 @@ def _rank(box: Tensor, row: Row) -> float:
     clipped = [torch.minimum(boxes.clamp(min=-0.5), end) for boxes in (proposals, box.double()[None])]
     right = (box_iou(*clipped)[:, 0] >= MIN_IOU).nonzero()[:, 0]
     return float(right[0]) + 1 if len(right) else math.inf
+
+
+def same_instances(samples: Sequence[Row]) -> list[list[int]]:
+    """Groups of the samples of a BOP set that show the same instance of an object in photographs of one scene.
+
+    Where the poses of the cameras are known, an instance is told by its place in the world. Elsewhere, objects of one
+    kind in the same photograph are told apart by their place in its list.
+    """
+    counts = Counter((s["scene_id"], s["obj_id"], s["image_id"]) for s in samples)
+    repeated = {key[:2] for key, count in counts.items() if count > 1}
+    groups: dict[tuple[int, ...], list[list[int]]] = defaultdict(list)
+    worlds = [s["T_cam_from_world"].double() for s in samples]
+    places = [T[:3, :3].mT @ (s["translation"].double() - T[:3, 3]) for T, s in zip(worlds, samples, strict=True)]
+    for i, (sample, place) in enumerate(zip(samples, places, strict=True)):
+        kind: tuple[int, ...] = (sample["scene_id"], sample["obj_id"])
+        if bool(place.isnan().any()):
+            kind = (*kind, sample["instance_index"] if kind in repeated else -1)
+        reach = SAME_PLACE * sample["model_info"]["diameter"]
+        near = [group for group in groups[kind] if not float((place - places[group[0]]).norm()) > reach]  # or NaN
+        if near:
+            near[0].append(i)
+        else:
+            groups[kind].append([i])
+    return [group for found in groups.values() for group in found]
 
 
 def estimated_rotations(rows: Sequence[Row]) -> Tensor:

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from ..errors import InvalidInputError
 from ..matching import cached_bank
 from ..mesh import load_mesh
 from ..pipeline import DEFAULT, PRESETS, Pipeline, preset_named
@@ -40,29 +41,26 @@ def evaluate(
     preset: str | Pipeline = DEFAULT,
     limit: int | None = None,
     renderer: str = "auto",
-    field: nn.Module | None = None,
     progress: bool = True,
 ) -> Row | None:
     """Register the objects of a benchmark and score the results.
 
     ``out`` gets ``results.jsonl``, ``predictions.csv``, ``summary.json`` and ``index.html``. A second call registers
-    only what is new or depends on other settings or files, see :func:`~curvireg_torch.evaluation.runner.run_entries`.
-    Under ``torchrun``, or in a job array that sets ``RANK`` and ``WORLD_SIZE``, each process registers a part of the
-    objects.
+    only what is new, or depends on files or settings that have changed. Under ``torchrun``, or in a job array that sets
+    ``RANK`` and ``WORLD_SIZE``, each process registers a part of the objects.
 
     Args:
         benchmark, out: the objects, and the folder for the results.
         preset: name of a pipeline, or a pipeline.
         limit: register only this many objects, spread evenly over the dataset.
         renderer: of the views.
-        field: photograph filter that replaces that of the pipeline.
         progress: show a bar.
 
     Returns:
         The summary, as written to ``summary.json``; None in processes that do not write it.
 
     Raises:
-        InvalidInputError: an unknown preset, or a bad limit.
+        InvalidInputError: an unknown preset, a bad limit, or a folder that holds the results of a list.
 
     Example:
         >>> from curvireg_torch.data import Pascal3DPlus
@@ -71,11 +69,12 @@ def evaluate(
         >>> evaluate(Pascal3DBenchmark(cars, Protocol()), Path("out"))["acc_pi_6"]          # doctest: +SKIP
     """
     pipeline = preset_named(preset) if isinstance(preset, str) else preset
-    pipeline = pipeline if field is None else pipeline.with_field(field)
     name = next((known for known, settings in PRESETS.items() if settings is pipeline), "custom")
     pipeline = pipeline.with_pose_prior(benchmark.protocol.pose)
     if limit is not None:
         check_positive(limit, "limit")
+    if (out / "results.csv").exists():
+        raise InvalidInputError(f"{out}: holds the results of a list; choose another --out")
     settings = {  # all that results depend on besides their files; --limit and --categories only select objects
         **benchmark.settings(),
         "protocol": str(benchmark.protocol),
@@ -89,7 +88,7 @@ def evaluate(
     def open_registrar(meshes: tuple[Path, ...]) -> Registrar:
         loaded = [load_mesh(path, unit=benchmark.unit) for path in meshes]
         banks = [cached_bank(mesh, pipeline=pipeline, renderer=renderer, progress=False) for mesh in loaded]
-        return Registrar(banks, pipeline=pipeline, field=field, renderer=renderer)
+        return Registrar(banks, pipeline=pipeline, renderer=renderer)
 
     store = run_entries(
         [entry for i in benchmark.selection(limit) if not (entry := benchmark.entries[i]).error],
@@ -104,6 +103,7 @@ def evaluate(
 
 def report(benchmark: Benchmark, store: ResultStore, settings: Row, limit: int | None = None) -> Row:
     """Write ``predictions.csv``, ``index.html`` and ``summary.json`` from results; returns the summary."""
+    located = benchmark.protocol.box is None and benchmark.protocol.views == 1
     skipped = Counter({k: n for k, n in benchmark.dataset.skipped.items() if k not in NOT_EVALUATED})
     scored: list[int] = []
     rows: list[Row] = []
@@ -121,7 +121,7 @@ def report(benchmark: Benchmark, store: ResultStore, settings: Row, limit: int |
     settings = {**settings, "root": Path(settings["root"]).name}  # a summary is shared: no paths
     summary = {
         **benchmark.summary(samples, rows, errors),
-        **({"detection": detection_recall(samples, rows)} if benchmark.protocol.box is None else {}),
+        **({"detection": detection_recall(samples, rows)} if located else {}),
         "failed": sum(row["status"] == "failed" for row in rows),
         "skipped": dict(sorted(skipped.items())),
         "protocol": settings["protocol"],

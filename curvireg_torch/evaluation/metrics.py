@@ -22,11 +22,9 @@ from ..geometry import rotation_error
 from ..utils.checks import (
     check_camera_matrix,
     check_finite,
-    check_last_axes,
     check_pose,
     check_positive,
     check_rotation,
-    check_same_device,
     check_symmetries,
     check_tensor,
 )
@@ -85,9 +83,8 @@ def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
 def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     """ADD-S: mean distance of each point under the true pose to the nearest point under the estimate.
 
-    Computed in float64 on the CPU with one k-d tree in the model frame, since rigid poses preserve distances.
-
-    Arguments and result are those of :func:`add_error`.
+    Arguments and result are those of :func:`add_error`. Computed in float64 on the CPU with one k-d tree in the model
+    frame, since rigid poses preserve distances.
 
     Example:
         >>> T = torch.eye(4)[None]
@@ -150,7 +147,6 @@ def mspd_error(
     T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
     batch = () if getattr(camera_matrix, "ndim", 0) == 2 else (len(T_est),)
     check_tensor(camera_matrix, "camera_matrix", (*batch, 3, 3))
-    check_same_device(camera_matrix, T_est, "camera_matrix")
     check_camera_matrix(camera_matrix)
     K = camera_matrix.to(T_est.dtype)
     if K.ndim == 3:
@@ -169,14 +165,10 @@ def mspd_error(
 
 
 def _least_maximum(largest: Callable[[Tensor, Tensor], Tensor], shape: Sequence[int], points: Tensor) -> Tensor:
-    """(B,) minima over S symmetries of the largest distance that any point moves.
+    """(B,) minima over S symmetries of the largest distance of a point, for a ``shape`` of (B, S).
 
-    A few of the points bound the maximum of all from below; all are compared only where a bound is the least one.
-
-    Args:
-        largest: maps indices (M,) into ``shape``, flattened, and some points to the largest distances (M,).
-        shape: (B, S).
-        points: (P, 3).
+    ``largest`` maps indices (M,) into the flattened ``shape``, and some points, to the largest distances (M,). A few of
+    the points bound the maximum of all from below; all are compared only where a bound is the least one.
     """
     everything = torch.arange(shape[0] * shape[1], device=points.device)
     distances = largest(everything, points[:: max(1, len(points) // BOUNDING_POINTS)]).view(*shape)
@@ -193,11 +185,7 @@ def _least_maximum(largest: Callable[[Tensor, Tensor], Tensor], shape: Sequence[
 
 
 def average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
-    """Fraction of the errors below a threshold, averaged over the thresholds; NaN for N = 0.
-
-    Args:
-        errors: (N,) >= 0 in the unit of the thresholds: diameters of the objects, or image widths.
-        thresholds: :data:`ADD_THRESHOLDS`, :data:`MSSD_THRESHOLDS` or :data:`MSPD_THRESHOLDS`.
+    """Fraction of the errors (N,) below a threshold, averaged over the thresholds in the same unit; NaN for N = 0.
 
     Example:
         >>> average_recall(torch.tensor([0.26]), MSSD_THRESHOLDS)      # below 0.30, 0.35, 0.40, 0.45 and 0.50
@@ -212,8 +200,6 @@ def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tenso
     check_tensor(T_est, "T_est", (None, 4, 4))
     check_tensor(T_gt, "T_gt", (len(T_est), 4, 4))
     check_tensor(points, "points", (None, 3))
-    check_same_device(T_gt, T_est, "T_gt")
-    check_same_device(points, T_est, "points")
     if len(points) == 0:
         raise InvalidInputError("points: expected at least one point, got none")
     check_finite(points, "points")
@@ -251,11 +237,7 @@ def _project(projections: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def accuracy(errors: Tensor, threshold_deg: float) -> float:
-    """Fraction of the errors below a threshold: Acc(pi/6) with 30, Acc(pi/18) with 10; NaN for N = 0.
-
-    Args:
-        errors: (N,) degrees >= 0; ``inf`` for an object without an estimate (a miss).
-        threshold_deg: degrees > 0.
+    """Fraction of the errors (N,) in degrees below a threshold: Acc(pi/6) with 30, Acc(pi/18) with 10; NaN for N = 0.
 
     Example:
         >>> accuracy(torch.tensor([5.0, 12.0, 40.0, 170.0]), 30.0)
@@ -266,9 +248,7 @@ def accuracy(errors: Tensor, threshold_deg: float) -> float:
 
 
 def median_error(errors: Tensor) -> float:
-    """Median of the errors (MedErr); the mean of the middle two for an even number, NaN for N = 0.
-
-    ``errors`` are those of :func:`accuracy`; the median is ``inf`` if half of them are.
+    """Median of the errors (N,) (MedErr): the mean of the middle two for an even number, NaN for N = 0.
 
     Example:
         >>> median_error(torch.tensor([40.0, 5.0, 12.0, 170.0]))
@@ -297,34 +277,23 @@ def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) ->
         >>> float(symmetric_rotation_error(half_turn, torch.eye(3), half_turn[None]))
         0.0
     """
-    valid = _check_rotations(R_est, R_gt)
-    check_tensor(symmetries, "symmetries", (None, 3, 3))
-    check_same_device(symmetries, R_gt, "symmetries")
+    for name, R in (("R_est", R_est), ("R_gt", R_gt), ("symmetries", symmetries)):
+        check_rotation(R, name)
+    check_finite(R_gt, "R_gt")
     check_finite(symmetries, "symmetries")
-    check_rotation(symmetries, "symmetries")
+    valid = R_est.isfinite().flatten(-2).all(-1)
     plain = rotation_error(R_est, R_gt)
     symmetric = rotation_error(R_est.unsqueeze(-3), R_gt.unsqueeze(-3) @ symmetries.to(R_gt.dtype))
     return inf_unless(valid, torch.cat([plain.unsqueeze(-1), symmetric], -1).amin(-1))
 
 
-def _check_rotations(R_est: Tensor, R_gt: Tensor) -> Tensor:
-    """Which estimates are not missing, (...) bool."""
-    for name, R in (("R_est", R_est), ("R_gt", R_gt)):
-        check_last_axes(R, name, (3, 3))
-    check_same_device(R_est, R_gt, "R_est")
-    check_rotation(R_gt, "R_gt")
-    check_rotation(R_est, "R_est")
-    check_finite(R_gt, "R_gt")
-    return R_est.isfinite().flatten(-2).all(-1)
-
-
-def check_errors(errors: Tensor, name: str = "errors") -> None:
+def check_errors(errors: Tensor) -> None:
     """``errors`` is a floating (N,) tensor of numbers >= 0, ``inf`` included, NaN excluded."""
-    check_tensor(errors, name, (None,))
+    check_tensor(errors, "errors", (None,))
     bad = int((~(errors >= 0)).sum())
     if bad:
         raise InvalidInputError(
-            f"{name}: expected numbers >= 0, got {bad} that are negative or NaN; a missing estimate counts as inf"
+            f"errors: expected numbers >= 0, got {bad} that are negative or NaN; a missing estimate counts as inf"
         )
 
 

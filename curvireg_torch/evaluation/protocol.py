@@ -119,9 +119,8 @@ def perturbed_box(box: Tensor, protocol: Protocol, label: str) -> Tensor:
 def hint_of_truth(rotation: Tensor, frame: Tensor, protocol: Protocol, label: str) -> PosePrior | None:
     """The hint about the object ``label``: a range around its true pose moved at random by up to half its width.
 
-    Args:
-        rotation: (3, 3) true rotation, NaN where it is unknown.
-        frame: of the mesh, see :func:`curvireg_torch.geometry.pose_prior.object_frame`.
+    ``rotation`` (3, 3) is the true one, NaN where it is unknown, ``frame`` that of the mesh, see
+    :func:`curvireg_torch.geometry.pose_prior.object_frame`.
 
     Example:
         >>> R = torch.eye(3, dtype=torch.float64)

@@ -22,34 +22,29 @@ def write_result(
 ) -> None:
     """Write the files of a result into the folder ``out``; ``document`` is the content of ``result.json``.
 
-    The picture and the scene are drawn beside each other, on threads.
-
-    The other arguments are those of :func:`curvireg_torch.visualization.registration_sheet`.
-
-    Raises:
-        OutputError: a file cannot be written.
+    The picture and the scene are drawn beside each other, on threads. The other arguments are those of
+    :func:`curvireg_torch.visualization.registration_sheet`. :class:`OutputError` if a file cannot be written.
     """
     mesh = registrar.of_model(result.model).bank.mesh
     _remove(out)
     write_file(out / "result.json", to_json(document).encode())  # first: no failure to draw it loses the result
 
-    def attempt(write: Callable[[], None]) -> Exception | None:
+    contents: dict[str, Callable[[], bytes]] = {
+        "overlay.png": lambda: png(registration_sheet(registrar, result, image, box)),
+        "pose.glb": lambda: pose_glb(mesh, *result.projection, image),
+    }
+    if len(mesh.faces) > MAX_GLB_FACES:
+        del contents["pose.glb"]
+
+    def attempt(name: str) -> Exception | None:
         try:
-            write()
+            write_file(out / name, contents[name]())
         except Exception as error:  # it must not cost the other file
             return error
         return None
 
-    def write_sheet() -> None:
-        write_file(out / "overlay.png", png(registration_sheet(registrar, result, image, box)))
-
-    def write_scene() -> None:
-        if len(mesh.faces) <= MAX_GLB_FACES:
-            write_file(out / "pose.glb", pose_glb(mesh, *result.projection, image))
-
-    for error in map_on_threads(attempt, [write_sheet, write_scene]):
-        if error is not None:
-            raise error
+    for error in filter(None, map_on_threads(attempt, list(contents))):
+        raise error
 
 
 def write_lost(out: Path, message: str) -> None:

@@ -47,6 +47,22 @@ OpenRegistrar = Callable[[tuple[Path, ...]], Registrar]
 
 
 @dataclass(frozen=True)
+class OtherView:
+    """Another photograph of the object of an :class:`Entry`, in the same pose.
+
+    Attributes:
+        photo, box, camera: as of an entry; the camera is needed.
+        T_cam_from_first: (4, 4) transform from the camera of the entry's photograph to that of this one, with lengths
+            in the unit of the mesh.
+    """
+
+    photo: Path
+    box: Sequence[float] | None
+    camera: Sequence[float]
+    T_cam_from_first: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
 class Entry:
     """One object in one photograph, to register.
 
@@ -61,6 +77,7 @@ class Entry:
         instances: without a box, see :func:`curvireg_torch.registration.detect`.
         prior: limits on the pose.
         start, start_confidence: (4, 4) pose that is refined, nothing is searched for; and its confidence if known.
+        views: other photographs, with which the pose in ``photo`` is found together.
         as_stored: boxes refer to the pixels as the file holds them; else the EXIF orientation is applied first.
         label: of a dataset's object: a name that no other object has.
         error: why the object cannot be registered; "" if it can.
@@ -77,6 +94,7 @@ class Entry:
     prior: PosePrior | None = None
     start: tuple[tuple[float, ...], ...] | None = None
     start_confidence: float | None = None
+    views: tuple[OtherView, ...] = ()
     as_stored: bool = False
     label: str = ""
     error: str = ""
@@ -85,7 +103,8 @@ class Entry:
         """All that the result depends on besides the content of files."""
         prior = None if self.prior is None else self.prior.to_dict()
         given = [self.name, self.box, self.camera, self.guess, self.instances, prior]
-        return [*given, self.start, self.start_confidence, self.as_stored]
+        views = [(view.box, view.camera, view.T_cam_from_first) for view in self.views]
+        return [*given, self.start, self.start_confidence, views, self.as_stored]
 
     @property
     def key(self) -> str:
@@ -93,17 +112,12 @@ class Entry:
         return self.label or text_digest(repr((self.request(), self.meshes)))
 
 
-def check_entry(entry: Entry, photo: Photo) -> tuple[str, ...]:
-    """Refuse a box or camera that cannot be used, before meshes are opened; returns what is questionable about them.
-
-    Raises:
-        CurviregError: as :func:`register_entry`.
-    """
+def check_entry(entry: Entry, photo: Photo) -> None:
+    """Refuse a box or camera that cannot be used, as :func:`register_entry` does, before meshes are opened."""
     K, _ = _camera(entry, photo)
     item = image_items([photo.image], None if entry.box is None else [entry.box], K, entry.prior)[0]
     if isinstance(item, CurviregError):
         raise item.with_subject(entry.name)
-    return item.warnings
 
 
 def register_entry(
@@ -121,6 +135,8 @@ def register_entry(
     K, source = _camera(entry, photo)
     if entry.start is not None:
         results = refine(registrar, [photo.image], K, [entry.start], start_confidences=[entry.start_confidence])
+    elif entry.views:
+        results = [_registered_views(entry, photo, registrar)]
     elif entry.box is None:
         results = detect(registrar, [photo.image], K, instances=entry.instances, prior=entry.prior)[0]
     else:
@@ -133,7 +149,7 @@ def register_entry(
     elif result.detection is not None:
         box = result.detection.box
     else:
-        box = projected_box(registrar.of_model(result.model).describer, result.projection)
+        box = projected_box(registrar.of_model(result.model).describer, projection_of(result, K))
     document = {
         **result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start}),
         "mesh": str(entry.meshes[result.model]),
@@ -151,6 +167,27 @@ def register_entry(
     if source in ("exif", "fov"):  # the error of a guessed camera is unknown
         document["covariance"] = document["standard_deviations"] = None
     return result, document
+
+
+def _registered_views(entry: Entry, photo: Photo, registrar: Registrar) -> Registration:
+    """The pose in the first of several photographs: the world is its camera."""
+    images: list[Any] = [photo.image]
+    for view in entry.views:
+        try:
+            images.append(read_photo(view.photo, as_stored=entry.as_stored).image)
+        except CurviregError:
+            images.append(view.photo)  # the registrar reports that it cannot be read, and goes on without it
+    boxes = [entry.box, *(view.box for view in entry.views)]
+    cameras = [entry.camera or (), *(view.camera for view in entry.views)]
+    K = torch.stack([camera_matrix(*camera, dtype=torch.float64) for camera in cameras])
+    first = torch.eye(4, dtype=torch.float64)
+    poses = [torch.tensor(view.T_cam_from_first, dtype=torch.float64) for view in entry.views]
+    return registrar.register_views(images, boxes, K, torch.stack([first, *poses]))
+
+
+def projection_of(result: Registration, K: Tensor | None) -> tuple[Tensor, Tensor]:
+    """``T_cam_from_model`` and the camera matrix that project the mesh onto the photograph, the first of several."""
+    return (result.views[0].T_cam_from_model, K) if result.views and K is not None else result.projection
 
 
 def _camera(entry: Entry, photo: Photo) -> tuple[Tensor | None, str | None]:
@@ -207,7 +244,8 @@ def run_entries(
     def digests(entry: Entry) -> dict[str, str]:
         meshes = [(path.name, digest_of_mesh(path)) for path in entry.meshes]
         request = text_digest(json.dumps([common, entry.request(), meshes]))
-        return {"request": request, "photo": photo_digest(entry.photo)}
+        photos = [photo_digest(path) for path in (entry.photo, *(view.photo for view in entry.views))]
+        return {"request": request, "photo": "-".join(photos) if all(photos) else ""}
 
     with workers() as group:
         if group.reports:
@@ -274,7 +312,8 @@ def _row(entry: Entry, registrar: Registrar | Exception, picture: Path, *, bank_
     except CurviregError as error:
         return failed_row(error, seconds={"bank": bank_seconds, "register": time.perf_counter() - start})
     renderer = registrar.of_model(result.model).describer.renderer
-    write_file(picture, thumbnail(renderer, result.projection, photo.image, used_box(document)))
+    projection = projection_of(result, _camera(entry, photo)[0])
+    write_file(picture, thumbnail(renderer, projection, photo.image, used_box(document)))
     return {"status": "ok", "message": "", **document}
 
 

@@ -25,11 +25,6 @@ from ..utils.checks import check_fraction, check_integer, check_option, check_te
 MIN_BLOCK_LENGTH = 1e-5  # relative to the longest block of the image; normalisation suppresses shorter ones
 
 
-def hog_length(*, grid: int = 8, bins: int = 9, block: int = 2) -> int:
-    """Number of entries of a descriptor: (grid - block + 1)^2 block^2 bins."""
-    return (grid - block + 1) ** 2 * block**2 * bins
-
-
 def hog(
     field: Tensor,
     *,
@@ -171,7 +166,7 @@ class HOG(FunctionModule):
         learnable: make ``bin_weights`` (bins,), initially 1, a positive parameter; otherwise it is None.
 
     Shape:
-        Input (B, 2, H, W); output (B, D), D = :func:`hog_length` of grid, bins and block.
+        Input (B, 2, H, W); output (B, D), D = ``length``.
 
     Example:
         >>> layer = HOG(grid=4)
@@ -202,8 +197,8 @@ class HOG(FunctionModule):
 
     @property
     def length(self) -> int:
-        """As :func:`hog_length`."""
-        return hog_length(grid=self.grid, bins=self.bins, block=self.block)
+        """Number of entries of a descriptor: (grid - block + 1)^2 block^2 bins."""
+        return (self.grid - self.block + 1) ** 2 * self.block**2 * self.bins
 
     def rotated_by_180(self, descriptors: Tensor) -> Tensor:
         """Descriptors (B, D) of the fields rotated by 180 degrees: cells are permuted, orientations are unchanged.

@@ -2,6 +2,7 @@
 and apparent ridges (AR)."""
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -62,42 +63,45 @@ def average_shading_gradient(
         >>> round(float(field[0, :, 32, 32].norm()) * 60 / (2 * torch.pi / 3) ** 0.5, 2)     # gamma sqrt(2) / radius
         1.0
     """
-    sigma, scale = check_shading(sigma, depth_scale, camera_matrix)
-    mask, camera = check_depth(depth, mask), batched_camera(camera_matrix, depth)
-
-    def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Planes:
-        a, b, c = normal_structure_tensor(depth, mask, camera, sigma, scale)
-        vx, vy, _ = dominant_eigenvector(a, b, b, c)
-        return scaled_direction(math.sqrt(math.pi / 3.0) * safe_sqrt(a + c), default_to_x(vx, vy), vy)
-
-    return apply_in_blocks(layer, at_least_float32(depth), mask, camera).to(depth.dtype)
+    return _field_of_normals(
+        depth, mask, camera_matrix, sigma, depth_scale, lambda trace, *_: math.sqrt(math.pi / 3.0) * safe_sqrt(trace)
+    )
 
 
-def check_shading(
-    sigma: float | Tensor, depth_scale: float | None, camera_matrix: Tensor | None
-) -> tuple[float | Tensor, float | None]:
-    """Return sigma and depth_scale."""
+def _field_of_normals(
+    depth: Tensor,
+    mask: Tensor | None,
+    camera_matrix: Tensor | None,
+    sigma: float | Tensor,
+    depth_scale: float | None,
+    length: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor],
+) -> Tensor:
+    """Vectors along which the normal changes fastest, of a length that follows from the trace and half the eigenvalue
+    difference of its structure tensor, and from the direction (vx, vy)."""
     if camera_matrix is not None:
         check_tensor(camera_matrix, "camera_matrix", (None,) * (camera_matrix.ndim == 3) + (3, 3))
+        if camera_matrix.ndim == 2 or len(camera_matrix) == 1:
+            camera_matrix = camera_matrix.expand(depth.shape[0], -1, -1)
+        check_tensor(camera_matrix, "camera_matrix", (depth.shape[0], 3, 3))
+        check_same_device(camera_matrix, depth, "camera_matrix")
         if is_host_readable(camera_matrix):
             check_camera_matrix(camera_matrix)
         if depth_scale is not None:
             raise InvalidInputError("depth_scale: has no meaning with a camera_matrix; leave one of them out")
-    return check_scalar(sigma, "sigma", zero_ok=True), check_depth_scale(depth_scale)
+        camera_matrix = camera_matrix.to(at_least_float32(depth).dtype)
+    mask, scale = check_depth(depth, mask), check_depth_scale(depth_scale)
+    sigma = check_scalar(sigma, "sigma", zero_ok=True)
+
+    def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Planes:
+        a, b, c = _normal_structure_tensor(depth, mask, camera, sigma, scale)
+        vx, vy, half_gap = dominant_eigenvector(a, b, b, c)
+        vx = default_to_x(vx, vy)
+        return scaled_direction(length(a + c, half_gap, vx, vy), vx, vy)
+
+    return apply_in_blocks(layer, at_least_float32(depth), mask, camera_matrix).to(depth.dtype)
 
 
-def batched_camera(camera_matrix: Tensor | None, depth: Tensor) -> Tensor | None:
-    """(B, 3, 3) in the dtype that ``depth`` is computed in; None stays None."""
-    if camera_matrix is None:
-        return None
-    if camera_matrix.ndim == 2 or len(camera_matrix) == 1:
-        camera_matrix = camera_matrix.expand(depth.shape[0], -1, -1)
-    check_tensor(camera_matrix, "camera_matrix", (depth.shape[0], 3, 3))
-    check_same_device(camera_matrix, depth, "camera_matrix")
-    return camera_matrix.to(at_least_float32(depth).dtype)
-
-
-def normal_structure_tensor(
+def _normal_structure_tensor(
     depth: Tensor, mask: Tensor | None, camera: Tensor | None, sigma: float | Tensor, depth_scale: float | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """N_x . N_x, N_x . N_y, N_y . N_y per px^2, each (B, 1, H, W), from the Hessian in closed form."""
@@ -158,8 +162,8 @@ def hessian_frobenius_norm(
         >>> hessian_frobenius_norm(bowl, sigma=0.0, depth_scale=1.0)[0, :, 16, 16].tolist()
         [1.0, 0.0]
     """
-    mask = check_depth(depth, mask)
-    sigma, scale = check_shading(sigma, depth_scale, None)
+    mask, scale = check_depth(depth, mask), check_depth_scale(depth_scale)
+    sigma = check_scalar(sigma, "sigma", zero_ok=True)
 
     def layer(depth: Tensor, mask: Tensor | None) -> Planes:
         _, _, zxx, zyy, zxy = central_derivatives(smooth(fill_depth(depth, mask, scale), sigma, linear=True))
@@ -201,19 +205,12 @@ def apparent_ridges(
         >>> int(field[0, :, 16].norm(dim=0).argmax())                              # its edge
         16
     """
-    sigma, scale = check_shading(sigma, depth_scale, camera_matrix)
-    mask, camera = check_depth(depth, mask), batched_camera(camera_matrix, depth)
 
-    def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Planes:
-        a, b, c = normal_structure_tensor(depth, mask, camera, sigma, scale)
-        vx, vy, half_gap = dominant_eigenvector(a, b, b, c)
-        vx = default_to_x(vx, vy)
-        curvature = safe_sqrt(0.5 * (a + c) + half_gap)
-        if maxima:
-            curvature = torch.where(is_directional_maximum(curvature, vx, vy), curvature, 0.0)
-        return scaled_direction(curvature, vx, vy)
+    def length(trace: Tensor, half_gap: Tensor, vx: Tensor, vy: Tensor) -> Tensor:
+        curvature = safe_sqrt(0.5 * trace + half_gap)
+        return torch.where(is_directional_maximum(curvature, vx, vy), curvature, 0.0) if maxima else curvature
 
-    return apply_in_blocks(layer, at_least_float32(depth), mask, camera).to(depth.dtype)
+    return _field_of_normals(depth, mask, camera_matrix, sigma, depth_scale, length)
 
 
 class AverageShadingGradient(DepthModule, function=average_shading_gradient):

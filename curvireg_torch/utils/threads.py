@@ -50,12 +50,7 @@ def for_each(count: int, job: Callable[[int], object]) -> None:
             job(number)
         return
     with ThreadPoolExecutor(threads, initializer=_start_working) as pool:
-        try:
-            for _ in pool.map(job, range(count)):
-                pass
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+        list(pool.map(job, range(count)))
 
 
 def _start_working() -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..registration import Hypothesis, Registrar
-from ..rendering.colour import shade
+from ..rendering import shade
 from ..visualization.contours import contour_layer
 from ..visualization.encoding import jpeg, png, shrink
 from ..visualization.overlay import to_uint8

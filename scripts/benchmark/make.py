@@ -4,18 +4,19 @@
     python scripts/benchmark/make.py --kind shelf --objects 8 20 --cameras 3 --count 100 --out /data/shelf
     python scripts/benchmark/make.py --kind furniture --meshes /data/furniture --count 300 --out /data/chairs
 
---kind: ``printed`` packages, whose labels alone tell their sides apart; ``furniture`` of meshes.py; ``solids``,
-procedural objects in plain colours; ``shelf``, several printed packages side by side, all annotated. A scene has one
-photograph, or one for each of --cameras, or --frames of a moving camera. --cad similar annotates furniture as another
-object of its kind, --cad wrong as any other object (to calibrate confidence). Scene i depends only on the seed and i;
-an interrupted run can be resumed. Boxes are exact: ``bbox_obj`` of the whole silhouette, ``bbox_visib`` of its visible
-part. OUT/benchmark.json holds the options, and group and form of each object for scripts/calibration.
+--kind: ``printed`` packages, whose labels alone tell their sides apart; ``furniture`` of meshes.py; ``shelf``,
+several printed packages side by side, all annotated. A scene has one photograph, or one for each of --cameras, or
+--frames of a moving camera. --cad similar annotates furniture as another object of its kind, --cad wrong as any other
+object (to calibrate confidence). Scene i depends only on the seed and i; an interrupted run can be resumed. Boxes are
+exact: ``bbox_obj`` of the whole silhouette, ``bbox_visib`` of its visible part. OUT/benchmark.json holds the options,
+and group and form of each object for scripts/calibration.
 """
 
 import argparse
 import json
 import os
 import shutil
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
 from multiprocessing import get_context
@@ -27,42 +28,29 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from scripts.scenes.families import random_shape
-from scripts.scenes.materials import Material, random_colour, random_texture
+from scripts.scenes.materials import random_colour, random_texture
 from scripts.scenes.packages import package
 from scripts.scenes.scene import Scene, camera_path, shelf, simulate_camera, single
 from scripts.scenes.surfaces import Array, Rng
 from scripts.scenes.textured import Texture, TexturedMesh
 
-KINDS = ("printed", "shelf", "furniture", "solids")
-SUFFIXES = (".jpg", ".jpeg", ".png")
-MIN_PIXELS = 400
-"""Fewer pixels of a silhouette are not annotated."""
-
-MAX_PROPORTION = 1.6
-"""Largest factor between the proportions of similar objects; if none is within it, the closest one is taken."""
-
-FULL_TURN = 12
-"""A mesh with so many symmetries about z is a body of revolution, whose azimuth is undefined. It is excluded."""
+KINDS = ("printed", "shelf", "furniture")
+MIN_PIXELS = 400  # of a silhouette; smaller ones are not annotated
+MAX_PROPORTION = 1.6  # factor between the proportions of similar objects; if none is within it, the closest is taken
+FULL_TURN = 12  # symmetries about z of a body of revolution, whose azimuth is undefined: it is excluded
 
 
 class Packages:
-    """Printed packages, or procedural solids; object k depends only on the seed and k."""
+    """Printed packages; object k depends only on the seed and k."""
+
+    photographs: Sequence[Path] = ()  # pictures on walls and floors
 
     def __init__(self, options: argparse.Namespace) -> None:
-        self.seed, self.solids = options.seed, options.kind == "solids"
-        self.ids = list(range(1, options.models + 1))
-        folder = options.photographs
-        self.photographs = sorted(p for p in folder.iterdir() if p.suffix in SUFFIXES) if folder else []
+        self.seed, self.ids = options.seed, list(range(1, options.models + 1))
 
     @lru_cache(maxsize=100)  # noqa: B019 (lives as long as its process)
     def mesh(self, obj_id: int) -> TexturedMesh:
-        rng = np.random.default_rng((self.seed, 0, obj_id))
-        if not self.solids:
-            return package(rng)
-        vertices, faces, materials = random_shape(rng)
-        colours = [Texture(random_colour(rng)[None, None].astype(np.float32)) for _ in range(materials.max() + 1)]
-        return TexturedMesh.from_arrays(0.1 * vertices, faces, colours, paint=materials)
+        return package(np.random.default_rng((self.seed, 0, obj_id)))
 
     def symmetries(self, obj_id: int) -> Array:
         return np.eye(3)[None]
@@ -71,14 +59,10 @@ class Packages:
         return f"{obj_id}"
 
     def similar(self, obj_id: int, rng: Rng) -> int:
-        raise SystemExit("--cad similar: printed packages and solids have no kinds; take --kind furniture")
+        raise SystemExit("--cad similar: printed packages have no kinds; take --kind furniture")
 
     def clutter(self, rng: Rng) -> TexturedMesh:
-        if not self.solids:
-            return self.mesh(int(rng.choice(self.ids)))
-        vertices, faces, materials = random_shape(rng)
-        paints = [Material(rng, plain=0.5) for _ in range(materials.max() + 1)]
-        return TexturedMesh.from_arrays(vertices, faces, paints, paint=materials)
+        return self.mesh(int(rng.choice(self.ids)))
 
     def texture(self, rng: Rng) -> Array:
         if not self.photographs or rng.random() < 0.5:
@@ -296,9 +280,8 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=29)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--size", type=int, nargs=2, default=(480, 640), metavar=("H", "W"))
-    parser.add_argument("--models", type=int, default=60, help="printed packages or solids to choose from")
+    parser.add_argument("--models", type=int, default=60, help="printed packages to choose from")
     parser.add_argument("--meshes", type=Path, help="folder of meshes.py, for furniture")
-    parser.add_argument("--photographs", type=Path, help="folder of pictures on walls and floors")
     parser.add_argument("--half", choices=("held-out", "train"), default="held-out", help="of the furniture")
     parser.add_argument("--cad", choices=("exact", "similar", "wrong"), default="exact")
     parser.add_argument("--pose", choices=("upright", "free", "mixed"), default="mixed")

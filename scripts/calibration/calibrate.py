@@ -46,17 +46,13 @@ SETS: dict[str, list[str]] = {
     "wrong": ["--cad", "wrong"],
     "sequences": ["--cad", "exact", "--frames", "30"],
 }
-RIGHT = 30.0
-"""Degrees within which a registration is right."""
-
-FINE_DEGREES, FINE_FRACTION = 10.0, 0.1
-"""Degrees, and fraction of the distance, within which a refined or tracked pose is right."""
+RIGHT = 30.0  # degrees within which a registration is right
+FINE_DEGREES, FINE_FRACTION = 10.0, 0.1  # and fraction of the distance, within which a refined or tracked pose is right
 
 STARTS = ((5.0, 0.0), (10.0, 0.0), (15.0, 0.0), (20.0, 0.0), (30.0, 0.0), (0.0, 0.05), (0.0, 0.1), (0.0, 0.2))
 """Degrees and fraction of the distance by which the starts of refinements are off."""
 
-WRONG_FRACTION = 0.1
-"""Weight of the wrong meshes in the fit of confidence, as if one photograph in ten came with a wrong mesh."""
+WRONG_FRACTION = 0.1  # weight of the wrong meshes in the fit, as if one photograph in ten came with a wrong mesh
 
 FOLDS = 5
 FIELDS = {"instance": ("exact", "wrong"), "category": ("similar",)}

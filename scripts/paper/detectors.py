@@ -10,6 +10,7 @@ from typing import NamedTuple, TypeVar, cast
 
 import cv2
 import numpy as np
+import skimage.feature
 import torch
 import torch.nn.functional as F
 from kornia.feature import gftt_response, harris_response
@@ -71,11 +72,6 @@ def detection_from_peaks(response: Tensor, fraction: float) -> Detection:
     return Detection(response, strongest_points(response, peaks & (response > 0), fraction))
 
 
-def to_uint8_images(image: Tensor) -> list[Tensor]:
-    """Each image as (H, W) uint8 in CPU memory, as OpenCV needs it."""
-    return list((image.detach().float().clamp(0.0, 1.0) * 255.0).round().byte().cpu()[:, 0])
-
-
 def sobel_gradient(image: Tensor) -> Tensor:
     """(B, 2, H, W) gradient of (B, 1, H, W) by the Sobel kernels, per px (their sums divided by 8)."""
     p = replicate_pad(image, 1)
@@ -92,56 +88,36 @@ def sobel(image: Tensor, *, fraction: float = 0.04) -> Detection:
 
 
 @detector
-def laplacian_of_gaussian(image: Tensor, *, sigma: float = 2.0, fraction: float = 0.04) -> Detection:
-    """Zero crossings of the Laplacian of the image smoothed by ``sigma`` px (Marr and Hildreth 1980).
+def laplacian_of_gaussian(image: Tensor, *, fraction: float = 0.04) -> Detection:
+    """Zero crossings of the Laplacian of the image smoothed by 2 px (Marr and Hildreth 1980).
 
-    A pixel is a crossing where the sign of the Laplacian differs from that of the right or the lower neighbour, or
-    where the Laplacian is 0 between opposite neighbours of opposite sign. The response is the largest of these steps in
-    grey levels per px^2, and 0 elsewhere.
+    A pixel is a crossing where the sign of the Laplacian differs from that of the right or the lower neighbour. The
+    response is the larger of these steps in grey levels per px^2, and 0 elsewhere.
     """
-    _, _, xx, yy, _ = central_derivatives(smooth(image, sigma))
-    laplacian = xx + yy
-    response = torch.zeros_like(laplacian)
-    for dim in (-1, -2):
-        n = laplacian.shape[dim] - 1
-        here, there = laplacian.narrow(dim, 0, n), laplacian.narrow(dim, 1, n)
-        step = torch.where(here * there < 0, (here - there).abs(), 0.0)
-        border = torch.zeros_like(laplacian.narrow(dim, 0, 1))
-        response = torch.maximum(response, torch.cat([step, border], dim=dim))
-        if n > 1:
-            before, at, after = (laplacian.narrow(dim, i, n - 1) for i in range(3))
-            through = torch.where((at == 0) & (before * after < 0), 0.5 * (after - before).abs(), 0.0)
-            response = torch.maximum(response, torch.cat([border, through, border], dim=dim))
+    _, _, xx, yy, _ = central_derivatives(smooth(image, 2.0))
+    laplacian = F.pad(xx + yy, (0, 1, 0, 1), mode="replicate")
+    here = laplacian[..., :-1, :-1]
+    steps = [
+        torch.where(here * x < 0, (here - x).abs(), 0.0) for x in (laplacian[..., :-1, 1:], laplacian[..., 1:, :-1])
+    ]
+    response = torch.maximum(*steps)
     return Detection(response, strongest_points(response, response > 0, fraction))
 
 
 @detector
-def canny(image: Tensor, *, sigma: float = 1.4, edges: float = 0.3, fraction: float = 0.04) -> Detection:
-    """Canny (1986) by OpenCV on the CPU, with thresholds set per image as in MATLAB's ``edge``.
+def canny(image: Tensor, *, fraction: float = 0.04) -> Detection:
+    """Canny (1986) by scikit-image, sigma 1.4 px; as in MATLAB's ``edge``, 30 % of the pixels exceed the upper
+    threshold, and the lower one is 0.4 times as high.
 
-    The response is the length of the Sobel gradient of the smoothed image per px. The fraction ``edges``, in (0, 1], of
-    the pixels exceeds the upper threshold; the lower threshold is 0.4 times as high.
+    The response is the length of the Sobel gradient of the smoothed image per px.
     """
-    responses, points = [], []
-    for grey in to_uint8_images(image):
-        # cv2.Canny takes 16-bit integer derivatives: use steps of 1/32 grey level.
-        blurred = cv2.GaussianBlur(grey.numpy().astype("float32"), (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
-        dx, dy = (
-            cv2.Sobel(blurred, cv2.CV_32F, *order, ksize=3, borderType=cv2.BORDER_REPLICATE)
-            for order in ((1, 0), (0, 1))
-        )
-        length = safe_sqrt(torch.from_numpy(dx) ** 2 + torch.from_numpy(dy) ** 2)
-        # torch.quantile refuses more than 16 million pixels.
-        high = max(float(np.quantile(length.numpy(), 1.0 - edges)), 1e-3) * 32.0
-        mask = cv2.Canny(
-            (dx * 32.0).round().astype("int16"), (dy * 32.0).round().astype("int16"), 0.4 * high, high, L2gradient=True
-        )
-        responses.append(length / (8.0 * 255.0))
-        points.append(torch.from_numpy(mask) > 0)
-    if not responses:
-        return Detection(torch.zeros_like(image, dtype=torch.float32), torch.zeros_like(image, dtype=torch.bool))
-    response = torch.stack(responses)[:, None].to(image.device)
-    return Detection(response, strongest_points(response, torch.stack(points)[:, None].to(image.device), fraction))
+    response = torch.linalg.vector_norm(sobel_gradient(smooth(image, 1.4, margin=0)), dim=1, keepdim=True)
+    points = torch.zeros_like(response, dtype=torch.bool)
+    for grey, length, mask in zip(image.double().numpy()[:, 0], response[:, 0], points[:, 0], strict=True):
+        high = 4.0 * float(np.quantile(length.numpy(), 0.7))  # scikit-image divides its Sobel sums by 4
+        edges = skimage.feature.canny(grey, 1.4, 0.4 * high, high, mode="nearest")
+        mask.copy_(torch.from_numpy(edges))
+    return Detection(response, strongest_points(response, points, fraction))
 
 
 @detector
@@ -160,84 +136,26 @@ def fuzzy_edges(image: Tensor, *, width: float = 0.1, fraction: float = 0.04) ->
     return detection_from_field((1.0 - zero) * gradient / torch.where(length > 0, length, 1.0), fraction)
 
 
-OCTAVES = ((9, 15, 21, 27), (15, 27, 39, 51), (27, 51, 75, 99))
+SIDES = (9, 15, 21, 27, 39, 51, 75, 99)
 """Sides in px of the box filters, as in Bay et al.; a side of 9 corresponds to a Gaussian of sigma 1.2 px."""
 
 
 @detector
 def fast_hessian(image: Tensor, *, threshold: float = 1e-4, fraction: float = 0.04) -> Detection:
-    r"""Fast-Hessian (Bay et al. 2008): determinant of a Hessian of box filters, the detector of SURF.
+    """Fast-Hessian (Bay et al. 2008), the detector of SURF: determinants of a Hessian of box filters by scikit-image.
 
-    Own code, because OpenCV packages come without SURF. The second derivatives are box sums divided by the filter area;
-    the response is the largest :math:`D_{xx} D_{yy} - (0.9 D_{xy})^2` over all filter sides, where positive. Points are
-    maxima above ``threshold`` > 0 over 3 x 3 px and three neighbouring sides of an octave. Every octave is sampled at
-    every pixel, without sub-pixel refinement. Filters larger than the image are skipped; borders are replicated.
-    Computed in float64 on the CPU.
+    The response is the largest positive determinant over all filter sides up to the image's. Points are maxima above
+    ``threshold`` > 0 over 3 x 3 px and three neighbouring sides.
     """
+    sides = [side for side in SIDES if side <= max(21, *image.shape[-2:])]
     H, W = image.shape[-2:]
-    x = image.detach().to("cpu", torch.float64)
-    determinants = {side: _determinant(x, side) for side in sorted(set(sum(OCTAVES, ()))) if side <= max(min(H, W), 9)}
-    response = torch.stack(list(determinants.values())).amax(dim=0).clamp(min=0.0)
-    best = torch.zeros_like(response)
-    for octave in OCTAVES:
-        stack = [determinants[side] for side in octave if side in determinants]
-        if len(stack) < 3 or len(image) == 0:
-            continue
-        volume = torch.cat(stack, dim=1)[:, None]  # (B, 1, sides, H, W)
-        peaks = F.max_pool3d(volume, 3, stride=1, padding=1)[:, 0, 1:-1]
-        inner = volume[:, 0, 1:-1]
-        strength = torch.where((inner == peaks) & (inner > threshold), inner, 0.0)
-        best = torch.maximum(best, strength.amax(dim=1, keepdim=True))
-    points = strongest_points(best, best > 0, fraction)
-    return Detection(response.float().to(image.device), points.to(image.device))
-
-
-def _determinant(x: Tensor, side: int) -> Tensor:
-    """det of the box Hessian with filters of side x side px, side = 3 lobe."""
-    H, W = x.shape[-2:]
-    lobe, radius = side // 3, side // 2
-    integral = F.pad(F.pad(x, (radius,) * 4, mode="replicate").cumsum(-1).cumsum(-2), (1, 0, 1, 0))
-
-    def box(y0: int, x0: int, height: int, width: int) -> Tensor:
-        """Sum over the box whose top-left pixel is at (y0, x0) relative to the filter centre."""
-        top, left = y0 + radius, x0 + radius
-
-        def corner(dy: int, dx: int) -> Tensor:
-            return integral[..., top + dy : top + dy + H, left + dx : left + dx + W]
-
-        return corner(height, width) - corner(0, width) - corner(height, 0) + corner(0, 0)
-
-    # Three lobes side by side, (2 lobe - 1) px across: +1, -2, +1 (Bay et al., fig. 2).
-    across, half = 2 * lobe - 1, lobe // 2
-    xx = box(-lobe + 1, -radius, across, side) - 3.0 * box(-lobe + 1, -half, across, lobe)
-    yy = box(-radius, -lobe + 1, side, across) - 3.0 * box(-half, -lobe + 1, lobe, across)
-    xy = box(-lobe, -lobe, lobe, lobe) + box(1, 1, lobe, lobe) - box(-lobe, 1, lobe, lobe) - box(1, -lobe, lobe, lobe)
-    area = float(side * side)
-    return (xx * yy - (0.9 * xy) ** 2) / area**2
-
-
-@detector
-def focus_curves(image: Tensor, *, fraction: float = 0.04) -> Detection:
-    """MFC, :func:`curvireg_torch.filters.multiscale_focus_curves`."""
-    return detection_from_field(multiscale_focus_curves(image), fraction)
-
-
-@detector
-def multiscale_saliency(image: Tensor, *, fraction: float = 0.04) -> Detection:
-    """MCS, :func:`curvireg_torch.filters.multiscale_curvilinear_saliency`."""
-    return detection_from_field(multiscale_curvilinear_saliency(image), fraction)
-
-
-@detector
-def gradient(image: Tensor, *, fraction: float = 0.04) -> Detection:
-    """IG, :func:`curvireg_torch.filters.image_gradient`."""
-    return detection_from_field(image_gradient(image), fraction)
-
-
-@detector
-def principal_curvature(image: Tensor, *, fraction: float = 0.04) -> Detection:
-    """PCI of the largest eigenvalue, :func:`curvireg_torch.filters.principal_curvature_image`."""
-    return detection_from_field(principal_curvature_image(image), fraction)
+    greys = F.pad(image.double(), (50,) * 4, mode="replicate").numpy()[:, 0]
+    found = [[skimage.feature.hessian_matrix_det(x, side / 3) for side in sides] for x in greys]
+    volume = torch.tensor(np.array(found), dtype=torch.float32).view(len(image), 1, len(sides), H + 100, W + 100)
+    volume = volume[..., 49 : 49 + H, 49 : 49 + W]  # scikit-image's result is one pixel too far up and left
+    inner, largest = volume[:, :, 1:-1], F.max_pool3d(volume, 3, stride=1, padding=(0, 1, 1))
+    best = torch.where((inner == largest) & (inner > threshold), inner, 0.0).amax(dim=2)
+    return Detection(volume.amax(dim=2).clamp(min=0.0), strongest_points(best, best > 0, fraction))
 
 
 @detector
@@ -260,20 +178,24 @@ def sift(image: Tensor, *, fraction: float = 0.04) -> Detection:
     """
     response = torch.zeros(image.shape, dtype=torch.float32)
     H, W = image.shape[-2:]
-    detector = cv2.SIFT.create(nfeatures=max(1, int(fraction * H * W)))
-    for i, grey in enumerate(to_uint8_images(image)):
-        for keypoint in detector.detect(grey.numpy(), None):
+    sift_detector = cv2.SIFT.create(nfeatures=max(1, int(fraction * H * W)))
+    for i, grey in enumerate((255.0 * image[:, 0].clamp(0.0, 1.0)).round().byte()):
+        for keypoint in sift_detector.detect(grey.numpy(), None):
             x, y = (min(max(round(c), 0), n - 1) for c, n in zip(keypoint.pt, (W, H), strict=True))
             response[i, 0, y, x] = max(float(response[i, 0, y, x]), keypoint.response)
-    response = response.to(image.device)
     return Detection(response, response > 0)
 
 
+def of_field(field: Callable[[Tensor], Tensor]) -> Callable[..., Detection]:
+    """The detector of a filter of the library."""
+    return detector(lambda image, fraction=0.04: detection_from_field(field(image), fraction))
+
+
 DETECTORS: dict[str, Callable[..., Detection]] = {
-    "mfc": focus_curves,
-    "mcs": multiscale_saliency,
-    "ig": gradient,
-    "pci": principal_curvature,
+    "mfc": of_field(multiscale_focus_curves),
+    "mcs": of_field(multiscale_curvilinear_saliency),
+    "ig": of_field(image_gradient),
+    "pci": of_field(principal_curvature_image),
     "sobel": sobel,
     "log": laplacian_of_gaussian,
     "canny": canny,

@@ -10,68 +10,34 @@ from torch import Tensor
 
 from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint
 
-__all__ = [
-    "hausdorff_distance",
-    "intersection_percentage",
-    "pose_parameter_errors",
-    "rank_precision",
-    "view_repeatability",
-]
-
 Mask = NDArray[np.bool_]
+SAME_DEGREES = 1e-2  # rotation errors closer than this count as equal
 
 
 def intersection_percentage(photo: Tensor, view: Tensor, *, eps_px: float = 2.0) -> Tensor:
-    """IP of the paper: fraction of the photograph's points within ``eps_px`` of a point of the view.
-
-    Args:
-        photo, view: (..., H, W) bool, one mask of feature points per image.
-        eps_px: Euclidean radius >= 0 in px, inclusive.
-
-    Returns:
-        (...) in [0, 1]; NaN where the photograph has no points, 0 where only the view has none.
-
-    """
-    return _per_image(_fraction_within(eps_px), photo, view)
+    """IP of the paper, (...) in [0, 1]: fraction of the photograph's points (..., H, W) within ``eps_px`` of a point of
+    the view; NaN where the photograph has no points, 0 where only the view has none."""
+    return _per_image(lambda a, b: float((_distances(a, b) <= eps_px).mean()) if a.any() else np.nan, photo, view)
 
 
 def view_repeatability(view: Tensor, photo: Tensor, *, eps_px: float = 2.0) -> Tensor:
-    """Repeatability of a detector: fraction of the view's points within ``eps_px`` of a point of the photograph.
-
-    This is :func:`intersection_percentage` with the roles exchanged. The paper's Rep, which ranks views
-    (:func:`curvireg_torch.terms.repeatability`), has the other direction.
-
-    """
-    return _per_image(_fraction_within(eps_px), view, photo)
+    """Repeatability of a detector: fraction of the view's points within ``eps_px`` of a point of the photograph."""
+    return intersection_percentage(view, photo, eps_px=eps_px)
 
 
-def hausdorff_distance(a: Tensor, b: Tensor, *, percentile: float = 100.0, directed: bool = False) -> Tensor:
-    """Hausdorff distance of two point sets in pixels, or a percentile of it.
+def hausdorff_distance(a: Tensor, b: Tensor, *, percentile: float = 100.0) -> Tensor:
+    """Hausdorff distance (...) of point sets (..., H, W) in px, or a percentile of it.
 
     ``h(A, B)`` is the percentile over a in A of the distance from a to the nearest point of B; the result is
-    ``max(h(A, B), h(B, A))``. The classical distance (percentile 100) depends on a single point; 95 is robust.
-
-    Args:
-        a, b: (..., H, W) bool.
-        percentile: in (0, 100], linear between order statistics.
-        directed: only ``h(A, B)``.
-
-    Returns:
-        (...) px >= 0; ``inf`` where one mask is empty, NaN where both are.
-
+    ``max(h(A, B), h(B, A))``, ``inf`` where one set is empty and NaN where both are.
     """
 
     def of_pair(x: Mask, y: Mask) -> float:
         if not (x.any() and y.any()):
             return np.inf if x.any() or y.any() else np.nan
-        forward = float(np.percentile(_distances(x, y), percentile))
-        return forward if directed else max(forward, float(np.percentile(_distances(y, x), percentile)))
+        return max(float(np.percentile(_distances(*pair), percentile)) for pair in ((x, y), (y, x)))
 
     return _per_image(of_pair, a, b)
-
-
-def _fraction_within(eps_px: float) -> Callable[[Mask, Mask], float]:
-    return lambda a, b: float((_distances(a, b) <= eps_px).mean()) if a.any() else np.nan
 
 
 def _distances(a: Mask, b: Mask) -> NDArray[np.float64]:
@@ -83,28 +49,22 @@ def _distances(a: Mask, b: Mask) -> NDArray[np.float64]:
 
 
 def _per_image(score: Callable[[Mask, Mask], float], a: Tensor, b: Tensor) -> Tensor:
-    """``score`` of each pair of (..., H, W) masks, as a (...) tensor of the default dtype on their device."""
+    """``score`` of each pair of (..., H, W) masks."""
     shape = (a.shape[:-2].numel(), *a.shape[-2:])
-    scores = [score(x, y) for x, y in zip(*(m.reshape(shape).cpu().numpy() for m in (a, b)), strict=True)]
-    return torch.tensor(scores, dtype=torch.get_default_dtype(), device=a.device).reshape(a.shape[:-2])
-
-
-SAME_DEGREES = 1e-2
-"""Rotation errors closer than this count as equal; float32 rotations are exact to about 1e-4 degrees."""
+    scores = [score(x, y) for x, y in zip(*(m.reshape(shape).numpy() for m in (a, b)), strict=True)]
+    return torch.tensor(scores, dtype=torch.get_default_dtype()).reshape(a.shape[:-2])
 
 
 def rank_precision(
     order: Tensor, errors: Tensor, *, ks: Sequence[int] = (1, 3, 5, 10, 20), threshold_deg: float | None = None
 ) -> dict[int, float]:
-    """Fraction of the queries that count at rank k, as ``{k: fraction}``; NaN for B = 0.
+    """Fraction of the queries that count at rank k, as ``{k: fraction}``.
 
     Args:
-        order: (B, M) integers, the views from best to worst: all N, or the first M >= min(max(ks), N).
-        errors: (B, N) finite degrees >= 0, the rotation error of each view of the bank.
+        order: (B, M) the views from best to worst: all N, or the first M >= min(max(ks), N).
+        errors: (B, N) degrees, the rotation error of each view of the bank.
         ks: ranks >= 1; a rank above N counts as N.
-        threshold_deg: None for the *nearest* definition (views of one rotation at several distances are all nearest),
-            degrees > 0 for the *threshold* definition.
-
+        threshold_deg: None: a query counts if the nearest view is among the first k; degrees: if one within them is.
     """
     n = errors.shape[1]
     best = errors.gather(1, order.long()).cummin(1).values
@@ -115,26 +75,15 @@ def rank_precision(
 
 
 def viewpoint_differences(a: Tensor, b: Tensor) -> Tensor:
-    """Absolute differences of viewpoint parameters; azimuth and theta are circular, in [0, 180].
-
-    Args:
-        a, b: (..., 4) azimuth, elevation, theta (in-plane) in degrees and distance, broadcast against each other.
-
-    """
+    """Absolute differences of (..., 4) azimuth, elevation, theta in degrees and distance; two angles are circular."""
     difference = (a - b).abs()
     remainder = difference % 360.0
-    circular = torch.tensor([True, False, True, False], device=difference.device)
+    circular = torch.tensor([True, False, True, False])
     return torch.where(circular, torch.minimum(remainder, 360.0 - remainder), difference)
 
 
 def closest_view(views: Tensor, truth: Tensor) -> Tensor:
-    """The best view of the bank, (B,) int64: the smallest rotation error, and among equal ones the nearest distance.
-
-    Args:
-        views: (N, 4), N >= 1, azimuth, elevation, theta in degrees and distance of the views of the bank.
-        truth: (B, 4), the same for the queries.
-
-    """
+    """(B,) index of the view (N, 4) with the smallest rotation error to the truth (B, 4), then the nearest distance."""
     error = rotation_error(
         rotation_from_viewpoint(*truth[:, :3].unbind(1)).unsqueeze(1), rotation_from_viewpoint(*views[:, :3].unbind(1))
     )
@@ -147,14 +96,8 @@ def pose_parameter_errors(estimate: Tensor, truth: Tensor, views: Tensor) -> dic
     """Mean absolute errors of the estimate (Est.) and of the closest view of the bank (Clo.), as in the paper.
 
     Args:
-        estimate, truth: (B, 4) azimuth, elevation, theta in degrees and distance; NaN in ``estimate`` for a missing
-            estimate, which makes the means of Est. infinite.
+        estimate, truth: (B, 4) azimuth, elevation, theta in degrees and distance; NaN for a missing estimate.
         views: (N, 4), the same for the views of the bank.
-
-    Returns:
-        ``{"est": {...}, "clo": {...}}``, each with ``azimuth``, ``elevation`` and ``theta`` in degrees and ``distance``
-        in the input unit; NaN for B = 0.
-
     """
     names = ("azimuth", "elevation", "theta", "distance")
     table = {}

@@ -1,6 +1,5 @@
 """The measurements of the paper, on any of the datasets."""
 
-import io
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -37,6 +36,7 @@ from curvireg_torch.matching.describe import depth_filter
 from curvireg_torch.mesh import load_mesh, mesh_centre, mesh_radius
 from curvireg_torch.pipeline import BankSettings, Pipeline
 from curvireg_torch.utils.files import write_csv, write_file
+from scripts._shared import table_lines
 from scripts.paper.detectors import DETECTORS
 from scripts.paper.measures import (
     hausdorff_distance,
@@ -58,7 +58,6 @@ class Table:
         title, definition: what was measured, on what.
         columns: the first names the rows.
         rows: as long as ``columns``.
-        curve: the other columns are curves over the first, which is numeric.
     """
 
     name: str
@@ -66,40 +65,18 @@ class Table:
     definition: str
     columns: list[str]
     rows: list[list[Cell]]
-    curve: bool = False
 
     def markdown(self) -> str:
         """Title, definition and table, three digits."""
-        lines = [self.columns, *([_short(v) for v in row] for row in self.rows)]
-        head, *body = ("| " + " | ".join(line) + " |\n" for line in lines)
-        return f"## {self.title}\n\n{self.definition}\n\n{head}|{'---|' * len(self.columns)}\n{''.join(body)}"
+        lines = table_lines([self.columns, *([_short(v) for v in row] for row in self.rows)])
+        return "\n".join([f"## {self.title}", "", self.definition, "", *lines, ""])
 
 
 def write_table(table: Table, folder: Path) -> list[Path]:
-    """Write ``NAME.csv``, ``NAME.md`` and, where matplotlib is installed, ``NAME.png``; returns their paths."""
-    paths = [folder / f"{table.name}.{suffix}" for suffix in ("csv", "md", "png")]
+    """Write ``NAME.csv`` and ``NAME.md``; returns their paths."""
+    paths = [folder / f"{table.name}.{suffix}" for suffix in ("csv", "md")]
     write_csv(paths[0], [table.columns, *table.rows])
     write_file(paths[1], table.markdown().encode())
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        return paths[:2]
-    figure = Figure(figsize=(8.0, 4.5), layout="constrained")
-    axes = figure.subplots()
-    width = 0.8 / (len(table.columns) - 1)
-    for k, name in enumerate(table.columns[1:]):
-        values = [float(row[k + 1]) for row in table.rows]
-        if table.curve:
-            axes.plot([float(row[0]) for row in table.rows], values, label=name)
-        else:
-            axes.bar([i + k * width for i in range(len(values))], values, width, label=name)
-    if not table.curve:
-        axes.set_xticks(range(len(table.rows)), [str(row[0]) for row in table.rows], rotation=30)
-    axes.set(title=table.title, xlabel=table.columns[0])
-    axes.legend(fontsize="small", ncols=2)
-    picture = io.BytesIO()
-    figure.savefig(picture, dpi=120, format="png")
-    write_file(paths[2], picture.getvalue())
     return paths
 
 
@@ -147,15 +124,7 @@ class Case:
 def find_cases(kind: str, root: Path, *, pixel_origin: int = 1, limit: int | None = None) -> list[Case]:
     """The objects that the paper uses: neither occluded nor truncated, with known pose; grouped by mesh.
 
-    Args:
-        kind: "pascal3d", "bop" or "web".
-        root: of the dataset.
-        pixel_origin: of PASCAL3D+, see :class:`Pascal3DPlus`.
-        limit: use only this many, spread evenly.
-
-    Raises:
-        InvalidInputError: no such object, or an unknown kind.
-        MissingFileError: the dataset is missing.
+    ``kind`` is "pascal3d", "bop" or "web"; ``limit`` uses only this many, spread evenly.
     """
     row = DATASETS[kind]
     origin = {"pixel_origin": pixel_origin} if "pixel_origin" in row.options else {}
@@ -224,11 +193,9 @@ def detector_tables(cases: list[Case], settings: BankSettings, eps_px: float, pr
                 if bool(value.isfinite().all()):
                     scores[table][category][name].append(float(value))
     where = f"Crops of {settings.image_size} px, N = {len(cases)}; mean over photographs with points"
+    hits = f"fraction of the photograph's points within {eps_px:g} px of a point of the view; chance: of all pixels"
     definitions = {
-        "ip": (
-            "Intersection percentage",
-            f"fraction of the photograph's points within {eps_px:g} px of a point of the view; chance: of all pixels",
-        ),
+        "ip": ("Intersection percentage", hits),
         "hausdorff": ("Hausdorff distance", "in px of the crop"),
         "hausdorff_95": ("Hausdorff distance, 95th percentile", "in px of the crop"),
         "points": ("Number of points", "in the photograph's crop"),
@@ -280,7 +247,7 @@ def curve_table(cases: list[Case], settings: BankSettings, eps_px: float, progre
         f"N = {len(cases)}."
     )
     rows: list[list[Cell]] = [[float(offset), *line] for offset, line in zip(CURVE_OFFSETS, means, strict=True)]
-    return Table("curve", "Repeatability around the true view", text, ["offset_deg", *detectors], rows, curve=True)
+    return Table("curve", "Repeatability around the true view", text, ["offset_deg", *detectors], rows)
 
 
 def _no_scores() -> Scores:
@@ -416,7 +383,7 @@ def rank_tables(rankings: Rankings) -> list[Table]:
         columns = [rank_precision(order, rankings.errors, ks=RANKS, threshold_deg=limit) for order in orders]
         rows: list[list[Cell]] = [[float(k), *(column[k] for column in columns)] for k in RANKS]
         text = f"Fraction of the photographs with {reading} among the best k. {rankings.definition}"
-        tables.append(Table(name, f"Precision at rank k: {reading}", text, names, rows, curve=True))
+        tables.append(Table(name, f"Precision at rank k: {reading}", text, names, rows))
     return tables
 
 

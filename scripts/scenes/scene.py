@@ -22,11 +22,8 @@ Draw: TypeAlias = Callable[[Rng], TexturedMesh]
 View: TypeAlias = tuple[Array, Array, Array]
 """Rotation (3, 3) and translation (3,), scene -> camera, and camera matrix (3, 3)."""
 
-MAX_TURN, MAX_SHIFT = 5.0, 0.05
-"""Largest rotation in degrees, and largest motion as a fraction of the distance, between two frames of a sequence."""
-
-RIG_STEP = (15.0, 45.0)
-"""Degrees of azimuth between neighbouring cameras of a rig."""
+MAX_TURN, MAX_SHIFT = 5.0, 0.05  # degrees, and fraction of the distance, between two frames of a sequence
+RIG_STEP = (15.0, 45.0)  # degrees of azimuth between neighbouring cameras of a rig
 
 
 @dataclass(frozen=True)

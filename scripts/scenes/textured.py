@@ -14,12 +14,9 @@ from curvireg_torch.rendering.embree import RayScene
 from scripts.scenes.light import Light, shade_points
 from scripts.scenes.surfaces import Array
 
-MAX_TEXTURE = 512
-"""Longer side of textures in px. Finer ones would only alias in pictures of this size."""
-
+MAX_TEXTURE = 512  # px, longer side of textures: finer ones would only alias in pictures of this size
 SUPERSAMPLING = 1.25
-MAX_REPEATS = 4
-"""Repetitions of a texture that an exported atlas keeps."""
+MAX_REPEATS = 4  # of a texture that an exported atlas keeps
 
 
 class Paint(Protocol):

@@ -10,7 +10,7 @@ only on an idle one.
 
 - cold, warm: ``curvireg register`` from process start to its files, without and with a cached bank
 - bank: ``ViewBank.build`` of all views
-- rank, search: one photograph without search and contour fit, and without the fit; one: the whole registration
+- rank: one photograph without contour fit; one: the whole registration
 - many: each of many photographs in one call
 - follow: each frame of a video in which the photograph moves by 2 px
 """
@@ -25,10 +25,9 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-STEPS = ("cold", "warm", "bank", "rank", "search", "one", "many", "follow")
+STEPS = ("cold", "warm", "bank", "rank", "one", "many", "follow")
 FRAMES = 12
-CAMERA = (900.0, 900.0, 319.5, 239.5)
-"""fx, fy, cx, cy of a photograph of 640 x 480 px."""
+CAMERA = (900.0, 900.0, 319.5, 239.5)  # fx, fy, cx, cy of a photograph of 640 x 480 px
 
 HERE = f"import sys; sys.path.append({str(Path(__file__).parent)!r}); from speed import measure, write_inputs"
 """Import of this file in a process that imports another checkout's package."""
@@ -78,8 +77,8 @@ def measure(step: str, folder: str, photographs: int) -> float:
         cr.ViewBank.build(mesh, progress=False)
         return time.perf_counter() - start
     box = json.loads(Path(folder, "box.json").read_text())
-    changes = {"rank": {"search": False, "contours": False}, "search": {"contours": False}}.get(step, {})
-    registrar = cr.Registrar(mesh, pipeline=replace(cr.Pipeline(), **changes), progress=False)
+    pipeline = replace(cr.Pipeline(), contours=step != "rank")
+    registrar = cr.Registrar(mesh, pipeline=pipeline, progress=False)
     if step == "follow":
         from curvireg_torch.data import read_image
         from curvireg_torch.registration import Follower

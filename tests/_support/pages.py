@@ -4,7 +4,7 @@ import re
 import shlex
 from pathlib import Path
 
-__all__ = ["BUILT", "DOCS", "PAGES", "ROOT", "python_blocks", "split_command", "steps"]
+__all__ = ["BUILT", "DOCS", "PAGES", "ROOT", "split_command", "steps"]
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -41,10 +41,6 @@ def steps(page: Path) -> list[tuple[str, str]]:
             lines = (code or block["inline"]).replace("\\\n", " ").splitlines()
             found += [("command", s.strip()) for s in lines if split_command(s) and (kind or re.match(PROGRAM, s))]
     return found
-
-
-def python_blocks(page: Path) -> list[str]:
-    return [text for kind, text in steps(page) if kind == "python"]
 
 
 def split_command(line: str) -> list[str]:

@@ -46,8 +46,8 @@ d:
 - 0.001
 - -0.002
 - 0.03
-k: [520.5, 0.0, 321.25,
-  0.0, 522.0, 238.5, 0.0, 0.0, 1.0]
+k: [[520.5, 0.0, 321.25],
+  [0.0, 522.0, 238.5], [0.0, 0.0, 1.0]]
 binning_x: 0
 roi:
   x_offset: 0
@@ -175,10 +175,10 @@ def replaced(old, new):
     [
         ("a.yaml", "", "no camera matrix; expected YAML, XML or JSON of OpenCV, camera_info"),
         ("a.yaml", "# nothing\n---\n", "no camera matrix"),
-        ("a.yaml", "just some words\n", "line 1: expected 'key: value', got 'just some words'"),
+        ("a.yaml", "just some words\n", "expected 'key: value', got 'just some words'"),
         ("a.png", b"\x89PNG\r\n\x1a\n\xff\xfe", "not a text file; expected"),
         ("a.yaml", ROS[: ROS.index("rows")], "expected 9 numbers, or fx, fy, cx, cy, got 0"),
-        ("a.yaml", replaced("238.5, 0, 0, 1]", "238.5, 0, 0, 1"), "line 7: '\\[' without its '\\]'"),
+        ("a.yaml", replaced("238.5, 0, 0, 1]", "238.5, 0, 0, 1"), "a list without its '\\]'"),
         ("a.yaml", replaced("[520.5, 0, ", "["), "expected 9 numbers, or fx, fy, cx, cy, got 7"),
         ("a.yaml", replaced("520.5", "five"), "camera_matrix: expected finite numbers, got .*'five'"),
         ("a.yaml", replaced("520.5", "nan"), "camera_matrix: expected finite numbers, got .*nan"),

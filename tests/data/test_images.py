@@ -179,13 +179,14 @@ def test_read_photo_refuses_cielab_floating_pixels_and_other_formats(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_read_image_refuses_truncated_files(tmp_path, suffix):
+def test_read_image_refuses_truncated_and_other_files(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     write_image(path, (64, 64))
     data = path.read_bytes()
-    for fraction in (0.02, 0.5, 0.9):
-        path.write_bytes(data[: int(len(data) * fraction)])
-        with pytest.raises(ImageError, match=r"truncated|not an image"):
+    others = (b"", b"no image at all", b"\xff\xd8\xff\xd9", b"\x89PNG\r\n\x1a\nIEND")
+    for content in (*(data[: int(len(data) * fraction)] for fraction in (0.02, 0.5, 0.9)), *others):
+        path.write_bytes(content)
+        with pytest.raises(ImageError, match=r"a\.\w+: (damaged or truncated|not an image)"):
             read_image(path)
 
 
@@ -242,13 +243,6 @@ def test_read_photo_bounds_scans_and_bytes(tmp_path, monkeypatch):
     monkeypatch.setattr(images, "MAX_IMAGE_BYTES", 100)
     with pytest.raises(ImageError, match="larger than 100 bytes"):
         read_photo(path)
-
-
-@pytest.mark.parametrize("content", [b"", b"no image at all", b"\xff\xd8\xff\xd9", b"\x89PNG\r\n\x1a\nIEND"])
-def test_read_image_refuses_other_content(tmp_path, content):
-    (tmp_path / "a.jpg").write_bytes(content)
-    with pytest.raises(ImageError, match=r"a\.jpg"):
-        read_image(tmp_path / "a.jpg")
 
 
 def test_read_image_reports_missing_files(tmp_path):

@@ -1,6 +1,5 @@
 """The datasets on the real photographs, against the counts and conventions of their README."""
 
-from collections import Counter
 from functools import cache
 
 import pytest
@@ -28,9 +27,6 @@ def test_pascal3d_counts():
     dataset = Pascal3DPlus(real_data("pascal3d_mini"), pixel_origin=0)
     samples = [dataset.annotation(i) for i in range(len(dataset))]
     assert not dataset.skipped
-    counts = {"aeroplane": 12, "bicycle": 7, "boat": 10, "bottle": 11, "bus": 5, "car": 12, "chair": 2}
-    counts |= {"diningtable": 1, "motorbike": 7, "sofa": 5, "train": 15, "tvmonitor": 6}
-    assert Counter(s["category"] for s in samples) == counts
     assert sum(s["truncated"] for s in samples) == 21
     assert sum(s["difficult"] for s in samples) == 19
     assert sum(not s["truncated"] and not s["difficult"] for s in samples) == 64
@@ -59,9 +55,3 @@ def test_bop_counts_and_projection(name, count):
     assert not dataset.skipped
     for sample in map(dataset.annotation, range(count)):
         assert (projected_box(sample["model_path"], sample) - sample["box"]).abs().max() < 2, "pixels"
-
-
-def test_bop_visibility():
-    dataset = BOPDataset(real_data("bop/hope"))
-    fractions = Counter(dataset.annotation(i)["visib_fract"] for i in range(len(dataset)))
-    assert fractions == {1.0: 45, 0.7: 20, 0.4: 15}

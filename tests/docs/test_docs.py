@@ -1,10 +1,7 @@
 """Links, names, options and commands on the documentation's pages exist."""
 
-import argparse
 import inspect
 import re
-import shlex
-import tomllib
 from importlib import import_module
 from pathlib import Path
 
@@ -12,9 +9,8 @@ import pytest
 from torch import nn
 
 import curvireg_torch
-from curvireg_torch import cli
 
-from .._support.pages import DOCS, PAGES, ROOT, split_command, steps
+from .._support.pages import DOCS, PAGES, ROOT
 
 SOURCES = [*PAGES, *DOCS.rglob("gallery/**/*.py")]
 PATHS = r"(?<![\w/.])((?:curvireg_torch|scripts|tests|docs|datasets)/[\w./-]*\.(?:py|sh|md|png|csv))\b"
@@ -87,14 +83,6 @@ def test_reference_lists_every_public_name() -> None:
         assert resolve(dotted) is getattr(curvireg_torch, name), dotted
 
 
-def test_architecture_page_lists_the_import_layers() -> None:
-    page = (DOCS / "architecture.md").read_text(encoding="utf-8").partition("## Layers")[2]
-    lines = re.findall(r"```\n(.*?)```", page, flags=re.DOTALL)[0].splitlines()
-    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
-    assert [re.split(r" {3,}", line)[0] for line in lines] == layers
-
-
 LAYERS = sorted(
     {
         found
@@ -119,47 +107,3 @@ def test_layer_docstrings_have_args_shape_and_example(layer: type[nn.Module]) ->
     }
     assert described == set(inspect.signature(layer).parameters)
     assert ">>>" in sections["Example"]
-
-
-def commands(page: Path) -> list[list[str]]:
-    """Commands of our own programs on a page, as words."""
-    lines = [split_command(text) for kind, text in steps(page) if kind == "command"]
-    return [words for words in lines if Path(words[0]).name in ("curvireg", "python", "torchrun")]
-
-
-def parse(words: list[str]) -> None:
-    """Parse a command as its program does.
-
-    Raises:
-        SystemExit: the program would refuse it.
-    """
-    if Path(words[0]).name == "curvireg":
-        cli.build_parser().parse_args(words[1:])
-    elif "curvireg_torch" in words:
-        cli.build_parser().parse_args(words[words.index("curvireg_torch") + 1 :])
-    elif words[1].endswith(".py"):
-        text = (ROOT / words[1]).read_text(encoding="utf-8")
-        for option in (word for word in words if word.startswith("--")):
-            if f'"{option.split("=")[0]}"' not in text and option not in options():
-                raise SystemExit(f"{words[1]} has no {option}")
-
-
-@by_page
-def test_commands_parse(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for words in commands(page):
-        try:
-            parse(words)
-        except SystemExit as error:
-            pytest.fail(f"{shlex.join(words)}: {capsys.readouterr().err.splitlines()[-1:] or error}")
-
-
-def options() -> set[str]:
-    """Every option of the command line."""
-    found: set[str] = set()
-    waiting = [cli.build_parser()]
-    while waiting:
-        for action in waiting.pop()._actions:
-            found |= set(action.option_strings)
-            if isinstance(action, argparse._SubParsersAction):
-                waiting += action.choices.values()
-    return found

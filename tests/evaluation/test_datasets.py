@@ -14,7 +14,6 @@ from curvireg_torch.cli import main
 from curvireg_torch.data import Photo, read_image
 from curvireg_torch.errors import InvalidInputError, RenderingError
 from curvireg_torch.evaluation import DATASETS, BOPBenchmark, Pascal3DBenchmark, Protocol
-from curvireg_torch.filters import ImageGradient
 from curvireg_torch.matching import ViewBank, ViewMatcher
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.registration import Registrar
@@ -131,17 +130,15 @@ def test_other_settings_are_registered_again(pascal, tmp_path):
 def test_bad_options_are_refused(pascal, tmp_path, options):
     with pytest.raises(InvalidInputError, match=next(iter(options))):
         run(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out", **options)
+    (tmp_path / "results.csv").write_text("photo\n")
+    with pytest.raises(InvalidInputError, match="results of a list"):
+        run(Pascal3DBenchmark(pascal, Protocol()), tmp_path)
 
 
 def test_selection_is_spread(pascal):
     benchmark = Pascal3DBenchmark(pascal, Protocol())
     assert benchmark.selection(2) == [0, 2]
     assert benchmark.selection(9) == [0, 1, 2, 3, 4]
-
-
-def test_settings_name_the_users_field(pascal, tmp_path):
-    summary = run(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out", field=ImageGradient(), limit=1)
-    assert summary["settings"]["pipeline"]["field"] == "custom:ImageGradient"
 
 
 def test_changed_photographs_are_registered_again(pascal, tmp_path):

@@ -88,17 +88,3 @@ def test_torchrun_gives_the_same_results(case, expected, tmp_path):
     assert read(out) == expected
     assert done.stdout.count(f"see {out}") == 1, "one process reports"
     assert not list(out.glob("results.*-of-*")), "the files of the processes are merged"
-
-
-def test_job_array_gives_the_same_results(case, expected, tmp_path):
-    words, read = case
-    out = tmp_path / "array"
-    for rank in (1, 0):
-        done = run([*words, "--out", out], RANK=rank, WORLD_SIZE=2)
-        assert done.returncode == 0, done.stderr
-        assert (f"see {out}" in done.stdout) == (rank == 0), "the last job completes it"
-    assert read(out) == expected
-    assert len(list(out.glob("results.*-of-2.jsonl"))) == 2
-    assert run([*words, "--out", out]).returncode == 0
-    assert read(out) == expected
-    assert not list(out.glob("results.*-of-*"))

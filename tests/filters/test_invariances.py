@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from .._support.layer_contract import LayerCase
-from .layer_cases import LAYERS, photos
+from .layer_cases import LAYERS
 
 FIELDS = [x for x in LAYERS.values() if x.name.partition("-")[0] not in ("hog", "diffusion", "blur")]
 # Suppression is strict on one side only, so which of two equal pixels remains depends on the side.
@@ -43,14 +43,6 @@ def test_fields_rotate_and_mirror_with_the_image(layer: LayerCase, seed: int) ->
     assert _close(layer.function(torch.rot90(x, 1, (-2, -1)), **options), torch.cat([vy, -vx], dim=1))
     vx, vy = field.flip(-1).split(1, dim=1)
     assert _close(layer.function(x.flip(-1), **options), torch.cat([-vx, vy], dim=1))
-
-
-@pytest.mark.parametrize("layer", [x for x in FIELDS if x.inputs is photos], ids=lambda x: x.name)
-@few
-@given(seed=seeds, offset=st.floats(-0.5, 0.5))
-def test_photo_fields_are_invariant_to_an_intensity_offset(layer: LayerCase, seed: int, offset: float) -> None:
-    x = _input(layer, seed)
-    assert _close(layer(x + offset), layer(x))
 
 
 # A gradient is proportional to contrast, saliency to its square; focus is invariant. MCS is invariant if kappa, which

@@ -79,3 +79,13 @@ def test_principal_curvature_image_has_the_direction_of_the_best_scale() -> None
     best = single.gather(0, winner.expand(1, 2, -1, -1))
     found = filters.principal_curvature_image(image, sigmas=sigmas)
     torch.testing.assert_close((found * best).sum(dim=1).abs(), best.square().sum(dim=1))  # the sign is free
+
+
+def test_multiscale_focus_curves_reject_edges_below_three_per_cent_of_the_contrast() -> None:
+    """Two steps 60 px apart: the saliency goes with the square of the contrast, and its limit is 0.1 %."""
+    x = torch.arange(121.0, dtype=torch.float64)
+    for contrast, retained in ((0.04, True), (0.025, False)):
+        image = (0.1 + 0.8 * (x > 30) + 0.8 * contrast * (x > 90)).expand(1, 1, 33, 121)
+        focus = filters.multiscale_focus_curves(image, saliency_weight=0.0)[0, :, 16].norm(dim=0)
+        assert float(focus[30]) > 0.5
+        assert (float(focus[90]) > 0.5) == retained

@@ -23,13 +23,6 @@ def test_square_boxes_match_values_by_hand() -> None:
         g.square_boxes(boxes, -0.1)
 
 
-def test_crop_transforms_map_borders_to_borders() -> None:
-    square = torch.tensor([[10.0, 30.0, 26.0, 46.0]])
-    A = g.crop_transforms(square, 32)[0]
-    corners = torch.tensor([[10.0, 30.0, 1.0], [26.0, 46.0, 1.0]]) @ A.T
-    assert corners.tolist() == [[-0.5, -0.5, 1.0], [31.5, 31.5, 1.0]]
-
-
 def test_image_transforms_invert_crop_transforms_with_exact_zeros() -> None:
     # A camera matrix with 1e-16 in place of 0, which some versions of LAPACK leave, is refused.
     squares = torch.tensor([[10.0, 30.0, 26.3, 46.3], [-3.7, 2.1, 0.4, 6.2]], dtype=torch.float64)
@@ -65,15 +58,6 @@ def test_crop_squares_are_triangle_filtered(side: float) -> None:
 
     for crop, (x0, y0, x1, y1) in zip(crops, squares.tolist(), strict=True):
         torch.testing.assert_close(crop, weights(y0, y1, 70) @ image @ weights(x0, x1, 90).mT)
-
-
-def test_crop_squares_scale_bytes_to_one() -> None:
-    image = torch.randint(0, 256, (3, 50, 60), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-    squares = torch.tensor([[2.0, 3.0, 30.0, 31.0], [10.5, 8.0, 52.5, 50.0]])
-    crops = crop_squares(image, squares, 16)
-    assert crops.dtype == torch.float32
-    assert torch.equal(crops, crop_squares(image / 255.0, squares, 16))
-    assert torch.equal(crop_squares(torch.full_like(image, 51), squares[:1], 64), torch.full((1, 3, 64, 64), 0.2))
 
 
 def test_crop_images_repeats_the_border() -> None:

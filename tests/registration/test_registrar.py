@@ -215,11 +215,11 @@ def test_covariance_needs_a_reliable_result_and_a_camera(monkeypatch, limit):
 
 
 def test_progress_reports_stages_and_may_cancel(monkeypatch):
-    monkeypatch.setattr("curvireg_torch.matching.bank.VIEWS_AT_A_TIME", 3)
     views, calls = sample_views(azimuth_step=90, elevations=[0, 30]), []
     pipeline = replace(PRESETS["classical"], hypotheses=1)
-    options = {"pipeline": pipeline, "progress": lambda *call: calls.append(call)}
-    bank = ViewBank.build(example_mesh(), views, image_size=64, **options)
+    options = {"pipeline": pipeline, "image_size": 64, "progress": lambda *call: calls.append(call)}
+    monkeypatch.setattr("curvireg_torch.matching.bank.VIEWS_AT_A_TIME", 3)
+    bank = ViewBank.build(example_mesh(), views, **options)
     assert calls == [("bank", 3, 8), ("bank", 6, 8), ("bank", 8, 8)]
     registrar = Registrar(bank, progress=lambda stage, *_: calls.append(stage))
     for boxes, expected in ((BOX[None], []), (None, ["detection"])):

@@ -48,7 +48,7 @@ def test_curve_table_peaks_at_the_true_view(cases, tmp_path):
             assert abs(best[0]) <= 5, name
             assert best[k] > 0.5, name
     names = {path.name for path in tables.write_table(table, tmp_path)}
-    assert {"curve.csv", "curve.md"} <= names
+    assert {"curve.csv", "curve.md"} == names
     assert "N = 2" in (tmp_path / "curve.md").read_text()
 
 

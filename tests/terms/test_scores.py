@@ -20,7 +20,6 @@ from curvireg_torch.terms import (
     Whitening,
     box_shapes,
     ledoit_wolf,
-    terms,
     whole_box_shapes,
 )
 from curvireg_torch.terms.terms import cell_counts, dilate_points
@@ -72,18 +71,6 @@ def test_whitening_decorrelates():
         Whitening(x[:5].mean(dim=0), x[:5].T.cov())
     with pytest.raises(InvalidInputError, match="covariance"):
         Whitening(torch.zeros(3), torch.eye(2))
-
-
-def test_ledoit_wolf_of_degenerate_samples():
-    """All shrinkage, because equal descriptors have no covariance; and no shrinkage is below 0."""
-    two = torch.tensor([[1.0, 0, 0], [-1.0, 0, 0]])
-    mean, covariance = ledoit_wolf(two)
-    assert torch.equal(mean, torch.zeros(3))
-    expected = sklearn.covariance.ledoit_wolf(two.numpy())[0]
-    np.testing.assert_allclose(covariance.numpy(), expected, rtol=1e-5)
-    assert torch.equal(ledoit_wolf(torch.ones(4, 3))[1], torch.zeros(3, 3))
-    with pytest.raises(InvalidInputError, match="at least 2"):
-        ledoit_wolf(torch.ones(1, 3))
 
 
 def test_matcher_ranks_by_whitened_correlation(bank, photographs):
@@ -153,28 +140,6 @@ def test_repeatability_counts_points_in_cut_cells_once(size, cell):
     assert term.cell == cell
     query = PointViews(size, ([size - 1, 0, 0, 2 * cell], [size - 1, size - 1, 0, cell])).points[None]
     assert term(SimpleNamespace(points=query)).item() == 0.5
-
-
-@pytest.mark.parametrize("size", [64, 128, 256])
-def test_repeatability_resolves_eps_with_64_cells_per_side(size):
-    """A point 3 px nearer than eps matches, and one 4 px farther does not."""
-    eps = 0.1
-    middle, distance = size // 2, int(eps * size)
-    views = PointViews(size, *((middle, middle + distance + d) for d in (-3, 4)))
-    term = Repeatability(eps=eps).build(views)
-    assert term.near.shape == (2, 64**2)
-    query = PointViews(size, (middle, middle)).points[None]
-    assert term(SimpleNamespace(points=query)).tolist() == [[1.0, 0.0]]
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_repeatability_keeps_views_of_several_chunks_in_order(threads):
-    count, before = 2 * terms.VIEWS_AT_A_TIME + 3, torch.get_num_threads()
-    views = PointViews(64, *((i // 64, i % 64) for i in range(count)))
-    torch.set_num_threads(threads)
-    near = Repeatability(eps=0.016).build(views).near
-    torch.set_num_threads(before)
-    assert torch.equal(near, dilate_points(views.points, 1.0).flatten(1).to(near.dtype))
 
 
 @pytest.mark.parametrize(("eps", "side"), [(0.016, 64), (0.008, 128)])

@@ -6,8 +6,7 @@ from unittest.mock import Mock
 
 import pytest
 
-import curvireg_torch
-from curvireg_torch import cli, evaluation
+from curvireg_torch import cli
 from curvireg_torch.cli import main, parse
 from curvireg_torch.errors import CurviregError
 from curvireg_torch.pipeline import PRESETS
@@ -55,13 +54,6 @@ def test_a_registration_imports_no_slow_library_that_it_hardly_uses():
     assert not loaded & (UNUSED | {"kornia", "sympy"})
 
 
-@pytest.mark.parametrize("package", [curvireg_torch, evaluation], ids=lambda p: p.__name__)
-def test_every_lazy_name_can_be_imported(package):
-    for name in package.__all__:
-        assert getattr(package, name) is not None
-    assert set(package.__all__) <= set(dir(package))
-
-
 def test_choices_agree_with_the_presets():
     assert list(PRESETS) == list(choices.PRESET_NAMES)
     assert choices.DEFAULT in PRESETS
@@ -104,13 +96,6 @@ def test_check_given_reports_missing_and_swapped_files_in_one_line(words, messag
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
     assert not Path("out").exists()
-
-
-@pytest.mark.parametrize("words", [["none.jpg", "part.stl"], ["photo.jpg", "none.stl"], ["part.stl", "photo.jpg"]])
-@pytest.mark.usefixtures("files")
-def test_check_given_runs_before_heavy_imports(words):
-    code = f"from curvireg_torch.cli import main; assert main({['register', *words, '--json']}) == 2"
-    assert not imported_by(code) & HEAVY
 
 
 def test_options_accept_numbers_with_commas():

@@ -2,34 +2,14 @@
 
 import math
 
-import pytest
 import torch
-from torch import Tensor
 
 import curvireg_torch as cr
 from curvireg_torch import filters
-from curvireg_torch.errors import ImageError
 from curvireg_torch.features.backbone import Backbone, describe
-from tests._support.scenes import scene, truck_registrar
+from tests._support.scenes import scene
 
 IMAGE, BOX, _ = scene(0)
-
-
-def with_hole(value: float) -> Tensor:
-    """The photograph without the pixel in the middle of the box."""
-    image = IMAGE.clone()
-    x, y = (int(v) for v in 0.5 * (BOX[:2] + BOX[2:]))
-    image[:, y, x] = value
-    return image
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_missing_pixels_in_the_box_are_refused(value: float) -> None:
-    registrar = truck_registrar(search=False, contours=False)
-    for lost in (with_hole(value), torch.full_like(IMAGE, value)):
-        (result,) = registrar([lost], BOX[None])
-        assert isinstance(result.error, ImageError)
-        assert "NaN or inf in the pixels" in str(result.error)
 
 
 def test_fields_fill_missing_pixels() -> None:

@@ -45,13 +45,6 @@ def test_for_each_runs_in_sequence_on_single_threads() -> None:
     assert here[3:] == [threading.get_ident()] * 2
 
 
-def test_for_each_may_be_nested() -> None:
-    # Threads that wait for others without a free thread would never end.
-    done = []
-    for_each(40, lambda i: for_each(3, lambda k: done.append((i, k))))
-    assert sorted(done) == [(i, k) for i in range(40) for k in range(3)]
-
-
 def test_for_each_stops_at_an_error_and_raises_it() -> None:
     done = []
 

@@ -1,0 +1,151 @@
+"""``--protocol views=3``: which photographs are registered together, and what is scored."""
+
+import json
+from collections import Counter
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from curvireg_torch.data import BOPDataset
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol
+from curvireg_torch.evaluation.benchmarks import same_instances
+from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint, transform
+from curvireg_torch.mesh import mesh_centre, mesh_radius
+from curvireg_torch.synthetic import example_mesh, synthesize_photograph
+from tests._support.scenes import CAMERA, SIZE
+
+from .helpers import rows_of, run
+
+WORLD = transform(rotation_from_axis_angle(torch.tensor([0.3, -0.8, 0.5]).double()), torch.ones(3).double())
+"""``T_world_from_model``."""
+
+
+@cache
+def photograph(azimuth: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Picture, box and ``T_cam_from_model`` of the truck."""
+    mesh, generator = example_mesh(), torch.Generator().manual_seed(int(azimuth))
+    R = rotation_from_viewpoint(azimuth, 10.0, 0.0).double()
+    ahead = torch.tensor([0.0, 0.0, 6.0 * mesh_radius(mesh)], dtype=torch.float64)
+    T = transform(R, ahead - R @ mesh_centre(mesh))
+    image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, generator, texture=0.6)
+    T[:3, 3] *= 1000.0  # BOP is in mm
+    return image, box, T
+
+
+@pytest.fixture
+def trucks(tmp_path):
+    """Two scenes of four photographs of one truck: in the first the poses of the cameras are known."""
+    root, azimuths = tmp_path / "trucks", (30.0, 70.0, 110.0, 150.0)
+    for scene in (1, 2):
+        folder, gt, info, cameras = root / "test" / f"{scene:06d}", {}, {}, {}
+        (folder / "rgb").mkdir(parents=True)
+        for number, azimuth in enumerate(azimuths):
+            image, box, T = photograph(azimuth)
+            pixels = (image.permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
+            cv2.imwrite(str(folder / "rgb" / f"{number:06d}.png"), pixels)
+            x0, y0, x1, y1 = box.tolist()
+            gt[number] = [{"obj_id": 1, "cam_R_m2c": flat(T[:3, :3]), "cam_t_m2c": T[:3, 3].tolist()}]
+            info[number] = [{"bbox_obj": [x0, y0, x1 - x0, y1 - y0], "visib_fract": 1.0}]
+            cameras[number] = {"cam_K": flat(CAMERA)}
+            if scene == 1:
+                camera = T @ torch.linalg.inv(WORLD)
+                cameras[number] |= {"cam_R_w2c": flat(camera[:3, :3]), "cam_t_w2c": camera[:3, 3].tolist()}
+        for name, content in (("gt", gt), ("gt_info", info), ("camera", cameras)):
+            (folder / f"scene_{name}.json").write_text(json.dumps(content))
+    (root / "models").mkdir()
+    mesh = example_mesh().apply_scale(1000.0)
+    mesh.export(root / "models" / "obj_000001.ply")
+    diameter = 2.0 * mesh_radius(mesh)
+    (root / "models" / "models_info.json").write_text(json.dumps({"1": {"diameter": diameter}}))
+    return BOPDataset(root)
+
+
+def flat(matrix):
+    return matrix.flatten().tolist()
+
+
+def test_each_photograph_is_the_first_once_and_relative_poses_are_right(trucks):
+    benchmark = BOPBenchmark(trucks, Protocol(pose="any", views=3))
+    truths = {entry.photo: transform(s["rotation"].double(), s["translation"].double())
+              for entry, s in zip(benchmark.entries, benchmark.samples, strict=True)}  # fmt: skip
+    assert len({entry.photo for entry in benchmark.entries}) == 8
+    for entry in benchmark.entries:
+        photos = {view.photo for view in entry.views}
+        assert len(photos | {entry.photo}) == 3
+        assert {photo.parts[-3] for photo in photos} == {entry.photo.parts[-3]}, "of the same scene"
+        for view in entry.views:
+            relative = torch.tensor(view.T_cam_from_first, dtype=torch.float64)
+            expected = truths[view.photo] @ torch.linalg.inv(truths[entry.photo])
+            torch.testing.assert_close(relative, expected, atol=1e-3, rtol=0)
+    drawn = [[view.photo for view in entry.views] for entry in benchmark.entries]
+    again = BOPBenchmark(trucks, Protocol(pose="any", views=3))
+    assert drawn == [[view.photo for view in entry.views] for entry in again.entries]
+    other = BOPBenchmark(trucks, Protocol(pose="any", views=3, seed=1))
+    assert drawn != [[view.photo for view in entry.views] for entry in other.entries]
+    assert {len(entry.views) for entry in BOPBenchmark(trucks, Protocol(pose="any", views=9)).entries} == {3}
+    assert not any(entry.views for entry in BOPBenchmark(trucks, Protocol(pose="any")).entries)
+
+
+def test_poses_of_the_cameras_come_first(trucks):
+    """The annotated poses say how the object moved, those of the cameras do not."""
+    path = trucks.root / "test" / "000001" / "scene_gt.json"
+    content = json.loads(path.read_text())
+    content["0"][0]["cam_t_m2c"][2] *= 1.001
+    path.write_text(json.dumps(content))
+    benchmark = BOPBenchmark(BOPDataset(trucks.root), Protocol(pose="any", views=4))
+    truths = [photograph(azimuth)[2] for azimuth in (30.0, 70.0, 110.0, 150.0)]
+    for view in benchmark.entries[0].views:
+        expected = truths[int(view.photo.stem)] @ torch.linalg.inv(truths[0])
+        torch.testing.assert_close(torch.tensor(view.T_cam_from_first).double(), expected, atol=1e-3, rtol=0)
+
+
+def sample(image, place=None, instance=0):
+    """An object at a place of the world, None for an unknown camera; the camera moves with the image's number."""
+    T = torch.eye(4)
+    T[0, 3] = image
+    t = torch.tensor(place or (0.0, 0.0, 0.0)) + T[:3, 3]
+    known = {"translation": t, "T_cam_from_world": T * torch.nan if place is None else T}
+    ids = {"scene_id": 1, "image_id": image, "obj_id": 1, "instance_index": instance}
+    return {**ids, **known, "model_info": {"diameter": 10.0}}
+
+
+def test_instances_are_told_apart_by_their_place():
+    near, far = (0.0, 0.0, 100.0), (30.0, 0.0, 100.0)
+    swapped = [sample(0, near), sample(0, far, 1), sample(1, far), sample(1, near, 1), sample(2, (5.0, 0.0, 100.0))]
+    assert same_instances(swapped) == [[0, 3], [1, 2], [4]]
+    assert same_instances([sample(0), sample(1, instance=3)]) == [[0, 1]], "one in each photograph"
+    listed = [sample(0), sample(0, instance=1), sample(1, instance=1), sample(1)]
+    assert same_instances(listed) == [[0, 3], [1, 2]]
+
+
+def test_evaluation_scores_the_pose_in_the_first_photograph(trucks, tmp_path):
+    benchmark = BOPBenchmark(trucks, Protocol(pose="any", views=3))
+    broken = trucks.root / "test" / "000002" / "rgb" / "000003.png"
+    broken.write_bytes(b"no picture")
+    summary = run(benchmark, tmp_path / "out")
+    assert summary["protocol"] == "cad=annotated pose=any box=annotated views=3 seed=0"
+    assert (summary["n"], summary["failed"], summary["skipped"]) == (7, 0, {"unreadable_image": 1})
+    rows = [row for row in rows_of(benchmark, tmp_path / "out").values() if row["status"] == "ok"]
+    failures = Counter()
+    for row in rows:
+        assert len(row["views"]) == 3
+        np.testing.assert_allclose(row["views"][0]["rotation"], row["rotation"])
+        np.testing.assert_allclose(row["views"][0]["translation"], row["translation"])
+        failures.update(view["failure"] is not None for view in row["views"])
+    drawn = sum(view.photo == broken for entry in benchmark.entries for view in entry.views if entry.photo != broken)
+    assert failures[True] >= drawn > 0, "a photograph that cannot be read does not spoil the others"
+    assert summary["acc_30_deg"] > 0.5
+    assert not run(benchmark, tmp_path / "out")["failed"]
+
+
+def test_views_are_refused_without_cameras(pascal):
+    with pytest.raises(InvalidInputError, match="views needs a dataset with cameras"):
+        Pascal3DBenchmark(pascal, Protocol(views=2))
+    for words in (["views=0"], ["views=x"], ["views=2", "hint=azimuth:45"]):
+        with pytest.raises(InvalidInputError, match=r"views|hints"):
+            Protocol.parse(words)
+    assert Protocol.parse(str(Protocol(views=3, seed=2)).split()) == Protocol(views=3, seed=2)
