@@ -4,6 +4,7 @@ import copy
 import math
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -178,6 +179,15 @@ def test_detect_follows_one_proposal_more_than_instances():
     assert box_iou(result.detection.box[None], box[None].double()) > 0.5
 
 
+@pytest.mark.parametrize(("gain", "kept"), [(-0.01, True), (0.01, False)])
+def test_box_around_the_pose_is_registered_where_it_is_more_certain(registrar, found, monkeypatch, gain, kept):
+    result, other = found[2], replace(found[2])
+    again = SimpleNamespace(score=result.detection.score + gain, register=lambda *_: other)
+    monkeypatch.setattr(Candidate, "ranked", lambda *_: again)
+    best = detection_module._refined(registrar, ImageItem(found[0], found[1], None), result)
+    assert best is (result if kept else other)
+
+
 @pytest.mark.parametrize("sure_first", [True, False])
 def test_add_keeps_the_most_certain_of_overlapping_results(found, sure_first):
     sure = found[2]
@@ -261,6 +271,7 @@ def test_detector_finds_the_object(seed, corner, scale):
     located = detector()(image)
     assert box_iou(located.boxes, box[None])[:2].max() > 0.6
     assert located.responses.diff().max() <= 0
+    assert len(located.boxes) == 20
     assert located.boxes.dtype == torch.float32
     assert (box_iou(located.boxes, located.boxes) > 0.5).sum() == len(located.boxes), "boxes are distinct"
 

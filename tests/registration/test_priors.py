@@ -103,6 +103,12 @@ COMBINED = PosePrior(azimuth=(20.0, 40.0), elevation=(50.0, 70.0), theta=(-5.0, 
 """Limits of which one moves a rotation out of another."""
 
 
+@pytest.mark.parametrize(("degrees", "word"), [(8.9, None), (9.1, "at the limit"), (11.0, "at the limit")])
+def test_poses_within_a_degree_of_a_limit_lie_at_it(degrees, word):
+    limits = limits_of(PosePrior(rotation=torch.eye(3, dtype=torch.float64), within=10.0))
+    assert limits.contradiction(pose_at(degrees=degrees), pose_at(), better_outside=False) == word
+
+
 def test_poses_are_turned_into_all_limits_about_their_centre():
     limits, describer = limits_of(COMBINED), truck_registrar().describer
     rotation = truck_bank().rotations.double()[::7]

@@ -122,6 +122,18 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
             _ = result.rotation
 
 
+def test_three_hypotheses_are_fitted_even_if_one_is_reported(monkeypatch):
+    fit_poses, counts = registrar_module.fit_poses, []
+
+    def counted(describer, images, poses, *rest):
+        counts.append(len(poses))
+        return fit_poses(describer, images, poses, *rest)
+
+    monkeypatch.setattr(registrar_module, "fit_poses", counted)
+    assert len(truck_registrar(hypotheses=1)([IMAGE], BOX[None], CAMERA)[0].hypotheses) == 1
+    assert counts == [3]
+
+
 def test_an_error_inside_a_fit_fails_its_photograph_alone(monkeypatch):
     fit_poses = registrar_module.fit_poses
 

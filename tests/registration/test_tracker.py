@@ -195,6 +195,16 @@ def test_tracker_follows_a_generated_sequence():
         assert float(torch.rad2deg(C[:3, :3].diagonal().sqrt()).max()) < 20.0
 
 
+def test_covariance_counts_edges_near_the_pose():
+    """At a pose that is 5 % too near, all edges are some 4 px inside its outline."""
+    follow, near = make_tracker(cube()), START.clone()
+    near[2, 3] *= 0.95
+    follow.start(drawn(START), K, START)
+    there, beside = (follow.covariance(follow.measure(drawn(START), K, T)) for T in (START, near))
+    assert bool(there.isfinite().all())
+    assert bool(beside.isnan().all())
+
+
 def test_frames_from_other_directions_become_keyframes():
     """The sequence turns by 4 degrees a frame: every second is another keyframe."""
     frames = sequence(10)
