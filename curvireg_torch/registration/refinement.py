@@ -50,8 +50,8 @@ def refine(
 
     Contours are fitted around each start that shows the mesh in the photograph. A start should lie within about 15
     degrees and 15 % of the distance of the truth. A fit from a wrong start may look as good as one from a good start,
-    so the photograph is registered as well, which no start influences: the confidence is the smaller one of that of the
-    fit and of the probability that the registration gives the pose, and never more than that of the start.
+    so the photograph is also registered in the box of the refined pose: the confidence is the smaller one of that of
+    the fit and of the probability that the registration gives the pose, and never more than that of the start.
 
     Args:
         registrar: :class:`Registrar` of the mesh.
