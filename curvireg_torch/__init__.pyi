@@ -81,7 +81,6 @@ from .pipeline import (
 from .registration import (
     Registrar as Registrar,
     Registration as Registration,
-    locate as locate,
 )
 from .rendering import (
     render_depth as render_depth,

@@ -47,7 +47,7 @@ def add_parser(commands: Any) -> None:
     frames = "a video, or a folder of frames in the order of their names"
     parser.add_argument("frames", type=Path, metavar="FRAMES", help=frames)
     parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh or a bank")
-    add_box_and_camera(parser, box="in px in the first frame; default: the object is localized", fov=False)
+    add_box_and_camera(parser, box="in px in the first frame; default: the object is detected", fov=False)
     parser.add_argument("--out", type=Path, metavar="DIR", required=True, help="folder of the results")
     parser.set_defaults(run=run)
 

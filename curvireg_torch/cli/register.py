@@ -70,13 +70,13 @@ def add_parser(commands: Any) -> None:
         type=Path,
         metavar="LIST",
         help="CSV with columns photo,x0,y0,x1,y1 and optionally fx,fy,cx,cy,mesh and azimuth,side,... (see below: what "
-        "is known about the pose). Paths are relative to the list's folder. Empty cells mean: localize the object, no "
+        "is known about the pose). Paths are relative to the list's folder. Empty cells mean: detect the object, no "
         "camera, MESH, what the options say. Or the same as JSON, COCO annotations, or the folder of a BOP scene",
     )
     add("--every", type=whole_number(1), default=1, metavar="N", help="use every N-th frame of videos (default: 1)")
     add_box_and_camera(
         parser,
-        box="in px; default: the object is localized",
+        box="in px; default: the object is detected",
         camera="in px; gives the translation. For an unknown camera give --camera exif (focal length of the "
         "photograph's file) or --fov; the result then has no covariance",
     )
@@ -193,7 +193,7 @@ def _register_one(options: "RegisterOptions", field: Any, out: Path | None, *, a
     if out is not None:
         check_writable(out, "--out")
     if options.box is None and options.start is None and options.progress:
-        print(f"{path}: localizing the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
+        print(f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
     with show_stages(enabled=options.progress) as progress:
         if progress is not None:
             progress("reading the mesh", 0, 1)

@@ -12,8 +12,8 @@ WEAK_CONTOURS = 0.35
 """Edge support of a right pose that hardly occurs: 24 generated scenes of the example mesh had 0.47 to 0.64, after a
 blur of 4 px 0.26 to 0.39, and with the meshes of a sphere and of a cuboid 0.14 to 0.43."""
 
-DOUBTFUL_PRESENCE = 0.5
-"""Probability below which the object is more likely absent from a localized box than there."""
+DOUBTFUL_SCORE = 0.5
+"""Probability below which the object is more likely absent from a detected box than there."""
 
 
 def print_result(document: Mapping[str, Any], out: Path) -> None:
@@ -28,8 +28,8 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
         print(f"mesh: {document['mesh']}")
     for line in remarks(document):
         print(line)
-    for instance in document.get("localization", {}).get("instances", []):
-        print(f"found in box {corners(instance['box'])}: there with probability {instance['presence']:.2f}")
+    for instance in document.get("detection", {}).get("instances", []):
+        print(f"found in box {corners(instance['box'])}: there with probability {instance['score']:.2f}")
     if document["translation"] is not None:
         print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")
     deviations = document["standard_deviations"]
@@ -59,7 +59,7 @@ def print_alternatives(document: Mapping[str, Any]) -> None:
 
 def _advice(document: Mapping[str, Any]) -> str:
     """What to try after a registration that is not reliable, by its likely reason."""
-    support, localization = document["edge_support"], document.get("localization")
+    support, detection = document["edge_support"], document.get("detection")
     upright = document["pipeline"]["views"]["pose"] == "upright"
     mesh = "that the mesh is the object's" + (", standing as in its file (--pose upright, --up)" if upright else "")
     if document["warnings"]:
@@ -68,8 +68,8 @@ def _advice(document: Mapping[str, Any]) -> str:
         return "more than one pose fits"
     if "distance" in document.get("prior", {}):
         return f"check --distance, --unit and --camera, and {mesh}"
-    if localization is not None:
-        if localization["presence"] < DOUBTFUL_PRESENCE:
+    if detection is not None:
+        if detection["score"] < DOUBTFUL_SCORE:
             return f"the object may not be in the photograph: add --box, and check {mesh}"
         return f"the object seems to be there, at an unsure pose: add --box, and check {mesh}"
     if support is not None and support < WEAK_CONTOURS:

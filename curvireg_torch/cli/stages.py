@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 __all__ = ["show_stages"]
 
-WORDS = {"localization": "localizing the object", "bank": "rendering views", "contours": "fitting contours"}
+WORDS = {"detection": "detecting the object", "bank": "rendering views", "contours": "fitting contours"}
 """Stages that are called otherwise than in the library."""
 
 INTERVAL = 0.5  # seconds between two updates

@@ -31,9 +31,9 @@ class RegisterOptions:
     Attributes:
         photos: photographs, folders, patterns or videos.
         meshes: mesh files or banks; of several, each photograph is registered to the best.
-        box, camera: x0, y0, x1, y1 and fx, fy, cx, cy in px; None: localized, and unknown.
+        box, camera: x0, y0, x1, y1 and fx, fy, cx, cy in px; None: detected, and unknown.
         guess: of an unknown camera: "exif", or the horizontal field of view in degrees.
-        instances: without a box, see :func:`curvireg_torch.registration.localize`.
+        instances: without a box, see :func:`curvireg_torch.registration.detect`.
         limits: on the pose, arguments of :class:`PosePrior`.
         start: file of a pose (``rotation`` and ``translation``, as in result.json) that is refined instead of a search.
         preset, pipeline: name of a pipeline, or its JSON file; None: the pipeline of a bank, or the default.

@@ -32,8 +32,8 @@ def test_show_stages_shows_stage_count_and_seconds(terminal):
     with show_stages(enabled=True) as report:
         report("bank", 20, 288)
         wait_for("rendering views 20 of 288, 0 s", terminal)
-        report("localization", 0, 1)
-        wait_for("localizing the object, 1 s", terminal)
+        report("detection", 0, 1)
+        wait_for("detecting the object, 1 s", terminal)
     assert terminal.getvalue().endswith("\r\033[K")
 
 
