@@ -20,13 +20,6 @@ class BoxDrawing:
     """A box in px of a picture, as the mouse changes it.
 
     The mouse drags an edge or a corner that it is near to, inside the box the whole box, and elsewhere a new box.
-
-    Example:
-        >>> drawing = BoxDrawing()
-        >>> drawing.press(10.0, 20.0, reach=5.0); drawing.move(60.0, 50.0); drawing.release()
-        >>> drawing.press(61.0, 35.0, reach=5.0); drawing.move(80.0, 90.0); drawing.release()     # the right edge
-        >>> drawing.box
-        (10.0, 20.0, 80.0, 50.0)
     """
 
     box: Box | None = None  # x0, y0, x1, y1

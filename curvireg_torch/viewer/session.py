@@ -20,6 +20,7 @@ from ..evaluation.opening import RegisterOptions, check_camera, open_registrar
 from ..evaluation.prior_options import QUALIFIERS
 from ..evaluation.runner import register_entry
 from ..geometry import rotation_error, rotation_from_axis_angle
+from ..geometry.calibration import Camera
 from ..geometry.cameras import rotation_towards, transform
 from ..geometry.pose_prior import object_frame
 from ..geometry.viewpoint import viewpoint_from_rotation
@@ -148,8 +149,18 @@ class Session:
         for path in options.photos:
             self.open_photo(path)
         facts = "".join([self.open_mesh(path) for path in options.meshes])
-        self.box, self.camera, self.guess = options.box, options.camera, options.guess
+        self.box, self.camera, self.guess = options.box, self._plain(options.camera), options.guess
         return facts
+
+    def _plain(self, camera: Any) -> Numbers | None:
+        """fx, fy, cx, cy of the option ``--camera``, which may be a calibrated one."""
+        if isinstance(camera, Camera):
+            if camera.distorts:
+                raise InvalidInputError("--camera: it has lens distortion; use 'curvireg register', which removes it")
+            size: Any = None if self.photo is None else self.photo.image.shape[-2:]
+            K = (camera if size is None else camera.at(size)).matrix
+            return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+        return camera and tuple(camera)
 
     def close(self) -> None:
         """Forget the photograph, the mesh, and what belongs to them."""

@@ -166,8 +166,7 @@ class Inputs:
         with fold("Camera", "camera"):
             text("p", "With it the position is found, not only the rotation.", "facts")
             with region("div", "numbers"):
-                names = ("fx", "fy", "cx", "cy")
-                self.camera = [self._number(f"camera-{name}", name, self._camera_typed) for name in names]
+                self.camera = [self._number(f"camera-{n}", n, self._camera_typed) for n in ("fx", "fy", "cx", "cy")]
             self.fov = self._number("fov", "or the horizontal field of view, degrees", self._fov_typed)
             self.camera_facts = text("p", "", "facts", data_testid="camera-facts")
             self.exif = button("Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet")
@@ -182,9 +181,8 @@ class Inputs:
 
     def _select(self, name: str, label: str, choices: Mapping[Any, str]) -> None:
         async def changed(event: Any) -> None:
-            if self._showing:
-                return
-            await self.workspace.set_option(name, event.value)
+            if not self._showing:
+                await self.workspace.set_option(name, event.value)
 
         value = getattr(self.session.options, name)
         select = ui.select(dict(choices), value=value, label=label, on_change=changed)
@@ -302,7 +300,9 @@ class Preview:
     def _draw(self, url: str, mesh: Any) -> None:
         camera = ui.scene.perspective_camera(fov=40)
         with self.place:
-            scene = ui.scene(340, 240, False, camera, self._clicked, click_events=["click"], background_color="#c8ced3")
+            scene = ui.scene(
+                width=340, height=240, grid=False, camera=camera, on_click=self._clicked, background_color="#c8ced3"
+            )
         with scene:
             scene.gltf(url).scale(1.0 / (mesh_radius(mesh) * UNITS[mesh_unit(mesh) or "m"])).move(0, 0, PREVIEW_DEPTH)
             for name, end in (("up", [0, 0, 1.0]), ("front", [0, -1.2, 0])):

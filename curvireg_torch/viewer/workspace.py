@@ -302,10 +302,6 @@ def identify(name: str, head: bytes) -> tuple[str, str]:
 
     Raises:
         InvalidInputError: it is none of them.
-
-    Example:
-        >>> identify("part", b"ply")
-        ('mesh', '.ply')
     """
     suffix = Path(name).suffix.lower()
     if head.startswith(b"PK\3\4"):

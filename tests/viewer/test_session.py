@@ -19,6 +19,7 @@ from curvireg_torch.errors import BankError, CurviregError, CurviregWarning, Ima
 from curvireg_torch.evaluation.opening import read_start
 from curvireg_torch.evaluation.store import to_json
 from curvireg_torch.geometry import rotation_error
+from curvireg_torch.geometry.calibration import Camera
 from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer.session import Answer, Session
@@ -237,6 +238,18 @@ def test_load_takes_files_box_and_camera_from_the_options():
     session = new_session("photo.png", "truck.ply", "--box", "10", "20", "90", "80", "--fov", "65")
     assert "968 faces" in session.load()
     assert session.command() == "curvireg register photo.png truck.ply --box 10 20 90 80 --fov 65 --out result"
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_calibrated_camera_becomes_numbers_unless_it_distorts():
+    K = [[500.0, 0, 239.5], [0, 500.0, 179.5], [0, 0, 1]]
+    session = new_session("photo.png", "truck.ply")  # 240 x 180 px
+    session.options = replace(session.options, camera=Camera(K, size=(360, 480)))
+    session.load()
+    assert session.camera == pytest.approx((250, 250, 119.5, 89.5))
+    session.options = replace(session.options, camera=Camera(K, (-0.3, 0.1, 0, 0)))
+    with pytest.raises(InvalidInputError, match=r"^--camera: it has lens distortion"):
+        session.load()
 
 
 def test_command_contains_inputs_and_options(folder):
