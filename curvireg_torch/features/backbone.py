@@ -204,11 +204,6 @@ def similarity(photographs: Tensor, views: Tensor) -> Tensor:
     Args:
         photographs: (B, K, D) descriptors of K crops each, from :func:`describe`.
         views: (N, D).
-
-    Example:
-        >>> d = describe(torch.rand(6, 3, 32, 32), Backbone())
-        >>> similarity(d.view(2, 3, -1), d[:1]).shape
-        torch.Size([2, 1])
     """
     check_tensor(photographs, "photographs", (None, None, None))
     check_tensor(views, "views", (None, photographs.shape[-1]))

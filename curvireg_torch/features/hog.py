@@ -7,19 +7,8 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from ..errors import InvalidInputError
+from ..filters import operations as ops
 from ..filters.modules import FunctionModule, Positive
-from ..filters.operations import (
-    Planes,
-    apply_in_blocks,
-    at_least_float32,
-    full_precision,
-    image_maximum,
-    is_directional_maximum,
-    is_host_readable,
-    safe_eps,
-    safe_sqrt,
-    zero_nonfinite_vectors,
-)
 from ..utils.checks import check_fraction, check_integer, check_option, check_tensor
 
 MIN_BLOCK_LENGTH = 1e-5  # relative to the longest block of the image; normalisation suppresses shorter ones
@@ -66,16 +55,16 @@ def hog(
         raise InvalidInputError(f"field: expected at least {grid} x {grid} px for grid={grid}, got {H} x {W}")
     if bin_weights is not None:
         check_tensor(bin_weights, "bin_weights", (bins,))
-        if is_host_readable(bin_weights) and not bool((bin_weights >= 0).all()):
+        if ops.is_host_readable(bin_weights) and not bool((bin_weights >= 0).all()):
             raise InvalidInputError(f"bin_weights: expected factors >= 0, got {bin_weights.tolist()}")
 
-    def layer(field: Tensor) -> Planes:
+    def layer(field: Tensor) -> ops.Planes:
         cells = _cell_histograms(field, (grid, grid), bins, voting)
         if bin_weights is not None:
             cells = cells * bin_weights.to(cells.dtype).view(1, -1, 1, 1)
         return (_normalised_blocks(cells, block, clip),)
 
-    return apply_in_blocks(layer, at_least_float32(field)).to(field.dtype)
+    return ops.apply_in_blocks(layer, ops.at_least_float32(field)).to(field.dtype)
 
 
 def orientation_cells(field: Tensor, *, grid: tuple[int, int], bins: int = 9) -> Tensor:
@@ -97,14 +86,14 @@ def orientation_cells(field: Tensor, *, grid: tuple[int, int], bins: int = 9) ->
     H, W = field.shape[-2:]
     if grid[0] > H or grid[1] > W:
         raise InvalidInputError(f"field: expected at least {grid[0]} x {grid[1]} px for {grid=}, got {H} x {W}")
-    return _cell_histograms(at_least_float32(field), grid, bins, "linear").to(field.dtype)
+    return _cell_histograms(ops.at_least_float32(field), grid, bins, "linear").to(field.dtype)
 
 
 def _cell_histograms(field: Tensor, grid: tuple[int, int], bins: int, voting: str) -> Tensor:
     """Mean votes per cell, (B, bins, rows, columns)."""
-    votes = _orientation_votes(zero_nonfinite_vectors(field), bins, voting)
+    votes = _orientation_votes(ops.zero_nonfinite_vectors(field), bins, voting)
     rows, columns = (_cell_weights(n, cells, voting, votes) for n, cells in zip(field.shape[-2:], grid, strict=True))
-    with full_precision(votes):
+    with ops.full_precision(votes):
         return rows @ (votes @ columns.T)
 
 
@@ -121,7 +110,7 @@ def _check_options(grid: int, bins: int, block: int, clip: float, voting: str) -
 def _orientation_votes(field: Tensor, bins: int, voting: str) -> Tensor:
     """(B, bins, H, W) vector length of each pixel, distributed over the bins of its orientation."""
     x, y = field[:, :1], field[:, 1:]
-    length = safe_sqrt(x * x + y * y)
+    length = ops.safe_sqrt(x * x + y * y)
     # atan2 has no derivative at the origin: use (1, 0) there, by arithmetic, since torch.where takes ten times as long.
     angle = torch.atan2(y, x + (length == 0).to(x.dtype))
     position = torch.remainder(angle * (bins / math.pi), bins)  # bin i covers [i, i + 1)
@@ -152,7 +141,7 @@ def _normalised_blocks(cells: Tensor, block: int, clip: float) -> Tensor:
     blocks = cells.unfold(2, block, 1).unfold(3, block, 1)  # (B, bins, n, n, block, block)
     blocks = blocks.permute(0, 2, 3, 4, 5, 1).flatten(3)  # (B, n, n, block * block * bins)
     squared = blocks.square().sum(-1, keepdim=True)
-    blocks = blocks / (squared + (MIN_BLOCK_LENGTH**2 * image_maximum(squared) + safe_eps(squared))).sqrt()
+    blocks = blocks / (squared + (MIN_BLOCK_LENGTH**2 * ops.image_maximum(squared) + ops.safe_eps(squared))).sqrt()
     blocks = blocks.clamp(max=clip)
     blocks = blocks / (blocks.square().sum(-1, keepdim=True) + MIN_BLOCK_LENGTH**2).sqrt()
     return blocks.flatten(1)
@@ -236,9 +225,9 @@ def field_points(field: Tensor, *, fraction: float = 0.04) -> Tensor:
         [0, 0, 0, 0, 9, 0, 0, 0, 0]
     """
     check_tensor(field, "field", (None, 2, None, None))
-    x, y = zero_nonfinite_vectors(at_least_float32(field)).split(1, dim=1)
-    length = safe_sqrt(x * x + y * y)
-    return strongest_points(length, is_directional_maximum(length, x, y), fraction)
+    x, y = ops.zero_nonfinite_vectors(ops.at_least_float32(field)).split(1, dim=1)
+    length = ops.safe_sqrt(x * x + y * y)
+    return strongest_points(length, ops.is_directional_maximum(length, x, y), fraction)
 
 
 def strongest_points(response: Tensor, candidates: Tensor, fraction: float) -> Tensor:
@@ -248,7 +237,7 @@ def strongest_points(response: Tensor, candidates: Tensor, fraction: float) -> T
     if B == 0:
         return candidates
     candidates, count = candidates & (response > 0), max(1, int(fraction * H * W))
-    if is_host_readable(response) and not bool((candidates.sum(dim=(1, 2, 3)) > count).any()):
+    if ops.is_host_readable(response) and not bool((candidates.sum(dim=(1, 2, 3)) > count).any()):
         return candidates  # most views have fewer, and topk is slow
     limit = torch.where(candidates, response, 0.0).flatten(1).topk(count, dim=1).values[:, -1]
     return candidates & (response >= limit.view(B, 1, 1, 1))

@@ -10,14 +10,7 @@ from safetensors.torch import load
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError, MissingFileError
-from ..filters.operations import (
-    at_least_float32,
-    fill_missing,
-    may_have_missing,
-    missing_mask,
-    safe_eps,
-    safe_sqrt,
-)
+from ..filters import operations as ops
 from ..utils.checks import check_colour_image
 from ..utils.files import write_tensors
 from .backbone import filters_channels_last
@@ -33,20 +26,20 @@ def doubled_angle(field: Tensor) -> Tensor:
 
     Opposite vectors then add up instead of cancelling, which averaging and learning need.
     """
-    x, y = at_least_float32(field).unbind(1)
-    length = safe_sqrt(x * x + y * y)
+    x, y = ops.at_least_float32(field).unbind(1)
+    length = ops.safe_sqrt(x * x + y * y)
     scale = length.clamp(min=1e-12) ** -1.5
     return torch.stack([(x * x - y * y) * scale, 2.0 * x * y * scale], dim=1).to(field.dtype)
 
 
 def halved_angle(doubled: Tensor) -> Tensor:
     """Inverse of :func:`doubled_angle`; each vector is in the half plane x >= 0."""
-    c, s = at_least_float32(doubled).unbind(1)
-    length = safe_sqrt(c * c + s * s)
+    c, s = ops.at_least_float32(doubled).unbind(1)
+    length = ops.safe_sqrt(c * c + s * s)
     # With m = length^2 and cos 2t = c / length, compute the larger of m |cos t| and m |sin t| without cancellation and
     # the other from sin 2t = 2 sin t cos t.
-    larger = safe_sqrt(0.5 * length * (length + c.abs()))
-    smaller = 0.5 * length * s.abs() / larger.clamp(min=safe_eps(larger))
+    larger = ops.safe_sqrt(0.5 * length * (length + c.abs()))
+    smaller = 0.5 * length * s.abs() / larger.clamp(min=ops.safe_eps(larger))
     x, y = torch.where(c >= 0, larger, smaller), torch.where(c >= 0, smaller, larger)
     return (length[:, None] * torch.stack([x, torch.where(s < 0, -y, y)], dim=1)).to(doubled.dtype)
 
@@ -148,9 +141,9 @@ class LearnedCurvilinearSaliency(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         field = halved_angle(self._network_output(image)[:, :2]).to(image.dtype)
-        if not may_have_missing(image):
+        if not ops.may_have_missing(image):
             return field
-        return field.masked_fill(missing_mask(image).any(dim=1, keepdim=True), 0.0)
+        return field.masked_fill(ops.missing_mask(image).any(dim=1, keepdim=True), 0.0)
 
     def mask(self, image: Tensor) -> Tensor:
         """(B, 1, H, W) probability that a pixel belongs to the central object, including its occluded parts."""
@@ -161,7 +154,7 @@ class LearnedCurvilinearSaliency(nn.Module):
         H, W = image.shape[-2:]
         zoom = WORK_SIZE / max(min(H, W), max(H, W) / MAX_ASPECT)
         size = [max(1, round(side * zoom / 16)) * 16 for side in (H, W)]
-        x = fill_missing(image.to(self.network.head.weight.dtype)).expand(-1, 3, -1, -1)
+        x = ops.fill_missing(image.to(self.network.head.weight.dtype)).expand(-1, 3, -1, -1)
         if size != [H, W]:
             x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=True)
         x = self.network(x.contiguous(memory_format=torch.channels_last))

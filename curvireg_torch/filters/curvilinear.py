@@ -8,22 +8,8 @@ from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_image, check_option, check_positive, check_same_device, type_and_shape
+from . import operations as ops
 from .modules import DepthModule, FunctionModule
-from .operations import (
-    Planes,
-    apply_in_blocks,
-    apply_to_photograph,
-    at_least_float32,
-    central_derivatives,
-    central_gradient,
-    check_scalar,
-    check_sigmas,
-    clone_if_grad,
-    safe_eps,
-    safe_sqrt,
-    smooth,
-    squared_length,
-)
 
 BACKGROUND_DEPTH = 1.25  # of missing pixels behind the nearest visible point, in units of the visible depth range
 MIN_RELATIVE_RANGE = 1e-6  # of visible depths, relative to the largest; below it (8 ulp of float32) they are rounding
@@ -91,15 +77,15 @@ def depth_curvilinear_saliency(
         1.0
     """
     mask, scale = check_depth(depth, mask), check_depth_scale(depth_scale)
-    sigma = check_scalar(sigma, "sigma", zero_ok=True)
+    sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
     check_option(formula, ("geometric", "paper"), "formula")
 
-    def layer(depth: Tensor, mask: Tensor | None) -> Planes:
-        factor, *m = _shape_operator(smooth(fill_depth(depth, mask, scale), sigma, linear=True), formula)
+    def layer(depth: Tensor, mask: Tensor | None) -> ops.Planes:
+        factor, *m = _shape_operator(ops.smooth(fill_depth(depth, mask, scale), sigma, linear=True), formula)
         vx, vy, half_gap = dominant_eigenvector(*m)
         return scaled_direction(factor.mul_(half_gap), vx, vy)
 
-    return apply_in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
+    return ops.apply_in_blocks(layer, ops.at_least_float32(depth), mask).to(depth.dtype)
 
 
 def check_depth(depth: Tensor, mask: Tensor | None) -> Tensor | None:
@@ -118,15 +104,15 @@ def check_depth_scale(depth_scale: float | None) -> float | None:
     return None if depth_scale is None else check_positive(depth_scale, "depth_scale")
 
 
-def _shape_operator(z: Tensor, formula: str) -> Planes:
+def _shape_operator(z: Tensor, formula: str) -> ops.Planes:
     """Ratio of CS to half the eigenvalue difference of M, and M row by row; z has a margin of 1 px."""
-    zx, zy, zxx, zyy, zxy = central_derivatives(z)
+    zx, zy, zxx, zyy, zxy = ops.central_derivatives(z)
     # M = adj(I_P) H_Z = H_Z + (z_y, -z_x)^T (u, -v).
     u, v = (zy * zxx).addcmul_(zx, zxy, value=-1), (zx * zyy).addcmul_(zy, zxy, value=-1)
-    m11, m12 = clone_if_grad(zxx).addcmul_(zy, u), torch.addcmul(zxy, zy, v, value=-1)
-    m21, m22 = clone_if_grad(zxy).addcmul_(zx, u, value=-1), clone_if_grad(zyy).addcmul_(zx, v)
+    m11, m12 = ops.clone_if_grad(zxx).addcmul_(zy, u), torch.addcmul(zxy, zy, v, value=-1)
+    m21, m22 = ops.clone_if_grad(zxy).addcmul_(zx, u, value=-1), ops.clone_if_grad(zyy).addcmul_(zx, v)
     if formula == "paper":
-        return safe_sqrt(squared_length(zx, zy)).mul_(2.0), m11, m12, m21, m22
+        return ops.safe_sqrt(ops.squared_length(zx, zy)).mul_(2.0), m11, m12, m21, m22
     # 2 alpha^3 = (c + c |grad Z|^2)^(-3/2)
     c = 2.0 ** (-2.0 / 3.0)
     metric = torch.addcmul(z.new_full((), c), zx, zx, value=c).addcmul_(zy, zy, value=c)
@@ -142,7 +128,7 @@ def dominant_eigenvector(
     """
     gap = m11 - m22
     # tr^2 / 4 - det in a form without cancellation.
-    half_gap = safe_sqrt((m12 * m21).addcmul_(gap, gap, value=0.25))
+    half_gap = ops.safe_sqrt((m12 * m21).addcmul_(gap, gap, value=0.25))
     # (s half_gap + gap / 2, m21) and (m12, s half_gap - gap / 2), where s is the sign, are both eigenvectors. Take the
     # one without cancellation, by arithmetic, since torch.where with an unpredictable mask is slow.
     sign = (m11 + m22).ge_(0.0).mul_(2.0).sub_(1.0) if sign is None else sign
@@ -151,17 +137,17 @@ def dominant_eigenvector(
     return torch.lerp(m12, diagonal, first), torch.lerp(diagonal, m21, first), half_gap
 
 
-def scaled_direction(length: Tensor, vx: Tensor, vy: Tensor) -> Planes:
+def scaled_direction(length: Tensor, vx: Tensor, vy: Tensor) -> ops.Planes:
     """Vectors parallel to (vx, vy) with the given length, as planes; 0 where (vx, vy) is 0."""
-    squared = squared_length(vx, vy)
-    scale = squared.clamp_(min=safe_eps(squared)).rsqrt_() * length
+    squared = ops.squared_length(vx, vy)
+    scale = squared.clamp_(min=ops.safe_eps(squared)).rsqrt_() * length
     return vx * scale, vy * scale
 
 
 def default_to_x(vx: Tensor, vy: Tensor) -> Tensor:
     """vx, replaced by 1 where (vx, vy) is numerically 0 and the direction is arbitrary."""
-    squared = squared_length(vx, vy)
-    return torch.where(squared <= safe_eps(squared), 1.0, vx)
+    squared = ops.squared_length(vx, vy)
+    return torch.where(squared <= ops.safe_eps(squared), 1.0, vx)
 
 
 def image_gradient(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
@@ -179,8 +165,8 @@ def image_gradient(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
         >>> image_gradient(ramp, sigma=0.0)[0, :, 4, 4].tolist()
         [1.0, 0.0]
     """
-    checked_sigma = check_scalar(sigma, "sigma", zero_ok=True)
-    return apply_to_photograph(lambda x: central_gradient(smooth(x, checked_sigma)), image)
+    checked_sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
+    return ops.apply_to_photograph(lambda x: ops.central_gradient(ops.smooth(x, checked_sigma)), image)
 
 
 def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
@@ -197,14 +183,14 @@ def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) ->
         >>> image_curvilinear_saliency(ramp, sigma=0.0)[0, :, 4, 4].tolist()
         [9.0, 0.0]
     """
-    checked_sigma = check_scalar(sigma, "sigma", zero_ok=True)
+    checked_sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
 
-    def layer(x: Tensor) -> Planes:
-        gx, gy = central_gradient(smooth(x, checked_sigma))
-        length = safe_sqrt(squared_length(gx, gy))
+    def layer(x: Tensor) -> ops.Planes:
+        gx, gy = ops.central_gradient(ops.smooth(x, checked_sigma))
+        length = ops.safe_sqrt(ops.squared_length(gx, gy))
         return gx * length, gy * length
 
-    return apply_to_photograph(layer, image)
+    return ops.apply_to_photograph(layer, image)
 
 
 def principal_curvature_image(
@@ -233,20 +219,20 @@ def principal_curvature_image(
         16
     """
     check_option(eigenvalue, ("largest", "smallest"), "eigenvalue")
-    scales = check_sigmas(sigmas, "sigmas")
+    scales = ops.check_sigmas(sigmas, "sigmas")
     sign = 1.0 if eigenvalue == "largest" else -1.0
 
-    def layer(image: Tensor) -> Planes:
+    def layer(image: Tensor) -> ops.Planes:
         best = vx = vy = torch.zeros_like(image)
         for sigma in scales:
-            xx, yy, xy = (sign * sigma**2 * h for h in central_derivatives(smooth(image, sigma))[2:])
+            xx, yy, xy = (sign * sigma**2 * h for h in ops.central_derivatives(ops.smooth(image, sigma))[2:])
             x, y, half_gap = dominant_eigenvector(xx, xy, xy, yy, sign=1.0)
             curvature = 0.5 * (xx + yy) + half_gap
             better = (curvature > best).to(best.dtype)
             best, vx, vy = torch.maximum(best, curvature), torch.lerp(vx, x, better), torch.lerp(vy, y, better)
         return scaled_direction(best, default_to_x(vx, vy), vy)  # a round blob has no unique direction
 
-    return apply_to_photograph(layer, image)
+    return ops.apply_to_photograph(layer, image)
 
 
 class ImageGradient(FunctionModule, function=image_gradient, learnable=("sigma",)):

@@ -8,20 +8,9 @@ import torch
 from torch import Tensor
 
 from ..utils.checks import check_integer, check_option, check_positive
+from . import operations as ops
 from .curvilinear import scaled_direction
 from .modules import FunctionModule
-from .operations import (
-    Planes,
-    apply_to_photograph,
-    central_gradient,
-    check_scalar,
-    check_sigmas,
-    image_maximum,
-    safe_eps,
-    safe_sqrt,
-    smooth,
-    squared_length,
-)
 
 MODES = ("reblur-image", "reblur-saliency")
 MAX_BLUR = 1000.0  # px, reported where re-blurring does not lower the saliency
@@ -59,29 +48,29 @@ def edge_blur(
         True
     """
     check_option(mode, MODES, "mode")
-    sigmas = check_sigmas(reblur_sigmas, "reblur_sigmas")
+    sigmas = ops.check_sigmas(reblur_sigmas, "reblur_sigmas")
 
-    def layer(x: Tensor) -> Planes:
-        gx, gy = central_gradient(smooth(x, 0.0))
-        return tuple(_edge_blur(x, squared_length(gx, gy), sigmas, mode))
+    def layer(x: Tensor) -> ops.Planes:
+        gx, gy = ops.central_gradient(ops.smooth(x, 0.0))
+        return tuple(_edge_blur(x, ops.squared_length(gx, gy), sigmas, mode))
 
-    return apply_to_photograph(layer, image, missing_value=MAX_BLUR)
+    return ops.apply_to_photograph(layer, image, missing_value=MAX_BLUR)
 
 
 def _edge_blur(x: Tensor, saliency: Tensor, reblur_sigmas: Sequence[float], mode: str) -> list[Tensor]:
     blurs = []
     for sigma in reblur_sigmas:
         if mode == "reblur-image":
-            rx, ry = central_gradient(smooth(x, sigma))
-            reblurred = squared_length(rx, ry)
+            rx, ry = ops.central_gradient(ops.smooth(x, sigma))
+            reblurred = ops.squared_length(rx, ry)
             # sigma_i^2 / (R - 1) with R = saliency / reblurred, without dividing by zero.
             numerator, denominator = sigma**2 * reblurred, saliency - reblurred
         else:
-            reblurred = smooth(saliency, sigma, margin=0)
+            reblurred = ops.smooth(saliency, sigma, margin=0)
             numerator, denominator = 2.0 * sigma**2 * reblurred.square(), saliency.square() - reblurred.square()
-        numerator = numerator + safe_eps(numerator)
+        numerator = numerator + ops.safe_eps(numerator)
         quotient = numerator / torch.maximum(denominator, numerator / (MAX_BLUR**2 + DIFFERENCE_VARIANCE))
-        blurs.append(safe_sqrt(quotient - DIFFERENCE_VARIANCE))
+        blurs.append(ops.safe_sqrt(quotient - DIFFERENCE_VARIANCE))
     return blurs
 
 
@@ -122,21 +111,21 @@ def multiscale_focus_curves(
     check_integer(scales, "scales", least=2)
     power = check_positive(saliency_weight, "saliency_weight", zero_ok=True)
     limit = check_positive(math.exp(-scales) if threshold is None else threshold, "threshold", zero_ok=True)
-    checked_sigma = check_scalar(sigma, "sigma", zero_ok=True)
+    checked_sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
 
-    def layer(image: Tensor) -> Planes:
-        x = smooth(image, checked_sigma)
-        gx, gy = central_gradient(x)
+    def layer(image: Tensor) -> ops.Planes:
+        x = ops.smooth(image, checked_sigma)
+        gx, gy = ops.central_gradient(x)
         x = x[..., 1:-1, 1:-1]
-        saliency = squared_length(gx, gy)
+        saliency = ops.squared_length(gx, gy)
         blur = functools.reduce(torch.maximum, _edge_blur(x, saliency, [float(i) for i in range(1, scales)], mode))
         # Blur below that of the derivative kernel cannot be measured.
         focus = blur.clamp(min=DIFFERENCE_VARIANCE**0.5).reciprocal()
-        retained = (focus > limit) & (saliency > MIN_RELATIVE_SALIENCY * image_maximum(saliency))
-        weight = saliency.clamp(min=safe_eps(saliency)) ** power
+        retained = (focus > limit) & (saliency > MIN_RELATIVE_SALIENCY * ops.image_maximum(saliency))
+        weight = saliency.clamp(min=ops.safe_eps(saliency)) ** power
         return scaled_direction(focus * weight * retained, gx, gy)
 
-    return apply_to_photograph(layer, image)
+    return ops.apply_to_photograph(layer, image)
 
 
 class EdgeBlur(FunctionModule, function=edge_blur):

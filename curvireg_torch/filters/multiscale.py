@@ -7,23 +7,9 @@ from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_integer, check_option, check_positive, check_tensor
+from . import operations as ops
 from .curvilinear import scaled_direction
 from .modules import FunctionModule
-from .operations import (
-    Planes,
-    apply_in_blocks,
-    apply_to_photograph,
-    at_least_float32,
-    central_gradient,
-    check_scalar,
-    fill_missing,
-    image_maximum,
-    replicate_pad,
-    safe_reciprocal,
-    smooth,
-    squared_length,
-    stack_channels,
-)
 
 CONDUCTANCES = ("rational", "exponential")
 DIFFUSION_STEP = 0.2  # of the diffusion under MCS
@@ -59,20 +45,20 @@ def anisotropic_diffusion(
     check_tensor(image, "image", (None, None, None, None))
     check_option(conductance, CONDUCTANCES, "conductance")
     check_integer(iterations, "iterations", least=0)
-    kappa, step = check_scalar(kappa, "kappa"), check_positive(step, "step")
+    kappa, step = ops.check_scalar(kappa, "kappa"), check_positive(step, "step")
     if step > 0.25:
         raise InvalidInputError(f"step: expected 0 < step <= 0.25 (stability), got {step}")
 
-    def layer(x: Tensor) -> Planes:
-        return (diffuse(fill_missing(x), iterations, kappa, step, conductance),)
+    def layer(x: Tensor) -> ops.Planes:
+        return (diffuse(ops.fill_missing(x), iterations, kappa, step, conductance),)
 
-    return apply_in_blocks(layer, at_least_float32(image)).to(image.dtype)
+    return ops.apply_in_blocks(layer, ops.at_least_float32(image)).to(image.dtype)
 
 
 def diffuse(x: Tensor, iterations: int, kappa: float | Tensor, step: float, conductance: str) -> Tensor:
     """:func:`anisotropic_diffusion` of checked arguments."""
     for _ in range(iterations):
-        p = replicate_pad(x, 1)  # no difference, hence no flow, across the border
+        p = ops.replicate_pad(x, 1)  # no difference, hence no flow, across the border
         # The flow between two neighbours is computed once and enters both with opposite signs.
         flow_x = _flow(p[..., 1:-1, 1:] - p[..., 1:-1, :-1], kappa, conductance)
         flow_y = _flow(p[..., 1:, 1:-1] - p[..., :-1, 1:-1], kappa, conductance)
@@ -82,7 +68,7 @@ def diffuse(x: Tensor, iterations: int, kappa: float | Tensor, step: float, cond
 
 
 def _flow(difference: Tensor, kappa: float | Tensor, conductance: str) -> Tensor:
-    scaled = difference * safe_reciprocal(kappa)
+    scaled = difference * ops.safe_reciprocal(kappa)
     if conductance == "rational":
         return difference / torch.addcmul(scaled.new_ones(()), scaled, scaled)
     return difference * torch.exp(-scaled.square())
@@ -126,9 +112,9 @@ def multiscale_curvilinear_saliency(
     if limit >= 1:
         raise InvalidInputError(f"threshold: expected 0 <= threshold < 1, got {threshold}")
     last = check_positive(2.0 ** (scales - 2) if diffusion_time is None else diffusion_time, "diffusion_time")
-    checked_sigma, contrast = check_scalar(sigma, "sigma", zero_ok=True), check_scalar(kappa, "kappa")
+    checked_sigma, contrast = ops.check_scalar(sigma, "sigma", zero_ok=True), ops.check_scalar(kappa, "kappa")
 
-    def layer(image: Tensor) -> Planes:
+    def layer(image: Tensor) -> ops.Planes:
         level, steps_done = image, 0
         field, saliency = _normalised_saliency(level, checked_sigma)
         lowest = saliency
@@ -142,16 +128,16 @@ def multiscale_curvilinear_saliency(
             saliency, lowest = torch.maximum(saliency, level_saliency), torch.minimum(lowest, level_saliency)
         return (field * (lowest > limit),)
 
-    return apply_to_photograph(layer, image)
+    return ops.apply_to_photograph(layer, image)
 
 
 def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> tuple[Tensor, Tensor]:
     """Vectors of the image CS of one level, and their lengths, with maximum 1 over the image."""
-    gx, gy = central_gradient(smooth(level, sigma))
-    saliency = squared_length(gx, gy)
-    peak = image_maximum(saliency)
+    gx, gy = ops.central_gradient(ops.smooth(level, sigma))
+    saliency = ops.squared_length(gx, gy)
+    peak = ops.image_maximum(saliency)
     saliency = saliency / torch.where(peak > 0, peak, 1.0)
-    return stack_channels(*scaled_direction(saliency, gx, gy)), saliency
+    return ops.stack_channels(*scaled_direction(saliency, gx, gy)), saliency
 
 
 class AnisotropicDiffusion(FunctionModule, function=anisotropic_diffusion, learnable=("kappa",)):

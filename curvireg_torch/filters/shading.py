@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..utils.checks import check_camera_matrix, check_same_device, check_tensor
+from . import operations as ops
 from .curvilinear import (
     BACKGROUND_DEPTH,
     check_depth,
@@ -20,17 +21,6 @@ from .curvilinear import (
     visible_range,
 )
 from .modules import DepthModule
-from .operations import (
-    Planes,
-    apply_in_blocks,
-    at_least_float32,
-    central_derivatives,
-    check_scalar,
-    is_directional_maximum,
-    is_host_readable,
-    safe_sqrt,
-    smooth,
-)
 
 
 def average_shading_gradient(
@@ -63,9 +53,11 @@ def average_shading_gradient(
         >>> round(float(field[0, :, 32, 32].norm()) * 60 / (2 * torch.pi / 3) ** 0.5, 2)     # gamma sqrt(2) / radius
         1.0
     """
-    return _field_of_normals(
-        depth, mask, camera_matrix, sigma, depth_scale, lambda trace, *_: math.sqrt(math.pi / 3.0) * safe_sqrt(trace)
-    )
+
+    def length(trace: Tensor, *_: Tensor) -> Tensor:
+        return math.sqrt(math.pi / 3.0) * ops.safe_sqrt(trace)
+
+    return _field_of_normals(depth, mask, camera_matrix, sigma, depth_scale, length)
 
 
 def _field_of_normals(
@@ -84,21 +76,21 @@ def _field_of_normals(
             camera_matrix = camera_matrix.expand(depth.shape[0], -1, -1)
         check_tensor(camera_matrix, "camera_matrix", (depth.shape[0], 3, 3))
         check_same_device(camera_matrix, depth, "camera_matrix")
-        if is_host_readable(camera_matrix):
+        if ops.is_host_readable(camera_matrix):
             check_camera_matrix(camera_matrix)
         if depth_scale is not None:
             raise InvalidInputError("depth_scale: has no meaning with a camera_matrix; leave one of them out")
-        camera_matrix = camera_matrix.to(at_least_float32(depth).dtype)
+        camera_matrix = camera_matrix.to(ops.at_least_float32(depth).dtype)
     mask, scale = check_depth(depth, mask), check_depth_scale(depth_scale)
-    sigma = check_scalar(sigma, "sigma", zero_ok=True)
+    sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
 
-    def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> Planes:
+    def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> ops.Planes:
         a, b, c = _normal_structure_tensor(depth, mask, camera, sigma, scale)
         vx, vy, half_gap = dominant_eigenvector(a, b, b, c)
         vx = default_to_x(vx, vy)
         return scaled_direction(length(a + c, half_gap, vx, vy), vx, vy)
 
-    return apply_in_blocks(layer, at_least_float32(depth), mask, camera_matrix).to(depth.dtype)
+    return ops.apply_in_blocks(layer, ops.at_least_float32(depth), mask, camera_matrix).to(depth.dtype)
 
 
 def _normal_structure_tensor(
@@ -106,13 +98,13 @@ def _normal_structure_tensor(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """N_x . N_x, N_x . N_y, N_y . N_y per px^2, each (B, 1, H, W), from the Hessian in closed form."""
     if camera is None:
-        z = smooth(fill_depth(depth, mask, depth_scale), sigma, linear=True)
-        zx, zy, zxx, zyy, zxy = central_derivatives(z)
+        z = ops.smooth(fill_depth(depth, mask, depth_scale), sigma, linear=True)
+        zx, zy, zxx, zyy, zxy = ops.central_derivatives(z)
         one, zero = torch.ones_like(zx), torch.zeros_like(zx)
         return _unit_vector_products((-zx, -zy, one), (-zxx, -zxy, zero), (-zxy, -zyy, zero))
     surface, near, span = visible_range(depth, mask)
-    z = smooth(torch.minimum(surface, near + BACKGROUND_DEPTH * span) / span, sigma, linear=True)
-    zx, zy, zxx, zyy, zxy = central_derivatives(z)
+    z = ops.smooth(torch.minimum(surface, near + BACKGROUND_DEPTH * span) / span, sigma, linear=True)
+    zx, zy, zxx, zyy, zxy = ops.central_derivatives(z)
     z = z[..., 1:-1, 1:-1]
     H, W = z.shape[-2:]
     fx, fy, cx, cy = (camera[:, i, j].view(-1, 1, 1, 1) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
@@ -163,14 +155,14 @@ def hessian_frobenius_norm(
         [1.0, 0.0]
     """
     mask, scale = check_depth(depth, mask), check_depth_scale(depth_scale)
-    sigma = check_scalar(sigma, "sigma", zero_ok=True)
+    sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
 
-    def layer(depth: Tensor, mask: Tensor | None) -> Planes:
-        _, _, zxx, zyy, zxy = central_derivatives(smooth(fill_depth(depth, mask, scale), sigma, linear=True))
+    def layer(depth: Tensor, mask: Tensor | None) -> ops.Planes:
+        _, _, zxx, zyy, zxy = ops.central_derivatives(ops.smooth(fill_depth(depth, mask, scale), sigma, linear=True))
         vx, vy, _ = dominant_eigenvector(zxx, zxy, zxy, zyy)
-        return scaled_direction(safe_sqrt(zxx * zxx + 2.0 * zxy * zxy + zyy * zyy), default_to_x(vx, vy), vy)
+        return scaled_direction(ops.safe_sqrt(zxx * zxx + 2.0 * zxy * zxy + zyy * zyy), default_to_x(vx, vy), vy)
 
-    return apply_in_blocks(layer, at_least_float32(depth), mask).to(depth.dtype)
+    return ops.apply_in_blocks(layer, ops.at_least_float32(depth), mask).to(depth.dtype)
 
 
 def apparent_ridges(
@@ -207,8 +199,8 @@ def apparent_ridges(
     """
 
     def length(trace: Tensor, half_gap: Tensor, vx: Tensor, vy: Tensor) -> Tensor:
-        curvature = safe_sqrt(0.5 * trace + half_gap)
-        return torch.where(is_directional_maximum(curvature, vx, vy), curvature, 0.0) if maxima else curvature
+        curvature = ops.safe_sqrt(0.5 * trace + half_gap)
+        return torch.where(ops.is_directional_maximum(curvature, vx, vy), curvature, 0.0) if maxima else curvature
 
     return _field_of_normals(depth, mask, camera_matrix, sigma, depth_scale, length)
 

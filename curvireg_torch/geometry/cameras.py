@@ -25,10 +25,6 @@ def camera_of_view(fov: float, size: tuple[int, int]) -> Tensor:
     """(3, 3) float64 camera matrix of a horizontal field of view, 0 < ``fov`` < 180 degrees, and an (H, W) in px.
 
     Pixels are square, the principal point is in the centre.
-
-    Example:
-        >>> camera_of_view(90.0, (480, 640))[0].round(decimals=6).tolist()
-        [320.0, 0.0, 319.5]
     """
     if not (isinstance(fov, int | float) and 0.0 < fov < 180.0):
         raise InvalidInputError(f"fov: expected 0 < degrees < 180 across the image's width, got {fov!r}")

@@ -110,12 +110,7 @@ def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
 
 
 def cross_matrix(vector: Tensor) -> Tensor:
-    """(..., 3) vectors to the (..., 3, 3) matrices [v]x whose product with x is the cross product v x x.
-
-    Example:
-        >>> cross_matrix(torch.tensor([1.0, 2.0, 3.0])).tolist()
-        [[0.0, -3.0, 2.0], [3.0, 0.0, -1.0], [-2.0, 1.0, 0.0]]
-    """
+    """(..., 3) vectors to the (..., 3, 3) matrices [v]x whose product with x is the cross product v x x."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(*vector.shape, 3)

@@ -53,13 +53,7 @@ def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
 
 
 def non_maximum_suppression(boxes: Tensor, scores: Tensor, threshold: float) -> Tensor:
-    """Indices of (N, 4) boxes by falling score (N,), without those that overlap a better one by more than an IoU.
-
-    Example:
-        >>> boxes = torch.tensor([[0.0, 0.0, 9.0, 9.0], [20.0, 0.0, 29.0, 9.0], [0.0, 1.0, 9.0, 10.0]])
-        >>> non_maximum_suppression(boxes, torch.tensor([0.1, 0.2, 0.3]), 0.5).tolist()
-        [2, 1]
-    """
+    """Indices of (N, 4) boxes by falling score (N,), without those that overlap a better one by more than an IoU."""
     from kornia.geometry.bbox import nms  # here, because its import takes 0.3 s
 
     kept: Tensor = nms(boxes, scores, threshold)

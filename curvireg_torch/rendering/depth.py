@@ -64,8 +64,7 @@ def make_renderer(
 
         return TorchRenderer(mesh, device=device)
     try:
-        from .embree import EmbreeRenderer
-        from .raster import RasterRenderer
+        from .embree import EmbreeRenderer, RasterRenderer
     except ImportError as error:
         message = f"renderer {backend!r} needs the package embreex ({error}): pip install embreex"
         raise MissingDependencyError(message) from error

@@ -1,4 +1,7 @@
-"""Depth by ray casting with embree: needs no GPU, no driver, no display."""
+"""Depth on the CPU, by ray casting with embree and by OpenCV's z-buffer: no GPU, no driver, no display."""
+
+import math
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -12,11 +15,18 @@ from ..mesh.mesh import box_corners, extreme_points, mesh_centre, mesh_radius
 from ..utils.threads import for_each
 from .depth import NEAREST, check_render_arguments
 
-__all__ = ["EmbreeRenderer", "RayScene"]
+__all__ = ["EmbreeRenderer", "RasterRenderer", "RayScene"]
 
 _MISS = 1e30  # embreex returns 1e37 where a ray hits nothing
 _MAX_HULL_VERTICES = 200_000  # above, a convex hull takes more time than it saves
 _MAX_COORDINATE = 16000  # px; OpenCV draws no polygons beyond
+
+BESIDE = 1e-3
+"""Space, in object radii, between the object and the planes in front and behind it between which OpenCV draws."""
+
+
+FARTHEST = 1000.0
+"""Depth, in object radii, beyond which single precision does not separate object and background."""
 
 
 class RayScene:
@@ -147,3 +157,81 @@ def _combined(pixels: tuple[np.ndarray, ...], x: np.ndarray, y: np.ndarray, z: f
     rays: np.ndarray = across.take(pixels[1], axis=0)  # four times as fast as across[pixels[1]]
     rays += down.take(pixels[0], axis=0)
     return rays
+
+
+class RasterRenderer:
+    """Draws into OpenCV's z-buffer, views in parallel on threads; rays take over where OpenCV is slower or wrong.
+
+    The time of the z-buffer grows with the faces, that of ray casting with the pixels: it is used for meshes of fewer
+    faces than the image has pixels. It does not clip faces that cross the near plane, is not precise far away, and
+    knows no parallel projection.
+
+    Attributes:
+        rays: a renderer of the same mesh by ray casting, built on first use.
+    """
+
+    name = "auto"
+
+    def __init__(self, mesh: trimesh.Trimesh) -> None:
+        self._mesh = mesh
+        # OpenCV computes in float32, so the object is centred and scaled to radius 1.
+        self._centre, self._radius = mesh_centre(mesh).numpy(), mesh_radius(mesh)
+        self._corners = (box_corners(mesh).numpy() - self._centre) / self._radius
+        vertices = (np.asarray(mesh.vertices) - self._centre) / self._radius
+        self._vertices = np.ascontiguousarray(vertices, np.float32)[:, None]
+        self._faces = np.array(mesh.faces, np.int32)[:, None]
+        self._settings = cv2.TriangleRasterizeSettings()
+        self._settings.setCullingMode(cv2.RASTERIZE_CULLING_NONE)
+
+    @cached_property
+    def rays(self) -> EmbreeRenderer:
+        return EmbreeRenderer(self._mesh)
+
+    def faces_at(
+        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tensor]:
+        """See :meth:`EmbreeRenderer.faces_at`."""
+        return self.rays.faces_at(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
+
+    def render(
+        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+    ) -> Tensor:
+        if orthographic or len(self._faces) > size[0] * size[1]:
+            return self.rays.render(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
+        T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
+        position = (T[:, :3, 3] + T[:, :3, :3] @ self._centre) / self._radius  # of the object's centre, in radii
+        z = position[:, 2:] + T[:, 2, :3] @ self._corners.T
+        near, far = z.min(axis=1) - BESIDE, z.max(axis=1) + BESIDE
+        depth = np.zeros((len(T), 1, *size), np.float32)
+
+        drawn = (near > NEAREST) & (far < FARTHEST)
+
+        def draw(i: int) -> None:
+            if drawn[i]:
+                depth[i, 0] = self._draw(T[i, :3, :3], position[i], K[i], size, float(near[i]), float(far[i]))
+
+        for_each(len(T), draw)
+        if len(rest := np.nonzero(~drawn & (far > NEAREST))[0]):
+            depth[rest] = self.rays.render(torch.from_numpy(T[rest]), torch.from_numpy(K[rest]), size).numpy()
+        return torch.from_numpy(depth)
+
+    def _draw(
+        self, R: np.ndarray, t: np.ndarray, K: np.ndarray, size: tuple[int, int], near: float, far: float
+    ) -> np.ndarray:
+        """(H, W) depth of one view."""
+        H, W = size
+        # OpenCV's camera: axes of OpenGL, 90 degrees from the top to the bottom of the image, centred, square pixels.
+        shear = np.array(
+            [
+                [2.0 * K[0, 0] / H, 0.0, (2.0 * K[0, 2] - (W - 1)) / H],
+                [0.0, -2.0 * K[1, 1] / H, -(2.0 * K[1, 2] - (H - 1)) / H],
+                [0.0, 0.0, -1.0],
+            ]
+        )
+        camera = (shear @ np.column_stack([R, t])).astype(np.float32)
+        z = np.full(size, far, np.float32)
+        cv2.triangleRasterizeDepth(self._vertices, self._faces, z, camera, math.pi / 2.0, near, far, self._settings)
+        background = z > far - 0.5 * BESIDE
+        z *= np.float32(self._radius)
+        z[background] = 0.0
+        return z

@@ -117,23 +117,13 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
 
 
 def box_shapes(boxes: Tensor) -> Tensor:
-    """(...,) log of width / height of (..., 4) boxes x0, y0, x1, y1.
-
-    Example:
-        >>> box_shapes(torch.tensor([0.0, 0.0, 10.0, 10.0])).item()
-        0.0
-    """
+    """(...,) log of width / height of (..., 4) boxes x0, y0, x1, y1."""
     sides = boxes[..., 2:] - boxes[..., :2]
     return torch.log(sides[..., 0] / sides[..., 1])
 
 
 def whole_box_shapes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
-    """(B,) shapes of (B, 4) boxes in px in images of ``sizes`` (H, W); NaN if the border may cut the object off.
-
-    Example:
-        >>> whole_box_shapes(torch.tensor([[9.0, 9, 19, 19], [-0.5, 9, 19, 19]]), [(48, 64)] * 2).tolist()
-        [0.0, nan]
-    """
+    """(B,) shapes of (B, 4) boxes in px in images of ``sizes`` (H, W); NaN if the border may cut the object off."""
     end = torch.tensor([[W, H] for H, W in sizes], dtype=boxes.dtype, device=boxes.device).view(-1, 2) - 0.5
     border = 1.0 + BORDER_DISTANCE * (boxes[:, 2:] - boxes[:, :2]).amax(dim=1, keepdim=True)
     inside = (boxes[:, :2] > -0.5 + border).all(dim=1) & (boxes[:, 2:] < end - border).all(dim=1)

@@ -143,11 +143,6 @@ def ledoit_wolf(descriptors: Tensor) -> tuple[Tensor, Tensor]:
 
     The covariance is (1 - a) S + a tr(S)/D Id with the a of Ledoit and Wolf (2004) that estimates the population's
     covariance best from the sample's covariance S.
-
-    Example:
-        >>> mean, covariance = ledoit_wolf(torch.rand(50, 8))
-        >>> Whitening(mean, covariance)(torch.rand(3, 8)).shape
-        torch.Size([3, 8])
     """
     check_tensor(descriptors, "descriptors", (None, None))
     count = len(descriptors)

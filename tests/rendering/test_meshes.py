@@ -56,16 +56,6 @@ def test_render_ignores_doubled_and_degenerate_faces(backend: str) -> None:
     assert_same_depth(render(damaged, backend), render(mesh, backend))
 
 
-def test_render_places_the_parts_of_a_scene(backend: str) -> None:
-    T = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3], [0.1, 0, 0])
-    part = trimesh.creation.box((0.3, 0.5, 0.7))
-    scene = trimesh.Scene()
-    scene.add_geometry(part, node_name="a", transform=T)
-    scene.add_geometry(part, node_name="b", parent_node_name="a", transform=T)  # relative to a
-    whole = trimesh.util.concatenate([part.copy().apply_transform(T), part.copy().apply_transform(T @ T)])
-    assert torch.equal(render(scene, backend), render(whole, backend))
-
-
 def test_render_with_the_camera_inside_and_the_object_behind(backend: str, orthographic: bool) -> None:
     renderer = make_renderer(trimesh.creation.box((2.0, 2.0, 2.0)), backend)
     wide = torch.tensor([[30.0, 0, 19.5], [0, 30.0, 14.5], [0, 0, 1]])
@@ -76,6 +66,23 @@ def test_render_with_the_camera_inside_and_the_object_behind(backend: str, ortho
     assert depth[0, 0, 15, 20] == pytest.approx(1.25, abs=1e-4)
     assert bool((depth[1] == 0).all())
     assert depth[2, 0, 15, 20] == pytest.approx(near, abs=1e-4)
+
+
+@pytest.mark.parametrize("times", [20.0, 3000.0])
+def test_render_from_far_away_is_that_of_parallel_projection(backend: str, times: float) -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=3)
+    T, one, size = camera(2)
+    far, longer = T.clone(), one.clone()
+    far[:, 2, 3] *= times
+    longer[:2, :2] *= times
+    depth = make_renderer(mesh, backend).render(far, longer, size).double()
+    flat = one.clone()
+    flat[:2, :2] /= 4.0  # at the distance of the object's centre
+    expected = make_renderer(mesh, "embree").render(T, flat, size, orthographic=True).double()
+    assert int(((depth > 0) != (expected > 0)).sum()) < 0.2 / times * (expected > 0).sum() + 10
+    both = (depth > 0) & (expected > 0)
+    error = (depth - 4.0 * (times - 1.0) - expected)[both].abs()
+    assert float(error.median()) < 0.5 / times + 1e-3
 
 
 def test_render_batches(backend: str) -> None:

@@ -30,17 +30,6 @@ def test_threads_share_a_renderer(backend: str) -> None:
     assert all(torch.equal(result, expected) for result in results)
 
 
-def test_threads_build_renderers(backend: str) -> None:
-    T, K, size = camera(2)
-
-    def render(edge: int) -> torch.Tensor:
-        return make_renderer(trimesh.creation.box([edge] * 3), backend).render(T, K, size)
-
-    with ThreadPoolExecutor(2) as pool:
-        for edge, depth in zip((1, 2, 1, 2), pool.map(render, (1, 2, 1, 2)), strict=True):
-            assert torch.equal(depth, render(edge))
-
-
 _SCENE = """
 import atexit, os, sys, torch, trimesh
 from curvireg_torch.errors import RenderingError

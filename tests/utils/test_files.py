@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from curvireg_torch.cli import main
-from curvireg_torch.errors import CurviregError, InvalidInputError, OutputError
+from curvireg_torch.errors import CurviregError, InvalidInputError, MissingFileError, OutputError
 from curvireg_torch.evaluation.runner import POSE_SOURCES
 from curvireg_torch.matching import cache
 from curvireg_torch.utils import files
@@ -36,7 +36,9 @@ def path(tmp_path: Path) -> Path:
 def test_write_file_replaces_files_and_targets_of_links(tmp_path: Path) -> None:
     path = tmp_path / "new" / "folder" / "file"
     write_file(path, OLD)
-    write_file(path, NEW)
+    with path.open("rb") as reader:
+        write_file(path, NEW)
+        assert reader.read() == OLD, "who has the file open keeps the old content"
     assert path.read_bytes() == NEW
     assert list(path.parent.iterdir()) == [path]
     link = tmp_path / "link"
@@ -125,6 +127,15 @@ def test_read_json_refuses_malicious_files(tmp_path: Path, content: bytes) -> No
         read_json(tmp_path / "a.json", dict, "README")
     assert len(str(caught.value).splitlines()) == 1
     assert len(str(caught.value)) < 1000
+
+
+def test_read_json_refuses_missing_and_large_files(tmp_path: Path) -> None:
+    with open(tmp_path / "a.json", "wb") as file:
+        file.truncate((1 << 25) + 1)  # a sparse file
+    with pytest.raises(InvalidInputError, match="larger than 33,554,432 bytes"):
+        read_json(tmp_path / "a.json", dict, "README")
+    with pytest.raises(MissingFileError, match="no such file; README"):
+        read_json(tmp_path / "none.json", dict, "README")
 
 
 def test_finite_numbers_accepts_finite_numbers_only() -> None:
