@@ -64,7 +64,8 @@ def register_views(
     Returns:
         A registration whose poses are ``T_world_from_model``, whose covariance is along the world's axes, and whose
         ``views`` have the pose in each photograph. ``projection`` and ``ranking`` are those of the first photograph
-        that counts. The covariance assumes that the poses of the cameras are right.
+        that counts. The covariance does not know the errors of the cameras; it grows where
+        photographs contradict each other.
 
     Raises:
         InvalidInputError: no photograph can be registered; a camera's pose is not rigid; two photographs that differ
