@@ -84,7 +84,6 @@ from .evaluation.photograph import (
 from .registration import (
     Registrar as Registrar,
     Registration as Registration,
-    locate as locate,
 )
 from .rendering import (
     render_depth as render_depth,

@@ -36,7 +36,7 @@ __all__ = [
     "FIELDS",
     "PRESETS",
     "BankSettings",
-    "LocateSettings",
+    "DetectionSettings",
     "Pipeline",
     "ViewPolicy",
     "field_digest",
@@ -153,8 +153,8 @@ class BankSettings:
 
 
 @dataclass(frozen=True)
-class LocateSettings:
-    """How an object without a box is searched for, see :class:`curvireg_torch.registration.Locator`.
+class DetectionSettings:
+    """How an object without a box is searched for, see :class:`curvireg_torch.registration.Detector`.
 
     Attributes:
         views: of each model, that represent all of its views.
@@ -170,9 +170,9 @@ class LocateSettings:
 
     def __post_init__(self) -> None:
         if min(self.views, self.proposals, self.candidates) < 1:
-            raise InvalidInputError(f"locate: expected views, proposals and candidates >= 1, got {self}")
+            raise InvalidInputError(f"detection: expected views, proposals and candidates >= 1, got {self}")
         if not 0.02 <= self.min_size <= 1.0:
-            raise InvalidInputError(f"locate: min_size: expected a fraction in [0.02, 1], got {self.min_size}")
+            raise InvalidInputError(f"detection: min_size: expected a fraction in [0.02, 1], got {self.min_size}")
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ class Pipeline:
         hypotheses: distinct views that are carried through search and contour fit.
         search: search around hypotheses in small rotation steps.
         contours: fit the mesh's contours to the photograph's edges.
-        locate: how boxes that are not given are found.
+        detection: how boxes that are not given are found.
 
     Raises:
         InvalidInputError: an unknown name or a number out of range.
@@ -212,7 +212,7 @@ class Pipeline:
     hypotheses: int = 5
     search: bool = False
     contours: bool = True
-    locate: LocateSettings = LocateSettings()
+    detection: DetectionSettings = DetectionSettings()
 
     def __post_init__(self) -> None:
         if not self.field.startswith(CUSTOM):
@@ -282,7 +282,7 @@ class Pipeline:
         data = _object(data, "pipeline")
         if data.pop("version", VERSION) != VERSION:
             raise InvalidInputError(f"pipeline: this library reads version {VERSION}; write the file again")
-        for name, settings in (("views", ViewPolicy), ("bank", BankSettings), ("locate", LocateSettings)):
+        for name, settings in (("views", ViewPolicy), ("bank", BankSettings), ("detection", DetectionSettings)):
             if name in data:
                 data[name] = _settings(settings, data[name], f"pipeline: {name}")
         if "terms" in data:

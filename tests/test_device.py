@@ -43,10 +43,10 @@ def test_bank_on_a_gpu():
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("localized", [False, True])
-def test_registrar_on_a_gpu(localized):
+@pytest.mark.parametrize("detected", [False, True])
+def test_registrar_on_a_gpu(detected):
     image, box, _ = scene(0)
-    boxes = None if localized else box[None]
+    boxes = None if detected else box[None]
     expected = cr.Registrar(truck_bank())([image], boxes, CAMERA)[0]
     found = cr.Registrar(truck_bank(), device="cuda")([image.cuda()], boxes, CAMERA)[0]
     assert float(cr.rotation_error(found.rotation.cpu(), expected.rotation)) < 0.5

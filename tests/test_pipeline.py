@@ -72,7 +72,7 @@ def test_json_contains_every_setting():
     for part, names in {
         "views": ("directions", "theta_step", "azimuth_step", "distance"),
         "bank": ("image_size", "sigma", "margin", "bins"),
-        "locate": ("views", "proposals", "candidates"),
+        "detection": ("views", "proposals", "candidates"),
     }.items():
         changed += [replace(base, **{part: replace(getattr(base, part), **{n: 40})}) for n in names]
     for term in base.terms:

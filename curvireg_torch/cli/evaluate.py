@@ -15,7 +15,7 @@ from .options import add_command, add_options
 PROTOCOL = (
     "cad=annotated|any: the annotated CAD model, or the best of the class; "
     "pose=upright|any: whether objects are known to stand upright; "
-    "box=annotated|none|FRACTION: as annotated; localized; or each edge moved by up to FRACTION of the side (seed=N); "
+    "box=annotated|none|FRACTION: as annotated; detected; or each edge moved by up to FRACTION of the side (seed=N); "
     "hint=none|azimuth:DEG|pose:DEG: azimuth or rotation known to lie within DEG of a value that is off by up to DEG; "
     "views=N: N photographs of one pose together (bop; seed=N)"
 )
@@ -94,6 +94,6 @@ def _print_summary(summary: Mapping[str, Any]) -> None:
         prefixes = ("acc_", "add_", "mssd_", "mspd_")
         numbers = [f"{name} {value:.3f}" for name, value in summary.items() if name.startswith(prefixes)]
         print("   ".join([*numbers, f"med_err_deg {summary['med_err_deg']:.1f}"]))
-    if "localization" in summary:
-        (_, n), *recalls = summary["localization"].items()
+    if "detection" in summary:
+        (_, n), *recalls = summary["detection"].items()
         print("   ".join(f"{name} {value:.3f}" for name, value in recalls) if n else "no box is annotated")

@@ -46,7 +46,7 @@ def add_follow(commands: Any) -> None:
     parser.add_argument("frames", metavar="FRAMES", help=frames + "rtsp://... Live frames are dropped, not delayed")
     parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh or a bank")
     options = [name for name in PHOTOGRAPH if name != "mask"]
-    add_options(parser, *options, "start", "field", box="in px in the first frame; default: the object is localized")
+    add_options(parser, *options, "start", "field", box="in px in the first frame; default: the object is detected")
     parser.add_argument("--json", action="store_true", help="print each pose as a line of JSON; --out is optional")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
 

@@ -27,15 +27,15 @@ MAX_FAILURES = 10
 NONE_RELIABLE, SOME_FAILED = 3, 4
 """Exit codes of ``--strict``."""
 
-STAGES = {"localization": "localizing the object", "bank": "rendering views", "contours": "fitting contours"}
+STAGES = {"detection": "detecting the object", "bank": "rendering views", "contours": "fitting contours"}
 """Stages that are called otherwise than in the library."""
 
 WEAK_CONTOURS = 0.35
 """Edge support of a right pose that hardly occurs: 24 generated scenes of the example mesh had 0.47 to 0.64, after a
 blur of 4 px 0.26 to 0.39, and with the meshes of a sphere and of a cuboid 0.14 to 0.43."""
 
-DOUBTFUL_PRESENCE = 0.5
-"""Probability below which the object is more likely absent from a localized box than there."""
+DOUBTFUL_SCORE = 0.5
+"""Probability below which the object is more likely absent from a detected box than there."""
 
 
 def add_register(commands: Any) -> None:
@@ -74,7 +74,7 @@ def add_register(commands: Any) -> None:
         type=Path,
         metavar="LIST",
         help="CSV with columns photo,x0,y0,x1,y1 and optionally fx,fy,cx,cy,mesh and azimuth,side,... (see below: what "
-        "is known about the pose). Paths are relative to the list's folder. Empty cells mean: localize the object, no "
+        "is known about the pose). Paths are relative to the list's folder. Empty cells mean: detect the object, no "
         "camera, MESH, what the options say. Or the same as JSON, COCO annotations, or the folder of a BOP scene",
     )
     add(
@@ -205,7 +205,7 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
     if out is not None:
         check_writable(out, "--out")
     if options.progress and not (options.box or options.mask or options.start):
-        print(f"{path}: localizing the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
+        print(f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
     with show_stages(enabled=options.progress) as progress:
         if progress is not None:
             progress("reading the mesh", 0, 1)
@@ -320,8 +320,8 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
         print(f"mesh: {document['mesh']}")
     for line in remarks(document):
         print(line)
-    for instance in document.get("localization", {}).get("instances", []):
-        print(f"found in box {corners(instance['box'])}: there with probability {instance['presence']:.2f}")
+    for instance in document.get("detection", {}).get("instances", []):
+        print(f"found in box {corners(instance['box'])}: there with probability {instance['score']:.2f}")
     if document["translation"] is not None:
         print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")
     if (deviations := document["standard_deviations"]) is not None:
@@ -355,7 +355,7 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
 
 def _advice(document: Mapping[str, Any]) -> str:
     """What to try after a registration that is not reliable, by its likely reason."""
-    support, localization = document["edge_support"], document.get("localization")
+    support, detection = document["edge_support"], document.get("detection")
     upright = document["pipeline"]["views"]["pose"] == "upright"
     mesh = "that the mesh is the object's" + (", standing as in its file (--pose upright, --up)" if upright else "")
     if document["warnings"]:
@@ -364,8 +364,8 @@ def _advice(document: Mapping[str, Any]) -> str:
         return "more than one pose fits"
     if "distance" in document.get("prior", {}):
         return f"check --distance, --unit and --camera, and {mesh}"
-    if localization is not None:
-        if localization["presence"] < DOUBTFUL_PRESENCE:
+    if detection is not None:
+        if detection["score"] < DOUBTFUL_SCORE:
             return f"the object may not be in the photograph: add --box, and check {mesh}"
         return f"the object seems to be there, at an unsure pose: add --box, and check {mesh}"
     if support is not None and support < WEAK_CONTOURS:

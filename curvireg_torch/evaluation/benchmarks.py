@@ -43,7 +43,7 @@ __all__ = [
     "Benchmark",
     "Pascal3DBenchmark",
     "PoseFolderBenchmark",
-    "localization_recall",
+    "detection_recall",
     "write_bop_csv",
 ]
 
@@ -396,7 +396,7 @@ def write_bop_csv(path: Path, poses: Iterable[BOPPose]) -> None:
     write_csv(path, lines)
 
 
-def localization_recall(samples: Sequence[Row], rows: Sequence[Row]) -> Row:
+def detection_recall(samples: Sequence[Row], rows: Sequence[Row]) -> Row:
     """``recall_1``, ``recall_5``, ``recall_20``: fractions of the ``n`` annotated boxes that the best proposals find.
 
     Boxes are clipped to the image on both sides: some datasets annotate the visible part, some the whole object. A row
@@ -410,9 +410,9 @@ def localization_recall(samples: Sequence[Row], rows: Sequence[Row]) -> Row:
 
 def _rank(box: Tensor, row: Row) -> float:
     """Rank of the first right proposal, from 1; infinite if none is right."""
-    if "localization" not in row:
+    if "detection" not in row:
         return math.inf
-    boxes = [proposal["box"] for proposal in row["localization"]["proposals"]]
+    boxes = [proposal["box"] for proposal in row["detection"]["proposals"]]
     proposals = torch.tensor(boxes, dtype=torch.float64).view(-1, 4)
     picture = row["inputs"]["picture"]
     end = torch.tensor([picture["width"], picture["height"]] * 2, dtype=torch.float64) - 0.5

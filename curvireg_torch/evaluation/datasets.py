@@ -18,7 +18,7 @@ from ..utils.checks import check_positive
 from ..utils.files import code_digest, write_file
 from ..version import __version__
 from ..visualization.sheet import SheetEntry, write_sheet
-from .benchmarks import Benchmark, localization_recall
+from .benchmarks import Benchmark, detection_recall
 from .runner import POSE_SOURCES, run_entries, thumbnail_of
 from .store import ResultStore, Row, to_json
 
@@ -121,7 +121,7 @@ def report(benchmark: Benchmark, store: ResultStore, settings: Row, limit: int |
     settings = {**settings, "root": Path(settings["root"]).name}  # a summary is shared: no paths
     summary = {
         **benchmark.summary(samples, rows, errors),
-        **({"localization": localization_recall(samples, rows)} if located else {}),
+        **({"detection": detection_recall(samples, rows)} if located else {}),
         "failed": sum(row["status"] == "failed" for row in rows),
         "skipped": dict(sorted(skipped.items())),
         "protocol": settings["protocol"],

@@ -61,7 +61,7 @@ def photo_list(
 
     Columns, in any order: ``photo``, ``x0``, ``y0``, ``x1``, ``y1``; optional ``fx``, ``fy``, ``cx``, ``cy`` or
     ``camera`` (a calibration file), ``mask`` (a file), ``mesh`` and those of :data:`.PRIOR_OPTIONS`; others are passed
-    through. Empty cells mean: localize the object, no camera, ``meshes``, ``limits``. A row that
+    through. Empty cells mean: detect the object, no camera, ``meshes``, ``limits``. A row that
     cannot be used holds the reason in its ``error``.
 
     Args:
@@ -175,7 +175,7 @@ def list_photographs(
     Args:
         paths: photographs, folders of them, patterns such as ``shots/*.jpg``, videos.
         meshes: mesh files; of several the best is found.
-        box, camera: x0, y0, x1, y1 (default: the object is localized) and fx, fy, cx, cy, in px; or a calibration.
+        box, camera: x0, y0, x1, y1 (default: the object is detected) and fx, fy, cx, cy, in px; or a calibration.
         limits: arguments of :class:`PosePrior`.
         every, frames: use every n-th frame of videos; folder for these, as PNG.
 

@@ -105,7 +105,7 @@ class RegisterOptions:
     Attributes:
         photos: photographs, folders, patterns or videos.
         meshes: mesh files or banks; of several, each photograph is registered to the best.
-        box, camera: x0, y0, x1, y1 and fx, fy, cx, cy in px, or a calibrated camera; None: localized, and unknown.
+        box, camera: x0, y0, x1, y1 and fx, fy, cx, cy in px, or a calibrated camera; None: detected, and unknown.
         guess: of an unknown camera: "exif", or the horizontal field of view in degrees.
         limits: on the pose, arguments of :class:`PosePrior`.
         preset, pipeline: name of a pipeline, or its JSON file; None: the pipeline of a bank, or the default.
@@ -118,7 +118,7 @@ class RegisterOptions:
     meshes: tuple[Path, ...] = ()
     box: Annotated[
         tuple[float, float, float, float] | None,
-        _option("in px of the photograph; default: the object is localized", type=Numbers("X0 Y0 X1 Y1")),
+        _option("in px of the photograph; default: the object is detected", type=Numbers("X0 Y0 X1 Y1")),
     ] = None
     camera: Annotated[
         Any,  # four numbers, a Camera, or None

@@ -18,7 +18,7 @@ from ..geometry.pose_prior import PosePrior
 from ..matching import ViewBank
 from ..mesh import load_mesh
 from ..pipeline import Pipeline
-from ..registration import FailedRegistration, Registrar, Registration, localize
+from ..registration import FailedRegistration, Registrar, Registration, detect
 from ..registration.inputs import ImageItem, image_items
 from ..registration.poses import projected_box
 from ..registration.result import result_document
@@ -129,7 +129,7 @@ def register(
     if not isinstance(item, ImageItem):
         raise item.with_subject("")
     if boxes is None and masks is None:
-        result = localize(registrar, [image], camera, prior=prior)[0][0]
+        result = detect(registrar, [image], camera, prior=prior)[0][0]
     else:
         result = registrar([image], boxes, camera, prior=prior, masks=masks)[0]
     if isinstance(result, FailedRegistration):
@@ -137,7 +137,7 @@ def register(
     found = item.box.double()
     if boxes is None and masks is None:
         describer = registrar.of_model(result.model).describer
-        found = result.localization.box if result.localization else projected_box(describer, result.projection)
+        found = result.detection.box if result.detection else projected_box(describer, result.projection)
     values = {field.name: getattr(result, field.name) for field in fields(Registration)}
     box = found if result.corrected_box is None else result.corrected_box
     return RegisteredPhotograph(**values, registrar=registrar, image=item.image, box=box)

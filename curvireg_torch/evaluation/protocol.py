@@ -24,7 +24,7 @@ class Protocol:
     Attributes:
         cad: "annotated": that CAD. "any": all CADs of the class, the best wins.
         pose: pose prior: "upright" or "any".
-        box: 0: as annotated; x > 0 moves each edge at random by up to x of the side; None: the object is localized.
+        box: 0: as annotated; x > 0 moves each edge at random by up to x of the side; None: the object is detected.
         hint: "azimuth:45": the azimuth lies within 45 degrees of a value that is itself up to 45 degrees off;
             "pose:45": the same of the whole rotation; "none".
         views: photographs of one pose that are registered together, each once as the first; for datasets of cameras.

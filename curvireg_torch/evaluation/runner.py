@@ -20,11 +20,11 @@ from ..geometry import Camera, camera_matrix, undistorted
 from ..geometry.cameras import camera_of_view
 from ..geometry.pose_prior import PosePrior
 from ..mesh.files import mesh_digest
-from ..registration import FailedRegistration, Registrar, Registration, localize
+from ..registration import FailedRegistration, Registrar, Registration, detect
 from ..registration.inputs import ImageItem, image_items
 from ..registration.poses import projected_box
 from ..registration.refinement import refine
-from ..registration.result import SCHEMA, localization_document, result_document, used_box
+from ..registration.result import SCHEMA, detection_document, result_document, used_box
 from ..utils.files import code_digest, file_digest, text_digest, write_file
 from ..utils.threads import map_on_threads
 from ..visualization.sheet import thumbnail
@@ -82,12 +82,12 @@ class Entry:
         cells: of a list: the texts of the row, one for each column.
         name, photo: the photograph as the user names it, and its file.
         meshes: mesh files; of several the best is found.
-        box: x0, y0, x1, y1 in px; None: the object is localized.
+        box: x0, y0, x1, y1 in px; None: the object is detected.
         camera: fx, fy, cx, cy in px, or a calibrated camera; None if unknown.
         mask: file of a mask of the object, instead of a box or beside it.
         guess: replaces an unknown camera: "exif" takes the focal length in the photograph's file, a number is the
             horizontal field of view in degrees; None: no camera.
-        instances: without a box, see :func:`curvireg_torch.registration.localize`.
+        instances: without a box, see :func:`curvireg_torch.registration.detect`.
         prior: limits on the pose.
         start, start_confidence: (4, 4) pose that is refined, nothing is searched for; and its confidence if known.
         views: other photographs, with which the pose in ``photo`` is found together.
@@ -168,7 +168,7 @@ def register_entry(
     elif entry.views:
         results = [_registered_views(entry, photo, registrar)]
     elif entry.box is None and entry.mask is None:
-        results = localize(registrar, images, camera, instances=entry.instances, prior=entry.prior)[0]
+        results = detect(registrar, images, camera, instances=entry.instances, prior=entry.prior)[0]
     else:
         box = None if entry.box is None else torch.tensor(entry.box)[None]
         masks = None if entry.mask is None else [entry.mask]
@@ -178,8 +178,8 @@ def register_entry(
         raise result.error.with_subject(entry.name)
     if entry.box is not None or entry.mask is not None:
         box = item.box
-    elif result.localization is not None:
-        box = result.localization.box
+    elif result.detection is not None:
+        box = result.detection.box
     else:
         box = projected_box(registrar.of_model(result.model).describer, projection_of(result, item.camera_matrix))
     K = item.camera_matrix
@@ -196,8 +196,8 @@ def register_entry(
         },
         "camera": None if K is None else (camera if isinstance(camera, Camera) else Camera(K)).at(item.size).describe(),
     }
-    if result.localization is not None:
-        document["localization"] = localization_document([r for r in results if isinstance(r, Registration)])
+    if result.detection is not None:
+        document["detection"] = detection_document([r for r in results if isinstance(r, Registration)])
     if source in ("exif", "fov"):  # the error of a guessed camera is unknown
         document["covariance"] = document["standard_deviations"] = None
     return result, document

@@ -2,29 +2,27 @@
 
 from .confidence import RELIABLE
 from .contour_fit import ContourFit, fit_contours
+from .detection import Detector, Proposals, detect
 from .following import Follower
-from .localization import Located, Locator, localize, locate, representative_views
 from .refinement import refine
 from .registrar import Registrar
-from .result import FailedRegistration, Hypothesis, Localization, PhotographPose, Registration
+from .result import Detection, FailedRegistration, Hypothesis, PhotographPose, Registration
 from .several import register_views
 
 __all__ = [
     "RELIABLE",
     "ContourFit",
+    "Detection",
+    "Detector",
     "FailedRegistration",
     "Follower",
     "Hypothesis",
-    "Localization",
-    "Located",
-    "Locator",
     "PhotographPose",
+    "Proposals",
     "Registrar",
     "Registration",
+    "detect",
     "fit_contours",
-    "localize",
-    "locate",
     "refine",
     "register_views",
-    "representative_views",
 ]

@@ -15,9 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..matching import Ranking
 from ..pipeline import BankSettings, Pipeline
-from ..terms import Correlation
 
 __all__ = [
     "CALIBRATION",
@@ -25,6 +23,7 @@ __all__ = [
     "COVARIANCE_SCALE",
     "RELIABLE",
     "LogisticModel",
+    "are_near",
     "concentration",
     "confidence_features",
     "detection_probability",
@@ -90,13 +89,17 @@ def model_name(*, exact: bool) -> str:
 def is_calibrated(pipeline: Pipeline) -> bool:
     """Whether the models were fitted for such a pipeline: learned field, default terms, contour fit, default views.
 
-    The number of hypotheses, the box jitter, the size of the views and their spacing may differ.
+    The number of hypotheses, the box jitter, the size of the views, their spacing, and how many of them the appearance
+    term compares may differ.
     """
     default, bank = Pipeline(), pipeline.bank
-    usual = BankSettings(image_size=bank.image_size)
-    plain = all(term.whitening == "none" for term in pipeline.terms if isinstance(term, Correlation))
-    same_field = (pipeline.field, pipeline.weights) == (default.field, default.weights)
-    return same_field and bank == usual and plain and pipeline.contours
+
+    def compared(pipeline: Pipeline) -> Any:
+        terms = [(term.name, term.weight, getattr(term, "whitening", None)) for term in pipeline.terms]
+        return pipeline.field, pipeline.weights, terms
+
+    usual = bank == BankSettings(image_size=bank.image_size) and pipeline.contours
+    return usual and compared(pipeline) == compared(default)
 
 
 def registration_confidence(features: Features, *, exact: bool) -> float:
@@ -123,69 +126,58 @@ def tracking_confidence(features: Features) -> float:
     return model({name: features[name] for name in model.weights})
 
 
-def detection_probability(score: float, similarity: float, *, learned: bool) -> float:
+def detection_probability(response: float, similarity: float) -> float:
     """Probability that a photograph shows the object in a box.
 
     Args:
-        score: the detector's, of the box.
+        response: the detector's, of the box.
         similarity: normalised correlation of the box's best view.
-        learned: whether the detector's features are; without, only the similarity counts.
 
     Example:
-        >>> detection_probability(8.0, 0.9, learned=True) > detection_probability(4.0, 0.6, learned=True)
+        >>> detection_probability(8.0, 0.9) > detection_probability(4.0, 0.6)
         True
     """
-    if not learned:
-        return LogisticModel.named("detection without networks")({"similarity": similarity})
-    return LogisticModel.named("detection")({"score": score, "similarity": similarity})
+    return LogisticModel.named("detection")({"response": response, "similarity": similarity})
 
 
-def concentration(ranking: Ranking, rotations: Tensor, symmetries: Tensor | None = None) -> Tensor:
-    """(B,) float64 fraction of the sum of S^4 over all views that lies within 30 degrees of the best view.
+def are_near(rotations: Tensor, rotation: Tensor, symmetries: Tensor | None = None) -> Tensor:
+    """(N,) bool: rotations (N, 3, 3) within ``RIVAL_ANGLE`` of one (3, 3), or of what a symmetry makes of it.
 
-    It is NaN where no view is further away.
+    ``symmetries`` are (K, 4, 4) or (K, 3, 3).
+    """
+    group = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
+    equivalent = rotation.to(rotations) @ group.to(rotations)
+    traces = (equivalent.flatten(1) @ rotations.flatten(1).T).amax(dim=0)
+    return traces >= 1.0 + 2.0 * math.cos(math.radians(RIVAL_ANGLE)) - 1e-5
 
-    Args:
-        ranking: of N views for B photographs.
-        rotations: (N, 3, 3) of the views.
-        symmetries: (K, 4, 4) or (K, 3, 3) of the mesh: views that differ by one of them count as the same.
+
+def concentration(scores: Tensor, near: Tensor) -> float | None:
+    """Fraction of the sum of S^4 over all views (N,) that the views ``near`` (N,) a pose have; None if all are near.
 
     Example:
-        >>> R = torch.stack([torch.eye(3), torch.diag(torch.tensor([1.0, -1.0, -1.0]))])
-        >>> concentration(Ranking(torch.tensor([[1.0, 0.5]]), torch.tensor([[0, 1]]), {}), R).tolist()
-        [0.9411764705882353]
+        >>> round(concentration(torch.tensor([1.0, 0.5]), torch.tensor([True, False])), 4)
+        0.9412
     """
-    scores = ranking.scores.double()
-    group = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
-    equivalent = rotations[ranking.order[:, :1]] @ group.to(rotations)  # (B, K, 3, 3)
-    traces = (equivalent.flatten(2) @ rotations.flatten(1).T).amax(dim=1)
-    near = traces >= 1.0 + 2.0 * math.cos(math.radians(RIVAL_ANGLE)) - 1e-5
-    tiny = 1e-300  # all scores may be 0
-    weights = (scores / scores.amax(dim=1, keepdim=True).clamp(min=tiny)) ** 4
-    share = (weights * near).sum(dim=1) / weights.sum(dim=1).clamp(min=tiny)
-    return share.masked_fill(near.all(dim=1), torch.nan)
+    scores = scores.double()
+    weights = (scores / scores.max().clamp(min=1e-300)) ** 4  # all scores may be 0
+    return None if bool(near.all()) else float((weights * near).sum() / weights.sum().clamp(min=1e-300))
 
 
-def confidence_features(evidence: Tensor, scores: Tensor, share: float) -> dict[str, float | None]:
+def confidence_features(evidence: Tensor, scores: Tensor, share: float | None) -> dict[str, float | None]:
     """``CONFIDENCE_FEATURES`` of the best hypothesis of one photograph.
 
     similarity, edge_support: of the best hypothesis. margin: its score minus the largest of its rivals, clamped to
-    +-5; None without rivals. concentration: of the ranking; None without views that are far from the best.
+    +-5; None without rivals.
 
     Args:
         evidence: (H, 4) :data:`POSE_FEATURES` of the hypotheses, the best first.
         scores: (H,) by which they are ordered.
-        share: of :func:`concentration`.
+        share: :func:`concentration` of the ranking.
     """
     _, similarity, edge_support, _ = evidence[0].tolist()
     rivals = scores[1:]
     margin = min(max(float(scores[0] - rivals.max()), -MAX_MARGIN), MAX_MARGIN) if len(rivals) else None
-    return {
-        "similarity": similarity,
-        "margin": margin,
-        "edge_support": edge_support,
-        "concentration": None if math.isnan(share) else share,
-    }
+    return {"similarity": similarity, "margin": margin, "edge_support": edge_support, "concentration": share}
 
 
 def hypothesis_probabilities(confidence: float, scores: Tensor, *, exact: bool) -> tuple[float, ...]:

@@ -1,6 +1,7 @@
 """Following an object through the frames of a video."""
 
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -8,14 +9,15 @@ from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..geometry.calibration import Camera
-from ..geometry.cameras import rotation_towards
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_tensor
 from ..utils.threads import map_on_threads
+from .confidence import RELIABLE
 from .inputs import ImageItem, image_items
+from .poses import Poses, hypothesis_of
 from .refinement import nearest_view, refine_item
 from .registrar import Registrar
-from .result import FailedRegistration, Hypothesis, Registration
+from .result import FailedRegistration, Registration
 from .tracker import TrackedPose, Tracker
 
 __all__ = ["Follower"]
@@ -24,7 +26,7 @@ TRUSTED_CONFIDENCE, KEPT_CONFIDENCE = 0.5, 0.2
 """Tracking confidence from which a tracked pose stands without a refinement, and after one that was no better."""
 
 BELIEVED_CONFIDENCE = 0.5
-"""Confidence of a registration from which it is followed; below, the next frame is registered again."""
+"""Confidence from which a pose is followed; while it is lower, each frame is registered to check it."""
 
 
 class Follower:
@@ -32,11 +34,13 @@ class Follower:
 
     The first frame is registered, unless :meth:`start` gives its pose, and so is every further one until a pose is
     believed. From then on frames are tracked (docs/method.md). Where tracking is not trusted, contours are fitted
-    around its pose (:func:`refine`), and the more certain pose counts; where neither finds the object, the frame is
-    registered, and that pose is used only if it is reliable.
+    around its pose and the result is compared with a registration (:func:`refine`); the more certain pose counts.
+    Where neither finds the object, the frame is registered, and that pose is used only if it is reliable.
 
     The ``confidence`` of a tracked frame is the probability that its pose is within 10 degrees and 10 % of the distance
-    of the truth: the tracker's own, times that of the pose from which tracking began. It never exceeds the latter.
+    of the truth: the tracker's own, times that of the last pose that a registration confirmed. It never exceeds the
+    latter, nor that of a doubtful pose that was kept: no pose gains confidence from being followed, unless a further
+    registration is reliable.
 
     Args:
         registrar: of one mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
@@ -61,8 +65,9 @@ class Follower:
         self.camera_matrix = camera_matrix
         describer = self.registrar.describer
         self._tracker = Tracker(describer.renderer, describer.contours, describer.hull)
-        self._start_confidence = 0.0  # of the pose from which tracking began; 0: there is none
+        self._base = 0.0  # confidence of the pose that tracking goes on from; 0: there is none
 
+    @torch.no_grad()
     def start(self, image: Any, pose: Any) -> None:
         """Begin from a known pose, in place of registering the first frame.
 
@@ -89,7 +94,8 @@ class Follower:
         item = image_items([image], None, self.camera_matrix)[0]
         if not isinstance(item, ImageItem):
             raise item
-        self._start(item, T, 1.0)
+        map_on_threads(lambda T: self._tracker.start(item.image, _camera(item), T), [T])
+        self._base = 1.0
 
     @torch.no_grad()
     def __call__(self, image: Any, box: Any = None) -> Registration | FailedRegistration:
@@ -97,93 +103,72 @@ class Follower:
 
         Args:
             image: see :class:`Registrar`.
-            box: x0, y0, x1, y1 in px of the object, for a frame that is registered; None localizes it.
+            box: x0, y0, x1, y1 in px of the object, for a frame that is registered; None detects it.
         """
         item = image_items([image], None, self.camera_matrix)[0]
         if not isinstance(item, ImageItem):
             return FailedRegistration(item)
-        boxes = None if box is None else [box]
-        if not self._start_confidence:
-            result = self.registrar([image], boxes, self.camera_matrix)[0]
-            if isinstance(result, Registration) and (result.confidence or 0.0) >= BELIEVED_CONFIDENCE:
-                self._begin(item, result)
-            return result
-        tracked = map_on_threads(lambda item: self._track(item), [item])[0]
+        if not self._base:
+            return self._registered(item, image, box, BELIEVED_CONFIDENCE)
+        tracked = map_on_threads(self._track, [item])[0]
         found = None if tracked is None else self._registration(tracked, item)
-        if tracked and found and tracked.confidence >= TRUSTED_CONFIDENCE:
+        if tracked and found and tracked.confidence >= TRUSTED_CONFIDENCE and self._base >= BELIEVED_CONFIDENCE:
             self._tracker.accept(tracked)
             return found
-        return self._search(item, image, boxes, tracked, found)
-
-    def _begin(self, item: ImageItem, result: Registration) -> None:
-        """Track from a registered pose, if it lies within the frame."""
-        with suppress(LostObjectError):
-            self._start(item, _pose(result), result.confidence or 0.0)
-
-    @torch.no_grad()
-    def _start(self, item: ImageItem, T: Tensor, confidence: float) -> None:
-        map_on_threads(lambda T: self._tracker.start(item.image, _camera(item), T), [T])
-        self._start_confidence = confidence
-
-    def _continue(self, item: ImageItem, result: Registration) -> None:
-        """Track on from a pose that the search found, if it lies within the frame."""
-        with suppress(LostObjectError):
-            pose = map_on_threads(lambda T: self._tracker.measure(item.image, _camera(item), T), [_pose(result)])[0]
-            self._tracker.accept(pose)
-
-    def _track(self, item: ImageItem) -> TrackedPose | None:
-        try:
-            return self._tracker.track(item.image, _camera(item))
-        except LostObjectError:
-            return None
-
-    def _search(
-        self, item: ImageItem, image: Any, boxes: Any, tracked: TrackedPose | None, found: Registration | None
-    ) -> Registration | FailedRegistration:
-        """The pose in a frame in which tracking ``found`` a doubtful one, or none."""
-        starts = [self._tracker.last_pose] if tracked is None else [tracked.T, self._tracker.last_pose]
-        limit = self._start_confidence
-        result: Registration | FailedRegistration
-        try:
-            result = map_on_threads(
-                lambda T: refine_item(self.registrar, item, T, limit=limit, check=False), [torch.cat(starts)]
-            )[0]
-        except CurviregError as error:
-            result = FailedRegistration(error)
-        better = isinstance(result, Registration) and (
-            found is None or (result.confidence or 0.0) > (found.confidence or 0.0)
-        )
-        if better and isinstance(result, Registration):
-            self._continue(item, result)
-            return result
+        starts = [self._tracker.last_pose] if tracked is None else [tracked.state.T, self._tracker.last_pose]
+        refined = map_on_threads(lambda T: self._refined(item, T), [torch.cat(starts)])[0]
+        if isinstance(refined, Registration) and _confidence(refined) >= (0.0 if found is None else _confidence(found)):
+            self._go_on(item, refined)
+            return refined
         if tracked and found and tracked.confidence >= KEPT_CONFIDENCE:
             self._tracker.accept(tracked)
+            self._base = _confidence(found)
             return found
-        registered = self.registrar([image], boxes, self.camera_matrix)[0]
-        if isinstance(registered, Registration) and registered.reliable:
-            self._begin(item, registered)
-            return registered
+        registered = self._registered(item, image, box, RELIABLE)
+        return registered if isinstance(registered, Registration) and registered.reliable else refined
+
+    def _registered(self, item: ImageItem, image: Any, box: Any, least: float) -> Registration | FailedRegistration:
+        """Register a frame; track from its pose if it lies within the frame, with a confidence of ``least``."""
+        result = self.registrar([image], None if box is None else [box], self.camera_matrix)[0]
+        if isinstance(result, Registration) and _confidence(result) >= least:
+            with suppress(LostObjectError):
+                map_on_threads(lambda T: self._tracker.start(item.image, _camera(item), T), [_pose(result)])
+                self._base = _confidence(result)
         return result
+
+    def _refined(self, item: ImageItem, starts: Tensor) -> Registration | FailedRegistration:
+        """Refined poses; a registration that is not reliable does not raise the confidence."""
+        try:
+            result = refine_item(self.registrar, item, starts)
+        except CurviregError as error:
+            return FailedRegistration(error)
+        bound = self._base if _confidence(result) < RELIABLE else 1.0
+        return replace(result, probabilities=tuple(min(p, bound) for p in result.probabilities))
+
+    def _go_on(self, item: ImageItem, result: Registration) -> None:
+        """Track on from a refined pose, if it lies within the frame."""
+        with suppress(LostObjectError):
+            measure = self._tracker.measure
+            self._tracker.accept(map_on_threads(lambda T: measure(item.image, _camera(item), T), [_pose(result)])[0])
+            self._base = _confidence(result)
+
+    def _track(self, item: ImageItem) -> TrackedPose | None:
+        with suppress(LostObjectError):
+            return self._tracker.track(item.image, _camera(item))
+        return None
 
     def _registration(self, tracked: TrackedPose, item: ImageItem) -> Registration:
         """The result of a tracked pose, without ranking and without rivals."""
-        T, support = tracked.T[0], tracked.features["edge_support"]
-        rotation, position = T[:3, :3], T[:3, :3] @ self._tracker.centre + T[:3, 3]
-        allocentric = rotation_towards(position).mT @ rotation
-        covariance = self._tracker.covariance(tracked)
-        hypothesis = Hypothesis(
-            rotation=rotation.clone(),
-            translation=T[:3, 3].clone(),
-            score=tracked.features["region"],
-            evidence=tracked.features,
-            allocentric_rotation=allocentric,
-            distance=float(torch.linalg.vector_norm(position)),
-            projection=(T.clone(), _camera(item)),
-            view=nearest_view(self.registrar, allocentric),
-            edge_support=support,
-            covariance=covariance if bool(covariance.isfinite().all()) else None,
+        describer, T, none = self.registrar.describer, tracked.state.T, torch.zeros(1, dtype=torch.long)
+        poses = Poses.at(T, _camera(item)[None], describer.centre, none, none)
+        poses = replace(
+            poses,
+            view=torch.tensor([nearest_view(self.registrar, poses.rotation[0])]),
+            edge_support=torch.tensor([tracked.features["edge_support"]]),
+            covariance=self._tracker.covariance(tracked)[None],
         )
-        probabilities = (self._start_confidence * tracked.confidence,)
+        hypothesis = hypothesis_of(poses, 0, tracked.features, score="region")
+        probabilities = (self._base * tracked.confidence,)
         warnings = item.warnings + self.registrar.mesh_warnings
         return Registration((hypothesis,), probabilities, Ranking.none(), dict(tracked.features), warnings=warnings)
 
@@ -198,3 +183,8 @@ def _pose(result: Registration) -> Tensor:
     """(4, 4) of a result with a camera matrix."""
     assert result.transform is not None
     return result.transform
+
+
+def _confidence(result: Registration) -> float:
+    """0 for pipelines without calibration."""
+    return result.confidence or 0.0

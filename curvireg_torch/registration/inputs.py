@@ -140,7 +140,7 @@ def image_items(
         except CurviregError as error:
             return error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])]))
 
-    return _OnDemand(item, n)
+    return OnDemand(item, n)
 
 
 def _boxes(given: Any, count: int) -> Sequence[Tensor | None]:
@@ -273,7 +273,7 @@ def _inside(pixels: Tensor, box: Tensor) -> Tensor:
     return pixels[y0:y1, x0:x1]
 
 
-class _OnDemand(Sequence[ImageItem | CurviregError]):
+class OnDemand(Sequence[ImageItem | CurviregError]):
     """``item(0)`` to ``item(count - 1)``, computed at each access."""
 
     def __init__(self, item: Callable[[int], ImageItem | CurviregError], count: int) -> None:

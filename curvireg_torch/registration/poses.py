@@ -1,6 +1,7 @@
-"""Candidate poses under work: the best distinct views of rankings, lifted in front of cameras, fitted and judged."""
+"""Candidate poses under work: the best distinct views of rankings, put into boxes, fitted and judged."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -20,14 +21,16 @@ __all__ = [
     "Poses",
     "best_views",
     "distinct_poses",
-    "edge_supports",
     "fit_poses",
     "fit_texture_of",
     "hypothesis_of",
-    "lifted",
+    "named_features",
     "placed",
+    "pose_features",
+    "pose_scores",
     "projected_box",
     "similarities",
+    "with_edge_support",
 ]
 
 SAME_POSE_ANGLE = 15.0
@@ -47,12 +50,12 @@ SCORE_WEIGHTS, RANK_ALONE = (1.0, 10.0, 10.0, 2.5), (1.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Poses:
-    """H candidate poses of the object in photographs; those of one photograph are adjacent.
+    """H candidate poses of the object in a photograph.
 
     Attributes:
-        image_index: (H,) int64, ascending.
+        crop_index: (H,) int64, in which of the boxes the pose is fitted.
         view: (H,) int64 view of the bank that the pose started from.
-        rank: (H,) float64 log S of that view, minus that of the photograph's best view.
+        rank: (H,) float64 log S of that view, minus that of the best view.
         rotation: (H, 3, 3) float64 allocentric rotations.
         distance: (H,) float64 of the object's centre, model units.
         T: (H, 4, 4) float64 ``T_cam_from_model``.
@@ -62,7 +65,7 @@ class Poses:
         observable: (H,) number of directions that a fit determines.
     """
 
-    image_index: Tensor
+    crop_index: Tensor
     view: Tensor
     rank: Tensor
     rotation: Tensor
@@ -74,6 +77,37 @@ class Poses:
     start_support: Tensor
     observable: Tensor
 
+    @staticmethod
+    def at(T: Tensor, cameras: Tensor, centre: Tensor, view: Tensor, rank: Tensor) -> "Poses":
+        """Poses ``T`` of an object with this centre (3,), which are not fitted, in the same box."""
+        nan, none = torch.full((len(T),), torch.nan, dtype=torch.float64), torch.zeros_like(view)
+        unknown = nan[:, None, None].repeat(1, 6, 6)
+        return placed(Poses(none, view, rank, T[:, :3, :3], nan, T, cameras, unknown, nan, nan, none), T, centre)
+
+    @staticmethod
+    def in_box(
+        describer: ViewDescriber,
+        box: Tensor,
+        K: Tensor | None,
+        rotation: Tensor,
+        distance: Tensor,
+        view: Tensor,
+        rank: Tensor,
+    ) -> "Poses":
+        """Poses of allocentric rotations (H, 3, 3) that fill a box (4,).
+
+        Without ``K`` (3, 3), cameras look straight at the box from ``distance`` (H,).
+        """
+        boxes = box.double().expand(len(view), 4)
+        if K is None:
+            T, cameras = describer.cameras_of_boxes(rotation, distance, boxes)
+            poses = Poses.at(T, cameras, describer.centre, view, rank)
+            return replace(poses, rotation=rotation, distance=distance)
+        cameras = K.double().expand(len(view), 3, 3)
+        T = torch.eye(4, dtype=torch.float64).repeat(len(view), 1, 1)
+        T[:, :3, :3], T[:, :3, 3] = pose_from_box(describer.hull, rotation, boxes, cameras)
+        return Poses.at(T, cameras, describer.centre, view, rank)
+
     def __len__(self) -> int:
         return len(self.view)
 
@@ -82,20 +116,8 @@ class Poses:
 
     @staticmethod
     def cat(parts: "Sequence[Poses]") -> "Poses":
-        """Return all poses, in the order of their photographs."""
-        joined = Poses(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Poses)))
-        return joined[joined.image_index.argsort(stable=True)]
-
-    def with_fit(self, fit: ContourFit, centre: Tensor) -> "Poses":
-        """Return the poses of a fit, for an object with this centre (3,)."""
-        fitted = replace(
-            self,
-            covariance=fit.covariance,
-            edge_support=fit.edge_support,
-            start_support=fit.start_support,
-            observable=fit.observable,
-        )
-        return placed(fitted, fit.transform, centre)
+        """Return all poses."""
+        return Poses(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Poses)))
 
     def replaced(self, index: Tensor, others: "Poses") -> "Poses":
         """Return these poses with ``others`` in the places ``index``."""
@@ -106,61 +128,10 @@ class Poses:
         """The poses as a fit."""
         return ContourFit(self.T, self.covariance, self.edge_support, self.start_support, self.observable)
 
-
-def best_views(
-    ranking: Ranking, bank: ViewBank, *, count: int, symmetries: Tensor | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """At most ``count`` best distinct views of every photograph: image index, view and rank, each (H,), on the CPU.
-
-    Where limits on the pose leave views out, the best view outside them comes last, as a rival.
-    """
-    chosen: list[list[int]] = []
-    for b, order in enumerate(ranking.order):
-        if ranking.allowed is not None:
-            order = order[ranking.allowed[b][order]]
-        views = distinct_views(order, bank.rotations, count=count, symmetries=symmetries)
-        chosen.append(views.tolist())
-    image_index = torch.tensor([b for b, views in enumerate(chosen) for _ in views], dtype=torch.long)
-    view = torch.tensor([v for views in chosen for v in views], dtype=torch.long)
-    log = ranking.scores.cpu().double().clamp(min=torch.finfo(torch.float64).tiny).log()
-    return image_index, view, log[image_index, view] - log.amax(dim=1)[image_index]
-
-
-def lifted(
-    describer: ViewDescriber,
-    image_index: Tensor,
-    view: Tensor,
-    rank: Tensor,
-    rotation: Tensor,
-    distance: Tensor,
-    boxes: Tensor,
-    K: Tensor | None,
-) -> Poses:
-    """Poses of allocentric rotations (H, 3, 3) that fill the photographs' boxes (B, 4).
-
-    Without ``K`` (B, 3, 3), cameras look straight at the boxes from ``distance`` (H,).
-    """
-    if K is None:
-        T, cameras = describer.cameras_of_boxes(rotation, distance, boxes[image_index])
-    else:
-        cameras = K[image_index]
-        T = torch.eye(4, dtype=torch.float64).repeat(len(view), 1, 1)
-        T[:, :3, :3], T[:, :3, 3] = pose_from_box(describer.hull, rotation, boxes[image_index], cameras)
-    nan = torch.full((len(view),), torch.nan, dtype=torch.float64)
-    poses = Poses(
-        image_index=image_index,
-        view=view,
-        rank=rank,
-        rotation=rotation,
-        distance=distance,
-        T=T,
-        cameras=cameras,
-        covariance=nan[:, None, None].repeat(1, 6, 6),
-        edge_support=nan,
-        start_support=nan,
-        observable=torch.zeros_like(view),
-    )
-    return poses if K is None else placed(poses, T, describer.centre)
+    def with_fit(self, fit: ContourFit, centre: Tensor) -> "Poses":
+        """Return the poses of a fit, for an object with this centre (3,)."""
+        measured = {f.name: getattr(fit, f.name) for f in fields(ContourFit) if f.name != "transform"}
+        return placed(replace(self, **measured), fit.transform, centre)
 
 
 def placed(poses: Poses, T: Tensor, centre: Tensor) -> Poses:
@@ -168,6 +139,18 @@ def placed(poses: Poses, T: Tensor, centre: Tensor) -> Poses:
     position = T[:, :3, :3] @ centre + T[:, :3, 3]
     rotation = rotation_towards(position).mT @ T[:, :3, :3]
     return replace(poses, T=T, rotation=rotation, distance=torch.linalg.vector_norm(position, dim=1))
+
+
+def best_views(
+    ranking: Ranking, bank: ViewBank, *, count: int, symmetries: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """At most ``count`` best distinct allowed views of the ranking of a photograph, and their ranks, each (H,)."""
+    order = ranking.order[0]
+    if ranking.allowed is not None:
+        order = order[ranking.allowed[0][order]]
+    view = distinct_views(order, bank.rotations, count=count, symmetries=symmetries).cpu()
+    log = ranking.scores[0].cpu().double().clamp(min=torch.finfo(torch.float64).tiny).log()
+    return view, log[view] - log.max()
 
 
 def fit_poses(
@@ -178,14 +161,14 @@ def fit_poses(
     object_mask: Tensor | None = None,
     **options: Any,
 ) -> Poses:
-    """Fit the contours of all poses, see :func:`fit_contours`, which has more ``options``."""
+    """Fit the contours of poses in images with ``boxes`` (B, 4), see :func:`fit_contours` and its ``options``."""
     fit = fit_contours(
         describer.contours,
         images,
         boxes,
         poses.cameras,
         poses.T,
-        image_index=poses.image_index,
+        image_index=poses.crop_index,
         margin=describer.settings.margin,
         object_mask=object_mask,
         **{"finish": FINISHED_FITS, **options},
@@ -200,7 +183,7 @@ def fit_texture_of(
     if not describer.draws_colours:
         return None
     one = poses[torch.tensor([h])]
-    b = int(one.image_index)
+    b = int(one.crop_index)
     fit = fit_texture(
         describer.draw,
         describer.renderer,
@@ -215,30 +198,40 @@ def fit_texture_of(
     return None if fit is None else one.with_fit(fit, describer.centre)
 
 
-def edge_supports(describer: ViewDescriber, images: Sequence[Tensor], poses: Poses, boxes: Tensor) -> Tensor:
-    """(H,) edge support of poses that are not fitted, see :func:`contour_support`."""
-    margin = describer.settings.margin
+def with_edge_support(describer: ViewDescriber, images: Sequence[Tensor], poses: Poses, boxes: Tensor) -> Poses:
+    """Poses that are not fitted, with their edge support, see :func:`contour_support`."""
     given = (describer.contours, images, boxes, poses.cameras, poses.T)
-    return contour_support(*given, image_index=poses.image_index, margin=margin)
+    support = contour_support(*given, image_index=poses.crop_index, margin=describer.settings.margin)
+    return replace(poses, edge_support=support)
 
 
 def similarities(describer: ViewDescriber, descriptors: Tensor, poses: Poses) -> Tensor:
-    """(H,) normalised correlations of the poses' views with their photographs, of (B, D) descriptors."""
-    queries = F.normalize(descriptors, dim=1)[poses.image_index.to(descriptors.device)]
+    """(H,) normalised correlations of the poses' views with their crops, of (B, D) descriptors."""
+    queries = F.normalize(descriptors, dim=1)[poses.crop_index.to(descriptors.device)]
     views = describer.descriptors(poses.rotation, poses.distance)
     return (F.normalize(views, dim=1) * queries).sum(dim=1).double().cpu()
 
 
+def pose_features(
+    describer: ViewDescriber, descriptors: Tensor, poses: Poses, appearance: Tensor | None = None
+) -> Tensor:
+    """(H, 4) :data:`POSE_FEATURES`, with an ``appearance`` (H,) where the pipeline has that term."""
+    similarity = similarities(describer, descriptors, poses)
+    appearance = torch.zeros_like(similarity) if appearance is None else appearance
+    return torch.stack([poses.rank, similarity, poses.edge_support.nan_to_num(0.0), appearance], dim=1)
+
+
+def pose_scores(features: Tensor, *, exact: bool) -> Tensor:
+    """(H,) scores that order poses: of all features with an exact mesh, the order of the ranking with a similar one."""
+    return features @ torch.tensor(SCORE_WEIGHTS if exact else RANK_ALONE, dtype=features.dtype)
+
+
 def distinct_poses(poses: Poses, score: Tensor, symmetries: Tensor | None = None) -> Tensor:
     """(H,) bool: False where a pose is within ``SAME_POSE_ANGLE`` degrees of one with a higher ``score`` (H,)."""
-    distinct = torch.zeros(len(poses), dtype=torch.bool)
     order = score.argsort(descending=True, stable=True)
-    for b in poses.image_index.unique():
-        own = order[poses.image_index[order] == b]
-        R, best_first = poses.rotation[own].float(), torch.arange(len(own))
-        chosen = distinct_views(best_first, R, count=len(own), angle=SAME_POSE_ANGLE, symmetries=symmetries)
-        distinct[own[chosen]] = True
-    return distinct
+    R, best_first = poses.rotation[order].float(), torch.arange(len(order))
+    chosen = distinct_views(best_first, R, count=len(order), angle=SAME_POSE_ANGLE, symmetries=symmetries)
+    return torch.zeros(len(order), dtype=torch.bool).index_fill(0, order[chosen], True)
 
 
 def projected_box(describer: ViewDescriber, projection: tuple[Tensor, Tensor]) -> Tensor:
@@ -247,20 +240,25 @@ def projected_box(describer: ViewDescriber, projection: tuple[Tensor, Tensor]) -
     return projected_boxes(describer.hull, T[None], K)[0]
 
 
-def hypothesis_of(poses: Poses, h: int, evidence: Tensor, *, with_camera: bool) -> Hypothesis:
-    """Pose ``h`` with its (H, 4) :data:`POSE_FEATURES`, as it is reported."""
-    T = poses.T[h]
-    features = dict(zip(POSE_FEATURES, evidence[h].tolist(), strict=True))
-    is_fitted, known = bool(poses.edge_support[h].isfinite()), bool(poses.covariance[h].isfinite().all())
+def hypothesis_of(
+    poses: Poses, h: int, evidence: Mapping[str, float], *, score: str = "similarity", with_camera: bool = True
+) -> Hypothesis:
+    """Pose ``h`` with its ``evidence``, one of which is its ``score``, as it is reported."""
+    T, support, covariance = poses.T[h], float(poses.edge_support[h]), poses.covariance[h]
     return Hypothesis(
         rotation=T[:3, :3].clone() if with_camera else poses.rotation[h].clone(),
         translation=T[:3, 3].clone() if with_camera else None,
-        score=features["similarity"],
-        evidence=features,
+        score=evidence[score],
+        evidence=evidence,
         allocentric_rotation=poses.rotation[h].clone(),
         distance=float(poses.distance[h]),
         projection=(T.clone(), poses.cameras[h].clone()),
         view=int(poses.view[h]),
-        edge_support=features["edge_support"] if is_fitted else None,
-        covariance=poses.covariance[h].clone() if known and with_camera else None,
+        edge_support=None if math.isnan(support) else support,
+        covariance=covariance.clone() if with_camera and bool(covariance.isfinite().all()) else None,
     )
+
+
+def named_features(features: Tensor, h: int) -> dict[str, float]:
+    """Row ``h`` of :func:`pose_features`, by the names of :data:`POSE_FEATURES`."""
+    return dict(zip(POSE_FEATURES, features[h].tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""Refinement of known poses: contours are fitted around starts, without boxes; an independent ranking checks them."""
+"""Refinement of known poses: contours are fitted around starts, without boxes; a registration checks them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,28 +7,20 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ..errors import CurviregError, InvalidInputError, LostObjectError
-from ..geometry import rotation_error
+from ..errors import InvalidInputError, LostObjectError
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose
-from .confidence import (
-    MAX_MARGIN,
-    RIVAL_ANGLE,
-    is_calibrated,
-    refinement_confidence,
-    registration_confidence,
-)
+from .confidence import are_near, is_calibrated, refinement_confidence
 from .inputs import MIN_BOX_SIDE, ImageItem, check_crop, image_items
 from .poses import (
-    SCORE_WEIGHTS,
     Poses,
     distinct_poses,
     fit_poses,
     fit_texture_of,
     hypothesis_of,
-    lifted,
-    placed,
-    similarities,
+    named_features,
+    pose_features,
+    pose_scores,
 )
 from .result import FailedRegistration, Registration
 from .tracker import OUTSIDE, boxes_at
@@ -36,7 +28,7 @@ from .tracker import OUTSIDE, boxes_at
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-__all__ = ["LOST_CONFIDENCE", "nearest_view", "refine"]
+__all__ = ["LOST_CONFIDENCE", "nearest_view", "refine", "refine_item"]
 
 WIDE_ANGLES = (14.0, 22.0)
 """Degrees by which given starts are rotated away, to fit from there too: they may be worse than views of a bank."""
@@ -58,8 +50,8 @@ def refine(
 
     Contours are fitted around each start that shows the mesh in the photograph. A start should lie within about 15
     degrees and 15 % of the distance of the truth. A fit from a wrong start may look as good as one from a good start,
-    so the refined pose is compared with all views of the bank, which no start influences: the confidence is the smaller
-    one of that of the fit and that of the ranking, and never more than that of the start.
+    so the photograph is also registered in the box of the refined pose: the confidence is the smaller one of that of
+    the fit and of the probability that the registration gives the pose, and never more than that of the start.
 
     Args:
         registrar: :class:`Registrar` of the mesh.
@@ -76,16 +68,12 @@ def refine(
     """
     if camera_matrices is None:
         raise InvalidInputError("refine: needs the camera matrix of each photograph")
-    items = image_items(images, None, camera_matrices)
-    starts = [_starts(one) for one in poses]
+    items, starts = image_items(images, None, camera_matrices), [_starts(one) for one in poses]
     limits = [None] * len(items) if start_confidences is None else list(start_confidences)
     if len(starts) != len(items) or len(limits) != len(items):
         raise InvalidInputError(f"refine: expected starts of {len(items)} photographs, got {len(starts)}")
 
-    def refine_some(some: Sequence[ImageItem | CurviregError], first: int) -> list[Registration | FailedRegistration]:
-        return [_refine_one(registrar, item, starts[i], limits[i], i) for i, item in enumerate(some, first)]
-
-    return registrar.map_items(items, refine_some)
+    return registrar.map_items(items, lambda item, i: refine_item(registrar, item, starts[i], limit=limits[i]))
 
 
 def _starts(poses: Any) -> Tensor:
@@ -95,23 +83,8 @@ def _starts(poses: Any) -> Tensor:
     return T
 
 
-def _refine_one(
-    registrar: "Registrar", item: ImageItem | CurviregError, T: Tensor, limit: float | None, index: int
-) -> Registration | FailedRegistration:
-    try:
-        if not isinstance(item, ImageItem):
-            raise item
-        return refine_item(registrar, item, T, limit=limit)
-    except CurviregError as error:
-        subject = str(error.subject)
-        return FailedRegistration(error if subject.startswith("image ") else error.with_subject(f"image {index}"))
-
-
-def refine_item(
-    registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: float | None = None, check: bool = True
-) -> Registration:
-    """Refine (S, 4, 4) starts in one photograph, see :func:`refine`; without ``check``, only ``limit`` bounds the
-    confidence.
+def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: float | None = None) -> Registration:
+    """Refine (S, 4, 4) starts in one photograph, see :func:`refine`; the confidence is at most ``limit``.
 
     Raises:
         LostObjectError: the object is not near any start.
@@ -124,76 +97,49 @@ def refine_item(
     T, boxes = T[visible], boxes[visible]
     if float((boxes[:, 2:] - boxes[:, :2]).amin(dim=1).max()) < MIN_BOX_SIDE:
         raise LostObjectError(f"at the start the mesh is less than {MIN_BOX_SIDE} px wide; check unit and distance")
-    images, K = [item.image] * len(T), K.expand(len(T), 3, 3)
+    images, each = [item.image] * len(T), torch.arange(len(T))
     query = registrar.matcher.query(images, boxes.float())
     check_crop(query.crops[0])
     descriptors = describer.descriptor(query.field)
-    poses = _poses(registrar, T, K, boxes)
+    poses = Poses.at(T, K.expand(len(T), 3, 3), describer.centre, each, torch.zeros(len(T), dtype=torch.float64))
+    views = torch.tensor([nearest_view(registrar, R) for R in poses.rotation])
+    poses = replace(poses, crop_index=each, view=views)
     mask = registrar.object_mask(query, [item] * len(T))
     poses = fit_poses(describer, images, poses, boxes, mask, wide_angles=WIDE_ANGLES)
-    evidence = _evidence(registrar, descriptors, poses)
-    best = _scores(evidence).argmax()
+    best = pose_scores(pose_features(describer, descriptors, poses), exact=True).argmax()[None]
     if (fitted := fit_texture_of(describer, images, poses, boxes, int(best))) is not None:
-        poses = poses.replaced(best[None], replace(fitted, image_index=best[None]))
-        evidence = _evidence(registrar, descriptors, poses)
-    scores, together = _scores(evidence), replace(poses, image_index=torch.zeros_like(poses.image_index))
-    distinct = distinct_poses(together, scores, registrar.symmetries_of(exact=True))
+        poses = poses.replaced(best, fitted)
+    evidence = pose_features(describer, descriptors, poses)
+    scores = pose_scores(evidence, exact=True)
+    distinct = distinct_poses(poses, scores, registrar.symmetries_of(exact=True))
     order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]
-    hypotheses = tuple(hypothesis_of(poses, h, evidence, with_camera=True) for h in order)
+    hypotheses = tuple(hypothesis_of(poses, h, named_features(evidence, h)) for h in order)
     features = {name: hypotheses[0].evidence[name] for name in ("similarity", "edge_support")}
-    fit_confidence = refinement_confidence(features)
-    if fit_confidence < LOST_CONFIDENCE:
+    confidence = refinement_confidence(features)
+    if confidence < LOST_CONFIDENCE:
         raise LostObjectError(
-            f"the object is not near the start (edge support {hypotheses[0].edge_support:.2f}, similarity "
-            f"{hypotheses[0].score:.2f}); give another start, or register it again"
+            f"the object is not near the start (edge support {features['edge_support']:.2f}, similarity "
+            f"{features['similarity']:.2f}); give another start, or register it again"
         )
-    confidence = fit_confidence if limit is None else min(fit_confidence, limit)
-    if check:
-        confidence = min(confidence, _ranked_confidence(registrar, item, poses[torch.tensor(order[:1])], features))
-    probabilities = (confidence, *[0.0] * (len(hypotheses) - 1)) if is_calibrated(registrar.pipeline) else ()
+    probabilities: tuple[float, ...] = ()
+    if is_calibrated(registrar.pipeline):
+        confidence = min(confidence, _registered_probability(registrar, item, poses[torch.tensor(order[:1])]))
+        probabilities = (confidence if limit is None else min(confidence, limit), *[0.0] * (len(hypotheses) - 1))
     warnings = item.warnings + registrar.mesh_warnings
     return Registration(hypotheses, probabilities, Ranking.none(), dict(features), warnings=warnings)
 
 
-def _poses(registrar: "Registrar", T: Tensor, K: Tensor, boxes: Tensor) -> Poses:
-    """Poses ``T`` (S, 4, 4), each in a photograph of its own."""
-    describer, every = registrar.describer, torch.arange(len(T))
-    one = torch.ones(len(T), dtype=torch.float64)
-    poses = lifted(describer, every, torch.zeros_like(every), 0.0 * one, T[:, :3, :3], one, boxes, K)
-    poses = placed(poses, T, describer.centre)
-    return replace(poses, view=torch.tensor([nearest_view(registrar, R) for R in poses.rotation]))
+def _registered_probability(registrar: "Registrar", item: ImageItem, pose: Poses) -> float:
+    """Probability of one pose in a registration of the box that it projects to, which its rotation does not influence.
 
-
-def _evidence(registrar: "Registrar", descriptors: Tensor, poses: Poses) -> Tensor:
-    """(H, 4) :data:`POSE_FEATURES` of fitted poses, without ranking and appearance."""
-    none = torch.zeros_like(poses.rank)
-    return torch.stack([none, similarities(registrar.describer, descriptors, poses), poses.edge_support, none], dim=1)
-
-
-def _scores(evidence: Tensor) -> Tensor:
-    return evidence @ torch.tensor(SCORE_WEIGHTS, dtype=evidence.dtype)
-
-
-def _ranked_confidence(registrar: "Registrar", item: ImageItem, pose: Poses, features: dict[str, float]) -> float:
-    """Confidence in one pose if all views of the bank are ranked in the box that it projects to.
-
-    The margin is that of the best view within 30 degrees of the pose over the best one beyond.
+    It is that of the hypotheses within 30 degrees of the pose.
     """
     boxes, _ = boxes_at(registrar.describer.hull, pose.T, pose.cameras, item.size)
     query = registrar.matcher.query([item.image], boxes.float())
-    scores = registrar.matcher.rank(query).scores[0].cpu().double()
-    views = registrar.bank.rotations.cpu().double()
-    symmetries = registrar.symmetries_of(exact=True)
-    group = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
-    near = (rotation_error(views[:, None], pose.rotation @ group.double()) <= RIVAL_ANGLE).any(dim=1)
-    if not bool(near.any()) or bool(near.all()):
-        return registration_confidence({**features, "margin": None, "concentration": None}, exact=True)
-    log = scores.clamp(min=1e-300).log()
-    margin = float(log[near].max() - log[~near].max())
-    weights = (scores / scores.max().clamp(min=1e-300)) ** 4
-    share = float(weights[near].sum() / weights.sum())
-    clamped = min(max(margin, -MAX_MARGIN), MAX_MARGIN)
-    return registration_confidence({**features, "margin": clamped, "concentration": share}, exact=True)
+    found = registrar.register(replace(item, box=boxes[0].float()), query)
+    rotations = torch.stack([hypothesis.allocentric_rotation for hypothesis in found.hypotheses])
+    near = are_near(rotations, pose.rotation[0], registrar.symmetries_of(exact=registrar.is_exact(with_camera=True)))
+    return sum(p for p, is_near in zip(found.probabilities, near.tolist(), strict=True) if is_near)
 
 
 def nearest_view(registrar: "Registrar", rotation: Tensor) -> int:

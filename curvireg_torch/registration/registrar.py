@@ -2,11 +2,13 @@
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..errors import CurviregError, InvalidInputError
@@ -23,29 +25,30 @@ from ..utils.checks import check_device, check_option, check_symmetries
 from ..utils.choices import MESH_KINDS
 from ..utils.threads import map_on_threads
 from .confidence import (
+    are_near,
     concentration,
     confidence_features,
     hypothesis_probabilities,
     is_calibrated,
     registration_confidence,
 )
+from .detection import Detector, detect
 from .inputs import ImageItem, check_crop, image_items
-from .localization import Locator, localize
 from .poses import (
-    RANK_ALONE,
     SCORE_WEIGHTS,
     Poses,
     best_views,
     distinct_poses,
-    edge_supports,
     fit_poses,
     fit_texture_of,
     hypothesis_of,
-    lifted,
+    named_features,
+    pose_features,
+    pose_scores,
     projected_box,
-    similarities,
+    with_edge_support,
 )
-from .priors import BatchPriors
+from .priors import Limits
 from .refinement import refine
 from .result import FailedRegistration, Registration
 from .search import search
@@ -73,17 +76,14 @@ _SHAPE_LOCK = threading.Lock()
 
 
 @dataclass(frozen=True)
-class _Batch:
-    """B photographs, all with a camera matrix or all without: boxes (B, 4) float64 px, cameras (B, 3, 3) or None,
-    and descriptors (B, D) on a grid twice as fine as the bank's."""
+class _Work:
+    """A photograph under work, with ``descriptors`` (1, D) on a grid twice as fine as the bank's."""
 
-    images: list[Tensor]
-    boxes: Tensor
-    cameras: Tensor | None
+    item: ImageItem
     query: QueryFeatures
     ranking: Ranking
     descriptors: Tensor
-    priors: BatchPriors | None
+    limits: Limits | None
     exact: bool
     symmetries: Tensor | None
 
@@ -111,7 +111,7 @@ class Registrar:
             differ by one of them are reported once. Default: those of the shape of an exact mesh without colours, see
             :func:`curvireg_torch.mesh.mesh_symmetries`; ``torch.eye(4)[None]`` for none.
         device: of modules, bank and search.
-        progress: True shows bars. A callback gets (stage, done, total), with the stages "localization" (without a box),
+        progress: True shows bars. A callback gets (stage, done, total), with the stages "detection" (without a box),
             "bank", "ranking", "search" and "contours"; to cancel, it may raise what is no :class:`CurviregError`. On a
             CPU photographs are registered in parallel: callback, custom renderer and custom field are then called from
             several threads.
@@ -157,7 +157,27 @@ class Registrar:
             same |= {"renderer": renderer, "mesh_is": mesh_is, "symmetries": symmetries, "device": device}
             self.others = [Registrar(mesh, **same, progress=progress) for mesh in meshes[1:]]
             bank_or_mesh = meshes[0]
-        self.matcher = _matcher(bank_or_mesh, pipeline, views, settings, field, renderer, device, progress)
+        self.matcher: ViewMatcher = bank_or_mesh
+        if isinstance(bank_or_mesh, ViewMatcher):
+            if any(value is not None for value in (pipeline, field, views, settings)):
+                raise InvalidInputError("Registrar: pipeline, field, views and settings belong to the matcher")
+        else:
+            if not isinstance(bank := bank_or_mesh, ViewBank):
+                pipeline = pipeline or Pipeline()
+                pipeline = replace(pipeline, bank=settings or pipeline.bank)
+                built: dict[str, Any] = {
+                    "pipeline": pipeline,
+                    "renderer": renderer,
+                    "progress": progress,
+                    "device": device or "cpu",
+                }
+                bank = cached_bank(bank_or_mesh, views, **built)
+            elif views is not None or settings is not None:
+                raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
+            bank = bank if device is None else bank.to(device)
+            options: dict[str, Any] = {"pipeline": pipeline, "field": field, "renderer": renderer}
+            # Built on one thread, so that rounding does not depend on the number of threads.
+            self.matcher = map_on_threads(lambda bank: ViewMatcher(bank, **options), [bank])[0]
         self.bank, self.pipeline = self.matcher.bank, self.matcher.pipeline
         self.mesh_is, self.symmetries, self.progress = mesh_is, symmetries, progress
 
@@ -176,7 +196,7 @@ class Registrar:
         Args:
             images: (B, C, H, W) or a list of (C, H, W) tensors, (H, W, C) arrays or paths, C = 1 or 3, floating in
                 [0, 1] or uint8.
-            boxes: (B, 4) x0, y0, x1, y1 in px; None searches for the object, see :func:`localize`.
+            boxes: (B, 4) x0, y0, x1, y1 in px; None searches for the object, see :func:`detect`.
             camera_matrices: (B, 3, 3) or (3, 3) in px, a :class:`Camera`, or a list of these; None: rotations are
                 relative to a camera that looks at the box.
             prior: what is known of the poses in advance, one for all photographs or a list.
@@ -192,10 +212,10 @@ class Registrar:
                 cameras.
         """
         if boxes is None and masks is None:
-            results = [found[0] for found in localize(self, images, camera_matrices, prior=prior)]
+            results = [found[0] for found in detect(self, images, camera_matrices, prior=prior)]
         else:
             items = image_items(images, boxes, camera_matrices, prior, masks)
-            results = self.map_items(items, self.register_items)
+            results = self.map_items(items, lambda item, _: self.register_item(item))
         for model, other in enumerate(self.others, 1):
             rivals = other(images, boxes, camera_matrices, prior=prior, masks=masks)
             results = [_better(one, rival, model) for one, rival in zip(results, rivals, strict=True)]
@@ -250,9 +270,9 @@ class Registrar:
         return self.matcher.describer.with_settings(replace(settings, grid=min(2 * settings.grid, settings.image_size)))
 
     @cached_property
-    def locator(self) -> Locator:
+    def detector(self) -> Detector:
         """Proposes boxes where none are given."""
-        return map_on_threads(lambda _: Locator(self.matcher), [0])[0]  # one thread: rounding is always the same
+        return map_on_threads(lambda _: Detector(self.matcher), [0])[0]  # one thread: rounding is always the same
 
     def report_progress(self, stage: str) -> None:
         """Call the progress callback, if there is one."""
@@ -260,145 +280,115 @@ class Registrar:
             self.progress(stage, 0, 1)
 
     def map_items(
-        self,
-        items: Sequence[Any],
-        function: Callable[[Sequence[Any], int], list[Any]],
+        self, items: Sequence[ImageItem | CurviregError], function: Callable[[ImageItem, int], Any]
     ) -> list[Any]:
-        """Results of ``function(some items, index of the first)`` for all items, in their order.
+        """Results of ``function(item, index)`` for all items, a :class:`FailedRegistration` for each error.
 
         On a CPU each photograph has a thread, in which torch uses no further ones: its result is the same to the bit,
-        whatever else is registered. On a GPU the matcher's ``chunk_size`` are registered at a time. Items are read on
-        demand, so that few photographs are in memory.
+        whatever else is registered. Items are read on demand, so that few photographs are in memory.
         """
-        size = 1 if self.bank.device.type == "cpu" else self.matcher.chunk_size
         _ = self.describer.contours, self.mesh_warnings  # create once what threads share, before they use it
 
-        def run(first: int) -> list[Any]:
-            return function(items[first : first + size], first)
+        def run(index: int) -> Any:
+            item = items[index]
+            if not isinstance(item, ImageItem):
+                return FailedRegistration(item)
+            try:
+                return function(item, index)
+            except CurviregError as error:
+                return FailedRegistration(error.with_subject(f"image {index}"))
 
-        parts = map_on_threads(run, range(0, len(items), size), device=self.bank.device)
-        return [result for part in parts for result in part]
+        return map_on_threads(run, range(len(items)), device=self.bank.device)
 
-    def register_items(self, items: Sequence[ImageItem | CurviregError], first: int) -> Results:
-        """Register photographs with boxes, then again those whose pose asks for another box."""
-        results = self._register_given(items, first)
-        if not (self.pipeline.box_jitter and self.pipeline.contours):
-            return results
-        for k, (item, result) in enumerate(zip(items, results, strict=True)):
-            # Without a camera matrix, poses are derived from their boxes.
-            if not isinstance(item, ImageItem) or not isinstance(result, Registration) or item.camera_matrix is None:
-                continue
+    def register_item(self, item: ImageItem) -> Registration:
+        """Register a photograph with a box, and again if its pose asks for another box."""
+        result = self._register_box(item)
+        # Without a camera matrix, poses are derived from their boxes.
+        if self.pipeline.box_jitter and self.pipeline.contours and item.camera_matrix is not None:
             box = projected_box(self.describer, result.projection)
             if _shows_other_part(box, item):
-                again = self._register_given([replace(item, box=box.float())], first + k)[0]
-                if isinstance(again, Registration) and again.score > result.score:
-                    results[k] = replace(again, corrected_box=box)
-        return results
+                with suppress(CurviregError):
+                    again = self._register_box(replace(item, box=box.float()))
+                    result = replace(again, corrected_box=box) if again.score > result.score else result
+        return result
 
-    def _register_given(self, items: Sequence[ImageItem | CurviregError], first: int) -> Results:
-        """Results of photographs or errors, the first of which has the index ``first``."""
-        results: list[Any] = [item if isinstance(item, ImageItem) else FailedRegistration(item) for item in items]
-        usable = [i for i, item in enumerate(items) if isinstance(item, ImageItem)]
-        if not usable:
-            return results
-        boxes = torch.stack([results[i].box for i in usable])
-        query = self.matcher.query([results[i].image for i in usable], boxes)
-        for row, i in enumerate(usable):
-            item, one = results[i], query[torch.tensor([row])]
-            try:
-                check_crop(one.crops[0])
-                results[i] = self.register([item], one)[0]
-            except CurviregError as error:
-                results[i] = FailedRegistration(error.with_subject(f"image {first + i}"))
-        return results
+    def _register_box(self, item: ImageItem) -> Registration:
+        query = self.matcher.query([item.image], item.box[None])
+        check_crop(query.crops[0])
+        return self.register(item, query)
 
     @torch.no_grad()
-    def register(
-        self, items: Sequence[ImageItem], query: QueryFeatures, ranking: Ranking | None = None
-    ) -> list[Registration]:
-        """Register described photographs: rank, fit, judge, report.
+    def register(self, item: ImageItem, query: QueryFeatures, ranking: Ranking | None = None) -> Registration:
+        """Register a photograph: rank, fit, judge, report.
 
         Args:
-            items: B photographs, all with a camera matrix or all without.
+            item: the photograph.
             query: the same, cropped and described by the matcher.
             ranking: of the same; default :meth:`ViewMatcher.rank`.
         """
-        batch = self._rank(items, query, ranking)
-        poses, outside = self._starts(batch)
-        starts = poses
+        work = self._rank(item, query, ranking)
+        starts, outside = self._starts(work)
+        poses = starts
         if self.pipeline.search:
-            poses = self._searched(batch, poses)
+            self.report_progress("search")
+            rotation = search(self.describer, work.descriptors, poses)
+            poses = self._in_box(work, rotation, poses.distance, poses.view, poses.rank)
+            if work.limits is not None:
+                poses = work.limits.moved_inside(poses)
         if self.pipeline.contours:
             self.report_progress("contours")
-            poses = fit_poses(self.describer, batch.images, poses, batch.boxes, self.object_mask(query, items))
-        evidence = self._evidence(batch, poses)
-        if self.pipeline.contours and batch.exact:
-            poses, evidence = self._fit_textures(batch, poses, evidence, outside)
-        distinct, inside = outside.clone(), (~outside).nonzero()[:, 0]
-        distinct[inside] = distinct_poses(poses[inside], self._scores(batch, evidence)[inside], batch.symmetries)
-        poses, evidence = self._restore(batch, starts, poses, evidence, distinct, outside)
-        return [
-            replace(result, warnings=item.warnings + self.mesh_warnings)
-            for result, item in zip(self._results(batch, poses, evidence, distinct, outside), items, strict=True)
-        ]
+            mask = self.object_mask(query, [item])
+            poses = fit_poses(self.describer, [item.image], poses, item.box[None], mask)
+        features = self._features(work, poses)
+        if self.pipeline.contours and work.exact:
+            poses, features = self._with_texture(work, poses, features, outside)
+        inside = (~outside).nonzero()[:, 0]
+        scores = pose_scores(features[inside], exact=work.exact)
+        distinct = outside.index_copy(0, inside, distinct_poses(poses[inside], scores, work.symmetries))
+        keep = self._kept(work, poses, distinct, outside)
+        if not bool(keep.all()):
+            # Poses that merged, or whose fit is not trusted, go back to the views that they started from.
+            back = (~keep).nonzero()[:, 0]
+            restored = starts[back]
+            if self.pipeline.contours:
+                restored = with_edge_support(self.describer, [item.image], restored, item.box[None])
+            poses = poses.replaced(back, restored)
+            features = features.index_copy(0, back, self._features(work, restored))
+        return self._result(work, poses, features, distinct, outside)
 
-    def _rank(self, items: Sequence[ImageItem], query: QueryFeatures, ranking: Ranking | None) -> _Batch:
+    def _rank(self, item: ImageItem, query: QueryFeatures, ranking: Ranking | None) -> _Work:
         self.report_progress("ranking")
-        matrices = [item.camera_matrix.double() for item in items if item.camera_matrix is not None]
-        if len(matrices) not in (0, len(items)):
-            raise InvalidInputError("camera_matrices: expected one for every photograph, or none")
-        priors = BatchPriors(items, self.bank) if any(item.prior is not None for item in items) else None
+        limits = None if item.prior is None else Limits(item, self.bank)
         if ranking is None:
-            ranking = self.matcher.rank(query, None if priors is None else priors.allowed(self.bank))
-        exact = self.is_exact(with_camera=bool(matrices))
-        return _Batch(
-            images=[item.image for item in items],
-            boxes=torch.stack([item.box for item in items]).double(),
-            cameras=torch.stack(matrices) if matrices else None,
-            query=query,
-            ranking=ranking,
-            descriptors=self.describer.descriptor(query.field),
-            priors=priors,
-            exact=exact,
-            symmetries=self.symmetries_of(exact=exact),
-        )
+            ranking = self.matcher.rank(query, None if limits is None else limits.allowed()[None])
+        exact = self.is_exact(with_camera=item.camera_matrix is not None)
+        symmetries = self.symmetries_of(exact=exact)
+        return _Work(item, query, ranking, self.describer.descriptor(query.field), limits, exact, symmetries)
 
-    def _starts(self, batch: _Batch) -> tuple[Poses, Tensor]:
-        """Poses of the best distinct views, and (H,) bool: those outside the limits, the best one of each photograph.
+    def _starts(self, work: _Work) -> tuple[Poses, Tensor]:
+        """Poses of the best distinct views, and (H,) bool: the last one may lie outside the limits.
 
-        The poses outside are never reported; they tell whether the limits are wrong.
+        That is the best view outside; it is never reported, and tells whether the limits are wrong.
         """
         count = max(MIN_REFINED, self.pipeline.hypotheses)
-        image_index, view, rank = best_views(batch.ranking, self.bank, count=count, symmetries=batch.symmetries)
-        rotations, distances = self.bank.rotations.cpu().double(), self.bank.distances.cpu()
-        rotation = rotations[view]
-        if batch.priors is not None:
-            rotation = batch.priors.moved_inside(image_index, rotation)
-        lifting = (batch.boxes, batch.cameras)
-        poses = lifted(self.describer, image_index, view, rank, rotation, distances[view], *lifting)
-        if batch.priors is None:
-            return poses, torch.zeros(len(poses), dtype=torch.bool)
-        poses = batch.priors.at_distance(poses)
-        assert batch.ranking.outside is not None
-        views = batch.ranking.outside.cpu()
-        index = (views >= 0).nonzero()[:, 0]
-        view = views[index]
-        none = torch.zeros(len(view), dtype=torch.float64)
-        others = lifted(self.describer, index, view, none, rotations[view], distances[view], *lifting)
-        order = torch.cat([poses.image_index, index]).argsort(stable=True)
-        return Poses.cat([poses, others]), order >= len(poses)
+        view, rank = best_views(work.ranking, self.bank, count=count, symmetries=work.symmetries)
+        poses = self._of_views(work, view, rank)
+        outside = torch.zeros(len(poses), dtype=torch.bool)
+        if work.limits is None:
+            return poses, outside
+        poses = work.limits.moved_inside(poses)
+        assert work.ranking.outside is not None
+        view = work.ranking.outside.cpu()
+        if int(view) < 0:
+            return poses, outside
+        other = self._of_views(work, view, torch.zeros(1, dtype=torch.float64))
+        return Poses.cat([poses, other]), F.pad(outside, (0, 1), value=True)
 
-    def _searched(self, batch: _Batch, poses: Poses) -> Poses:
-        self.report_progress("search")
-        allow = None
-        if (priors := batch.priors) is not None:
-            allow = lambda image_index, rotation: (  # noqa: E731
-                (priors.moved_inside(image_index, rotation) - rotation).abs().amax(dim=(1, 2)) < 1e-6
-            )
-        rotation = search(self.describer, batch.descriptors, poses, allow=allow)
-        found = (poses.image_index, poses.view, poses.rank, rotation, poses.distance)
-        poses = lifted(self.describer, *found, batch.boxes, batch.cameras)
-        return poses if batch.priors is None else batch.priors.at_distance(poses)
+    def _of_views(self, work: _Work, view: Tensor, rank: Tensor) -> Poses:
+        return self._in_box(work, self.bank.rotations.cpu()[view].double(), self.bank.distances.cpu()[view], view, rank)
+
+    def _in_box(self, work: _Work, *poses: Tensor) -> Poses:
+        return Poses.in_box(self.describer, work.item.box, work.item.camera_matrix, *poses)
 
     def object_mask(self, query: QueryFeatures, items: Sequence[ImageItem]) -> Tensor | None:
         """(B, 1, S, S) probability that pixels of the crops belong to the object: given, predicted, or None."""
@@ -412,118 +402,66 @@ class Registrar:
             return None
         return torch.cat([torch.ones_like(known) if mask is None else mask.to(known) for mask in masks])
 
-    def _evidence(self, batch: _Batch, poses: Poses) -> Tensor:
+    def _features(self, work: _Work, poses: Poses) -> Tensor:
         """(H, 4) :data:`POSE_FEATURES`."""
-        similarity = similarities(self.describer, batch.descriptors, poses)
-        support, appearance = torch.zeros_like(similarity), torch.zeros_like(similarity)
-        if self.pipeline.contours:
-            unfitted = poses.edge_support.isnan()
-            support = poses.edge_support.clone()
-            if bool(unfitted.any()):
-                support[unfitted] = edge_supports(self.describer, batch.images, poses[unfitted], batch.boxes)
-        if Appearance.name in batch.ranking.terms:
+        appearance = None
+        if Appearance.name in work.ranking.terms:
             pictures = self.matcher.describer.shaded(poses.rotation, poses.distance)
-            compared = (batch.query, batch.ranking, pictures, poses.image_index)
+            compared = (work.query, work.ranking, pictures, torch.zeros_like(poses.view))
             appearance = self.matcher.reranking_score(Appearance.name, *compared)
-        return torch.stack([poses.rank, similarity, support, appearance], dim=1)
+        return pose_features(self.describer, work.descriptors, poses, appearance)
 
-    def _scores(self, batch: _Batch, evidence: Tensor) -> Tensor:
-        """(H,) scores of poses: all features with an exact mesh, the order of the ranking with a similar one."""
-        return evidence @ torch.tensor(SCORE_WEIGHTS if batch.exact else RANK_ALONE, dtype=evidence.dtype)
+    def _with_texture(self, work: _Work, poses: Poses, features: Tensor, outside: Tensor) -> tuple[Poses, Tensor]:
+        """Fit the best pose to the mesh's colours as well."""
+        best = pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]
+        fitted = fit_texture_of(self.describer, [work.item.image], poses, work.item.box[None], int(best))
+        if fitted is None or (work.limits is not None and not bool(work.limits.keeps(fitted))):
+            return poses, features
+        return poses.replaced(best, fitted), features.index_copy(0, best, self._features(work, fitted))
 
-    def _fit_textures(self, batch: _Batch, poses: Poses, evidence: Tensor, outside: Tensor) -> tuple[Poses, Tensor]:
-        """Fit the best pose of each photograph to the mesh's colours as well."""
-        order = self._scores(batch, evidence).masked_fill(outside, -torch.inf).argsort(descending=True, stable=True)
-        for b in range(len(batch.images)):
-            best = order[poses.image_index[order] == b][:1]
-            fitted = fit_texture_of(self.describer, batch.images, poses, batch.boxes, int(best))
-            if fitted is not None and (batch.priors is None or bool(batch.priors.keeps(fitted))):
-                poses = poses.replaced(best, fitted)
-                evidence = evidence.index_copy(0, best, self._evidence(batch, fitted))
-        return poses, evidence
-
-    def _restore(
-        self, batch: _Batch, starts: Poses, poses: Poses, evidence: Tensor, distinct: Tensor, outside: Tensor
-    ) -> tuple[Poses, Tensor]:
-        """Put poses that merged, or whose fit is not trusted, back to the views that they started from."""
-        keep = distinct
-        if self.pipeline.contours and not batch.exact:
+    def _kept(self, work: _Work, poses: Poses, distinct: Tensor, outside: Tensor) -> Tensor:
+        """(H,) bool: poses that do not return to their views."""
+        kept = distinct
+        if self.pipeline.contours and not work.exact:
             # Where the contours of a similar object do not fit, the view has the smaller error.
-            keep = distinct & poses.fit.trustworthy
-        if batch.priors is not None:
-            keep = keep & (batch.priors.keeps(poses) | outside)
-        if bool(keep.all()):
-            return poses, evidence
-        back = (~keep).nonzero()[:, 0]
-        evidence = evidence.index_copy(0, back, self._evidence(batch, starts[back]))
-        restored = replace(starts[back], edge_support=evidence[back, 2])
-        return poses.replaced(back, restored if self.pipeline.contours else starts[back]), evidence
+            kept = kept & poses.fit.trustworthy
+        return kept if work.limits is None else kept & (work.limits.keeps(poses) | outside)
 
-    def _results(
-        self, batch: _Batch, poses: Poses, evidence: Tensor, distinct: Tensor, outside: Tensor
-    ) -> list[Registration]:
-        """Hypotheses of each photograph, best first, those that merged last, and their probabilities."""
-        scores = self._scores(batch, evidence)
+    def _result(self, work: _Work, poses: Poses, features: Tensor, distinct: Tensor, outside: Tensor) -> Registration:
+        """Hypotheses, best first, those that merged last, and their probabilities."""
+        scores = pose_scores(features, exact=work.exact)
         order = (scores + torch.where(distinct, 0.0, -1e6)).argsort(descending=True, stable=True)
-        shares = concentration(batch.ranking, self.bank.rotations, batch.symmetries).tolist()
-        results = []
-        for b in range(len(batch.images)):
-            ours = order[poses.image_index[order] == b]
-            own, rivals = ours[~outside[ours]], ours[outside[ours]]
-            reported = own[: self.pipeline.hypotheses].tolist()
-            with_camera = batch.cameras is not None
-            hypotheses = tuple(hypothesis_of(poses, h, evidence, with_camera=with_camera) for h in reported)
-            features = confidence_features(evidence[own], scores[own], shares[b])
-            # Without the rank, which views outside the limits do not have.
-            lead = evidence[rivals, 1:] - evidence[own[:1], 1:]
-            gain = float((lead @ torch.tensor(SCORE_WEIGHTS[1:], dtype=lead.dtype)).max()) if len(rivals) else None
-            if len(own) == 1 and gain is not None:  # limits that leave no rival do not make a pose uncertain
-                features["margin"] = max(-gain, 0.0)
-                features["concentration"] = features["concentration"] or 1.0
-            probabilities: tuple[float, ...] = ()
-            if is_calibrated(self.pipeline):
-                confidence = registration_confidence(features, exact=batch.exact)
-                probabilities = hypothesis_probabilities(confidence, scores[own], exact=batch.exact)[: len(reported)]
-            result = Registration(hypotheses, probabilities, batch.ranking[b : b + 1], features)
-            if batch.priors is not None and batch.priors.limits_of(b) is not None:
-                best = poses[own[:1]]
-                views = (best.image_index, best.view, best.rank, best.rotation, best.distance)
-                filling = lifted(self.describer, *views, batch.boxes, batch.cameras)
-                better = gain is not None and gain > OUTSIDE_MARGIN
-                word = batch.priors.contradiction(best, filling, better_outside=better)
-                result = replace(result, prior=batch.priors.limits_of(b), prior_contradiction=word)
-            results.append(result)
-        return results
-
-
-def _matcher(
-    given: Any,
-    pipeline: Pipeline | None,
-    views: ViewSphere | None,
-    settings: BankSettings | None,
-    field: nn.Module | None,
-    renderer: str | DepthRenderer,
-    device: torch.device | str | None,
-    progress: bool | Callable[[str, int, int], object],
-) -> ViewMatcher:
-    """The matcher of a bank, or of the bank of a mesh, with the arguments of :class:`Registrar`."""
-    if isinstance(given, ViewMatcher):
-        if any(value is not None for value in (pipeline, field, views, settings)):
-            raise InvalidInputError("Registrar: pipeline, field, views and settings belong to the matcher")
-        return given
-    if isinstance(given, ViewBank):
-        if views is not None or settings is not None:
-            raise InvalidInputError("Registrar: views and settings belong to the bank; give them with a mesh only")
-        bank = given if device is None else given.to(device)
-    else:
-        pipeline = pipeline or Pipeline()
-        pipeline = replace(pipeline, bank=settings or pipeline.bank)
-        bank = cached_bank(
-            given, views, pipeline=pipeline, renderer=renderer, progress=progress, device=device or "cpu"
+        own, rivals = order[~outside[order]], order[outside[order]]
+        best, reported = own[:1], own[: self.pipeline.hypotheses].tolist()
+        with_camera = work.item.camera_matrix is not None
+        R, ranking = self.bank.rotations, work.ranking
+        near = are_near(R, R[ranking.order[0, 0]], work.symmetries)
+        measured = confidence_features(features[own], scores[own], concentration(ranking.scores[0], near))
+        gain = None
+        if len(rivals):  # without the rank, which views outside the limits do not have
+            gain = float((features[rivals, 1:] - features[best, 1:]) @ torch.tensor(SCORE_WEIGHTS[1:]).to(features))
+            if len(own) == 1:  # limits that leave no rival do not make a pose uncertain
+                share = measured["concentration"] or 1.0
+                measured = {**measured, "margin": max(-gain, 0.0), "concentration": share}
+        probabilities: tuple[float, ...] = ()
+        if is_calibrated(self.pipeline):
+            confidence = registration_confidence(measured, exact=work.exact)
+            probabilities = hypothesis_probabilities(confidence, scores[own], exact=work.exact)[: len(reported)]
+        contradiction = None
+        if work.limits is not None:
+            one = poses[best]
+            filling = self._in_box(work, one.rotation, one.distance, one.view, one.rank)
+            better = gain is not None and gain > OUTSIDE_MARGIN
+            contradiction = work.limits.contradiction(one, filling, better_outside=better)
+        return Registration(
+            tuple(hypothesis_of(poses, h, named_features(features, h), with_camera=with_camera) for h in reported),
+            probabilities,
+            ranking[:1],
+            measured,
+            prior=work.item.prior,
+            prior_contradiction=contradiction,
+            warnings=work.item.warnings + self.mesh_warnings,
         )
-    # Built on one thread, so that rounding does not depend on the number of threads.
-    options: dict[str, Any] = {"pipeline": pipeline, "field": field, "renderer": renderer}
-    return map_on_threads(lambda bank: ViewMatcher(bank, **options), [bank])[0]
 
 
 def _better(

@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "SCHEMA",
+    "Detection",
     "FailedRegistration",
     "Hypothesis",
-    "Localization",
     "PhotographPose",
     "Registration",
     "ambiguity",
     "corners",
-    "localization_document",
+    "detection_document",
     "pose_in_words",
     "remarks",
     "result_document",
@@ -68,12 +68,12 @@ CONVENTIONS = {
     "boxes": "x0, y0, x1, y1 in those pixels",
     "score": "normalised correlation of photograph and view, 0 to 1",
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth, null for pipelines that "
-    "were not calibrated; times presence for an object without a given box; of a pose refined from a start: at most "
-    "that it is within 10 degrees and 10 % of the distance",
+    "were not calibrated; times the detection's score for an object without a given box; of a pose refined from a "
+    "start: at most that it is within 10 degrees and 10 % of the distance",
     "probabilities": "of the poses of top, in their order, to be within 30 degrees of the truth; none: of none of them",
     "ambiguous": "how poses differ that are nearly as probable as the first: half turn, mirror or several; else null",
     "symmetries": "number of orientations in which the mesh looks the same; poses that differ by them count as one",
-    "presence": "estimated probability that the photograph shows the object in that box",
+    "detection": "score: estimated probability that the photograph shows the object in that box",
     "reliable": f"confidence of at least {RELIABLE:g}, no warnings, and no better match outside the prior; false = no "
     "reliable match, the pose is a guess",
     "warnings": "what is questionable about the box and the camera",
@@ -152,21 +152,21 @@ class Hypothesis:
 
 
 @dataclass(frozen=True)
-class Localization:
+class Detection:
     """Where the object was found in a photograph that came without a box.
 
     Attributes:
         box: (4,) float64 x0, y0, x1, y1 in px, around the projected mesh.
-        presence: probability that the photograph shows the object there.
-        score: the detector's score of the proposal that led here.
-        boxes: (P, 4) float64, all proposals, the results' boxes first, with their ``scores`` (P,).
+        score: probability that the photograph shows the object there.
+        response: the detector's, of the proposal that led here, see :class:`.Proposals`.
+        boxes: (P, 4) float64, all proposals, the results' boxes first, with their ``responses`` (P,).
     """
 
     box: Tensor
-    presence: float
     score: float
+    response: float
     boxes: Tensor
-    scores: Tensor
+    responses: Tensor
 
 
 @dataclass(frozen=True)
@@ -214,11 +214,11 @@ class Registration:
 
     Attributes:
         hypotheses: distinct poses, best first; all but the first are rivals, such as the pose seen from behind.
-        probabilities: of each hypothesis to be within 30 degrees of the truth, times ``localization.presence`` for an
+        probabilities: of each hypothesis to be within 30 degrees of the truth, times ``detection.score`` for an
             object without a box; empty for a pipeline that was not calibrated.
         ranking: scores of the bank's views for this photograph (B = 1).
         confidence_features: what the confidence is computed from, see :func:`.confidence.confidence_features`.
-        localization: where the object was found; None if its box was given.
+        detection: where the object was found; None if its box was given.
         corrected_box: (4,) float64, the box that replaced a given one that did not fit the pose; else None.
         prior: the limits on the pose that were given.
         prior_contradiction: "better outside": a pose outside the limits fits better by the same evidence, or the box
@@ -235,7 +235,7 @@ class Registration:
     probabilities: tuple[float, ...]
     ranking: Ranking
     confidence_features: Mapping[str, float | None] = field(default_factory=dict)
-    localization: Localization | None = None
+    detection: Detection | None = None
     corrected_box: Tensor | None = None
     prior: PosePrior | None = None
     prior_contradiction: str | None = None
@@ -346,11 +346,6 @@ class Registration:
     def _repr_html_(self) -> str:
         """For notebooks."""
         return f"<pre>{html.escape(repr(self))}</pre>"
-
-    @property
-    def candidates(self) -> Tensor:
-        """(K,) view indices of the hypotheses."""
-        return torch.tensor([h.view for h in self.hypotheses])
 
     @property
     def covariance(self) -> Tensor | None:
@@ -466,21 +461,23 @@ def result_document(result: Registration, registrar: "Registrar", seconds: Mappi
     }
 
 
-def localization_document(results: Sequence[Registration]) -> dict[str, Any]:
-    """The key ``localization``: the objects that :func:`localize` found in one photograph."""
-    located = [(result, result.localization) for result in results if result.localization is not None]
-    first = located[0][1]
+def detection_document(results: Sequence[Registration]) -> dict[str, Any]:
+    """The key ``detection``: the objects that :func:`.detect` found in one photograph."""
+    found = [(result, result.detection) for result in results if result.detection is not None]
+    first = found[0][1]
     return {
-        "presence": first.presence,
-        "proposals": [{"box": b.tolist(), "score": float(s)} for b, s in zip(first.boxes, first.scores, strict=True)],
+        "score": first.score,
+        "proposals": [
+            {"box": b.tolist(), "response": float(r)} for b, r in zip(first.boxes, first.responses, strict=True)
+        ],
         "instances": [
             {
                 "box": at.box.tolist(),
-                "presence": at.presence,
+                "score": at.score,
                 "confidence": result.confidence,
                 **result.hypotheses[0].pose_dict(),
             }
-            for result, at in located
+            for result, at in found
         ],
     }
 

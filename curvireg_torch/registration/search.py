@@ -1,6 +1,5 @@
 """Coarse-to-fine search around views of rankings (the paper's section "Registration of 2D images"), batched."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -26,13 +25,7 @@ MAX_ROUNDS = 8
 
 
 @torch.no_grad()
-def search(
-    describer: ViewDescriber,
-    descriptors: Tensor,
-    starts: Poses,
-    *,
-    allow: Callable[[Tensor, Tensor], Tensor] | None = None,
-) -> Tensor:
+def search(describer: ViewDescriber, descriptors: Tensor, starts: Poses) -> Tensor:
     """Return (H, 3, 3) allocentric rotations whose views match the photographs best, near those of the starts.
 
     Every round takes the six rotations by +-step about the camera's axes around the best pose; the step is halved where
@@ -42,7 +35,6 @@ def search(
         describer: of the mesh.
         descriptors: (B, D) of the photographs' fields, computed by the describer.
         starts: poses in those photographs.
-        allow: (H,) bool for the image index (H,) and rotations (H, 3, 3) of poses; None allows all.
     """
     axes = torch.cat([torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)])
     best, score = starts.rotation, similarities(describer, descriptors, starts)
@@ -55,10 +47,8 @@ def search(
         candidates = turns @ best[active, None]
         each = replace(starts[active.repeat_interleave(6)], rotation=candidates.flatten(0, 1))
         scores = similarities(describer, descriptors, each)
-        outside = rotation_error(candidates, starts.rotation[active, None]).flatten() > SEARCH_ANGLE
-        if allow is not None:
-            outside |= ~allow(each.image_index, each.rotation)
-        value, winner = scores.masked_fill(outside, -1.0).view(-1, 6).max(dim=1)
+        far = rotation_error(candidates, starts.rotation[active, None]).flatten() > SEARCH_ANGLE
+        value, winner = scores.masked_fill(far, -1.0).view(-1, 6).max(dim=1)
         better = value > score[active]
         moved = torch.where(better[:, None, None], candidates[torch.arange(len(active)), winner], best[active])
         motion = torch.linalg.matrix_norm(best[active].mT @ moved - torch.eye(3, dtype=torch.float64))

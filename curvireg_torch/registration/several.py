@@ -16,8 +16,8 @@ from .confidence import (
     is_calibrated,
     registration_confidence,
 )
-from .inputs import ImageItem, image_items, is_missing, rig_cameras
-from .localization import localize
+from .detection import detect
+from .inputs import ImageItem, OnDemand, image_items, is_missing, rig_cameras
 from .result import FailedRegistration, PhotographPose, Registration
 from .rig import ELSEWHERE, Found, Rig, RigPhotograph
 from .tracker import boxes_at
@@ -64,7 +64,8 @@ def register_views(
     Returns:
         A registration whose poses are ``T_world_from_model``, whose covariance is along the world's axes, and whose
         ``views`` have the pose in each photograph. ``projection`` and ``ranking`` are those of the first photograph
-        that counts. The covariance assumes that the poses of the cameras are right.
+        that counts. The covariance does not know the errors of the cameras; it grows where
+        photographs contradict each other.
 
     Raises:
         InvalidInputError: no photograph can be registered; a camera's pose is not rigid; two photographs that differ
@@ -89,7 +90,7 @@ def register_views(
     if given:
         found = _registered(registrar, items, cameras, given)
     else:
-        for i, (result,) in enumerate(localize(registrar, images, camera_matrices)):
+        for i, (result,) in enumerate(detect(registrar, images, camera_matrices)):
             found[i] = _photograph(registrar, items[i], result, i, cameras[i])
     if missing := [i for i in range(len(items)) if i not in found]:
         where = Rig.of(registrar, found).answer().T[:1]
@@ -106,15 +107,23 @@ def _registered(
 ) -> Found:
     """Some photographs registered alone: in their boxes, or in those around a world pose ``T`` (1, 4, 4)."""
 
-    def register(i: int) -> RigPhotograph | CurviregError:
-        item = items[i]
-        if T is not None and isinstance(item, ImageItem) and item.camera_matrix is not None:
-            box, visible = boxes_at(registrar.describer.hull, cameras[i] @ T, item.camera_matrix.double(), item.size)
-            item = replace(item, box=box[0].float()) if bool(visible) else LostObjectError(ELSEWHERE)
-        return _photograph(registrar, item, registrar.register_items([item], i)[0], i, cameras[i])
+    def located(k: int) -> ImageItem | CurviregError:
+        item = items[chosen[k]]
+        if T is None or not isinstance(item, ImageItem) or item.camera_matrix is None:
+            return item
+        T_cam, K = cameras[chosen[k]] @ T, item.camera_matrix.double()
+        box, visible = boxes_at(registrar.describer.hull, T_cam, K, item.size)
+        return replace(item, box=box[0].float()) if bool(visible) else LostObjectError(ELSEWHERE)
 
-    found = registrar.map_items(chosen, lambda some, _: [register(i) for i in some])
-    return dict(zip(chosen, found, strict=True))
+    def register(item: ImageItem, k: int) -> RigPhotograph | CurviregError:
+        i = chosen[k]
+        try:
+            return _photograph(registrar, item, registrar.register_item(item), i, cameras[i])
+        except CurviregError as error:
+            return error.with_subject(f"image {i}")
+
+    found = registrar.map_items(OnDemand(located, len(chosen)), register)
+    return {i: r.error if isinstance(r, FailedRegistration) else r for i, r in zip(chosen, found, strict=True)}
 
 
 def _photograph(
@@ -127,8 +136,8 @@ def _photograph(
     if isinstance(result, FailedRegistration):
         return result.error
     assert isinstance(item, ImageItem)
-    if result.localization is not None:
-        item = replace(item, box=result.localization.box.float())
+    if result.detection is not None:
+        item = replace(item, box=result.detection.box.float())
     return RigPhotograph.of(registrar, item, result, index, camera)
 
 
@@ -154,10 +163,8 @@ def _registration(registrar: "Registrar", found: Found, cameras: Tensor) -> Regi
     if is_calibrated(registrar.pipeline) and len(rig.photographs) + len(lost) > 1:
         confidence = probabilities[0]
         if len(rig.photographs) > 1:
-            presence = [
-                1.0 if p.result.localization is None else p.result.localization.presence for p in rig.photographs
-            ]
-            confidence = max(presence) * registration_confidence(features, exact=rig.exact)
+            scores = [1.0 if p.result.detection is None else p.result.detection.score for p in rig.photographs]
+            confidence = max(scores) * registration_confidence(features, exact=rig.exact)
         against = [
             p for p in every.photographs if p.index in lost and rig.angles(p.poses[:1], answer.T[:1]) > RIVAL_ANGLE
         ]

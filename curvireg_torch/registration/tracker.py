@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -16,10 +16,10 @@ from ..geometry import rotation_error
 from ..geometry.cameras import projected_boxes, transform
 from ..geometry.crops import crop_transforms, square_boxes
 from ..rendering import DepthRenderer
-from ..rendering.contours import ContourPoints, MeshContours
+from ..rendering.contours import MeshContours
 from ..terms import crop_regions
 from .confidence import RELIABLE, tracking_confidence
-from .contour_fit import STALE_SHIFT, ContourProblem, ContourState, EdgeField, inside_photographs
+from .contour_fit import ContourProblem, ContourState, EdgeField, inside_photographs
 from .least_squares import (
     INLIER_SCALE,
     Measurements,
@@ -86,7 +86,7 @@ outline: nearer to it, patches show the background."""
 
 
 @dataclass(frozen=True)
-class Window:
+class Frame:
     """The part of a frame around the object: ``colours`` (1, 3, S, S) in [0, 1], their mean ``grey`` (S, S) uint8, the
     camera ``K`` (1, 3, 3), and ``inside`` (1, 1, S, S), 0 beyond the border of the frame."""
 
@@ -94,29 +94,42 @@ class Window:
     grey: np.ndarray
     K: Tensor
     inside: Tensor
+    contours: MeshContours
 
+    @classmethod
+    def cut(cls, image: Tensor, K: Tensor, hull: Tensor, contours: MeshContours, T: Tensor) -> "Frame":
+        """The square around a mesh, ``WINDOW_SIZE`` px wide.
 
-def cut_window(image: Tensor, K: Tensor, hull: Tensor, T: Tensor) -> Window:
-    """The square window around an object, ``WINDOW_SIZE`` px wide.
+        Args:
+            image: (C, H, W), C = 1 or 3, in [0, 1] or uint8; missing pixels are filled from their neighbours.
+            K: (3, 3) float64 camera matrix in px.
+            hull, contours: (V, 3) float64 points, and contours, of the mesh.
+            T: (1, 4, 4) float64 pose.
 
-    Args:
-        image: (C, H, W), C = 1 or 3, in [0, 1] or uint8; missing pixels are filled from their neighbours.
-        K: (3, 3) float64 camera matrix in px.
-        hull: (V, 3) float64 points of the mesh.
-        T: (1, 4, 4) float64 pose.
+        Raises:
+            LostObjectError: the mesh lies behind the camera, or outside the image.
+        """
+        boxes, visible = boxes_at(hull, T, K[None], (int(image.shape[-2]), int(image.shape[-1])))
+        if not bool(visible):
+            raise LostObjectError(OUTSIDE)
+        box = boxes.float()
+        crop = crop_regions([image], box[:, None], size=WINDOW_SIZE, margin=WINDOW_MARGIN)[:, 0].float()
+        colours = fill_missing(crop).expand(-1, 3, -1, -1)
+        grey = (255.0 * colours[0].mean(dim=0)).round().clamp(0, 255).to(torch.uint8).numpy()
+        inside = inside_photographs([image], box, WINDOW_SIZE, WINDOW_MARGIN)
+        K = crop_transforms(square_boxes(box, WINDOW_MARGIN), WINDOW_SIZE).double() @ K
+        return cls(colours, grey, K, inside, contours)
 
-    Raises:
-        LostObjectError: the mesh lies behind the camera, or outside the image.
-    """
-    boxes, visible = boxes_at(hull, T, K[None], (int(image.shape[-2]), int(image.shape[-1])))
-    if not bool(visible):
-        raise LostObjectError(OUTSIDE)
-    box = boxes.float()
-    crop = crop_regions([image], box[:, None], size=WINDOW_SIZE, margin=WINDOW_MARGIN)[:, 0].float()
-    colours = fill_missing(crop).expand(-1, 3, -1, -1)
-    grey = (255.0 * colours[0].mean(dim=0)).round().clamp(0, 255).to(torch.uint8).numpy()
-    inside = inside_photographs([image], box, WINDOW_SIZE, WINDOW_MARGIN)
-    return Window(colours, grey, crop_transforms(square_boxes(box, WINDOW_MARGIN), WINDOW_SIZE).double() @ K, inside)
+    @cached_property
+    def bins(self) -> Tensor:
+        """(S, S) histogram bins of the colours."""
+        return colour_bins(self.colours)
+
+    @cached_property
+    def problem(self) -> ContourProblem:
+        """The fit of contours to the edges of the frame."""
+        edges = EdgeField(self.colours, self.inside)
+        return ContourProblem(self.contours, edges, torch.zeros(1, dtype=torch.long), self.K, WINDOW_SIZE)
 
 
 def boxes_at(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -133,27 +146,26 @@ def boxes_at(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A frame with a known pose ``T`` (1, 4, 4): its window, and corners ``uv`` (P, 2) px, float32, at the points
-    ``model`` (1, P, 3) of the surface."""
+    """A ``grey`` picture (S, S) uint8 with a known pose ``T`` (1, 4, 4), and corners ``uv`` (P, 2) px, float32, at the
+    points ``model`` (1, P, 3) of the surface."""
 
-    window: Window
+    grey: np.ndarray
     T: Tensor
     uv: np.ndarray
     model: Tensor
 
 
-def track_points(keyframe: Keyframe, window: Window, T: Tensor, centre: Tensor, *, levels: int) -> PointMatches:
-    """Corners of a keyframe in a new window, searched where the pose ``T`` (1, 4, 4) projects them.
+def track_points(keyframe: Keyframe, frame: Frame, T: Tensor, centre: Tensor, *, levels: int) -> PointMatches:
+    """Corners of a keyframe in a new frame, searched where the pose ``T`` (1, 4, 4) projects them.
 
     Matches from which the flow does not lead back to the corner have weight 0. A pyramid of ``levels`` halvings lets
     the search reach further.
     """
     if len(keyframe.uv) == 0:
         return PointMatches(keyframe.model, torch.zeros(1, 0, 2).double(), torch.zeros(1, 0).double())
-    guess = pixels(keyframe.model, T, window.K, centre)[0].float().numpy()
-    before, after = keyframe.window.grey, window.grey
-    there, found = _optical_flow(before, after, keyframe.uv, guess, levels)
-    back, returned = _optical_flow(after, before, there, keyframe.uv, levels)
+    guess = pixels(keyframe.model, T, frame.K, centre)[0].float().numpy()
+    there, found = _optical_flow(keyframe.grey, frame.grey, keyframe.uv, guess, levels)
+    back, returned = _optical_flow(frame.grey, keyframe.grey, there, keyframe.uv, levels)
     kept = found & returned & (np.linalg.norm(back - keyframe.uv, axis=1) < MAX_RETURN_ERROR)
     return PointMatches(keyframe.model, torch.from_numpy(there).double()[None], torch.from_numpy(kept).double()[None])
 
@@ -175,47 +187,19 @@ def _optical_flow(
 
 
 @dataclass(frozen=True)
-class Frame:
-    """A window of a frame and what is measured in it: histogram bins (S, S) and edges."""
-
-    window: Window
-    bins: Tensor
-    problem: ContourProblem
-
-
-@dataclass(frozen=True)
-class Outline:
-    """The contour ``points`` of the mesh at a pose ``T`` (1, 4, 4), and of those that have the background beside them,
-    ``model`` (1, Q, 3) and unit ``normals`` (1, Q, 2) that point there."""
-
-    T: Tensor
-    points: ContourPoints
-
-    @cached_property
-    def model(self) -> Tensor:
-        return self.points.model[self.points.outline][None]
-
-    @cached_property
-    def normals(self) -> Tensor:
-        return self.points.normals[self.points.outline][None]
-
-
-@dataclass(frozen=True)
 class TrackedPose:
     """A pose in a frame.
 
     Attributes:
-        T: (1, 4, 4) float64 ``T_cam_from_model``.
         features: what the confidence is computed from, all in [0, 1]: ``edge_support`` as of a contour fit; ``region``,
             how clearly and how near to the outline the object's colours end; ``flow`` and ``keyframe``, the fraction
             of the corners of the last frame, and of a keyframe, that are found where the pose has them.
-        frame, outline: what the features were measured in.
+        frame, state: the frame, and the pose (1, 4, 4) with its contours.
     """
 
-    T: Tensor
     features: Mapping[str, float]
     frame: Frame
-    outline: Outline
+    state: ContourState
 
     @property
     def confidence(self) -> float:
@@ -264,8 +248,7 @@ class Tracker:
         """
         start = T.detach().cpu().double()[None]
         frame = self._frame(image, K, start)
-        outline = self._outline(frame, start)
-        return TrackedPose(start, self._features(frame, outline, start, []), frame, outline)
+        return self._tracked(frame, frame.problem.state(start), [])
 
     def track(self, image: Tensor, K: Tensor) -> TrackedPose:
         """The pose in the next frame (C, H, W) with camera matrix ``K`` (3, 3).
@@ -287,19 +270,16 @@ class Tracker:
 
     def accept(self, pose: TrackedPose) -> None:
         """Go on from a pose of :meth:`track` or :meth:`measure`, and learn from its frame."""
-        self._poses = [*self._poses[-1:], pose.T]
-        depth = self.renderer.render(pose.outline.T, pose.frame.window.K, (WINDOW_SIZE, WINDOW_SIZE)).cpu()
-        self._learn(pose.frame, pose.outline, depth, rate=LEARNING_RATE)
-        self._remember(pose.frame, pose.outline, depth)
+        self._poses = [*self._poses[-1:], pose.state.T]
+        depth = self.renderer.render(pose.state.T, pose.frame.K, (WINDOW_SIZE, WINDOW_SIZE)).cpu()
+        self._learn(pose.frame, pose.state, depth, rate=LEARNING_RATE)
+        self._remember(pose.frame, pose.state.T, depth)
 
     def covariance(self, pose: TrackedPose) -> Tensor:
         """(6, 6) of a pose, see :func:`curvireg_torch.registration.fit_contours`."""
-        frame = pose.frame
-        measured = frame.problem.measured_edges(
-            ContourState(pose.T, pose.outline.T, pose.outline.points), SEARCH_RADII[-1]
-        )
-        points, K = pose.outline.points, frame.window.K
-        return pose_covariance(measured, points, pose.T, K, self.centre, radius=self.radius)[0][0]
+        problem, points = pose.frame.problem, pose.state.points
+        measured = problem.measured_edges(pose.state, SEARCH_RADII[-1])
+        return pose_covariance(measured, points, pose.state.T, problem.K, self.centre, radius=self.radius)[0][0]
 
     @property
     def last_pose(self) -> Tensor:
@@ -318,75 +298,76 @@ class Tracker:
     def _fit(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
         """The pose around a start (1, 4, 4)."""
         assert self._last is not None
-        first = cut_window(image, K, self.hull, T)
+        first = self._frame(image, K, T)
         flow = track_points(self._last, first, T, self.centre, levels=PYRAMID_LAST)
         T = fit_points(flow, T, first.K, self.centre, FLOW_SCALES)
         frame = self._frame(image, K, T)
-        flows = [(POINT_WEIGHT, flow.moved(first.K, frame.window.K))]
+        flows = [(POINT_WEIGHT, flow.moved(first.K, frame.K))]
         keyframe = self._nearest(T)
         if keyframe is not self._last:
-            flows.append(
-                (KEYFRAME_WEIGHT, track_points(keyframe, frame.window, T, self.centre, levels=PYRAMID_KEYFRAME))
-            )
-        outline = self._outline(frame, T)
+            flows.append((KEYFRAME_WEIGHT, track_points(keyframe, frame, T, self.centre, levels=PYRAMID_KEYFRAME)))
+        state = frame.problem.state(T)
         for radius in SEARCH_RADII:
             for _ in range(STEPS_PER_ROUND):
-                others = self._measurements(frame, outline, T, flows, radius)
-                T = frame.problem.step(outline.points, T, radius, others)
-            T = nearest_rigid(T)
-            if float(frame.problem.mean_shift(outline.points, outline.T, T)) > STALE_SHIFT:
-                outline = self._outline(frame, T)
-        return TrackedPose(T, self._features(frame, outline, T, [flow for _, flow in flows]), frame, outline)
+                others = self._measurements(frame, state, flows, radius)
+                state = replace(state, T=frame.problem.step(state.points, state.T, radius, others))
+            state = frame.problem.with_current_contours(replace(state, T=nearest_rigid(state.T)))
+        return self._tracked(frame, state, [flow for _, flow in flows])
 
     def _measurements(
-        self, frame: Frame, outline: Outline, T: Tensor, flows: list[tuple[float, PointMatches]], radius: float
+        self, frame: Frame, state: ContourState, flows: list[tuple[float, PointMatches]], radius: float
     ) -> list[Measurements]:
         """Colours and points, beside the edges."""
-        mean, variance = self._ends(frame, outline, T, math.ceil(radius))
+        mean, variance = self._ends(frame, state, math.ceil(radius))
         flat = math.ceil(radius) ** 2 / 3.0  # variance of lines along which colours say nothing
         information = (1.0 / (variance + REGION_VARIANCE) - 1.0 / flat).clamp(min=0.0)
-        J = (outline.normals[..., None, :] @ project(outline.model, T, frame.window.K, self.centre)[1])[..., 0, :]
+        model, normals = _silhouette(state)
+        J = (normals[None, :, None] @ project(model[None], state.T, frame.K, self.centre)[1])[..., 0, :]
         colours = Measurements(J, mean[None, :, None], REGION_WEIGHT * information[None, :, None])
-        points = [flow.measurements(T, frame.window.K, self.centre, INLIER_SCALE).scaled(w) for w, flow in flows]
+        points = [flow.measurements(state.T, frame.K, self.centre, INLIER_SCALE).scaled(w) for w, flow in flows]
         return [colours, *points]
 
-    def _ends(self, frame: Frame, outline: Outline, T: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+    def _ends(self, frame: Frame, state: ContourState, radius: int) -> tuple[Tensor, Tensor]:
         """Mean and variance (Q,) of where the object's colours end along the normals of its silhouette."""
-        uv = pixels(outline.model, T, frame.window.K, self.centre)[0]
-        offsets = torch.arange(-radius, radius + 1, dtype=torch.float64)
-        samples = uv[:, None] + offsets[:, None] * outline.normals[0][:, None]
-        log_ratio = self._regions.log_ratio(frame.bins, samples, self._directions(frame, T, uv))
-        mean, variance = line_posterior(log_ratio.double(), radius)
-        return mean, variance
+        samples, directions = self._lines(frame, state, torch.arange(-radius, radius + 1, dtype=torch.float64))
+        return line_posterior(self._regions.log_ratio(frame.bins, samples, directions).double(), radius)
 
-    def _features(self, frame: Frame, outline: Outline, T: Tensor, flows: list[PointMatches]) -> dict[str, float]:
-        """Features of a pose with its ``flows`` from the last frame and, if that is another one, a keyframe."""
-        mean, variance = self._ends(frame, outline, T, REGION_FEATURE_RADIUS)
+    def _lines(self, frame: Frame, state: ContourState, offsets: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (Q, L, 2) at offsets (L,) px along the normals of the silhouette, and directions (Q,) rad of these
+        lines from the object's centre."""
+        model, normals = _silhouette(state)
+        points = torch.cat([self.centre[None], model])[None]
+        middle, uv = pixels(points, state.T, frame.K, self.centre)[0].split([1, len(model)])
+        x, y = (uv - middle).unbind(-1)
+        return uv[:, None] + offsets[:, None] * normals[:, None], torch.atan2(y, x)
+
+    def _tracked(self, frame: Frame, state: ContourState, flows: list[PointMatches]) -> TrackedPose:
+        """A pose with its ``flows`` from the last frame and, if that is another one, a keyframe."""
+        mean, variance = self._ends(frame, state, REGION_FEATURE_RADIUS)
         clear = torch.exp(-0.125 * mean.square()) * (1.0 - 3.0 * variance / REGION_FEATURE_RADIUS**2).clamp(min=0.0)
-        shares = [flow.inlier_ratio(T, frame.window.K, self.centre) for flow in flows] or [0.0]
-        return {
-            "edge_support": float(frame.problem.edge_support(ContourState(T, outline.T, outline.points))),
+        ratios = [flow.inlier_ratio(state.T, frame.K, self.centre) for flow in flows] or [0.0]
+        features = {
+            "edge_support": float(frame.problem.edge_support(state)),
             "region": float(clear.sum()) / max(len(clear), 1),
-            "flow": shares[0],
-            "keyframe": shares[-1],
+            "flow": ratios[0],
+            "keyframe": ratios[-1],
         }
+        return TrackedPose(features, frame, state)
 
-    def _learn(self, frame: Frame, outline: Outline, depth: Tensor, *, rate: float) -> None:
+    def _learn(self, frame: Frame, state: ContourState, depth: Tensor, *, rate: float) -> None:
         """Learn the colours beside the outline; where the mesh hides the background again, they are the object's."""
-        uv = pixels(outline.model, outline.T, frame.window.K, self.centre)[0]
         distance = torch.arange(LEARNED_BAND[0], LEARNED_BAND[1] + 1, dtype=torch.float64)
-        samples = uv[:, None] + torch.cat([-distance, distance])[:, None] * outline.normals[0][:, None]
+        samples, directions = self._lines(frame, state, torch.cat([-distance, distance]))
         x, y = samples.round().long().clamp(0, WINDOW_SIZE - 1).unbind(-1)
         inside = depth[0, 0, y, x] > 0
-        directions = self._directions(frame, outline.T, uv)[:, None].expand(inside.shape)
+        directions = directions[:, None].expand(inside.shape)
         self._regions.learn(frame.bins, samples.flatten(0, 1), directions.flatten(), inside.flatten(), rate=rate)
 
-    def _remember(self, frame: Frame, outline: Outline, depth: Tensor) -> None:
+    def _remember(self, frame: Frame, T: Tensor, depth: Tensor) -> None:
         """Keep the frame as the last one, and if none from a similar direction is kept, as a keyframe."""
-        window, T = frame.window, outline.T
-        uv, model = surface_corners(window.grey, depth, T, window.K, quality=CORNER_QUALITY, inside=CORNER_INSET)
-        self._last = Keyframe(window, T, uv, model)
-        if not self._keyframes or float(self._angles(outline.T).min()) > KEYFRAME_ANGLE:
+        uv, model = surface_corners(frame.grey, depth, T, frame.K, quality=CORNER_QUALITY, inside=CORNER_INSET)
+        self._last = Keyframe(frame.grey, T, uv, model)
+        if not self._keyframes or float(self._angles(T).min()) > KEYFRAME_ANGLE:
             self._keyframes = [*self._keyframes[1 - MAX_KEYFRAMES :], self._last]
 
     def _nearest(self, T: Tensor) -> Keyframe:
@@ -396,16 +377,10 @@ class Tracker:
         """(K,) degrees between the rotations of a pose (1, 4, 4) and of the keyframes."""
         return rotation_error(torch.cat([keyframe.T for keyframe in self._keyframes])[:, :3, :3], T[:, :3, :3])
 
-    def _directions(self, frame: Frame, T: Tensor, uv: Tensor) -> Tensor:
-        """(Q,) rad of pixels (Q, 2) from the object's centre."""
-        x, y = (uv - pixels(self.centre[None, None], T, frame.window.K, self.centre)[0]).unbind(-1)
-        return torch.atan2(y, x)
-
     def _frame(self, image: Tensor, K: Tensor, T: Tensor) -> Frame:
-        window = cut_window(image, K, self.hull, T)
-        index, edges = torch.zeros(1, dtype=torch.long), EdgeField(window.colours, window.inside)
-        problem = ContourProblem(self.contours, edges, index, window.K, WINDOW_SIZE)
-        return Frame(window, colour_bins(window.colours), problem)
+        return Frame.cut(image, K, self.hull, self.contours, T)
 
-    def _outline(self, frame: Frame, T: Tensor) -> Outline:
-        return Outline(T, self.contours.points(T, frame.window.K, WINDOW_SIZE))
+
+def _silhouette(state: ContourState) -> tuple[Tensor, Tensor]:
+    """Contour points (Q, 3) that have the background beside them, and unit normals (Q, 2) that point there."""
+    return state.points.model[state.points.outline], state.points.normals[state.points.outline]

@@ -17,7 +17,7 @@ __all__ = ["Page", "Steps", "add_assets"]
 TICK_SECONDS = 0.15  # between two looks at what changed
 STAGES: Mapping[str, str] = {
     "bank": "rendering views of the mesh",
-    "localization": "looking for the object in the photograph",
+    "detection": "looking for the object in the photograph",
     "ranking": "comparing the photograph with the views",
     "search": "searching around the best views",
     "contours": "fitting contours",

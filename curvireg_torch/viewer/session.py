@@ -324,10 +324,10 @@ class Session:
             document |= registration.to_dict()
             if document["inputs"]["camera_source"] in ("exif", "fov"):
                 document["covariance"] = document["standard_deviations"] = None
-            if "localization" in document:
-                first, *others = document["localization"]["instances"]
+            if "detection" in document:
+                first, *others = document["detection"]["instances"]
                 first = {**first, "confidence": registration.confidence, **answer.pose.pose_dict()}
-                document["localization"] = {**document["localization"], "instances": [first, *others]}
+                document["detection"] = {**document["detection"], "instances": [first, *others]}
         by_hand = {"hypothesis": answer.number, "by_hand": list(answer.edits)}
         return {**document, "viewer": {"command": _command_line(result.request, self.names), **by_hand}}
 

@@ -104,7 +104,7 @@ show(picture, torch.tensor([x0 - 0.3 * wide, y0 - 0.1 * high, x1 + 0.1 * wide, y
 # The whole image as the box
 # --------------------------
 #
-# A given box is trusted: the object is assumed to fill it. Without a box, the object would be localized.
+# A given box is trusted: the object is assumed to fill it. Without a box, the object would be detected.
 
 picture, box, truth = photograph(5)
 show(picture, torch.tensor([-0.5, -0.5, 479.5, 359.5]), truth, "the whole image")

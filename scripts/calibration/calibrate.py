@@ -151,10 +151,10 @@ def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
         result = registrar([shown["image"]], None, shown["camera_matrix"].double())[0]
         if result.ok:
             evidence = result.hypotheses[0].evidence
-            features = {"score": result.localization.score, "similarity": evidence["similarity"]}
+            features = {"response": result.detection.response, "similarity": evidence["similarity"]}
             x0, y0, x1, y1 = torch.cat([
-                torch.maximum(result.localization.box[:2], shown["box"][:2].double()),
-                torch.minimum(result.localization.box[2:], shown["box"][2:].double()),
+                torch.maximum(result.detection.box[:2], shown["box"][:2].double()),
+                torch.minimum(result.detection.box[2:], shown["box"][2:].double()),
             ]).tolist()  # fmt: skip
             area = (shown["box"][2:] - shown["box"][:2]).prod()
             overlaps = max(0.0, x1 - x0) * max(0.0, y1 - y0) > 0.5 * float(area)
@@ -269,7 +269,7 @@ def fit_rivals(rows: Sequence[Row]) -> Row:
 def calibrate(work: Path, jobs: int, limit: int | None) -> tuple[Row, Row]:
     """Constants, and their quality on held-out kinds of objects."""
     old = json.loads(CONSTANTS.read_text())
-    constants: Row = {"detection without networks": old["detection without networks"]}
+    constants: Row = {}
     quality: Row = {}
     for name, sets in FIELDS.items():
         rows = [row | {"set": s} for s in sets for row in rows_of(work, s, jobs, limit)]

@@ -7,7 +7,7 @@ import pytest
 
 from curvireg_torch.cli import parse
 from curvireg_torch.errors import InvalidInputError, MissingFileError
-from curvireg_torch.evaluation.benchmarks import localization_recall
+from curvireg_torch.evaluation.benchmarks import detection_recall
 from curvireg_torch.pipeline import DEFAULT, PRESETS
 from tests.evaluation.small import SMALL
 
@@ -50,18 +50,18 @@ def test_evaluate_bop_assumes_any_pose(bop, evaluate):
     assert (views["pose"], views["directions"], views["theta_step"]) == ("any", 18, 360.0)
 
 
-def test_evaluate_without_boxes_reports_localization(pascal, evaluate, tmp_path, capsys, monkeypatch):
+def test_evaluate_without_boxes_reports_detection(pascal, evaluate, tmp_path, capsys, monkeypatch):
     """The summary has the recall of boxes, or says that no box is annotated; thumbnails show the found box."""
     boxes = []
     monkeypatch.setattr("curvireg_torch.evaluation.runner.thumbnail", lambda *a: boxes.append(a[3]) or b"")
     words = ("pascal3d", pascal.root, "--limit", "2", "--protocol", "box=none")
     summary = evaluate(*words)
-    assert summary["localization"]["n"] == 2
-    assert f"recall_1 {summary['localization']['recall_1']:.3f}   recall_5" in capsys.readouterr().out
+    assert summary["detection"]["n"] == 2
+    assert f"recall_1 {summary['detection']['recall_1']:.3f}   recall_5" in capsys.readouterr().out
     rows = [json.loads(line) for line in (tmp_path / "out" / "results.jsonl").read_text().splitlines()]
-    row = next(row for row in rows if "localization" in row)
-    assert row["localization"]["proposals"][0]["box"] in boxes
-    summary["localization"] = localization_recall([], [])
+    row = next(row for row in rows if "detection" in row)
+    assert row["detection"]["proposals"][0]["box"] in boxes
+    summary["detection"] = detection_recall([], [])
     monkeypatch.setattr("curvireg_torch.evaluation.datasets.evaluate", lambda *_, **__: summary)
     evaluate(*words)
     assert "no box is annotated" in capsys.readouterr().out

@@ -64,7 +64,7 @@ ROWS = [
     (["negative", "photos/0.png", *box_of(0), "-260", "260", "119.5", "89.5"], "focal"),
     (["one colour", "flat.png", *EMPTY, *EMPTY], "one colour"),
     (["short", "photos/0.png"], "2 cells"),
-    (["localized", "photos/2.png", *EMPTY, *EMPTY], None),
+    (["detected", "photos/2.png", *EMPTY, *EMPTY], None),
     (["last", " photos/2.png ", *box_of(2), *CAMERA], 2),
 ]
 

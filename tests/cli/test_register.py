@@ -47,9 +47,9 @@ def test_register_writes_result_and_overlay(register_one, document, tmp_path, ca
 def test_register_without_box_and_camera(folder, register_one, document, capsys):
     words = ["register", str(folder / "photos/0.png"), str(folder / "truck.safetensors"), "--no-refine", "--json"]
     assert main([*words, "--box", *box_of(0)]) == 0
-    assert "localizing" not in capsys.readouterr().err
+    assert "detecting" not in capsys.readouterr().err
     assert main(words) == 0
-    assert "0.png: localizing the object" in capsys.readouterr().err
+    assert "0.png: detecting the object" in capsys.readouterr().err
     assert register_one("--no-refine", box=()) == 0
     assert capsys.readouterr().err == ""
     keys = ("translation", "covariance", "standard_deviations")

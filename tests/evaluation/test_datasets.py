@@ -59,8 +59,8 @@ def test_evaluate_bop(bop, tmp_path):
     summary = run(BOPBenchmark(bop, Protocol(pose="any")), tmp_path / "out")
     assert (summary["n"], summary["failed"]) == (3, 0)
     assert summary["skipped"]["unknown_box"] == 1, "without scene_gt_info there is no box"
-    localized = run(BOPBenchmark(bop, Protocol(pose="any", box=None)), tmp_path / "localized")
-    assert "unknown_box" not in localized["skipped"]
+    detected = run(BOPBenchmark(bop, Protocol(pose="any", box=None)), tmp_path / "detected")
+    assert "unknown_box" not in detected["skipped"]
     table = bop_poses(tmp_path / "out" / "predictions.csv")
     assert len(table) == 3
     assert all(row["t"][2] > 0 for row in table)

@@ -13,7 +13,7 @@ import trimesh
 from curvireg_torch.data import Pascal3DPlus
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, PoseFolderBenchmark, Protocol
-from curvireg_torch.evaluation.benchmarks import localization_recall, write_bop_csv
+from curvireg_torch.evaluation.benchmarks import detection_recall, write_bop_csv
 from curvireg_torch.evaluation.datasets import report
 from curvireg_torch.evaluation.store import ResultStore, to_json
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
@@ -246,18 +246,18 @@ def sample(*box):
 
 def located(*boxes):
     proposals = [{"box": list(map(float, box)), "score": 0.5} for box in boxes]
-    return {"localization": {"proposals": proposals}, "inputs": {"picture": {"width": 200, "height": 100}}}
+    return {"detection": {"proposals": proposals}, "inputs": {"picture": {"width": 200, "height": 100}}}
 
 
-def test_localization_recall_counts_the_first_right_proposal_and_failures_but_no_unknown_boxes():
+def test_detection_recall_counts_the_first_right_proposal_and_failures_but_no_unknown_boxes():
     half, less = (10, 10, 30, 20), (10, 10, 30, 19.9)
     rows = [located(BOX), located(AWAY, half), located(*[AWAY] * 5, BOX), located(less), located(*[AWAY] * 20, BOX)]
-    recall = localization_recall([sample(*BOX)] * 5, rows)
+    recall = detection_recall([sample(*BOX)] * 5, rows)
     assert recall == {"n": 5, "recall_1": 0.2, "recall_5": 0.4, "recall_20": 0.6}
     unknown = sample(*[math.nan] * 4)
-    recall = localization_recall([sample(*BOX), unknown, sample(*BOX)], [located(BOX), located(AWAY), FAILED])
+    recall = detection_recall([sample(*BOX), unknown, sample(*BOX)], [located(BOX), located(AWAY), FAILED])
     assert (recall["n"], recall["recall_1"]) == (2, 0.5)
-    assert localization_recall([], []) == {"n": 0, "recall_1": None, "recall_5": None, "recall_20": None}
+    assert detection_recall([], []) == {"n": 0, "recall_1": None, "recall_5": None, "recall_20": None}
 
 
 @pytest.mark.parametrize(
@@ -268,5 +268,5 @@ def test_localization_recall_counts_the_first_right_proposal_and_failures_but_no
         ((10.0, 60.0, 30.0, 159.5), (10.0, 60.0, 30.0, 99.5)),
     ],
 )
-def test_localization_recall_clips_boxes_to_the_image(annotated, proposed):
-    assert localization_recall([sample(*annotated)], [located(proposed)])["recall_1"] == 1.0
+def test_detection_recall_clips_boxes_to_the_image(annotated, proposed):
+    assert detection_recall([sample(*annotated)], [located(proposed)])["recall_1"] == 1.0

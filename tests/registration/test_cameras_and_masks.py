@@ -10,7 +10,7 @@ from curvireg_torch import Camera, camera_matrix, project_points, render_depth, 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import undistorted
 from curvireg_torch.geometry.cameras import boxes_around
-from curvireg_torch.registration import FailedRegistration, Follower, localize
+from curvireg_torch.registration import FailedRegistration, Follower, detect
 from curvireg_torch.registration.inputs import image_item, image_items
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
@@ -77,10 +77,10 @@ def test_camera_is_scaled_to_each_photograph():
         image_items([photo], None, [RADIAL, OFF_CENTRE])
 
 
-def test_localization_refinement_and_following_take_cameras():
+def test_detection_refinement_and_following_take_cameras():
     _, photo, box, _, T = distorted(RADIAL, 0)
     register = truck_registrar()
-    assert errors(localize(register, [photo], RADIAL)[0][0], T)[1] < 0.02
+    assert errors(detect(register, [photo], RADIAL)[0][0], T)[1] < 0.02
     start = T.clone()
     start[0, 3] += 0.02 * start[2, 3]
     assert errors(register.refine([photo], RADIAL, [start])[0], T)[1] < 0.01

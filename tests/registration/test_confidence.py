@@ -10,7 +10,6 @@ import trimesh
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, rotation_error, sample_views
 from curvireg_torch.geometry import symmetry_transforms
-from curvireg_torch.matching import Ranking
 from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration.confidence import (
@@ -20,6 +19,7 @@ from curvireg_torch.registration.confidence import (
     RELIABLE,
     UNCOMPARED_CONFIDENCE,
     LogisticModel,
+    are_near,
     concentration,
     confidence_features,
     detection_probability,
@@ -36,35 +36,28 @@ R30 = sample_views(azimuth_step=12, elevations=[0]).rotations
 R4 = sample_views(azimuth_step=90, elevations=[0]).rotations
 
 
-def ranking(scores: torch.Tensor) -> Ranking:
-    return Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), {})
-
-
 def scores_of(values: dict[int, float], others: float) -> torch.Tensor:
-    return torch.tensor([[values.get(view, others) for view in range(30)]])
+    return torch.tensor([values.get(view, others) for view in range(30)])
 
 
 def test_concentration_in_closed_form():
-    """Of a batch: two peaks, a plateau, one peak, and scores of zero; views 1 to 5 are within 30 degrees of view 3."""
-    two = scores_of({3: 1.0, 4: 0.9, 20: 0.5}, 0.1)
-    found = concentration(
-        ranking(torch.cat([two, torch.ones(1, 30), scores_of({5: 1.0}, 0.0), torch.zeros(1, 30)])), R30
-    )
-    near = 1 + 0.9**4 + 3 * 0.1**4
-    expected = [near / (near + 0.5**4 + 24 * 0.1**4), 5 / 30, 1.0, 0.0]
-    assert found.tolist() == pytest.approx(expected, rel=1e-4, abs=1e-6)
+    """Two peaks, a plateau, one peak, and scores of zero; views 1 to 5 are within 30 degrees of view 3."""
+    near = are_near(R30, R30[3])
+    assert near.nonzero()[:, 0].tolist() == [1, 2, 3, 4, 5]
+    share = 1 + 0.9**4 + 3 * 0.1**4
+    for scores, expected in (
+        (scores_of({3: 1.0, 4: 0.9, 20: 0.5}, 0.1), share / (share + 0.5**4 + 24 * 0.1**4)),
+        (torch.ones(30), 5 / 30),
+        (scores_of({5: 1.0}, 0.0), 1.0),
+        (torch.zeros(30), 0.0),
+    ):
+        assert concentration(scores, near) == pytest.approx(expected, rel=1e-4, abs=1e-6)
+    assert concentration(torch.ones(3), torch.ones(3, dtype=torch.bool)) is None
 
 
-def test_concentration_counts_symmetric_views_together():
-    scores, symmetries = torch.tensor([[1.0, 0.2, 0.9, 0.1]]), symmetry_transforms(HALF_TURN)
-    total = 1 + 0.2**4 + 0.9**4 + 0.1**4
-    assert float(concentration(ranking(scores), R4)) == pytest.approx(1 / total, rel=1e-5)
-    assert float(concentration(ranking(scores), R4, symmetries)) == pytest.approx((1 + 0.9**4) / total, rel=1e-5)
-
-
-def test_concentration_without_rival_views_is_nan():
-    R = sample_views(elevations=[0])[:3].rotations
-    assert bool(concentration(ranking(torch.tensor([[1.0, 0.1, 0.1]])), R).isnan().all())
+def test_views_near_symmetric_ones_are_near():
+    assert are_near(R4, R4[0]).tolist() == [True, False, False, False]
+    assert are_near(R4, R4[0], symmetry_transforms(HALF_TURN)).tolist() == [True, False, True, False]
 
 
 def test_logistic_model():
@@ -93,7 +86,7 @@ def test_confidence_features():
     assert confidence_features(evidence, scores, 0.3) == pytest.approx(expected)
     for factor in (10.0, -10.0):
         assert confidence_features(evidence, factor * scores, 0.3)["margin"] == math.copysign(MAX_MARGIN, factor)
-    alone = confidence_features(evidence[:1], scores[:1], math.nan)
+    alone = confidence_features(evidence[:1], scores[:1], None)
     assert alone["margin"] is alone["concentration"] is None
 
 
@@ -105,11 +98,9 @@ def test_probabilities_of_hypotheses_in_closed_form():
     assert hypothesis_probabilities(0.6, torch.tensor([3.0]), exact=True) == (0.6,)
 
 
-def test_detection_needs_the_score_of_learned_features_only():
-    assert detection_probability(8.0, 0.7, learned=True) > detection_probability(4.0, 0.7, learned=True)
-    assert detection_probability(8.0, 0.7, learned=False) == detection_probability(4.0, 0.7, learned=False)
-    for learned in (True, False):
-        assert detection_probability(5.0, 0.8, learned=learned) > detection_probability(5.0, 0.7, learned=learned)
+def test_response_and_similarity_raise_the_probability_of_a_detection():
+    assert detection_probability(8.0, 0.7) > detection_probability(4.0, 0.7)
+    assert detection_probability(5.0, 0.8) > detection_probability(5.0, 0.7)
 
 
 @pytest.mark.parametrize(
@@ -119,6 +110,8 @@ def test_detection_needs_the_score_of_learned_features_only():
         (replace(Pipeline(), hypotheses=1, box_jitter=0.0), True),
         (replace(Pipeline(), contours=False), False),
         (Pipeline().with_term("hog", whitening="bank"), False),
+        (Pipeline().with_term("appearance", weight=0), False),
+        (Pipeline().with_term("appearance", top=8), True),
         *((PRESETS[name], False) for name in ("classical", "paper", "fast")),
     ],
     ids=str,
@@ -195,6 +188,7 @@ def test_evidence_is_measured_at_the_reported_pose(camera):
         view = describer.descriptors(h.allocentric_rotation[None], distance)
         assert h.score == pytest.approx(float(torch.nn.functional.cosine_similarity(view, query)), abs=1e-5)
         T, K = h.projection
+        assert h.distance == pytest.approx(float((T[:3, :3] @ describer.centre + T[:3, 3]).norm()))
         margin = describer.settings.margin
         support = contour_support(describer.contours, image[None], box[None], K[None], T[None], margin=margin)
         assert h.edge_support == pytest.approx(float(support), abs=0.03)

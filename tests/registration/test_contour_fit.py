@@ -306,6 +306,13 @@ def test_fit_finishes_the_best_starts_of_each_photograph():
         torch.testing.assert_close(one.edge_support[index == b].max(), best, rtol=0, atol=1e-4)
 
 
+def test_start_support_is_that_of_the_start_at_full_size():
+    off = torch.tensor([[0.1, 0.1, 0.0, 0.05, 0.0, 0.1]], dtype=torch.float64)
+    start, image = apply_twist(CUBE_POSE[None], off, mesh_centre(cube())), silhouette(cube(), CUBE_POSE)
+    expected = contour_support(MeshContours(cube()), [image], BOX[None], K, start)
+    torch.testing.assert_close(fitted(image, start).start_support, expected)
+
+
 def test_trustworthy_depends_on_support_or_gain():
     none, start = torch.zeros(4), torch.tensor([0.49, 0.45, 0.1, 0.1])
     fit = ContourFit(none, none, torch.tensor([0.51, 0.49, 0.35, 0.25]), start, none)

@@ -27,7 +27,9 @@ def bank() -> ViewBank:
     """The default pipeline; the appearance of views is described on demand, as in large banks."""
     views = sample_views(azimuth_step=30, elevations=[0, 30, 60])
     pipeline = Pipeline().with_term("appearance", exhaustive_limit=10, top=8)
-    pipeline = replace(pipeline, hypotheses=2, locate=replace(pipeline.locate, views=12, proposals=4, candidates=2))
+    pipeline = replace(
+        pipeline, hypotheses=2, detection=replace(pipeline.detection, views=12, proposals=4, candidates=2)
+    )
     return ViewBank.build(example_mesh(), views, pipeline=pipeline, progress=False)
 
 
@@ -52,11 +54,11 @@ def test_registration_is_bit_identical_in_any_company(bank: ViewBank) -> None:
             assert all(map(torch.equal, numbers(one), numbers(other)))
 
 
-def test_localization_is_bit_identical_in_any_company(bank: ViewBank) -> None:
+def test_detection_is_bit_identical_in_any_company(bank: ViewBank) -> None:
     torch.set_num_threads(1)
     alone = Registrar(bank)(IMAGES[1:])[0]
     torch.set_num_threads(2)
     together = Registrar(bank)(IMAGES)[1]
-    assert torch.equal(alone.localization.boxes, together.localization.boxes)
+    assert torch.equal(alone.detection.boxes, together.detection.boxes)
     assert torch.equal(alone.rotation, together.rotation)
     assert alone.confidence == together.confidence

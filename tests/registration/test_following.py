@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from curvireg_torch import Registrar
-from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.registration import FailedRegistration, Follower, following
 from curvireg_torch.registration.following import BELIEVED_CONFIDENCE
@@ -63,6 +63,10 @@ def test_follower_takes_frames_with_gradients_on_any_threads(threads):
     assert all(result.ok and not result.rotation.requires_grad for result in results)
 
 
+def lost(*_, **__):
+    raise LostObjectError("lost")
+
+
 def answering(monkeypatch, registrar, answers):
     """Let the registrar give these confidences, one a call, for the true pose of the frame's object."""
     given = iter(answers)
@@ -108,13 +112,32 @@ def test_the_same_frame_again_and_again_does_not_raise_the_confidence(monkeypatc
 
 
 def test_a_wrong_start_never_becomes_believed():
-    """Seen from behind, in a frame after frame of the real one."""
+    """Seen from behind, in frame after frame; a registration of each frame does not confirm it."""
+    frames = sequence(3)
+    behind = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
+    follow = Follower(learned_registrar(), CAMERA)
+    follow.start(frames[0][0], frames[0][2] @ behind)
+    follow._base = 0.45  # doubtful
+    for image, _, T in frames[1:]:
+        result = follow(image)
+        assert not result.ok or errors(result, T)[0] < 5.0 or result.confidence < BELIEVED_CONFIDENCE
+
+
+def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
+    """Until a registration of a later frame confirms it."""
     frames = sequence(4)
-    wrong = frames[0][2].clone()
-    wrong[:3, :3] = wrong[:3, :3] @ torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
-    registrar = learned_registrar()
-    refined = registrar.refine([frames[0][0]], CAMERA, [wrong])[0]
-    assert not refined.ok or refined.confidence < BELIEVED_CONFIDENCE
+    follow = Follower(learned_registrar(), CAMERA)
+    follow.start(frames[0][0], frames[0][2])
+    with monkeypatch.context() as patch:
+        patch.setattr("curvireg_torch.registration.tracker.tracking_confidence", lambda _: 0.3)
+        patch.setattr(following, "refine_item", lost)
+        assert follow(frames[1][0]).confidence == pytest.approx(0.3)
+    with monkeypatch.context() as patch:
+        patch.setattr(following, "refine_item", lost)
+        assert follow(frames[2][0]).confidence <= 0.3
+    confirmed = follow(frames[3][0])
+    assert confirmed.confidence > BELIEVED_CONFIDENCE
+    assert errors(confirmed, frames[3][2])[0] < 4.0
 
 
 def test_dark_frame_keeps_or_doubts_the_pose():
@@ -165,11 +188,8 @@ def test_doubtful_pose_is_kept_above_a_limit(monkeypatch, tracked, kept):
     follow.start(frames[0][0], frames[0][2])
     monkeypatch.setattr("curvireg_torch.registration.tracker.tracking_confidence", lambda _: tracked)
 
-    def lost(*_, **__):
-        raise following.LostObjectError("lost")
-
     monkeypatch.setattr(following, "refine_item", lost)
-    monkeypatch.setattr(Registrar, "__call__", lambda *_, **__: [FailedRegistration(following.LostObjectError("no"))])
+    monkeypatch.setattr(Registrar, "__call__", lambda *_, **__: [FailedRegistration(LostObjectError("no"))])
     result = follow(frames[1][0])
     assert result.ok == kept
     assert not kept or result.confidence == pytest.approx(tracked)

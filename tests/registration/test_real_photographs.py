@@ -1,9 +1,10 @@
-"""Real photographs, default pipeline: the poses agree with the annotations in frame and unit.
+"""Real photographs and a video, default pipeline: the poses agree with the annotations in frame and unit.
 
 These photographs are registered correctly by a wide margin; docs/accuracy.md has fractions of correct results. The
-tests take about 70 seconds on one core, mostly for banks of any orientation.
+tests take about two minutes on one core, mostly for banks of any orientation.
 """
 
+import json
 from dataclasses import dataclass
 
 import pytest
@@ -13,7 +14,9 @@ import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset, Pascal3DPlus, read_image
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol
 from curvireg_torch.evaluation.metrics import symmetric_rotation_error
-from curvireg_torch.geometry import rotation_error, symmetry_transforms
+from curvireg_torch.geometry import projected_boxes, rotation_error, symmetry_transforms, transform
+from curvireg_torch.registration import Follower
+from curvireg_torch.registration.following import BELIEVED_CONFIDENCE
 from tests._support.real_data import real_data
 
 pytestmark = pytest.mark.data
@@ -82,3 +85,38 @@ def test_viewpoints_of_similar_meshes(case):
         reported = cr.rotation_from_viewpoint(*(torch.as_tensor(v, dtype=torch.float64) for v in result.viewpoint))
         assert float(rotation_error(reported, known["rotation"].double())) < case.rotation, key
         assert result.translation is None
+
+
+@pytest.fixture(scope="module")
+def cube():
+    """The first twelve frames of a real video, with poses, and a follower's registrar and camera."""
+    folder = real_data("rbt/cube")
+    K = json.loads((folder / "camera.json").read_text())
+    truth = list(json.loads((folder / "truth.json").read_text()).items())[:12]
+    poses = [transform(*(torch.tensor(pose[name]).double() for name in ("R", "t"))) for _, pose in truth]
+    images = [read_image(folder / "frames" / f"{name}.jpg") for name, _ in truth]
+    registrar = cr.Registrar(cr.load_mesh(folder / "mesh.ply", unit="mm"))
+    return registrar, cr.camera_matrix(*(K[name] for name in ("fx", "fy", "cx", "cy"))), images, poses
+
+
+def test_video_is_followed_from_a_box(cube):
+    registrar, K, images, poses = cube
+    box = projected_boxes(registrar.describer.hull, poses[0][None], K)[0]
+    follow, symmetries = Follower(registrar, K), registrar.symmetries_of(exact=True)
+    for k, (image, T) in enumerate(zip(images, poses, strict=True)):
+        result = follow(image, box if k == 0 else None)
+        error = symmetric_rotation_error(result.rotation[None], T[None, :3, :3], symmetries[:, :3, :3])
+        assert float(error[0]) < 5.0
+        assert float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.05
+        assert result.confidence >= BELIEVED_CONFIDENCE
+
+
+def test_video_without_a_box_believes_no_wrong_pose(cube):
+    """The cube stands among other things on a desk, and is not found."""
+    registrar, K, images, poses = cube
+    follow, symmetries = Follower(registrar, K), registrar.symmetries_of(exact=True)
+    for image, T in zip(images, poses, strict=True):
+        result = follow(image)
+        error = symmetric_rotation_error(result.rotation[None], T[None, :3, :3], symmetries[:, :3, :3])
+        beside = float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm())
+        assert (float(error[0]) < 5.0 and beside < 0.05) or result.confidence < BELIEVED_CONFIDENCE

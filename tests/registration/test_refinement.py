@@ -67,14 +67,22 @@ def test_refine_loses_or_doubts_an_object_that_is_not_there(seed):
     assert result.ok or (isinstance(result.error, LostObjectError) and "image 0" in str(result.error))
 
 
-@pytest.mark.parametrize("move", [(0.0, 0.0, -100.0), (50.0, 0.0, 0.0)], ids=["behind", "beside"])
-def test_refine_refuses_a_start_outside_the_photograph(registrar, move):
+@pytest.mark.parametrize(
+    ("move", "message"),
+    [
+        ((0.0, 0.0, -100.0), "outside the photograph"),
+        ((50.0, 0.0, 0.0), "outside the photograph"),
+        ((0.0, 0.0, 1000.0), "less than 12 px wide; check unit and distance"),
+    ],
+    ids=["behind", "beside", "far"],
+)
+def test_refine_refuses_a_start_that_does_not_show_the_mesh(registrar, move, message):
     image, _, T = scene(0)
     T = T.clone()
     T[:3, 3] += torch.tensor(move)
     result = registrar.refine([image], CAMERA, [T])[0]
     assert isinstance(result.error, LostObjectError)
-    assert "outside the photograph" in str(result.error)
+    assert message in str(result.error)
 
 
 def test_refine_leaves_out_a_start_outside_the_photograph(registrar):

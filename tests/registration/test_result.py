@@ -11,10 +11,10 @@ from curvireg_torch import Registration
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import object_frame
 from curvireg_torch.matching import Ranking
-from curvireg_torch.registration import Hypothesis, Localization
+from curvireg_torch.registration import Detection, Hypothesis
 from curvireg_torch.registration.result import (
     ambiguity,
-    localization_document,
+    detection_document,
     pose_in_words,
     remarks,
     result_document,
@@ -22,7 +22,7 @@ from curvireg_torch.registration.result import (
 )
 
 
-def registration(covariance=None, confidence=0.9, localization=None):
+def registration(covariance=None, confidence=0.9, detection=None):
     """A registration to a bank of two views, the second of which one term did not compare."""
     terms = {"hog": torch.tensor([[0.5, 0.4]]), "appearance": torch.tensor([[0.3, torch.nan]])}
     ranking = Ranking(torch.tensor([[0.9, 0.8]]), torch.tensor([[0, 1]]), terms)
@@ -41,7 +41,7 @@ def registration(covariance=None, confidence=0.9, localization=None):
         )
         for view in (0, 1)
     )
-    return Registration(hypotheses, (confidence, 0.0), ranking, localization=localization)
+    return Registration(hypotheses, (confidence, 0.0), ranking, detection=detection)
 
 
 class Bank(list):
@@ -78,14 +78,14 @@ def test_result_document_leaves_out_terms_that_did_not_compare_a_view():
     json.dumps(document, allow_nan=False)
 
 
-def test_localization_document_reports_the_presence_of_the_most_certain_instance():
-    boxes, scores = torch.tensor([[1.0, 2, 30, 40], [50, 2, 80, 40]]).double(), torch.tensor([7.0, 6.5])
-    found = [Localization(box, p, s, boxes, scores) for box, p, s in zip(boxes, (0.9, 0.4), (7.0, 6.5), strict=True)]
-    document = localization_document([registration(localization=x, confidence=0.5 * x.presence) for x in found])
-    assert document["presence"] == 0.9
-    assert [(one["presence"], one["confidence"]) for one in document["instances"]] == [(0.9, 0.45), (0.4, 0.2)]
+def test_detection_document_reports_the_score_of_the_most_certain_instance():
+    boxes, responses = torch.tensor([[1.0, 2, 30, 40], [50, 2, 80, 40]]).double(), torch.tensor([7.0, 6.5])
+    found = [Detection(box, p, r, boxes, responses) for box, p, r in zip(boxes, (0.9, 0.4), (7.0, 6.5), strict=True)]
+    document = detection_document([registration(detection=one, confidence=0.5 * one.score) for one in found])
+    assert document["score"] == 0.9
+    assert [(one["score"], one["confidence"]) for one in document["instances"]] == [(0.9, 0.45), (0.4, 0.2)]
     assert [one["box"] for one in document["proposals"]] == boxes.tolist()
-    assert [one["score"] for one in document["proposals"]] == [7.0, 6.5]
+    assert [one["response"] for one in document["proposals"]] == [7.0, 6.5]
 
 
 @pytest.mark.parametrize(
@@ -121,13 +121,6 @@ def test_pose_in_words(viewpoint, words):
     assert pose_in_words(R) == words
     for up, front in (("y", None), ("-x", None), ("z", "x")):
         assert pose_in_words(R @ object_frame(up, front), up=up, front=front) == words
-
-
-def test_pose_in_words_tilts_as_the_photograph_shows():
-    """Tilted to the left: the object's up axis points to the left in the picture."""
-    R = rotation_from_viewpoint(10.0, 20.0, 30.0)
-    assert float(R[0, 2]) < 0
-    assert "to the left" in pose_in_words(R)
 
 
 def test_verdict_has_three_words():

@@ -1,5 +1,7 @@
 """Texture fit: a label determines the rotation of a can, and a pose without the label in the photograph stays."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -12,8 +14,9 @@ from curvireg_torch.geometry.cameras import projected_boxes, transform
 from curvireg_torch.geometry.viewpoint import rotation_from_viewpoint, up_rotation
 from curvireg_torch.mesh.mesh import extreme_points, mesh_centre
 from curvireg_torch.registration import ContourFit, fit_contours
+from curvireg_torch.registration.contour_fit import ContourProblem
 from curvireg_torch.registration.least_squares import apply_twist
-from curvireg_torch.registration.texture_fit import fit_texture, match_patches, turned
+from curvireg_torch.registration.texture_fit import _TextureRounds, fit_texture, match_patches, turned
 from curvireg_torch.rendering import make_renderer, render_colour
 from curvireg_torch.rendering.contours import MeshContours
 from tests._support.cans import can, photograph
@@ -101,10 +104,37 @@ def test_pose_in_place_remains(renderer):
     assert found is None or error(found) < 0.5
 
 
-def test_registrar_refines_a_can_that_is_turned():
-    registrar = cr.Registrar(MESH, views=cr.sample_views(azimuth_step=30, elevations=[20]).for_up("y"))
+@pytest.mark.parametrize(("after", "counts"), [(0.46, False), (0.48, True)])
+def test_fit_may_lose_a_little_edge_support(monkeypatch, renderer, after, counts):
+    supports = iter([torch.tensor([0.5]), torch.tensor([after])])
+    monkeypatch.setattr(ContourProblem, "edge_support", lambda *_: next(supports))
+    assert (fit(renderer, photograph(MESH, TRUTH), turned_can(5.0)) is not None) == counts
+
+
+@pytest.mark.parametrize(("before", "counts"), [(1.0, False), (0.0, True)])
+def test_fit_must_find_more_corners_than_the_start(monkeypatch, renderer, before, counts):
+    search = _TextureRounds.round
+    monkeypatch.setattr(_TextureRounds, "round", lambda *given: replace(search(*given), before=before))
+    assert (fit(renderer, photograph(MESH, TRUTH), turned_can(5.0)) is not None) == counts
+
+
+@pytest.fixture(scope="module")
+def registrar():
+    return cr.Registrar(MESH, views=cr.sample_views(azimuth_step=30, elevations=[20]).for_up("y"))
+
+
+def test_registrar_refines_a_can_that_is_turned(registrar):
     result = registrar.refine([photograph(MESH, TRUTH)], CAMERA, turned_can(10.0)[None, 0])[0]
     assert float(rotation_error(result.rotation, R)) < 1.0
+
+
+def test_label_does_not_pull_a_pose_out_of_its_limits(registrar):
+    """They are 10 degrees away from the true rotation."""
+    prior = cr.PosePrior(rotation=turned_can(14.0)[0, :3, :3], within=4.0)
+    box = projected_boxes(extreme_points(MESH), TRUTH, CAMERA)
+    free, limited = (registrar([photograph(MESH, TRUTH)], box, CAMERA, prior=p)[0] for p in (None, prior))
+    assert float(rotation_error(free.rotation, R)) < 1.0
+    assert float(prior.excess(limited.rotation)) <= 3.0
 
 
 def test_match_finds_patches_that_moved_by_fractions_of_pixels():

@@ -1,5 +1,7 @@
 """The tracker: each measurement alone on drawn objects, and together on generated sequences."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -13,7 +15,7 @@ from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.registration import tracker
 from curvireg_torch.registration.least_squares import fit_points, pixels
 from curvireg_torch.registration.texture_fit import surface_corners
-from curvireg_torch.registration.tracker import FLOW_SCALES, WINDOW_SIZE, Keyframe, Tracker, Window, track_points
+from curvireg_torch.registration.tracker import FLOW_SCALES, WINDOW_SIZE, Frame, Keyframe, Tracker, track_points
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import example_mesh
@@ -69,12 +71,18 @@ def plate(x: float = 0.0, y: float = 0.0):
     shift = 80.0 * torch.tensor([x, y])
     look = smooth[(v - shift[1] + 300).long(), (u - shift[0] + 300).long()]  # shifts of whole pixels
     grey = (255 * torch.where(depth[0, 0] > 0, look, 0.5)).clamp(0, 255).byte().numpy()
-    return Window(torch.zeros(1, 3, *size), grey, WINDOW_K, torch.ones(1, 1, *size)), T, depth
+    return framed(grey), T, depth
+
+
+def framed(grey) -> Frame:
+    """A frame of which only the grey picture is looked at."""
+    none: Any = None
+    return Frame(none, grey, WINDOW_K, none, none)
 
 
 def keyframe_of(window, T, depth) -> Keyframe:
     uv, model = surface_corners(window.grey, depth, T, WINDOW_K, quality=0.01, inside=3)
-    return Keyframe(window, T, uv, model)
+    return Keyframe(window.grey, T, uv, model)
 
 
 def test_corners_lie_on_the_surface_inside_the_outline():
@@ -103,7 +111,7 @@ def test_flow_finds_the_corners_of_a_moved_plate_and_their_pose():
 def test_flow_that_does_not_lead_back_is_left_out():
     """The right half of the plate is covered by another print."""
     window, T, depth = plate()
-    covered = Window(window.colours, window.grey.copy(), WINDOW_K, window.inside)
+    covered = framed(window.grey.copy())
     covered.grey[:, 128:] = np.random.default_rng(0).integers(0, 255, (256, 128))
     flow = track_points(keyframe_of(window, T, depth), covered, T, ZERO, levels=1)
     right = flow.model[0, :, 0] > 0.1
@@ -113,7 +121,7 @@ def test_flow_that_does_not_lead_back_is_left_out():
 
 def test_uniform_surface_has_no_corners_and_no_flow():
     window, T, depth = plate()
-    bare = Window(window.colours, np.full_like(window.grey, 90), WINDOW_K, window.inside)
+    bare = framed(np.full_like(window.grey, 90))
     flow = track_points(keyframe_of(bare, T, depth), window, T, ZERO, levels=1)
     assert flow.uv.shape == (1, 0, 2)
     assert flow.inlier_ratio(T, WINDOW_K, ZERO) == 0.0
@@ -141,7 +149,7 @@ def test_each_measurement_alone_moves_the_outline_onto_a_plain_cube(request, mea
     follow = make_tracker(cube())
     follow.start(drawn(START), K, START)
     assert shift_in_pixels(START, truth) > 3.0
-    assert shift_in_pixels(follow.track(drawn(truth), K).T[0], truth) < 0.5
+    assert shift_in_pixels(follow.track(drawn(truth), K).state.T[0], truth) < 0.5
 
 
 def test_colours_pull_towards_the_object():
@@ -150,8 +158,7 @@ def test_colours_pull_towards_the_object():
     follow.start(drawn(START), K, START)
     step = 2.0 * 6.0 / 500.0
     frame = follow._frame(drawn(moved(START, [0.0, 0.0, 0.0], [step, 0.0, 0.0])), K, START[None])
-    outline = follow._outline(frame, START[None])
-    A, b = follow._measurements(frame, outline, START[None], [], 6.0)[0].equations()
+    A, b = follow._measurements(frame, frame.problem.state(START[None]), [], 6.0)[0].equations()
     x = torch.linalg.solve(A[:, 3:, 3:], b[:, 3:])[0, :, 0]
     assert float(x[0]) == pytest.approx(step, rel=0.3)
     assert float(x[1:].abs().max()) < 0.3 * step
@@ -177,15 +184,25 @@ def test_tracker_follows_a_generated_sequence():
     for image, _, T in frames[1:]:
         found = follow.track(image, CAMERA)
         follow.accept(found)
-        assert float(rotation_error(found.T[0, :3, :3], T[:3, :3])) < 2.0
-        assert float((found.T[0, :3, 3] - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.02
+        assert float(rotation_error(found.state.T[0, :3, :3], T[:3, :3])) < 2.0
+        assert float((found.state.T[0, :3, 3] - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.02
         assert found.confidence > 0.5
         assert all(0.0 <= value <= 1.0 for value in found.features.values())
-        R = found.T[0, :3, :3]
+        R = found.state.T[0, :3, :3]
         assert float((R @ R.mT - torch.eye(3)).abs().max()) < 1e-12
         C = follow.covariance(found)
         assert float(torch.linalg.eigvalsh(C).min()) > 0
         assert float(torch.rad2deg(C[:3, :3].diagonal().sqrt()).max()) < 20.0
+
+
+def test_covariance_counts_edges_near_the_pose():
+    """At a pose that is 5 % too near, all edges are some 4 px inside its outline."""
+    follow, near = make_tracker(cube()), START.clone()
+    near[2, 3] *= 0.95
+    follow.start(drawn(START), K, START)
+    there, beside = (follow.covariance(follow.measure(drawn(START), K, T)) for T in (START, near))
+    assert bool(there.isfinite().all())
+    assert bool(beside.isnan().all())
 
 
 def test_frames_from_other_directions_become_keyframes():

@@ -173,8 +173,8 @@ def test_without_a_box_the_object_is_found_in_the_whole_photograph(browser, fold
     assert "--box" not in command
     document = saved(browser)
     assert document["rotation"] == run_command(folder, command)["rotation"]
-    assert document["localization"]["instances"][0]["rotation"] == document["rotation"]
+    assert document["detection"]["instances"][0]["rotation"] == document["rotation"]
     browser.click("answer-2")
     browser.wait(lambda: browser.part("answer-2").get_attribute("aria-pressed") == "true", "chosen")
     second = saved(browser)
-    assert second["localization"]["instances"][0]["rotation"] == second["rotation"] != document["rotation"]
+    assert second["detection"]["instances"][0]["rotation"] == second["rotation"] != document["rotation"]

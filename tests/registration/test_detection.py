@@ -1,4 +1,4 @@
-"""Objects without a box: located, registered, counted, or reported as absent."""
+"""Objects without a box: detected, registered, counted, or reported as absent."""
 
 import copy
 import math
@@ -12,28 +12,35 @@ import torch.nn.functional as F
 
 import curvireg_torch as cr
 from curvireg_torch import ViewBank
-from curvireg_torch.errors import CurviregError, InvalidInputError
+from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import PosePrior, box_iou, projected_boxes, rotation_error, viewpoint_from_rotation
 from curvireg_torch.matching import ViewDescriber, ViewMatcher
-from curvireg_torch.registration import Located, Locator, localize, representative_views
-from curvireg_torch.registration import localization as localization_module
+from curvireg_torch.registration import Detector, Proposals, detect
+from curvireg_torch.registration import detection as detection_module
+from curvireg_torch.registration.detection import (
+    Candidate,
+    _allowed_views,
+    _medoids,
+    _nearest_representatives,
+    representative_views,
+)
 from curvireg_torch.registration.inputs import ImageItem
-from curvireg_torch.registration.localization import Candidate, _allowed_views, _medoids, _nearest_representatives
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from tests._support.scenes import CAMERA, scene, truck_bank, unrefined
 
 SIZE = (240, 320)
+FOCAL = float(CAMERA[0, 0])
 
 
 @cache
-def bank(preset="learned"):
+def bank():
     views = cr.sample_views(azimuth_step=30, elevations=[15, 45])
-    return cr.ViewBank.build(example_mesh(), views, pipeline=cr.pipeline.PRESETS[preset], progress=False)
+    return cr.ViewBank.build(example_mesh(), views, progress=False)
 
 
 @cache
-def locator(preset="learned"):
-    return Locator(ViewMatcher(bank(preset)))
+def detector():
+    return Detector(ViewMatcher(bank()))
 
 
 def pasted_scene(seed, corner, scale):
@@ -63,46 +70,39 @@ def found(registrar):
     return image, box, registrar([image])[0]
 
 
-class FixedLocator:
-    """A locator that always proposes the same boxes."""
-
-    features = SimpleNamespace(learned=True)
-
-    def __init__(self, boxes, scores):
-        self.located = Located(boxes, torch.tensor(scores), torch.zeros(len(boxes), dtype=torch.long))
-
-    def __call__(self, images, **_):
-        return [self.located] * len(images)
+def fixed(boxes, responses):
+    """A detector that always proposes the same boxes."""
+    return lambda *_, **__: Proposals(boxes, torch.tensor(responses), torch.zeros(len(boxes), dtype=torch.long))
 
 
-def test_localization_agrees_with_the_given_box(registrar, found):
+def test_detection_agrees_with_the_given_box(registrar, found):
     image, box, result = found
-    where = result.localization
+    where = result.detection
     assert box_iou(where.box[None], box[None].double()) > 0.6
     centre = 0.5 * (where.box[:2] + where.box[2:]) - 0.5 * (box[:2] + box[2:])
     assert centre.abs().max() < 0.1 * (box[2:] - box[:2]).max(), "a tenth of its size"
     assert torch.equal(where.boxes[0], where.box), "the result is the first of the proposals"
-    assert len(where.boxes) == len(where.scores)
+    assert len(where.boxes) == len(where.responses)
     given = registrar([image], box[None])[0]
-    assert given.localization is None
+    assert given.detection is None
     assert rotation_error(result.rotation, given.rotation) < 35, "one step of this bank"
-    assert 0.0 <= where.presence <= 1.0
+    assert 0.0 <= where.score <= 1.0
 
 
 @pytest.mark.parametrize(("seed", "corner", "scale"), [(5, (30, 60), 0.6), (3, (40, 10), 1.1)])
-def test_localized_pose_is_the_true_one(seed, corner, scale):
+def test_detected_pose_is_the_true_one(seed, corner, scale):
     """Pasted elsewhere at another scale; the camera of the scene is transformed accordingly."""
     image, box = pasted_scene(seed, corner, scale)
     K, truth = CAMERA.clone(), scene(seed)[2]
     K[:2, :2] *= scale
     K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5 + torch.tensor(corner)
     result = cr.Registrar(bank())([image], camera_matrices=K)[0]
-    assert (result.localization.box - box).abs().max() < 0.1 * (box[2:] - box[:2]).max()
+    assert (result.detection.box - box).abs().max() < 0.1 * (box[2:] - box[:2]).max()
     assert rotation_error(result.rotation, truth[:3, :3]) < 5
     assert (result.translation - truth[:3, 3]).norm() < 0.05 * truth[:3, 3].norm()
 
 
-def test_localization_with_camera_and_distance(registrar):
+def test_detection_with_camera_and_distance(registrar):
     image, _, truth = scene(5)
     result = registrar([image], camera_matrices=CAMERA)[0]
     assert (result.translation - truth[:3, 3]).norm() < 0.25 * truth[:3, 3].norm()
@@ -111,18 +111,18 @@ def test_localization_with_camera_and_distance(registrar):
     assert 0.75 * far < float(within.translation[2]) < 1.3 * far
 
 
-def test_pose_outside_the_photograph_has_presence_zero(registrar, found, monkeypatch):
+def test_pose_outside_the_photograph_has_score_zero(registrar, found, monkeypatch):
     outside = torch.tensor([-300.0, -200.0, -100.0, -50.0], dtype=torch.float64)
-    monkeypatch.setattr(localization_module, "projected_box", lambda *_: outside)
+    monkeypatch.setattr(detection_module, "projected_box", lambda *_: outside)
     result = registrar([found[0]])[0]
     assert result.ok
-    assert result.localization.presence == 0.0
+    assert result.detection.score == 0.0
 
 
-def test_presence_is_lower_without_the_object(registrar):
-    there = [registrar([pasted_scene(seed, (40, 30), 0.9)[0]])[0].localization.presence for seed in (0, 1, 5)]
+def test_score_is_lower_without_the_object(registrar):
+    there = [registrar([pasted_scene(seed, (40, 30), 0.9)[0]])[0].detection.score for seed in (0, 1, 5)]
     absent = registrar([clutter(20 + k) for k in range(3)])
-    assert min(there) > max(result.localization.presence for result in absent)
+    assert min(there) > max(result.detection.score for result in absent)
 
 
 def two_trucks():
@@ -132,76 +132,73 @@ def two_trucks():
     return first, box, other
 
 
-def test_localize_sorts_by_the_presence_of_refined_boxes(registrar, monkeypatch):
+def test_detect_sorts_by_the_score_of_refined_boxes(registrar, monkeypatch):
     def inverted(_, __, result):
-        where = result.localization
-        return replace(result, localization=replace(where, presence=1.0 - where.presence))
+        where = result.detection
+        return replace(result, detection=replace(where, score=1.0 - where.score))
 
-    monkeypatch.setattr(localization_module, "_refined", inverted)
-    first, second = localize(registrar, [two_trucks()[0]], instances=2)[0]
-    assert first.localization.presence > second.localization.presence
+    monkeypatch.setattr(detection_module, "_refined", inverted)
+    first, second = detect(registrar, [two_trucks()[0]], instances=2)[0]
+    assert first.detection.score > second.detection.score
 
 
-def test_localize_finds_several_instances(registrar):
+def test_detect_finds_several_instances(registrar):
     image, box, other = two_trucks()
-    results = localize(registrar, [image], instances=2)[0]
-    boxes = torch.stack([r.localization.box for r in results])
+    results = detect(registrar, [image], instances=2)[0]
+    boxes = torch.stack([r.detection.box for r in results])
     overlap = box_iou(boxes, torch.stack([box, other]).double())
     assert sorted(overlap.argmax(dim=1).tolist()) == [0, 1]
     assert overlap.amax(dim=1).min() > 0.5
-    assert results[0].localization.presence >= results[1].localization.presence
-    assert torch.equal(results[0].localization.boxes[:2], boxes)
+    assert results[0].detection.score >= results[1].detection.score
+    assert torch.equal(results[0].detection.boxes[:2], boxes)
     with pytest.raises(InvalidInputError, match="instances: expected >= 1, got 0"):
-        localize(registrar, [image], instances=0)
+        detect(registrar, [image], instances=0)
 
 
-def test_localize_reports_an_object_once(registrar, monkeypatch):
+def test_detect_reports_an_object_once(registrar, monkeypatch):
     """Two proposals lead to the same truck, and two instances are requested."""
     image, box = pasted_scene(5, (60, 40), 0.9)
     side = float((box[2:] - box[:2]).max())
     beside = torch.stack([box - 0.36 * side, box + 0.36 * side]).float()
     assert box_iou(beside[:1], beside[1:]) < 0.5, "distinct proposals"
-    monkeypatch.setattr(registrar, "locator", FixedLocator(beside, [9.0, 8.0]))
-    monkeypatch.setattr(localization_module, "projected_box", lambda *_: box.double())
-    results = localize(registrar, [image], instances=2)[0]
+    monkeypatch.setattr(registrar, "detector", fixed(beside, [9.0, 8.0]))
+    monkeypatch.setattr(detection_module, "projected_box", lambda *_: box.double())
+    results = detect(registrar, [image], instances=2)[0]
     assert len(results) == 1
-    assert torch.equal(results[0].localization.box, box.double())
+    assert torch.equal(results[0].detection.box, box.double())
 
 
-def test_localize_follows_one_proposal_more_than_instances():
-    """The locator prefers a box of the background; the more certain one is reported, even if one is to be followed."""
-    pipeline = unrefined(bank(), locate=replace(bank().pipeline.locate, candidates=1))
+def test_detect_follows_one_proposal_more_than_instances():
+    """The detector prefers a box of the background; the more certain one is reported, even if one is to be followed."""
+    pipeline = unrefined(bank(), detection=replace(bank().pipeline.detection, candidates=1))
     registrar = cr.Registrar(bank(), pipeline=pipeline)
     image, box = pasted_scene(5, (90, 40), 0.9)
     background = torch.tensor([2.0, 2.0, 60.0, 40.0])
-    registrar.__dict__["locator"] = FixedLocator(torch.stack([background, box]), [6.2, 6.0])
-    result = localize(registrar, [image], instances=1)[0][0]
-    assert box_iou(result.localization.box[None], box[None].double()) > 0.5
+    registrar.__dict__["detector"] = fixed(torch.stack([background, box]), [6.2, 6.0])
+    result = detect(registrar, [image], instances=1)[0][0]
+    assert box_iou(result.detection.box[None], box[None].double()) > 0.5
+
+
+@pytest.mark.parametrize(("gain", "kept"), [(-0.01, True), (0.01, False)])
+def test_box_around_the_pose_is_registered_where_it_is_more_certain(registrar, found, monkeypatch, gain, kept):
+    result, other = found[2], replace(found[2])
+    again = SimpleNamespace(score=result.detection.score + gain, register=lambda *_: other)
+    monkeypatch.setattr(Candidate, "ranked", lambda *_: again)
+    best = detection_module._refined(registrar, ImageItem(found[0], found[1], None), result)
+    assert best is (result if kept else other)
 
 
 @pytest.mark.parametrize("sure_first", [True, False])
 def test_add_keeps_the_most_certain_of_overlapping_results(found, sure_first):
     sure = found[2]
-    where = sure.localization
-    beside = replace(sure, localization=replace(where, box=where.box + 500.0, presence=0.1))
-    less = replace(sure, localization=replace(where, presence=0.5 * where.presence))
+    where = sure.detection
+    beside = replace(sure, detection=replace(where, box=where.box + 500.0, score=0.1))
+    less = replace(sure, detection=replace(where, score=0.5 * where.score))
     results = [beside, sure if sure_first else less]
-    localization_module._add(results, less if sure_first else sure)
+    detection_module._add(results, less if sure_first else sure)
     assert len(results) == 2
     assert results[0] is beside
     assert results[1] is sure
-
-
-def test_failures_do_not_affect_other_photographs(registrar, found):
-    image, _, alone = found
-    nan = image.clone()
-    nan[0, 3, 3] = torch.nan
-    results = registrar([torch.full((3, 80, 100), 0.5), image, nan, torch.rand(2, 9, 9)])
-    assert [result.ok for result in results] == [False, True, False, False]
-    assert torch.equal(alone.localization.boxes, results[1].localization.boxes)
-    for k, message in ((0, ".*one colour"), (2, "NaN"), (3, "photograph: expected 1")):
-        with pytest.raises(CurviregError, match=f"image {k}: {message}"):
-            _ = results[k].rotation
 
 
 def test_bad_distances_raise(registrar, found):
@@ -218,13 +215,12 @@ def test_bad_distances_raise(registrar, found):
             _ = registrar([found[0]], boxes, CAMERA, prior=prior)[0].rotation
 
 
-@pytest.mark.parametrize(("preset", "learned"), [("learned", True), ("fast", True), ("classical", False)])
 @torch.no_grad()
-def test_presence_uses_the_score_of_learned_features_only(preset, learned):
-    registrar = cr.Registrar(bank(preset))
+def test_score_grows_with_the_response():
+    registrar = cr.Registrar(bank())
     image, box = pasted_scene(5, (90, 40), 0.9)
-    low, high = (Candidate.ranked(registrar, ImageItem(image, box, None), box, score) for score in (4.0, 9.0))
-    assert (low.presence < high.presence) if learned else (low.presence == high.presence)
+    low, high = (Candidate.ranked(registrar, ImageItem(image, box, None), box, response) for response in (4.0, 9.0))
+    assert low.score < high.score
 
 
 def test_right_hint_that_leaves_no_view_at_some_proposals_does_not_fail():
@@ -235,23 +231,23 @@ def test_right_hint_that_leaves_no_view_at_some_proposals_does_not_fail():
     alone = registrar([image], box[None], K)[0]
     prior = PosePrior(rotation=alone.rotation, within=2.0)
     far = torch.tensor([[4.0, 4.0, 44.0, 44.0], [4.0, 190.0, 44.0, 230.0]])
-    registrar.__dict__["locator"] = FixedLocator(torch.cat([far, box[None]]), [9.0, 8.0, 7.0])
+    registrar.__dict__["detector"] = fixed(torch.cat([far, box[None]]), [9.0, 8.0, 7.0])
     result = registrar([image], camera_matrices=K, prior=prior)[0]
     assert result.ok
-    assert box_iou(result.localization.box[None], box[None].double()) > 0.5
+    assert box_iou(result.detection.box[None], box[None].double()) > 0.5
 
 
-def test_locator_does_not_compare_views_that_the_prior_excludes(registrar, found):
+def test_detector_does_not_compare_views_that_the_prior_excludes(registrar, found):
     image, azimuth = found[0], 200.0
     prior = PosePrior(azimuth=(azimuth - 20, azimuth + 20))
     result = registrar([image], prior=prior)[0]
     allowed = _allowed_views(registrar, ImageItem(image, torch.tensor([0.0, 0.0, 9.0, 9.0]), None, prior))
     assert sorted(viewpoint_from_rotation(bank().rotations[allowed])[0].round().unique().tolist()) == [180.0, 210.0]
-    located = registrar.locator([image], allowed=allowed)[0]
+    located = registrar.detector(image, allowed=allowed)
     assert bool(allowed[located.views].all()), "each view of this small bank is its own template"
-    assert set(result.localization.scores.tolist()) <= set(located.scores.tolist())
-    everything = registrar.locator([image], allowed=torch.ones_like(allowed))[0]
-    assert torch.equal(everything.boxes, registrar.locator([image])[0].boxes)
+    assert set(result.detection.responses.tolist()) <= set(located.responses.tolist())
+    everything = registrar.detector(image, allowed=torch.ones_like(allowed))
+    assert torch.equal(everything.boxes, registrar.detector(image).boxes)
     assert not bool(allowed[everything.views].all())
 
 
@@ -266,85 +262,54 @@ def test_allowed_views_are_those_of_any_place_in_the_photograph(registrar):
 
 
 def test_dense_features_reuse_the_network_of_the_appearance_term():
-    assert any(locator().features.backbone is module for module in locator().matcher.modules())
+    assert any(detector().backbone is module for module in detector().matcher.modules())
 
 
-def test_locator_uses_learned_features_where_the_pipeline_has_any():
-    """The preset "fast" has the learned field, but not the appearance term."""
-    assert locator("fast").features.learned
-    assert not locator("classical").features.learned
-    image, box = pasted_scene(1, (100, 30), 0.8)
-    fast, default = locator("fast")([image])[0], locator()([image])[0]
-    assert torch.equal(fast.boxes, default.boxes)
-    assert box_iou(fast.boxes[:1], box[None]) > 0.6
-
-
-@pytest.mark.parametrize(("preset", "among", "least"), [("learned", 2, 0.6), ("classical", 5, 0.55)])
 @pytest.mark.parametrize(("seed", "corner", "scale"), [(0, (10, 20), 0.8), (1, (100, 30), 0.8), (3, (40, 10), 1.1)])
-def test_locator_finds_the_object(preset, among, least, seed, corner, scale):
+def test_detector_finds_the_object(seed, corner, scale):
     image, box = pasted_scene(seed, corner, scale)
-    located = locator(preset)([image])[0]
-    assert box_iou(located.boxes, box[None])[:among].max() > least
-    assert located.scores.diff().max() <= 0
+    located = detector()(image)
+    assert box_iou(located.boxes, box[None])[:2].max() > 0.6
+    assert located.responses.diff().max() <= 0
+    assert len(located.boxes) == 20
     assert located.boxes.dtype == torch.float32
     assert (box_iou(located.boxes, located.boxes) > 0.5).sum() == len(located.boxes), "boxes are distinct"
-
-
-def test_located_box_moves_with_the_object():
-    centres = []
-    for corner in ((10, 40), (100, 40), (100, 10)):
-        image, box = pasted_scene(5, corner, 0.8)
-        best = locator()([image])[0].boxes[0]
-        assert box_iou(best[None], box[None]) > 0.6
-        centres.append(0.5 * (best[:2] + best[2:]))
-    for shift, expected in zip(torch.stack(centres).diff(dim=0).tolist(), [(90, 0), (0, -30)], strict=True):
-        assert shift == pytest.approx(expected, abs=10)
-
-
-def test_located_scores_are_lower_without_the_object():
-    with_it = [locator()([pasted_scene(seed, (40, 30), 0.9)[0]])[0].scores[0] for seed in (0, 1, 3)]
-    without = [locator()([clutter(7 + k)])[0].scores[0] for k in range(3)]
-    assert min(with_it) > max(without)
 
 
 def test_scores_are_relative_to_the_view_elsewhere_in_the_photograph():
     """Level and spread of a view's similarity do not matter."""
     generator = torch.Generator().manual_seed(3)
-    K = len(locator()._templates.views)
+    K = len(detector()._templates.views)
     maps = [0.1 * torch.rand(K, *size, generator=generator) for size in ((15, 20), (21, 28))]
     fits, ratios = [torch.ones(K, dtype=torch.bool)] * 2, [(1.0, 1.0), (1.4, 1.4)]
     gain, level = 0.5 + torch.rand(2, K, 1, 1, generator=generator)
-    plain = locator()._peaks(maps, fits, ratios)
-    biased = locator()._peaks([gain * m + level for m in maps], fits, ratios)
+    plain = detector()._peaks(maps, fits, ratios)
+    biased = detector()._peaks([gain * m + level for m in maps], fits, ratios)
     assert torch.equal(biased.views, plain.views)
-    assert torch.allclose(biased.scores, plain.scores, atol=1e-4)
+    assert torch.allclose(biased.responses, plain.responses, atol=1e-4)
     every = torch.cat([m.flatten(1) for m in maps], dim=1)
     z = (every - every.mean(dim=1, keepdim=True)) / every.std(dim=1, keepdim=True)
-    assert float(plain.scores[0]) == pytest.approx(float(z.max()), rel=1e-4)
+    assert float(plain.responses[0]) == pytest.approx(float(z.max()), rel=1e-4)
 
 
-def test_locator_is_independent_of_batch_dtype_and_grey_channels():
-    images = [pasted_scene(0, (10, 20), 0.8)[0], pasted_scene(1, (60, 30), 0.8)[0]]
-    both, alone = locator()(images), locator()(images[1:])
-    assert torch.equal(both[1].boxes, alone[0].boxes)
-    assert torch.equal(both[1].scores, alone[0].scores)
-    as_bytes, grey = (images[0] * 255).round().to(torch.uint8), images[0].mean(dim=0, keepdim=True)
+def test_detector_is_independent_of_dtype_and_grey_channels():
+    image = pasted_scene(0, (10, 20), 0.8)[0]
+    as_bytes, grey = (image * 255).round().to(torch.uint8), image.mean(dim=0, keepdim=True)
     for one, other in ((as_bytes, as_bytes.float() / 255), (grey, grey.expand(3, -1, -1))):
-        assert torch.equal(locator()([one])[0].boxes, locator()([other])[0].boxes)
+        assert torch.equal(detector()(one).boxes, detector()(other).boxes)
 
 
 def test_distance_limits_sizes():
     image, box, T = scene(1)
     true = float(T[2, 3])
-    within = locator()([image], camera_matrices=[CAMERA], distance=(0.85 * true, 1.15 * true))[0]
+    within = detector()(image, focal=FOCAL, distance=(0.85 * true, 1.15 * true))
     assert box_iou(within.boxes[:2], box[None]).max() > 0.5
     side = (box[2:] - box[:2]).max()
     for factor in (0.5, 2.0):
-        other = locator()([image], camera_matrices=[CAMERA], distance=(0.9 * factor * true, 1.1 * factor * true))[0]
+        other = detector()(image, focal=FOCAL, distance=(0.9 * factor * true, 1.1 * factor * true))
         sides = (other.boxes[:, 2:] - other.boxes[:, :2]).amax(dim=1)
         assert 0.5 < float(sides.median() * factor / side) < 2.0, "nearer is larger"
-    doubled = torch.diag(torch.tensor([2.0, 2.0, 1.0])).double() @ CAMERA
-    same = locator()([image], camera_matrices=[doubled], distance=(1.7 * true, 2.3 * true))[0]
+    same = detector()(image, focal=2.0 * FOCAL, distance=(1.7 * true, 2.3 * true))
     assert torch.equal(same.boxes, within.boxes), "twice the focal length is half the distance"
 
 
@@ -352,56 +317,38 @@ def test_distance_limits_each_box_by_its_view():
     """To half a step of sizes, and what rounding a size to cells of 16 px adds."""
     image, _, T = scene(1)
     low, high = 0.95 * float(T[2, 3]), 1.05 * float(T[2, 3])
-    located = locator()([image], camera_matrices=[CAMERA], distance=(low, high))[0]
+    located = detector()(image, focal=FOCAL, distance=(low, high))
     boxes, views = bank().boxes[located.views], located.views
     sides = (boxes[:, 2:] - boxes[:, :2]).amax(dim=1) * bank().distances[views]
-    away = sides * float(CAMERA[0, 0]) / (located.boxes[:, 2:] - located.boxes[:, :2]).amax(dim=1)
+    away = sides * FOCAL / (located.boxes[:, 2:] - located.boxes[:, :2]).amax(dim=1)
     assert len(away) > 5
     assert float(away.min()) > low / 2.0**0.25 * 0.9
     assert float(away.max()) < high * 2.0**0.25 * 1.1
 
 
-def test_locator_rejects_bad_distances_images_and_settings():
-    for distance in ((0.0, 1.0), (2.0, 1.0), (-1.0, 1.0), (1.0, float("inf")), (float("nan"), 1.0)):
+def test_detector_rejects_bad_distances_images_and_settings():
+    for distance in ((0.0, 1.0), (2.0, 1.0), (1.0, float("inf")), (float("nan"), 1.0)):
         with pytest.raises(InvalidInputError, match="distance: expected 0 < NEAR <= FAR"):
-            locator()([torch.rand(3, 60, 80)], camera_matrices=[CAMERA], distance=distance)
+            detector()(torch.rand(3, 60, 80), focal=FOCAL, distance=distance)
     with pytest.raises(InvalidInputError, match="distance: needs the camera matrix"):
-        locator()([torch.rand(3, 60, 80)], distance=(1.0, 2.0))
-    for wrong in (torch.rand(2, 60, 80), torch.rand(60, 80), torch.rand(3, 0, 80)):
-        with pytest.raises(InvalidInputError, match="images: expected"):
-            locator()([wrong])
+        detector()(torch.rand(3, 60, 80), distance=(1.0, 2.0))
+    with pytest.raises(InvalidInputError, match="images: expected"):
+        detector()(torch.rand(2, 60, 80))
     for settings, message in (({"min_size": 0.0}, "min_size"), ({"views": 0}, "views, proposals")):
         with pytest.raises(InvalidInputError, match=message):
-            cr.pipeline.LocateSettings(**settings)
-
-
-def test_locate_pads_photographs_with_fewer_boxes():
-    images = [pasted_scene(0, (10, 20), 0.8)[0], torch.full((3, 120, 160), 0.5)]
-    boxes, scores = cr.locate(truck_bank().pipeline, truck_bank(), images)
-    assert boxes.shape[:2] == scores.shape
-    assert len(scores) == 2
-    assert torch.equal(boxes.isnan().all(dim=2), scores == -torch.inf)
-    assert cr.locate(truck_bank().pipeline, truck_bank(), [])[0].shape == (0, 0, 4)
-
-
-def test_locator_is_independent_of_resolution():
-    image, box = pasted_scene(3, (40, 10), 1.1)
-    large = F.interpolate(image[None], scale_factor=3, mode="bilinear")[0]
-    best, best_large = (locator()([picture])[0].boxes[:1] for picture in (image, large))
-    assert box_iou(best, (best_large + 0.5) / 3 - 0.5) > 0.7
-    assert box_iou(best, box[None]) > 0.4
+            cr.pipeline.DetectionSettings(**settings)
 
 
 def test_boxes_of_peaks_are_exact():
     """The box of a peak is that of the view's projected hull, scaled and shifted with the template."""
-    views = locator()._templates.views
+    views = detector()._templates.views
     describer = ViewDescriber(example_mesh(), replace(bank().settings, image_size=96))
     T, K, _ = describer.cameras(bank().rotations[views], bank().distances[views])
     drawn = projected_boxes(describer.hull, T, K)
     for k, i, j, ratio in ((0, 8, 11, (1.0, 1.0)), (3, 5, 9, (0.5, 0.4)), (5, 9, 3, (1.5, 1.6))):
         similarity = torch.zeros(len(views), 15, 20)
         similarity[k, i, j] = 1.0
-        best = locator()._peaks([similarity], [torch.ones(len(views), dtype=torch.bool)], [ratio])
+        best = detector()._peaks([similarity], [torch.ones(len(views), dtype=torch.bool)], [ratio])
         # The template's centre, 47.5 px, is 8 j px from the left border of the resized photograph.
         centre = torch.tensor([8.0 * j, 8.0 * i] * 2, dtype=torch.float64)
         expected = (drawn[k] - 47.5 + centre) / torch.tensor(ratio * 2, dtype=torch.float64) - 0.5
@@ -412,8 +359,8 @@ def test_boxes_of_peaks_are_exact():
 @pytest.mark.parametrize(("shape", "least"), [((60, 80), 32.0), ((20, 24), 24.0), ((900, 1200), None)])
 def test_smallest_size(shape, least):
     """32 px in small photographs, at most the whole photograph; a fraction of the longer side in large ones."""
-    least = 1200 * locator().settings.min_size if least is None else least
-    scales = locator()._scales(torch.zeros(3, *shape), None, None, 80.0)
+    least = 1200 * detector().settings.min_size if least is None else least
+    scales = detector()._scales(torch.zeros(3, *shape), None, None, 80.0)
     assert 80.0 / max(scales) == pytest.approx(least)
 
 
@@ -435,22 +382,8 @@ def test_medoids_are_the_centres_of_clusters() -> None:
     assert sorted(points[_medoids(squared_distances(points), 3)].tolist()) == pytest.approx([0.1, 5.1, 9.1])
 
 
-def test_medoids_are_better_than_random_choices() -> None:
-    points = torch.randn(300, 4, generator=torch.Generator().manual_seed(0))
-    distances = torch.cdist(points, points).square()
-    cost = distances[:, _medoids(distances, 12)].amin(dim=1).sum()
-    generator = torch.Generator().manual_seed(1)
-    random = [distances[:, torch.randperm(300, generator=generator)[:12]].amin(dim=1).sum() for _ in range(20)]
-    assert cost < 0.9 * min(random)
-
-
-def test_medoids_of_duplicates_are_different_points() -> None:
-    points = torch.tensor([0.0, 0.0, 2.0])
-    assert sorted(_medoids(squared_distances(points), 2).tolist()) in ([0, 2], [1, 2])
-
-
 def test_medoids_start_at_the_centre_and_continue_with_the_farthest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(localization_module, "MEDOID_ROUNDS", 0)
+    monkeypatch.setattr(detection_module, "MEDOID_ROUNDS", 0)
     points = torch.tensor([1.0, 0.0, 3.0, 10.0, 2.0])
     assert points[_medoids(squared_distances(points), 3)].tolist() == [3.0, 10.0, 0.0]
 
@@ -460,8 +393,6 @@ def test_representative_views() -> None:
     assert torch.equal(views, views.unique())
     assert len(views) == 7
     assert len(representative_views(truck_bank(), 10_000)) == len(truck_bank()), "all of a smaller bank"
-    with pytest.raises(InvalidInputError, match="count: expected >= 1, got 0"):
-        representative_views(truck_bank(), 0)
 
 
 def test_representative_views_differ_by_logarithms_of_aspect_ratios() -> None:
@@ -477,11 +408,3 @@ def test_representative_views_differ_by_logarithms_of_aspect_ratios() -> None:
 def test_nearest_representatives_of_representatives_are_themselves() -> None:
     chosen = representative_views(truck_bank(), 7)
     assert torch.equal(_nearest_representatives(truck_bank(), chosen)[chosen], torch.arange(7))
-
-
-def test_nearest_representatives_compare_descriptors_and_ratios() -> None:
-    bank = bank_of_ratios(torch.linspace(0.5, 2.0, len(truck_bank()), dtype=torch.float64))
-    n = len(bank)
-    assert _nearest_representatives(bank, torch.tensor([0, n - 1])).diff().tolist().index(1) + 1 == pytest.approx(
-        n / 3, abs=1
-    )

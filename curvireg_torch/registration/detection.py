@@ -1,0 +1,459 @@
+"""Detection: objects are found and registered in photographs that come without a box.
+
+A few representative views are compared with every position of the photograph; the best boxes are ranked as given boxes
+are, and the most certain ones are registered.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ..errors import CurviregError, InvalidInputError
+from ..features.backbone import STRIDES, Backbone
+from ..geometry.crops import box_iou, crop_transforms, non_maximum_suppression, square_boxes
+from ..geometry.pose_prior import PosePrior, check_distance
+from ..matching import Ranking, ViewBank, ViewDescriber, ViewMatcher
+from ..terms import QueryFeatures
+from ..utils.checks import check_photograph, check_pixels
+from .confidence import detection_probability
+from .inputs import ImageItem, check_crop, image_items
+from .poses import projected_box
+from .priors import Limits
+from .result import Detection, FailedRegistration, Registration
+
+if TYPE_CHECKING:
+    from .registrar import Registrar
+
+__all__ = ["Detector", "Proposals", "detect"]
+
+TEMPLATE_SIDE = 96
+"""Side of the template views in px."""
+
+SIZE_STEP = 2.0**0.5
+"""Factor between successive sizes of the object."""
+
+SAME_OBJECT_OVERLAP = 0.5
+"""Intersection over union from which boxes show the same object."""
+
+MIN_OBJECT_SIDE = 32.0
+"""Longer side in px of the smallest object that can be recognised."""
+
+MAX_PEAKS = 500
+"""Best peaks of a photograph that boxes are selected from."""
+
+MAX_COMPARED_VIEWS = 1500
+"""Largest number of views, evenly spread over the bank, whose pairwise distances are computed."""
+
+MEDOID_ROUNDS = 10
+"""Largest number of rounds of k-medoids."""
+
+Results = list[Registration | FailedRegistration]
+
+
+@torch.no_grad()
+def detect(
+    registrar: "Registrar",
+    images: Tensor | Sequence[Any],
+    camera_matrices: Any | None = None,
+    *,
+    instances: int = 1,
+    prior: PosePrior | Sequence[PosePrior | None] | None = None,
+) -> list[Results]:
+    """Find and register objects in whole photographs, the most certain first.
+
+    The detector's best proposals are ranked as given boxes are, which yields the probability that each shows the
+    object; the most certain are registered. The box around each pose is ranked too, and registered where it is more
+    certain.
+
+    Args:
+        registrar: :class:`Registrar` of the mesh.
+        images, camera_matrices, prior: see :class:`Registrar`.
+        instances: largest number of objects in each photograph.
+
+    Returns:
+        For each photograph one to ``instances`` registrations with their ``detection``; or one that failed.
+
+    Raises:
+        InvalidInputError: not as many cameras or priors as images, a distance limited without cameras, or
+            ``instances`` < 1.
+    """
+    if instances < 1:
+        raise InvalidInputError(f"instances: expected >= 1, got {instances}")
+    detector = registrar.detector  # created once, before threads use it
+
+    def detect_in(item: ImageItem, _: int) -> list[Registration]:
+        registrar.report_progress("detection")
+        check_crop(_extremes(item.image))
+        limits: dict[str, Any] = {}
+        if item.prior is not None:
+            limits = {"distance": item.prior.distance, "allowed": _allowed_views(registrar, item)}
+        focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
+        proposals = detector(item.image, focal=focal, **limits)
+        if not len(proposals.boxes):
+            raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
+        return _with_proposals(_register_candidates(registrar, item, proposals, instances), proposals)
+
+    found = registrar.map_items(image_items(images, None, camera_matrices, prior), detect_in)
+    return [[one] if isinstance(one, FailedRegistration) else one for one in found]
+
+
+def _allowed_views(registrar: "Registrar", item: ImageItem) -> Tensor:
+    """(N,) bool: views of the bank that the prior does not exclude everywhere in the photograph, which is the box."""
+    off_centre = 0.0
+    if item.camera_matrix is not None:
+        x0, y0, x1, y1 = item.box.double().tolist()
+        points = torch.tensor([((x0 + x1) / 2, (y0 + y1) / 2, 1), (x0, y0, 1), (x1, y0, 1), (x0, y1, 1), (x1, y1, 1)])
+        rays = F.normalize(torch.linalg.solve(item.camera_matrix.double(), points.double().T), dim=0)
+        off_centre = float(torch.rad2deg(torch.acos((rays[:, :1] * rays[:, 1:]).sum(dim=0).clamp(-1, 1).min())))
+    return Limits(item, registrar.bank).allowed(off_centre=off_centre)
+
+
+def _extremes(image: Tensor) -> Tensor:
+    """(C, 2) smallest and largest value of each channel, NaN where one is missing; as :func:`check_crop` takes them."""
+    pair = torch.stack([image.flatten(1).amin(dim=1), image.flatten(1).amax(dim=1)], dim=1)
+    return pair.float() / 255.0 if image.dtype == torch.uint8 else pair
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """Boxes of one photograph, best first.
+
+    Attributes:
+        boxes: (P, 4) x0, y0, x1, y1 in px, of the whole object: they may extend beyond the image.
+        responses: (P,) similarity, in standard deviations above the view's mean over the photograph.
+        views: (P,) int64 view of the bank.
+    """
+
+    boxes: Tensor
+    responses: Tensor
+    views: Tensor
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A box (4,) of a photograph, described and ranked, with the detector's ``response`` and the ``score``, the
+    probability that it shows the object."""
+
+    box: Tensor
+    response: float
+    query: QueryFeatures
+    ranking: Ranking
+    score: float
+
+    @classmethod
+    def ranked(cls, registrar: "Registrar", item: ImageItem, box: Tensor, response: float) -> "Candidate":
+        """Rank a box (4,) with the detector's response."""
+        query = registrar.matcher.query([item.image], box[None].float())
+        allowed = None
+        if item.prior is not None:
+            allowed = Limits(replace(item, box=box.float()), registrar.bank).allowed()[None]
+        ranking = registrar.matcher.rank(query, allowed)
+        similarity = float(ranking.hog[0, ranking.order[0, 0]])
+        return cls(box, response, query, ranking, detection_probability(response, similarity))
+
+    def register(self, registrar: "Registrar", item: ImageItem) -> Registration:
+        """Register the box; the result's box is the one around its pose."""
+        result = registrar.register(replace(item, box=self.box.float()), self.query, self.ranking)
+        box = projected_box(registrar.describer, result.projection)
+        none = torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0)
+        return replace(result, detection=Detection(box, self.score, self.response, *none))
+
+
+def _register_candidates(
+    registrar: "Registrar", item: ImageItem, proposals: Proposals, instances: int
+) -> list[Registration]:
+    """The most certain objects, at most ``instances``, whose boxes do not overlap.
+
+    Raises:
+        CurviregError: of the best candidate, if none can be registered.
+    """
+    count = max(registrar.pipeline.detection.candidates, instances + 1)
+    candidates, failed = [], None
+    for box, response in zip(proposals.boxes[:count], proposals.responses[:count].tolist(), strict=True):
+        try:
+            candidates.append(Candidate.ranked(registrar, item, box, response))
+        except CurviregError as error:  # such as limits on the pose that leave no view here
+            failed = failed or error
+    if not candidates and failed is not None:
+        raise failed
+    boxes, scores = torch.stack([c.box for c in candidates]), torch.tensor([c.score for c in candidates])
+    results: list[Registration] = []
+    for k in non_maximum_suppression(boxes, scores, SAME_OBJECT_OVERLAP).tolist():
+        if len(results) < instances:
+            _add(results, _refined(registrar, item, candidates[k].register(registrar, item)))
+    return sorted(results, key=_score, reverse=True)
+
+
+def _refined(registrar: "Registrar", item: ImageItem, result: Registration) -> Registration:
+    """The more certain one of a result and of the registration of the box around its pose."""
+    where = detection_of(result)
+    try:
+        candidate = Candidate.ranked(registrar, item, where.box, where.response)
+    except InvalidInputError:  # the projected mesh lies outside the photograph: nothing there supports the pose
+        return replace(result, detection=replace(where, score=0.0))
+    return result if candidate.score <= where.score else candidate.register(registrar, item)
+
+
+def _add(results: list[Registration], new: Registration) -> None:
+    """Add a result. Of results whose boxes overlap the most certain is kept: proposals may lead to the same object."""
+    boxes = torch.stack([detection_of(new).box, *(detection_of(result).box for result in results)])
+    overlap = box_iou(boxes[:1], boxes[1:])[0].tolist()
+    same = [result for result, iou in zip(results, overlap, strict=True) if iou > SAME_OBJECT_OVERLAP]
+    if all(_score(new) > _score(result) for result in same):
+        results[:] = [result for result in results if not any(result is other for other in same)]
+        results.append(new)
+
+
+def _with_proposals(results: list[Registration], proposals: Proposals) -> list[Registration]:
+    """Results with all proposals, their own boxes first, and the score as a factor of their probabilities."""
+    boxes = torch.cat([torch.stack([detection_of(r).box for r in results]), proposals.boxes.double()])
+    responses = torch.cat([torch.tensor([detection_of(r).response for r in results]), proposals.responses])
+    kept = non_maximum_suppression(boxes, -torch.arange(len(boxes)), SAME_OBJECT_OVERLAP)  # in their present order
+    return [
+        replace(
+            result,
+            detection=replace(detection_of(result), boxes=boxes[kept], responses=responses[kept]),
+            probabilities=tuple(p * _score(result) for p in result.probabilities),
+        )
+        for result in results
+    ]
+
+
+def detection_of(result: Registration) -> Detection:
+    """``detection`` of a result that has one."""
+    assert result.detection is not None
+    return result.detection
+
+
+def _score(result: Registration) -> float:
+    return detection_of(result).score
+
+
+@dataclass(frozen=True)
+class _Templates:
+    """K views of a bank, and their weights (K, C, h, w) for each stride and each shading.
+
+    ``boxes`` (K, 4) are in px of the templates, from the outer border; at the distances ``unit`` (K,) a camera with a
+    focal length of 1 px sees the object at this size.
+    """
+
+    views: Tensor
+    weights: list[list[Tensor]]
+    boxes: Tensor
+    unit: Tensor
+
+
+class Detector(nn.Module):
+    r"""Proposes boxes in which a photograph may show a bank's object.
+
+    A few representative views (:func:`representative_views`) are compared with every position of the photograph, at
+    sizes in steps of :math:`\sqrt 2`. A view's similarity is the mean cosine of the backbone's features of the view,
+    shaded grey and, where the mesh has colours, in colour, and of the photograph over the cells that the view covers;
+    its response is the similarity in standard deviations above its mean over the photograph. Peaks over position, size
+    and view are boxes.
+
+    Args:
+        matcher: of the bank; ``locate`` of its pipeline holds the settings.
+
+    Example:
+        >>> import trimesh
+        >>> from curvireg_torch.geometry import sample_views
+        >>> bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), sample_views(azimuth_step=45, elevations=[20]),
+        ...                       image_size=64, progress=False)
+        >>> proposals = Detector(ViewMatcher(bank))(torch.rand(3, 96, 128))
+        >>> proposals.boxes.shape[0] == len(proposals.responses)
+        True
+    """
+
+    def __init__(self, matcher: ViewMatcher) -> None:
+        super().__init__()
+        self.matcher, self.settings = matcher, matcher.pipeline.detection
+        networks = (module for module in matcher.modules() if isinstance(module, Backbone))
+        self.backbone = (next(networks, None) or Backbone()).to(matcher.device)
+        self._templates = _templates(self.backbone, matcher.describer, matcher.bank, self.settings.views)
+
+    @cached_property
+    def _template_of_view(self) -> Tensor:
+        """(N,) template that stands for each view of the bank."""
+        return _nearest_representatives(self.matcher.bank, self._templates.views)
+
+    @torch.no_grad()
+    def forward(
+        self,
+        image: Tensor,
+        *,
+        focal: float | None = None,
+        distance: tuple[float, float] | None = None,
+        allowed: Tensor | None = None,
+    ) -> Proposals:
+        """Boxes of a photograph.
+
+        Args:
+            image: (C, H, W), C = 1 or 3, floating in [0, 1] or uint8.
+            focal: focal length in px, for ``distance``.
+            distance: range of the distance of the object's centre, in the mesh's unit.
+            allowed: (N,) bool; views that stand for none of these views of the bank are not compared.
+
+        Raises:
+            InvalidInputError: wrong shape or dtype, or a ``distance`` without ``focal`` or not 0 < NEAR <= FAR.
+            ImageError: missing pixels (NaN or infinite), or pixels outside [0, 1].
+        """
+        check_photograph(image)
+        check_distance(distance)
+        if distance is not None and focal is None:
+            raise InvalidInputError("distance: needs the camera matrix of every photograph")
+        templates = self._templates
+        usable = torch.ones(len(templates.views), dtype=torch.bool)
+        if allowed is not None:
+            usable = torch.zeros_like(usable).index_fill(0, self._template_of_view[allowed.cpu()], True)
+        side = (templates.boxes[:, 2:] - templates.boxes[:, :2]).amax(dim=1)
+        scales = self._scales(image, focal, distance, float(side.quantile(0.5)))
+        maps, fitting, ratios = [], [], []
+        largest: Tensor | None = None  # comes first; the smaller copies are resized from it
+        for scale in scales:
+            h, w = (max(1, round(s * scale / 16)) * 16 for s in image.shape[-2:])
+            if largest is None:
+                largest = _resized(image, (h, w)).to(self.matcher.device)
+                check_pixels(largest, "of the photograph")  # on the resized copy, which missing pixels spread to
+            maps.append(self._similarity(_resized(largest, (h, w))[None]))
+            ratios.append((w / image.shape[-1], h / image.shape[-2]))
+            fits = usable.to(side.device)
+            if distance is not None and focal is not None:
+                away = templates.unit * focal * scale
+                fits = fits & (away >= distance[0] / SIZE_STEP**0.5) & (away <= distance[1] * SIZE_STEP**0.5)
+            fitting.append(fits)
+        if not maps:
+            return Proposals(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, dtype=torch.long))
+        return self._peaks(maps, fitting, ratios)
+
+    def _scales(
+        self, image: Tensor, focal: float | None, distance: tuple[float, float] | None, side: float
+    ) -> list[float]:
+        """Factors by which the photograph is resized, so that objects of all sizes match templates of ``side`` px."""
+        longer = float(max(image.shape[-2:]))
+        small, large = min(max(self.settings.min_size * longer, MIN_OBJECT_SIDE), longer), longer
+        if focal is not None and distance is not None:
+            extent = side * focal * self._templates.unit  # px at distance 1
+            small = max(small, float(extent.min()) / distance[1])
+            large = min(large, float(extent.max()) / distance[0])
+        scales, size = [], small
+        while size <= large * SIZE_STEP**0.5:
+            scales.append(side / size)
+            size *= SIZE_STEP
+        return scales
+
+    def _similarity(self, image: Tensor) -> Tensor:
+        """(K, h, w) mean cosines; position (i, j) is that of a view whose centre is at px 8 i, 8 j."""
+        cosines: list[Tensor] = []
+        for cells, weights in zip(_features(self.backbone, image), self._templates.weights, strict=True):
+            cells = F.normalize(cells - cells.mean(dim=(0, 2, 3))[:, None, None], dim=1)
+            padded = F.pad(cells, (weights[0].shape[-1] // 2,) * 4)
+            cosines.append(torch.stack([F.conv2d(padded, shading)[0] for shading in weights]).amax(dim=0))
+        size = cosines[0].shape[1:]
+        fine = [F.interpolate(c[None], size=size, mode="bilinear", align_corners=True)[0] for c in cosines[1:]]
+        return sum(fine, cosines[0]) / len(cosines)
+
+    def _peaks(self, maps: list[Tensor], fitting: list[Tensor], ratios: list[tuple[float, float]]) -> Proposals:
+        templates = self._templates
+        every = torch.cat([m.flatten(1) for m in maps], dim=1)
+        mean, spread = every.mean(dim=1), every.std(dim=1).clamp(min=1e-6)
+        boxes, responses, views = [], [], []
+        for similarity, fits, ratio in zip(maps, fitting, ratios, strict=True):
+            z = (similarity - mean[:, None, None]) / spread[:, None, None]
+            best, view = z.masked_fill(~fits[:, None, None], -torch.inf).max(dim=0)
+            peak = (best == F.max_pool2d(best[None], 3, stride=1, padding=1)[0]) & best.isfinite()
+            i, j = peak.nonzero(as_tuple=True)
+            corner = torch.stack([j, i], dim=1).repeat(1, 2) * 8.0 - TEMPLATE_SIDE / 2.0
+            boxes.append((templates.boxes[view[i, j]] + corner) / best.new_tensor([*ratio, *ratio]) - 0.5)
+            responses.append(best[i, j])
+            views.append(templates.views[view[i, j].cpu()])
+        response, index = torch.cat(responses).sort(descending=True, stable=True)
+        index = index[:MAX_PEAKS]
+        box, view = torch.cat(boxes)[index], torch.cat(views)[index.cpu()]
+        kept = non_maximum_suppression(box, response[:MAX_PEAKS], SAME_OBJECT_OVERLAP)[: self.settings.proposals]
+        return Proposals(box[kept].cpu(), response[kept].cpu(), view[kept.cpu()])
+
+
+def _features(backbone: Backbone, image: Tensor) -> list[Tensor]:
+    """(B, C, H / stride, W / stride) for each of ``STRIDES``, of (B, 1 or 3, H, W) images in [0, 1]."""
+    return [f / s[:, None, None] for f, s in zip(backbone(image), backbone.spreads, strict=True)]
+
+
+def _templates(backbone: Backbone, describer: ViewDescriber, bank: ViewBank, count: int) -> _Templates:
+    views = representative_views(bank, count)
+    R, z, boxes = bank.rotations[views], bank.distances[views], bank.boxes[views].double()
+    masks = bank.silhouettes_at(views)[:, None].float()
+    small = F.interpolate(
+        describer.shaded(R, z), size=(TEMPLATE_SIDE,) * 2, mode="bilinear", antialias=True, align_corners=False
+    )
+    weights: list[list[Tensor]] = [[] for _ in STRIDES]
+    # Grey, and in colour where the mesh has colours.
+    for shaded in (small[:, :1], small[:, 1:])[: 2 if small.shape[1] > 1 else 1]:
+        for stride, cells, templates in zip(STRIDES, _features(backbone, shaded), weights, strict=True):
+            mask = F.interpolate(masks, size=(TEMPLATE_SIDE // stride,) * 2, mode="area")
+            common = (cells * mask).sum(dim=(0, 2, 3)) / mask.sum()
+            unit = F.normalize(cells - common[:, None, None], dim=1) * mask
+            templates.append(unit / mask.sum(dim=(2, 3), keepdim=True).clamp(min=1e-6))
+    A = crop_transforms(square_boxes(boxes, bank.settings.margin), TEMPLATE_SIDE)
+    scale, shift = A[:, 0, 0, None], A[:, :2, 2]
+    corners = boxes * scale + shift.repeat(1, 2) + 0.5
+    away = torch.ones_like(z) if bank.settings.camera == "orthographic" else z
+    return _Templates(views.cpu(), weights, corners.float(), (away.to(scale) / scale[:, 0]).float())
+
+
+def _resized(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """(C, h, w) float32 in [0, 1]."""
+    if tuple(image.shape[-2:]) == size and image.is_floating_point():
+        return image.float()
+    options: dict[str, Any] = {"size": size, "mode": "bilinear", "antialias": True, "align_corners": False}
+    # One channel at a time to save memory: photographs are large.
+    small = torch.cat([F.interpolate(channel[None, None].float(), **options)[0] for channel in image])
+    return small / 255.0 if image.dtype == torch.uint8 else small
+
+
+def representative_views(bank: ViewBank, count: int) -> Tensor:
+    """(K,) k-medoids of a bank's views, ascending, on the CPU; all of a bank that has no more than ``count``.
+
+    The distance of two views is the squared distance of their unit descriptors plus that of the logarithms of their
+    boxes' aspect ratios. The first medoid is the most central view, each further one the farthest from those before;
+    views are then assigned to their nearest medoid, and medoids recomputed, until nothing changes.
+    """
+    views = torch.arange(len(bank))
+    if len(views) > MAX_COMPARED_VIEWS:
+        views = torch.arange(MAX_COMPARED_VIEWS) * len(bank) // MAX_COMPARED_VIEWS
+    features = _view_features(bank, views)
+    return views[_medoids(torch.cdist(features, features).square(), count).cpu()].sort().values
+
+
+def _nearest_representatives(bank: ViewBank, chosen: Tensor) -> Tensor:
+    """(N,) index into ``chosen`` views of the most similar one of each view; on the CPU."""
+    every = torch.arange(len(bank))
+    return torch.cdist(_view_features(bank, every), _view_features(bank, chosen)).argmin(dim=1).cpu()
+
+
+def _view_features(bank: ViewBank, views: Tensor) -> Tensor:
+    sides = (bank.boxes[:, 2:] - bank.boxes[:, :2])[views]
+    ratios = (sides[:, :1] / sides[:, 1:]).log().float()
+    return torch.cat([F.normalize(bank.descriptors[views].float(), dim=1), ratios.to(bank.descriptors.device)], dim=1)
+
+
+def _medoids(distances: Tensor, count: int) -> Tensor:
+    """(min(count, N),) indices for (N, N) distances."""
+    medoids = distances.sum(dim=1).argmin()[None]
+    nearest = distances[medoids[0]]
+    while len(medoids) < min(count, len(distances)):
+        medoids = torch.cat([medoids, nearest.argmax()[None]])
+        nearest = torch.minimum(nearest, distances[medoids[-1]])
+    for _ in range(MEDOID_ROUNDS):
+        group = F.one_hot(distances[:, medoids].argmin(dim=1), len(medoids)).to(distances)
+        total = (distances @ group).masked_fill(group == 0, torch.inf)
+        better = torch.where(group.any(dim=0), total.argmin(dim=0), medoids)
+        if torch.equal(better, medoids):
+            break
+        medoids = better
+    return medoids
