@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import CurviregError, ImageError, InvalidInputError, LostObjectError, MissingFileError
 from ..utils.choices import VIDEOS, check_given
 from ..utils.files import check_writable
-from .options import PHOTOGRAPH, add_command, add_options, register_options
+from .options import PHOTOGRAPH, add_command, add_limits, add_options, register_options
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -47,6 +47,7 @@ def add_follow(commands: Any) -> None:
     parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh or a bank")
     options = [name for name in PHOTOGRAPH if name != "mask"]
     add_options(parser, *options, "start", "field", box="in px in the first frame; default: the object is detected")
+    add_limits(parser)
     parser.add_argument("--json", action="store_true", help="print each pose as a line of JSON; --out is optional")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
 
@@ -133,7 +134,7 @@ class _Poses:
     def __call__(self, image: "Tensor | ImageError") -> tuple["Tensor | None", "Registration | FailedRegistration"]:
         import torch
 
-        from ..evaluation.opening import read_start
+        from ..evaluation.opening import prior_from_limits, read_start
         from ..geometry import Camera, undistorted
         from ..registration import FailedRegistration, Follower
 
@@ -145,9 +146,11 @@ class _Poses:
                 seen = undistorted(image, camera, None if self.box is None else torch.tensor(self.box))
                 image, self.box = seen.image, seen.box
             if self.follow is None:
-                self.follow = Follower(self.registrar, self._matrix(image))
+                prior = prior_from_limits(self.options.limits or {})
+                self.follow = Follower(self.registrar, self._matrix(image), prior=prior)
                 if self.options.start is not None:
-                    self.follow.start(image, read_start(self.options.start)[0])
+                    pose, confidence = read_start(self.options.start)
+                    self.follow.start(image, pose, confidence=1.0 if confidence is None else confidence)
             box, self.box = self.box, None  # of the first frame
             return image, self.follow(image, box)
         except CurviregError as error:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..geometry.calibration import Camera
+from ..geometry.pose_prior import PosePrior
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_tensor
 from ..utils.threads import map_on_threads
@@ -45,6 +46,7 @@ class Follower:
     Args:
         registrar: of one mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
         camera_matrix: (3, 3) in px, or a :class:`Camera`, of all frames.
+        prior: limits on the pose in frames that are registered.
 
     Raises:
         InvalidInputError: a registrar of several meshes.
@@ -58,22 +60,23 @@ class Follower:
         torch.Size([3])
     """
 
-    def __init__(self, registrar: Any, camera_matrix: Tensor | Camera) -> None:
+    def __init__(self, registrar: Any, camera_matrix: Tensor | Camera, *, prior: PosePrior | None = None) -> None:
         self.registrar = registrar if isinstance(registrar, Registrar) else Registrar(registrar)
         if self.registrar.others:
             raise InvalidInputError("Follower: expected a registrar of one mesh, which is followed, got several")
-        self.camera_matrix = camera_matrix
+        self.camera_matrix, self.prior = camera_matrix, prior
         describer = self.registrar.describer
         self._tracker = Tracker(describer.renderer, describer.contours, describer.hull)
         self._base = 0.0  # confidence of the pose that tracking goes on from; 0: there is none
 
     @torch.no_grad()
-    def start(self, image: Any, pose: Any) -> None:
+    def start(self, image: Any, pose: Any, *, confidence: float = 1.0) -> None:
         """Begin from a known pose, in place of registering the first frame.
 
         Args:
             image: the frame, see :class:`Registrar`.
             pose: (4, 4) rigid ``T_cam_from_model``.
+            confidence: that the pose is right; no tracked pose has more, unless a registration confirms it.
 
         Raises:
             InvalidInputError: ``pose`` is not rigid and finite, or the frame cannot be used.
@@ -95,7 +98,7 @@ class Follower:
         if not isinstance(item, ImageItem):
             raise item
         map_on_threads(lambda T: self._tracker.start(item.image, _camera(item), T), [T])
-        self._base = 1.0
+        self._base = confidence
 
     @torch.no_grad()
     def __call__(self, image: Any, box: Any = None) -> Registration | FailedRegistration:
@@ -129,7 +132,7 @@ class Follower:
 
     def _registered(self, item: ImageItem, image: Any, box: Any, least: float) -> Registration | FailedRegistration:
         """Register a frame; track from its pose if it lies within the frame, with a confidence of ``least``."""
-        result = self.registrar([image], None if box is None else [box], self.camera_matrix)[0]
+        result = self.registrar([image], None if box is None else [box], self.camera_matrix, prior=self.prior)[0]
         if isinstance(result, Registration) and _confidence(result) >= least:
             with suppress(LostObjectError):
                 map_on_threads(lambda T: self._tracker.start(item.image, _camera(item), T), [_pose(result)])

@@ -11,7 +11,7 @@ import torch
 
 from curvireg_torch.cli import main
 from curvireg_torch.data import Video
-from curvireg_torch.geometry import rotation_error
+from curvireg_torch.geometry import rotation_error, viewpoint_from_rotation
 from curvireg_torch.registration import Follower
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA
@@ -160,11 +160,26 @@ def test_follow_guesses_the_camera_from_the_first_frame(frames, follow, tmp_path
     check_poses(table(tmp_path), frames[1])
 
 
-def test_follow_starts_from_a_known_pose(frames, follow, tmp_path):
+@pytest.mark.parametrize(("confidence", "status"), [(None, "ok"), (0.2, "unsure")])
+def test_follow_starts_from_a_known_pose_and_its_confidence(frames, follow, tmp_path, monkeypatch, confidence, status):
+    """No registration confirms a doubtful one here."""
     T = frames[1][0][2]
-    (tmp_path / "start.json").write_text(json.dumps({"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist()}))
+    pose = {"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist(), "confidence": confidence}
+    (tmp_path / "start.json").write_text(json.dumps(pose))
+    monkeypatch.setattr("curvireg_torch.registration.following.RELIABLE", 2.0)
     assert follow("--camera", *CAMERA, "--start", tmp_path / "start.json", "--out", tmp_path / "out", box=False) == 0
-    check_poses(table(tmp_path / "out"), frames[1])
+    rows = table(tmp_path / "out")
+    check_poses(rows, frames[1])
+    assert rows[0]["status"] == status
+
+
+def test_follow_takes_hints(frames, follow, tmp_path):
+    azimuth = float(viewpoint_from_rotation(frames[1][0][2][:3, :3])[0])
+    low, high = (azimuth + 140) % 360, (azimuth + 220) % 360
+    assert follow("--camera", *CAMERA, "--azimuth", low, high, "--out", tmp_path) in (0, 2)
+    row = table(tmp_path)[0]
+    R = torch.tensor([float(row[f"r{i}{j}"]) for i in (1, 2, 3) for j in (1, 2, 3)]).double().view(3, 3)
+    assert (float(viewpoint_from_rotation(R)[0]) - low) % 360 <= 81
 
 
 @pytest.mark.parametrize(
