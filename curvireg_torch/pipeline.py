@@ -274,7 +274,7 @@ class Pipeline:
 
     @classmethod
     def from_json(cls, text: str) -> "Pipeline":
-        """Read what :meth:`to_json` wrote, or a part of it; what is missing keeps its default."""
+        """Read what ``to_json`` wrote, or a part of it; what is missing keeps its default."""
         try:
             data = json.loads(text)
         except (ValueError, RecursionError) as error:

@@ -75,7 +75,7 @@ class DescribedViews:
 class ViewDescriber:
     """Renders, filters and describes arbitrary views of one mesh.
 
-    Framed views are rendered from a mesh of at most :data:`VIEW_FACES` faces; ``renderer`` is one of the whole mesh.
+    Framed views are rendered from a mesh of at most ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh.
 
     Args:
         mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.

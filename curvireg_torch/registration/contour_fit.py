@@ -382,14 +382,14 @@ def fit_contours(
 
     Prints, shadows and clutter have edges too. With an ``object_mask``, an edge counts for the outline as far as the
     object lies on its inner side alone, and for creases and inner contours as far as the object lies on both sides
-    (:class:`.ObjectMask`); this weights the least squares and the choice among the fits, not the reported support.
+    (``ObjectMask``); this weights the least squares and the choice among the fits, not the reported support.
 
     The covariance is of rotation (rad) about the camera's x, y, z, then translation (model units) along them: with the
     true pose R, t,
 
         R = exp([w]x) R_fit,   t = t_fit + e,   (w, e) of mean 0 and that covariance,
 
-    see :func:`pose_covariance`; it is scaled by the errors of reliable results on photographs. Computed on the CPU.
+    see ``pose_covariance``; it is scaled by the errors of reliable results on photographs. Computed on the CPU.
 
     Args:
         contours: of the mesh.

@@ -251,7 +251,7 @@ class _Templates:
 class Detector(nn.Module):
     r"""Proposes boxes in which a photograph may show a bank's object.
 
-    A few representative views (:func:`representative_views`) are compared with every position of the photograph, at
+    A few representative views (``representative_views``) are compared with every position of the photograph, at
     sizes in steps of :math:`\sqrt 2`. A view's similarity is the mean cosine of the backbone's features of the view,
     shaded grey and, where the mesh has colours, in colour, and of the photograph over the cells that the view covers;
     its response is the similarity in standard deviations above its mean over the photograph. Peaks over position, size

@@ -91,7 +91,7 @@ class ImageItem:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is questionable about box, camera and mask, see :func:`input_warnings`."""
+        """What is questionable about box, camera and mask, see ``input_warnings``."""
         return input_warnings(self.box, self.camera_matrix, self.size) + self.notes
 
     def mask_crop(self, size: int, margin: float) -> Tensor | None:

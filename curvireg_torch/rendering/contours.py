@@ -105,7 +105,7 @@ class MeshContours:
     """Occluding contours and creases of a mesh, at any pose.
 
     An edge of the mesh lies on an occluding contour where all of its faces are on one side of it, seen from the camera;
-    creases are edges between faces that meet at an angle (:class:`.MeshEdges`). Points are placed along these edges,
+    creases are edges between faces that meet at an angle (``MeshEdges``). Points are placed along these edges,
     evenly in the image. A ray one pixel outside an occluding contour tells the outline (nothing hit), an inner
     occluding contour (hit far behind) and what is hidden (hit in front); one at each crease tells whether it is seen.
 
