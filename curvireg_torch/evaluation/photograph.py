@@ -68,8 +68,8 @@ class RegisteredPhotograph(Registration):
 def register(
     image: Any,
     mesh: Any,
-    box: Any = None,
     *,
+    box: Any = None,
     camera: Any = None,
     mask: Any = None,
     prior: PosePrior | None = None,
@@ -101,7 +101,7 @@ def register(
         >>> scene = cr.synthetic.demo_scene()
         >>> views = cr.sample_views(azimuth_step=20, elevations=[10, 30])
         >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
-        >>> result = cr.register(scene.image, bank, scene.box, camera=scene.camera_matrix)
+        >>> result = cr.register(scene.image, bank, box=scene.box, camera=scene.camera_matrix)
         >>> result.quaternion.shape, result.overlay().shape
         (torch.Size([4]), (720, 960, 3))
     """

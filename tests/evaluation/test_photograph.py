@@ -24,7 +24,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def result(folder):
     photo, box = folder / "photos" / "0.png", [float(v) for v in box_of(0)]
-    return cr.register(str(photo), str(folder / "learned.safetensors"), box, camera=[float(v) for v in CAMERA])
+    return cr.register(str(photo), str(folder / "learned.safetensors"), box=box, camera=[float(v) for v in CAMERA])
 
 
 def test_register_equals_the_command_to_the_last_digit(folder, result, tmp_path):
@@ -43,7 +43,7 @@ def test_register_takes_pictures_of_other_kinds(folder, result):
     with Image.open(folder / "photos" / "0.png") as picture:
         pixels = np.array(picture.convert("RGB"))
         for image in (picture, pixels, torch.from_numpy(pixels).permute(2, 0, 1)):
-            same = cr.register(image, registrar, numbers, camera=cr.camera_matrix(*map(float, CAMERA)))
+            same = cr.register(image, registrar, box=numbers, camera=cr.camera_matrix(*map(float, CAMERA)))
             assert same.rotation.equal(result.rotation)
 
 
@@ -58,9 +58,9 @@ def test_register_takes_the_camera_from_exif(folder):
     photo = folder / "exif.png"
     cv2.imwrite(str(photo), cv2.imread(str(folder / "photos" / "0.png")))
     with pytest.raises(cr.CurviregError, match="no focal length"):
-        cr.register(photo, learned_registrar(), [1, 1, 90, 90], camera="exif")
+        cr.register(photo, learned_registrar(), box=[1, 1, 90, 90], camera="exif")
     with_exif(photo, exif(1, 38))
-    guessed = cr.register(photo, learned_registrar(), [float(v) for v in box_of(0)], camera="exif")
+    guessed = cr.register(photo, learned_registrar(), box=[float(v) for v in box_of(0)], camera="exif")
     assert guessed.translation is not None
 
 
@@ -68,7 +68,7 @@ def test_errors_are_raised(folder):
     with pytest.raises(cr.CurviregError, match=r"none\.png: no such file"):
         cr.register(folder / "none.png", learned_registrar())
     with pytest.raises(cr.CurviregError, match="entirely outside"):
-        cr.register(folder / "photos" / "0.png", learned_registrar(), [900, 5, 950, 90])
+        cr.register(folder / "photos" / "0.png", learned_registrar(), box=[900, 5, 950, 90])
 
 
 def test_result_is_shown_in_ten_lines_and_in_notebooks(result):
