@@ -179,6 +179,13 @@ def test_detect_follows_one_proposal_more_than_instances():
     assert box_iou(result.detection.box[None], box[None].double()) > 0.5
 
 
+def test_probabilities_are_those_of_a_right_box_times_its_score(found):
+    result = replace(found[2], probabilities=(0.8, 0.1))
+    none = Proposals(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, dtype=torch.long))
+    (found_there,) = detection_module._with_proposals([result], none)
+    assert found_there.probabilities == pytest.approx((0.8 * result.detection.score, 0.1 * result.detection.score))
+
+
 @pytest.mark.parametrize(("gain", "kept"), [(-0.01, True), (0.01, False)])
 def test_box_around_the_pose_is_registered_where_it_is_more_certain(registrar, found, monkeypatch, gain, kept):
     result, other = found[2], replace(found[2])

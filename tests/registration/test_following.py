@@ -125,7 +125,7 @@ def test_a_wrong_start_never_becomes_believed():
 
 def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
     """Until a registration of a later frame confirms it."""
-    frames = sequence(4)
+    frames = sequence(5)
     follow = Follower(learned_registrar(), CAMERA)
     follow.start(frames[0][0], frames[0][2])
     with monkeypatch.context() as patch:
@@ -138,6 +138,8 @@ def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
     confirmed = follow(frames[3][0])
     assert confirmed.confidence > BELIEVED_CONFIDENCE
     assert errors(confirmed, frames[3][2])[0] < 4.0
+    monkeypatch.setattr(following, "refine_item", lost)
+    assert follow(frames[4][0]).confidence > BELIEVED_CONFIDENCE, "tracked from the confirmed pose"
 
 
 def test_dark_frame_keeps_or_doubts_the_pose():
@@ -193,6 +195,19 @@ def test_doubtful_pose_is_kept_above_a_limit(monkeypatch, tracked, kept):
     result = follow(frames[1][0])
     assert result.ok == kept
     assert not kept or result.confidence == pytest.approx(tracked)
+
+
+@pytest.mark.parametrize(("confidence", "used"), [(0.89, False), (0.95, True)])
+def test_a_lost_frame_is_registered_and_counts_if_that_is_reliable(monkeypatch, confidence, used):
+    frames, registrar = sequence(2), truck_registrar()
+    follow = Follower(registrar, CAMERA)
+    follow.start(frames[0][0], frames[0][2])
+    monkeypatch.setattr("curvireg_torch.registration.tracker.tracking_confidence", lambda _: 0.1)
+    monkeypatch.setattr(following, "refine_item", lost)
+    answering(monkeypatch, registrar, [confidence])
+    result = follow(*frames[1][:2])
+    assert result.ok == used
+    assert not used or result.confidence == confidence
 
 
 @pytest.mark.parametrize("pose", [torch.eye(3), torch.full((4, 4), torch.nan), 2.0 * torch.eye(4)])

@@ -2,13 +2,14 @@
 
 import pytest
 import torch
+import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, LostObjectError
-from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
+from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, transform
 from curvireg_torch.registration import refinement
-from curvireg_torch.synthetic import procedural_background
-from tests._support.scenes import CAMERA, learned_registrar, scene, truck_bank
+from curvireg_torch.synthetic import procedural_background, synthesize_photograph
+from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +136,22 @@ def test_a_half_turn_does_not_become_believed_by_being_refined():
         assert not wrong.ok or wrong.confidence < min(0.5, right.confidence)
         registered = registrar([image], box[None], CAMERA)[0]
         assert right.confidence <= registered.confidence + 0.05
+
+
+def test_poses_that_look_alike_are_confirmed_by_the_same_registration():
+    """A cuboid, from its true pose and from those that its three half turns make of it."""
+    mesh = trimesh.creation.box((0.2, 0.3, 0.15))
+    views = cr.sample_views(azimuth_step=30, elevations=[0, 30, 60])
+    registrar = cr.Registrar(cr.ViewBank.build(mesh, views, image_size=96, progress=False))
+    R = cr.rotation_from_viewpoint(30.0, 30.0, 0.0).double()
+    T = transform(R, torch.tensor([0.0, 0.0, 1.2], dtype=torch.float64))
+    image, _ = synthesize_photograph(mesh, T, CAMERA, SIZE, torch.Generator().manual_seed(0))
+    symmetries = registrar.symmetries_of(exact=True).double()
+    assert len(symmetries) == 4
+    found = registrar.refine([image] * 4, CAMERA, [T @ S for S in symmetries])
+    assert all(result.ok for result in found)
+    assert [one.confidence for one in found] == pytest.approx([found[0].confidence] * 4, abs=0.02)
+    assert found[0].confidence > 0.1
 
 
 @pytest.mark.parametrize("start_confidence", [0.015, 0.4])

@@ -118,6 +118,13 @@ def test_fit_must_find_more_corners_than_the_start(monkeypatch, renderer, before
     assert (fit(renderer, photograph(MESH, TRUTH), turned_can(5.0)) is not None) == counts
 
 
+@pytest.mark.parametrize(("coarse", "fine", "counts"), [(0.02, 0.5, False), (0.04, 0.14, False), (0.04, 0.16, True)])
+def test_fit_must_find_enough_corners(monkeypatch, renderer, coarse, fine, counts):
+    search, ratios = _TextureRounds.round, iter([coarse, fine])
+    monkeypatch.setattr(_TextureRounds, "round", lambda *given: replace(search(*given), before=0.0, after=next(ratios)))
+    assert (fit(renderer, photograph(MESH, TRUTH), turned_can(5.0)) is not None) == counts
+
+
 @pytest.fixture(scope="module")
 def registrar():
     return cr.Registrar(MESH, views=cr.sample_views(azimuth_step=30, elevations=[20]).for_up("y"))
@@ -135,6 +142,7 @@ def test_label_does_not_pull_a_pose_out_of_its_limits(registrar):
     free, limited = (registrar([photograph(MESH, TRUTH)], box, CAMERA, prior=p)[0] for p in (None, prior))
     assert float(rotation_error(free.rotation, R)) < 1.0
     assert float(prior.excess(limited.rotation)) <= 3.0
+    assert limited.hypotheses[0].covariance is not None, "its contours are fitted"
 
 
 def test_match_finds_patches_that_moved_by_fractions_of_pixels():
