@@ -39,7 +39,7 @@ class Term(ABC):
     """One factor of the score S = prod S_t^w_t of a view for a photograph.
 
     A new term is a frozen dataclass of plain numbers with a ``name`` and these two methods, added to
-    :data:`curvireg_torch.terms.TERMS` if JSON files of pipelines name it.
+    ``curvireg_torch.terms.TERMS`` if JSON files of pipelines name it.
 
     Attributes:
         weight: w >= 0; a term of weight 0 is left out.
@@ -162,7 +162,7 @@ def ledoit_wolf(descriptors: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Correlation(Term):
-    """S_hog: normalised correlation of descriptors, the best over the jittered crops, mapped by :func:`log_unit_score`.
+    """S_hog: normalised correlation of descriptors, the best over the jittered crops, mapped by ``log_unit_score``.
 
     Attributes:
         whitening: "none", or "bank": both descriptors are whitened by the mean mu and the covariance Sigma of the
@@ -345,7 +345,7 @@ class Appearance(RerankingTerm):
 
     A mesh with colours is rendered in grey and in its colours, and the better match counts for each view: a print
     distinguishes top from bottom, and the grey picture remains where it misleads. Raw scores are mean cosines
-    (:func:`curvireg_torch.features.backbone.similarity`), mapped by :func:`log_unit_score` over the compared views.
+    (``features.backbone.similarity``), mapped by ``log_unit_score`` over the compared views.
 
     Attributes:
         weights: digest of the network's weights.

@@ -48,4 +48,4 @@ plt.show()
 
 # %%
 # One peak: the photograph determines the pose. Two peaks: both poses are reported as hypotheses. A ridge: the rotation
-# about the axis is undetermined. :doc:`/guides/symmetric` shows how to declare a symmetry.
+# about the axis is undetermined. :doc:`/guides/ambiguous` shows how to declare a symmetry.
