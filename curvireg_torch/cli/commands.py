@@ -115,7 +115,6 @@ def view(arguments: argparse.Namespace) -> None:
     photos, meshes = ([path] if path else [] for path in (arguments.photo, arguments.mesh))
     check_given(photos, meshes)
     try:
-        import matplotlib  # noqa: F401
         import nicegui  # noqa: F401
     except ImportError as error:
         message = f"curvireg view: {error.name} is not installed; in the folder of curvireg_torch: pip install -e "
