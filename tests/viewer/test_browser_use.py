@@ -16,6 +16,14 @@ pytestmark = [
 ]
 
 
+@pytest.fixture(autouse=True)
+def _own_screen(browser):
+    """A test that fails leaves no small screen, and none begins scrolled down."""
+    yield
+    browser.emulate(0, 0)
+    browser.driver.execute_script("scrollTo(0, 0)")
+
+
 def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browser):
     assert browser.driver.find_element("css selector", "html").get_attribute("lang") == "en-US"
     assert [browser.text(name) for name in ("sample", "register")] == ["Try the sample", "Find the pose"]
@@ -100,7 +108,6 @@ def test_dark_colours_follow_the_system(browser):
     body = browser.driver.find_element("css selector", "body")
     browser.wait(lambda: body.value_of_css_property("background-color") == "rgba(20, 23, 26, 1)", "dark")
     browser.picture("viewer-dark")
-    browser.emulate(0, 0)
 
 
 @pytest.mark.parametrize("size", [(1440, 900), (390, 844)])
@@ -115,7 +122,6 @@ def test_the_photograph_fits_the_window_and_stays_in_view(browser, size):
         browser.wait(lambda: browser.driver.execute_script(inside, viewport), f"in view at {end}", 5)
     assert browser.driver.execute_script("return scrollY") > 300
     assert viewport.rect["width"] > 0.5 * size[0]
-    browser.emulate(0, 0)
 
 
 def test_a_small_screen_stacks_everything(browser):
@@ -129,7 +135,6 @@ def test_a_small_screen_stacks_everything(browser):
     assert [part["y"] for part in parts] == sorted(part["y"] for part in parts)
     assert browser.part("photograph").rect["width"] > 300
     browser.picture("viewer-phone")
-    browser.emulate(0, 0)
 
 
 def test_keys_undo_and_zoom_change_the_box(browser):
@@ -193,7 +198,6 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     assert browser.text("photograph-facts") == "photo.png: 240 x 180 px", "the former one stays"
     browser.emulate(1440, 900)
     browser.picture("viewer-mistakes")
-    browser.emulate(0, 0)
     browser.drop(folder / "photo.png")
     browser.wait(lambda: browser.text("message-photograph") == "", "gone")
     mesh = example_mesh()
