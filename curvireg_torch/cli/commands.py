@@ -2,7 +2,6 @@
 
 import argparse
 import time
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -120,18 +119,11 @@ def view(arguments: argparse.Namespace) -> None:
         message = f"curvireg view: {error.name} is not installed; in the folder of curvireg_torch: pip install -e "
         raise MissingDependencyError(f"{message}'.[viewer]'") from error
     from ..evaluation.opening import check_camera
-    from ..geometry import Camera
     from ..utils.threads import one_torch_thread
     from ..viewer.server import serve
 
     options = register_options(arguments, photos, meshes)
     check_camera(options.camera, options.guess)
-    if isinstance(options.camera, Camera):
-        if options.camera.distorts:
-            message = "has distortion, which the page does not remove; use curvireg register"
-            raise InvalidInputError(message, subject=arguments.camera)
-        K = options.camera.matrix
-        options = replace(options, camera=(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])))
     with one_torch_thread():
         serve(options, host=arguments.host, port=arguments.port, browser=arguments.browser)
 

@@ -36,7 +36,7 @@ class Page:
     """One browser window. It holds nothing: several times a second it shows what changed in its workspace."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace, self.session, self._busy = workspace, workspace.session, False
+        self.workspace, self._busy = workspace, False
 
     def build(self) -> None:
         """Lay out the page."""
@@ -88,8 +88,12 @@ class Steps:
                     else:
                         file_chooser("Choose files", f"upload-{name}")
                         self.messages[name] = self._message(name)
+                    if name == "photograph":
+                        self.no_photo = button("Remove it", workspace.remove_photo, "no-photo", "quiet below")
                     if name == "mesh":
-                        self.use_mm = button("Use mm", lambda: workspace.set_option("unit", "mm"), "use-mm", "quiet")
+                        self.use_mm = button(
+                            "Use mm", lambda: workspace.set_option("unit", "mm"), "use-mm", "quiet below"
+                        )
         self.messages["file"] = self._message("file")
         with region("div", "go"):
             self.find = button("Find the pose", self._find, "register", "primary")
@@ -106,45 +110,44 @@ class Steps:
         self.workspace.start_search()  # the task outlives the page
 
     def _remove_box(self) -> None:
-        self.session.box = None
+        self.session.shot.set_box(None)
 
     def refresh(self) -> None:
         """Show the state of the workspace."""
-        session, workspace = self.session, self.workspace
+        session, workspace, shot = self.session, self.workspace, self.session.shot
         for part, element in self.messages.items():
             set_text(element, workspace.messages.get(part, ""))
-        done = {"photograph": session.photo, "mesh": session.mesh_path, "box": session.box or session.result}
+        done = {"photograph": shot.photo, "mesh": session.mesh_path, "box": shot.box or shot.result}
         for name, card in self.cards.items():
             card.classes(**{"add" if done[name] else "remove": "done"})
         set_text(self.facts["photograph"], self._describe_photo())
         set_text(self.facts["mesh"], self._describe_mesh())
-        set_text(self.facts["box"], BOX_HINT if session.box is None else " ".join(f"{v:g}" for v in session.box))
-        self.no_box.set_visibility(session.box is not None)
+        set_text(self.facts["box"], BOX_HINT if shot.box is None else " ".join(f"{v:g}" for v in shot.box))
+        self.no_box.set_visibility(shot.box is not None)
+        self.no_photo.set_visibility(shot.photo is not None)
         self.use_mm.set_visibility("(mm?)" in workspace.messages.get("mesh", "") and session.options.unit != "mm")
-        set_text(self.find, "Find the pose" if session.box or session.photo is None else "Find the object and its pose")
+        set_text(self.find, "Find the pose" if shot.box or shot.photo is None else "Find the object and its pose")
         set_enabled(self.find, bool(done["photograph"] and done["mesh"]) and not workspace.searching)
         self._show_progress()
 
     def _describe_photo(self) -> str:
-        photo, path = self.session.photo, self.session.photo_path
-        if photo is None or path is None:
-            return "A picture with the whole object in it."
+        photo = self.session.shot.photo
+        if photo is None:
+            return "A picture with the whole object in it, or several of the same object."
         H, W = photo.image.shape[-2:]
-        return "; ".join([f"{self.session.names[path]}: {W} x {H} px", *photo.notes])
+        return "; ".join([f"{self.session.name(self.session.shot.path)}: {W} x {H} px", *photo.notes])
 
     def _describe_mesh(self) -> str:
         path = self.session.mesh_path
         if path is None:
             return "The object's 3D model: .obj, .ply, .stl, .off, .glb, or .gltf with its parts as a .zip."
-        return f"{self.session.names[path]}: {self.workspace.mesh_facts}"
+        return f"{self.session.name(path)}: {self.workspace.mesh_facts}"
 
     def _show_progress(self) -> None:
         session, workspace = self.session, self.workspace
         stage, done, total = session.progress
         share, words = 0.0, ""
-        if workspace.waiting:
-            words = "waiting for another search"
-        elif workspace.searching and session.cancelled:
+        if workspace.searching and session.cancelled:
             words = "stopping"
         elif workspace.searching and stage:
             share = (list(STAGES).index(stage) + done / total) / len(STAGES)
@@ -153,8 +156,8 @@ class Steps:
             words = "starting"
         elif workspace.receiving:
             words = f"receiving {', '.join(workspace.receiving.values())}"
-        elif session.result is not None:
-            changed = session.result.request != session.request()
+        elif session.shot.result is not None:
+            changed = session.shot.result.request != session.request()
             share, words = 1.0, "the inputs have changed since this answer" if changed else "done"
         self.stop.set_visibility(workspace.searching)
         self.bar.set_visibility(workspace.searching)

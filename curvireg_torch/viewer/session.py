@@ -1,9 +1,9 @@
-"""The state of one page: inputs, result and the chosen pose. It needs no page and no NiceGUI."""
+"""Photographs, mesh, results and the chosen poses. It needs no page and no NiceGUI."""
 
 import math
 import shlex
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -13,12 +13,12 @@ import torch
 import trimesh
 from torch import Tensor
 
-from ..data import read_photo
+from ..data import load_camera, read_photo
 from ..data.images import Photo
-from ..errors import CurviregError, CurviregWarning, InvalidInputError
+from ..errors import MAX_VIEWER_PHOTOGRAPHS, CurviregError, CurviregWarning, InvalidInputError
 from ..evaluation.opening import QUALIFIERS, RegisterOptions, check_camera, open_registrar
 from ..evaluation.runner import register_entry
-from ..geometry import rotation_error, rotation_from_axis_angle
+from ..geometry import rotation_error, rotation_from_axis_angle, undistorted
 from ..geometry.calibration import Camera
 from ..geometry.cameras import rotation_towards, transform
 from ..geometry.pose_prior import object_frame
@@ -27,11 +27,10 @@ from ..matching import ViewBank
 from ..mesh import has_colours, load_mesh, mesh_centre, mesh_radius, mesh_up
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
 from ..registration.result import used_box
-from ..utils.choices import DEFAULT
 from ..visualization import contour_overlay, pose_glb
 from ..visualization.encoding import png
 
-__all__ = ["Answer", "Result", "Session"]
+__all__ = ["Answer", "Result", "Session", "Shot"]
 
 HINT_WIDTH = 45.0  # degrees by which the pose may differ from a hint
 PREVIEW_DEPTH = 2.0  # radii by which the mesh of a preview is below the origin: its format knows what is in view
@@ -110,75 +109,178 @@ class Result:
         return T
 
 
-@dataclass
-class Session:
-    """The state of one page. Methods that compute may take minutes: call them in a thread.
+@dataclass(eq=False)
+class Shot:
+    """A photograph with what belongs to it.
 
     Attributes:
-        options: of ``curvireg view``; replace them to change unit, up, pose or preset, call ``set_limits`` for limits.
-        names: what the user calls the files, for messages and the command line.
-        box, camera: as ``--box`` and ``--camera``, or None.
-        guess: of an unknown camera: "exif", or the horizontal field of view in degrees; None: no camera.
-        result, answer: the last result and its chosen pose, or None.
-        answer_before: the answer before the last change by hand, or None.
+        path: of its file.
+        photo: without the distortion of a calibrated camera.
+        box, box_before: x0, y0, x1, y1 in px, now and before the last change.
+        result, answer: the last result and its chosen pose.
+        answer_before: the answer before the last change by hand.
+    """
+
+    path: Path | None = None
+    photo: Photo | None = None
+    box: Numbers | None = None
+    box_before: Numbers | None = None
+    result: Result | None = None
+    answer: Answer | None = None
+    answer_before: Answer | None = None
+
+    def set_box(self, box: Numbers | None) -> None:
+        """Replace the box."""
+        if box != self.box:
+            self.box_before, self.box = self.box, box
+
+    def require_result(self) -> tuple[Result, Answer]:
+        """The result and the chosen pose; an error if there is none yet."""
+        if self.result is None or self.answer is None:
+            raise InvalidInputError("there is no result yet; register first")
+        return self.result, self.answer
+
+    def choose(self, number: int) -> None:
+        """Make a hypothesis the answer, by its number from 0."""
+        assert self.result is not None
+        self.answer_before = None
+        self.answer = Answer(self.result.registration.hypotheses[number], number)
+
+    def place(self, T: Tensor, edit: str = "") -> None:
+        """Move the answer to the (4, 4) pose ``T``; ``edit`` says how it was done, in words."""
+        result, answer = self.require_result()
+        describer, before = result.registrar.describer, answer.pose.projection[0]
+        degrees = float(rotation_error(T[:3, :3], before[:3, :3]))
+        centres = [pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (before, T)]
+        radii = float(torch.linalg.vector_norm(centres[1] - centres[0])) / describer.radius
+        edit = f"{edit or 'moved'}: rotated {degrees:.1f} degrees, shifted {radii:.2f} radii"
+        self.answer_before, self.answer = answer, answer.placed(describer.centre, T, edit)
+
+    def fit(self) -> None:
+        """Fit the contours at the answer to the photograph's edges."""
+        result, answer = self.require_result()
+        T, K = answer.pose.projection
+        registrar = result.registrar
+        margin = registrar.bank.settings.margin
+        fit = fit_contours(registrar.describer.contours, result.image, result.box, K, T[None], margin=margin)
+        supports = f"{float(fit.start_support[0]):.2f} to {float(fit.edge_support[0]):.2f}"
+        self.place(fit.transform[0], f"contours fitted, edge support {supports}")
+
+    def undo(self) -> None:
+        """Take back the last change by hand; a second call repeats it."""
+        if self.answer_before is not None:
+            self.answer, self.answer_before = self.answer_before, self.answer
+
+    def glb(self) -> bytes:
+        """The answer as a GLB file, see :func:`curvireg_torch.visualization.pose_glb`."""
+        result, answer = self.require_result()
+        return pose_glb(result.registrar.bank.mesh, *answer.pose.projection, result.image)
+
+    def overlay(self) -> bytes:
+        """The contours at the answer on the photograph, as a PNG file."""
+        result, answer = self.require_result()
+        return png(contour_overlay(result.registrar, answer.pose, result.image, result.box))
+
+
+@dataclass
+class Session:
+    """Photographs, one of which is shown, and the mesh. Methods that compute may take minutes: call them in a thread.
+
+    Attributes:
+        options: of ``curvireg view``; replace them to change unit, up, pose or preset. Their camera is that of all
+            photographs; call ``set_camera`` and ``set_limits`` for these.
+        folder: of uploaded files, which messages call by their names alone.
+        shots, shot: the photographs, and the one that is shown; an empty one before the first.
         progress: stage, done and total.
         cancelled: set it to end a registration at its next step.
     """
 
     options: RegisterOptions
-    photo_path: Path | None = None
+    folder: Path | None = None
+    shots: list[Shot] = field(default_factory=list)
+    shot: Shot = field(default_factory=Shot)
     mesh_path: Path | None = None
     mesh: trimesh.Trimesh | None = None
-    names: dict[Path, str] = field(default_factory=dict)
-    photo: Photo | None = None
-    box: Numbers | None = None
-    camera: Numbers | None = None
-    guess: str | float | None = None
-    result: Result | None = None
-    answer: Answer | None = None
     progress: tuple[str, int, int] = ("", 0, 1)
     cancelled: bool = False
     _registrar: tuple[RegisterOptions, Registrar] | None = None
-    answer_before: Answer | None = None
 
     def load(self) -> str:
-        """Open the files that the options name, and take their box and camera; describes the mesh, or ""."""
+        """Open the files that the options name, and take their box; describes the mesh, or ""."""
         options = self.options
-        self.options = replace(options, photos=(), meshes=(), box=None, camera=None, guess=None)
+        self.options = replace(options, photos=(), meshes=(), box=None)
         for path in options.photos:
-            self.open_photo(path)
-        facts = "".join([self.open_mesh(path) for path in options.meshes])
-        self.box, self.camera, self.guess = options.box, self._plain(options.camera), options.guess
-        return facts
+            self.open_photo(path).box = options.box
+        return "".join([self.open_mesh(path) for path in options.meshes])
 
-    def _plain(self, camera: Any) -> Numbers | None:
-        """fx, fy, cx, cy of the option ``--camera``, which may be a calibrated one."""
-        if isinstance(camera, Camera):
-            if camera.distorts:
-                raise InvalidInputError("--camera: it has lens distortion; use 'curvireg register', which removes it")
-            size: Any = None if self.photo is None else self.photo.image.shape[-2:]
-            K = (camera if size is None else camera.at(size)).matrix
-            return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-        return camera and tuple(camera)
+    def name(self, path: str | Path | None) -> str:
+        """What the user calls a file."""
+        return Path(path).name if path and self.folder in Path(path).parents else str(path or "")
 
     def close(self) -> None:
-        """Forget the photograph, the mesh, and what belongs to them."""
-        self.photo_path = self.photo = self.mesh_path = self.mesh = self.box = self.camera = self.guess = None
-        self.result = self.answer = None
+        """Forget the photographs and the mesh."""
+        self.shots, self.shot, self.mesh_path, self.mesh = [], Shot(), None, None
 
-    def open_photo(self, path: Path, name: str | None = None) -> Photo:
-        """Read a photograph; it removes box, camera and result of the one before."""
-        self.names[path] = name or str(path)
+    def open_photo(self, path: Path) -> Shot:
+        """Add a photograph, and show it."""
+        if len(self.shots) >= MAX_VIEWER_PHOTOGRAPHS:
+            raise InvalidInputError(
+                f"{MAX_VIEWER_PHOTOGRAPHS} photographs are open; remove one", subject=self.name(path)
+            )
+        self.shot = Shot(path, self._read(path))
+        self.shots.append(self.shot)
+        return self.shot
+
+    def remove_photo(self) -> None:
+        """Close the photograph that is shown; the next one is shown instead."""
+        number = self.shots.index(self.shot)
+        del self.shots[number]
+        self.shot = self.shots[min(number, len(self.shots) - 1)] if self.shots else Shot()
+
+    def _read(self, path: Path) -> Photo:
+        """A photograph without the distortion of a calibrated camera, which must be one of such photographs."""
         with self._user_names():
             photo = read_photo(path, dtype=torch.uint8)
-        if self.photo is not None:  # those of the command line are meant for the first
-            self.box = self.camera = self.guess = None
-        self.photo_path, self.photo, self.result, self.answer = path, photo, None, None
-        return photo
+        if not isinstance(self.options.camera, Camera):
+            return photo
+        try:
+            image = undistorted(photo.image, self.options.camera).image
+        except InvalidInputError as error:
+            raise error.with_subject(self.name(path)) from error
+        return replace(photo, image=image, notes=(*photo.notes, *(["undistorted"] if self.is_undistorted else [])))
 
-    def open_mesh(self, path: Path, name: str | None = None) -> str:
+    @property
+    def is_undistorted(self) -> bool:
+        """Whether the distortion of the camera is removed from photographs."""
+        return isinstance(self.options.camera, Camera) and self.options.camera.distorts
+
+    def set_camera(self, camera: Any = None, guess: str | float | None = None) -> None:
+        """Change the camera of all photographs: four numbers, a calibrated one, or a guess.
+
+        They keep their boxes and results unless distortion is removed, or no longer is.
+
+        Raises:
+            InvalidInputError: the camera is not one of these photographs; nothing changes.
+        """
+        before, was_undistorted = self.options, self.is_undistorted
+        self.options = replace(before, camera=camera, guess=guess)
+        if isinstance(camera, Camera) or was_undistorted:
+            try:
+                photos = [self._read(shot.path) for shot in self.shots if shot.path is not None]
+            except CurviregError:
+                self.options = before
+                raise
+            for shot, photo in zip(self.shots, photos, strict=True):
+                if self.is_undistorted or was_undistorted:
+                    shot.photo, shot.box, shot.box_before, shot.result, shot.answer = photo, None, None, None, None
+
+    def open_calibration(self, path: Path) -> None:
+        """Take the camera of a calibration file for all photographs."""
+        with self._user_names():
+            self.set_camera(load_camera(path))
+
+    def open_mesh(self, path: Path) -> str:
         """Check that a mesh or a bank can be used, and describe it; it replaces the one before."""
-        self.names[path] = name or str(path)
         with self._user_names():
             if path.suffix == ".safetensors":
                 bank = ViewBank.load(path)
@@ -188,13 +290,15 @@ class Session:
                 size = " x ".join(f"{v:.4g}" for v in mesh.extents)
                 colours = "in its colours" if has_colours(mesh) else "in grey"
                 facts = f"{len(mesh.faces):,} faces, {size} {self.options.unit}, rendered {colours}"
-        self.mesh_path, self.mesh, self.result, self.answer = path, mesh, None, None
+        self.mesh_path, self.mesh = path, mesh
+        for shot in self.shots:
+            shot.result = shot.answer = None
         return facts
 
     @property
     def has_exif(self) -> bool:
         """Whether the photograph's file tells the focal length."""
-        return self.photo is not None and self.photo.guessed_camera_matrix() is not None
+        return self.shot.photo is not None and self.shot.photo.guessed_camera_matrix() is not None
 
     def set_limits(self, **limits: Any) -> None:
         """Change what is known of the pose: arguments of :class:`PosePrior`; None removes a limit."""
@@ -237,36 +341,35 @@ class Session:
 
     def request(self) -> RegisterOptions:
         """The registration that the inputs describe."""
-        return replace(
-            self.options,
-            photos=() if self.photo_path is None else (self.photo_path,),
-            meshes=() if self.mesh_path is None else (self.mesh_path,),
-            box=self.box,
-            camera=self.camera,
-            guess=self.guess,
-        )
+        shot, camera = self.shot, self.options.camera
+        if isinstance(camera, Camera):
+            K = camera.matrix if shot.photo is None else camera.at(_size(shot.photo)).matrix
+            camera = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+        photos, meshes = ([path] if path else [] for path in (shot.path, self.mesh_path))
+        return replace(self.options, photos=tuple(photos), meshes=tuple(meshes), box=shot.box, camera=camera)
 
     def command(self) -> str:
-        """The command line that gives the same result."""
-        return _command_line(self.request(), self.names)
+        """The command line that gives the same result; none takes the box of an undistorted photograph."""
+        return "" if self.is_undistorted else _command_line(self.request(), self.name)
 
     def register(self) -> Registration:
-        """Find the pose, as ``curvireg register`` does.
+        """Find the pose in the photograph that is shown, as ``curvireg register`` does.
 
         Raises:
             CurviregError: an input is missing or cannot be used, or the registration was cancelled or took too long.
         """
-        request, start, photo = self.request(), time.perf_counter(), self.photo
-        if photo is None or not request.meshes:
+        request, start, shot, camera = self.request(), time.perf_counter(), self.shot, self.options.camera
+        if shot.photo is None or not request.meshes:
             raise InvalidInputError("register: choose a photograph and a mesh first")
+        photo, command = shot.photo, self.command()
         check_camera(request.camera, request.guess)
-        names = {path: Path(name) for path, name in self.names.items()}
         try:
             with self._user_names():
                 registrar = self._open_registrar(request.meshes[0])
                 registrar.progress = self._report_progress
                 entry = request.entry(request.photos[0])
-                entry = replace(entry, name=self.names[entry.photo], meshes=tuple(names[p] for p in entry.meshes))
+                meshes = tuple(Path(self.name(path)) for path in entry.meshes)
+                entry = replace(entry, name=self.name(entry.photo), meshes=meshes)
                 ready = time.perf_counter() - start
                 registration, document = register_entry(entry, photo, registrar, bank_seconds=ready)
             self._report_progress("contours", 1, 1)  # it may have been stopped in the last step
@@ -274,51 +377,18 @@ class Session:
             raise (CurviregError("stopped") if self.cancelled else error) from None
         finally:
             self.cancelled = False
+        if isinstance(camera, Camera):
+            document["camera"] = camera.at(_size(photo)).describe()
+            document["inputs"]["camera_source"] = "file"
+        document["viewer"] = {"command": command}
         box = torch.tensor(used_box(document))
-        self.result = Result(registrar, registration, document, photo.image, box, request)
-        self.choose(0)
+        shot.result = Result(registrar, registration, document, photo.image, box, request)
+        shot.choose(0)
         return registration
-
-    def require_result(self) -> tuple[Result, Answer]:
-        """The result and the chosen pose; an error if there is none yet."""
-        if self.result is None or self.answer is None:
-            raise InvalidInputError("there is no result yet; register first")
-        return self.result, self.answer
-
-    def choose(self, number: int) -> None:
-        """Make a hypothesis the answer, by its number from 0."""
-        assert self.result is not None
-        self.answer_before = None
-        self.answer = Answer(self.result.registration.hypotheses[number], number)
-
-    def place(self, T: Tensor, edit: str = "") -> None:
-        """Move the answer to the (4, 4) pose ``T``; ``edit`` says how it was done, in words."""
-        result, answer = self.require_result()
-        describer, before = result.registrar.describer, answer.pose.projection[0]
-        degrees = float(rotation_error(T[:3, :3], before[:3, :3]))
-        centres = [pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (before, T)]
-        radii = float(torch.linalg.vector_norm(centres[1] - centres[0])) / describer.radius
-        edit = f"{edit or 'moved'}: rotated {degrees:.1f} degrees, shifted {radii:.2f} radii"
-        self.answer_before, self.answer = answer, answer.placed(describer.centre, T, edit)
-
-    def fit(self) -> None:
-        """Fit the contours at the answer to the photograph's edges."""
-        result, answer = self.require_result()
-        T, K = answer.pose.projection
-        registrar = result.registrar
-        margin = registrar.bank.settings.margin
-        fit = fit_contours(registrar.describer.contours, result.image, result.box, K, T[None], margin=margin)
-        supports = f"{float(fit.start_support[0]):.2f} to {float(fit.edge_support[0]):.2f}"
-        self.place(fit.transform[0], f"contours fitted, edge support {supports}")
-
-    def undo(self) -> None:
-        """Take back the last change by hand; a second call repeats it."""
-        if self.answer_before is not None:
-            self.answer, self.answer_before = self.answer_before, self.answer
 
     def document(self) -> dict[str, Any]:
         """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done by hand."""
-        result, answer = self.require_result()
+        result, answer = self.shot.require_result()
         document, registration = dict(result.document), answer.registration(result.registration)
         if registration is not result.registration:
             document |= registration.to_dict()
@@ -329,50 +399,38 @@ class Session:
                 first = {**first, "confidence": registration.confidence, **answer.pose.pose_dict()}
                 document["detection"] = {**document["detection"], "instances": [first, *others]}
         by_hand = {"hypothesis": answer.number, "by_hand": list(answer.edits)}
-        return {**document, "viewer": {"command": _command_line(result.request, self.names), **by_hand}}
+        return {**document, "viewer": {**document["viewer"], **by_hand}}
 
     def python(self) -> str:
         """A Python program that gives the answer."""
-        result, answer = self.require_result()
-        request, camera = result.request, result.document["inputs"]["camera"]
-        photo, mesh = self.names[request.photos[0]], self.names[request.meshes[0]]
-        prior = None if result.registration.prior is None else result.registration.prior.to_dict()
-        pipeline = f"Pipeline.read({str(request.pipeline)!r})" if request.pipeline else ""
-        pipeline = pipeline or f"PRESETS[{request.preset or DEFAULT!r}]"
-        pipeline += "" if request.pose is None else f".with_pose_prior({request.pose!r})"
-        if mesh.endswith(".safetensors"):
-            model, pipeline = f"cr.ViewBank.load({mesh!r})", "None" if request.bank_decides else pipeline
-        else:
-            model = f"cr.load_mesh({mesh!r}, unit={request.unit!r}, up={request.up!r})"
+        result, answer = self.shot.require_result()
+        request, prior = result.request, result.registration.prior
+        photo, mesh = repr(self.name(request.photos[0])), repr(self.name(request.meshes[0]))
+        if "undistorted" in result.document["inputs"]["picture"]["notes"]:
+            photo = f"cr.geometry.undistorted(cr.data.read_photo({photo}).image, cr.load_camera('CALIBRATION')).image"
+        model = f"cr.load_mesh({mesh}, unit={request.unit!r}, up={request.up!r})"
+        pipeline = "None" if request.preset is None else f"cr.pipeline.PRESETS[{request.preset!r}]"
+        pipeline = f"cr.Pipeline.read({str(request.pipeline)!r})" if request.pipeline else pipeline
+        if mesh.endswith(".safetensors'"):
+            model = f"cr.ViewBank.load({mesh})"
+        elif request.pose is not None:
+            pipeline = f"({pipeline if pipeline != 'None' else 'cr.Pipeline()'}).with_pose_prior({request.pose!r})"
         lines = [
             "import curvireg_torch as cr",
-            "from curvireg_torch.pipeline import PRESETS, Pipeline",
             "",
-            f"model, pipeline = {model}, {pipeline}",
-            f"registrar = cr.Registrar(model, pipeline=pipeline, mesh_is={request.mesh_is!r})",
-            f"box = {None if request.box is None else [list(request.box)]}",
-            f"camera = {None if camera is None else f'cr.camera_matrix(*{camera})'}",
-            f"prior = {None if prior is None else f'cr.PosePrior(**{prior})'}",
-            f"result = registrar([{photo!r}], box, camera, prior=prior)[0]",
+            f"registrar = cr.Registrar({model}, pipeline={pipeline}, mesh_is={request.mesh_is!r})",
+            f"prior = {None if prior is None else f'cr.PosePrior(**{prior.to_dict()})'}",
+            f"box, camera = {request.box}, {result.document['inputs']['camera']}",
+            f"result = cr.register({photo}, registrar, box=box, camera=camera, prior=prior)",
             f"pose = result.hypotheses[{answer.number}].pose_dict()",
         ]
         lines += [f"pose = {answer.pose.pose_dict()}  # corrected by hand"] if answer.edits else []
         return "\n".join([*lines, "print(pose)", ""])
 
-    def glb(self) -> bytes:
-        """The answer as a GLB file, see :func:`curvireg_torch.visualization.pose_glb`."""
-        result, answer = self.require_result()
-        return pose_glb(result.registrar.bank.mesh, *answer.pose.projection, result.image)
-
-    def overlay(self) -> bytes:
-        """The contours at the answer on the photograph, as a PNG file."""
-        result, answer = self.require_result()
-        return png(contour_overlay(result.registrar, answer.pose, result.image, result.box))
-
     def describe_warning(self, warning: Warning) -> str:
         """The text of a warning, with the user's name of its file."""
         if isinstance(warning, CurviregWarning):
-            warning = warning.with_subject(self.names.get(Path(warning.subject), warning.subject))
+            warning = warning.with_subject(self.name(warning.subject))
         return str(warning)
 
     def _report_progress(self, stage: str, done: int, total: int) -> None:
@@ -382,7 +440,7 @@ class Session:
 
     def _open_registrar(self, mesh: Path) -> Registrar:
         """The registrar of a mesh and the present options; the last one is reused."""
-        key = replace(self.options, meshes=(mesh,), limits=None)
+        key = replace(self.options, meshes=(mesh,), limits=None, camera=None, guess=None)
         if self._registrar is None or self._registrar[0] != key:
             self._registrar = key, open_registrar(key, key.meshes, progress=self._report_progress)
         return self._registrar[1]
@@ -393,26 +451,30 @@ class Session:
         try:
             yield
         except CurviregError as error:
-            raise error.with_subject(self.names.get(Path(error.subject), error.subject)) from error
+            raise error.with_subject(self.name(error.subject)) from error
 
 
-def _command_line(options: RegisterOptions, names: Mapping[Path, str]) -> str:
-    """``curvireg register`` with these options; ``names`` are what the user calls the files."""
+def _size(photo: Photo) -> tuple[int, int]:
+    return int(photo.image.shape[-2]), int(photo.image.shape[-1])
+
+
+def _command_line(options: RegisterOptions, name: Callable[[Path], str]) -> str:
+    """``curvireg register`` with these options; ``name`` tells what the user calls a file."""
     words = ["curvireg", "register"]
     for paths, placeholder in ((options.photos, "PHOTO"), (options.meshes, "MESH")):
-        words += [names[path] for path in paths] or [placeholder]
+        words += list(map(name, paths)) or [placeholder]
     limits = {} if options.limits is None or not options.limits.keys() - QUALIFIERS else dict(options.limits)
     values: dict[str, Any] = {
         "box": options.box,
         "camera": "exif" if options.guess == "exif" else options.camera,
         "fov": None if options.guess == "exif" else options.guess,
-        **{"near" if name == "viewpoint" else name: value for name, value in limits.items()},
-        **{name.replace("_", "-"): v for name in _OPTIONS if (v := getattr(options, name)) != _DEFAULTS[name]},
+        **{"near" if limit == "viewpoint" else limit: value for limit, value in limits.items()},
+        **{key.replace("_", "-"): v for key in _OPTIONS if (v := getattr(options, key)) != _DEFAULTS[key]},
     }
-    for name, value in values.items():
+    for option, value in values.items():
         if value is not None:
             texts = [v if isinstance(v, str) else _number(v) for v in (value if isinstance(value, tuple) else (value,))]
-            words += [f"--{name}={value}"] if isinstance(value, str) and value[0] == "-" else [f"--{name}", *texts]
+            words += [f"--{option}={value}"] if isinstance(value, str) and value[0] == "-" else [f"--{option}", *texts]
     return shlex.join([*words, "--out", "result"])
 
 

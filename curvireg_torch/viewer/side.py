@@ -1,6 +1,6 @@
 """The column beside the photograph: the answers to choose from, the model, and the inputs besides files and box."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -8,7 +8,7 @@ from nicegui import ui
 
 from ..errors import MAX_VIEWER_FACES
 from ..evaluation.store import to_json
-from ..geometry import rotation_error
+from ..geometry import Camera, rotation_error
 from ..mesh import mesh_radius, mesh_unit, mesh_up
 from ..registration.result import pose_in_words, remarks, verdict
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
@@ -30,6 +30,7 @@ VERDICTS = {
     "no match": "Probably it is not right: check the mesh, its unit and the box, or choose another answer.",
     "by hand": "You set this pose. How probable it is, nobody has measured.",
 }
+UNDISTORTED = "None: the command line takes the box in the photograph as it was taken, the page in the undistorted one."
 PROBABILITY = "estimated probability that this answer is within 30 degrees of the truth"
 AXES: Mapping[str | None, str] = {None: "as the format says", **{axis: axis for axis in UP_AXES}}
 POSES: Mapping[str | None, str] = {None: "default", "any": "any", "upright": "upright"}
@@ -58,17 +59,18 @@ class Answers:
 
     async def _download(self, kind: str) -> None:
         name, media_type = DOWNLOADS[kind]
+        shot = self.session.shot
         make = {
-            "picture": self.session.overlay,
+            "picture": shot.overlay,
             "result.json": lambda: to_json(self.session.document()).encode(),
-            "pose.glb": self.session.glb,
+            "pose.glb": shot.glb,
         }[kind]
         if content := await self.workspace.run("pose", make):
             ui.download.from_url(self.workspace.serve(name, content, media_type), name)
 
     async def refresh(self) -> None:
         """Show the answer of the session, if it changed."""
-        result, answer = self.session.result, self.session.answer
+        result, answer = self.session.shot.result, self.session.shot.answer
         self.section.set_visibility(answer is not None)
         if answer is not self.shown_answer:
             self.shown_answer = answer
@@ -82,7 +84,7 @@ class Answers:
             card.props(f"aria-pressed={'true' if answer and number == answer.number else 'false'}")
 
     def _describe(self) -> None:
-        result, answer = self.session.require_result()
+        result, answer = self.session.shot.require_result()
         document, pose = self.session.document(), answer.pose
         word = verdict(document["confidence"], document["none"], document["reliable"])
         word = "by hand" if answer.edits else word
@@ -110,25 +112,26 @@ class Answers:
     def _repairs(self, document: Mapping[str, Any], word: str) -> dict[str, Callable[[], None]]:
         """What one click can do about what the page says of the answer."""
         session, box, found = self.session, document["corrected_box"], dict[str, Callable[[], None]]()
+        shot, options = session.shot, session.options
 
-        def search_with(**inputs: Any) -> None:
-            for name, value in inputs.items():
-                setattr(session, name, value)
+        def search_with(**changes: Any) -> None:
+            shot.set_box(changes.pop("box", shot.box))
+            session.options = replace(session.options, **changes)
             self.workspace.start_search()
 
         if document.get("prior", {}).get("contradiction") is not None:
-            front = {name: value for name, value in (session.options.limits or {}).items() if name == "front"}
-            found["Search without the hint"] = lambda: search_with(options=replace(session.options, limits=front))
+            front = {name: value for name, value in (options.limits or {}).items() if name == "front"}
+            found["Search without the hint"] = lambda: search_with(limits=front)
         if box is not None:
             found["Search with that box"] = lambda: search_with(box=tuple(round(v, 1) for v in box))
-        if session.camera is None and session.guess is None and session.has_exif:
+        if options.camera is None and options.guess is None and session.has_exif:
             found["Search with the photograph's EXIF camera"] = lambda: search_with(guess="exif")
         if word == "no match":
-            found["Draw the box again"] = lambda: setattr(session, "box", None)
+            found["Draw the box again"] = lambda: shot.set_box(None)
         return found
 
     async def _draw_cards(self) -> None:
-        result, _ = self.session.require_result()
+        result, _ = self.session.shot.require_result()
         renderer, hypotheses = result.registrar.describer.renderer, result.registration.hypotheses
         probabilities = result.registration.probabilities or (None,) * len(hypotheses)
 
@@ -143,7 +146,7 @@ class Answers:
             url = self.workspace.serve(f"answer-{number}.jpeg", picture, "image/jpeg")
             card = region("button", "card", type="button", data_testid=f"answer-{number + 1}")
             card.move(self.cards)
-            card.on("click", lambda number=number: self.session.choose(number))
+            card.on("click", lambda number=number: self.session.shot.choose(number))
             with card:
                 region("img", src=url, alt=f"contours of answer {number + 1}")
                 text("span", f"Answer {number + 1}" + (f", {degrees:.0f}° from 1" if number else ""))
@@ -164,7 +167,11 @@ class Inputs:
             self._select("pose", "how it may stand", POSES)
             self._select("preset", "method", PRESETS)
         with fold("Camera", "camera"):
-            text("p", "With it the position is found, not only the rotation.", "facts")
+            text(
+                "p",
+                "With it the position is found. All photographs have the same: drop a calibration file, or type.",
+                "facts",
+            )
             with region("div", "numbers"):
                 self.camera = [self._number(f"camera-{n}", n, self._camera_typed) for n in ("fx", "fy", "cx", "cy")]
             self.fov = self._number("fov", "or the horizontal field of view, degrees", self._fov_typed)
@@ -188,41 +195,39 @@ class Inputs:
         select = ui.select(dict(choices), value=value, label=label, on_change=changed)
         self.selects[name] = select.props(f"dense options-dense data-testid={name}")
 
-    def _number(self, test_id: str, label: str, on_change: Callable[[], None]) -> Any:
-        def changed() -> None:
-            if not self._showing:
-                on_change()
+    def _number(self, test_id: str, label: str, on_change: Callable[[], Awaitable[None]]) -> Any:
+        return ui.number(label, on_change=lambda: None if self._showing else on_change()).props(
+            f"dense data-testid={test_id}"
+        )
 
-        return ui.number(label, on_change=changed).props(f"dense data-testid={test_id}")
-
-    def _camera_typed(self) -> None:
+    async def _camera_typed(self) -> None:
         fx, fy, cx, cy = (number.value for number in self.camera)
         if None not in (fx, fy, cx, cy):
-            self._set_camera((float(fx), float(fy), float(cx), float(cy)))
-        else:
-            self.session.camera = None
+            await self._set_camera((float(fx), float(fy), float(cx), float(cy)))
+        elif self.session.options.camera is not None:
+            await self._set_camera()
 
-    def _fov_typed(self) -> None:
+    async def _fov_typed(self) -> None:
         if self.fov.value is not None:
-            self._set_camera(guess=float(self.fov.value))
-        elif self.session.guess != "exif":
-            self.session.guess = None
+            await self._set_camera(guess=float(self.fov.value))
+        elif self.session.options.guess != "exif":
+            await self._set_camera()
 
-    def _set_camera(self, camera: Any = None, guess: str | float | None = None) -> None:
-        self.session.camera, self.session.guess = camera, guess
+    async def _set_camera(self, camera: Any = None, guess: str | float | None = None) -> None:
+        await self.workspace.run("page", lambda: self.session.set_camera(camera, guess), stop=True)
 
     def refresh(self) -> None:
         """Show what changed in the session since the last time, here or in another window."""
         session = self.session
-        set_text(self.command, session.command())
-        set_text(self.python, "" if session.answer is None else session.python())
-        now = (session.camera, session.guess, session.photo_path, session.options)
+        set_text(self.command, session.command() or UNDISTORTED)
+        set_text(self.python, "" if session.shot.answer is None else session.python())
+        now = (session.shot.path, session.options)
         if now == self.shown:
             return
-        self.shown, self._showing = now, True
-        for number, value in zip(self.camera, session.camera or (None,) * 4, strict=True):
+        self.shown, self._showing, camera = now, True, session.request().camera
+        for number, value in zip(self.camera, camera or (None,) * 4, strict=True):
             number.value = value
-        self.fov.value = session.guess if isinstance(session.guess, float) else None
+        self.fov.value = session.options.guess if isinstance(session.options.guess, float) else None
         for name, select in self.selects.items():
             select.value = getattr(session.options, name)
         self._showing = False
@@ -230,14 +235,19 @@ class Inputs:
         set_text(self.camera_facts, self._describe_camera())
 
     def _describe_camera(self) -> str:
-        session = self.session
-        if session.guess == "exif" and session.photo is not None:
-            focal = session.photo.focal_35mm
-            source = f"{focal:g} mm of a 35 mm camera: no covariance" if focal else "which has no focal length"
+        options, photo = self.session.options, self.session.shot.photo
+        if options.guess == "exif" and photo is not None:
+            source = (
+                f"{photo.focal_35mm:g} mm of a 35 mm camera: no covariance"
+                if photo.focal_35mm
+                else "has no focal length"
+            )
             return f"guessed from the photograph's EXIF, {source}"
-        if session.guess is not None:
+        if options.guess is not None:
             return "guessed from the field of view: no covariance"
-        return "" if session.camera is not None else "unknown: the result is a rotation without translation"
+        if isinstance(options.camera, Camera):
+            return "from a calibration file" + (", without its distortion" if self.session.is_undistorted else "")
+        return "" if options.camera is not None else "unknown: the result is a rotation without translation"
 
 
 class Preview:

@@ -52,11 +52,6 @@ class Browser:
         self.driver.get(address)
         self.wait(lambda: self.part("register"), "the page")
 
-    @property
-    def page(self):
-        """The name of the page in its address."""
-        return self.driver.current_url.rsplit("/", 1)[1]
-
     def part(self, name):
         return self.driver.find_element("css selector", f'[data-testid="{name}"]')
 
