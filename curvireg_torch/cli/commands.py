@@ -6,11 +6,20 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from ..errors import InvalidInputError, MissingDependencyError
+from ..errors import InvalidInputError
 from ..evaluation.opening import whole_number
 from ..utils.choices import check_given
 from ..utils.files import check_writable, write_file
-from .options import MESH, METHOD, PHOTOGRAPH, add_command, add_limits, add_options, register_options
+from .options import (
+    MESH,
+    METHOD,
+    PHOTOGRAPH,
+    add_command,
+    add_limits,
+    add_options,
+    check_viewer,
+    register_options,
+)
 
 LOCAL = "127.0.0.1"
 PICTURES = {
@@ -113,11 +122,7 @@ def view(arguments: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C."""
     photos, meshes = ([path] if path else [] for path in (arguments.photo, arguments.mesh))
     check_given(photos, meshes)
-    try:
-        import nicegui  # noqa: F401
-    except ImportError as error:
-        message = f"curvireg view: {error.name} is not installed; in the folder of curvireg_torch: pip install -e "
-        raise MissingDependencyError(f"{message}'.[viewer]'") from error
+    check_viewer("view")
     from ..evaluation.opening import check_camera
     from ..utils.threads import one_torch_thread
     from ..viewer.server import serve

@@ -124,7 +124,7 @@ class Steps:
         set_text(self.facts["mesh"], self._describe_mesh())
         set_text(self.facts["box"], BOX_HINT if shot.box is None else " ".join(f"{v:g}" for v in shot.box))
         self.no_box.set_visibility(shot.box is not None)
-        self.no_photo.set_visibility(shot.photo is not None)
+        self.no_photo.set_visibility(len(session.shots) > 1)
         self.use_mm.set_visibility("(mm?)" in workspace.messages.get("mesh", "") and session.options.unit != "mm")
         set_text(self.find, "Find the pose" if shot.box or shot.photo is None else "Find the object and its pose")
         set_enabled(self.find, bool(done["photograph"] and done["mesh"]) and not workspace.searching)

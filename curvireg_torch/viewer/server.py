@@ -9,6 +9,7 @@ import threading
 import warnings
 import webbrowser
 from pathlib import Path
+from typing import TextIO
 from urllib.parse import unquote, urlsplit
 
 import uvicorn
@@ -63,7 +64,9 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
             server.run(sockets=[listener])
 
 
-def make_server(listener: socket.socket, host: str, *, browser: bool) -> uvicorn.Server:
+def make_server(
+    listener: socket.socket, host: str, *, browser: bool, printed_to: TextIO | None = None
+) -> uvicorn.Server:
     """A guarded server of the application of NiceGUI, whose secret address is printed, and perhaps opened."""
     prefix = f"/{secrets.token_urlsafe(16)}"
     site = FastAPI(openapi_url=None)
@@ -80,7 +83,7 @@ def make_server(listener: socket.socket, host: str, *, browser: bool) -> uvicorn
     # h11 refuses requests with two hosts.
     config = uvicorn.Config(guarded(site, host), log_level="warning", server_header=False, ws="wsproto", http="h11")
     addresses = [f"http://{name}{prefix}/" for name in public_addresses(host, listener.getsockname()[1])]
-    print(f"curvireg: {addresses[0]}   (Ctrl-C ends it)", flush=True)
+    print(f"curvireg: {addresses[0]}   (Ctrl-C ends it)", flush=True, file=printed_to)
     if host not in _LOOPBACK:
         print("curvireg: everyone who reaches this machine with this address can use the page", file=sys.stderr)
     if browser:

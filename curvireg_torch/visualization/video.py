@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 from torch import Tensor
 
 from ..errors import LostObjectError
@@ -14,7 +15,7 @@ from ..registration import FailedRegistration, Registrar, Registration
 from ..registration.result import verdict
 from .contours import draw_window
 
-__all__ = ["OverlayVideo"]
+__all__ = ["OverlayVideo", "annotated_frame"]
 
 _LONGER_SIDE = 960  # of the frames in px; larger ones are scaled down
 _NO_POSE = (255, 90, 80)
@@ -33,7 +34,6 @@ class OverlayVideo:
 
     Example:
         >>> import tempfile
-        >>> import torch
         >>> import curvireg_torch as cr
         >>> from curvireg_torch.synthetic import example_mesh
         >>> bank = cr.ViewBank.build(example_mesh(), cr.sample_views(azimuth_step=90), image_size=64, progress=False)
@@ -58,14 +58,12 @@ class OverlayVideo:
         if image is None:
             if self._writer is None:
                 return
-            picture = np.zeros((self._size[1], self._size[0], 3), np.uint8)
-        else:
-            picture = draw_frame(self.registrar, image, result)
-            if self._writer is None:
-                self._writer = self._open(picture)
-            if picture.shape[1::-1] != self._size:
-                picture = np.asarray(cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA))
-        _write_caption(picture, result)
+            image = torch.zeros(3, self._size[1], self._size[0], dtype=torch.uint8)
+        picture = annotated_frame(self.registrar, image, result)
+        if self._writer is None:
+            self._writer = self._open(picture)
+        if picture.shape[1::-1] != self._size:
+            picture = np.asarray(cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA))
         self._writer.write(picture[..., ::-1])
 
     def _open(self, picture: np.ndarray) -> cv2.VideoWriter:
@@ -90,13 +88,19 @@ class OverlayVideo:
         self.close()
 
 
-def draw_frame(registrar: Registrar, image: Tensor, result: Registration | FailedRegistration) -> np.ndarray:
-    """(H, W, 3) uint8 of the image, of at most 960 px, with the contours of the mesh if there is a pose."""
+def annotated_frame(registrar: Registrar, image: Tensor, result: Registration | FailedRegistration) -> np.ndarray:
+    """(H, W, 3) uint8 of the image, of at most 960 px, with the mesh's contours if there is a pose, and a caption."""
     H, W = image.shape[-2:]
     found = isinstance(result, Registration)
     renderer = registrar.of_model(result.model if found else 0).describer.renderer
     scale = min(1.0, _LONGER_SIDE / max(H, W))
-    return draw_window(renderer, result.projection if found else None, image, (0, 0, W, H), scale)
+    picture = draw_window(renderer, result.projection if found else None, image, (0, 0, W, H), scale)
+    text, colour = caption(result)
+    scale = max(0.4, picture.shape[1] / 1200)
+    (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    cv2.rectangle(picture, (0, 0), (width + 12, height + below + 6), (0, 0, 0), cv2.FILLED)
+    cv2.putText(picture, text, (6, height + 4), cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
+    return picture
 
 
 def caption(result: Registration | FailedRegistration) -> tuple[str, tuple[int, int, int]]:
@@ -106,11 +110,3 @@ def caption(result: Registration | FailedRegistration) -> tuple[str, tuple[int, 
     word = verdict(result.confidence, result.none, result.reliable)
     number = "" if result.confidence is None else f", confidence {result.confidence:.2f}"
     return word + number, _COLOURS[word]
-
-
-def _write_caption(picture: np.ndarray, result: Registration | FailedRegistration) -> None:
-    text, colour = caption(result)
-    scale = max(0.4, picture.shape[1] / 1200)
-    (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
-    cv2.rectangle(picture, (0, 0), (width + 12, height + below + 6), (0, 0, 0), cv2.FILLED)
-    cv2.putText(picture, text, (6, height + 4), cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)

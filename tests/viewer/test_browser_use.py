@@ -208,3 +208,33 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     browser.click("use-mm")
     browser.wait(lambda: browser.text("mesh-facts").endswith(" mm, rendered in grey"), "in mm")
     browser.wait(lambda: browser.messages() == [], "all gone")
+
+
+def test_each_of_several_photographs_keeps_its_box_and_a_calibration_is_for_all(browser, folder):
+    browser.drop(folder / "photo.png", folder / "other.png")
+    browser.wait(lambda: browser.text("photograph-facts").startswith("other.png: "), "the second")
+    browser.wait(lambda: not browser.text("box-facts")[0].isdigit(), "no box yet")
+    browser.drag((20, 30), (120, 90), 240)
+    browser.wait(lambda: browser.box() == pytest.approx([20, 30, 120, 90], abs=0.5), "its box")
+    thumbnails = browser.part("strip").find_elements("css selector", "img")
+    assert [image.get_attribute("alt") for image in thumbnails][-2:] == ["photo.png", "other.png"]
+    for number, is_there in ((len(thumbnails) - 1, False), (len(thumbnails), True)):
+        browser.click(f"photograph-{number}")
+        browser.wait(lambda is_there=is_there: (browser.box() is not None) == is_there, f"box of {number}")
+    browser.emulate(1440, 900)
+    browser.picture("viewer-strip")
+    (folder / "cam.yaml").write_text(
+        "%YAML:1.0\n---\nimage_width: 240\nimage_height: 180\n"
+        "camera_matrix: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n"
+        "  data: [250., 0., 119.5, 0., 250., 89.5, 0., 0., 1.]\n"
+        "distortion_coefficients: !!opencv-matrix\n  rows: 1\n  cols: 5\n  dt: d\n  data: [-0.3, 0.1, 0., 0., 0.]\n"
+    )
+    browser.drop(folder / "cam.yaml")
+    browser.wait(lambda: browser.text("photograph-facts").endswith("; undistorted"), "undistorted")
+    browser.unfold("camera")
+    browser.wait(lambda: browser.text("camera-facts") == "from a calibration file, without its distortion", "facts")
+    browser.picture("viewer-camera")
+    strip = browser.part("strip")
+    for left in (*range(len(thumbnails) - 1, 1, -1), 0):  # the last one needs no strip
+        browser.click("no-photo")
+        browser.wait(lambda n=left: len(strip.find_elements("css selector", "img")) == n, f"{left} left")

@@ -1,0 +1,75 @@
+"""A page with the latest frame of a video and the contours of its pose: ``curvireg follow --show``."""
+
+import sys
+import threading
+from types import TracebackType
+from typing import Any, Self
+
+from nicegui import app, ui
+from starlette.responses import Response
+from torch import Tensor
+
+from ..registration import FailedRegistration, Registrar, Registration
+from ..visualization.encoding import jpeg
+from ..visualization.video import annotated_frame
+from .server import listen, make_server
+
+__all__ = ["LivePage"]
+
+HOST = "127.0.0.1"
+TICK_SECONDS = 0.04  # between two looks for a new frame
+QUALITY = 80  # of the JPEG files
+STOP_SECONDS = 5.0  # that the server may take to end
+
+
+class LivePage:
+    """Serves the latest frame in a thread; a frame is drawn only once the one before has reached a browser.
+
+    As a context manager, it listens on this machine while it is open.
+
+    Args:
+        registrar: whose mesh is drawn.
+        browser: open the page.
+    """
+
+    def __init__(self, registrar: Registrar, *, browser: bool = True) -> None:
+        self.registrar, self.browser = registrar, browser
+        self.frame, self.number = b"", 0
+        self._wanted = True
+
+    def __enter__(self) -> Self:
+        app.get("/frame")(self._send)
+        ui.page("/")(self._build)
+        self._listener = listen(HOST, 0)
+        self._server = make_server(self._listener, HOST, browser=self.browser, printed_to=sys.stderr)
+        self._thread = threading.Thread(target=self._server.run, args=([self._listener],), daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._server.should_exit = True
+        self._server.force_exit = True  # browsers keep their channels open
+        self._thread.join(STOP_SECONDS)
+        self._listener.close()
+
+    def show(self, image: Tensor | None, result: Registration | FailedRegistration) -> None:
+        """Take the next frame; dropped while the one before is on its way."""
+        if self._wanted and image is not None:
+            self._wanted = False
+            self.frame = jpeg(annotated_frame(self.registrar, image, result), QUALITY)
+            self.number += 1
+
+    def _send(self) -> Response:
+        self._wanted = True
+        return Response(self.frame, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
+
+    def _build(self) -> None:
+        picture: Any = ui.interactive_image().style("width: min(100%, 80rem)").props("data-testid=live")
+        picture.shown = 0
+
+        def refresh() -> None:
+            if picture.shown != self.number:
+                picture.shown = self.number
+                picture.set_source(f"frame?{self.number}")
+
+        ui.timer(TICK_SECONDS, refresh)
