@@ -23,39 +23,38 @@ STOP_SECONDS = 5.0  # that the server may take to end
 
 
 class LivePage:
-    """Serves the latest frame in a thread; a frame is drawn only once the one before has reached a browser.
+    """Opens a page that shows the latest frame; a frame is drawn only once the one before has reached a browser.
 
-    As a context manager, it listens on this machine while it is open.
+    As a context manager, it serves the page on this machine, in a thread.
 
     Args:
         registrar: whose mesh is drawn.
-        browser: open the page.
     """
 
-    def __init__(self, registrar: Registrar, *, browser: bool = True) -> None:
-        self.registrar, self.browser = registrar, browser
-        self.frame, self.number = b"", 0
+    def __init__(self, registrar: Registrar) -> None:
+        self.registrar, self.frame, self.number, self.ratio = registrar, b"", 0, 1.0
         self._wanted = True
 
     def __enter__(self) -> Self:
         app.get("/frame")(self._send)
         ui.page("/")(self._build)
         self._listener = listen(HOST, 0)
-        self._server = make_server(self._listener, HOST, browser=self.browser, printed_to=sys.stderr)
+        self._server = make_server(self._listener, HOST, browser=True, printed_to=sys.stderr)
         self._thread = threading.Thread(target=self._server.run, args=([self._listener],), daemon=True)
         self._thread.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._server.should_exit = True
-        self._server.force_exit = True  # browsers keep their channels open
         self._thread.join(STOP_SECONDS)
         self._listener.close()
 
     def show(self, image: Tensor | None, result: Registration | FailedRegistration) -> None:
         """Take the next frame; dropped while the one before is on its way."""
         if self._wanted and image is not None:
-            self._wanted = False
+            self._wanted, self.ratio = False, image.shape[-1] / image.shape[-2]
             self.frame = jpeg(annotated_frame(self.registrar, image, result), QUALITY)
             self.number += 1
 
@@ -64,12 +63,13 @@ class LivePage:
         return Response(self.frame, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
 
     def _build(self) -> None:
-        picture: Any = ui.interactive_image().style("width: min(100%, 80rem)").props("data-testid=live")
+        picture: Any = ui.interactive_image().props("data-testid=live")
         picture.shown = 0
 
         def refresh() -> None:
             if picture.shown != self.number:
                 picture.shown = self.number
                 picture.set_source(f"frame?{self.number}")
+                picture.style(f"width: min(100%, {95 * self.ratio:.1f}vh)")
 
         ui.timer(TICK_SECONDS, refresh)
