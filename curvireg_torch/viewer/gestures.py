@@ -6,7 +6,7 @@ from torch import Tensor
 
 from .session import Numbers, Result
 
-__all__ = ["dragged_box", "dragged_pose", "nudged_box", "scaled_pose"]
+__all__ = ["dragged_box", "dragged_pose", "scaled_pose"]
 
 Point = tuple[float, float]
 
@@ -39,14 +39,6 @@ def _near_edges(at: float, low: float, high: float, reach: float) -> tuple[bool,
     """Whether the low or the high edge is near; inside, at most a third of the box is near to an edge."""
     inside = min(reach, (high - low) / 3)
     return at <= low + inside, at > low + inside and at >= high - inside
-
-
-def nudged_box(box: Numbers, dx: float, dy: float, *, resize: bool) -> Numbers:
-    """A box moved by px, or only its right and lower edges."""
-    x0, y0, x1, y1 = box
-    if resize:
-        return x0, y0, max(x1 + dx, x0 + MIN_SIDE), max(y1 + dy, y0 + MIN_SIDE)
-    return x0 + dx, y0 + dy, x1 + dx, y1 + dy
 
 
 def dragged_pose(result: Result, T: Tensor, K: Tensor, start: Point, end: Point, *, turns: bool) -> Tensor:

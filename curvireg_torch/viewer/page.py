@@ -36,7 +36,7 @@ class Page:
     """One browser window. It holds nothing: several times a second it shows what changed in its workspace."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace, self._busy = workspace, False
+        self.workspace = workspace
 
     def build(self) -> None:
         """Lay out the page."""
@@ -57,17 +57,11 @@ class Page:
         ui.timer(TICK_SECONDS, self._refresh)
 
     async def _refresh(self) -> None:
-        if self._busy:  # still drawing
-            return
-        self._busy = True
-        try:
-            self.steps.refresh()
-            self.inputs.refresh()
-            await self.stage.refresh()
-            await self.answers.refresh()
-            await self.preview.refresh()
-        finally:
-            self._busy = False
+        self.steps.refresh()
+        self.inputs.refresh()
+        await self.stage.refresh()
+        await self.answers.refresh()
+        await self.preview.refresh()
 
 
 class Steps:
@@ -75,16 +69,16 @@ class Steps:
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace, self.session = workspace, workspace.session
-        self.cards: dict[str, Any] = {}
-        self.facts: dict[str, Any] = {}
-        self.messages: dict[str, Any] = {}
+        self.cards, self.facts, self.messages = dict[str, Any](), dict[str, Any](), dict[str, Any]()
         with region("ol", "steps"):
             for number, name in enumerate(("photograph", "mesh", "box"), start=1):
                 with region("li", "step", data_testid=f"step-{name}") as self.cards[name]:
                     text("h2", name.capitalize(), data_number=str(number))
                     self.facts[name] = text("p", "", "facts", data_testid=f"{name}-facts")
                     if name == "box":
-                        self.no_box = button("Remove the box", self._remove_box, "no-box", "quiet")
+                        self.no_box = button(
+                            "Remove the box", lambda: self.session.shot.set_box(None), "no-box", "quiet"
+                        )
                     else:
                         file_chooser("Choose files", f"upload-{name}")
                         self.messages[name] = self._message(name)
@@ -109,9 +103,6 @@ class Steps:
     def _find(self) -> None:
         self.workspace.start_search()  # the task outlives the page
 
-    def _remove_box(self) -> None:
-        self.session.shot.set_box(None)
-
     def refresh(self) -> None:
         """Show the state of the workspace."""
         session, workspace, shot = self.session, self.workspace, self.session.shot
@@ -131,11 +122,11 @@ class Steps:
         self._show_progress()
 
     def _describe_photo(self) -> str:
-        photo = self.session.shot.photo
-        if photo is None:
+        shot = self.session.shot
+        if shot.photo is None:
             return "A picture with the whole object in it, or several of the same object."
-        H, W = photo.image.shape[-2:]
-        return "; ".join([f"{self.session.name(self.session.shot.path)}: {W} x {H} px", *photo.notes])
+        H, W = shot.size
+        return "; ".join([f"{self.session.name(shot.path)}: {W} x {H} px", *shot.photo.notes])
 
     def _describe_mesh(self) -> str:
         path = self.session.mesh_path

@@ -82,12 +82,13 @@ def make_server(
     )
     # h11 refuses requests with two hosts.
     config = uvicorn.Config(guarded(site, host), log_level="warning", server_header=False, ws="wsproto", http="h11")
-    addresses = [f"http://{name}{prefix}/" for name in public_addresses(host, listener.getsockname()[1])]
-    print(f"curvireg: {addresses[0]}   (Ctrl-C ends it)", flush=True, file=printed_to)
+    name = socket.gethostname() if host in _EVERYONE else f"[{host}]" if ":" in host else host
+    address = f"http://{name}:{listener.getsockname()[1]}{prefix}/"
+    print(f"curvireg: {address}   (Ctrl-C ends it)", flush=True, file=printed_to)
     if host not in _LOOPBACK:
         print("curvireg: everyone who reaches this machine with this address can use the page", file=sys.stderr)
     if browser:
-        threading.Timer(0.5, webbrowser.open, (addresses[-1],)).start()
+        threading.Timer(0.5, webbrowser.open, (address,)).start()
     return uvicorn.Server(config)
 
 
@@ -99,18 +100,6 @@ def listen(host: str, port: int) -> socket.socket:
         if error.errno == errno.EADDRINUSE:
             raise InvalidInputError(f"--port {port}: in use by another program; leave it out for a free one") from None
         raise InvalidInputError(f"--host {host} --port {port}: {error.strerror}") from None
-
-
-def public_addresses(host: str, port: int) -> list[str]:
-    """Hosts with ports under which a server that listens on ``host`` is reached, the best first.
-
-    Example:
-        >>> public_addresses("::1", 8080)
-        ['[::1]:8080']
-    """
-    if host not in _EVERYONE:
-        return [f"[{host}]:{port}" if ":" in host else f"{host}:{port}"]
-    return [f"{socket.gethostname()}:{port}", f"127.0.0.1:{port}"]
 
 
 def guarded(site: ASGIApp, host: str) -> ASGIApp:

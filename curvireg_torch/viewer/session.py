@@ -22,18 +22,17 @@ from ..geometry import rotation_error, rotation_from_axis_angle, undistorted
 from ..geometry.calibration import Camera
 from ..geometry.cameras import rotation_towards, transform
 from ..geometry.pose_prior import object_frame
-from ..geometry.viewpoint import viewpoint_from_rotation
 from ..matching import ViewBank
 from ..mesh import has_colours, load_mesh, mesh_centre, mesh_radius, mesh_up
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
 from ..registration.result import used_box
 from ..visualization import contour_overlay, pose_glb
 from ..visualization.encoding import png
+from ..visualization.pose_glb import mesh_glb
 
 __all__ = ["Answer", "Result", "Session", "Shot"]
 
 HINT_WIDTH = 45.0  # degrees by which the pose may differ from a hint
-PREVIEW_DEPTH = 2.0  # radii by which the mesh of a preview is below the origin: its format knows what is in view
 NEAREST = 1.2  # least depth of the object's centre, in its radii, to which it can be moved by hand
 
 Numbers = tuple[float, float, float, float]
@@ -58,25 +57,6 @@ class Answer:
         probabilities = () if self.edits or not found.probabilities else tuple(found.probabilities[k] for k in order)
         hypotheses = (self.pose, *(found.hypotheses[k] for k in order[1:]))
         return replace(found, hypotheses=hypotheses, probabilities=probabilities, confidence_features={})
-
-    def placed(self, centre: Tensor, T: Tensor, edit: str) -> "Answer":
-        """Return it at (4, 4) ``T_cam_from_model``, without its measurements; ``centre`` (3,) is that of the mesh."""
-        position = T[:3, :3] @ centre + T[:3, 3]
-        allocentric = rotation_towards(position).mT @ T[:3, :3]
-        has_translation = self.pose.translation is not None
-        pose = replace(
-            self.pose,
-            rotation=T[:3, :3].clone() if has_translation else allocentric,
-            translation=T[:3, 3].clone() if has_translation else None,
-            score=float("nan"),
-            evidence={},
-            allocentric_rotation=allocentric,
-            distance=float(torch.linalg.vector_norm(position)),
-            projection=(T, self.pose.projection[1]),
-            edge_support=None,
-            covariance=None,
-        )
-        return replace(self, pose=pose, edits=(*self.edits, edit))
 
 
 @dataclass(frozen=True)
@@ -121,13 +101,19 @@ class Shot:
         answer_before: the answer before the last change by hand.
     """
 
-    path: Path | None = None
+    path: Path = Path()
     photo: Photo | None = None
     box: Numbers | None = None
     box_before: Numbers | None = None
     result: Result | None = None
     answer: Answer | None = None
     answer_before: Answer | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W) of the photograph."""
+        assert self.photo is not None
+        return int(self.photo.image.shape[-2]), int(self.photo.image.shape[-1])
 
     def set_box(self, box: Numbers | None) -> None:
         """Replace the box."""
@@ -146,21 +132,33 @@ class Shot:
         self.answer_before = None
         self.answer = Answer(self.result.registration.hypotheses[number], number)
 
-    def place(self, T: Tensor, edit: str = "") -> None:
-        """Move the answer to the (4, 4) pose ``T``; ``edit`` says how it was done, in words."""
+    def place(self, T: Tensor, edit: str = "moved") -> None:
+        """Move the answer to (4, 4) ``T_cam_from_model``, without its measurements; ``edit`` says how, in words."""
         result, answer = self.require_result()
-        describer, before = result.registrar.describer, answer.pose.projection[0]
+        describer, (before, K) = result.registrar.describer, answer.pose.projection
+        old, centre = (pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (before, T))
         degrees = float(rotation_error(T[:3, :3], before[:3, :3]))
-        centres = [pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (before, T)]
-        radii = float(torch.linalg.vector_norm(centres[1] - centres[0])) / describer.radius
-        edit = f"{edit or 'moved'}: rotated {degrees:.1f} degrees, shifted {radii:.2f} radii"
-        self.answer_before, self.answer = answer, answer.placed(describer.centre, T, edit)
+        radii = float(torch.linalg.vector_norm(centre - old)) / describer.radius
+        allocentric, has_translation = rotation_towards(centre).mT @ T[:3, :3], answer.pose.translation is not None
+        pose = replace(
+            answer.pose,
+            rotation=T[:3, :3].clone() if has_translation else allocentric,
+            translation=T[:3, 3].clone() if has_translation else None,
+            score=float("nan"),
+            evidence={},
+            allocentric_rotation=allocentric,
+            distance=float(torch.linalg.vector_norm(centre)),
+            projection=(T, K),
+            edge_support=None,
+            covariance=None,
+        )
+        edit = f"{edit}: rotated {degrees:.1f} degrees, shifted {radii:.2f} radii"
+        self.answer_before, self.answer = answer, Answer(pose, answer.number, (*answer.edits, edit))
 
     def fit(self) -> None:
         """Fit the contours at the answer to the photograph's edges."""
         result, answer = self.require_result()
-        T, K = answer.pose.projection
-        registrar = result.registrar
+        (T, K), registrar = answer.pose.projection, result.registrar
         margin = registrar.bank.settings.margin
         fit = fit_contours(registrar.describer.contours, result.image, result.box, K, T[None], margin=margin)
         supports = f"{float(fit.start_support[0]):.2f} to {float(fit.edge_support[0]):.2f}"
@@ -213,9 +211,9 @@ class Session:
             self.open_photo(path).box = options.box
         return "".join([self.open_mesh(path) for path in options.meshes])
 
-    def name(self, path: str | Path | None) -> str:
+    def name(self, path: str | Path) -> str:
         """What the user calls a file."""
-        return Path(path).name if path and self.folder in Path(path).parents else str(path or "")
+        return Path(path).name if self.folder in Path(path).parents else str(path)
 
     def close(self) -> None:
         """Forget the photographs and the mesh."""
@@ -240,14 +238,14 @@ class Session:
     def _read(self, path: Path) -> Photo:
         """A photograph without the distortion of a calibrated camera, which must be one of such photographs."""
         with self._user_names():
-            photo = read_photo(path, dtype=torch.uint8)
-        if not isinstance(self.options.camera, Camera):
-            return photo
-        try:
-            image = undistorted(photo.image, self.options.camera).image
-        except InvalidInputError as error:
-            raise error.with_subject(self.name(path)) from error
-        return replace(photo, image=image, notes=(*photo.notes, *(["undistorted"] if self.is_undistorted else [])))
+            photo, camera = read_photo(path, dtype=torch.uint8), self.options.camera
+            if not isinstance(camera, Camera):
+                return photo
+            try:
+                seen = undistorted(photo.image, camera)
+            except InvalidInputError as error:
+                raise error.with_subject(path) from error
+        return replace(photo, image=seen.image, notes=(*photo.notes, *["undistorted"] * camera.distorts))
 
     @property
     def is_undistorted(self) -> bool:
@@ -264,15 +262,14 @@ class Session:
         """
         before, was_undistorted = self.options, self.is_undistorted
         self.options = replace(before, camera=camera, guess=guess)
-        if isinstance(camera, Camera) or was_undistorted:
+        if self.shots and (isinstance(camera, Camera) or was_undistorted):
             try:
-                photos = [self._read(shot.path) for shot in self.shots if shot.path is not None]
+                shots = [Shot(shot.path, self._read(shot.path)) for shot in self.shots]
             except CurviregError:
                 self.options = before
                 raise
-            for shot, photo in zip(self.shots, photos, strict=True):
-                if self.is_undistorted or was_undistorted:
-                    shot.photo, shot.box, shot.box_before, shot.result, shot.answer = photo, None, None, None, None
+            if self.is_undistorted or was_undistorted:
+                self.shot, self.shots = shots[self.shots.index(self.shot)], shots
 
     def open_calibration(self, path: Path) -> None:
         """Take the camera of a calibration file for all photographs."""
@@ -316,37 +313,32 @@ class Session:
 
     def hint_direction(self, position: Sequence[float]) -> None:
         """Limit the pose to views like that from a point beside the object, in the frame of limits, z up."""
-        forward = -torch.tensor(list(position), dtype=torch.float64)
-        right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-        R = torch.nn.functional.normalize(torch.stack([right, torch.linalg.cross(forward, right), forward]), dim=1)
-        azimuth, elevation, _ = (round(float(v), 1) for v in viewpoint_from_rotation(R))
+        x, y, z = position
+        azimuth, elevation = math.degrees(math.atan2(x, -y)) % 360.0, math.degrees(math.atan2(z, math.hypot(x, y)))
         self.remove_limits()
-        self.set_limits(viewpoint=(azimuth % 360.0, elevation, 0.0), within=HINT_WIDTH)
+        self.set_limits(viewpoint=(round(azimuth, 1), round(elevation, 1), 0.0), within=HINT_WIDTH)
 
     def mesh_axis(self, position: Sequence[float]) -> str:
         """The mesh's axis that points to a point on its surface, in the frame of limits about the object's centre."""
-        x, y, z = (self.object_frame().mT @ torch.tensor(list(position), dtype=torch.float64)).tolist()
-        value, name = max(((abs(v), v), axis) for v, axis in zip((x, y, z), "xyz", strict=True))
-        return name if value[1] > 0 else f"-{name}"
+        at = self.object_frame().mT @ torch.tensor(list(position), dtype=torch.float64)
+        axis = int(at.abs().argmax())
+        return ("" if at[axis] > 0 else "-") + "xyz"[axis]
 
     def preview(self) -> bytes:
-        """The mesh as a GLB file, in the frame of limits and its radii; :data:`PREVIEW_DEPTH` below the origin."""
+        """The mesh as a GLB file, in the frame of limits and its radii."""
         assert self.mesh is not None
         frame, radius = self.object_frame(), mesh_radius(self.mesh)
-        T = transform(frame, -frame @ mesh_centre(self.mesh))
-        T = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)) @ T  # back from glTF's axes
-        T[2, 3] += PREVIEW_DEPTH * radius
-        K = torch.tensor([[8.0, 0.0, 3.5], [0.0, 8.0, 3.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
-        return pose_glb(self.mesh, T, K, torch.zeros(3, 8, 8), photograph=False)
+        return mesh_glb(self.mesh, transform(frame, -frame @ mesh_centre(self.mesh)) / radius)
 
     def request(self) -> RegisterOptions:
         """The registration that the inputs describe."""
         shot, camera = self.shot, self.options.camera
         if isinstance(camera, Camera):
-            K = camera.matrix if shot.photo is None else camera.at(_size(shot.photo)).matrix
+            K = camera.matrix if shot.photo is None else camera.at(shot.size).matrix
             camera = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-        photos, meshes = ([path] if path else [] for path in (shot.path, self.mesh_path))
-        return replace(self.options, photos=tuple(photos), meshes=tuple(meshes), box=shot.box, camera=camera)
+        photos = () if shot.photo is None else (shot.path,)
+        meshes = () if self.mesh_path is None else (self.mesh_path,)
+        return replace(self.options, photos=photos, meshes=meshes, box=shot.box, camera=camera)
 
     def command(self) -> str:
         """The command line that gives the same result; none takes the box of an undistorted photograph."""
@@ -378,7 +370,7 @@ class Session:
         finally:
             self.cancelled = False
         if isinstance(camera, Camera):
-            document["camera"] = camera.at(_size(photo)).describe()
+            document["camera"] = camera.at(shot.size).describe()
             document["inputs"]["camera_source"] = "file"
         document["viewer"] = {"command": command}
         box = torch.tensor(used_box(document))
@@ -409,12 +401,11 @@ class Session:
         if "undistorted" in result.document["inputs"]["picture"]["notes"]:
             photo = f"cr.geometry.undistorted(cr.data.read_photo({photo}).image, cr.load_camera('CALIBRATION')).image"
         model = f"cr.load_mesh({mesh}, unit={request.unit!r}, up={request.up!r})"
-        pipeline = "None" if request.preset is None else f"cr.pipeline.PRESETS[{request.preset!r}]"
-        pipeline = f"cr.Pipeline.read({str(request.pipeline)!r})" if request.pipeline else pipeline
-        if mesh.endswith(".safetensors'"):
-            model = f"cr.ViewBank.load({mesh})"
-        elif request.pose is not None:
-            pipeline = f"({pipeline if pipeline != 'None' else 'cr.Pipeline()'}).with_pose_prior({request.pose!r})"
+        model = f"cr.ViewBank.load({mesh})" if request.meshes[0].suffix == ".safetensors" else model
+        pipeline = f"cr.Pipeline.read({str(request.pipeline)!r})" if request.pipeline else "cr.Pipeline()"
+        pipeline = f"cr.pipeline.PRESETS[{request.preset!r}]" if request.preset else pipeline
+        pipeline = f"{pipeline}.with_pose_prior({request.pose!r})" if request.pose else pipeline
+        pipeline = "None" if request.bank_decides and not request.pose else pipeline
         lines = [
             "import curvireg_torch as cr",
             "",
@@ -423,8 +414,8 @@ class Session:
             f"box, camera = {request.box}, {result.document['inputs']['camera']}",
             f"result = cr.register({photo}, registrar, box=box, camera=camera, prior=prior)",
             f"pose = result.hypotheses[{answer.number}].pose_dict()",
+            *([f"pose = {answer.pose.pose_dict()}  # corrected by hand"] if answer.edits else []),
         ]
-        lines += [f"pose = {answer.pose.pose_dict()}  # corrected by hand"] if answer.edits else []
         return "\n".join([*lines, "print(pose)", ""])
 
     def describe_warning(self, warning: Warning) -> str:
@@ -454,10 +445,6 @@ class Session:
             raise error.with_subject(self.name(error.subject)) from error
 
 
-def _size(photo: Photo) -> tuple[int, int]:
-    return int(photo.image.shape[-2]), int(photo.image.shape[-1])
-
-
 def _command_line(options: RegisterOptions, name: Callable[[Path], str]) -> str:
     """``curvireg register`` with these options; ``name`` tells what the user calls a file."""
     words = ["curvireg", "register"]
@@ -473,13 +460,8 @@ def _command_line(options: RegisterOptions, name: Callable[[Path], str]) -> str:
     }
     for option, value in values.items():
         if value is not None:
-            texts = [v if isinstance(v, str) else _number(v) for v in (value if isinstance(value, tuple) else (value,))]
-            words += [f"--{option}={value}"] if isinstance(value, str) and value[0] == "-" else [f"--{option}", *texts]
+            texts = [str(v).removesuffix(".0") for v in (value if isinstance(value, tuple) else (value,))]
+            words += (
+                [f"--{option}={value}"] if texts[0][0] == "-" and isinstance(value, str) else [f"--{option}", *texts]
+            )
     return shlex.join([*words, "--out", "result"])
-
-
-def _number(value: Any) -> str:
-    """A path, or a number without needless digits."""
-    if isinstance(value, Path):
-        return str(value)
-    return repr(int(value)) if math.isfinite(value) and value == int(value) else repr(float(value))

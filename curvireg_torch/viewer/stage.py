@@ -10,12 +10,13 @@ from nicegui import ui
 from torch import Tensor
 
 from ..errors import InvalidInputError
+from ..geometry import Camera
 from ..registration import Hypothesis, Registrar
 from ..rendering import shade
 from ..visualization.contours import contour_layer
 from ..visualization.encoding import jpeg, png, shrink
-from ..visualization.overlay import to_uint8
-from .gestures import Point, dragged_box, dragged_pose, nudged_box, scaled_pose
+from ..visualization.overlay import LEGEND, to_uint8
+from .gestures import Point, dragged_box, dragged_pose, scaled_pose
 from .session import Numbers
 from .widgets import button, file_chooser, region, set_enabled, text
 from .workspace import Workspace
@@ -28,7 +29,6 @@ LAYER_SIDE = 1400  # px of the longer side of the layers over it
 CONTOUR_SIDE = 256  # px of the crop in which contours are followed while a pose is moved
 DASH = 0.011  # half the length of a contour's dash, as a fraction of that crop
 COMMIT_SECONDS = 0.5  # without wheel or keys, after which a moved pose becomes the answer
-LEGEND = {"outline": "outline of the mesh at this pose", "crease": "its inner edges", "box": "the box"}
 HELP = {
     "box": "Drag to draw a box; drag its edges, corners or middle to correct it. Arrow keys move it. The wheel zooms.",
     "pose": "Drag the mesh to move it, drag beside it to turn it. Wheel: distance; with Shift: roll. Arrow keys move, "
@@ -95,9 +95,7 @@ class Stage:
                 self.contours = region("input", type="checkbox", data_testid="contours", checked="checked")
                 text("span", "Contours")
             self.contours.on("change", lambda e: self.lines.set_visibility(bool(e.args)), args=["target.checked"])
-            with region("ul", "legend"):
-                for name, meaning in LEGEND.items():
-                    text("li", meaning, name)
+            text("p", LEGEND, "facts")
 
     def _set_mode(self, mode: str) -> None:
         self._commit()
@@ -120,7 +118,7 @@ class Stage:
         shot, what = self.session.shot, event.args
         if shot.photo is None:
             return
-        H, W = shot.photo.image.shape[-2:]
+        H, W = shot.size
         point = float(what.get("x", 0.0)) * W - 0.5, float(what.get("y", 0.0)) * H - 0.5
         if what["type"] == "undo":
             self._undo()
@@ -142,8 +140,9 @@ class Stage:
             if kind == "release":
                 shot.set_box(self.drawn)
         elif kind == "nudge" and shot.box is not None:
-            step = 10.0 if what["shift"] else 1.0
-            shot.set_box(nudged_box(shot.box, step * what["dx"], step * what["dy"], resize=what["alt"]))
+            dx, dy = (what[name] * (10.0 if what["shift"] else 1.0) for name in ("dx", "dy"))
+            x0, y0, x1, y1 = shot.box
+            shot.set_box((x0 + dx, y0 + dy, x1 + dx, y1 + dy))
         elif kind == "remove":
             shot.set_box(None)
 
@@ -166,8 +165,6 @@ class Stage:
                 self.moved = scaled_pose(result, T, float(what["factor"]), float(what["roll"]))
             elif kind == "nudge" and what["shift"]:
                 self.moved = result.moved(T, rotation=(what["dy"], -what["dx"], 0.0))
-            elif kind == "nudge" and what["alt"]:
-                self.moved = scaled_pose(result, T, 1.01 ** -what["dy"], what["dx"])
             elif kind == "nudge":
                 self.moved = result.moved(T, translation=(0.01 * what["dx"], 0.01 * what["dy"], 0.0))
         except InvalidInputError:  # the object would touch the camera: it stays
@@ -175,10 +172,8 @@ class Stage:
 
     def _on_mesh(self, x: float, y: float) -> bool:
         """Whether the mesh is drawn at a pixel."""
-        photo = self.session.shot.photo
-        assert photo is not None
-        rows, columns = self.mask.shape
-        row, column = int((y + 0.5) / photo.image.shape[-2] * rows), int((x + 0.5) / photo.image.shape[-1] * columns)
+        (rows, columns), (H, W) = self.mask.shape, self.session.shot.size
+        row, column = int((y + 0.5) / H * rows), int((x + 0.5) / W * columns)
         return 0 <= row < rows and 0 <= column < columns and bool(self.mask[row, column])
 
     async def _follow(self) -> None:
@@ -278,17 +273,15 @@ class Stage:
         assert photo is not None
         content = await self.workspace.run("page", lambda: jpeg(shrink(to_uint8(photo.image), PHOTO_SIDE), 92))
         if content:
-            H, W = photo.image.shape[-2:]
+            H, W = self.session.shot.size
             self.photo.props(f'src="{self.workspace.serve("photograph.jpg", content, "image/jpeg")}"')
             self.viewport.style(f"--ratio: {W / H:.5f}")
 
     async def _render_answer(self) -> None:
         if self.session.shot.answer is None:
             return
-        result, answer = self.session.shot.require_result()
-        size = (int(result.image.shape[-2]), int(result.image.shape[-1]))
-        layers = await self.workspace.run("page", lambda: pose_layers(result.registrar, answer.pose, size))
-        if layers:
+        size, (result, answer) = self.session.shot.size, self.session.shot.require_result()
+        if layers := await self.workspace.run("page", lambda: pose_layers(result.registrar, answer.pose, size)):
             self.mask = layers[2]
             for element, name, content in zip((self.solid, self.lines), ("solid", "lines"), layers, strict=False):
                 element.props(f'src="{self.workspace.serve(f"{name}.png", content, "image/png")}"')
@@ -304,7 +297,7 @@ class Stage:
         box = self.drawn if is_box and self.pressed is not None else shot.box
         if shot.photo is None:
             return
-        H, W = shot.photo.image.shape[-2:]
+        H, W = shot.size
         if box is not None:
             x0, y0, x1, y1 = box
             shape = f"x='{x0:g}' y='{y0:g}' width='{x1 - x0:g}' height='{y1 - y0:g}'"
@@ -346,9 +339,7 @@ def pose_layers(registrar: Registrar, pose: Hypothesis, size: tuple[int, int]) -
     T, K = pose.projection
     scale = min(1.0, LAYER_SIDE / max(size))
     small = max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
-    sy, sx = small[0] / size[0], small[1] / size[1]
-    to_layer = torch.tensor([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
-    K = to_layer.double() @ K
+    K = Camera(K, size=size).at(small).matrix
     depth = registrar.describer.renderer.render(T[None], K, small)[0, 0].cpu().float()
     mask: np.ndarray = (depth > 0).numpy()
     grey = shade(depth[None, None], K[None])[0, 0].numpy()

@@ -201,26 +201,21 @@ class Workspace:
 
     async def load_sample(self) -> None:
         """Open the scene of ``curvireg demo``, with its box and camera."""
-        photo, mesh = self.folder / "sample.png", self.folder / "sample.ply"
-
-        def write() -> Any:
-            scene = demo_scene()
-            write_file(photo, png(to_uint8(scene.image)))
-            write_file(mesh, scene.mesh.export(file_type="ply"))
-            return scene
-
         self.messages.clear()
-        if scene := await self.run("file", write):
-            self._before_sample = self._before_sample or self.session.options
-            K = scene.camera_matrix
-            camera = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-            sample: dict[str, Any] = {"unit": "m", "up": None, "pose": "upright", "limits": None, "guess": None}
-            self.session.options = replace(self.session.options, **sample, camera=camera)
-            self.session.close()
-            await self.open_photo(photo)
-            await self.open_mesh(mesh)
-            x0, y0, x1, y1 = (round(float(v), 1) for v in scene.box)
-            self.session.shot.set_box((x0, y0, x1, y1))
+        self._before_sample = self._before_sample or self.session.options
+        await self.run("file", self._open_sample, stop=True)
+
+    def _open_sample(self) -> None:
+        scene, session, photo, mesh = demo_scene(), self.session, self.folder / "sample.png", self.folder / "sample.ply"
+        write_file(photo, png(to_uint8(scene.image)))
+        write_file(mesh, scene.mesh.export(file_type="ply"))
+        K, (x0, y0, x1, y1) = scene.camera_matrix, (round(float(v), 1) for v in scene.box)
+        sample: dict[str, Any] = {"unit": "m", "up": None, "pose": "upright", "limits": None, "guess": None}
+        sample["camera"] = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+        session.close()
+        session.options = replace(session.options, **sample)
+        session.open_photo(photo).set_box((x0, y0, x1, y1))
+        self.mesh_facts = session.open_mesh(mesh)
 
     def serve(self, name: str, content: bytes, media_type: str) -> str:
         """Put a file on the server; returns its address relative to the page, which is new each time."""
@@ -247,15 +242,13 @@ def unpack(archive: Path, folder: Path) -> Path:
     try:
         with zipfile.ZipFile(archive) as content:
             members = content.infolist()
-            if len(members) > MAX_ARCHIVE_FILES:
-                raise InvalidInputError(f"{name}: {len(members):,} files, more than {MAX_ARCHIVE_FILES:,}")
-            total = sum(member.file_size for member in members)
-            if total > MAX_MESH_BYTES:
-                raise InvalidInputError(f"{name}: {total:,} bytes when unpacked, more than {MAX_MESH_BYTES:,}")
+            if len(members) > MAX_ARCHIVE_FILES or sum(member.file_size for member in members) > MAX_MESH_BYTES:
+                limits = f"{MAX_ARCHIVE_FILES:,} files or {MAX_MESH_BYTES:,} bytes when unpacked"
+                raise InvalidInputError(f"{name}: more than {limits}; pack only the mesh and its parts")
             content.extractall(folder)  # at most the bytes that the headers claim
     except InvalidInputError:
         raise
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, OSError):
+    except Exception:  # zipfile raises many kinds
         raise InvalidInputError(f"{name}: the archive cannot be unpacked; pack it again, without a password") from None
     meshes = [p for p in folder.rglob("*") if p.suffix.lower() in MESHES and not p.name.startswith("._")]
     if len(meshes) != 1:

@@ -53,29 +53,37 @@ def contour_overlay(registrar: Registrar, result: Registration | Hypothesis, ima
 def views_sheet(
     renderer: DepthRenderer, views: Sequence[tuple[tuple[Tensor, Tensor], Tensor, Sequence[float] | None, str]]
 ) -> np.ndarray:
-    """Photographs beside each other, with a mesh's contours.
+    """(H', W', 3) uint8 RGB: photographs beside each other, with a mesh's contours and captions.
 
-    Args:
-        renderer: of the mesh.
-        views: of each photograph pose (4, 4) and camera matrix (3, 3), (1 or 3, H, W) pixels, box or None, and caption.
-
-    Returns:
-        (H', W', 3) uint8 RGB.
+    A view is a pose (4, 4) and camera matrix (3, 3), (1 or 3, H, W) pixels, box or None, and caption.
     """
     columns = math.ceil(math.sqrt(len(views)))
-    side, line = MOST // columns - GAP, 16
-    pictures = []
-    for projection, image, box, _ in views:
+    side = MOST // columns - GAP
+    tiles = []
+    for projection, image, box, caption in views:
         H, W = image.shape[-2:]
-        pictures.append(draw_window(renderer, projection, image, (0, 0, W, H), side / max(H, W), box))
-    height = max(picture.shape[0] for picture in pictures) + 2 * line
-    sheet = Image.new("RGB", (MOST, -(-len(views) // columns) * height), PAPER)
-    draw = ImageDraw.Draw(sheet)
-    for k, (picture, (*_, caption)) in enumerate(zip(pictures, views, strict=True)):
-        x, y = k % columns * (side + GAP), k // columns * height
-        sheet.paste(Image.fromarray(picture), (x, y + 2 * line))
-        draw.text((x, y + line // 3), caption, INK, ImageFont.load_default(line))
+        tiles.append((caption, draw_window(renderer, projection, image, (0, 0, W, H), side / max(H, W), box)))
+    height = max(picture.shape[0] for _, picture in tiles)
+    sheet = Image.new("RGB", (MOST, -(-len(views) // columns) * (height + 32 + GAP)), PAPER)
+    _paste_tiles(sheet, tiles, (0, 0), columns, (side, height), 16)
     return np.asarray(sheet).copy()
+
+
+def _paste_tiles(
+    sheet: Image.Image,
+    tiles: Sequence[tuple[str, np.ndarray]],
+    corner: tuple[int, int],
+    columns: int,
+    size: tuple[int, int],
+    line: int,
+) -> None:
+    """Paste pictures into a grid of cells of ``size`` (W, H), each with its caption below, ``line`` px high."""
+    draw, font, (W, H) = ImageDraw.Draw(sheet), ImageFont.load_default(line), size
+    for k, (caption, picture) in enumerate(tiles):
+        x, y = corner[0] + k % columns * (W + GAP), corner[1] + k // columns * (H + 2 * line + GAP)
+        h, w = picture.shape[:2]
+        sheet.paste(Image.fromarray(picture), (x + (W - w) // 2, y + (H - h) // 2))
+        draw.text((x, y + H + line // 3), caption, INK, font)
 
 
 @torch.no_grad()
@@ -139,13 +147,8 @@ def registration_sheet(
     top, step = height + 4 * text + GAP, side + 2 * line + GAP
     sheet = Image.new("RGB", (width, top + rows * step), PAPER)
     sheet.paste(Image.fromarray(photograph), ((width - photograph.shape[1]) // 2, 0))
-    draw = ImageDraw.Draw(sheet)
-    _draw_caption(draw, registrar, result, (GAP, height + text // 2), text, note)
-    for k, (name, picture) in enumerate(_small_pictures(registrar, result, item, side)):
-        x, y = GAP + k % columns * (side + GAP), top + k // columns * step
-        h, w = picture.shape[:2]
-        sheet.paste(Image.fromarray(picture), (x + (side - w) // 2, y + (side - h) // 2))
-        draw.text((x, y + side + line // 3), name, INK, ImageFont.load_default(line))
+    _draw_caption(ImageDraw.Draw(sheet), registrar, result, (GAP, height + text // 2), text, note)
+    _paste_tiles(sheet, _small_pictures(registrar, result, item, side), (GAP, top), columns, (side, side), line)
     return np.asarray(sheet).copy()
 
 

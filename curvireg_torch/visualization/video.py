@@ -1,7 +1,5 @@
 """A video of the poses of a followed object."""
 
-import os
-import secrets
 import warnings
 from pathlib import Path
 
@@ -46,7 +44,6 @@ class OverlayVideo:
 
     def __init__(self, path: Path, registrar: Registrar, *, fps: float) -> None:
         self.path, self.registrar, self.fps = path, registrar, fps
-        self._temporary = path.with_name(f"{path.stem}.{secrets.token_hex(4)}.tmp{path.suffix}")
         self._writer: cv2.VideoWriter | None = None
         self._size = (0, 0)
 
@@ -69,7 +66,7 @@ class OverlayVideo:
     def _open(self, picture: np.ndarray) -> cv2.VideoWriter:
         self._size = (picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2)  # the codec needs even numbers
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        writer = cv2.VideoWriter(str(self._temporary), cv2.VideoWriter.fourcc(*"mp4v"), self.fps, self._size)
+        writer = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), self.fps, self._size)
         if not writer.isOpened():
             warnings.warn("this OpenCV has no MPEG-4 encoder; no overlay is written", stacklevel=3)
         return writer
@@ -78,8 +75,6 @@ class OverlayVideo:
         """Finish the file. Nothing is written if there was no frame."""
         if self._writer is not None:
             self._writer.release()
-        if self._temporary.exists():
-            os.replace(self._temporary, self.path)
 
     def __enter__(self) -> "OverlayVideo":
         return self

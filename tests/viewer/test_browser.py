@@ -36,11 +36,11 @@ def test_page_from_upload_to_download(browser, folder):
     browser.unfold("camera")
     browser.unfold("command-line")
     assert browser.text("camera-facts").startswith("unknown")
-    browser.part("fov").send_keys("65")
+    browser.part("camera").send_keys("65")
     browser.wait(lambda: browser.text("camera-facts").startswith("guessed from the field of view"), "field of view")
     browser.wait(lambda: "--fov 65" in browser.text("command"), "command")
     browser.click("exif")
-    browser.wait(lambda: browser.text("fov") == "", "field of view cleared")
+    browser.wait(lambda: browser.text("camera") == "", "field of view cleared")
     caption = "guessed from the photograph's EXIF, 37 mm of a 35 mm camera: no covariance"
     browser.wait(lambda: browser.text("camera-facts") == caption, "EXIF")
     assert browser.part("register").get_attribute("disabled")

@@ -5,7 +5,7 @@ import torch
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_error
-from curvireg_torch.viewer.gestures import dragged_box, dragged_pose, nudged_box, scaled_pose
+from curvireg_torch.viewer.gestures import dragged_box, dragged_pose, scaled_pose
 
 BOX = (10.0, 20.0, 60.0, 50.0)
 
@@ -27,11 +27,6 @@ BOX = (10.0, 20.0, 60.0, 50.0)
 )
 def test_a_drag_draws_moves_and_resizes_boxes(box, start, end, expected):
     assert dragged_box(box, start, end, reach=4.0) == expected
-
-
-def test_keys_move_and_resize_the_box():
-    assert nudged_box(BOX, 2, -3, resize=False) == (12, 17, 62, 47)
-    assert nudged_box(BOX, -100, 1, resize=True) == (10, 20, 13, 51), "a least size"
 
 
 @pytest.fixture

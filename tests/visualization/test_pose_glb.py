@@ -62,17 +62,16 @@ def test_pose_glb_camera_projects_mesh_and_photograph(unit, metres):
 def test_pose_glb_extras_hold_pose_and_camera():
     image, _, T = scene(0)
     K = camera_matrix(260.0, 255.0, 100.0, 95.0, dtype=torch.float64)
-    tree = tree_of(pose_glb(trimesh.creation.box(), T, K, image, photograph=False))
+    tree = tree_of(pose_glb(trimesh.creation.box(), T, K, image))
     extras = next(n for n in tree["nodes"] if "camera" in n)["extras"]
     assert (extras["T_cam_from_model"], extras["camera_matrix"]) == (T.tolist(), K.tolist())
-    assert "images" not in tree
 
 
 def test_pose_glb_keeps_vertex_colours():
     image, _, T = scene(0)
     mesh = trimesh.creation.box()
     mesh.visual.face_colors = [[200, 20, 20, 255]] * 6 + [[20, 20, 200, 255]] * 6
-    data = pose_glb(mesh, T, CAMERA, image, photograph=False)
+    data = pose_glb(mesh, T, CAMERA, image)
     tree = tree_of(data)
     part = tree["meshes"][0]["primitives"][0]
     accessor = tree["accessors"][part["attributes"]["COLOR_0"]]
