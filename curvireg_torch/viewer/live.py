@@ -2,7 +2,6 @@
 
 import sys
 import threading
-from types import TracebackType
 from typing import Any, Self
 
 from nicegui import app, ui
@@ -26,9 +25,6 @@ class LivePage:
     """Opens a page that shows the latest frame; a frame is drawn only once the one before has reached a browser.
 
     As a context manager, it serves the page on this machine, in a thread.
-
-    Args:
-        registrar: whose mesh is drawn.
     """
 
     def __init__(self, registrar: Registrar) -> None:
@@ -44,9 +40,7 @@ class LivePage:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._server.should_exit = True
         self._thread.join(STOP_SECONDS)
         self._listener.close()

@@ -12,7 +12,7 @@ from .stage import Stage
 from .widgets import button, file_chooser, region, set_enabled, set_text, text
 from .workspace import Workspace
 
-__all__ = ["Page", "Steps", "add_assets"]
+__all__ = ["Steps", "build_page"]
 
 TICK_SECONDS = 0.15  # between two looks at what changed
 STAGES: Mapping[str, str] = {
@@ -25,43 +25,36 @@ STAGES: Mapping[str, str] = {
 BOX_HINT = "Drag a rectangle around the object. Without one the whole photograph is searched: slower, less certain."
 
 
-def add_assets() -> None:
-    """Put styles and script into the page, before it is sent."""
+def build_page(workspace: Workspace) -> None:
+    """Lay out one browser window. It holds nothing: several times a second it shows what changed in the workspace."""
     static = Path(__file__).parent / "static"
     ui.add_css((static / "page.css").read_text())
     ui.add_body_html(f"<script>{(static / 'page.js').read_text()}</script>")
+    text("a", "To the photograph", "skip", href="#work")
+    ui.dark_mode(None)
+    with region("header", "top"):
+        with region("div"):
+            text("h1", "curvireg")
+            text("p", "Where is this object, and how is it turned? One photograph and its 3D model are enough.")
+        button("Sample", workspace.load_sample, "sample-again", "quiet")
+    with region("div", "work", id="work"):
+        stage = Stage(workspace)
+        with region("div", "side"):
+            steps, answers, preview, inputs = (
+                Steps(workspace),
+                Answers(workspace),
+                Preview(workspace),
+                Inputs(workspace),
+            )
 
+    async def refresh() -> None:
+        steps.refresh()
+        inputs.refresh()
+        await stage.refresh()
+        await answers.refresh()
+        await preview.refresh()
 
-class Page:
-    """One browser window. It holds nothing: several times a second it shows what changed in its workspace."""
-
-    def __init__(self, workspace: Workspace) -> None:
-        self.workspace = workspace
-
-    def build(self) -> None:
-        """Lay out the page."""
-        text("a", "To the photograph", "skip", href="#work")
-        ui.dark_mode(None)
-        with region("header", "top"):
-            with region("div"):
-                text("h1", "curvireg")
-                text("p", "Where is this object, and how is it turned? One photograph and its 3D model are enough.")
-            button("Sample", self.workspace.load_sample, "sample-again", "quiet")
-        with region("div", "work", id="work"):
-            self.stage = Stage(self.workspace)
-            with region("div", "side"):
-                self.steps = Steps(self.workspace)
-                self.answers = Answers(self.workspace)
-                self.preview = Preview(self.workspace)
-                self.inputs = Inputs(self.workspace)
-        ui.timer(TICK_SECONDS, self._refresh)
-
-    async def _refresh(self) -> None:
-        self.steps.refresh()
-        self.inputs.refresh()
-        await self.stage.refresh()
-        await self.answers.refresh()
-        await self.preview.refresh()
+    ui.timer(TICK_SECONDS, refresh)
 
 
 class Steps:

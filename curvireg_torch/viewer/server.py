@@ -24,7 +24,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from ..errors import MAX_MESH_BYTES, InvalidInputError
 from ..evaluation.opening import RegisterOptions
 from ..utils.threads import one_torch_thread
-from .page import Page, add_assets
+from .page import build_page
 from .workspace import Workspace, file_name, show_warning
 
 __all__ = ["SECURITY_HEADERS", "guarded", "listen", "make_server", "serve"]
@@ -47,12 +47,7 @@ _EVERYONE = ("0.0.0.0", "::")
 
 
 def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> None:
-    """Serve the page with these inputs until Ctrl-C; the printed address contains a random token.
-
-    Raises:
-        CurviregError: a file of the options cannot be used.
-        InvalidInputError: nothing can listen on that host and port.
-    """
+    """Serve the page with these inputs until Ctrl-C; the printed address contains a random token."""
     with listen(host, port) as listener, tempfile.TemporaryDirectory(prefix="curvireg-view-") as folder:
         workspace = Workspace(options, Path(folder))
         workspace.load()  # errors come before anything opens
@@ -131,10 +126,6 @@ def guarded(site: ASGIApp, host: str) -> ASGIApp:
 def add_page(workspace: Workspace) -> None:
     """Add the page, its files and its uploads to the application of NiceGUI."""
 
-    def build() -> None:
-        add_assets()
-        Page(workspace).build()
-
     def send_file(name: str) -> Response:
         content, media_type = workspace.files.get(name, (b"", ""))
         if not media_type:
@@ -155,7 +146,7 @@ def add_page(workspace: Workspace) -> None:
             workspace.messages["file"] = f"{name}: it did not arrive; send it again"
         return Response(status_code=204)
 
-    ui.page("/")(build)
+    ui.page("/")(lambda: build_page(workspace))
     app.get("/file/{name}")(send_file)
     app.post("/upload")(receive_file)
     app.add_exception_handler(404, lambda *_: PlainTextResponse("not found", status_code=404))

@@ -30,12 +30,14 @@ from ..visualization import contour_overlay, pose_glb
 from ..visualization.encoding import png
 from ..visualization.pose_glb import mesh_glb
 
-__all__ = ["Answer", "Result", "Session", "Shot"]
+__all__ = ["Answer", "Numbers", "Point", "Result", "Session", "Shot", "dragged_box"]
 
 HINT_WIDTH = 45.0  # degrees by which the pose may differ from a hint
+MIN_SIDE = 3.0  # px of a new box; a smaller one was a click
 NEAREST = 1.2  # least depth of the object's centre, in its radii, to which it can be moved by hand
 
 Numbers = tuple[float, float, float, float]
+Point = tuple[float, float]
 
 _OPTIONS = ("unit", "up", "pose", "mesh_is", "preset", "pipeline", "renderer", "device")
 _DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
@@ -75,8 +77,7 @@ class Result:
     ) -> Tensor:
         """Return the (4, 4) pose ``T``, turned by degrees about the camera's axes and moved along them by radii.
 
-        Raises:
-            InvalidInputError: the object would touch the camera.
+        :class:`InvalidInputError` if the object would touch the camera.
         """
         describer = self.registrar.describer
         angles, shift = (torch.tensor(list(v), dtype=torch.float64) for v in (rotation, translation))
@@ -88,17 +89,30 @@ class Result:
         T[:3, 3] = centre - T[:3, :3] @ describer.centre
         return T
 
+    def dragged(self, T: Tensor, K: Tensor, start: Point, end: Point, *, turns: bool) -> Tensor:
+        """Return the pose after a drag: the object's centre follows the mouse or, if it ``turns``, its near side."""
+        describer, (dx, dy) = self.registrar.describer, (end[0] - start[0], end[1] - start[1])
+        if max(abs(dx), abs(dy)) < 1.0:  # a click
+            return T
+        depth = float((T[:3, :3] @ describer.centre + T[:3, 3])[2])
+        radii = depth / float(K[0, 0]) / describer.radius  # that one pixel is long
+        if turns:
+            return self.moved(T, rotation=(math.degrees(dy * radii), -math.degrees(dx * radii), 0.0))
+        return self.moved(T, translation=(dx * radii, dy * radii, 0.0))
+
+    def scaled(self, T: Tensor, factor: float, roll: float = 0.0) -> Tensor:
+        """Return the pose that shows the object larger, at the same place in the photograph, and rolled by degrees."""
+        describer = self.registrar.describer
+        centre = T[:3, :3] @ describer.centre + T[:3, 3]
+        shift = ((1.0 / factor - 1.0) * centre / describer.radius).tolist()
+        return self.moved(T, rotation=(0.0, 0.0, roll), translation=shift)
+
 
 @dataclass(eq=False)
 class Shot:
-    """A photograph with what belongs to it.
+    """A photograph, without the distortion of a calibrated camera, and what belongs to it.
 
-    Attributes:
-        path: of its file.
-        photo: without the distortion of a calibrated camera.
-        box, box_before: x0, y0, x1, y1 in px, now and before the last change.
-        result, answer: the last result and its chosen pose.
-        answer_before: the answer before the last change by hand.
+    ``box_before`` and ``answer_before`` are those before the last change by hand.
     """
 
     path: Path = Path()
@@ -185,12 +199,10 @@ class Session:
     """Photographs, one of which is shown, and the mesh. Methods that compute may take minutes: call them in a thread.
 
     Attributes:
-        options: of ``curvireg view``; replace them to change unit, up, pose or preset. Their camera is that of all
-            photographs; call ``set_camera`` and ``set_limits`` for these.
+        options: of ``curvireg view``, with the camera of all photographs; :meth:`set_camera` changes it.
         folder: of uploaded files, which messages call by their names alone.
         shots, shot: the photographs, and the one that is shown; an empty one before the first.
-        progress: stage, done and total.
-        cancelled: set it to end a registration at its next step.
+        progress, cancelled: stage, done and total of a registration; True ends it at its next step.
     """
 
     options: RegisterOptions
@@ -255,10 +267,7 @@ class Session:
     def set_camera(self, camera: Any = None, guess: str | float | None = None) -> None:
         """Change the camera of all photographs: four numbers, a calibrated one, or a guess.
 
-        They keep their boxes and results unless distortion is removed, or no longer is.
-
-        Raises:
-            InvalidInputError: the camera is not one of these photographs; nothing changes.
+        Boxes and results stay unless distortion is removed, or no longer is; after an error nothing has changed.
         """
         before, was_undistorted = self.options, self.is_undistorted
         self.options = replace(before, camera=camera, guess=guess)
@@ -345,11 +354,7 @@ class Session:
         return "" if self.is_undistorted else _command_line(self.request(), self.name)
 
     def register(self) -> Registration:
-        """Find the pose in the photograph that is shown, as ``curvireg register`` does.
-
-        Raises:
-            CurviregError: an input is missing or cannot be used, or the registration was cancelled or took too long.
-        """
+        """Find the pose in the photograph that is shown, as ``curvireg register`` does."""
         request, start, shot, camera = self.request(), time.perf_counter(), self.shot, self.options.camera
         if shot.photo is None or not request.meshes:
             raise InvalidInputError("register: choose a photograph and a mesh first")
@@ -443,6 +448,30 @@ class Session:
             yield
         except CurviregError as error:
             raise error.with_subject(self.name(error.subject)) from error
+
+
+def dragged_box(box: Numbers | None, start: Point, end: Point, *, reach: float) -> Numbers | None:
+    """The box in px after a drag: of an edge or corner within ``reach`` px, of all of it from inside, or a new one."""
+    (x, y), (u, v) = start, end
+    x0, y0, x1, y1 = box or (math.inf, math.inf, -math.inf, -math.inf)
+    if x0 - reach <= x <= x1 + reach and y0 - reach <= y <= y1 + reach:
+        left, right = _near_edges(x, x0, x1, reach)
+        top, bottom = _near_edges(y, y0, y1, reach)
+        if not (left or right or top or bottom):
+            x0, y0, x1, y1 = x0 + u - x, y0 + v - y, x1 + u - x, y1 + v - y
+        x0, y0 = u if left else x0, v if top else y0
+        x1, y1 = u if right else x1, v if bottom else y1
+    else:
+        x0, y0, x1, y1 = x, y, u, v
+    if min(abs(x1 - x0), abs(y1 - y0)) < MIN_SIDE:
+        return box
+    return round(min(x0, x1), 1), round(min(y0, y1), 1), round(max(x0, x1), 1), round(max(y0, y1), 1)
+
+
+def _near_edges(at: float, low: float, high: float, reach: float) -> tuple[bool, bool]:
+    """Whether the low or the high edge is near; inside, at most a third of the box is near to an edge."""
+    inside = min(reach, (high - low) / 3)
+    return at <= low + inside, at > low + inside and at >= high - inside
 
 
 def _command_line(options: RegisterOptions, name: Callable[[Path], str]) -> str:

@@ -16,8 +16,7 @@ from ..rendering import shade
 from ..visualization.contours import contour_layer
 from ..visualization.encoding import jpeg, png, shrink
 from ..visualization.overlay import LEGEND, to_uint8
-from .gestures import Point, dragged_box, dragged_pose, scaled_pose
-from .session import Numbers
+from .session import Numbers, Point, dragged_box
 from .widgets import button, file_chooser, region, set_enabled, text
 from .workspace import Workspace
 
@@ -156,13 +155,13 @@ class Stage:
                 self.pressed = T, point, not self._on_mesh(*point)
             elif kind == "move" and self.pressed is not None:
                 T, start, turns = self.pressed
-                self.moved = dragged_pose(result, T, K, start, point, turns=turns)
+                self.moved = result.dragged(T, K, start, point, turns=turns)
             elif kind == "release":
                 self._commit()
             elif kind == "cancel":
                 self.pressed = self.moved = None
             elif kind == "scale":  # wheel and pinch
-                self.moved = scaled_pose(result, T, float(what["factor"]), float(what["roll"]))
+                self.moved = result.scaled(T, float(what["factor"]), float(what["roll"]))
             elif kind == "nudge" and what["shift"]:
                 self.moved = result.moved(T, rotation=(what["dy"], -what["dx"], 0.0))
             elif kind == "nudge":
@@ -254,7 +253,8 @@ class Stage:
 
     def _select(self, number: int) -> None:
         self._commit()
-        self.workspace.select_photo(number)
+        self.session.shot = self.session.shots[number]
+        self.workspace.messages.pop("pose", None)
 
     def _show_mode(self) -> None:
         is_pose, shot = self.mode == "pose", self.session.shot
@@ -311,10 +311,7 @@ class Stage:
 
 
 def contour_paths(registrar: Registrar, T: Tensor, K: Tensor) -> str:
-    """SVG paths of the contours of a mesh at a pose (4, 4), in px of the photograph with the camera matrix (3, 3).
-
-    They are short dashes along the mesh's edges, which needs no rendered view.
-    """
+    """SVG paths of the contours of a mesh at (4, 4) ``T`` with the (3, 3) camera matrix: short dashes along its edges."""
     describer = registrar.describer
     centre = T[:3, :3] @ describer.centre + T[:3, 3]
     u, v, _ = (K @ centre / centre[2]).tolist()

@@ -40,11 +40,9 @@ class Workspace:
 
     Attributes:
         session: inputs and results.
-        messages: what is wrong with, or remarkable about, a part of the work: "file", "photograph", "mesh", "pose" or
-            the "page" itself.
+        messages: about a part of the work: "file", "photograph", "mesh", "pose", or the "page" itself.
         files: pictures and downloads by name, with their media types.
-        receiving: folders and names of files that are being received.
-        mesh_facts: the mesh in words.
+        receiving, mesh_facts: folders and names of files that are being received; the mesh in words.
         started: when the search began, in seconds of ``time.monotonic``.
     """
 
@@ -110,11 +108,7 @@ class Workspace:
         self.session.cancelled = self.searching
 
     async def receive(self, name: str, size: int, blocks: AsyncIterator[bytes]) -> None:
-        """Store a file of ``size`` bytes and open it as a photograph, a mesh or a calibration.
-
-        Raises:
-            InvalidInputError: too much has been received.
-        """
+        """Store a file of ``size`` bytes, if there is room, and open it as a photograph, a mesh or a calibration."""
         if size + sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file()) > MAX_VIEWER_BYTES:
             raise InvalidInputError(f"{name}: all files have more than {MAX_VIEWER_BYTES:,} bytes; remove photographs")
         folder = Path(tempfile.mkdtemp(prefix="upload-", dir=self.folder))
@@ -167,11 +161,6 @@ class Workspace:
         if opened := await self.run("mesh", lambda: self.session.open_mesh(path), stop=True):
             self.mesh_facts = opened
             self.messages.pop("pose", None)
-
-    def select_photo(self, number: int) -> None:
-        """Show another photograph, by its number from 0."""
-        self.session.shot = self.session.shots[number]
-        self.messages.pop("pose", None)
 
     def remove_photo(self) -> None:
         """Close the photograph that is shown."""
@@ -231,13 +220,7 @@ def file_name(text: str) -> str:
 
 
 def unpack(archive: Path, folder: Path) -> Path:
-    """Unpack a zip archive into a new folder; returns the path of the only mesh in it.
-
-    Names that lead outside stay inside, as ``zipfile`` removes ``..`` and drives.
-
-    Raises:
-        InvalidInputError: it is damaged, too large, encrypted, or does not hold one mesh.
-    """
+    """Unpack a zip archive into a new folder, which ``zipfile`` does not leave; return the path of the only mesh."""
     name = archive.name
     try:
         with zipfile.ZipFile(archive) as content:

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..rendering import DepthRenderer
 from .encoding import to_uint8
 
-__all__ = ["contour_layer", "draw_box", "draw_window", "line_width"]
+__all__ = ["close_up", "contour_layer", "draw_box", "draw_window", "line_width"]
 
 OUTLINE, CREASE, BOX, RIM = (0, 255, 80), (255, 170, 0), (255, 255, 255), (0, 0, 0)
 RIM_OPACITY = 0.7  # of the black rim
@@ -22,6 +22,15 @@ SMOOTH, SHORT = 0.01, 0.06  # fractions of the object's size: over which faces a
 def line_width(size: Sequence[int]) -> float:
     """Width of the outline in px in a picture of ``size`` (H, W)."""
     return max(1.5, max(size) / 350)
+
+
+def close_up(size: Sequence[int], box: Sequence[float]) -> tuple[int, int, int, int]:
+    """A square window around a box in px with a margin, moved into a photograph of ``size`` (H, W) and cut there."""
+    (H, W), (x0, y0, x1, y1) = size, box
+    side = round(1.3 * max(x1 - x0, y1 - y0)) + 2
+    left = max(0, min(round(0.5 * (x0 + x1 - side)), W - side))
+    top = max(0, min(round(0.5 * (y0 + y1 - side)), H - side))
+    return left, top, min(W, left + side), min(H, top + side)
 
 
 def draw_window(

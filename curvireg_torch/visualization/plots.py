@@ -1,7 +1,4 @@
-"""Figures of registrations, as ``matplotlib.figure.Figure``: ``.savefig("a.png")`` writes them.
-
-They need matplotlib (``pip install matplotlib``) and raise :class:`MissingDependencyError` without it.
-"""
+"""Figures of registrations, as ``matplotlib.figure.Figure``; :class:`MissingDependencyError` without matplotlib."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -12,12 +12,11 @@ from ..errors import LostObjectError
 from ..registration import FailedRegistration, Registrar, Registration
 from ..registration.result import verdict
 from .contours import draw_window
+from .overlay import VERDICT_COLOURS
 
 __all__ = ["OverlayVideo", "annotated_frame"]
 
 _LONGER_SIDE = 960  # of the frames in px; larger ones are scaled down
-_NO_POSE = (255, 90, 80)
-_COLOURS = {"likely": (90, 230, 120), "unsure": (255, 190, 60), "no match": _NO_POSE}
 
 
 class OverlayVideo:
@@ -93,15 +92,15 @@ def annotated_frame(registrar: Registrar, image: Tensor, result: Registration | 
     text, colour = caption(result)
     scale = max(0.4, picture.shape[1] / 1200)
     (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
-    cv2.rectangle(picture, (0, 0), (width + 12, height + below + 6), (0, 0, 0), cv2.FILLED)
-    cv2.putText(picture, text, (6, height + 4), cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
+    cv2.rectangle(picture, (0, 0), (width + 12, height + below + 6), colour, cv2.FILLED)
+    cv2.putText(picture, text, (6, height + 4), cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255), 1, cv2.LINE_AA)
     return picture
 
 
 def caption(result: Registration | FailedRegistration) -> tuple[str, tuple[int, int, int]]:
     """How sure the result is, in words and as a colour."""
     if isinstance(result, FailedRegistration):
-        return "lost" if isinstance(result.error, LostObjectError) else "failed", _NO_POSE
+        return "lost" if isinstance(result.error, LostObjectError) else "failed", VERDICT_COLOURS["no match"]
     word = verdict(result.confidence, result.none, result.reliable)
     number = "" if result.confidence is None else f", confidence {result.confidence:.2f}"
-    return word + number, _COLOURS[word]
+    return word + number, VERDICT_COLOURS[word]

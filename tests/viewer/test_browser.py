@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from curvireg_torch.visualization.contours import close_up
 from tests.viewer.browser import MISSING
 from tests.viewer.test_session import run_command
 
@@ -89,11 +90,10 @@ def test_page_shows_the_result(browser, folder):
     browser.part("mesh").click()  # in the middle
     browser.wait(lambda: 0.45 < float(layer.value_of_css_property("opacity")) < 0.55, "opacity", 20)
     images = browser.wait(lambda: browser.part("panel-answer").find_elements("css selector", "img"), "cards")
-    x0, y0, x1, y1 = json.loads((folder / "box.json").read_text())
-    margin = 0.25 * max(x1 - x0, y1 - y0)
-    width = min(240, int(x1 + margin) + 1) - max(0, int(x0 - margin))  # the box with a margin
+    left, _, right, _ = close_up((180, 240), json.loads((folder / "box.json").read_text()))
     browser.wait(
-        lambda: [int(x.get_attribute("naturalWidth")) for x in images] == pytest.approx([width] * 2, abs=2), "two"
+        lambda: [int(x.get_attribute("naturalWidth")) for x in images] == pytest.approx([right - left] * 2, abs=2),
+        "two",
     )
 
 

@@ -5,7 +5,7 @@ import torch
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_error
-from curvireg_torch.viewer.gestures import dragged_box, dragged_pose, scaled_pose
+from curvireg_torch.viewer.session import dragged_box
 
 BOX = (10.0, 20.0, 60.0, 50.0)
 
@@ -43,7 +43,7 @@ def seen(T, K, point):
 
 def test_the_centre_follows_the_mouse_that_drags_the_mesh(pose):
     result, T, K, describer = pose
-    moved = dragged_pose(result, T, K, (100.0, 80.0), (112.0, 75.0), turns=False)
+    moved = result.dragged(T, K, (100.0, 80.0), (112.0, 75.0), turns=False)
     shift = seen(moved, K, describer.centre) - seen(T, K, describer.centre)
     torch.testing.assert_close(shift, torch.tensor([12.0, -5.0], dtype=torch.float64))
     assert torch.equal(moved[:3, :3], T[:3, :3])
@@ -52,7 +52,7 @@ def test_the_centre_follows_the_mouse_that_drags_the_mesh(pose):
 def test_the_near_side_follows_the_mouse_that_drags_beside_the_mesh(pose):
     result, T, K, describer = pose
     near = T[:3, :3].T @ torch.tensor([0, 0, -describer.radius], dtype=torch.float64) + describer.centre
-    turned = dragged_pose(result, T, K, (0.0, 0.0), (4.0, 3.0), turns=True)
+    turned = result.dragged(T, K, (0.0, 0.0), (4.0, 3.0), turns=True)
     shift = seen(turned, K, near) - seen(T, K, near)
     assert 4 < shift[0] < 8, "right and down, a little more than the mouse, as it is nearer"
     assert 3 < shift[1] < 6
@@ -61,7 +61,7 @@ def test_the_near_side_follows_the_mouse_that_drags_beside_the_mesh(pose):
 
 def test_wheel_and_twist_scale_and_roll_about_the_centre(pose):
     result, T, K, describer = pose
-    moved = scaled_pose(result, T, 1.25, roll=30.0)
+    moved = result.scaled(T, 1.25, roll=30.0)
     centres = [pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (T, moved)]
     torch.testing.assert_close(centres[1], centres[0] / 1.25)
     assert float(rotation_error(moved[:3, :3], T[:3, :3])) == pytest.approx(30, abs=1e-4)
@@ -69,4 +69,4 @@ def test_wheel_and_twist_scale_and_roll_about_the_centre(pose):
     right = T[:3, :3].T @ torch.tensor([describer.radius, 0, 0], dtype=torch.float64) + describer.centre
     assert seen(moved, K, right)[1] > seen(T, K, right)[1]
     with pytest.raises(InvalidInputError, match="touch the camera"):
-        scaled_pose(result, T, 1000.0)
+        result.scaled(T, 1000.0)

@@ -60,7 +60,7 @@ def test_uploads_find_their_place(workspace, scene):
     assert session.shot.photo.image.shape == (3, 180, 240)
     assert workspace.messages == {}
     assert sorted(stored(workspace)) == ["a.png", "b.png", "part.PLY"], "the former mesh is removed"
-    workspace.select_photo(0)
+    session.shot = session.shots[0]
     workspace.remove_photo()
     assert (names(workspace), sorted(stored(workspace))) == (["b.png"], ["b.png", "part.PLY"])
     calibration = {"camera_matrix": [300.0, 0, 119.5, 0, 300, 89.5, 0, 0, 1], "dist": [0.1, 0, 0, 0]}
