@@ -311,7 +311,7 @@ class Stage:
 
 
 def contour_paths(registrar: Registrar, T: Tensor, K: Tensor) -> str:
-    """SVG paths of the contours of a mesh at (4, 4) ``T`` with the (3, 3) camera matrix: short dashes along its edges."""
+    """SVG paths of the contours of a mesh at (4, 4) ``T``, with (3, 3) camera matrix: short dashes along its edges."""
     describer = registrar.describer
     centre = T[:3, :3] @ describer.centre + T[:3, 3]
     u, v, _ = (K @ centre / centre[2]).tolist()

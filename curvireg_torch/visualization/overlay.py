@@ -52,7 +52,7 @@ def contour_overlay(registrar: Registrar, result: Registration | Hypothesis, ima
 def views_sheet(
     renderer: DepthRenderer, views: Sequence[tuple[tuple[Tensor, Tensor], Tensor, Sequence[float] | None, str]]
 ) -> np.ndarray:
-    """(H, W, 3) uint8 RGB: photographs side by side; of each (pose, camera matrix), pixels, box or None, and caption."""
+    """(H, W, 3) uint8 RGB: photographs side by side; of each pose and camera matrix, pixels, box or None, caption."""
     columns = math.ceil(math.sqrt(len(views)))
     side = MOST // columns - GAP
     tiles = []
@@ -86,7 +86,7 @@ def _paste_tiles(
 def side_pictures(
     registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any
 ) -> dict[str, np.ndarray]:
-    """(S, S, 3) uint8 RGB each of "photograph", "photograph field", "pose", "view field"; see :func:`contour_overlay`."""
+    """(S, S, 3) uint8 RGB of "photograph", "photograph field", "pose", "view field"; see :func:`contour_overlay`."""
     item = image_item(image, as_numbers(box, "box"))
     settings = registrar.bank.settings
     crop = crop_regions([item.image], item.box[None, None], size=settings.image_size, margin=settings.margin)[0]

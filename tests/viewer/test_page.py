@@ -1,11 +1,9 @@
 """The photograph, the steps and the fields of the page, without a browser."""
 
 import asyncio
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 pytest.importorskip("nicegui", reason="nicegui is not installed")
@@ -17,7 +15,7 @@ from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.geometry import Camera
 from curvireg_torch.viewer.page import Steps
 from curvireg_torch.viewer.side import Answers, Inputs, Preview
-from curvireg_torch.viewer.stage import Stage, contour_paths
+from curvireg_torch.viewer.stage import Stage
 from curvireg_torch.viewer.workspace import Workspace
 from tests.viewer.test_session import write_scene
 
@@ -67,25 +65,12 @@ def test_gestures_come_as_fractions_and_become_a_box_in_px(workspace, build):
     assert "<rect" not in stage.shapes.content
 
 
-def test_steps_tick_off_and_say_what_is_missing(workspace, build):
+def test_messages_are_text_and_not_html(workspace, build):
     steps = build(Steps)
-
-    def done():
-        steps.refresh()
-        return [name for name, card in steps.cards.items() if "done" in card.classes]
-
-    assert done() == ["photograph"]
-    assert steps.facts["photograph"].content == "photo.png: 240 x 180 px"
-    assert "disabled" in steps.find.props
-    asyncio.run(workspace.open_mesh(workspace.folder / "truck.ply"))
     workspace.messages["mesh"] = "a.ply: <b>empty</b>"
-    assert done() == ["photograph", "mesh"]
-    assert steps.messages["mesh"].content == "a.ply: &lt;b&gt;empty&lt;/b&gt;", "text, not HTML"
-    assert "disabled" not in steps.find.props
-    assert steps.find.content == "Find the object and its pose"
-    workspace.session.shot.set_box((10.0, 20.0, 60.0, 70.0))
-    assert done() == ["photograph", "mesh", "box"]
-    assert steps.find.content == "Find the pose"
+    steps.refresh()
+    assert steps.messages["mesh"].content == "a.ply: &lt;b&gt;empty&lt;/b&gt;"
+    assert "disabled" in steps.find.props
 
 
 def test_typed_numbers_go_into_the_session(workspace, build):
@@ -115,34 +100,30 @@ def test_typed_numbers_go_into_the_session(workspace, build):
     assert inputs.command.content.startswith("None: ")
 
 
-def test_two_windows_show_the_same_hints(workspace, build):
-    session = workspace.session
+def test_clicks_on_the_model_mark_what_is_up_and_the_front_in_all_windows(workspace, build):
+    session, previews = workspace.session, [build(Preview), build(Preview)]
     asyncio.run(workspace.open_mesh(workspace.folder / "truck.ply"))
-    previews = [build(Preview), build(Preview)]
+
+    def click(mark, *point):
+        previews[0].mark = mark
+        hit = SimpleNamespace(**dict(zip("xyz", point, strict=True)))
+        asyncio.run(previews[0]._clicked(SimpleNamespace(hits=[hit])))
+        return session.options.up, session.options.limits.get("front")
+
+    assert click("", 0, 0.9, 0) == (None, "-x")
+    assert click("front", 0.1, -0.9, 0.2) == (None, session.mesh_axis((0.0, -1.0, 0.0)))
     session.hint_direction((3.0, 0.0, 0.0))
-    previews[1].mark = "front"
-    asyncio.run(previews[1]._clicked(SimpleNamespace(hits=[SimpleNamespace(x=0.1, y=-0.9, z=0.2)])))
     for preview in previews:
         asyncio.run(preview.refresh())
         assert preview.facts.content == "Hint: seen from azimuth 90, elevation 0, within 45 degrees."
     assert "--near 90 0 0 --within 45" in session.command()
-    assert session.options.limits["front"] == session.mesh_axis((0.0, -1.0, 0.0))
     session.remove_limits()
     assert "--near" not in session.command()
-
-
-def test_a_click_marks_what_is_up(workspace, build):
-    session, preview = workspace.session, build(Preview)
     session.set_limits(front=None)
-    asyncio.run(workspace.open_mesh(workspace.folder / "truck.ply"))
-    for mark, point, up in (("", (0, 0.9, 0), None), ("up", (0.1, 0.9, 0.2), "y"), ("up", (0, 0, -1.0), "-y")):
-        preview.mark = mark
-        asyncio.run(preview._clicked(SimpleNamespace(hits=[SimpleNamespace(**dict(zip("xyz", point, strict=True)))])))
-        assert session.options.up == up
+    assert click("up", 0.1, 0.9, 0.2) == ("y", None)
+    assert click("up", 0, 0, -1.0) == ("-y", None)
     assert session.mesh.metadata["up"] == "-y"
-    preview.mark = "front"
-    asyncio.run(preview._clicked(SimpleNamespace(hits=[SimpleNamespace(x=0.0, y=0.0, z=1.0)])))
-    assert "front" not in session.options.limits, "what is up is not the front"
+    assert click("front", 0, 0, 1.0) == ("-y", None), "what is up is not the front"
 
 
 @pytest.fixture
@@ -237,16 +218,3 @@ def test_photographs_are_chosen_from_a_strip(shown, registered):
     shown.remove_photo()
     asyncio.run(stage.refresh())
     assert stage.strip.default_slot.children == []
-
-
-def test_contours_are_followed_at_their_place(registered):
-    result = registered[0].shot.result
-    T, K = result.registration.projection
-    paths = contour_paths(result.registrar, T, K)
-    ends = np.array([float(v) for v in re.findall(r"[-\d.]+", paths.split("class='rim'/>")[2].split("class=")[0])])
-    ends = ends.reshape(-1, 2)
-    depth = result.registrar.describer.renderer.render(T[None], K, (180, 240))[0, 0].numpy() > 0
-    rows, columns = np.nonzero(depth)
-    assert len(ends) > 200
-    box = [columns.min(), rows.min(), columns.max(), rows.max()]
-    assert [*ends.min(axis=0), *ends.max(axis=0)] == pytest.approx(box, abs=2.5)  # half a dash is 1.1 px

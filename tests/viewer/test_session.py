@@ -2,7 +2,6 @@
 
 import io
 import json
-import math
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -15,14 +14,14 @@ import trimesh
 
 from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.options import register_options
-from curvireg_torch.errors import BankError, CurviregError, CurviregWarning, ImageError, InvalidInputError, MeshError
+from curvireg_torch.errors import BankError, CurviregError, CurviregWarning, InvalidInputError
 from curvireg_torch.evaluation.opening import RegisterOptions, read_start
 from curvireg_torch.evaluation.store import to_json
 from curvireg_torch.geometry import Camera, rotation_error, undistorted
 from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer import session as module
-from curvireg_torch.viewer.session import Answer, Session
+from curvireg_torch.viewer.session import Answer, Session, dragged_box
 from tests._support.exif import exif, with_exif
 from tests._support.scenes import scene
 
@@ -165,8 +164,10 @@ def test_the_python_program_gives_the_same_numbers(session, registered):
 
 
 def test_move_without_a_camera_keeps_the_allocentric_rotation(session):
+    registrar = session.shot.result.registrar
     session.set_camera()
     session.register()
+    assert session.shot.result.registrar is registrar, "the views are not rendered again"
     before, T = session.shot.answer.pose, session.shot.answer.pose.projection[0]
     session.shot.place(session.shot.result.moved(T, rotation=(0, 0, 5)))
     pose = session.shot.answer.pose
@@ -179,44 +180,17 @@ def test_move_without_a_camera_keeps_the_allocentric_rotation(session):
     assert session.document()["translation"] is None
 
 
-def test_register_with_a_field_of_view(session):
-    session.set_camera(guess=2 * math.degrees(math.atan(120 / 260)))
-    session.register()
-    document = session.document()
-    assert document["inputs"]["camera_source"] == "fov"
-    assert document["inputs"]["camera"] == pytest.approx([260.0, 260.0, 119.5, 89.5])
-    assert document["translation"] is not None
-    assert document["covariance"] is None
-
-
 def test_messages_use_the_names_of_the_user(folder):
-    session = Session(RegisterOptions(), folder / "uploads")
-    uploads = folder / "uploads" / "1"
-    uploads.mkdir(parents=True)
-    (uploads / "cat.jpg").write_text("not a picture")
-    with pytest.raises(ImageError, match=r"^cat\.jpg: "):
-        session.open_photo(uploads / "cat.jpg")
-    for name, error in (("cat.obj", MeshError), ("cat.safetensors", BankError)):
-        (uploads / name).write_text("")
-        with pytest.raises(error, match=rf"^{name}: ") as caught:
-            session.open_mesh(uploads / name)
-        assert str(folder) not in str(caught.value)
-    assert session.shots == []
-    assert session.mesh_path is None
-    warnings = CurviregWarning("large", subject=uploads / "cat.obj"), UserWarning("plain")
+    session = Session(RegisterOptions(), folder)
+    (folder / "cat.safetensors").write_text("")
+    with pytest.raises(BankError, match=r"^cat\.safetensors: "):
+        session.open_mesh(folder / "cat.safetensors")
+    warnings = CurviregWarning("large", subject=folder / "cat.obj"), UserWarning("plain")
     assert list(map(session.describe_warning, warnings)) == ["cat.obj: large", "plain"]
     with pytest.raises(InvalidInputError, match="choose a photograph and a mesh"):
         session.register()
     with pytest.raises(InvalidInputError, match="register first"):
         session.shot.fit()
-
-
-def test_open_mesh_describes_the_mesh(folder):
-    mesh = example_mesh()
-    mesh.visual.face_colors = [200, 20, 20, 255]
-    mesh.export(folder / "red.ply")
-    assert new_session().open_mesh(folder / "truck.ply").endswith(" m, rendered in grey")
-    assert new_session().open_mesh(folder / "red.ply").endswith(" m, rendered in its colours")
 
 
 def test_each_photograph_keeps_its_box_and_its_result(registered, monkeypatch):
@@ -235,13 +209,6 @@ def test_each_photograph_keeps_its_box_and_its_result(registered, monkeypatch):
     session.shot = second
     session.remove_photo()
     assert (session.shots, session.shot) == ([first], first)
-
-
-@pytest.mark.usefixtures("folder")
-def test_load_takes_files_box_and_camera_from_the_options():
-    session = new_session("photo.png", "truck.ply", "--box", "10", "20", "90", "80", "--fov", "65")
-    assert "968 faces" in session.load()
-    assert session.command() == "curvireg register photo.png truck.ply --box 10 20 90 80 --fov 65 --out result"
 
 
 def test_distortion_is_removed_from_all_photographs(folder):
@@ -298,33 +265,15 @@ def test_command_contains_inputs_and_options(folder):
         session.register()
 
 
-def test_command_contains_the_limits_on_the_pose(folder):
-    words = ["--near", "10", "-20.5", "--within", "30", "--front=-x", "--distance", "0.5", "2"]
-    session = new_session("photo.png", "truck.ply", *words)
-    session.load()
+def test_command_contains_the_limits_on_the_pose():
+    words = ["--near", "10", "-20.5", "--within", "30", "--front=-x", "--distance", "0.5", "2", "--fov", "65"]
+    session = new_session(*words)
     session.set_limits(azimuth=(315.0, 45.0), elevation=(-10.0, 40.0))
     again = register_options(parse(shlex.split(session.command())[1:]))
-    assert again.limits == session.request().limits
-    assert session.request().entry(folder / "photo.png").prior.to_dict() == {
-        "azimuth": (315.0, 45.0),
-        "elevation": (-10.0, 40.0),
-        "distance": (0.5, 2.0),
-        "viewpoint": (10.0, -20.5, 0.0),
-        "within": 30.0,
-        "front": "-x",
-    }
+    assert (again.limits, again.guess) == (session.request().limits, 65)
+    assert again.limits["viewpoint"] == (10.0, -20.5, 0.0)
     session.set_limits(**{**dict.fromkeys(session.options.limits), "front": "y"})
     assert "--front" not in session.command(), "it limits nothing by itself"
-
-
-def test_limits_do_not_open_the_mesh_again(session):
-    registrar = session.shot.result.registrar
-    session.set_limits(elevation=(35.0, 90.0))
-    session.register()
-    session.set_limits(elevation=None)
-    assert session.shot.result.registrar is registrar
-    assert session.document()["prior"]["elevation"] == (35.0, 90.0)
-    assert session.shot.answer.pose.viewpoint[1] > 32.0
 
 
 @pytest.mark.usefixtures("folder")
@@ -346,3 +295,68 @@ def test_register_is_cancelled_by_the_user(monkeypatch):
     assert len(set(stages)) == 2, "at the first step after it"
     assert session.shot.result is None
     assert not session.cancelled
+
+
+BOX = (10.0, 20.0, 60.0, 50.0)
+
+
+@pytest.mark.parametrize(
+    ("box", "start", "end", "expected"),
+    [
+        (None, (60, 50), (10, 20.26), (10, 20.3, 60, 50)),
+        (BOX, (200, 200), (201, 202), BOX),
+        (BOX, (11, 35), (5, 99), (5, 20, 60, 50)),
+        (BOX, (30, 19), (0, 25), (10, 25, 60, 50)),
+        (BOX, (59, 51), (80, 90), (10, 20, 80, 90)),
+        (BOX, (30, 35), (35, 25), (15, 10, 65, 40)),
+        (BOX, (100, 100), (120, 130), (100, 100, 120, 130)),
+        (BOX, (10, 35), (90, 35), (60, 20, 90, 50)),
+        ((10, 10, 16, 16), (15.5, 13), (30, 13), (10, 10, 30, 16)),
+    ],
+    ids=["new", "click", "left", "top", "corner", "inside", "outside", "across", "small"],
+)
+def test_a_drag_draws_moves_and_resizes_boxes(box, start, end, expected):
+    assert dragged_box(box, start, end, reach=4.0) == expected
+
+
+@pytest.fixture
+def pose(session):
+    """A result, its pose and camera, and the mesh's centre and radius."""
+    result = session.shot.result
+    return result, *result.registration.projection, result.registrar.describer
+
+
+def seen(T, K, point):
+    at = K @ (T[:3, :3] @ point + T[:3, 3])
+    return at[:2] / at[2]
+
+
+def test_the_centre_follows_the_mouse_that_drags_the_mesh(pose):
+    result, T, K, describer = pose
+    moved = result.dragged(T, K, (100.0, 80.0), (112.0, 75.0), turns=False)
+    shift = seen(moved, K, describer.centre) - seen(T, K, describer.centre)
+    torch.testing.assert_close(shift, torch.tensor([12.0, -5.0], dtype=torch.float64))
+    assert torch.equal(moved[:3, :3], T[:3, :3])
+
+
+def test_the_near_side_follows_the_mouse_that_drags_beside_the_mesh(pose):
+    result, T, K, describer = pose
+    near = T[:3, :3].T @ torch.tensor([0, 0, -describer.radius], dtype=torch.float64) + describer.centre
+    turned = result.dragged(T, K, (0.0, 0.0), (4.0, 3.0), turns=True)
+    shift = seen(turned, K, near) - seen(T, K, near)
+    assert 4 < shift[0] < 8, "right and down, a little more than the mouse, as it is nearer"
+    assert 3 < shift[1] < 6
+    torch.testing.assert_close(seen(turned, K, describer.centre), seen(T, K, describer.centre))
+
+
+def test_wheel_and_twist_scale_and_roll_about_the_centre(pose):
+    result, T, K, describer = pose
+    moved = result.scaled(T, 1.25, roll=30.0)
+    centres = [pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (T, moved)]
+    torch.testing.assert_close(centres[1], centres[0] / 1.25)
+    assert float(rotation_error(moved[:3, :3], T[:3, :3])) == pytest.approx(30, abs=1e-4)
+    # Clockwise on the screen: what is right of the centre goes down.
+    right = T[:3, :3].T @ torch.tensor([describer.radius, 0, 0], dtype=torch.float64) + describer.centre
+    assert seen(moved, K, right)[1] > seen(T, K, right)[1]
+    with pytest.raises(InvalidInputError, match="touch the camera"):
+        result.scaled(T, 1000.0)

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import secrets
 import struct
 import threading
 import warnings
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from curvireg_torch.errors import MAX_MESH_BYTES, CurviregError, CurviregWarning, InvalidInputError
+from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.viewer import workspace as module
 from curvireg_torch.viewer.workspace import Workspace, file_name, show_warning, unpack
@@ -150,7 +151,6 @@ class Search:
             if self.session.cancelled:
                 self.session.cancelled = False
                 raise CurviregError("stopped")
-        return "pose"
 
 
 @pytest.fixture
@@ -161,34 +161,31 @@ def search(workspace, monkeypatch):
     search.released.set()
 
 
-def test_photographs_are_added_while_a_search_runs_but_another_mesh_ends_it(workspace, scene, search):
-    async def work():
+def test_photographs_are_added_while_a_search_runs_but_stop_and_another_mesh_end_it(workspace, scene, search):
+    async def start():
+        search.begun.clear()
         running = workspace.start_search()
         assert workspace.start_search() is running, "one search at a time"
         await asyncio.to_thread(search.begun.wait, 10)
+        return running
+
+    async def work():
+        await start()
         await asyncio.wait_for(upload(workspace, scene / "photo.png"), 10)
         assert workspace.searching
         await asyncio.wait_for(upload(workspace, scene / "truck.ply"), 10)
         assert not workspace.searching
-
-    asyncio.run(work())
-    assert names(workspace) == ["photo.png"]
-    assert workspace.messages == {}
-
-
-def test_a_search_is_stopped_and_started_again(workspace, search):
-    async def work():
-        running = workspace.start_search()
-        await asyncio.to_thread(search.begun.wait, 10)
+        assert workspace.messages == {}
+        running = await start()
         workspace.stop()
         await asyncio.wait_for(running, 5)
-        assert workspace.messages["pose"] == "stopped"
+        assert workspace.messages == {"pose": "stopped"}
         workspace.stop()  # nothing that could end the next search
         search.released.set()
-        await workspace.start_search()
+        await (await start())
+        assert workspace.messages == {}
 
     asyncio.run(work())
-    assert "pose" not in workspace.messages
 
 
 def test_find_while_a_photograph_opens_searches_in_the_new_one(workspace, scene, search, monkeypatch):
@@ -233,46 +230,31 @@ def pack(path, members):
     return path
 
 
-def test_unpack_finds_the_mesh_among_its_parts(tmp_path):
-    scene = trimesh.Scene(trimesh.creation.box())
-    files = trimesh.exchange.gltf.export_gltf(scene)
+def test_unpack_finds_the_mesh_among_its_parts_and_keeps_everything_inside(tmp_path):
+    files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(trimesh.creation.box()))
     parts = {f"part/{name}": content for name, content in files.items()}
-    archive = pack(tmp_path / "a.zip", {**parts, "__MACOSX/part/._model.gltf": b"x"})
-    mesh = unpack(archive, tmp_path / "unpacked")
-    assert mesh == tmp_path / "unpacked" / "part" / "model.gltf"
+    outside = {"../../a.png": b"x", "/etc/b.png": b"x", "..\\c.png": b"x", "__MACOSX/part/._model.gltf": b"x"}
+    archive, folder = pack(tmp_path / "a.zip", {**parts, **outside}), tmp_path / "upload" / "parts"
+    mesh = unpack(archive, folder)
+    assert mesh == folder / "part" / "model.gltf"
     assert np.allclose(trimesh.load(mesh).extents, 1)
+    assert all(folder in path.parents for path in tmp_path.rglob("*") if path.is_file() and path != archive)
+    assert len([path for path in folder.rglob("*") if path.is_file()]) == len(parts) + 4
 
 
-def test_unpack_refuses_several_meshes_and_keeps_everything_inside(tmp_path):
-    for members, match in (({"a.txt": b""}, "no mesh"), ({"a.ply": b"", "b.stl": b""}, r"several meshes: .*b\.stl")):
-        with pytest.raises(InvalidInputError, match=rf"^a\.zip: {match}"):
-            unpack(pack(tmp_path / "a.zip", members), tmp_path / members.popitem()[0])
-    (tmp_path / "upload").mkdir()
-    archive = pack(tmp_path / "upload" / "a.zip", {"../../a.ply": b"x", "/etc/b.png": b"x", "..\\c.png": b"x"})
-    before = {path for path in tmp_path.rglob("*") if path.is_file()}
-    mesh = unpack(archive, tmp_path / "upload" / "parts")
-    assert mesh.parent == tmp_path / "upload" / "parts"
-    new = {path for path in tmp_path.rglob("*") if path.is_file()} - before
-    assert all(tmp_path / "upload" / "parts" in path.parents for path in new)
-    assert len(new) == 3
+def test_unpack_refuses_what_is_too_large_damaged_or_not_one_mesh(tmp_path, monkeypatch):
+    def refused(content, message):
+        archive = tmp_path / "a.zip"
+        pack(archive, content) if isinstance(content, dict) else archive.write_bytes(content)
+        with pytest.raises(InvalidInputError, match=rf"^a\.zip: .*{message}"):
+            unpack(archive, tmp_path / secrets.token_hex(4))
 
-
-def test_unpack_refuses_what_is_too_large_or_damaged(tmp_path, monkeypatch):
-    archive = pack(tmp_path / "a.zip", {"a.ply": b"0" * 5000})
-    content = archive.read_bytes()
-    archive.write_bytes(content[:40])
-    with pytest.raises(InvalidInputError, match=r"^a\.zip: the archive cannot be unpacked"):
-        unpack(archive, tmp_path / "unpacked")
-    archive.write_bytes(content.replace(struct.pack("<I", 5000), struct.pack("<I", 10)))  # a header that lies
-    with pytest.raises(InvalidInputError, match="cannot be unpacked"):
-        unpack(archive, tmp_path / "lies")
-    archive.write_bytes(content)
+    content = pack(tmp_path / "good.zip", {"a.ply": b"0" * 5000}).read_bytes()
+    refused({"a.txt": b""}, "no mesh")
+    refused({"a.ply": b"", "b.stl": b""}, r"several meshes: .*b\.stl")
+    refused(content[:40], "cannot be unpacked")
+    refused(content.replace(struct.pack("<I", 5000), struct.pack("<I", 10)), "cannot be unpacked")  # a header that lies
     monkeypatch.setattr(module, "MAX_MESH_BYTES", 4999)
-    with pytest.raises(InvalidInputError, match="or 4,999 bytes when unpacked"):
-        unpack(archive, tmp_path / "unpacked")
-    monkeypatch.setattr(module, "MAX_MESH_BYTES", MAX_MESH_BYTES)
+    refused(content, "or 4,999 bytes when unpacked")
     monkeypatch.setattr(module, "MAX_ARCHIVE_FILES", 2)
-    pack(archive, {f"{k}.txt": b"" for k in range(3)})
-    with pytest.raises(InvalidInputError, match="more than 2 files"):
-        unpack(archive, tmp_path / "unpacked")
-    assert not (tmp_path / "unpacked").exists()
+    refused({f"{k}.txt": b"" for k in range(3)}, "more than 2 files")

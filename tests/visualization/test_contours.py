@@ -66,12 +66,6 @@ def test_contour_layer_leaves_out_specks():
     assert not colour(contour_layer(bump, CAMERA), ORANGE)[30:90, 30:90].any()
 
 
-def test_contour_layer_of_an_object_outside_the_picture():
-    assert not contour_layer(torch.zeros(9, 7), CAMERA).any()
-    full = contour_layer(torch.full((40, 40), 2.0), CAMERA)
-    assert not full.any(), "the picture's border is no contour"
-
-
 @pytest.mark.parametrize("background", [0, 128, 255])
 def test_draw_box_shows_on_any_background(background):
     picture = np.full((100, 100, 3), background, np.uint8)

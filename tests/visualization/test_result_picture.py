@@ -11,7 +11,7 @@ from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.visualization import registration_sheet
 from curvireg_torch.visualization.overlay import VERDICT_COLOURS
-from tests._support.scenes import CAMERA, SIZE, scene, truck_bank, unrefined
+from tests._support.scenes import CAMERA, scene, truck_bank, unrefined
 
 GREEN = (0, 255, 80)
 SIDE = 227  # px of a small picture: four in a row of 960 px
@@ -66,26 +66,6 @@ def test_registration_sheet_draws_rivals_at_their_poses(registered):
     rows, columns = np.nonzero((sheet != other).any(axis=2))
     assert np.ptp(rows) < SIDE, "nothing else changes"
     assert np.ptp(columns) < SIDE
-
-
-def in_larger_photograph(registered, factor):
-    """The sheet of the photograph in the midst of grey, ``factor`` times as wide and high."""
-    registrar, result, image, box = registered
-    (H, W), first = SIZE, result.hypotheses[0]
-    canvas = torch.nn.functional.pad(image, (W, (factor - 2) * W, H, (factor - 2) * H), value=0.5)
-    shift = torch.tensor([W, H], dtype=torch.float64)
-    T, K = first.projection[0], CAMERA.clone()
-    K[:2, 2] += shift
-    moved = replace(result, hypotheses=(replace(first, projection=(T, K)), *result.hypotheses[1:]))
-    return registration_sheet(registrar, moved, canvas, box + shift.repeat(2))
-
-
-def test_registration_sheet_enlarges_small_objects_and_shrinks_large_photographs(registered):
-    rows, columns = np.nonzero(is_outline(small_picture(in_larger_photograph(registered, 4), 0)))
-    assert 0.6 * SIDE < max(np.ptp(rows), np.ptp(columns)) < 0.9 * SIDE
-    sheet = in_larger_photograph(registered, 8)
-    assert sheet.shape[1] == 1600
-    assert is_outline(sheet[200:400, 200:400]).any()
 
 
 def test_registration_sheet_has_the_verdict_in_its_colour(registered):
