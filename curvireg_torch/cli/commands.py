@@ -110,7 +110,7 @@ def add_view(commands: Any) -> None:
     )
     parser.add_argument("photo", type=Path, nargs="?", metavar="PHOTO")
     parser.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help="a mesh or a bank; both can be added later")
-    add_options(parser, *PHOTOGRAPH, box="in px; can be drawn")
+    add_options(parser, *[name for name in PHOTOGRAPH if name != "mask"], box="in px; can be drawn")
     add_limits(parser)
     hosts = f"who may connect: {LOCAL}, only this machine (default), or 0.0.0.0, everyone"
     parser.add_argument("--host", default=LOCAL, help=hosts)

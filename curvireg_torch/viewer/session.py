@@ -3,8 +3,7 @@
 import math
 import shlex
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from ..data import load_camera, read_photo
+from ..data import read_photo
 from ..data.images import Photo
 from ..errors import MAX_VIEWER_PHOTOGRAPHS, CurviregError, CurviregWarning, InvalidInputError
 from ..evaluation.opening import QUALIFIERS, RegisterOptions, check_camera, open_registrar
@@ -218,6 +217,8 @@ class Session:
     def load(self) -> str:
         """Open the files that the options name, and take their box; describes the mesh, or ""."""
         options = self.options
+        if options.box is not None and not options.photos:
+            raise InvalidInputError("--box: needs a photograph; name one, or draw the box on the page")
         self.options = replace(options, photos=(), meshes=(), box=None)
         for path in options.photos:
             self.open_photo(path).box = options.box
@@ -234,9 +235,7 @@ class Session:
     def open_photo(self, path: Path) -> Shot:
         """Add a photograph, and show it."""
         if len(self.shots) >= MAX_VIEWER_PHOTOGRAPHS:
-            raise InvalidInputError(
-                f"{MAX_VIEWER_PHOTOGRAPHS} photographs are open; remove one", subject=self.name(path)
-            )
+            raise InvalidInputError(f"{MAX_VIEWER_PHOTOGRAPHS} photographs are open; remove one", subject=path)
         self.shot = Shot(path, self._read(path))
         self.shots.append(self.shot)
         return self.shot
@@ -249,15 +248,14 @@ class Session:
 
     def _read(self, path: Path) -> Photo:
         """A photograph without the distortion of a calibrated camera, which must be one of such photographs."""
-        with self._user_names():
-            photo, camera = read_photo(path, dtype=torch.uint8), self.options.camera
-            if not isinstance(camera, Camera):
-                return photo
-            try:
-                seen = undistorted(photo.image, camera)
-            except InvalidInputError as error:
-                raise error.with_subject(path) from error
-        return replace(photo, image=seen.image, notes=(*photo.notes, *["undistorted"] * camera.distorts))
+        photo, camera = read_photo(path, dtype=torch.uint8), self.options.camera
+        if not isinstance(camera, Camera):
+            return photo
+        try:
+            image = undistorted(photo.image, camera).image
+        except InvalidInputError as error:
+            raise error.with_subject(path) from error
+        return replace(photo, image=image, notes=(*photo.notes, *["undistorted"] * camera.distorts))
 
     @property
     def is_undistorted(self) -> bool:
@@ -280,22 +278,16 @@ class Session:
             if self.is_undistorted or was_undistorted:
                 self.shot, self.shots = shots[self.shots.index(self.shot)], shots
 
-    def open_calibration(self, path: Path) -> None:
-        """Take the camera of a calibration file for all photographs."""
-        with self._user_names():
-            self.set_camera(load_camera(path))
-
     def open_mesh(self, path: Path) -> str:
         """Check that a mesh or a bank can be used, and describe it; it replaces the one before."""
-        with self._user_names():
-            if path.suffix == ".safetensors":
-                bank = ViewBank.load(path)
-                mesh, facts = bank.mesh, f"bank of {len(bank)} views"
-            else:
-                mesh = load_mesh(path, unit=self.options.unit, up=self.options.up)
-                size = " x ".join(f"{v:.4g}" for v in mesh.extents)
-                colours = "in its colours" if has_colours(mesh) else "in grey"
-                facts = f"{len(mesh.faces):,} faces, {size} {self.options.unit}, rendered {colours}"
+        if path.suffix == ".safetensors":
+            bank = ViewBank.load(path)
+            mesh, facts = bank.mesh, f"bank of {len(bank)} views"
+        else:
+            mesh = load_mesh(path, unit=self.options.unit, up=self.options.up)
+            size = " x ".join(f"{v:.4g}" for v in mesh.extents)
+            colours = "in its colours" if has_colours(mesh) else "in grey"
+            facts = f"{len(mesh.faces):,} faces, {size} {self.options.unit}, rendered {colours}"
         self.mesh_path, self.mesh = path, mesh
         for shot in self.shots:
             shot.result = shot.answer = None
@@ -339,9 +331,9 @@ class Session:
         frame, radius = self.object_frame(), mesh_radius(self.mesh)
         return mesh_glb(self.mesh, transform(frame, -frame @ mesh_centre(self.mesh)) / radius)
 
-    def request(self) -> RegisterOptions:
-        """The registration that the inputs describe."""
-        shot, camera = self.shot, self.options.camera
+    def request(self, shot: Shot | None = None) -> RegisterOptions:
+        """The registration that the inputs describe, in the photograph that is shown, or in another."""
+        shot, camera = shot or self.shot, self.options.camera
         if isinstance(camera, Camera):
             K = camera.matrix if shot.photo is None else camera.at(shot.size).matrix
             camera = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
@@ -355,20 +347,20 @@ class Session:
 
     def register(self) -> Registration:
         """Find the pose in the photograph that is shown, as ``curvireg register`` does."""
-        request, start, shot, camera = self.request(), time.perf_counter(), self.shot, self.options.camera
+        start, shot, camera = time.perf_counter(), self.shot, self.options.camera
+        request = self.request(shot)  # another photograph may be shown meanwhile
         if shot.photo is None or not request.meshes:
             raise InvalidInputError("register: choose a photograph and a mesh first")
-        photo, command = shot.photo, self.command()
+        photo, command = shot.photo, "" if self.is_undistorted else _command_line(request, self.name)
         check_camera(request.camera, request.guess)
         try:
-            with self._user_names():
-                registrar = self._open_registrar(request.meshes[0])
-                registrar.progress = self._report_progress
-                entry = request.entry(request.photos[0])
-                meshes = tuple(Path(self.name(path)) for path in entry.meshes)
-                entry = replace(entry, name=self.name(entry.photo), meshes=meshes)
-                ready = time.perf_counter() - start
-                registration, document = register_entry(entry, photo, registrar, bank_seconds=ready)
+            registrar = self._open_registrar(request.meshes[0])
+            registrar.progress = self._report_progress
+            entry = request.entry(request.photos[0])
+            meshes = tuple(Path(self.name(path)) for path in entry.meshes)
+            entry = replace(entry, name=self.name(entry.photo), meshes=meshes)
+            ready = time.perf_counter() - start
+            registration, document = register_entry(entry, photo, registrar, bank_seconds=ready)
             self._report_progress("contours", 1, 1)  # it may have been stopped in the last step
         except CurviregError as error:
             raise (CurviregError("stopped") if self.cancelled else error) from None
@@ -440,14 +432,6 @@ class Session:
         if self._registrar is None or self._registrar[0] != key:
             self._registrar = key, open_registrar(key, key.meshes, progress=self._report_progress)
         return self._registrar[1]
-
-    @contextmanager
-    def _user_names(self) -> Iterator[None]:
-        """Errors inside call files what the user calls them."""
-        try:
-            yield
-        except CurviregError as error:
-            raise error.with_subject(self.name(error.subject)) from error
 
 
 def dragged_box(box: Numbers | None, start: Point, end: Point, *, reach: float) -> Numbers | None:

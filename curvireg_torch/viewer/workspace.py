@@ -1,7 +1,9 @@
 """The work that the windows of the page show, and the files that it receives. It needs no NiceGUI."""
 
 import asyncio
+import os
 import shutil
+import struct
 import tempfile
 import time
 import traceback
@@ -13,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ..data import load_camera
 from ..errors import MAX_ARCHIVE_FILES, MAX_MESH_BYTES, MAX_VIEWER_BYTES, CurviregError, InvalidInputError
 from ..evaluation.opening import RegisterOptions
 from ..synthetic import demo_scene
@@ -25,6 +28,7 @@ from .session import Session
 __all__ = ["CALIBRATIONS", "Workspace", "file_name", "show_warning", "unpack"]
 
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".json", ".txt")
+DIRECTORY_BYTES = 1024  # largest mean size of an entry in the directory of a zip archive
 MAX_NAME = 60  # characters of the name of an uploaded file
 
 _caught: ContextVar[list[Any]] = ContextVar("caught")
@@ -50,7 +54,7 @@ class Workspace:
         self.session, self.folder = Session(options, folder), folder
         self.messages: dict[str, str] = {}
         self.files: dict[str, tuple[bytes, str]] = {}
-        self.receiving: dict[Path, str] = {}
+        self.receiving, self._sizes = dict[Path, str](), dict[Path, int]()
         self.mesh_facts, self.started, self._version = "", 0.0, 0
         self._lock = asyncio.Lock()
         self._search: asyncio.Task[None] | None = None
@@ -81,7 +85,9 @@ class Workspace:
             if caught:
                 self.messages[part] = "; ".join(map(self.session.describe_warning, caught))
             return True if result is None else result
-        except (CurviregError, OSError) as error:
+        except CurviregError as error:
+            self.messages[part] = str(error.with_subject(self.session.name(error.subject)))
+        except OSError as error:
             self.messages[part] = str(error)
         except Exception as error:  # a defect must not end the page; the terminal has the traceback
             traceback.print_exc()
@@ -109,23 +115,26 @@ class Workspace:
 
     async def receive(self, name: str, size: int, blocks: AsyncIterator[bytes]) -> None:
         """Store a file of ``size`` bytes, if there is room, and open it as a photograph, a mesh or a calibration."""
-        if size + sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file()) > MAX_VIEWER_BYTES:
+        stored = sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file())
+        if stored + sum(self._sizes.values()) + size > MAX_VIEWER_BYTES:
             raise InvalidInputError(f"{name}: all files have more than {MAX_VIEWER_BYTES:,} bytes; remove photographs")
         folder = Path(tempfile.mkdtemp(prefix="upload-", dir=self.folder))
-        self.receiving[folder] = name
+        self.receiving[folder], self._sizes[folder] = name, size
         try:
             with (folder / name).open("wb") as file:
                 async for block in blocks:
                     await asyncio.to_thread(file.write, block)
             await self._open_upload(folder / name)
         finally:
-            self.receiving.pop(folder)
+            del self.receiving[folder], self._sizes[folder]
             self._remove_unused()
 
     async def _open_upload(self, path: Path) -> None:
         suffix, session = path.suffix.lower(), self.session
         kinds = (*IMAGES, ".heic", *MESHES_AND_BANKS, *CALIBRATIONS, ".zip")
         self.messages.pop("file", None)
+        if suffix in kinds:
+            self._leave_sample()
         if suffix not in kinds:
             self.messages["file"] = (
                 f"{path.name}: neither a photograph (JPEG, PNG, TIFF, WebP, BMP, PGM or PPM) nor a mesh "
@@ -133,16 +142,14 @@ class Workspace:
                 f"calibration ({', '.join(CALIBRATIONS)})"
             )
         elif suffix in CALIBRATIONS:
-            await self.run("file", lambda: session.open_calibration(path), stop=True)
+            await self.run("file", lambda: session.set_camera(load_camera(path)), stop=True)
+        elif suffix == ".zip":
+            if mesh := await self.run("mesh", lambda: unpack(path, path.parent / "parts")):
+                await self.open_mesh(mesh)
+        elif suffix in MESHES_AND_BANKS:
+            await self.open_mesh(path)
         else:
-            self._leave_sample()
-            if suffix == ".zip":
-                if mesh := await self.run("mesh", lambda: unpack(path, path.parent / "parts")):
-                    await self.open_mesh(mesh)
-            elif suffix in MESHES_AND_BANKS:
-                await self.open_mesh(path)
-            else:
-                await self.open_photo(path)
+            await self.open_photo(path)
 
     def _remove_unused(self) -> None:
         """Remove uploaded files that were replaced or refused."""
@@ -223,6 +230,11 @@ def unpack(archive: Path, folder: Path) -> Path:
     """Unpack a zip archive into a new folder, which ``zipfile`` does not leave; return the path of the only mesh."""
     name = archive.name
     try:
+        with archive.open("rb") as file:
+            file.seek(-min(archive.stat().st_size, 1 << 16), os.SEEK_END)
+            end = file.read()  # before zipfile reads the whole directory
+        if struct.unpack_from("<I", end, end.rindex(b"PK\5\6") + 12)[0] > MAX_ARCHIVE_FILES * DIRECTORY_BYTES:
+            raise InvalidInputError(f"{name}: more than {MAX_ARCHIVE_FILES:,} files; pack only the mesh and its parts")
         with zipfile.ZipFile(archive) as content:
             members = content.infolist()
             if len(members) > MAX_ARCHIVE_FILES or sum(member.file_size for member in members) > MAX_MESH_BYTES:

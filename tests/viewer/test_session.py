@@ -14,7 +14,7 @@ import trimesh
 
 from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.options import register_options
-from curvireg_torch.errors import BankError, CurviregError, CurviregWarning, InvalidInputError
+from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError
 from curvireg_torch.evaluation.opening import RegisterOptions, read_start
 from curvireg_torch.evaluation.store import to_json
 from curvireg_torch.geometry import Camera, rotation_error, undistorted
@@ -182,9 +182,11 @@ def test_move_without_a_camera_keeps_the_allocentric_rotation(session):
 
 def test_messages_use_the_names_of_the_user(folder):
     session = Session(RegisterOptions(), folder)
-    (folder / "cat.safetensors").write_text("")
-    with pytest.raises(BankError, match=r"^cat\.safetensors: "):
-        session.open_mesh(folder / "cat.safetensors")
+    assert [session.name(path) for path in (folder / "cat.obj", "other/cat.obj", "")] == [
+        "cat.obj",
+        "other/cat.obj",
+        "",
+    ]
     warnings = CurviregWarning("large", subject=folder / "cat.obj"), UserWarning("plain")
     assert list(map(session.describe_warning, warnings)) == ["cat.obj: large", "plain"]
     with pytest.raises(InvalidInputError, match="choose a photograph and a mesh"):
@@ -221,10 +223,8 @@ def test_distortion_is_removed_from_all_photographs(folder):
     assert plain.notes == ()
     assert "--camera 250 250 119.5 89.5" in session.command()
     session.shot.set_box((10.0, 20.0, 90.0, 80.0))
-    calibration = {"camera_matrix": K.tolist(), "distortion_coefficients": [-0.3, 0.1, 0, 0, 0]}
-    (folder / "cam.json").write_text(json.dumps({**calibration, "image_width": 480, "image_height": 360}))
-    session.open_calibration(folder / "cam.json")
     camera = Camera(K, (-0.3, 0.1, 0, 0, 0), size=(360, 480))
+    session.set_camera(camera)
     assert torch.equal(session.shot.photo.image, undistorted(plain.image, camera).image)
     assert session.shot.photo.notes == ("undistorted",)
     assert (session.shot.box, session.command()) == (None, ""), "boxes were of other pixels"

@@ -252,9 +252,12 @@ def test_unpack_refuses_what_is_too_large_damaged_or_not_one_mesh(tmp_path, monk
     content = pack(tmp_path / "good.zip", {"a.ply": b"0" * 5000}).read_bytes()
     refused({"a.txt": b""}, "no mesh")
     refused({"a.ply": b"", "b.stl": b""}, r"several meshes: .*b\.stl")
-    refused(content[:40], "cannot be unpacked")
+    for damaged in (content[:40], b""):
+        refused(damaged, "cannot be unpacked")
     refused(content.replace(struct.pack("<I", 5000), struct.pack("<I", 10)), "cannot be unpacked")  # a header that lies
     monkeypatch.setattr(module, "MAX_MESH_BYTES", 4999)
     refused(content, "or 4,999 bytes when unpacked")
     monkeypatch.setattr(module, "MAX_ARCHIVE_FILES", 2)
     refused({f"{k}.txt": b"" for k in range(3)}, "more than 2 files")
+    monkeypatch.setattr(zipfile.ZipFile, "infolist", None)  # the directory is not even read
+    refused({f"{k:0200}.txt": b"" for k in range(20)}, "more than 2 files")
