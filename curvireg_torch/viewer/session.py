@@ -221,7 +221,7 @@ class Session:
             raise InvalidInputError("--box: needs a photograph; name one, or draw the box on the page")
         self.options = replace(options, photos=(), meshes=(), box=None)
         for path in options.photos:
-            self.open_photo(path).box = options.box
+            self.open_photo(path, options.box)
         return "".join([self.open_mesh(path) for path in options.meshes])
 
     def name(self, path: str | Path) -> str:
@@ -232,11 +232,11 @@ class Session:
         """Forget the photographs and the mesh."""
         self.shots, self.shot, self.mesh_path, self.mesh = [], Shot(), None, None
 
-    def open_photo(self, path: Path) -> Shot:
-        """Add a photograph, and show it."""
+    def open_photo(self, path: Path, box: Numbers | None = None) -> Shot:
+        """Add a photograph, and show it; a box in it loses its distortion too."""
         if len(self.shots) >= MAX_VIEWER_PHOTOGRAPHS:
             raise InvalidInputError(f"{MAX_VIEWER_PHOTOGRAPHS} photographs are open; remove one", subject=path)
-        self.shot = Shot(path, self._read(path))
+        self.shot = Shot(path, *self._read(path, box))
         self.shots.append(self.shot)
         return self.shot
 
@@ -246,16 +246,19 @@ class Session:
         del self.shots[number]
         self.shot = self.shots[min(number, len(self.shots) - 1)] if self.shots else Shot()
 
-    def _read(self, path: Path) -> Photo:
-        """A photograph without the distortion of a calibrated camera, which must be one of such photographs."""
+    def _read(self, path: Path, box: Numbers | None = None) -> tuple[Photo, Numbers | None]:
+        """A photograph and a box without the distortion of a calibrated camera, which must fit the photograph."""
         photo, camera = read_photo(path, dtype=torch.uint8), self.options.camera
         if not isinstance(camera, Camera):
-            return photo
+            return photo, box
         try:
-            image = undistorted(photo.image, camera).image
+            image, moved, _, _ = undistorted(photo.image, camera, None if box is None else torch.tensor(box))
         except InvalidInputError as error:
             raise error.with_subject(path) from error
-        return replace(photo, image=image, notes=(*photo.notes, *["undistorted"] * camera.distorts))
+        if moved is not None and camera.distorts:
+            x0, y0, x1, y1 = (round(float(v), 1) for v in moved)
+            box = x0, y0, x1, y1
+        return replace(photo, image=image, notes=(*photo.notes, *["undistorted"] * camera.distorts)), box
 
     @property
     def is_undistorted(self) -> bool:
@@ -271,7 +274,7 @@ class Session:
         self.options = replace(before, camera=camera, guess=guess)
         if self.shots and (isinstance(camera, Camera) or was_undistorted):
             try:
-                shots = [Shot(shot.path, self._read(shot.path)) for shot in self.shots]
+                shots = [Shot(shot.path, *self._read(shot.path)) for shot in self.shots]
             except CurviregError:
                 self.options = before
                 raise

@@ -2,7 +2,6 @@
 
 import json
 import threading
-import time
 import urllib.error
 import urllib.request
 import webbrowser
@@ -18,28 +17,7 @@ from curvireg_torch.registration import Follower
 from curvireg_torch.visualization.contours import OUTLINE
 from tests._support.lists import CAMERA
 from tests._support.scenes import learned_registrar, sequence
-
-
-class Camera:
-    """Delivers each frame once the one before was seen in the browser."""
-
-    def __init__(self, frames, seen):
-        self.frames, self.seen, self.number = frames, seen, 0
-
-    def isOpened(self):  # noqa: N802
-        return True
-
-    def get(self, _):
-        return 0.0
-
-    def release(self):
-        pass
-
-    def read(self):
-        while len(self.seen) < self.number:
-            time.sleep(0.01)
-        self.number += 1
-        return self.number <= len(self.frames), self.frames[min(self.number, len(self.frames)) - 1]
+from tests.cli.test_follow import Camera
 
 
 def test_the_page_shows_each_pose_until_ctrl_c(tmp_path, monkeypatch, capsys):

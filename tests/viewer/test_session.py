@@ -223,9 +223,19 @@ def test_distortion_is_removed_from_all_photographs(folder):
     assert plain.notes == ()
     assert "--camera 250 250 119.5 89.5" in session.command()
     session.shot.set_box((10.0, 20.0, 90.0, 80.0))
-    camera = Camera(K, (-0.3, 0.1, 0, 0, 0), size=(360, 480))
+    camera, box = Camera(K, (-0.3, 0.1, 0, 0, 0), size=(360, 480)), ["--box", "10", "20", "90", "80"]
+    (folder / "cam.json").write_text(json.dumps({"K": K.tolist(), "D": camera.distortion, "image_size": [480, 360]}))
+    given = new_session("photo.png", "truck.ply", "--camera", "cam.json", *box)
+    given.load()
+    seen = undistorted(plain.image, camera, torch.tensor([10.0, 20, 90, 80]))
+    assert torch.equal(given.shot.photo.image, seen.image)
+    assert given.shot.box == pytest.approx(seen.box.tolist(), abs=0.06), (
+        "the option is of the photograph as it was taken"
+    )
+    with pytest.raises(InvalidInputError, match="--box: needs a photograph"):
+        new_session(*box).load()
     session.set_camera(camera)
-    assert torch.equal(session.shot.photo.image, undistorted(plain.image, camera).image)
+    assert torch.equal(session.shot.photo.image, seen.image)
     assert session.shot.photo.notes == ("undistorted",)
     assert (session.shot.box, session.command()) == (None, ""), "boxes were of other pixels"
     session.open_photo(folder / "photo.png")

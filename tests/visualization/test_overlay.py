@@ -11,7 +11,7 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.rendering import make_renderer, render_depth
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.visualization import contour_overlay
-from tests._support.scenes import CAMERA, SIZE, scene, truck_bank, unrefined
+from tests._support.scenes import CAMERA, SIZE, scene, truck_bank
 
 GREEN = (0, 255, 80)
 
@@ -44,12 +44,6 @@ def test_contour_overlay_draws_the_object_although_the_box_is_wrong(camera, shif
         assert fraction_near(contour_overlay(registrar, filling, image, box), mask, 2) < 0.5
 
 
-def test_contour_overlay_uses_the_renderer_of_the_registrar(bank):
-    (image, box, _), renderer, sizes = scene(0), make_renderer(example_mesh()), []
-    render = renderer.render
-    renderer.render = lambda T, K, size, **options: sizes.append(size) or render(T, K, size, **options)
-    registrar = Registrar(bank, pipeline=unrefined(bank), renderer=renderer)
-    contour_overlay(registrar, registrar([image], box[None])[0], image, box)
-    assert sizes[-1] == SIZE
+def test_a_custom_renderer_knows_one_mesh(bank):
     with pytest.raises(InvalidInputError, match="knows one mesh"):
-        Registrar([bank, bank], renderer=renderer)
+        Registrar([bank, bank], renderer=make_renderer(example_mesh()))
