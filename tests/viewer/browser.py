@@ -46,9 +46,6 @@ class Browser:
         options.add_experimental_option("prefs", {"download.default_directory": str(folder / "downloads")})
         self.driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(PROGRAMS[1]))
         self.folder = folder
-        self.open(address)
-
-    def open(self, address):
         self.driver.get(address)
         self.wait(lambda: self.part("register"), "the page")
 

@@ -154,6 +154,16 @@ def test_the_pose_is_corrected_on_the_photograph(browser, folder):
     assert saved(browser)["rotation"] == before["rotation"]
 
 
+def test_another_photograph_has_its_own_answer(browser, folder):
+    before = saved(browser)
+    browser.drop(folder / "photo.png")
+    browser.wait(lambda: not browser.part("answers").is_displayed(), "no answer yet")
+    browser.click("photograph-1")
+    browser.wait(lambda: browser.part("answers").is_displayed(), "its answer again")
+    assert saved(browser) == before
+    assert browser.part("mode-pose").get_attribute("aria-pressed") == "true"
+
+
 def scroll(browser, element, amount):
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
