@@ -16,12 +16,7 @@ DIFFUSION_STEP = 0.2  # of the diffusion under MCS
 
 
 def anisotropic_diffusion(
-    image: Tensor,
-    *,
-    iterations: int,
-    kappa: float | Tensor = 0.03,
-    step: float = 0.2,
-    conductance: str = "rational",
+    image: Tensor, *, iterations: int, kappa: float | Tensor = 0.03, step: float = 0.2, conductance: str = "rational"
 ) -> Tensor:
     r"""Perona-Malik diffusion: explicit steps, four neighbours, no flow through the border.
 

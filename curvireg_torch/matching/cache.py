@@ -32,16 +32,7 @@ CACHE_LIMIT = 2_000_000_000
 ABANDONED_SECONDS = 3600.0
 """Age from which an incomplete file counts as the remains of a killed process."""
 
-_SOURCES = (
-    "features",
-    "filters",
-    "geometry",
-    "mesh",
-    "rendering",
-    "terms",
-    "pipeline.py",
-    "matching/describe.py",
-)
+_SOURCES = ("features", "filters", "geometry", "mesh", "rendering", "terms", "pipeline.py", "matching/describe.py")
 """Code that turns a mesh into described views: a bank that another version of it built is not found."""
 
 

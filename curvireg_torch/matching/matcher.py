@@ -102,12 +102,7 @@ class Ranking:
 
 
 def distinct_views(
-    order: Tensor,
-    rotations: Tensor,
-    *,
-    count: int,
-    angle: float = 30.0,
-    symmetries: Tensor | None = None,
+    order: Tensor, rotations: Tensor, *, count: int, angle: float = 30.0, symmetries: Tensor | None = None
 ) -> Tensor:
     """Best views that are more than ``angle`` degrees from every better selected one.
 

@@ -7,12 +7,7 @@ import torch
 
 from curvireg_torch import camera_matrix
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import (
-    rotation_error,
-    rotation_from_axis_angle,
-    rotation_towards,
-    viewpoint_from_rotation,
-)
+from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, rotation_towards, viewpoint_from_rotation
 from curvireg_torch.geometry.pose_prior import PosePrior
 from curvireg_torch.registration.inputs import ImageItem
 from curvireg_torch.registration.poses import Poses

@@ -89,8 +89,7 @@ def test_detection_document_reports_the_score_of_the_most_certain_instance():
 
 
 @pytest.mark.parametrize(
-    ("contradiction", "words"),
-    [(None, ""), ("better outside", "much better outside"), ("at the limit", "at one of")],
+    ("contradiction", "words"), [(None, ""), ("better outside", "much better outside"), ("at the limit", "at one of")]
 )
 def test_remarks_name_a_contradicted_prior(contradiction, words):
     lines = remarks({"corrected_box": None, "prior": {"azimuth": [0, 9], "contradiction": contradiction}})
